@@ -1,0 +1,97 @@
+"""labseq: lab control for neutral-atom tweezer arrays.
+
+The flat public namespace for users and plugin writers. Names are resolved when
+they are first used, so that importing labseq costs next to nothing.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any, Final
+
+_HOMES: Final = {
+    "labseq._markers": ("hookimpl",),
+    "labseq.api": ("make_planner", "make_target"),
+    "labseq.config.settings": (
+        "Angle",
+        "Duration",
+        "Fraction",
+        "Frequency",
+        "Length",
+        "Settings",
+        "Speed",
+        "Temperature",
+        "Voltage",
+    ),
+    "labseq.errors": (
+        "ConfigError",
+        "DeviceError",
+        "DeviceTimeoutError",
+        "InvalidPlanError",
+        "LabseqError",
+        "LimitError",
+        "PlanError",
+        "PluginLoadError",
+        "RecordingError",
+        "StopRequested",
+        "TransientError",
+        "UnknownPluginError",
+    ),
+    "labseq.hookspecs": ("LABSEQ_API",),
+    "labseq.model": (
+        "Batch",
+        "DepthRamp",
+        "Frame",
+        "MotionSpec",
+        "Occupancy",
+        "Plan",
+        "PlanReport",
+        "RandomStream",
+        "RunRecord",
+        "ShotRecord",
+        "SiteGrid",
+        "TargetPattern",
+        "TimelineEntry",
+        "ToneProgram",
+        "Waveform",
+        "as_occupancy",
+    ),
+    "labseq.motion": ("check_plan", "tone_program"),
+    "labseq.recording": ("Run", "open_run"),
+    "labseq.registry": ("Registry",),
+    "labseq.roles": (
+        "Camera",
+        "Clock",
+        "Context",
+        "Detector",
+        "Device",
+        "Lines",
+        "MobileTweezers",
+        "Planner",
+        "Shot",
+        "Simulation",
+        "StaticTweezers",
+        "Step",
+        "StepContext",
+        "Trigger",
+        "TruthTeller",
+        "Warmable",
+    ),
+    "labseq.session": ("Session",),
+}
+_HOME_OF: Final = {name: home for home, names in _HOMES.items() for name in names}
+
+__version__: Final = "0.1.0"
+
+
+def __getattr__(name: str) -> Any:
+    home = _HOME_OF.get(name)
+    if home is None:
+        raise AttributeError(f"module 'labseq' has no attribute '{name}'")
+    value = getattr(importlib.import_module(home), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_HOME_OF})

@@ -1,0 +1,1 @@
+"""YAML to frozen, validated specs, with errors that name file, line and column."""

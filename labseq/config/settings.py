@@ -1,0 +1,52 @@
+"""The base class of all settings, and the types of its quantities."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, TypeAlias
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+
+from labseq.units import parse_quantity
+
+
+class Settings(BaseModel):
+    """Base of every settings model: frozen, strict about keys, SI inside.
+
+    Subclass it for your plugin; give each field a description and, where it has
+    one, a default. Quantities take a number in SI or text such as "45 ms".
+
+    Example:
+        >>> class Mine(Settings):
+        ...     exposure: Duration = 45e-3
+        >>> Mine(exposure="20 ms").exposure
+        0.02
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, validate_default=False)
+
+
+def _quantity(dimension: str) -> BeforeValidator:
+    def read(value: Any) -> Any:
+        if isinstance(value, bool):
+            raise ValueError(f"{str(value).lower()} is not a {dimension}")  # noqa: TRY004 - pydantic wants ValueError
+        return parse_quantity(value, dimension) if isinstance(value, str) else value
+
+    return BeforeValidator(read)
+
+
+Duration: TypeAlias = Annotated[float, _quantity("time"), Field(ge=0)]
+"""Seconds, at least 0; "45 ms"."""
+Length: TypeAlias = Annotated[float, _quantity("length")]
+"""Metres; "4.49 um"."""
+Frequency: TypeAlias = Annotated[float, _quantity("frequency")]
+"""Hertz; "80 MHz"."""
+Speed: TypeAlias = Annotated[float, _quantity("speed"), Field(gt=0)]
+"""Metres per second, more than 0; "130 um/ms"."""
+Voltage: TypeAlias = Annotated[float, _quantity("voltage")]
+"""Volts; "200 mV"."""
+Temperature: TypeAlias = Annotated[float, _quantity("temperature")]
+"""Kelvins; "300 uK"."""
+Angle: TypeAlias = Annotated[float, _quantity("angle")]
+"""Radians; "60 deg"."""
+Fraction: TypeAlias = Annotated[float, _quantity("fraction"), Field(ge=0, le=1)]
+"""0 to 1; "75 %"."""

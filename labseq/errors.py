@@ -1,0 +1,244 @@
+"""The one error tree of labseq.
+
+Every error that labseq raises on purpose is a :class:`LabseqError`. It carries
+its values as fields, and its text says what came, what was expected and what
+to do about it. ``exit_code`` is what the command line exits with.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+
+class LabseqError(Exception):
+    """Base of all errors that labseq raises on purpose."""
+
+    exit_code: ClassVar[int] = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """One thing that is wrong in a configuration file.
+
+    Attributes:
+        what: What is wrong, naming the offending key or value.
+        source: File name, or the option it came from (``--set a.b=c``).
+        line: Line in ``source``, counted from 1; 0 if the source has no lines.
+        column: Column in ``source``, counted from 1; 0 if there is none.
+        expected: What would have been right, or "".
+        hint: What to do, for example "did you mean 'rows'?", or "".
+    """
+
+    what: str
+    source: str = ""
+    line: int = 0
+    column: int = 0
+    expected: str = ""
+    hint: str = ""
+
+    def __str__(self) -> str:
+        where = self.source
+        if self.line:
+            where += f":{self.line}:{self.column}"
+        text = f"{where}: {self.what}" if where else self.what
+        if self.expected:
+            text += f"; expected {self.expected}"
+        if self.hint:
+            text += f"; {self.hint}"
+        return text
+
+
+class ConfigError(LabseqError, ValueError):
+    """A sequence, a profile or an option is wrong.
+
+    Attributes:
+        problems: Everything that was found, in file order.
+    """
+
+    exit_code: ClassVar[int] = 2
+
+    def __init__(self, problems: Problem | str | Sequence[Problem]) -> None:
+        if isinstance(problems, str):
+            problems = Problem(problems)
+        if isinstance(problems, Problem):
+            problems = (problems,)
+        self.problems: tuple[Problem, ...] = tuple(problems)
+        super().__init__("\n".join(str(problem) for problem in self.problems))
+
+
+class PluginLoadError(LabseqError):
+    """A plugin that is needed could not be loaded.
+
+    Attributes:
+        plugin: Name of the plugin.
+        reason: Why it failed to load.
+    """
+
+    exit_code: ClassVar[int] = 2
+
+    def __init__(self, plugin: str, reason: str) -> None:
+        self.plugin = plugin
+        self.reason = reason
+        super().__init__(f"plugin '{plugin}' failed to load: {reason}")
+
+
+class UnknownPluginError(LabseqError, LookupError):
+    """No installed plugin offers what was asked for.
+
+    Attributes:
+        kind: What was asked for: "planner", "camera", "pattern", ...
+        name: The name asked for.
+        known: The names that exist.
+        hint: What to do, or "".
+    """
+
+    exit_code: ClassVar[int] = 2
+
+    def __init__(self, kind: str, name: str, known: Sequence[str] = (), hint: str = "") -> None:
+        self.kind = kind
+        self.name = name
+        self.known = tuple(known)
+        self.hint = hint
+        text = f"unknown {kind} '{name}'; expected {one_of(self.known)}"
+        super().__init__(f"{text}; {hint}" if hint else text)
+
+    def __str__(self) -> str:  # LookupError would print the repr
+        return str(self.args[0])
+
+
+class DeviceError(LabseqError):
+    """A device, its driver or a plugin in its role failed.
+
+    Attributes:
+        device: Role or device name in the profile, for example "camera".
+    """
+
+    exit_code: ClassVar[int] = 3
+
+    def __init__(self, device: str, message: str) -> None:
+        self.device = device
+        super().__init__(f"{device}: {message}")
+
+
+class DeviceTimeoutError(DeviceError, TimeoutError):
+    """A device did not answer in time.
+
+    Attributes:
+        device: Role or device name in the profile.
+        timeout_s: How long labseq waited, in seconds.
+    """
+
+    def __init__(self, device: str, message: str, timeout_s: float) -> None:
+        self.timeout_s = timeout_s
+        super().__init__(device, message)
+
+
+class LimitError(LabseqError, ValueError):
+    """A value lies outside what a device or the profile allows.
+
+    Attributes:
+        what: The quantity, for example "row tones in batch 3".
+        value: The value that came.
+        limit: The limit that it broke.
+    """
+
+    exit_code: ClassVar[int] = 2
+
+    def __init__(self, what: str, value: object, limit: object, hint: str = "") -> None:
+        self.what = what
+        self.value = value
+        self.limit = limit
+        text = f"{what} is {value}; the limit is {limit}"
+        super().__init__(f"{text}; {hint}" if hint else text)
+
+
+class PlanError(LabseqError):
+    """A planner failed, or what it returned is not a plan.
+
+    Attributes:
+        planner: Name of the planner, or "".
+    """
+
+    exit_code: ClassVar[int] = 1
+
+    def __init__(self, message: str, planner: str = "") -> None:
+        self.planner = planner
+        super().__init__(f"planner '{planner}': {message}" if planner else message)
+
+
+class InvalidPlanError(PlanError):
+    """A plan breaks a rule of :func:`labseq.check_plan`.
+
+    Attributes:
+        rule: The rule that was broken, one of :data:`labseq.motion.RULES`.
+        batch: Index of the batch, or -1 when the plan as a whole is wrong.
+        move: Index of the atom move within the batch, or -1.
+        detail: What exactly is wrong, with the sites.
+    """
+
+    def __init__(self, rule: str, detail: str, *, batch: int = -1, move: int = -1, planner: str = "") -> None:
+        self.rule = rule
+        self.batch = batch
+        self.move = move
+        self.detail = detail
+        where = f"batch {batch}" if batch >= 0 else "plan"
+        if move >= 0:
+            where += f", atom move {move}"
+        super().__init__(f"{where} breaks the rule '{rule}': {detail}", planner)
+
+
+class RecordingError(LabseqError):
+    """Data could not be written or read back.
+
+    Attributes:
+        path: The file or folder.
+    """
+
+    exit_code: ClassVar[int] = 1
+
+    def __init__(self, path: object, message: str) -> None:
+        self.path = str(path)
+        super().__init__(f"{path}: {message}")
+
+
+class TransientError(LabseqError):
+    """Something rare went wrong that a repetition of the shot may mend.
+
+    Attributes:
+        device: Role or device name, or "".
+    """
+
+    exit_code: ClassVar[int] = 3
+
+    def __init__(self, message: str, device: str = "") -> None:
+        self.device = device
+        super().__init__(f"{device}: {message}" if device else message)
+
+
+class StopRequested(LabseqError):  # noqa: N818 - a request, not an error
+    """The operator asked the run to stop; raised by every wait, within 50 ms.
+
+    Attributes:
+        signal_number: 2 for Ctrl-C (SIGINT), 15 for SIGTERM.
+    """
+
+    def __init__(self, signal_number: int = 2) -> None:
+        self.signal_number = signal_number
+        super().__init__("stopped by Ctrl-C" if signal_number == 2 else "stopped by SIGTERM")
+
+
+def one_of(names: Sequence[str]) -> str:
+    """Name the alternatives in words.
+
+    Example:
+        >>> one_of(["psca", "lsap"])
+        "one of 'psca', 'lsap'"
+        >>> one_of([])
+        'nothing: none is installed'
+    """
+    if not names:
+        return "nothing: none is installed"
+    quoted = ", ".join(f"'{name}'" for name in names)
+    return quoted if len(names) == 1 else f"one of {quoted}"

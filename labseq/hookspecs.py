@@ -1,0 +1,50 @@
+"""The hooks of labseq, all four. The docstrings are the contract.
+
+A plugin is a module (or an installed package with an entry point of group
+``labseq``) that implements any of these with ``@labseq.hookimpl`` and states the
+``LABSEQ_API`` it was written for.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from labseq._markers import hookspec
+from labseq.model import RunRecord, ShotRecord
+from labseq.registry import Registry
+
+LABSEQ_API: Final = 1
+"""Version of the hooks and roles; a plugin written for another one is not loaded."""
+
+
+@hookspec
+def labseq_register(registry: Registry) -> None:
+    """Offer factories: ``registry.planner("mine", MyPlanner, MySettings)`` and likewise.
+
+    Called once, when the plugin is loaded. Do no I/O and import no vendor
+    package here; a device's ``open()`` is the place for both.
+    """
+
+
+@hookspec
+def labseq_run_started(run: RunRecord) -> None:
+    """A run has started: all devices are open and no shot has been taken.
+
+    A failure is logged with the plugin's name and never stops the run.
+    """
+
+
+@hookspec
+def labseq_shot_finished(shot: ShotRecord) -> None:
+    """A shot is on disk. Called between shots; be quick.
+
+    A failure is logged with the plugin's name and never stops the run.
+    """
+
+
+@hookspec
+def labseq_run_finished(run: RunRecord) -> None:
+    """A run has ended, in whatever way; all devices are in their safe state.
+
+    A failure is logged with the plugin's name and never stops the run.
+    """

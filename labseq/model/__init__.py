@@ -1,0 +1,43 @@
+"""The frozen domain types: what the rest of labseq talks about."""
+
+from labseq.model.arrays import Occupancy, as_occupancy, read_only
+from labseq.model.frame import Frame
+from labseq.model.grid import SiteGrid
+from labseq.model.motion import MotionSpec
+from labseq.model.plan import Batch, Plan, PlanReport
+from labseq.model.random import RandomStream
+from labseq.model.records import (
+    CycleRecord,
+    ImageRecord,
+    RunRecord,
+    ShotRecord,
+    StageTiming,
+)
+from labseq.model.signals import AxisTones, DepthRamp, SegmentKind, ToneProgram, Waveform
+from labseq.model.target import TargetPattern
+from labseq.model.timeline import TimelineEntry
+
+__all__ = [
+    "AxisTones",
+    "Batch",
+    "CycleRecord",
+    "DepthRamp",
+    "Frame",
+    "ImageRecord",
+    "MotionSpec",
+    "Occupancy",
+    "Plan",
+    "PlanReport",
+    "RandomStream",
+    "RunRecord",
+    "SegmentKind",
+    "ShotRecord",
+    "SiteGrid",
+    "StageTiming",
+    "TargetPattern",
+    "TimelineEntry",
+    "ToneProgram",
+    "Waveform",
+    "as_occupancy",
+    "read_only",
+]

@@ -1,0 +1,94 @@
+"""The grid of static tweezer sites."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq.model.arrays import read_only
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SiteGrid:
+    """A rhombic grid of sites, spanned by a1 (along a row) and a2 (from row to row).
+
+    On the triangular lattice a1 = a (1, 0) and a2 = a (1/2, +-sqrt(3)/2); on the
+    square lattice a2 = a (0, 1). Positions are in the atom plane, x to the right
+    and y down the image, with the grid's centre at the origin, so that row 0 is
+    at the top of the image. The default is the paper's base array (Tian et al.,
+    "Experimental Setup").
+
+    Attributes:
+        n_rows: Number of rows.
+        n_cols: Number of columns.
+        spacing_m: Distance a between neighbours, in metres.
+        lattice: "triangular" or "square".
+        shear: +1 if rows shift to the right on the way down the image, -1 if to
+            the left. The wrong sign makes 120 degrees out of 60.
+        row_frequency_hz: Frequency of the mobile tweezers' tone at each row,
+            float64 (n_rows,), equally spaced or by calibration.
+        column_frequency_hz: The same for each column, float64 (n_cols,).
+        positions_m: float64 (n_rows, n_cols, 2), (x, y) of each site; derived.
+    """
+
+    n_rows: int = 20
+    n_cols: int = 20
+    spacing_m: float = 4.49e-6
+    lattice: Literal["triangular", "square"] = "triangular"
+    shear: Literal[1, -1] = 1
+    row_frequency_hz: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+    column_frequency_hz: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+    positions_m: NDArray[np.float64] = field(init=False)
+
+    def __post_init__(self) -> None:
+        if self.n_rows < 1 or self.n_cols < 1:
+            raise ValueError(f"a grid has at least 1 x 1 sites, not {self.n_rows} x {self.n_cols}")
+        if not self.spacing_m > 0:
+            raise ValueError(f"the spacing is {self.spacing_m} m; expected more than 0")
+        set_field = object.__setattr__
+        for name, n in (("row_frequency_hz", self.n_rows), ("column_frequency_hz", self.n_cols)):
+            values = getattr(self, name)
+            if len(values) == 0:
+                values = centred_comb(n)
+            set_field(self, name, read_only(values, np.float64, (n,), name))
+        set_field(self, "positions_m", read_only(self._positions(), np.float64, (-1, -1, 2), "positions_m"))
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(n_rows, n_cols)."""
+        return self.n_rows, self.n_cols
+
+    @property
+    def axes(self) -> NDArray[np.float64]:
+        """a1 and a2 in metres, float64 (2, 2): ``axes[0]`` along a row, ``axes[1]`` row to row."""
+        if self.lattice == "square":
+            unit = np.array([[1.0, 0.0], [0.0, 1.0]])
+        else:
+            unit = np.array([[1.0, 0.0], [0.5 * self.shear, np.sqrt(3.0) / 2.0]])
+        return self.spacing_m * unit
+
+    def _positions(self) -> NDArray[np.float64]:
+        rows = np.arange(self.n_rows) - (self.n_rows - 1) / 2
+        cols = np.arange(self.n_cols) - (self.n_cols - 1) / 2
+        a1, a2 = self.axes
+        return cols[None, :, None] * a1 + rows[:, None, None] * a2
+
+
+def centred_comb(n_sites: int, centre_hz: float = 100e6, step_hz: float = 1.6e6) -> NDArray[np.float64]:
+    """Equally spaced tone frequencies around the AOD's centre.
+
+    The defaults keep 20 sites and an ejection slot on each side within the band
+    of about 36 MHz around 100 MHz of the mobile tweezers' AOD.
+
+    Returns:
+        float64 (n_sites,), in Hz.
+
+    Example:
+        >>> centred_comb(3).tolist()
+        [98400000.0, 100000000.0, 101600000.0]
+    """
+    sites = np.arange(n_sites, dtype=np.float64)
+    return centre_hz + step_hz * (sites - (n_sites - 1) / 2)

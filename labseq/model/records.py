@@ -1,0 +1,182 @@
+"""What happened, in memory; ``labseq.recording`` puts it on disk."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq.model.frame import Frame
+from labseq.model.plan import Plan, PlanReport
+from labseq.model.target import TargetPattern
+
+ShotStatus = Literal["complete", "interrupted", "failed"]
+RunStatus = Literal["running", "complete", "stopped", "failed"]
+
+
+@dataclass(frozen=True, slots=True)
+class StageTiming:
+    """How long one stage took, against its budget.
+
+    Attributes:
+        stage: "load", "expose", "detect", "plan", "check", "prepare", "play", ...
+        step: Index of the step in the shot.
+        cycle: Rearrangement cycle, counted from 1; 0 outside of one.
+        t_start_s: Start on the session's clock, from the start of the shot.
+        duration_s: Duration on the session's clock. In a dry run this is the
+            modelled time.
+        host_s: Duration on this computer's clock. Never decisive in a dry run.
+        budget_s: What it may take; nan if it has no budget.
+    """
+
+    stage: str
+    step: int
+    cycle: int
+    t_start_s: float
+    duration_s: float
+    host_s: float
+    budget_s: float = float("nan")
+
+    @property
+    def over_budget(self) -> bool:
+        """Whether it took longer than its budget (with a nanosecond for rounding)."""
+        return self.duration_s > self.budget_s + 1e-9
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImageRecord:
+    """One image and what was seen on it.
+
+    Attributes:
+        frame: The frame, or None if frames are not kept.
+        occupancy: bool (n_rows, n_cols), as the detector saw it.
+        confidence: float32 (n_rows, n_cols), the detector's confidence per site.
+        step: Index of the step in the shot.
+        cycle: Rearrangement cycle that it ended, counted from 1; 0 for the image
+            of an ``image`` step.
+        t_start_s: Start of the exposure, from the start of the shot.
+        exposure_s: Exposure time, in seconds.
+    """
+
+    frame: Frame | None
+    occupancy: NDArray[np.bool_]
+    confidence: NDArray[np.float32]
+    step: int
+    cycle: int
+    t_start_s: float
+    exposure_s: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CycleRecord:
+    """One cycle of plan, check, move.
+
+    Attributes:
+        step: Index of the step in the shot.
+        cycle: Counted from 1.
+        plan: The whole plan.
+        report: What the check said of it.
+        n_batches_played: How many batches fitted into the window and were played.
+        window_s: The window of this cycle, in seconds.
+        t_start_s: Start of the cycle, from the start of the shot.
+        moves_s: Modelled duration of what was played, overheads included.
+    """
+
+    step: int
+    cycle: int
+    plan: Plan
+    report: PlanReport
+    n_batches_played: int
+    window_s: float
+    t_start_s: float
+    moves_s: float
+
+
+@dataclass(slots=True, eq=False)
+class ShotRecord:
+    """Everything that one attempt at a shot left behind. Filled while it runs.
+
+    Attributes:
+        shot_index: Index of the shot in the run, from 0.
+        attempt: 0 for the first try.
+        seed: The run's seed.
+        t_start_utc: Wall time of its start, ISO 8601, UTC.
+        t_end_utc: Wall time of its end.
+        status: "complete", "interrupted" (operator) or "failed".
+        error: Why it did not complete, or "".
+        images: In the order they were taken.
+        cycles: In the order they were made.
+        timing: In the order the stages ended.
+        seen_defect_free_cycle: First cycle whose image met the target; 0 if none.
+        success: Whether the last ``image`` step met the target.
+        filling_fraction: Filling of the target on the last ``image`` step; nan
+            without one.
+        n_missing_atoms: Atoms that the loading fell short of the target.
+        readings: Values read from devices during the shot.
+        parameters: Resolved values of this shot (scan point, overrides).
+    """
+
+    shot_index: int
+    attempt: int
+    seed: int
+    t_start_utc: str
+    t_end_utc: str = ""
+    status: ShotStatus = "failed"
+    error: str = ""
+    images: list[ImageRecord] = field(default_factory=list[ImageRecord])
+    cycles: list[CycleRecord] = field(default_factory=list[CycleRecord])
+    timing: list[StageTiming] = field(default_factory=list[StageTiming])
+    seen_defect_free_cycle: int = 0
+    success: bool = False
+    filling_fraction: float = float("nan")
+    n_missing_atoms: int = 0
+    readings: dict[str, Any] = field(default_factory=dict[str, Any])
+    parameters: Mapping[str, Any] = field(default_factory=dict[str, Any])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RunRecord:
+    """What is known of a run when it starts; it does not change afterwards.
+
+    Attributes:
+        name: The sequence's name.
+        n_shots: Shots asked for.
+        seed: The run's seed.
+        simulated: Whether all hardware is simulated.
+        t_start_utc: Wall time, ISO 8601, UTC.
+        target: The target of the run.
+        sequence_text: Exact bytes of the sequence file, decoded.
+        profile_text: Exact bytes of the profile, decoded.
+        sequence_path: Where the sequence came from.
+        profile_path: Where the profile came from.
+        resolved: Every setting after defaults and overrides, SI, JSON-ready.
+        overrides: What ``--set`` and other options changed: address -> value.
+        devices: ``describe()`` of each device: role -> values.
+        plugins: Name, version and origin of each plugin that was used.
+        provenance: Code and package versions, host, user.
+        record_frames: Which frames are kept: "all", "last" or "none".
+        grid_spacing_m: Spacing of the sites, in metres.
+        lattice: Lattice of the grid.
+    """
+
+    name: str
+    n_shots: int
+    seed: int
+    simulated: bool
+    t_start_utc: str
+    target: TargetPattern
+    sequence_text: str
+    profile_text: str
+    sequence_path: str
+    profile_path: str
+    resolved: Mapping[str, Any]
+    overrides: Mapping[str, Any]
+    devices: Mapping[str, Mapping[str, Any]]
+    plugins: tuple[Mapping[str, str], ...]
+    provenance: Mapping[str, Any]
+    record_frames: Literal["all", "last", "none"]
+    grid_spacing_m: float
+    lattice: str

@@ -1,0 +1,151 @@
+"""Quantities with units, read into plain SI numbers.
+
+Only YAML and the screen speak of "45 ms"; everything inside labseq and on disk
+is SI. A plain number is taken as SI.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Final
+
+_MICRO = ("u", "µ", "μ")  # ASCII, MICRO SIGN, GREEK SMALL LETTER MU
+
+
+def _with_micro(units: dict[str, float]) -> Mapping[str, float]:
+    """Let every unit spelled with "u" be spelled with either micro sign too."""
+    spelled = dict(units)
+    for unit, factor in units.items():
+        if unit.startswith("u"):
+            spelled |= {micro + unit[1:]: factor for micro in _MICRO}
+    return MappingProxyType(spelled)
+
+
+UNITS: Final[Mapping[str, Mapping[str, float]]] = MappingProxyType(
+    {
+        "time": _with_micro({"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}),
+        "length": _with_micro({"m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9}),
+        "frequency": MappingProxyType({"Hz": 1.0, "kHz": 1e3, "MHz": 1e6, "GHz": 1e9}),
+        "speed": _with_micro(
+            {"m/s": 1.0, "mm/s": 1e-3, "mm/ms": 1.0, "um/ms": 1e-3, "um/us": 1.0, "um/s": 1e-6}
+        ),
+        "voltage": _with_micro({"V": 1.0, "mV": 1e-3, "uV": 1e-6}),
+        "power": _with_micro({"W": 1.0, "mW": 1e-3, "uW": 1e-6}),
+        "temperature": _with_micro({"K": 1.0, "mK": 1e-3, "uK": 1e-6}),
+        "angle": MappingProxyType({"rad": 1.0, "mrad": 1e-3, "deg": math.pi / 180.0}),
+        "fraction": MappingProxyType({"%": 1e-2, "": 1.0}),
+    }
+)
+"""Dimension -> unit -> factor to SI."""
+
+_NUMBER = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(\S.*?)?\s*\Z")
+
+
+def parse_quantity(text: str, dimension: str) -> float:
+    """Read a quantity such as "45 ms" into SI.
+
+    Args:
+        text: A number and a unit; the space between them may be left out.
+        dimension: A key of :data:`UNITS`.
+
+    Returns:
+        The value in the SI unit of the dimension.
+
+    Raises:
+        ValueError: The text is no quantity, or its unit is of another dimension.
+
+    Example:
+        >>> parse_quantity("45 ms", "time")
+        0.045
+        >>> parse_quantity("130 um/ms", "speed")
+        0.13
+    """
+    units = UNITS[dimension]
+    match = _NUMBER.match(text)
+    if match is None:
+        raise ValueError(f"'{text}' is not a {dimension}; expected {expected(dimension)}")
+    unit = match[2] or ""
+    if unit not in units:
+        other = next((name for name, known in UNITS.items() if unit in known and unit), None)
+        if not unit:
+            came = f"'{text}' has no unit"
+        elif other is not None:
+            came = f"'{text}' is a {other}, not a {dimension}"
+        else:
+            came = f"'{unit}' in '{text}' is not a unit of {dimension}"
+        raise ValueError(f"{came}; expected {expected(dimension)}")
+    return scaled(float(match[1]), units[unit])
+
+
+def scaled(number: float, factor: float) -> float:
+    """Multiply so that powers of ten come out exact: 4.49 um is 4.49e-06, not 4.4899...e-06.
+
+    Example:
+        >>> scaled(4.49, 1e-6)
+        4.49e-06
+    """
+    inverse = round(1.0 / factor) if 0.0 < factor < 1.0 else 0
+    if inverse and math.isclose(inverse * factor, 1.0, rel_tol=1e-12):
+        return number / inverse
+    return number * factor
+
+
+def expected(dimension: str) -> str:
+    """Say in words what a quantity of this dimension looks like.
+
+    Example:
+        >>> expected("time")
+        "a time such as '45 ms' (s, ms, us, ns, min, h) or a plain number in s"
+    """
+    units = UNITS[dimension]
+    names = [unit for unit in units if unit and not unit.startswith(_MICRO[1:])]
+    examples = {
+        "time": "45 ms",
+        "length": "4.49 um",
+        "frequency": "80 MHz",
+        "speed": "130 um/ms",
+        "voltage": "200 mV",
+        "power": "10 mW",
+        "temperature": "300 uK",
+        "angle": "60 deg",
+        "fraction": "75 %",
+    }
+    plain = "" if dimension == "fraction" else f" in {names[0]}"
+    article = "an" if dimension == "angle" else "a"
+    return (
+        f"{article} {dimension} such as '{examples[dimension]}' ({', '.join(names)}) or a plain number{plain}"
+    )
+
+
+def format_quantity(value: float, dimension: str, digits: int = 3) -> str:
+    """Write an SI value with the unit that a physicist would choose.
+
+    Example:
+        >>> format_quantity(0.045, "time")
+        '45 ms'
+        >>> format_quantity(4.49e-6, "length")
+        '4.49 um'
+    """
+    ladders = {
+        "time": ("s", "ms", "us", "ns"),
+        "length": ("m", "mm", "um", "nm"),
+        "frequency": ("GHz", "MHz", "kHz", "Hz"),
+        "speed": ("um/ms",),
+        "voltage": ("V", "mV", "uV"),
+        "power": ("W", "mW", "uW"),
+        "temperature": ("K", "mK", "uK"),
+        "angle": ("deg",),
+        "fraction": ("%",),
+    }
+    units = UNITS[dimension]
+    ladder = ladders[dimension]
+    unit = next((u for u in ladder if abs(value) >= units[u] * (1 - 1e-9)), ladder[-1])
+    if value == 0:
+        unit = ladder[0]
+    number = f"{value / units[unit]:.{digits}g}"
+    if "e" in number:
+        number = f"{value / units[unit]:.0f}"
+    return f"{number} {unit}"

@@ -1,0 +1,1 @@
+"""The parallel sort-and-compression algorithm."""

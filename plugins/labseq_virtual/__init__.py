@@ -1,0 +1,1 @@
+"""Virtual hardware on one simulated world."""
