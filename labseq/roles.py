@@ -13,6 +13,7 @@ Failures: a device raises ``DeviceError`` (or ``DeviceTimeoutError``),
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from typing import Any, Literal, ParamSpec, Protocol, TypeVar, runtime_checkable
 
@@ -357,8 +358,42 @@ class Shot(Protocol):
         """Occupancy on the last image of this shot; None before the first."""
         ...
 
+    @property
+    def planner_name(self) -> str:
+        """Name of the planner, for messages."""
+        ...
+
+    @property
+    def degree_of_parallelism(self) -> int:
+        """Most mobile tweezers that a batch of this run may use."""
+        ...
+
+    @property
+    def step(self) -> int:
+        """Index of the running step."""
+        ...
+
+    @property
+    def start_s(self) -> float:
+        """Start of the shot on the session's clock."""
+        ...
+
+    @property
+    def call_timeout_s(self) -> float:
+        """How long a device call may take beyond its own duration, from the profile."""
+        ...
+
+    @property
+    def plan_timeout_s(self) -> float:
+        """How long one plan may take, from the profile."""
+        ...
+
     def device(self, name: str) -> Device:
         """A named device of the profile."""
+        ...
+
+    def judge(self) -> None:
+        """Judge the shot's success on the image just taken."""
         ...
 
     def call(
@@ -380,7 +415,7 @@ class Shot(Protocol):
         """
         ...
 
-    def stage(self, name: str, budget_s: float = ..., cycle: int = 0) -> Any:
+    def stage(self, name: str, budget_s: float = ..., cycle: int = 0) -> AbstractContextManager[None]:
         """Context manager that times a stage against its budget."""
         ...
 

@@ -1,0 +1,38 @@
+"""What labseq itself offers, registered like any plugin's."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from labseq._markers import hookimpl
+from labseq.hookspecs import LABSEQ_API as _API
+from labseq.registry import Registry
+
+LABSEQ_API: Final = _API
+
+
+@hookimpl
+def labseq_register(registry: Registry) -> None:
+    """Offer the built-in steps, patterns and detector."""
+    from labseq.config.detectors import ThresholdSettings
+    from labseq.config.patterns import BitmapSettings, CompactSettings
+    from labseq.config.steps import (
+        DeviceSettings,
+        ImageSettings,
+        LoadSettings,
+        RearrangeSettings,
+        WaitSettings,
+    )
+    from labseq.geometry import bitmap, compact
+    from labseq.imaging import ThresholdDetector
+    from labseq.sequencer.rearrange import RearrangeStep
+    from labseq.sequencer.steps import DeviceStep, ImageStep, LoadStep, WaitStep
+
+    registry.step("load", LoadStep, LoadSettings)
+    registry.step("image", ImageStep, ImageSettings)
+    registry.step("rearrange", RearrangeStep, RearrangeSettings)
+    registry.step("wait", WaitStep, WaitSettings)
+    registry.step("device", DeviceStep, DeviceSettings)
+    registry.pattern("compact", compact, CompactSettings)
+    registry.pattern("bitmap", bitmap, BitmapSettings)
+    registry.detector("threshold", ThresholdDetector, ThresholdSettings)

@@ -1,0 +1,130 @@
+"""Calls into plugins that neither hang the run nor escape a stop request."""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from collections.abc import Callable
+from typing import Any, Final, ParamSpec, TypeVar
+
+from labseq.errors import DeviceError, DeviceTimeoutError, LabseqError, PlanError
+from labseq.sequencer.clock import StopFlag
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+LOOK_S: Final = 0.05
+"""How often a waiting call looks for a stop request and its deadline."""
+GRACE_S: Final = 1.0
+"""How long a call may take to come back after a stop request."""
+
+
+class _Job:
+    def __init__(self, function: Callable[[], Any]) -> None:
+        self._function = function
+        self.done = threading.Event()
+        self.result: Any = None
+        self.error: BaseException | None = None
+
+    def run(self) -> None:
+        try:
+            self.result = self._function()
+        except BaseException as error:  # noqa: BLE001 - handed to the thread that waits
+            self.error = error
+        self.done.set()
+
+
+class _Worker:
+    """One thread per device: vendor libraries want all calls from the same one."""
+
+    def __init__(self, owner: str) -> None:
+        self._jobs: queue.SimpleQueue[_Job | None] = queue.SimpleQueue()
+        self.current: _Job | None = None
+        threading.Thread(target=self._loop, name=f"labseq {owner}", daemon=True).start()
+
+    @property
+    def busy(self) -> bool:
+        return self.current is not None and not self.current.done.is_set()
+
+    def submit(self, job: _Job) -> None:
+        self.current = job
+        self._jobs.put(job)
+
+    def end(self) -> None:
+        self._jobs.put(None)
+
+    def _loop(self) -> None:
+        while (job := self._jobs.get()) is not None:
+            job.run()
+
+
+class Guard:
+    """Runs every call into a device or plugin in that device's own thread.
+
+    A call that does not return in time is given up: the run ends, and the thread,
+    which nothing can end, dies with the process.
+    """
+
+    def __init__(self, stop: StopFlag) -> None:
+        self._stop = stop
+        self._workers: dict[str, _Worker] = {}
+
+    def call(
+        self, owner: str, timeout_s: float, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs
+    ) -> T:
+        """Call a function; see ``labseq.roles.Shot.call``."""
+        self._stop.check()
+        return self._wait(owner, self._submit(owner, lambda: function(*args, **kwargs)), timeout_s, True)
+
+    def call_to_the_end(
+        self, owner: str, timeout_s: float, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs
+    ) -> T:
+        """The same, whether or not the run is asked to stop; for safe states and closing."""
+        job = self._submit(owner, lambda: function(*args, **kwargs))
+        return self._wait(owner, job, timeout_s, False)
+
+    def end(self) -> None:
+        """Let idle threads end; a hung one is left to the end of the process."""
+        for worker in self._workers.values():
+            worker.end()
+        self._workers.clear()
+
+    def _submit(self, owner: str, function: Callable[[], Any]) -> _Job:
+        job = _Job(function)
+        worker = self._workers.get(owner)
+        if worker is not None and worker.busy:
+            worker.end()  # it hangs: leave it behind
+            worker = None
+        if worker is None:
+            worker = self._workers[owner] = _Worker(owner)
+        worker.submit(job)
+        return job
+
+    def _wait(self, owner: str, job: _Job, timeout_s: float, stoppable: bool) -> Any:
+        deadline = time.monotonic() + timeout_s
+        while not job.done.wait(min(LOOK_S, max(0.0, deadline - time.monotonic()))):
+            if stoppable and self._stop.is_set:
+                job.done.wait(GRACE_S)
+                if not job.done.is_set():
+                    self._stop.check()
+            if time.monotonic() >= deadline and not job.done.is_set():
+                raise _timeout(owner, timeout_s)
+        if job.error is not None:
+            raise _translated(owner, job.error)
+        return job.result
+
+
+def _timeout(owner: str, timeout_s: float) -> LabseqError:
+    text = f"did not answer within {timeout_s:.3g} s and is given up"
+    return PlanError(text) if owner == "planner" else DeviceTimeoutError(owner, text, timeout_s)
+
+
+def _translated(owner: str, error: BaseException) -> BaseException:
+    """Name the plugin in whatever it raised; labseq's own errors pass as they are."""
+    if isinstance(error, LabseqError):
+        return error
+    text = f"raised {type(error).__name__}: {error}" if str(error) else f"raised {type(error).__name__}"
+    named = PlanError(f"the planner {text}") if owner == "planner" else DeviceError(owner, text)
+    named.__cause__ = error
+    return named

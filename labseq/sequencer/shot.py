@@ -1,0 +1,155 @@
+"""One attempt at a shot: what the steps work with, and its record."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Generator, Mapping
+from contextlib import contextmanager
+from typing import Any, ParamSpec, TypeVar
+
+import numpy as np
+
+from labseq.errors import ConfigError, DeviceError
+from labseq.model import CycleRecord, Frame, ImageRecord, Occupancy, ShotRecord, StageTiming
+from labseq.roles import Device, TruthTeller
+from labseq.sequencer.guard import Guard
+from labseq.sequencer.lab import Lab
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+Emit = Callable[[str, Mapping[str, Any]], None]
+
+
+class RunningShot:
+    """Implements ``labseq.roles.Shot`` for the steps and fills the shot's record.
+
+    Args:
+        lab: The devices.
+        guard: Runs every call into them.
+        record: Filled while the shot runs, so that what it has is never lost.
+        emit: Told every event: name and values.
+    """
+
+    def __init__(self, lab: Lab, guard: Guard, record: ShotRecord, emit: Emit) -> None:
+        self.lab = lab
+        self.record = record
+        self.index = record.shot_index
+        self.occupancy: Occupancy | None = None
+        self.grid = lab.grid
+        self.motion = lab.motion
+        self.target = lab.target
+        self.clock = lab.clock
+        self.simulation = lab.simulation
+        self.static_tweezers = lab.static_tweezers
+        self.mobile_tweezers = lab.mobile_tweezers
+        self.planner = lab.planner
+        self.planner_name = lab.planner_name
+        self.degree_of_parallelism = lab.degree_of_parallelism
+        self.call_timeout_s = lab.timeouts.call_s
+        self.plan_timeout_s = lab.timeouts.plan_s
+        self.step = 0
+        self.start_s = lab.clock.now()
+        self._guard = guard
+        self._emit = emit
+
+    @property
+    def elapsed_s(self) -> float:
+        """Time since the start of the shot, on the session's clock."""
+        return self.clock.now() - self.start_s
+
+    def begin_step(self, index: int) -> None:
+        """Name the step that the following stages and images belong to."""
+        self.step = index
+
+    def device(self, name: str) -> Device:
+        """A named device of the profile."""
+        try:
+            return self.lab.devices[name]
+        except KeyError:
+            known = ", ".join(self.lab.devices) or "none"
+            raise ConfigError(f"the profile has no device '{name}'; it has: {known}") from None
+
+    def call(
+        self, owner: str, timeout_s: float, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs
+    ) -> T:
+        """Call a device or plugin; see ``labseq.roles.Shot``."""
+        return self._guard.call(owner, timeout_s, function, *args, **kwargs)
+
+    @contextmanager
+    def stage(self, name: str, budget_s: float = float("nan"), cycle: int = 0) -> Generator[None]:
+        """Time a stage against its budget; it is recorded however it ends."""
+        start_s, host_start_s = self.elapsed_s, time.perf_counter()
+        try:
+            yield
+        finally:
+            host_s = time.perf_counter() - host_start_s
+            duration_s = self.elapsed_s - start_s
+            timing = StageTiming(name, self.step, cycle, start_s, duration_s, host_s, budget_s)
+            self.record.timing.append(timing)
+            self._emit("stage", {"timing": timing})
+
+    def take_image(self, exposure_s: float, cycle: int = 0) -> Occupancy:
+        """Expose, read, detect and record an image.
+
+        Raises:
+            DeviceError: Camera or detector delivered something of the wrong kind.
+        """
+        camera, timeout_s = self.lab.camera, self.call_timeout_s
+        start_s = self.elapsed_s
+        with self.stage("expose", cycle=cycle):
+            self.call("camera", timeout_s, camera.arm, 1, exposure_s, "software")
+            self.call("camera", timeout_s + exposure_s, camera.trigger)
+            limit_s = timeout_s + exposure_s
+            frame = self.call("camera", limit_s + LATE_S, camera.read, limit_s)
+        if not isinstance(frame, Frame):  # pyright: ignore[reportUnnecessaryIsInstance]
+            raise DeviceError("camera", f"read() returned {type(frame).__name__}; expected a Frame")
+        with self.stage("detect", cycle=cycle):
+            answer = self.call("detector", timeout_s, self.lab.detector.detect, frame)
+        occupancy, confidence = self._detected(answer)
+        self.occupancy = occupancy
+        image = ImageRecord(frame, occupancy, confidence, self.step, cycle, start_s, exposure_s)
+        self.record.images.append(image)
+        if cycle and not self.record.seen_defect_free_cycle and self.target.is_met_by(occupancy):
+            self.record.seen_defect_free_cycle = cycle
+        self._emit("image", {"image": image, "filling_fraction": self.target.filling_fraction(occupancy)})
+        return occupancy
+
+    def judge(self) -> None:
+        """Judge the shot on the image just taken; called by the ``image`` step alone."""
+        if self.occupancy is None:
+            return
+        self.record.success = self.target.is_met_by(self.occupancy)
+        self.record.filling_fraction = self.target.filling_fraction(self.occupancy)
+
+    def record_cycle(self, cycle: CycleRecord) -> None:
+        """Add a rearrangement cycle to the shot's record."""
+        self.record.cycles.append(cycle)
+        self._emit("cycle", {"cycle": cycle})
+
+    def log(self, event: str, **values: Any) -> None:
+        """Add a line to the run's event log."""
+        self._emit(event, {"shot": self.index, **values})
+
+    def note_truth(self) -> None:
+        """Keep the true occupancy, where the simulation tells it."""
+        if isinstance(self.simulation, TruthTeller):
+            truth = self.simulation.truth()
+            self.record.readings["simulation.n_atoms_true"] = int(np.count_nonzero(truth))
+            self.record.readings["simulation.n_defects_true"] = self.target.n_defects(truth)
+
+    def _detected(self, answer: Any) -> tuple[Occupancy, Any]:
+        shape = self.grid.shape
+        if not (isinstance(answer, tuple) and len(answer) == 2):
+            raise DeviceError("detector", f"detect() returned {type(answer).__name__}; expected a pair")
+        occupancy, confidence = answer
+        for name, array, kind in (("occupancy", occupancy, "b"), ("confidence", confidence, "f")):
+            if not isinstance(array, np.ndarray) or array.shape != shape or array.dtype.kind != kind:
+                came = f"{getattr(array, 'dtype', type(array).__name__)} {getattr(array, 'shape', '')}"
+                wanted = "bool" if kind == "b" else "float32"
+                raise DeviceError("detector", f"the {name} is {came}; expected {wanted} {shape}")
+        return np.ascontiguousarray(occupancy), np.ascontiguousarray(confidence, np.float32)
+
+
+LATE_S = 2.0
+"""A driver's own timeout comes first; only then does the guard count it as hung."""

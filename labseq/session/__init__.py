@@ -1,0 +1,18 @@
+"""The composition root: sequence + profile + plugins -> open devices -> sequencer -> recorder."""
+
+from labseq.session.assembly import Assembly, Bench, assemble, load_plugins, set_up_bench
+from labseq.session.provenance import gather_provenance
+from labseq.session.safe import make_profile_safe
+from labseq.session.session import Options, Session
+
+__all__ = [
+    "Assembly",
+    "Bench",
+    "Options",
+    "Session",
+    "assemble",
+    "gather_provenance",
+    "load_plugins",
+    "make_profile_safe",
+    "set_up_bench",
+]

@@ -1,0 +1,77 @@
+"""Fans a run's events out: event log, plugins' observer hooks, live view."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, Final
+
+from labseq.model import CycleRecord, ShotRecord, StageTiming
+from labseq.plugins import PluginHost
+from labseq.roles import RunObserver
+
+_QUIET: Final = frozenset({"image", "cycle", "state", "warming", "warmed"})
+"""Events that the shot files tell better than the log would."""
+
+
+class Observers:
+    """Implements ``RunObserver`` for the sequencer; no failure of a listener stops the run.
+
+    Attributes:
+        log: Writes a line into the run's event log; set once the run has a folder.
+    """
+
+    def __init__(self, host: PluginHost, observer: RunObserver | None) -> None:
+        self._host = host
+        self._observer = observer
+        self.log: Callable[..., None] | None = None
+
+    def event(self, name: str, values: Mapping[str, Any]) -> None:
+        """Tell everybody."""
+        self._write(name, values)
+        for plugin, error in self._notify(name, values):
+            text = f"plugin '{plugin}' failed in its observer hook: {type(error).__name__}: {error}"
+            self._write("warning", {"text": text})
+            self._show("warning", {"text": text})
+        self._show(name, values)
+
+    def _notify(self, name: str, values: Mapping[str, Any]) -> list[tuple[str, Exception]]:
+        if name == "run_started":
+            return self._host.notify("labseq_run_started", run=values["record"])
+        if name == "shot_finished":
+            return self._host.notify("labseq_shot_finished", shot=values["shot"])
+        if name == "run_finished":
+            return self._host.notify("labseq_run_finished", run=values["record"])
+        return []
+
+    def _show(self, name: str, values: Mapping[str, Any]) -> None:
+        if self._observer is None:
+            return
+        try:
+            self._observer.event(name, values)
+        except Exception as error:  # noqa: BLE001 - a broken screen must not stop the run
+            self._observer = None
+            self._write("warning", {"text": f"the live view failed and is off: {error!r}"})
+
+    def _write(self, name: str, values: Mapping[str, Any]) -> None:
+        if self.log is None or name in _QUIET:
+            return
+        timing = values.get("timing")
+        if isinstance(timing, StageTiming):
+            if timing.over_budget:
+                self.log("over_budget", **_timing(timing))
+            return
+        self.log(name, **{key: _plain(value) for key, value in values.items() if key != "record"})
+
+
+def _timing(timing: StageTiming) -> dict[str, Any]:
+    names = ("stage", "step", "cycle", "duration_s", "host_s", "budget_s")
+    return {name: getattr(timing, name) for name in names}
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, ShotRecord):
+        names = ("shot_index", "attempt", "status", "error", "success", "filling_fraction")
+        return {name: getattr(value, name) for name in names}
+    if isinstance(value, CycleRecord):
+        return {"cycle": value.cycle, "n_batches_played": value.n_batches_played}
+    return value

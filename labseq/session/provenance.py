@@ -1,0 +1,81 @@
+"""Which code made the data."""
+
+from __future__ import annotations
+
+import getpass
+import importlib.metadata
+import os
+import platform
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any, Final
+
+import labseq
+
+_GIT_TIMEOUT_S: Final = 5.0
+
+
+def gather_provenance(sequence_folder: Path) -> dict[str, Any]:
+    """Collect what is needed to know, years later, which code made the data.
+
+    Args:
+        sequence_folder: Folder of the sequence; its repository is recorded beside
+            that of labseq's own code.
+
+    Returns:
+        JSON-ready values: labseq, python, platform, host, user, git (of the code
+        and of the sequence, with whether uncommitted changes were there), packages.
+    """
+    return {
+        "labseq": labseq.__version__,
+        "python": sys.version.split()[0],
+        "platform": platform.platform(),
+        "host": platform.node(),
+        "user": _user(),
+        "pid": os.getpid(),
+        "git": {
+            "code": git_state(Path(labseq.__file__).parent),
+            "sequence": git_state(sequence_folder),
+        },
+        "packages": {
+            name: distribution.version
+            for distribution in importlib.metadata.distributions()
+            if (name := distribution.metadata["Name"])
+        },
+    }
+
+
+def git_state(folder: Path) -> dict[str, Any] | None:
+    """Commit of the repository that a folder is in, and whether tracked files differ from it.
+
+    Returns:
+        ``{"commit": str, "dirty": bool}``, or None outside of a repository or
+        where git is not installed.
+    """
+    commit = _git(folder, "rev-parse", "HEAD")
+    if commit is None:
+        return None
+    changes = _git(folder, "status", "--porcelain", "--untracked-files=no")
+    return {"commit": commit, "dirty": bool(changes)}
+
+
+def _git(folder: Path, *arguments: str) -> str | None:
+    try:
+        done = subprocess.run(  # noqa: S603 - fixed arguments, no shell
+            ["git", "-C", str(folder), *arguments],  # noqa: S607 - the user's own git
+            capture_output=True,
+            check=True,
+            timeout=_GIT_TIMEOUT_S,
+            stdin=subprocess.DEVNULL,
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout.decode(errors="replace").strip()
+
+
+def _user() -> str:
+    try:
+        return getpass.getuser()
+    except (OSError, KeyError, ImportError):
+        return ""

@@ -1,0 +1,84 @@
+"""``labseq safe``: open each device of a profile, make it safe, close it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from labseq.config import split_overrides
+from labseq.errors import LabseqError
+from labseq.roles import Hardware, RunObserver, Simulation
+from labseq.sequencer import Guard, RealClock, StopFlag, VirtualClock
+from labseq.sequencer.lab import Timeouts, in_safe_order
+from labseq.session.assembly import set_up_bench, timeouts_of
+from labseq.session.choosing import HARDWARE_KINDS, construct
+
+
+def secure(
+    devices: Iterable[tuple[str, Hardware]],
+    timeouts: Timeouts,
+    simulation: Simulation | None = None,
+    observer: RunObserver | None = None,
+) -> dict[str, LabseqError | None]:
+    """Open, make safe and close each device; one that fails never stops the others.
+
+    Args:
+        devices: Name and device, in the order of the safe state.
+        timeouts: How long each call may take.
+        simulation: The world that virtual devices act on.
+        observer: Told each device's outcome.
+
+    Returns:
+        Device name -> what went wrong, or None.
+    """
+    guard = Guard(StopFlag())
+    outcome: dict[str, LabseqError | None] = {}
+    if simulation is not None:
+        simulation.open()
+    for name, device in devices:
+        failure: LabseqError | None = None
+        calls = (
+            (device.open, timeouts.call_s),
+            (device.safe_state, timeouts.safe_state_s),
+            (device.close, timeouts.safe_state_s),
+        )
+        for method, timeout_s in calls:
+            try:
+                guard.call_to_the_end(name, timeout_s, method)
+            except LabseqError as error:  # a device that cannot be opened may still be made safe
+                failure = failure or error
+        outcome[name] = failure
+        if observer is not None:
+            observer.event("safe_state", {"device": name, "ok": failure is None, "error": str(failure or "")})
+    if simulation is not None:
+        simulation.close()
+    guard.end()
+    return outcome
+
+
+def make_profile_safe(
+    profile: str, overrides: Sequence[str] = (), observer: RunObserver | None = None
+) -> dict[str, LabseqError | None]:
+    """Bring every device of a profile to its safe state.
+
+    Args:
+        profile: Name or path of the profile.
+        overrides: ``"profile.address=value"`` strings, as given to ``--set``.
+        observer: Told each device's outcome.
+
+    Returns:
+        Device name -> what went wrong, or None.
+
+    Raises:
+        ConfigError: The profile is wrong or does not exist.
+        PluginLoadError: A plugin that it names failed to load.
+    """
+    _, for_profile = split_overrides(overrides)
+    bench = set_up_bench(profile, Path(), for_profile)
+    stop = StopFlag()
+    clock = VirtualClock(stop) if bench.virtual_time else RealClock(stop)
+    needed = HARDWARE_KINDS | {"simulation"}
+    chosen = {role: c for role, c in bench.chosen.items() if c.entry.kind in needed}
+    made, _ = construct(chosen, bench.grid, bench.profile.motion_spec(), clock, seed=0)
+    simulation = made.pop("simulation", None)
+    return secure(in_safe_order(made), timeouts_of(bench.profile), simulation, observer)

@@ -1,0 +1,303 @@
+"""A session: one sequence on one profile, from the files to the data."""
+
+from __future__ import annotations
+
+import secrets
+import signal
+import threading
+from collections.abc import Generator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Final, Self
+
+from labseq.errors import ConfigError, LabseqError, StopRequested
+from labseq.model import RunRecord, TimelineEntry
+from labseq.model.records import RunStatus
+from labseq.recording import Run, RunWriter, clear_active, data_root, died, mark_active, open_run
+from labseq.roles import RunObserver, StepContext, Warmable
+from labseq.sequencer import PacedClock, RealClock, Sequencer, StopFlag, VirtualClock
+from labseq.sequencer.lab import Lab, describe
+from labseq.session.assembly import Assembly, assemble, build_lab
+from labseq.session.choosing import DryRun
+from labseq.session.observers import Observers
+from labseq.session.provenance import gather_provenance
+from labseq.session.safe import secure
+
+_EXIT_SIGNALS: Final = tuple(
+    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGBREAK") if hasattr(signal, name)
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """What a user may change when opening a session.
+
+    Attributes:
+        profile: Name or path of the profile, instead of the sequence's own.
+        shots: Number of shots, instead of the sequence's own.
+        seed: Seed, instead of the sequence's own or a fresh one.
+        overrides: ``"address=value"`` strings, as given to ``--set``; they win.
+        output: Folder for the data, instead of LABSEQ_DATA or ``./data``.
+        dry_run: "off", "full" or "fast".
+        realtime: Let virtual time take as long as it says.
+    """
+
+    profile: str | None = None
+    shots: int | None = None
+    seed: int | None = None
+    overrides: Sequence[str] = ()
+    output: Path | None = None
+    dry_run: DryRun = "off"
+    realtime: bool = False
+
+    def all_overrides(self) -> list[str]:
+        """The overrides with ``shots`` and ``seed`` among them, weakest first."""
+        given = [("shots", self.shots), ("seed", self.seed)]
+        return [*(f"{key}={value}" for key, value in given if value is not None), *self.overrides]
+
+
+class Session:
+    """Opens a sequence, runs it, and leaves every device safe; a context manager.
+
+    Example::
+
+        with labseq.Session.open("sequences/compact_225.yaml", shots=5) as session:
+            run = session.run()
+    """
+
+    def __init__(self, assembly: Assembly, options: Options, observer: RunObserver | None = None) -> None:
+        self.assembly = assembly
+        self.options = options
+        self.seed = assembly.sequence.seed
+        if self.seed is None:
+            self.seed = secrets.randbits(63)
+        self.run_dir: Path | None = None
+        self.stop_flag = StopFlag()
+        self._observers = Observers(assembly.bench.host, observer)
+        self._sequencer: Sequencer | None = None
+
+    @classmethod
+    def open(
+        cls,
+        sequence: str | Path,
+        *,
+        profile: str | None = None,
+        shots: int | None = None,
+        seed: int | None = None,
+        overrides: Sequence[str] = (),
+        output: str | Path | None = None,
+        dry_run: DryRun = "off",
+        realtime: bool = False,
+        observer: RunObserver | None = None,
+    ) -> Session:
+        """Read and check sequence and profile; nothing is opened yet.
+
+        Args:
+            sequence: The sequence file.
+            profile: See :class:`Options`, as for all others.
+            shots: Number of shots.
+            seed: Seed of the run.
+            overrides: ``"address=value"`` strings.
+            output: Folder for the data.
+            dry_run: "off", "full" or "fast".
+            realtime: Let virtual time take as long as it says.
+            observer: Told everything that happens.
+
+        Raises:
+            ConfigError: Sequence, profile or an option is wrong; names file, line and column.
+            UnknownPluginError: A plugin that is named does not exist.
+            PluginLoadError: A plugin that is named failed to load.
+        """
+        folder = Path(output) if output is not None else None
+        options = Options(profile, shots, seed, tuple(overrides), folder, dry_run, realtime)
+        assembly = assemble(
+            Path(sequence), profile=profile, overrides=options.all_overrides(), dry_run=dry_run
+        )
+        return cls(assembly, options, observer)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Make every device safe and close it; legal at any time."""
+        if self._sequencer is not None:
+            self._sequencer.shut_down()
+
+    def timeline(self) -> list[tuple[str, list[TimelineEntry]]]:
+        """What a shot will do: name of each step and its bars."""
+        assembly = self.assembly
+        context = StepContext(assembly.bench.grid, assembly.bench.profile.motion_spec(), assembly.target)
+        return [(name, list(step.plan_timeline(context))) for name, step in assembly.steps]
+
+    def run(self) -> Run:
+        """Take all shots.
+
+        Returns:
+            The finished run, read back from disk.
+
+        Raises:
+            StopRequested: Ctrl-C or SIGTERM; devices are safe, the data is on disk.
+            LabseqError: Whatever ended the run; devices are safe, the data is on disk.
+        """
+        if self.run_dir is not None:
+            raise ConfigError("a session runs once; open another for the next run")
+        root = self.options.output or data_root()
+        for text in self.assembly.bench.warnings:
+            self._observers.event("warning", {"text": text})
+        with self._signals():
+            lab = self._build()
+            self._warm(lab)
+            return self._run(lab, root)
+
+    def _build(self) -> Lab:
+        assert self.seed is not None
+        if not self.assembly.virtual_time:
+            clock = RealClock(self.stop_flag)
+        elif self.options.realtime:
+            clock = PacedClock(self.stop_flag)
+        else:
+            clock = VirtualClock(self.stop_flag)
+        return build_lab(self.assembly, clock, self.seed)
+
+    def _warm(self, lab: Lab) -> None:
+        """Compile before the first shot: a compile in mid-shot would cost the atoms."""
+        for name, part in (("motion", _CoreKernels()), ("planner", lab.planner), ("detector", lab.detector)):
+            if isinstance(part, Warmable):
+                self._observers.event("warming", {"part": name})
+                part.warm()
+                self.stop_flag.check()
+        self._observers.event("warmed", {})
+
+    def _run(self, lab: Lab, root: Path) -> Run:
+        assembly, spec = self.assembly, self.assembly.sequence
+        profile_key = str(assembly.bench.document.path.resolve())
+        self._secure_after_crash(lab, root, profile_key)
+        record = self._record(lab)
+        writer = RunWriter.create(root, record)
+        self.run_dir = writer.run_dir
+        self._observers.log = writer.event
+        sequencer = self._sequencer = Sequencer(
+            lab,
+            assembly.steps,
+            self.stop_flag,
+            writer,
+            self._observers,
+            seed=record.seed,
+            attempts=spec.attempts,
+            parameters=assembly.resolved,
+        )
+        status: RunStatus = "failed"
+        error: BaseException | None = None
+        try:
+            mark_active(root, profile_key, writer.run_dir)
+            self._observers.event("run_starting", {"record": record, "run_dir": str(writer.run_dir)})
+            sequencer.open()
+            writer.write_devices(describe(lab, sequencer.guard))
+            self._observers.event("run_started", {"record": record, "run_dir": str(writer.run_dir)})
+            sequencer.run(range(spec.shots))
+            status = "complete"
+        except BaseException as failure:
+            error = failure
+            status = "stopped" if isinstance(failure, StopRequested | KeyboardInterrupt) else "failed"
+            raise
+        finally:
+            all_safe = sequencer.shut_down()
+            self._finish(writer, record, status, error)
+            if all_safe:
+                clear_active(root, profile_key)
+        return open_run(writer.run_dir)
+
+    def _finish(
+        self, writer: RunWriter, record: RunRecord, status: RunStatus, error: BaseException | None
+    ) -> None:
+        text = "" if error is None else f"{type(error).__name__}: {error}"
+        try:
+            writer.finish(status, text)
+        except LabseqError as failure:  # a full disk must not hide what came before
+            self._observers.event("warning", {"text": str(failure)})
+        self._observers.event("run_finished", {"record": record, "status": status, "error": text})
+
+    def _secure_after_crash(self, lab: Lab, root: Path, profile_key: str) -> None:
+        """If the last run on this profile died, its devices may still be on."""
+        dead = died(root, profile_key)
+        if dead is None:
+            return
+        text = f"the last run on this profile ({dead}) died; its devices are made safe first"
+        self._observers.event("warning", {"text": text})
+        secure(lab.safe_order(), lab.timeouts, lab.simulation, self._observers)
+        clear_active(root, profile_key)
+
+    def _record(self, lab: Lab) -> RunRecord:
+        assembly, spec = self.assembly, self.assembly.sequence
+        assert self.seed is not None
+        chosen = [*assembly.bench.chosen.values(), assembly.planner]
+        origins = {item.entry.origin for item in chosen}
+        plugins = tuple(
+            {"name": info.name, "origin": info.origin, "version": info.version}
+            for info in assembly.bench.host.infos
+            if info.name in origins
+        )
+        return RunRecord(
+            name=spec.name,
+            n_shots=spec.shots,
+            seed=self.seed,
+            simulated=assembly.virtual_time,
+            t_start_utc=datetime.now(UTC).isoformat(timespec="microseconds"),
+            target=assembly.target,
+            sequence_text=assembly.document.text,
+            profile_text=assembly.bench.document.text,
+            sequence_path=str(assembly.document.path),
+            profile_path=str(assembly.bench.document.path),
+            resolved=assembly.resolved,
+            overrides=_override_map(self.options),
+            devices={},
+            plugins=plugins,
+            provenance=gather_provenance(assembly.document.path.resolve().parent),
+            record_frames=spec.record_frames,
+            grid_spacing_m=lab.grid.spacing_m,
+            lattice=lab.grid.lattice,
+        )
+
+    @contextmanager
+    def _signals(self) -> Generator[None]:
+        """Turn Ctrl-C and SIGTERM into a stop request while a run is on."""
+        if threading.current_thread() is not threading.main_thread():
+            yield
+            return
+        before = {number: signal.getsignal(number) for number in _EXIT_SIGNALS}
+        for number in _EXIT_SIGNALS:
+            signal.signal(number, self._on_signal)
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+    def _on_signal(self, number: int, _frame: object) -> None:
+        self.stop_flag.request(signal.SIGTERM if number == signal.SIGTERM else signal.SIGINT)
+
+
+class _CoreKernels:
+    """The core's own kernels, warmed like a plugin's."""
+
+    def warm(self) -> None:
+        from labseq.motion import warm
+
+        warm()
+
+
+def _override_map(options: Options) -> Mapping[str, Any]:
+    given = dict(item.split("=", 1) for item in options.all_overrides())
+    if options.profile is not None:
+        given["profile"] = options.profile
+    if options.dry_run != "off":
+        given["dry_run"] = options.dry_run
+    return given

@@ -1,0 +1,76 @@
+import threading
+import time
+
+import pytest
+
+from labseq.errors import StopRequested
+from labseq.sequencer import PacedClock, RealClock, StopFlag, VirtualClock
+
+
+def test_virtual_time_passes_only_by_waiting():
+    clock = VirtualClock(StopFlag())
+    start = time.monotonic()
+    clock.sleep(3600.0)
+    assert clock.now() == 3600.0
+    assert time.monotonic() - start < 60.0
+
+
+def test_negative_waits_do_not_turn_time_back():
+    clock = VirtualClock(StopFlag())
+    clock.sleep(-1.0)
+    assert clock.now() == 0.0
+
+
+@pytest.mark.parametrize("kind", [RealClock, VirtualClock, PacedClock])
+def test_a_stop_request_ends_every_wait(kind):
+    stop = StopFlag()
+    stop.request(15)
+    clock = kind(stop)
+    with pytest.raises(StopRequested) as caught:
+        clock.sleep(1000.0)
+    assert caught.value.signal_number == 15
+    with pytest.raises(StopRequested):
+        clock.check()
+
+
+def test_a_stop_request_ends_a_wait_that_is_under_way():
+    stop = StopFlag()
+    raised = threading.Event()
+
+    def wait() -> None:
+        with pytest.raises(StopRequested):
+            RealClock(stop).sleep(1000.0)
+        raised.set()
+
+    thread = threading.Thread(target=wait)
+    thread.start()
+    stop.request()
+    thread.join(30.0)
+    assert raised.is_set()
+
+
+def test_the_first_signal_decides_the_exit_code():
+    stop = StopFlag()
+    stop.request(15)
+    stop.request(2)
+    assert stop.signal_number == 15
+
+
+def test_while_devices_are_made_safe_waits_finish():
+    stop = StopFlag()
+    stop.request()
+    stop.hold()
+    clock = VirtualClock(stop)
+    clock.sleep(0.005)
+    clock.check()
+    RealClock(stop).sleep(0.001)
+    assert clock.now() == 0.005
+    assert stop.is_set
+
+
+def test_paced_time_takes_as_long_as_it_says():
+    clock = PacedClock(StopFlag())
+    start = time.monotonic()
+    clock.sleep(0.02)
+    assert clock.now() == 0.02
+    assert time.monotonic() - start >= 0.02

@@ -1,0 +1,120 @@
+import threading
+
+import pytest
+
+from labseq.errors import DeviceError, DeviceTimeoutError, LimitError, PlanError, StopRequested
+from labseq.sequencer import Guard, StopFlag
+
+
+@pytest.fixture
+def stop():
+    return StopFlag()
+
+
+@pytest.fixture
+def guard(stop):
+    guard = Guard(stop)
+    yield guard
+    guard.end()
+
+
+def test_a_call_returns_what_the_function_returns(guard):
+    assert guard.call("camera", 10.0, lambda a, b: a + b, 1, b=2) == 3
+
+
+def test_all_calls_of_a_device_come_from_one_thread_of_its_own(guard):
+    names = {guard.call("camera", 10.0, lambda: threading.current_thread().name) for _ in range(5)}
+    assert names == {"labseq camera"}
+
+
+def test_labseq_errors_pass_as_they_are(guard):
+    def refuse():
+        raise LimitError("exposure", 100, 10)
+
+    with pytest.raises(LimitError, match="exposure is 100; the limit is 10"):
+        guard.call("camera", 10.0, refuse)
+
+
+@pytest.mark.parametrize(("owner", "kind"), [("camera", DeviceError), ("planner", PlanError)])
+def test_anything_else_is_named(guard, owner, kind):
+    def fail():
+        raise ZeroDivisionError("by zero")
+
+    with pytest.raises(kind, match=r"raised ZeroDivisionError: by zero") as caught:
+        guard.call(owner, 10.0, fail)
+    assert owner in str(caught.value)
+    assert isinstance(caught.value.__cause__, ZeroDivisionError)
+
+
+def test_even_system_exit_is_named(guard):
+    def leave():
+        raise SystemExit(3)
+
+    with pytest.raises(DeviceError, match="SystemExit"):
+        guard.call("camera", 10.0, leave)
+
+
+def test_a_call_that_hangs_is_given_up(guard):
+    release = threading.Event()
+    with pytest.raises(DeviceTimeoutError, match=r"camera: did not answer within 0\.02 s") as caught:
+        guard.call("camera", 0.02, release.wait)
+    assert caught.value.timeout_s == 0.02
+    release.set()
+
+
+def test_a_planner_that_hangs_is_a_plan_error(guard):
+    release = threading.Event()
+    with pytest.raises(PlanError, match="did not answer within"):
+        guard.call("planner", 0.02, release.wait)
+    release.set()
+
+
+def test_after_a_hang_the_device_can_still_be_made_safe(guard):
+    release, safe = threading.Event(), threading.Event()
+    with pytest.raises(DeviceTimeoutError):
+        guard.call("camera", 0.02, release.wait)
+    guard.call_to_the_end("camera", 10.0, safe.set)
+    assert safe.is_set()
+    assert not release.is_set()
+    release.set()
+
+
+def test_no_call_is_made_after_a_stop_request(guard, stop):
+    called = threading.Event()
+    stop.request()
+    with pytest.raises(StopRequested):
+        guard.call("camera", 10.0, called.set)
+    assert not called.is_set()
+
+
+def test_safe_states_are_called_after_a_stop_request(guard, stop):
+    called = threading.Event()
+    stop.request()
+    guard.call_to_the_end("camera", 10.0, called.set)
+    assert called.is_set()
+
+
+def test_a_stop_request_does_not_wait_for_a_call_that_hangs(guard, stop, monkeypatch):
+    monkeypatch.setattr("labseq.sequencer.guard.GRACE_S", 0.01)
+    release, entered = threading.Event(), threading.Event()
+
+    def hang():
+        entered.set()
+        release.wait()
+
+    def ask():
+        entered.wait()
+        stop.request()
+
+    threading.Thread(target=ask).start()
+    with pytest.raises(StopRequested):
+        guard.call("camera", 1000.0, hang)
+    release.set()
+
+
+def test_a_call_that_comes_back_in_time_after_a_stop_request_keeps_its_result(guard, stop):
+    def answer():
+        stop.request()
+        return 7
+
+    assert guard.call("camera", 10.0, answer) == 7

@@ -1,0 +1,41 @@
+"""The flat public namespace: complete, consistent, and cheap to import."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import labseq
+
+
+def stub_names():
+    tree = ast.parse(Path(labseq.__file__).with_suffix(".pyi").read_text(encoding="utf-8"))
+    imports = [node for node in tree.body if isinstance(node, ast.ImportFrom)]
+    return {alias.asname for node in imports for alias in node.names}
+
+
+def test_the_stub_and_the_table_name_the_same():
+    assert stub_names() == set(labseq._HOME_OF)
+
+
+@pytest.mark.parametrize("name", sorted(labseq._HOME_OF))
+def test_every_name_resolves_and_is_documented(name):
+    value = getattr(labseq, name)
+    assert value is not None
+    assert name in dir(labseq)
+    if isinstance(value, type) or callable(value):
+        assert value.__doc__
+
+
+def test_an_unknown_name_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="no attribute 'make_plan'"):
+        labseq.make_plan  # noqa: B018
+
+
+def test_importing_labseq_pulls_nothing_heavy():
+    code = "import sys, labseq; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    heavy = {"numpy", "numba", "scipy", "h5py", "pydantic", "yaml", "rich", "typer", "spcm", "serial"}
+    assert not heavy & set(done.stdout.split())

@@ -1,0 +1,202 @@
+"""The plugin host: loading, blocking, reporting."""
+
+import importlib.metadata
+import sys
+from types import ModuleType
+
+import pytest
+
+from labseq import hookspecs
+from labseq.errors import ConfigError, PluginLoadError, UnknownPluginError
+from labseq.plugins import LOCAL_PACKAGE, PluginHost
+
+GOOD = """
+from labseq import hookimpl
+LABSEQ_API = 1
+
+class Mine:
+    def __init__(self, settings, context): pass
+
+@hookimpl
+def labseq_register(registry):
+    registry.planner("mine", Mine)
+"""
+
+
+@pytest.fixture
+def host():
+    return PluginHost()
+
+
+@pytest.fixture(autouse=True)
+def clean_local_modules():
+    yield
+    for name in [n for n in sys.modules if n.startswith(LOCAL_PACKAGE)]:
+        del sys.modules[name]
+
+
+def load(host, folder, text, name="mine"):
+    (folder / f"{name}.py").write_text(text, encoding="utf-8")
+    host.load_folders([folder])
+    return host.infos[-1]
+
+
+def test_a_file_in_a_folder_is_a_plugin(host, tmp_path):
+    info = load(host, tmp_path, GOOD)
+    assert (info.name, info.state, info.origin) == ("mine", "loaded", str(tmp_path / "mine.py"))
+    entry = host.get("planner", "mine")
+    assert entry.origin == "mine"
+    assert entry.factory.__module__ == "labseq_local.mine"
+
+
+def test_a_package_in_a_folder_is_a_plugin(host, tmp_path):
+    package = tmp_path / "mine"
+    package.mkdir()
+    (package / "__init__.py").write_text(GOOD.replace("class Mine:", "from .part import VALUE\nclass Mine:"))
+    (package / "part.py").write_text("VALUE = 1\n")
+    host.load_folders([tmp_path])
+    assert host.infos[-1].state == "loaded", host.infos[-1].reason
+    assert host.get("planner", "mine")
+
+
+def test_hidden_files_and_other_files_are_left_alone(host, tmp_path):
+    for name in ("_private.py", ".hidden.py", "notes.txt", "not-an-identifier.py", "data.json"):
+        (tmp_path / name).write_text("raise SystemExit(1)")
+    (tmp_path / "empty_folder").mkdir()
+    host.load_folders([tmp_path])
+    assert host.infos == []
+
+
+def test_the_environment_names_folders_too(host, tmp_path, monkeypatch):
+    (tmp_path / "mine.py").write_text(GOOD)
+    monkeypatch.setenv("LABSEQ_PLUGIN_PATH", str(tmp_path))
+    host.load_folders([])
+    assert host.get("planner", "mine")
+
+
+def test_a_folder_given_twice_is_loaded_once(host, tmp_path, monkeypatch):
+    monkeypatch.setenv("LABSEQ_PLUGIN_PATH", str(tmp_path))
+    load(host, tmp_path, GOOD)
+    assert [info.state for info in host.infos] == ["loaded"]
+
+
+def test_a_missing_folder_is_the_users_mistake(host, tmp_path):
+    with pytest.raises(ConfigError, match="does not exist"):
+        host.load_folders([tmp_path / "nowhere"])
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("import nothing_of_this_name\nLABSEQ_API = 1\n", "ModuleNotFoundError: No module named"),
+        ("LABSEQ_API = 1\ndef broken(:\n", "SyntaxError"),
+        ("LABSEQ_API = 1\nraise SystemExit(2)\n", "SystemExit: 2"),
+        ("x = 1\n", "does not state LABSEQ_API"),
+        ("LABSEQ_API = 99\n", "was written for LABSEQ_API 99"),
+        (GOOD.replace("def labseq_register(registry)", "def labseq_register(register)"), "Argument"),
+        (GOOD.replace("def labseq_register", "def labseq_regster"), "unknown hook"),
+        (GOOD.replace('"mine", Mine', '"", Mine'), "a planner needs a name"),
+        (GOOD.replace('"mine", Mine', '"mine", 5'), "cannot be called"),
+        (GOOD.replace("registry.planner", "registry.planer"), "has no attribute 'planer'"),
+        (GOOD.replace('("mine", Mine)', '("mine", Mine); 1 / 0'), "ZeroDivisionError"),
+    ],
+)
+def test_a_broken_plugin_is_reported_and_contained(host, tmp_path, text, reason):
+    info = load(host, tmp_path, text)
+    assert info.state == "failed"
+    assert reason in info.reason
+    assert host.registry.entries() == []
+    with pytest.raises(PluginLoadError, match="plugin 'mine' failed to load") as caught:
+        host.get("planner", "mine")
+    assert reason in str(caught.value)
+
+
+def test_the_reason_names_file_and_line(host, tmp_path):
+    info = load(host, tmp_path, "LABSEQ_API = 1\n\nraise RuntimeError('no')\n")
+    assert f"{tmp_path / 'mine.py'}:3" in info.reason
+
+
+def test_a_broken_plugin_does_not_hide_the_next(host, tmp_path):
+    load(host, tmp_path, "1 / 0", "a_broken")
+    load(host, tmp_path, GOOD)
+    assert host.get("planner", "mine")
+
+
+def test_a_name_taken_twice_names_both_origins(host, tmp_path):
+    load(host, tmp_path, GOOD, "first")
+    other = tmp_path / "more"
+    other.mkdir()
+    info = load(host, other, GOOD, "second")
+    assert info.state == "failed"
+    assert "planner 'mine' is offered by 'first' already" in info.reason
+
+
+def test_two_files_of_one_name_in_two_folders(host, tmp_path):
+    load(host, tmp_path, GOOD)
+    other = tmp_path / "more"
+    other.mkdir()
+    info = load(host, other, GOOD.replace('"mine"', '"mine_too"'))
+    assert info.state == "failed"
+    assert str(tmp_path / "mine.py") in info.reason
+
+
+def test_an_unknown_name_suggests_the_nearest(host, tmp_path):
+    load(host, tmp_path, GOOD)
+    with pytest.raises(UnknownPluginError, match="did you mean 'mine'"):
+        host.get("planner", "mien")
+
+
+def test_an_unknown_name_tells_of_plugins_that_did_not_load(host, tmp_path):
+    load(host, tmp_path, "1 / 0", "other")
+    with pytest.raises(UnknownPluginError, match="plugin 'other' did not load"):
+        host.get("planner", "mine")
+
+
+def test_one_failing_entry_point_takes_nothing_down(host, monkeypatch):
+    class Point:
+        dist = None
+
+        def __init__(self, name, load):
+            self.name = name
+            self.load = load
+
+    def fail():
+        raise ImportError("no vendor library")
+
+    good = ModuleType("good")
+    exec(GOOD, good.__dict__)
+    points = [Point("bad", fail), Point("good", lambda: good)]
+    monkeypatch.setattr(importlib.metadata, "entry_points", lambda group: points)
+    host.load_entry_points()
+    assert [(info.name, info.state) for info in host.infos] == [("bad", "failed"), ("good", "loaded")]
+    assert host.get("planner", "mine")
+
+
+def test_observers_that_fail_are_named_and_the_others_called(host, tmp_path):
+    watcher = """
+from labseq import hookimpl
+LABSEQ_API = 1
+seen = []
+
+@hookimpl
+def labseq_shot_finished(shot):
+    seen.append(shot)
+"""
+    load(host, tmp_path, watcher, "good_watcher")
+    load(host, tmp_path, watcher.replace("seen.append(shot)", "1 / 0"), "bad_watcher")
+    failures = host.notify("labseq_shot_finished", shot="a shot")
+    assert [(name, type(error)) for name, error in failures] == [("bad_watcher", ZeroDivisionError)]
+    assert sys.modules["labseq_local.good_watcher"].seen == ["a shot"]
+
+
+def test_every_hook_is_documented():
+    hooks = [value for name, value in vars(hookspecs).items() if name.startswith("labseq_")]
+    assert len(hooks) == 4
+    assert all(hook.__doc__ for hook in hooks)
+
+
+def test_hosts_share_nothing(host, tmp_path):
+    load(host, tmp_path, GOOD)
+    other = PluginHost()
+    assert other.infos == []
+    assert other.registry.find("planner", "mine") is None
