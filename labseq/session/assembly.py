@@ -9,16 +9,20 @@ from typing import Any
 
 from labseq import builtins
 from labseq.config import (
+    ROLES,
+    Collected,
     Document,
+    Override,
     ProfileSpec,
     SequenceSpec,
-    find_profile,
+    StepSpec,
     load_profile,
     load_sequence,
+    plugin_paths,
     split_overrides,
 )
 from labseq.config.settings import Settings
-from labseq.errors import LabseqError, PluginLoadError, UnknownPluginError, one_of
+from labseq.errors import ConfigError, LabseqError, PluginLoadError, UnknownPluginError, one_of
 from labseq.model import SiteGrid, TargetPattern
 from labseq.plugins import PluginHost
 from labseq.roles import Clock, Step
@@ -105,48 +109,72 @@ def assemble(
     """
     for_sequence, for_profile = split_overrides(overrides)
     document, sequence = load_sequence(sequence_path, for_sequence)
-    beside = sequence_path.parent if profile is None else Path()
-    folders = [sequence_path.parent / folder for folder in sequence.plugin_folders]
-    bench = set_up_bench(profile or sequence.profile, beside, for_profile, dry_run, folders)
-    target, target_dump = _make_target(bench, document, sequence)
-    steps, steps_dump = _make_steps(bench, document, sequence)
-    planner = resolve(bench.host, document, "planner", sequence.planner_choice)
+    found = Collected()
+    bench = set_up_bench(
+        profile or sequence.profile,
+        Path() if profile else sequence_path.parent,
+        for_profile,
+        dry_run,
+        named_in=None if profile else document,
+        plugin_folders=plugin_paths(document, sequence.plugin_folders),
+        found=found,
+    )
+    made: dict[str, Any] = {}
+    with found:
+        made["target"], made["target_dump"] = _make_target(bench, document, sequence)
+    with found:
+        made["planner"] = resolve(bench.host, document, "planner", sequence.planner)
+    steps, step_dumps = _make_steps(bench, document, sequence, found)
+    found.raise_any()
     resolved = {
         **sequence.model_dump(mode="json", exclude={"shot", "target", "planner"}),
-        "target": target_dump,
-        "planner": planner.dump(),
-        "shot": steps_dump,
-        "profile": {
-            **bench.profile.core_dump(),
-            **{role: chosen.dump() for role, chosen in bench.chosen.items()},
-        },
+        "target": made["target_dump"],
+        "planner": made["planner"].dump(),
+        "shot": step_dumps,
+        "profile": _profile_dump(bench),
     }
-    return Assembly(document, sequence, bench, target, planner, steps, dry_run, resolved)
+    return Assembly(
+        document, sequence, bench, made["target"], made["planner"], tuple(steps), dry_run, resolved
+    )
 
 
 def set_up_bench(
     profile: str,
-    beside: Path,
-    overrides: Sequence[tuple[str, str]] = (),
+    beside: Path = Path(),
+    overrides: Sequence[Override] = (),
     dry_run: DryRun = "off",
+    *,
+    named_in: Document | None = None,
     plugin_folders: Sequence[Path] = (),
+    found: Collected | None = None,
 ) -> Bench:
     """Read a profile, load the plugins and choose what plays each role.
+
+    Args:
+        profile: Name or path of the profile.
+        beside: Folder of the file that names it.
+        overrides: Values that replace those of the file.
+        dry_run: "off", "full" or "fast".
+        named_in: The sequence that names the profile, for messages.
+        plugin_folders: Folders with plugins beside those that the profile names.
+        found: Where the problems with roles go; without it they are raised.
 
     Raises:
         ConfigError: The profile is wrong.
         PluginLoadError: A plugin that it names failed to load.
     """
-    path = find_profile(profile, beside)
-    document, spec = load_profile(path, overrides)
-    own_folders = [path.parent / folder for folder in spec.plugin_folders]
-    host = load_plugins([*own_folders, *plugin_folders])
+    document, spec = load_profile(profile, beside=beside, overrides=overrides, named_in=named_in)
+    host = load_plugins([*plugin_paths(document, spec.plugin_folders), *plugin_folders])
+    problems = found or Collected()
     chosen: dict[str, Chosen] = {}
     warnings: list[str] = []
-    for role, choice in spec.role_choices().items():
-        kind = "device" if role in spec.devices else role
-        chosen[role], warning = choose(host, document, kind, choice, dry_run)
-        warnings += [warning] if warning else []
+    for role, choice in {**spec.choices, **spec.devices}.items():
+        kind = role if role in ROLES else "device"
+        with problems:
+            chosen[role], warning = choose(host, document, kind, choice, dry_run)
+            warnings += [f"{role}: {warning}"] if warning else []
+    if found is None:
+        problems.raise_any()
     return Bench(document, spec, host, spec.grid_model(), chosen, tuple(warnings))
 
 
@@ -159,15 +187,24 @@ def load_plugins(folders: Sequence[Path] = ()) -> PluginHost:
     return host
 
 
+def _profile_dump(bench: Bench) -> dict[str, Any]:
+    spec = bench.profile
+    core = spec.model_dump(mode="json", exclude={*ROLES, "devices"})
+    roles = {role: chosen.dump() for role, chosen in bench.chosen.items() if role in ROLES}
+    roles["mobile_tweezers"] |= spec.mobile_tweezers.model_dump(mode="json", exclude={"use"})
+    devices = {name: bench.chosen[name].dump() for name in spec.devices}
+    return {**core, **roles, "devices": devices}
+
+
 def _make_target(
     bench: Bench, document: Document, sequence: SequenceSpec
 ) -> tuple[TargetPattern, dict[str, Any]]:
-    choice, grid = sequence.target_choice, bench.grid
+    choice, grid = sequence.target, bench.grid
     chosen = resolve(bench.host, document, "pattern", choice)
     try:
         target = chosen.entry.factory(chosen.settings, grid)
     except LabseqError as error:
-        raise document.error(choice.loc, f"target: {error}") from error
+        raise document.error(choice.loc, str(error)) from error
     if not isinstance(target, TargetPattern) or target.shape != grid.shape:
         text = f"pattern '{chosen.entry.name}' made no TargetPattern of shape {grid.shape}"
         raise PluginLoadError(chosen.entry.origin, text)
@@ -175,43 +212,49 @@ def _make_target(
 
 
 def _make_steps(
-    bench: Bench, document: Document, sequence: SequenceSpec
-) -> tuple[tuple[tuple[str, Step], ...], list[dict[str, Any]]]:
+    bench: Bench, document: Document, sequence: SequenceSpec, found: Collected
+) -> tuple[list[tuple[str, Step]], list[dict[str, Any]]]:
     steps: list[tuple[str, Step]] = []
     dumps: list[dict[str, Any]] = []
     image_seen = False
-    for spec in sequence.steps:
-        try:
-            entry = bench.host.get("step", spec.kind)
-        except UnknownPluginError as error:
-            what = f"unknown step '{spec.kind}'"
-            raise document.error(spec.loc, what, one_of(error.known), error.hint, key=True) from None
-        settings = validate(document, entry, spec.loc)
-        step: Step = entry.factory(settings)
-        if step.needs_image and not image_seen:
-            what = f"'{spec.kind}' needs an image before it in the shot"
-            raise document.error(spec.loc, what, "an 'image' step before it", key=True)
-        if spec.kind == "device":
-            _check_device_name(bench, document, settings, spec.loc)
-        image_seen = image_seen or step.takes_image
-        steps.append((spec.name or spec.kind, step))
-        dumps.append({spec.kind: dump(settings), **({"name": spec.name} if spec.name else {})})
-    return tuple(steps), dumps
+    for spec in sequence.shot:
+        with found:
+            step, settings = _make_step(bench, document, spec)
+            steps.append((spec.name or spec.kind, step))
+            dumps.append({spec.kind: dump(settings), **({"name": spec.name} if spec.name else {})})
+            if step.needs_image and not image_seen:
+                what = f"'{spec.kind}' needs an image before it in the shot"
+                raise document.error(spec.loc, what, "an 'image' step before it", key=True)
+            image_seen = image_seen or step.takes_image
+    return steps, dumps
 
 
-def _check_device_name(
-    bench: Bench, document: Document, settings: Settings | None, loc: tuple[str | int, ...]
-) -> None:
+def _make_step(bench: Bench, document: Document, spec: StepSpec) -> tuple[Step, Settings | None]:
+    try:
+        entry = bench.host.get("step", spec.kind)
+    except UnknownPluginError as error:
+        what = f"unknown step '{spec.kind}'"
+        raise document.error(spec.loc, what, one_of(error.known), error.hint, key=True) from None
+    settings = validate(document, entry, spec.loc)
+    if spec.kind == "device":
+        _check_device_name(bench, document, settings, spec)
+    try:
+        return entry.factory(settings), settings
+    except ConfigError as error:
+        raise document.error(spec.loc, str(error)) from error
+
+
+def _check_device_name(bench: Bench, document: Document, settings: Settings | None, spec: StepSpec) -> None:
     name = getattr(settings, "name", None)
     if name not in bench.profile.devices:
         what = f"the profile '{bench.profile.name}' has no device '{name}'"
-        raise document.error((*loc, "name"), what, one_of(sorted(bench.profile.devices)))
+        raise document.error((*spec.loc, "name"), what, one_of(sorted(bench.profile.devices)))
 
 
 def build_lab(assembly: Assembly, clock: Clock, seed: int) -> Lab:
     """Construct every role's object; nothing is opened."""
     bench = assembly.bench
-    profile, motion = bench.profile, bench.profile.motion_spec()
+    profile, motion = bench.profile, bench.profile.motion
     chosen = {**bench.chosen, "planner": assembly.planner}
     made, streams = construct(chosen, bench.grid, motion, clock, seed)
     dop = getattr(made["planner"], "degree_of_parallelism", motion.max_tweezers)

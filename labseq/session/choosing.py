@@ -60,9 +60,9 @@ def validate(
     document: Document, entry: Entry, loc: tuple[str | int, ...], drop: frozenset[str] = frozenset()
 ) -> Settings | None:
     """Validate the settings of an entry; None if it takes none."""
-    model = entry.settings_model or Settings
-    settings = document.validate(model, loc, drop=drop, also_known=sorted(drop - {"use", "pattern"}))
-    return settings if entry.settings_model is not None else None
+    also_known = sorted(drop - {"use", "pattern"})
+    called = f"{entry.kind.replace('_', ' ')} '{entry.name}'"
+    return document.validate(entry.settings_model, loc, drop=drop, also_known=also_known, called=called)
 
 
 def choose(
@@ -84,9 +84,8 @@ def choose(
     if dry_run == "fast":
         return Chosen(twin, _defaults(twin)), ""
     if host.registry.find(kind, choice.use) is None:
-        where = f"{kind.replace('_', ' ')}: plugin '{choice.use}' is not installed"
-        text = f"{where}; its virtual twin takes its place and its settings were not checked"
-        return Chosen(twin, _defaults(twin)), text
+        text = f"plugin '{choice.use}' is not installed; its virtual twin takes its place"
+        return Chosen(twin, _defaults(twin)), f"{text} and its settings were not checked"
     chosen = resolve(host, document, kind, choice, drop)
     if chosen.entry.virtual_time:
         return chosen, ""

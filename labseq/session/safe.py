@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 
 from labseq.config import split_overrides
 from labseq.errors import LabseqError
@@ -74,11 +73,11 @@ def make_profile_safe(
         PluginLoadError: A plugin that it names failed to load.
     """
     _, for_profile = split_overrides(overrides)
-    bench = set_up_bench(profile, Path(), for_profile)
+    bench = set_up_bench(profile, overrides=for_profile)
     stop = StopFlag()
     clock = VirtualClock(stop) if bench.virtual_time else RealClock(stop)
     needed = HARDWARE_KINDS | {"simulation"}
     chosen = {role: c for role, c in bench.chosen.items() if c.entry.kind in needed}
-    made, _ = construct(chosen, bench.grid, bench.profile.motion_spec(), clock, seed=0)
+    made, _ = construct(chosen, bench.grid, bench.profile.motion, clock, seed=0)
     simulation = made.pop("simulation", None)
     return secure(in_safe_order(made), timeouts_of(bench.profile), simulation, observer)

@@ -134,7 +134,7 @@ class Session:
     def timeline(self) -> list[tuple[str, list[TimelineEntry]]]:
         """What a shot will do: name of each step and its bars."""
         assembly = self.assembly
-        context = StepContext(assembly.bench.grid, assembly.bench.profile.motion_spec(), assembly.target)
+        context = StepContext(assembly.bench.grid, assembly.bench.profile.motion, assembly.target)
         return [(name, list(step.plan_timeline(context))) for name, step in assembly.steps]
 
     def run(self) -> Run:
@@ -200,7 +200,7 @@ class Session:
             mark_active(root, profile_key, writer.run_dir)
             self._observers.event("run_starting", {"record": record, "run_dir": str(writer.run_dir)})
             sequencer.open()
-            writer.write_devices(describe(lab, sequencer.guard))
+            writer.set_devices(describe(lab, sequencer.guard))
             self._observers.event("run_started", {"record": record, "run_dir": str(writer.run_dir)})
             sequencer.run(range(spec.shots))
             status = "complete"

@@ -1,0 +1,133 @@
+"""Where runs lie: data root / local date / counter_name."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import unicodedata
+from datetime import datetime
+from pathlib import Path
+from typing import Final
+
+from labseq.errors import RecordingError
+from labseq.recording.durable import explained, sync_folder
+
+RUN_FILE: Final = "run.json"
+STATE_FILE: Final = "STATE"
+INDEX_FILE: Final = "index.jsonl"
+EVENTS_FILE: Final = "events.jsonl"
+SEQUENCE_FILE: Final = "sequence.yaml"
+PROFILE_FILE: Final = "profile.yaml"
+SHOTS_FOLDER: Final = "shots"
+OWN_NAMES: Final = frozenset(
+    {RUN_FILE, STATE_FILE, INDEX_FILE, EVENTS_FILE, SEQUENCE_FILE, PROFILE_FILE, SHOTS_FOLDER}
+)
+
+_COUNTER = re.compile(r"\.?(\d{4,})[_.]")
+_MAX_SLUG: Final = 60
+
+
+def data_root() -> Path:
+    """Where runs are kept if nothing else is said: LABSEQ_DATA, else ``./data``."""
+    return Path(os.environ.get("LABSEQ_DATA") or "data").expanduser()
+
+
+def slug(name: str) -> str:
+    """A name that every file system takes.
+
+    Example:
+        >>> slug("20 x 20: to/from µ")
+        '20_x_20_to_from_µ'
+        >>> slug("../")
+        'run'
+    """
+    words = re.sub(r"[^\w.-]+", "_", unicodedata.normalize("NFC", name))
+    return words[:_MAX_SLUG].strip("._-") or "run"
+
+
+def shot_file_name(shot_index: int, attempt: int, *, counts: bool) -> str:
+    """Path of a shot's file, relative to the run's folder.
+
+    Example:
+        >>> shot_file_name(17, 1, counts=False)
+        'shots/shot_000017.attempt_1.h5'
+    """
+    kept = "" if counts else f".attempt_{attempt}"
+    return f"{SHOTS_FOLDER}/shot_{shot_index:06d}{kept}.h5"
+
+
+def make_run_folder(root: Path, name: str, started: datetime) -> Path:
+    """Make ``<root>/<local date>/<counter>_<slug>``; no two runs of a day share a counter.
+
+    A counter is claimed by making the folder ``.<counter>.claim``, which succeeds
+    for one process only. Whoever comes later, when the claim is gone again, sees
+    the run's folder.
+
+    Raises:
+        RecordingError: The place cannot be written to.
+    """
+    day = root / started.astimezone().date().isoformat()
+    with explained(day):
+        day.mkdir(parents=True, exist_ok=True)
+        sync_folder(root)
+        counter = max(_counters(day), default=0)
+    while True:
+        counter += 1
+        claim = day / f".{counter:04d}.claim"
+        folder = day / f"{counter:04d}_{slug(name)}"
+        with explained(folder):
+            try:
+                claim.mkdir()
+            except FileExistsError:
+                continue
+            try:
+                if any(n == counter for n in _counters(day, claims=False)):
+                    continue
+                folder.mkdir()
+                sync_folder(day)
+                return folder
+            finally:
+                with contextlib.suppress(OSError):
+                    claim.rmdir()
+
+
+def _counters(day: Path, *, claims: bool = True) -> list[int]:
+    names = (entry.name for entry in day.iterdir())
+    found = (_COUNTER.match(name) for name in names if claims or not name.startswith("."))
+    return [int(match[1]) for match in found if match]
+
+
+def find_run(path: Path) -> Path:
+    """The run that a path belongs to.
+
+    Args:
+        path: A run's folder or any file or folder in it.
+
+    Raises:
+        RecordingError: It is no part of a run; the text says what to give instead.
+    """
+    path = Path(path).expanduser().resolve()
+    if not path.exists():
+        raise RecordingError(
+            path, "no such file or folder; give a run's folder, <data>/<date>/<counter>_<name>"
+        )
+    for folder in (path, path.parent, path.parent.parent):
+        if (folder / RUN_FILE).is_file():
+            return folder
+    for folder in (path, path.parent, path.parent.parent):
+        if (folder / STATE_FILE).is_file():
+            raise RecordingError(folder, _without_run_file(folder))
+    runs = sorted(found.parent for depth in ("*", "*/*") for found in path.glob(f"{depth}/{RUN_FILE}"))
+    if runs:
+        holds = "1 run" if len(runs) == 1 else f"{len(runs)} runs"
+        raise RecordingError(
+            path, f"holds {holds} and is none itself; give one of them, for example {runs[-1]}"
+        )
+    raise RecordingError(path, f"is not a run: it has no {RUN_FILE}; give a run's folder")
+
+
+def _without_run_file(folder: Path) -> str:
+    if any((folder / SHOTS_FOLDER).glob("*.h5")):
+        return f"holds shots, but its {RUN_FILE} is gone; take that from a backup"
+    return f"has no {RUN_FILE}: the run died while its folder was made; it holds no shots, delete it"

@@ -1,0 +1,296 @@
+"""Reads a run back, finished or not."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq.errors import RecordingError
+from labseq.model import CycleRecord, Plan, ShotRecord, StageTiming, TargetPattern
+from labseq.model.records import RunStatus, ShotStatus
+from labseq.recording import folders
+from labseq.recording.durable import read_lines
+from labseq.recording.run_file import read_run, read_state, target_of
+
+if TYPE_CHECKING:
+    from labseq.recording.shot_reader import ShotContent
+
+_NEEDED: Final = frozenset(
+    {"shot", "attempt", "counts", "file", "status", "success", "filling_fraction", "seen_defect_free_cycle"}
+)
+
+
+def open_run(path: str | Path) -> Run:
+    """Open a run, finished, still running, or killed.
+
+    Reads the index only; a shot's file is read when something of it is asked for.
+
+    Args:
+        path: The run's folder or any file in it.
+
+    Raises:
+        RecordingError: It is no run, is damaged, or is of a newer labseq.
+    """
+    folder = folders.find_run(Path(path))
+    record = read_run(folder)
+    status, error = read_state(folder)
+    rows, damaged = read_lines(folder / folders.INDEX_FILE)
+    usable = [row for row in rows if row.keys() >= _NEEDED and isinstance(row["shot"], int)]
+    load = lru_cache(maxsize=8)(_load)  # looking at several values of a shot reads its file once
+    counted = {row["shot"]: row for row in usable if row["counts"]}  # a shot written again: the last one
+    return Run(
+        path=folder,
+        record=record,
+        status=status,
+        error=error,
+        shots=tuple(Shot(folder / row["file"], row, load) for _, row in sorted(counted.items())),
+        attempts=tuple(Shot(folder / row["file"], row, load) for row in usable if not row["counts"]),
+        n_damaged_lines=len(damaged) + len(rows) - len(usable),
+    )
+
+
+def _load(path: Path) -> ShotContent:
+    from labseq.recording.shot_reader import read_content  # h5py takes 0.1 s to import
+
+    return read_content(path)
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Run:
+    """A run on disk, as it was when it was opened.
+
+    Attributes:
+        path: The run's folder.
+        record: What run.json says: settings, devices, versions, ...
+        status: "running", "complete", "stopped" or "failed"; a run whose process
+            is gone without having said so has failed.
+        error: Why it did not complete, or "".
+        shots: The shots that count, in order.
+        attempts: Attempts at shots that failed or were interrupted, in the order
+            they were made.
+        n_damaged_lines: Lines of the index that cannot be read; 0 unless somebody
+            or something damaged the file.
+    """
+
+    path: Path
+    record: dict[str, Any]
+    status: RunStatus
+    error: str
+    shots: Sequence[Shot]
+    attempts: Sequence[Shot]
+    n_damaged_lines: int = 0
+
+    def __repr__(self) -> str:
+        return f"<Run {self.path}: {len(self.shots)} of {self.n_shots} shots, {self.status}>"
+
+    @property
+    def name(self) -> str:
+        """Name of the sequence."""
+        return str(self.record["name"])
+
+    @property
+    def n_shots(self) -> int:
+        """Shots asked for."""
+        return int(self.record["n_shots"])
+
+    @property
+    def seed(self) -> int:
+        """Seed of the run."""
+        return int(self.record["seed"])
+
+    @property
+    def simulated(self) -> bool:
+        """Whether all hardware was simulated."""
+        return bool(self.record["simulated"])
+
+    @property
+    def target(self) -> TargetPattern:
+        """Target of the run."""
+        return target_of(self.path / folders.RUN_FILE, self.record)
+
+    @property
+    def defect_free(self) -> float:
+        """Fraction of the shots that met the target; nan without shots."""
+        return _mean([float(shot.success) for shot in self.shots])
+
+    @property
+    def filling_fraction(self) -> float:
+        """Mean filling of the target over the shots that have one; nan without any."""
+        values = (shot.filling_fraction for shot in self.shots)
+        return _mean([value for value in values if not math.isnan(value)])
+
+    @property
+    def events(self) -> tuple[dict[str, Any], ...]:
+        """The event log: dicts with ``t_utc``, ``event`` and ``values``; read anew each time.
+
+        Raises:
+            RecordingError: The file cannot be read.
+        """
+        return tuple(read_lines(self.path / folders.EVENTS_FILE)[0])
+
+    def summary(self) -> dict[str, Any]:
+        """The run in a few JSON-ready numbers; None where there is none."""
+        return {
+            "run_dir": str(self.path),
+            "shots": len(self.shots),
+            "defect_free": _or_none(self.defect_free),
+            "filling_fraction": _or_none(self.filling_fraction),
+            "status": self.status,
+        }
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Shot:
+    """A shot on disk. What the index holds costs nothing; the rest reads the shot's file.
+
+    Every property from ``occupancies`` on raises ``RecordingError`` if the file
+    is missing or damaged.
+
+    Attributes:
+        file: The shot's HDF5 file.
+        row: Its line in the index.
+    """
+
+    file: Path
+    row: dict[str, Any]
+    _load: Callable[[Path], ShotContent] = field()
+
+    def __repr__(self) -> str:
+        return f"<Shot {self.index}: {self.status}, {self.file}>"
+
+    @property
+    def index(self) -> int:
+        """Index in the run, from 0."""
+        return int(self.row["shot"])
+
+    @property
+    def attempt(self) -> int:
+        """Which attempt this is, from 0."""
+        return int(self.row["attempt"])
+
+    @property
+    def status(self) -> ShotStatus:
+        """One of "complete", "interrupted" and "failed"."""
+        return self.row["status"]
+
+    @property
+    def success(self) -> bool:
+        """Whether the last ``image`` step met the target."""
+        return bool(self.row["success"])
+
+    @property
+    def filling_fraction(self) -> float:
+        """Filling of the target on the last ``image`` step; nan without one."""
+        value = self.row["filling_fraction"]
+        return math.nan if value is None else float(value)
+
+    @property
+    def seen_defect_free_cycle(self) -> int:
+        """First cycle whose image met the target; 0 if none."""
+        return int(self.row["seen_defect_free_cycle"])
+
+    @property
+    def occupancies(self) -> NDArray[np.bool_]:
+        """As detected, bool (n_images, n_rows, n_cols)."""
+        images = self._content.record.images
+        return np.array([i.occupancy for i in images], np.bool_).reshape(len(images), *self._grid_shape)
+
+    @property
+    def confidences(self) -> NDArray[np.float32]:
+        """The detector's confidence, float32 (n_images, n_rows, n_cols)."""
+        images = self._content.record.images
+        return np.array([i.confidence for i in images], np.float32).reshape(len(images), *self._grid_shape)
+
+    @property
+    def plans(self) -> tuple[Plan, ...]:
+        """The plan of each cycle."""
+        return tuple(cycle.plan for cycle in self.cycles)
+
+    @property
+    def cycles(self) -> tuple[CycleRecord, ...]:
+        """The rearrangement cycles."""
+        return tuple(self._content.record.cycles)
+
+    @property
+    def timing(self) -> tuple[StageTiming, ...]:
+        """The stages, in the order they ended."""
+        return tuple(self._content.record.timing)
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """Resolved values of this shot: overrides, scan point."""
+        return dict(self._content.record.parameters)
+
+    @property
+    def readings(self) -> dict[str, Any]:
+        """Values read from devices during the shot."""
+        return dict(self._content.record.readings)
+
+    @property
+    def provenance(self) -> dict[str, Any]:
+        """Seed, versions, texts and settings, as the shot's file has them."""
+        return dict(self._content.provenance)
+
+    @property
+    def devices(self) -> dict[str, Any]:
+        """What each device said of itself."""
+        return dict(self._content.devices)
+
+    @property
+    def frames(self) -> NDArray[np.uint16]:
+        """The frames that were kept, uint16 (n_frames, height, width); read anew each time.
+
+        Raises:
+            RecordingError: The frames differ in size; :meth:`record` gives them one by one.
+        """
+        from labseq.recording.shot_reader import read_frames
+
+        images = [frame.image for frame in read_frames(self.file).values()]
+        if len({image.shape for image in images}) > 1:
+            raise RecordingError(self.file, "holds frames of several sizes; use shot.record().images")
+        return np.stack(images) if images else np.empty((0, 0, 0), np.uint16)
+
+    def record(self) -> ShotRecord:
+        """The whole record as it was written, frames included."""
+        from labseq.recording.shot_reader import read_frames, with_frames
+
+        return with_frames(self._content.record, read_frames(self.file))
+
+    def verify(self) -> None:
+        """Compare the file with the checksum in the index.
+
+        Raises:
+            RecordingError: A byte has changed since it was written.
+        """
+        try:
+            data = self.file.read_bytes()
+        except OSError as error:
+            raise RecordingError(
+                self.file, f"cannot be read: {error.strerror}; take it from a backup"
+            ) from error
+        if hashlib.sha256(data).hexdigest() != self.row.get("sha256"):
+            raise RecordingError(self.file, "has changed since it was written; take it from a backup")
+
+    @property
+    def _content(self) -> ShotContent:
+        return self._load(self.file)
+
+    @property
+    def _grid_shape(self) -> tuple[int, int]:
+        return self._content.target.shape
+
+
+def _mean(values: Sequence[float]) -> float:
+    return math.fsum(values) / len(values) if values else math.nan
+
+
+def _or_none(value: float) -> float | None:
+    return None if math.isnan(value) else value

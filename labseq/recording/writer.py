@@ -1,0 +1,169 @@
+"""Writes a run's folder while the run goes on."""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+import threading
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from labseq.errors import RecordingError
+from labseq.model import RunRecord, ShotRecord
+from labseq.model.records import RunStatus
+from labseq.recording import folders
+from labseq.recording.durable import LineLog, explained, sync_folder, write_file
+from labseq.recording.run_file import encode_run, encode_state, encode_text, index_row
+
+if TYPE_CHECKING:
+    from labseq.recording.shot_file import ShotEncoder
+
+
+class RunWriter:
+    """The folder of a run in progress; made by :meth:`create`, used by one process.
+
+    A shot is on the disk, whole, before its line is in the index. Whatever
+    happens, also a kill or a full disk, the shots in the index stay whole.
+
+    Attributes:
+        run_dir: The run's folder.
+        n_written: Shots written that count; failed attempts do not.
+    """
+
+    def __init__(self, run_dir: Path, run: RunRecord, *, compress: bool = False) -> None:
+        self.run_dir = run_dir
+        self.n_written = 0
+        self._run = run
+        self._compress = compress
+        self._encoder = self._make_encoder()
+        self._index = LineLog(run_dir / folders.INDEX_FILE)
+        self._events = LineLog(run_dir / folders.EVENTS_FILE)
+        self._hasher = ThreadPoolExecutor(1, "labseq-hash")
+        self._events_lock = threading.Lock()
+        self._n_events_lost = 0
+
+    @classmethod
+    def create(
+        cls,
+        root: Path,
+        run: RunRecord,
+        extra_files: Mapping[str, str | bytes] | None = None,
+        *,
+        compress: bool = False,
+    ) -> RunWriter:
+        """Make ``<root>/<local date>/<counter>_<name>/`` and put down what is known at the start.
+
+        Safe against other processes that do the same at the same time.
+
+        Args:
+            root: Data root; made if it does not exist.
+            run: What is known of the run.
+            extra_files: Further files for the folder: name -> content.
+            compress: Whether frames are compressed; needs ``labseq[compress]``.
+
+        Raises:
+            RecordingError: The place cannot be written to, the disk is full, or
+                the package for compression is missing.
+        """
+        started = datetime.fromisoformat(run.t_start_utc)
+        run_dir = folders.make_run_folder(root, run.name, started)
+        try:
+            return cls._fill(run_dir, run, extra_files or {}, compress=compress)
+        except BaseException:
+            shutil.rmtree(run_dir, ignore_errors=True)  # it holds no shots yet
+            raise
+
+    @classmethod
+    def _fill(
+        cls, run_dir: Path, run: RunRecord, extra_files: Mapping[str, str | bytes], *, compress: bool
+    ) -> RunWriter:
+        with explained(run_dir):
+            (run_dir / folders.SHOTS_FOLDER).mkdir()
+        write_file(run_dir / folders.STATE_FILE, encode_state("running"))
+        write_file(run_dir / folders.SEQUENCE_FILE, encode_text(run.sequence_text))
+        write_file(run_dir / folders.PROFILE_FILE, encode_text(run.profile_text))
+        for name, content in extra_files.items():
+            if Path(name).name != name or name.startswith(".") or not name or name in folders.OWN_NAMES:
+                raise RecordingError(run_dir / name, "cannot be an extra file: expected a plain, unused name")
+            write_file(run_dir / name, encode_text(content) if isinstance(content, str) else content)
+        writer = cls(run_dir, run, compress=compress)
+        write_file(run_dir / folders.RUN_FILE, encode_run(run, _run_id(run_dir)))
+        with explained(run_dir):
+            sync_folder(run_dir)
+        return writer
+
+    def set_devices(self, devices: Mapping[str, Mapping[str, Any]]) -> None:
+        """Add what the devices say of themselves; before the first shot, once they are open.
+
+        Args:
+            devices: Role or device name -> its ``describe()``.
+
+        Raises:
+            RecordingError: The disk is full.
+        """
+        self._run = replace(self._run, devices=devices)
+        self._encoder = self._make_encoder()
+        write_file(self.run_dir / folders.RUN_FILE, encode_run(self._run, _run_id(self.run_dir)))
+
+    def _make_encoder(self) -> ShotEncoder:
+        from labseq.recording.shot_file import ShotEncoder  # h5py takes 0.1 s to import
+
+        return ShotEncoder(self._run, _run_id(self.run_dir), compress=self._compress)
+
+    def write_shot(self, shot: ShotRecord) -> Path:
+        """Write an attempt at a shot; it counts if it is complete.
+
+        Returns:
+            The shot's file; it and its line in the index are on the disk.
+
+        Raises:
+            RecordingError: The disk is full, or the record contradicts itself.
+                The shots written before are whole, and this one may be written again.
+        """
+        counts = shot.status == "complete"
+        file = folders.shot_file_name(shot.shot_index, shot.attempt, counts=counts)
+        path = self.run_dir / file
+        data = self._encoder.encode(shot)
+        digest = self._hasher.submit(hashlib.sha256, data)  # while the disk works
+        write_file(path, data)
+        sha256 = digest.result().hexdigest()
+        self._index.append(index_row(shot, file=file, sha256=sha256, n_bytes=data.nbytes), sync=True)
+        self.n_written += counts
+        return path
+
+    def event(self, name: str, /, **values: Any) -> None:
+        """Add a line to the event log; never raises, from any thread.
+
+        A line that the disk does not take is lost; the next line counts the lost ones.
+        """
+        line: dict[str, Any] = {
+            "t_utc": datetime.now(UTC).isoformat(timespec="microseconds"),
+            "event": name,
+            "values": values,
+        }
+        with self._events_lock:
+            if self._n_events_lost:
+                line["n_lost_before"] = self._n_events_lost
+            try:
+                self._events.append(line, sync=False)
+                self._n_events_lost = 0
+            except RecordingError:
+                self._n_events_lost += 1
+
+    def finish(self, status: RunStatus, error: str = "") -> None:
+        """Mark how the run ended.
+
+        Raises:
+            RecordingError: The disk is full. The run counts as failed as soon as
+                this process is gone.
+        """
+        self.event("run_finished", status=status, error=error, n_shots=self.n_written)
+        write_file(self.run_dir / folders.STATE_FILE, encode_state(status, error))
+
+
+def _run_id(run_dir: Path) -> str:
+    return f"{run_dir.parent.name}/{run_dir.name}"

@@ -1,0 +1,150 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from labseq.errors import RecordingError
+from labseq.recording import data_root
+from labseq.recording.folders import find_run, make_run_folder, slug
+
+NOON = datetime(2026, 11, 20, 12, tzinfo=UTC)
+
+MAKE = """
+import sys
+from datetime import datetime
+from pathlib import Path
+from labseq.recording.folders import make_run_folder
+noon = datetime.fromisoformat("2026-11-20T12:00:00+00:00")
+input()
+for i in range(10):
+    print(make_run_folder(Path(sys.argv[1]), sys.argv[2], noon))
+"""
+
+
+def test_the_data_root_comes_from_the_environment(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.delenv("LABSEQ_DATA", raising=False)
+    assert data_root() == Path("data")
+    monkeypatch.setenv("LABSEQ_DATA", "")
+    assert data_root() == Path("data")
+    monkeypatch.setenv("LABSEQ_DATA", str(tmp_path))
+    assert data_root() == tmp_path
+
+
+def test_counters_go_on_whatever_the_name(tmp_path: Path) -> None:
+    made = [make_run_folder(tmp_path, name, NOON).name for name in ("a", "b", "größe 2/3", "")]
+    assert made == ["0001_a", "0002_b", "0003_größe_2_3", "0004_run"]
+    day = NOON.astimezone().date().isoformat()
+    assert {path.name for path in tmp_path.iterdir()} == {day}
+
+
+def test_counters_outgrow_four_digits(tmp_path: Path) -> None:
+    day = make_run_folder(tmp_path, "a", NOON).parent
+    (day / "9999_z").mkdir()
+    assert make_run_folder(tmp_path, "b", NOON).name == "10000_b"
+    assert make_run_folder(tmp_path, "b", NOON).name == "10001_b"
+
+
+def test_a_claim_left_by_a_killed_process_is_stepped_over(tmp_path: Path) -> None:
+    day = make_run_folder(tmp_path, "a", NOON).parent
+    (day / ".0002.claim").mkdir()
+    assert make_run_folder(tmp_path, "b", NOON).name == "0003_b"
+
+
+def test_threads_never_share_a_counter(tmp_path: Path) -> None:
+    with ThreadPoolExecutor(8) as pool:
+        made = list(pool.map(lambda i: make_run_folder(tmp_path, f"run{i % 3}", NOON), range(80)))
+    assert sorted(int(path.name[:4]) for path in made) == list(range(1, 81))
+
+
+def test_processes_never_share_a_counter(tmp_path: Path) -> None:
+    children = [
+        subprocess.Popen(
+            [sys.executable, "-c", MAKE, tmp_path, f"run{i}"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        for i in range(4)
+    ]
+    for child in children:  # all are imported and waiting before the first one starts
+        assert child.stdin is not None
+        child.stdin.write("\n")
+        child.stdin.flush()
+    made = [line for child in children for line in child.communicate()[0].split()]
+    assert len(made) == 40
+    assert len({Path(path).name[:4] for path in made}) == 40
+    assert not list(tmp_path.glob("*/.*"))
+
+
+@given(st.text())
+def test_every_slug_is_a_plain_file_name(name: str) -> None:
+    made = slug(name)
+    assert made == Path(made).name
+    assert made[0] not in ".-"
+    assert len(made) <= 60
+    assert not set(made) & set('<>:"/\\|?*\0 ')
+
+
+def test_a_place_that_cannot_be_written_to_is_explained(tmp_path: Path) -> None:
+    root = tmp_path / "file"
+    root.write_text("")
+    with pytest.raises(RecordingError, match="a file is in the way of a folder; move it, or choose another"):
+        make_run_folder(root, "a", NOON)
+
+
+def make_finished(tmp_path: Path, name: str) -> Path:
+    run = make_run_folder(tmp_path, name, NOON)
+    (run / "run.json").write_text("{}")
+    (run / "shots").mkdir()
+    (run / "shots" / "shot_000000.h5").touch()
+    return run
+
+
+def test_any_path_in_a_run_finds_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = make_finished(tmp_path, "a")
+    for path in (run, run / "run.json", run / "shots", run / "shots" / "shot_000000.h5"):
+        assert find_run(path) == run
+    monkeypatch.chdir(run / "shots")
+    assert find_run(Path()) == run
+
+
+def test_a_folder_of_runs_names_its_latest(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match=r"is not a run: it has no run\.json; give a run's folder"):
+        find_run(tmp_path)
+    make_finished(tmp_path, "a")
+    with pytest.raises(RecordingError, match=r"holds 1 run and is none itself; .*0001_a"):
+        find_run(tmp_path)
+    latest = make_finished(tmp_path, "b")
+    for folder in (tmp_path, latest.parent):
+        with pytest.raises(RecordingError, match=r"holds 2 runs and is none itself; .*0002_b"):
+            find_run(folder)
+
+
+def test_what_is_not_there_is_explained(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match="no such file or folder"):
+        find_run(tmp_path / "nothing")
+
+
+def test_a_run_that_died_at_birth_is_explained(tmp_path: Path) -> None:
+    run = make_run_folder(tmp_path, "a", NOON)
+    (run / "STATE").write_text("{}")
+    with pytest.raises(RecordingError, match="died while its folder was made"):
+        find_run(run / "STATE")
+
+
+def test_a_run_that_lost_its_run_file_is_not_to_be_deleted(tmp_path: Path) -> None:
+    run = make_finished(tmp_path, "a")
+    (run / "STATE").write_text("{}")
+    (run / "run.json").unlink()
+    for path in (run, run / "shots" / "shot_000000.h5"):
+        with pytest.raises(
+            RecordingError, match=r"holds shots, but its run\.json is gone; take that from a backup"
+        ):
+            find_run(path)

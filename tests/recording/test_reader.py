@@ -1,0 +1,218 @@
+from __future__ import annotations
+
+import json
+import math
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import pytest
+
+from labseq.errors import RecordingError
+from labseq.model import RunRecord, ShotRecord
+from labseq.recording import RunWriter, open_run
+
+MakeRun = Callable[..., RunRecord]
+MakeShot = Callable[..., ShotRecord]
+
+
+@pytest.fixture
+def run_dir(tmp_path: Path, make_run: MakeRun, make_shot: MakeShot) -> Path:
+    """A finished run of three shots, one of them a success."""
+    writer = RunWriter.create(tmp_path, make_run())
+    for index, (success, filling) in enumerate([(True, 1.0), (False, 0.5), (False, math.nan)]):
+        writer.write_shot(make_shot(index, success=success, filling_fraction=filling))
+    writer.finish("complete")
+    return writer.run_dir
+
+
+def rewrite_json(path: Path, **changes: Any) -> None:
+    path.write_text(json.dumps({**json.loads(path.read_text("utf-8")), **changes}), "utf-8")
+
+
+def test_a_run_tells_what_it_was(run_dir: Path) -> None:
+    run = open_run(str(run_dir / "run.json"))
+    assert run.path == run_dir
+    assert (run.name, run.n_shots, run.seed, run.simulated) == ("compact-225", 20, 7, True)
+    assert run.target.n_atoms == 6
+    assert run.defect_free == pytest.approx(1 / 3)
+    assert run.filling_fraction == 0.75
+    assert run.status == "complete"
+    assert run.record["overrides"] == {"planner.degree_of_parallelism": 7}
+    assert run.summary() == {
+        "run_dir": str(run_dir),
+        "shots": 3,
+        "defect_free": pytest.approx(1 / 3),
+        "filling_fraction": 0.75,
+        "status": "complete",
+    }
+    assert "3 of 20 shots, complete" in repr(run)
+    shot = run.shots[1]
+    assert (shot.index, shot.attempt, shot.status, shot.success) == (1, 0, "complete", False)
+    assert (shot.filling_fraction, shot.seen_defect_free_cycle) == (0.5, 2)
+    assert math.isnan(run.shots[2].filling_fraction)
+    assert "Shot 1" in repr(shot)
+
+
+def test_a_run_without_shots_has_no_averages(tmp_path: Path, make_run: MakeRun) -> None:
+    run = open_run(RunWriter.create(tmp_path, make_run()).run_dir)
+    assert math.isnan(run.defect_free)
+    assert math.isnan(run.filling_fraction)
+    assert run.summary()["defect_free"] is None
+    assert run.summary()["filling_fraction"] is None
+    assert len(run.shots) == len(run.attempts) == len(run.events) == 0
+
+
+def test_the_index_is_enough_to_open_a_run(run_dir: Path) -> None:
+    for path in (run_dir / "shots").iterdir():
+        path.unlink()
+    row = json.loads((run_dir / "index.jsonl").read_text("utf-8").splitlines()[0])
+    lines = [
+        json.dumps({**row, "shot": i, "file": f"shots/shot_{i:06d}.h5"}) for i in reversed(range(10_000))
+    ]
+    (run_dir / "index.jsonl").write_text("\n".join(lines) + "\n")
+    run = open_run(run_dir)
+    assert [shot.index for shot in run.shots] == list(range(10_000))
+    assert run.defect_free == 1.0
+    with pytest.raises(RecordingError, match=r"shot_000017.h5: is missing; take it from a backup"):
+        _ = run.shots[17].plans
+    with pytest.raises(RecordingError, match=r"shot_000017.h5: is missing"):
+        _ = run.shots[17].frames
+    with pytest.raises(RecordingError, match=r"shot_000017.h5: cannot be read"):
+        run.shots[17].verify()
+
+
+def test_what_a_kill_left_is_ignored(run_dir: Path) -> None:
+    index = run_dir / "index.jsonl"
+    index.write_bytes(index.read_bytes() + b'{"shot": 3, "counts": true, "fi')
+    (run_dir / "shots" / "shot_000003.h5.part").write_bytes(b"\x89HDF")
+    (run_dir / "events.jsonl").write_bytes(b'{"event": "a"}\n{"ev')
+    run = open_run(run_dir)
+    assert len(run.shots) == 3
+    assert run.n_damaged_lines == 0
+    assert run.events == ({"event": "a"},)
+
+
+def test_damaged_lines_are_counted_and_do_not_hide_the_others(run_dir: Path) -> None:
+    index = run_dir / "index.jsonl"
+    lines = index.read_bytes().splitlines()
+    odd = json.dumps({**json.loads(lines[0]), "shot": "x"}).encode()
+    index.write_bytes(b"\n".join([lines[0], b"\0\0", b"{}", odd, lines[2], b""]))
+    run = open_run(run_dir)
+    assert [shot.index for shot in run.shots] == [0, 2]
+    assert run.n_damaged_lines == 3
+
+
+def test_a_shot_written_again_counts_once(tmp_path: Path, make_run: MakeRun, make_shot: MakeShot) -> None:
+    writer = RunWriter.create(tmp_path, make_run())
+    writer.write_shot(make_shot(0, success=False))
+    writer.write_shot(make_shot(0, success=True))
+    (shot,) = open_run(writer.run_dir).shots
+    assert shot.success
+    shot.verify()
+
+
+def test_a_run_whose_process_is_gone_has_failed(run_dir: Path) -> None:
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as child:
+        rewrite_json(run_dir / "STATE", state="running", pid=child.pid, started="")
+        assert open_run(run_dir).status == "running"
+    run = open_run(run_dir)
+    assert (run.status, run.error) == ("failed", "the process that ran it is gone")
+    assert len(run.shots) == 3
+
+
+def test_a_run_on_another_computer_is_believed(run_dir: Path) -> None:
+    rewrite_json(run_dir / "STATE", state="running", started="long ago", host="another")
+    assert open_run(run_dir).status == "running"
+
+
+@pytest.mark.parametrize("content", [b"", b"{}", b'{"state": "odd"}', None])
+def test_a_run_without_a_state_has_failed(run_dir: Path, content: bytes | None) -> None:
+    (run_dir / "STATE").unlink()
+    if content is not None:
+        (run_dir / "STATE").write_bytes(content)
+    run = open_run(run_dir)
+    assert (run.status, run.error) == ("failed", "STATE is missing or damaged")
+
+
+@pytest.mark.parametrize("content", [b"", b"[]", b"\xff", b'{"format": "other"}'])
+def test_a_damaged_run_file_is_explained(run_dir: Path, content: bytes) -> None:
+    (run_dir / "run.json").write_bytes(content)
+    with pytest.raises(RecordingError, match=r"run.json: is damaged, or not labseq's; take it from a backup"):
+        open_run(run_dir)
+
+
+def test_a_run_file_that_lacks_something_is_explained(run_dir: Path) -> None:
+    record = json.loads((run_dir / "run.json").read_text("utf-8"))
+    del record["seed"]
+    (run_dir / "run.json").write_text(json.dumps(record), "utf-8")
+    with pytest.raises(RecordingError, match=r"run.json: is damaged: it has no 'seed'"):
+        open_run(run_dir)
+
+
+def test_a_damaged_target_is_explained(run_dir: Path) -> None:
+    rewrite_json(run_dir / "run.json", target={"fill": ["01", "0"], "clear": [], "name": ""})
+    with pytest.raises(RecordingError, match="damaged target"):
+        _ = open_run(run_dir).target
+
+
+def test_a_run_of_a_newer_labseq_is_refused(run_dir: Path) -> None:
+    rewrite_json(run_dir / "run.json", format_version="1.9")  # a newer minor version only adds things
+    open_run(run_dir)
+    rewrite_json(run_dir / "run.json", format_version="2.0")
+    with pytest.raises(
+        RecordingError, match=r"has format version 2\.0, this labseq reads 1\.0; update labseq"
+    ):
+        open_run(run_dir)
+
+
+@pytest.mark.parametrize(
+    ("attributes", "message"),
+    [
+        ({"format_version": "2.0"}, r"has format version 2\.0, this labseq reads 1\.0; update labseq"),
+        ({"format_version": "x"}, "has the format version 'x'; expected one like 1.0"),
+        ({"format": "nexus"}, "is not a shot's file of labseq"),
+    ],
+)
+def test_other_shot_files_are_refused(run_dir: Path, attributes: dict[str, str], message: str) -> None:
+    shot = open_run(run_dir).shots[0]
+    with h5py.File(shot.file, "r+") as file:
+        file.attrs.update(attributes)
+    with pytest.raises(RecordingError, match=message):
+        _ = shot.plans
+    with pytest.raises(RecordingError, match="has changed since it was written"):
+        shot.verify()
+
+
+@pytest.mark.parametrize("part", [0.0, 0.01, 0.3, 0.9])
+def test_a_damaged_shot_file_is_explained(run_dir: Path, part: float) -> None:
+    shot = open_run(run_dir).shots[0]
+    data = shot.file.read_bytes()
+    shot.file.write_bytes(data[: int(part * len(data))])
+    with pytest.raises(RecordingError, match=r"shot_000000.h5: is damaged: .*; take it from a backup"):
+        _ = shot.occupancies
+    with pytest.raises(RecordingError, match="is damaged"):
+        _ = shot.frames
+
+
+def test_a_shot_file_that_lacks_something_is_explained(run_dir: Path) -> None:
+    shot = open_run(run_dir).shots[0]
+    with h5py.File(shot.file, "r+") as file:
+        del file["entry/timing"]
+    with pytest.raises(RecordingError, match="is damaged"):
+        _ = shot.timing
+
+
+def test_several_values_of_a_shot_read_its_file_once(run_dir: Path) -> None:
+    shot = open_run(run_dir).shots[0]
+    assert len(shot.plans) == 3
+    shot.file.unlink()
+    assert len(shot.timing) == 4
+
+
+def test_importing_the_package_is_light() -> None:
+    code = "import sys, labseq.recording; assert 'h5py' not in sys.modules and 'pydantic' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True)

@@ -1,0 +1,219 @@
+"""What stands in a shot's file, seen with h5py alone."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import json
+import subprocess
+import sys
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+
+from labseq.errors import RecordingError
+from labseq.model import Frame, RunRecord, ShotRecord
+from labseq.recording.layout import FORMAT_VERSION
+from labseq.recording.shot_file import ShotEncoder
+
+MakeRun = Callable[..., RunRecord]
+MakeShot = Callable[..., ShotRecord]
+
+
+@contextmanager
+def opened(data: memoryview | bytes) -> Generator[Any]:
+    with h5py.File(io.BytesIO(data), "r") as file:
+        yield file
+
+
+def default_plot(file: Any) -> Any:
+    """Follow the chain of NeXus defaults, as silx, H5Web and NeXpy do."""
+    node = file
+    while "signal" not in node.attrs:
+        node = node[node.attrs["default"]]
+    assert node.attrs["NX_class"] == "NXdata"
+    return node
+
+
+def test_viewers_open_the_frames(make_run: MakeRun, make_shot: MakeShot) -> None:
+    shot = make_shot()
+    with opened(ShotEncoder(make_run(), "day/run").encode(shot)) as file:
+        view = default_plot(file)
+        assert view.name == "/entry/images_view"
+        signal = view[view.attrs["signal"]]
+        assert signal.shape == (3, 6, 8)
+        assert list(view.attrs["axes"]) == ["t_s", ".", "."]
+        assert view["t_s"].shape == (3,)
+        assert signal.attrs["interpretation"] == "image"
+        np.testing.assert_array_equal(signal[1], shot.images[1].frame.image)  # pyright: ignore[reportOptionalMemberAccess]
+
+
+def test_viewers_open_the_occupancies_where_there_are_no_frames(
+    make_run: MakeRun, make_shot: MakeShot
+) -> None:
+    shot = make_shot()
+    with opened(ShotEncoder(make_run(record_frames="none"), "day/run").encode(shot)) as file:
+        view = default_plot(file)
+        assert view.name == "/entry/detection"
+        np.testing.assert_array_equal(view["occupancy"][2], shot.images[2].occupancy)
+        assert view["occupancy"].attrs["interpretation"] == "image"
+        assert list(view.attrs["axes"]) == ["t_s", ".", "."]
+        assert "camera" not in file["entry"]
+
+
+def test_the_root_and_the_entry_say_what_it_is(make_run: MakeRun, make_shot: MakeShot) -> None:
+    with opened(ShotEncoder(make_run(), "2026-11-20/0001_a").encode(make_shot(3))) as file:
+        assert file.attrs["format"] == "labseq-shot"
+        assert file.attrs["format_version"] == FORMAT_VERSION
+        assert file.attrs["NX_class"] == "NXroot"
+        assert file.attrs["creator"].startswith("labseq ")
+        entry = file["entry"].attrs
+        assert entry["NX_class"] == "NXentry"
+        assert entry["run_id"] == "2026-11-20/0001_a"
+        assert entry["shot_index"] == 3
+        assert entry["filling_fraction"] == 0.875
+        assert entry["simulated"]
+        assert entry["success"]
+        assert entry["t_start_utc"] == "2026-11-20T10:00:00.000000+00:00"
+
+
+def test_every_time_has_its_unit(make_run: MakeRun, make_shot: MakeShot) -> None:
+    checked: list[str] = []
+
+    def check(name: str, node: Any) -> None:
+        if not isinstance(node, h5py.Dataset):
+            return
+        if node.dtype.names:
+            units: Any = node.attrs["units"]
+            assert list(units) == ["s" if column.endswith("_s") else "" for column in node.dtype.names]
+            checked.append(name)
+        elif name.endswith("_s"):
+            assert node.attrs["units"] == "s"
+            checked.append(name)
+
+    with opened(ShotEncoder(make_run(), "day/run").encode(make_shot())) as file:
+        file.visititems(check)
+        assert file["entry/images_view/images"].attrs["units"] == "adu"
+    assert len(checked) == 9
+
+
+def test_the_tables_hold_every_move(make_run: MakeRun, make_shot: MakeShot) -> None:
+    shot = make_shot()
+    with opened(ShotEncoder(make_run(), "day/run").encode(shot)) as file:
+        moves = file["entry/rearrangement/moves"][()]
+        cycles = file["entry/rearrangement/cycles"][()]
+    assert list(moves["cycle"]) == [1] * 6 + [3]
+    assert list(moves["batch"]) == [0, 0, 1, 2, 2, 2, 0]
+    assert list(moves["played"]) == [True] * 3 + [False] * 4
+    sites = np.stack([moves[name] for name in ("from_row", "from_col", "to_row", "to_col")], axis=1)
+    np.testing.assert_array_equal(sites[:6], shot.cycles[0].plan.moves)
+    assert list(cycles["n_batches"]) == [3, 0, 1]
+    assert list(cycles["n_batches_played"]) == [2, 0, 0]
+    assert cycles["planned_duration_s"][0] == shot.cycles[0].report.duration_s
+
+
+def test_stages_over_budget_are_marked(make_run: MakeRun, make_shot: MakeShot) -> None:
+    with opened(ShotEncoder(make_run(), "day/run").encode(make_shot())) as file:
+        timing = file["entry/timing"][()]
+        assert [stage.decode() for stage in timing["stage"]] == ["load", "plan", "plan", "prüfen"]
+        assert list(timing["over_budget"]) == [False, True, False, False]
+
+
+def test_provenance_and_devices_stand_in_every_file(make_run: MakeRun, make_shot: MakeShot) -> None:
+    with opened(ShotEncoder(make_run(), "day/run").encode(make_shot())) as file:
+        provenance = file["entry/provenance"]
+        assert provenance.attrs["git_commit"] == "a" * 40
+        assert provenance.attrs["git_dirty"]
+        assert provenance.attrs["seed"] == 7
+        assert len(provenance.attrs["sequence_sha256"]) == 64
+        assert json.loads(provenance["packages"][()]) == {"numpy": "2"}
+        assert provenance["sequence"][()].decode() == make_run().sequence_text
+        assert json.loads(file["entry/devices/laser_780 nm"][()]) == {"power_w": 0.1}
+
+
+def test_any_hdf5_from_1_8_on_can_read_it(make_run: MakeRun, make_shot: MakeShot) -> None:
+    data = bytes(ShotEncoder(make_run(), "day/run").encode(make_shot()))
+    assert data[:8] == b"\x89HDF\r\n\x1a\n"
+    assert data[8] == 0  # superblock version 0: no flag that a killed writer could leave set
+
+
+def test_it_reads_without_labseq(make_run: MakeRun, make_shot: MakeShot, tmp_path: Path) -> None:
+    path = tmp_path / "shot.h5"
+    path.write_bytes(ShotEncoder(make_run(), "day/run").encode(make_shot()))
+    code = (
+        "import sys, h5py\n"
+        "with h5py.File(sys.argv[1]) as f:\n"
+        "    print(f['entry/images_view/images'].shape, f['entry/rearrangement/moves'].dtype.names[:3])\n"
+        "assert 'labseq' not in sys.modules\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code, path], capture_output=True, text=True, check=True)
+    assert done.stdout == "(3, 6, 8) ('step', 'cycle', 'batch')\n"
+
+
+@pytest.mark.parametrize(("record_frames", "kept"), [("all", [0, 1, 2]), ("last", [2]), ("none", [])])
+def test_the_frames_that_are_asked_for_are_kept(
+    make_run: MakeRun, make_shot: MakeShot, record_frames: str, kept: list[int]
+) -> None:
+    with opened(ShotEncoder(make_run(record_frames=record_frames), "day/run").encode(make_shot())) as file:
+        found = list(file["entry/camera/camera/image"]) if "camera" in file["entry"] else []
+        assert found == kept
+        assert file["entry/detection/occupancy"].shape == (3, 4, 5)
+
+
+def test_the_same_record_gives_the_same_bytes(make_run: MakeRun, make_shot: MakeShot) -> None:
+    one, two = (ShotEncoder(make_run(), "day/run").encode(make_shot()) for _ in range(2))
+    assert one == two
+
+
+def test_frames_of_several_cameras_and_sizes_have_groups_of_their_own(
+    make_run: MakeRun, make_shot: MakeShot
+) -> None:
+    shot = make_shot(n_images=4)
+    sizes_and_names = [((6, 8), "a/b"), ((3, 2), "a/b"), ((6, 8), "a/b"), ((6, 8), "日")]
+    frames = [
+        Frame(np.full(size, i, np.uint16), 0.1, 0.0, name) for i, (size, name) in enumerate(sizes_and_names)
+    ]
+    shot.images = [
+        dataclasses.replace(image, frame=frame) for image, frame in zip(shot.images, frames, strict=True)
+    ]
+    with opened(ShotEncoder(make_run(), "day/run").encode(shot)) as file:
+        cameras = file["entry/camera"]
+        assert {name: list(group["image"]) for name, group in cameras.items()} == {
+            "a_b": [0, 2],
+            "a_b_2": [1],
+            "日": [3],
+        }
+        assert cameras["a_b_2"].attrs["name"] == "a/b"
+        assert default_plot(file)["images"].shape == (2, 6, 8)
+
+
+def test_compressed_frames_are_smaller_and_the_same(make_run: MakeRun, make_shot: MakeShot) -> None:
+    pytest.importorskip("hdf5plugin")
+    shot = make_shot(n_images=1)
+    dark = np.random.default_rng(0).poisson(3, (256, 256)).astype(np.uint16)
+    shot.images = [dataclasses.replace(shot.images[0], frame=Frame(dark, 0.1, 0.0))]
+    plain = ShotEncoder(make_run(), "day/run").encode(shot)
+    small = ShotEncoder(make_run(), "day/run", compress=True).encode(shot)
+    assert small.nbytes < 0.6 * plain.nbytes
+    with opened(small) as file:
+        np.testing.assert_array_equal(file["entry/images_view/images"][0], dark)
+
+
+def test_compression_without_its_package_is_explained(
+    make_run: MakeRun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "hdf5plugin", None)
+    with pytest.raises(RecordingError, match=r"install labseq\[compress\]"):
+        ShotEncoder(make_run(), "day/run", compress=True)
+
+
+def test_a_record_that_contradicts_itself_is_explained(make_run: MakeRun, make_shot: MakeShot) -> None:
+    shot = make_shot(5)
+    shot.images[1] = dataclasses.replace(shot.images[1], occupancy=np.zeros((2, 2), np.bool_))
+    with pytest.raises(RecordingError, match=r"shot 5 \(attempt 0\): cannot be laid out as a file"):
+        ShotEncoder(make_run(), "day/run").encode(shot)

@@ -1,0 +1,256 @@
+from __future__ import annotations
+
+import errno
+import hashlib
+import json
+import os
+import threading
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from labseq.errors import RecordingError
+from labseq.model import RunRecord, ShotRecord
+from labseq.recording import RunWriter, open_run
+
+MakeRun = Callable[..., RunRecord]
+MakeShot = Callable[..., ShotRecord]
+
+
+class FullDisk:
+    """From the n-th call of write, fsync or replace on, ``n_failures`` calls fail."""
+
+    def __init__(self, n_good: int, n_failures: int) -> None:
+        self.n_good = n_good
+        self.n_failures = n_failures
+        self.n_calls = 0
+
+    def may_go_on(self) -> bool:
+        self.n_calls += 1
+        return not self.n_good < self.n_calls <= self.n_good + self.n_failures
+
+    @contextmanager
+    def inserted(self, monkeypatch: pytest.MonkeyPatch) -> Generator[None]:
+        real = {name: getattr(os, name) for name in ("write", "fsync", "replace")}
+
+        def guarded(name: str) -> Callable[..., Any]:
+            def call(*args: Any, **kwargs: Any) -> Any:
+                if self.may_go_on():
+                    return real[name](*args, **kwargs)
+                if name == "write":  # some of it still fits
+                    real[name](args[0], bytes(args[1])[: len(args[1]) // 2])
+                raise OSError(errno.ENOSPC, "No space left on device")
+
+            return call
+
+        with monkeypatch.context() as patch:
+            for name in real:
+                patch.setattr(os, name, guarded(name))
+            yield
+
+
+def files(folder: Path) -> set[str]:
+    return {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_a_run_folder_holds_everything_from_the_start(tmp_path: Path, make_run: MakeRun) -> None:
+    record = make_run()
+    writer = RunWriter.create(tmp_path / "new" / "data", record, {"git.diff": "+ µ\r\n", "env.bin": b"\xff"})
+    run_dir = writer.run_dir
+    day = datetime.fromisoformat(record.t_start_utc).astimezone().date().isoformat()
+    assert run_dir == tmp_path / "new" / "data" / day / "0001_compact-225"
+    own = {"STATE", "events.jsonl", "index.jsonl", "profile.yaml", "run.json", "sequence.yaml"}
+    assert files(run_dir) == own | {"env.bin", "git.diff"}
+    assert (run_dir / "sequence.yaml").read_bytes() == record.sequence_text.encode()
+    assert (run_dir / "git.diff").read_bytes() == "+ µ\r\n".encode()
+    assert (run_dir / "env.bin").read_bytes() == b"\xff"
+    state = json.loads((run_dir / "STATE").read_text())
+    assert (state["state"], state["pid"]) == ("running", os.getpid())
+    run = json.loads((run_dir / "run.json").read_text("utf-8"))
+    assert run["run_id"] == f"{day}/0001_compact-225"
+    assert run["target"]["fill"] == ["00000", "01110", "01110", "00000"]
+    assert run["target"]["clear"] == ["11111", "00000", "00000", "00000"]
+    assert run["sequence_sha256"] == hashlib.sha256(record.sequence_text.encode()).hexdigest()
+    assert run["devices"]["laser/780 nm"] == {"power_w": 0.1}
+    assert {*RunRecord.__slots__} <= run.keys()
+
+
+def test_the_index_tells_each_shot_in_a_line(tmp_path: Path, make_run: MakeRun, make_shot: MakeShot) -> None:
+    writer = RunWriter.create(tmp_path, make_run())
+    path = writer.write_shot(make_shot())
+    row = json.loads((writer.run_dir / "index.jsonl").read_text("utf-8"))
+    assert row == {
+        "shot": 0,
+        "attempt": 0,
+        "counts": True,
+        "file": "shots/shot_000000.h5",
+        "status": "complete",
+        "error": "",
+        "t_start_utc": "2026-11-20T10:00:00.000000+00:00",
+        "t_end_utc": "2026-11-20T10:00:01.250000+00:00",
+        "success": True,
+        "filling_fraction": 0.875,
+        "seen_defect_free_cycle": 2,
+        "n_cycles": 3,
+        "n_images": 3,
+        "n_batches": 2,
+        "n_atom_moves": 3,
+        "n_missing_atoms": 3,
+        "stage_s": {"load": 0.5, "plan": pytest.approx(0.003), "prüfen": 1e-9},
+        "parameters": {"shot.2.rearrange.window": 0.06, "ümlaut": [1, None]},
+        "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
+        "bytes": path.stat().st_size,
+    }
+
+
+def test_attempts_that_failed_stand_beside_the_shot(
+    tmp_path: Path, make_run: MakeRun, make_shot: MakeShot
+) -> None:
+    writer = RunWriter.create(tmp_path, make_run())
+    writer.write_shot(make_shot(3, status="failed", error="no frame", filling_fraction=float("nan")))
+    writer.write_shot(make_shot(3, attempt=1))
+    writer.write_shot(make_shot(4, status="interrupted"))
+    assert writer.n_written == 1
+    assert files(writer.run_dir / "shots") == {
+        "shot_000003.attempt_0.h5", "shot_000003.h5", "shot_000004.attempt_0.h5"
+    }  # fmt: skip
+    run = open_run(writer.run_dir)
+    assert [(shot.index, shot.attempt) for shot in run.shots] == [(3, 1)]
+    assert [(shot.index, shot.status) for shot in run.attempts] == [(3, "failed"), (4, "interrupted")]
+    assert run.attempts[0].row["error"] == "no frame"
+    assert run.attempts[0].row["filling_fraction"] is None
+
+
+def test_events_take_any_value(tmp_path: Path, make_run: MakeRun) -> None:
+    writer = RunWriter.create(tmp_path, make_run())
+    writer.event("odd", name="shutter", self=np.float32("nan"), what=object, loop=[...])
+    (event,) = open_run(writer.run_dir).events
+    assert event["event"] == "odd"
+    assert event["values"] == {
+        "name": "shutter", "self": None, "what": "<class 'object'>", "loop": ["Ellipsis"]
+    }  # fmt: skip
+    assert datetime.fromisoformat(event["t_utc"]).tzinfo is not None
+    assert len(event["t_utc"]) == len("2026-11-20T10:00:00.000000+00:00")
+
+
+def test_events_come_from_any_thread(tmp_path: Path, make_run: MakeRun) -> None:
+    writer = RunWriter.create(tmp_path, make_run())
+    threads = [
+        threading.Thread(target=lambda: [writer.event("tick", text="x" * 500) for _ in range(50)])
+        for _ in range(4)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(open_run(writer.run_dir).events) == 200
+
+
+def test_a_full_disk_loses_events_and_counts_them(
+    tmp_path: Path, make_run: MakeRun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    writer = RunWriter.create(tmp_path, make_run())
+    with FullDisk(0, 99).inserted(monkeypatch):
+        writer.event("lost")
+        writer.event("lost")
+    writer.event("back")
+    writer.event("again")
+    events = open_run(writer.run_dir).events
+    assert [(event["event"], event.get("n_lost_before")) for event in events] == [
+        ("back", 2),
+        ("again", None),
+    ]
+
+
+@pytest.mark.parametrize("status", ["complete", "stopped", "failed"])
+def test_the_end_is_marked(tmp_path: Path, make_run: MakeRun, status: Any) -> None:
+    writer = RunWriter.create(tmp_path, make_run())
+    assert open_run(writer.run_dir).status == "running"
+    writer.finish(status, "because µ")
+    run = open_run(writer.run_dir)
+    assert (run.status, run.error) == (status, "because µ")
+    assert run.events[-1]["values"] == {"status": status, "error": "because µ", "n_shots": 0}
+
+
+def test_a_place_that_cannot_be_written_to_is_explained(tmp_path: Path, make_run: MakeRun) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(RecordingError, match="choose another place with --output or LABSEQ_DATA"):
+        RunWriter.create(tmp_path / "file", make_run())
+
+
+@pytest.mark.parametrize("name", ["run.json", "../x", "a/b", "..", ""])
+def test_an_extra_file_cannot_stand_in_the_way(tmp_path: Path, make_run: MakeRun, name: str) -> None:
+    with pytest.raises(RecordingError, match="cannot be an extra file"):
+        RunWriter.create(tmp_path, make_run(), {name: ""})
+    assert files(tmp_path) == set()
+
+
+def n_disk_calls(action: Callable[[], object], monkeypatch: pytest.MonkeyPatch) -> int:
+    disk = FullDisk(10**9, 0)
+    with disk.inserted(monkeypatch):
+        action()
+    return disk.n_calls
+
+
+def test_a_run_that_finds_no_room_at_its_start_leaves_nothing(
+    tmp_path: Path, make_run: MakeRun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    record = make_run()
+    n_calls = n_disk_calls(lambda: RunWriter.create(tmp_path / "good", record), monkeypatch)
+    assert n_calls > 15
+    for n_good in range(n_calls):
+        root = tmp_path / f"full{n_good}"
+        with FullDisk(n_good, 99).inserted(monkeypatch), pytest.raises(RecordingError, match="disk is full"):
+            RunWriter.create(root, record)
+        assert files(root) == set()
+
+
+@pytest.mark.parametrize("n_failures", [1, 99])
+def test_a_full_disk_at_any_moment_of_a_shot_leaves_the_others_whole(
+    tmp_path: Path, make_run: MakeRun, make_shot: MakeShot, monkeypatch: pytest.MonkeyPatch, n_failures: int
+) -> None:
+    writer = RunWriter.create(tmp_path, make_run())
+    n_calls = n_disk_calls(lambda: writer.write_shot(make_shot(0)), monkeypatch)
+    assert n_calls == 6  # write, fsync, replace, fsync of the folder; write, fsync of the index
+    for index in range(1, 1 + n_calls):
+        shot = make_shot(index)
+        with (
+            FullDisk(index - 1, n_failures).inserted(monkeypatch),
+            pytest.raises(RecordingError, match=f"(shot_{index:06d}.h5|index.jsonl).*disk is full; free"),
+        ):
+            writer.write_shot(shot)
+        run = open_run(writer.run_dir)
+        assert [found.index for found in run.shots] == list(range(index))
+        for found in run.shots:
+            found.verify()
+        assert not list(writer.run_dir.rglob("*.part"))
+        writer.write_shot(shot)  # there is room again
+    assert writer.n_written == 1 + n_calls
+    for found in open_run(writer.run_dir).shots:
+        assert len(found.record().images) == 3
+
+
+def test_a_full_disk_at_the_end_is_an_error_and_harms_nothing(
+    tmp_path: Path, make_run: MakeRun, make_shot: MakeShot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    writer = RunWriter.create(tmp_path, make_run())
+    writer.write_shot(make_shot())
+    with FullDisk(0, 99).inserted(monkeypatch), pytest.raises(RecordingError, match=r"STATE.*disk is full"):
+        writer.finish("failed", "the disk is full")
+    run = open_run(writer.run_dir)
+    assert run.status == "running"
+    run.shots[0].verify()
+
+
+def test_devices_are_added_once_they_are_open(tmp_path: Path, make_run: MakeRun, make_shot: MakeShot) -> None:
+    writer = RunWriter.create(tmp_path, make_run())
+    writer.set_devices({"camera": {"model": "iXon", "serial_number": "X-1"}})
+    writer.write_shot(make_shot())
+    run = open_run(writer.run_dir)
+    assert run.record["devices"]["camera"]["serial_number"] == "X-1"
+    assert run.shots[0].devices["camera"] == {"model": "iXon", "serial_number": "X-1"}

@@ -1,0 +1,424 @@
+"""Whole runs on fakes: order of calls, retries, and every way out."""
+
+import numpy as np
+import pytest
+
+from labseq.errors import (
+    DeviceError,
+    DeviceTimeoutError,
+    InvalidPlanError,
+    LabseqError,
+    PlanError,
+    RecordingError,
+    StopRequested,
+    TransientError,
+)
+from labseq.model import Frame, Plan
+from labseq.sequencer import Sequencer, State
+from labseq.sequencer.lab import Timeouts
+from labseq.sequencer.steps import DeviceStep, ImageStep, LoadStep, WaitStep
+from labseq.testing.fakes import ListSink, RecordingObserver, ScriptedPlanner, fake_lab
+
+
+class Given:
+    """Settings of a step, by keyword."""
+
+    def __init__(self, **values):
+        self.__dict__.update(values)
+
+
+LOAD = ("load", LoadStep(Given(duration=0.5)))
+IMAGE = ("image", ImageStep(Given(exposure=0.045)))
+SAFE_ORDER = ["mobile_tweezers", "shutter", "camera", "static_tweezers"]
+FULL, EMPTY = np.ones((2, 2), bool), np.zeros((2, 2), bool)
+
+
+class Rig:
+    """A sequencer on a fake lab."""
+
+    def __init__(self, steps=(LOAD, IMAGE), attempts=3, sink=None, **lab):
+        self.lab = fake_lab(**lab)
+        self.sink = sink or ListSink()
+        self.observer = RecordingObserver()
+        self.sequencer = Sequencer(
+            self.lab, steps, self.lab.stop, self.sink, self.observer, seed=1, attempts=attempts
+        )
+
+    def run(self, n_shots=1):
+        try:
+            self.sequencer.open()
+            self.sequencer.run(range(n_shots))
+        finally:
+            self.all_safe = self.sequencer.shut_down()
+
+    def made_safe(self):
+        return [call.device for call in self.lab.calls if call.method == "safe_state"]
+
+    def record(self):
+        return self.sink.shots[-1]
+
+
+def test_devices_open_before_and_are_safe_and_closed_after():
+    rig = Rig()
+    rig.run()
+    names = rig.lab.calls.names()
+    opened = [n for n in names if n.endswith(".open")]
+    assert opened == ["static_tweezers.open", "camera.open", "shutter.open", "mobile_tweezers.open"]
+    assert names[-4:] == [f"{device}.close" for device in SAFE_ORDER]
+    assert rig.made_safe() == SAFE_ORDER
+    assert rig.all_safe
+    assert rig.sequencer.state is State.CLOSED
+
+
+def test_a_complete_shot_is_judged_on_its_last_image():
+    rig = Rig(occupancies=[FULL, EMPTY], steps=(LOAD, IMAGE, IMAGE))
+    rig.run()
+    record = rig.record()
+    assert (record.status, record.success, record.filling_fraction) == ("complete", False, 0.0)
+    assert [image.occupancy.sum() for image in record.images] == [4, 0]
+    assert record.t_start_utc <= record.t_end_utc
+
+
+def test_every_step_is_timed_against_its_budget():
+    rig = Rig(steps=(LOAD, IMAGE, ("pause", WaitStep(Given(duration=0.2)))))
+    rig.run()
+    steps = {t.stage: t for t in rig.record().timing if t.stage.startswith("step")}
+    assert list(steps) == ["step 0 load", "step 1 image", "step 2 pause"]
+    assert [t.duration_s for t in steps.values()] == pytest.approx([0.5, 0.045, 0.2])
+    assert [t.budget_s for t in steps.values()] == pytest.approx([0.5, 0.045, 0.2])
+    assert not any(t.over_budget for t in steps.values())
+
+
+def test_the_simulation_is_told_of_shots_and_loading():
+    rig = Rig(simulated=True)
+    rig.run(2)
+    names = rig.lab.calls.names("simulation")
+    assert names[0] == "simulation.open"
+    assert names[-1] == "simulation.close"
+    assert names.count("simulation.begin_shot") == names.count("simulation.load") == 2
+
+
+def test_random_streams_follow_shot_and_attempt():
+    drawn = []
+
+    class Draw:
+        needs_image = takes_image = False
+
+        def plan_timeline(self, context):
+            return []
+
+        def run(self, shot):
+            drawn.append(rig.lab.random_streams[0].shot.random())
+
+    rig = Rig(steps=(("draw", Draw()),))
+    rig.run(3)
+    first, drawn = drawn, []
+    rig = Rig(steps=(("draw", Draw()),))
+    rig.run(3)
+    assert drawn == first
+    assert len(set(drawn)) == 3
+
+
+def test_a_transient_failure_repeats_the_shot_and_keeps_the_attempt():
+    rig = Rig(fail_on={"camera.read": [TransientError("frame lost", "camera"), None]})
+    rig.run(2)
+    outcome = [(s.shot_index, s.attempt, s.status) for s in rig.sink.shots]
+    assert outcome == [(0, 0, "failed"), (0, 1, "complete"), (1, 0, "complete")]
+    assert rig.sink.shots[0].error == "TransientError: camera: frame lost"
+    assert rig.observer.names.count("shot_repeated") == 1
+    recovered = rig.lab.calls.names()[: rig.lab.calls.names().index("camera.safe_state") + 1]
+    assert recovered[-2:] == ["mobile_tweezers.safe_state", "camera.safe_state"]
+
+
+def test_attempts_run_out():
+    rig = Rig(attempts=2, fail_on={"camera.read": TransientError("frame lost", "camera")})
+    with pytest.raises(TransientError):
+        rig.run(2)
+    assert [(s.shot_index, s.attempt, s.status) for s in rig.sink.shots] == [
+        (0, 0, "failed"),
+        (0, 1, "failed"),
+    ]
+    assert rig.made_safe()[-4:] == SAFE_ORDER
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        "camera.arm",
+        "camera.trigger",
+        "camera.read",
+        "static_tweezers.start",
+        "static_tweezers.open",
+        "mobile_tweezers.open",
+    ],
+)
+def test_any_error_leaves_every_device_safe(call):
+    rig = Rig(fail_on={call: RuntimeError("cable")})
+    with pytest.raises(DeviceError, match="raised RuntimeError: cable"):
+        rig.run()
+    assert rig.made_safe() == SAFE_ORDER
+    assert rig.sequencer.state is State.CLOSED
+
+
+def test_safety_comes_before_the_record():
+    order = []
+
+    class Sink(ListSink):
+        def write_shot(self, shot):
+            order.append("written")
+            super().write_shot(shot)
+
+    rig = Rig(sink=Sink(), fail_on={"camera.read": RuntimeError("cable")})
+    rig.observer.event = lambda name, values: order.append(name)
+    with pytest.raises(DeviceError):
+        rig.run()
+    assert order.index("written") > max(i for i, name in enumerate(order) if name == "safe_state")
+    assert rig.record().status == "failed"
+    assert rig.record().timing
+
+
+@pytest.mark.parametrize("failing", SAFE_ORDER)
+def test_one_device_that_cannot_be_made_safe_never_stops_the_others(failing):
+    rig = Rig(fail_on={f"{failing}.safe_state": OSError("gone")})
+    rig.run()
+    assert rig.made_safe() == SAFE_ORDER
+    assert not rig.all_safe
+    told = {v["device"]: v["ok"] for v in rig.observer.of("safe_state")}
+    assert told == {device: device != failing for device in SAFE_ORDER}
+
+
+def test_a_safe_state_that_hangs_is_given_up():
+    timeouts = Timeouts(call_s=10.0, safe_state_s=0.05, plan_s=10.0)
+    rig = Rig(hang_on={"mobile_tweezers.safe_state"}, timeouts=timeouts)
+    rig.run()
+    assert rig.made_safe() == SAFE_ORDER
+    assert not rig.all_safe
+
+
+def test_a_device_that_hangs_is_named_and_still_made_safe():
+    timeouts = Timeouts(call_s=0.05, safe_state_s=10.0, plan_s=10.0)
+    rig = Rig(hang_on={"camera.trigger"}, timeouts=timeouts)
+    with pytest.raises(DeviceTimeoutError, match="camera: did not answer within"):
+        rig.run()
+    assert rig.made_safe() == SAFE_ORDER
+    assert rig.all_safe
+    rig.lab.hangs["camera.trigger"].release.set()
+
+
+def test_a_stop_request_between_shots_ends_the_run():
+    rig = Rig()
+    rig.observer.event = lambda name, values: rig.lab.stop.request(15) if name == "shot_finished" else None
+    with pytest.raises(StopRequested) as caught:
+        rig.run(5)
+    assert caught.value.signal_number == 15
+    assert [s.status for s in rig.sink.shots] == ["complete"]
+    assert rig.made_safe() == SAFE_ORDER
+
+
+def test_a_stop_request_in_a_shot_keeps_what_it_has():
+    stopping = ("stop", WaitStep(Given(duration=1.0)))
+    rig = Rig(steps=(LOAD, IMAGE, stopping))
+    rig.observer.event = lambda name, values: rig.lab.stop.request() if name == "image" else None
+    with pytest.raises(StopRequested):
+        rig.run()
+    record = rig.record()
+    assert (record.status, len(record.images)) == ("interrupted", 1)
+    assert rig.made_safe() == SAFE_ORDER
+
+
+def test_an_error_in_a_third_party_step_is_named():
+    class Broken:
+        needs_image = takes_image = False
+
+        def plan_timeline(self, context):
+            return []
+
+        def run(self, shot):
+            raise KeyError("typo")
+
+    rig = Rig(steps=(("mine", Broken()),))
+    with pytest.raises(LabseqError, match=r"step 0 \(mine\) raised KeyError: 'typo'"):
+        rig.run()
+    assert rig.made_safe() == SAFE_ORDER
+
+
+def test_a_disk_that_is_full_ends_the_run_safely():
+    class Full(ListSink):
+        def write_shot(self, shot):
+            raise RecordingError("shots", "no space left")
+
+    rig = Rig(sink=Full())
+    with pytest.raises(RecordingError):
+        rig.run(3)
+    assert rig.made_safe() == SAFE_ORDER
+
+
+def test_a_device_step_sends_its_command():
+    step = DeviceStep(Given(name="shutter", do="on", arguments={"level": 2}, timeout=1.0))
+    rig = Rig(steps=(("device", step),))
+    rig.run()
+    (call,) = rig.lab.calls.of("shutter.command")
+    assert (call.args, dict(call.kwargs)) == (("on",), {"level": 2})
+    assert rig.observer.of("device_command") == [
+        {"shot": 0, "device": "shutter", "command": "on", "arguments": {"level": 2}}
+    ]
+
+
+@pytest.mark.parametrize(
+    ("answer", "message"),
+    [
+        (None, "detect\\(\\) returned NoneType"),
+        ((np.ones((2, 2)), np.ones((2, 2))), "the occupancy is float64"),
+        ((np.ones((3, 2), bool), np.ones((2, 2))), r"the occupancy is bool \(3, 2\); expected bool \(2, 2\)"),
+        ((FULL, np.ones(4)), "the confidence is"),
+    ],
+)
+def test_a_detector_of_the_wrong_shape_is_named(answer, message):
+    class Wrong:
+        def detect(self, frame):
+            return answer
+
+    rig = Rig(occupancies=[FULL], detector=Wrong())
+    with pytest.raises(DeviceError, match=message) as caught:
+        rig.run()
+    assert caught.value.device == "detector"
+    assert rig.made_safe() == SAFE_ORDER
+
+
+def test_a_camera_that_returns_no_frame_is_named():
+    rig = Rig()
+    rig.lab.camera.read = lambda timeout_s: np.zeros((2, 2))
+    with pytest.raises(DeviceError, match=r"camera: read\(\) returned ndarray; expected a Frame"):
+        rig.run()
+
+
+def test_frames_are_kept_as_they_came():
+    rig = Rig()
+    rig.run()
+    (image,) = rig.record().images
+    assert isinstance(image.frame, Frame)
+    assert image.exposure_s == 0.045
+
+
+class TestRearrange:
+    """The closed loop, on scripted sights."""
+
+    half = np.array([[1, 0, 1], [0, 0, 0]], bool)
+    fill = np.array([[1, 1, 0], [0, 0, 0]], bool)
+    done = np.array([[1, 1, 0], [0, 0, 0]], bool)
+
+    def rig(self, sights, planner=None, clock=None, **settings):
+        from labseq.sequencer.rearrange import RearrangeStep
+
+        defaults = {"cycles": 3, "exposure": 0.02, "stop_when": "defect_free", "window_mode": "early"}
+        window_s = settings.pop("window", 0.06)
+        given = Given(**{**defaults, **settings}, window_of=lambda cycle: window_s)
+        parts = {} if planner is None else {"planner": planner, "planner_name": "scripted"}
+        return Rig(
+            occupancies=sights,
+            fill=self.fill,
+            steps=(LOAD, IMAGE, ("sort", RearrangeStep(given)), IMAGE),
+            **parts,
+        )
+
+    def test_it_stops_when_the_target_is_met(self):
+        rig = self.rig([self.half, self.half, self.done, self.done])
+        rig.run()
+        record = rig.record()
+        assert [cycle.cycle for cycle in record.cycles] == [1, 2]
+        assert record.seen_defect_free_cycle == 2
+        assert record.success
+        assert [image.cycle for image in record.images] == [0, 1, 2, 0]
+        assert rig.lab.calls.names("mobile_tweezers").count("mobile_tweezers.play") == 2
+
+    def test_seen_defect_free_is_no_success(self):
+        rig = self.rig([self.half, self.done, self.half])
+        rig.run()
+        assert rig.record().seen_defect_free_cycle == 1
+        assert not rig.record().success
+
+    def test_nothing_moves_on_a_target_that_is_met(self):
+        rig = self.rig([self.done])
+        rig.run()
+        assert rig.record().cycles == []
+        assert not rig.lab.calls.of("mobile_tweezers.prepare")
+
+    def test_never_makes_every_cycle_and_plays_nothing_for_an_empty_plan(self):
+        rig = self.rig([self.done], stop_when="never")
+        rig.run()
+        assert [c.n_batches_played for c in rig.record().cycles] == [0, 0, 0]
+        assert [i.cycle for i in rig.record().images] == [0, 1, 2, 3, 0]
+        assert not rig.lab.calls.of("mobile_tweezers.play")
+
+    @pytest.mark.parametrize("mode", ["early", "fixed"])
+    def test_the_window_is_waited_out_only_when_fixed(self, mode):
+        rig = self.rig([self.half, self.done], window_mode=mode, cycles=1)
+        rig.run()
+        (move,) = [t for t in rig.record().timing if t.stage == "move"]
+        (cycle,) = rig.record().cycles
+        assert move.duration_s == pytest.approx(0.06 if mode == "fixed" else cycle.moves_s)
+        assert cycle.moves_s == pytest.approx(cycle.report.duration_s)
+        assert 0.013 < cycle.moves_s < 0.016
+
+    def test_a_batch_that_does_not_fit_is_not_started(self):
+        rig = self.rig([self.half], window=0.0132, cycles=1)
+        rig.run()
+        (cycle,) = rig.record().cycles
+        assert (cycle.plan.n_batches, cycle.n_batches_played, cycle.moves_s) == (1, 0, 0.0)
+        assert not rig.lab.calls.of("mobile_tweezers.play")
+        (told,) = rig.observer.of("window_too_short")
+        assert (told["n_batches"], told["n_batches_played"]) == (1, 0)
+
+    def test_an_image_is_needed(self):
+        from labseq.sequencer.rearrange import RearrangeStep
+
+        given = Given(
+            cycles=1, exposure=0.02, stop_when="never", window_mode="early", window_of=lambda c: 0.06
+        )
+        rig = Rig(steps=(("sort", RearrangeStep(given)),))
+        with pytest.raises(PlanError, match="needs an image"):
+            rig.run()
+
+    def test_a_plan_that_is_wrong_never_plays(self):
+        over_the_atom = Plan.from_batches([([(0, 2)], [(0, 0)])])
+        rig = self.rig([self.half], planner=ScriptedPlanner([over_the_atom]))
+        with pytest.raises(InvalidPlanError) as caught:
+            rig.run()
+        assert caught.value.planner == "scripted"
+        assert not rig.lab.calls.of("mobile_tweezers.prepare")
+        assert rig.made_safe() == SAFE_ORDER
+
+    @pytest.mark.parametrize("answer", [None, [], "a plan", np.zeros((1, 4))])
+    def test_what_is_no_plan_is_named(self, answer):
+        rig = self.rig([self.half], planner=ScriptedPlanner([answer]))
+        with pytest.raises(PlanError, match="expected a Plan"):
+            rig.run()
+
+    def test_a_planner_cannot_change_what_was_seen(self):
+        class Vandal:
+            def plan(self, occupancy, target):
+                occupancy[:] = True
+                return Plan.from_batches([])
+
+        rig = self.rig([self.half], planner=Vandal(), cycles=1)
+        rig.run()
+        assert (rig.record().images[0].occupancy == self.half).all()
+
+    def test_a_planner_that_hangs_is_given_up(self):
+        import threading
+
+        release = threading.Event()
+
+        class Slow:
+            def plan(self, occupancy, target):
+                release.wait(30.0)
+
+        rig = self.rig([self.half], planner=Slow())
+        rig.sequencer.lab = rig.lab = type(rig.lab)(
+            **{f: getattr(rig.lab, f) for f in rig.lab.__dataclass_fields__ if f != "timeouts"},
+            timeouts=Timeouts(10.0, 10.0, 0.05),
+        )
+        with pytest.raises(PlanError, match="did not answer within"):
+            rig.run()
+        release.set()
+        assert rig.made_safe() == SAFE_ORDER

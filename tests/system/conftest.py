@@ -1,0 +1,170 @@
+"""Runs of the real command line in processes of its own, on devices that note every call."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+WATCHED = '''
+"""The virtual devices, noting every call in a file as it is entered."""
+import os
+import pathlib
+
+from labseq import Context, Settings, hookimpl
+from labseq_virtual import camera, device, mobile_tweezers, settings, static_tweezers
+
+LABSEQ_API = 1
+LOG = pathlib.Path(os.environ["WATCHED_LOG"])
+
+
+def watched(cls, role):
+    def noting(method):
+        def call(self, *args, **kwargs):
+            with LOG.open("a") as log:
+                log.write(f"{role}.{method}\\n")
+            if f"{role}.{method}" == os.environ.get("WATCHED_FAILS"):
+                raise RuntimeError("rehearsed failure")
+            if f"{role}.{method}" == os.environ.get("WATCHED_HANGS"):
+                import threading
+                threading.Event().wait()
+            if method == "command" and args == ("slow",):
+                self._clock.sleep(600.0)
+                return None
+            return getattr(cls, method)(self, *args, **kwargs)
+        return call
+
+    names = [n for n in dir(cls) if not n.startswith("_") and callable(getattr(cls, n))]
+    return type("Watched" + cls.__name__, (cls,), {n: noting(n) for n in names})
+
+
+class Shutter(device.VirtualDevice):
+    def __init__(self, settings, context):
+        super().__init__(settings, context)
+        self._clock = context.clock
+
+
+@hookimpl
+def labseq_register(registry):
+    mobile, static = mobile_tweezers.VirtualMobileTweezers, static_tweezers.VirtualStaticTweezers
+    add = {"virtual_time": True}
+    registry.camera("watched", watched(camera.VirtualCamera, "camera"), settings.CameraSettings, **add)
+    registry.static_tweezers("watched", watched(static, "static_tweezers"), settings.StaticTweezersSettings, **add)
+    registry.mobile_tweezers("watched", watched(mobile, "mobile_tweezers"), settings.MobileTweezersSettings, **add)
+    registry.device("watched", watched(Shutter, "shutter"), settings.DeviceSettings, **add)
+'''
+
+PROFILE = """
+labseq: 1
+name: watched
+grid: {rows: 10, cols: 10, spacing: 4.49 um}
+camera: {use: watched, max_exposure: 1 h}
+static_tweezers: {use: watched}
+mobile_tweezers: {use: watched}
+detector: {use: threshold}
+devices: {shutter: {use: watched, commands: [open, close, slow]}}
+simulation: {use: virtual}
+plugin_folders: [plugins]
+timeouts: {call: 3 s, safe_state: 2 s, plan: 5 s}
+"""
+
+SEQUENCE = """
+labseq: 1
+name: watched run
+profile: watched
+shots: 4
+seed: 7
+target: {pattern: compact, rows: 6, cols: 6}
+planner: {use: psca, degree_of_parallelism: 4}
+shot:
+"""
+
+STEPS = """
+  - load: {duration: 10 ms}
+  - image: {exposure: 5 ms}
+  - rearrange: {cycles: 2, window: 60 ms, exposure: 5 ms}
+  - image: {exposure: 5 ms}
+"""
+
+
+class Bench:
+    """A folder with a sequence, a profile whose devices note their calls, and a place for data."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.data = folder / "data"
+        self.log = folder / "calls.log"
+        self.environment = {**os.environ, "LABSEQ_DATA": str(self.data), "WATCHED_LOG": str(self.log)}
+        (folder / "plugins").mkdir()
+        (folder / "plugins" / "watched.py").write_text(WATCHED, encoding="utf-8")
+        (folder / "watched.yaml").write_text(PROFILE, encoding="utf-8")
+        self.write_sequence(STEPS)
+
+    def write_sequence(self, steps: str) -> None:
+        (self.folder / "sequence.yaml").write_text(SEQUENCE + steps, encoding="utf-8")
+
+    def start(self, *arguments: str) -> subprocess.Popen[str]:
+        command = [sys.executable, "-m", "labseq", *arguments]
+        pipe = subprocess.PIPE
+        return subprocess.Popen(
+            command,
+            cwd=self.folder,
+            env=self.environment,
+            text=True,
+            stdout=pipe,
+            stderr=pipe,
+            stdin=subprocess.DEVNULL,
+        )
+
+    def run(self, *arguments: str, timeout: float = 120.0) -> subprocess.CompletedProcess[str]:
+        process = self.start(*arguments)
+        out, err = process.communicate(timeout=timeout)
+        return subprocess.CompletedProcess(process.args, process.returncode, out, err)
+
+    def calls(self) -> list[str]:
+        return self.log.read_text().split() if self.log.exists() else []
+
+    def await_calls(self, process: subprocess.Popen[str], call: str, n: int = 1) -> None:
+        """Wait until a device was called for the n-th time."""
+        deadline = time.monotonic() + 120.0
+        while self.calls().count(call) < n:
+            if process.poll() is not None:
+                raise AssertionError(f"the run ended before {call}: {process.communicate()}")
+            if time.monotonic() > deadline:
+                process.kill()
+                raise AssertionError(f"{call} was not called; calls so far: {self.calls()}")
+            select_pause()
+
+    def run_dir(self) -> Path:
+        (state,) = self.data.glob("*/*/STATE")
+        return state.parent
+
+    def index(self) -> list[dict]:
+        text = (self.run_dir() / "index.jsonl").read_text(encoding="utf-8")
+        return [json.loads(line) for line in text.splitlines()]
+
+    def events(self, name: str) -> list[dict]:
+        text = (self.run_dir() / "events.jsonl").read_text(encoding="utf-8")
+        lines = [json.loads(line) for line in text.splitlines()]
+        return [line for line in lines if line["event"] == name]
+
+    def interrupt(self, process: subprocess.Popen[str], number: int = signal.SIGINT) -> tuple[int, str, str]:
+        process.send_signal(number)
+        out, err = process.communicate(timeout=60.0)
+        return process.returncode, out, err
+
+
+def select_pause() -> None:
+    """Give way to the process that is waited for."""
+    import threading
+
+    threading.Event().wait(0.005)
+
+
+@pytest.fixture
+def bench(tmp_path):
+    return Bench(tmp_path)

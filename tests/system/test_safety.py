@@ -1,0 +1,157 @@
+"""Every way out of a run: devices safe in the stated order, data whole, exit code right."""
+
+import json
+import signal
+import sys
+
+import pytest
+
+import labseq
+
+pytestmark = [
+    pytest.mark.system,
+    pytest.mark.skipif(sys.platform == "win32", reason="signals are sent the POSIX way here"),
+]
+
+SAFE_ORDER = [
+    "mobile_tweezers.safe_state",
+    "shutter.safe_state",
+    "camera.safe_state",
+    "static_tweezers.safe_state",
+]
+
+LONG_STEPS = {
+    "load": ("  - load: {duration: 600 s}\n", "static_tweezers.start", 2),
+    "image": ("  - load: {duration: 1 ms}\n  - image: {exposure: 600 s}\n", "camera.read", 1),
+    "wait": (
+        "  - device: {name: shutter, do: open}\n  - wait: {duration: 600 s}\n",
+        "shutter.command",
+        1,
+    ),
+    "device": ("  - device: {name: shutter, do: slow, timeout: 1000 s}\n", "shutter.command", 1),
+    "rearrange, moving": (
+        "  - load: {duration: 500 ms}\n  - image: {exposure: 45 ms}\n  - rearrange: {window: 600 s}\n",
+        "mobile_tweezers.wait",
+        1,
+    ),
+    "rearrange, imaging": (
+        "  - load: {duration: 500 ms}\n  - image: {exposure: 45 ms}\n"
+        "  - rearrange: {window: 600 s, exposure: 500 s}\n",
+        "camera.read",
+        2,
+    ),
+}
+
+
+def safe_calls(calls):
+    return [call for call in calls if call.endswith("safe_state")]
+
+
+@pytest.mark.parametrize("step", LONG_STEPS)
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_in_any_step_ends_safely(bench, step, number, code):
+    steps, call, n = LONG_STEPS[step]
+    bench.write_sequence(steps)
+    slow = "50 s" if step == "rearrange, moving" else "1 ms"
+    process = bench.start(
+        "run",
+        "sequence.yaml",
+        "--realtime",
+        "--json",
+        "--set",
+        f"profile.mobile_tweezers.overhead_per_batch={slow}",
+    )
+    bench.await_calls(process, call, n)
+    returncode, out, err = bench.interrupt(process, number)
+    assert returncode == code, err
+    assert safe_calls(bench.calls()) == SAFE_ORDER
+    assert "Traceback" not in err
+    assert json.loads(out.splitlines()[-1])["status"] == "stopped"
+    run = labseq.open_run(bench.run_dir())
+    assert run.status == "stopped"
+    (attempt,) = run.attempts
+    assert attempt.status == "interrupted"
+    assert attempt.timing  # what the shot has is written
+
+
+def test_a_signal_before_the_run_has_begun_ends_it(bench):
+    process = bench.start("run", "sequence.yaml", "--realtime")
+    bench.await_calls(process, "static_tweezers.open")
+    returncode, _, err = bench.interrupt(process)
+    assert returncode == 130, err
+    assert safe_calls(bench.calls()) == SAFE_ORDER
+
+
+@pytest.mark.parametrize(
+    ("call", "says"),
+    [
+        ("camera.read", "camera: raised RuntimeError: rehearsed failure"),
+        ("mobile_tweezers.prepare", "mobile_tweezers: raised RuntimeError: rehearsed failure"),
+        ("static_tweezers.open", "static_tweezers: raised RuntimeError: rehearsed failure"),
+        ("mobile_tweezers.open", "mobile_tweezers: raised RuntimeError: rehearsed failure"),
+    ],
+)
+def test_a_device_that_fails_is_named_and_all_are_made_safe(bench, call, says):
+    bench.environment["WATCHED_FAILS"] = call
+    done = bench.run("run", "sequence.yaml", "--json")
+    assert done.returncode == 3, done.stderr
+    assert says in done.stderr
+    assert "Traceback" not in done.stderr
+    assert safe_calls(bench.calls()) == SAFE_ORDER
+    assert json.loads(done.stdout.splitlines()[-1])["status"] == "failed"
+
+
+def test_one_device_that_cannot_be_made_safe_never_stops_the_others(bench):
+    bench.environment["WATCHED_FAILS"] = "mobile_tweezers.safe_state"
+    done = bench.run("run", "sequence.yaml", "--shots", "1")
+    assert safe_calls(bench.calls()) == SAFE_ORDER
+    failures = [e["values"] for e in bench.events("safe_state") if not e["values"]["ok"]]
+    assert [f["device"] for f in failures] == ["mobile_tweezers"]
+    assert "mobile_tweezers" in done.stderr + done.stdout
+
+
+@pytest.mark.parametrize("call", ["camera.read", "mobile_tweezers.safe_state"])
+def test_a_device_that_hangs_is_given_up(bench, call):
+    bench.environment["WATCHED_HANGS"] = call
+    done = bench.run("run", "sequence.yaml", "--shots", "1", "--set", "profile.timeouts.call=0.3 s")
+    assert safe_calls(bench.calls()) == SAFE_ORDER
+    device = call.split(".")[0]
+    if call == "camera.read":
+        assert done.returncode == 3
+        assert "camera: did not answer within" in done.stderr
+    failures = [e["values"]["device"] for e in bench.events("safe_state") if not e["values"]["ok"]]
+    assert failures == ([device] if call.endswith("safe_state") else [])
+
+
+def test_after_a_run_that_was_killed_the_next_makes_the_devices_safe_first(bench):
+    bench.write_sequence("  - load: {duration: 600 s}\n")
+    process = bench.start("run", "sequence.yaml", "--realtime")
+    bench.await_calls(process, "static_tweezers.start", 2)
+    process.kill()
+    process.communicate()
+    assert safe_calls(bench.calls()) == []
+    assert labseq.open_run(bench.run_dir()).status == "failed"
+    bench.log.unlink()
+    bench.write_sequence("  - load: {duration: 1 ms}\n  - image: {exposure: 5 ms}\n")
+    done = bench.run("run", "sequence.yaml", "--shots", "1")
+    assert done.returncode == 0, done.stderr
+    assert "died" in done.stderr + done.stdout
+    assert safe_calls(bench.calls()) == SAFE_ORDER * 2
+    first_start = bench.calls().index("static_tweezers.start")
+    assert bench.calls().index("mobile_tweezers.safe_state") < first_start
+    bench.log.unlink()
+    bench.run("run", "sequence.yaml", "--shots", "1")
+    assert safe_calls(bench.calls()) == SAFE_ORDER
+
+
+def test_the_safe_command(bench):
+    done = bench.run("safe", "watched.yaml")
+    assert done.returncode == 0, done.stderr
+    assert safe_calls(bench.calls()) == SAFE_ORDER
+    assert {c for c in bench.calls() if c.endswith(".close")} == {
+        f"{d}.close" for d in ("mobile_tweezers", "shutter", "camera", "static_tweezers")
+    }
+    bench.environment["WATCHED_FAILS"] = "camera.open"
+    done = bench.run("safe", "watched.yaml")
+    assert done.returncode == 3
+    assert "camera" in done.stdout + done.stderr
