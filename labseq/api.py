@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from labseq.config import validate_values
+from labseq.config.values import validate_values
 from labseq.model import MotionSpec, SiteGrid, TargetPattern
 from labseq.roles import Context, Planner
 from labseq.session import load_plugins

@@ -66,14 +66,14 @@ def parse_quantity(text: str, dimension: str) -> float:
     units = UNITS[dimension]
     match = _NUMBER.match(text)
     if match is None:
-        raise ValueError(f"'{text}' is not a {dimension}; expected {expected(dimension)}")
+        raise ValueError(f"'{text}' is not {_a(dimension)}; expected {expected(dimension)}")
     unit = match[2] or ""
     if unit not in units:
         other = next((name for name, known in UNITS.items() if unit in known and unit), None)
         if not unit:
             came = f"'{text}' has no unit"
         elif other is not None:
-            came = f"'{text}' is a {other}, not a {dimension}"
+            came = f"'{text}' is {_a(other)}, not {_a(dimension)}"
         else:
             came = f"'{unit}' in '{text}' is not a unit of {dimension}"
         raise ValueError(f"{came}; expected {expected(dimension)}")
@@ -120,6 +120,10 @@ def expected(dimension: str) -> str:
     )
 
 
+def _a(dimension: str) -> str:
+    return f"an {dimension}" if dimension[0] in "aeiou" else f"a {dimension}"
+
+
 def format_quantity(value: float, dimension: str, digits: int = 3) -> str:
     """Write an SI value with the unit that a physicist would choose.
 
@@ -144,7 +148,7 @@ def format_quantity(value: float, dimension: str, digits: int = 3) -> str:
     ladder = ladders[dimension]
     unit = next((u for u in ladder if abs(value) >= units[u] * (1 - 1e-9)), ladder[-1])
     if value == 0:
-        unit = ladder[0]
+        unit = next((u for u in ladder if units[u] == 1.0), ladder[-1])
     number = f"{value / units[unit]:.{digits}g}"
     if "e" in number:
         number = f"{value / units[unit]:.0f}"

@@ -33,6 +33,8 @@ def test_quantities_become_si(text, dimension, value):
         ("45", "time", "'45' has no unit"),
         ("45 MHz", "time", "'45 MHz' is a frequency, not a time"),
         ("45 lightyears", "length", "'lightyears' in '45 lightyears' is not a unit of length"),
+        ("steep", "angle", "'steep' is not an angle"),
+        ("45 deg", "time", "'45 deg' is an angle, not a time"),
         ("fast", "speed", "'fast' is not a speed"),
         ("", "time", "'' is not a time"),
         ("1.2.3 ms", "time", "is not a unit of time"),

@@ -6,7 +6,7 @@ from typing import Annotated, Any, TypeAlias
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
-from labseq.units import parse_quantity
+from labseq.units import expected, parse_quantity
 
 
 class Settings(BaseModel):
@@ -25,11 +25,17 @@ class Settings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, validate_default=False)
 
 
+class NoSettings(Settings):
+    """The settings of what takes none."""
+
+
 def _quantity(dimension: str) -> BeforeValidator:
     def read(value: Any) -> Any:
-        if isinstance(value, bool):
-            raise ValueError(f"{str(value).lower()} is not a {dimension}")  # noqa: TRY004 - pydantic wants ValueError
-        return parse_quantity(value, dimension) if isinstance(value, str) else value
+        if isinstance(value, str):
+            return parse_quantity(value, dimension)
+        if value is None or isinstance(value, bool | list | tuple | dict):
+            raise ValueError(f"expected {expected(dimension)}")
+        return value
 
     return BeforeValidator(read)
 

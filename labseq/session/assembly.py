@@ -91,6 +91,7 @@ def assemble(
     *,
     profile: str | None = None,
     overrides: Sequence[str] = (),
+    given: Sequence[Override] = (),
     dry_run: DryRun = "off",
 ) -> Assembly:
     """Read and validate everything that can be validated without opening a device.
@@ -98,7 +99,8 @@ def assemble(
     Args:
         sequence_path: The sequence file.
         profile: Name or path of the profile, instead of the sequence's own.
-        overrides: ``"address=value"`` strings, as given to ``--set``.
+        overrides: ``"address=value"`` strings, as given to ``--set``; they win.
+        given: Values of other options.
         dry_run: "full": every device by its simulated counterpart where its plugin
             declares one, else its virtual twin; "fast": virtual twins only.
 
@@ -108,7 +110,7 @@ def assemble(
         PluginLoadError: A plugin that is named failed to load.
     """
     for_sequence, for_profile = split_overrides(overrides)
-    document, sequence = load_sequence(sequence_path, for_sequence)
+    document, sequence = load_sequence(sequence_path, [*given, *for_sequence])
     found = Collected()
     bench = set_up_bench(
         profile or sequence.profile,

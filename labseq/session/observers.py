@@ -9,8 +9,8 @@ from labseq.model import CycleRecord, ShotRecord, StageTiming
 from labseq.plugins import PluginHost
 from labseq.roles import RunObserver
 
-_QUIET: Final = frozenset({"image", "cycle", "state", "warming", "warmed"})
-"""Events that the shot files tell better than the log would."""
+_QUIET: Final = frozenset({"image", "cycle", "state", "warming", "warmed", "run_finished"})
+"""Events that the shot files tell better than the log would, and the one that the writer logs itself."""
 
 
 class Observers:

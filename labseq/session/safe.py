@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 from labseq.config import split_overrides
-from labseq.errors import LabseqError
+from labseq.errors import LabseqError, StopRequested
 from labseq.roles import Hardware, RunObserver, Simulation
 from labseq.sequencer import Guard, RealClock, StopFlag, VirtualClock
 from labseq.sequencer.lab import Timeouts, in_safe_order
 from labseq.session.assembly import set_up_bench, timeouts_of
 from labseq.session.choosing import HARDWARE_KINDS, construct
+from labseq.session.signals import stop_on_signals
 
 
 def secure(
@@ -65,12 +66,15 @@ def make_profile_safe(
         overrides: ``"profile.address=value"`` strings, as given to ``--set``.
         observer: Told each device's outcome.
 
+    Ctrl-C does not leave it half done: it is obeyed once every device has been tried.
+
     Returns:
         Device name -> what went wrong, or None.
 
     Raises:
         ConfigError: The profile is wrong or does not exist.
         PluginLoadError: A plugin that it names failed to load.
+        StopRequested: Ctrl-C or SIGTERM came meanwhile.
     """
     _, for_profile = split_overrides(overrides)
     bench = set_up_bench(profile, overrides=for_profile)
@@ -80,4 +84,9 @@ def make_profile_safe(
     chosen = {role: c for role, c in bench.chosen.items() if c.entry.kind in needed}
     made, _ = construct(chosen, bench.grid, bench.profile.motion, clock, seed=0)
     simulation = made.pop("simulation", None)
-    return secure(in_safe_order(made), timeouts_of(bench.profile), simulation, observer)
+    stop.hold()
+    with stop_on_signals(stop):
+        outcome = secure(in_safe_order(made), timeouts_of(bench.profile), simulation, observer)
+    if stop.is_set:
+        raise StopRequested(stop.signal_number)
+    return outcome

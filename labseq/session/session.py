@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import secrets
-import signal
-import threading
-from collections.abc import Generator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Final, Self
+from typing import Any, Self
 
+from labseq.config import Override
 from labseq.errors import ConfigError, LabseqError, StopRequested
 from labseq.model import RunRecord, TimelineEntry
 from labseq.model.records import RunStatus
@@ -25,10 +23,7 @@ from labseq.session.choosing import DryRun
 from labseq.session.observers import Observers
 from labseq.session.provenance import gather_provenance
 from labseq.session.safe import secure
-
-_EXIT_SIGNALS: Final = tuple(
-    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGBREAK") if hasattr(signal, name)
-)
+from labseq.session.signals import stop_on_signals
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,10 +48,22 @@ class Options:
     dry_run: DryRun = "off"
     realtime: bool = False
 
-    def all_overrides(self) -> list[str]:
-        """The overrides with ``shots`` and ``seed`` among them, weakest first."""
-        given = [("shots", self.shots), ("seed", self.seed)]
-        return [*(f"{key}={value}" for key, value in given if value is not None), *self.overrides]
+    def own(self) -> list[Override]:
+        """``shots`` and ``seed`` as overrides that know which option they came from."""
+        given = {"shots": self.shots, "seed": self.seed}
+        return [
+            Override(key, str(value), f"--{key} {value}") for key, value in given.items() if value is not None
+        ]
+
+    def changes(self) -> dict[str, Any]:
+        """Everything that differs from the files, for the record: address -> value."""
+        changed: dict[str, Any] = {override.address: override.value for override in self.own()}
+        changed |= dict(item.split("=", 1) for item in self.overrides)
+        if self.profile is not None:
+            changed["profile"] = self.profile
+        if self.dry_run != "off":
+            changed["dry_run"] = self.dry_run
+        return changed
 
 
 class Session:
@@ -114,7 +121,7 @@ class Session:
         folder = Path(output) if output is not None else None
         options = Options(profile, shots, seed, tuple(overrides), folder, dry_run, realtime)
         assembly = assemble(
-            Path(sequence), profile=profile, overrides=options.all_overrides(), dry_run=dry_run
+            Path(sequence), profile=profile, overrides=overrides, given=options.own(), dry_run=dry_run
         )
         return cls(assembly, options, observer)
 
@@ -152,7 +159,7 @@ class Session:
         root = self.options.output or data_root()
         for text in self.assembly.bench.warnings:
             self._observers.event("warning", {"text": text})
-        with self._signals():
+        with stop_on_signals(self.stop_flag):
             lab = self._build()
             self._warm(lab)
             return self._run(lab, root)
@@ -219,6 +226,8 @@ class Session:
         self, writer: RunWriter, record: RunRecord, status: RunStatus, error: BaseException | None
     ) -> None:
         text = "" if error is None else f"{type(error).__name__}: {error}"
+        if isinstance(error, StopRequested):
+            text = str(error)
         try:
             writer.finish(status, text)
         except LabseqError as failure:  # a full disk must not hide what came before
@@ -257,7 +266,7 @@ class Session:
             sequence_path=str(assembly.document.path),
             profile_path=str(assembly.bench.document.path),
             resolved=assembly.resolved,
-            overrides=_override_map(self.options),
+            overrides=self.options.changes(),
             devices={},
             plugins=plugins,
             provenance=gather_provenance(assembly.document.path.resolve().parent),
@@ -265,24 +274,6 @@ class Session:
             grid_spacing_m=lab.grid.spacing_m,
             lattice=lab.grid.lattice,
         )
-
-    @contextmanager
-    def _signals(self) -> Generator[None]:
-        """Turn Ctrl-C and SIGTERM into a stop request while a run is on."""
-        if threading.current_thread() is not threading.main_thread():
-            yield
-            return
-        before = {number: signal.getsignal(number) for number in _EXIT_SIGNALS}
-        for number in _EXIT_SIGNALS:
-            signal.signal(number, self._on_signal)
-        try:
-            yield
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
-
-    def _on_signal(self, number: int, _frame: object) -> None:
-        self.stop_flag.request(signal.SIGTERM if number == signal.SIGTERM else signal.SIGINT)
 
 
 class _CoreKernels:
@@ -292,12 +283,3 @@ class _CoreKernels:
         from labseq.motion import warm
 
         warm()
-
-
-def _override_map(options: Options) -> Mapping[str, Any]:
-    given = dict(item.split("=", 1) for item in options.all_overrides())
-    if options.profile is not None:
-        given["profile"] = options.profile
-    if options.dry_run != "off":
-        given["dry_run"] = options.dry_run
-    return given

@@ -1,1 +1,18 @@
 """Virtual hardware on one simulated world."""
+
+from labseq import Registry, hookimpl
+
+LABSEQ_API = 1
+
+
+@hookimpl
+def labseq_register(registry: Registry) -> None:
+    """Offer the world, and a virtual twin for each hardware role."""
+    from labseq_virtual import camera, device, mobile_tweezers, settings, static_tweezers, world
+
+    mobile, static = mobile_tweezers.VirtualMobileTweezers, static_tweezers.VirtualStaticTweezers
+    registry.simulation("virtual", world.World, settings.WorldSettings)
+    registry.camera("virtual", camera.VirtualCamera, settings.CameraSettings, virtual_time=True)
+    registry.static_tweezers("virtual", static, settings.StaticTweezersSettings, virtual_time=True)
+    registry.mobile_tweezers("virtual", mobile, settings.MobileTweezersSettings, virtual_time=True)
+    registry.device("virtual", device.VirtualDevice, settings.DeviceSettings, virtual_time=True)

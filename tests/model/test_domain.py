@@ -79,7 +79,7 @@ def test_a_site_cannot_be_full_and_empty():
 
 def test_frames_are_never_converted():
     with pytest.raises(ValueError, match="uint16"):
-        Frame(np.zeros((2, 2)), 0.1, 0.0)
+        Frame(np.zeros((2, 2), np.float64), 0.1, 0.0)  # pyright: ignore[reportArgumentType]
 
 
 def test_shots_draw_the_same_whatever_came_before():

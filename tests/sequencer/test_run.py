@@ -1,5 +1,8 @@
 """Whole runs on fakes: order of calls, retries, and every way out."""
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -20,15 +23,13 @@ from labseq.sequencer.steps import DeviceStep, ImageStep, LoadStep, WaitStep
 from labseq.testing.fakes import ListSink, RecordingObserver, ScriptedPlanner, fake_lab
 
 
-class Given:
+def given(**values: Any) -> Any:
     """Settings of a step, by keyword."""
-
-    def __init__(self, **values):
-        self.__dict__.update(values)
+    return SimpleNamespace(**values)
 
 
-LOAD = ("load", LoadStep(Given(duration=0.5)))
-IMAGE = ("image", ImageStep(Given(exposure=0.045)))
+LOAD = ("load", LoadStep(given(duration=0.5)))
+IMAGE = ("image", ImageStep(given(exposure=0.045)))
 SAFE_ORDER = ["mobile_tweezers", "shutter", "camera", "static_tweezers"]
 FULL, EMPTY = np.ones((2, 2), bool), np.zeros((2, 2), bool)
 
@@ -80,7 +81,7 @@ def test_a_complete_shot_is_judged_on_its_last_image():
 
 
 def test_every_step_is_timed_against_its_budget():
-    rig = Rig(steps=(LOAD, IMAGE, ("pause", WaitStep(Given(duration=0.2)))))
+    rig = Rig(steps=(LOAD, IMAGE, ("pause", WaitStep(given(duration=0.2)))))
     rig.run()
     steps = {t.stage: t for t in rig.record().timing if t.stage.startswith("step")}
     assert list(steps) == ["step 0 load", "step 1 image", "step 2 pause"]
@@ -216,7 +217,7 @@ def test_a_stop_request_between_shots_ends_the_run():
 
 
 def test_a_stop_request_in_a_shot_keeps_what_it_has():
-    stopping = ("stop", WaitStep(Given(duration=1.0)))
+    stopping = ("stop", WaitStep(given(duration=1.0)))
     rig = Rig(steps=(LOAD, IMAGE, stopping))
     rig.observer.event = lambda name, values: rig.lab.stop.request() if name == "image" else None
     with pytest.raises(StopRequested):
@@ -254,7 +255,7 @@ def test_a_disk_that_is_full_ends_the_run_safely():
 
 
 def test_a_device_step_sends_its_command():
-    step = DeviceStep(Given(name="shutter", do="on", arguments={"level": 2}, timeout=1.0))
+    step = DeviceStep(given(name="shutter", do="on", arguments={"level": 2}, timeout=1.0))
     rig = Rig(steps=(("device", step),))
     rig.run()
     (call,) = rig.lab.calls.of("shutter.command")
@@ -287,7 +288,7 @@ def test_a_detector_of_the_wrong_shape_is_named(answer, message):
 
 def test_a_camera_that_returns_no_frame_is_named():
     rig = Rig()
-    rig.lab.camera.read = lambda timeout_s: np.zeros((2, 2))
+    vars(rig.lab.camera)["read"] = lambda timeout_s: np.zeros((2, 2))
     with pytest.raises(DeviceError, match=r"camera: read\(\) returned ndarray; expected a Frame"):
         rig.run()
 
@@ -312,12 +313,12 @@ class TestRearrange:
 
         defaults = {"cycles": 3, "exposure": 0.02, "stop_when": "defect_free", "window_mode": "early"}
         window_s = settings.pop("window", 0.06)
-        given = Given(**{**defaults, **settings}, window_of=lambda cycle: window_s)
-        parts = {} if planner is None else {"planner": planner, "planner_name": "scripted"}
+        settings_given = given(**{**defaults, **settings}, window_of=lambda cycle: window_s)
+        parts: dict[str, Any] = {} if planner is None else {"planner": planner, "planner_name": "scripted"}
         return Rig(
             occupancies=sights,
             fill=self.fill,
-            steps=(LOAD, IMAGE, ("sort", RearrangeStep(given)), IMAGE),
+            steps=(LOAD, IMAGE, ("sort", RearrangeStep(settings_given)), IMAGE),
             **parts,
         )
 
@@ -372,10 +373,10 @@ class TestRearrange:
     def test_an_image_is_needed(self):
         from labseq.sequencer.rearrange import RearrangeStep
 
-        given = Given(
+        settings_given = given(
             cycles=1, exposure=0.02, stop_when="never", window_mode="early", window_of=lambda c: 0.06
         )
-        rig = Rig(steps=(("sort", RearrangeStep(given)),))
+        rig = Rig(steps=(("sort", RearrangeStep(settings_given)),))
         with pytest.raises(PlanError, match="needs an image"):
             rig.run()
 

@@ -1,0 +1,184 @@
+"""The commands and their options; each body is imported only when its command runs."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from labseq import __version__
+
+app = typer.Typer(
+    name="labseq",
+    help="Lab control for neutral-atom tweezer arrays: YAML sequences in, one HDF5 file per shot out.",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+)
+
+RUN_EXAMPLES = """\b
+Examples:
+  labseq run sequences/compact_225.yaml
+  labseq run sequences/compact_225.yaml --shots 5 --seed 1 --json
+  labseq run sequences/compact_225.yaml --profile lab --dry-run
+  labseq run sequences/compact_225.yaml --set planner.degree_of_parallelism=2 --set shot.2.rearrange.window="200 ms"
+"""  # noqa: E501 - a command line that is to be copied
+
+
+class DryRunKind(StrEnum):
+    """What ``--dry-run`` may be followed by."""
+
+    FULL = "full"
+    FAST = "fast"
+
+
+SequenceFile = Annotated[
+    Path, typer.Argument(metavar="SEQUENCE", help="The sequence file.", show_default=False)
+]
+Profile = Annotated[
+    str | None,
+    typer.Option(
+        "--profile",
+        "-p",
+        metavar="NAME|FILE",
+        help="Hardware profile, instead of the one that the sequence names.",
+    ),
+]
+Overrides = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="ADDRESS=VALUE",
+        help="Change one value, for example planner.degree_of_parallelism=2 or profile.mobile_tweezers.speed="
+        '"100 um/ms"; may be given several times.',
+    ),
+]
+DryRun = Annotated[
+    DryRunKind | None,
+    typer.Option(
+        "--dry-run",
+        metavar="[=fast]",
+        help="Open no hardware: every device is replaced by its driver's own simulation where it has one, "
+        "else by its virtual twin; with =fast by virtual twins only.",
+        show_choices=False,
+    ),
+]
+Json = Annotated[
+    bool, typer.Option("--json", help="Print the outcome as one line of JSON on stdout, all else on stderr.")
+]
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"labseq {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def common(
+    _version: Annotated[
+        bool,
+        typer.Option("--version", help="Print the version and exit.", callback=_print_version, is_eager=True),
+    ] = False,
+    _debug: Annotated[
+        bool, typer.Option("--debug", help="Show the traceback of an error, too; also after the command.")
+    ] = False,
+) -> None:
+    """Take the options that come before the command; ``main`` looks at ``--debug`` itself."""
+
+
+@app.command(epilog=RUN_EXAMPLES)
+def run(
+    sequence: SequenceFile,
+    profile: Profile = None,
+    dry_run: DryRun = None,
+    shots: Annotated[
+        int | None, typer.Option(min=1, help="Number of shots, instead of the sequence's own.")
+    ] = None,
+    seed: Annotated[
+        int | None, typer.Option(min=0, help="Seed of all random numbers: the same seed, the same run.")
+    ] = None,
+    overrides: Overrides = None,
+    output: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Folder for the data, instead of LABSEQ_DATA or ./data."),
+    ] = None,
+    as_json: Json = False,
+    realtime: Annotated[
+        bool, typer.Option("--realtime", help="Let a simulated run take as long as a real one.")
+    ] = False,
+) -> None:
+    """Run a sequence and record every shot."""
+    from labseq.cli.run import run_sequence
+    from labseq.session import Options
+
+    options = Options(
+        profile=profile,
+        shots=shots,
+        seed=seed,
+        overrides=tuple(overrides or ()),
+        output=output,
+        dry_run="off" if dry_run is None else dry_run.value,
+        realtime=realtime,
+    )
+    run_sequence(sequence, options, as_json=as_json)
+
+
+@app.command(short_help="Check a sequence; print its timeline and limits.")
+def check(
+    sequence: SequenceFile,
+    profile: Profile = None,
+    dry_run: DryRun = None,
+    overrides: Overrides = None,
+) -> None:
+    """Check a sequence and print its timeline and limits; opens no device."""
+    from labseq.cli.check import check_sequence
+
+    check_sequence(sequence, profile, overrides or (), "off" if dry_run is None else dry_run.value)
+
+
+@app.command()
+def show(
+    run: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[RUN]", help="A run's folder; the newest run by default.", show_default=False
+        ),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Show what a run has recorded, finished or not."""
+    from labseq.cli.show import show_run
+
+    show_run(run, as_json=as_json)
+
+
+@app.command(short_help="List the plugins and what they offer.")
+def plugins(
+    profile: Annotated[
+        str | None,
+        typer.Option(
+            "--profile", "-p", metavar="NAME|FILE", help="Also look in this profile's plugin folders."
+        ),
+    ] = None,
+) -> None:
+    """List the plugins: what each offers, where it comes from, and why it failed to load."""
+    from labseq.cli.plugins import list_plugins
+
+    list_plugins(profile)
+
+
+@app.command(short_help="Bring every device of a profile to its safe state.")
+def safe(
+    profile: Annotated[
+        str,
+        typer.Argument(metavar="PROFILE", help="Name or file of the hardware profile.", show_default=False),
+    ],
+    overrides: Overrides = None,
+) -> None:
+    """Open every device of a profile, bring it to its safe state, and close it."""
+    from labseq.cli.safe import secure_profile
+
+    raise typer.Exit(secure_profile(profile, overrides or ()))

@@ -1,0 +1,66 @@
+"""From an exception to words on stderr and an exit code."""
+
+from __future__ import annotations
+
+import sys
+import traceback
+from typing import Final
+
+from labseq.cli.output import say
+from labseq.errors import ConfigError, LabseqError, StopRequested
+
+EXIT_SIGNALLED: Final = 128
+"""Added to the signal's number, as shells do: 130 for Ctrl-C, 143 for SIGTERM."""
+EXIT_INTERRUPTED: Final = EXIT_SIGNALLED + 2
+EXIT_INTERNAL: Final = 1
+
+
+def report(error: BaseException, *, debug: bool = False) -> int:
+    """Say on stderr what went wrong.
+
+    Args:
+        error: What ended the command.
+        debug: Whether to print the traceback as well.
+
+    Returns:
+        The exit code.
+    """
+    if debug:
+        traceback.print_exception(error)
+    say(*lines_of(error), stream=sys.stderr)
+    return exit_code_of(error)
+
+
+def lines_of(error: BaseException) -> list[str]:
+    """The message for the user.
+
+    A problem in a file starts with its place, as compilers print it.
+
+    Example:
+        >>> lines_of(ConfigError("a session runs once"))
+        ['error: a session runs once']
+    """
+    if isinstance(error, ConfigError):
+        return [str(p) if p.source else f"error: {p}" for p in error.problems]
+    if isinstance(error, StopRequested):
+        return [str(error)]
+    if isinstance(error, LabseqError):
+        return [f"error: {error}"]
+    if isinstance(error, KeyboardInterrupt):
+        return ["stopped by Ctrl-C"]
+    text = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+    return [f"internal error: {text}; please report it; run again with --debug to see where"]
+
+
+def exit_code_of(error: BaseException) -> int:
+    """The exit code of a command that ended so.
+
+    Example:
+        >>> exit_code_of(StopRequested(15))
+        143
+    """
+    if isinstance(error, StopRequested):
+        return EXIT_SIGNALLED + error.signal_number
+    if isinstance(error, LabseqError):
+        return error.exit_code
+    return EXIT_INTERRUPTED if isinstance(error, KeyboardInterrupt) else EXIT_INTERNAL

@@ -1,0 +1,82 @@
+"""Text on stdout and stderr: streams, columns, characters."""
+
+from __future__ import annotations
+
+import io
+import os
+import sys
+from collections.abc import Callable, Sequence
+from typing import TextIO
+
+
+def forgive_encoding() -> None:
+    """Let stdout and stderr replace characters that they cannot encode instead of failing."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
+
+
+def divert_stdout() -> Callable[[str], None]:
+    """Send whatever anybody prints to stderr, for the rest of the process.
+
+    That includes C libraries and child processes, so that nothing but the answer
+    reaches a program that reads stdout.
+
+    Returns:
+        Prints a line to the real stdout, and closes it.
+    """
+    sys.stdout.flush()
+    real, sys.stdout = os.dup(1), sys.stderr
+    os.dup2(2, 1)
+
+    def answer(line: str) -> None:
+        with os.fdopen(real, "w", encoding="utf-8") as stream:
+            say(line, stream=stream)
+
+    return answer
+
+
+def say(*lines: str, stream: TextIO | None = None) -> None:
+    """Print lines, at once.
+
+    Args:
+        *lines: Without line ends.
+        stream: Where to; stdout by default.
+    """
+    out = sys.stdout if stream is None else stream
+    out.write("".join(f"{line}\n" for line in lines))
+    out.flush()
+
+
+def encodes(encoding: str | None, characters: str) -> bool:
+    """Whether an encoding has all of these characters.
+
+    Example:
+        >>> encodes("cp1252", "●"), encodes("utf-8", "●")
+        (False, True)
+    """
+    try:
+        characters.encode(encoding or "ascii")
+    except (UnicodeEncodeError, LookupError):
+        return False
+    return True
+
+
+def columns(rows: Sequence[Sequence[str]], right: Sequence[int] = ()) -> list[str]:
+    """Lay out rows in columns two spaces apart.
+
+    Args:
+        rows: The cells; all rows have the same number of them.
+        right: Indices of columns that are aligned on the right.
+
+    Example:
+        >>> columns([["image", "45 ms"], ["load", "500 ms"]], right=[1])
+        ['image   45 ms', 'load   500 ms']
+    """
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines: list[str] = []
+    for row in rows:
+        cells = zip(row, widths, strict=True)
+        padded = (c.rjust(w) if i in right else c.ljust(w) for i, (c, w) in enumerate(cells))
+        lines.append("  ".join(padded).rstrip())
+    return lines

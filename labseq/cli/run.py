@@ -1,0 +1,74 @@
+"""``labseq run``: a session with a view, and what came of it."""
+
+from __future__ import annotations
+
+import sys
+from contextlib import suppress
+from dataclasses import asdict
+from pathlib import Path
+
+from labseq.cli.failures import lines_of
+from labseq.cli.live import observer_for
+from labseq.cli.output import divert_stdout, say
+from labseq.cli.show import as_line, json_summary, summary_lines
+from labseq.errors import LabseqError, StopRequested
+from labseq.recording import Run, open_run
+from labseq.session import Options, Session
+
+
+def run_sequence(sequence: Path, options: Options, *, as_json: bool) -> None:
+    """Run a sequence and say what came of it, also when it was stopped or failed.
+
+    Args:
+        sequence: The sequence file.
+        options: What the user changed.
+        as_json: Whether to print the outcome as JSON, last and alone on stdout.
+
+    Raises:
+        LabseqError: Whatever ended the run.
+    """
+    answer = divert_stdout() if as_json else None
+    observer = observer_for(sys.stdout)
+    session: Session | None = None
+    failure: BaseException | None = None
+    try:
+        session = Session.open(sequence, **asdict(options), observer=observer)
+        with session:
+            session.run()
+    except BaseException as error:
+        failure = error
+        raise
+    finally:
+        with suppress(Exception):  # a broken screen must not hide what came of the run
+            observer.close()
+        run = _read_back(session)
+        if run is not None:
+            say(*summary_lines(run))
+        if answer is not None:
+            answer(outcome(session, run, failure))
+
+
+def outcome(session: Session | None, run: Run | None, failure: BaseException | None) -> str:
+    """What came of a run, as one line of JSON.
+
+    Args:
+        session: The session, if it came to one.
+        run: The run as it is on disk, if it can be read.
+        failure: What ended the run, or None.
+    """
+    values = json_summary(run)
+    if run is None and session is not None and session.run_dir is not None:
+        values["run_dir"] = str(session.run_dir)
+    if failure is not None:  # the disk may be too full to have taken the status
+        values["status"] = "stopped" if isinstance(failure, StopRequested | KeyboardInterrupt) else "failed"
+        values["error"] = "\n".join(lines_of(failure))
+    return as_line(values)
+
+
+def _read_back(session: Session | None) -> Run | None:
+    if session is None or session.run_dir is None:
+        return None
+    try:
+        return open_run(session.run_dir)
+    except LabseqError:
+        return None

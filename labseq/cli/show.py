@@ -1,0 +1,126 @@
+"""``labseq show``: what a run has recorded."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from datetime import datetime
+from pathlib import Path
+from typing import Any, Final
+
+from labseq.cli.output import columns, say
+from labseq.cli.telling import outcome
+from labseq.cli.words import count_of, percent, plural
+from labseq.errors import RecordingError
+from labseq.recording import Run, Shot, data_root, open_run
+from labseq.units import format_quantity
+
+MAX_ROWS: Final = 40
+"""Rows of the table of shots; of a longer run the first and the last are shown."""
+
+
+def show_run(path: Path | None, *, as_json: bool) -> None:
+    """Print what a run has recorded.
+
+    Args:
+        path: The run's folder or any file in it; None for the newest run.
+        as_json: Whether to print one line of JSON instead.
+
+    Raises:
+        RecordingError: There is no such run, or it is damaged.
+    """
+    run = open_run(newest_run(data_root()) if path is None else path)
+    if as_json:
+        say(as_line(json_summary(run)))
+    else:
+        say(*shot_table(run), "", *summary_lines(run))
+
+
+def newest_run(root: Path) -> Path:
+    """The folder of the run that was started last: newest day, highest counter.
+
+    Raises:
+        RecordingError: There is none.
+    """
+    folders = [file.parent for file in root.glob("*-*-*/*_*/run.json")]
+    if not folders:
+        raise RecordingError(root, "holds no runs; give a run's folder, or set LABSEQ_DATA")
+    return max(folders, key=lambda folder: (folder.parent.name, _counter(folder)))
+
+
+def _counter(folder: Path) -> int:
+    number = folder.name.partition("_")[0]
+    return int(number) if number.isdecimal() else -1
+
+
+def json_summary(run: Run | None) -> dict[str, Any]:
+    """What ``--json`` prints; for None, what is true of a run that never came to be."""
+    if run is None:
+        nothing = {"defect_free": None, "filling_fraction": None}
+        return {"run_dir": None, "shots": 0, **nothing, "status": "failed"}
+    return run.summary() | ({"error": run.error} if run.error else {})
+
+
+def as_line(values: Mapping[str, Any]) -> str:
+    """JSON on one line, in ASCII, whatever the terminal can show."""
+    return json.dumps(values)
+
+
+def shot_table(run: Run) -> list[str]:
+    """A table of the shots that count."""
+    n_atoms = run.target.n_atoms
+    rows = [_shot_row(shot, n_atoms) for shot in run.shots]
+    header = ("shot", "outcome", "filling", "cycles", "atom moves", "shot time")
+    lines = columns([header, *rows], right=(0, 2, 3, 4, 5))
+    if len(rows) > MAX_ROWS:
+        half = MAX_ROWS // 2
+        lines = [*lines[: half + 1], "...", *lines[-half:]]
+    return lines
+
+
+def _shot_row(shot: Shot, n_atoms: int) -> tuple[str, ...]:
+    row = shot.row
+    stages: Mapping[str, float] = row.get("stage_s", {})
+    duration_s = math.fsum(s for name, s in stages.items() if name.startswith("step "))
+    return (
+        str(shot.index + 1),
+        outcome(shot.success, shot.seen_defect_free_cycle, shot.filling_fraction, n_atoms),
+        percent(shot.filling_fraction),
+        str(row.get("n_cycles", "-")),
+        str(row.get("n_atom_moves", "-")),
+        format_quantity(duration_s, "time") if duration_s else "-",
+    )
+
+
+def summary_lines(run: Run) -> list[str]:
+    """The run in a few lines."""
+    n = len(run.shots)
+    seen = sum(shot.success or shot.seen_defect_free_cycle > 0 for shot in run.shots)
+    rows = [
+        ("run", str(run.path)),
+        ("status", f"{run.status}: {run.error}" if run.status == "failed" else run.status),
+        ("shots", f"{n} of {run.n_shots}" + (_repeated(run) if run.attempts else "")),
+        ("defect-free", count_of(sum(shot.success for shot in run.shots), n)),
+        ("seen defect-free", count_of(seen, n)),
+        ("filling", percent(run.filling_fraction, 2)),
+        ("duration", _duration(run)),
+    ]
+    if run.n_damaged_lines:
+        rows.append(("warning", f"{plural(run.n_damaged_lines, 'line')} of the index cannot be read"))
+    return columns(rows)
+
+
+def _repeated(run: Run) -> str:
+    return f", {plural(len(run.attempts), 'attempt')} kept that did not complete"
+
+
+def _duration(run: Run) -> str:
+    """From the start of the run to the end of its last shot, on the clock on the wall."""
+    ends = [str(shot.row.get("t_end_utc") or "") for shot in (*run.shots, *run.attempts)]
+    try:
+        start = datetime.fromisoformat(str(run.record["t_start_utc"]))
+        end = max(datetime.fromisoformat(text) for text in ends if text)
+    except (KeyError, ValueError):  # no shots, or a damaged index
+        return "-"
+    return format_quantity((end - start).total_seconds(), "time")

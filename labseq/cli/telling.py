@@ -1,0 +1,89 @@
+"""Events of a run in words."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+from labseq.cli.words import percent, plural
+from labseq.model import RunRecord, ShotRecord
+from labseq.units import format_quantity
+
+LASTING: Final = frozenset({"warning", "run_starting", "shot_repeated", "safe_state", "closed"})
+"""Events that must not scroll out of the live view unseen."""
+
+
+def tell(name: str, values: Mapping[str, Any], run: RunRecord | None) -> str:
+    """Put an event into words.
+
+    Args:
+        name: Name of the event.
+        values: Its values.
+        run: The run, once it is known.
+
+    Returns:
+        One line, or "" for an event that is not worth one.
+    """
+    match name:
+        case "run_starting":
+            return tell_run(values["record"], values["run_dir"])
+        case "shot_finished":
+            return tell_shot(values["shot"], run)
+        case "shot_repeated":
+            shot: ShotRecord = values["shot"]
+            return f"shot {shot.shot_index + 1}: attempt {shot.attempt + 1} failed, once more: {shot.error}"
+        case "safe_state" | "closed" if not values["ok"]:
+            task = "brought to its safe state" if name == "safe_state" else "closed"
+            return f"warning: {values['device']} could not be {task}: {values['error']}"
+        case "warning":
+            return f"warning: {values['text']}"
+        case "window_too_short":
+            where = f"shot {values['shot'] + 1}, cycle {values['cycle']}"
+            return f"{where}: {values['n_batches_played']} of {values['n_batches']} batches fit the window"
+        case "device_command":
+            return f"shot {values['shot'] + 1}: {values['device']}: {values['command']}"
+        case _:
+            return ""
+
+
+def tell_run(run: RunRecord, run_dir: str) -> str:
+    """A line about a run that starts."""
+    simulated = ", simulated" if run.simulated else ""
+    profile = Path(run.profile_path).stem
+    return f"{run_dir}: {plural(run.n_shots, 'shot')}, seed {run.seed}, profile {profile}{simulated}"
+
+
+def tell_shot(shot: ShotRecord, run: RunRecord | None) -> str:
+    """A line about a shot that is over."""
+    of = f"{shot.shot_index + 1}/{run.n_shots}" if run is not None else f"{shot.shot_index + 1}"
+    if shot.status != "complete":
+        return f"shot {of}  {shot.status}" + (f": {shot.error}" if shot.status == "failed" else "")
+    n_atoms = run.target.n_atoms if run is not None else 0
+    parts = [f"shot {of}", outcome(shot.success, shot.seen_defect_free_cycle, shot.filling_fraction, n_atoms)]
+    if not math.isnan(shot.filling_fraction):
+        parts.append(f"filling {percent(shot.filling_fraction)}")
+    if shot.n_missing_atoms:
+        parts.append(f"{plural(shot.n_missing_atoms, 'atom')} too few loaded")
+    duration_s = max((timing.t_start_s + timing.duration_s for timing in shot.timing), default=0.0)
+    return "  ".join([*parts, format_quantity(duration_s, "time")])
+
+
+def outcome(success: bool, seen_cycle: int, filling_fraction: float, n_atoms: int) -> str:
+    """How a shot ended, in words.
+
+    Example:
+        >>> outcome(True, 2, 1.0, 225)
+        'defect-free in cycle 2'
+        >>> outcome(False, 3, 0.9955555, 225)
+        '1 defect (defect-free in cycle 3)'
+    """
+    seen = f"defect-free in cycle {seen_cycle}" if seen_cycle else ""
+    if success:
+        return seen or "defect-free"
+    if math.isnan(filling_fraction):
+        return "not judged: no image"
+    n_defects = round((1.0 - filling_fraction) * n_atoms)
+    found = plural(n_defects, "defect") if n_defects else "surplus atoms"
+    return f"{found} ({seen})" if seen else found

@@ -1,0 +1,133 @@
+"""Settings addressed from outside of the file: ``--set shot.2.rearrange.window="40 ms"``."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from typing import Final, NamedTuple
+
+from labseq.config.nodes import Loc, Node
+from labseq.config.wording import clean, did_you_mean, listing, shown, visible
+from labseq.errors import ConfigError, Problem
+
+_PROFILE: Final = "profile."
+_SHOWN: Final = 80
+
+
+class Override(NamedTuple):
+    """A value that replaces the one in the file.
+
+    Attributes:
+        address: For example "planner.degree_of_parallelism".
+        value: As typed, YAML.
+        origin: The option, for messages; "" stands for ``--set address=value``.
+    """
+
+    address: str
+    value: str
+    origin: str = ""
+
+    @property
+    def source(self) -> str:
+        """What messages name as the place."""
+        text = self.origin or f"--set {self.address}={self.value}"
+        return visible(text if len(text) <= _SHOWN else text[: _SHOWN - 3] + "...")
+
+
+def split_overrides(options: Sequence[str]) -> tuple[list[Override], list[Override]]:
+    """Read the values of ``--set`` and part those of the sequence from those of the profile.
+
+    ``profile=lab`` chooses the sequence's profile; ``profile.camera.gain=5``
+    sets a value in it.
+
+    Returns:
+        Those of the sequence, and those of the profile without "profile.".
+
+    Raises:
+        ConfigError: Not of the form ``address=value``.
+
+    Example:
+        >>> split_overrides(["shots=5", "profile.grid.rows=10"])[1][0].address
+        'grid.rows'
+    """
+    problems: list[Problem] = []
+    sequence: list[Override] = []
+    profile: list[Override] = []
+    for option in options:
+        address, equals, value = option.partition("=")
+        address = address.strip()
+        origin = f"--set {option}"
+        if not equals or not all(part.strip() == part != "" for part in address.split(".")):
+            what = "this is not of the form address=value"
+            example = "for example --set planner.degree_of_parallelism=5"
+            problems.append(Problem(what, clean(origin), expected=example))
+        elif address.startswith(_PROFILE):
+            profile.append(Override(address.removeprefix(_PROFILE), value, origin))
+        else:
+            sequence.append(Override(address, value, origin))
+    if problems:
+        raise ConfigError(problems)
+    return sequence, profile
+
+
+def find(root: Node, address: str, name: str, source: str, may_add: Collection[str] = ()) -> Loc:
+    """Turn an address into a location; the last key of a mapping need not exist yet.
+
+    A list item with a ``name`` is addressed by it, and then stands for its
+    settings: ``shot.sort.window`` for ``shot.2.rearrange.window``.
+
+    Raises:
+        ConfigError: A part of the address leads nowhere.
+    """
+    parts = address.split(".")
+    loc: Loc = ()
+    node: Node | None = root
+    for i, part in enumerate(parts):
+        here = ".".join(parts[:i])
+        if node is None or node.value is None:
+            node = None
+            loc = (*loc, part)
+            continue
+        steps = _steps(node, part)
+        child = node.at(steps) if steps else None
+        is_new = isinstance(node.value, dict) and (i == len(parts) - 1 or ".".join(parts[: i + 1]) in may_add)
+        if child is None and not is_new:
+            raise ConfigError(_lost(node, part, here, name, source))
+        loc, node = loc + (steps or (part,)), child
+    return loc
+
+
+def _steps(node: Node, part: str) -> Loc:
+    """The way that one part of an address goes; () if it leads nowhere."""
+    if isinstance(node.value, dict):
+        return (part,) if part in node.value else ()
+    if not isinstance(node.value, list):
+        return ()
+    if part.isascii() and part.isdigit():
+        return (int(part),) if len(part) < 6 and int(part) < len(node.value) else ()
+    for i, item in enumerate(node.value):
+        if _item_name(item) == part and isinstance(item.value, dict):
+            kinds = [key for key in item.value if key != "name"]
+            return (i, kinds[0]) if len(kinds) == 1 else (i,)
+    return ()
+
+
+def _lost(node: Node, part: str, here: str, name: str, source: str) -> Problem:
+    """Say why an address leads nowhere."""
+    where = f"'{here}'" if here else clean(name)
+    if isinstance(node.value, dict):
+        known = list(node.value)
+        what = f"there is no '{clean(part)}' in {where}"
+        return Problem(what, source, expected=listing(known), hint=did_you_mean(part, known))
+    if isinstance(node.value, list):
+        names = [item for item in map(_item_name, node.value) if item]
+        what = f"{where} has no item '{clean(part)}'"
+        last = len(node.value) - 1
+        indices = f"an index from 0 to {last}" if last > 0 else "the index 0" if last == 0 else "nothing"
+        expected = indices + (f" or a name ({', '.join(names)})" if names else "")
+        return Problem(what, source, expected=expected, hint=did_you_mean(part, names))
+    return Problem(f"{where} is {shown(node.value, node.raw)} and has no '{clean(part)}' in it", source)
+
+
+def _item_name(item: Node) -> str:
+    name = item.child("name")
+    return name.value if name is not None and isinstance(name.value, str) else ""

@@ -1,0 +1,188 @@
+"""One YAML file with the places of its values."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, TypeVar, cast, overload
+
+from pydantic import BaseModel
+
+from labseq.config.addresses import Override, find
+from labseq.config.collect import Collected
+from labseq.config.composer import compose
+from labseq.config.nodes import Loc, Mark, Node
+from labseq.config.reading import decode, read_bytes
+from labseq.config.settings import NoSettings
+from labseq.config.validation import Asked, validate
+from labseq.config.wording import shown, visible
+from labseq.errors import ConfigError, Problem
+
+M = TypeVar("M", bound=BaseModel)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Document:
+    r"""A sequence or a profile as it was written. Immutable: do not change ``data``.
+
+    Example:
+        >>> document = Document.parse("shots: 20\nshot:\n  - load: {}\n", "mine.yaml")
+        >>> document.locate(("shot", 0, "load"))
+        (3, 11)
+        >>> print(document.problem(("shots",), "too many shots"))
+        mine.yaml:1:8: too many shots
+
+    Attributes:
+        path: The file.
+        name: The file's name as the user gave it, for messages.
+        text: The file's text, exactly, but for a byte order mark.
+        root: The top mapping.
+        data: The same as plain dicts, lists and scalars, overrides included.
+    """
+
+    path: Path
+    name: str
+    text: str
+    root: Node
+    data: dict[str, Any] = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "data", self.root.plain())
+
+    @classmethod
+    def read(cls, path: Path) -> Document:
+        """Read a file.
+
+        Raises:
+            ConfigError: It cannot be read, or is no strict YAML 1.2 with a mapping at the top.
+        """
+        return replace(cls.parse(read_bytes(path), visible(str(path))), path=path)
+
+    @classmethod
+    def parse(cls, text: str | bytes, name: str) -> Document:
+        """Read the content of a file called ``name``.
+
+        Raises:
+            ConfigError: It is no strict YAML 1.2 with a mapping at the top.
+        """
+        decoded = decode(text, name) if isinstance(text, bytes) else text.removeprefix("\ufeff")
+        root = compose(decoded, name)
+        expected = "a mapping that begins with 'labseq: 1'"
+        if root is None or root.value is None:
+            raise ConfigError(Problem("the file is empty", name, expected=expected))
+        if not isinstance(root.value, dict):
+            what = f"the file holds {shown(root.plain(), root.raw)} at its top"
+            raise ConfigError(root.mark.problem(name, what, expected))
+        return cls(Path(name), name, decoded, root)
+
+    def get(self, loc: Loc, default: Any = None) -> Any:
+        """The plain value at a location, or the default."""
+        node = self.root.at(loc)
+        return default if node is None else node.plain()
+
+    def locate(self, loc: Loc, key: bool = False) -> tuple[int, int]:
+        """Line and column, from 1, of the value at a location, or of its key.
+
+        For what does not exist, those of the nearest parent that does; (0, 0)
+        for what came from an option.
+        """
+        mark = self.root.mark_at(loc, key)
+        return mark.line, mark.column
+
+    def problem(self, loc: Loc, what: str, expected: str = "", hint: str = "", key: bool = False) -> Problem:
+        """Say that something is wrong at a location: in the file, or in the option it came from."""
+        return self.root.mark_at(loc, key).problem(self.name, what, expected, hint)
+
+    def error(
+        self, loc: Loc, what: str, expected: str = "", hint: str = "", key: bool = False
+    ) -> ConfigError:
+        """The same as an error to raise."""
+        return ConfigError(self.problem(loc, what, expected, hint, key))
+
+    def override(self, address: str, value: str, origin: str, *, may_add: Collection[str] = ()) -> Document:
+        """A copy with one value replaced, or added to a mapping.
+
+        Args:
+            address: Keys, list indices and names of list items: "shot.2.rearrange.window"
+                or "shot.sort.window".
+            value: YAML for one value: ``5``, ``45 ms``, ``[60 ms, 40 ms]``, ``{use: psca}``.
+            origin: The option, named as the place of anything wrong with the value.
+            may_add: Addresses of mappings that are made if the file has none.
+
+        Raises:
+            ConfigError: The address leads nowhere, or the value is no YAML.
+        """
+        loc = find(self.root, address, self.name, origin, may_add)
+        node = compose(value, self.name, origin) or Node(None, Mark(0, 0, origin))
+        return Document(self.path, self.name, self.text, self.root.replaced(loc, node))
+
+    def override_all(
+        self, overrides: Iterable[Override | tuple[str, str]], *, may_add: Collection[str] = ()
+    ) -> Document:
+        """A copy with several values replaced, in order; see :meth:`override`.
+
+        Raises:
+            ConfigError: All the overrides that cannot be applied.
+        """
+        document = self
+        collected = Collected()
+        for one in overrides:
+            override = Override(*one)
+            with collected:
+                document = document.override(
+                    override.address, override.value, override.source, may_add=may_add
+                )
+        collected.raise_any()
+        return document
+
+    @overload
+    def validate(
+        self,
+        model: type[M],
+        loc: Loc = ...,
+        *,
+        drop: Collection[str] = ...,
+        also_known: Collection[str] = ...,
+        called: str = ...,
+    ) -> M: ...
+    @overload
+    def validate(
+        self,
+        model: None,
+        loc: Loc = ...,
+        *,
+        drop: Collection[str] = ...,
+        also_known: Collection[str] = ...,
+        called: str = ...,
+    ) -> None: ...
+    def validate(
+        self,
+        model: type[M] | None,
+        loc: Loc = (),
+        *,
+        drop: Collection[str] = (),
+        also_known: Collection[str] = (),
+        called: str = "",
+    ) -> M | None:
+        """Make settings of the mapping at a location; an empty or missing one counts as {}.
+
+        Args:
+            model: The settings model; None for what takes no settings.
+            loc: Where the mapping is.
+            drop: Keys that are somebody else's and left out.
+            also_known: Keys to name as known when one is misspelt.
+            called: What messages call the mapping: "camera 'andor'"; "" for its key.
+
+        Raises:
+            ConfigError: Everything that is wrong in the mapping, in file order.
+        """
+        name = next((step for step in reversed(loc) if isinstance(step, str)), "")
+        asked = Asked(name, called, drop, also_known)
+        result = validate(model or NoSettings, self.root.at(loc), asked)
+        if not isinstance(result, list):
+            return None if model is None else cast("M", result)
+        placed = [(self.root.mark_at(loc + found.loc, found.key), found.words) for found in result]
+        placed.sort(key=lambda pair: pair[0].order)
+        problems = [mark.problem(self.name, w.what, w.expected, w.hint) for mark, w in placed]
+        raise ConfigError(problems)

@@ -1,0 +1,246 @@
+"""Hardware profiles: what a run runs on."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Final, Literal, Self, TypeAlias
+
+from pydantic import AfterValidator, Field, field_validator, model_validator
+
+from labseq.config.addresses import Override
+from labseq.config.document import Document
+from labseq.config.fields import (
+    Choice,
+    Folders,
+    FormatVersion,
+    Name,
+    check_kind,
+    empty_is,
+    misfit,
+    placed_by_field,
+)
+from labseq.config.find import find_profile
+from labseq.config.settings import Duration, Frequency, Length, Settings, Speed
+from labseq.config.wording import clean
+from labseq.model import MotionSpec, SiteGrid
+from labseq.model.grid import centred_comb
+from labseq.model.motion import SpeedProfile
+from labseq.units import format_quantity
+
+_MOTION: Final = MotionSpec()
+_DEVICE_NAME: Final = re.compile(r"[^\W\d][\w-]*")
+_MAY_ADD: Final = ("timeouts", "grid.row_frequency", "grid.column_frequency")
+ROLES: Final = ("camera", "static_tweezers", "mobile_tweezers", "detector", "simulation")
+"""The roles of a profile that are one plugin each."""
+
+Sites: TypeAlias = Annotated[int, Field(ge=1, le=1000)]
+Timeout: TypeAlias = Annotated[Duration, Field(gt=0)]
+
+
+class FrequencyComb(Settings):
+    """Equally spaced tones, one per row or column of the grid."""
+
+    centre: Frequency = Field(default=100e6, gt=0, description="frequency of the grid's centre")
+    step: Frequency = Field(
+        default=1.6e6, description="frequency from one row or column to the next; negative if it falls"
+    )
+
+    @field_validator("step")
+    @classmethod
+    def _tones_differ(cls, step: float) -> float:
+        if step == 0:
+            raise ValueError("a step of 0 puts all tones at one frequency; expected another value")
+        return step
+
+    def lowest(self, n_sites: int) -> float:
+        """Frequency of the lowest tone of so many sites, in Hz."""
+        return self.centre - abs(self.step) * (n_sites - 1) / 2
+
+
+class GridSettings(Settings):
+    """The grid of static tweezer sites, and the mobile tweezers' tones at them."""
+
+    rows: Sites = Field(description="number of rows")
+    cols: Sites = Field(description="number of columns")
+    spacing: Annotated[Length, Field(gt=0)] = Field(description="distance between neighbouring sites")
+    lattice: Literal["triangular", "square"] = Field(default="triangular", description="kind of lattice")
+    shear: Literal[1, -1] = Field(
+        default=1, description="1 if rows shift to the right on the way down the image, -1 if to the left"
+    )
+    row_frequency: Annotated[FrequencyComb, empty_is({})] = Field(
+        default=FrequencyComb(), description="tones of the rows"
+    )
+    column_frequency: Annotated[FrequencyComb, empty_is({})] = Field(
+        default=FrequencyComb(), description="tones of the columns"
+    )
+
+    @model_validator(mode="after")
+    def _tones_are_positive(self) -> Self:
+        combs = (
+            ("row_frequency", self.row_frequency, self.rows),
+            ("column_frequency", self.column_frequency, self.cols),
+        )
+        for name, comb, n_sites in combs:
+            lowest = comb.lowest(n_sites)
+            if lowest <= 0:
+                what = f"the lowest of the {n_sites} tones is at {format_quantity(lowest, 'frequency')}"
+                raise misfit(what, "all tones above 0 Hz", "choose a smaller step", at=(name,))
+        return self
+
+    def model(self) -> SiteGrid:
+        """The grid."""
+        rows, columns = self.row_frequency, self.column_frequency
+        return SiteGrid(
+            self.rows,
+            self.cols,
+            self.spacing,
+            self.lattice,
+            self.shear,
+            centred_comb(self.rows, rows.centre, rows.step),
+            centred_comb(self.cols, columns.centre, columns.step),
+        )
+
+
+class MotionSettings(Settings):
+    """How the mobile tweezers move, whatever their driver."""
+
+    pick_up: Duration = Field(default=_MOTION.pick_up_s, description="pick-up ramp")
+    drop_off: Duration = Field(default=_MOTION.drop_off_s, description="drop-off ramp")
+    speed: Speed = Field(default=_MOTION.speed_m_s, description="transport speed")
+    speed_profile: SpeedProfile = Field(
+        default=_MOTION.speed_profile, description="course of the speed during a transport"
+    )
+    overhead_per_batch: Duration = Field(
+        default=_MOTION.overhead_per_batch_s, description="time that passes before each batch, tweezers off"
+    )
+    overhead_per_cycle: Duration = Field(
+        default=_MOTION.overhead_per_cycle_s, description="time that passes before the first batch of a cycle"
+    )
+    max_tweezers: Sites = Field(default=_MOTION.max_tweezers, description="most mobile tweezers on at once")
+    max_row_tones: Sites = Field(
+        default=_MOTION.max_row_tones, description="most tones on the row axis at once"
+    )
+    max_column_tones: Sites = Field(
+        default=_MOTION.max_column_tones, description="most tones on the column axis at once"
+    )
+    eject_slots: int = Field(
+        default=_MOTION.eject_slots,
+        ge=0,
+        le=100,
+        description="sites beyond the grid that the tones reach, each side",
+    )
+
+    def spec(self) -> MotionSpec:
+        """The same for the core."""
+        return MotionSpec(
+            pick_up_s=self.pick_up,
+            drop_off_s=self.drop_off,
+            speed_m_s=self.speed,
+            speed_profile=self.speed_profile,
+            overhead_per_batch_s=self.overhead_per_batch,
+            overhead_per_cycle_s=self.overhead_per_cycle,
+            max_tweezers=self.max_tweezers,
+            max_row_tones=self.max_row_tones,
+            max_column_tones=self.max_column_tones,
+            eject_slots=self.eject_slots,
+        )
+
+
+MOTION_KEYS: Final = tuple(MotionSettings.model_fields)
+"""Keys of ``mobile_tweezers`` that belong to the core, not to the plugin."""
+
+
+class MobileTweezersChoice(MotionSettings, Choice):
+    """The plugin of the mobile tweezers, and how they move."""
+
+
+class TimeoutSettings(Settings):
+    """How long plugins may take before they count as hung."""
+
+    call: Timeout = Field(default=10.0, description="longest device call, beyond what it does by itself")
+    safe_state: Timeout = Field(default=5.0, description="longest way of a device to its safe state")
+    plan: Timeout = Field(default=5.0, description="longest planning of a cycle")
+
+
+def _named(devices: dict[str, Choice]) -> dict[str, Choice]:
+    for name in devices:
+        if name in (*ROLES, "planner"):
+            raise misfit(f"a device is called '{name}', like a role", "another name", at=(name,), key=True)
+        if not _DEVICE_NAME.fullmatch(name):
+            expected = "a word of letters, digits, '_' and '-' that begins with a letter"
+            raise misfit(f"a device is called '{clean(name)}'", expected, at=(name,), key=True)
+    return {name: choice.placed("devices", name) for name, choice in devices.items()}
+
+
+class ProfileSpec(Settings):
+    """A hardware profile, checked but for the settings of its plugins."""
+
+    labseq: FormatVersion = Field(description="version of the file format: 1")
+    name: Name = Field(description="name of the machine")
+    grid: GridSettings = Field(description="the grid of sites")
+    camera: Annotated[Choice, placed_by_field] = Field(description="the camera")
+    static_tweezers: Annotated[Choice, placed_by_field] = Field(description="the static tweezers")
+    mobile_tweezers: Annotated[MobileTweezersChoice, placed_by_field] = Field(
+        description="the mobile tweezers"
+    )
+    detector: Annotated[Choice, placed_by_field] = Field(description="what finds the atoms on an image")
+    devices: Annotated[dict[str, Choice], empty_is({}), AfterValidator(_named)] = Field(
+        default={}, description="further instruments, by name"
+    )
+    simulation: Annotated[Choice, placed_by_field] | None = Field(
+        default=None, description="the simulated world that virtual devices act on"
+    )
+    plugin_folders: Folders = Field(default=[], description="folders with plugins, relative to this file")
+    timeouts: Annotated[TimeoutSettings, empty_is({})] = Field(
+        default=TimeoutSettings(), description="how long plugins may take"
+    )
+
+    @property
+    def choices(self) -> dict[str, Choice]:
+        """The plugins chosen in this file, by role; the simulation only if there is one."""
+        chosen = {role: getattr(self, role) for role in ROLES}
+        return {role: choice for role, choice in chosen.items() if choice is not None}
+
+    @property
+    def motion(self) -> MotionSpec:
+        """How the mobile tweezers move."""
+        return self.mobile_tweezers.spec()
+
+    def grid_model(self) -> SiteGrid:
+        """The grid of sites, with the tones of its rows and columns."""
+        return self.grid.model()
+
+
+def load_profile(
+    name_or_path: str | Path,
+    *,
+    beside: Path,
+    overrides: Sequence[Override | tuple[str, str]] = (),
+    named_in: Document | None = None,
+) -> tuple[Document, ProfileSpec]:
+    """Find and read a hardware profile.
+
+    Args:
+        name_or_path: See :func:`find_profile`.
+        beside: Folder of the file that names the profile.
+        overrides: Values that replace those of the file, addresses without "profile.".
+        named_in: The sequence whose key ``profile`` names it, for messages.
+
+    Returns:
+        The document, overrides included, and what it says.
+
+    Raises:
+        ConfigError: Everything that is wrong, but for the settings of plugins.
+    """
+    document = Document.read(find_profile(name_or_path, beside, named_in=named_in))
+    check_kind(document, "hardware profile")
+    placed = [_of_profile(Override(*override)) for override in overrides]
+    document = document.override_all(placed, may_add=_MAY_ADD)
+    return document, document.validate(ProfileSpec, called="a hardware profile")
+
+
+def _of_profile(override: Override) -> Override:
+    origin = override.origin or f"--set profile.{override.address}={override.value}"
+    return Override(override.address, override.value, origin)

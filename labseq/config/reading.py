@@ -1,0 +1,144 @@
+"""From a path to checked text: the faults of a file that are no faults of YAML."""
+
+from __future__ import annotations
+
+import codecs
+import re
+import stat
+import unicodedata
+from pathlib import Path
+from typing import Final
+
+from labseq.config.nodes import Mark
+from labseq.config.wording import did_you_mean, visible
+from labseq.errors import ConfigError, Problem
+
+MAX_BYTES: Final = 1 << 20
+"""Largest file, in bytes."""
+
+YAML_SUFFIXES: Final = (".yaml", ".yml")
+
+_LINE_BREAK: Final = re.compile(r"\r\n|\r|\n")
+# U+0085, U+2028 and U+2029 are line breaks for PyYAML but for few editors, so
+# that all line numbers after them would be wrong; U+FEFF cannot be seen.
+_FORBIDDEN: Final = re.compile(
+    "[^\t\n\r\x20-\x7e\xa0-\u2027\u202a-\ud7ff\ue000-\ufefe\uff00-\ufffd\U00010000-\U0010ffff]"
+)
+_UTF16: Final = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+
+
+def read_bytes(path: Path) -> bytes:
+    """Read a file of at most :data:`MAX_BYTES`.
+
+    Raises:
+        ConfigError: Missing, a folder, no regular file, unreadable or too large.
+    """
+    name = visible(str(path))
+    try:
+        data = _bytes_of(path)
+    except (FileNotFoundError, NotADirectoryError):
+        hint = did_you_mean(path.name, yaml_files(path.parent))
+        raise ConfigError(Problem("there is no such file", name, hint=hint)) from None
+    except (OSError, ValueError) as error:  # ValueError: a NUL character in the path
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        what = f"the file cannot be read: {str(reason or error).lower()}"
+        raise ConfigError(Problem(what, name)) from error
+    if isinstance(data, str):
+        raise ConfigError(Problem(data, name, expected="a YAML file"))
+    if len(data) > MAX_BYTES:
+        raise ConfigError(Problem("the file is larger than 1 MiB", name, expected="a few kilobytes"))
+    return data
+
+
+def _bytes_of(path: Path) -> bytes | str:
+    """The first bytes of a file, one more than allowed; or why this is none."""
+    mode = path.stat().st_mode
+    if stat.S_ISDIR(mode):
+        return "this is a folder"
+    if not stat.S_ISREG(mode):  # reading a pipe could wait for ever
+        return "this is not an ordinary file"
+    with path.open("rb") as file:
+        return file.read(MAX_BYTES + 1)
+
+
+def decode(data: bytes, name: str) -> str:
+    """Decode UTF-8, with or without a byte order mark; the mark is left out.
+
+    Raises:
+        ConfigError: Not UTF-8; with the place of the first wrong byte.
+    """
+    if data.startswith(_UTF16):
+        raise ConfigError(Problem("the file is UTF-16", name, 1, 1, "UTF-8", "save it as UTF-8"))
+    body = data.removeprefix(codecs.BOM_UTF8)
+    try:
+        return body.decode("utf-8")
+    except UnicodeDecodeError as error:
+        byte = body[error.start]
+        offset = error.start + len(data) - len(body)
+        latin = bytes([byte]).decode("latin-1")
+        likely = f" (in Latin-1 it is '{latin}')" if latin.isprintable() else ""
+        mark = _mark_at(body[: error.start].decode("utf-8"), error.start)
+        what = f"byte 0x{byte:02X} at offset {offset} is not UTF-8{likely}"
+        raise ConfigError(mark.problem(name, what, "a file in UTF-8", "save the file as UTF-8")) from None
+
+
+def check_characters(text: str, name: str, origin: str = "") -> None:
+    """Refuse control characters, odd line breaks and what is no character at all.
+
+    Raises:
+        ConfigError: With the place of the first one.
+    """
+    match = _FORBIDDEN.search(text)
+    if match is None:
+        return
+    char = match[0]
+    code = f"U+{ord(char):04X}"
+    hint = "delete it"
+    if char == "\0":
+        what, hint = f"a NUL character ({code})", "is this a YAML file, saved as UTF-8?"
+    elif "\ud800" <= char <= "\udfff":
+        what = "a byte that is not UTF-8" if origin else f"half of a character ({code})"
+    else:
+        kind = unicodedata.name(char, "control character").lower()
+        what = f"an invisible character ({code}, {kind})"
+    mark = Mark(0, 0, origin) if origin else _mark_at(text, match.start())
+    raise ConfigError(mark.problem(name, what, "plain text", hint))
+
+
+def _mark_at(text: str, index: int) -> Mark:
+    """Line and column of a character of the text."""
+    breaks = [match.end() for match in _LINE_BREAK.finditer(text, 0, index)]
+    start = breaks[-1] if breaks else 0
+    return Mark(len(breaks) + 1, min(index, len(text)) - start + 1)
+
+
+def yaml_files(folder: Path) -> list[str]:
+    """Names of the YAML files in a folder, sorted; none if it cannot be read."""
+    try:
+        return sorted(path.name for path in folder.iterdir() if path.suffix in YAML_SUFFIXES)
+    except (OSError, ValueError):
+        return []
+
+
+def beside(folder: Path, path: str) -> Path:
+    """A path that a file in ``folder`` names; ``~`` is the user's home."""
+    try:
+        return folder / Path(path).expanduser()
+    except RuntimeError:  # "~nobody"
+        return folder / path
+
+
+def is_file(path: Path) -> bool:
+    """Whether there is such a file; False where that cannot be told."""
+    try:
+        return path.is_file()
+    except OSError:
+        return False
+
+
+def is_folder(path: Path) -> bool:
+    """Whether there is such a folder; False where that cannot be told."""
+    try:
+        return path.is_dir()
+    except OSError:
+        return False

@@ -1,0 +1,134 @@
+"""Sequence files: what a run does."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, Final, Literal, TypeAlias, cast
+
+from pydantic import AfterValidator, Field, PlainValidator
+
+from labseq.config.addresses import Override
+from labseq.config.document import Document
+from labseq.config.fields import (
+    Choice,
+    Folders,
+    FormatVersion,
+    Name,
+    PatternChoice,
+    Text,
+    check_kind,
+    misfit,
+    placed_by_field,
+)
+from labseq.config.nodes import Loc
+from labseq.config.settings import Settings
+from labseq.config.wording import clean, shown
+
+DEFAULT_PLANNER: Final = "psca"
+
+_STEP_NAME: Final = re.compile(r"[^\W\d][\w-]*")
+
+
+@dataclass(frozen=True, slots=True)
+class StepSpec:
+    """One step of the shot.
+
+    Attributes:
+        kind: Name of the step in the registry: "load", "image", ...
+        name: The step's own name, for addresses; "" if it has none.
+        loc: Where the mapping of its settings is in the document.
+    """
+
+    kind: str
+    name: str
+    loc: Loc
+
+
+def _step(value: Any) -> StepSpec:
+    """Read one item of ``shot``; its index is added later."""
+    if isinstance(value, str) and _STEP_NAME.fullmatch(value):
+        raise misfit(f"a step is just '{value}'", "a mapping", f"write '- {value}: {{}}'")
+    if not isinstance(value, dict):
+        raise misfit(f"a step is {shown(value)}", "a mapping such as 'image: {exposure: 45 ms}'")
+    item = cast("dict[str, Any]", value)
+    kinds = [key for key in item if key != "name"]
+    if not kinds:
+        raise misfit("a step says nothing to do", "a mapping such as 'image: {exposure: 45 ms}'")
+    if len(kinds) > 1:
+        what = f"'{clean(kinds[1])}' stands in the same step as '{clean(kinds[0])}'"
+        hint = f"begin a new step with '- ', or indent settings of '{clean(kinds[0])}' further"
+        raise misfit(what, "one step in each item of the list", hint, at=(kinds[1],), key=True)
+    kind, settings = kinds[0], item[kinds[0]]
+    if settings is not None and not isinstance(settings, dict):
+        expected = "a mapping of settings such as {key: value}"
+        hint = "put a space after the ':'" if ":" in kind else ""
+        raise misfit(f"{clean(kind)} is {shown(settings)}", expected, hint, at=(kind,))
+    name = item.get("name", "")
+    if "name" in item and not (isinstance(name, str) and _STEP_NAME.fullmatch(name)):
+        expected = "a word of letters, digits, '_' and '-' that begins with a letter"
+        raise misfit(f"the name of the step is {shown(name)}", expected, at=("name",))
+    return StepSpec(kind, cast("str", name), (kind,))
+
+
+def _numbered(steps: tuple[StepSpec, ...]) -> tuple[StepSpec, ...]:
+    """Give each step its location, and each name to one step only."""
+    first: dict[str, int] = {}
+    for i, step in enumerate(steps):
+        if step.name and first.setdefault(step.name, i) != i:
+            what = f"the name '{step.name}' is taken by step {first[step.name]} (counted from 0)"
+            raise misfit(what, "another name", at=(i, "name"))
+    return tuple(replace(step, loc=("shot", i, step.kind)) for i, step in enumerate(steps))
+
+
+Steps: TypeAlias = Annotated[
+    tuple[Annotated[StepSpec, PlainValidator(_step)], ...], Field(min_length=1), AfterValidator(_numbered)
+]
+"""The steps of a shot, in order."""
+
+
+class SequenceSpec(Settings):
+    """A sequence file, checked but for the settings of its plugins."""
+
+    labseq: FormatVersion = Field(description="version of the file format: 1")
+    name: Name = Field(description="name of the sequence and of its run folders")
+    profile: Text = Field(default="virtual", description="hardware profile: a name, or a path to its file")
+    shots: int = Field(ge=1, le=1_000_000, description="how many shots a run takes")
+    seed: Annotated[int, Field(ge=0, lt=2**63)] | None = Field(
+        default=None, description="seed of all random numbers; without one, each run draws a fresh one"
+    )
+    target: Annotated[PatternChoice, placed_by_field] = Field(description="the pattern of atoms to end with")
+    planner: Annotated[Choice, placed_by_field] = Field(description="what decides the moves")
+    record_frames: Literal["all", "last", "none"] = Field(
+        default="all", description="which camera frames of a shot are kept"
+    )
+    attempts: int = Field(
+        default=3, ge=1, le=100, description="how often a shot is tried before the run stops"
+    )
+    plugin_folders: Folders = Field(default=[], description="folders with plugins, relative to this file")
+    shot: Steps = Field(description="the steps of a shot")
+
+
+def load_sequence(
+    path: Path, overrides: Sequence[Override | tuple[str, str]] = ()
+) -> tuple[Document, SequenceSpec]:
+    """Read a sequence file.
+
+    Args:
+        path: The file.
+        overrides: Values that replace those of the file: (address, value) each.
+
+    Returns:
+        The document, overrides and the default planner included, and what it says.
+
+    Raises:
+        ConfigError: Everything that is wrong, but for the settings of plugins.
+    """
+    document = Document.read(path)
+    check_kind(document, "sequence")
+    if document.data.get("planner") is None:
+        document = document.override("planner", f"{{use: {DEFAULT_PLANNER}}}", "the default planner")
+    document = document.override_all(overrides)
+    return document, document.validate(SequenceSpec, called="a sequence")

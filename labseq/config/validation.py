@@ -1,0 +1,236 @@
+"""A mapping of the file against a settings model: pydantic's errors, placed and put in words."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from typing import Any, TypeVar, cast
+
+from pydantic import BaseModel, ValidationError
+
+from labseq.config.nodes import Loc, Mark, Node
+from labseq.config.schema import description_of, keys_of, models_at
+from labseq.config.wording import EXPECTED_TYPES, Words, clean, closest, listing, put_in_words, shown
+
+M = TypeVar("M", bound=BaseModel)
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """Something wrong at a location below the mapping, or (``key``) with the key there."""
+
+    loc: Loc
+    words: Words
+    key: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class _Placed:
+    """An error of pydantic with the location in the file that it is about.
+
+    Attributes:
+        error: pydantic's error.
+        loc: Location below the mapping; it may end with a missing key.
+        union: Location of the union that it comes out of, or None.
+        branch: Which branch of the union.
+    """
+
+    error: Mapping[str, Any]
+    loc: Loc
+    union: Loc | None
+    branch: str
+
+    @property
+    def is_wrong_type(self) -> bool:
+        """Whether it only says that the value is of another type."""
+        return self.error["type"] in EXPECTED_TYPES and self.loc == self.union
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """What a mapping is validated for.
+
+    Attributes:
+        name: Name of the mapping in messages; "" at the top of a file.
+        called: What to call it in messages; "" for its name.
+        drop: Keys that are left out.
+        also_known: Keys that belong to somebody else: named, but not validated.
+    """
+
+    name: str
+    called: str = ""
+    drop: Collection[str] = ()
+    also_known: Collection[str] = ()
+
+
+def validate(model: type[M], node: Node | None, asked: Asked) -> M | list[Finding]:
+    """Make settings of a mapping, or say everything that is wrong with it."""
+    data = {} if node is None or node.value is None else node.plain()
+    if not isinstance(data, dict):
+        raw = node.raw if node else ""
+        words = Words(f"{asked.name} is {shown(data, raw)}", "a mapping of settings such as {key: value}")
+        return [Finding((), words)]
+    kept = {key: value for key, value in cast("dict[str, Any]", data).items() if key not in asked.drop}
+    try:
+        return _validated(model, json.dumps(kept))
+    except ValidationError as error:
+        return _findings(error, model, node or Node({}, Mark(1, 1)), asked)
+    except Exception as error:  # noqa: BLE001 - a plugin's own validator may raise anything
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        return [Finding((), Words(f"these settings make the plugin's check fail: {reason}"))]
+
+
+def _validated(model: type[M], text: str) -> M:
+    """Validate JSON, because there strict means: no number out of a text, but a tuple out of a list."""
+    try:
+        return model.model_validate_json(text, strict=True)
+    except ValidationError as error:
+        # Behind a validator of the model's own, strict wants a tuple from the start.
+        if all(_is_list_for_tuple(one) for one in error.errors(include_url=False)):
+            return model.model_validate_json(text)
+        raise
+
+
+def _is_list_for_tuple(error: Mapping[str, Any]) -> bool:
+    return error["type"] in ("tuple_type", "set_type", "frozen_set_type") and isinstance(error["input"], list)
+
+
+def _is_long_enough(error: Mapping[str, Any]) -> bool:
+    """Whether a list is only "too short" because items with errors of their own are not counted."""
+    return error["type"] == "too_short" and len(error["input"]) >= error["ctx"]["min_length"]
+
+
+def _findings(error: ValidationError, model: type[BaseModel], top: Node, asked: Asked) -> list[Finding]:
+    found = cast("list[Mapping[str, Any]]", error.errors(include_url=False))
+    errors = [_place(one, top) for one in found if not (_is_list_for_tuple(one) or _is_long_enough(one))]
+    chosen = [one for one in errors if one.union is None]
+    unions: dict[Loc, list[_Placed]] = {}
+    for one in errors:
+        if one.union is not None:
+            unions.setdefault(one.union, []).append(one)
+    findings: list[Finding] = []
+    for union in unions.values():
+        if all(one.is_wrong_type for one in union):
+            findings.append(_no_type_fits(union, top, asked))
+        else:
+            chosen += _best_branch(union)
+    missing = {one.loc for one in chosen if one.error["type"] == "missing"}
+    misspelt = {_meant_key(one, model, asked) for one in chosen if one.error["type"] == "extra_forbidden"}
+    for one in chosen:
+        if one.error["type"] == "extra_forbidden":
+            findings.append(_unknown_key(one, model, asked))
+        elif one.error["type"] != "missing":
+            findings.append(_wrong_value(one, top, asked))
+        elif isinstance(index := one.loc[-1], int):
+            if (*one.loc[:-1], index + 1) not in missing:
+                findings.append(_missing_item(one, index, top, asked))
+        elif one.loc not in misspelt:  # a misspelt key is not missing as well
+            findings.append(_missing_key(one, model, top, asked))
+    return findings
+
+
+def _place(error: Mapping[str, Any], top: Node) -> _Placed:
+    """Follow pydantic's location through the file; what is no key or index names a union's branch."""
+    steps: tuple[str | int, ...] = error["loc"]
+    loc: Loc = ()
+    union: Loc | None = None
+    branch = ""
+    node = top
+    for i, step in enumerate(steps):
+        child = node.child(step)
+        if child is not None:
+            loc, node = (*loc, step), child
+        elif error["type"] == "missing" and i == len(steps) - 1:
+            loc = (*loc, step)
+        elif union is None and step != "[key]":
+            union, branch = loc, str(step)
+    return _Placed(error, loc, union, branch)
+
+
+def _best_branch(union: list[_Placed]) -> list[_Placed]:
+    """The errors of the branch that the writer most likely meant: the one that fits furthest."""
+    branches: dict[str, list[_Placed]] = {}
+    for one in union:
+        branches.setdefault(one.branch, []).append(one)
+
+    def fit(errors: list[_Placed]) -> tuple[int, bool, int]:
+        is_about_value = not any(one.is_wrong_type for one in errors)
+        return max(len(one.loc) for one in errors), is_about_value, -len(errors)
+
+    return max(branches.values(), key=fit)
+
+
+def _no_type_fits(union: list[_Placed], top: Node, asked: Asked) -> Finding:
+    loc = union[0].loc
+    expected = dict.fromkeys(EXPECTED_TYPES[one.error["type"]] for one in union)
+    node = top.at(loc) or top
+    *others, last = expected
+    either = f"{', '.join(others)} or {last}" if others else last
+    return Finding(loc, Words(f"{_name(loc, asked)} is {shown(node.plain(), node.raw)}", either))
+
+
+def _wrong_value(one: _Placed, top: Node, asked: Asked) -> Finding:
+    context = one.error.get("ctx", {})
+    at = (context["discriminator"].strip("'"),) if one.error["type"] == "union_tag_invalid" else ()
+    loc = one.loc + tuple(context.get("at", at))
+    node = top.at(one.loc) or top
+    name = _name(one.loc, asked)
+    if "[key]" in one.error["loc"]:
+        words = put_in_words(one.error, f"the key '{clean(str(one.loc[-1]))}'", one.loc[-1], "")
+        return Finding(loc, words, key=True)
+    return Finding(loc, put_in_words(one.error, name, node.plain(), node.raw), bool(context.get("key")))
+
+
+def _unknown_key(one: _Placed, model: type[BaseModel], asked: Asked) -> Finding:
+    loc, key = one.loc, clean(str(one.loc[-1]))
+    known = _known_keys(loc[:-1], model, asked)
+    owner = _called(loc[:-1], asked)
+    if not known:
+        words = Words(f"{owner} takes no settings, but '{key}' is given", "", "remove it")
+        return Finding(loc, words, key=True)
+    meant = closest(key, known)
+    hint = "put a space after the ':'" if ":" in key else f"did you mean '{meant}'?" if meant else ""
+    return Finding(loc, Words(f"'{key}' is not a setting of {owner}", listing(known), hint), key=True)
+
+
+def _missing_key(one: _Placed, model: type[BaseModel], top: Node, asked: Asked) -> Finding:
+    loc, key = one.loc, str(one.loc[-1])
+    parent = top.at(loc[:-1])
+    about = description_of(models_at(model, loc[:-1]), key)
+    where = f" from {_called(loc[:-1], asked)}" if asked.name or len(loc) > 1 else ""
+    what = f"'{key}' is missing{where}" + (f" ({about})" if about else "")
+    known = _known_keys(loc[:-1], model, asked)
+    others = [k for k in parent.value if k not in known] if parent and isinstance(parent.value, dict) else []
+    alike = closest(key, others)
+    return Finding(loc, Words(what, "", f"did you write '{clean(alike)}' for it?" if alike else ""))
+
+
+def _missing_item(one: _Placed, index: int, top: Node, asked: Asked) -> Finding:
+    loc = one.loc[:-1]
+    node = top.at(loc)
+    n = len(node.value) if node and isinstance(node.value, list) else 0
+    what = f"{_name(loc, asked)} has {n} {'entry' if n == 1 else 'entries'}"
+    return Finding(loc, Words(what, f"at least {index + 1}"))
+
+
+def _known_keys(loc: Loc, model: type[BaseModel], asked: Asked) -> list[str]:
+    known = [key for key in keys_of(models_at(model, loc)) if loc or key not in asked.drop]
+    return known if loc else [*known, *(key for key in asked.also_known if key not in known)]
+
+
+def _meant_key(one: _Placed, model: type[BaseModel], asked: Asked) -> Loc:
+    return (*one.loc[:-1], closest(str(one.loc[-1]), _known_keys(one.loc[:-1], model, asked)))
+
+
+def _called(loc: Loc, asked: Asked) -> str:
+    """What to call a mapping."""
+    if loc:
+        return f"'{_name(loc, asked)}'"
+    return asked.called or (f"'{asked.name}'" if asked.name else "this file")
+
+
+def _name(loc: Loc, asked: Asked) -> str:
+    """Name of a value: its key, and the indices of the lists within."""
+    last = next((i for i in reversed(range(len(loc))) if isinstance(loc[i], str)), 0)
+    return ".".join(str(step) for step in loc[last:]) if loc else asked.name

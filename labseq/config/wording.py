@@ -1,0 +1,179 @@
+"""How values, alternatives and pydantic's findings are put into words."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Iterable, Mapping, Sized
+from dataclasses import dataclass
+from typing import Any, Final, cast
+
+from labseq.config.scalars import resolve
+
+_SHOWN: Final = 60
+
+_MAPPING: Final = "a mapping (key: value)"
+_LIST: Final = "a list ([a, b], or lines that begin with '- ')"
+EXPECTED_TYPES: Final[Mapping[str, str]] = {
+    **dict.fromkeys(("bool_type", "bool_parsing"), "true or false"),
+    **dict.fromkeys(("int_type", "int_parsing", "int_from_float", "int_parsing_size"), "a whole number"),
+    **dict.fromkeys(("float_type", "float_parsing", "decimal_type", "decimal_parsing"), "a number"),
+    **dict.fromkeys(("string_type", "string_sub_type", "path_type"), "text"),
+    **dict.fromkeys(("list_type", "tuple_type", "set_type", "frozen_set_type", "iterable_type"), _LIST),
+    **dict.fromkeys(("dict_type", "mapping_type", "model_type", "dataclass_type"), _MAPPING),
+    "model_attributes_type": _MAPPING,
+    "none_required": "nothing",
+}
+"""pydantic's error types that say "this is a wrong type", and the right one in words."""
+
+_LIMITS: Final[Mapping[str, tuple[str, str]]] = {
+    "greater_than": ("more than", "gt"),
+    "greater_than_equal": ("at least", "ge"),
+    "less_than": ("less than", "lt"),
+    "less_than_equal": ("at most", "le"),
+    "multiple_of": ("a multiple of", "multiple_of"),
+}
+_LENGTHS: Final[Mapping[str, tuple[str, str, str]]] = {
+    "too_short": ("at least", "min_length", "entries"),
+    "too_long": ("at most", "max_length", "entries"),
+    "string_too_short": ("at least", "min_length", "characters"),
+    "string_too_long": ("at most", "max_length", "characters"),
+}
+_ONE: Final = {"entries": "entry", "characters": "character"}
+
+
+@dataclass(frozen=True, slots=True)
+class Words:
+    """What is wrong, what was expected, what to do."""
+
+    what: str
+    expected: str = ""
+    hint: str = ""
+
+
+def did_you_mean(name: str, names: Iterable[str]) -> str:
+    """A hint at the known name that is spelled most alike, or "".
+
+    Example:
+        >>> did_you_mean("winow", ["cycles", "window"])
+        "did you mean 'window'?"
+    """
+    close = closest(name, names)
+    return f"did you mean '{close}'?" if close else ""
+
+
+def closest(name: str, names: Iterable[str]) -> str:
+    """The known name that is spelled most alike, whatever its case and dashes, or ""."""
+    folded = {known.lower().replace("-", "_"): known for known in names}
+    found = difflib.get_close_matches(name.lower().replace("-", "_")[:_SHOWN], folded, n=1)
+    return folded[found[0]] if found else ""
+
+
+def listing(names: Iterable[str]) -> str:
+    """Name the keys that are known: "one of rows, cols"."""
+    known = list(names)
+    return ("one of " if len(known) > 1 else "") + ", ".join(known)
+
+
+def shown(value: Any, raw: str = "") -> str:
+    """A value in words, short enough for a message.
+
+    Example:
+        >>> shown("45 ms"), shown(True), shown([1, 2]), shown(None)
+        ("'45 ms'", 'true', 'a list', 'empty')
+    """
+    if value is None:
+        return "empty"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):
+        return f"'{clean(value)}'"
+    if isinstance(value, Mapping):
+        return "a mapping"
+    return "a list" if isinstance(value, list) else clean(raw or str(value))
+
+
+def clean(text: str) -> str:
+    """A text on one line, shortened, with everything visible."""
+    return visible(text if len(text) <= _SHOWN else text[: _SHOWN - 3] + "...")
+
+
+def visible(text: str) -> str:
+    """A text with what cannot be seen, or printed, as escapes."""
+    return "".join(char if char.isprintable() else repr(char)[1:-1] for char in text)
+
+
+def put_in_words(error: Mapping[str, Any], name: str, value: Any, raw: str) -> Words:
+    """Put an error of pydantic into a physicist's words.
+
+    Args:
+        error: One of ``ValidationError.errors()``, neither "missing" nor "extra_forbidden".
+        name: Name of the setting.
+        value: Its value in the file.
+        raw: Its value as it is written, or "".
+    """
+    kind, context = str(error["type"]), error.get("ctx", {})
+    what = f"{name} is {shown(value, raw)}" if name else f"this is {shown(value, raw)}"
+    if kind == "misfit":
+        return Words(context["what"], context["expected"], context["hint"])
+    if kind in ("value_error", "assertion_error"):
+        return _own_words(str(context.get("error", error["msg"])), name, what)
+    if kind in EXPECTED_TYPES:
+        return Words(what, EXPECTED_TYPES[kind], _meant(kind, value))
+    if kind in _LIMITS:
+        words, key = _LIMITS[kind]
+        return Words(what, f"{words} {_limit(context[key], isinstance(value, str))}")
+    if kind in _LENGTHS:
+        words, key, unit = _LENGTHS[kind]
+        n = len(cast("Sized", value))
+        return Words(f"{name} has {n} {_ONE[unit] if n == 1 else unit}", f"{words} {context[key]}")
+    if kind == "finite_number":
+        return Words(what, "a finite number")
+    if kind in ("literal_error", "enum"):
+        choices = re.findall(r"'([^']*)'", context["expected"])
+        return Words(what, context["expected"], did_you_mean(str(value), choices))
+    if kind == "union_tag_invalid":
+        tags = context["expected_tags"]
+        hint = did_you_mean(str(context["tag"]), re.findall(r"'([^']*)'", tags))
+        setting = context["discriminator"].strip("'")
+        return Words(f"{setting} is {shown(context['tag'])}", tags, hint)
+    if kind == "union_tag_not_found":
+        return Words(f"{context['discriminator']} is missing from '{name}'")
+    message = str(error["msg"])
+    expected = message.removeprefix("Input should be ")
+    return Words(what, expected) if expected != message else Words(f"{name}: {message}")
+
+
+def _own_words(text: str, name: str, plain: str) -> Words:
+    """The text of a validator, on one line and parted at "; expected"."""
+    text = " ".join(text.split())
+    if text.startswith("expected "):
+        return Words(plain, text.removeprefix("expected "))
+    what, _, rest = text.partition("; expected ")
+    expected, _, hint = rest.partition("; ")
+    return Words(f"{name}: {what}" if name else what, expected, hint)
+
+
+def _limit(limit: Any, is_text: bool) -> str:
+    text = f"{limit:g}" if isinstance(limit, float) else str(limit)
+    return f"{text} (in SI units)" if is_text and limit != 0 else text
+
+
+def _meant(kind: str, value: Any) -> str:
+    """What the writer of a text probably meant, where a number or a switch was expected."""
+    if not isinstance(value, str):
+        is_word = isinstance(value, bool | int | float) and kind == "string_type"
+        return "put it in quotes" if is_word else ""
+    if kind.startswith("bool"):
+        word = value.lower()
+        meant = "true" if word in ("yes", "on") else "false" if word in ("no", "off") else ""
+        return f"did you mean {meant}?" if meant else ""
+    if kind.startswith(("int", "float")):
+        try:
+            number = resolve(value.replace("_", ""))
+        except ValueError:
+            return ""
+        is_right = type(number) is int or (type(number) is float and kind.startswith("float"))
+        hint = f"did you mean {number}?" if "_" in value else f"write {number} without quotes"
+        return hint if is_right else ""
+    return ""

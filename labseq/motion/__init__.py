@@ -1,0 +1,20 @@
+"""From a plan to what the mobile tweezers play.
+
+Importing this package imports no numba: the kernels come with the first call, or
+with :func:`warm`.
+"""
+
+import importlib
+
+from labseq.motion.check import check_plan
+from labseq.motion.rules import RULES
+from labseq.motion.timing import fitting_batches
+from labseq.motion.tones import tone_program
+
+__all__ = ["RULES", "check_plan", "fitting_batches", "tone_program", "warm"]
+
+
+def warm() -> None:
+    """Compile the kernels of this package, or load them from the cache."""
+    for module in ("plan_check", "tone_build"):
+        importlib.import_module(f"labseq.kernels.{module}")

@@ -1,0 +1,133 @@
+"""The checker that every plan must pass before it is played."""
+
+from __future__ import annotations
+
+from typing import NoReturn, cast
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from labseq.errors import InvalidPlanError, LimitError
+from labseq.model import MotionSpec, Plan, PlanReport, SiteGrid, TargetPattern, as_occupancy
+from labseq.motion.rules import FAULTS
+from labseq.motion.timing import default_grid, site_time_s
+
+
+def check_plan(
+    plan: Plan,
+    occupancy: ArrayLike,
+    target: TargetPattern,
+    degree_of_parallelism: int,
+    grid: SiteGrid | None = None,
+    motion: MotionSpec | None = None,
+    planner: str = "",
+) -> PlanReport:
+    """Check a plan against all :data:`RULES` and work out what it will do.
+
+    Why comparing the ends is enough for ``order``: the tones of a batch start
+    together and have the same speed v until each reaches its goal. The gap of two
+    neighbours is constant while they move the same way and changes at 2v, v or
+    not at all otherwise, always with the same sign: towards each other it only
+    shrinks, apart it only grows, and after the first has arrived it goes on
+    monotonically until the second has. Where both move the same way, the gap is
+    constant until the first arrival and monotonic from then on. So the gap is
+    monotonic from start to end and never below the smaller of the two, which are
+    whole numbers of sites: it is at least one site if the order is kept.
+
+    Args:
+        plan: The plan.
+        occupancy: bool (n_rows, n_cols), the occupancy that it was made for.
+        target: What it is to end with; not meeting it breaks no rule.
+        degree_of_parallelism: Most tweezers on at once that the planner was allowed.
+        grid: The grid of sites; by default one of the occupancy's shape with the
+            paper's spacing.
+        motion: How the tweezers move; by default as in the paper.
+        planner: Name of the planner, for the error message.
+
+    Returns:
+        Predicted occupancy, times and numbers of tweezers.
+
+    Raises:
+        InvalidPlanError: The plan breaks a rule; it says which, where and how.
+        LimitError: The degree of parallelism is below 1, or the speed profile is
+            none that exists.
+
+    Example:
+        >>> target = TargetPattern(fill=[[False, True]], clear=[[True, False]])
+        >>> plan = Plan.from_batches([([(0, 0)], [(0, 1)])])
+        >>> check_plan(plan, [[True, False]], target, degree_of_parallelism=1).meets_target
+        True
+    """
+    from labseq.kernels.plan_check import check, count_wrong
+
+    if degree_of_parallelism < 1:
+        raise LimitError("the degree of parallelism", degree_of_parallelism, "at least 1")
+    if not isinstance(cast("object", plan), Plan):
+        raise InvalidPlanError("shape", f"a Plan was expected, {type(plan).__name__} came", planner=planner)
+    motion = motion or MotionSpec()
+    try:
+        atoms = as_occupancy(occupancy, target.shape if grid is None else grid.shape).copy()
+    except (TypeError, ValueError) as error:
+        raise InvalidPlanError("shape", str(error), planner=planner) from error
+    if target.shape != atoms.shape:
+        detail = f"the target has shape {target.shape}; the occupancy has {atoms.shape}"
+        raise InvalidPlanError("shape", detail, planner=planner)
+    grid = grid or default_grid(*target.shape)
+    max_tweezers = min(degree_of_parallelism, motion.max_tweezers)
+    end_s = np.empty(plan.n_batches, np.float64)
+    n_tweezers = np.empty(plan.n_batches, np.int32)
+    fault, *where = check(
+        plan.moves,
+        plan.batch_offsets,
+        plan.linked,
+        atoms,
+        max_tweezers,
+        motion.max_row_tones,
+        motion.max_column_tones,
+        motion.eject_slots,
+        motion.pick_up_s,
+        motion.drop_off_s,
+        site_time_s(grid, motion),
+        motion.overhead_per_batch_s,
+        motion.overhead_per_cycle_s,
+        end_s,
+        n_tweezers,
+    )
+    if fault:
+        _refuse(fault, where, plan, atoms.shape, max_tweezers, motion.eject_slots, planner)
+    n_defects, n_surplus = count_wrong(atoms, target.fill, target.clear)
+    for array in (atoms, end_s, n_tweezers):
+        array.flags.writeable = False
+    return PlanReport(atoms, end_s, n_tweezers, n_defects, n_surplus)
+
+
+def _refuse(
+    fault: int,
+    where: list[int],
+    plan: Plan,
+    shape: tuple[int, ...],
+    max_tweezers: int,
+    slots: int,
+    planner: str,
+) -> NoReturn:
+    """Put a fault into words."""
+    from labseq.kernels import plan_rules
+
+    batch, move, a, b = (int(number) for number in where)
+    rule, wording = next(FAULTS[name] for name in FAULTS if getattr(plan_rules, name) == fault)
+    row = col = to_row = to_col = -1  # only worded where an atom move is at fault
+    if move >= 0:
+        row, col, to_row, to_col = plan.moves[plan.batch_offsets[batch] + move].tolist()
+    detail = wording.format(
+        source=(row, col),
+        goal=(to_row, to_col),
+        site=(a, b),
+        a=a,
+        b=b,
+        n_tweezers=a * b,
+        limit=max_tweezers,
+        n_rows=shape[0],
+        n_cols=shape[1],
+        slots=slots,
+    )
+    raise InvalidPlanError(rule, detail, batch=batch, move=move, planner=planner)

@@ -1,0 +1,60 @@
+"""For everyone who writes a plugin: contract suites, hypothesis strategies, fakes.
+
+A plugin's test inherits the suite of its role and provides one fixture::
+
+    from functools import partial
+    from labseq.testing import CameraContract
+
+
+    class TestMyCamera(CameraContract):
+        @pytest.fixture
+        def factory(self):
+            return partial(MyCamera, MySettings(port="simulated"))
+
+``factory(context)`` constructs what is tested, as labseq itself does after it
+has read the settings. Each failure names the promise that was broken.
+
+Never imported at run time: needs pytest and hypothesis. Names are resolved when
+they are first used, because pytest loads this package wherever labseq is installed.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any, Final
+
+if TYPE_CHECKING:
+    from labseq.testing import fakes as fakes
+    from labseq.testing import strategies as strategies
+    from labseq.testing.contracts import BrokenPromise as BrokenPromise
+    from labseq.testing.contracts import CameraContract as CameraContract
+    from labseq.testing.contracts import DetectorContract as DetectorContract
+    from labseq.testing.contracts import DeviceContract as DeviceContract
+    from labseq.testing.contracts import MobileTweezersContract as MobileTweezersContract
+    from labseq.testing.contracts import PlannerContract as PlannerContract
+    from labseq.testing.contracts import StaticTweezersContract as StaticTweezersContract
+    from labseq.testing.contracts import StepContract as StepContract
+
+_CONTRACTS: Final = (
+    "BrokenPromise",
+    "CameraContract",
+    "DetectorContract",
+    "DeviceContract",
+    "MobileTweezersContract",
+    "PlannerContract",
+    "StaticTweezersContract",
+    "StepContract",
+)
+_MODULES: Final = ("fakes", "strategies")
+
+
+def __getattr__(name: str) -> Any:
+    if name in _MODULES:
+        return importlib.import_module(f"labseq.testing.{name}")
+    if name in _CONTRACTS:
+        return getattr(importlib.import_module("labseq.testing.contracts"), name)
+    raise AttributeError(f"module 'labseq.testing' has no attribute '{name}'")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_CONTRACTS, *_MODULES})

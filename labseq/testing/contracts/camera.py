@@ -1,0 +1,148 @@
+"""What a camera promises."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+
+from labseq.errors import DeviceError
+from labseq.model import Frame
+from labseq.roles import Camera
+from labseq.testing.contracts.hardware import Action, Factory, HardwareContract, Wait
+from labseq.testing.contracts.promises import promise, refusal
+
+
+class CameraContract(HardwareContract[Camera]):
+    """Promises of a camera; software triggers.
+
+    Attributes:
+        exposure_s: Exposure of the test frames, in seconds.
+        exposure_tolerance: Greatest relative deviation of the exposure that a frame
+            tells from the one that was asked for.
+        timeout_s: Timeout for a frame beyond its exposure, in seconds.
+    """
+
+    role: ClassVar[str] = "camera"
+    exposure_s: ClassVar[float] = 0.01
+    exposure_tolerance: ClassVar[float] = 0.01
+    timeout_s: ClassVar[float] = 2.0
+
+    def work(self, device: Camera) -> None:
+        """One image."""
+        self.take(device)
+
+    def uses(self) -> Mapping[str, Action[Camera]]:
+        """Arm, trigger, read."""
+        return {
+            "arm()": lambda camera: camera.arm(1, self.exposure_s, "software"),
+            "trigger()": lambda camera: camera.trigger(),
+            "read()": lambda camera: camera.read(0.1),
+        }
+
+    def states(self) -> Mapping[str, Action[Camera]]:
+        """Armed, exposing, and with a frame that nobody reads."""
+
+        def expose(camera: Camera) -> None:
+            camera.arm(2, self.exposure_s, "software")
+            camera.trigger()
+
+        def leave_unread(camera: Camera) -> None:
+            self.take(camera, 2)
+            expose(camera)
+
+        return {
+            "while armed": lambda camera: camera.arm(2, self.exposure_s, "software"),
+            "while exposing": expose,
+            "with a frame unread": leave_unread,
+        }
+
+    def excesses(self) -> Mapping[str, Action[Camera]]:
+        """Series and exposures that no camera can make."""
+
+        def arm(n_frames: int, exposure_s: float) -> Action[Camera]:
+            return lambda camera: camera.arm(n_frames, exposure_s, "software")
+
+        return {
+            "arm() for no frames": arm(0, self.exposure_s),
+            "arm() for -1 frames": arm(-1, self.exposure_s),
+            "arm() with a negative exposure": arm(1, -self.exposure_s),
+            "arm() with an exposure of nan": arm(1, float("nan")),
+            "arm() with an exposure of a year": arm(1, 3.2e7),
+        }
+
+    def waits(self) -> Mapping[str, Wait[Camera]]:
+        """For a frame that was never triggered."""
+        arm: Action[Camera] = lambda camera: camera.arm(1, self.exposure_s, "software")  # noqa: E731 - as in uses()
+        return {"read() without a trigger": Wait(0.1, arm, lambda camera: camera.read(0.1))}
+
+    def take(self, camera: Camera, n_frames: int = 1) -> list[Any]:
+        """Arm, then trigger and read each frame."""
+        camera.arm(n_frames, self.exposure_s, "software")
+        frames: list[Any] = []
+        for _ in range(n_frames):
+            camera.trigger()
+            frames.append(camera.read(self.exposure_s + self.timeout_s))
+        return frames
+
+    @promise("arm, trigger, read gives a Frame: uint16 (height, width), with the exposure asked for")
+    def test_gives_a_frame(self, factory: Factory[Camera]) -> None:
+        """One image, as the ``image`` step takes it."""
+        with self.opened(factory) as (camera, _):
+            frame = self.take(camera)[0]
+            assert isinstance(frame, Frame), f"read() gave a {type(frame).__name__}"
+            assert frame.image.dtype == np.uint16, f"the image is {frame.image.dtype}"
+            assert frame.image.ndim == 2, f"the image has shape {frame.image.shape}"
+            assert frame.image.size > 0, f"the image has shape {frame.image.shape}"
+            deviation = abs(frame.exposure_s / self.exposure_s - 1.0)
+            told = f"the frame tells {frame.exposure_s} s; asked for {self.exposure_s} s"
+            assert deviation <= self.exposure_tolerance, told
+
+    @promise("after arm(n) come n frames, the oldest first, and no more")
+    def test_gives_as_many_frames_as_armed_for(self, factory: Factory[Camera]) -> None:
+        """And the next series begins anew."""
+        with self.opened(factory) as (camera, _):
+            shapes = {np.shape(frame.image) for frame in self.take(camera, 3)}
+            assert len(shapes) == 1, f"the frames of a series have the shapes {sorted(shapes)}"
+            refusal(DeviceError, "a fourth trigger after arm(3)", camera.trigger)
+            camera.arm(3, self.exposure_s, "software")
+            camera.trigger()
+            camera.read(self.exposure_s + self.timeout_s)
+            self.take(camera)
+            refusal(DeviceError, "a second trigger after arm(1)", camera.trigger)
+
+    @promise("t_start_s is the start of the exposure on the session's clock")
+    def test_tells_when_it_exposed(self, factory: Factory[Camera]) -> None:
+        """Later frames start later, and each between its trigger and its reading."""
+        with self.opened(factory) as (camera, context):
+            camera.arm(3, self.exposure_s, "software")
+            last_s = -np.inf
+            for _ in range(3):
+                context.clock.sleep(1e-3)
+                before_s = context.clock.now()
+                camera.trigger()
+                t_start_s = camera.read(self.exposure_s + self.timeout_s).t_start_s
+                after_s = context.clock.now()
+                told = f"a frame triggered at {before_s} s and read at {after_s} s tells {t_start_s} s"
+                assert before_s - 1e-9 <= t_start_s <= after_s + 1e-9, told
+                assert t_start_s > last_s, f"it tells {t_start_s} s after {last_s} s"
+                last_s = t_start_s
+
+    @promise("a frame does not change after it was read")
+    def test_frames_do_not_change(self, factory: Factory[Camera]) -> None:
+        """A driver that hands out its own buffer would overwrite the last image with the next."""
+        with self.opened(factory) as (camera, _):
+            frame = self.take(camera)[0]
+            before = np.array(frame.image)
+            self.take(camera, 3)
+            assert np.array_equal(before, frame.image), "the next exposures overwrote it"
+
+    @promise("trigger() without arm() raises DeviceError")
+    def test_refuses_trigger_without_arm(self, factory: Factory[Camera]) -> None:
+        """Nor after safe_state(): the camera has forgotten the series."""
+        with self.opened(factory) as (camera, _):
+            refusal(DeviceError, "trigger() after open()", camera.trigger)
+            camera.arm(1, self.exposure_s, "software")
+            camera.safe_state()
+            refusal(DeviceError, "trigger() after safe_state()", camera.trigger)

@@ -1,0 +1,270 @@
+"""What all hardware roles promise."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Generator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from typing import Any, ClassVar, Final, Generic, TypeAlias, TypeVar
+
+import pytest
+
+from labseq.errors import DeviceError, DeviceTimeoutError, LimitError
+from labseq.model import SiteGrid
+from labseq.roles import Context, Hardware
+from labseq.testing.contracts.promises import (
+    HangsError,
+    doing,
+    in_time,
+    no_factory,
+    promise,
+    promised,
+    refusal,
+)
+from labseq.testing.contracts.watch import watch_io
+from labseq.testing.fakes import Calls, FakeClock, RecordingSimulation
+
+D = TypeVar("D", bound=Hardware)
+Factory: TypeAlias = Callable[[Context], D]
+Action: TypeAlias = Callable[[D], object]
+
+ALWAYS_SAFE: Final = "safe_state() is legal in every state, and twice"
+
+
+@dataclass(frozen=True, slots=True)
+class Wait(Generic[D]):
+    """A wait for something that does not come within its timeout.
+
+    Attributes:
+        timeout_s: The timeout, in seconds.
+        enter: Brings an open device to where it can wait.
+        wait: The call, with that timeout.
+    """
+
+    timeout_s: float
+    enter: Action[D]
+    wait: Action[D]
+
+
+class HardwareContract(Generic[D]):
+    """Promises of every camera, tweezer driver and instrument.
+
+    Inherit the suite of the role, not this one, and provide the fixture ``factory``.
+
+    Attributes:
+        role: Name that the device has in the profile.
+        patience_s: Real time after which a call counts as hung, in seconds.
+    """
+
+    role: ClassVar[str] = "device"
+    patience_s: ClassVar[float] = 10.0
+
+    @pytest.fixture
+    def factory(self) -> Factory[D]:
+        """Constructs the device, given a context; provided by the plugin's test."""
+        no_factory(self, "context -> device")
+
+    def context(self) -> Context:
+        """What the device is constructed with; override it for another grid or simulation.
+
+        Keep the clock virtual: then waiting for a timeout costs no time.
+        """
+        clock = FakeClock()
+        return Context(self.role, SiteGrid(), clock=clock, simulation=RecordingSimulation(Calls(clock)))
+
+    def work(self, device: D) -> None:
+        """What the role does in a shot, once; the device is open."""
+
+    def ready(self, device: D) -> None:
+        """What comes before any work; the device is open."""
+
+    def uses(self) -> Mapping[str, Action[D]]:
+        """Calls of the role that need an open device: description -> call."""
+        return {}
+
+    def states(self) -> Mapping[str, Action[D]]:
+        """States of an open device: description -> how to get there."""
+        return {}
+
+    def excesses(self) -> Mapping[str, Action[D]]:
+        """Calls that ask for more than any device can do: description -> call."""
+        return {}
+
+    def waits(self) -> Mapping[str, Wait[D]]:
+        """Waits in vain: description -> wait."""
+        return {}
+
+    @contextmanager
+    def opened(self, factory: Factory[D]) -> Generator[tuple[D, Context]]:
+        """A new device, opened, with its context; closed at the end."""
+        context = self.context()
+        if context.simulation is not None:
+            context.simulation.open()
+        _begin_shot(context)
+        device = factory(context)
+        device.open()
+        try:
+            yield device, context
+        finally:
+            with suppress(Exception):  # what close() promises has tests of its own
+                device.close()
+
+    @promise("the constructor does no I/O")
+    def test_constructor_does_no_io(self, factory: Factory[D]) -> None:
+        """Nothing is opened, connected or started before open()."""
+        context = self.context()
+        with watch_io() as seen:
+            factory(context)
+        assert not seen, f"it did {', '.join(seen)}; open() is the place for that"
+
+    @promise("open() and close() twice do no harm, and a closed device can be opened again")
+    def test_opens_and_closes_twice(self, factory: Factory[D]) -> None:
+        """Open, open, close, close, and open again."""
+        with self.opened(factory) as (device, _):
+            for method in (device.open, device.close, device.close, device.open, device.close):
+                with doing(f"{method.__name__}()"):
+                    method()
+
+    @promise("close() is legal before open()")
+    def test_closes_before_open(self, factory: Factory[D]) -> None:
+        """A run that fails while it opens its devices closes them all."""
+        factory(self.context()).close()
+
+    @promise(ALWAYS_SAFE)
+    def test_safe_state_in_every_state(self, factory: Factory[D]) -> None:
+        """Before open(), after it, in each state of the role, after close()."""
+        _safe_twice(factory(self.context()), "before open()")
+        for state, enter in {"after open()": _stay, **self.states()}.items():
+            with self.opened(factory) as (device, _):
+                enter(device)
+                _safe_twice(device, state)
+        with self.opened(factory) as (device, _):
+            device.close()
+            _safe_twice(device, "after close()")
+
+    @promise("the device works in the next shot after safe_state()")
+    def test_works_after_safe_state(self, factory: Factory[D]) -> None:
+        """A shot that failed with TransientError is repeated without another open()."""
+        for state, enter in {"after open()": _stay, **self.states()}.items():
+            with self.opened(factory) as (device, context):
+                enter(device)
+                with promised(ALWAYS_SAFE):
+                    device.safe_state()
+                _begin_shot(context)
+                with doing(f"work after safe_state() {state}"):
+                    self.work(device)
+
+    @promise("safe_state() and close() work after a failure")
+    def test_closes_after_failures(self, factory: Factory[D]) -> None:
+        """A failure must leave a device that can be made safe and closed."""
+        for what, fail in self._failures().items():
+            with self.opened(factory) as (device, context):
+                try:
+                    self._in_time(context, what, fail, device)
+                except HangsError:  # timeouts have a test of their own
+                    continue
+                except Exception:  # noqa: BLE001, S110 - and so have errors
+                    pass
+                for method in (device.safe_state, device.close):
+                    with doing(f"{method.__name__}() after {what}"):
+                        method()
+
+    @promise("describe() gives values that JSON can hold")
+    def test_describes_itself(self, factory: Factory[D]) -> None:
+        """It is written into every run."""
+        with self.opened(factory) as (device, _):
+            described: Any = device.describe()
+            assert isinstance(described, Mapping), f"it gave a {type(described).__name__}"
+            json.dumps(dict(described), allow_nan=False)
+
+    @promise("calls before open() and after close() raise DeviceError")
+    def test_refuses_calls_while_closed(self, factory: Factory[D]) -> None:
+        """Every call of the role that needs the device."""
+        for what, use in self.uses().items():
+            refusal(DeviceError, f"{what} before open()", use, factory(self.context()))
+        for what, use in self.uses().items():
+            with self.opened(factory) as (device, _):
+                device.close()
+                refusal(DeviceError, f"{what} after close()", use, device)
+
+    @promise("what exceeds a limit is refused with LimitError before anything moves")
+    def test_refuses_what_exceeds_limits(self, factory: Factory[D]) -> None:
+        """Neither does time pass nor does the simulation see anything, and the device goes on working."""
+        for what, ask in self.excesses().items():
+            with self.opened(factory) as (device, context):
+                self.ready(device)
+                before_s, before = context.clock.now(), n_calls(context)
+                refusal(LimitError, what, ask, device)
+                assert context.clock.now() == before_s, f"{what} was refused only after a wait"
+                assert n_calls(context) == before, f"{what} was refused only after it was played"
+                with doing(f"work after {what} was refused"):
+                    self.work(device)
+
+    @promise("timeouts are kept, and end with DeviceTimeoutError")
+    def test_keeps_timeouts(self, factory: Factory[D]) -> None:
+        """On the virtual clock, so that it costs no time."""
+        for what, wait in self.waits().items():
+            with self.opened(factory) as (device, context):
+                wait.enter(device)
+                before_s = context.clock.now()
+                self._in_time(context, what, refusal, DeviceTimeoutError, what, wait.wait, device)
+                passed_s = context.clock.now() - before_s
+                assert passed_s <= 1.1 * wait.timeout_s + 1e-3, f"{what} took {passed_s:g} s"
+
+    @promise("a DeviceError names the device as the profile does")
+    def test_errors_name_the_device(self, factory: Factory[D]) -> None:
+        """Else nobody knows which of the instruments failed."""
+        for what, fail in {**self.uses(), **self._failures()}.items():
+            context = self.context()
+            device = factory(context)
+            if what not in self.uses():
+                device.open()
+            named = context.name
+            try:
+                self._in_time(context, what, fail, device)
+            except DeviceError as error:
+                named = error.device
+            except Exception:  # noqa: BLE001, S110 - that it fails rightly has tests of its own
+                pass
+            text = f"{what} raised an error of '{named}'; the profile calls it '{context.name}'"
+            assert named == context.name, text
+
+    def _failures(self) -> Mapping[str, Action[D]]:
+        """Every way in which the suite makes an open device fail."""
+
+        def waiting(wait: Wait[D]) -> Action[D]:
+            return lambda device: (wait.enter(device), wait.wait(device))
+
+        return {**self.excesses(), **{what: waiting(wait) for what, wait in self.waits().items()}}
+
+    def _in_time(self, context: Context, what: str, call: Callable[..., object], *args: object) -> None:
+        """A call that must come back; one that polls the clock for ever is ended by it."""
+        try:
+            in_time(self.patience_s, what, call, *args)
+        except HangsError:
+            if isinstance(context.clock, FakeClock):
+                context.clock.stop.request()
+            raise
+
+
+def _stay(device: object) -> None:
+    """A device that was opened is in that state already."""
+    del device
+
+
+def _begin_shot(context: Context) -> None:
+    if context.simulation is not None:
+        context.simulation.begin_shot()
+
+
+def _safe_twice(device: Hardware, state: str) -> None:
+    for count in ("once", "twice"):
+        with doing(f"safe_state() {state}, {count}"):
+            device.safe_state()
+
+
+def n_calls(context: Context) -> int:
+    """How often the simulation was called; 0 for one that does not note it."""
+    simulation = context.simulation
+    return len(simulation.calls) if isinstance(simulation, RecordingSimulation) else 0

@@ -1,0 +1,286 @@
+"""What a planner promises."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar, TypeAlias
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from numpy.typing import NDArray
+
+from labseq.errors import LabseqError
+from labseq.model import Occupancy, Plan, PlanReport, SiteGrid, TargetPattern
+from labseq.motion import check_plan
+from labseq.roles import Context, Planner, Warmable
+from labseq.testing.contracts.planner_cases import (
+    Case,
+    cases_of,
+    extreme_cases,
+    loaded,
+    paper_cases,
+    small_targets,
+)
+from labseq.testing.contracts.plans import (
+    NO_ATOM_CREATED,
+    RETURNS_A_PLAN,
+    equal,
+    fresh_global_random_state,
+    global_random_state,
+    plan_of,
+    replay,
+)
+from labseq.testing.contracts.promises import (
+    BrokenPromise,
+    doing,
+    in_time,
+    no_factory,
+    promise,
+    promised,
+    refusal,
+    retold,
+    told,
+)
+from labseq.testing.contracts.watch import watch_io
+from labseq.testing.strategies import cases, drawn
+
+Factory: TypeAlias = Callable[[Context], Planner]
+Check: TypeAlias = Callable[[TargetPattern, Occupancy], None]
+
+PASSES_THE_CHECK = "the plan passes labseq.check_plan at the planner's degree of parallelism"
+
+
+class PlannerContract:
+    """Promises of a planner; provide the fixture ``factory``.
+
+    Attributes:
+        fills_any_target: Whether it fills every target that the atoms suffice for.
+            If not, it fills ``targets``, and for any other target its plan is
+            legal or it raises a LabseqError.
+        targets: Targets that it fills; only needed without ``fills_any_target``.
+        time_limit_s: Longest time for one plan of the paper's size (15 x 15 out of
+            20 x 20 sites at 75 % filling) or the largest of ``targets``, in seconds.
+        n_examples: Number of random cases for each promise that is tested on them.
+    """
+
+    fills_any_target: ClassVar[bool] = True
+    targets: ClassVar[Sequence[TargetPattern]] = ()
+    time_limit_s: ClassVar[float] = 2.0
+    n_examples: ClassVar[int] = 60
+
+    @pytest.fixture
+    def factory(self) -> Factory:
+        """Constructs the planner, given a context; provided by the plugin's test."""
+        no_factory(self, "context -> planner")
+
+    def context(self, shape: tuple[int, int]) -> Context:
+        """What the planner is constructed with; override it for other limits of motion."""
+        return Context("planner", SiteGrid(*shape))
+
+    def trials(self) -> settings:
+        """How hypothesis tries random cases: always the same ones, without a deadline for each."""
+        return settings(max_examples=self.n_examples, deadline=None, database=None, derandomize=True)
+
+    @promise(RETURNS_A_PLAN)
+    def test_returns_a_plan(self, factory: Factory) -> None:
+        """Not a list of batches, not None."""
+        for target, atoms in self.large_cases():
+            self.planned(factory, target, atoms)
+
+    @promise(NO_ATOM_CREATED)
+    def test_creates_no_atom(self, factory: Factory) -> None:
+        """Random small arrays, on any target."""
+
+        def check(target: TargetPattern, atoms: Occupancy) -> None:
+            plan = self.answered(factory(self.context(target.shape)), target, atoms)
+            if plan is not None:
+                replay(plan, atoms)
+
+        self.on_examples(check)
+
+    @promise(PASSES_THE_CHECK)
+    def test_plans_are_legal(self, factory: Factory) -> None:
+        """Random small arrays with any number of atoms, and one of full size."""
+
+        def check(target: TargetPattern, atoms: Occupancy) -> None:
+            self.checked(factory, target, atoms)
+
+        self.on_examples(check)
+        for case in self.large_cases():
+            check(*case)
+
+    @promise("the target is filled, and clear sites are emptied, when there are enough atoms")
+    def test_fills_the_target(self, factory: Factory) -> None:
+        """Random small arrays with enough atoms, and one of full size."""
+
+        def check(target: TargetPattern, atoms: Occupancy) -> None:
+            report = self.checked(factory, target, atoms)
+            if report is None or np.count_nonzero(atoms) < target.n_atoms:
+                return
+            left = f"the plan leaves {report.n_defects} defects and {report.n_surplus} surplus atoms"
+            assert report.meets_target, f"{left} of\n{drawn(target, atoms)}"
+
+        self.on_examples(check, served=True)
+        for case in self.large_cases():
+            check(*case)
+
+    @promise("with too few atoms the plan leaves no more defects than it found")
+    def test_does_what_it_can_with_too_few_atoms(self, factory: Factory) -> None:
+        """Random small arrays."""
+
+        def check(target: TargetPattern, atoms: Occupancy) -> None:
+            report = self.checked(factory, target, atoms)
+            if report is not None and np.count_nonzero(atoms) < target.n_atoms:
+                found = target.n_defects(atoms)
+                text = f"it found {found} and leaves {report.n_defects} of\n{drawn(target, atoms)}"
+                assert report.n_defects <= found, text
+
+        self.on_examples(check, served=True)
+
+    @promise(RETURNS_A_PLAN)
+    def test_plans_for_extremes(self, factory: Factory) -> None:
+        """Single sites and lines, empty and full loadings, targets without atoms."""
+        for case in self.extreme_cases():
+            self.checked(factory, *case)
+
+    @promise("the same input gives the same plan")
+    def test_same_input_same_plan(self, factory: Factory) -> None:
+        """Again, after other calls, and from a fresh instance."""
+        for target, atoms in self.large_cases():
+            planner = factory(self.context(target.shape))
+            first = planner.plan(atoms.copy(), target)
+            again = {"the second time": planner.plan(atoms.copy(), target)}
+            planner.plan(~atoms, target)
+            again["after another input"] = planner.plan(atoms.copy(), target)
+            again["from a fresh instance"] = self.planned(factory, target, atoms.copy())
+            for when, plan in again.items():
+                assert equal(first, plan), f"the plan is another {when}"
+
+    @promise("the input is left untouched")
+    def test_leaves_the_input_untouched(self, factory: Factory) -> None:
+        """The occupancy belongs to the shot's record."""
+        for target, atoms in self.large_cases():
+            given_atoms = atoms.copy()
+            fill, clear = target.fill.copy(), target.clear.copy()
+            self.planned(factory, target, given_atoms)
+            assert np.array_equal(given_atoms, atoms), "plan() changed the occupancy"
+            assert np.array_equal(target.fill, fill), "plan() changed the target's fill"
+            assert np.array_equal(target.clear, clear), "plan() changed the target's clear"
+
+    @promise("read-only and non-contiguous occupancies are planned for like others")
+    def test_takes_any_memory_layout(self, factory: Factory) -> None:
+        """Recorded occupancies are read-only; a view of a larger array is not contiguous."""
+        for target, atoms in self.large_cases():
+            expected = target.n_defects(replay(self.planned(factory, target, atoms.copy()), atoms))
+            read_only = atoms.copy()
+            read_only.flags.writeable = False
+            strided = np.repeat(atoms, 2, axis=1)[:, ::2]
+            layouts = {"read-only": read_only, "Fortran": np.asfortranarray(atoms), "strided": strided}
+            for layout, same_atoms in layouts.items():
+                with doing(f"a {layout} occupancy"):
+                    plan = factory(self.context(target.shape)).plan(same_atoms, target)
+                    with retold():
+                        left = target.n_defects(replay(plan, atoms))
+                    assert left == expected, f"the plan leaves {left} defects, not {expected}"
+
+    @promise("what is no occupancy of the target's shape raises LabseqError or ValueError")
+    def test_refuses_wrong_input(self, factory: Factory) -> None:
+        """Rather than a wrong plan, or an error from somewhere inside."""
+        target, atoms = self.large_cases()[0]
+        planner = factory(self.context(target.shape))
+        wrong: dict[str, NDArray[Any]] = {
+            "an occupancy of one row too few": atoms[:-1],
+            "an occupancy of one column too many": np.pad(atoms, ((0, 0), (0, 1))),
+            "a flat occupancy": atoms.ravel(),
+            "a stack of occupancies": atoms[None],
+            "an occupancy of 0.5": np.full(target.shape, 0.5),
+            "an occupancy of text": np.full(target.shape, "atom"),
+        }
+        for what, values in wrong.items():
+            refusal((LabseqError, ValueError), what, planner.plan, values, target)
+
+    @promise("a plan is made within the time limit")
+    def test_plans_in_time(self, factory: Factory) -> None:
+        """The best of three, after compiling."""
+        for target, atoms in self.large_cases():
+            planner = self.warmed(factory, target)
+            taken_s: list[float] = []
+            for _ in range(3):
+                start_s = time.perf_counter()
+                in_time(2 * self.time_limit_s, "plan()", planner.plan, atoms.copy(), target)
+                taken_s.append(time.perf_counter() - start_s)
+                if taken_s[-1] <= self.time_limit_s:
+                    break
+            text = f"plan() took {min(taken_s):.3g} s; the limit is {self.time_limit_s:g} s"
+            assert min(taken_s) <= self.time_limit_s, text
+
+    @promise("plan() is pure: no I/O, no use of the global random numbers")
+    def test_is_pure(self, factory: Factory) -> None:
+        """Other plugins draw from the global random numbers too."""
+        for target, atoms in self.large_cases():
+            planner = self.warmed(factory, target)
+            planner.plan(atoms.copy(), target)
+            before = fresh_global_random_state()
+            with watch_io() as seen:
+                planner.plan(atoms.copy(), target)
+            assert not seen, f"it did {', '.join(seen)}"
+            assert global_random_state() == before, "it drew from random or numpy.random; make a Generator"
+
+    def planned(self, factory: Factory, target: TargetPattern, atoms: Occupancy) -> Plan:
+        """What a fresh planner plans; it is given the array itself, not a copy."""
+        return plan_of(factory(self.context(target.shape)), target, atoms)
+
+    def answered(self, planner: Planner, target: TargetPattern, atoms: Occupancy) -> Plan | None:
+        """What a planner plans; None if it rightly refuses the target."""
+        try:
+            return plan_of(planner, target, atoms.copy())
+        except LabseqError as error:
+            if self.fills_any_target or any(target is served for served in self.targets):
+                detail = f"it {told(error)} for\n{drawn(target, atoms)}"
+                raise BrokenPromise(RETURNS_A_PLAN, detail) from error
+            return None
+
+    def checked(self, factory: Factory, target: TargetPattern, atoms: Occupancy) -> PlanReport | None:
+        """The check's report on a fresh planner's plan; None if it rightly refuses the target."""
+        context = self.context(target.shape)
+        planner = factory(context)
+        plan = self.answered(planner, target, atoms)
+        if plan is None:
+            return None
+        replay(plan, atoms)
+        dop = getattr(planner, "degree_of_parallelism", context.motion.max_tweezers)
+        with promised(PASSES_THE_CHECK):
+            return check_plan(plan, atoms, target, dop, grid=context.grid, motion=context.motion)
+
+    def warmed(self, factory: Factory, target: TargetPattern) -> Planner:
+        """A fresh planner, compiled."""
+        planner = factory(self.context(target.shape))
+        if isinstance(planner, Warmable):
+            planner.warm()
+        return planner
+
+    def on_examples(self, check: Check, *, served: bool = False) -> None:
+        """Check random cases; the smallest one that fails is reported.
+
+        Args:
+            check: Given a target and an occupancy.
+            served: Whether the target must be one that the planner fills.
+        """
+        of_any = cases() if self.fills_any_target or not served else cases_of(self.targets)
+
+        @self.trials()
+        @given(of_any)
+        def run(case: Case) -> None:
+            check(*case)
+
+        run()
+
+    def large_cases(self) -> list[Case]:
+        """Cases of full size with enough atoms."""
+        return paper_cases() if self.fills_any_target else [loaded(target) for target in self.targets]
+
+    def extreme_cases(self) -> list[Case]:
+        """Cases at the edge of what there is."""
+        return extreme_cases(self.targets if not self.fills_any_target else small_targets())

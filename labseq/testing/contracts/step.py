@@ -1,0 +1,113 @@
+"""What a step of a shot promises."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from typing import Any, Final, TypeAlias
+
+import numpy as np
+import pytest
+
+from labseq.errors import StopRequested
+from labseq.model import ShotRecord, TimelineEntry
+from labseq.roles import Step, StepContext
+from labseq.sequencer.guard import Guard
+from labseq.sequencer.shot import RunningShot
+from labseq.testing.contracts.promises import BrokenPromise, no_factory, promise, refusal
+from labseq.testing.contracts.watch import watch_io
+from labseq.testing.fakes import FakeLab, fake_lab
+
+Factory: TypeAlias = Callable[[], Step]
+
+TIMELINE: Final = "the timeline is known beforehand: labelled bars with 0 <= typical_s <= duration_s"
+
+
+class StepContract:
+    """Promises of a step; provide the fixture ``factory``, which takes nothing here.
+
+    Devices are fakes. The detector sees 4 x 4 sites full of atoms but for one that
+    the target wants filled, image after image.
+    """
+
+    @pytest.fixture
+    def factory(self) -> Factory:
+        """Constructs the step; provided by the plugin's test."""
+        no_factory(self, "nothing -> step")
+
+    def lab(self) -> FakeLab:
+        """Where the step runs; override it for devices or occupancies that it needs."""
+        seen = np.ones((4, 4), np.bool_)
+        seen[1, 1] = False
+        fill = np.zeros((4, 4), np.bool_)
+        fill[1:3, 1:3] = True
+        return fake_lab([seen], fill=fill, simulated=True)
+
+    @promise(TIMELINE)
+    def test_lays_out_its_timeline(self, factory: Factory) -> None:
+        """``labseq check`` prints it and adds it up."""
+        for entry in self._timeline(factory()):
+            assert entry.label, f"{entry} has no label"
+            assert 0.0 <= entry.typical_s <= entry.duration_s < float("inf"), f"{entry}"
+            assert entry.n_images >= 0, f"{entry}"
+
+    @promise("constructor and timeline do no I/O, and the timeline is always the same")
+    def test_timeline_is_pure(self, factory: Factory) -> None:
+        """``labseq check`` opens nothing."""
+        with watch_io() as seen:
+            step = factory()
+            first = self._timeline(step)
+        assert not seen, f"it did {', '.join(seen)}"
+        assert self._timeline(step) == first, "the second call gave another one"
+
+    @promise("needs_image and takes_image are known before the run")
+    def test_declares_its_images(self, factory: Factory) -> None:
+        """The order of the steps is checked by them."""
+        step = factory()
+        for name in ("needs_image", "takes_image"):
+            value: Any = getattr(step, name)
+            assert isinstance(value, bool), f"{name} is {value!r}"
+
+    @promise("it takes no longer, and no more images, than its timeline says")
+    def test_keeps_its_timeline(self, factory: Factory) -> None:
+        """On the virtual clock; a step whose bars have no length does not know it."""
+        step = factory()
+        bars = self._timeline(step)
+        with self.shot() as (shot, _):
+            start_s, n_before = shot.elapsed_s, len(shot.record.images)
+            step.run(shot)
+            taken_s, n_taken = shot.elapsed_s - start_s, len(shot.record.images) - n_before
+        planned_s, n_planned = sum(bar.duration_s for bar in bars), sum(bar.n_images for bar in bars)
+        assert taken_s <= planned_s + 1e-6 or not planned_s, f"it took {taken_s} s; planned {planned_s} s"
+        assert n_taken <= n_planned, f"it took {n_taken} images; planned {n_planned}"
+
+    @promise("a stop request ends it with StopRequested")
+    def test_hears_a_stop_request(self, factory: Factory) -> None:
+        """It waits and calls devices through the shot, which looks for the request."""
+        step = factory()
+        with self.shot() as (shot, lab):
+            lab.stop.request()
+            refusal(StopRequested, "a step that was asked to stop", step.run, shot)
+
+    @contextmanager
+    def shot(self) -> Generator[tuple[RunningShot, FakeLab]]:
+        """A shot on open devices that has taken an image."""
+        lab = self.lab()
+        for _, device in lab.hardware():
+            device.open()
+        lab.static_tweezers.start()
+        guard = Guard(lab.stop)
+        shot = RunningShot(lab, guard, ShotRecord(0, 0, 0, ""), lambda _name, _values: None)
+        shot.take_image(0.045)
+        try:
+            yield shot, lab
+        finally:
+            guard.end()
+
+    def _timeline(self, step: Step) -> list[TimelineEntry]:
+        lab = self.lab()
+        entries: list[Any] = list(step.plan_timeline(StepContext(lab.grid, lab.motion, lab.target)))
+        for entry in entries:
+            if not isinstance(entry, TimelineEntry):
+                raise BrokenPromise(TIMELINE, f"plan_timeline() gave a {type(entry).__name__}")
+        return entries

@@ -1,0 +1,39 @@
+"""Stand-ins for tests: a clock, devices that note every call, deciders that follow a script."""
+
+from labseq.testing.fakes.calls import Call, Calls, Failure, Hang
+from labseq.testing.fakes.clock import FakeClock
+from labseq.testing.fakes.deciders import (
+    FixedDetector,
+    RecordingSimulation,
+    ScriptedDetector,
+    ScriptedPlanner,
+)
+from labseq.testing.fakes.devices import (
+    RecordingCamera,
+    RecordingDevice,
+    RecordingMobileTweezers,
+    RecordingStaticTweezers,
+)
+from labseq.testing.fakes.lab import FakeLab, ListSink, RecordingObserver, fake_lab
+from labseq.testing.planner import OneByOnePlanner
+
+__all__ = [
+    "Call",
+    "Calls",
+    "Failure",
+    "FakeClock",
+    "FakeLab",
+    "FixedDetector",
+    "Hang",
+    "ListSink",
+    "OneByOnePlanner",
+    "RecordingCamera",
+    "RecordingDevice",
+    "RecordingMobileTweezers",
+    "RecordingObserver",
+    "RecordingSimulation",
+    "RecordingStaticTweezers",
+    "ScriptedDetector",
+    "ScriptedPlanner",
+    "fake_lab",
+]

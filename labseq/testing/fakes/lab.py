@@ -1,0 +1,180 @@
+"""A whole lab of fakes, for tests of steps, of the sequencer and of what is built on them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from labseq.model import RandomStream, ShotRecord, SiteGrid, TargetPattern, as_occupancy
+from labseq.roles import Clock, Context
+from labseq.sequencer.clock import StopFlag
+from labseq.sequencer.lab import Lab, Timeouts
+from labseq.testing.fakes.base import RecordingHardware
+from labseq.testing.fakes.calls import Calls, Failure, Hang
+from labseq.testing.fakes.clock import FakeClock
+from labseq.testing.fakes.deciders import RecordingSimulation, ScriptedDetector
+from labseq.testing.fakes.devices import (
+    RecordingCamera,
+    RecordingDevice,
+    RecordingMobileTweezers,
+    RecordingStaticTweezers,
+)
+from labseq.testing.planner import OneByOnePlanner
+
+T = TypeVar("T")
+
+_FAKE_OF_ROLE: Final = {
+    "camera": RecordingCamera,
+    "static_tweezers": RecordingStaticTweezers,
+    "mobile_tweezers": RecordingMobileTweezers,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class FakeLab(Lab):
+    """A lab of fakes, with what a test wants to look at.
+
+    Attributes:
+        calls: Every call of every fake device, in order.
+        stop: The request to stop; the clock and the guard look for it.
+        hangs: "camera.read" -> the :class:`Hang`, for each call named in ``hang_on``.
+    """
+
+    calls: Calls
+    stop: StopFlag
+    hangs: Mapping[str, Hang]
+
+
+def fake_lab(
+    occupancies: Sequence[ArrayLike] | None = None,
+    *,
+    grid: SiteGrid | None = None,
+    fill: ArrayLike | None = None,
+    devices: Iterable[str] = ("shutter",),
+    fail_on: Mapping[str, Failure] | None = None,
+    hang_on: Iterable[str] = (),
+    simulated: bool = False,
+    clock: Clock | None = None,
+    stop: StopFlag | None = None,
+    **parts: Any,
+) -> FakeLab:
+    """Build a lab of fakes; the devices are not open yet.
+
+    Args:
+        occupancies: What the detector sees, image after image, the last one again
+            and again; by default every site holds an atom.
+        grid: The grid of sites; by default as large as the occupancies, or 4 x 4.
+        fill: Sites that must hold an atom, of the grid's shape; by default all.
+            The other sites are reservoir. For more, give ``target``.
+        devices: Names of the further devices; each knows the commands "on" and "off".
+        fail_on: Call -> what it raises, for example ``{"camera.read": DeviceError(...)}``.
+        hang_on: Calls that hang, for example ``{"mobile_tweezers.wait"}``; see
+            :attr:`FakeLab.hangs`.
+        simulated: Whether there is a :class:`RecordingSimulation`.
+        clock: By default a :class:`FakeClock` that looks for ``stop``.
+        stop: The request to stop; by default one of its own.
+        **parts: Any field of ``labseq.sequencer.Lab`` that the test brings itself.
+
+    Raises:
+        ValueError: A call in ``fail_on`` or ``hang_on`` does not exist.
+
+    Example:
+        >>> lab = fake_lab([[[1, 0]], [[1, 1]]], fail_on={"camera.trigger": OSError("cable")})
+        >>> lab.camera.open()
+        >>> lab.calls.names(), lab.target.n_atoms
+        (['camera.open'], 2)
+    """
+    seen = [as_occupancy(occupancy) for occupancy in occupancies or ()]
+    n_rows, n_cols = seen[0].shape if seen else (4, 4)
+    grid = grid or SiteGrid(n_rows, n_cols)
+    mask = np.ones(grid.shape, np.bool_) if fill is None else as_occupancy(fill, grid.shape)
+    stop = stop or StopFlag()
+    clock = clock or FakeClock(stop)
+    calls = Calls(clock)
+    simulation = RecordingSimulation(calls) if simulated else None
+    context = Context("", grid, clock=clock, simulation=simulation)
+    hangs = {call: Hang() for call in hang_on}
+    made = _make_hardware(context, calls, tuple(devices), fail_on or {}, hangs)
+    fields: dict[str, Any] = {
+        **{role: made.pop(role) for role in _FAKE_OF_ROLE},
+        "devices": made,
+        "grid": grid,
+        "motion": context.motion,
+        "target": TargetPattern(mask, np.zeros(grid.shape, np.bool_)),
+        "clock": clock,
+        "detector": ScriptedDetector(seen or [np.ones(grid.shape, np.bool_)]),
+        "planner": OneByOnePlanner(),
+        "planner_name": "one_by_one",
+        "degree_of_parallelism": 1,
+        "simulation": simulation,
+        "random_streams": (RandomStream(0),),
+        "timeouts": Timeouts(),
+    }
+    return FakeLab(**{**fields, **parts}, calls=calls, stop=stop, hangs=hangs)
+
+
+def _make_hardware(
+    context: Context,
+    calls: Calls,
+    names: Sequence[str],
+    fail_on: Mapping[str, Failure],
+    hang_on: Mapping[str, Hang],
+) -> dict[str, RecordingHardware]:
+    made: dict[str, RecordingHardware] = {}
+    for name in (*_FAKE_OF_ROLE, *names):
+        fake = _FAKE_OF_ROLE.get(name, RecordingDevice)
+        failures, hangs = _of_device(name, fail_on), _of_device(name, hang_on)
+        made[name] = fake(replace(context, name=name), calls, fail_on=failures, hang_on=hangs)
+    for call in (*fail_on, *hang_on):  # a misspelt call would never fail, and the test would prove nothing
+        device, _, method = call.rpartition(".")
+        if not hasattr(made.get(device), method):
+            raise ValueError(f"no fake has the call '{call}'; expected 'camera.read' or the like")
+    return made
+
+
+def _of_device(name: str, by_call: Mapping[str, T]) -> dict[str, T]:
+    prefix = f"{name}."
+    return {call.removeprefix(prefix): what for call, what in by_call.items() if call.startswith(prefix)}
+
+
+class ListSink:
+    """Keeps the shots that a sequencer writes; stands in for the recorder.
+
+    Attributes:
+        shots: The records, in the order they were written.
+    """
+
+    def __init__(self) -> None:
+        self.shots: list[ShotRecord] = []
+
+    def write_shot(self, shot: ShotRecord) -> None:
+        """Keep it."""
+        self.shots.append(shot)
+
+
+class RecordingObserver:
+    """Keeps the events of a run; implements ``labseq.roles.RunObserver``.
+
+    Attributes:
+        events: (name, values) of each, in order.
+    """
+
+    def __init__(self) -> None:
+        self.events: list[tuple[str, Mapping[str, Any]]] = []
+
+    def event(self, name: str, values: Mapping[str, Any]) -> None:
+        """Keep it."""
+        self.events.append((name, values))
+
+    @property
+    def names(self) -> list[str]:
+        """The events' names, in order."""
+        return [name for name, _ in self.events]
+
+    def of(self, name: str) -> list[Mapping[str, Any]]:
+        """The values of the events of one name."""
+        return [values for event, values in self.events if event == name]

@@ -1,0 +1,44 @@
+"""Fixtures for everyone who tests a plugin; pytest finds them by itself.
+
+Loaded into every pytest of the environment, so labseq is imported only inside
+the fixtures.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+if TYPE_CHECKING:
+    from labseq.model import SiteGrid
+    from labseq.roles import Context
+    from labseq.testing.fakes import FakeClock
+
+pytest.register_assert_rewrite("labseq.testing.contracts")
+
+
+@pytest.fixture
+def paper_grid() -> SiteGrid:
+    """The paper's base array: 20 x 20 sites, triangular, 4.49 um."""
+    from labseq.model import SiteGrid
+
+    return SiteGrid()
+
+
+@pytest.fixture
+def virtual_clock() -> FakeClock:
+    """A clock whose time passes only when somebody waits; it notes every wait."""
+    from labseq.testing.fakes import FakeClock
+
+    return FakeClock()
+
+
+@pytest.fixture
+def labseq_context(paper_grid: SiteGrid, virtual_clock: FakeClock) -> Context:
+    """What a plugin's factory is given: the paper's grid, virtual time, a simulation that notes all calls."""
+    from labseq.roles import Context
+    from labseq.testing.fakes import Calls, RecordingSimulation
+
+    simulation = RecordingSimulation(Calls(virtual_clock))
+    return Context("plugin", paper_grid, clock=virtual_clock, simulation=simulation)

@@ -1,0 +1,166 @@
+"""The virtual mobile tweezers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq import Context, DeviceError, DeviceTimeoutError, LimitError, ToneProgram
+from labseq.model import AxisTones
+from labseq.units import format_quantity
+from labseq_virtual.driver import VirtualDriver
+from labseq_virtual.settings import MobileTweezersSettings
+
+_NOTHING: Final = np.empty(0)
+_NO_TONES: Final = AxisTones(np.zeros(1, np.int32), _NOTHING, _NOTHING, _NOTHING, _NOTHING, _NOTHING)
+SILENCE: Final = ToneProgram(_NO_TONES, _NO_TONES, _NOTHING, np.empty(0, np.int8), np.empty(0, np.int32))
+"""The program that has no segments: all tones off."""
+ROUNDING: Final = 1e-9
+"""How far a sum of amplitudes may exceed its limit by rounding."""
+
+
+class VirtualMobileTweezers(VirtualDriver):
+    """Ideal mobile tweezers: what a tone program says is what the atoms feel.
+
+    A program is refused before it plays if it leaves the AOD's band or would clip.
+    Each ``play`` needs a ``prepare`` of its own, so that nothing is ever replayed
+    by mistake. ``safe_state`` cuts a program short: atoms in flight are lost.
+
+    Args:
+        settings: The limits.
+        context: Clock and the simulated world.
+    """
+
+    def __init__(self, settings: MobileTweezersSettings, context: Context) -> None:
+        super().__init__(context, "mobile_tweezers")
+        self._settings = settings
+        self._prepared: ToneProgram | None = None
+        self._playing_until_s: float | None = None
+
+    def prepare(self, program: ToneProgram) -> float:
+        """Check a program and keep it for the next ``play``.
+
+        Returns:
+            Playing time in seconds.
+
+        Raises:
+            LimitError: It has no length, leaves the AOD's band, or clips.
+            DeviceError: Not open, or still playing.
+        """
+        self._check_open()
+        self._check_idle("prepare()")
+        self._prepared = None
+        self._check_durations(program)
+        self._check_axis("row", program.row, program)
+        self._check_axis("column", program.column, program)
+        self._prepared = program
+        return program.total_duration_s
+
+    def play(self) -> None:
+        """Start playing what was prepared; returns at once.
+
+        Raises:
+            DeviceError: Nothing was prepared since the last ``play``, or still playing.
+        """
+        self._check_open()
+        self._check_idle("play()")
+        if self._prepared is None:
+            raise DeviceError(
+                self._name, "play() without a prepared program; call prepare() before each play()"
+            )
+        program, self._prepared = self._prepared, None
+        now_s = self._clock.now()
+        self._world.play("mobile_tweezers", program, now_s)
+        self._playing_until_s = now_s + program.total_duration_s
+
+    def wait(self, timeout_s: float) -> None:
+        """Wait until the program has been played to its end; at once if none is playing.
+
+        Raises:
+            DeviceTimeoutError: It did not end within ``timeout_s``.
+        """
+        self._check_open()
+        if self._playing_until_s is None:
+            return
+        left_s = max(0.0, self._playing_until_s - self._clock.now())
+        self._clock.sleep(min(left_s, timeout_s))
+        if left_s > timeout_s:
+            waited, left = format_quantity(timeout_s, "time"), format_quantity(left_s, "time")
+            raise DeviceTimeoutError(
+                self._name, f"still playing after {waited}; the program needed {left}", timeout_s
+            )
+        self._playing_until_s = None
+
+    def safe_state(self) -> None:
+        """All tones off, at once; the prepared program is dropped."""
+        self._prepared = None
+        if self._playing_until_s is not None:
+            self._playing_until_s = None
+            self._world.play("mobile_tweezers", SILENCE, self._clock.now())
+
+    def describe(self) -> Mapping[str, Any]:
+        """Model and settings."""
+        return {"model": "virtual mobile tweezers", **self._settings.model_dump(mode="json")}
+
+    def _check_idle(self, call: str) -> None:
+        if self._playing_until_s is not None and self._clock.now() < self._playing_until_s - 1e-9:
+            raise DeviceError(
+                self._name,
+                f"{call} while a program plays until {self._playing_until_s:.6f} s; call wait() first",
+            )
+
+    def _check_durations(self, program: ToneProgram) -> None:
+        durations = program.duration_s
+        if not (np.isfinite(durations).all() and (durations >= 0).all()):
+            raise LimitError(f"{self._name}: a segment's duration", "negative or not finite", "0 s or more")
+        if not program.total_duration_s > 0:
+            raise LimitError(f"{self._name}: length of the program", "0 s", "more than 0 s")
+
+    def _check_axis(self, axis: str, tones: AxisTones, program: ToneProgram) -> None:
+        low = self._settings.band_centre - self._settings.band_half_width
+        high = self._settings.band_centre + self._settings.band_half_width
+        hz = np.stack([tones.start_hz, tones.end_hz], axis=1)
+        for tone, value in _first_outside(hz, low, high):
+            raise LimitError(
+                f"{self._name}: frequency of {_where(axis, tones, program, tone)}",
+                f"{value / 1e6:.6g} MHz",
+                f"the band of {low / 1e6:.6g} to {high / 1e6:.6g} MHz",
+            )
+        most = self._settings.max_amplitude_sum
+        amplitudes = np.stack([tones.start_amplitude, tones.end_amplitude], axis=1)
+        for tone, value in _first_outside(amplitudes, 0.0, most + ROUNDING):
+            raise LimitError(
+                f"{self._name}: amplitude of {_where(axis, tones, program, tone)}",
+                f"{value:g} of full scale",
+                f"0 to {most:g}",
+            )
+        sums = _sums(amplitudes, tones.offsets)
+        for segment, value in _first_outside(sums, -ROUNDING, most + ROUNDING):
+            where = f"segment {segment} (batch {program.batch[segment]})"
+            raise LimitError(
+                f"{self._name}: sum of the {axis} amplitudes in {where}",
+                f"{value:g} of full scale",
+                f"{most:g}: the output would clip",
+            )
+
+
+def _first_outside(values: NDArray[np.float64], low: float, high: float) -> list[tuple[int, float]]:
+    """Row and value of the first that is not within the limits, or nothing; nan is outside."""
+    rows, columns = np.nonzero(~((values >= low) & (values <= high)))
+    return [(int(rows[0]), float(values[rows[0], columns[0]]))] if len(rows) else []
+
+
+def _sums(values: NDArray[np.float64], offsets: NDArray[np.int32]) -> NDArray[np.float64]:
+    """Sums over the tones of each segment, (n_segments, 2) of values (n_tones, 2)."""
+    running = np.concatenate([np.zeros((1, 2)), np.cumsum(values, axis=0)])
+    return np.diff(running[offsets], axis=0)
+
+
+def _where(axis: str, tones: AxisTones, program: ToneProgram, tone: int) -> str:
+    """Name a tone: its axis, number, segment and batch."""
+    segment = int(np.searchsorted(tones.offsets, tone, side="right")) - 1
+    number = tone - int(tones.offsets[segment])
+    return f"{axis} tone {number} in segment {segment} (batch {program.batch[segment]})"

@@ -1,0 +1,188 @@
+"""Settings of the virtual lab; each field says where its default comes from.
+
+"Paper" is Tian et al., "Parallel assembly of arbitrary defect-free atom arrays
+with a multi-tweezer algorithm"; "derived" is worked out from it; "ours" is a
+choice where it is silent.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
+
+from labseq import Angle, Duration, Fraction, Frequency, Length, Settings
+
+PositiveDuration = Annotated[Duration, Field(gt=0)]
+PositiveLength = Annotated[Length, Field(gt=0)]
+
+
+class ImageSettings(Settings):
+    """What the virtual EMCCD sees."""
+
+    frame: tuple[PositiveInt, PositiveInt] = Field(
+        default=(512, 512), description="[height, width] of a frame in pixels (ours: a common EMCCD)"
+    )
+    pixel_size: PositiveLength = Field(
+        default=0.35e-6,
+        description="size of a pixel in the atom plane (ours: 16 um behind a magnification of 46)",
+    )
+    centre_px: tuple[float, float] = Field(
+        default=(255.5, 255.5), description="[y, x] of the grid's centre in pixels (ours: the middle)"
+    )
+    angle: Angle = Field(default=0.0, description="rotation of the grid on the frame, clockwise (ours)")
+    spot: PositiveLength = Field(
+        default=0.42e-6,
+        description="Gaussian width (1 sigma) of an atom's image in the atom plane (derived: 0.33 um is "
+        "0.21 wavelengths of 780 nm over the paper's NA of 0.5; ours: 0.26 um of aberrations in quadrature)",
+    )
+    exposure: PositiveDuration = Field(
+        default=45e-3, description="exposure that photoelectrons and background belong to (paper)"
+    )
+    photoelectrons: PositiveFloat = Field(
+        default=60.0,
+        description="mean photoelectrons of an atom in that exposure (ours, chosen with the background "
+        "so that the detection fidelity is the paper's 99.946 %)",
+    )
+    background: NonNegativeFloat = Field(
+        default=0.37,
+        description="mean photoelectrons of stray light per pixel in that exposure (ours, likewise)",
+    )
+    clock_induced_charge: NonNegativeFloat = Field(
+        default=0.005, description="mean spurious electrons per pixel and frame (ours: typical of EMCCDs)"
+    )
+    em_gain: float = Field(
+        default=300.0,
+        ge=10,
+        description="mean gain of the EM register; the exponential law of its noise needs a high one (ours)",
+    )
+    read_noise: NonNegativeFloat = Field(
+        default=80.0,
+        description="read noise behind the EM register, electrons r.m.s. (ours: typical at 10 MHz)",
+    )
+    electrons_per_adu: PositiveFloat = Field(
+        default=5.0, description="electrons behind the EM register per count (ours)"
+    )
+    offset: NonNegativeFloat = Field(default=500.0, description="counts of a dark pixel (ours)")
+
+
+class WorldSettings(Settings):
+    """The virtual lab's atoms and light."""
+
+    loading: Fraction = Field(
+        default=0.75,
+        description="probability that a site holds an atom after a long loading (paper: 75 to 78 %)",
+    )
+    loading_time: PositiveDuration = Field(
+        default=50e-3,
+        description="time constant of the loading (ours: the paper's 500 ms are ten of them)",
+    )
+    lifetime: PositiveDuration = Field(
+        default=33.0, description="lifetime of an atom in a tweezer, cooled, exposures included (paper)"
+    )
+    imaging_loss: Fraction = Field(
+        default=0.00314,
+        lt=1,
+        description="loss in one exposure of 45 ms beside the lifetime's; longer ones lose at the same rate "
+        "(derived: with the lifetime it gives the paper's survival of 99.55 %)",
+    )
+    imaging_loss_exposure: PositiveDuration = Field(
+        default=45e-3, description="exposure that the imaging loss belongs to (paper)"
+    )
+    transport_loss: Fraction = Field(
+        default=0.0188,
+        description="mean loss of an atom that is picked up, moved and dropped (derived: gives about the "
+        "paper's filling of 97.66 % after one cycle at a degree of parallelism of 7)",
+    )
+    transport_loss_per_tone: Fraction = Field(
+        default=0.0,
+        description="added to it for each tone on beyond one per axis (ours; the paper sees more loss with "
+        "more tones and gives no number)",
+    )
+    transport_loss_spread: NonNegativeFloat = Field(
+        default=0.5,
+        description="spread of the transport loss from shot to shot: s.d. of the logarithm of a log-normal "
+        "factor with mean 1 (ours: independent losses would leave a third of the paper's defect-free shots "
+        "after one cycle)",
+    )
+    depth_disorder: Fraction = Field(
+        default=0.04, description="relative s.d. of the static tweezers' depths, fixed for a seed (paper)"
+    )
+    lost_below_depth: Fraction = Field(
+        default=0.1,
+        description="fraction of the nominal depth below which a static tweezer loses its atom and loads "
+        "none (ours)",
+    )
+    site_tolerance: float = Field(
+        default=0.25,
+        gt=0,
+        lt=0.5,
+        description="distance, in sites along each axis, within which a mobile tweezer is on a site, "
+        "hits the atom there, and is the same tweezer in the next segment (ours: the waist is 0.22 sites)",
+    )
+    on_amplitude: float = Field(
+        default=1e-3,
+        gt=0,
+        lt=1,
+        description="amplitude, as a fraction of full scale, above which a tone makes light (ours)",
+    )
+    image: ImageSettings = Field(default=ImageSettings(), description="what the camera sees")
+
+
+class CameraFaults(Settings):
+    """Failures to rehearse; none by default."""
+
+    transient: Fraction = Field(
+        default=0.0,
+        description="probability that a frame is lost with an error that a repeated shot may mend",
+    )
+    missed_trigger: Fraction = Field(
+        default=0.0, description="probability that a trigger is not seen, so that no frame comes"
+    )
+
+
+class CameraSettings(Settings):
+    """The virtual camera; what it sees is set in the simulation."""
+
+    readout: Duration = Field(
+        default=5e-3, description="time from the end of an exposure until its frame can be read (ours)"
+    )
+    max_exposure: PositiveDuration = Field(default=10.0, description="longest exposure (ours)")
+    faults: CameraFaults = Field(default=CameraFaults(), description="failures to rehearse")
+
+
+class StaticTweezersSettings(Settings):
+    """The virtual static tweezers."""
+
+    max_depth: PositiveFloat = Field(
+        default=1.5, description="greatest depth, as a fraction of the nominal depth (ours)"
+    )
+    max_amplitude_sum: PositiveFloat = Field(
+        default=1.0,
+        description="greatest sum of the tones' amplitudes on an axis, as a fraction of full scale",
+    )
+
+
+class MobileTweezersSettings(Settings):
+    """The virtual mobile tweezers."""
+
+    band_centre: Frequency = Field(default=100e6, description="middle of the AOD's band (ours)")
+    band_half_width: Annotated[Frequency, Field(gt=0)] = Field(
+        default=18e6, description="reach of the AOD's band to each side (ours: about 36 MHz in all)"
+    )
+    max_amplitude_sum: PositiveFloat = Field(
+        default=1.0,
+        description="greatest sum of the tones' amplitudes on an axis, as a fraction of full scale: above "
+        "it the output clips",
+    )
+
+
+class DeviceSettings(Settings):
+    """A virtual instrument; also the stand-in for one whose driver is missing."""
+
+    commands: tuple[str, ...] = Field(
+        default=(), description="names of the commands that it knows; none: it accepts every command"
+    )
+    values: dict[str, bool | int | float | str] = Field(
+        default={}, description="values that it can be asked for: name -> value at the start"
+    )

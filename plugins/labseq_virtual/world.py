@@ -1,0 +1,218 @@
+"""The simulated world: one seeded array of atoms that all virtual hardware acts on."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq import Context, DepthRamp, DeviceError, Frame, LimitError, Occupancy, ToneProgram
+from labseq.imaging import site_pixels
+from labseq_virtual import emccd
+from labseq_virtual.settings import WorldSettings
+from labseq_virtual.transport import Transport
+
+ROUNDING_S: Final = 1e-6
+"""How far into the past an event may lie because sums of times were rounded."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Playing:
+    """A program on its way."""
+
+    program: ToneProgram
+    t_start_s: float
+
+    @property
+    def t_end_s(self) -> float:
+        return self.t_start_s + self.program.total_duration_s
+
+
+class World:
+    """Atoms in static tweezers, what light does to them, and what a camera sees of it.
+
+    Implements ``labseq.Simulation`` and ``labseq.TruthTeller``. Events come in the
+    order of time. A program of the mobile tweezers is carried out when it has
+    ended, or as far as it came when another program takes its place: playing a
+    program without segments cuts it short, and atoms in flight are lost. A ramp of
+    the static tweezers that comes during a program or an exposure acts at its end.
+
+    Args:
+        settings: Every constant of the model.
+        context: Grid, clock and random numbers.
+    """
+
+    def __init__(self, settings: WorldSettings, context: Context) -> None:
+        self._settings = settings
+        self._name = context.name or "simulation"
+        self._grid = context.grid
+        self._random = context.random
+        self._transport = Transport(context.grid, settings)
+        image = settings.image
+        self._pixels = site_pixels(context.grid, image.pixel_size, image.centre_px, image.angle)
+        self._imaging_rate_hz = -math.log1p(-settings.imaging_loss) / settings.imaging_loss_exposure
+        self._is_open = False
+        self._site_depth: NDArray[np.float64] = np.ones(context.grid.shape)
+        self._depth = 0.0
+        self._occupied: Occupancy = np.zeros(context.grid.shape, np.bool_)
+        self._now_s = -math.inf
+        self._playing: _Playing | None = None
+        self._loss_factor = 1.0
+
+    def open(self) -> None:
+        """Draw the machine's own disorder; no atoms, static tweezers off."""
+        disorder = self._random.machine().standard_normal(self._grid.shape)
+        self._site_depth = np.maximum(0.0, 1.0 + self._settings.depth_disorder * disorder)
+        self._is_open = True
+        self._depth = 0.0
+        self._forget()
+
+    def close(self) -> None:
+        """Forget everything."""
+        self._is_open = False
+        self._depth = 0.0
+        self._forget()
+
+    def begin_shot(self) -> None:
+        """Remove all atoms and draw the shot's factor on the transport loss."""
+        self._check_open()
+        self._forget()
+        spread = self._settings.transport_loss_spread
+        self._loss_factor = math.exp(spread * self._random.shot.standard_normal() - spread**2 / 2)
+
+    def load(self, t_start_s: float, duration_s: float) -> None:
+        """Load every site whose static tweezer is on.
+
+        A site is loaded afresh with the probability 1 - exp(-duration / loading_time)
+        and then holds an atom with the probability ``loading``; else it stays as it was.
+
+        Raises:
+            DeviceError: The world is further in time already.
+        """
+        self._advance(t_start_s, "loading")
+        afresh = -math.expm1(-duration_s / self._settings.loading_time)
+        draws = self._random.shot.random((2, *self._grid.shape))
+        reloaded = (draws[0] < afresh) & self._holds()
+        self._occupied = np.where(reloaded, draws[1] < self._settings.loading, self._occupied)
+        self._now_s = t_start_s + duration_s
+
+    def play(self, role: str, signal: ToneProgram | DepthRamp, t_start_s: float) -> None:
+        """Let a device's output act on the atoms, from ``t_start_s`` on.
+
+        Raises:
+            DeviceError: The world is further in time already, or the role does not
+                play such a signal.
+        """
+        self._check_open()
+        if role == "mobile_tweezers" and isinstance(signal, ToneProgram):
+            self._play_tones(signal, t_start_s)
+        elif role == "static_tweezers" and isinstance(signal, DepthRamp):
+            self._play_ramp(signal, t_start_s)
+        else:
+            raise DeviceError(
+                self._name,
+                f"'{role}' played a {type(signal).__name__}; expected 'mobile_tweezers' with a ToneProgram "
+                "or 'static_tweezers' with a DepthRamp",
+            )
+
+    def expose(self, t_start_s: float, exposure_s: float) -> Frame:
+        """Take a frame; the imaging light heats some atoms out, and they shine until they are lost.
+
+        Raises:
+            DeviceError: The world is further in time already.
+            LimitError: The exposure is not longer than 0.
+        """
+        if not exposure_s > 0:
+            raise LimitError("the exposure", f"{exposure_s} s", "more than 0")
+        self._advance(t_start_s, "an exposure")
+        rng = self._random.shot
+        row, col = np.nonzero(self._occupied)
+        loss_rate_hz = self._imaging_rate_hz + 1.0 / self._settings.lifetime
+        life_s = rng.exponential(1.0 / loss_rate_hz, len(row))
+        shining = np.minimum(life_s / exposure_s, 1.0)
+        image = emccd.render(self._settings.image, self._pixels[row, col], shining, exposure_s, rng)
+        image.flags.writeable = False
+        lost = life_s < exposure_s
+        self._occupied[row[lost], col[lost]] = False
+        self._now_s = t_start_s + exposure_s
+        return Frame(image, exposure_s, t_start_s)
+
+    def truth(self) -> Occupancy:
+        """The true occupancy now, bool (n_rows, n_cols); after the program that is on its way."""
+        self._finish_program()
+        return self._occupied.copy()
+
+    def describe(self) -> Mapping[str, Any]:
+        """Every constant of the model, in SI, and the seed of its disorder."""
+        return {
+            "model": "labseq_virtual",
+            "seed": self._random.seed,
+            **self._settings.model_dump(mode="json"),
+        }
+
+    def _play_tones(self, program: ToneProgram, t_start_s: float) -> None:
+        self._finish_program(t_start_s)
+        if program.n_segments == 0:  # silence: legal at any time, it makes safe
+            return
+        self._advance(t_start_s, "a program of the mobile tweezers")
+        self._playing = _Playing(program, t_start_s)
+
+    def _play_ramp(self, ramp: DepthRamp, t_start_s: float) -> None:
+        self._finish_program()
+        self._advance(max(t_start_s, self._now_s), "a ramp of the static tweezers")
+        for depth in (ramp.start, ramp.end):
+            self._depth = depth
+            self._occupied &= self._holds()
+        self._now_s += ramp.duration_s
+
+    def _finish_program(self, until_s: float = math.inf) -> None:
+        """Carry out the program on its way, as far as it comes until a time."""
+        if self._playing is None:
+            return
+        program, t_start_s, t_end_s = self._playing.program, self._playing.t_start_s, self._playing.t_end_s
+        self._playing = None
+        segment_end_s = t_start_s + np.cumsum(program.duration_s)
+        n_played = int(np.searchsorted(segment_end_s, until_s + ROUNDING_S, side="right"))
+        self._transport.carry(self._occupied, program, n_played, self._random.shot, self._loss_factor)
+        self._let_pass(max(t_start_s, min(t_end_s, until_s)))
+
+    def _advance(self, t_s: float, what: str) -> None:
+        """Let time pass until an event."""
+        self._check_open()
+        if self._playing is not None and t_s >= self._playing.t_end_s - ROUNDING_S:
+            self._finish_program()
+        busy_until_s = self._now_s if self._playing is None else self._playing.t_end_s
+        if t_s < busy_until_s - ROUNDING_S:
+            raise DeviceError(
+                self._name,
+                f"{what} at {t_s:.6f} s, but what came before it lasts until {busy_until_s:.6f} s; "
+                "wait for its end (mobile_tweezers.wait, camera.read) first",
+            )
+        self._let_pass(t_s)
+
+    def _let_pass(self, t_s: float) -> None:
+        """Let atoms be lost to the vacuum, at the rate of the lifetime."""
+        elapsed_s = max(0.0, t_s - self._now_s)
+        self._now_s = max(self._now_s, t_s)
+        if not self._occupied.any():  # also before the first event, when the time since the last is infinite
+            return
+        stays = math.exp(-elapsed_s / self._settings.lifetime)
+        self._occupied &= self._random.shot.random(self._grid.shape) < stays
+
+    def _holds(self) -> NDArray[np.bool_]:
+        """Which static tweezers are deep enough to hold an atom, bool (n_rows, n_cols)."""
+        return self._depth * self._site_depth >= self._settings.lost_below_depth
+
+    def _forget(self) -> None:
+        self._occupied = np.zeros(self._grid.shape, np.bool_)
+        self._playing = None
+        self._now_s = -math.inf
+        self._loss_factor = 1.0
+
+    def _check_open(self) -> None:
+        if not self._is_open:
+            raise DeviceError(self._name, "the simulated world is not open; call open() first")

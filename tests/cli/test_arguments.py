@@ -1,0 +1,32 @@
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from labseq.cli.arguments import arrange
+
+
+@pytest.mark.parametrize(
+    ("given_arguments", "expected"),
+    [
+        (["run", "a.yaml", "--dry-run"], ["run", "a.yaml", "--dry-run=full"]),
+        (["run", "--dry-run", "a.yaml"], ["run", "--dry-run=full", "a.yaml"]),
+        (["run", "--dry-run=fast", "a.yaml"], ["run", "--dry-run=fast", "a.yaml"]),
+        (["run", "a.yaml", "--debug"], ["--debug", "run", "a.yaml"]),
+        (["--debug", "run", "--debug"], ["--debug", "run"]),
+        (["show", "--", "--dry-run", "--debug"], ["show", "--", "--dry-run", "--debug"]),
+        ([], []),
+    ],
+)
+def test_arrange(given_arguments: list[str], expected: list[str]) -> None:
+    assert arrange(given_arguments) == expected
+
+
+@given(st.lists(st.sampled_from(["run", "a.yaml", "--dry-run", "--debug", "--", "--set", "x=1"])))
+def test_arranging_twice_changes_nothing_more(arguments: list[str]) -> None:
+    once = arrange(arguments)
+    assert arrange(once) == once
+
+
+@given(st.lists(st.text(max_size=5).filter(lambda text: text not in {"--dry-run", "--debug"})))
+def test_other_arguments_pass_as_they_are(arguments: list[str]) -> None:
+    assert arrange(arguments) == arguments

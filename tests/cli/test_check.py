@@ -1,0 +1,53 @@
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from labseq.cli.check import BAR_WIDTH, timeline_table
+from labseq.model import TimelineEntry
+
+TIMELINE = [
+    ("load", [TimelineEntry("load", 0.5, 0.5)]),
+    ("image", [TimelineEntry("image", 0.045, 0.045, 1)]),
+    (
+        "sort",
+        [TimelineEntry("cycle 1: move", 0.06, 0.06), TimelineEntry("cycle 1: image", 0.045, 0.045, 1)],
+    ),
+    ("device", [TimelineEntry("shutter: open", 0.0, 0.0)]),
+]
+
+
+def test_timeline_table() -> None:
+    assert timeline_table(TIMELINE, "#") == [
+        "step                       start  at most",
+        "0 load                       0 s   500 ms  " + "#" * 23,
+        "1 image                   500 ms    45 ms  " + " " * 23 + "##",
+        "2 sort    cycle 1: move   545 ms    60 ms  " + " " * 25 + "###",
+        "          cycle 1: image  605 ms    45 ms  " + " " * 28 + "##",
+        "3 device  shutter: open   650 ms      0 s  " + " " * 29 + "#",
+    ]
+
+
+@given(st.lists(st.floats(0, 1e3), min_size=1, max_size=30))
+def test_bars_follow_one_another_and_stay_in_their_column(durations_s: list[float]) -> None:
+    bars = [TimelineEntry("bar", duration_s, duration_s) for duration_s in durations_s]
+    lines = timeline_table([("step", bars)], "#")[1:]
+    column = max(line.find("#") for line in lines)
+    if not sum(durations_s):
+        assert column == -1
+        return
+    first = min(line.index("#") for line in lines)
+    assert all(len(line) - first <= BAR_WIDTH for line in lines)
+    starts = [line.index("#") for line in lines]
+    assert starts == sorted(starts)
+
+
+def test_a_timeline_of_no_length() -> None:
+    assert timeline_table([("x", [TimelineEntry("x", 0.0, 0.0)])], "#")[1].split() == [
+        "0",
+        "x",
+        "0",
+        "s",
+        "0",
+        "s",
+    ]

@@ -1,0 +1,65 @@
+import pytest
+
+from labseq.cli.failures import exit_code_of, lines_of, report
+from labseq.errors import (
+    ConfigError,
+    DeviceTimeoutError,
+    LabseqError,
+    PlanError,
+    Problem,
+    RecordingError,
+    StopRequested,
+    UnknownPluginError,
+)
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (ConfigError("wrong"), 2),
+        (UnknownPluginError("planner", "x"), 2),
+        (DeviceTimeoutError("camera", "silent", 1.0), 3),
+        (PlanError("no plan"), 1),
+        (RecordingError("x", "full"), 1),
+        (LabseqError("other"), 1),
+        (StopRequested(2), 130),
+        (StopRequested(15), 143),
+        (KeyboardInterrupt(), 130),
+        (ZeroDivisionError("by zero"), 1),
+    ],
+)
+def test_exit_codes(error: BaseException, code: int) -> None:
+    assert exit_code_of(error) == code
+
+
+def test_problems_start_with_their_place() -> None:
+    error = ConfigError(
+        [
+            Problem("unknown key 'shot'", "a.yaml", 3, 5, "one of 'shots'", "did you mean 'shots'?"),
+            Problem("no such address", "--set a.b=1"),
+            Problem("no place at all"),
+        ]
+    )
+    assert lines_of(error) == [
+        "a.yaml:3:5: unknown key 'shot'; expected one of 'shots'; did you mean 'shots'?",
+        "--set a.b=1: no such address",
+        "error: no place at all",
+    ]
+
+
+def test_an_internal_error_says_how_to_report_it(capsys: pytest.CaptureFixture[str]) -> None:
+    assert report(KeyError("lost")) == 1
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err == "internal error: KeyError: 'lost'; please report it; run again with --debug to see where\n"
+
+
+@pytest.mark.parametrize("debug", [False, True])
+def test_only_debug_shows_the_traceback(debug: bool, capsys: pytest.CaptureFixture[str]) -> None:
+    try:
+        raise PlanError("no plan")
+    except PlanError as error:
+        report(error, debug=debug)
+    err = capsys.readouterr().err
+    assert ("Traceback" in err) is debug
+    assert err.endswith("error: no plan\n")

@@ -1,0 +1,123 @@
+from __future__ import annotations
+
+import io
+import math
+from typing import Any
+
+import pytest
+
+from labseq.cli.log_lines import LogLines
+from labseq.cli.notice import PATIENCE_S, Notice
+from labseq.cli.telling import tell
+
+
+class HandTimer:
+    """A timer that runs out when it is told to."""
+
+    def __init__(self, delay_s: float, call: Any) -> None:
+        self.delay_s = delay_s
+        self.run_out = call
+        self.state = "new"
+
+    def start(self) -> None:
+        self.state = "started"
+
+    def cancel(self) -> None:
+        self.state = "cancelled"
+
+
+def lines_of(events: Any) -> list[str]:
+    stream = io.StringIO()
+    log = LogLines(stream)
+    for name, values in events:
+        log.event(name, values)
+    log.close()
+    return stream.getvalue().splitlines()
+
+
+def test_a_run_in_lines(fake: Any) -> None:
+    assert lines_of(fake.script(fake.run())) == [
+        "data/2026-01-02/0001_compact-225: 20 shots, seed 1, profile virtual, simulated",
+        "shot 1/20  defect-free in cycle 2  filling 100.0 %  1.9 s",
+        "shot 2/20  defect-free in cycle 2  filling 100.0 %  1.9 s",
+    ]
+
+
+def test_what_goes_wrong_is_told(fake: Any) -> None:
+    failed = fake.shot(status="failed", error="TransientError: no light", attempt=1)
+    events = [
+        ("warning", {"text": "the laser is warm"}),
+        ("shot_repeated", {"shot": failed}),
+        ("shot_finished", {"shot": failed}),
+        ("safe_state", {"device": "camera", "ok": True, "error": ""}),
+        ("safe_state", {"device": "camera", "ok": False, "error": "camera: mute"}),
+        ("closed", {"device": "shutter", "ok": False, "error": "shutter: jammed"}),
+        ("something_new", {}),
+    ]
+    assert lines_of(events) == [
+        "warning: the laser is warm",
+        "shot 1: attempt 2 failed, once more: TransientError: no light",
+        "shot 1  failed: TransientError: no light",
+        "warning: camera could not be brought to its safe state: camera: mute",
+        "warning: shutter could not be closed: shutter: jammed",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"success": True, "seen": 0}, "defect-free  filling 100.0 %"),
+        (
+            {"success": False, "seen": 4, "filling": 223 / 225},
+            "2 defects (defect-free in cycle 4)  filling 99.1 %",
+        ),
+        ({"success": False, "seen": 0, "filling": 224 / 225}, "1 defect  filling 99.6 %"),
+        ({"success": False, "seen": 0, "filling": 1.0}, "surplus atoms  filling 100.0 %"),
+        ({"success": False, "seen": 0, "filling": math.nan}, "not judged: no image"),
+    ],
+)
+def test_a_shot_in_words(fake: Any, changes: Any, words: str) -> None:
+    text = tell("shot_finished", {"shot": fake.shot(2, **changes)}, fake.run())
+    assert text == f"shot 3/20  {words}  1.9 s"
+
+
+def test_a_shot_that_was_interrupted_needs_no_reason(fake: Any) -> None:
+    shot = fake.shot(0, status="interrupted", error="StopRequested: stopped by Ctrl-C")
+    assert tell("shot_finished", {"shot": shot}, fake.run()) == "shot 1/20  interrupted"
+
+
+def test_missing_atoms_are_told(fake: Any) -> None:
+    shot = fake.shot(0, success=False, seen=0, filling=0.9)
+    shot.n_missing_atoms = 3
+    assert "3 atoms too few loaded" in tell("shot_finished", {"shot": shot}, fake.run())
+
+
+def test_a_window_that_was_too_short(fake: Any) -> None:
+    values = {"shot": 0, "cycle": 2, "n_batches": 40, "n_batches_played": 12}
+    assert tell("window_too_short", values, fake.run()) == "shot 1, cycle 2: 12 of 40 batches fit the window"
+
+
+def test_only_what_takes_long_is_announced() -> None:
+    said: list[str] = []
+    timers: list[HandTimer] = []
+    now = 0.0
+
+    def make_timer(delay_s: float, call: Any) -> HandTimer:
+        timers.append(HandTimer(delay_s, call))
+        return timers[-1]
+
+    log = LogLines(io.StringIO(), Notice(said.append, lambda: now, make_timer))
+    log.event("warming", {"part": "motion"})
+    assert (timers[0].delay_s, timers[0].state) == (PATIENCE_S, "started")
+    log.event("warming", {"part": "planner"})
+    assert timers[0].state == "cancelled"
+    assert said == []
+    timers[1].run_out()
+    assert len(said) == 1
+    assert said[0].startswith("preparing planner ... (the first run")
+    now = 12.34
+    log.event("warmed", {})
+    assert said[1:] == ["preparing planner took 12.3 s"]
+    log.close()
+    assert len(said) == 2
+    assert timers[1].state == "cancelled"

@@ -1,0 +1,202 @@
+"""``labseq run`` around a session that is made up; tests/system has real ones."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from labseq.cli.run import run_sequence
+from labseq.errors import ConfigError, DeviceError, Problem, StopRequested
+from labseq.recording import RunWriter
+from labseq.session import Options
+
+NOTHING = {"run_dir": None, "shots": 0, "defect_free": None, "filling_fraction": None}
+
+
+class FakeSession:
+    """Records what it was opened with; takes the shots that it was given and then fails, if told to."""
+
+    def __init__(self, root: Path, run: Any, shots: Any, error: BaseException | None = None) -> None:
+        self.root, self.record, self.shots, self.error = root, run, shots, error
+        self.run_dir: Path | None = None
+        self.given: dict[str, Any] = {}
+        self.closed = False
+
+    def open(self, sequence: Path, **given: Any) -> FakeSession:
+        self.given = given
+        if isinstance(self.error, ConfigError):
+            raise self.error
+        return self
+
+    def __enter__(self) -> FakeSession:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.closed = True
+
+    def run(self) -> None:
+        observer = self.given["observer"]
+        print("a plugin prints")
+        os.write(1, b"a C library prints\n")
+        writer = RunWriter.create(self.root, self.record)
+        self.run_dir = writer.run_dir
+        observer.event("run_starting", {"record": self.record, "run_dir": str(self.run_dir)})
+        for shot in self.shots:
+            writer.write_shot(shot)
+            observer.event("shot_finished", {"shot": shot})
+        stopped = isinstance(self.error, StopRequested)
+        writer.finish(
+            "complete" if self.error is None else "stopped" if stopped else "failed", str(self.error or "")
+        )
+        if self.error is not None:
+            raise self.error
+
+
+@pytest.fixture
+def perform(fake: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: Any) -> Any:
+    """Run a made-up session; returns it, stdout, stderr and the error."""
+
+    def run(error: BaseException | None = None, *, as_json: bool = True, options: Any = None) -> Any:
+        shots = [fake.shot(0), fake.shot(1, success=False, seen=1, filling=224 / 225)]
+        session = FakeSession(tmp_path, fake.run(n_shots=2), shots, error)
+        monkeypatch.setattr("labseq.cli.run.Session", session)
+        monkeypatch.setattr(sys, "stdout", sys.stdout)  # given back at the end
+        caught: BaseException | None = None
+        try:
+            run_sequence(Path("a.yaml"), options or Options(), as_json=as_json)
+        except BaseException as failure:  # noqa: BLE001 - the tests look at it
+            caught = failure
+        return session, *capfd.readouterr(), caught
+
+    return run
+
+
+def test_json_is_alone_on_stdout(perform: Any) -> None:
+    session, out, err, caught = perform()
+    assert caught is None
+    assert json.loads(out) == {
+        "run_dir": str(session.run_dir),
+        "shots": 2,
+        "defect_free": 0.5,
+        "filling_fraction": pytest.approx(449 / 450),
+        "status": "complete",
+    }
+    assert out.count("\n") == 1
+    assert "a plugin prints\n" in err
+    assert "a C library prints\n" in err
+    assert "shot 2/2" in err
+    assert session.closed
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "text"),
+    [
+        (StopRequested(15), "stopped", "stopped by SIGTERM"),
+        (KeyboardInterrupt(), "stopped", "stopped by Ctrl-C"),
+        (DeviceError("camera", "mute"), "failed", "error: camera: mute"),
+        (
+            MemoryError(),
+            "failed",
+            "internal error: MemoryError; please report it; run again with --debug to see where",
+        ),
+    ],
+)
+def test_json_of_a_run_that_ended_early(perform: Any, error: BaseException, status: str, text: str) -> None:
+    session, out, _, caught = perform(error)
+    assert caught is error
+    answer = json.loads(out)
+    assert (answer["shots"], answer["status"], answer["error"]) == (2, status, text)
+    assert answer["run_dir"] == str(session.run_dir)
+    assert session.closed
+
+
+def test_json_of_a_run_that_never_began(perform: Any) -> None:
+    problems = [Problem("unknown key", "a.yaml", 1, 2), Problem("wrong", "a.yaml", 3, 4)]
+    _, out, _, caught = perform(ConfigError(problems))
+    assert isinstance(caught, ConfigError)
+    assert json.loads(out) == {
+        **NOTHING,
+        "status": "failed",
+        "error": "a.yaml:1:2: unknown key\na.yaml:3:4: wrong",
+    }
+
+
+def test_a_run_that_cannot_be_read_back(perform: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    def finish(writer: RunWriter, *_: object) -> None:
+        (writer.run_dir / "run.json").unlink()
+
+    monkeypatch.setattr(RunWriter, "finish", finish)
+    session, out, _, caught = perform(DeviceError("camera", "mute"))
+    assert isinstance(caught, DeviceError)
+    assert json.loads(out) == {
+        **NOTHING,
+        "run_dir": str(session.run_dir),
+        "status": "failed",
+        "error": "error: camera: mute",
+    }
+
+
+def test_for_people(perform: Any) -> None:
+    session, out, err, _ = perform(as_json=False)
+    assert err == ""
+    lines = out.splitlines()
+    assert lines[-7:] == [
+        f"run               {session.run_dir}",
+        "status            complete",
+        "shots             2 of 2",
+        "defect-free       1 of 2 (50.0 %)",
+        "seen defect-free  2 of 2 (100.0 %)",
+        "filling           99.78 %",
+        "duration          2 s",
+    ]
+    assert "shot 1/2  defect-free in cycle 2  filling 100.0 %  1.9 s" in lines
+
+
+def test_options_reach_the_session(perform: Any, tmp_path: Path) -> None:
+    options = Options("lab", 3, 7, ("a.b=1", "c=2"), tmp_path, "fast", realtime=True)
+    session, *_ = perform(options=options)
+    given = {name: value for name, value in session.given.items() if name != "observer"}
+    assert given == {
+        "profile": "lab",
+        "shots": 3,
+        "seed": 7,
+        "overrides": ("a.b=1", "c=2"),
+        "output": tmp_path,
+        "dry_run": "fast",
+        "realtime": True,
+    }
+
+
+def test_a_broken_screen_does_not_hide_the_outcome(perform: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(_: object) -> None:
+        raise OSError("no screen")
+
+    monkeypatch.setattr("labseq.cli.log_lines.LogLines.close", fail)
+    _, out, _, caught = perform()
+    assert caught is None
+    assert json.loads(out)["status"] == "complete"
+
+
+LATE_PRINTS = """
+import atexit, ctypes, ctypes.util, sys
+from labseq.cli.output import divert_stdout, say
+answer = divert_stdout()
+atexit.register(print, "said at the end")
+library = ctypes.CDLL(None)
+library.puts(b"buffered by the C library until the process ends")
+answer("the answer")
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="finds the C library as Unix does")
+def test_what_is_printed_late_does_not_follow_the_answer() -> None:
+    done = subprocess.run([sys.executable, "-c", LATE_PRINTS], capture_output=True, text=True, check=True)
+    assert done.stdout == "the answer\n"
+    assert "said at the end" in done.stderr
+    assert "buffered by the C library" in done.stderr

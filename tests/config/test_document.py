@@ -1,0 +1,146 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from labseq.config import Document
+from labseq.errors import ConfigError
+
+TEXT = """\
+shots: 20
+planner: {use: psca}
+shot:
+  - load:
+  - name: sort
+    rearrange: {cycles: 2, window: [1, 2]}
+empty:
+"""
+
+
+@pytest.fixture
+def document() -> Document:
+    return Document.parse(TEXT, "f.yaml")
+
+
+def said(error: pytest.ExceptionInfo[ConfigError]) -> str:
+    return str(error.value)
+
+
+def test_fields(document: Document) -> None:
+    assert document.path == Path("f.yaml")
+    assert document.name == "f.yaml"
+    assert document.text == TEXT
+    assert document.data["planner"] == {"use": "psca"}
+    assert document.get(("shot", 1, "rearrange", "window", 1)) == 2
+    assert document.get(("shot", 2), "none") == "none"
+
+
+def test_problem_and_error(document: Document) -> None:
+    problem = document.problem(
+        ("planner", "use"), "no such planner", "another", "did you mean 'lsap'?", key=True
+    )
+    assert str(problem) == "f.yaml:2:11: no such planner; expected another; did you mean 'lsap'?"
+    assert str(document.error(("planner", "use"), "no such planner")) == "f.yaml:2:16: no such planner"
+
+
+@pytest.mark.parametrize(
+    ("address", "value", "expected"),
+    [
+        ("shots", "5", {"shots": 5}),
+        ("shots", "'5'", {"shots": "5"}),
+        ("shots", "", {"shots": None}),
+        ("shots", "45 ms", {"shots": "45 ms"}),
+        ("new", "[1, {a: b}]", {"new": [1, {"a": "b"}]}),
+        ("planner.degree_of_parallelism", "7", {"planner": {"use": "psca", "degree_of_parallelism": 7}}),
+        ("planner", "{use: lsap}", {"planner": {"use": "lsap"}}),
+        ("empty.within", "1", {"empty": {"within": 1}}),
+    ],
+)
+def test_override(document: Document, address: str, value: str, expected: dict[str, Any]) -> None:
+    changed = document.override(address, value, "--set")
+    assert changed.data == document.data | expected
+    assert changed.text == TEXT
+    assert document.data == Document.parse(TEXT, "f.yaml").data
+
+
+@pytest.mark.parametrize("address", ["shot.1.rearrange.window", "shot.sort.window"])
+def test_override_of_a_step(document: Document, address: str) -> None:
+    changed = document.override(address, "40 ms", "--set")
+    assert changed.get(("shot", 1)) == {"name": "sort", "rearrange": {"cycles": 2, "window": "40 ms"}}
+
+
+def test_override_of_an_empty_step_and_of_a_list_item(document: Document) -> None:
+    changed = document.override("shot.0.load.duration", "1 s", "--set").override(
+        "shot.sort.window.1", "9", "--set"
+    )
+    assert changed.get(("shot", 0)) == {"load": {"duration": "1 s"}}
+    assert changed.get(("shot", 1, "rearrange", "window")) == [1, 9]
+
+
+def test_problems_of_an_override_name_the_option(document: Document) -> None:
+    changed = document.override("planner.use", "x", "--set planner.use=x")
+    assert str(changed.problem(("planner", "use"), "wrong")) == "--set planner.use=x: wrong"
+    assert str(changed.problem(("planner", "use", "deeper"), "wrong")) == "--set planner.use=x: wrong"
+    assert changed.locate(("planner", "use")) == (0, 0)
+    # The key stands in the file, and so does everything around it.
+    assert str(changed.problem(("planner",), "wrong")) == "f.yaml:2:10: wrong"
+    assert str(changed.problem(("shot", 1, "name"), "wrong")) == "f.yaml:5:11: wrong"
+
+
+def test_key_that_an_option_adds_is_the_option_s(document: Document) -> None:
+    changed = document.override("empty.a", "{b: 1}", "--set empty.a={b: 1}")
+    assert str(changed.problem(("empty", "a"), "unknown", key=True)) == "--set empty.a={b: 1}: unknown"
+    assert str(changed.problem(("empty", "a", "b"), "unknown", key=True)) == "--set empty.a={b: 1}: unknown"
+    assert str(changed.problem(("empty",), "unknown", key=True)) == "f.yaml:7:1: unknown"
+
+
+def test_missing_parents_are_made_where_allowed(document: Document) -> None:
+    changed = document.override("timeouts.call", "3", "--set", may_add=["timeouts"])
+    assert changed.data["timeouts"] == {"call": 3}
+    with pytest.raises(ConfigError):
+        document.override("timeouts.call", "3", "--set", may_add=["other"])
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        ("[1", "o: the '[' that opens here is never closed; expected ',' or ']'"),
+        ("a: b", "o: this is YAML of several lines; expected one value: 5, '45 ms', [a, b] or {key: value}"),
+        ("- a", "o: this is YAML of several lines; expected one value: 5, '45 ms', [a, b] or {key: value}"),
+        ("{a: 1, a: 2}", "o: 'a' is given twice; remove one of them"),
+        ("!!str x", "o: '!!str' is a YAML tag, which is not allowed; expected a plain value; "),
+        ("\udcb5", "o: a byte that is not UTF-8; expected plain text; delete it"),
+    ],
+)
+def test_override_that_is_no_value(document: Document, value: str, message: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        document.override("shots", value, "o")
+    assert said(caught).startswith(message)
+
+
+def test_all_wrong_overrides_are_reported(document: Document) -> None:
+    with pytest.raises(ConfigError) as caught:
+        document.override_all([("a.b", "1"), ("shots", "5"), ("shots", "{")])
+    assert said(caught).split("\n") == [
+        "--set a.b=1: there is no 'a' in f.yaml; expected one of shots, planner, shot, empty",
+        "--set shots={: the '{' that opens here is never closed; expected ',' or '}'",
+    ]
+
+
+plain_text = st.text(st.characters(min_codepoint=32, max_codepoint=0x2FFF, exclude_categories=["C", "Z"]))
+json_values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | plain_text,
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(plain_text, inner, max_size=3),
+    max_leaves=10,
+)
+
+
+@given(st.dictionaries(plain_text, json_values, max_size=4))
+def test_json_is_yaml(data: dict[str, Any]) -> None:
+    text = json.dumps(data, ensure_ascii=False)
+    assert json.dumps(Document.parse(text, "f.json").data) == json.dumps(data)

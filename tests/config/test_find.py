@@ -1,0 +1,93 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from labseq.config import Document, find, find_profile, packaged_profiles_dir
+from labseq.errors import ConfigError
+
+
+@pytest.fixture(autouse=True)
+def shelves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The three places where profiles are looked for."""
+    for folder in ("sequences", "hardware_profiles", "packaged"):
+        (tmp_path / folder).mkdir()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(find, "packaged_profiles_dir", lambda: tmp_path / "packaged")
+    return tmp_path
+
+
+def refusal(name: str, named_in: Document | None = None) -> str:
+    with pytest.raises(ConfigError) as caught:
+        find_profile(name, Path("sequences"), named_in=named_in)
+    return str(caught.value)
+
+
+def test_order_of_the_places(shelves: Path) -> None:
+    places = [shelves / "packaged", Path("hardware_profiles"), Path("sequences")]
+    for place in places:
+        (place / "lab.yaml").touch()
+        assert find_profile("lab", Path("sequences")) == place / "lab.yaml"
+
+
+def test_both_endings() -> None:
+    Path("hardware_profiles/lab.yml").touch()
+    assert find_profile("lab", Path("sequences")) == Path("hardware_profiles/lab.yml")
+
+
+@pytest.mark.parametrize("name", ["../mine/lab.yaml", "lab.yaml", "sub/lab.YML", "./lab.yaml"])
+def test_paths_are_relative_to_the_file_that_names_them(name: str) -> None:
+    path = Path("sequences") / name
+    path.parent.mkdir(exist_ok=True)
+    path.touch()
+    assert find_profile(name, Path("sequences")) == path
+
+
+def test_a_path_object_is_taken_as_it_is() -> None:
+    assert find_profile(Path("anything"), Path("sequences")) == Path("anything")
+
+
+def test_unknown_name(shelves: Path) -> None:
+    Path("hardware_profiles/lab.yaml").touch()
+    (shelves / "packaged" / "virtual.yaml").touch()
+    (shelves / "packaged" / "notes.txt").touch()
+    Path("sequences/other.yaml").touch()  # a sequence, most likely
+    places = f"sequences, hardware_profiles, {shelves / 'packaged'}"
+    expected = "expected one of lab, virtual; did you mean 'virtual'?"
+    assert refusal("virtul") == f"there is no hardware profile 'virtul' in {places}; {expected}"
+
+
+def test_place_of_the_name_is_told() -> None:
+    document = Document.parse("labseq: 1\nprofile: virtul\n", "s.yaml")
+    assert refusal("virtul", document).startswith("s.yaml:2:10: there is no hardware profile 'virtul' in ")
+    document = document.override("profile", "b.yaml", "--set profile=b.yaml")
+    Path("sequences/a.yaml").touch()
+    expected = f"there is no hardware profile at {Path('sequences') / 'b.yaml'}; did you mean 'a.yaml'?"
+    assert refusal("b.yaml", document) == f"--set profile=b.yaml: {expected}"
+
+
+@pytest.mark.parametrize("name", ["", "..", "a\0b", "x" * 5000, "~nobody-of-this-name/x.yaml", "\0/x.yaml"])
+def test_odd_names(name: str) -> None:
+    assert refusal(name).startswith("there is no hardware profile ")
+    assert refusal(name).isprintable()
+
+
+def test_folder_is_no_profile() -> None:
+    Path("sequences/lab.yaml").mkdir()
+    assert refusal("lab").startswith("there is no hardware profile 'lab'")
+
+
+def test_packaged_profiles() -> None:
+    folder = packaged_profiles_dir()
+    assert folder.name == "hardware_profiles"
+    assert folder.is_dir()
+
+
+def test_packaged_profiles_of_a_wheel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "hardware_profiles").rename(tmp_path / "elsewhere")
+    inside = tmp_path / "labseq" / "config" / "hardware_profiles"
+    monkeypatch.setattr(find, "__file__", str(inside.parent / "find.py"))
+    assert packaged_profiles_dir() == tmp_path.resolve() / "hardware_profiles"
+    inside.mkdir(parents=True)
+    assert packaged_profiles_dir() == inside.resolve()

@@ -1,0 +1,131 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from labseq.config import Override, SequenceSpec, StepSpec, load_sequence, plugin_paths
+from labseq.config.fields import PatternChoice
+from labseq.errors import ConfigError
+
+DATA = Path(__file__).parent / "data"
+SMALL = "labseq: 1\nname: s\nshots: 1\ntarget: {pattern: compact}\nshot: [{load: {}}]\n"
+
+
+def load(folder: Path, text: str, *overrides: Override | tuple[str, str]) -> SequenceSpec:
+    path = folder / "s.yaml"
+    path.write_text(text, encoding="utf-8")
+    return load_sequence(path, overrides)[1]
+
+
+def refusal(folder: Path, text: str, *overrides: Override | tuple[str, str]) -> str:
+    with pytest.raises(ConfigError) as caught:
+        load(folder, text, *overrides)
+    return str(caught.value).removeprefix(str(folder / "s.yaml"))
+
+
+def test_everything_in_it() -> None:
+    document, spec = load_sequence(DATA / "sequence.yaml")
+    assert spec.name == "compact-225"
+    assert spec.profile == "virtual"
+    assert spec.shots == 20
+    assert spec.seed == 7
+    assert spec.record_frames == "last"
+    assert spec.attempts == 2
+    assert (spec.target.use, spec.target.loc, spec.target.key) == ("compact", ("target",), "pattern")
+    assert (spec.planner.use, spec.planner.loc, spec.planner.key) == ("psca", ("planner",), "use")
+    assert spec.shot == (
+        StepSpec("load", "", ("shot", 0, "load")),
+        StepSpec("image", "", ("shot", 1, "image")),
+        StepSpec("rearrange", "sort", ("shot", 2, "rearrange")),
+        StepSpec("device", "", ("shot", 3, "device")),
+        StepSpec("wait", "", ("shot", 4, "wait")),
+        StepSpec("image", "", ("shot", 5, "image")),
+    )
+    assert [document.get(step.loc) is None for step in spec.shot] == [False] * 5 + [True]
+
+
+def test_defaults(tmp_path: Path) -> None:
+    spec = load(tmp_path, SMALL)
+    assert (spec.profile, spec.seed, spec.record_frames, spec.attempts) == ("virtual", None, "all", 3)
+    assert spec.plugin_folders == []
+    assert spec.planner.use == "psca"
+
+
+@pytest.mark.parametrize("planner", ["", "planner:\n"])
+def test_default_planner_can_be_set(tmp_path: Path, planner: str) -> None:
+    path = tmp_path / "s.yaml"
+    path.write_text(SMALL + planner, encoding="utf-8")
+    document, spec = load_sequence(path, [("planner.degree_of_parallelism", "3")])
+    assert document.get(spec.planner.loc) == {"use": "psca", "degree_of_parallelism": 3}
+
+
+@pytest.mark.parametrize("name", ["a", "Größe 3", "x_y-z.1", "原子", "e\u0301te\u0301", "n" * 80])
+def test_names(tmp_path: Path, name: str) -> None:
+    assert len(load(tmp_path, SMALL.replace("name: s", f"name: '{name}'")).name) <= 80
+
+
+@pytest.mark.parametrize(
+    "name", ["..", "a/b", "a\\\\b", "a:b", "a\\nb", "\u202ea", "_", " a", "a ", "a*", "\\0"]
+)
+def test_no_names(tmp_path: Path, name: str) -> None:
+    assert refusal(tmp_path, SMALL.replace("name: s", f'name: "{name}"')).startswith(":2:7: name is '")
+
+
+def test_plain_pairs_are_overrides(tmp_path: Path) -> None:
+    assert load(tmp_path, SMALL, ("shots", "5"), ("profile", "lab")).shots == 5
+
+
+def test_wrong_override_names_its_option(tmp_path: Path) -> None:
+    assert refusal(tmp_path, SMALL, ("shots", "0")) == "--set shots=0: shots is 0; expected at least 1"
+    assert refusal(tmp_path, SMALL, Override("shots", "0", "--shots 0")) == (
+        "--shots 0: shots is 0; expected at least 1"
+    )
+
+
+def test_wrong_value_is_mended_by_an_override(tmp_path: Path) -> None:
+    assert load(tmp_path, SMALL.replace("shots: 1", "shots: many"), ("shots", "2")).shots == 2
+
+
+def test_profile_in_place_of_a_sequence() -> None:
+    with pytest.raises(ConfigError, match=r":4:1: this is a hardware profile .* expected a sequence$"):
+        load_sequence(DATA / "profile.yaml")
+
+
+@pytest.mark.parametrize("version", ["1.0", "true", "'1'", "0", "[1]", ""])
+def test_no_version(tmp_path: Path, version: str) -> None:
+    message = refusal(tmp_path, SMALL.replace("labseq: 1", f"labseq: {version}"))
+    assert message.endswith("; expected 1, the version of the file format")
+    assert message.startswith(":1:9: labseq is " if version else ":1:8: labseq is empty")
+
+
+def test_only_the_newer_format_is_reported(tmp_path: Path) -> None:
+    assert refusal(tmp_path, "labseq: 2\nnew: 1\nshots: 0\n") == (
+        ":1:9: this file is written for a newer labseq: its format is 2, this labseq reads 1; update labseq"
+    )
+
+
+def test_all_problems_at_once(tmp_path: Path) -> None:
+    text = SMALL.replace("shots: 1", "shots: 0").replace("{load: {}}", "{load: 5}, {name: x}, {a: , b: }")
+    lines = refusal(tmp_path, text).split("\n")
+    assert [line.split(": ")[0][-4:] for line in lines] == [":3:8", "5:15", "5:19", "5:36"]
+
+
+def test_plugin_folders_are_beside_the_file(tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    path = tmp_path / "s.yaml"
+    path.write_text(SMALL + "plugin_folders: [mine, ~nobody-of-this-name, yours]\n", encoding="utf-8")
+    document, spec = load_sequence(path)
+    assert plugin_paths(document, ["mine"]) == [tmp_path / "mine"]
+    with pytest.raises(ConfigError) as caught:
+        plugin_paths(document, spec.plugin_folders)
+    first, second = caught.value.problems
+    assert (first.line, first.column) == (6, 24)
+    assert str(second) == (
+        f"{path}:6:46: there is no plugin folder 'yours'; expected a folder at {tmp_path / 'yours'}"
+    )
+
+
+def test_every_setting_is_described() -> None:
+    models = (SequenceSpec, PatternChoice)
+    assert all(field.description for model in models for field in model.model_fields.values())

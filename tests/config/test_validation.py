@@ -1,0 +1,260 @@
+# ruff: noqa: E501, RUF012 - messages stand here as they are printed; pydantic copies defaults
+
+from __future__ import annotations
+
+from datetime import date
+from enum import Enum
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import pytest
+from pydantic import Field
+
+from labseq.config import Document, Settings
+from labseq.config.settings import Duration, Fraction, Length
+from labseq.errors import ConfigError
+
+LENGTH = "a length such as '4.49 um' (m, mm, um, nm) or a plain number in m"
+TIME = "a time such as '45 ms' (s, ms, us, ns, min, h) or a plain number in s"
+
+
+class Colour(Enum):
+    RED = "red"
+    BLUE = "blue"
+
+
+class Inner(Settings):
+    width: Length = 1e-6
+    count: int = Field(default=1, ge=1, description="How many. And more")
+
+
+class Cat(Settings):
+    kind: Literal["cat"]
+    lives: int = 9
+
+
+class Dog(Settings):
+    kind: Literal["dog"]
+    tricks: list[str] = []
+
+
+class Model(Settings):
+    rows: int = Field(description="Rows of the block. Not columns")
+    fraction: Fraction = 0.5
+    exposure: Annotated[Duration, Field(gt=0, le=10)] = 0.1
+    on: bool = False
+    text: str = ""
+    colour: Colour = Colour.RED
+    pair: tuple[int, int] = (0, 0)
+    files: set[str] = set()
+    path: Path = Path()
+    inner: Inner = Inner()
+    many: list[Inner] = []
+    named: dict[str, Inner] = {}
+    by_number: dict[int, int] = {}
+    either: int | list[int] | None = None
+    window: Duration | tuple[Duration, ...] = 1.0
+    shape: Inner | Literal["none"] = "none"
+    pet: Annotated[Cat | Dog, Field(discriminator="kind")] | None = None
+    day: date | None = None
+    other: int = Field(default=0, alias="else", multiple_of=3, lt=10)
+
+
+def validate(text: str, **options: Any) -> Model:
+    document = Document.parse(f"plan:\n  rows: 1\n{text}", "f.yaml")
+    return document.validate(Model, ("plan",), **options)
+
+
+def problems(text: str, **options: Any) -> list[str]:
+    with pytest.raises(ConfigError) as caught:
+        validate(text, **options)
+    return [str(problem).removeprefix("f.yaml:") for problem in caught.value.problems]
+
+
+def test_good_settings() -> None:
+    model = validate(
+        "  fraction: 75 %\n  exposure: 3\n  pair: [1, 2]\n  files: [a]\n  path: x/y\n  colour: blue\n"
+        "  inner: {width: 4.49 um}\n  many: [{}, {count: 2}]\n  named: {a: {count: 3}}\n  either: [1]\n"
+        "  window: [60 ms, 0.1]\n  shape: none\n  pet: {kind: dog, tricks: [sit]}\n  else: 9\n  by_number: {'1': 2}"
+    )
+    assert model == Model.model_construct(
+        rows=1,
+        fraction=0.75,
+        exposure=3.0,
+        pair=(1, 2),
+        files={"a"},
+        path=Path("x/y"),
+        colour=Colour.BLUE,
+        inner=Inner(width=4.49e-6),
+        many=[Inner(), Inner(count=2)],
+        named={"a": Inner(count=3)},
+        by_number={1: 2},
+        either=[1],
+        window=(0.06, 0.1),
+        pet=Dog(kind="dog", tricks=["sit"]),
+        other=9,
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("  on: yes", ["3:7: on is 'yes'; expected true or false; did you mean true?"]),
+        ("  on: Off", ["3:7: on is 'Off'; expected true or false; did you mean false?"]),
+        ("  on: 1", ["3:7: on is 1; expected true or false"]),
+        ("  text: 2026", ["3:9: text is 2026; expected text; put it in quotes"]),
+        ("  text: [a]", ["3:9: text is a list; expected text"]),
+        ("  colour: rde", ["3:11: colour is 'rde'; expected 'red' or 'blue'; did you mean 'red'?"]),
+        ("  pair: [1]", ["3:9: pair has 1 entry; expected at least 2"]),
+        ("  pair: []", ["3:9: pair has 0 entries; expected at least 2"]),
+        ("  pair: [1, 2, 3]", ["3:9: pair has 3 entries; expected at most 2"]),
+        ("  pair: [1, x]", ["3:13: pair.1 is 'x'; expected a whole number"]),
+        ("  files: a", ["3:10: files is 'a'; expected a list ([a, b], or lines that begin with '- ')"]),
+        ("  fraction: 120 %", ["3:13: fraction is '120 %'; expected at most 1 (in SI units)"]),
+        ("  exposure: 1 h", ["3:13: exposure is '1 h'; expected at most 10 (in SI units)"]),
+        ("  exposure: 11", ["3:13: exposure is 11; expected at most 10"]),
+        ("  inner: {count: 0}", ["3:18: count is 0; expected at least 1"]),
+        ("  inner: [1]", ["3:10: inner is a list; expected a mapping (key: value)"]),
+        (
+            "  inner: {cuont: 1}",
+            [
+                "3:11: 'cuont' is not a setting of 'inner'; expected one of width, count; did you mean 'count'?"
+            ],
+        ),
+        ("  many: [{}, {count: 0x0}]", ["3:22: count is 0x0; expected at least 1"]),
+        ("  many: [{}, 5]", ["3:14: many.1 is 5; expected a mapping (key: value)"]),
+        (
+            "  many: [{COUNT: 1}]",
+            [
+                "3:11: 'COUNT' is not a setting of 'many.0'; expected one of width, count; did you mean 'count'?"
+            ],
+        ),
+        ("  named: {a: {width: 1 s}}", [f"3:22: width: '1 s' is a time, not a length; expected {LENGTH}"]),
+        (
+            "  named: {a: {wdth: 1}}",
+            ["3:15: 'wdth' is not a setting of 'a'; expected one of width, count; did you mean 'width'?"],
+        ),
+        ("  by_number: {x: 1}", ["3:15: the key 'x' is 'x'; expected a whole number"]),
+        ("  else: 4", ["3:9: else is 4; expected a multiple of 3"]),
+        ("  else: 12", ["3:9: else is 12; expected less than 10"]),
+    ],
+)
+def test_one_problem(text: str, expected: list[str]) -> None:
+    assert problems(text) == expected
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (
+            "  either: x",
+            "3:11: either is 'x'; expected a whole number or a list ([a, b], or lines that begin with '- ')",
+        ),
+        ("  either: [1, x]", "3:15: either.1 is 'x'; expected a whole number"),
+        ("  window: 1 K", f"3:11: window: '1 K' is a temperature, not a time; expected {TIME}"),
+        ("  window: -1", "3:11: window is -1; expected at least 0"),
+        ("  window: {}", f"3:11: window is a mapping; expected {TIME}"),
+        ("  window: [1, 2 K]", f"3:15: window.1: '2 K' is a temperature, not a time; expected {TIME}"),
+        ("  window: [1, -2]", "3:15: window.1 is -2; expected at least 0"),
+        ("  shape: noen", "3:10: shape is 'noen'; expected 'none'; did you mean 'none'?"),
+        ("  shape: {count: 0}", "3:18: count is 0; expected at least 1"),
+        ("  pet: {kind: cow}", "3:15: kind is 'cow'; expected 'cat', 'dog'"),
+        ("  pet: {lives: 1}", "3:8: 'kind' is missing from 'pet'"),
+        ("  pet: {kind: cat, lives: many}", "3:27: lives is 'many'; expected a whole number"),
+        (
+            "  pet: {kind: cat, live: 1}",
+            "3:20: 'live' is not a setting of 'pet'; expected one of kind, lives, tricks; did you mean 'lives'?",
+        ),
+    ],
+)
+def test_union_gives_one_sensible_problem(text: str, expected: str) -> None:
+    assert problems(text) == [expected]
+
+
+def test_words_of_pydantic_where_there_are_no_better() -> None:
+    (problem,) = problems("  day: today")
+    assert problem.startswith("3:8: day is 'today'; expected a valid date")
+
+
+def test_endless_digits_in_quotes() -> None:
+    (problem,) = problems(f"  else: '{'1' * 150}'")
+    assert problem == f"3:9: else is '{'1' * 57}...'; expected a whole number"
+
+
+def test_all_problems_in_file_order() -> None:
+    found = problems("  inner: {cuont: 1, width: 1 K}\n  txt: 1\n  on: 5\n  pair: 5")
+    assert [line.split(": ")[0] for line in found] == ["3:11", "3:28", "4:3", "5:7", "6:9"]
+
+
+def test_problems_of_options_come_last() -> None:
+    document = Document.parse("rows: x\non: 5\n", "f.yaml").override("rows", "1.5", "--set rows=1.5")
+    with pytest.raises(ConfigError) as caught:
+        document.validate(Model)
+    assert [str(problem) for problem in caught.value.problems] == [
+        "f.yaml:2:5: on is 5; expected true or false",
+        "--set rows=1.5: rows is 1.5; expected a whole number",
+    ]
+
+
+@pytest.mark.parametrize("text", ["", "plan:", "plan: {}", "other: 1"])
+def test_empty_and_missing_mappings_count_as_empty(text: str) -> None:
+    document = Document.parse(f"first: 1\n{text}", "f.yaml")
+    assert document.validate(Inner, ("plan",)) == Inner()
+    with pytest.raises(ConfigError, match=r"'rows' is missing from 'plan' \(rows of the block\)$"):
+        document.validate(Model, ("plan",))
+
+
+def test_missing_keys_are_at_their_mapping() -> None:
+    document = Document.parse("plan:\n  on: true\n", "f.yaml")
+    with pytest.raises(ConfigError) as caught:
+        document.validate(Model, ("plan",))
+    assert str(caught.value).startswith("f.yaml:2:3: 'rows' is missing")
+
+
+def test_misspelt_key_is_not_missing_as_well() -> None:
+    document = Document.parse("plan: {row: 1}", "f.yaml")
+    with pytest.raises(ConfigError) as caught:
+        document.validate(Model, ("plan",))
+    (problem,) = caught.value.problems
+    assert problem.hint == "did you mean 'rows'?"
+
+
+@pytest.mark.parametrize("value", ["5", "[1]", "text"])
+def test_no_mapping(value: str) -> None:
+    document = Document.parse(f"plan: {value}", "f.yaml")
+    with pytest.raises(ConfigError) as caught:
+        document.validate(Inner, ("plan",))
+    assert str(caught.value).endswith("expected a mapping of settings such as {key: value}")
+
+
+def test_dropped_keys_are_left_out_and_not_offered() -> None:
+    assert validate("  use: psca\n  speed: fast\n", drop={"use", "speed"}).rows == 1
+    (problem,) = problems("  user: x", drop={"use"}, also_known=["speed"])
+    assert "did you mean" not in problem
+    assert ", speed" in problem
+    assert "use," not in problem
+
+
+def test_keys_of_others_are_suggested() -> None:
+    (problem,) = problems("  spede: 1", also_known=["speed"])
+    assert problem.endswith("did you mean 'speed'?")
+
+
+def test_what_the_mapping_is_called() -> None:
+    (problem,) = problems("  zzz: 1", called="camera 'andor'")
+    assert problem.startswith("3:3: 'zzz' is not a setting of camera 'andor'; expected one of rows,")
+
+
+def test_nothing_to_set() -> None:
+    document = Document.parse("camera: {use: x, gain: 3}", "f.yaml")
+    assert document.validate(None, ("camera",), drop={"use", "gain"}) is None
+    with pytest.raises(ConfigError) as caught:
+        document.validate(None, ("camera",), drop={"use"})
+    assert str(caught.value) == "f.yaml:1:18: 'camera' takes no settings, but 'gain' is given; remove it"
+
+
+def test_thousands_of_problems() -> None:
+    text = "".join(f"k{i}: 1\n" for i in range(3000))
+    with pytest.raises(ConfigError) as caught:
+        Document.parse(text, "f.yaml").validate(Inner)
+    assert len(caught.value.problems) == 3000

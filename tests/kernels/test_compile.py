@@ -1,0 +1,262 @@
+from __future__ import annotations
+
+import importlib
+import os
+import subprocess
+import sys
+import textwrap
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+
+from labseq.kernels import compile as compiling
+from labseq.kernels.compile import announcing, cache_root, const, kernel
+
+MAX_LACK = 3
+
+LEAF = """
+    from labseq.kernels.compile import kernel
+
+    @kernel("int64(int64)")
+    def leaf(x):
+        return x + {step}
+"""
+MIDDLE = """
+    from labseq.kernels.compile import kernel
+    from {package}.leaf import leaf
+
+    @kernel("int64(int64)")
+    def middle(x):
+        return 2 * leaf(x)
+"""
+TOP = """
+    from labseq.kernels.compile import kernel
+    from {package} import middle
+    from {package}.constants import OFFSET
+
+    MIDDLE = middle.middle
+
+    @kernel("int64(int64)")
+    def top(x):
+        return MIDDLE(x) + OFFSET
+"""
+
+
+class Package:
+    """A package of kernels in a folder of its own, which can be edited and imported anew."""
+
+    def __init__(self, folder: Path, name: str) -> None:
+        self.folder = folder / name
+        self.name = name
+        self.folder.mkdir()
+        self.write("__init__", "")
+        self.write("leaf", LEAF.format(step=1))
+        self.write("middle", MIDDLE.format(package=name))
+        self.write("constants", "OFFSET = 100")
+        self.write("top", TOP.format(package=name))
+
+    def write(self, module: str, text: str) -> None:
+        (self.folder / f"{module}.py").write_text(textwrap.dedent(text), encoding="utf-8")
+
+    def load(self) -> ModuleType:
+        for module in [name for name in sys.modules if name.split(".")[0] == self.name]:
+            del sys.modules[module]
+        importlib.invalidate_caches()
+        return importlib.import_module(f"{self.name}.top")
+
+    def result(self) -> int:
+        return self.load().top(0)
+
+
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    folder = tmp_path / "cache"
+    monkeypatch.setenv("LABSEQ_CACHE", str(folder))
+    return folder
+
+
+@pytest.fixture
+def package(tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch, request: Any) -> Package:
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)  # else edits within a second pass unseen
+    monkeypatch.syspath_prepend(str(tmp_path))
+    return Package(tmp_path, f"kernels_of_{request.node.name.split('[')[0]}")
+
+
+def compiled_modules(load: Callable[[], object]) -> list[str]:
+    announced: list[str] = []
+    with announcing(announced.append):
+        load()
+    return [name.split(".")[-1] for name in announced]
+
+
+def test_an_edit_of_a_callee_in_another_file_is_seen(package: Package) -> None:
+    assert package.result() == 102
+    package.write("leaf", LEAF.format(step=2))
+    assert package.result() == 104
+    package.write("leaf", LEAF.format(step=1))
+    assert package.result() == 102
+
+
+def test_an_edit_of_a_constant_in_another_file_is_seen(package: Package) -> None:
+    assert package.result() == 102
+    package.write("constants", "OFFSET = 200")
+    assert package.result() == 202
+
+
+def test_only_what_an_edit_touches_is_compiled_again(package: Package) -> None:
+    assert compiled_modules(package.load) == ["leaf", "middle", "top"]
+    assert compiled_modules(package.load) == []
+    package.write("constants", "OFFSET = 200")
+    assert compiled_modules(package.load) == ["top"]
+    package.write("middle", MIDDLE.format(package=package.name) + "\n")
+    assert compiled_modules(package.load) == ["middle", "top"]
+
+
+def test_a_cache_that_cannot_be_written_does_no_harm(
+    package: Package, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").write_text("in the way")
+    monkeypatch.setenv("LABSEQ_CACHE", str(tmp_path / "file" / "cache"))
+    assert package.result() == 102
+    assert not list(package.folder.rglob("*.nbi"))
+
+
+@pytest.mark.parametrize("suffix", ["nbi", "nbc"])
+def test_files_cut_short_by_a_crash_are_replaced(package: Package, cache: Path, suffix: str) -> None:
+    package.load()
+    for file in cache.rglob(f"*.{suffix}"):
+        file.write_bytes(file.read_bytes()[:7])
+    assert package.result() == 102
+    assert compiled_modules(package.load) == ["leaf", "middle", "top"]
+    assert compiled_modules(package.load) == []
+
+
+def test_kernels_unused_for_long_are_deleted_and_nothing_else(package: Package, cache: Path) -> None:
+    root = cache / "kernels"
+    long_ago = time.time() - 31 * 86400
+    for name in ("0" * 24, "1" * 24, "notes"):
+        (root / name).mkdir(parents=True)
+        (root / name / "kernel.nbi").write_text("")
+        os.utime(root / name, (long_ago, long_ago))
+    os.utime(root / ("1" * 24))
+    package.load()
+    assert not (root / ("0" * 24)).exists()
+    assert (root / ("1" * 24) / "kernel.nbi").exists()
+    assert (root / "notes" / "kernel.nbi").exists()
+
+
+def test_numbas_own_cache_folder_is_left_as_it_was(package: Package) -> None:
+    config: Any = importlib.import_module("numba.core.config")
+    before = config.CACHE_DIR
+    config.CACHE_DIR = "somebody's"
+    try:
+        package.load()
+        assert config.CACHE_DIR == "somebody's"
+    finally:
+        config.CACHE_DIR = before
+
+
+def test_a_function_without_a_file_is_compiled_without_the_cache(cache: Path) -> None:
+    scope: dict[str, Any] = {"kernel": kernel}
+    exec("@kernel('int64(int64)')\ndef double(x):\n    return 2 * x", scope)  # a notebook's way
+    assert scope["double"](4) == 8
+    assert not cache.exists()
+
+
+def test_several_signatures_and_read_only_arrays(cache: Path) -> None:
+    @kernel([f"int64({const('int64', 1)})", f"float64({const('float64', 1)})"])
+    def total(values: Any) -> Any:
+        result = values[0]
+        for value in values[1:]:
+            result += value
+        return result + MAX_LACK
+
+    values = np.arange(4)
+    assert total(values) == 9
+    values.flags.writeable = False
+    assert total(values) == 9
+    assert total(values / 2) == 6.0
+    with pytest.raises(TypeError, match="No matching definition"):
+        total(values.astype(np.int16))
+
+
+def test_the_lock_of_python_is_free_while_a_kernel_runs(cache: Path) -> None:
+    @kernel("int64(int64)")
+    def same(x: int) -> int:
+        return x
+
+    options: Any = same
+    assert options.targetoptions["nogil"]
+
+
+@pytest.mark.parametrize(
+    ("platform", "environment", "expected"),
+    [
+        ("linux", {"LABSEQ_CACHE": "/own", "NUMBA_CACHE_DIR": "/numba"}, "/own"),
+        ("linux", {"NUMBA_CACHE_DIR": "/numba", "XDG_CACHE_HOME": "/xdg"}, "/numba/labseq"),
+        ("linux", {"XDG_CACHE_HOME": "/xdg"}, "/xdg/labseq"),
+        ("linux", {}, "/home/me/.cache/labseq"),
+        ("darwin", {}, "/home/me/Library/Caches/labseq"),
+        ("win32", {"LOCALAPPDATA": "/local"}, "/local/labseq/Cache"),
+        ("win32", {}, "/home/me/AppData/Local/labseq/Cache"),
+    ],
+)
+def test_the_cache_is_where_the_platform_keeps_caches(
+    platform: str, environment: dict[str, str], expected: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("LABSEQ_CACHE", "NUMBA_CACHE_DIR", "XDG_CACHE_HOME", "LOCALAPPDATA"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setattr(compiling.sys, "platform", platform)
+    monkeypatch.setattr(Path, "home", lambda: Path("/home/me"))
+    assert cache_root() == Path(expected)
+
+
+def run_python(code: str, **environment: str) -> str:
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", textwrap.dedent(code)],
+        env=os.environ | environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip()
+
+
+def test_numba_is_imported_only_with_a_kernel() -> None:
+    code = """
+        import sys
+        import labseq.motion, labseq.kernels.compile, labseq_psca
+        print("numba" in sys.modules)
+    """
+    assert run_python(code) == "False"
+
+
+def test_kernels_are_plain_python_without_the_compiler() -> None:
+    code = """
+        import numpy as np
+        from labseq import Context, MotionSpec, SiteGrid, TargetPattern, check_plan, tone_program
+        from labseq_psca.planner import PscaPlanner, PscaSettings
+
+        atoms = np.random.default_rng(3).random((8, 7)) < 0.7
+        fill = np.zeros((8, 7), np.bool_)
+        fill[1:7, 1:6] = np.indices((6, 5)).sum(axis=0) % 3 > 0
+        clear = np.zeros((8, 7), np.bool_)
+        clear[1:7, 1:6] = ~fill[1:7, 1:6]
+        target = TargetPattern(fill, clear)
+        plan = PscaPlanner(PscaSettings(degree_of_parallelism=3), Context()).plan(atoms, target)
+        report = check_plan(plan, atoms, target, 3)
+        program = tone_program(plan, SiteGrid(8, 7))
+        print(plan.moves.tolist(), plan.batch_offsets.tolist(), report.meets_target)
+        print(report.batch_end_s.tolist(), program.column.end_hz.tolist(), program.row.phase_rad.tolist())
+    """
+    plain = run_python(code, NUMBA_DISABLE_JIT="1")
+    assert plain == run_python(code)
+    assert "True" in plain

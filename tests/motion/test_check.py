@@ -1,0 +1,275 @@
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from labseq.errors import InvalidPlanError, LimitError
+from labseq.kernels import plan_rules
+from labseq.model import Batch, MotionSpec, Plan, PlanReport, SiteGrid, TargetPattern
+from labseq.motion import RULES, check_plan
+from labseq.motion.rules import FAULTS
+
+Move = tuple[int, int, int, int]
+
+
+def grid_of(text: str) -> NDArray[np.bool_]:
+    """Rows of a picture: # is an atom."""
+    return np.array([[site == "#" for site in row] for row in text.split()])
+
+
+def batch(*moves: Move, linked: bool = False) -> Batch:
+    table = np.array(moves, np.int16).reshape(-1, 4)
+    return Batch(table[:, :2], table[:, 2:], linked)
+
+
+def check(atoms: str, *batches: Batch, dop: int = 20, **options: Any) -> PlanReport:
+    occupancy = grid_of(atoms)
+    nothing = np.zeros_like(occupancy)
+    target = TargetPattern(nothing, nothing)
+    motion = MotionSpec(**options)
+    return check_plan(Plan.from_batches(batches), occupancy, target, dop, motion=motion, planner="test")
+
+
+def refusal(atoms: str, *batches: Batch, dop: int = 20, **options: Any) -> InvalidPlanError:
+    with pytest.raises(InvalidPlanError) as error:
+        check(atoms, *batches, dop=dop, **options)
+    assert error.value.planner == "test"
+    return error.value
+
+
+class TestLegal:
+    def test_a_line_shifts_onto_the_places_that_it_frees(self) -> None:
+        report = check("###.", batch((0, 0, 0, 1), (0, 1, 0, 2), (0, 2, 0, 3)))
+        assert report.predicted.tolist() == grid_of(".###").tolist()
+        assert report.n_tweezers.tolist() == [3]
+
+    def test_a_grid_of_tones_moves_rows_and_columns_at_once(self) -> None:
+        report = check("#.#. .... #.#.", batch((0, 0, 0, 1), (0, 2, 0, 3), (2, 0, 2, 1), (2, 2, 2, 3)), dop=4)
+        assert report.predicted.tolist() == grid_of(".#.# .... .#.#").tolist()
+        assert report.n_tweezers.tolist() == [4]
+
+    def test_crossings_without_an_atom_count_as_tweezers(self) -> None:
+        report = check("#... ..#. ....", batch((0, 0, 0, 1), (1, 2, 1, 3)), dop=4)
+        assert report.n_tweezers.tolist() == [4]
+
+    def test_an_l_shaped_path_is_two_linked_batches(self) -> None:
+        report = check("#.. ... ...", batch((0, 0, 0, 2)), batch((0, 2, 2, 2), linked=True))
+        assert report.predicted.tolist() == grid_of("... ... ..#").tolist()
+
+    def test_an_atom_may_wait_in_a_chain(self) -> None:
+        report = check(
+            "#.#. .... ....",
+            batch((0, 0, 0, 1), (0, 2, 0, 2)),
+            batch((0, 1, 2, 1), (0, 2, 2, 2), linked=True),
+        )
+        assert report.predicted.tolist() == grid_of(".... .... .##.").tolist()
+
+    def test_an_atom_is_ejected_beyond_its_edge(self) -> None:
+        report = check(".#. ...", batch((0, 1, 0, -1)), dop=1)
+        assert not report.predicted.any()
+        assert check(".#. ...", batch((0, 1, -1, 1))).predicted.sum() == 0
+        assert check(".#. ...", batch((0, 1, 2, 1))).predicted.sum() == 0
+        assert check(".#. ...", batch((0, 1, 0, 3))).predicted.sum() == 0
+
+    def test_several_slots_take_several_atoms(self) -> None:
+        report = check("##. ...", batch((0, 0, 0, -2), (0, 1, 0, -1)), eject_slots=2)
+        assert not report.predicted.any()
+
+    def test_an_empty_plan(self) -> None:
+        report = check("#.")
+        assert report.duration_s == 0.0
+        assert report.predicted.tolist() == [[True, False]]
+
+    def test_the_occupancy_is_left_untouched(self) -> None:
+        occupancy = grid_of("#.")
+        target = TargetPattern(~occupancy, occupancy)
+        report = check_plan(Plan.from_batches([batch((0, 0, 0, 1))]), occupancy, target, 1)
+        assert occupancy.tolist() == [[True, False]]
+        assert report.meets_target
+        for array in (report.predicted, report.batch_end_s, report.n_tweezers):
+            assert not array.flags.writeable
+
+    def test_defects_and_surplus_are_counted_after_the_plan(self) -> None:
+        target = TargetPattern(grid_of("##.. ...."), grid_of("..## #..."))
+        report = check_plan(Plan.from_batches([batch((1, 0, 1, 1))]), grid_of("#.## #..."), target, 1)
+        assert (report.n_defects, report.n_surplus) == (1, 2)
+        assert not report.meets_target
+
+
+class TestTimes:
+    MOTION: ClassVar[Any] = {
+        "pick_up_s": 3.0,
+        "drop_off_s": 5.0,
+        "overhead_per_batch_s": 100.0,
+        "overhead_per_cycle_s": 1000.0,
+        "speed_m_s": 4.49e-6,
+    }
+
+    def test_the_longest_move_counts(self) -> None:
+        plan = [batch((0, 0, 0, 1), (0, 2, 0, 5)), batch((0, 5, 1, 5))]
+        report = check("#.#... ......", *plan, **self.MOTION)
+        assert report.batch_end_s == pytest.approx([1000 + 108 + 3, 1000 + 108 + 3 + 108 + 1])
+        assert report.duration_s == report.batch_end_s[-1]
+
+    def test_linked_batches_need_no_overhead_and_ramps(self) -> None:
+        plan = [batch((0, 0, 0, 2)), batch((0, 2, 1, 2), linked=True), batch((1, 2, 1, 0))]
+        report = check("#.. ...", *plan, **self.MOTION)
+        assert report.batch_end_s == pytest.approx([1105.0, 1111.0, 1111.0 + 110.0])
+
+    def test_an_ejected_atom_moves_to_its_slot(self) -> None:
+        report = check("..#", batch((0, 2, 0, -1)), **self.MOTION)
+        assert report.duration_s == pytest.approx(1000 + 108 + 3)
+
+    def test_spacing_and_speed(self) -> None:
+        occupancy, nothing = grid_of("#.."), grid_of("...")
+        report = check_plan(
+            Plan.from_batches([batch((0, 0, 0, 2))]),
+            occupancy,
+            TargetPattern(nothing, nothing),
+            1,
+            grid=SiteGrid(1, 3, spacing_m=10e-6),
+            motion=MotionSpec(speed_m_s=0.1),
+        )
+        assert report.duration_s == pytest.approx(13e-3 + 0.5e-3 + 120e-6 + 200e-6)
+
+
+@pytest.mark.parametrize(
+    ("rule", "words", "atoms", "batches", "options"),
+    [
+        ("shape", "no atom moves", "#..", [batch()], {}),
+        ("shape", "no atom moves", "#..", [batch((0, 0, 0, 1)), batch()], {}),
+        ("grid", r"\(0, 5\) lies outside of the grid of 1 x 3", "#..", [batch((0, 5, 0, 1))], {}),
+        ("grid", r"\(-1, 0\)", "#..", [batch((-1, 0, 0, 0))], {}),
+        ("grid", "within 1 site", "#..", [batch((0, 0, 0, -2))], {}),
+        ("grid", "within 0 site", "#..", [batch((0, 0, 0, -1))], {"eject_slots": 0}),
+        ("straight", "changes row and column", "#.. ...", [batch((0, 0, 1, 1))], {}),
+        ("straight", "goes nowhere", "#.#", [batch((0, 0, 0, 1), (0, 2, 0, 2))], {}),
+        ("straight", "0 follows a row, 1 a column", "#.. ..#", [batch((0, 0, 0, 1), (1, 2, 0, 2))], {}),
+        ("linked", "first batch", "#..", [batch((0, 0, 0, 1), linked=True)], {}),
+        (
+            "linked",
+            "ejects",
+            "#.#",
+            [batch((0, 0, 0, -1)), batch((0, 2, 0, 1), linked=True)],
+            {},
+        ),
+        (
+            "linked",
+            "moves 1 atoms while 2 are held",
+            "#.#.",
+            [batch((0, 0, 0, 1), (0, 2, 0, 3)), batch((0, 1, 0, 0), linked=True)],
+            {},
+        ),
+        (
+            "linked",
+            r"\(0, 2\) is not a goal",
+            "#.#.",
+            [batch((0, 0, 0, 1)), batch((0, 2, 0, 3), linked=True)],
+            {},
+        ),
+        ("source", r"no atom on \(0, 1\)", "#..", [batch((0, 1, 0, 2))], {}),
+        ("source", r"starts from \(0, 0\) too", "#..", [batch((0, 0, 0, 1), (0, 0, 0, 2))], {}),
+        ("goal", "ends on an atom that stays", "#.#", [batch((0, 0, 0, 2))], {}),
+        ("goal", r"ends on \(0, 1\) too", "#.#", [batch((0, 0, 0, 1), (0, 2, 0, 1))], {}),
+        ("tones", "column 0 goes to column 1", "#.. #..", [batch((0, 0, 0, 1), (1, 0, 1, 2))], {}),
+        ("tones", "row 0 goes to row 1", "##. ... ...", [batch((0, 0, 1, 0), (0, 1, 2, 1))], {}),
+        (
+            "tones",
+            "2 row tones; the limit is 1",
+            "#.. .#.",
+            [batch((0, 0, 0, 1), (1, 1, 1, 2))],
+            {"max_row_tones": 1},
+        ),
+        (
+            "tones",
+            "3 column tones; the limit is 2",
+            "###.",
+            [batch((0, 0, 0, 1), (0, 1, 0, 2), (0, 2, 0, 3))],
+            {"max_column_tones": 2},
+        ),
+        ("order", "columns 0 and 1", "##..", [batch((0, 0, 0, 3), (0, 1, 0, 2))], {}),
+        ("order", "rows 0 and 1", "#. .# .. ..", [batch((0, 0, 3, 0), (1, 1, 3, 1))], {}),
+        ("order", "columns 0 and 2", "#.#", [batch((0, 0, 0, -1), (0, 2, 0, -1))], {}),
+        (
+            "parallelism",
+            "1 row x 3 column tones make 3 tweezers; the limit is 2",
+            "###.",
+            [batch((0, 0, 0, 1), (0, 1, 0, 2), (0, 2, 0, 3))],
+            {"dop": 2},
+        ),
+        ("parallelism", "limit is 3", "#... ..#.", [batch((0, 0, 0, 1), (1, 2, 1, 3))], {"max_tweezers": 3}),
+        ("crossing", r"\(0, 2\)", "#.#. ..#.", [batch((0, 0, 0, 1), (1, 2, 1, 3))], {}),
+        ("path", r"stands on \(0, 1\)", "##..", [batch((0, 0, 0, 2))], {}),
+        ("path", r"stands on \(0, 3\)", "#..# ..#.", [batch((0, 0, 0, 1), (1, 2, 1, 3))], {}),
+        ("ejection", r"one on \(0, 0\)", "##.", [batch((0, 1, 0, -1))], {}),
+        ("ejection", r"one on \(2, 1\)", ".#. ... .#.", [batch((0, 1, 3, 1))], {}),
+    ],
+)  # fmt: skip
+def test_each_rule(rule: str, words: str, atoms: str, batches: list[Batch], options: Any) -> None:
+    error = refusal(atoms, *batches, **options)
+    assert error.rule == rule
+    assert error.batch == len(batches) - 1
+    with pytest.raises(InvalidPlanError, match=words):
+        raise error
+
+
+def test_a_later_chunk_of_the_line_stands() -> None:
+    first, second = batch((0, 0, 0, 1), (0, 1, 0, 2)), batch((0, 2, 0, 3))
+    assert refusal("###.", first, second).rule == "goal"
+    check("###.", second, first)
+
+
+def test_the_error_names_the_batch_and_the_atom_move() -> None:
+    error = refusal("##..", batch((0, 1, 0, 2)), batch((0, 2, 0, 3), (0, 1, 0, 2)))
+    assert (error.batch, error.move, error.rule) == (1, 1, "source")
+    assert str(error) == (
+        "planner 'test': batch 1, atom move 1 breaks the rule 'source': there is no atom on (0, 1)"
+    )
+
+
+class TestShape:
+    TARGET = TargetPattern(grid_of("#."), grid_of(".#"))
+    PLAN = Plan.from_batches([])
+
+    def test_what_is_no_plan(self) -> None:
+        with pytest.raises(InvalidPlanError, match="'shape': a Plan was expected, list came"):
+            check_plan([], grid_of("#."), self.TARGET, 1)  # pyright: ignore[reportArgumentType]
+
+    @pytest.mark.parametrize(
+        ("occupancy", "grid"),
+        [
+            (grid_of("#.."), None),
+            (grid_of("#..."), SiteGrid(1, 4)),
+            (grid_of("#."), SiteGrid(2, 1)),
+            ([[0.5, 1.0]], None),
+            ([1, 0], None),
+        ],
+    )
+    def test_occupancy_target_and_grid_belong_together(self, occupancy: Any, grid: SiteGrid | None) -> None:
+        with pytest.raises(InvalidPlanError) as error:
+            check_plan(self.PLAN, occupancy, self.TARGET, 1, grid=grid)
+        assert error.value.rule == "shape"
+        assert error.value.batch == -1
+
+    def test_any_layout_and_type_of_zeros_and_ones(self) -> None:
+        for occupancy in ([[1, 0]], np.array([[1.0, 0.0]]), np.array([[1], [0]], np.uint8).T):
+            assert check_plan(self.PLAN, occupancy, self.TARGET, 1).meets_target
+
+    def test_the_degree_of_parallelism_is_at_least_one(self) -> None:
+        with pytest.raises(LimitError, match="degree of parallelism is 0; the limit is at least 1"):
+            check_plan(self.PLAN, grid_of("#."), self.TARGET, 0)
+
+    def test_an_unknown_speed_profile(self) -> None:
+        with pytest.raises(LimitError, match="speed profile is 'constant_jerk'; the limit is 'constant'"):
+            check_plan(
+                self.PLAN, grid_of("#."), self.TARGET, 1, motion=MotionSpec(speed_profile="constant_jerk")
+            )
+
+
+def test_every_fault_has_words_and_every_rule_a_fault() -> None:
+    assert {rule for rule, _ in FAULTS.values()} == set(RULES)
+    codes = [getattr(plan_rules, name) for name in FAULTS]
+    assert sorted(codes) == list(range(1, len(FAULTS) + 1))

@@ -1,0 +1,258 @@
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from labseq_psca.planner import PscaPlanner, PscaSettings
+from numpy.typing import NDArray
+
+from labseq.errors import LimitError, PlanError
+from labseq.model import (
+    AxisTones,
+    Batch,
+    MotionSpec,
+    Occupancy,
+    Plan,
+    SegmentKind,
+    SiteGrid,
+    TargetPattern,
+    ToneProgram,
+)
+from labseq.motion import check_plan, tone_program
+from labseq.motion.tones import preassigned_phases
+from labseq.roles import Context
+from labseq.testing.strategies import cases
+
+Move = tuple[int, int, int, int]
+IDLE, PICK_UP, TRANSPORT, DROP_OFF = SegmentKind
+GRID = SiteGrid(4, 6)
+SITE_S = GRID.spacing_m / MotionSpec().speed_m_s
+
+
+def batch(*moves: Move, linked: bool = False) -> Batch:
+    table = np.array(moves, np.int16).reshape(-1, 4)
+    return Batch(table[:, :2], table[:, 2:], linked)
+
+
+def program_of(*batches: Batch, grid: SiteGrid = GRID, **motion: Any) -> ToneProgram:
+    return tone_program(Plan.from_batches(batches), grid, MotionSpec(**motion))
+
+
+def segment(axis: AxisTones, index: int) -> dict[str, NDArray[np.float64]]:
+    tones = slice(axis.offsets[index], axis.offsets[index + 1])
+    names = ("start_hz", "end_hz", "start_amplitude", "end_amplitude", "phase_rad")
+    return {name: getattr(axis, name)[tones] for name in names}
+
+
+def sites(hz: NDArray[np.float64], site_hz: NDArray[np.float64]) -> list[float]:
+    """Where tones are, in sites of an equally spaced axis."""
+    return ((hz - site_hz[0]) / (site_hz[1] - site_hz[0])).tolist()
+
+
+def test_a_row_move_segment_by_segment() -> None:
+    program = program_of(batch((1, 0, 1, 1), (1, 2, 1, 5)))
+    assert program.kind.tolist() == [IDLE, PICK_UP, TRANSPORT, TRANSPORT, DROP_OFF]
+    assert program.batch.tolist() == [0] * 5
+    assert program.duration_s == pytest.approx([13.5e-3, 60e-6, SITE_S, 2 * SITE_S, 60e-6])
+    assert program.row.offsets.tolist() == [0, 0, 1, 2, 3, 4]
+    assert program.column.offsets.tolist() == [0, 0, 2, 4, 6, 8]
+
+    way = [sites(segment(program.column, i)["start_hz"], GRID.column_frequency_hz) for i in range(1, 5)]
+    assert way == [pytest.approx(at) for at in ([0, 2], [0, 2], [1, 3], [1, 5])]
+    assert sites(segment(program.column, 4)["end_hz"], GRID.column_frequency_hz) == pytest.approx([1, 5])
+    for i in range(1, 5):
+        row = segment(program.row, i)
+        assert sites(row["start_hz"], GRID.row_frequency_hz) == pytest.approx([1])
+        assert row["end_hz"].tolist() == row["start_hz"].tolist()
+
+
+def test_only_the_axis_that_moves_is_ramped() -> None:
+    program = program_of(batch((1, 0, 1, 1), (1, 2, 1, 5)), batch((0, 0, 2, 0)), max_row_tones=10)
+    full = {"row": 1 / 10, "column": 1 / 20}
+    for i, kind in enumerate(program.kind.tolist()):
+        ramped = ("column", "row")[int(program.batch[i])]
+        for name, axis in (("row", program.row), ("column", program.column)):
+            tones = segment(axis, i)
+            start, end = tones["start_amplitude"], tones["end_amplitude"]
+            low = kind in (PICK_UP, DROP_OFF) and name == ramped
+            assert start == pytest.approx(0.0 if low and kind == PICK_UP else full[name])
+            assert end == pytest.approx(0.0 if low and kind == DROP_OFF else full[name])
+
+
+def test_amplitudes_never_exceed_full_scale() -> None:
+    moves = [(0, col, 0, col + 2) for col in range(18)]
+    program = program_of(batch(*moves), grid=SiteGrid(), max_column_tones=18)
+    assert segment(program.column, 2)["start_amplitude"].sum() == pytest.approx(1.0)
+
+
+def test_linked_batches_keep_their_tones_on() -> None:
+    program = program_of(batch((0, 0, 0, 2)), batch((0, 2, 3, 2), linked=True), batch((3, 2, 3, 1)))
+    assert program.kind.tolist() == [IDLE, PICK_UP, TRANSPORT, TRANSPORT, DROP_OFF, *range(4)]
+    assert program.batch.tolist() == [0, 0, 0, 1, 1, 2, 2, 2, 2]
+    assert program.duration_s[3] == pytest.approx(3 * SITE_S)
+    assert segment(program.column, 1)["start_amplitude"] == [0.0]
+    assert segment(program.row, 4)["end_amplitude"] == [0.0]
+    assert segment(program.column, 4)["end_amplitude"] == [1 / 20]
+
+
+def test_a_waiting_tone_stays() -> None:
+    program = program_of(batch((0, 0, 0, 1), (0, 3, 0, 3)), batch((0, 1, 2, 1), (0, 3, 2, 3), linked=True))
+    end = segment(program.column, 2)["end_hz"]
+    assert sites(end, GRID.column_frequency_hz) == pytest.approx([1, 3])
+
+
+def test_ejection_goes_on_beyond_the_edge() -> None:
+    program = program_of(batch((0, 0, 0, -1), (0, 5, 0, 6)))
+    step = 1.6e6
+    first, last = GRID.column_frequency_hz[[0, -1]]
+    assert segment(program.column, 2)["end_hz"] == pytest.approx([first - step, last + step])
+    program = program_of(batch((2, 1, 4, 1)))
+    assert segment(program.row, 2)["end_hz"] == pytest.approx([GRID.row_frequency_hz[-1] + step])
+
+
+@pytest.mark.parametrize(
+    ("shape", "move", "axis", "end_hz"),
+    [
+        ((1, 3), (0, 1, -1, 1), "row", 100e6 - 1.6e6),
+        ((3, 1), (1, 0, 1, 1), "column", 100e6 + 1.6e6),
+        ((1, 1), (0, 0, 0, 1), "column", 100e6 + 1.6e6),
+    ],
+)
+def test_ejection_from_an_axis_with_a_single_site(shape: Any, move: Move, axis: str, end_hz: float) -> None:
+    program = program_of(batch(move), grid=SiteGrid(*shape))
+    assert getattr(program, axis).end_hz[-1] == pytest.approx(end_hz)
+
+
+def test_calibrated_frequencies_are_met_at_every_site_where_a_tone_starts_or_ends() -> None:
+    site_hz = np.array([90e6, 91e6, 93e6, 96e6])
+    grid = SiteGrid(1, 4, column_frequency_hz=site_hz)
+    program = program_of(batch((0, 1, 0, 2)), batch((0, 0, 0, -1), (0, 3, 0, 4)), grid=grid)
+    assert program.column.end_hz[1] == 93e6
+    assert program.column.end_hz[-2:].tolist() == [89e6, 99e6]
+
+
+def test_phases_start_as_preassigned() -> None:
+    program = program_of(batch((1, 0, 1, 1), (1, 2, 1, 5)), batch((0, 0, 2, 0)))
+    rows, columns = preassigned_phases(4, 6)
+    assert segment(program.column, 1)["phase_rad"] == pytest.approx(2 * np.pi * columns[[0, 2]])
+    assert segment(program.row, 1)["phase_rad"] == pytest.approx(2 * np.pi * rows[[1]])
+    assert segment(program.row, 6)["phase_rad"] == pytest.approx(2 * np.pi * rows[[0]])
+    assert preassigned_phases(20, 20)[1][:6].tolist() == columns.tolist()
+    assert len({*rows, *columns}) == 10
+
+
+def check_joints(program: ToneProgram) -> None:
+    """Frequency, amplitude and phase go on at every joint while the tweezers are on."""
+    for axis in (program.row, program.column):
+        for i in range(1, program.n_segments):
+            before, after = segment(axis, i - 1), segment(axis, i)
+            if IDLE in (program.kind[i - 1], program.kind[i]) or program.kind[i] == PICK_UP:
+                continue
+            assert after["start_hz"] == pytest.approx(before["end_hz"], abs=1e-6)
+            assert after["start_amplitude"] == pytest.approx(before["end_amplitude"])
+            cycles = 0.5 * (before["start_hz"] + before["end_hz"]) * program.duration_s[i - 1]
+            jump = np.exp(1j * (before["phase_rad"] + 2 * np.pi * cycles - after["phase_rad"]))
+            assert jump == pytest.approx(1.0, abs=1e-6)
+
+
+def check_motion(program: ToneProgram, atoms: Occupancy, grid: SiteGrid) -> set[Any]:
+    """Let the tweezers carry atoms; returns where they are in the end."""
+    held: dict[tuple[int, int], tuple[int, int]] = {}
+    places = {(int(r), int(c)) for r, c in np.argwhere(atoms)}
+    for i, kind in enumerate(program.kind.tolist()):
+        row, col = segment(program.row, i), segment(program.column, i)
+        ends: list[list[int]] = []
+        for tones, site_hz, key in (
+            (row, grid.row_frequency_hz, "start_hz"),
+            (col, grid.column_frequency_hz, "start_hz"),
+            (row, grid.row_frequency_hz, "end_hz"),
+            (col, grid.column_frequency_hz, "end_hz"),
+        ):
+            step = 1.6e6
+            at = (tones[key] - site_hz[0]) / step
+            assert at == pytest.approx(np.round(at), abs=1e-6)
+            ends.append(np.round(at).astype(int).tolist())
+        if kind == PICK_UP:
+            held = {(a, b): (r, c) for a, r in enumerate(ends[0]) for b, c in enumerate(ends[1])}
+            held = {tones: site for tones, site in held.items() if site in places}
+        elif kind == TRANSPORT:
+            sites_passed = max(abs(a - b) for a, b in zip(ends[0] + ends[1], ends[2] + ends[3], strict=True))
+            assert program.duration_s[i] == pytest.approx(sites_passed * SITE_S)
+            moved = {tones: (ends[2][tones[0]], ends[3][tones[1]]) for tones in held}
+            places = (places - set(held.values())) | set(moved.values())
+            held = moved
+    return {site for site in places if site[0] in range(grid.n_rows) and site[1] in range(grid.n_cols)}
+
+
+@given(cases((6, 6)), st.integers(1, 6))
+@settings(max_examples=100, deadline=None)
+def test_programs_do_what_the_plan_says(case: tuple[TargetPattern, Occupancy], dop: int) -> None:
+    target, atoms = case
+    grid, motion = SiteGrid(*target.shape), MotionSpec(overhead_per_cycle_s=0.0)
+    context = Context(grid=grid, motion=motion)
+    plan = PscaPlanner(PscaSettings(degree_of_parallelism=dop), context).plan(atoms, target)
+    report = check_plan(plan, atoms, target, dop, grid, motion)
+    program = tone_program(plan, grid, motion)
+    assert program.total_duration_s == pytest.approx(report.duration_s)
+    ends = [program.duration_s[program.batch <= i].sum() for i in range(plan.n_batches)]
+    assert report.batch_end_s == pytest.approx(ends)
+    check_joints(program)
+    carried = check_motion(program, atoms, grid)
+    assert carried == {(int(r), int(c)) for r, c in np.argwhere(report.predicted)}
+    for i, kind in enumerate(program.kind.tolist()):
+        n_tweezers = np.diff(program.row.offsets)[i] * np.diff(program.column.offsets)[i]
+        assert n_tweezers == (0 if kind == IDLE else report.n_tweezers[program.batch[i]])
+
+
+def test_phases_go_on_through_a_chain() -> None:
+    check_joints(
+        program_of(
+            batch((0, 0, 0, 2), (0, 3, 0, 4)),
+            batch((0, 2, 3, 2), (0, 4, 3, 4), linked=True),
+            batch((3, 2, 3, 0), (3, 4, 3, 5), linked=True),
+        )
+    )
+
+
+def test_the_first_batches_only() -> None:
+    plan = Plan.from_batches([batch((0, 0, 0, 1)), batch((0, 1, 0, 2)), batch((0, 2, 0, 3))])
+    whole = tone_program(plan, GRID)
+    part = tone_program(plan, GRID, n_batches=2)
+    n = part.n_segments
+    assert part.batch.tolist() == [0, 0, 0, 0, 1, 1, 1, 1]
+    assert part.duration_s.tolist() == whole.duration_s[:n].tolist()
+    assert part.column.phase_rad.tolist() == whole.column.phase_rad[: part.column.offsets[n]].tolist()
+    for wrong in (-1, 4):
+        with pytest.raises(PlanError, match=f"3 batches; {wrong} cannot be played"):
+            tone_program(plan, GRID, n_batches=wrong)
+
+
+def test_an_empty_plan_is_an_empty_program() -> None:
+    program = tone_program(Plan.from_batches([]))
+    assert program.n_segments == 0
+    assert program.total_duration_s == 0.0
+
+
+def test_segments_without_duration_are_left_out() -> None:
+    program = program_of(
+        batch((0, 0, 0, 1)), pick_up_s=0.0, drop_off_s=0.0, overhead_per_batch_s=0.0, overhead_per_cycle_s=0.0
+    )
+    assert program.kind.tolist() == [TRANSPORT]
+
+
+def test_the_same_plan_gives_the_same_program() -> None:
+    one, two = (program_of(batch((0, 0, 0, 1), (0, 2, 0, 5))) for _ in range(2))
+    assert one.column.phase_rad.tolist() == two.column.phase_rad.tolist()
+
+
+def test_what_cannot_be_played() -> None:
+    with pytest.raises(LimitError, match="column tones in batch 1 is 2; the limit is 1"):
+        program_of(batch((0, 0, 0, 1)), batch((0, 1, 0, 2), (0, 3, 0, 4)), max_column_tones=1)
+    with pytest.raises(LimitError, match="speed profile is 'minimum_jerk'; the limit is 'constant'"):
+        program_of(batch((0, 0, 0, 1)), speed_profile="minimum_jerk")
+    for move in ((4, 0, 4, 1), (0, 6, 0, 5), (-1, 0, -1, 1)):
+        with pytest.raises(PlanError, match="does not fit onto the grid of 4 x 6 sites; check it first"):
+            program_of(batch(move))

@@ -1,0 +1,257 @@
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import combinations, product
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from labseq_psca import _kernels, _kernels_lines, _kernels_rows
+from numpy.typing import NDArray
+
+Sites = list[int]
+
+
+def bools(values: Any) -> NDArray[np.bool_]:
+    return np.array(values, np.bool_)
+
+
+def ints(values: Sequence[int]) -> NDArray[np.int64]:
+    return np.array(values, np.int64)
+
+
+class TestCompress:
+    """The goals of a line's atoms, against trying all there are."""
+
+    @staticmethod
+    def kernel(source: Sites, fill: Sequence[bool], clear: Sequence[bool], limit: int, slots: int) -> Sites:
+        n = len(fill)
+        goal = np.zeros(n, np.int64)
+        cost, step = np.zeros((n, 2 * n + 1), np.int64), np.zeros((n, 2 * n + 1), np.int16)
+        padded = ints(source + [0] * (n - len(source)))
+        assert _kernels_lines.compress(
+            padded, len(source), bools(fill), bools(clear), limit, slots, cost, step, goal
+        )
+        return goal[: len(source)].tolist()
+
+    @staticmethod
+    def cost(source: Sites, goal: Sites, clear: Sequence[bool], limit: int) -> tuple[int, int, int, int]:
+        """Sites not cleared, ejections, batches' worth of atoms moved or waiting, distance."""
+        n = len(clear)
+        not_cleared = sum(clear[site] for site in goal if 0 <= site < n)
+        low, high = sum(site < 0 for site in goal), sum(site >= n for site in goal)
+        moved = sum(a != b for a, b in zip(source, goal, strict=True))
+        waiting = sum(range(low)) + sum(range(high))
+        ends = [min(max(site, -1), n) for site in goal]
+        distance = sum(abs(a - b) for a, b in zip(source, ends, strict=True))
+        return not_cleared, low + high, moved + limit * waiting, distance
+
+    @given(st.data())
+    @settings(max_examples=300, deadline=None)
+    def test_finds_the_cheapest_goals(self, data: st.DataObject) -> None:
+        n = data.draw(st.integers(1, 6), "sites")
+        wish = data.draw(st.lists(st.integers(0, 2), min_size=n, max_size=n), "1 fill, 2 clear")
+        fill, clear = [w == 1 for w in wish], [w == 2 for w in wish]
+        atoms = data.draw(st.lists(st.booleans(), min_size=n, max_size=n), "atoms")
+        source = [site for site in range(n) if atoms[site]]
+        assume(len(source) >= max(1, sum(fill)))
+        slots, limit = data.draw(st.integers(0, 1), "slots"), data.draw(st.integers(1, 4), "limit")
+
+        beyond = len(source) if slots else 0
+        choices = combinations(range(-beyond, n + beyond), len(source))
+        full = [site for site in range(n) if fill[site]]
+        costs = [self.cost(source, list(goal), clear, limit) for goal in choices if set(full) <= set(goal)]
+        goal = self.kernel(source, fill, clear, limit, slots)
+        assert set(full) <= set(goal)
+        assert goal == sorted(set(goal))
+        assert self.cost(source, goal, clear, limit) == min(costs)
+
+    def test_ejections_are_shared_out_to_both_sides(self) -> None:
+        goal = self.kernel([0, 1, 2, 3], [False] * 4, [True] * 4, 4, 1)
+        assert [site < 0 for site in goal] == [True, True, False, False]
+
+    def test_too_few_atoms_for_the_fill_sites(self) -> None:
+        cost, step = np.zeros((2, 5), np.int64), np.zeros((2, 5), np.int16)
+        fill, clear = bools([True, True]), bools([False, False])
+        assert not _kernels_lines.compress(ints([0, 0]), 1, fill, clear, 1, 1, cost, step, ints([0, 0]))
+
+
+class TestFillBatch:
+    """Which atoms of a line go together."""
+
+    @given(st.data())
+    @settings(max_examples=300, deadline=None)
+    def test_the_way_is_free_and_no_batch_is_wasted(self, data: st.DataObject) -> None:
+        n = data.draw(st.integers(1, 8), "sites")
+        source = sorted(data.draw(st.sets(st.integers(0, n - 1), min_size=1), "atoms"))
+        reach = st.sets(st.integers(-2, n + 1), min_size=len(source), max_size=len(source))
+        goal = sorted(data.draw(reach, "goals"))
+        limit, slots = data.draw(st.integers(1, 4), "limit"), data.draw(st.integers(1, 2), "slots")
+        turn = ints([-1 if a == b else 0 for a, b in zip(source, goal, strict=True)])
+        place = dict(enumerate(source))
+        batch = 0
+        while 0 in turn:
+            batch += 1
+            chosen = _kernels_lines.fill_batch(
+                ints(source), ints(goal), len(source), n, limit, slots, turn, batch
+            )
+            going = [i for i in place if turn[i] == batch]
+            assert 0 < len(going) == chosen <= limit
+            assert sum(goal[i] < 0 for i in going) <= slots
+            assert sum(goal[i] >= n for i in going) <= slots
+            for i, other in product(going, place):
+                if other not in going:  # it stands
+                    assert not min(place[i], goal[i]) <= place[other] <= max(place[i], goal[i])
+            for i in going:
+                place[i] = goal[i]
+                if not 0 <= goal[i] < n:
+                    del place[i]
+        n_ejected = max(sum(site < 0 for site in goal), sum(site >= n for site in goal))
+        n_moved = sum(a != b for a, b in zip(source, goal, strict=True))
+        if n_ejected == 0:
+            assert batch == -(-n_moved // limit)
+
+
+class TestBestExchange:
+    """Which atoms of a row change their columns, against trying all exchanges."""
+
+    @staticmethod
+    def worth(atoms: Sequence[bool], gain: Sites, cost: Sites, change: Sequence[int]) -> int | None:
+        """Gains minus costs minus atoms moved, by pairing old and new places; None if not allowed."""
+        total = 0
+        for col, atom in enumerate(atoms):
+            fills, leaves = change[col] == 1, change[col] == -1
+            if (fills and (atom or gain[col] == 0)) or (leaves and (not atom or cost[col] < 0)):
+                return None
+            total += fills * gain[col] - leaves * cost[col]
+        if sum(change):
+            return None
+        before = [col for col, atom in enumerate(atoms) if atom]
+        after = [col for col, atom in enumerate(atoms) if atom + change[col]]
+        total -= sum(a != b for a, b in zip(before, after, strict=True))
+        return total
+
+    @given(st.data())
+    @settings(max_examples=200, deadline=None)
+    def test_finds_the_exchange_worth_most(self, data: st.DataObject) -> None:
+        n = data.draw(st.integers(1, 7), "columns")
+        atoms = data.draw(st.lists(st.booleans(), min_size=n, max_size=n), "atoms")
+        gain = data.draw(st.lists(st.integers(0, 12), min_size=n, max_size=n), "gain")
+        cost = data.draw(st.lists(st.integers(-1, 5), min_size=n, max_size=n), "cost")
+        n_leavers = sum(atom and cost[col] >= 0 for col, atom in enumerate(atoms))
+        n_vacancies = sum(not atom and gain[col] > 0 for col, atom in enumerate(atoms))
+        change = np.zeros(n, np.int64)
+        found = _kernels_rows.best_exchange(
+            bools(atoms),
+            ints(gain),
+            ints(cost),
+            min(n_leavers, n_vacancies),
+            np.zeros((n + 1, n + 2), np.int64),
+            np.zeros((n, n + 2), np.int16),
+            change,
+        )
+        worths = [self.worth(atoms, gain, cost, c) for c in product((-1, 0, 1), repeat=n)]
+        assert found == max(worth for worth in worths if worth is not None)
+        assert self.worth(atoms, gain, cost, change.tolist()) == found
+
+        row = bools(atoms)
+        before = np.flatnonzero(row)
+        source, goal = np.zeros(n, np.int64), np.zeros(n, np.int64)
+        n_moved = _kernels_rows.n_moved(row, change)
+        n_atoms = _kernels_rows.exchange(row, change, source, goal)
+        assert source[:n_atoms].tolist() == before.tolist()
+        assert goal[:n_atoms].tolist() == np.flatnonzero(row).tolist()
+        assert n_moved == np.count_nonzero(source[:n_atoms] != goal[:n_atoms])
+
+
+class TestChooseRow:
+    @staticmethod
+    def choose(
+        atoms: Any, weight: Sites, leave: Sites, fill: Any = None, limit: int = 9
+    ) -> tuple[int, Sites]:
+        grid = bools(atoms)
+        n = grid.shape[1]
+        change = np.zeros(n, np.int64)
+        row = _kernels_rows.choose_row(
+            grid,
+            np.zeros_like(grid) if fill is None else bools(fill),
+            ints(weight),
+            ints(leave),
+            limit,
+            np.zeros((n + 1, n + 2), np.int64),
+            np.zeros((n, n + 2), np.int16),
+            change,
+        )
+        return row, change.tolist()
+
+    def test_takes_the_row_that_helps_most(self) -> None:
+        atoms = [[1, 0, 1, 1], [1, 1, 0, 0], [0, 0, 0, 0]]
+        assert self.choose(atoms, [0, 0, 90, 90], [0, 0, -1, -1]) == (1, [-1, -1, 1, 1])
+
+    def test_counts_the_batches_that_a_row_takes(self) -> None:
+        atoms = [[1, 1, 1, 0], [0, 0, 1, 0]]
+        weights, leave = [0, 0, 0, 90], [0, 0, 0, -1]
+        assert self.choose(atoms, weights, leave, limit=1) == (0, [0, 0, -1, 1])
+        far = [[1, 1, 1, 0], [0, 1, 0, 0]]
+        assert self.choose(far, weights, [0, -1, -1, -1], limit=1) == (0, [-1, 0, 0, 1])
+
+    def test_of_equals_takes_the_one_closest_to_half_filled(self) -> None:
+        atoms = [[1, 0, 1, 1], [1, 0, 0, 1], [1, 0, 0, 0]]
+        assert self.choose(atoms, [0, 90, 0, 0], [0, -1, -1, -1])[0] == 1
+
+    def test_prefers_to_land_on_fill_sites(self) -> None:
+        atoms = [[1, 0], [1, 0]]
+        assert self.choose(atoms, [0, 90], [0, -1], [[0, 0], [0, 1]])[0] == 1
+
+    def test_no_row_helps(self) -> None:
+        assert self.choose([[1, 1], [0, 0]], [0, 90], [0, -1])[0] == -1
+
+
+def test_weights_of_columns() -> None:
+    weight, leave = np.zeros(4, np.int64), np.zeros(4, np.int64)
+    need, room, count = ints([3, 2, 0, 1]), ints([5, 5, 5, 2]), ints([1, 4, 1, 3])
+    assert _kernels_rows.weigh_columns(need, room, count, weight, leave) == 2
+    assert weight.tolist() == [2 * (80 + 4), 0, 0, 0]
+    assert leave.tolist() == [-1, 20, 0, 0]  # the last has more atoms than room
+
+
+def test_unlocking_moves_the_nearest_atom_within_its_column() -> None:
+    atoms = bools([[1, 1], [1, 1], [0, 0], [0, 0]])
+    assert _kernels_rows.choose_unlocking(atoms, ints([0, 90]), ints([0, -1])) == (0, 1, 2)
+    assert _kernels_rows.choose_unlocking(atoms, ints([0, 90]), ints([-1, -1]))[0] == -1
+
+
+def test_a_growing_plan_is_lengthened() -> None:
+    moves, offsets = np.zeros((1, 4), np.int16), np.zeros(2, np.int32)
+    n_batches = 0
+    for line in range(4):
+        moves, offsets, n_batches = _kernels.add_line(
+            moves, offsets, n_batches, ints([0, 1]), ints([1, 2]), 2, 3, line, line % 2 == 0, 1, 0
+        )
+    assert n_batches == 8
+    assert offsets[:9].tolist() == list(range(9))
+    assert moves[:4].tolist() == [[0, 1, 0, 2], [0, 0, 0, 1], [1, 1, 2, 1], [0, 1, 1, 1]]
+
+
+@pytest.mark.parametrize("slots", [1, 2])
+def test_ejection_slots_are_used_from_the_outermost_atom_on(slots: int) -> None:
+    moves, offsets, n_batches = _kernels.add_line(
+        np.zeros((9, 4), np.int16),
+        np.zeros(10, np.int32),
+        0,
+        ints([0, 1, 3, 4]),
+        ints([-2, -1, 5, 6]),
+        4,
+        5,
+        7,
+        True,
+        4,
+        slots,
+    )
+    batches = [moves[offsets[i] : offsets[i + 1]].tolist() for i in range(n_batches)]
+    if slots == 1:
+        assert batches == [[[7, 0, 7, -1], [7, 4, 7, 5]], [[7, 1, 7, -1], [7, 3, 7, 5]]]
+    else:
+        assert batches == [[[7, 0, 7, -2], [7, 1, 7, -1], [7, 3, 7, 5], [7, 4, 7, 6]]]

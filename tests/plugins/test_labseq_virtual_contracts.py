@@ -1,0 +1,54 @@
+"""The virtual drivers keep the promises of their roles."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import ClassVar
+
+import pytest
+from labseq_virtual.camera import VirtualCamera
+from labseq_virtual.device import VirtualDevice
+from labseq_virtual.mobile_tweezers import VirtualMobileTweezers
+from labseq_virtual.settings import (
+    CameraSettings,
+    DeviceSettings,
+    MobileTweezersSettings,
+    StaticTweezersSettings,
+)
+from labseq_virtual.static_tweezers import VirtualStaticTweezers
+
+from labseq import Context
+from labseq.testing import (
+    CameraContract,
+    DeviceContract,
+    MobileTweezersContract,
+    StaticTweezersContract,
+)
+
+
+class TestVirtualCamera(CameraContract):
+    @pytest.fixture
+    def factory(self) -> Callable[[Context], VirtualCamera]:
+        return partial(VirtualCamera, CameraSettings())
+
+
+class TestVirtualStaticTweezers(StaticTweezersContract):
+    @pytest.fixture
+    def factory(self) -> Callable[[Context], VirtualStaticTweezers]:
+        return partial(VirtualStaticTweezers, StaticTweezersSettings())
+
+
+class TestVirtualMobileTweezers(MobileTweezersContract):
+    @pytest.fixture
+    def factory(self) -> Callable[[Context], VirtualMobileTweezers]:
+        return partial(VirtualMobileTweezers, MobileTweezersSettings())
+
+
+class TestVirtualDevice(DeviceContract):
+    commands: ClassVar = {"open": {}, "set": {"power": 0.5}}
+    values: ClassVar = ("state", "power")
+
+    @pytest.fixture
+    def factory(self) -> Callable[[Context], VirtualDevice]:
+        return partial(VirtualDevice, DeviceSettings(commands=("open", "set"), values={"power": 1.0}))

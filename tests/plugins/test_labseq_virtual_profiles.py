@@ -1,0 +1,118 @@
+"""The profiles that come with labseq, and the plugin's defaults."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import labseq_virtual
+import numpy as np
+import pytest
+from labseq_virtual.settings import (
+    CameraSettings,
+    DeviceSettings,
+    MobileTweezersSettings,
+    StaticTweezersSettings,
+    WorldSettings,
+)
+
+from labseq import MotionSpec, Registry, Settings, SiteGrid
+from labseq.config import MOTION_KEYS, load_profile
+from labseq.config.detectors import ThresholdSettings
+from labseq.config.patterns import BitmapSettings, CompactSettings
+
+MODELS: Mapping[str, type[Settings]] = {
+    "camera": CameraSettings,
+    "static_tweezers": StaticTweezersSettings,
+    "mobile_tweezers": MobileTweezersSettings,
+    "detector": ThresholdSettings,
+    "simulation": WorldSettings,
+}
+
+
+def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested settings as one mapping, address -> value."""
+    found: dict[str, Any] = {}
+    for key, value in values.items():
+        nested: Mapping[str, Any] | None = value if isinstance(value, Mapping) else None
+        found |= {prefix + key: value} if nested is None else flat(nested, f"{prefix}{key}.")
+    return found
+
+
+def test_the_virtual_profile_states_the_defaults() -> None:
+    document, profile = load_profile("virtual", beside=Path())
+    assert all(choice.use == "virtual" for role, choice in profile.choices.items() if role != "detector")
+    for role, model in MODELS.items():
+        read = document.validate(model, (role,), drop={"use", *MOTION_KEYS})
+        stated, default = flat(read.model_dump()), flat(model().model_dump())
+        assert stated.keys() == default.keys()
+        for key, value in default.items():
+            expected = pytest.approx(value) if isinstance(value, float) else value
+            assert stated[key] == expected, f"{role}.{key}"
+    shutter = document.validate(DeviceSettings, ("devices", "shutter"), drop={"use"})
+    assert shutter.commands == ("open", "close")
+
+
+@pytest.mark.parametrize("name", ["virtual", "lab"])
+def test_the_profiles_describe_the_papers_machine(name: str) -> None:
+    document, profile = load_profile(name, beside=Path())
+    grid, paper = profile.grid_model(), SiteGrid()
+    assert profile.motion == MotionSpec()
+    np.testing.assert_allclose(grid.positions_m, paper.positions_m)
+    np.testing.assert_allclose(grid.row_frequency_hz, paper.row_frequency_hz)
+    np.testing.assert_allclose(grid.column_frequency_hz, paper.column_frequency_hz)
+    assert document.validate(ThresholdSettings, ("detector",), drop={"use"}) == ThresholdSettings()
+    assert document.validate(WorldSettings, ("simulation",), drop={"use"}).lifetime == 33.0
+
+
+def test_camera_and_detector_agree_on_where_the_atoms_are() -> None:
+    image, detector = WorldSettings().image, ThresholdSettings()
+    for name in ("frame", "centre_px", "pixel_size", "angle", "offset"):
+        assert getattr(image, name) == getattr(detector, name)
+
+
+def test_the_grid_and_its_ejection_slots_fit_into_the_aods_band() -> None:
+    grid, limits, slots = SiteGrid(), MobileTweezersSettings(), MotionSpec().eject_slots
+    for hz in (grid.row_frequency_hz, grid.column_frequency_hz):
+        reach = max(abs(hz - limits.band_centre)) + slots * (hz[1] - hz[0])
+        assert reach <= limits.band_half_width
+
+
+def test_the_plugin_registers_a_virtual_twin_for_each_role() -> None:
+    registry = Registry()
+    labseq_virtual.labseq_register(registry)
+    entries = registry.entries()
+    assert [entry.kind for entry in entries] == [
+        "camera",
+        "static_tweezers",
+        "mobile_tweezers",
+        "device",
+        "simulation",
+    ]
+    for entry in entries:
+        assert entry.name == "virtual"
+        assert entry.virtual_time
+        assert entry.settings_model is not None
+        entry.settings_model()
+
+
+@pytest.mark.parametrize("model", [*MODELS.values(), DeviceSettings, CompactSettings, BitmapSettings])
+def test_every_setting_is_described(model: type[Settings]) -> None:
+    for name, described in fields(model).items():
+        assert described, f"{model.__name__}.{name} has no description"
+
+
+def fields(model: type[Settings]) -> dict[str, str | None]:
+    found: dict[str, str | None] = {}
+    for name, info in model.model_fields.items():
+        found[name] = info.description
+        if isinstance(info.annotation, type) and issubclass(info.annotation, Settings):
+            found |= {f"{name}.{key}": text for key, text in fields(info.annotation).items()}
+    return found
+
+
+@pytest.mark.parametrize("name", [name for name in flat(WorldSettings().model_dump()) if name != "image"])
+def test_every_constant_of_the_world_says_where_it_comes_from(name: str) -> None:
+    description = fields(WorldSettings)[name] or ""
+    assert any(source in description for source in ("paper", "derived", "ours"))

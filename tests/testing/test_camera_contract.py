@@ -1,0 +1,114 @@
+"""Each promise of a camera is broken once, and the suite names it and no other."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from labseq.model import Frame
+from labseq.roles import Context, Trigger
+from labseq.testing import CameraContract
+from labseq.testing.fakes import RecordingCamera
+
+
+class GivesAnArray(RecordingCamera):
+    def read(self, timeout_s: float) -> Any:
+        frame = super().read(timeout_s)
+        return ArrayWithAttributes(frame)
+
+
+class ArrayWithAttributes:
+    """What looks like a frame, but is none."""
+
+    def __init__(self, frame: Frame) -> None:
+        self.image = frame.image
+        self.exposure_s = frame.exposure_s
+        self.t_start_s = frame.t_start_s
+
+
+class GivesEmptyImages(RecordingCamera):
+    def __init__(self, context: Context) -> None:
+        super().__init__(context)
+        self.frame_shape = (0, 0)
+
+
+class TellsAnotherExposure(RecordingCamera):
+    def read(self, timeout_s: float) -> Frame:
+        frame = super().read(timeout_s)
+        return Frame(frame.image, frame.exposure_s * 1000, frame.t_start_s)
+
+
+class ExposesOnceMore(RecordingCamera):
+    def arm(self, n_frames: int, exposure_s: float, trigger: Trigger) -> None:
+        super().arm(n_frames + (n_frames == 3), exposure_s, trigger)
+
+
+class KeepsTheOldSeries(RecordingCamera):
+    def arm(self, n_frames: int, exposure_s: float, trigger: Trigger) -> None:
+        n_left = self._n_left
+        super().arm(n_frames, exposure_s, trigger)
+        self._n_left += n_left
+
+
+class ChangesItsShape(RecordingCamera):
+    def trigger(self) -> None:
+        super().trigger()
+        self.frame_shape = (self.frame_shape[0] + 1, 16)
+
+
+class TellsTheWallClock(RecordingCamera):
+    def read(self, timeout_s: float) -> Frame:
+        frame = super().read(timeout_s)
+        return Frame(frame.image, frame.exposure_s, frame.t_start_s + 1.7e9)
+
+
+class TellsTheTimeOfOpening(RecordingCamera):
+    def read(self, timeout_s: float) -> Frame:
+        frame = super().read(timeout_s)
+        return Frame(frame.image, frame.exposure_s, 0.0)
+
+
+class SharesItsBuffer(RecordingCamera):
+    def __init__(self, context: Context) -> None:
+        super().__init__(context)
+        self.buffer = np.zeros((16, 16), np.uint16)
+
+    def read(self, timeout_s: float) -> Frame:
+        frame = super().read(timeout_s)
+        self.buffer[...] = frame.image
+        view = self.buffer[:]
+        view.flags.writeable = False
+        return Frame(view, frame.exposure_s, frame.t_start_s)
+
+
+class TriggersUnarmed(RecordingCamera):
+    def open(self) -> None:
+        super().open()
+        self._n_left = 1
+
+
+class StaysArmed(RecordingCamera):
+    def safe_state(self) -> None:
+        n_left = self._n_left
+        super().safe_state()
+        self._n_left = n_left
+
+
+@pytest.mark.parametrize(
+    ("camera", "test"),
+    [
+        (GivesAnArray, "test_gives_a_frame"),
+        (GivesEmptyImages, "test_gives_a_frame"),
+        (TellsAnotherExposure, "test_gives_a_frame"),
+        (ExposesOnceMore, "test_gives_as_many_frames_as_armed_for"),
+        (KeepsTheOldSeries, "test_gives_as_many_frames_as_armed_for"),
+        (ChangesItsShape, "test_gives_as_many_frames_as_armed_for"),
+        (TellsTheWallClock, "test_tells_when_it_exposed"),
+        (TellsTheTimeOfOpening, "test_tells_when_it_exposed"),
+        (SharesItsBuffer, "test_frames_do_not_change"),
+        (TriggersUnarmed, "test_refuses_trigger_without_arm"),
+        (StaysArmed, "test_refuses_trigger_without_arm"),
+    ],
+)
+def test_the_broken_promise_is_named_and_no_other(breaks_only, camera: Any, test: str) -> None:
+    breaks_only(CameraContract(), camera, test)

@@ -1,0 +1,76 @@
+"""Each promise of an instrument is broken once, and the suite names it and no other."""
+
+from typing import Any, ClassVar
+
+import pytest
+
+from labseq.errors import DeviceError, LimitError
+from labseq.testing import DeviceContract
+from labseq.testing.fakes import RecordingDevice
+
+
+class Suite(DeviceContract):
+    commands: ClassVar = {"on": {}, "off": {}}
+    values: ClassVar = ("state",)
+    excessive_commands: ClassVar = {"too bright": ("on", {"power": 100.0})}
+
+
+class Right(RecordingDevice):
+    def command(self, name: str, **arguments: Any) -> None:
+        if arguments.get("power", 0.0) > 1.0:
+            raise LimitError("the power", arguments["power"], 1.0)
+        super().command(name, **arguments)
+
+
+class CannotTellItsState(Right):
+    def read(self, name: str) -> Any:
+        super().read(name)
+        raise NotImplementedError
+
+
+class RaisesKeyError(Right):
+    def command(self, name: str, **arguments: Any) -> None:
+        if name not in self.commands:
+            raise KeyError(name)
+        super().command(name, **arguments)
+
+
+class IsTerse(Right):
+    def command(self, name: str, **arguments: Any) -> None:
+        if name not in self.commands:
+            raise DeviceError(self.name, "what?")
+        super().command(name, **arguments)
+
+
+class IgnoresUnknownCommands(Right):
+    def command(self, name: str, **arguments: Any) -> None:
+        if name in self.commands:
+            super().command(name, **arguments)
+
+
+class AnswersNone(Right):
+    def read(self, name: str) -> Any:
+        return super().read(name) if name in self.values else None
+
+
+class ObeysAnyPower(RecordingDevice):
+    pass
+
+
+@pytest.mark.parametrize(
+    ("device", "test"),
+    [
+        (CannotTellItsState, "test_does_what_it_declares"),
+        (RaisesKeyError, "test_refuses_unknown_commands"),
+        (IsTerse, "test_refuses_unknown_commands"),
+        (IgnoresUnknownCommands, "test_refuses_unknown_commands"),
+        (AnswersNone, "test_refuses_unknown_values"),
+        (ObeysAnyPower, "test_refuses_what_exceeds_limits"),
+    ],
+)
+def test_the_broken_promise_is_named_and_no_other(breaks_only, device: Any, test: str) -> None:
+    breaks_only(Suite(), device, test)
+
+
+def test_a_right_device_keeps_all_promises(keeps_all) -> None:
+    keeps_all(Suite(), Right)

@@ -1,0 +1,103 @@
+"""Each promise of a step is broken once, and the suite names it and no other."""
+
+import itertools
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from labseq.errors import StopRequested
+from labseq.model import TimelineEntry
+from labseq.roles import Shot, StepContext
+from labseq.testing import StepContract
+
+
+class Right:
+    """Waits, then takes an image."""
+
+    needs_image = False
+    takes_image = True
+
+    def plan_timeline(self, context: StepContext) -> Sequence[Any]:
+        return [TimelineEntry("wait", 0.1, 0.1), TimelineEntry("image", 0.045, 0.045, n_images=1)]
+
+    def run(self, shot: Shot) -> None:
+        shot.clock.sleep(0.1)
+        shot.take_image(0.045)
+
+
+class PlansInWords(Right):
+    def plan_timeline(self, context: StepContext) -> Sequence[Any]:
+        super().plan_timeline(context)
+        return ["wait", "image"]
+
+
+class UsuallyTakesLonger(Right):
+    def plan_timeline(self, context: StepContext) -> Sequence[Any]:
+        return [TimelineEntry("wait", 0.15, 0.2, n_images=1)]
+
+
+class HasNoEnd(Right):
+    def plan_timeline(self, context: StepContext) -> Sequence[Any]:
+        return [TimelineEntry("wait", float("inf"), 0.1, n_images=1)]
+
+
+class ReadsAFile(Right):
+    def __init__(self) -> None:
+        Path(os.devnull).read_bytes()
+
+
+class ChangesItsMind(Right):
+    def __init__(self) -> None:
+        self.durations = itertools.cycle((0.2, 0.3))
+
+    def plan_timeline(self, context: StepContext) -> Sequence[Any]:
+        return [TimelineEntry("wait", next(self.durations), 0.1, n_images=1)]
+
+
+class KnowsItsImagesLater(Right):
+    takes_image: Any = None
+
+
+class TakesLonger(Right):
+    def run(self, shot: Shot) -> None:
+        super().run(shot)
+        shot.clock.sleep(0.1)
+
+
+class TakesAnotherImage(Right):
+    def run(self, shot: Shot) -> None:
+        shot.take_image(0.045)
+        shot.take_image(0.045)
+
+
+class HearsNothing(Right):
+    def run(self, shot: Shot) -> None:
+        try:
+            super().run(shot)
+        except StopRequested:
+            return
+
+
+@pytest.mark.parametrize(
+    ("step", "test"),
+    [
+        (UsuallyTakesLonger, "test_lays_out_its_timeline"),
+        (HasNoEnd, "test_lays_out_its_timeline"),
+        (ReadsAFile, "test_timeline_is_pure"),
+        (ChangesItsMind, "test_timeline_is_pure"),
+        (KnowsItsImagesLater, "test_declares_its_images"),
+        (TakesLonger, "test_keeps_its_timeline"),
+        (TakesAnotherImage, "test_keeps_its_timeline"),
+        (HearsNothing, "test_hears_a_stop_request"),
+        (PlansInWords, "test_lays_out_its_timeline"),
+    ],
+)
+def test_the_broken_promise_is_named_and_no_other(breaks_only, step: Any, test: str) -> None:
+    breaks_only(StepContract(), step, test)
+
+
+def test_a_right_step_keeps_all_promises(keeps_all) -> None:
+    keeps_all(StepContract(), Right)

@@ -1,0 +1,153 @@
+"""Each promise of static and mobile tweezers is broken once, and the suite names it and no other."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from labseq.errors import LimitError
+from labseq.model import ToneProgram
+from labseq.testing import MobileTweezersContract, StaticTweezersContract
+from labseq.testing.fakes import RecordingMobileTweezers, RecordingStaticTweezers
+
+
+class StartsAgain(RecordingStaticTweezers):
+    def start(self) -> None:
+        self.depth = 0.0
+        super().start()
+
+
+class NeverTurnsOff(RecordingStaticTweezers):
+    def ramp(self, depth: float, duration_s: float) -> None:
+        if depth == 0.0:
+            raise LimitError("the depth", depth, "more than 0")
+        super().ramp(depth, duration_s)
+
+
+class NeedsATimeToRamp(RecordingStaticTweezers):
+    def ramp(self, depth: float, duration_s: float) -> None:
+        super().ramp(depth + 0 / duration_s, duration_s)
+
+
+class NormalizesInPlace(RecordingStaticTweezers):
+    def load(self, amplitudes: Any) -> None:
+        super().load(amplitudes)
+        if amplitudes is not None:
+            amplitudes[0][...] /= amplitudes[0].sum()
+
+
+class ClipsTheDepth(RecordingStaticTweezers):
+    def ramp(self, depth: float, duration_s: float) -> None:
+        super().ramp(float(np.clip(depth, 0, 1)), duration_s)
+
+
+class RampsBeforeItLooks(RecordingStaticTweezers):
+    def ramp(self, depth: float, duration_s: float) -> None:
+        if depth > 1:
+            super().ramp(1.0, duration_s)
+        super().ramp(depth, duration_s)
+
+
+class LoadsAnything(RecordingStaticTweezers):
+    def load(self, amplitudes: Any) -> None:
+        super().load(None)
+
+
+@pytest.mark.parametrize(
+    ("tweezers", "test"),
+    [
+        (StartsAgain, "test_starts_twice"),
+        (NeverTurnsOff, "test_ramps"),
+        (NeedsATimeToRamp, "test_ramps"),
+        (NormalizesInPlace, "test_loads_amplitudes"),
+        (ClipsTheDepth, "test_refuses_what_exceeds_limits"),
+        (RampsBeforeItLooks, "test_refuses_what_exceeds_limits"),
+        (LoadsAnything, "test_refuses_what_exceeds_limits"),
+    ],
+)
+def test_of_static_tweezers_the_broken_promise_is_named(breaks_only, tweezers: Any, test: str) -> None:
+    breaks_only(StaticTweezersContract(), tweezers, test)
+
+
+class LeavesOutThePauses(RecordingMobileTweezers):
+    def prepare(self, program: ToneProgram) -> float:
+        return 0.5 * super().prepare(program)
+
+
+class RunsOutOfMemory(RecordingMobileTweezers):
+    def prepare(self, program: ToneProgram) -> float:
+        if len(self.programs) == 2:
+            raise MemoryError
+        return super().prepare(program)
+
+
+class PlaysToTheEnd(RecordingMobileTweezers):
+    def play(self) -> None:
+        super().play()
+        self.clock.sleep(0.6 * self.programs[-1].total_duration_s)
+
+
+class PlaysSilence(RecordingMobileTweezers):
+    def play(self) -> None:
+        self.use("play")
+        if self._prepared is not None:
+            super().play()
+
+
+class StaysPrepared(RecordingMobileTweezers):
+    def safe_state(self) -> None:
+        prepared = self._prepared
+        super().safe_state()
+        self._prepared = prepared
+
+
+class FailsOnNothing(RecordingMobileTweezers):
+    def prepare(self, program: ToneProgram) -> float:
+        duration_s = super().prepare(program)
+        np.max(program.row.start_hz)
+        return duration_s
+
+
+class LooksWhenItPlays(RecordingMobileTweezers):
+    def prepare(self, program: ToneProgram) -> float:
+        try:
+            return super().prepare(program)
+        except LimitError:
+            return program.total_duration_s
+
+
+class WaitsToTheEnd(RecordingMobileTweezers):
+    def wait(self, timeout_s: float) -> None:
+        super().wait(3600.0)
+
+
+@pytest.mark.parametrize(
+    ("tweezers", "test"),
+    [
+        (LeavesOutThePauses, "test_tells_the_playing_time"),
+        (RunsOutOfMemory, "test_plays_programs"),
+        (PlaysToTheEnd, "test_play_returns_at_once"),
+        (PlaysSilence, "test_refuses_play_without_prepare"),
+        (StaysPrepared, "test_refuses_play_without_prepare"),
+        (FailsOnNothing, "test_takes_an_empty_program"),
+        (LooksWhenItPlays, "test_refuses_what_exceeds_limits"),
+        (WaitsToTheEnd, "test_keeps_timeouts"),
+    ],
+)
+def test_of_mobile_tweezers_the_broken_promise_is_named(breaks_only, tweezers: Any, test: str) -> None:
+    breaks_only(MobileTweezersContract(), tweezers, test)
+
+
+def test_right_tweezers_keep_all_promises(keeps_all) -> None:
+    keeps_all(StaticTweezersContract(), RecordingStaticTweezers)
+    keeps_all(MobileTweezersContract(), RecordingMobileTweezers)
+
+
+def test_an_empty_program_may_be_refused(keeps_all) -> None:
+    class WantsTones(RecordingMobileTweezers):
+        def prepare(self, program: ToneProgram) -> float:
+            if program.n_segments == 0:
+                raise LimitError("the length of the program", 0, "more than 0")
+            return super().prepare(program)
+
+    keeps_all(MobileTweezersContract(), WantsTones)
