@@ -68,6 +68,7 @@ _HOMES: Final = {
         "Lines",
         "MobileTweezers",
         "Planner",
+        "ReadsOut",
         "Shot",
         "Simulation",
         "StaticTweezers",

@@ -163,6 +163,9 @@ from labseq.roles import (
     Planner as Planner,
 )
 from labseq.roles import (
+    ReadsOut as ReadsOut,
+)
+from labseq.roles import (
     Shot as Shot,
 )
 from labseq.roles import (

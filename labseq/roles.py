@@ -105,6 +105,16 @@ class Camera(Hardware, Protocol):
         ...
 
 
+@runtime_checkable
+class ReadsOut(Protocol):
+    """A camera that says how long it reads out after an exposure."""
+
+    @property
+    def readout_s(self) -> float:
+        """From the end of the exposure until the frame can be read, in seconds."""
+        ...
+
+
 class StaticTweezers(Hardware, Protocol):
     """The static array."""
 
@@ -192,7 +202,8 @@ class Planner(Protocol):
         With too few atoms it fills what it can, from the centre of the target.
 
         Args:
-            occupancy: bool (n_rows, n_cols), as detected.
+            occupancy: bool (n_rows, n_cols), as detected; of any memory layout, and
+                perhaps read-only.
             target: What to end with.
         """
         ...
@@ -434,11 +445,19 @@ class Shot(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class StepContext:
-    """What a step needs to know to lay out its timeline before anything is opened."""
+    """What a step needs to know to lay out its timeline before anything is opened.
+
+    Attributes:
+        grid: The grid of sites.
+        motion: How the mobile tweezers move.
+        target: What the array shall look like.
+        readout_s: Read-out time of the camera, 0 if it does not say.
+    """
 
     grid: SiteGrid
     motion: MotionSpec
     target: TargetPattern
+    readout_s: float = 0.0
 
 
 class Step(Protocol):

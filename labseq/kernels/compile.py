@@ -8,8 +8,8 @@ numba's own cache notices an edit of the file that a kernel stands in, but not o
 a kernel or constant that it takes from another file: it would go on using the
 old machine code. So each kernel is kept in a folder named after everything that
 it is compiled from: its file, the kernels that its module takes from other files
-(and theirs), the constants that it names, and the versions of Python, numba and
-numpy. An edit anywhere therefore leads to a new folder.
+(and theirs), the constants that it names, numba's settings, and the versions of
+Python, numba and numpy. An edit anywhere therefore leads to a new folder.
 """
 
 from __future__ import annotations
@@ -160,6 +160,7 @@ def _jit(function: FunctionType, signatures: list[str], folder: Path | None) -> 
 def _digest(function: FunctionType) -> str:
     """Name of everything that a kernel is compiled from."""
     parts: list[object] = [sys.version, _numba().__version__, np.__version__]
+    parts += sorted(item for item in os.environ.items() if item[0].startswith("NUMBA_"))
     parts.append(_source(function))
     module_globals = function.__globals__
     taken = list(module_globals.values())

@@ -116,7 +116,7 @@ class ShotRecord:
             without one.
         n_missing_atoms: Atoms that the loading fell short of the target.
         readings: Values read from devices during the shot.
-        parameters: Resolved values of this shot (scan point, overrides).
+        parameters: What differs from the files in this shot: address -> value.
     """
 
     shot_index: int

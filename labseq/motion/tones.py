@@ -69,7 +69,7 @@ def tone_program(
     n_batches = plan.n_batches if n_batches is None else n_batches
     _refuse_misfits(plan, grid, n_batches)
     sizes = np.diff(plan.batch_offsets[: n_batches + 1]).astype(np.int64)
-    n_segments = 3 * n_batches + int(sizes.sum())
+    n_segments = 3 * n_batches + 2 * int(sizes.sum())  # a tone may arrive on either axis
     kind = np.empty(n_segments, np.int8)
     batch = np.empty(n_segments, np.int32)
     duration_s = np.empty(n_segments, np.float64)
@@ -78,7 +78,7 @@ def tone_program(
     axes: list[AxisTones] = []
     for axis in (0, 1):
         offsets = np.empty(n_segments + 1, np.int32)
-        values = np.empty((N_FIELDS, int(((sizes + 2) * sizes).sum())), np.float64)
+        values = np.empty((N_FIELDS, int(((2 * sizes + 2) * sizes).sum())), np.float64)
         n_segments_used, n_tones = build_axis(
             plan.moves,
             plan.batch_offsets,

@@ -125,6 +125,6 @@ def _translated(owner: str, error: BaseException) -> BaseException:
     if isinstance(error, LabseqError):
         return error
     text = f"raised {type(error).__name__}: {error}" if str(error) else f"raised {type(error).__name__}"
-    named = PlanError(f"the planner {text}") if owner == "planner" else DeviceError(owner, text)
+    named = PlanError(text) if owner == "planner" else DeviceError(owner, text)
     named.__cause__ = error
     return named

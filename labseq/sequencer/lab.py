@@ -16,8 +16,10 @@ from labseq.roles import (
     Hardware,
     MobileTweezers,
     Planner,
+    ReadsOut,
     Simulation,
     StaticTweezers,
+    StepContext,
 )
 from labseq.sequencer.guard import Guard
 
@@ -56,6 +58,12 @@ class Lab:
     simulation: Simulation | None
     random_streams: tuple[RandomStream, ...]
     timeouts: Timeouts
+
+    @property
+    def step_context(self) -> StepContext:
+        """What steps need to lay out their timelines."""
+        readout_s = self.camera.readout_s if isinstance(self.camera, ReadsOut) else 0.0
+        return StepContext(self.grid, self.motion, self.target, readout_s)
 
     def hardware(self) -> Iterator[tuple[str, Hardware]]:
         """Name and device, in the order of opening: static tweezers first."""

@@ -37,14 +37,14 @@ class RearrangeStep:
     def __init__(self, settings: _Settings) -> None:
         self.settings = settings
 
-    def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:  # noqa: ARG002 - Protocol
+    def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:
         """Two bars per cycle, the moves at their window."""
-        exposure_s = self.settings.exposure
+        image_s = self.settings.exposure + context.readout_s
         bars: list[TimelineEntry] = []
         for cycle in range(1, self.settings.cycles + 1):
             window_s = self.settings.window_of(cycle)
             bars.append(TimelineEntry(f"cycle {cycle}: move", window_s, window_s))
-            bars.append(TimelineEntry(f"cycle {cycle}: image", exposure_s, exposure_s, n_images=1))
+            bars.append(TimelineEntry(f"cycle {cycle}: image", image_s, image_s, n_images=1))
         return bars
 
     def run(self, shot: Shot) -> None:
@@ -77,7 +77,10 @@ class RearrangeStep:
         assert occupancy is not None
         with shot.stage("plan", cycle=cycle):
             seen = occupancy.copy()  # a planner that writes into its input harms only itself
-            plan = shot.call("planner", shot.plan_timeout_s, shot.planner.plan, seen, shot.target)
+            try:
+                plan = shot.call("planner", shot.plan_timeout_s, shot.planner.plan, seen, shot.target)
+            except PlanError as error:
+                raise error if error.planner else PlanError(str(error), shot.planner_name) from error
         if not isinstance(plan, Plan):  # pyright: ignore[reportUnnecessaryIsInstance]
             raise PlanError(f"plan() returned {type(plan).__name__}; expected a Plan", shot.planner_name)
         with shot.stage("check", cycle=cycle):

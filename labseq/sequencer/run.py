@@ -10,7 +10,7 @@ from typing import Any, Protocol
 from labseq.errors import LabseqError, StopRequested, TransientError
 from labseq.model import ShotRecord
 from labseq.model.records import ShotStatus
-from labseq.roles import RunObserver, Step, StepContext
+from labseq.roles import RunObserver, Step
 from labseq.sequencer.clock import StopFlag
 from labseq.sequencer.guard import Guard
 from labseq.sequencer.lab import Lab, close_all, make_safe
@@ -37,7 +37,7 @@ class Sequencer:
         observer: Told everything that happens.
         seed: The run's seed.
         attempts: How often a shot is tried when it fails with ``TransientError``.
-        parameters: Resolved values, kept with each shot.
+        parameters: What differs from the files, kept with each shot: address -> value.
     """
 
     def __init__(
@@ -62,8 +62,7 @@ class Sequencer:
         self._attempts = attempts
         self._parameters = dict(parameters or {})
         self._states = StateTable(lambda state: self._emit("state", {"state": state.value}))
-        context = StepContext(lab.grid, lab.motion, lab.target)
-        self._budgets = [sum(e.duration_s for e in step.plan_timeline(context)) for _, step in steps]
+        self._budgets = [sum(e.duration_s for e in step.plan_timeline(lab.step_context)) for _, step in steps]
 
     @property
     def state(self) -> State:

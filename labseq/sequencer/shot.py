@@ -97,7 +97,8 @@ class RunningShot:
         """
         camera, timeout_s = self.lab.camera, self.call_timeout_s
         start_s = self.elapsed_s
-        with self.stage("expose", cycle=cycle):
+        budget_s = exposure_s + self.lab.step_context.readout_s
+        with self.stage("expose", budget_s, cycle):
             self.call("camera", timeout_s, camera.arm, 1, exposure_s, "software")
             self.call("camera", timeout_s + exposure_s, camera.trigger)
             limit_s = timeout_s + exposure_s
@@ -123,7 +124,12 @@ class RunningShot:
         self.record.filling_fraction = self.target.filling_fraction(self.occupancy)
 
     def record_cycle(self, cycle: CycleRecord) -> None:
-        """Add a rearrangement cycle to the shot's record."""
+        """Add a rearrangement cycle, made on the image that was taken last, to the shot's record."""
+        if not self.record.cycles and self.occupancy is not None:
+            n_missing = self.target.n_atoms - int(np.count_nonzero(self.occupancy))
+            self.record.n_missing_atoms = max(0, n_missing)
+            if n_missing > 0:
+                self.log("too_few_atoms", n_missing_atoms=n_missing)
         self.record.cycles.append(cycle)
         self._emit("cycle", {"cycle": cycle})
 

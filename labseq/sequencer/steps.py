@@ -63,9 +63,10 @@ class ImageStep:
     def __init__(self, settings: _Exposure) -> None:
         self.exposure_s = settings.exposure
 
-    def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:  # noqa: ARG002 - Protocol
-        """One bar."""
-        return [TimelineEntry("image", self.exposure_s, self.exposure_s, n_images=1)]
+    def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:
+        """One bar, read-out included."""
+        image_s = self.exposure_s + context.readout_s
+        return [TimelineEntry("image", image_s, image_s, n_images=1)]
 
     def run(self, shot: Shot) -> None:
         """Take the image and judge the shot on it."""

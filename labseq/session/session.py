@@ -15,7 +15,7 @@ from labseq.errors import ConfigError, LabseqError, StopRequested
 from labseq.model import RunRecord, TimelineEntry
 from labseq.model.records import RunStatus
 from labseq.recording import Run, RunWriter, clear_active, data_root, died, mark_active, open_run
-from labseq.roles import RunObserver, StepContext, Warmable
+from labseq.roles import RunObserver, Warmable
 from labseq.sequencer import PacedClock, RealClock, Sequencer, StopFlag, VirtualClock
 from labseq.sequencer.lab import Lab, describe
 from labseq.session.assembly import Assembly, assemble, build_lab
@@ -140,9 +140,8 @@ class Session:
 
     def timeline(self) -> list[tuple[str, list[TimelineEntry]]]:
         """What a shot will do: name of each step and its bars."""
-        assembly = self.assembly
-        context = StepContext(assembly.bench.grid, assembly.bench.profile.motion, assembly.target)
-        return [(name, list(step.plan_timeline(context))) for name, step in assembly.steps]
+        context = self._build().step_context
+        return [(name, list(step.plan_timeline(context))) for name, step in self.assembly.steps]
 
     def run(self) -> Run:
         """Take all shots.
@@ -199,7 +198,7 @@ class Session:
             self._observers,
             seed=record.seed,
             attempts=spec.attempts,
-            parameters=assembly.resolved,
+            parameters=self.options.changes(),
         )
         status: RunStatus = "failed"
         error: BaseException | None = None

@@ -32,6 +32,11 @@ class VirtualCamera(VirtualDriver):
         self._exposing_until_s = 0.0
         self._frames: deque[tuple[float, Frame]] = deque()
 
+    @property
+    def readout_s(self) -> float:
+        """From the end of the exposure until the frame can be read, in seconds."""
+        return self._settings.readout
+
     def arm(self, n_frames: int, exposure_s: float, trigger: Trigger) -> None:
         """Get ready for a series of exposures; frames not yet read are dropped.
 

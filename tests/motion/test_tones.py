@@ -230,6 +230,25 @@ def test_the_first_batches_only() -> None:
             tone_program(plan, GRID, n_batches=wrong)
 
 
+def test_both_axes_have_the_same_segments_even_if_the_plan_was_never_checked() -> None:
+    program = program_of(batch((0, 0, 1, 3)))
+    assert program.kind.tolist() == [IDLE, PICK_UP, TRANSPORT, TRANSPORT, DROP_OFF]
+    assert program.duration_s[2:4] == pytest.approx([SITE_S, 2 * SITE_S])
+
+
+WILD = st.tuples(st.integers(0, 3), st.integers(0, 5), st.integers(-9, 9), st.integers(-9, 9))
+
+
+@given(st.lists(st.tuples(st.lists(WILD, max_size=5), st.booleans()), max_size=3))
+@settings(max_examples=100, deadline=None)
+def test_an_unchecked_plan_makes_a_program_too(batches: list[tuple[list[Move], bool]]) -> None:
+    program = program_of(*(batch(*moves, linked=linked) for moves, linked in batches))
+    for axis in (program.row, program.column):
+        assert np.isfinite(axis.end_hz).all()
+        assert (axis.phase_rad >= 0).all()
+        assert (axis.phase_rad < 2 * np.pi).all()
+
+
 def test_an_empty_plan_is_an_empty_program() -> None:
     program = tone_program(Plan.from_batches([]))
     assert program.n_segments == 0

@@ -42,7 +42,6 @@ def test_anything_else_is_named(guard, owner, kind):
 
     with pytest.raises(kind, match=r"raised ZeroDivisionError: by zero") as caught:
         guard.call(owner, 10.0, fail)
-    assert owner in str(caught.value)
     assert isinstance(caught.value.__cause__, ZeroDivisionError)
 
 

@@ -1,0 +1,436 @@
+"""Whole runs in this process, on the virtual lab."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+
+import labseq
+from labseq.errors import ConfigError, DeviceError, InvalidPlanError, PlanError
+from labseq.testing.fakes import RecordingObserver
+
+ROOT = Path(__file__).parents[2]
+COMPACT = ROOT / "sequences" / "compact_225.yaml"
+
+
+def run(tmp_path: Path, sequence: Path = COMPACT, observer: Any = None, **options: Any) -> labseq.Run:
+    with labseq.Session.open(sequence, output=tmp_path / "data", observer=observer, **options) as session:
+        return session.run()
+
+
+def contents(run):
+    """Everything in the shots that must be the same for the same seed."""
+    return [
+        (
+            shot.frames.tobytes(),
+            shot.occupancies.tobytes(),
+            [(plan.moves.tobytes(), plan.batch_offsets.tobytes()) for plan in shot.plans],
+            shot.success,
+        )
+        for shot in run.shots
+    ]
+
+
+@pytest.mark.parametrize("options", [{}, {"profile": "lab", "dry_run": "full"}, {"dry_run": "fast"}])
+def test_the_same_seed_gives_the_same_data(tmp_path, options):
+    first = run(tmp_path, shots=2, seed=11, **options)
+    again = run(tmp_path, shots=2, seed=11, **options)
+    other = run(tmp_path, shots=2, seed=12, **options)
+    assert contents(first) == contents(again)
+    assert contents(first) != contents(other)
+    assert first.path != again.path
+
+
+def test_a_run_reads_back(tmp_path):
+    done = run(tmp_path, shots=2, seed=3)
+    assert (done.status, len(done.shots), done.seed, done.simulated) == ("complete", 2, 3, True)
+    shot = done.shots[0]
+    assert shot.frames.shape[1:] == (512, 512)
+    assert shot.occupancies.shape[1:] == (20, 20)
+    assert len(shot.frames) == len(shot.occupancies) == len(shot.plans) + 2
+    assert 0.9 < shot.filling_fraction <= 1.0
+    assert {t.stage for t in shot.timing} >= {"expose", "detect", "plan", "check", "prepare", "play", "move"}
+    assert shot.parameters == {"shots": "2", "seed": "3"}
+    assert done.record["resolved"]["planner"] == {"use": "psca", "degree_of_parallelism": 7}
+    assert done.record["resolved"]["profile"]["mobile_tweezers"]["speed"] == 0.13
+    assert done.record["devices"]["camera"]
+    assert {p["name"] for p in done.record["plugins"]} == {"labseq_psca", "labseq_virtual", "labseq.builtins"}
+    assert done.record["sequence_text"] == COMPACT.read_text(encoding="utf-8")
+    assert "numpy" in done.record["provenance"]["packages"]
+    assert not done.events[-1]["values"]["error"]
+
+
+def test_a_shot_file_needs_no_labseq(tmp_path):
+    done = run(tmp_path, shots=1, seed=3)
+    with h5py.File(next((done.path / "shots").glob("*.h5"))) as file:
+        entry: Any = file[file.attrs["default"]]
+        view = entry[entry.attrs["default"]]
+        assert view[view.attrs["signal"]].shape[1:] == (512, 512)
+
+
+def test_nothing_is_over_budget_on_the_virtual_lab(tmp_path):
+    done = run(tmp_path, shots=3, seed=4)
+    assert [t for shot in done.shots for t in shot.timing if t.over_budget] == []
+
+
+def test_values_can_be_set(tmp_path):
+    options: dict[str, Any] = {
+        "shots": 1,
+        "overrides": [
+            "planner.degree_of_parallelism=3",
+            "shot.2.rearrange.window=200 ms",
+            "profile.mobile_tweezers.speed=100 um/ms",
+            "record_frames=last",
+        ],
+    }
+    done = run(tmp_path, seed=1, **options)
+    shot = done.shots[0]
+    assert max(len(batch) for plan in shot.plans for batch in plan.batches) == 3
+    assert shot.cycles[0].window_s == 0.2
+    assert done.record["resolved"]["profile"]["mobile_tweezers"]["speed"] == pytest.approx(0.1)
+    assert len(shot.frames) == 1
+    assert shot.parameters["planner.degree_of_parallelism"] == "3"
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["planer.use=psca"], "did you mean 'planner'"),
+        (["planner.degree_of_parallelism=0"], "--set planner.degree_of_parallelism=0"),
+        (["profile.camera.use=cannon"], "unknown camera 'cannon'"),
+        (["target.rows=21"], "21"),
+        (["profile=lab"], "unknown camera 'andor'"),
+    ],
+)
+def test_wrong_values_are_refused_before_anything_opens(tmp_path, overrides, message):
+    with pytest.raises(ConfigError, match=message):
+        run(tmp_path, overrides=overrides)
+    assert not (tmp_path / "data").exists()
+
+
+def test_all_problems_are_told_in_one_go(tmp_path):
+    text = COMPACT.read_text(encoding="utf-8")
+    text = (
+        text.replace("rows: 15", "rows: 25").replace("psca", "pcsa").replace("window: 60 ms", "windw: 60 ms")
+    )
+    wrong = tmp_path / "wrong.yaml"
+    wrong.write_text(text, encoding="utf-8")
+    with pytest.raises(ConfigError) as caught:
+        run(tmp_path, wrong)
+    assert len(caught.value.problems) == 3
+    assert [p.line for p in caught.value.problems] == sorted(p.line for p in caught.value.problems)
+
+
+def test_an_option_is_named_as_the_user_gave_it(tmp_path):
+    with pytest.raises(ConfigError, match=r"--shots 0: shots is 0"):
+        run(tmp_path, shots=0)
+
+
+def test_a_session_runs_once(tmp_path):
+    with labseq.Session.open(COMPACT, shots=1, output=tmp_path) as session:
+        session.run()
+        with pytest.raises(ConfigError, match="runs once"):
+            session.run()
+
+
+def test_without_a_seed_every_run_is_another(tmp_path):
+    assert run(tmp_path, shots=1).seed != run(tmp_path, shots=1).seed
+
+
+def test_a_missing_plugin_is_replaced_in_a_dry_run_with_a_warning(tmp_path):
+    seen = RecordingObserver()
+    run(tmp_path, observer=seen, shots=1, profile="lab", dry_run="full")
+    warnings = [v["text"] for v in seen.of("warning")]
+    assert any("andor" in w and "settings were not checked" in w for w in warnings)
+
+
+def test_a_rehearsed_loss_of_frames_repeats_shots(tmp_path):
+    options: dict[str, Any] = {"overrides": ["profile.camera.faults={transient: 0.05}", "attempts=50"]}
+    done = run(tmp_path, shots=4, seed=2, **options)
+    assert [s.index for s in done.shots] == [0, 1, 2, 3]
+    assert done.attempts
+    assert all("TransientError" in attempt.row["error"] for attempt in done.attempts)
+
+
+def test_too_few_atoms_fill_what_can_be_filled_from_the_centre(tmp_path):
+    options: dict[str, Any] = {
+        "overrides": ["profile.simulation.loading=0.3", "shot.2.rearrange.window=500 ms"]
+    }
+    done = run(tmp_path, shots=1, seed=2, **options)
+    shot = done.shots[0]
+    loaded = shot.occupancies[0].sum()
+    assert loaded < 225
+    assert shot.row["n_missing_atoms"] == 225 - loaded
+    first = shot.cycles[0]
+    assert first.report.n_defects == 225 - loaded
+    sites_m = labseq.SiteGrid().positions_m
+    fill = done.target.fill
+    from_centre_m = np.linalg.norm(sites_m - sites_m[fill].mean(axis=0), axis=-1)
+    filled = fill & first.report.predicted
+    assert from_centre_m[filled].max() <= from_centre_m[fill & ~filled].min() + 1e-9
+
+
+THIRD_PARTY = """
+import numpy as np
+
+import labseq
+
+LABSEQ_API = 1
+
+
+class OneByOne:
+    def __init__(self, settings, context):
+        self.degree_of_parallelism = 1
+
+    def plan(self, occupancy, target):
+        now, batches = occupancy.copy(), []
+        for row, col in np.argwhere(target.fill):
+            atoms = np.flatnonzero(now[row, col:])
+            if not now[row, col] and len(atoms):
+                source = col + atoms[0]
+                batches.append(([(row, source)], [(row, col)]))
+                now[row, source], now[row, col] = False, True
+        return labseq.Plan.from_batches(batches)
+
+
+@labseq.hookimpl
+def labseq_register(registry):
+    registry.planner("mine", OneByOne)
+"""
+
+SEQUENCE = """
+labseq: 1
+name: my-planner
+plugin_folders: [my_plugins]
+shots: 1
+target: {pattern: compact, rows: 5, cols: 5}
+planner: {use: mine}
+shot:
+  - load: {duration: 500 ms}
+  - image: {exposure: 45 ms}
+  - rearrange: {cycles: 3, window: 200 ms}
+  - image: {exposure: 45 ms}
+"""
+
+
+def with_plugin(tmp_path, text, sequence=SEQUENCE):
+    folder = tmp_path / "my_plugins"
+    folder.mkdir()
+    (folder / "mine.py").write_text(text, encoding="utf-8")
+    path = tmp_path / "mine.yaml"
+    path.write_text(sequence, encoding="utf-8")
+    return path
+
+
+def test_a_planner_in_a_folder_of_ones_own_runs(tmp_path):
+    done = run(tmp_path, with_plugin(tmp_path, THIRD_PARTY), seed=1)
+    assert done.status == "complete"
+    assert done.shots[0].plans[0].n_batches > 0
+    assert "mine" in {p["name"] for p in done.record["plugins"]}
+
+
+DAMAGED = '''
+import numpy as np
+
+import labseq
+
+LABSEQ_API = 1
+
+
+class Settings(labseq.Settings):
+    damage: str
+
+
+class Damaged:
+    """One damaged plan per kind, made for the occupancy at hand."""
+
+    degree_of_parallelism = 2
+
+    def __init__(self, settings, context):
+        self.damage = settings.damage
+
+    def plan(self, occupancy, target):
+        return labseq.Plan.from_batches(getattr(self, self.damage)(occupancy))
+
+    def find(self, occupancy, pattern):
+        width = len(pattern)
+        for row in range(occupancy.shape[0]):
+            for col in range(1, occupancy.shape[1] - width):
+                if occupancy[row, col : col + width].tolist() == [bool(int(c)) for c in pattern]:
+                    return row, col
+        raise LookupError(pattern)
+
+    def straight(self, occupancy):
+        row, col = self.find(occupancy[:-1], "1")
+        return [([(row, col)], [(row + 1, col + 1)])]
+
+    def source(self, occupancy):
+        row, col = self.find(occupancy, "00")
+        return [([(row, col)], [(row, col + 1)])]
+
+    def goal(self, occupancy):
+        row, col = self.find(occupancy, "101")
+        return [([(row, col), (row, col + 2)], [(row, col + 1), (row, col + 1)])]
+
+    def path(self, occupancy):
+        row, col = self.find(occupancy, "110")
+        return [([(row, col)], [(row, col + 2)])]
+
+    def order(self, occupancy):
+        row, col = self.find(occupancy, "1100")
+        return [([(row, col), (row, col + 1)], [(row, col + 3), (row, col + 2)])]
+
+    def parallelism(self, occupancy):
+        row, col = self.find(occupancy, "1110")
+        return [([(row, col + i) for i in range(3)], [(row, col + i + 1) for i in range(3)])]
+
+    def crossing(self, occupancy):
+        rows, cols = occupancy.shape
+        for row in range(rows - 1):
+            for col in range(1, cols - 2):
+                a, b = occupancy[row], occupancy[row + 1]
+                if a[col] and not a[col + 1] and b[col]:
+                    for other in range(col + 2, cols - 1):
+                        if b[other] and not b[other + 1] and a[other] and not b[col + 1]:
+                            return [([(row, col), (row + 1, other)], [(row, col + 1), (row + 1, other + 1)])]
+        raise LookupError("crossing")
+
+    def ejection(self, occupancy):
+        row, col = next((r, c) for r, c in np.argwhere(occupancy) if c == 0)
+        return [([(row, col)], [(row, -3)])]
+
+    def grid(self, occupancy):
+        return [([(occupancy.shape[0], 0)], [(occupancy.shape[0], 1)])]
+
+    def linked(self, occupancy):
+        row, col = self.find(occupancy, "100")
+        first = ([(row, col)], [(row, col + 1)])
+        again = labseq.Batch([(row, col + 2)], [(row, col + 1)], linked=True)
+        return [first, again]
+
+
+@labseq.hookimpl
+def labseq_register(registry):
+    registry.planner("damaged", Damaged, Settings)
+'''
+
+RULES_OF = {  # damage -> the rules that may rightly be named first
+    "straight": {"straight"},
+    "source": {"source"},
+    "goal": {"goal", "order"},
+    "path": {"path"},
+    "order": {"order"},
+    "parallelism": {"parallelism"},
+    "crossing": {"crossing", "parallelism"},
+    "ejection": {"ejection", "grid"},
+    "grid": {"grid"},
+    "linked": {"linked"},
+}
+
+
+@pytest.mark.parametrize("damage", RULES_OF)
+def test_a_damaged_plan_is_stopped_before_anything_plays(tmp_path, damage):
+    sequence = SEQUENCE.replace("{use: mine}", f"{{use: damaged, damage: {damage}}}")
+    path = with_plugin(tmp_path, DAMAGED, sequence)
+    seen = RecordingObserver()
+    with pytest.raises(InvalidPlanError) as caught:
+        run(tmp_path, path, seed=1, observer=seen)
+    assert caught.value.rule in RULES_OF[damage]
+    assert caught.value.planner == "damaged"
+    stages = [v["timing"].stage for v in seen.of("stage")]
+    assert "check" in stages
+    assert not {"prepare", "play"} & set(stages)
+    safe = [v["device"] for v in seen.of("safe_state")]
+    assert safe == ["mobile_tweezers", "shutter", "camera", "static_tweezers"]
+    (index,) = (tmp_path / "data").glob("*/*/index.jsonl")
+    (line,) = [json.loads(text) for text in index.read_text().splitlines()]
+    assert line["status"] == "failed"
+    assert caught.value.rule in line["error"]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "kind", "message"),
+    [
+        (
+            "now, batches =",
+            "raise KeyError('typo')\n        now, batches =",
+            PlanError,
+            "raised KeyError: 'typo'",
+        ),
+        ("return labseq.Plan.from_batches(batches)", "return batches", PlanError, "expected a Plan"),
+        (
+            "def __init__(self, settings, context):",
+            "def __init__(self, settings, context):\n        raise OSError('no')",
+            labseq.PluginLoadError,
+            "constructor of planner 'mine' raised OSError: no",
+        ),
+        (
+            "import labseq\n",
+            "import labseq\nimport nothing_like_it\n",
+            labseq.PluginLoadError,
+            "nothing_like_it",
+        ),
+    ],
+)
+def test_a_plugin_that_fails_is_named(tmp_path, old, new, kind, message):
+    path = with_plugin(tmp_path, THIRD_PARTY.replace(old, new, 1))
+    with pytest.raises(kind, match=message) as caught:
+        run(tmp_path, path, seed=1)
+    assert "mine" in str(caught.value)
+
+
+def test_an_unwritable_place_is_named_before_anything_opens(tmp_path):
+    (tmp_path / "data").write_text("a file, not a folder")
+    seen = RecordingObserver()
+    with pytest.raises(labseq.RecordingError, match="data"):
+        run(tmp_path, shots=1, observer=seen)
+    assert "state" not in seen.names
+
+
+def test_a_disk_that_fills_up_stops_the_run_and_keeps_what_is_there(tmp_path, monkeypatch):
+    from labseq.recording import RunWriter
+
+    real, n_written = RunWriter.write_shot, 0
+
+    def write(self, shot):
+        nonlocal n_written
+        if n_written == 2:
+            raise labseq.RecordingError(self.run_dir, "no space left on device")
+        n_written += 1
+        return real(self, shot)
+
+    monkeypatch.setattr(RunWriter, "write_shot", write)
+    seen = RecordingObserver()
+    with pytest.raises(labseq.RecordingError, match="no space left"):
+        run(tmp_path, shots=5, seed=1, observer=seen)
+    assert len(seen.of("safe_state")) == 4
+    (state,) = (tmp_path / "data").glob("*/*/STATE")
+    done = labseq.open_run(state.parent)
+    assert (done.status, len(done.shots)) == ("failed", 2)
+    assert done.shots[1].frames.size
+
+
+def test_a_detector_of_the_wrong_shape_stops_the_run(tmp_path):
+    text = """
+import numpy as np
+import labseq
+LABSEQ_API = 1
+
+class Wrong:
+    def __init__(self, settings, context): pass
+    def detect(self, frame):
+        return np.zeros((3, 3), bool), np.zeros((3, 3), np.float32)
+
+@labseq.hookimpl
+def labseq_register(registry):
+    registry.detector("wrong", Wrong)
+"""
+    path = with_plugin(tmp_path, text, SEQUENCE.replace("use: mine", "use: psca"))
+    profile = (ROOT / "hardware_profiles" / "virtual.yaml").read_text(encoding="utf-8")
+    start, end = profile.index("\ndetector:"), profile.index("\ndevices:")
+    (tmp_path / "virtual.yaml").write_text(profile[:start] + "\ndetector: {use: wrong}\n" + profile[end:])
+    with pytest.raises(DeviceError, match="the occupancy is bool"):
+        run(tmp_path, path, seed=1)
