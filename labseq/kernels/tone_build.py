@@ -164,7 +164,7 @@ def add_segment(
 
 @kernel(
     f"UniTuple(int64, 2)({MOVES}, {const('int32', 1)}, {const('bool_', 1)}, int64, int64, int64, {HZ},"
-    f" float64, {HZ}, float64, float64, float64, float64, float64, float64, int8[::1], int32[::1],"
+    f" float64, {HZ}, float64, float64, float64, float64, float64, int8[::1], int32[::1],"
     " float64[::1], int32[::1], float64[:, ::1])"
 )
 def build_axis(
@@ -182,7 +182,6 @@ def build_axis(
     drop_off_s: float,
     site_s: float,
     batch_overhead_s: float,
-    cycle_overhead_s: float,
     kind: NDArray[np.int8],
     batch_of: Offsets,
     duration_s: Floats,
@@ -211,7 +210,6 @@ def build_axis(
         drop_off_s: Drop-off ramp, in seconds.
         site_s: Time to move by one site, in seconds.
         batch_overhead_s: Time before each batch that is not linked, in seconds.
-        cycle_overhead_s: Time before the first batch, in seconds.
         kind: Result, int8 (>= n_segments,).
         batch_of: Result, int32 (>= n_segments,).
         duration_s: Result, float64 (>= n_segments,).
@@ -236,9 +234,8 @@ def build_axis(
         if not linked[batch]:
             for k in range(n_tones):
                 phase[k] = first_phase[tones[0, k]]
-            pause_s = batch_overhead_s + (cycle_overhead_s if batch == 0 else 0.0)
-            if pause_s > 0.0:
-                m = add_segment(kind, batch_of, duration_s, offsets, m, IDLE, batch, pause_s, n)
+            if batch_overhead_s > 0.0:
+                m = add_segment(kind, batch_of, duration_s, offsets, m, IDLE, batch, batch_overhead_s, n)
             if pick_up_s > 0.0:
                 n = add_tones(
                     values, n, site_hz, step_hz, tones, n_tones, 0, 0, off, amplitude, pick_up_s, phase

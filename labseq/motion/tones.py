@@ -38,8 +38,8 @@ def tone_program(
 ) -> ToneProgram:
     """Turn a checked plan into a tone program, with the paper's timing.
 
-    For each batch: a pause without tones (the overhead; before the first batch
-    that of the cycle too), the pick-up, the transport at constant speed, cut
+    For each batch: a pause without tones (the overhead of a batch; that of the cycle
+    has passed before anything plays), the pick-up, the transport at constant speed, cut
     wherever a tone arrives, and the drop-off. At pick-up and drop-off the tones of
     the axis that moves are ramped; those of the other axis are on before and off
     after. Between linked batches there is no drop-off, pause and pick-up. Every
@@ -94,7 +94,6 @@ def tone_program(
             motion.drop_off_s,
             site_time_s(grid, motion),
             motion.overhead_per_batch_s,
-            motion.overhead_per_cycle_s,
             kind,
             batch,
             duration_s,
