@@ -18,7 +18,6 @@ from rich.text import Text
 
 from labseq.cli.glyphs import UNICODE, glyphs_for
 from labseq.cli.log_lines import LogLines
-from labseq.cli.notice import FIRST_RUN, Notice
 from labseq.cli.picture import draw
 from labseq.cli.tally import Tally
 from labseq.cli.telling import LASTING, tell
@@ -55,15 +54,11 @@ class LiveView:
     Args:
         console: The terminal.
         now: Monotonic time in seconds.
-        notice: Announces what takes long before the first shot; made if left out.
     """
 
-    def __init__(
-        self, console: Console, now: Callable[[], float] = time.monotonic, notice: Notice | None = None
-    ) -> None:
+    def __init__(self, console: Console, now: Callable[[], float] = time.monotonic) -> None:
         self._console = console
         self._now = now
-        self._notice = notice or Notice(self._print)
         self._glyphs = glyphs_for(console.encoding)
         self._tally = Tally(now)
         self._recent: deque[str] = deque(maxlen=3)
@@ -72,10 +67,6 @@ class LiveView:
 
     def event(self, name: str, values: Mapping[str, Any]) -> None:
         """Take an event into account and draw if it is time."""
-        if name == "warming":
-            self._notice.begin(f"preparing {values['part']}", FIRST_RUN)
-            return
-        self._notice.end()
         self._tally.note(name, values)
         text = tell(name, values, self._tally.record)
         if text and name in LASTING:
@@ -92,7 +83,6 @@ class LiveView:
 
     def close(self) -> None:
         """Draw a last time and give the terminal back; any number of times."""
-        self._notice.end()
         if self._live.is_started:
             try:
                 self._draw()

@@ -11,7 +11,9 @@ from labseq.cli.words import percent, plural
 from labseq.model import RunRecord, ShotRecord
 from labseq.units import format_quantity
 
-LASTING: Final = frozenset({"warning", "run_starting", "shot_repeated", "safe_state", "closed"})
+LASTING: Final = frozenset(
+    {"compiling", "compiled", "warning", "run_starting", "shot_repeated", "safe_state", "closed"}
+)
 """Events that must not scroll out of the live view unseen."""
 
 
@@ -37,6 +39,10 @@ def tell(name: str, values: Mapping[str, Any], run: RunRecord | None) -> str:
         case "safe_state" | "closed" if not values["ok"]:
             task = "brought to its safe state" if name == "safe_state" else "closed"
             return f"warning: {values['device']} could not be {task}: {values['error']}"
+        case "compiling":
+            return f"compiling {values['module']}; later runs find it in the cache"
+        case "compiled":
+            return f"compiled in {format_quantity(values['duration_s'], 'time')}"
         case "warning":
             return f"warning: {values['text']}"
         case "window_too_short":

@@ -9,7 +9,7 @@ from labseq.model import CycleRecord, ShotRecord, StageTiming
 from labseq.plugins import PluginHost
 from labseq.roles import RunObserver
 
-_QUIET: Final = frozenset({"image", "cycle", "state", "warming", "warmed", "run_finished"})
+_QUIET: Final = frozenset({"image", "cycle", "state", "compiling", "compiled", "run_finished"})
 """Events that the shot files tell better than the log would, and the one that the writer logs itself."""
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import secrets
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -10,8 +11,10 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from labseq import motion
 from labseq.config import Override
 from labseq.errors import ConfigError, LabseqError, StopRequested
+from labseq.kernels.compile import announcing
 from labseq.model import RunRecord, TimelineEntry
 from labseq.model.records import RunStatus
 from labseq.recording import Run, RunWriter, clear_active, data_root, died, mark_active, open_run
@@ -175,12 +178,20 @@ class Session:
 
     def _warm(self, lab: Lab) -> None:
         """Compile before the first shot: a compile in mid-shot would cost the atoms."""
-        for name, part in (("motion", _CoreKernels()), ("planner", lab.planner), ("detector", lab.detector)):
-            if isinstance(part, Warmable):
-                self._observers.event("warming", {"part": name})
-                part.warm()
+        start_s, compiled = time.monotonic(), list[str]()
+
+        def announce(module: str) -> None:
+            compiled.append(module)
+            self._observers.event("compiling", {"module": module})
+
+        with announcing(announce):
+            motion.warm()
+            for part in (lab.planner, lab.detector):
+                if isinstance(part, Warmable):
+                    part.warm()
                 self.stop_flag.check()
-        self._observers.event("warmed", {})
+        if compiled:
+            self._observers.event("compiled", {"duration_s": time.monotonic() - start_s})
 
     def _run(self, lab: Lab, root: Path) -> Run:
         assembly, spec = self.assembly, self.assembly.sequence
@@ -273,12 +284,3 @@ class Session:
             grid_spacing_m=lab.grid.spacing_m,
             lattice=lab.grid.lattice,
         )
-
-
-class _CoreKernels:
-    """The core's own kernels, warmed like a plugin's."""
-
-    def warm(self) -> None:
-        from labseq.motion import warm
-
-        warm()

@@ -86,8 +86,8 @@ class Script:
 
     def __iter__(self) -> Iterator[Event]:
         run_dir = "data/2026-01-02/0001_compact-225"
-        yield "warming", {"part": "planner"}
-        yield "warmed", {}
+        yield "compiling", {"module": "labseq_psca._kernels"}
+        yield "compiled", {"duration_s": 6.0}
         yield "run_starting", {"record": self.run, "run_dir": run_dir}
         yield "run_started", {"record": self.run, "run_dir": run_dir}
         for shot in range(self.n_shots):

@@ -11,7 +11,6 @@ from rich.console import Console
 
 from labseq.cli.live import REDRAW_S, LiveView, observer_for
 from labseq.cli.log_lines import LogLines
-from labseq.cli.notice import Notice
 
 
 class Screen(io.TextIOWrapper):
@@ -40,7 +39,7 @@ class Bench:
         console = Console(
             file=self.screen, force_terminal=True, width=width, height=height, legacy_windows=False
         )
-        self.view = LiveView(console, lambda: self.now, Notice(lambda _: None))
+        self.view = LiveView(console, lambda: self.now)
 
     def play(self, events: Any) -> None:
         for name, values in events:

@@ -7,23 +7,7 @@ from typing import Any
 import pytest
 
 from labseq.cli.log_lines import LogLines
-from labseq.cli.notice import PATIENCE_S, Notice
 from labseq.cli.telling import tell
-
-
-class HandTimer:
-    """A timer that runs out when it is told to."""
-
-    def __init__(self, delay_s: float, call: Any) -> None:
-        self.delay_s = delay_s
-        self.run_out = call
-        self.state = "new"
-
-    def start(self) -> None:
-        self.state = "started"
-
-    def cancel(self) -> None:
-        self.state = "cancelled"
 
 
 def lines_of(events: Any) -> list[str]:
@@ -97,27 +81,12 @@ def test_a_window_that_was_too_short(fake: Any) -> None:
     assert tell("window_too_short", values, fake.run()) == "shot 1, cycle 2: 12 of 40 batches fit the window"
 
 
-def test_only_what_takes_long_is_announced() -> None:
-    said: list[str] = []
-    timers: list[HandTimer] = []
-    now = 0.0
-
-    def make_timer(delay_s: float, call: Any) -> HandTimer:
-        timers.append(HandTimer(delay_s, call))
-        return timers[-1]
-
-    log = LogLines(io.StringIO(), Notice(said.append, lambda: now, make_timer))
-    log.event("warming", {"part": "motion"})
-    assert (timers[0].delay_s, timers[0].state) == (PATIENCE_S, "started")
-    log.event("warming", {"part": "planner"})
-    assert timers[0].state == "cancelled"
-    assert said == []
-    timers[1].run_out()
-    assert len(said) == 1
-    assert said[0].startswith("preparing planner ... (the first run")
-    now = 12.34
-    log.event("warmed", {})
-    assert said[1:] == ["preparing planner took 12.3 s"]
-    log.close()
-    assert len(said) == 2
-    assert timers[1].state == "cancelled"
+def test_compiling_is_announced_module_by_module() -> None:
+    stream = io.StringIO()
+    log = LogLines(stream)
+    log.event("compiling", {"module": "labseq.kernels.plan_check"})
+    log.event("compiled", {"duration_s": 7.25})
+    assert stream.getvalue().splitlines() == [
+        "compiling labseq.kernels.plan_check; later runs find it in the cache",
+        "compiled in 7.25 s",
+    ]
