@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.model import (
+    CameraFacts,
     CycleRecord,
     DepthRamp,
     Frame,
@@ -106,12 +107,12 @@ class Camera(Hardware, Protocol):
 
 
 @runtime_checkable
-class ReadsOut(Protocol):
-    """A camera that says how long it reads out after an exposure."""
+class KnownCamera(Protocol):
+    """A camera that tells its limits before it is opened, for ``labseq check`` and budgets."""
 
     @property
-    def readout_s(self) -> float:
-        """From the end of the exposure until the frame can be read, in seconds."""
+    def facts(self) -> CameraFacts:
+        """Read-out time, longest exposure, shape of its frames."""
         ...
 
 
@@ -251,6 +252,16 @@ class Simulation(Protocol):
 
     def describe(self) -> Mapping[str, Any]:
         """Every constant of the model: JSON-ready values."""
+        ...
+
+
+@runtime_checkable
+class KnownLoading(Protocol):
+    """A simulation that tells how well it loads, for estimates before a run."""
+
+    @property
+    def loading_probability(self) -> float:
+        """Probability that a site holds an atom after loading."""
         ...
 
 
@@ -451,13 +462,13 @@ class StepContext:
         grid: The grid of sites.
         motion: How the mobile tweezers move.
         target: What the array shall look like.
-        readout_s: Read-out time of the camera, 0 if it does not say.
+        camera: What the camera says of itself before it is opened.
     """
 
     grid: SiteGrid
     motion: MotionSpec
     target: TargetPattern
-    readout_s: float = 0.0
+    camera: CameraFacts = CameraFacts()
 
 
 class Step(Protocol):

@@ -6,8 +6,7 @@ import re
 from dataclasses import dataclass
 from typing import Final, cast
 
-from yaml.error import Mark as YamlMark
-from yaml.error import MarkedYAMLError
+from yaml.error import Mark as YamlMark, MarkedYAMLError
 from yaml.events import Event, ScalarEvent
 
 from labseq.config.nodes import Mark

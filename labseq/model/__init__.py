@@ -1,7 +1,7 @@
 """The frozen domain types: what the rest of labseq talks about."""
 
 from labseq.model.arrays import Occupancy, as_occupancy, read_only
-from labseq.model.frame import Frame
+from labseq.model.frame import CameraFacts, Frame
 from labseq.model.grid import SiteGrid
 from labseq.model.motion import MotionSpec
 from labseq.model.plan import Batch, Plan, PlanReport
@@ -20,6 +20,7 @@ from labseq.model.timeline import TimelineEntry
 __all__ = [
     "AxisTones",
     "Batch",
+    "CameraFacts",
     "CycleRecord",
     "DepthRamp",
     "Frame",

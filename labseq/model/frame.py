@@ -10,6 +10,21 @@ from numpy.typing import NDArray
 from labseq.model.arrays import read_only
 
 
+@dataclass(frozen=True, slots=True)
+class CameraFacts:
+    """What a camera can say of itself before it is opened, from its settings.
+
+    Attributes:
+        readout_s: From the end of an exposure until the frame can be read, in seconds.
+        max_exposure_s: Longest exposure, in seconds.
+        frame_shape: (height, width) of its frames; None if not known.
+    """
+
+    readout_s: float = 0.0
+    max_exposure_s: float = float("inf")
+    frame_shape: tuple[int, int] | None = None
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
     """One exposure as the camera delivered it.

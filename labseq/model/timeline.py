@@ -12,11 +12,13 @@ class TimelineEntry:
     Attributes:
         label: What happens, for example "image" or "cycle 3: move".
         duration_s: How long it takes at most, in seconds.
-        typical_s: How long it usually takes; equal to ``duration_s`` if fixed.
+        least_s: How long it takes at least; 0 if it may be left out.
         n_images: Images that it takes at most.
+        exposure_s: Exposure of each image, in seconds.
     """
 
     label: str
     duration_s: float
-    typical_s: float
+    least_s: float
     n_images: int = 0
+    exposure_s: float = 0.0

@@ -7,16 +7,16 @@ from dataclasses import dataclass
 from typing import Any
 
 from labseq.errors import LabseqError
-from labseq.model import MotionSpec, RandomStream, SiteGrid, TargetPattern
+from labseq.model import CameraFacts, MotionSpec, RandomStream, SiteGrid, TargetPattern
 from labseq.roles import (
     Camera,
     Clock,
     Detector,
     Device,
     Hardware,
+    KnownCamera,
     MobileTweezers,
     Planner,
-    ReadsOut,
     Simulation,
     StaticTweezers,
     StepContext,
@@ -62,8 +62,8 @@ class Lab:
     @property
     def step_context(self) -> StepContext:
         """What steps need to lay out their timelines."""
-        readout_s = self.camera.readout_s if isinstance(self.camera, ReadsOut) else 0.0
-        return StepContext(self.grid, self.motion, self.target, readout_s)
+        facts = self.camera.facts if isinstance(self.camera, KnownCamera) else CameraFacts()
+        return StepContext(self.grid, self.motion, self.target, facts)
 
     def hardware(self) -> Iterator[tuple[str, Hardware]]:
         """Name and device, in the order of opening: static tweezers first."""

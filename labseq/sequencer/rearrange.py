@@ -39,12 +39,17 @@ class RearrangeStep:
 
     def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:
         """Two bars per cycle, the moves at their window."""
-        image_s = self.settings.exposure + context.readout_s
+        exposure_s = self.settings.exposure
+        image_s = exposure_s + context.camera.readout_s
+        all_made = self.settings.stop_when == "never"
+        waited_out = all_made and self.settings.window_mode == "fixed"
         bars: list[TimelineEntry] = []
         for cycle in range(1, self.settings.cycles + 1):
             window_s = self.settings.window_of(cycle)
-            bars.append(TimelineEntry(f"cycle {cycle}: move", window_s, window_s))
-            bars.append(TimelineEntry(f"cycle {cycle}: image", image_s, image_s, n_images=1))
+            bars.append(TimelineEntry(f"cycle {cycle}: move", window_s, window_s if waited_out else 0.0))
+            bars.append(
+                TimelineEntry(f"cycle {cycle}: image", image_s, image_s if all_made else 0.0, 1, exposure_s)
+            )
         return bars
 
     def run(self, shot: Shot) -> None:

@@ -97,7 +97,7 @@ class RunningShot:
         """
         camera, timeout_s = self.lab.camera, self.call_timeout_s
         start_s = self.elapsed_s
-        budget_s = exposure_s + self.lab.step_context.readout_s
+        budget_s = exposure_s + self.lab.step_context.camera.readout_s
         with self.stage("expose", budget_s, cycle):
             self.call("camera", timeout_s, camera.arm, 1, exposure_s, "software")
             self.call("camera", timeout_s + exposure_s, camera.trigger)

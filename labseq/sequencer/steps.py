@@ -65,8 +65,8 @@ class ImageStep:
 
     def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:
         """One bar, read-out included."""
-        image_s = self.exposure_s + context.readout_s
-        return [TimelineEntry("image", image_s, image_s, n_images=1)]
+        image_s = self.exposure_s + context.camera.readout_s
+        return [TimelineEntry("image", image_s, image_s, n_images=1, exposure_s=self.exposure_s)]
 
     def run(self, shot: Shot) -> None:
         """Take the image and judge the shot on it."""

@@ -143,7 +143,7 @@ class Session:
 
     def timeline(self) -> list[tuple[str, list[TimelineEntry]]]:
         """What a shot will do: name of each step and its bars."""
-        context = self._build().step_context
+        context = self.build_lab().step_context
         return [(name, list(step.plan_timeline(context))) for name, step in self.assembly.steps]
 
     def run(self) -> Run:
@@ -162,11 +162,12 @@ class Session:
         for text in self.assembly.bench.warnings:
             self._observers.event("warning", {"text": text})
         with stop_on_signals(self.stop_flag):
-            lab = self._build()
+            lab = self.build_lab()
             self._warm(lab)
             return self._run(lab, root)
 
-    def _build(self) -> Lab:
+    def build_lab(self) -> Lab:
+        """Construct every role's object on the clock that the run will have; nothing is opened."""
         assert self.seed is not None
         if not self.assembly.virtual_time:
             clock = RealClock(self.stop_flag)

@@ -24,16 +24,17 @@ import importlib
 from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
-    from labseq.testing import fakes as fakes
-    from labseq.testing import strategies as strategies
-    from labseq.testing.contracts import BrokenPromise as BrokenPromise
-    from labseq.testing.contracts import CameraContract as CameraContract
-    from labseq.testing.contracts import DetectorContract as DetectorContract
-    from labseq.testing.contracts import DeviceContract as DeviceContract
-    from labseq.testing.contracts import MobileTweezersContract as MobileTweezersContract
-    from labseq.testing.contracts import PlannerContract as PlannerContract
-    from labseq.testing.contracts import StaticTweezersContract as StaticTweezersContract
-    from labseq.testing.contracts import StepContract as StepContract
+    from labseq.testing import fakes as fakes, strategies as strategies
+    from labseq.testing.contracts import (
+        BrokenPromise as BrokenPromise,
+        CameraContract as CameraContract,
+        DetectorContract as DetectorContract,
+        DeviceContract as DeviceContract,
+        MobileTweezersContract as MobileTweezersContract,
+        PlannerContract as PlannerContract,
+        StaticTweezersContract as StaticTweezersContract,
+        StepContract as StepContract,
+    )
 
 _CONTRACTS: Final = (
     "BrokenPromise",

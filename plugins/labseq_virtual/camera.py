@@ -7,7 +7,16 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from labseq import Context, DeviceError, DeviceTimeoutError, Frame, LimitError, TransientError, Trigger
+from labseq import (
+    CameraFacts,
+    Context,
+    DeviceError,
+    DeviceTimeoutError,
+    Frame,
+    LimitError,
+    TransientError,
+    Trigger,
+)
 from labseq.units import format_quantity
 from labseq_virtual.driver import VirtualDriver
 from labseq_virtual.settings import CameraSettings
@@ -33,9 +42,10 @@ class VirtualCamera(VirtualDriver):
         self._frames: deque[tuple[float, Frame]] = deque()
 
     @property
-    def readout_s(self) -> float:
-        """From the end of the exposure until the frame can be read, in seconds."""
-        return self._settings.readout
+    def facts(self) -> CameraFacts:
+        """Read-out time, longest exposure, shape of the simulated frames."""
+        shape = getattr(self._simulation, "frame_shape", None)
+        return CameraFacts(self._settings.readout, self._settings.max_exposure, shape)
 
     def arm(self, n_frames: int, exposure_s: float, trigger: Trigger) -> None:
         """Get ready for a series of exposures; frames not yet read are dropped.

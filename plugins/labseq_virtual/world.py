@@ -63,6 +63,16 @@ class World:
         self._playing: _Playing | None = None
         self._loss_factor = 1.0
 
+    @property
+    def loading_probability(self) -> float:
+        """Probability that a site holds an atom after a long loading."""
+        return self._settings.loading
+
+    @property
+    def frame_shape(self) -> tuple[int, int]:
+        """(height, width) of its frames."""
+        return self._settings.image.frame
+
     def open(self) -> None:
         """Draw the machine's own disorder; no atoms, static tweezers off."""
         disorder = self._random.machine().standard_normal(self._grid.shape)

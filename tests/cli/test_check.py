@@ -1,7 +1,6 @@
 from __future__ import annotations
 
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from labseq.cli.check import BAR_WIDTH, timeline_table
 from labseq.model import TimelineEntry

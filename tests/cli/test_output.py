@@ -1,7 +1,6 @@
 import io
 
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from labseq.cli.output import columns, say
 

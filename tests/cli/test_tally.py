@@ -5,8 +5,7 @@ import statistics
 from typing import Any
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from labseq.cli.tally import Tally
 from labseq.model import ShotRecord, StageTiming

@@ -24,8 +24,6 @@ from labseq import Context
 from labseq.config.detectors import ThresholdSettings
 from labseq.config.steps import (
     DeviceSettings as DeviceStepSettings,
-)
-from labseq.config.steps import (
     ImageSettings,
     LoadSettings,
     RearrangeSettings,

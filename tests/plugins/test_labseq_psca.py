@@ -7,8 +7,7 @@ from typing import Any
 import labseq_psca
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from labseq_psca.planner import PscaPlanner, PscaSettings, nearest_to_centre
 from numpy.typing import NDArray
 from pydantic import ValidationError

@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
-from hypothesis import strategies as st
+from hypothesis import assume, given, settings, strategies as st
 from labseq_psca import _kernels, _kernels_lines, _kernels_rows
 from numpy.typing import NDArray
 

@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from labseq_virtual.settings import WorldSettings
 from labseq_virtual.transport import FrequencyMap, Transport
 from numpy.typing import NDArray

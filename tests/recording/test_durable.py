@@ -5,8 +5,7 @@ import os
 from pathlib import Path
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from labseq.errors import RecordingError
 from labseq.recording.durable import LineLog, explained, read_lines, write_file

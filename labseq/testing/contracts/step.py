@@ -20,7 +20,7 @@ from labseq.testing.fakes import FakeLab, fake_lab
 
 Factory: TypeAlias = Callable[[], Step]
 
-TIMELINE: Final = "the timeline is known beforehand: labelled bars with 0 <= typical_s <= duration_s"
+TIMELINE: Final = "the timeline is known beforehand: labelled bars with 0 <= least_s <= duration_s"
 
 
 class StepContract:
@@ -48,7 +48,7 @@ class StepContract:
         """``labseq check`` prints it and adds it up."""
         for entry in self._timeline(factory()):
             assert entry.label, f"{entry} has no label"
-            assert 0.0 <= entry.typical_s <= entry.duration_s < float("inf"), f"{entry}"
+            assert 0.0 <= entry.least_s <= entry.duration_s < float("inf"), f"{entry}"
             assert entry.n_images >= 0, f"{entry}"
 
     @promise("constructor and timeline do no I/O, and the timeline is always the same")

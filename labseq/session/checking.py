@@ -1,0 +1,194 @@
+"""``labseq check``: everything that can be known of a run without opening a device."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq.errors import LabseqError, Problem
+from labseq.model import TimelineEntry
+from labseq.motion import check_plan
+from labseq.roles import KnownLoading, Step
+from labseq.sequencer import Guard, StopFlag
+from labseq.sequencer.lab import Lab
+from labseq.session.session import Session
+from labseq.units import format_quantity
+
+N_LOADINGS: Final = 200
+"""Random loadings that the planner is tried on."""
+PATIENCE_S: Final = 5.0
+"""Host time after which no further loading is tried."""
+PAPERS_LOADING: Final = 0.75
+"""Loading probability where the profile has no simulation that tells it."""
+SHOT_OVERHEAD_BYTES: Final = 60_000
+"""Size of a shot file without frames, roughly."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rehearsal:
+    """What the planner made of random loadings.
+
+    Attributes:
+        n_loadings: How many were tried.
+        n_filled: How many had atoms enough, and a plan that meets the target.
+        duration_s: float64 (n_loadings,), from the start of a cycle to the end of its last batch.
+        first_batch_s: float64 (n_loadings,), the same for its first batch.
+    """
+
+    n_loadings: int
+    n_filled: int
+    duration_s: NDArray[np.float64]
+    first_batch_s: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class CheckReport:
+    """What a run will do and need.
+
+    Attributes:
+        timeline: Name of each step and its bars.
+        n_shots: Shots of the run.
+        warnings: What is allowed but hardly meant, with its place in the files.
+        rehearsal: What the planner made of random loadings; None without a rearrangement.
+        shot_bytes: Size of a shot on disk at most; None if the camera does not tell its frames.
+    """
+
+    timeline: Sequence[tuple[str, Sequence[TimelineEntry]]]
+    n_shots: int
+    warnings: tuple[Problem, ...]
+    rehearsal: Rehearsal | None
+    shot_bytes: int | None
+
+    @property
+    def bars(self) -> list[TimelineEntry]:
+        """The bars of all steps."""
+        return [bar for _, bars in self.timeline for bar in bars]
+
+    @property
+    def longest_shot_s(self) -> float:
+        """Duration of a shot that uses every cycle and window."""
+        return sum(bar.duration_s for bar in self.bars)
+
+    @property
+    def shortest_shot_s(self) -> float:
+        """Duration of a shot that leaves out what it may leave out."""
+        return sum(bar.least_s for bar in self.bars)
+
+    @property
+    def n_images(self) -> int:
+        """Images of a shot at most."""
+        return sum(bar.n_images for bar in self.bars)
+
+
+def check(session: Session) -> CheckReport:
+    """Find out what a run will do and need; nothing is opened.
+
+    Args:
+        session: An opened session; its sequence and profile have no errors.
+    """
+    assembly = session.assembly
+    lab = session.build_lab()
+    timeline = session.timeline()
+    windows = _windows(assembly.steps)
+    rehearsal, failure = _rehearse(lab) if windows else (None, "")
+    warnings = [Problem(text) for text in assembly.bench.warnings]
+    document = assembly.document
+    if failure:
+        warnings.append(document.problem((*assembly.sequence.planner.loc, "use"), failure))
+    if rehearsal is not None:
+        warnings += _window_warnings(session, windows, rehearsal)
+    warnings += _exposure_warnings(session, lab, timeline)
+    return CheckReport(
+        timeline, assembly.sequence.shots, tuple(warnings), rehearsal, _shot_bytes(session, lab, timeline)
+    )
+
+
+def _windows(steps: Sequence[tuple[str, Step]]) -> list[tuple[int, list[float]]]:
+    """Step number and window per cycle, of each rearrangement."""
+    found: list[tuple[int, list[float]]] = []
+    for number, (_, step) in enumerate(steps):
+        settings: Any = getattr(step, "settings", None)
+        if hasattr(settings, "window_of"):
+            cycles = range(1, settings.cycles + 1)
+            found.append((number, [float(settings.window_of(cycle)) for cycle in cycles]))
+    return found
+
+
+def _rehearse(lab: Lab) -> tuple[Rehearsal | None, str]:
+    """Plan for random loadings; what the planner does wrong is told, not raised."""
+    loading = (
+        lab.simulation.loading_probability if isinstance(lab.simulation, KnownLoading) else PAPERS_LOADING
+    )
+    rng, guard = np.random.default_rng(0), Guard(StopFlag())
+    durations, firsts, n_filled = list[float](), list[float](), 0
+    deadline = time.monotonic() + PATIENCE_S
+    try:
+        while len(durations) < N_LOADINGS and time.monotonic() < deadline:
+            occupancy = rng.random(lab.grid.shape) < loading
+            plan = guard.call("planner", lab.timeouts.plan_s, lab.planner.plan, occupancy.copy(), lab.target)
+            report = check_plan(
+                plan, occupancy, lab.target, lab.degree_of_parallelism, lab.grid, lab.motion, lab.planner_name
+            )
+            n_filled += report.meets_target
+            durations.append(report.duration_s)
+            firsts.append(float(report.batch_end_s[0]) if len(report.batch_end_s) else 0.0)
+    except LabseqError as error:
+        return None, f"on a random loading (75 % of the sites unless the simulation says else): {error}"
+    finally:
+        guard.end()
+    return Rehearsal(len(durations), n_filled, np.array(durations), np.array(firsts)), ""
+
+
+def _window_warnings(
+    session: Session, windows: Sequence[tuple[int, list[float]]], rehearsal: Rehearsal
+) -> list[Problem]:
+    document, sequence = session.assembly.document, session.assembly.sequence
+    problems: list[Problem] = []
+    for number, window_s in windows:
+        loc = (*sequence.shot[number].loc, "window")
+        first, shortest = window_s[0], min(window_s)
+        n_fit = int(np.count_nonzero(rehearsal.duration_s <= first + 1e-9))
+        typical = format_quantity(float(np.median(rehearsal.duration_s)), "time")
+        if 2 * n_fit < rehearsal.n_loadings:
+            what = f"the first cycle's window of {format_quantity(first, 'time')} is too short for most plans"
+            told = f"{n_fit} of {rehearsal.n_loadings} fit"
+            problems.append(document.problem(loc, f"{what} ({told})", f"about {typical} or more"))
+        elif shortest < np.median(rehearsal.first_batch_s):
+            what = f"a window of {format_quantity(shortest, 'time')} is over before the first batch is"
+            problems.append(document.problem(loc, what, "more than the overheads of a cycle and a batch"))
+    if rehearsal.n_filled < 0.9 * rehearsal.n_loadings:
+        what = f"only {rehearsal.n_filled} of {rehearsal.n_loadings} loadings allow to fill the target"
+        problems.append(document.problem(sequence.target.loc, what, "a smaller target, or better loading"))
+    return problems
+
+
+def _exposure_warnings(
+    session: Session, lab: Lab, timeline: Sequence[tuple[str, Sequence[TimelineEntry]]]
+) -> list[Problem]:
+    limit_s = lab.step_context.camera.max_exposure_s
+    document, sequence = session.assembly.document, session.assembly.sequence
+    problems: list[Problem] = []
+    for spec, (_, bars) in zip(sequence.shot, timeline, strict=True):
+        longest_s = max((bar.exposure_s for bar in bars), default=0.0)
+        if longest_s > limit_s:
+            what = f"an exposure of {format_quantity(longest_s, 'time')} is more than the camera can do"
+            expected = f"at most {format_quantity(limit_s, 'time')}"
+            problems.append(document.problem((*spec.loc, "exposure"), what, expected))
+    return problems
+
+
+def _shot_bytes(
+    session: Session, lab: Lab, timeline: Sequence[tuple[str, Sequence[TimelineEntry]]]
+) -> int | None:
+    shape = lab.step_context.camera.frame_shape
+    n_images = sum(bar.n_images for _, bars in timeline for bar in bars)
+    kept = {"all": n_images, "last": min(1, n_images), "none": 0}[session.assembly.sequence.record_frames]
+    if shape is None and kept:
+        return None
+    return SHOT_OVERHEAD_BYTES + kept * 2 * math.prod(shape or (0,))
