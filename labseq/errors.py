@@ -29,6 +29,8 @@ class Problem:
         column: Column in ``source``, counted from 1; 0 if there is none.
         expected: What would have been right, or "".
         hint: What to do, for example "did you mean 'rows'?", or "".
+        notes: Where else to look: the place of a value that this one does not go with,
+            or the default that it meets.
     """
 
     what: str
@@ -37,6 +39,7 @@ class Problem:
     column: int = 0
     expected: str = ""
     hint: str = ""
+    notes: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         where = self.source

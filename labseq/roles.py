@@ -468,7 +468,7 @@ class StepContext:
     grid: SiteGrid
     motion: MotionSpec
     target: TargetPattern
-    camera: CameraFacts = CameraFacts()
+    camera: CameraFacts = field(default_factory=CameraFacts)
 
 
 class Step(Protocol):

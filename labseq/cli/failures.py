@@ -6,6 +6,7 @@ import sys
 import traceback
 from typing import Final
 
+from labseq.cli.excerpt import excerpt
 from labseq.cli.output import say
 from labseq.errors import ConfigError, LabseqError, StopRequested
 
@@ -27,8 +28,19 @@ def report(error: BaseException, *, debug: bool = False) -> int:
     """
     if debug:
         traceback.print_exception(error)
-    say(*lines_of(error), stream=sys.stderr)
+    if isinstance(error, ConfigError):
+        say(*told(error), stream=sys.stderr)
+    else:
+        say(*lines_of(error), stream=sys.stderr)
     return exit_code_of(error)
+
+
+def told(error: ConfigError) -> list[str]:
+    """Every problem with the line that it is in, and what else there is to look at."""
+    lines: list[str] = []
+    for problem, text in zip(error.problems, lines_of(error), strict=True):
+        lines += [text, *excerpt(problem), *(f"      = {note}" for note in problem.notes)]
+    return lines
 
 
 def lines_of(error: BaseException) -> list[str]:

@@ -178,7 +178,7 @@ class Document:
             ConfigError: Everything that is wrong in the mapping, in file order.
         """
         name = next((step for step in reversed(loc) if isinstance(step, str)), "")
-        asked = Asked(name, called, drop, also_known)
+        asked = Asked(name, called, drop, also_known, self.path.parent)
         result = validate(model or NoSettings, self.root.at(loc), asked)
         if not isinstance(result, list):
             return None if model is None else cast("M", result)

@@ -6,6 +6,7 @@ import codecs
 import re
 import stat
 import unicodedata
+from collections.abc import Collection
 from pathlib import Path
 from typing import Final
 
@@ -27,8 +28,13 @@ _FORBIDDEN: Final = re.compile(
 _UTF16: Final = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 
 
-def read_bytes(path: Path) -> bytes:
+def read_bytes(path: Path, expected: str = "a YAML file", suffixes: Collection[str] = YAML_SUFFIXES) -> bytes:
     """Read a file of at most :data:`MAX_BYTES`.
+
+    Args:
+        path: The file.
+        expected: What it should be, in words.
+        suffixes: Endings of the names that come into question if there is no such file.
 
     Raises:
         ConfigError: Missing, a folder, no regular file, unreadable or too large.
@@ -37,14 +43,14 @@ def read_bytes(path: Path) -> bytes:
     try:
         data = _bytes_of(path)
     except (FileNotFoundError, NotADirectoryError):
-        hint = did_you_mean(path.name, yaml_files(path.parent))
+        hint = did_you_mean(path.name, files_in(path.parent, suffixes))
         raise ConfigError(Problem("there is no such file", name, hint=hint)) from None
     except (OSError, ValueError) as error:  # ValueError: a NUL character in the path
         reason = error.strerror if isinstance(error, OSError) else str(error)
         what = f"the file cannot be read: {str(reason or error).lower()}"
         raise ConfigError(Problem(what, name)) from error
     if isinstance(data, str):
-        raise ConfigError(Problem(data, name, expected="a YAML file"))
+        raise ConfigError(Problem(data, name, expected=expected))
     if len(data) > MAX_BYTES:
         raise ConfigError(Problem("the file is larger than 1 MiB", name, expected="a few kilobytes"))
     return data
@@ -112,10 +118,10 @@ def _mark_at(text: str, index: int) -> Mark:
     return Mark(len(breaks) + 1, min(index, len(text)) - start + 1)
 
 
-def yaml_files(folder: Path) -> list[str]:
-    """Names of the YAML files in a folder, sorted; none if it cannot be read."""
+def files_in(folder: Path, suffixes: Collection[str] = YAML_SUFFIXES) -> list[str]:
+    """Names of the files in a folder with one of the suffixes, sorted; none if it cannot be read."""
     try:
-        return sorted(path.name for path in folder.iterdir() if path.suffix in YAML_SUFFIXES)
+        return sorted(path.name for path in folder.iterdir() if path.suffix in suffixes)
     except (OSError, ValueError):
         return []
 

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, TypeAlias
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Final, TypeAlias, cast
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationInfo
 
+from labseq.config.reading import beside
 from labseq.units import expected, parse_quantity
+
+FOLDER: Final = "folder"
+"""Key of the validation context: the folder of the file that the settings stand in."""
 
 
 class Settings(BaseModel):
@@ -40,6 +46,13 @@ def _quantity(dimension: str) -> BeforeValidator:
     return BeforeValidator(read)
 
 
+def _beside_its_file(path: Path, info: ValidationInfo) -> Path:
+    context = cast("Mapping[str, Path]", info.context or {})
+    return beside(context.get(FOLDER, Path()), str(path))
+
+
+FilePath: TypeAlias = Annotated[Path, AfterValidator(_beside_its_file)]
+"""A file, relative to the sequence or profile that names it; in Python, to the working folder."""
 Duration: TypeAlias = Annotated[float, _quantity("time"), Field(ge=0)]
 """Seconds, at least 0; "45 ms"."""
 Length: TypeAlias = Annotated[float, _quantity("length")]

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, TypeAlias
+from typing import Annotated, Literal, Self, TypeAlias
 
-from pydantic import Field, ValidationInfo, field_validator
+from pydantic import Field, model_validator
 
-from labseq.config.fields import Text, empty_is
+from labseq.config.fields import Text, empty_is, misfit
 from labseq.config.settings import Duration, Settings
 
 Exposure: TypeAlias = Annotated[Duration, Field(gt=0)]
@@ -40,16 +40,14 @@ class RearrangeSettings(Settings):
         default="early", description="whether the image follows the last batch, or the end of the window"
     )
 
-    @field_validator("window")
-    @classmethod
-    def _one_window_per_cycle(
-        cls, window: float | tuple[float, ...], info: ValidationInfo
-    ) -> float | tuple[float, ...]:
-        cycles = info.data.get("cycles")
-        if isinstance(window, tuple) and cycles is not None and len(window) != cycles:
-            entries = "1 entry" if len(window) == 1 else f"{len(window)} entries"
-            raise ValueError(f"the list has {entries}; expected {cycles}, one per cycle")
-        return window
+    @model_validator(mode="after")
+    def _one_window_per_cycle(self) -> Self:
+        if isinstance(self.window, tuple) and len(self.window) != self.cycles:
+            entries = "1 entry" if len(self.window) == 1 else f"{len(self.window)} entries"
+            default = "" if "cycles" in self.model_fields_set else ", its default"
+            what = f"the list has {entries}, but cycles is {self.cycles}{default}"
+            raise misfit(what, f"{self.cycles}, one per cycle", at=("window",))
+        return self
 
     def window_of(self, cycle: int) -> float:
         """The window of a cycle, in seconds.

@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, TypeVar, cast
 
 from pydantic import BaseModel, ValidationError
 
 from labseq.config.nodes import Loc, Mark, Node
 from labseq.config.schema import description_of, keys_of, models_at
+from labseq.config.settings import FOLDER
 from labseq.config.wording import EXPECTED_TYPES, Words, clean, closest, listing, put_in_words, shown
 
 M = TypeVar("M", bound=BaseModel)
@@ -56,12 +58,14 @@ class Asked:
         called: What to call it in messages; "" for its name.
         drop: Keys that are left out.
         also_known: Keys that belong to somebody else: named, but not validated.
+        folder: Folder that the paths in it are relative to.
     """
 
     name: str
     called: str = ""
     drop: Collection[str] = ()
     also_known: Collection[str] = ()
+    folder: Path = Path()
 
 
 def validate(model: type[M], node: Node | None, asked: Asked) -> M | list[Finding]:
@@ -73,7 +77,7 @@ def validate(model: type[M], node: Node | None, asked: Asked) -> M | list[Findin
         return [Finding((), words)]
     kept = {key: value for key, value in cast("dict[str, Any]", data).items() if key not in asked.drop}
     try:
-        return _validated(model, json.dumps(kept))
+        return _validated(model, json.dumps(kept), {FOLDER: asked.folder})
     except ValidationError as error:
         return _findings(error, model, node or Node({}, Mark(1, 1)), asked)
     except Exception as error:  # noqa: BLE001 - a plugin's own validator may raise anything
@@ -81,14 +85,14 @@ def validate(model: type[M], node: Node | None, asked: Asked) -> M | list[Findin
         return [Finding((), Words(f"these settings make the plugin's check fail: {reason}"))]
 
 
-def _validated(model: type[M], text: str) -> M:
+def _validated(model: type[M], text: str, context: Mapping[str, Any]) -> M:
     """Validate JSON, because there strict means: no number out of a text, but a tuple out of a list."""
     try:
-        return model.model_validate_json(text, strict=True)
+        return model.model_validate_json(text, strict=True, context=context)
     except ValidationError as error:
         # Behind a validator of the model's own, strict wants a tuple from the start.
         if all(_is_list_for_tuple(one) for one in error.errors(include_url=False)):
-            return model.model_validate_json(text)
+            return model.model_validate_json(text, context=context)
         raise
 
 

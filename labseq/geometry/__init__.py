@@ -1,5 +1,6 @@
 """Target patterns: from a few settings to the sites that must hold an atom."""
 
+from labseq.geometry.drawing import DrawingError, read_bitmap
 from labseq.geometry.patterns import (
     BitmapLike,
     Clear,
@@ -8,16 +9,18 @@ from labseq.geometry.patterns import (
     bitmap,
     compact,
     pattern,
-    read_bitmap,
 )
-from labseq.geometry.placing import place
+from labseq.geometry.placing import block, check_size, place
 
 __all__ = [
     "BitmapLike",
     "Clear",
     "CompactLike",
+    "DrawingError",
     "Origin",
     "bitmap",
+    "block",
+    "check_size",
     "compact",
     "pattern",
     "place",

@@ -7,7 +7,7 @@ from typing import Literal, Protocol, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.geometry.placing import place
+from labseq.geometry.placing import check_size, place
 from labseq.model import SiteGrid, TargetPattern
 
 Origin: TypeAlias = tuple[int, int] | None
@@ -39,13 +39,8 @@ class BitmapLike(Protocol):
     """Settings of :func:`bitmap`."""
 
     @property
-    def sites(self) -> str:
-        """The drawing, one line per row."""
-        ...
-
-    @property
-    def fill(self) -> str:
-        """Characters that stand for an atom."""
+    def mask(self) -> NDArray[np.bool_]:
+        """What is drawn: bool (rows, cols), True where an atom must be."""
         ...
 
     @property
@@ -97,6 +92,7 @@ def compact(settings: CompactLike, grid: SiteGrid) -> TargetPattern:
     Raises:
         LimitError: It is larger than the grid or sticks out of it.
     """
+    check_size((settings.rows, settings.cols), grid.shape)
     mask = np.ones((settings.rows, settings.cols), np.bool_)
     name = f"compact {settings.rows} x {settings.cols}"
     return pattern(mask, grid, origin=settings.origin, name=name)
@@ -106,41 +102,8 @@ def bitmap(settings: BitmapLike, grid: SiteGrid) -> TargetPattern:
     """Sites as they are drawn; the bounding box is the whole drawing, margins included.
 
     Raises:
-        ValueError: The drawing is empty, holds no atom, or its rows differ in length.
         LimitError: It is larger than the grid or sticks out of it.
     """
-    mask = read_bitmap(settings.sites, settings.fill)
+    mask = settings.mask
     name = f"bitmap {mask.shape[0]} x {mask.shape[1]}"
     return pattern(mask, grid, origin=settings.origin, clear=settings.clear, name=name)
-
-
-def read_bitmap(text: str, fill: str = "#") -> NDArray[np.bool_]:
-    """Read a drawing, one line per row; empty lines before and after it do not count.
-
-    Args:
-        text: The drawing.
-        fill: Characters that stand for an atom; all others stand for none.
-
-    Returns:
-        bool (rows, cols).
-
-    Raises:
-        ValueError: The drawing is empty, holds no atom, or its rows differ in length.
-
-    Example:
-        >>> read_bitmap("#.#").astype(int).tolist()
-        [[1, 0, 1]]
-    """
-    lines = text.strip("\r\n").splitlines()
-    if not lines or not lines[0]:
-        raise ValueError("the bitmap is empty; draw rows such as '#.#', with '#' for an atom")
-    for number, line in enumerate(lines, start=1):
-        if len(line) != len(lines[0]):
-            raise ValueError(
-                f"row {number} of the bitmap has {len(line)} characters and row 1 has {len(lines[0])}; "
-                "every row must have the same number"
-            )
-    mask = np.array([[character in fill for character in line] for line in lines], np.bool_)
-    if not mask.any():
-        raise ValueError(f"the bitmap holds no atom; draw an atom as one of '{fill}', or set `fill`")
-    return mask

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -206,7 +206,8 @@ def _make_target(
     try:
         target = chosen.entry.factory(chosen.settings, grid)
     except LabseqError as error:
-        raise document.error(choice.loc, str(error)) from error
+        problem = document.problem(choice.loc, str(error))
+        raise ConfigError(replace(problem, notes=(_grid_note(bench),))) from error
     if not isinstance(target, TargetPattern) or target.shape != grid.shape:
         text = f"pattern '{chosen.entry.name}' made no TargetPattern of shape {grid.shape}"
         raise PluginLoadError(chosen.entry.origin, text)
@@ -250,7 +251,18 @@ def _check_device_name(bench: Bench, document: Document, settings: Settings | No
     name = getattr(settings, "name", None)
     if name not in bench.profile.devices:
         what = f"the profile '{bench.profile.name}' has no device '{name}'"
-        raise document.error((*spec.loc, "name"), what, one_of(sorted(bench.profile.devices)))
+        problem = document.problem((*spec.loc, "name"), what, one_of(sorted(bench.profile.devices)))
+        raise ConfigError(replace(problem, notes=(_place(bench.document, "devices"),)))
+
+
+def _grid_note(bench: Bench) -> str:
+    grid = bench.grid
+    return f"the grid has {grid.n_rows} x {grid.n_cols} sites: {_place(bench.document, 'grid')}"
+
+
+def _place(document: Document, key: str) -> str:
+    line, column = document.locate((key,), key=True)
+    return f"see '{key}' at {document.path}:{line}:{column}"
 
 
 def build_lab(assembly: Assembly, clock: Clock, seed: int) -> Lab:

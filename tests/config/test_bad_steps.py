@@ -187,7 +187,7 @@ CASES = [
         "too few windows",
         "        - 50 ms\n",
         "",
-        "s.yaml:21:9: window: the list has 2 entries; expected 3, one per cycle",
+        "s.yaml:21:9: the list has 2 entries, but cycles is 3; expected 3, one per cycle",
     ),
     (
         "mapping for windows",
