@@ -132,11 +132,13 @@ def check(
     profile: Profile = None,
     dry_run: DryRun = None,
     overrides: Overrides = None,
+    as_json: Json = False,
 ) -> None:
-    """Check a sequence and print its timeline and limits; opens no device."""
+    """Check a sequence: every error, warnings, timeline, limits; opens no device."""
     from labseq.cli.check import check_sequence
 
-    check_sequence(sequence, profile, overrides or (), "off" if dry_run is None else dry_run.value)
+    mode = "off" if dry_run is None else dry_run.value
+    check_sequence(sequence, profile, overrides or (), mode, as_json=as_json)
 
 
 @app.command()

@@ -4,13 +4,21 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final, cast
 
-from labseq.cli.output import columns, encodes, say
+import numpy as np
+
+from labseq.cli.excerpt import excerpt
+from labseq.cli.log_lines import LogLines
+from labseq.cli.output import columns, divert_stdout, encodes, say
+from labseq.cli.show import as_line
 from labseq.cli.words import clock_time, plural
+from labseq.errors import ConfigError
 from labseq.model import TimelineEntry
-from labseq.session import Assembly, Session
+from labseq.session import Assembly, CheckReport, Session, check
+from labseq.session.checking import Rehearsal
 from labseq.session.choosing import DryRun
 from labseq.units import format_quantity
 
@@ -19,31 +27,75 @@ BAR_WIDTH: Final = 30
 Timeline = Sequence[tuple[str, Sequence[TimelineEntry]]]
 
 
-def check_sequence(sequence: Path, profile: str | None, overrides: Sequence[str], dry_run: DryRun) -> None:
-    """Check a sequence and print its timeline and limits.
+def check_sequence(
+    sequence: Path, profile: str | None, overrides: Sequence[str], dry_run: DryRun, *, as_json: bool
+) -> None:
+    """Check a sequence and print all that can be known of it without opening a device.
 
     Args:
         sequence: The sequence file.
         profile: Name or path of the profile, instead of the sequence's own.
         overrides: ``"address=value"`` strings.
         dry_run: "off", "full" or "fast".
+        as_json: Whether to print everything as one line of JSON, alone on stdout.
 
     Raises:
         ConfigError: Sequence, profile or an override is wrong.
         UnknownPluginError: A plugin that is named does not exist.
         PluginLoadError: A plugin that is named failed to load.
     """
-    session = Session.open(sequence, profile=profile, overrides=overrides, dry_run=dry_run)
-    assembly, timeline = session.assembly, session.timeline()
+    answer = divert_stdout() if as_json else None
+    observer = LogLines(sys.stderr)
+    try:
+        session = Session.open(
+            sequence, profile=profile, overrides=overrides, dry_run=dry_run, observer=observer
+        )
+        checked = check(session)
+    except ConfigError as error:
+        if answer is not None:
+            answer(as_line({"problems": [asdict(p) for p in error.problems], "warnings": []}))
+        raise
+    if answer is not None:
+        answer(as_line(_as_values(checked)))
+    else:
+        _print(session.assembly, checked)
+
+
+def _print(assembly: Assembly, checked: CheckReport) -> None:
     block = "█" if encodes(sys.stdout.encoding, "█") else "#"
     parts = (
         columns(_what(assembly)),
-        timeline_table(timeline, block),
-        columns(_sums(timeline, assembly.sequence.shots)),
+        timeline_table(checked.timeline, block),
+        columns([*_sums(checked), *_rehearsed(checked)]),
         columns(_limits(assembly)),
     )
     say("\n\n".join("\n".join(lines) for lines in parts))
-    say(*(f"warning: {text}" for text in assembly.bench.warnings), stream=sys.stderr)
+    for warning in checked.warnings:
+        say(f"warning: {warning}", *excerpt(warning), stream=sys.stderr)
+
+
+def _as_values(checked: CheckReport) -> dict[str, Any]:
+    rehearsal = checked.rehearsal
+    return {
+        "problems": [],
+        "warnings": [asdict(warning) for warning in checked.warnings],
+        "timeline": [
+            {"step": number, "name": name, "bars": [asdict(bar) for bar in bars]}
+            for number, (name, bars) in enumerate(checked.timeline)
+        ],
+        "shots": checked.n_shots,
+        "shot_s": [checked.shortest_shot_s, checked.longest_shot_s],
+        "run_s": [checked.n_shots * checked.shortest_shot_s, checked.n_shots * checked.longest_shot_s],
+        "n_images": checked.n_images,
+        "shot_bytes": checked.shot_bytes,
+        "run_bytes": None if checked.shot_bytes is None else checked.n_shots * checked.shot_bytes,
+        "first_cycle_s": None if rehearsal is None else _quantiles(rehearsal),
+    }
+
+
+def _quantiles(rehearsal: Rehearsal) -> dict[str, float]:
+    median, p95 = np.quantile(rehearsal.duration_s, [0.5, 0.95])
+    return {"median": float(median), "p95": float(p95), "n_loadings": rehearsal.n_loadings}
 
 
 def timeline_table(timeline: Timeline, block: str) -> list[str]:
@@ -99,14 +151,38 @@ def _simulation(assembly: Assembly) -> str:
     return ", simulated" if assembly.virtual_time else ""
 
 
-def _sums(timeline: Timeline, n_shots: int) -> list[tuple[str, str]]:
-    bars = [bar for _, step_bars in timeline for bar in step_bars]
-    shot_s = sum(bar.duration_s for bar in bars)
-    n_images = sum(bar.n_images for bar in bars)
+def _sums(checked: CheckReport) -> list[tuple[str, str]]:
+    shot = [format_quantity(t, "time") for t in (checked.shortest_shot_s, checked.longest_shot_s)]
+    n = checked.n_shots
+    run = [clock_time(n * t) for t in (checked.shortest_shot_s, checked.longest_shot_s)]
+    size = "of unknown size" if checked.shot_bytes is None else f"{size_text(checked.shot_bytes)} each"
+    disk = "unknown" if checked.shot_bytes is None else f"{size_text(n * checked.shot_bytes)} at most"
     return [
-        ("shot", f"{format_quantity(shot_s, 'time')} at most, {plural(n_images, 'image')} at most"),
-        ("run", f"{plural(n_shots, 'shot')}, {clock_time(n_shots * shot_s)} at most"),
+        ("shot", f"{shot[0]} to {shot[1]}, {plural(checked.n_images, 'image')} at most, {size}"),
+        ("run", f"{plural(n, 'shot')}, {run[0]} to {run[1]}, {disk} on disk"),
     ]
+
+
+def _rehearsed(checked: CheckReport) -> list[tuple[str, str]]:
+    if checked.rehearsal is None:
+        return []
+    found = _quantiles(checked.rehearsal)
+    median, p95 = (format_quantity(found[name], "time") for name in ("median", "p95"))
+    text = f"{median} in the median, {p95} in 19 of 20, on {checked.rehearsal.n_loadings} random loadings"
+    return [("first cycle", text)]
+
+
+def size_text(n_bytes: int) -> str:
+    """A size on disk for people.
+
+    Example:
+        >>> size_text(6_351_456), size_text(900)
+        ('6.4 MB', '0.9 kB')
+    """
+    for unit, factor in (("TB", 1e12), ("GB", 1e9), ("MB", 1e6)):
+        if n_bytes >= factor:
+            return f"{n_bytes / factor:.1f} {unit}"
+    return f"{n_bytes / 1e3:.1f} kB"
 
 
 def _limits(assembly: Assembly) -> list[tuple[str, str]]:

@@ -55,7 +55,7 @@ def find_profile(name_or_path: str | Path, beside: Path, *, named_in: Document |
         if reading.is_file(path):
             return path
         what, expected = f"there is no hardware profile at {visible(str(path))}", ""
-        hint = did_you_mean(path.name, reading.yaml_files(path.parent))
+        hint = did_you_mean(path.name, reading.files_in(path.parent))
     else:
         for folder in folders:
             for suffix in reading.YAML_SUFFIXES:
@@ -74,4 +74,4 @@ def find_profile(name_or_path: str | Path, beside: Path, *, named_in: Document |
 
 def _names(folders: list[Path]) -> list[str]:
     """Names of the profiles in the folders; a sequence's folder is full of other files."""
-    return list(dict.fromkeys(Path(name).stem for folder in folders for name in reading.yaml_files(folder)))
+    return list(dict.fromkeys(Path(name).stem for folder in folders for name in reading.files_in(folder)))

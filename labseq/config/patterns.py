@@ -4,10 +4,15 @@ from __future__ import annotations
 
 from typing import Annotated, Literal, Self
 
-from pydantic import Field, model_validator
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, PrivateAttr, model_validator
 
-from labseq.config.settings import Settings
-from labseq.geometry import read_bitmap
+from labseq.config.drawings import read_drawing
+from labseq.config.fields import misfit
+from labseq.config.settings import FilePath, Settings
+from labseq.errors import ConfigError
+from labseq.geometry import DrawingError, read_bitmap
 
 Index = Annotated[int, Field(ge=0)]
 """Index of a row or a column, from 0."""
@@ -24,16 +29,24 @@ class CompactSettings(Settings):
 
 
 class BitmapSettings(Settings):
-    r"""Sites as they are drawn.
+    r"""Sites as they are drawn, in the sequence or in a file.
 
     Example:
-        >>> BitmapSettings(sites="#.#\n.#.").clear
-        'bounding_box'
+        >>> BitmapSettings(sites="#.#\n.#.").mask.astype(int).tolist()
+        [[1, 0, 1], [0, 1, 0]]
     """
 
-    sites: str = Field(description="the drawing: one line of text per row, all of the same length")
+    sites: str | None = Field(
+        default=None, description="the drawing: one line of text per row, all of the same length"
+    )
+    file: FilePath | None = Field(
+        default=None,
+        description="a file with the drawing, instead of sites: text, or a PNG with one pixel per site",
+    )
     fill: str = Field(
-        default="#", min_length=1, description="characters that stand for an atom; all others are empty sites"
+        default="#",
+        min_length=1,
+        description="characters of a text that stand for an atom; all others are empty sites",
     )
     origin: tuple[Index, Index] | None = Field(
         default=None, description="[row, column] of its top left site, from 0; centred if left out"
@@ -42,8 +55,27 @@ class BitmapSettings(Settings):
         default="bounding_box",
         description="bounding_box: all other sites of the drawing must be empty; none: they are reservoir",
     )
+    _mask: NDArray[np.bool_] = PrivateAttr()
+
+    @property
+    def mask(self) -> NDArray[np.bool_]:
+        """What is drawn: bool (rows, cols), True where an atom must be."""
+        return self._mask
 
     @model_validator(mode="after")
-    def _drawing_is_right(self) -> Self:
-        read_bitmap(self.sites, self.fill)
+    def _read(self) -> Self:
+        if self.sites is not None and self.file is not None:
+            raise misfit("'file' stands beside 'sites'", "one of them", at=("file",), key=True)
+        if self.file is not None:
+            try:
+                self._mask = read_drawing(self.file, self.fill)
+            except ConfigError as error:
+                raise misfit(str(error), at=("file",)) from None
+        elif self.sites is not None:
+            try:
+                self._mask = read_bitmap(self.sites, self.fill)
+            except DrawingError as error:
+                raise misfit(str(error), at=("sites",)) from None
+        else:
+            raise misfit("a bitmap needs a drawing", "'sites' or 'file'")
         return self

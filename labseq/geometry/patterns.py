@@ -7,6 +7,7 @@ from typing import Literal, Protocol, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from labseq.errors import LimitError
 from labseq.geometry.placing import check_size, place
 from labseq.model import SiteGrid, TargetPattern
 
@@ -74,13 +75,15 @@ def pattern(
         name: For records and the screen.
 
     Raises:
-        LimitError: The mask is larger than the grid or sticks out of it.
+        LimitError: The mask holds no atom, is larger than the grid or sticks out of it.
 
     Example:
         >>> target = pattern(np.eye(2, dtype=np.bool_), SiteGrid(2, 3), name="diagonal")
         >>> target.clear.astype(int).tolist()
         [[0, 1, 0], [1, 0, 0]]
     """
+    if not mask.any():
+        raise LimitError(f"the number of atoms of {name}", 0, "at least 1", "choose a larger target")
     fill = place(mask, grid.shape, origin)
     empty = ~mask if clear == "bounding_box" else np.zeros_like(mask)
     return TargetPattern(fill, place(empty, grid.shape, origin), name)

@@ -4,8 +4,14 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Generator
+from contextlib import contextmanager
+from typing import Final
 
 from labseq.errors import StopRequested
+
+LOOK_S: Final = 0.05
+"""How often everything that waits looks for a stop request; Windows wakes no waiting thread for Ctrl-C."""
 
 
 class StopFlag:
@@ -17,7 +23,7 @@ class StopFlag:
 
     def __init__(self) -> None:
         self._event = threading.Event()
-        self._held = False
+        self._n_holds = 0
         self.signal_number = 2
 
     def request(self, signal_number: int = 2) -> None:
@@ -26,9 +32,14 @@ class StopFlag:
             self.signal_number = signal_number
         self._event.set()
 
-    def hold(self) -> None:
-        """From now on the run is ending anyway: let waits finish."""
-        self._held = True
+    @contextmanager
+    def held(self) -> Generator[None]:
+        """Within the block let waits finish."""
+        self._n_holds += 1
+        try:
+            yield
+        finally:
+            self._n_holds -= 1
 
     @property
     def is_set(self) -> bool:
@@ -37,17 +48,17 @@ class StopFlag:
 
     def check(self) -> None:
         """Raise ``StopRequested`` if the run was asked to stop."""
-        if self._event.is_set() and not self._held:
+        if self._event.is_set() and not self._n_holds:
             raise StopRequested(self.signal_number)
 
     def wait(self, duration_s: float) -> None:
         """Wait in real time, or raise ``StopRequested`` as soon as it is asked for."""
-        deadline = time.monotonic() + duration_s
+        deadline_s = time.monotonic() + duration_s
         self.check()
-        while (left := deadline - time.monotonic()) > 0:
-            if self._held:
-                threading.Event().wait(left)
-            elif self._event.wait(left):
+        while (left_s := deadline_s - time.monotonic()) > 0:
+            if self._n_holds:
+                time.sleep(min(left_s, LOOK_S))
+            elif self._event.wait(min(left_s, LOOK_S)):
                 self.check()
 
 

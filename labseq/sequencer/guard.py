@@ -9,13 +9,11 @@ from collections.abc import Callable
 from typing import Any, Final, ParamSpec, TypeVar
 
 from labseq.errors import DeviceError, DeviceTimeoutError, LabseqError, PlanError
-from labseq.sequencer.clock import StopFlag
+from labseq.sequencer.clock import LOOK_S, StopFlag
 
 P = ParamSpec("P")
 T = TypeVar("T")
 
-LOOK_S: Final = 0.05
-"""How often a waiting call looks for a stop request and its deadline."""
 GRACE_S: Final = 1.0
 """How long a call may take to come back after a stop request."""
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -88,46 +88,42 @@ def in_safe_order(devices: Mapping[str, Hardware]) -> Iterator[tuple[str, Hardwa
         yield name, devices[name]
 
 
-Report = Callable[[str, LabseqError | None], None]
+Outcome = dict[str, LabseqError | None]
+"""Device name -> what went wrong, or None; in the order of the calls."""
 
 
-def make_safe(lab: Lab, guard: Guard, report: Report) -> bool:
+def make_safe(lab: Lab, guard: Guard) -> Outcome:
     """Bring every device to its safe state; one that fails never stops the others.
 
-    Args:
-        lab: The devices.
-        guard: Runs the calls; each device has a timeout of its own.
-        report: Told each device's name and its error, or None.
-
-    Returns:
-        Whether every device is in its safe state.
+    Each device has a timeout of its own.
     """
-    return _each(lab, guard, report, "safe_state", lab.timeouts.safe_state_s)
+    return _each(lab.safe_order(), guard, "safe_state", lab.timeouts.safe_state_s)
 
 
-def close_all(lab: Lab, guard: Guard, report: Report) -> bool:
-    """Close every device, in the order of the safe state; failures never stop the others."""
-    return _each(lab, guard, report, "close", lab.timeouts.safe_state_s)
+def close_all(lab: Lab, guard: Guard) -> Outcome:
+    """Close every device in the order of the safe state, then the simulation; failures never stop the others."""
+    parts: list[tuple[str, Hardware | Simulation]] = list(lab.safe_order())
+    if lab.simulation is not None:
+        parts.append(("simulation", lab.simulation))
+    return _each(parts, guard, "close", lab.timeouts.safe_state_s)
 
 
-def _each(lab: Lab, guard: Guard, report: Report, method: str, timeout_s: float) -> bool:
-    all_well = True
-    for name, device in lab.safe_order():
-        error: LabseqError | None = None
+def _each(
+    parts: Iterable[tuple[str, Hardware | Simulation]], guard: Guard, method: str, timeout_s: float
+) -> Outcome:
+    outcome: Outcome = {}
+    for name, part in parts:
         try:
-            guard.call_to_the_end(name, timeout_s, getattr(device, method))
+            guard.call_to_the_end(name, timeout_s, getattr(part, method))
+            outcome[name] = None
         except LabseqError as failure:
-            error = failure
-            all_well = False
-        report(name, error)
-    return all_well
+            outcome[name] = failure
+    return outcome
 
 
 def describe(lab: Lab, guard: Guard) -> dict[str, Mapping[str, Any]]:
     """What each device says of itself: name -> JSON-ready values."""
-    described: dict[str, Mapping[str, Any]] = {}
-    for name, device in lab.hardware():
-        described[name] = guard.call(name, lab.timeouts.call_s, device.describe)
+    parts: dict[str, Hardware | Simulation] = dict(lab.hardware())
     if lab.simulation is not None:
-        described["simulation"] = lab.simulation.describe()
-    return described
+        parts["simulation"] = lab.simulation
+    return {name: guard.call(name, lab.timeouts.call_s, part.describe) for name, part in parts.items()}

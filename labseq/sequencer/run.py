@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
+from contextlib import contextmanager
 from datetime import UTC, datetime
-from functools import partial
 from typing import Any, Protocol
 
 from labseq.errors import LabseqError, StopRequested, TransientError
-from labseq.model import ShotRecord
+from labseq.model import ShotRecord, TimelineEntry
 from labseq.model.records import ShotStatus
 from labseq.roles import RunObserver, Step
 from labseq.sequencer.clock import StopFlag
 from labseq.sequencer.guard import Guard
-from labseq.sequencer.lab import Lab, close_all, make_safe
+from labseq.sequencer.lab import Lab, Outcome, close_all, make_safe
 from labseq.sequencer.shot import RunningShot
 from labseq.sequencer.states import State, StateTable
 
@@ -38,6 +38,9 @@ class Sequencer:
         seed: The run's seed.
         attempts: How often a shot is tried when it fails with ``TransientError``.
         parameters: What differs from the files, kept with each shot: address -> value.
+
+    Raises:
+        LabseqError: A step fails to lay out its timeline.
     """
 
     def __init__(
@@ -62,7 +65,11 @@ class Sequencer:
         self._attempts = attempts
         self._parameters = dict(parameters or {})
         self._states = StateTable(lambda state: self._emit("state", {"state": state.value}))
-        self._budgets = [sum(e.duration_s for e in step.plan_timeline(lab.step_context)) for _, step in steps]
+        self._unsafe: dict[str, LabseqError] = {}
+        self._budgets = [
+            sum(entry.duration_s for entry in _timeline(step, number, name, lab))
+            for number, (name, step) in enumerate(steps)
+        ]
 
     @property
     def state(self) -> State:
@@ -74,7 +81,7 @@ class Sequencer:
         self._states.to(State.OPENING)
         lab, timeout_s = self.lab, self.lab.timeouts.call_s
         if lab.simulation is not None:
-            lab.simulation.open()
+            self.guard.call("simulation", timeout_s, lab.simulation.open)
         for name, device in lab.hardware():
             self.guard.call(name, timeout_s, device.open)
         self.guard.call("static_tweezers", timeout_s, lab.static_tweezers.load, None)
@@ -89,86 +96,81 @@ class Sequencer:
                 must call :meth:`shut_down` on this way out too.
         """
         for index in shot_indices:
-            self._stop.check()
             for attempt in range(self._attempts):
-                if self._take(index, attempt):
+                self._stop.check()
+                if self._take(index, attempt, last=attempt + 1 == self._attempts):
                     break
-            self._states.to(State.IDLE)
 
-    def shut_down(self) -> bool:
+    def shut_down(self) -> Mapping[str, LabseqError]:
         """Safe state of every device, then close; from any state, any number of times.
 
         Returns:
-            Whether every device is in its safe state.
+            The devices that could not be made safe, and why.
         """
-        if self.state is State.CLOSED:
-            return True
-        self._stop.hold()
-        all_safe = True
-        if self.state is not State.SAFE:
-            all_safe = self._secure()
-        self._states.to(State.CLOSING)
-        close_all(self.lab, self.guard, partial(self._device_event, "closed"))
-        if self.lab.simulation is not None:
-            self.lab.simulation.close()
-        self.guard.end()
-        self._states.to(State.CLOSED)
-        return all_safe
+        if self.state is not State.CLOSED:
+            if self.state is not State.SAFE:
+                self._secure()
+            self._states.to(State.CLOSING)
+            with self._stop.held():
+                outcome = close_all(self.lab, self.guard)
+            self._tell("closed", outcome)
+            self.guard.end()
+            self._states.to(State.CLOSED)
+        return self._unsafe
 
-    def _secure(self) -> bool:
-        self._stop.hold()
+    def _secure(self) -> None:
         self._states.to(State.MAKING_SAFE)
-        all_safe = make_safe(self.lab, self.guard, partial(self._device_event, "safe_state"))
+        with self._stop.held():
+            outcome = make_safe(self.lab, self.guard)
+        self._unsafe = {name: error for name, error in outcome.items() if error is not None}
+        self._tell("safe_state", outcome)  # only now: neither a screen nor a disk shall delay the devices
         self._states.to(State.SAFE)
-        return all_safe
 
-    def _take(self, index: int, attempt: int) -> bool:
+    def _take(self, index: int, attempt: int, *, last: bool) -> bool:
         """Take one attempt at a shot and write it; whether the shot is done."""
         self._states.to(State.SHOT)
         record = ShotRecord(index, attempt, self._seed, _utc_now(), parameters=self._parameters)
+        failure: TransientError | None = None
         try:
-            self._perform(record)
-        except TransientError as error:
-            if attempt + 1 < self._attempts:
-                self._close_record(record, "failed", error)
-                self._recover(record)
-                return False
-            self._abort(record, "failed", error)
-            raise
+            try:
+                self._perform(record)
+            except TransientError as error:
+                if last:
+                    raise
+                failure = error
+                self._recover()
         except BaseException as error:  # KeyboardInterrupt too, where no signal handler could be set
             stopped = isinstance(error, StopRequested | KeyboardInterrupt)
             self._abort(record, "interrupted" if stopped else "failed", error)
             raise
-        self._close_record(record, "complete", None)
+        self._close_record(record, "complete" if failure is None else "failed", failure)
         self._states.to(State.WRITING)
         self._sink.write_shot(record)
-        self._emit("shot_finished", {"shot": record})
-        return True
+        self._emit("shot_finished" if failure is None else "shot_repeated", {"shot": record})
+        self._states.to(State.IDLE)
+        return failure is None
 
     def _perform(self, record: ShotRecord) -> None:
         for stream in self.lab.random_streams:
             stream.begin_shot(record.shot_index, record.attempt)
         if self.lab.simulation is not None:
-            self.lab.simulation.begin_shot()
+            self.guard.call("simulation", self.lab.timeouts.call_s, self.lab.simulation.begin_shot)
         self._emit("shot_started", {"shot": record.shot_index, "attempt": record.attempt})
         shot = RunningShot(self.lab, self.guard, record, self._emit)
         for number, (name, step) in enumerate(self._steps):
             self._stop.check()
             shot.begin_step(number)
-            with shot.stage(f"step {number} {name}", self._budgets[number]):
-                _run_step(step, shot, number, name)
+            with shot.stage(f"step {number} {name}", self._budgets[number]), _named(number, name):
+                step.run(shot)
         shot.note_truth()
 
-    def _recover(self, record: ShotRecord) -> None:
-        """Silence what may still be busy, keep the failed attempt, and go back to idle."""
+    def _recover(self) -> None:
+        """Silence what may still be busy."""
         self._states.to(State.RECOVERING)
         lab, timeout_s = self.lab, self.lab.timeouts.safe_state_s
-        self.guard.call("mobile_tweezers", timeout_s, lab.mobile_tweezers.safe_state)
-        self.guard.call("camera", timeout_s, lab.camera.safe_state)
-        self._states.to(State.WRITING)
-        self._sink.write_shot(record)
-        self._emit("shot_repeated", {"shot": record})
-        self._states.to(State.IDLE)
+        with self._stop.held():
+            self.guard.call_to_the_end("mobile_tweezers", timeout_s, lab.mobile_tweezers.safe_state)
+            self.guard.call_to_the_end("camera", timeout_s, lab.camera.safe_state)
 
     def _abort(self, record: ShotRecord, status: ShotStatus, error: BaseException) -> None:
         """Safety first; only then is what the shot has written down."""
@@ -185,19 +187,27 @@ class Sequencer:
         record.error = "" if error is None else f"{type(error).__name__}: {error}"
         record.t_end_utc = _utc_now()
 
-    def _device_event(self, event: str, name: str, error: LabseqError | None) -> None:
-        self._emit(event, {"device": name, "ok": error is None, "error": str(error or "")})
+    def _tell(self, event: str, outcome: Outcome) -> None:
+        for name, error in outcome.items():
+            self._emit(event, {"device": name, "ok": error is None, "error": str(error or "")})
 
     def _emit(self, name: str, values: Mapping[str, Any]) -> None:
         self._observer.event(name, values)
 
 
-def _run_step(step: Step, shot: RunningShot, number: int, name: str) -> None:
+def _timeline(step: Step, number: int, name: str, lab: Lab) -> Sequence[TimelineEntry]:
+    with _named(number, name):
+        return step.plan_timeline(lab.step_context)
+
+
+@contextmanager
+def _named(number: int, name: str) -> Generator[None]:
+    """Name the step in whatever it raises; labseq's own errors pass as they are."""
     try:
-        step.run(shot)
+        yield
     except LabseqError:
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         text = f"step {number} ({name}) raised {type(error).__name__}: {error}"
         raise LabseqError(text) from error
 

@@ -140,7 +140,7 @@ class RunningShot:
     def note_truth(self) -> None:
         """Keep the true occupancy, where the simulation tells it."""
         if isinstance(self.simulation, TruthTeller):
-            truth = self.simulation.truth()
+            truth = self.call("simulation", self.call_timeout_s, self.simulation.truth)
             self.record.readings["simulation.n_atoms_true"] = int(np.count_nonzero(truth))
             self.record.readings["simulation.n_defects_true"] = self.target.n_defects(truth)
 

@@ -32,12 +32,15 @@ TRANSITIONS: Final = MappingProxyType(
         State.SHOT: frozenset({State.WRITING, State.RECOVERING, State.MAKING_SAFE}),
         State.RECOVERING: frozenset({State.WRITING, State.MAKING_SAFE}),
         State.WRITING: frozenset({State.IDLE, State.MAKING_SAFE}),
-        State.MAKING_SAFE: frozenset({State.SAFE}),
+        State.MAKING_SAFE: frozenset({State.SAFE, State.MAKING_SAFE}),
         State.SAFE: frozenset({State.CLOSING}),
-        State.CLOSING: frozenset({State.CLOSED}),
+        State.CLOSING: frozenset({State.CLOSED, State.MAKING_SAFE}),
     }
 )
-"""The state table: state -> states that may follow. Every state but the last three leads to MAKING_SAFE."""
+"""The state table: state -> states that may follow.
+
+Every state in which a device may be on leads to MAKING_SAFE; an ending that was itself cut short begins anew.
+"""
 
 
 class StateTable:

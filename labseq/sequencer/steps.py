@@ -51,7 +51,7 @@ class LoadStep:
         start_s = shot.clock.now()
         shot.clock.sleep(self.duration_s)
         if shot.simulation is not None:
-            shot.simulation.load(start_s, self.duration_s)
+            shot.call("simulation", shot.call_timeout_s, shot.simulation.load, start_s, self.duration_s)
 
 
 class ImageStep:

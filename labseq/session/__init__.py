@@ -1,6 +1,7 @@
 """The composition root: sequence + profile + plugins -> open devices -> sequencer -> recorder."""
 
 from labseq.session.assembly import Assembly, Bench, assemble, load_plugins, set_up_bench
+from labseq.session.checking import CheckReport, check
 from labseq.session.provenance import gather_provenance
 from labseq.session.safe import make_profile_safe
 from labseq.session.session import Options, Session
@@ -8,9 +9,11 @@ from labseq.session.session import Options, Session
 __all__ = [
     "Assembly",
     "Bench",
+    "CheckReport",
     "Options",
     "Session",
     "assemble",
+    "check",
     "gather_provenance",
     "load_plugins",
     "make_profile_safe",

@@ -34,7 +34,7 @@ def secure(
     guard = Guard(StopFlag())
     outcome: dict[str, LabseqError | None] = {}
     if simulation is not None:
-        simulation.open()
+        guard.call_to_the_end("simulation", timeouts.call_s, simulation.open)
     for name, device in devices:
         failure: LabseqError | None = None
         calls = (
@@ -51,7 +51,7 @@ def secure(
         if observer is not None:
             observer.event("safe_state", {"device": name, "ok": failure is None, "error": str(failure or "")})
     if simulation is not None:
-        simulation.close()
+        guard.call_to_the_end("simulation", timeouts.call_s, simulation.close)
     guard.end()
     return outcome
 
@@ -84,8 +84,7 @@ def make_profile_safe(
     chosen = {role: c for role, c in bench.chosen.items() if c.entry.kind in needed}
     made, _ = construct(chosen, bench.grid, bench.profile.motion, clock, seed=0)
     simulation = made.pop("simulation", None)
-    stop.hold()
-    with stop_on_signals(stop):
+    with stop_on_signals(stop), stop.held():
         outcome = secure(in_safe_order(made), timeouts_of(bench.profile), simulation, observer)
     if stop.is_set:
         raise StopRequested(stop.signal_number)

@@ -163,7 +163,7 @@ class Session:
             self._observers.event("warning", {"text": text})
         with stop_on_signals(self.stop_flag):
             lab = self.build_lab()
-            self._warm(lab)
+            self.warm(lab)
             return self._run(lab, root)
 
     def build_lab(self) -> Lab:
@@ -177,7 +177,7 @@ class Session:
             clock = VirtualClock(self.stop_flag)
         return build_lab(self.assembly, clock, self.seed)
 
-    def _warm(self, lab: Lab) -> None:
+    def warm(self, lab: Lab) -> None:
         """Compile before the first shot: a compile in mid-shot would cost the atoms."""
         start_s, compiled = time.monotonic(), list[str]()
 

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM as a request to stop, never as an exception in the wrong place."""
+"""Ctrl-C, SIGTERM and a lost terminal as a request to stop, never as an exception in the wrong place."""
 
 from __future__ import annotations
 

@@ -1,0 +1,77 @@
+"""Drawings in files: text, or a PNG with one pixel per site."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any, Final, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq.config.reading import decode, read_bytes
+from labseq.config.wording import visible
+from labseq.errors import ConfigError, Problem
+from labseq.geometry import DrawingError, read_bitmap
+
+MAX_PIXELS: Final = 1024
+"""Longest side of a picture, in pixels: far more than any grid has sites."""
+
+_HALF: Final = 128
+_SUFFIXES: Final = (".txt", ".png")
+
+
+def read_drawing(path: Path, fill: str = "#") -> NDArray[np.bool_]:
+    """Read a pattern that is drawn in a file.
+
+    A file whose name ends in .png is a picture; any other is text.
+
+    Args:
+        path: The file.
+        fill: Characters that stand for an atom, in a text.
+
+    Returns:
+        bool (rows, cols), True where an atom must be.
+
+    Raises:
+        ConfigError: It cannot be read, or it is no drawing; with the line that is wrong.
+    """
+    data = read_bytes(path, "a text file or a PNG", _SUFFIXES)
+    name = visible(str(path))
+    if path.suffix.lower() == ".png":
+        return _picture(data, name)
+    try:
+        return read_bitmap(decode(data, name), fill)
+    except DrawingError as error:
+        column = 1 if error.line else 0
+        raise ConfigError(Problem(str(error), name, error.line, column)) from None
+
+
+def _picture(data: bytes, name: str) -> NDArray[np.bool_]:
+    """Dark pixels are atoms; in a picture with transparent pixels, opaque ones."""
+    try:
+        from PIL import Image
+    except ImportError:
+        hint = 'pip install "labseq[plot]", or draw it as text'
+        raise ConfigError(
+            Problem("reading a PNG needs Pillow, which is not installed", name, hint=hint)
+        ) from None
+    try:
+        with Image.open(io.BytesIO(data), formats=["PNG"]) as image:
+            if max(image.size) > MAX_PIXELS:
+                what = f"the picture has {image.height} x {image.width} pixels"
+                raise ConfigError(Problem(what, name, expected="one pixel per site", hint="scale it down"))
+            # Grey levels of 16 bits fit into no other mode; the upper 8 are enough.
+            grey = np.asarray(image) // 257 if image.mode.startswith("I") else np.asarray(image.convert("L"))
+            opacity = np.asarray(cast("Any", image).convert("RGBA"))[..., 3]
+    except ConfigError:
+        raise
+    except (
+        Exception
+    ) as error:  # damaged data make Pillow raise SyntaxError, OSError, ValueError, zlib.error ...
+        raise ConfigError(Problem(f"this is not a readable PNG: {error}", name)) from error
+    mask = opacity >= _HALF if opacity.min() < _HALF else grey < _HALF
+    if not mask.any():
+        hint = "make the pixels of atoms dark, or all others transparent"
+        raise ConfigError(Problem("the picture holds no atom", name, hint=hint))
+    return mask

@@ -1,0 +1,212 @@
+"""An occupancy as it is named on the command line: a file, standard input, a shot, or a draw."""
+
+from __future__ import annotations
+
+import re
+import secrets
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO, Final, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq.config.reading import decode, is_file, is_folder
+from labseq.config.wording import clean, shown, visible
+from labseq.errors import ConfigError, Problem, RecordingError
+from labseq.model import CycleRecord, ImageRecord, Occupancy, TargetPattern, as_occupancy
+from labseq.units import parse_quantity
+
+MAX_SITES: Final = 1000
+"""Most rows, and most columns, as in a hardware profile."""
+MAX_BYTES: Final = 4 << 20
+"""Largest text, in bytes."""
+FORMS: Final = (
+    "a .npy file, a text file of 0 and 1, '-' for standard input, a shot file such as "
+    "shots/shot_000003.h5#2, or random:20x20@0.75"
+)
+
+_RANDOM: Final = re.compile(r"random:\s*(\d{1,9})\s*[xX]\s*(\d{1,9})\s*@(.+)")
+_SHOT: Final = re.compile(r"(.+\.h5)(?:#(.*))?", re.IGNORECASE)
+_LINE_BREAK: Final = re.compile(r"\r\n|\r|\n")
+_CHARACTERS: Final = {"1": True, "#": True, "0": False, ".": False}
+_SEPARATORS: Final = " \t,;"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Source:
+    """An occupancy and where it comes from.
+
+    Attributes:
+        occupancy: bool (n_rows, n_cols).
+        label: Where it comes from, for people.
+        seed: Seed that it was drawn with; None if nothing was drawn.
+        target: The target that it was seen with; None but for shots.
+        machine: The resolved profile that it was seen with; None but for shots.
+    """
+
+    occupancy: Occupancy
+    label: str
+    seed: int | None = None
+    target: TargetPattern | None = None
+    machine: dict[str, Any] | None = None
+
+
+def read_source(text: str, seed: int | None = None, stdin: BinaryIO | None = None) -> Source:
+    """Read what a user gives as an occupancy.
+
+    ``random:ROWSxCOLS@P`` is ``numpy.random.default_rng(seed).random((rows, cols)) < P``.
+
+    Args:
+        text: See :data:`FORMS`.
+        seed: Seed for ``random:``; a fresh one if None.
+        stdin: What "-" reads; standard input if None.
+
+    Raises:
+        ConfigError: It is none of these, or cannot be read; says what was expected.
+    """
+    if text == "-":
+        data = (stdin or sys.stdin.buffer).read(MAX_BYTES + 1)
+        return Source(parse_text(data, "standard input"), "standard input")
+    if text.startswith("random:"):
+        return _random(text, seed)
+    match = _SHOT.fullmatch(text)
+    path = Path(match[1] if match else text)
+    if not is_file(path):
+        problem = "this is a folder" if is_folder(path) else "there is no such file"
+        raise ConfigError(Problem(problem, visible(str(path)), expected=FORMS))
+    if match:
+        return _shot(path, match[2])
+    if path.suffix.lower() == ".npy":
+        return Source(_npy(path), str(path))
+    return Source(parse_text(_read(path), visible(str(path))), str(path))
+
+
+def parse_text(data: bytes, name: str) -> Occupancy:
+    r"""Read rows of 0 and 1 (or "." and "#"), with or without spaces or commas between them.
+
+    Args:
+        data: UTF-8.
+        name: What messages call it.
+
+    Raises:
+        ConfigError: With line and column.
+
+    Example:
+        >>> parse_text(b"1 0 1\n#.#\n", "mine").astype(int).tolist()
+        [[1, 0, 1], [1, 0, 1]]
+    """
+    if len(data) > MAX_BYTES:
+        raise ConfigError(Problem("it is larger than 4 MiB", name, expected=_size_limit()))
+    lines = _LINE_BREAK.split(decode(data, name))
+    filled = [i for i, line in enumerate(lines) if line.strip(_SEPARATORS)]
+    if not filled:
+        raise ConfigError(Problem("it is empty", name, expected="rows of 0 and 1, one line each"))
+    numbered = [(i, lines[i]) for i in range(filled[0], filled[-1] + 1)]
+    rows = [_text_row(line, name, i + 1) for i, line in numbered]
+    for (i, _), row in zip(numbered, rows, strict=True):
+        if len(row) != len(rows[0]):
+            what = f"this row has {len(row)} sites"
+            expected = f"{len(rows[0])}, as in line {filled[0] + 1}"
+            raise ConfigError(Problem(what, name, i + 1, 1, expected))
+    return _checked(np.array(rows, np.bool_), name)
+
+
+def _text_row(line: str, name: str, number: int) -> list[bool]:
+    for i, character in enumerate(line):
+        if character not in _CHARACTERS and character not in _SEPARATORS:
+            what = f"{shown(character)} is no site"
+            expected = "0 or '.' for an empty site, 1 or '#' for an atom"
+            raise ConfigError(Problem(what, name, number, i + 1, expected))
+    return [_CHARACTERS[character] for character in line if character in _CHARACTERS]
+
+
+def _random(text: str, seed: int | None) -> Source:
+    expected = "random:ROWSxCOLS@P, for example random:20x20@0.75"
+    match = _RANDOM.fullmatch(text)
+    if match is None:
+        raise ConfigError(Problem("this is no occupancy", clean(text), expected=expected))
+    rows, cols = int(match[1]), int(match[2])
+    try:
+        probability = parse_quantity(match[3], "fraction")
+    except ValueError:
+        probability = np.nan
+    if not 0.0 <= probability <= 1.0:
+        what = f"the filling fraction is '{clean(match[3])}'"
+        raise ConfigError(Problem(what, clean(text), expected="a number from 0 to 1, or 0 % to 100 %"))
+    if not (1 <= rows <= MAX_SITES and 1 <= cols <= MAX_SITES):
+        raise ConfigError(Problem(f"it has {rows} x {cols} sites", clean(text), expected=_size_limit()))
+    if seed is None:
+        seed = secrets.randbits(32)
+    atoms = np.random.default_rng(seed).random((rows, cols)) < probability
+    return Source(atoms, f"{text}, seed {seed}", seed)
+
+
+def _npy(path: Path) -> Occupancy:
+    name = visible(str(path))
+    expected = "a two-dimensional array of bool, or of 0 and 1, saved by numpy.save"
+    try:
+        array = cast("object", np.load(path, mmap_mode="r", allow_pickle=False))
+    except (OSError, ValueError, EOFError) as error:
+        what = f"it cannot be read: {visible(str(error).splitlines()[0])}" if str(error) else "it is damaged"
+        raise ConfigError(Problem(what, name, expected=expected)) from error
+    if not isinstance(array, np.ndarray):
+        raise ConfigError(Problem("it is an archive of arrays", name, expected=expected))
+    if array.ndim != 2 or array.dtype.kind not in "biuf":
+        what = f"it holds an array of shape {array.shape} and type {array.dtype}"
+        raise ConfigError(Problem(what, name, expected=expected))
+    return _checked(array, name)
+
+
+def _checked(array: NDArray[Any], name: str) -> Occupancy:
+    if max(array.shape) > MAX_SITES:
+        what = f"it has {array.shape[0]} x {array.shape[1]} sites"
+        raise ConfigError(Problem(what, name, expected=_size_limit()))
+    try:
+        return as_occupancy(np.array(array))
+    except ValueError as error:
+        raise ConfigError(Problem(str(error), name, expected="0 and 1, or False and True")) from error
+
+
+def _shot(path: Path, cycle: str | None) -> Source:
+    from labseq.recording.shot_reader import read_content  # h5py takes 0.1 s to import
+
+    name = visible(str(path))
+    try:
+        content = read_content(path)
+    except RecordingError as error:
+        text = str(error).removeprefix(f"{error.path}: ")
+        raise ConfigError(Problem(text, name, expected="a shot's file")) from error
+    cycles, images = content.record.cycles, content.record.images
+    if not cycles:
+        raise ConfigError(Problem("this shot has no cycles", name, expected="a shot that was rearranged"))
+    number = 1 if cycle is None else int(cycle) if re.fullmatch(r"[0-9]{1,6}", cycle) else 0
+    if not 1 <= number <= len(cycles):
+        there_are = "1, the only one there is" if len(cycles) == 1 else f"a cycle from 1 to {len(cycles)}"
+        raise ConfigError(Problem(f"there is no cycle '{clean(cycle or '')}'", name, expected=there_are))
+    seen = _image_before(cycles[number - 1], images)
+    if seen is None:
+        raise ConfigError(Problem(f"there is no image before cycle {number}", name, expected="one"))
+    label = f"{path}, before cycle {number} of {len(cycles)}"
+    machine = cast("dict[str, Any]", content.provenance.get("resolved", {})).get("profile")
+    return Source(seen.occupancy, label, target=content.target, machine=machine)
+
+
+def _image_before(cycle: CycleRecord, images: list[ImageRecord]) -> ImageRecord | None:
+    """The image that a cycle was planned on: cycle k ends with its own."""
+    before = [image for image in images if (image.step, image.cycle) < (cycle.step, cycle.cycle)]
+    return before[-1] if before else None
+
+
+def _read(path: Path) -> bytes:
+    try:
+        with path.open("rb") as file:
+            return file.read(MAX_BYTES + 1)
+    except OSError as error:
+        what = f"it cannot be read: {error.strerror}"
+        raise ConfigError(Problem(what, visible(str(path)), expected=FORMS)) from error
+
+
+def _size_limit() -> str:
+    return f"1 to {MAX_SITES} rows and columns"

@@ -1,0 +1,55 @@
+from pathlib import Path
+
+import pytest
+from hypothesis import given, strategies as st
+
+from labseq.cli.excerpt import excerpt
+from labseq.errors import Problem
+
+
+def shown(tmp_path: Path, text: str | bytes, line: int, column: int) -> list[str]:
+    path = tmp_path / "a.yaml"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return excerpt(Problem("wrong", str(path), line, column))
+
+
+def test_the_word_is_underlined(tmp_path: Path):
+    assert shown(tmp_path, "a: 1\nb: {windw: 60 ms, c: 2}\n", 2, 5) == [
+        "    2 | b: {windw: 60 ms, c: 2}",
+        "      |     ^^^^^",
+    ]
+
+
+def test_a_value_of_several_words_is_underlined_whole(tmp_path: Path):
+    assert shown(tmp_path, "b: {window: 60 ms, c: 2}\n", 1, 13)[1] == "      |             ^^^^^"
+
+
+def test_quoted_text_is_underlined_with_its_quotes(tmp_path: Path):
+    assert shown(tmp_path, "b: 'a, b'\n", 1, 4)[1] == "      |    ^^^^^^"
+
+
+def test_tabs_keep_the_caret_in_place(tmp_path: Path):
+    assert shown(tmp_path, "\tb: 1\n", 1, 2)[1] == "      | \t^"
+
+
+def test_long_lines_are_cut_around_the_place(tmp_path: Path):
+    line, carets = shown(tmp_path, "x" * 200 + " wrong: 1 " + "y" * 200, 1, 202)
+    assert len(line) <= 110
+    assert line[carets.index("^") :].startswith("wrong")
+
+
+def test_what_cannot_be_shown_is_left_out(tmp_path: Path):
+    assert excerpt(Problem("wrong", str(tmp_path / "gone.yaml"), 1, 1)) == []
+    assert excerpt(Problem("wrong", "--set a=b")) == []
+    assert shown(tmp_path, "a: 1\n", 9, 1) == []
+    assert shown(tmp_path, "", 1, 1) == []
+    assert shown(tmp_path, b"a: \xff\xfe\x1b[31m\n", 1, 4)[0].isprintable()
+
+
+@given(st.binary(max_size=300), st.integers(1, 8), st.integers(1, 320))
+def test_any_file_and_place_can_be_shown(
+    tmp_path_factory: pytest.TempPathFactory, content: bytes, line: int, column: int
+):
+    lines = shown(tmp_path_factory.mktemp("any"), content, line, column)
+    assert len(lines) in (0, 2)
+    assert all("\n" not in text and len(text) < 120 for text in lines)
