@@ -13,8 +13,9 @@ import importlib.util
 import os
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Final, Literal
@@ -177,20 +178,12 @@ class PluginHost:
             hint = f"{error.hint}; {reasons}" if error.hint else reasons
             raise UnknownPluginError(kind, name, error.known, hint) from None
 
-    def notify(self, hook: str, **values: Any) -> list[tuple[str, Exception]]:
-        """Call an observer hook of every plugin.
-
-        Returns:
-            Name and error of each plugin that failed; the others were called all the same.
-        """
-        failures: list[tuple[str, Exception]] = []
-        for implementation in getattr(self._pluggy.hook, hook).get_hookimpls():
-            wanted = {name: values[name] for name in implementation.argnames}
-            try:
-                implementation.function(**wanted)
-            except Exception as error:  # noqa: BLE001 - observers never stop a run
-                failures.append((implementation.plugin_name, error))
-        return failures
+    def listeners(self, hook: str, **values: Any) -> list[tuple[str, Callable[[], object]]]:
+        """Name of each plugin that implements an observer hook, and the call that tells it."""
+        return [
+            (found.plugin_name, partial(found.function, **{name: values[name] for name in found.argnames}))
+            for found in getattr(self._pluggy.hook, hook).get_hookimpls()
+        ]
 
 
 def _import_file(name: str, path: Path) -> ModuleType:

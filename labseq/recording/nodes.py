@@ -16,7 +16,7 @@ _JSON: Final = "application/json"
 _TEXT: Final = "text/plain"
 
 
-def set_attributes(node: Any, **values: Any) -> None:
+def set_attributes(node: Any, /, **values: Any) -> None:
     """Set attributes of a group or dataset; text is made fit for HDF5."""
     for name, value in values.items():
         node.attrs[name] = plain_text(value) if isinstance(value, str) else value

@@ -43,7 +43,7 @@ def open_run(path: str | Path) -> Run:
     record = read_run(folder)
     status, error = read_state(folder)
     rows, damaged = read_lines(folder / folders.INDEX_FILE)
-    usable = [row for row in rows if row.keys() >= _NEEDED and isinstance(row["shot"], int)]
+    usable = [row for row in rows if _is_usable(row)]
     load = lru_cache(maxsize=8)(_load)  # looking at several values of a shot reads its file once
     counted = {row["shot"]: row for row in usable if row["counts"]}  # a shot written again: the last one
     return Run(
@@ -55,6 +55,10 @@ def open_run(path: str | Path) -> Run:
         attempts=tuple(Shot(folder / row["file"], row, load) for row in usable if not row["counts"]),
         n_damaged_lines=len(damaged) + len(rows) - len(usable),
     )
+
+
+def _is_usable(row: dict[str, Any]) -> bool:
+    return row.keys() >= _NEEDED and isinstance(row["shot"], int) and isinstance(row["file"], str)
 
 
 def _load(path: Path) -> ShotContent:

@@ -6,7 +6,6 @@ import hashlib
 import shutil
 import threading
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -42,7 +41,6 @@ class RunWriter:
         self._encoder = self._make_encoder()
         self._index = LineLog(run_dir / folders.INDEX_FILE)
         self._events = LineLog(run_dir / folders.EVENTS_FILE)
-        self._hasher = ThreadPoolExecutor(1, "labseq-hash")
         self._events_lock = threading.Lock()
         self._n_events_lost = 0
 
@@ -128,9 +126,8 @@ class RunWriter:
         file = folders.shot_file_name(shot.shot_index, shot.attempt, counts=counts)
         path = self.run_dir / file
         data = self._encoder.encode(shot)
-        digest = self._hasher.submit(hashlib.sha256, data)  # while the disk works
         write_file(path, data)
-        sha256 = digest.result().hexdigest()
+        sha256 = hashlib.sha256(data).hexdigest()
         self._index.append(index_row(shot, file=file, sha256=sha256, n_bytes=data.nbytes), sync=True)
         self.n_written += counts
         return path

@@ -101,7 +101,7 @@ def make_safe(lab: Lab, guard: Guard) -> Outcome:
 
 
 def close_all(lab: Lab, guard: Guard) -> Outcome:
-    """Close every device in the order of the safe state, then the simulation; failures never stop the others."""
+    """Close every device in the safe order, then the simulation; failures never stop the others."""
     parts: list[tuple[str, Hardware | Simulation]] = list(lab.safe_order())
     if lab.simulation is not None:
         parts.append(("simulation", lab.simulation))

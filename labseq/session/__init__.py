@@ -2,9 +2,10 @@
 
 from labseq.session.assembly import Assembly, Bench, assemble, load_plugins, set_up_bench
 from labseq.session.checking import CheckReport, check
+from labseq.session.options import Options
 from labseq.session.provenance import gather_provenance
 from labseq.session.safe import make_profile_safe
-from labseq.session.session import Options, Session
+from labseq.session.session import Session
 
 __all__ = [
     "Assembly",

@@ -27,7 +27,17 @@ from labseq.model import SiteGrid, TargetPattern
 from labseq.plugins import PluginHost
 from labseq.roles import Clock, Step
 from labseq.sequencer.lab import Lab, Timeouts
-from labseq.session.choosing import HARDWARE_KINDS, Chosen, DryRun, choose, construct, dump, resolve, validate
+from labseq.session.choosing import (
+    HARDWARE_KINDS,
+    Chosen,
+    DryRun,
+    choose,
+    construct,
+    construct_target,
+    dump,
+    resolve,
+    validate,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,13 +214,12 @@ def _make_target(
     choice, grid = sequence.target, bench.grid
     chosen = resolve(bench.host, document, "pattern", choice)
     try:
-        target = chosen.entry.factory(chosen.settings, grid)
+        target = construct_target(chosen, grid)
+    except PluginLoadError:
+        raise
     except LabseqError as error:
         problem = document.problem(choice.loc, str(error))
         raise ConfigError(replace(problem, notes=(_grid_note(bench),))) from error
-    if not isinstance(target, TargetPattern) or target.shape != grid.shape:
-        text = f"pattern '{chosen.entry.name}' made no TargetPattern of shape {grid.shape}"
-        raise PluginLoadError(chosen.entry.origin, text)
     return target, {"pattern": chosen.entry.name, **dump(chosen.settings)}
 
 

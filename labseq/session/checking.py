@@ -160,7 +160,9 @@ def _window_warnings(
         if 2 * n_fit < rehearsal.n_loadings:
             what = f"the first cycle's window of {format_quantity(first, 'time')} is too short for most plans"
             told = f"{n_fit} of {rehearsal.n_loadings} fit"
-            problems.append(document.problem(loc, f"{what} ({told})", f"about {enough}, which 19 of 20 fit into"))
+            problems.append(
+                document.problem(loc, f"{what} ({told})", f"about {enough}, which 19 of 20 fit into")
+            )
         elif shortest < np.median(rehearsal.first_batch_s):
             what = f"a window of {format_quantity(shortest, 'time')} is over before the first batch is"
             problems.append(document.problem(loc, what, "more than the overheads of a cycle and a batch"))

@@ -9,7 +9,7 @@ from typing import Any, Final, Literal
 from labseq.config import MOTION_KEYS, Choice, Document
 from labseq.config.settings import Settings
 from labseq.errors import LabseqError, PluginLoadError, UnknownPluginError, one_of
-from labseq.model import MotionSpec, RandomStream, SiteGrid
+from labseq.model import MotionSpec, RandomStream, SiteGrid, TargetPattern
 from labseq.plugins import PluginHost
 from labseq.registry import VIRTUAL_TWIN, Entry
 from labseq.roles import Clock, Context, Simulation
@@ -124,6 +124,27 @@ def construct(
         if role == "simulation":
             simulation = made[role]
     return made, tuple(streams)
+
+
+def construct_target(chosen: Chosen, grid: SiteGrid) -> TargetPattern:
+    """Make a target of its pattern.
+
+    Raises:
+        LabseqError: The pattern refuses, for example because it does not fit on the grid.
+        PluginLoadError: The pattern's plugin is at fault; names it.
+    """
+    entry = chosen.entry
+    try:
+        target = entry.factory(chosen.settings, grid)
+    except LabseqError:
+        raise
+    except Exception as error:
+        text = f"pattern '{entry.name}' raised {type(error).__name__}: {error}"
+        raise PluginLoadError(entry.origin, text) from error
+    if not isinstance(target, TargetPattern) or target.shape != grid.shape:
+        text = f"pattern '{entry.name}' made no TargetPattern of shape {grid.shape}"
+        raise PluginLoadError(entry.origin, text)
+    return target
 
 
 def dump(settings: Settings | None) -> dict[str, Any]:

@@ -5,12 +5,21 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any, Final
 
+from labseq.errors import DeviceTimeoutError, LabseqError
 from labseq.model import CycleRecord, ShotRecord, StageTiming
 from labseq.plugins import PluginHost
 from labseq.roles import RunObserver
+from labseq.sequencer import Guard, StopFlag
 
 _QUIET: Final = frozenset({"image", "cycle", "state", "compiling", "compiled", "run_finished"})
 """Events that the shot files tell better than the log would, and the one that the writer logs itself."""
+_HOOKS: Final = {  # event -> hook of plugins, and what it is told of the event's values
+    "run_started": ("labseq_run_started", {"run": "record"}),
+    "shot_finished": ("labseq_shot_finished", {"shot": "shot"}),
+    "run_finished": ("labseq_run_finished", {"run": "record"}),
+}
+PATIENCE_S: Final = 5.0
+"""How long a plugin's observer hook may take; one that takes longer is not called again in the run."""
 
 
 class Observers:
@@ -23,32 +32,43 @@ class Observers:
     def __init__(self, host: PluginHost, observer: RunObserver | None) -> None:
         self._host = host
         self._observer = observer
+        self._guard = Guard(StopFlag())
+        self._given_up: set[str] = set()
         self.log: Callable[..., None] | None = None
 
     def event(self, name: str, values: Mapping[str, Any]) -> None:
         """Tell everybody."""
         self._write(name, values)
-        for plugin, error in self._notify(name, values):
-            text = f"plugin '{plugin}' failed in its observer hook: {type(error).__name__}: {error}"
-            self._write("warning", {"text": text})
-            self._show("warning", {"text": text})
+        self._notify(name, values)
         self._show(name, values)
 
-    def _notify(self, name: str, values: Mapping[str, Any]) -> list[tuple[str, Exception]]:
-        if name == "run_started":
-            return self._host.notify("labseq_run_started", run=values["record"])
-        if name == "shot_finished":
-            return self._host.notify("labseq_shot_finished", shot=values["shot"])
-        if name == "run_finished":
-            return self._host.notify("labseq_run_finished", run=values["record"])
-        return []
+    def end(self) -> None:
+        """Let the plugins' threads end."""
+        self._guard.end()
+
+    def _notify(self, name: str, values: Mapping[str, Any]) -> None:
+        if name not in _HOOKS:
+            return
+        hook, names = _HOOKS[name]
+        told = {argument: values[key] for argument, key in names.items()}
+        for plugin, tell in self._host.listeners(hook, **told):
+            if plugin in self._given_up:
+                continue
+            try:
+                self._guard.call_to_the_end(plugin, PATIENCE_S, tell)
+            except LabseqError as error:
+                if isinstance(error, DeviceTimeoutError):
+                    self._given_up.add(plugin)
+                warning = {"text": f"plugin '{plugin}' failed in its observer hook: {error}"}
+                self._write("warning", warning)
+                self._show("warning", warning)
 
     def _show(self, name: str, values: Mapping[str, Any]) -> None:
         if self._observer is None:
             return
         try:
             self._observer.event(name, values)
-        except Exception as error:  # noqa: BLE001 - a broken screen must not stop the run
+        except (Exception, SystemExit) as error:  # noqa: BLE001 - a broken screen must not stop the run
             self._observer = None
             self._write("warning", {"text": f"the live view failed and is off: {error!r}"})
 

@@ -35,7 +35,7 @@ def gather_provenance(sequence_folder: Path) -> dict[str, Any]:
         "user": _user(),
         "pid": os.getpid(),
         "git": {
-            "code": git_state(Path(labseq.__file__).parent),
+            "code": git_state(Path(labseq.__file__).parent, of="__init__.py"),
             "sequence": git_state(sequence_folder),
         },
         "packages": {
@@ -46,13 +46,20 @@ def gather_provenance(sequence_folder: Path) -> dict[str, Any]:
     }
 
 
-def git_state(folder: Path) -> dict[str, Any] | None:
+def git_state(folder: Path, of: str = "") -> dict[str, Any] | None:
     """Commit of the repository that a folder is in, and whether tracked files differ from it.
+
+    Args:
+        folder: The folder.
+        of: A file in it that must be tracked: what is installed in an environment
+            inside of somebody's repository does not come from that.
 
     Returns:
         ``{"commit": str, "dirty": bool}``, or None outside of a repository or
         where git is not installed.
     """
+    if of and _git(folder, "ls-files", "--error-unmatch", of) is None:
+        return None
     commit = _git(folder, "rev-parse", "HEAD")
     if commit is None:
         return None
@@ -63,7 +70,7 @@ def git_state(folder: Path) -> dict[str, Any] | None:
 def _git(folder: Path, *arguments: str) -> str | None:
     try:
         done = subprocess.run(  # noqa: S603 - fixed arguments, no shell
-            ["git", "-C", str(folder), *arguments],  # noqa: S607 - the user's own git
+            ["git", "--no-optional-locks", "-C", str(folder), *arguments],  # noqa: S607 - the user's own git
             capture_output=True,
             check=True,
             timeout=_GIT_TIMEOUT_S,

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import secrets
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import ParamSpec, Self
 
 from labseq import motion
-from labseq.config import Override
-from labseq.errors import ConfigError, LabseqError, StopRequested
+from labseq.errors import ConfigError, DeviceError, LabseqError, StopRequested
 from labseq.kernels.compile import announcing
 from labseq.model import RunRecord, TimelineEntry
 from labseq.model.records import RunStatus
@@ -24,49 +22,12 @@ from labseq.sequencer.lab import Lab, describe
 from labseq.session.assembly import Assembly, assemble, build_lab
 from labseq.session.choosing import DryRun
 from labseq.session.observers import Observers
+from labseq.session.options import Options
 from labseq.session.provenance import gather_provenance
 from labseq.session.safe import secure
 from labseq.session.signals import stop_on_signals
 
-
-@dataclass(frozen=True, slots=True)
-class Options:
-    """What a user may change when opening a session.
-
-    Attributes:
-        profile: Name or path of the profile, instead of the sequence's own.
-        shots: Number of shots, instead of the sequence's own.
-        seed: Seed, instead of the sequence's own or a fresh one.
-        overrides: ``"address=value"`` strings, as given to ``--set``; they win.
-        output: Folder for the data, instead of LABSEQ_DATA or ``./data``.
-        dry_run: "off", "full" or "fast".
-        realtime: Let virtual time take as long as it says.
-    """
-
-    profile: str | None = None
-    shots: int | None = None
-    seed: int | None = None
-    overrides: Sequence[str] = ()
-    output: Path | None = None
-    dry_run: DryRun = "off"
-    realtime: bool = False
-
-    def own(self) -> list[Override]:
-        """``shots`` and ``seed`` as overrides that know which option they came from."""
-        given = {"shots": self.shots, "seed": self.seed}
-        return [
-            Override(key, str(value), f"--{key} {value}") for key, value in given.items() if value is not None
-        ]
-
-    def changes(self) -> dict[str, Any]:
-        """Everything that differs from the files, for the record: address -> value."""
-        changed: dict[str, Any] = {override.address: override.value for override in self.own()}
-        changed |= dict(item.split("=", 1) for item in self.overrides)
-        if self.profile is not None:
-            changed["profile"] = self.profile
-        if self.dry_run != "off":
-            changed["dry_run"] = self.dry_run
-        return changed
+P = ParamSpec("P")
 
 
 class Session:
@@ -138,8 +99,7 @@ class Session:
 
     def close(self) -> None:
         """Make every device safe and close it; legal at any time."""
-        if self._sequencer is not None:
-            self._sequencer.shut_down()
+        self._shut_down()
 
     def timeline(self) -> list[tuple[str, list[TimelineEntry]]]:
         """What a shot will do: name of each step and its bars."""
@@ -158,7 +118,7 @@ class Session:
         """
         if self.run_dir is not None:
             raise ConfigError("a session runs once; open another for the next run")
-        root = self.options.output or data_root()
+        root = (self.options.output or data_root()).absolute()  # some vendors' libraries change the folder
         for text in self.assembly.bench.warnings:
             self._observers.event("warning", {"text": text})
         with stop_on_signals(self.stop_flag):
@@ -182,6 +142,7 @@ class Session:
         start_s, compiled = time.monotonic(), list[str]()
 
         def announce(module: str) -> None:
+            self.stop_flag.check()
             compiled.append(module)
             self._observers.event("compiling", {"module": module})
 
@@ -195,16 +156,34 @@ class Session:
             self._observers.event("compiled", {"duration_s": time.monotonic() - start_s})
 
     def _run(self, lab: Lab, root: Path) -> Run:
-        assembly, spec = self.assembly, self.assembly.sequence
-        profile_key = str(assembly.bench.document.path.resolve())
-        self._secure_after_crash(lab, root, profile_key)
+        self._secure_after_crash(lab, root)
         record = self._record(lab)
         writer = RunWriter.create(root, record)
         self.run_dir = writer.run_dir
         self._observers.log = writer.event
+        error: BaseException | None = None
+        try:
+            self._take_shots(lab, root, writer, record)
+        except BaseException as failure:  # noqa: BLE001 - raised again once the run is over
+            error = failure
+        unsafe = self._shut_down()
+        if error is None and unsafe:
+            reasons = "; ".join(str(failure) for failure in unsafe.values())
+            error = DeviceError(next(iter(unsafe)), f"not in its safe state after the run: {reasons}")
+        self._finish(writer, record, error)
+        if not unsafe:
+            self._try(clear_active, root, self._profile_key)
+        self._observers.end()
+        if error is not None:
+            raise error
+        return open_run(writer.run_dir)
+
+    def _take_shots(self, lab: Lab, root: Path, writer: RunWriter, record: RunRecord) -> None:
+        spec = self.assembly.sequence
+        about = {"record": record, "run_dir": str(writer.run_dir)}
         sequencer = self._sequencer = Sequencer(
             lab,
-            assembly.steps,
+            self.assembly.steps,
             self.stop_flag,
             writer,
             self._observers,
@@ -212,48 +191,53 @@ class Session:
             attempts=spec.attempts,
             parameters=self.options.changes(),
         )
-        status: RunStatus = "failed"
-        error: BaseException | None = None
-        try:
-            mark_active(root, profile_key, writer.run_dir)
-            self._observers.event("run_starting", {"record": record, "run_dir": str(writer.run_dir)})
-            sequencer.open()
-            writer.set_devices(describe(lab, sequencer.guard))
-            self._observers.event("run_started", {"record": record, "run_dir": str(writer.run_dir)})
-            sequencer.run(range(spec.shots))
-            status = "complete"
-        except BaseException as failure:
-            error = failure
-            status = "stopped" if isinstance(failure, StopRequested | KeyboardInterrupt) else "failed"
-            raise
-        finally:
-            all_safe = sequencer.shut_down()
-            self._finish(writer, record, status, error)
-            if all_safe:
-                clear_active(root, profile_key)
-        return open_run(writer.run_dir)
+        mark_active(root, self._profile_key, writer.run_dir)
+        self._observers.event("run_starting", about)
+        sequencer.open()
+        writer.set_devices(describe(lab, sequencer.guard))
+        self._observers.event("run_started", about)
+        sequencer.run(range(spec.shots))
 
-    def _finish(
-        self, writer: RunWriter, record: RunRecord, status: RunStatus, error: BaseException | None
-    ) -> None:
+    def _shut_down(self) -> Mapping[str, LabseqError]:
+        return self._sequencer.shut_down() if self._sequencer is not None else {}
+
+    def _finish(self, writer: RunWriter, record: RunRecord, error: BaseException | None) -> None:
+        status: RunStatus = "complete"
+        if error is not None:
+            status = "stopped" if isinstance(error, StopRequested | KeyboardInterrupt) else "failed"
         text = "" if error is None else f"{type(error).__name__}: {error}"
         if isinstance(error, StopRequested):
             text = str(error)
-        try:
-            writer.finish(status, text)
-        except LabseqError as failure:  # a full disk must not hide what came before
-            self._observers.event("warning", {"text": str(failure)})
+        self._try(writer.finish, status, text)
         self._observers.event("run_finished", {"record": record, "status": status, "error": text})
 
-    def _secure_after_crash(self, lab: Lab, root: Path, profile_key: str) -> None:
+    def _try(self, act: Callable[P, None], *args: P.args, **kwargs: P.kwargs) -> None:
+        """Do what a full disk may prevent; that must not hide how the run ended."""
+        try:
+            act(*args, **kwargs)
+        except LabseqError as failure:
+            self._observers.event("warning", {"text": str(failure)})
+
+    @property
+    def _profile_key(self) -> str:
+        """What the hardware is known by; a dry run touches none, and says nothing about it."""
+        path = str(self.assembly.bench.document.path.resolve())
+        return path if self.options.dry_run == "off" else f"{path} (dry run)"
+
+    def _secure_after_crash(self, lab: Lab, root: Path) -> None:
         """If the last run on this profile died, its devices may still be on."""
-        dead = died(root, profile_key)
+        dead = died(root, self._profile_key)
         if dead is None:
             return
         text = f"the last run on this profile ({dead}) died; its devices are made safe first"
         self._observers.event("warning", {"text": text})
-        secure(lab.safe_order(), lab.timeouts, lab.simulation, self._observers)
-        clear_active(root, profile_key)
+        with self.stop_flag.held():
+            outcome = secure(lab.safe_order(), lab.timeouts, lab.simulation, self._observers)
+        for failure in outcome.values():
+            if failure is not None:
+                raise failure
+        clear_active(root, self._profile_key)
+        self.stop_flag.check()
 
     def _record(self, lab: Lab) -> RunRecord:
         assembly, spec = self.assembly, self.assembly.sequence

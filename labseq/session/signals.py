@@ -10,29 +10,40 @@ from typing import Final
 
 from labseq.sequencer import StopFlag
 
-_EXIT_SIGNALS: Final = tuple(
-    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGBREAK") if hasattr(signal, name)
-)
+_SIGHUP: Final = getattr(signal, "SIGHUP", None)
+_EXIT_SIGNALS: Final = {  # signal -> what the run says it was stopped by
+    getattr(signal, name): meaning
+    for name, meaning in {
+        "SIGINT": signal.SIGINT,
+        "SIGTERM": signal.SIGTERM,
+        "SIGHUP": signal.SIGTERM,  # the terminal or the ssh connection is gone
+        "SIGBREAK": signal.SIGINT,  # Ctrl-Break on Windows
+    }.items()
+    if hasattr(signal, name)
+}
 
 
 @contextmanager
 def stop_on_signals(stop: StopFlag) -> Generator[None]:
-    """Let Ctrl-C and SIGTERM set a flag while the block runs.
+    """Let Ctrl-C, SIGTERM and SIGHUP set a flag while the block runs.
 
-    Python lets only the main thread handle signals; in any other this does nothing.
+    Where a lost terminal is to be ignored (``nohup``) it stays so. Python lets only
+    the main thread handle signals; in any other this does nothing.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
 
     def handle(number: int, _frame: object) -> None:
-        stop.request(signal.SIGTERM if number == signal.SIGTERM else signal.SIGINT)
+        stop.request(_EXIT_SIGNALS[number])
 
     before = {number: signal.getsignal(number) for number in _EXIT_SIGNALS}
-    for number in _EXIT_SIGNALS:
+    if before.get(_SIGHUP) is signal.SIG_IGN:
+        del before[_SIGHUP]
+    for number in before:
         signal.signal(number, handle)
     try:
         yield
     finally:
         for number, handler in before.items():
-            signal.signal(number, handler)
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)

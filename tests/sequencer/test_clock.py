@@ -59,13 +59,15 @@ def test_the_first_signal_decides_the_exit_code():
 def test_while_devices_are_made_safe_waits_finish():
     stop = StopFlag()
     stop.request()
-    stop.hold()
     clock = VirtualClock(stop)
-    clock.sleep(0.005)
-    clock.check()
-    RealClock(stop).sleep(0.001)
+    with stop.held():
+        clock.sleep(0.005)
+        clock.check()
+        RealClock(stop).sleep(0.001)
     assert clock.now() == 0.005
     assert stop.is_set
+    with pytest.raises(StopRequested):
+        clock.check()
 
 
 def test_paced_time_takes_as_long_as_it_says():

@@ -50,7 +50,7 @@ class Rig:
             self.sequencer.open()
             self.sequencer.run(range(n_shots))
         finally:
-            self.all_safe = self.sequencer.shut_down()
+            self.unsafe = self.sequencer.shut_down()
 
     def made_safe(self):
         return [call.device for call in self.lab.calls if call.method == "safe_state"]
@@ -67,7 +67,7 @@ def test_devices_open_before_and_are_safe_and_closed_after():
     assert opened == ["static_tweezers.open", "camera.open", "shutter.open", "mobile_tweezers.open"]
     assert names[-4:] == [f"{device}.close" for device in SAFE_ORDER]
     assert rig.made_safe() == SAFE_ORDER
-    assert rig.all_safe
+    assert not rig.unsafe
     assert rig.sequencer.state is State.CLOSED
 
 
@@ -183,7 +183,7 @@ def test_one_device_that_cannot_be_made_safe_never_stops_the_others(failing):
     rig = Rig(fail_on={f"{failing}.safe_state": OSError("gone")})
     rig.run()
     assert rig.made_safe() == SAFE_ORDER
-    assert not rig.all_safe
+    assert list(rig.unsafe) == [failing]
     told = {v["device"]: v["ok"] for v in rig.observer.of("safe_state")}
     assert told == {device: device != failing for device in SAFE_ORDER}
 
@@ -193,7 +193,7 @@ def test_a_safe_state_that_hangs_is_given_up():
     rig = Rig(hang_on={"mobile_tweezers.safe_state"}, timeouts=timeouts)
     rig.run()
     assert rig.made_safe() == SAFE_ORDER
-    assert not rig.all_safe
+    assert list(rig.unsafe) == ["mobile_tweezers"]
 
 
 def test_a_device_that_hangs_is_named_and_still_made_safe():
@@ -202,7 +202,7 @@ def test_a_device_that_hangs_is_named_and_still_made_safe():
     with pytest.raises(DeviceTimeoutError, match="camera: did not answer within"):
         rig.run()
     assert rig.made_safe() == SAFE_ORDER
-    assert rig.all_safe
+    assert not rig.unsafe
     rig.lab.hangs["camera.trigger"].release.set()
 
 
@@ -224,22 +224,6 @@ def test_a_stop_request_in_a_shot_keeps_what_it_has():
         rig.run()
     record = rig.record()
     assert (record.status, len(record.images)) == ("interrupted", 1)
-    assert rig.made_safe() == SAFE_ORDER
-
-
-def test_an_error_in_a_third_party_step_is_named():
-    class Broken:
-        needs_image = takes_image = False
-
-        def plan_timeline(self, context):
-            return []
-
-        def run(self, shot):
-            raise KeyError("typo")
-
-    rig = Rig(steps=(("mine", Broken()),))
-    with pytest.raises(LabseqError, match=r"step 0 \(mine\) raised KeyError: 'typo'"):
-        rig.run()
     assert rig.made_safe() == SAFE_ORDER
 
 
@@ -299,6 +283,113 @@ def test_frames_are_kept_as_they_came():
     (image,) = rig.record().images
     assert isinstance(image.frame, Frame)
     assert image.exposure_s == 0.045
+
+
+def test_a_recovery_that_fails_keeps_the_attempt():
+    lost, jammed = TransientError("frame lost", "camera"), OSError("jammed")
+    rig = Rig(fail_on={"camera.read": lost, "camera.safe_state": [jammed]})
+    with pytest.raises(DeviceError, match="camera: raised OSError: jammed"):
+        rig.run()
+    assert rig.record().status == "failed"
+    assert rig.record().timing
+    assert rig.made_safe() == ["mobile_tweezers", "camera", *SAFE_ORDER]
+    assert not rig.unsafe
+
+
+def test_a_stop_request_in_a_recovery_lets_the_driver_ramp_down():
+    rig = Rig(fail_on={"camera.read": TransientError("frame lost", "camera")})
+    ramps = []
+
+    def ramp_down():
+        rig.lab.stop.request()
+        rig.lab.clock.sleep(0.01)
+        ramps.append("down")
+
+    vars(rig.lab.mobile_tweezers)["safe_state"] = ramp_down
+    with pytest.raises(StopRequested):
+        rig.run()
+    assert ramps == ["down", "down"]
+    assert [s.status for s in rig.sink.shots] == ["failed"]
+    assert not rig.unsafe
+
+
+@pytest.mark.parametrize("method", ["open", "begin_shot", "load", "close"])
+def test_a_simulation_that_fails_is_named_and_all_devices_are_safe(method):
+    rig = Rig(simulated=True)
+
+    def fail(*args):
+        raise ValueError("nothing there")
+
+    vars(rig.lab.simulation)[method] = fail
+    if method == "close":
+        rig.run()
+        told = rig.observer.of("closed")[-1]
+        assert told == {
+            "device": "simulation",
+            "ok": False,
+            "error": "simulation: raised ValueError: nothing there",
+        }
+    else:
+        with pytest.raises(DeviceError, match="simulation: raised ValueError: nothing there"):
+            rig.run()
+    assert rig.made_safe() == SAFE_ORDER
+    assert rig.sequencer.state is State.CLOSED
+
+
+@pytest.mark.parametrize("failing", SAFE_ORDER)
+def test_a_device_that_cannot_be_made_safe_in_a_shot_that_failed_is_told(failing):
+    rig = Rig(fail_on={"camera.read": RuntimeError("cable"), f"{failing}.safe_state": OSError("gone")})
+    with pytest.raises(DeviceError, match="cable"):
+        rig.run()
+    assert list(rig.unsafe) == [failing]
+    assert list(rig.sequencer.shut_down()) == [failing]
+    assert rig.made_safe() == SAFE_ORDER
+
+
+def test_nobody_is_told_before_all_devices_are_safe():
+    rig = Rig()
+    safe_when_told = []
+    rig.observer.event = lambda name, values: (
+        safe_when_told.append(len(rig.made_safe())) if name == "safe_state" else None
+    )
+    rig.run()
+    assert safe_when_told == [4, 4, 4, 4]
+
+
+def test_an_ending_that_was_cut_short_begins_anew():
+    rig = Rig()
+    rig.sequencer.open()
+
+    def fail(name, values):
+        raise MemoryError
+
+    tell, rig.observer.event = rig.observer.event, fail
+    with pytest.raises(MemoryError):
+        rig.sequencer.shut_down()
+    rig.observer.event = tell
+    assert not rig.sequencer.shut_down()
+    assert rig.made_safe() == SAFE_ORDER
+    assert rig.sequencer.state is State.CLOSED
+
+
+@pytest.mark.parametrize("error", [KeyError("typo"), SystemExit(0)])
+@pytest.mark.parametrize("method", ["plan_timeline", "run"])
+def test_whatever_a_third_party_step_raises_is_named(method, error):
+    class Broken:
+        needs_image = takes_image = False
+
+        def plan_timeline(self, context):
+            return []
+
+        def run(self, shot):
+            return None
+
+    def fail(self, given):
+        raise error
+
+    setattr(Broken, method, fail)
+    with pytest.raises(LabseqError, match=rf"step 0 \(mine\) raised {type(error).__name__}"):
+        Rig(steps=(("mine", Broken()),)).run()
 
 
 class TestRearrange:
@@ -394,6 +485,15 @@ class TestRearrange:
         rig = self.rig([self.half], planner=ScriptedPlanner([answer]))
         with pytest.raises(PlanError, match="expected a Plan"):
             rig.run()
+
+    @pytest.mark.parametrize("answer", [None, "1 ms", float("nan"), float("inf"), -1.0])
+    def test_a_playing_time_that_is_none_is_named(self, answer):
+        rig = self.rig([self.half])
+        vars(rig.lab.mobile_tweezers)["prepare"] = lambda program: answer
+        with pytest.raises(DeviceError, match=r"mobile_tweezers: prepare\(\) returned"):
+            rig.run()
+        assert not rig.lab.calls.of("mobile_tweezers.play")
+        assert rig.made_safe() == SAFE_ORDER
 
     def test_a_planner_cannot_change_what_was_seen(self):
         class Vandal:

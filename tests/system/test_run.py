@@ -153,7 +153,9 @@ def test_a_wrong_sequence(tmp_path: Path) -> None:
     assert f"{wrong}:{line}:1: " in done.stderr
     answer = json.loads(done.stdout)
     assert (answer["run_dir"], answer["status"]) == (None, "failed")
-    assert answer["error"] == done.stderr.strip()
+    message, _, excerpt = done.stderr.strip().partition("\n")
+    assert answer["error"] == message
+    assert "^^^^^^" in excerpt
 
 
 @pytest.mark.parametrize(

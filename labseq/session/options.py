@@ -1,0 +1,51 @@
+"""What a user may change when opening a session."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from labseq.config import Override
+from labseq.session.choosing import DryRun
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """What a user may change when opening a session.
+
+    Attributes:
+        profile: Name or path of the profile, instead of the sequence's own.
+        shots: Number of shots, instead of the sequence's own.
+        seed: Seed, instead of the sequence's own or a fresh one.
+        overrides: ``"address=value"`` strings, as given to ``--set``; they win.
+        output: Folder for the data, instead of LABSEQ_DATA or ``./data``.
+        dry_run: "off", "full" or "fast".
+        realtime: Let virtual time take as long as it says.
+    """
+
+    profile: str | None = None
+    shots: int | None = None
+    seed: int | None = None
+    overrides: Sequence[str] = ()
+    output: Path | None = None
+    dry_run: DryRun = "off"
+    realtime: bool = False
+
+    def own(self) -> list[Override]:
+        """``shots`` and ``seed`` as overrides that know which option they came from."""
+        given = {"shots": self.shots, "seed": self.seed}
+        return [
+            Override(key, str(value), f"--{key} {value}") for key, value in given.items() if value is not None
+        ]
+
+    def changes(self) -> dict[str, Any]:
+        """Everything that differs from the files, for the record: address -> value."""
+        changed: dict[str, Any] = {override.address: override.value for override in self.own()}
+        changed |= dict(item.split("=", 1) for item in self.overrides)
+        if self.profile is not None:
+            changed["profile"] = self.profile
+        if self.dry_run != "off":
+            changed["dry_run"] = self.dry_run
+        return changed
