@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from labseq.config import (
     MOTION_KEYS,
@@ -24,14 +24,15 @@ from labseq.config.profile import GridSettings
 from labseq.config.reading import YAML_SUFFIXES
 from labseq.config.sequence import DEFAULT_PLANNER
 from labseq.config.wording import clean, visible
-from labseq.errors import ConfigError, Problem
+from labseq.errors import ConfigError, LimitError, Problem
 from labseq.model import MotionSpec, SiteGrid, TargetPattern
 from labseq.plugins import PluginHost
 from labseq.session.assembly import load_plugins
-from labseq.session.choosing import Chosen, make_target, resolve
+from labseq.session.choosing import Chosen, construct_target, resolve
 from labseq.session.occupancies import Source
 
 _TARGET: Final = re.compile(r"([^\W\d][\w-]*)(?::(.*))?", re.DOTALL)
+_NAME: Final = re.compile(r"[^\W\d][\w.-]*")
 _SIZE: Final = re.compile(r"\s*(\d{1,6})\s*[xX]\s*(\d{1,6})\s*")
 _ORIGIN: Final = re.compile(r"\s*(-?\d{1,6})\s*,\s*(-?\d{1,6})\s*")
 _NEXT_SETTING: Final = re.compile(r",(?=\s*[^\W\d]\w*\s*=)")
@@ -94,33 +95,129 @@ def read_inputs(request: PlanRequest, source: Source) -> PlanInputs:
         ConfigError: Something is wrong; says what was expected.
         PluginLoadError: A plugin that is named failed to load.
     """
-    folders: list[Path] = []
-    machine = _machine(request, source, folders)
-    document = Document.parse("{}", "the command line").override_all(
-        [*_planner_settings(request), *_target_settings(request)], may_add=("planner", "target")
+    machine, folders = _machine(request, source)
+    document, choice, more_folders = _target_choice(request, source)
+    host = load_plugins([*folders, *more_folders])
+    target = source.target if choice is None else _make_target(host, document, choice, machine.grid)
+    assert target is not None  # see _target_choice
+    return PlanInputs(machine, target, _planner(host, request))
+
+
+def _machine(request: PlanRequest, source: Source) -> tuple[Machine, list[Path]]:
+    """Grid and motion, and the profile's plugin folders."""
+    shape = source.occupancy.shape
+    if request.profile is None:
+        return _default_machine(source), []
+    document, spec = load_profile(request.profile, beside=Path())
+    grid = spec.grid_model()
+    if grid.shape != shape:
+        what = f"the occupancy has {shape[0]} x {shape[1]} sites"
+        expected = f"{grid.n_rows} x {grid.n_cols}, as in {visible(str(document.path))}"
+        raise ConfigError(Problem(what, visible(source.label), expected=expected))
+    return Machine(grid, spec.motion), plugin_paths(document, spec.plugin_folders)
+
+
+def _default_machine(source: Source) -> Machine:
+    """What a shot was taken with; else the paper's spacing and motion."""
+    if source.machine is None:
+        n_rows, n_cols = source.occupancy.shape
+        return Machine(SiteGrid(n_rows, n_cols), MotionSpec())
+    called = "the profile in the shot's file"
+    motion = {key: source.machine["mobile_tweezers"][key] for key in MOTION_KEYS}
+    return Machine(
+        validate_values(GridSettings, source.machine["grid"], called).model(),
+        validate_values(MotionSettings, motion, called).spec(),
     )
-    choice = PatternChoice(pattern=document.get(("target", "pattern"), "-")).placed("target")
-    if _is_sequence(request.target):
-        assert request.target is not None
-        target_document, sequence = load_sequence(Path(request.target), _origin(request))
-        folders += plugin_paths(target_document, sequence.plugin_folders)
-        choice = sequence.target
-    else:
-        target_document = document
-    host = load_plugins(folders)
-    planner = resolve(host, document, "planner", Choice(use=request.planner).placed("planner"))
-    if request.target is not None:
-        target, _ = make_target(host, target_document, choice, machine.grid)
-    else:
-        target = _targets_own(request, source)
-    return PlanInputs(machine, target, planner)
 
 
-def _targets_own(request: PlanRequest, source: Source) -> TargetPattern:
-    """The target that a shot was taken with."""
-    if source.target is None:
-        raise ConfigError(Problem("--target is missing", expected=_TARGET_FORMS))
-    if request.origin is not None:
-        problem = Problem("there is no target to move", f"--origin {clean(request.origin)}")
-        raise ConfigError(problem)
-    return source.target
+def _target_choice(request: PlanRequest, source: Source) -> tuple[Document, PatternChoice | None, list[Path]]:
+    """The target's pattern, the document that names it, and that document's plugin folders.
+
+    The pattern is None where the target is the one that a shot was taken with.
+    """
+    text, origin = request.target, _origin(request.origin)
+    empty = Document.parse("{}", "the command line")
+    if text is None:
+        if source.target is None:
+            raise ConfigError(Problem("--target is missing", expected=_TARGET_FORMS))
+        if origin:
+            raise ConfigError(Problem("there is no --target to move", origin[0].source))
+        return empty, None, []
+    if text.lower().endswith(YAML_SUFFIXES):
+        document, sequence = load_sequence(Path(text), origin)
+        return document, sequence.target, plugin_paths(document, sequence.plugin_folders)
+    name, settings = parse_target(text)
+    option = f"--target {text}"
+    overrides = [Override(f"target.{key}", value, option) for key, value in settings.items()]
+    document = empty.override_all(
+        [Override("target.pattern", name, option), *overrides, *origin], may_add=("target",)
+    )
+    return document, PatternChoice(pattern=name).placed("target"), []
+
+
+def parse_target(text: str) -> tuple[str, dict[str, str]]:
+    """Part "pattern:settings" into the name and the settings as written.
+
+    Raises:
+        ConfigError: It is not of this form.
+
+    Example:
+        >>> parse_target("kagome:15x15")
+        ('kagome', {'rows': '15', 'cols': '15'})
+        >>> parse_target("ring:radius=4, origin=[2, 3]")
+        ('ring', {'radius': '4', 'origin': '[2, 3]'})
+    """
+    match = _TARGET.fullmatch(text)
+    wrong = Problem("this is no target", clean(f"--target {text}"), expected=_TARGET_FORMS)
+    if match is None:
+        raise ConfigError(wrong)
+    settings: dict[str, str] = {}
+    parts = _NEXT_SETTING.split(match[2]) if match[2] is not None else []
+    for i, part in enumerate(parts):
+        size = _SIZE.fullmatch(part) if i == 0 else None
+        key, equals, value = part.partition("=")
+        if size is not None:
+            settings |= {"rows": size[1], "cols": size[2]}
+        elif equals and key.strip().isidentifier():
+            settings[key.strip()] = value.strip()
+        else:
+            raise ConfigError(wrong)
+    return match[1], settings
+
+
+def _origin(text: str | None) -> list[Override]:
+    if text is None:
+        return []
+    match = _ORIGIN.fullmatch(text)
+    if match is None:
+        what, expected = "this is no site", "row and column of the target's top left site, for example 2,3"
+        raise ConfigError(Problem(what, clean(f"--origin {text}"), expected=expected))
+    return [Override("target.origin", f"[{match[1]}, {match[2]}]", f"--origin {text}")]
+
+
+def _make_target(
+    host: PluginHost, document: Document, choice: PatternChoice, grid: SiteGrid
+) -> TargetPattern:
+    chosen = resolve(host, document, "pattern", choice)
+    try:
+        return construct_target(chosen, grid)
+    except LimitError as error:
+        raise document.error(choice.loc, str(error)) from error
+
+
+def _planner(host: PluginHost, request: PlanRequest) -> Chosen:
+    option = f"--planner {request.planner}"
+    if not _NAME.fullmatch(request.planner):
+        raise ConfigError(Problem("this is no name of a planner", clean(option), expected="a name"))
+    overrides = [Override("planner.use", request.planner, option)]
+    if request.degree_of_parallelism is not None:
+        dop = str(request.degree_of_parallelism)
+        overrides.append(Override("planner.degree_of_parallelism", dop, f"--dop {dop}"))
+    for text in request.overrides:
+        key, equals, value = text.partition("=")
+        if not equals or not key.strip():
+            expected = "key=value, for example --set degree_of_parallelism=5"
+            raise ConfigError(Problem("this is no setting", clean(f"--set {text}"), expected=expected))
+        overrides.append(Override(f"planner.{key.strip().removeprefix('planner.')}", value, f"--set {text}"))
+    document = Document.parse("{}", "the command line").override_all(overrides, may_add=("planner",))
+    return resolve(host, document, "planner", Choice(use=request.planner).placed("planner"))

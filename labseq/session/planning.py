@@ -2,72 +2,20 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
-from pathlib import Path
-from typing import Any, BinaryIO, Final
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.config import (
-    MOTION_KEYS,
-    Choice,
-    Document,
-    MotionSettings,
-    Override,
-    load_profile,
-    load_sequence,
-    plugin_paths,
-    validate_values,
-)
-from labseq.config.fields import PatternChoice
-from labseq.config.profile import GridSettings
-from labseq.config.reading import YAML_SUFFIXES
-from labseq.config.sequence import DEFAULT_PLANNER
-from labseq.config.wording import clean
-from labseq.errors import ConfigError, LabseqError, PlanError, Problem
+from labseq.errors import LabseqError, PlanError
 from labseq.model import MotionSpec, Occupancy, Plan, PlanReport, SiteGrid, TargetPattern
 from labseq.motion import check_plan
-from labseq.plugins import PluginHost
 from labseq.roles import NeverStopped, Planner
-from labseq.session.assembly import load_plugins
-from labseq.session.choosing import construct, make_target, resolve
-from labseq.session.occupancies import Source, read_source
-
-_COMMAND_LINE: Final = "the command line"
-_TARGET: Final = re.compile(r"([^\W\d][\w-]*)(?::(.*))?", re.DOTALL)
-_SIZE: Final = re.compile(r"(\d{1,6})\s*[xX]\s*(\d{1,6})")
-_ORIGIN: Final = re.compile(r"\s*(-?\d{1,6})\s*,\s*(-?\d{1,6})\s*")
-_NEXT_SETTING: Final = re.compile(r",(?=\s*[^\W\d]\w*\s*=)")
-
-
-@dataclass(frozen=True, slots=True)
-class PlanRequest:
-    """What is to be planned, in the words of the command line.
-
-    Attributes:
-        occupancy: See :func:`labseq.session.occupancies.read_source`.
-        target: "kagome:15x15", "kagome:rows=15,cols=15" or a sequence file; None
-            for the target that a shot was taken with.
-        planner: Its name.
-        degree_of_parallelism: The planner's setting of that name; None for its default.
-        overrides: Further settings of the planner, ``"key=value"`` each.
-        seed: Seed of a drawn occupancy; None for a fresh one.
-        origin: "R,C", the top left site of the target; None for the pattern's own.
-        profile: Name or path of a profile for grid, motion and plugin folders.
-    """
-
-    occupancy: str
-    target: str | None = None
-    planner: str = DEFAULT_PLANNER
-    degree_of_parallelism: int | None = None
-    overrides: Sequence[str] = ()
-    seed: int | None = None
-    origin: str | None = None
-    profile: str | None = None
+from labseq.session.choosing import construct, dump
+from labseq.session.occupancies import read_source
+from labseq.session.plan_inputs import PlanRequest, read_inputs
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -158,31 +106,42 @@ def plan_moves(
     from labseq.kernels.compile import announcing
 
     source = read_source(request.occupancy, request.seed, stdin)
-    setting = _Setting.of(request, source)
-    target = _target(request, source, setting)
-    chosen = resolve(setting.host, setting.document, "planner", Choice(use=request.planner).placed("planner"))
-    made, _ = construct(
-        {"planner": chosen}, setting.grid, setting.motion, NeverStopped(), request.seed or 0
-    )
+    occupancy = source.occupancy
+    inputs = read_inputs(request, source)
+    grid, motion, target = inputs.machine.grid, inputs.machine.motion, inputs.target
+    made, _ = construct({"planner": inputs.planner}, grid, motion, NeverStopped(), request.seed or 0)
     planner: Planner = made["planner"]
-    dop = getattr(planner, "degree_of_parallelism", setting.motion.max_tweezers)
-    dop = dop if isinstance(dop, int) else setting.motion.max_tweezers
+    dop = getattr(planner, "degree_of_parallelism", None)
+    dop = dop if isinstance(dop, int) else motion.max_tweezers
     with announcing(announce):
-        plan = _plan(planner, request.planner, source.occupancy, target)
-        report = check_plan(
-            plan, source.occupancy, target, dop, setting.grid, setting.motion, request.planner
-        )
-    settings = {key: value for key, value in chosen.dump().items() if key != "use"}
+        plan = _plan(planner, request.planner, occupancy, target)
+        report = check_plan(plan, occupancy, target, dop, grid, motion, request.planner)
     return PlannedMoves(
         source=source.label,
-        occupancy=source.occupancy,
+        occupancy=occupancy,
         target=target,
-        grid=setting.grid,
-        motion=setting.motion,
+        grid=grid,
+        motion=motion,
         planner=request.planner,
-        settings=settings,
+        settings=dump(inputs.planner.settings),
         degree_of_parallelism=dop,
         seed=source.seed,
         plan=plan,
         report=report,
     )
+
+
+def _plan(planner: Planner, name: str, occupancy: Occupancy, target: TargetPattern) -> Plan:
+    """Call the planner with a copy, so that one that writes into its input harms only itself."""
+    try:
+        return planner.plan(occupancy.copy(), target)
+    except PlanError as error:
+        raise error if error.planner else PlanError(str(error), name) from error
+    except LabseqError:
+        raise
+    except Exception as error:
+        raise PlanError(f"plan() raised {type(error).__name__}: {error}", name) from error
+
+
+def _bits(sites: NDArray[np.bool_]) -> list[list[int]]:
+    return sites.astype(int).tolist()

@@ -41,7 +41,8 @@ def ring(settings: RingSettings, grid: SiteGrid) -> TargetPattern:
         radius = settings.radius
         rows = cols = 2 * math.floor(radius / line_distance + _ROUNDING) + 1
     else:
-        assert settings.rows is not None and settings.cols is not None  # see RingSettings
+        assert settings.rows is not None  # see RingSettings
+        assert settings.cols is not None
         rows, cols = settings.rows, settings.cols
         radius = (min(rows, cols) - 1) / 2 * line_distance
     row, col = block(rows, cols, grid.shape)

@@ -56,7 +56,8 @@ class SierpinskiSettings(Settings):
         """(rows, cols) of the block."""
         if self.order is not None:
             return 2**self.order, 2**self.order
-        assert self.rows is not None and self.cols is not None  # see _has_one_size
+        assert self.rows is not None  # see _has_one_size
+        assert self.cols is not None
         return self.rows, self.cols
 
     @model_validator(mode="after")
