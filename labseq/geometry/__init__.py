@@ -1,5 +1,6 @@
 """Target patterns: from a few settings to the sites that must hold an atom."""
 
+from labseq.geometry.centre import from_the_centre, nearest_to_centre
 from labseq.geometry.drawing import DrawingError, read_bitmap
 from labseq.geometry.patterns import (
     BitmapLike,
@@ -22,6 +23,8 @@ __all__ = [
     "block",
     "check_size",
     "compact",
+    "from_the_centre",
+    "nearest_to_centre",
     "pattern",
     "place",
     "read_bitmap",

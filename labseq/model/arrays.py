@@ -29,6 +29,10 @@ def read_only(values: Any, dtype: DTypeLike, shape: tuple[int, ...], name: str) 
     """
     wanted = np.dtype(dtype)
     array: NDArray[Any] = np.asarray(values)
+    if array.dtype == wanted and _fits(array.shape, shape):
+        flags = array.flags
+        if not flags.writeable and flags.c_contiguous:
+            return array
     if array.dtype != wanted:
         if array.size == 0:
             array = array.astype(wanted)
@@ -39,16 +43,22 @@ def read_only(values: Any, dtype: DTypeLike, shape: tuple[int, ...], name: str) 
             array = converted
     if array.size == 0 and 0 not in shape and array.ndim != len(shape):
         array = array.reshape(tuple(0 if n == -1 else n for n in shape))
-    fits = array.ndim == len(shape) and all(
-        want in (-1, have) for want, have in zip(shape, array.shape, strict=True)
-    )
-    if not fits:
+    if not _fits(array.shape, shape):
         wanted_text = "(" + ", ".join("n" if n == -1 else str(n) for n in shape) + ")"
         raise ValueError(f"{name} has shape {array.shape}; expected {wanted_text}")
     if array.flags.writeable or not array.flags.c_contiguous:
         array = np.array(array, dtype=wanted, order="C", copy=True)
         array.flags.writeable = False
     return array
+
+
+def _fits(shape: tuple[int, ...], wanted: tuple[int, ...]) -> bool:
+    if len(shape) != len(wanted):
+        return False
+    for have, want in zip(shape, wanted, strict=True):  # noqa: SIM110 - all() takes three times as long
+        if want not in (-1, have):
+            return False
+    return True
 
 
 def as_occupancy(values: Any, shape: tuple[int, int] | None = None) -> Occupancy:

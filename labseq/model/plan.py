@@ -60,7 +60,7 @@ class Plan:
         offsets = read_only(self.batch_offsets, np.int32, (-1,), "batch_offsets")
         if len(offsets) == 0 or offsets[0] != 0 or offsets[-1] != len(moves):
             raise ValueError(f"batch_offsets must run from 0 to the number of moves, {len(moves)}")
-        if np.any(np.diff(offsets) < 0):
+        if (offsets[1:] < offsets[:-1]).any():
             raise ValueError("batch_offsets must not decrease")
         n_batches = len(offsets) - 1
         linked = self.linked if len(self.linked) else np.zeros(n_batches, np.bool_)

@@ -60,8 +60,8 @@ def add_line(
         moves: Of the growing plan, as ``offsets`` and ``n_batches``.
         offsets: int32, where each batch starts.
         n_batches: Number of batches so far.
-        source: int64 (>= n_atoms,), where the atoms are, ascending.
-        goal: int64 (>= n_atoms,), where they go, ascending.
+        source: int64 (>= n_atoms,), where the atoms are, ascending; overwritten.
+        goal: int64 (>= n_atoms,), where they go, ascending; overwritten.
         n_atoms: Number of atoms in the line.
         n_sites: Number of sites in the line.
         line: Index of the row or column.
@@ -71,12 +71,14 @@ def add_line(
     """
     if offsets[n_batches] + n_atoms > len(moves):
         moves, offsets = resized(moves, offsets, n_batches, 2 * len(moves) + n_atoms)
+    n_left = 0
+    for i in range(n_atoms):  # atoms that stay are in nobody's way, because the order is kept
+        if source[i] != goal[i]:
+            source[n_left] = source[i]
+            goal[n_left] = goal[i]
+            n_left += 1
+    n_atoms = n_left
     turn = np.zeros(n_atoms, np.int64)
-    n_left = n_atoms
-    for i in range(n_atoms):
-        if source[i] == goal[i]:
-            turn[i] = -1
-            n_left -= 1
     batch = 0
     while n_left > 0:
         batch += 1
@@ -104,7 +106,22 @@ def add_line(
     return moves, offsets, n_batches
 
 
-@kernel(f"Tuple(({GROWING}))({GROWING}, bool_[:, ::1], {GRID}, {GRID}, int64, int64)")
+@kernel(f"UniTuple(int64[::1], 3)({GRID}, {GRID}, {GRID})")
+def count_columns(atoms: Bools, fill: Bools, clear: Bools) -> tuple[Ints, Ints, Ints]:
+    """Count the fill sites of each column, its sites that may hold an atom, and its atoms."""
+    n_rows, n_cols = atoms.shape
+    need = np.zeros(n_cols, np.int64)
+    room = np.zeros(n_cols, np.int64)
+    count = np.zeros(n_cols, np.int64)
+    for row in range(n_rows):
+        for col in range(n_cols):
+            need[col] += fill[row, col]
+            room[col] += not clear[row, col]
+            count[col] += atoms[row, col]
+    return need, room, count
+
+
+@kernel(f"Tuple(({GROWING}))({GROWING}, bool_[:, ::1], {GRID}, {GRID}, int64, int64, int64)")
 def sort_rows(
     moves: Moves,
     offsets: Offsets,
@@ -114,6 +131,7 @@ def sort_rows(
     clear: Bools,
     row_limit: int,
     column_limit: int,
+    order: int,
 ) -> Growing:
     """Sort rows until every column holds at least as many atoms as it has fill sites.
 
@@ -126,25 +144,19 @@ def sort_rows(
         clear: bool (n_rows, n_cols), sites that must be empty.
         row_limit: Most atoms in a batch that moves along a row.
         column_limit: Most atoms in a batch that moves along a column.
+        order: Which of equal rows goes first: HALF_FILLED, FULLEST or EMPTIEST.
     """
     n_rows, n_cols = atoms.shape
-    need = np.zeros(n_cols, np.int64)
-    room = np.zeros(n_cols, np.int64)
-    count = np.zeros(n_cols, np.int64)
-    for row in range(n_rows):
-        for col in range(n_cols):
-            need[col] += fill[row, col]
-            room[col] += not clear[row, col]
-            count[col] += atoms[row, col]
+    need, room, count = count_columns(atoms, fill, clear)
     weight = np.empty(n_cols, np.int64)
     leave = np.empty(n_cols, np.int64)
     change = np.empty(n_cols, np.int64)
-    worth = np.empty((n_cols + 1, n_cols + 2), np.int64)
-    step = np.empty((n_cols, n_cols + 2), np.int16)
-    source = np.empty(n_cols, np.int64)
-    goal = np.empty(n_cols, np.int64)
+    worth = np.empty(n_cols + 1, np.int64)
+    step = np.empty((n_cols, n_cols + 1), np.int8)
+    source = np.empty(max(n_rows, n_cols), np.int64)
+    goal = np.empty(max(n_rows, n_cols), np.int64)
     while weigh_columns(need, room, count, weight, leave) > 0:
-        row = choose_row(atoms, fill, weight, leave, row_limit, worth, step, change)
+        row = choose_row(atoms, fill, weight, leave, row_limit, order, worth, step, change)
         if row >= 0:
             n_atoms = exchange(atoms[row], change, source, goal)
             for col in range(n_cols):
@@ -215,36 +227,35 @@ def compress_columns(
     return moves, offsets, n_batches
 
 
-@kernel(f"{PLAN}({GRID}, {GRID}, {GRID}, int64, int64, int64)")
-def plan_rows_first(
-    occupied: Bools, fill: Bools, clear: Bools, row_limit: int, column_limit: int, slots: int
-) -> tuple[Moves, Offsets]:
-    """Plan row sorting and column compression.
+@kernel(f"int64({GRID}, {GRID}, {GRID}, int64)")
+def least_batches(atoms: Bools, fill: Bools, clear: Bools, limit: int) -> int:
+    """Count the batches that the compression of all columns takes at least.
 
     Args:
-        occupied: bool (n_rows, n_cols), no fewer atoms than fill sites.
+        atoms: bool (n_rows, n_cols), after row sorting.
         fill: bool (n_rows, n_cols), sites that must hold an atom.
         clear: bool (n_rows, n_cols), sites that must be empty.
-        row_limit: Most atoms in a batch that moves along a row.
-        column_limit: Most atoms in a batch that moves along a column.
-        slots: Ejection slots on each side.
-
-    Returns:
-        moves, int16 (n_moves, 4), and batch offsets, int32 (n_batches + 1,).
+        limit: Most atoms in a batch.
     """
-    atoms = occupied.copy()
-    moves = np.empty((2 * occupied.size, 4), np.int16)
-    offsets = np.empty(2 * occupied.size + 1, np.int32)
+    n_rows, n_cols = atoms.shape
+    vacant = np.zeros(n_cols, np.int64)
+    surplus = np.zeros(n_cols, np.int64)
+    for row in range(n_rows):
+        for col in range(n_cols):
+            vacant[col] += fill[row, col] and not atoms[row, col]
+            surplus[col] += clear[row, col] and atoms[row, col]
+    n = 0
+    for col in range(n_cols):
+        n += (max(vacant[col], surplus[col]) + limit - 1) // limit
+    return n
+
+
+@kernel(f"{PLAN}(int64)")
+def empty_plan(n_sites: int) -> tuple[Moves, Offsets]:
+    """Make the arrays of a plan that is about to grow."""
+    offsets = np.empty(2 * n_sites + 1, np.int32)
     offsets[0] = 0
-    n_batches = 0
-    moves, offsets, n_batches = sort_rows(
-        moves, offsets, n_batches, atoms, fill, clear, row_limit, column_limit
-    )
-    moves, offsets, n_batches = compress_columns(
-        moves, offsets, n_batches, atoms, fill, clear, column_limit, slots
-    )
-    moves, offsets = resized(moves, offsets, n_batches, offsets[n_batches])
-    return moves, offsets[: n_batches + 1]
+    return np.empty((2 * n_sites, 4), np.int16), offsets
 
 
 @kernel(f"boolean[:, ::1]({GRID})")
@@ -267,25 +278,66 @@ def distance(moves: Moves) -> int:
     return total
 
 
-@kernel(f"{PLAN}({GRID}, {GRID}, {GRID}, int64, int64, int64)")
+@kernel(f"{PLAN}({GROWING}, boolean)")
+def ended(moves: Moves, offsets: Offsets, n_batches: int, swapped: bool) -> tuple[Moves, Offsets]:
+    """Cut a grown plan to its length; with rows and columns swapped back if they were."""
+    moves, offsets = resized(moves, offsets, n_batches, offsets[n_batches])
+    if swapped:
+        for i in range(len(moves)):
+            for site in (0, 2):
+                row, col = moves[i, site + 1], moves[i, site]
+                moves[i, site] = row
+                moves[i, site + 1] = col
+    return moves, offsets[: n_batches + 1]
+
+
+@kernel(f"{PLAN}({GRID}, {GRID}, {GRID}, int64, int64, int64, int64)")
 def plan_best_way(
-    occupied: Bools, fill: Bools, clear: Bools, row_limit: int, column_limit: int, slots: int
+    occupied: Bools, fill: Bools, clear: Bools, row_limit: int, column_limit: int, slots: int, order: int
 ) -> tuple[Moves, Offsets]:
     """Plan both ways round and keep the plan of fewer batches, then atom moves, then distance.
 
-    Arguments and result as for :func:`plan_rows_first`.
+    The way that promises fewer batches after sorting is ended first; the other
+    one only if it can still be as good.
+
+    Args:
+        occupied: bool (n_rows, n_cols), no fewer atoms than fill sites.
+        fill: bool (n_rows, n_cols), sites that must hold an atom.
+        clear: bool (n_rows, n_cols), sites that must be empty.
+        row_limit: Most atoms in a batch that moves along a row.
+        column_limit: Most atoms in a batch that moves along a column.
+        slots: Ejection slots on each side.
+        order: Which of equal rows goes first: HALF_FILLED, FULLEST or EMPTIEST.
+
+    Returns:
+        moves, int16 (n_moves, 4), and batch offsets, int32 (n_batches + 1,).
     """
-    moves, offsets = plan_rows_first(occupied, fill, clear, row_limit, column_limit, slots)
-    other_moves, other_offsets = plan_rows_first(
-        transposed(occupied), transposed(fill), transposed(clear), column_limit, row_limit, slots
+    atoms, other_atoms = occupied.copy(), transposed(occupied)
+    other_fill, other_clear = transposed(fill), transposed(clear)
+    moves, offsets = empty_plan(atoms.size)
+    moves, offsets, n = sort_rows(moves, offsets, 0, atoms, fill, clear, row_limit, column_limit, order)
+    other_moves, other_offsets = empty_plan(atoms.size)
+    other_moves, other_offsets, other_n = sort_rows(
+        other_moves, other_offsets, 0, other_atoms, other_fill, other_clear, column_limit, row_limit, order
     )
-    size = (len(offsets), len(moves), distance(moves))
-    other_size = (len(other_offsets), len(other_moves), distance(other_moves))
-    if size <= other_size:
-        return moves, offsets
-    for i in range(len(other_moves)):
-        for site in (0, 2):
-            row, col = other_moves[i, site + 1], other_moves[i, site]
-            other_moves[i, site] = row
-            other_moves[i, site + 1] = col
-    return other_moves, other_offsets
+    least = n + least_batches(atoms, fill, clear, column_limit)
+    other_least = other_n + least_batches(other_atoms, other_fill, other_clear, row_limit)
+    if least <= other_least:
+        moves, offsets, n = compress_columns(moves, offsets, n, atoms, fill, clear, column_limit, slots)
+        if n < other_least:
+            return ended(moves, offsets, n, False)
+    other_moves, other_offsets, other_n = compress_columns(
+        other_moves, other_offsets, other_n, other_atoms, other_fill, other_clear, row_limit, slots
+    )
+    if least > other_least:
+        if other_n < least:
+            return ended(other_moves, other_offsets, other_n, True)
+        moves, offsets, n = compress_columns(moves, offsets, n, atoms, fill, clear, column_limit, slots)
+    n_moves, other_n_moves = offsets[n], other_offsets[other_n]
+    if (n, n_moves, distance(moves[:n_moves])) <= (
+        other_n,
+        other_n_moves,
+        distance(other_moves[:other_n_moves]),
+    ):
+        return ended(moves, offsets, n, False)
+    return ended(other_moves, other_offsets, other_n, True)

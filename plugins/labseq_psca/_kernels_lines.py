@@ -54,6 +54,38 @@ def cost_of_move(source: int, goal: int, clear: Bools, batch: int) -> int:
     return cost if goal == source else cost + ATOM_MOVED + abs(goal - source)
 
 
+@kernel(f"void({LINE}, int64, int64, int64[:, ::1])")
+def reach(fill: Bools, n_atoms: int, beyond: int, places: Ints) -> None:
+    """Find the first and the last place of each atom with which all fill sites can be taken.
+
+    The place of atom i is its site less i, plus ``beyond``: in the order kept it
+    never falls from one atom to the next. Atom i needs no more fill sites on its
+    left than there are atoms before it, and none more on its right than after it.
+
+    Args:
+        fill: bool (n_sites,), sites that must hold an atom.
+        n_atoms: Number of atoms, no fewer than fill sites.
+        beyond: How many sites the line is lengthened by on each side.
+        places: Result, int64 (>= n_atoms, 2): first and last place, last included.
+    """
+    n_sites = len(fill)
+    last = n_sites - n_atoms + 2 * beyond
+    n_right = 0
+    site = n_sites + beyond - 1
+    for i in range(n_atoms - 1, -1, -1):
+        while site > i - beyond and n_right + (0 <= site < n_sites and fill[site]) <= n_atoms - 1 - i:
+            n_right += 0 <= site < n_sites and fill[site]
+            site -= 1
+        places[i, 0] = max(site - i + beyond, 0)
+    n_left = 0
+    site = -beyond
+    for i in range(n_atoms):
+        while site < i - beyond + last and n_left + (0 <= site < n_sites and fill[site]) <= i:
+            n_left += 0 <= site < n_sites and fill[site]
+            site += 1
+        places[i, 1] = min(site - i + beyond, last)
+
+
 @kernel(f"bool_(int64[::1], int64, {LINE}, {LINE}, int64, int64, int64[:, ::1], int16[:, ::1], int64[::1])")
 def compress(
     source: Ints,
@@ -68,11 +100,8 @@ def compress(
 ) -> bool:
     """Find the cheapest goals of a line's atoms, with every fill site taken.
 
-    A dynamic programme over atoms and sites; the line is lengthened on both sides
-    by as many sites as atoms must be ejected. In the order kept, atom i is at
-    least i sites from the one end and as far from the other as there are atoms
-    after it, so only ``n_sites - n_atoms + 1`` sites come into question for each,
-    plus those for ejection.
+    A dynamic programme over atoms and places, see :func:`reach`; the line is
+    lengthened on both sides by as many sites as atoms must be ejected.
 
     Args:
         source: int64 (>= n_atoms,), where the atoms are, ascending.
@@ -89,29 +118,39 @@ def compress(
         Whether all fill sites can be taken.
     """
     n_sites = len(fill)
+    n_fill = 0
+    for site in range(n_sites):
+        if fill[site]:
+            if n_fill < n_atoms:
+                goal[n_fill] = site
+            n_fill += 1
+    if n_fill >= n_atoms:  # no choice
+        return n_fill == n_atoms
     beyond = n_to_eject(fill, clear, n_atoms, slots)
-    width = n_sites - n_atoms + 2 * beyond + 1
+    places = np.empty((n_atoms, 2), np.int64)
+    reach(fill, n_atoms, beyond, places)
+    before, last_before = 0, -1
     for i in range(n_atoms):
-        best = 0 if i == 0 else IMPOSSIBLE
+        first, last = places[i]
+        best = IMPOSSIBLE if i > 0 else 0
         best_place = 0
-        for place in range(width):
-            if i > 0 and cost[i - 1, place] < best:
+        for place in range(min(before, first), last + 1):
+            if before <= place <= last_before and cost[i - 1, place] < best:
                 best = cost[i - 1, place]
                 best_place = place
             site = i + place - beyond
-            cost[i, place] = best + cost_of_move(source[i], site, clear, limit * ATOM_MOVED)
-            step[i, place] = best_place
+            if place >= first:
+                cost[i, place] = best + cost_of_move(source[i], site, clear, limit * ATOM_MOVED)
+                step[i, place] = best_place
             if 0 <= site < n_sites and fill[site]:
                 best = IMPOSSIBLE  # beyond a fill site, no atom may follow one before it
+        before, last_before = first, last
     best = IMPOSSIBLE
     place = -1
-    for last in range(width - 1, -1, -1):
-        if n_atoms > 0 and cost[n_atoms - 1, last] < best:
+    for last in range(places[n_atoms - 1, 1], places[n_atoms - 1, 0] - 1, -1):
+        if cost[n_atoms - 1, last] < best:
             best = cost[n_atoms - 1, last]
             place = last
-        site = n_atoms - 1 + last - beyond
-        if 0 <= site < n_sites and fill[site]:
-            break
     if place < 0:
         return False
     for i in range(n_atoms - 1, -1, -1):
@@ -132,14 +171,14 @@ def fill_batch(
     into a batch.
 
     Args:
-        source: int64 (>= n_atoms,), where the atoms are, ascending.
+        source: int64 (>= n_atoms,), where the atoms that move are, ascending.
         goal: int64 (>= n_atoms,), where they go, ascending.
-        n_atoms: Number of atoms.
+        n_atoms: Number of atoms that move.
         n_sites: Number of sites of the line.
         limit: Most atoms in a batch.
         slots: Ejection slots on each side.
-        turn: int64 (>= n_atoms,): -1 if the atom stays, the batch in which it
-            moved, from 1, or 0 if it is still to move; updated.
+        turn: int64 (>= n_atoms,): the batch in which the atom moved, from 1, or 0 if
+            it is still to move; updated.
         batch: Number of the batch to fill.
 
     Returns:

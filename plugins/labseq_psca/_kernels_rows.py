@@ -21,8 +21,14 @@ NEED: Final = 80  # for an atom in a column that lacks one: this plus the number
 LACK_COUNTS: Final = 8  # which counts up to here
 ON_TARGET: Final = 10  # more for an atom that lands on a fill site, less for one that leaves it
 TARGET_COLUMN: Final = 20  # less for an atom that leaves a column with fill sites
-ROWS_TRIED: Final = 8  # rows that are looked at closely for each choice; more hardly helps
+EFFORT: Final = 240  # columns looked at closely for each choice, but no fewer than
+ROWS_TRIED: Final = 3  # so many rows; more hardly helps
 PER_BATCH: Final = 1000  # worth per batch is compared in integers, in thousandths
+
+# Which of equal rows goes first: closest to half filled, or by a factor of its number of atoms.
+HALF_FILLED: Final = 0
+FULLEST: Final = -1
+EMPTIEST: Final = 1
 
 
 @kernel("int64(int64[::1], int64[::1], int64[::1], int64[::1], int64[::1])")
@@ -52,8 +58,14 @@ def weigh_columns(need: Ints, room: Ints, count: Ints, weight: Ints, leave: Ints
     return n_lacking
 
 
-@kernel(f"void({GRID}, int64[::1], int64[::1], int64, int64[:, ::1])")
-def rank_rows(atoms: Bools, weight: Ints, leave: Ints, limit: int, rank: Ints) -> None:
+@kernel("int64(int64, int64, int64)")
+def place_in_order(n_atoms: int, n_sites: int, order: int) -> int:
+    """Place of a row in an order; lower goes first."""
+    return abs(2 * n_atoms - n_sites) if order == HALF_FILLED else order * n_atoms
+
+
+@kernel(f"void({GRID}, int64[::1], int64[::1], int64, int64, int64[:, ::1])")
+def rank_rows(atoms: Bools, weight: Ints, leave: Ints, limit: int, order: int, rank: Ints) -> None:
     """Bound from above what sorting each row is worth per batch.
 
     Args:
@@ -61,8 +73,8 @@ def rank_rows(atoms: Bools, weight: Ints, leave: Ints, limit: int, rank: Ints) -
         weight: int64 (n_cols,), see :func:`weigh_columns`.
         leave: int64 (n_cols,), likewise.
         limit: Most atoms in a batch.
-        rank: Result, int64 (n_rows, 3): the bound; how far from half filled the
-            row is, in half atoms; how many atoms can change their column at most.
+        order: Which of equal rows goes first: HALF_FILLED, FULLEST or EMPTIEST.
+        rank: Result, int64 (n_rows, 2): the bound, and the place in the order.
     """
     n_rows, n_cols = atoms.shape
     for row in range(n_rows):
@@ -79,64 +91,77 @@ def rank_rows(atoms: Bools, weight: Ints, leave: Ints, limit: int, rank: Ints) -
                 least = min(least, weight[col])
         n_most = min(n_leavers, n_vacancies)
         rank[row, 0] = 0
-        rank[row, 1] = abs(2 * n_atoms - n_cols)
-        rank[row, 2] = n_most
+        rank[row, 1] = place_in_order(n_atoms, n_cols, order)
         if n_most > 0:
             worth = total - (n_vacancies - n_most) * least + (ON_TARGET - 1) * n_most
             rank[row, 0] = worth * PER_BATCH // ((n_most + limit - 1) // limit)
 
 
-@kernel(f"int64({LINE}, int64[::1], int64[::1], int64, int64[:, ::1], int16[:, ::1], int64[::1])")
+@kernel(f"int64({LINE}, int64[::1], int64[::1], int64[::1], int8[:, ::1], int64[::1])")
 def best_exchange(
-    atoms: Bools, gain: Ints, cost: Ints, n_most: int, worth: Ints, step: NDArray[np.int16], change: Ints
+    atoms: Bools, gain: Ints, cost: Ints, worth: Ints, step: NDArray[np.int8], change: Ints
 ) -> int:
     """Find the atoms of a row that had best leave their columns, and the vacancies to fill.
 
     The order is kept, so atoms between a leaver and a filled vacancy shift by one
     place each: atoms move that leave, or whose balance (leavers minus filled
     vacancies to their left) is not zero. A dynamic programme over columns and
-    balances finds the exchange that is worth most.
+    balances finds the exchange that is worth most; of the balances only those are
+    looked at that can come about and can be evened out again.
 
     Args:
         atoms: bool (n,), the row.
         gain: int64 (n,), worth of filling a vacancy; 0 where it is not wanted.
         cost: int64 (n,), cost of an atom's leaving; -1 where it must stay.
-        n_most: How many atoms can leave at most.
-        worth: Work space, int64 (> n, > 2 n_most).
-        step: Work space, int16, likewise.
+        worth: Work space, int64 (> n,).
+        step: Work space, int8 (>= n, > n).
         change: Result, int64 (n,): -1 the atom leaves, 1 the vacancy is filled, else 0.
 
     Returns:
         Gains minus costs minus one for each atom moved.
     """
     n = len(atoms)
-    width = 2 * n_most + 1
-    for balance in range(width):
-        worth[0, balance] = -IMPOSSIBLE
-    worth[0, n_most] = 0
+    leavers_left = vacancies_left = 0
     for col in range(n):
-        shifted = 1 if atoms[col] else 0
-        for balance in range(width):
-            worth[col + 1, balance] = worth[col, balance] - shifted
-            step[col, balance] = 0
-        worth[col + 1, n_most] = worth[col, n_most]
-        if atoms[col] and cost[col] >= 0:
-            for balance in range(1, width):
-                leaving = worth[col, balance - 1] - cost[col] - 1
-                if leaving > worth[col + 1, balance]:
-                    worth[col + 1, balance] = leaving
-                    step[col, balance] = -1
-        elif not atoms[col] and gain[col] > 0:
-            for balance in range(width - 1):
-                filling = worth[col, balance + 1] + gain[col]
-                if filling > worth[col + 1, balance]:
-                    worth[col + 1, balance] = filling
-                    step[col, balance] = 1
-    balance = n_most
+        change[col] = 0
+        leavers_left += atoms[col] and cost[col] >= 0
+        vacancies_left += not atoms[col] and gain[col] > 0
+    even = min(leavers_left, vacancies_left)
+    if even == 0:
+        return 0
+    for i in range(2 * even + 1):
+        worth[i] = -IMPOSSIBLE
+    worth[even] = 0
+    low = high = even
+    leavers = vacancies = 0
+    for col in range(n):
+        can_leave = atoms[col] and cost[col] >= 0
+        can_fill = not atoms[col] and gain[col] > 0
+        leavers += can_leave
+        leavers_left -= can_leave
+        vacancies += can_fill
+        vacancies_left -= can_fill
+        low, high = even - min(vacancies, leavers_left), even + min(leavers, vacancies_left)
+        if can_fill:
+            for i in range(low, high + 1):
+                filling = worth[i + 1] + gain[col] if i < 2 * even else -IMPOSSIBLE
+                step[col, i] = filling > worth[i]
+                worth[i] = max(filling, worth[i])
+        elif can_leave:
+            for i in range(high, low - 1, -1):
+                leaving = worth[i - 1] - cost[col] - 1 if i > 0 else -IMPOSSIBLE
+                staying = worth[i] - (i != even)
+                step[col, i] = -1 if leaving > staying else 0
+                worth[i] = max(leaving, staying)
+        elif atoms[col]:
+            for i in range(low, high + 1):
+                worth[i] -= i != even
+    i = even
     for col in range(n - 1, -1, -1):
-        change[col] = step[col, balance]
-        balance += step[col, balance]
-    return int(worth[n, n_most])
+        if (atoms[col] and cost[col] >= 0) or (not atoms[col] and gain[col] > 0):
+            change[col] = step[col, i]
+            i += step[col, i]
+    return int(worth[even])
 
 
 @kernel(f"int64({LINE}, int64[::1])")
@@ -150,18 +175,19 @@ def n_moved(atoms: Bools, change: Ints) -> int:
     return n
 
 
-@kernel(f"int64({GRID}, {GRID}, int64[::1], int64[::1], int64, int64[:, ::1], int16[:, ::1], int64[::1])")
+@kernel(f"int64({GRID}, {GRID}, int64[::1], int64[::1], int64, int64, int64[::1], int8[:, ::1], int64[::1])")
 def choose_row(
     atoms: Bools,
     fill: Bools,
     weight: Ints,
     leave: Ints,
     limit: int,
+    order: int,
     worth: Ints,
-    step: NDArray[np.int16],
+    step: NDArray[np.int8],
     change: Ints,
 ) -> int:
-    """Choose the row whose sorting helps most per batch; of equals the one closest to half filled.
+    """Choose the row whose sorting helps most per batch.
 
     Rows are looked at closely in the order of their bounds, until no bound beats what was found.
 
@@ -171,6 +197,7 @@ def choose_row(
         weight: int64 (n_cols,), see :func:`weigh_columns`.
         leave: int64 (n_cols,), likewise.
         limit: Most atoms in a batch.
+        order: Which of equal rows goes first: HALF_FILLED, FULLEST or EMPTIEST.
         worth: Work space, see :func:`best_exchange`.
         step: Work space, likewise.
         change: Result, int64 (n_cols,), the row's exchange.
@@ -179,14 +206,14 @@ def choose_row(
         The row, or -1 if no row helps.
     """
     n_rows, n_cols = atoms.shape
-    rank = np.empty((n_rows, 3), np.int64)
+    rank = np.empty((n_rows, 2), np.int64)
     gain = np.empty(n_cols, np.int64)
     cost = np.empty(n_cols, np.int64)
     trial = np.empty(n_cols, np.int64)
-    rank_rows(atoms, weight, leave, limit, rank)
+    rank_rows(atoms, weight, leave, limit, order, rank)
     best = 0
     best_row = -1
-    for _ in range(ROWS_TRIED):
+    for _ in range(max(ROWS_TRIED, EFFORT // n_cols)):
         row = -1
         for r in range(n_rows):
             if rank[r, 0] > best and (
@@ -201,7 +228,7 @@ def choose_row(
             on_target = ON_TARGET if fill[row, col] else 0
             gain[col] = weight[col] + on_target if weight[col] > 0 else 0
             cost[col] = leave[col] + on_target if leave[col] >= 0 else -1
-        total = best_exchange(atoms[row], gain, cost, rank[row, 2], worth, step, trial)
+        total = best_exchange(atoms[row], gain, cost, worth, step, trial)
         n_batches = (n_moved(atoms[row], trial) + limit - 1) // limit
         if total * PER_BATCH > best * n_batches:
             best = total * PER_BATCH // n_batches

@@ -2,15 +2,32 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable
+from typing import Annotated, Final, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
-from labseq import Context, Plan, PlanError, Settings, SiteGrid, TargetPattern, as_occupancy
+from labseq import Context, Occupancy, Plan, PlanError, Settings, TargetPattern, as_occupancy
+from labseq.geometry import nearest_to_centre
 
 Kernel = Callable[..., tuple[NDArray[np.int16], NDArray[np.int32]]]
+RowOrder = Literal["half_filled", "fullest", "emptiest"]
+
+_ORDERS: Final[dict[RowOrder, int]] = {"half_filled": 0, "fullest": -1, "emptiest": 1}  # see _kernels_rows
+
+
+class ToneLimits(Settings):
+    """Most tones on at once on each axis."""
+
+    row: Annotated[int, Field(ge=1)] | None = Field(
+        default=None, description="most tones of the row axis, so most atoms that move along a column at once"
+    )
+    col: Annotated[int, Field(ge=1)] | None = Field(
+        default=None, description="most tones of the column axis: most atoms that move along a row together"
+    )
 
 
 class PscaSettings(Settings):
@@ -18,6 +35,24 @@ class PscaSettings(Settings):
 
     degree_of_parallelism: int = Field(
         default=7, ge=1, description="most mobile tweezers on at once; the profile's limits hold besides"
+    )
+    max_tones: ToneLimits = Field(
+        default=ToneLimits(),
+        description="most tones on each axis, for cards with fewer tones than the degree of parallelism",
+    )
+    variant: Literal["fewest", "paper"] = Field(
+        default="fewest",
+        description="fewest: few batches; paper: each row sort helps one column, to compare with the paper",
+    )
+    row_order: RowOrder = Field(
+        default="half_filled",
+        description="which row is sorted first: of equally helpful ones, or of all with variant paper",
+    )
+    repair_below: float = Field(
+        default=0.1,
+        ge=0,
+        le=1,
+        description="fraction of defects up to which few atom moves count more than few batches",
     )
 
 
@@ -42,19 +77,27 @@ class PscaPlanner:
     """
 
     def __init__(self, settings: PscaSettings, context: Context) -> None:
-        motion = context.motion
-        self.degree_of_parallelism = min(settings.degree_of_parallelism, motion.max_tweezers)
-        self._row_limit = min(self.degree_of_parallelism, motion.max_column_tones)
-        self._column_limit = min(self.degree_of_parallelism, motion.max_row_tones)
+        motion, tones = context.motion, settings.max_tones
+        dop = self.degree_of_parallelism = min(settings.degree_of_parallelism, motion.max_tweezers)
+        self._limits = (
+            min(dop, motion.max_column_tones, tones.col or dop),  # along a row
+            min(dop, motion.max_row_tones, tones.row or dop),  # along a column
+        )
+        self._settings = settings
         self._eject_slots = motion.eject_slots
+        self._order = _ORDERS[settings.row_order]
         self._grid = context.grid
         self._kernel: Kernel | None = None
 
     def warm(self) -> None:
         """Compile the kernels, or load them from the cache."""
-        from labseq_psca._kernels import plan_best_way
+        if self._settings.variant == "paper":
+            from labseq_psca._kernels_paper import plan_as_in_paper as kernel
+        else:
+            from labseq_psca._kernels import plan_best_way as kernel
 
-        self._kernel = plan_best_way
+            importlib.import_module("labseq_psca._kernels_repair")  # so that it is ready too
+        self._kernel = kernel
 
     def plan(self, occupancy: ArrayLike, target: TargetPattern) -> Plan:
         """Plan the moves that fill the target and clear what must be empty.
@@ -78,44 +121,39 @@ class PscaPlanner:
             occupied = as_occupancy(occupancy, target.shape)
         except (TypeError, ValueError) as error:
             raise PlanError(str(error), "psca") from error
-        if self._kernel is None:
-            self.warm()
-        assert self._kernel is not None
-        fill = target.fill
+        fill, n_wanted = target.fill, target.n_atoms
         n_atoms = int(np.count_nonzero(occupied))
-        if n_atoms < target.n_atoms:
+        if n_atoms < n_wanted:
             fill = nearest_to_centre(fill, n_atoms, self._grid)
-        moves, offsets = self._kernel(
-            occupied, fill, target.clear, self._row_limit, self._column_limit, self._eject_slots
-        )
+        moves, offsets = self._sort_and_compress(occupied, fill, target.clear)
+        if self._settings.variant == "fewest" and self._settings.repair_below > 0:
+            n_defects = int(np.count_nonzero(fill > occupied))
+            if 0 < n_defects <= self._settings.repair_below * n_wanted:
+                repaired = self._repair(occupied, fill, target.clear)
+                moves, offsets = min((moves, offsets), repaired, key=_cost)
         moves.flags.writeable = offsets.flags.writeable = False  # else Plan would copy them
         return Plan(moves, offsets)
 
+    def _sort_and_compress(
+        self, occupied: Occupancy, fill: NDArray[np.bool_], clear: NDArray[np.bool_]
+    ) -> tuple[NDArray[np.int16], NDArray[np.int32]]:
+        if self._kernel is None:
+            self.warm()
+        assert self._kernel is not None
+        return self._kernel(occupied, fill, clear, *self._limits, self._eject_slots, self._order)
 
-def nearest_to_centre(fill: NDArray[np.bool_], n_sites: int, grid: SiteGrid) -> NDArray[np.bool_]:
-    """Keep the fill sites that lie nearest to their common centre.
+    def _repair(
+        self, occupied: Occupancy, fill: NDArray[np.bool_], clear: NDArray[np.bool_]
+    ) -> tuple[NDArray[np.int16], NDArray[np.int32]]:
+        """Fill each defect from the side that takes fewest atoms; sort and compress what that leaves."""
+        from labseq_psca._kernels_repair import plan_repair
 
-    Distances are those on the lattice; of sites equally far the one in the upper
-    row, then in the left column, is kept.
+        moves, offsets, atoms = plan_repair(occupied, fill, *self._limits)
+        more_moves, more_offsets = self._sort_and_compress(atoms, fill, clear)
+        return np.concatenate([moves, more_moves]), np.concatenate([offsets, more_offsets[1:] + offsets[-1]])
 
-    Args:
-        fill: bool (n_rows, n_cols).
-        n_sites: How many sites to keep.
-        grid: Tells the lattice.
 
-    Returns:
-        bool (n_rows, n_cols) with ``n_sites`` sites.
-
-    Example:
-        >>> nearest_to_centre(np.ones((1, 5), np.bool_), 2, SiteGrid()).tolist()
-        [[False, True, True, False, False]]
-    """
-    rows, cols = np.nonzero(fill)
-    down = len(rows) * rows - rows.sum()  # from the centre, times the number of sites: exact in integers
-    right = len(cols) * cols - cols.sum()
-    shear = grid.shear if grid.lattice == "triangular" else 0
-    distance = down**2 + right**2 + shear * down * right  # |right a1 + down a2|^2 / a^2
-    kept = np.lexsort((cols, rows, distance))[:n_sites]
-    nearest = np.zeros_like(fill)
-    nearest[rows[kept], cols[kept]] = True
-    return nearest
+def _cost(plan: tuple[NDArray[np.int16], NDArray[np.int32]]) -> int:
+    """What a plan of few moves loses; see ``_kernels_repair``."""
+    moves, offsets = plan
+    return 3 * len(moves) + len(offsets)

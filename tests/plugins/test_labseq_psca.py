@@ -8,7 +8,7 @@ import labseq_psca
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
-from labseq_psca.planner import PscaPlanner, PscaSettings, nearest_to_centre
+from labseq_psca.planner import PscaPlanner, PscaSettings, ToneLimits
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
@@ -70,6 +70,18 @@ class TestPscaContract(PlannerContract):
         return partial(PscaPlanner, PscaSettings())
 
 
+class TestPaperVariantContract(PlannerContract):
+    @pytest.fixture
+    def factory(self) -> Callable[[Context], PscaPlanner]:
+        return partial(PscaPlanner, PscaSettings(variant="paper"))
+
+
+class TestRepairContract(PlannerContract):
+    @pytest.fixture
+    def factory(self) -> Callable[[Context], PscaPlanner]:
+        return partial(PscaPlanner, PscaSettings(repair_below=1))
+
+
 @given(cases((7, 7)), st.integers(1, 8), st.integers(1, 2))
 @settings(max_examples=300, deadline=None)
 def test_any_target_on_any_grid(case: tuple[TargetPattern, Occupancy], dop: int, eject_slots: int) -> None:
@@ -103,6 +115,68 @@ def test_large_grids(seed: int, n_rows: int, n_cols: int, filling: float, wanted
     _, report = plan_and_check(atoms, target)
     missing = max(0, target.n_atoms - int(np.count_nonzero(atoms)))
     assert (report.n_defects, report.n_surplus) == (missing, 0)
+
+
+@given(cases((7, 7)), st.sampled_from([{"variant": "paper"}, {"repair_below": 1}]))
+@settings(max_examples=200, deadline=None)
+def test_any_target_in_every_variant(case: tuple[TargetPattern, Occupancy], variant: dict[str, Any]) -> None:
+    target, atoms = case
+    planner = PscaPlanner(PscaSettings(**variant), Context())
+    report = check_plan(planner.plan(atoms, target), atoms, target, 7)
+    assert report.n_surplus == 0
+    assert report.n_defects == max(0, target.n_atoms - int(np.count_nonzero(atoms)))
+
+
+@pytest.mark.parametrize(("dop", "paper"), [(15, 29.61), (2, 160.0)])
+def test_the_papers_variant_comes_near_its_numbers_of_batches(dop: int, paper: float) -> None:
+    planner = PscaPlanner(PscaSettings(variant="paper", degree_of_parallelism=dop), Context())
+    plans = [planner.plan(atoms, COMPACT) for atoms in loadings(200)]
+    assert np.mean([plan.n_batches for plan in plans]) == pytest.approx(paper, rel=0.12)
+
+
+@pytest.mark.parametrize(("order", "row"), [("half_filled", 1), ("fullest", 0), ("emptiest", 2)])
+def test_the_papers_variant_sorts_rows_in_the_order_that_is_set(order: Any, row: int) -> None:
+    atoms = np.array([[1, 1, 0, 1], [1, 1, 0, 0], [0, 1, 0, 0]], np.bool_)
+    fill = np.array([[0, 0, 1, 0], [0, 0, 0, 0], [0, 0, 0, 0]], np.bool_)
+    planner = PscaPlanner(PscaSettings(variant="paper", row_order=order), Context())
+    plan = planner.plan(atoms, TargetPattern(fill, np.zeros_like(fill)))
+    assert plan.moves[0, 0] == row
+
+
+def test_few_defects_are_repaired_with_few_atom_moves() -> None:
+    rng = np.random.default_rng(1)
+    repairing, plain = (PscaPlanner(PscaSettings(repair_below=x), Context()) for x in (0.1, 0))
+    n_defects, moves = 0, np.zeros(2, np.int64)
+    for atoms in loadings(200):
+        plan, report = plan_and_check(atoms, COMPACT)
+        lost = np.zeros((22, 22), np.bool_)
+        lost[tuple(plan.moves[:, 2:].T + 1)] = True
+        seen = report.predicted & ~(lost[1:-1, 1:-1] & (rng.random((20, 20)) < 0.02))
+        n_defects += COMPACT.n_defects(seen)
+        for i, planner in enumerate((repairing, plain)):
+            plan = planner.plan(seen, COMPACT)
+            assert check_plan(plan, seen, COMPACT, 7).meets_target
+            moves[i] += plan.n_atom_moves
+    assert moves[0] <= 4.5 * n_defects
+    assert moves[0] < 0.8 * moves[1]
+
+
+def test_many_defects_are_sorted_and_compressed_in_few_batches() -> None:
+    plain = PscaPlanner(PscaSettings(repair_below=0), Context())
+    for atoms in loadings(20):
+        assert np.array_equal(make_planner().plan(atoms, COMPACT).moves, plain.plan(atoms, COMPACT).moves)
+
+
+@pytest.mark.parametrize("limits", [{"row": 3, "col": 5}, {"row": 4}, {"col": 1}])
+def test_tone_limits_of_each_axis_are_kept(limits: dict[str, int]) -> None:
+    tones = ToneLimits(**limits)
+    planner = PscaPlanner(PscaSettings(max_tones=tones, degree_of_parallelism=6), Context())
+    for atoms in loadings(10):
+        plan = planner.plan(atoms, COMPACT)
+        assert check_plan(plan, atoms, COMPACT, 6).meets_target
+        for batch in plan.batches:
+            for axis, limit in ((0, tones.row), (1, tones.col)):
+                assert len(np.unique(batch.from_sites[:, axis])) <= (limit or 6)
 
 
 @pytest.mark.parametrize(("dop", "most_batches"), [(15, 18.6), (7, 33.8), (2, 97.0)])
@@ -158,11 +232,6 @@ def test_too_few_atoms_fill_the_target_from_its_centre(lattice: Any, shear: Any)
     distance = np.linalg.norm(grid.positions_m - centre, axis=-1)
     assert np.count_nonzero(filled) == np.count_nonzero(atoms)
     assert distance[filled].max() <= distance[COMPACT.fill & ~filled].min() * (1 + 1e-9)
-
-
-def test_ties_for_the_centre_are_broken_by_row_and_column() -> None:
-    kept = nearest_to_centre(np.ones((2, 2), np.bool_), 1, SiteGrid(lattice="square"))
-    assert kept.tolist() == [[True, False], [False, False]]
 
 
 def test_the_better_way_round_is_taken() -> None:

@@ -1,13 +1,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import combinations, product
+from itertools import combinations, pairwise, product
 from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings, strategies as st
-from labseq_psca import _kernels, _kernels_lines, _kernels_rows
+from labseq_psca import _kernels, _kernels_lines, _kernels_paper, _kernels_repair, _kernels_rows
 from numpy.typing import NDArray
 
 Sites = list[int]
@@ -88,7 +88,10 @@ class TestFillBatch:
         reach = st.sets(st.integers(-2, n + 1), min_size=len(source), max_size=len(source))
         goal = sorted(data.draw(reach, "goals"))
         limit, slots = data.draw(st.integers(1, 4), "limit"), data.draw(st.integers(1, 2), "slots")
-        turn = ints([-1 if a == b else 0 for a, b in zip(source, goal, strict=True)])
+        moving = [(a, b) for a, b in zip(source, goal, strict=True) if a != b]
+        staying = {a for a, b in zip(source, goal, strict=True) if a == b}
+        source, goal = [a for a, _ in moving], [b for _, b in moving]
+        turn = ints([0] * len(moving))
         place = dict(enumerate(source))
         batch = 0
         while 0 in turn:
@@ -103,6 +106,8 @@ class TestFillBatch:
             for i, other in product(going, place):
                 if other not in going:  # it stands
                     assert not min(place[i], goal[i]) <= place[other] <= max(place[i], goal[i])
+            for i, site in product(going, staying):
+                assert not min(place[i], goal[i]) <= site <= max(place[i], goal[i])
             for i in going:
                 place[i] = goal[i]
                 if not 0 <= goal[i] < n:
@@ -139,16 +144,13 @@ class TestBestExchange:
         atoms = data.draw(st.lists(st.booleans(), min_size=n, max_size=n), "atoms")
         gain = data.draw(st.lists(st.integers(0, 12), min_size=n, max_size=n), "gain")
         cost = data.draw(st.lists(st.integers(-1, 5), min_size=n, max_size=n), "cost")
-        n_leavers = sum(atom and cost[col] >= 0 for col, atom in enumerate(atoms))
-        n_vacancies = sum(not atom and gain[col] > 0 for col, atom in enumerate(atoms))
         change = np.zeros(n, np.int64)
         found = _kernels_rows.best_exchange(
             bools(atoms),
             ints(gain),
             ints(cost),
-            min(n_leavers, n_vacancies),
-            np.zeros((n + 1, n + 2), np.int64),
-            np.zeros((n, n + 2), np.int16),
+            np.zeros(n + 1, np.int64),
+            np.zeros((n, n + 1), np.int8),
             change,
         )
         worths = [self.worth(atoms, gain, cost, c) for c in product((-1, 0, 1), repeat=n)]
@@ -168,7 +170,12 @@ class TestBestExchange:
 class TestChooseRow:
     @staticmethod
     def choose(
-        atoms: Any, weight: Sites, leave: Sites, fill: Any = None, limit: int = 9
+        atoms: Any,
+        weight: Sites,
+        leave: Sites,
+        fill: Any = None,
+        limit: int = 9,
+        order: int = _kernels_rows.HALF_FILLED,
     ) -> tuple[int, Sites]:
         grid = bools(atoms)
         n = grid.shape[1]
@@ -179,8 +186,9 @@ class TestChooseRow:
             ints(weight),
             ints(leave),
             limit,
-            np.zeros((n + 1, n + 2), np.int64),
-            np.zeros((n, n + 2), np.int16),
+            order,
+            np.zeros(n + 1, np.int64),
+            np.zeros((n, n + 1), np.int8),
             change,
         )
         return row, change.tolist()
@@ -196,9 +204,11 @@ class TestChooseRow:
         far = [[1, 1, 1, 0], [0, 1, 0, 0]]
         assert self.choose(far, weights, [0, -1, -1, -1], limit=1) == (0, [-1, 0, 0, 1])
 
-    def test_of_equals_takes_the_one_closest_to_half_filled(self) -> None:
+    @pytest.mark.parametrize(("order", "row"), [("HALF_FILLED", 1), ("FULLEST", 0), ("EMPTIEST", 2)])
+    def test_of_equals_takes_the_first_in_the_order(self, order: str, row: int) -> None:
         atoms = [[1, 0, 1, 1], [1, 0, 0, 1], [1, 0, 0, 0]]
-        assert self.choose(atoms, [0, 90, 0, 0], [0, -1, -1, -1])[0] == 1
+        chosen, _ = self.choose(atoms, [0, 90, 0, 0], [0, -1, -1, -1], order=getattr(_kernels_rows, order))
+        assert chosen == row
 
     def test_prefers_to_land_on_fill_sites(self) -> None:
         atoms = [[1, 0], [1, 0]]
@@ -254,3 +264,64 @@ def test_ejection_slots_are_used_from_the_outermost_atom_on(slots: int) -> None:
         assert batches == [[[7, 0, 7, -1], [7, 4, 7, 5]], [[7, 1, 7, -1], [7, 3, 7, 5]]]
     else:
         assert batches == [[[7, 0, 7, -2], [7, 1, 7, -1], [7, 3, 7, 5], [7, 4, 7, 6]]]
+
+
+class TestPaper:
+    """Row sorting for one column at a time."""
+
+    def test_the_most_distant_column_of_the_target_gives(self) -> None:
+        row, need = bools([1, 1, 0, 0, 1, 1]), ints([0, 1, 1, 1, 1, 0])
+        assert _kernels_paper.partner(row, need, ints([2, 1, -1, 0, 1, 2]), 2) == 4
+        assert _kernels_paper.partner(row, need, ints([2, 0, -1, 0, 0, 2]), 2) == 5
+        assert _kernels_paper.partner(row, need, ints([0, 0, -1, 0, 0, 0]), 2) == -1
+
+    def test_surplus_goes_to_the_nearest_column_with_room(self) -> None:
+        row, need = bools([0, 0, 1, 1, 0]), ints([0, 0, 1, 1, 0])
+        assert _kernels_paper.partner(row, need, ints([-1, -1, 1, 0, -1]), 2) == 1
+
+    def test_the_column_most_in_need_comes_first_and_surplus_last(self) -> None:
+        spare = np.zeros(4, np.int64)
+        room = ints([9, 9, 9, 9])
+        assert _kernels_paper.column_in_need(ints([3, 4, 2, 0]), room, ints([2, 2, 5, 1]), spare) == 1
+        assert _kernels_paper.column_in_need(ints([3, 4, 2, 0]), room, ints([3, 4, 5, 1]), spare) == 2
+        assert spare.tolist() == [0, 0, 3, -8]
+        assert _kernels_paper.column_in_need(ints([3, 4, 2, 0]), room, ints([3, 4, 2, 1]), spare) == -1
+
+
+class TestRepair:
+    """Defects are filled from the side that costs least."""
+
+    @staticmethod
+    def repair(atoms: Any, fill: Any) -> tuple[list[list[Sites]], NDArray[np.bool_]]:
+        moves, offsets, after = _kernels_repair.plan_repair(bools(atoms), bools(fill), 9, 9)
+        return [moves[a:b].tolist() for a, b in pairwise(offsets.tolist())], after
+
+    def test_the_nearest_of_the_four_sides(self) -> None:
+        atoms = np.ones((7, 7), np.bool_)
+        atoms[3, 1] = False
+        fill = np.zeros((7, 7), np.bool_)
+        fill[1:6, 1:6] = True
+        assert self.repair(atoms, fill)[0] == [[[3, 0, 3, 1]]]
+
+    def test_atoms_between_move_up_by_one_fill_site(self) -> None:
+        batches, after = self.repair([[1, 0, 1, 0, 1, 1]], [[0, 1, 1, 0, 1, 0]])
+        assert batches == [[[0, 0, 0, 1]]]
+        batches, after = self.repair([[0, 0, 1, 0, 1, 1]], [[0, 1, 1, 0, 1, 0]])
+        assert batches == [[[0, 2, 0, 1], [0, 4, 0, 2], [0, 5, 0, 4]]]
+        assert after.tolist() == [[False, True, True, False, True, False]]
+
+    def test_two_defects_of_a_line_are_filled_together(self) -> None:
+        batches, _ = self.repair([[0, 1, 0, 1, 1, 1]], [[1, 1, 1, 1, 0, 0]])
+        assert batches == [[[0, 1, 0, 0], [0, 3, 0, 1], [0, 4, 0, 2], [0, 5, 0, 3]]]
+
+    def test_an_atom_comes_from_beside_where_the_line_has_none(self) -> None:
+        batches, _ = self.repair(
+            [[0, 0, 0, 1], [1, 0, 1, 1], [1, 1, 1, 1]],
+            [[0, 0, 0, 0], [1, 1, 1, 1], [1, 1, 1, 1]],
+        )
+        assert batches == [[[0, 3, 0, 1]], [[0, 1, 1, 1]]]
+
+    def test_what_no_shift_can_fill_is_left(self) -> None:
+        batches, after = self.repair([[1, 0], [0, 0]], [[1, 1], [0, 0]])
+        assert batches == []
+        assert after.tolist() == [[True, False], [False, False]]
