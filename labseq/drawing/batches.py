@@ -56,14 +56,22 @@ def _tell(batch: Batch, shape: tuple[int, int]) -> BatchStory:
         axis=axis,
         lines=tuple(lines.tolist()),
         n_atoms=len(batch),
-        n_ejected=int(np.count_nonzero(~on_grid(batch, shape))),
+        n_ejected=int(np.count_nonzero(~on_grid(batch.to_sites, shape))),
         n_sites=int(np.abs(way).max(initial=0)),
     )
 
 
-def on_grid(batch: Batch, shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """Which atom moves of a batch end on the grid, bool (n,)."""
-    inside = (batch.to_sites >= 0) & (batch.to_sites < shape)
+def on_grid(sites: NDArray[np.integer], shape: tuple[int, int]) -> NDArray[np.bool_]:
+    """Which sites are on the grid.
+
+    Args:
+        sites: (n, 2), row and column.
+        shape: (n_rows, n_cols) of the grid.
+
+    Returns:
+        bool (n,).
+    """
+    inside = (sites >= 0) & (sites < shape)
     return inside[:, 0] & inside[:, 1]
 
 
@@ -83,7 +91,7 @@ def occupancies(plan: Plan, occupancy: Occupancy) -> list[Occupancy]:
     for batch in plan.batches:
         atoms = before[-1].copy()
         atoms[tuple(batch.from_sites.T)] = False
-        atoms[tuple(batch.to_sites[on_grid(batch, occupancy.shape)].T)] = True
+        atoms[tuple(batch.to_sites[on_grid(batch.to_sites, occupancy.shape)].T)] = True
         before.append(atoms)
     return before
 

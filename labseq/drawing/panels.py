@@ -11,6 +11,8 @@ from labseq.drawing.batches import Axis, BatchStory, line_words
 
 MAX_PANELS: Final = 38
 """Most panels of batches; with the ones before and after that makes 40."""
+MAX_WORDS: Final = 24
+"""Characters for the lines in a panel's title; if they are more, the lines are only counted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,6 +30,11 @@ class Panel:
     moves_along: tuple[tuple[Axis, tuple[int, ...]], ...]
 
     @property
+    def n_batches(self) -> int:
+        """How many batches."""
+        return self.last - self.first + 1
+
+    @property
     def title(self) -> str:
         """Numbers of the batches, from 1, and the lines that they move along.
 
@@ -35,8 +42,8 @@ class Panel:
             >>> Panel(2, 4, (("row", (7, 9)),)).title
             'batches 3-5: rows 7, 9'
         """
-        numbers = f"batch {self.first + 1}" if self.first == self.last else f"batches {self._numbers}"
-        return f"{numbers}: " + "; ".join(line_words(axis, lines) for axis, lines in self.moves_along)
+        numbers = f"batch {self.first + 1}" if self.n_batches == 1 else f"batches {self._numbers}"
+        return f"{numbers}: " + "; ".join(_words(axis, lines) for axis, lines in self.moves_along)
 
     @property
     def _numbers(self) -> str:
@@ -68,6 +75,11 @@ def make_panels(stories: Sequence[BatchStory], max_panels: int = MAX_PANELS) -> 
             phases = [list(range(len(stories)))]
         groups = _evenly(phases, max_panels)
     return [_panel(stories, group) for group in groups]
+
+
+def _words(axis: Axis, lines: tuple[int, ...]) -> str:
+    words = line_words(axis, lines)
+    return words if len(words) <= MAX_WORDS else f"{len(lines)} {axis}s"
 
 
 def _together(stories: Sequence[BatchStory], key: Callable[[BatchStory], Any]) -> list[list[int]]:

@@ -14,8 +14,8 @@ def honeycomb(settings: BlockSettings, grid: SiteGrid) -> TargetPattern:
     The three sublattices of the triangular lattice are row - column modulo 3; left
     out is the one of the block's top left site (its top right site with
     ``shear: -1``). In a block with as many rows as columns the two acute corners
-    are empty, and no atom hangs on by a single neighbour. In the bulk each atom has
-    3 nearest neighbours.
+    are empty; if that number is 3 n or 3 n + 1, no atom hangs on by a single
+    neighbour. In the bulk each atom has 3 nearest neighbours.
 
     Args:
         settings: Size and place.

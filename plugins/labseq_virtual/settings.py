@@ -33,7 +33,7 @@ class ImageSettings(Settings):
     angle: Angle = Field(default=0.0, description="rotation of the grid on the frame, clockwise (ours)")
     spot: PositiveLength = Field(
         default=0.42e-6,
-        description="Gaussian width (1 sigma) of an atom's image in the atom plane (derived: 0.33 um is "
+        description="width (1 sigma of a Gaussian) of an atom's image in the atom plane (derived: 0.33 um is "
         "0.21 wavelengths of 780 nm over the paper's NA of 0.5; ours: 0.26 um of aberrations in quadrature)",
     )
     exposure: PositiveDuration = Field(
