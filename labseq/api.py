@@ -2,49 +2,64 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from operator import index
 from pathlib import Path
-from typing import Any
+from typing import Any, Final, TypeAlias
 
 from labseq.config.values import validate_values
+from labseq.errors import ConfigError, Problem
 from labseq.model import MotionSpec, SiteGrid, TargetPattern
+from labseq.registry import Entry
 from labseq.roles import Context, Planner
 from labseq.session import load_plugins
+from labseq.session.choosing import Chosen, construct_one, construct_target
+
+Folders: TypeAlias = str | Path | Sequence[str | Path]
+"""A folder, or several."""
+
+MAX_SITES: Final = 1000
+"""Most rows or columns of a grid, as in a profile."""
 
 
 def make_planner(
     name: str,
     *,
-    grid: SiteGrid | None = None,
+    grid: SiteGrid | tuple[int, int] | None = None,
     motion: MotionSpec | None = None,
-    plugin_folders: tuple[str | Path, ...] = (),
+    plugin_folders: Folders = (),
     **settings: Any,
 ) -> Planner:
     """Make a planner by the name that a sequence would use.
 
     Args:
         name: For example "psca".
-        grid: The grid of sites; the paper's by default.
+        grid: The grid of sites, or its (n_rows, n_cols); the paper's by default.
         motion: How the mobile tweezers move; the paper's by default.
         plugin_folders: Folders with further plugins.
         **settings: The planner's own settings.
 
     Raises:
         UnknownPluginError: No installed plugin offers it.
+        PluginLoadError: Its plugin failed to load, or is at fault.
         ConfigError: A setting is wrong.
 
     Example:
         >>> planner = make_planner("psca", degree_of_parallelism=7)
     """
-    entry = load_plugins([Path(folder) for folder in plugin_folders]).get("planner", name)
+    entry = _find("planner", name, plugin_folders)
     made = validate_values(entry.settings_model, settings, f"planner '{name}'")
-    return entry.factory(made, Context("planner", grid or SiteGrid(), motion or MotionSpec()))
+    if not isinstance(motion, MotionSpec | None):  # pyright: ignore[reportUnnecessaryIsInstance]
+        raise ConfigError(Problem(f"motion is {motion!r}", expected="a labseq.MotionSpec"))
+    context = Context("planner", _grid(grid), motion or MotionSpec())
+    return construct_one(Chosen(entry, made), context)
 
 
 def make_target(
     pattern: str,
     *,
     grid: SiteGrid | tuple[int, int] = (20, 20),
-    plugin_folders: tuple[str | Path, ...] = (),
+    plugin_folders: Folders = (),
     **settings: Any,
 ) -> TargetPattern:
     """Make a target by the name that a sequence would use.
@@ -57,6 +72,7 @@ def make_target(
 
     Raises:
         UnknownPluginError: No installed plugin offers it.
+        PluginLoadError: Its plugin failed to load, or is at fault.
         ConfigError: A setting is wrong.
         LimitError: The target does not fit on the grid.
 
@@ -64,6 +80,31 @@ def make_target(
         >>> make_target("compact", rows=15, cols=15, grid=(20, 20)).n_atoms
         225
     """
-    entry = load_plugins([Path(folder) for folder in plugin_folders]).get("pattern", pattern)
+    entry = _find("pattern", pattern, plugin_folders)
     made = validate_values(entry.settings_model, settings, f"pattern '{pattern}'")
-    return entry.factory(made, grid if isinstance(grid, SiteGrid) else SiteGrid(*grid))
+    return construct_target(Chosen(entry, made), _grid(grid))
+
+
+def _find(kind: str, name: str, folders: Folders) -> Entry:
+    if not isinstance(name, str):  # pyright: ignore[reportUnnecessaryIsInstance]
+        raise ConfigError(Problem(f"the name of the {kind} is {name!r}", expected="text"))
+    given = (folders,) if isinstance(folders, str | Path) else folders
+    return load_plugins([Path(folder) for folder in given]).get(kind, name)
+
+
+def _grid(grid: SiteGrid | tuple[int, int] | None) -> SiteGrid:
+    """The grid that is meant by a size.
+
+    Raises:
+        ConfigError: It is none.
+    """
+    if grid is None or isinstance(grid, SiteGrid):
+        return grid or SiteGrid()
+    try:
+        n_rows, n_cols = map(index, grid)
+    except (TypeError, ValueError):
+        n_rows = n_cols = 0
+    if not (1 <= n_rows <= MAX_SITES and 1 <= n_cols <= MAX_SITES):
+        expected = f"a labseq.SiteGrid or (n_rows, n_cols), each from 1 to {MAX_SITES}"
+        raise ConfigError(Problem(f"grid is {grid!r}", expected=expected))
+    return SiteGrid(n_rows, n_cols)

@@ -16,20 +16,24 @@ import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from inspect import signature
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, cast
 
 import pluggy
 
 from labseq import hookspecs
-from labseq.errors import ConfigError, PluginLoadError, Problem
+from labseq.errors import ConfigError, PluginLoadError, Problem, UnknownPluginError, one_of
 from labseq.hookspecs import LABSEQ_API
 from labseq.registry import Entry, Registry
 
 ENTRY_POINT_GROUP: Final = "labseq"
 LOCAL_PACKAGE: Final = "labseq_local"
 PATH_VARIABLE: Final = "LABSEQ_PLUGIN_PATH"
+
+_MARK: Final = "labseq_impl"  # what ``hookimpl`` puts on a function
+_HOOKS: Final = [key for key, value in vars(hookspecs).items() if hasattr(value, "labseq_spec")]
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +87,7 @@ class PluginHost:
             try:
                 module = point.load()
                 self._register(module, info)
-            except (Exception, SystemExit) as error:  # noqa: BLE001 - a plugin may raise anything
+            except BaseException as error:  # noqa: BLE001 - a plugin may raise anything
                 info = _failed(info, error, None)
             self._infos[info.name] = info
 
@@ -91,38 +95,42 @@ class PluginHost:
         """Load single files and packages from folders, and from LABSEQ_PLUGIN_PATH.
 
         Raises:
-            ConfigError: A folder does not exist.
+            ConfigError: A folder does not exist, or cannot be read.
         """
         from_environment = [Path(p) for p in os.environ.get(PATH_VARIABLE, "").split(os.pathsep) if p]
         for folder in [*folders, *from_environment]:
-            if not folder.is_dir():
-                origin = "" if folder in folders else f" (from {PATH_VARIABLE})"
-                raise ConfigError(
-                    Problem(
-                        f"plugin folder {folder}{origin} does not exist", expected="a folder with plugins"
-                    )
-                )
-            for path in sorted(folder.iterdir()):
+            origin = "" if folder in folders else f" (from {PATH_VARIABLE})"
+            try:
+                paths = sorted(folder.iterdir())
+            except OSError as error:
+                what = f"plugin folder {folder}{origin} cannot be read: {error.strerror}"
+                if isinstance(error, FileNotFoundError):
+                    what = f"plugin folder {folder}{origin} does not exist"
+                raise ConfigError(Problem(what, expected="a folder with plugins")) from error
+            for path in paths:
                 self._load_path(path)
 
     def _load_path(self, path: Path) -> None:
         name = path.stem
-        if name.startswith((".", "_")) or not name.isidentifier():
+        if name.startswith((".", "_")):
             return
         if path.is_dir():
             path = path / "__init__.py"
         if path.suffix != ".py" or not path.is_file() or self._is_loaded(path):
             return
         info = PluginInfo(name, str(path))
-        if name in self._infos:
+        if not name.isidentifier():
+            reason = "its name is no Python name: letters, digits and '_' only; rename it"
+            info = replace(info, state="failed", reason=reason)
+        elif name in self._infos:
             taken = self._infos[name].origin
-            info = replace(
-                info, name=f"{name} ({path})", state="failed", reason=f"'{name}' came from {taken} already"
-            )
+            where = "an installed plugin" if taken == "installed" else f"the plugin in {taken}"
+            reason = f"{where} is called '{name}' already; rename one of them"
+            info = replace(info, name=f"{name} ({path})", state="failed", reason=reason)
         else:
             try:
                 self._register(_import_file(name, path), info)
-            except (Exception, SystemExit) as error:  # noqa: BLE001 - a plugin may raise anything
+            except BaseException as error:  # noqa: BLE001 - a plugin may raise anything
                 sys.modules.pop(f"{LOCAL_PACKAGE}.{name}", None)
                 info = _failed(info, error, path)
         self._infos[info.name] = info
@@ -137,9 +145,10 @@ class PluginHost:
             came = (
                 "does not state LABSEQ_API"
                 if written_for is None
-                else f"was written for LABSEQ_API {written_for}"
+                else f"was written for LABSEQ_API {written_for!r}"
             )
             raise PluginLoadError(info.name, f"it {came}; this labseq has LABSEQ_API = {LABSEQ_API}")
+        _check_hooks(module, info.name)
         self._pluggy.register(module, info.name)
         self.registry.set_origin(info.name)
         try:
@@ -156,9 +165,12 @@ class PluginHost:
         """Find what a sequence or profile names.
 
         Raises:
-            PluginLoadError: The plugin of that name was found but did not load.
+            PluginLoadError: The plugin of that name was found but did not load, or two plugins
+                offer the name.
             UnknownPluginError: Nothing offers it.
         """
+        if (kind, name) in self.registry.contested:
+            raise self.registry.contested[kind, name]
         if self.registry.find(kind, name) is None:
             broken = [info for info in self._infos.values() if info.state == "failed"]
             for info in broken:
@@ -169,8 +181,6 @@ class PluginHost:
         return self.registry.get(kind, name)
 
     def _raise_with_broken(self, kind: str, name: str, broken: Sequence[PluginInfo]) -> None:
-        from labseq.errors import UnknownPluginError
-
         try:
             self.registry.get(kind, name)
         except UnknownPluginError as error:
@@ -184,6 +194,31 @@ class PluginHost:
             (found.plugin_name, partial(found.function, **{name: values[name] for name in found.argnames}))
             for found in getattr(self._pluggy.hook, hook).get_hookimpls()
         ]
+
+
+def _check_hooks(module: ModuleType, name: str) -> None:
+    """Refuse a plugin without hooks, and hooks that pluggy would refuse in less plain words.
+
+    Raises:
+        PluginLoadError: With what to change.
+    """
+    implemented: dict[str, Callable[..., object]] = {}
+    for attribute, value in vars(module).items():
+        options = getattr(value, _MARK, None)
+        if isinstance(options, dict):
+            implemented[cast("dict[str, Any]", options).get("specname") or attribute] = value
+    if not implemented:
+        raise PluginLoadError(name, "it implements no hook; write '@hookimpl' above 'def labseq_register'")
+    for key, function in implemented.items():
+        if key not in _HOOKS:
+            raise PluginLoadError(name, f"it implements the unknown hook '{key}'; expected {one_of(_HOOKS)}")
+        known = signature(getattr(hookspecs, key)).parameters
+        given = signature(function).parameters
+        if unknown := [argument for argument in given if argument not in known]:
+            text = f"its {key} has an argument '{unknown[0]}'; expected {one_of(list(known))}"
+            raise PluginLoadError(name, text)
+        if key == "labseq_register" and not given:
+            raise PluginLoadError(name, f"its {key} has no argument; expected {one_of(list(known))}")
 
 
 def _import_file(name: str, path: Path) -> ModuleType:
@@ -202,15 +237,19 @@ def _import_file(name: str, path: Path) -> ModuleType:
 
 
 def _failed(info: PluginInfo, error: BaseException, path: Path | None) -> PluginInfo:
+    if isinstance(error, KeyboardInterrupt):
+        raise error
     if isinstance(error, PluginLoadError):
         return replace(info, state="failed", reason=error.reason)
     frames = traceback.extract_tb(error.__traceback__)
     inside = [f for f in frames if path is not None and f.filename == str(path)]
     frame = inside[-1] if inside else (frames[-1] if frames else None)
     where = f" ({frame.filename}:{frame.lineno})" if frame is not None else ""
+    text = str(error)
     if isinstance(error, SyntaxError):
-        where = f" ({error.filename}:{error.lineno})"
-    return replace(info, state="failed", reason=f"{type(error).__name__}: {error}{where}")
+        text, where = error.msg, f" ({error.filename or path}:{error.lineno or 1})"
+    reason = " ".join(f"{type(error).__name__}: {text}{where}".split())
+    return replace(info, state="failed", reason="".join(c if c.isprintable() else "?" for c in reason))
 
 
 def _version(distribution: str) -> str:

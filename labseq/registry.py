@@ -60,9 +60,13 @@ class Registry:
 
     Every method ``registry.<kind>(name, factory, settings_model)`` adds an entry.
     A name that is taken is an error that names both origins.
+
+    Attributes:
+        contested: Kind and name of what more than one plugin offers, and what is said of that.
     """
 
     def __init__(self) -> None:
+        self.contested: dict[tuple[str, str], PluginLoadError] = {}
         self._entries: dict[tuple[str, str], Entry] = {}
         self._origin = "labseq"
 
@@ -90,10 +94,14 @@ class Registry:
             raise PluginLoadError(self._origin, f"the factory of {kind} '{name}' cannot be called")
         taken = self._entries.get((kind, name))
         if taken is not None:
-            raise PluginLoadError(
-                self._origin,
-                f"{kind} '{name}' is offered by '{taken.origin}' already; rename one of them",
-            )
+            text = f"{kind} '{name}' is offered by '{taken.origin}' already; rename one of them"
+            error = PluginLoadError(self._origin, text)
+            if taken.origin != self._origin:
+                self.contested[kind, name] = error
+            raise error
+        if settings_model is not None and not callable(getattr(settings_model, "model_validate_json", None)):
+            text = f"the settings model of {kind} '{name}' is {settings_model!r}"
+            raise PluginLoadError(self._origin, f"{text}; expected a subclass of labseq.Settings")
         self._entries[kind, name] = Entry(
             kind, name, factory, settings_model, self._origin, virtual_time, simulated
         )

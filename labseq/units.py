@@ -41,6 +41,21 @@ UNITS: Final[Mapping[str, Mapping[str, float]]] = MappingProxyType(
 )
 """Dimension -> unit -> factor to SI."""
 
+EXAMPLES: Final[Mapping[str, str]] = MappingProxyType(
+    {
+        "time": "45 ms",
+        "length": "4.49 um",
+        "frequency": "80 MHz",
+        "speed": "130 um/ms",
+        "voltage": "200 mV",
+        "power": "10 mW",
+        "temperature": "300 uK",
+        "angle": "60 deg",
+        "fraction": "75 %",
+    }
+)
+"""Dimension -> what a quantity of it looks like."""
+
 _NUMBER = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(\S.*?)?\s*\Z")
 
 
@@ -100,24 +115,22 @@ def expected(dimension: str) -> str:
         >>> expected("time")
         "a time such as '45 ms' (s, ms, us, ns, min, h) or a plain number in s"
     """
-    units = UNITS[dimension]
-    names = [unit for unit in units if unit and not unit.startswith(_MICRO[1:])]
-    examples = {
-        "time": "45 ms",
-        "length": "4.49 um",
-        "frequency": "80 MHz",
-        "speed": "130 um/ms",
-        "voltage": "200 mV",
-        "power": "10 mW",
-        "temperature": "300 uK",
-        "angle": "60 deg",
-        "fraction": "75 %",
-    }
+    names = unit_names(dimension)
     plain = "" if dimension == "fraction" else f" in {names[0]}"
     article = "an" if dimension == "angle" else "a"
     return (
-        f"{article} {dimension} such as '{examples[dimension]}' ({', '.join(names)}) or a plain number{plain}"
+        f"{article} {dimension} such as '{EXAMPLES[dimension]}' ({', '.join(names)}) or a plain number{plain}"
     )
+
+
+def unit_names(dimension: str) -> list[str]:
+    """Name the units of a dimension, micro spelled with "u" only.
+
+    Example:
+        >>> unit_names("time")
+        ['s', 'ms', 'us', 'ns', 'min', 'h']
+    """
+    return [unit for unit in UNITS[dimension] if unit and not unit.startswith(_MICRO[1:])]
 
 
 def _a(dimension: str) -> str:

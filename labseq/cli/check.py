@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -11,11 +12,12 @@ from typing import Any, Final, cast
 import numpy as np
 
 from labseq.cli.excerpt import excerpt
+from labseq.cli.failures import lines_of
 from labseq.cli.log_lines import LogLines
 from labseq.cli.output import columns, divert_stdout, encodes, say
 from labseq.cli.show import as_line
 from labseq.cli.words import clock_time, plural
-from labseq.errors import ConfigError
+from labseq.errors import ConfigError, Problem
 from labseq.model import TimelineEntry
 from labseq.session import Assembly, CheckReport, Session, check
 from labseq.session.checking import Rehearsal
@@ -23,6 +25,7 @@ from labseq.session.choosing import DryRun
 from labseq.units import format_quantity
 
 BAR_WIDTH: Final = 30
+_TEXT_WIDTH: Final = 48  # of the timeline without its bars
 
 Timeline = Sequence[tuple[str, Sequence[TimelineEntry]]]
 
@@ -51,9 +54,9 @@ def check_sequence(
             sequence, profile=profile, overrides=overrides, dry_run=dry_run, observer=observer
         )
         checked = check(session)
-    except ConfigError as error:
+    except BaseException as error:
         if answer is not None:
-            answer(as_line({"problems": [asdict(p) for p in error.problems], "warnings": []}))
+            answer(as_line({"problems": [asdict(p) for p in _problems(error)], "warnings": []}))
         raise
     if answer is not None:
         answer(as_line(_as_values(checked)))
@@ -61,17 +64,23 @@ def check_sequence(
         _print(session.assembly, checked)
 
 
+def _problems(error: BaseException) -> Sequence[Problem]:
+    return error.problems if isinstance(error, ConfigError) else [Problem(text) for text in lines_of(error)]
+
+
 def _print(assembly: Assembly, checked: CheckReport) -> None:
     block = "█" if encodes(sys.stdout.encoding, "█") else "#"
+    room = shutil.get_terminal_size((_TEXT_WIDTH + BAR_WIDTH, 24)).columns - _TEXT_WIDTH
     parts = (
         columns(_what(assembly)),
-        timeline_table(checked.timeline, block),
+        timeline_table(checked.timeline, block, max(0, min(BAR_WIDTH, room))),
         columns([*_sums(checked), *_rehearsed(checked)]),
         columns(_limits(assembly)),
     )
     say("\n\n".join("\n".join(lines) for lines in parts))
     for warning in checked.warnings:
-        say(f"warning: {warning}", *excerpt(warning), stream=sys.stderr)
+        notes = (f"      = {note}" for note in warning.notes)
+        say(f"warning: {warning}", *excerpt(warning), *notes, stream=sys.stderr)
 
 
 def _as_values(checked: CheckReport) -> dict[str, Any]:
@@ -98,12 +107,13 @@ def _quantiles(rehearsal: Rehearsal) -> dict[str, float]:
     return {"median": float(median), "p95": float(p95), "n_loadings": rehearsal.n_loadings}
 
 
-def timeline_table(timeline: Timeline, block: str) -> list[str]:
+def timeline_table(timeline: Timeline, block: str, width: int = BAR_WIDTH) -> list[str]:
     """A row per bar of the timeline: step, start, length, and the bar itself.
 
     Args:
         timeline: Name of each step and its bars.
         block: What bars are made of.
+        width: Characters of the longest bar; 0 for none.
     """
     total_s = sum(bar.duration_s for _, bars in timeline for bar in bars)
     rows = [("step", "", "start", "at most", "")]
@@ -112,18 +122,18 @@ def timeline_table(timeline: Timeline, block: str) -> list[str]:
         for i, bar in enumerate(bars):
             label = bar.label if bar.label != name else ""
             length = format_quantity(bar.duration_s, "time")
-            drawn = _bar(start_s, bar.duration_s, total_s, block)
+            drawn = _bar(start_s, bar.duration_s, total_s, block, width)
             step = f"{number} {name}" if i == 0 else ""
             rows.append((step, label, format_quantity(start_s, "time"), length, drawn))
             start_s += bar.duration_s
     return columns(rows, right=(2, 3))
 
 
-def _bar(start_s: float, duration_s: float, total_s: float, block: str) -> str:
-    if not total_s:
+def _bar(start_s: float, duration_s: float, total_s: float, block: str, width: int) -> str:
+    if not total_s or not width:
         return ""
-    first, last = (round(BAR_WIDTH * t / total_s) for t in (start_s, start_s + duration_s))
-    first = min(first, BAR_WIDTH - 1)
+    first, last = (round(width * t / total_s) for t in (start_s, start_s + duration_s))
+    first = min(first, width - 1)
     return " " * first + block * max(1, last - first)
 
 

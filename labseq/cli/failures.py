@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import sys
 import traceback
+from contextlib import suppress
 from typing import Final
 
 from labseq.cli.excerpt import excerpt
 from labseq.cli.output import say
-from labseq.errors import ConfigError, LabseqError, StopRequested
+from labseq.cli.words import plural
+from labseq.errors import ConfigError, LabseqError, RecordingError, StopRequested
 
 EXIT_SIGNALLED: Final = 128
 """Added to the signal's number, as shells do: 130 for Ctrl-C, 143 for SIGTERM."""
 EXIT_INTERRUPTED: Final = EXIT_SIGNALLED + 2
 EXIT_INTERNAL: Final = 1
+MAX_TOLD: Final = 50
+"""Problems of a file that are told; a file with more of them is not what it was taken for."""
 
 
 def report(error: BaseException, *, debug: bool = False) -> int:
@@ -28,19 +32,22 @@ def report(error: BaseException, *, debug: bool = False) -> int:
     """
     if debug:
         traceback.print_exception(error)
-    if isinstance(error, ConfigError):
-        say(*told(error), stream=sys.stderr)
-    else:
-        say(*lines_of(error), stream=sys.stderr)
+    lines = told(error) if isinstance(error, ConfigError) else lines_of(error)
+    with suppress(OSError, RecordingError):  # the exit code says it, too
+        say(*lines, stream=sys.stderr)
     return exit_code_of(error)
 
 
 def told(error: ConfigError) -> list[str]:
-    """Every problem with the line that it is in, and what else there is to look at."""
+    """Every problem with the line that it is in, and what else there is to look at.
+
+    Of very many problems only the first are told.
+    """
     lines: list[str] = []
-    for problem, text in zip(error.problems, lines_of(error), strict=True):
+    for problem, text in zip(error.problems[:MAX_TOLD], lines_of(error), strict=False):
         lines += [text, *excerpt(problem), *(f"      = {note}" for note in problem.notes)]
-    return lines
+    n_more = len(error.problems) - MAX_TOLD
+    return [*lines, f"and {plural(n_more, 'more problem')}"] if n_more > 0 else lines
 
 
 def lines_of(error: BaseException) -> list[str]:

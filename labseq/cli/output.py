@@ -8,9 +8,18 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import TextIO
 
+from labseq.errors import RecordingError
+
 
 def forgive_encoding() -> None:
-    """Let stdout and stderr replace characters that they cannot encode instead of failing."""
+    """Let stdout and stderr replace characters that they cannot encode instead of failing.
+
+    Closed ones lead nowhere from now on, so that no file of a run takes their place.
+    """
+    for name in ("stdin", "stdout", "stderr"):
+        if getattr(sys, name) is None:
+            mode = "r" if name == "stdin" else "w"
+            setattr(sys, name, open(os.devnull, mode, encoding="utf-8"))  # noqa: PTH123, SIM115 - for good
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
@@ -30,8 +39,13 @@ def divert_stdout() -> Callable[[str], None]:
     os.dup2(2, 1)
 
     def answer(line: str) -> None:
-        with os.fdopen(real, "w", encoding="utf-8") as stream:
-            say(line, stream=stream)
+        try:
+            with os.fdopen(real, "wb", buffering=0) as stream:
+                stream.write(f"{line}\n".encode())
+        except OSError as error:
+            if isinstance(error, BrokenPipeError):
+                raise
+            raise RecordingError("<stdout>", f"cannot be written: {error.strerror}") from error
 
     return answer
 
@@ -42,10 +56,19 @@ def say(*lines: str, stream: TextIO | None = None) -> None:
     Args:
         *lines: Without line ends.
         stream: Where to; stdout by default.
+
+    Raises:
+        BrokenPipeError: Nobody reads it any more.
+        RecordingError: It cannot be written, for example to a full disk.
     """
     out = sys.stdout if stream is None else stream
-    out.write("".join(f"{line}\n" for line in lines))
-    out.flush()
+    try:
+        out.write("".join(f"{line}\n" for line in lines))
+        out.flush()
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        raise RecordingError(out.name, f"cannot be written: {error.strerror}") from error
 
 
 def encodes(encoding: str | None, characters: str) -> bool:

@@ -34,3 +34,5 @@ class _Lines:
         if name == "safe_state":
             state = "safe" if values["ok"] else f"NOT SAFE: {values['error']}"
             say(f"{values['device']:<20} {state}")
+        elif name == "closed" and not values["ok"]:
+            say(f"{values['device']:<20} could not be closed: {values['error']}")

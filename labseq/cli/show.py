@@ -81,8 +81,10 @@ def shot_table(run: Run) -> list[str]:
 
 def _shot_row(shot: Shot, n_atoms: int) -> tuple[str, ...]:
     row = shot.row
-    stages: Mapping[str, float] = row.get("stage_s", {})
-    duration_s = math.fsum(s for name, s in stages.items() if name.startswith("step "))
+    found = row.get("stage_s")
+    stages: Mapping[str, object] = found if isinstance(found, dict) else {}  # the line may be damaged
+    steps_s = [s for name, s in stages.items() if name.startswith("step ")]
+    duration_s = math.fsum(s for s in steps_s if isinstance(s, float | int))
     return (
         str(shot.index + 1),
         outcome(shot.success, shot.seen_defect_free_cycle, shot.filling_fraction, n_atoms),
@@ -120,7 +122,7 @@ def _duration(run: Run) -> str:
     ends = [str(shot.row.get("t_end_utc") or "") for shot in (*run.shots, *run.attempts)]
     try:
         start = datetime.fromisoformat(str(run.record["t_start_utc"]))
-        end = max(datetime.fromisoformat(text) for text in ends if text)
-    except (KeyError, ValueError):  # no shots, or a damaged index
+        duration = max(datetime.fromisoformat(text) for text in ends if text) - start
+    except (KeyError, ValueError, TypeError):  # no shots, or a damaged index
         return "-"
-    return format_quantity((end - start).total_seconds(), "time")
+    return format_quantity(duration.total_seconds(), "time")

@@ -49,6 +49,9 @@ def split_overrides(options: Sequence[str]) -> tuple[list[Override], list[Overri
         >>> split_overrides(["shots=5", "profile.grid.rows=10"])[1][0].address
         'grid.rows'
     """
+    if isinstance(options, str) or not all(isinstance(option, str) for option in options):  # pyright: ignore[reportUnnecessaryIsInstance]
+        what = f"overrides is {options!r}"
+        raise ConfigError(Problem(clean(what), expected="a list of texts such as ['shots=5']"))
     problems: list[Problem] = []
     sequence: list[Override] = []
     profile: list[Override] = []

@@ -34,8 +34,17 @@ class Collected:
     ) -> bool:
         if not isinstance(error, ConfigError):
             return False
-        self.problems += error.problems
+        self.add(error)
         return True
+
+    def add(self, error: ConfigError) -> None:
+        """Gather what an error says."""
+        self.problems += error.problems
+
+    def stop(self, error: ConfigError) -> ConfigError:
+        """An error after which nothing else can be checked, together with what was gathered."""
+        self.add(error)
+        return self._joined()
 
     def raise_any(self) -> None:
         """Raise what was gathered, each file's problems in its order.
@@ -44,7 +53,8 @@ class Collected:
             ConfigError: Anything was gathered.
         """
         if self.problems:
-            sources = list(dict.fromkeys(problem.source for problem in self.problems))
-            raise ConfigError(
-                sorted(self.problems, key=lambda p: (sources.index(p.source), p.line, p.column))
-            )
+            raise self._joined()
+
+    def _joined(self) -> ConfigError:
+        sources = list(dict.fromkeys(problem.source for problem in self.problems))
+        return ConfigError(sorted(self.problems, key=lambda p: (sources.index(p.source), p.line, p.column)))

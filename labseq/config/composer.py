@@ -28,7 +28,7 @@ from labseq.config.nodes import MAX_DEPTH, MAX_VALUES, Mark, Node, Scalar
 from labseq.config.reading import check_characters
 from labseq.config.scalars import resolve
 from labseq.config.syntax import explain
-from labseq.config.wording import clean, did_you_mean, shown
+from labseq.config.wording import clean, comma_hint, did_you_mean, shown
 from labseq.errors import ConfigError, Problem
 
 _FLOW: Final = "one value: 5, '45 ms', [a, b] or {key: value}"
@@ -161,6 +161,7 @@ class _Composer:
             size, height = size + key.size + value.size, max(height, value.height)
             if not isinstance(key.value, str):
                 hint = f"write '{clean(key.raw)}' in quotes" if key.raw else ""
+                hint = comma_hint(key.raw, value.value) or hint
                 self._note(key.mark, f"a key is {shown(key.plain(), key.raw)}", "text", hint)
             elif self._is_good_key(key, key.value, keys):
                 keys[key.value], values[key.value] = key.mark, value

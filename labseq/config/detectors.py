@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, PositiveFloat, PositiveInt, field_validator
 
-from labseq.config.settings import Angle, Length, Settings
+from labseq.config.settings import Angle, FilePath, Length, Settings
 
 
 class ThresholdSettings(Settings):
@@ -32,7 +32,7 @@ class ThresholdSettings(Settings):
     )
     shape: Literal["square", "disc"] = Field(default="square", description="shape of the region of interest")
     offset: float = Field(default=500.0, description="counts of a dark pixel")
-    threshold: float | str | tuple[tuple[float, ...], ...] = Field(
+    threshold: float | FilePath | tuple[tuple[float, ...], ...] = Field(
         default=1630.0,
         description="counts over the offset, summed over the region, above which there is an atom: "
         "one number, one for each site (rows of numbers), or the path of a .npy file with one for each site",

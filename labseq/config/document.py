@@ -118,22 +118,32 @@ class Document:
         return Document(self.path, self.name, self.text, self.root.replaced(loc, node))
 
     def override_all(
-        self, overrides: Iterable[Override | tuple[str, str]], *, may_add: Collection[str] = ()
+        self,
+        overrides: Iterable[Override | tuple[str, str]],
+        *,
+        may_add: Collection[str] = (),
+        found: Collected | None = None,
     ) -> Document:
         """A copy with several values replaced, in order; see :meth:`override`.
+
+        Args:
+            overrides: Address and value of each.
+            may_add: Addresses of mappings that are made if the file has none.
+            found: Where the problems go; without it they are raised.
 
         Raises:
             ConfigError: All the overrides that cannot be applied.
         """
         document = self
-        collected = Collected()
+        collected = Collected() if found is None else found
         for one in overrides:
             override = Override(*one)
             with collected:
                 document = document.override(
                     override.address, override.value, override.source, may_add=may_add
                 )
-        collected.raise_any()
+        if found is None:
+            collected.raise_any()
         return document
 
     @overload

@@ -54,8 +54,9 @@ def find_profile(name_or_path: str | Path, beside: Path, *, named_in: Document |
         path = reading.beside(beside, name_or_path)
         if reading.is_file(path):
             return path
-        what, expected = f"there is no hardware profile at {visible(str(path))}", ""
-        hint = did_you_mean(path.name, reading.files_in(path.parent))
+        kind = "a folder, not a hardware profile," if reading.is_folder(path) else "no hardware profile"
+        what, expected = f"there is {kind} at {visible(str(path))}", ""
+        hint = reading.alike_file(path)
     else:
         for folder in folders:
             for suffix in reading.YAML_SUFFIXES:

@@ -10,8 +10,10 @@ from typing import Annotated, Final, Literal, Self, TypeAlias
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from labseq.config.addresses import Override
+from labseq.config.collect import Collected
 from labseq.config.document import Document
 from labseq.config.fields import (
+    FORMAT,
     Choice,
     Folders,
     FormatVersion,
@@ -22,6 +24,7 @@ from labseq.config.fields import (
     placed_by_field,
 )
 from labseq.config.find import find_profile
+from labseq.config.mending import StandIns, load_checked
 from labseq.config.settings import Duration, Frequency, Length, Settings, Speed
 from labseq.config.wording import clean
 from labseq.model import MotionSpec, SiteGrid
@@ -106,11 +109,12 @@ class GridSettings(Settings):
 class MotionSettings(Settings):
     """How the mobile tweezers move, whatever their driver."""
 
-    pick_up: Duration = Field(default=_MOTION.pick_up_s, description="pick-up ramp")
-    drop_off: Duration = Field(default=_MOTION.drop_off_s, description="drop-off ramp")
+    pick_up: Duration = Field(default=_MOTION.pick_up_s, description="duration of the pick-up ramp")
+    drop_off: Duration = Field(default=_MOTION.drop_off_s, description="duration of the drop-off ramp")
     speed: Speed = Field(default=_MOTION.speed_m_s, description="transport speed")
     speed_profile: SpeedProfile = Field(
-        default=_MOTION.speed_profile, description="course of the speed during a transport"
+        default=_MOTION.speed_profile,
+        description="course of the speed during a transport; none but constant can be played so far",
     )
     overhead_per_batch: Duration = Field(
         default=_MOTION.overhead_per_batch_s, description="time that passes before each batch, tweezers off"
@@ -129,7 +133,7 @@ class MotionSettings(Settings):
         default=_MOTION.eject_slots,
         ge=0,
         le=100,
-        description="sites beyond the grid that the tones reach, each side",
+        description="how many sites beyond the grid the tones reach, on each side",
     )
 
     def spec(self) -> MotionSpec:
@@ -180,10 +184,10 @@ class ProfileSpec(Settings):
     labseq: FormatVersion = Field(description="version of the file format: 1")
     name: Name = Field(description="name of the machine")
     grid: GridSettings = Field(description="the grid of sites")
-    camera: Annotated[Choice, placed_by_field] = Field(description="the camera")
-    static_tweezers: Annotated[Choice, placed_by_field] = Field(description="the static tweezers")
+    camera: Annotated[Choice, placed_by_field] = Field(description="what takes images")
+    static_tweezers: Annotated[Choice, placed_by_field] = Field(description="what makes the static array")
     mobile_tweezers: Annotated[MobileTweezersChoice, placed_by_field] = Field(
-        description="the mobile tweezers"
+        description="what moves the atoms, and how"
     )
     detector: Annotated[Choice, placed_by_field] = Field(description="what finds the atoms on an image")
     devices: Annotated[dict[str, Choice], empty_is({}), AfterValidator(_named)] = Field(
@@ -213,12 +217,35 @@ class ProfileSpec(Settings):
         return self.grid.model()
 
 
+_VIRTUAL: Final = {"use": "virtual"}
+_NARROW: Final = {"step": 1.0}
+_STAND_INS: Final = StandIns(
+    values={
+        "labseq": FORMAT,
+        "name": "x",
+        "grid": {
+            "rows": 1000,
+            "cols": 1000,
+            "spacing": 1e-6,
+            "row_frequency": _NARROW,
+            "column_frequency": _NARROW,
+        },
+        "camera": _VIRTUAL,
+        "static_tweezers": _VIRTUAL,
+        "mobile_tweezers": _VIRTUAL,
+        "detector": {"use": "threshold"},
+    },
+    items={"devices": _VIRTUAL},
+)
+
+
 def load_profile(
     name_or_path: str | Path,
     *,
     beside: Path,
     overrides: Sequence[Override | tuple[str, str]] = (),
     named_in: Document | None = None,
+    found: Collected | None = None,
 ) -> tuple[Document, ProfileSpec]:
     """Find and read a hardware profile.
 
@@ -227,9 +254,11 @@ def load_profile(
         beside: Folder of the file that names the profile.
         overrides: Values that replace those of the file, addresses without "profile.".
         named_in: The sequence whose key ``profile`` names it, for messages.
+        found: Where the problems of a file that can be read go; without it they are raised.
 
     Returns:
-        The document, overrides included, and what it says.
+        The document, overrides included, and what it says; stand-ins for everything of which
+        a problem was found.
 
     Raises:
         ConfigError: Everything that is wrong, but for the settings of plugins.
@@ -237,8 +266,8 @@ def load_profile(
     document = Document.read(find_profile(name_or_path, beside, named_in=named_in))
     check_kind(document, "hardware profile")
     placed = [_of_profile(Override(*override)) for override in overrides]
-    document = document.override_all(placed, may_add=_MAY_ADD)
-    return document, document.validate(ProfileSpec, called="a hardware profile")
+    document = document.override_all(placed, may_add=_MAY_ADD, found=found)
+    return load_checked(document, ProfileSpec, "a hardware profile", _STAND_INS, found)
 
 
 def _of_profile(override: Override) -> Override:

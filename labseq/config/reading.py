@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Final
 
 from labseq.config.nodes import Mark
-from labseq.config.wording import did_you_mean, visible
+from labseq.config.wording import clean, closest, visible
 from labseq.errors import ConfigError, Problem
 
 MAX_BYTES: Final = 1 << 20
@@ -25,7 +25,10 @@ _LINE_BREAK: Final = re.compile(r"\r\n|\r|\n")
 _FORBIDDEN: Final = re.compile(
     "[^\t\n\r\x20-\x7e\xa0-\u2027\u202a-\ud7ff\ue000-\ufefe\uff00-\ufffd\U00010000-\U0010ffff]"
 )
+# At the beginning of a line, all other spaces are text to YAML and indentation to the eye.
+_ODD_INDENT: Final = re.compile("^[ \t-]*([\u00a0\u1680\u2000-\u200a\u202f\u205f\u3000])", re.MULTILINE)
 _UTF16: Final = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+_UTF32: Final = (codecs.BOM_UTF32_LE, codecs.BOM_UTF32_BE)
 
 
 def read_bytes(path: Path, expected: str = "a YAML file", suffixes: Collection[str] = YAML_SUFFIXES) -> bytes:
@@ -43,7 +46,7 @@ def read_bytes(path: Path, expected: str = "a YAML file", suffixes: Collection[s
     try:
         data = _bytes_of(path)
     except (FileNotFoundError, NotADirectoryError):
-        hint = did_you_mean(path.name, files_in(path.parent, suffixes))
+        hint = alike_file(path, suffixes)
         raise ConfigError(Problem("there is no such file", name, hint=hint)) from None
     except (OSError, ValueError) as error:  # ValueError: a NUL character in the path
         reason = error.strerror if isinstance(error, OSError) else str(error)
@@ -73,8 +76,9 @@ def decode(data: bytes, name: str) -> str:
     Raises:
         ConfigError: Not UTF-8; with the place of the first wrong byte.
     """
-    if data.startswith(_UTF16):
-        raise ConfigError(Problem("the file is UTF-16", name, 1, 1, "UTF-8", "save it as UTF-8"))
+    if data.startswith((*_UTF16, *_UTF32)):
+        came = "UTF-32" if data.startswith(_UTF32) else "UTF-16"
+        raise ConfigError(Problem(f"the file is {came}", name, 1, 1, "UTF-8", "save it as UTF-8"))
     body = data.removeprefix(codecs.BOM_UTF8)
     try:
         return body.decode("utf-8")
@@ -96,6 +100,7 @@ def check_characters(text: str, name: str, origin: str = "") -> None:
     """
     match = _FORBIDDEN.search(text)
     if match is None:
+        _check_indentation(text, name, origin)
         return
     char = match[0]
     code = f"U+{ord(char):04X}"
@@ -111,6 +116,15 @@ def check_characters(text: str, name: str, origin: str = "") -> None:
     raise ConfigError(mark.problem(name, what, "plain text", hint))
 
 
+def _check_indentation(text: str, name: str, origin: str) -> None:
+    match = _ODD_INDENT.search(text)
+    if match is not None:
+        kind = unicodedata.name(match[1]).lower()
+        mark = Mark(0, 0, origin) if origin else _mark_at(text, match.start(1))
+        what = f"{'an' if kind[0] in 'aeio' else 'a'} {kind} (U+{ord(match[1]):04X}) is used for indentation"
+        raise ConfigError(mark.problem(name, what, "plain spaces"))
+
+
 def _mark_at(text: str, index: int) -> Mark:
     """Line and column of a character of the text."""
     breaks = [match.end() for match in _LINE_BREAK.finditer(text, 0, index)]
@@ -124,6 +138,14 @@ def files_in(folder: Path, suffixes: Collection[str] = YAML_SUFFIXES) -> list[st
         return sorted(path.name for path in folder.iterdir() if path.suffix in suffixes)
     except (OSError, ValueError):
         return []
+
+
+def alike_file(path: Path, suffixes: Collection[str] = YAML_SUFFIXES) -> str:
+    """A hint at the file in the same folder that is spelled most alike, whatever its suffix, or ""."""
+    names = {Path(name).stem: name for name in files_in(path.parent, suffixes)}
+    stem = path.stem if path.suffix in suffixes else path.name
+    meant = closest(stem, names)
+    return f"did you mean '{clean(names[meant])}'?" if meant else ""
 
 
 def beside(folder: Path, path: str) -> Path:

@@ -11,8 +11,10 @@ from typing import Annotated, Any, Final, Literal, TypeAlias, cast
 from pydantic import AfterValidator, Field, PlainValidator
 
 from labseq.config.addresses import Override
+from labseq.config.collect import Collected
 from labseq.config.document import Document
 from labseq.config.fields import (
+    FORMAT,
     Choice,
     Folders,
     FormatVersion,
@@ -23,6 +25,7 @@ from labseq.config.fields import (
     misfit,
     placed_by_field,
 )
+from labseq.config.mending import StandIns, load_checked
 from labseq.config.nodes import Loc
 from labseq.config.settings import Settings
 from labseq.config.wording import clean, shown
@@ -111,17 +114,32 @@ class SequenceSpec(Settings):
     shot: Steps = Field(description="the steps of a shot")
 
 
+_STAND_INS: Final = StandIns(
+    values={
+        "labseq": FORMAT,
+        "name": "x",
+        "shots": 1,
+        "target": {"pattern": "compact", "rows": 1, "cols": 1},
+        "planner": {"use": DEFAULT_PLANNER},
+        "shot": [{"image": {}}],
+    },
+    items={"shot": {"image": {}}},
+)
+
+
 def load_sequence(
-    path: Path, overrides: Sequence[Override | tuple[str, str]] = ()
+    path: Path, overrides: Sequence[Override | tuple[str, str]] = (), *, found: Collected | None = None
 ) -> tuple[Document, SequenceSpec]:
     """Read a sequence file.
 
     Args:
         path: The file.
         overrides: Values that replace those of the file: (address, value) each.
+        found: Where the problems of a file that can be read go; without it they are raised.
 
     Returns:
-        The document, overrides and the default planner included, and what it says.
+        The document, overrides and the default planner included, and what it says; stand-ins
+        for everything of which a problem was found.
 
     Raises:
         ConfigError: Everything that is wrong, but for the settings of plugins.
@@ -130,5 +148,5 @@ def load_sequence(
     check_kind(document, "sequence")
     if document.data.get("planner") is None:
         document = document.override("planner", f"{{use: {DEFAULT_PLANNER}}}", "the default planner")
-    document = document.override_all(overrides)
-    return document, document.validate(SequenceSpec, called="a sequence")
+    document = document.override_all(overrides, found=found)
+    return load_checked(document, SequenceSpec, "a sequence", _STAND_INS, found)

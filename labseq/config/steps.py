@@ -16,7 +16,7 @@ Exposure: TypeAlias = Annotated[Duration, Field(gt=0)]
 class LoadSettings(Settings):
     """``load``: fill the static tweezers with atoms."""
 
-    duration: Duration = Field(default=0.5, description="how long the atom source is on")
+    duration: Duration = Field(default=0.5, description="how long atoms load")
 
 
 class ImageSettings(Settings):
@@ -30,7 +30,8 @@ class RearrangeSettings(Settings):
 
     cycles: int = Field(default=1, ge=1, le=100, description="most cycles of plan, move and image")
     window: Duration | tuple[Duration, ...] = Field(
-        default=60e-3, description="most time for the moves of one cycle; a list gives one per cycle"
+        default=60e-3,
+        description="most time for the moves of one cycle, overheads included; a list gives one per cycle",
     )
     exposure: Exposure = Field(default=45e-3, description="exposure time of the image that ends a cycle")
     stop_when: Literal["defect_free", "never"] = Field(

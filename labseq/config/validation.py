@@ -13,7 +13,16 @@ from pydantic import BaseModel, ValidationError
 from labseq.config.nodes import Loc, Mark, Node
 from labseq.config.schema import description_of, keys_of, models_at
 from labseq.config.settings import FOLDER
-from labseq.config.wording import EXPECTED_TYPES, Words, clean, closest, listing, put_in_words, shown
+from labseq.config.wording import (
+    EXPECTED_TYPES,
+    Words,
+    clean,
+    closest,
+    comma_hint,
+    listing,
+    put_in_words,
+    shown,
+)
 
 M = TypeVar("M", bound=BaseModel)
 
@@ -123,7 +132,7 @@ def _findings(error: ValidationError, model: type[BaseModel], top: Node, asked: 
     misspelt = {_meant_key(one, model, asked) for one in chosen if one.error["type"] == "extra_forbidden"}
     for one in chosen:
         if one.error["type"] == "extra_forbidden":
-            findings.append(_unknown_key(one, model, asked))
+            findings.append(_unknown_key(one, model, top, asked))
         elif one.error["type"] != "missing":
             findings.append(_wrong_value(one, top, asked))
         elif isinstance(index := one.loc[-1], int):
@@ -186,16 +195,19 @@ def _wrong_value(one: _Placed, top: Node, asked: Asked) -> Finding:
     return Finding(loc, put_in_words(one.error, name, node.plain(), node.raw), bool(context.get("key")))
 
 
-def _unknown_key(one: _Placed, model: type[BaseModel], asked: Asked) -> Finding:
+def _unknown_key(one: _Placed, model: type[BaseModel], top: Node, asked: Asked) -> Finding:
     loc, key = one.loc, clean(str(one.loc[-1]))
+    node = top.at(loc)
+    comma = comma_hint(key, node.value) if node is not None else ""
     known = _known_keys(loc[:-1], model, asked)
     owner = _called(loc[:-1], asked)
     if not known:
-        words = Words(f"{owner} takes no settings, but '{key}' is given", "", "remove it")
+        words = Words(f"{owner} takes no settings, but '{key}' is given", "", comma or "remove it")
         return Finding(loc, words, key=True)
     meant = closest(key, known)
     hint = "put a space after the ':'" if ":" in key else f"did you mean '{meant}'?" if meant else ""
-    return Finding(loc, Words(f"'{key}' is not a setting of {owner}", listing(known), hint), key=True)
+    words = Words(f"'{key}' is not a setting of {owner}", listing(known), comma or hint)
+    return Finding(loc, words, key=True)
 
 
 def _missing_key(one: _Placed, model: type[BaseModel], top: Node, asked: Asked) -> Finding:

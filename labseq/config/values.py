@@ -13,6 +13,7 @@ from pydantic import BaseModel
 from labseq.config.nodes import Mark, Node
 from labseq.config.settings import NoSettings
 from labseq.config.validation import Asked, validate
+from labseq.config.wording import clean
 from labseq.errors import ConfigError
 
 M = TypeVar("M", bound=BaseModel)
@@ -33,7 +34,7 @@ def validate_values(model: type[M] | None, values: Mapping[str, Any], called: st
     Raises:
         ConfigError: Everything that is wrong with them.
     """
-    root = _node(dict(values), Mark(0, 0, called))
+    root = node_of(dict(values), Mark(0, 0, called))
     result = validate(model or NoSettings, root, Asked("", "it"))
     if isinstance(result, list):
         raise ConfigError(
@@ -42,18 +43,25 @@ def validate_values(model: type[M] | None, values: Mapping[str, Any], called: st
     return None if model is None else cast("M", result)
 
 
-def _node(value: Any, mark: Mark) -> Node:
+def node_of(value: Any, mark: Mark) -> Node:
+    """Plain values as nodes that all stand at one place.
+
+    Raises:
+        ConfigError: A value that no file could hold.
+    """
     if isinstance(value, np.ndarray | np.generic):
         value = value.tolist()
     if isinstance(value, Mapping):
-        items = cast("Mapping[Any, Any]", value).items()
-        return Node({str(key): _node(inner, mark) for key, inner in items}, mark)
+        nodes = {str(key): node_of(inner, mark) for key, inner in cast("Mapping[Any, Any]", value).items()}
+        return Node(nodes, mark, dict.fromkeys(nodes, mark))
     if isinstance(value, list | tuple | set | frozenset):
-        return Node([_node(inner, mark) for inner in cast("list[Any]", value)], mark)
+        return Node([node_of(inner, mark) for inner in cast("list[Any]", value)], mark)
     if isinstance(value, Enum):
-        return _node(value.value, mark)
+        return node_of(value.value, mark)
     if isinstance(value, PurePath):
         return Node(str(value), mark)
+    if isinstance(value, str) and any("\ud800" <= char <= "\udfff" for char in value):
+        raise ConfigError(mark.problem("", f"half of a character stands in '{clean(value)}'", "text"))
     if value is None or isinstance(value, str | int | float):
         return Node(value, mark)
     kind = type(cast("object", value)).__name__

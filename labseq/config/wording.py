@@ -69,6 +69,13 @@ def closest(name: str, names: Iterable[str]) -> str:
     return folded[found[0]] if found else ""
 
 
+def comma_hint(key: str, value: Any) -> str:
+    """What to do about a key such as "5 ms" without a value, out of ``{exposure: 4,5 ms}``, or ""."""
+    if value is None and key[:1].isdigit():
+        return "a ',' begins another key: write 4.5 for 4,5 and [4, 5] for a list"
+    return ""
+
+
 def listing(names: Iterable[str]) -> str:
     """Name the keys that are known: "one of rows, cols"."""
     known = list(names)

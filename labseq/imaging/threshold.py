@@ -67,7 +67,7 @@ class ThresholdLike(Protocol):
         ...
 
     @property
-    def threshold(self) -> float | str | Sequence[Sequence[float]]:
+    def threshold(self) -> float | str | Path | Sequence[Sequence[float]]:
         """Counts over the offset, summed over the region, above which there is an atom."""
         ...
 
@@ -155,10 +155,10 @@ def _region_pixels(settings: ThresholdLike, grid: SiteGrid) -> NDArray[np.intp]:
 
 
 def _thresholds(
-    threshold: float | str | Sequence[Sequence[float]], shape: tuple[int, int]
+    threshold: float | str | Path | Sequence[Sequence[float]], shape: tuple[int, int]
 ) -> NDArray[np.float64]:
     """One threshold per site, float64 (n_rows, n_cols)."""
-    if isinstance(threshold, str):
+    if isinstance(threshold, str | Path):
         values, source = _load(Path(threshold)), f"the thresholds in {threshold}"
     else:
         values, source = threshold, "the detector's thresholds"
@@ -182,7 +182,8 @@ def _load(path: Path) -> NDArray[np.float64]:
         with path.open("rb") as file:
             return np.lib.format.read_array(file, allow_pickle=False).astype(np.float64)
     except (OSError, ValueError, TypeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else str(error)
         raise ConfigError(
-            f"the detector's thresholds cannot be read from '{path}': {error}; "
+            f"the detector's thresholds cannot be read from '{path}': {reason}; "
             "expected a .npy file of one float per site"
         ) from error

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,14 +18,10 @@ from labseq.model import CycleRecord, Plan, ShotRecord, StageTiming, TargetPatte
 from labseq.model.records import RunStatus, ShotStatus
 from labseq.recording import folders
 from labseq.recording.durable import read_lines
-from labseq.recording.run_file import read_run, read_state, target_of
+from labseq.recording.run_file import is_index_row, read_run, read_state, target_of
 
 if TYPE_CHECKING:
     from labseq.recording.shot_reader import ShotContent
-
-_NEEDED: Final = frozenset(
-    {"shot", "attempt", "counts", "file", "status", "success", "filling_fraction", "seen_defect_free_cycle"}
-)
 
 
 def open_run(path: str | Path) -> Run:
@@ -43,7 +39,7 @@ def open_run(path: str | Path) -> Run:
     record = read_run(folder)
     status, error = read_state(folder)
     rows, damaged = read_lines(folder / folders.INDEX_FILE)
-    usable = [row for row in rows if _is_usable(row)]
+    usable = [row for row in rows if is_index_row(row)]
     load = lru_cache(maxsize=8)(_load)  # looking at several values of a shot reads its file once
     counted = {row["shot"]: row for row in usable if row["counts"]}  # a shot written again: the last one
     return Run(
@@ -55,10 +51,6 @@ def open_run(path: str | Path) -> Run:
         attempts=tuple(Shot(folder / row["file"], row, load) for row in usable if not row["counts"]),
         n_damaged_lines=len(damaged) + len(rows) - len(usable),
     )
-
-
-def _is_usable(row: dict[str, Any]) -> bool:
-    return row.keys() >= _NEEDED and isinstance(row["shot"], int) and isinstance(row["file"], str)
 
 
 def _load(path: Path) -> ShotContent:

@@ -6,7 +6,8 @@ import hashlib
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, cast
+from types import UnionType
+from typing import Any, Final, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,19 @@ from labseq.recording.durable import parse_object
 from labseq.recording.folders import PROFILE_FILE, RUN_FILE, SEQUENCE_FILE, STATE_FILE
 from labseq.recording.plain import dumps, to_plain
 from labseq.recording.process import Owner
+
+_IN_RUN: Final = {"name": str, "n_shots": int, "seed": int, "simulated": bool, "target": dict}
+_IN_INDEX: Final[Mapping[str, type | UnionType]] = {
+    "shot": int,
+    "attempt": int,
+    "counts": bool,
+    "file": str,
+    "status": str,
+    "success": bool,
+    "filling_fraction": float | int | None,
+    "seen_defect_free_cycle": int,
+}
+_STATUSES: Final = ("running", "complete", "stopped", "failed")
 
 
 def encode_text(text: str) -> bytes:
@@ -65,9 +79,9 @@ def read_run(folder: Path) -> dict[str, Any]:
     if record is None or record.get("format") != layout.RUN_FORMAT:
         raise RecordingError(path, "is damaged, or not labseq's; take it from a backup")
     check_version(path, str(record.get("format_version")), layout.RUN_FORMAT_VERSION)
-    missing = [name for name in ("name", "n_shots", "seed", "simulated", "target") if name not in record]
-    if missing:
-        raise RecordingError(path, f"is damaged: it has no '{missing[0]}'; take it from a backup")
+    wrong = [name for name, kind in _IN_RUN.items() if not isinstance(record.get(name), kind)]
+    if wrong:
+        raise RecordingError(path, f"is damaged: it has no valid '{wrong[0]}'; take it from a backup")
     return record
 
 
@@ -122,7 +136,7 @@ def read_state(folder: Path) -> tuple[RunStatus, str]:
         state = parse_object((folder / STATE_FILE).read_bytes())
     except OSError:
         state = None
-    if state is None or state.get("state") not in {"running", "complete", "stopped", "failed"}:
+    if state is None or state.get("state") not in _STATUSES:
         return "failed", f"{STATE_FILE} is missing or damaged"
     status = cast("RunStatus", state["state"])
     if status != "running":
@@ -161,3 +175,8 @@ def index_row(shot: ShotRecord, *, file: str, sha256: str, n_bytes: int) -> dict
         "sha256": sha256,
         "bytes": n_bytes,
     }
+
+
+def is_index_row(row: Mapping[str, Any]) -> bool:
+    """Whether a line of the index holds what a run cannot be shown without; other values may be missing."""
+    return all(name in row and isinstance(row[name], kind) for name, kind in _IN_INDEX.items())

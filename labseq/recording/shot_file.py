@@ -50,11 +50,10 @@ class ShotEncoder:
         try:
             with h5py.File(buffer, "r+", libver=layout.LIBRARY_VERSIONS) as file:
                 self._write_shot(file["entry"], shot)
-        except (ValueError, TypeError, OverflowError) as error:
+        except Exception as error:  # a stranger's camera or step may put anything into the record
             where = f"shot {shot.shot_index} (attempt {shot.attempt})"
-            raise RecordingError(
-                where, f"cannot be laid out as a file: {error}; see the step that made it"
-            ) from error
+            what = f"cannot be laid out as a file: {type(error).__name__}: {error}"
+            raise RecordingError(where, f"{what}; see the plugin that made it") from error
         return buffer.getbuffer()
 
     def _encode_common(self) -> bytes:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 import queue
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any, Final, ParamSpec, TypeVar
 
-from labseq.errors import DeviceError, DeviceTimeoutError, LabseqError, PlanError
+from labseq.errors import DeviceError, DeviceTimeoutError, LabseqError, PlanError, StopRequested
 from labseq.sequencer.clock import LOOK_S, StopFlag
 
 P = ParamSpec("P")
@@ -16,18 +18,22 @@ T = TypeVar("T")
 
 GRACE_S: Final = 1.0
 """How long a call may take to come back after a stop request."""
+STEP_GRACE_S: Final = 2.0
+"""The same for a step, whose own call into a device has its grace first."""
 
 
 class _Job:
-    def __init__(self, function: Callable[[], Any]) -> None:
-        self._function = function
+    def __init__(self, work: partial[Any]) -> None:
+        self._work = work
+        name = getattr(work.func, "__name__", "")
+        self.name = f"{name}() " if name.isidentifier() else ""  # a lambda has none
         self.done = threading.Event()
         self.result: Any = None
         self.error: BaseException | None = None
 
     def run(self) -> None:
         try:
-            self.result = self._function()
+            self.result = self._work()
         except BaseException as error:  # noqa: BLE001 - handed to the thread that waits
             self.error = error
         self.done.set()
@@ -71,16 +77,26 @@ class Guard:
     def call(
         self, owner: str, timeout_s: float, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs
     ) -> T:
-        """Call a function; see ``labseq.roles.Shot.call``."""
+        """Call a function; see ``labseq.roles.Shot.call``.
+
+        After a stop request nothing is called any more, not even while it is held:
+        a step that was given up must not switch anything on behind the safe state.
+        """
+        if self._stop.is_set:
+            raise StopRequested(self._stop.signal_number)
+        job = self._submit(owner, partial(function, *args, **kwargs))
+        return self._wait(owner, job, timeout_s, GRACE_S)
+
+    def run_step(self, run: partial[None]) -> None:
+        """Run a step, however long it takes; after a stop request one that hangs is given up."""
         self._stop.check()
-        return self._wait(owner, self._submit(owner, lambda: function(*args, **kwargs)), timeout_s, True)
+        self._wait("step", self._submit("step", run), math.inf, STEP_GRACE_S)
 
     def call_to_the_end(
         self, owner: str, timeout_s: float, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs
     ) -> T:
         """The same, whether or not the run is asked to stop; for safe states and closing."""
-        job = self._submit(owner, lambda: function(*args, **kwargs))
-        return self._wait(owner, job, timeout_s, False)
+        return self._wait(owner, self._submit(owner, partial(function, *args, **kwargs)), timeout_s)
 
     def end(self) -> None:
         """Let idle threads end; a hung one is left to the end of the process."""
@@ -88,8 +104,8 @@ class Guard:
             worker.end()
         self._workers.clear()
 
-    def _submit(self, owner: str, function: Callable[[], Any]) -> _Job:
-        job = _Job(function)
+    def _submit(self, owner: str, work: partial[Any]) -> _Job:
+        job = _Job(work)
         worker = self._workers.get(owner)
         if worker is not None and worker.busy:
             worker.end()  # it hangs: leave it behind
@@ -99,30 +115,32 @@ class Guard:
         worker.submit(job)
         return job
 
-    def _wait(self, owner: str, job: _Job, timeout_s: float, stoppable: bool) -> Any:
+    def _wait(self, owner: str, job: _Job, timeout_s: float, grace_s: float = math.inf) -> Any:
         deadline = time.monotonic() + timeout_s
         while not job.done.wait(min(LOOK_S, max(0.0, deadline - time.monotonic()))):
-            if stoppable and self._stop.is_set:
-                job.done.wait(GRACE_S)
+            if grace_s < math.inf and self._stop.is_set:
+                job.done.wait(grace_s)
                 if not job.done.is_set():
                     self._stop.check()
             if time.monotonic() >= deadline and not job.done.is_set():
-                raise _timeout(owner, timeout_s)
+                raise _timeout(owner, job.name, timeout_s)
         if job.error is not None:
-            raise _translated(owner, job.error)
+            raise _translated(owner, job.name, job.error)
         return job.result
 
 
-def _timeout(owner: str, timeout_s: float) -> LabseqError:
-    text = f"did not answer within {timeout_s:.3g} s and is given up"
+def _timeout(owner: str, name: str, timeout_s: float) -> LabseqError:
+    text = f"{name}did not answer within {timeout_s:.3g} s and is given up"
     return PlanError(text) if owner == "planner" else DeviceTimeoutError(owner, text, timeout_s)
 
 
-def _translated(owner: str, error: BaseException) -> BaseException:
-    """Name the plugin in whatever it raised; labseq's own errors pass as they are."""
+def _translated(owner: str, name: str, error: BaseException) -> BaseException:
+    """Name the plugin and the call in whatever it raised; labseq's own errors pass as they are."""
     if isinstance(error, LabseqError):
         return error
-    text = f"raised {type(error).__name__}: {error}" if str(error) else f"raised {type(error).__name__}"
+    text = f"{name}raised {type(error).__name__}"
+    if str(error):
+        text += f": {error}"
     named = PlanError(text) if owner == "planner" else DeviceError(owner, text)
     named.__cause__ = error
     return named

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
+from functools import partial
 from typing import Any, Protocol
 
 from labseq.errors import LabseqError, StopRequested, TransientError
-from labseq.model import ShotRecord, TimelineEntry
+from labseq.model import ShotRecord
 from labseq.model.records import ShotStatus
 from labseq.roles import RunObserver, Step
 from labseq.sequencer.clock import StopFlag
@@ -67,7 +68,7 @@ class Sequencer:
         self._states = StateTable(lambda state: self._emit("state", {"state": state.value}))
         self._unsafe: dict[str, LabseqError] = {}
         self._budgets = [
-            sum(entry.duration_s for entry in _timeline(step, number, name, lab))
+            self.guard.call("step", lab.timeouts.call_s, _budget, step, number, name, lab)
             for number, (name, step) in enumerate(steps)
         ]
 
@@ -160,8 +161,8 @@ class Sequencer:
         for number, (name, step) in enumerate(self._steps):
             self._stop.check()
             shot.begin_step(number)
-            with shot.stage(f"step {number} {name}", self._budgets[number]), _named(number, name):
-                step.run(shot)
+            with shot.stage(f"step {number} {name}", self._budgets[number]):
+                self.guard.run_step(partial(_run, step, number, name, shot))
         shot.note_truth()
 
     def _recover(self) -> None:
@@ -195,9 +196,14 @@ class Sequencer:
         self._observer.event(name, values)
 
 
-def _timeline(step: Step, number: int, name: str, lab: Lab) -> Sequence[TimelineEntry]:
+def _budget(step: Step, number: int, name: str, lab: Lab) -> float:
     with _named(number, name):
-        return step.plan_timeline(lab.step_context)
+        return sum(entry.duration_s for entry in step.plan_timeline(lab.step_context))
+
+
+def _run(step: Step, number: int, name: str, shot: RunningShot) -> None:
+    with _named(number, name):
+        step.run(shot)
 
 
 @contextmanager
@@ -207,7 +213,7 @@ def _named(number: int, name: str) -> Generator[None]:
         yield
     except LabseqError:
         raise
-    except (Exception, SystemExit) as error:
+    except BaseException as error:
         text = f"step {number} ({name}) raised {type(error).__name__}: {error}"
         raise LabseqError(text) from error
 

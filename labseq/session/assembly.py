@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,55 +15,18 @@ from labseq.config import (
     Override,
     ProfileSpec,
     SequenceSpec,
-    StepSpec,
     load_profile,
     load_sequence,
     plugin_paths,
     split_overrides,
 )
-from labseq.config.settings import Settings
-from labseq.errors import ConfigError, LabseqError, PluginLoadError, UnknownPluginError, one_of
-from labseq.model import SiteGrid, TargetPattern
+from labseq.errors import ConfigError
+from labseq.model import TargetPattern
 from labseq.plugins import PluginHost
 from labseq.roles import Clock, Step
 from labseq.sequencer.lab import Lab, Timeouts
-from labseq.session.choosing import (
-    HARDWARE_KINDS,
-    Chosen,
-    DryRun,
-    choose,
-    construct,
-    construct_target,
-    dump,
-    resolve,
-    validate,
-)
-
-
-@dataclass(frozen=True, slots=True)
-class Bench:
-    """A profile with its plugins chosen, before anything is opened.
-
-    Attributes:
-        document: The profile's file.
-        profile: What it says.
-        host: The plugins.
-        grid: The grid of sites.
-        chosen: Role or device name -> what plays it; no planner.
-        warnings: What the user should know although it is no error.
-    """
-
-    document: Document
-    profile: ProfileSpec
-    host: PluginHost
-    grid: SiteGrid
-    chosen: Mapping[str, Chosen]
-    warnings: tuple[str, ...]
-
-    @property
-    def virtual_time(self) -> bool:
-        """Whether no device needs real time."""
-        return all(c.entry.virtual_time for c in self.chosen.values() if c.entry.kind in HARDWARE_KINDS)
+from labseq.session.choosing import Bench, Chosen, DryRun, check_dry_run, choose, construct, resolve, validate
+from labseq.session.contents import make_steps, make_target
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,24 +82,32 @@ def assemble(
         UnknownPluginError: A plugin that is named does not exist.
         PluginLoadError: A plugin that is named failed to load.
     """
+    check_dry_run(dry_run)
     for_sequence, for_profile = split_overrides(overrides)
-    document, sequence = load_sequence(sequence_path, [*given, *for_sequence])
     found = Collected()
-    bench = set_up_bench(
-        profile or sequence.profile,
-        Path() if profile else sequence_path.parent,
-        for_profile,
-        dry_run,
-        named_in=None if profile else document,
-        plugin_folders=plugin_paths(document, sequence.plugin_folders),
-        found=found,
-    )
+    try:
+        document, sequence = load_sequence(sequence_path, [*given, *for_sequence], found=found)
+    except ConfigError as error:
+        raise found.stop(error) from None
+    try:
+        bench = set_up_bench(
+            sequence.profile if profile is None else profile,
+            sequence_path.parent if profile is None else Path(),
+            for_profile,
+            dry_run,
+            named_in=document if profile is None else None,
+            plugin_folders=plugin_paths(document, sequence.plugin_folders),
+            found=found,
+        )
+    except ConfigError as error:
+        _check_alone(document, sequence, found)
+        raise found.stop(error) from None
     made: dict[str, Any] = {}
     with found:
-        made["target"], made["target_dump"] = _make_target(bench, document, sequence)
+        made["target"], made["target_dump"] = make_target(bench, document, sequence)
     with found:
         made["planner"] = resolve(bench.host, document, "planner", sequence.planner)
-    steps, step_dumps = _make_steps(bench, document, sequence, found)
+    steps, step_dumps = make_steps(bench, document, sequence, found)
     found.raise_any()
     resolved = {
         **sequence.model_dump(mode="json", exclude={"shot", "target", "planner"}),
@@ -148,6 +119,23 @@ def assemble(
     return Assembly(
         document, sequence, bench, made["target"], made["planner"], tuple(steps), dry_run, resolved
     )
+
+
+def _check_alone(document: Document, sequence: SequenceSpec, found: Collected) -> None:
+    """Check a sequence without its profile: the settings of what needs no plugin folder."""
+    host = PluginHost()
+    host.load_builtin(builtins)
+    host.load_entry_points()
+    choices = [("pattern", sequence.target), ("planner", sequence.planner)]
+    for kind, choice in choices:
+        if host.registry.find(kind, choice.use) is not None:
+            with found:
+                resolve(host, document, kind, choice)
+    for spec in sequence.shot:
+        entry = host.registry.find("step", spec.kind)
+        if entry is not None:
+            with found:
+                validate(document, entry, spec.loc)
 
 
 def set_up_bench(
@@ -169,15 +157,15 @@ def set_up_bench(
         dry_run: "off", "full" or "fast".
         named_in: The sequence that names the profile, for messages.
         plugin_folders: Folders with plugins beside those that the profile names.
-        found: Where the problems with roles go; without it they are raised.
+        found: Where the problems of a profile that can be read go; without it they are raised.
 
     Raises:
         ConfigError: The profile is wrong.
         PluginLoadError: A plugin that it names failed to load.
     """
-    document, spec = load_profile(profile, beside=beside, overrides=overrides, named_in=named_in)
+    document, spec = load_profile(profile, beside=beside, overrides=overrides, named_in=named_in, found=found)
     host = load_plugins([*plugin_paths(document, spec.plugin_folders), *plugin_folders])
-    problems = found or Collected()
+    problems = Collected() if found is None else found
     chosen: dict[str, Chosen] = {}
     warnings: list[str] = []
     for role, choice in {**spec.choices, **spec.devices}.items():
@@ -206,72 +194,6 @@ def _profile_dump(bench: Bench) -> dict[str, Any]:
     roles["mobile_tweezers"] |= spec.mobile_tweezers.model_dump(mode="json", exclude={"use"})
     devices = {name: bench.chosen[name].dump() for name in spec.devices}
     return {**core, **roles, "devices": devices}
-
-
-def _make_target(
-    bench: Bench, document: Document, sequence: SequenceSpec
-) -> tuple[TargetPattern, dict[str, Any]]:
-    choice, grid = sequence.target, bench.grid
-    chosen = resolve(bench.host, document, "pattern", choice)
-    try:
-        target = construct_target(chosen, grid)
-    except PluginLoadError:
-        raise
-    except LabseqError as error:
-        problem = document.problem(choice.loc, str(error))
-        raise ConfigError(replace(problem, notes=(_grid_note(bench),))) from error
-    return target, {"pattern": chosen.entry.name, **dump(chosen.settings)}
-
-
-def _make_steps(
-    bench: Bench, document: Document, sequence: SequenceSpec, found: Collected
-) -> tuple[list[tuple[str, Step]], list[dict[str, Any]]]:
-    steps: list[tuple[str, Step]] = []
-    dumps: list[dict[str, Any]] = []
-    image_seen = False
-    for spec in sequence.shot:
-        with found:
-            step, settings = _make_step(bench, document, spec)
-            steps.append((spec.name or spec.kind, step))
-            dumps.append({spec.kind: dump(settings), **({"name": spec.name} if spec.name else {})})
-            if step.needs_image and not image_seen:
-                what = f"'{spec.kind}' needs an image before it in the shot"
-                raise document.error(spec.loc, what, "an 'image' step before it", key=True)
-            image_seen = image_seen or step.takes_image
-    return steps, dumps
-
-
-def _make_step(bench: Bench, document: Document, spec: StepSpec) -> tuple[Step, Settings | None]:
-    try:
-        entry = bench.host.get("step", spec.kind)
-    except UnknownPluginError as error:
-        what = f"unknown step '{spec.kind}'"
-        raise document.error(spec.loc, what, one_of(error.known), error.hint, key=True) from None
-    settings = validate(document, entry, spec.loc)
-    if spec.kind == "device":
-        _check_device_name(bench, document, settings, spec)
-    try:
-        return entry.factory(settings), settings
-    except ConfigError as error:
-        raise document.error(spec.loc, str(error)) from error
-
-
-def _check_device_name(bench: Bench, document: Document, settings: Settings | None, spec: StepSpec) -> None:
-    name = getattr(settings, "name", None)
-    if name not in bench.profile.devices:
-        what = f"the profile '{bench.profile.name}' has no device '{name}'"
-        problem = document.problem((*spec.loc, "name"), what, one_of(sorted(bench.profile.devices)))
-        raise ConfigError(replace(problem, notes=(_place(bench.document, "devices"),)))
-
-
-def _grid_note(bench: Bench) -> str:
-    grid = bench.grid
-    return f"the grid has {grid.n_rows} x {grid.n_cols} sites: {_place(bench.document, 'grid')}"
-
-
-def _place(document: Document, key: str) -> str:
-    line, column = document.locate((key,), key=True)
-    return f"see '{key}' at {document.path}:{line}:{column}"
 
 
 def build_lab(assembly: Assembly, clock: Clock, seed: int) -> Lab:

@@ -106,6 +106,8 @@ def check(session: Session) -> CheckReport:
     if rehearsal is not None:
         warnings += _window_warnings(session, windows, rehearsal)
     warnings += _exposure_warnings(session, lab, timeline)
+    warnings += _judgement_warnings(session, [number for number, _ in windows])
+    warnings += _parallelism_warnings(session)
     return CheckReport(
         timeline, assembly.sequence.shots, tuple(warnings), rehearsal, _shot_bytes(session, lab, timeline)
     )
@@ -185,6 +187,28 @@ def _exposure_warnings(
             expected = f"at most {format_quantity(limit_s, 'time')}"
             problems.append(document.problem((*spec.loc, "exposure"), what, expected))
     return problems
+
+
+def _judgement_warnings(session: Session, rearrangements: Sequence[int]) -> list[Problem]:
+    """Success is judged on the last ``image`` step; one before the last rearrangement shows nothing of it."""
+    assembly = session.assembly
+    images = [n for n, (_, step) in enumerate(assembly.steps) if step.takes_image and n not in rearrangements]
+    if not rearrangements or max(images, default=-1) > rearrangements[-1]:
+        return []
+    loc = assembly.sequence.shot[rearrangements[-1]].loc
+    what = "no image follows the last rearrangement, so the shot's success is judged without it"
+    return [assembly.document.problem(loc, what, "an 'image' step at the end of the shot", key=True)]
+
+
+def _parallelism_warnings(session: Session) -> list[Problem]:
+    assembly = session.assembly
+    asked = getattr(assembly.planner.settings, "degree_of_parallelism", None)
+    limit = assembly.bench.profile.motion.max_tweezers
+    if not isinstance(asked, int) or asked <= limit:
+        return []
+    loc = (*assembly.sequence.planner.loc, "degree_of_parallelism")
+    what = f"degree_of_parallelism is {asked}, but the profile allows {limit} mobile tweezers at once"
+    return [assembly.document.problem(loc, what, f"at most {limit}")]
 
 
 def _shot_bytes(

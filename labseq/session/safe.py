@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 from labseq.config import split_overrides
 from labseq.errors import LabseqError, StopRequested
@@ -29,31 +29,33 @@ def secure(
         observer: Told each device's outcome.
 
     Returns:
-        Device name -> what went wrong, or None.
+        Device name -> why it is not safe, or None. One that is safe and only cannot be
+        closed is told to the observer alone, as at the end of a run.
     """
     guard = Guard(StopFlag())
     outcome: dict[str, LabseqError | None] = {}
     if simulation is not None:
         guard.call_to_the_end("simulation", timeouts.call_s, simulation.open)
     for name, device in devices:
-        failure: LabseqError | None = None
-        calls = (
-            (device.open, timeouts.call_s),
-            (device.safe_state, timeouts.safe_state_s),
-            (device.close, timeouts.safe_state_s),
-        )
-        for method, timeout_s in calls:
-            try:
-                guard.call_to_the_end(name, timeout_s, method)
-            except LabseqError as error:  # a device that cannot be opened may still be made safe
-                failure = failure or error
-        outcome[name] = failure
+        opened = _try(guard, name, timeouts.call_s, device.open)
+        safe = _try(guard, name, timeouts.safe_state_s, device.safe_state)  # perhaps even if it did not open
+        closed = _try(guard, name, timeouts.safe_state_s, device.close)
+        outcome[name] = opened or safe
         if observer is not None:
-            observer.event("safe_state", {"device": name, "ok": failure is None, "error": str(failure or "")})
+            for event, failure in (("safe_state", outcome[name]), ("closed", closed)):
+                observer.event(event, {"device": name, "ok": failure is None, "error": str(failure or "")})
     if simulation is not None:
         guard.call_to_the_end("simulation", timeouts.call_s, simulation.close)
     guard.end()
     return outcome
+
+
+def _try(guard: Guard, name: str, timeout_s: float, method: Callable[[], None]) -> LabseqError | None:
+    try:
+        guard.call_to_the_end(name, timeout_s, method)
+    except LabseqError as failure:
+        return failure
+    return None
 
 
 def make_profile_safe(

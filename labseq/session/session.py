@@ -8,16 +8,16 @@ from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from types import TracebackType
-from typing import ParamSpec, Self
+from typing import Final, ParamSpec, Self
 
 from labseq import motion
-from labseq.errors import ConfigError, DeviceError, LabseqError, StopRequested
+from labseq.errors import ConfigError, DeviceError, LabseqError, PlanError, StopRequested
 from labseq.kernels.compile import announcing
 from labseq.model import RunRecord, TimelineEntry
 from labseq.model.records import RunStatus
 from labseq.recording import Run, RunWriter, clear_active, data_root, died, mark_active, open_run
 from labseq.roles import RunObserver, Warmable
-from labseq.sequencer import PacedClock, RealClock, Sequencer, StopFlag, VirtualClock
+from labseq.sequencer import Guard, PacedClock, RealClock, Sequencer, StopFlag, VirtualClock
 from labseq.sequencer.lab import Lab, describe
 from labseq.session.assembly import Assembly, assemble, build_lab
 from labseq.session.choosing import DryRun
@@ -28,6 +28,9 @@ from labseq.session.safe import secure
 from labseq.session.signals import stop_on_signals
 
 P = ParamSpec("P")
+
+WARM_S: Final = 300.0
+"""How long a planner or detector may compile; a slow computer needs half a minute."""
 
 
 class Session:
@@ -46,6 +49,9 @@ class Session:
         if self.seed is None:
             self.seed = secrets.randbits(63)
         self.run_dir: Path | None = None
+        # What the hardware is known by; a dry run touches none, and says nothing about it.
+        profile = str(assembly.bench.document.path.resolve())  # now: vendors' libraries change the folder
+        self._profile_key = profile if options.dry_run == "off" else f"{profile} (dry run)"
         self.stop_flag = StopFlag()
         self._observers = Observers(assembly.bench.host, observer)
         self._sequencer: Sequencer | None = None
@@ -148,12 +154,20 @@ class Session:
 
         with announcing(announce):
             motion.warm()
-            for part in (lab.planner, lab.detector):
-                if isinstance(part, Warmable):
-                    part.warm()
-                self.stop_flag.check()
+            self._warm_plugins(lab)
         if compiled:
             self._observers.event("compiled", {"duration_s": time.monotonic() - start_s})
+
+    def _warm_plugins(self, lab: Lab) -> None:
+        guard = Guard(self.stop_flag)
+        for name, part in (("planner", lab.planner), ("detector", lab.detector)):
+            if isinstance(part, Warmable):
+                try:
+                    guard.call(name, WARM_S, part.warm)
+                except PlanError as error:
+                    raise error if error.planner else PlanError(str(error), lab.planner_name) from error
+            self.stop_flag.check()
+        guard.end()
 
     def _run(self, lab: Lab, root: Path) -> Run:
         self._secure_after_crash(lab, root)
@@ -217,12 +231,6 @@ class Session:
             act(*args, **kwargs)
         except LabseqError as failure:
             self._observers.event("warning", {"text": str(failure)})
-
-    @property
-    def _profile_key(self) -> str:
-        """What the hardware is known by; a dry run touches none, and says nothing about it."""
-        path = str(self.assembly.bench.document.path.resolve())
-        return path if self.options.dry_run == "off" else f"{path} (dry run)"
 
     def _secure_after_crash(self, lab: Lab, root: Path) -> None:
         """If the last run on this profile died, its devices may still be on."""

@@ -41,6 +41,14 @@ def test_bars_follow_one_another_and_stay_in_their_column(durations_s: list[floa
     assert starts == sorted(starts)
 
 
+def test_a_narrow_terminal_gets_no_bars() -> None:
+    assert not any("#" in line for line in timeline_table(TIMELINE, "#", 0))
+    assert (
+        max(map(len, timeline_table(TIMELINE, "#", 7)))
+        == len("1 image                   500 ms    45 ms  ") + 7
+    )
+
+
 def test_a_timeline_of_no_length() -> None:
     assert timeline_table([("x", [TimelineEntry("x", 0.0, 0.0)])], "#")[1].split() == [
         "0",

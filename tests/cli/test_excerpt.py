@@ -32,6 +32,26 @@ def test_tabs_keep_the_caret_in_place(tmp_path: Path):
     assert shown(tmp_path, "\tb: 1\n", 1, 2)[1] == "      | \t^"
 
 
+def test_wide_and_combining_characters_keep_the_caret_in_place(tmp_path: Path):
+    assert shown(tmp_path, "{東京: e\u0301, wrng: 東}\n", 1, 10)[1] == "      | " + " " * 10 + "^^^^"
+    assert shown(tmp_path, "a: 東京 x\n", 1, 4)[1] == "      |    ^^^^^^"
+
+
+def test_a_colon_inside_of_a_word_belongs_to_it(tmp_path: Path):
+    assert shown(tmp_path, "{time: 10:30, b: 1}\n", 1, 8)[1] == "      |        ^^^^^"
+
+
+def test_a_narrow_terminal_gets_a_narrow_excerpt(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("COLUMNS", "40")
+    line, carets = shown(tmp_path, "x" * 60 + " wrong: 1 " + "東" * 60, 1, 62)
+    assert len(line) <= 40
+    assert line[carets.index("^") :].startswith("wrong")
+
+
+def test_a_file_in_utf_16_is_not_shown(tmp_path: Path):
+    assert shown(tmp_path, "a: 1\n".encode("utf-16"), 1, 1) == []
+
+
 def test_long_lines_are_cut_around_the_place(tmp_path: Path):
     line, carets = shown(tmp_path, "x" * 200 + " wrong: 1 " + "y" * 200, 1, 202)
     assert len(line) <= 110

@@ -1,6 +1,6 @@
 import pytest
 
-from labseq.cli.failures import exit_code_of, lines_of, report
+from labseq.cli.failures import MAX_TOLD, exit_code_of, lines_of, report
 from labseq.errors import (
     ConfigError,
     DeviceTimeoutError,
@@ -63,3 +63,9 @@ def test_only_debug_shows_the_traceback(debug: bool, capsys: pytest.CaptureFixtu
     err = capsys.readouterr().err
     assert ("Traceback" in err) is debug
     assert err.endswith("error: no plan\n")
+
+
+def test_of_very_many_problems_the_first_are_told(capsys: pytest.CaptureFixture[str]) -> None:
+    assert report(ConfigError([Problem(f"wrong {i}") for i in range(MAX_TOLD + 3)])) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[-2:] == [f"error: wrong {MAX_TOLD - 1}", "and 3 more problems"]

@@ -24,7 +24,7 @@ CASES = [
         "role missing",
         "camera: {use: virtual, readout: 5 ms}\n",
         "",
-        "p.yaml:2:1: 'camera' is missing (the camera)",
+        "p.yaml:2:1: 'camera' is missing (what takes images)",
     ),
     (
         "role by name alone",

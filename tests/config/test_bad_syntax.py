@@ -240,6 +240,24 @@ CASES = [
         "s.yaml:5:8: an invisible character (U+FEFF, zero width no-break space); expected plain text; delete it",
     ),
     (
+        "no-break space for indentation",
+        "  - image: {",
+        "\u00a0 - image: {",
+        "s.yaml:16:1: a no-break space (U+00A0) is used for indentation; expected plain spaces",
+    ),
+    (
+        "wide space behind the dash",
+        "  - image: {",
+        "  -\u3000image: {",
+        "s.yaml:16:4: an ideographic space (U+3000) is used for indentation; expected plain spaces",
+    ),
+    (
+        "list without brackets",
+        "cols: 15}",
+        "cols: 15, origin: 1,2}",
+        "s.yaml:7:58: a key is 2; expected text; a ',' begins another key: write 4.5 for 4,5 and [4, 5] for a list",
+    ),
+    (
         "surrogate",
         "name: compact-225",
         'name: "\\ud800"',

@@ -61,10 +61,17 @@ def test_unknown_name(shelves: Path) -> None:
 def test_place_of_the_name_is_told() -> None:
     document = Document.parse("labseq: 1\nprofile: virtul\n", "s.yaml")
     assert refusal("virtul", document).startswith("s.yaml:2:10: there is no hardware profile 'virtul' in ")
-    document = document.override("profile", "b.yaml", "--set profile=b.yaml")
-    Path("sequences/a.yaml").touch()
-    expected = f"there is no hardware profile at {Path('sequences') / 'b.yaml'}; did you mean 'a.yaml'?"
-    assert refusal("b.yaml", document) == f"--set profile=b.yaml: {expected}"
+    document = document.override("profile", "lab_onn.yaml", "--set profile=lab_onn.yaml")
+    Path("sequences/lab_one.yaml").touch()
+    what = f"there is no hardware profile at {Path('sequences') / 'lab_onn.yaml'}"
+    expected = f"--set profile=lab_onn.yaml: {what}; did you mean 'lab_one.yaml'?"
+    assert refusal("lab_onn.yaml", document) == expected
+
+
+def test_a_file_that_only_ends_alike_is_not_meant() -> None:
+    Path("sequences/other.yaml").touch()
+    assert "did you mean" not in refusal("./nope.yaml")
+    assert refusal("./").startswith("there is a folder, not a hardware profile, at ")
 
 
 @pytest.mark.parametrize("name", ["", "..", "a\0b", "x" * 5000, "~nobody-of-this-name/x.yaml", "\0/x.yaml"])
@@ -74,7 +81,7 @@ def test_odd_names(name: str) -> None:
 
 
 def test_folder_is_no_profile() -> None:
-    Path("sequences/lab.yaml").mkdir()
+    Path("sequences/lalab_onn.yaml").mkdir()
     assert refusal("lab").startswith("there is no hardware profile 'lab'")
 
 

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import errno
 import os
+import stat
 from pathlib import Path
 
 import pytest
@@ -51,6 +52,20 @@ def test_the_error_says_what_to_do(number: int, advice: str, tmp_path: Path) -> 
     with pytest.raises(RecordingError, match=advice) as caught, explained(tmp_path):
         raise OSError(number, os.strerror(number))
     assert caught.value.path == str(tmp_path)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows opens no folders")
+def test_a_folder_that_cannot_be_flushed_is_no_fault(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    real = os.fsync
+
+    def network_folder(handle: int) -> None:
+        if stat.S_ISDIR(os.fstat(handle).st_mode):
+            raise OSError(errno.EINVAL, "Invalid argument")
+        real(handle)
+
+    monkeypatch.setattr(os, "fsync", network_folder)
+    write_file(tmp_path / "file", b"one")
+    assert (tmp_path / "file").read_bytes() == b"one"
 
 
 def test_a_log_goes_on_after_a_torn_line(tmp_path: Path) -> None:

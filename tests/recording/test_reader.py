@@ -106,6 +106,20 @@ def test_damaged_lines_are_counted_and_do_not_hide_the_others(run_dir: Path) -> 
     assert run.n_damaged_lines == 3
 
 
+@pytest.mark.parametrize(
+    "name", ["attempt", "counts", "success", "filling_fraction", "seen_defect_free_cycle"]
+)
+@pytest.mark.parametrize("value", ["x", [], {}])
+def test_a_line_with_a_value_of_the_wrong_kind_is_damaged(run_dir: Path, name: str, value: Any) -> None:
+    index = run_dir / "index.jsonl"
+    lines = index.read_text("utf-8").splitlines()
+    odd = json.dumps({**json.loads(lines[0]), name: value})
+    index.write_text("\n".join([odd, *lines[1:], ""]), "utf-8")
+    run = open_run(run_dir)
+    assert [shot.index for shot in run.shots] == [1, 2]
+    assert run.n_damaged_lines == 1
+
+
 def test_a_shot_written_again_counts_once(tmp_path: Path, make_run: MakeRun, make_shot: MakeShot) -> None:
     writer = RunWriter.create(tmp_path, make_run())
     writer.write_shot(make_shot(0, success=False))
@@ -129,7 +143,7 @@ def test_a_run_on_another_computer_is_believed(run_dir: Path) -> None:
     assert open_run(run_dir).status == "running"
 
 
-@pytest.mark.parametrize("content", [b"", b"{}", b'{"state": "odd"}', None])
+@pytest.mark.parametrize("content", [b"", b"{}", b'{"state": "odd"}', b'{"state": {}}', None])
 def test_a_run_without_a_state_has_failed(run_dir: Path, content: bytes | None) -> None:
     (run_dir / "STATE").unlink()
     if content is not None:
@@ -148,9 +162,10 @@ def test_a_damaged_run_file_is_explained(run_dir: Path, content: bytes) -> None:
 def test_a_run_file_that_lacks_something_is_explained(run_dir: Path) -> None:
     record = json.loads((run_dir / "run.json").read_text("utf-8"))
     del record["seed"]
-    (run_dir / "run.json").write_text(json.dumps(record), "utf-8")
-    with pytest.raises(RecordingError, match=r"run.json: is damaged: it has no 'seed'"):
-        open_run(run_dir)
+    for damaged in (record, {**record, "seed": "x"}, {**record, "seed": None}):
+        (run_dir / "run.json").write_text(json.dumps(damaged), "utf-8")
+        with pytest.raises(RecordingError, match=r"run.json: is damaged: it has no valid 'seed'"):
+            open_run(run_dir)
 
 
 def test_a_damaged_target_is_explained(run_dir: Path) -> None:

@@ -217,3 +217,12 @@ def test_a_record_that_contradicts_itself_is_explained(make_run: MakeRun, make_s
     shot.images[1] = dataclasses.replace(shot.images[1], occupancy=np.zeros((2, 2), np.bool_))
     with pytest.raises(RecordingError, match=r"shot 5 \(attempt 0\): cannot be laid out as a file"):
         ShotEncoder(make_run(), "day/run").encode(shot)
+
+
+def test_a_record_that_a_plugin_has_spoilt_is_explained(make_run: MakeRun, make_shot: MakeShot) -> None:
+    shot = make_shot(5)
+    frame = shot.images[0].frame
+    assert frame is not None
+    object.__setattr__(frame, "camera", None)
+    with pytest.raises(RecordingError, match=r"AttributeError: .*; see the plugin that made it"):
+        ShotEncoder(make_run(), "day/run").encode(shot)

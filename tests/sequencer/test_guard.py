@@ -1,4 +1,5 @@
 import threading
+from functools import partial
 
 import pytest
 
@@ -55,7 +56,7 @@ def test_even_system_exit_is_named(guard):
 
 def test_a_call_that_hangs_is_given_up(guard):
     release = threading.Event()
-    with pytest.raises(DeviceTimeoutError, match=r"camera: did not answer within 0\.02 s") as caught:
+    with pytest.raises(DeviceTimeoutError, match=r"camera: wait\(\) did not answer within 0\.02 s") as caught:
         guard.call("camera", 0.02, release.wait)
     assert caught.value.timeout_s == 0.02
     release.set()
@@ -84,6 +85,27 @@ def test_no_call_is_made_after_a_stop_request(guard, stop):
     with pytest.raises(StopRequested):
         guard.call("camera", 10.0, called.set)
     assert not called.is_set()
+
+
+def test_no_call_is_made_while_a_stop_request_is_held(guard, stop):
+    called = threading.Event()
+    stop.request()
+    with stop.held(), pytest.raises(StopRequested):
+        guard.call("static_tweezers", 10.0, called.set)  # a step that was given up and has come back
+    assert not called.is_set()
+
+
+def test_a_step_that_hangs_is_left_at_a_stop_request(guard, stop, monkeypatch):
+    monkeypatch.setattr("labseq.sequencer.guard.STEP_GRACE_S", 0.01)
+    release = threading.Event()
+
+    def hang():
+        stop.request(15)
+        release.wait()
+
+    with pytest.raises(StopRequested, match="SIGTERM"):
+        guard.run_step(partial(hang))
+    release.set()
 
 
 def test_safe_states_are_called_after_a_stop_request(guard, stop):

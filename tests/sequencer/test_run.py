@@ -199,7 +199,7 @@ def test_a_safe_state_that_hangs_is_given_up():
 def test_a_device_that_hangs_is_named_and_still_made_safe():
     timeouts = Timeouts(call_s=0.05, safe_state_s=10.0, plan_s=10.0)
     rig = Rig(hang_on={"camera.trigger"}, timeouts=timeouts)
-    with pytest.raises(DeviceTimeoutError, match="camera: did not answer within"):
+    with pytest.raises(DeviceTimeoutError, match=r"camera: trigger\(\) did not answer within"):
         rig.run()
     assert rig.made_safe() == SAFE_ORDER
     assert not rig.unsafe
@@ -288,7 +288,7 @@ def test_frames_are_kept_as_they_came():
 def test_a_recovery_that_fails_keeps_the_attempt():
     lost, jammed = TransientError("frame lost", "camera"), OSError("jammed")
     rig = Rig(fail_on={"camera.read": lost, "camera.safe_state": [jammed]})
-    with pytest.raises(DeviceError, match="camera: raised OSError: jammed"):
+    with pytest.raises(DeviceError, match=r"camera: safe_state\(\) raised OSError: jammed"):
         rig.run()
     assert rig.record().status == "failed"
     assert rig.record().timing
@@ -327,10 +327,10 @@ def test_a_simulation_that_fails_is_named_and_all_devices_are_safe(method):
         assert told == {
             "device": "simulation",
             "ok": False,
-            "error": "simulation: raised ValueError: nothing there",
+            "error": "simulation: fail() raised ValueError: nothing there",
         }
     else:
-        with pytest.raises(DeviceError, match="simulation: raised ValueError: nothing there"):
+        with pytest.raises(DeviceError, match=r"simulation: fail\(\) raised ValueError: nothing there"):
             rig.run()
     assert rig.made_safe() == SAFE_ORDER
     assert rig.sequencer.state is State.CLOSED
@@ -372,7 +372,7 @@ def test_an_ending_that_was_cut_short_begins_anew():
     assert rig.sequencer.state is State.CLOSED
 
 
-@pytest.mark.parametrize("error", [KeyError("typo"), SystemExit(0)])
+@pytest.mark.parametrize("error", [KeyError("typo"), SystemExit(0), KeyboardInterrupt()])
 @pytest.mark.parametrize("method", ["plan_timeline", "run"])
 def test_whatever_a_third_party_step_raises_is_named(method, error):
     class Broken:
@@ -390,6 +390,21 @@ def test_whatever_a_third_party_step_raises_is_named(method, error):
     setattr(Broken, method, fail)
     with pytest.raises(LabseqError, match=rf"step 0 \(mine\) raised {type(error).__name__}"):
         Rig(steps=(("mine", Broken()),)).run()
+
+
+@pytest.mark.parametrize("answer", [None, "bars", [None]])
+def test_a_timeline_that_is_none_is_named(answer):
+    class Broken:
+        needs_image = takes_image = False
+
+        def plan_timeline(self, context):
+            return answer
+
+        def run(self, shot):
+            return None
+
+    with pytest.raises(LabseqError, match=r"step 0 \(mine\) raised (Type|Attribute)Error"):
+        Rig(steps=(("mine", Broken()),))
 
 
 class TestRearrange:

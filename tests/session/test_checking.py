@@ -118,3 +118,14 @@ def test_a_planner_that_fails_is_a_warning(tmp_path: Path):
     (warning,) = check(labseq.Session.open(path)).warnings
     assert "raised KeyError: 'typo'" in warning.what
     assert warning.line == next(i for i, line in enumerate(text.splitlines(), 1) if "broken" in line)
+
+
+def test_a_rearrangement_that_no_image_follows():
+    (warning,) = checked("shot=[{load: {}}, {image: {}}, {rearrange: {cycles: 3}}]").warnings
+    assert "no image follows the last rearrangement" in warning.what
+
+
+def test_a_degree_of_parallelism_that_the_profile_does_not_allow():
+    (warning,) = checked("planner.degree_of_parallelism=700").warnings
+    assert warning.source == "--set planner.degree_of_parallelism=700"
+    assert "the profile allows 20 mobile tweezers at once" in warning.what

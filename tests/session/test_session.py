@@ -54,7 +54,8 @@ def test_a_run_reads_back(tmp_path):
     assert 0.9 < shot.filling_fraction <= 1.0
     assert {t.stage for t in shot.timing} >= {"expose", "detect", "plan", "check", "prepare", "play", "move"}
     assert shot.parameters == {"shots": "2", "seed": "3"}
-    assert done.record["resolved"]["planner"] == {"use": "psca", "degree_of_parallelism": 7}
+    planner = done.record["resolved"]["planner"]
+    assert (planner["use"], planner["degree_of_parallelism"], planner["variant"]) == ("psca", 7, "fewest")
     assert done.record["resolved"]["profile"]["mobile_tweezers"]["speed"] == 0.13
     assert done.record["devices"]["camera"]
     assert {p["name"] for p in done.record["plugins"]} == {"labseq_psca", "labseq_virtual", "labseq.builtins"}
@@ -362,6 +363,12 @@ def test_a_damaged_plan_is_stopped_before_anything_plays(tmp_path, damage):
         ),
         ("return labseq.Plan.from_batches(batches)", "return batches", PlanError, "expected a Plan"),
         (
+            "    def plan(",
+            "    def warm(self):\n        raise SystemExit(0)\n\n    def plan(",
+            PlanError,
+            r"warm\(\) raised SystemExit: 0",
+        ),
+        (
             "def __init__(self, settings, context):",
             "def __init__(self, settings, context):\n        raise OSError('no')",
             labseq.PluginLoadError,
@@ -370,7 +377,7 @@ def test_a_damaged_plan_is_stopped_before_anything_plays(tmp_path, damage):
         (
             "import labseq\n",
             "import labseq\nimport nothing_like_it\n",
-            labseq.PluginLoadError,
+            labseq.ConfigError,
             "nothing_like_it",
         ),
     ],
@@ -380,6 +387,19 @@ def test_a_plugin_that_fails_is_named(tmp_path, old, new, kind, message):
     with pytest.raises(kind, match=message) as caught:
         run(tmp_path, path, seed=1)
     assert "mine" in str(caught.value)
+
+
+def test_a_plugin_that_changes_the_folder_does_no_harm(tmp_path, monkeypatch):
+    code = "\n\n@labseq.hookimpl\ndef labseq_run_started(run):\n    __import__('os').chdir('/')\n"
+    path = with_plugin(tmp_path, THIRD_PARTY + code)
+    (tmp_path / "own.yaml").write_text(
+        (ROOT / "hardware_profiles" / "virtual.yaml").read_text("utf-8"), "utf-8"
+    )
+    monkeypatch.chdir(tmp_path)
+    with labseq.Session.open(path.name, profile="own.yaml", shots=1, output="here") as session:
+        assert session.run().path.is_relative_to(tmp_path / "here")
+    assert Path.cwd() != tmp_path
+    assert list((tmp_path / "here" / ".active").iterdir()) == []
 
 
 def test_an_unwritable_place_is_named_before_anything_opens(tmp_path):

@@ -43,6 +43,7 @@ def watched(cls, role):
                 return getattr(cls, method)(self, *args, **kwargs)
             finally:
                 self.__dict__["inside"] = False
+        call.__name__ = method
         return call
 
     names = [n for n in dir(cls) if not n.startswith("_") and callable(getattr(cls, n))]

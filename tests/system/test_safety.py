@@ -78,10 +78,10 @@ def test_a_signal_before_the_run_has_begun_ends_it(bench):
 @pytest.mark.parametrize(
     ("call", "says"),
     [
-        ("camera.read", "camera: raised RuntimeError: rehearsed failure"),
-        ("mobile_tweezers.prepare", "mobile_tweezers: raised RuntimeError: rehearsed failure"),
-        ("static_tweezers.open", "static_tweezers: raised RuntimeError: rehearsed failure"),
-        ("mobile_tweezers.open", "mobile_tweezers: raised RuntimeError: rehearsed failure"),
+        ("camera.read", "camera: read() raised RuntimeError: rehearsed failure"),
+        ("mobile_tweezers.prepare", "mobile_tweezers: prepare() raised RuntimeError: rehearsed failure"),
+        ("static_tweezers.open", "static_tweezers: open() raised RuntimeError: rehearsed failure"),
+        ("mobile_tweezers.open", "mobile_tweezers: open() raised RuntimeError: rehearsed failure"),
     ],
 )
 def test_a_device_that_fails_is_named_and_all_are_made_safe(bench, call, says):
@@ -111,7 +111,7 @@ def test_a_device_that_hangs_is_given_up(bench, call):
     device = call.split(".")[0]
     if call == "camera.read":
         assert done.returncode == 3
-        assert "camera: did not answer within" in done.stderr
+        assert "camera: read() did not answer within" in done.stderr
     failures = [e["values"]["device"] for e in bench.events("safe_state") if not e["values"]["ok"]]
     assert failures == ([device] if call.endswith("safe_state") else [])
 
@@ -148,3 +148,7 @@ def test_the_safe_command(bench):
     done = bench.run("safe", "watched.yaml")
     assert done.returncode == 3
     assert "camera" in done.stdout + done.stderr
+    bench.environment["WATCHED_FAILS"] = "camera.close"
+    done = bench.run("safe", "watched.yaml")
+    assert done.returncode == 0
+    assert "could not be closed: camera: close() raised RuntimeError" in done.stdout

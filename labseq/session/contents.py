@@ -1,0 +1,91 @@
+"""What a sequence asks for: its target and its steps."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+from labseq.config import Collected, Document, SequenceSpec, StepSpec
+from labseq.config.settings import Settings
+from labseq.errors import ConfigError, LabseqError, PluginLoadError, one_of
+from labseq.model import TargetPattern
+from labseq.roles import Step
+from labseq.session.choosing import Bench, construct_target, dump, named, resolve, validate
+
+
+def make_target(
+    bench: Bench, document: Document, sequence: SequenceSpec
+) -> tuple[TargetPattern, dict[str, Any]]:
+    """The target of a sequence, and its settings for the record.
+
+    Raises:
+        ConfigError: The pattern is unknown, its settings are wrong, or it does not fit on the grid.
+        PluginLoadError: The pattern's plugin is at fault; names it.
+    """
+    choice, grid = sequence.target, bench.grid
+    chosen = resolve(bench.host, document, "pattern", choice)
+    try:
+        target = construct_target(chosen, grid)
+    except PluginLoadError:
+        raise
+    except LabseqError as error:
+        problem = document.problem(choice.loc, str(error))
+        raise ConfigError(replace(problem, notes=(_grid_note(bench),))) from error
+    return target, {"pattern": chosen.entry.name, **dump(chosen.settings)}
+
+
+def make_steps(
+    bench: Bench, document: Document, sequence: SequenceSpec, found: Collected
+) -> tuple[list[tuple[str, Step]], list[dict[str, Any]]]:
+    """Name and step, in order, and the settings of each for the record.
+
+    Args:
+        bench: The profile.
+        document: The sequence's file.
+        sequence: What it says.
+        found: Where the problems go.
+    """
+    steps: list[tuple[str, Step]] = []
+    dumps: list[dict[str, Any]] = []
+    image_seen = False
+    for spec in sequence.shot:
+        step: Step | None = None
+        with found:
+            step, settings = _make_step(bench, document, spec)
+            steps.append((spec.name or spec.kind, step))
+            dumps.append({spec.kind: dump(settings), **({"name": spec.name} if spec.name else {})})
+            if step.needs_image and not image_seen:
+                what = f"'{spec.kind}' needs an image before it in the shot"
+                raise document.error(spec.loc, what, "an 'image' step before it", key=True)
+        # Whether a step that is wrong would take an image, nobody knows.
+        image_seen = image_seen or step is None or step.takes_image
+    return steps, dumps
+
+
+def _make_step(bench: Bench, document: Document, spec: StepSpec) -> tuple[Step, Settings | None]:
+    entry = named(bench.host, document, "step", spec.kind, spec.loc, key=True)
+    settings = validate(document, entry, spec.loc)
+    if spec.kind == "device":
+        _check_device_name(bench, document, settings, spec)
+    try:
+        return entry.factory(settings), settings
+    except ConfigError as error:
+        raise document.error(spec.loc, str(error)) from error
+
+
+def _check_device_name(bench: Bench, document: Document, settings: Settings | None, spec: StepSpec) -> None:
+    name = getattr(settings, "name", None)
+    if name not in bench.profile.devices:
+        what = f"the profile '{bench.profile.name}' has no device '{name}'"
+        problem = document.problem((*spec.loc, "name"), what, one_of(sorted(bench.profile.devices)))
+        raise ConfigError(replace(problem, notes=(_place(bench.document, "devices"),)))
+
+
+def _grid_note(bench: Bench) -> str:
+    grid = bench.grid
+    return f"the grid has {grid.n_rows} x {grid.n_cols} sites: {_place(bench.document, 'grid')}"
+
+
+def _place(document: Document, key: str) -> str:
+    line, column = document.locate((key,), key=True)
+    return f"see '{key}' at {document.path}:{line}:{column}"

@@ -1,0 +1,252 @@
+"""Wrong files as a session meets them: every error of both, in one go, and none that only follows from another."""
+
+# ruff: noqa: E501 - messages stand here as they are printed
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import labseq
+from labseq.errors import ConfigError, PluginLoadError
+from labseq.session import check
+
+ROOT = Path(__file__).parents[2]
+SEQUENCE = (ROOT / "sequences" / "compact_225.yaml").read_text(encoding="utf-8")
+PROFILE = (ROOT / "hardware_profiles" / "virtual.yaml").read_text(encoding="utf-8")
+TIME = "expected a time such as '45 ms' (s, ms, us, ns, min, h) or a plain number in s"
+NO_HOOK = "it implements no hook; write '@hookimpl' above 'def labseq_register'"
+
+CASES: list[tuple[str, dict[str, str], list[str]]] = [
+    (
+        "a wrong exposure hides no image from the rearrangement",
+        {"- image: {exposure: 45 ms}": "- image: {exposure: 45 parsecs}"},
+        [f"s.yaml:12:23: exposure: 'parsecs' in '45 parsecs' is not a unit of time; {TIME}"],
+    ),
+    (
+        "a misspelt image hides no image from the rearrangement",
+        {"- image: {exposure: 45 ms}": "- imge: {exposure: 45 ms}"},
+        ["s.yaml:12:5: unknown step 'imge'; expected ...; did you mean 'image'?"],
+    ),
+    (
+        "no image before the rearrangement",
+        {"  - image: {exposure: 45 ms}\n  #": "  #"},
+        ["s.yaml:13:5: 'rearrange' needs an image before it in the shot; expected an 'image' step before it"],
+    ),
+    (
+        "the file's own keys and plugins' settings",
+        {"shots: 20": "shots: 0", "rows: 15": "rows: 0", "duration: 500 ms": "time: 500 ms"},
+        [
+            "s.yaml:5:8: shots is 0; expected at least 1",
+            "s.yaml:7:34: rows is 0; expected at least 1",
+            "s.yaml:11:12: 'time' is not a setting of step 'load'; expected duration",
+        ],
+    ),
+    (
+        "sequence and profile",
+        {"use: psca": "use: pcsa", "spacing: 4.49 um": "spacing: 0", "readout: 5 ms": "readout: 5 Hz"},
+        [
+            "p.yaml:16:12: spacing is 0; expected more than 0",
+            f"p.yaml:27:12: readout: '5 Hz' is a frequency, not a time; {TIME}",
+            "s.yaml:8:16: unknown planner 'pcsa'; expected ...; did you mean 'psca'?",
+        ],
+    ),
+    (
+        "a wrong grid says nothing of the target's size",
+        {"rows: 20 ": "rows: -20 "},
+        ["p.yaml:14:9: rows is -20; expected at least 1"],
+    ),
+    (
+        "a wrong device takes no other away",
+        {
+            "shutter: {use: virtual": "laser: 5\n  shutter: {use: virtual",
+            "- image: {exposure: 45 ms}": "- device: {name: shutter, do: open}\n  - image: {exposure: 45 ms}",
+        },
+        ["p.yaml:68:10: laser is 5; expected a mapping (key: value)"],
+    ),
+    (
+        "one wrong step among right ones",
+        {"- load: {duration: 500 ms}": "- load", "window: 60 ms": "window: 60 mm"},
+        [
+            "s.yaml:11:5: a step is just 'load'; expected a mapping; write '- load: {}'",
+            f"s.yaml:14:37: window: '60 mm' is a length, not a time; {TIME}",
+        ],
+    ),
+    (
+        "no profile: the settings are checked all the same",
+        {"profile: p.yaml": "profile: ./gone.yaml", "rows: 15": "rows: 0", "use: psca": "use: elsewhere"},
+        [
+            "s.yaml:4:10: there is no hardware profile at gone.yaml",
+            "s.yaml:7:34: rows is 0; expected at least 1",
+        ],
+    ),
+    (
+        "plugin folders missing: what they would offer is not unknown",
+        {"shots: 20": "shots: 0\nplugin_folders: [gone]", "use: psca": "use: mine"},
+        [
+            "s.yaml:5:8: shots is 0; expected at least 1",
+            "s.yaml:6:18: there is no plugin folder 'gone'; expected a folder at gone",
+        ],
+    ),
+    (
+        "plugin folders wrong: what they would offer is not unknown",
+        {"shots: 20": "shots: 20\nplugin_folders: mine", "use: psca": "use: mine"},
+        ["s.yaml:6:17: plugin_folders is 'mine'; expected a list ([a, b], or lines that begin with '- ')"],
+    ),
+    (
+        "a comma for a decimal point",
+        {"- image: {exposure: 45 ms}": "- image: {exposure: 4,5 ms}"},
+        [
+            "s.yaml:12:25: '5 ms' is not a setting of step 'image'; expected exposure; a ',' begins another key: write 4.5 for 4,5 and [4, 5] for a list"
+        ],
+    ),
+    (
+        "a target larger than the grid",
+        {"rows: 15": "rows: 25"},
+        [
+            "s.yaml:7:9: the size of the target is 25 rows x 15 columns; the limit is the grid of 20 rows x 20 columns; choose a smaller target, or a profile with a larger grid"
+        ],
+    ),
+    (
+        "a device that the profile lacks",
+        {"- image: {exposure: 45 ms}": "- device: {name: shuter, do: open}\n  - image: {exposure: 45 ms}"},
+        ["s.yaml:12:20: the profile 'virtual' has no device 'shuter'; expected 'shutter'"],
+    ),
+]
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def write(changes: dict[str, str]) -> None:
+    sequence, profile = SEQUENCE.replace("profile: virtual", "profile: p.yaml"), PROFILE
+    for old, new in changes.items():
+        assert old in sequence or old in profile
+        sequence, profile = (
+            (sequence.replace(old, new, 1), profile)
+            if old in sequence
+            else (sequence, profile.replace(old, new, 1))
+        )
+    Path("s.yaml").write_text(sequence, encoding="utf-8")
+    Path("p.yaml").write_text(profile, encoding="utf-8")
+
+
+def messages(**options: Any) -> list[str]:
+    with pytest.raises(ConfigError) as caught:
+        check(labseq.Session.open("s.yaml", **options))
+    return [str(problem) for problem in caught.value.problems]
+
+
+@pytest.mark.parametrize(("changes", "expected"), [pytest.param(*case[1:], id=case[0]) for case in CASES])
+def test_all_messages(changes: dict[str, str], expected: list[str]) -> None:
+    write(changes)
+    # What plugins offer, and so what is expected, changes with the plugins.
+    assert [
+        re.sub(r"^(.* unknown .*; expected )(one of )?'.*'(;|$)", r"\1...\3", m) for m in messages()
+    ] == expected
+
+
+def test_wrong_options_are_told_with_the_files() -> None:
+    write({"rows: 15": "rows: 0"})
+    assert messages(shots=0, overrides=["planr.x=1", "profile.camera.gain=5"]) == [
+        "--set planr.x=1: there is no 'planr' in s.yaml; expected one of labseq, name, profile, shots, target, planner, shot; did you mean 'planner'?",
+        "--shots 0: shots is 0; expected at least 1",
+        "--set profile.camera.gain=5: 'gain' is not a setting of camera 'virtual'; expected one of readout, max_exposure, faults",
+        "s.yaml:7:34: rows is 0; expected at least 1",
+    ]
+
+
+def test_an_empty_profile_name_is_no_name() -> None:
+    write({})
+    assert messages(profile="")[0].startswith("there is no hardware profile '' in ")
+
+
+@pytest.mark.parametrize("dry_run", [True, False, None, "slow", "Full"])
+def test_a_wrong_kind_of_dry_run_is_refused(dry_run: Any) -> None:
+    write({})
+    assert messages(dry_run=dry_run) == [f"dry_run is {dry_run!r}; expected one of 'off', 'full', 'fast'"]
+
+
+@pytest.mark.parametrize("overrides", ["shots=5", [("shots", "5")], [5]])
+def test_overrides_of_the_wrong_type_are_refused(overrides: Any) -> None:
+    write({})
+    assert messages(overrides=overrides) == [
+        f"overrides is {overrides!r}; expected a list of texts such as ['shots=5']"
+    ]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("spacing: 4.49 um", "spacing: 4.49", "the region of interest of site (0, 0) is rows "),
+        ("threshold: 1630", "threshold: gone.npy", "thresholds cannot be read from 'gone.npy': No such file"),
+        ("threshold: 1630", "threshold: [[1, 2]]", "the shape of the detector's thresholds is (1, 2)"),
+    ],
+)
+def test_what_a_constructor_refuses_has_its_place(old: str, new: str, words: str) -> None:
+    write({old: new})
+    (message,) = messages()
+    assert message.startswith("p.yaml:56:3: ")
+    assert words in message
+
+
+def test_thresholds_are_looked_for_beside_the_profile() -> None:
+    write({"threshold: 1630": "threshold: t.npy"})
+    Path("lab").mkdir()
+    Path("p.yaml").rename("lab/p.yaml")
+    np.save("lab/t.npy", np.full((20, 20), 1630.0))
+    check(labseq.Session.open("s.yaml", profile=os.fspath(Path("lab", "p.yaml"))))
+
+
+PLUGIN = """
+from labseq import hookimpl
+LABSEQ_API = 1
+
+class Mine:
+    def __init__(self, settings, context): pass
+    def plan(self, occupancy, target): return None
+
+@hookimpl
+def labseq_register(registry):
+    registry.planner("mine", Mine)
+"""
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "use", "words"),
+    [
+        ("LABSEQ_API", "import nothing_like_it\nLABSEQ_API", "mine", "No module named 'nothing_like_it'"),
+        ("@hookimpl\n", "", "mine", NO_HOOK),
+        (
+            '"mine"',
+            '"psca"',
+            "psca",
+            "planner 'psca' is offered by 'labseq_psca' already; rename one of them",
+        ),
+    ],
+)
+def test_a_plugin_that_does_not_load_is_told_where_it_is_named(
+    old: str, new: str, use: str, words: str
+) -> None:
+    write({"{use: psca, degree_of_parallelism: 7}": f"{{use: {use}}}", "rows: 15": "rows: 0"})
+    Path("plugins").mkdir()
+    Path("plugins/mine.py").write_text(PLUGIN.replace(old, new, 1), encoding="utf-8")
+    first, second = messages(overrides=["plugin_folders=[plugins]"])
+    assert first == "s.yaml:7:34: rows is 0; expected at least 1"
+    assert second.startswith("s.yaml:8:16: plugin 'mine' failed to load: ")
+    assert words in second
+
+
+def test_an_object_without_the_methods_of_its_role_is_named() -> None:
+    write({"{use: psca, degree_of_parallelism: 7}": "{use: mine}"})
+    Path("plugins").mkdir()
+    Path("plugins/mine.py").write_text(PLUGIN.replace("def plan(", "def plann("), encoding="utf-8")
+    with pytest.raises(PluginLoadError, match=r"planner 'mine' has no plan; see labseq\.Planner"):
+        check(labseq.Session.open("s.yaml", overrides=["plugin_folders=[plugins]"]))
