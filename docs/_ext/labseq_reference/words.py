@@ -1,0 +1,223 @@
+"""Types, limits and defaults of settings, in the words of somebody who writes YAML."""
+
+from __future__ import annotations
+
+import math
+import re
+import types
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Final, Literal, Union, get_args, get_origin
+
+from annotated_types import Ge, Gt, Le, Lt, MaxLen, MinLen
+from pydantic import BaseModel, BeforeValidator
+from pydantic.fields import FieldInfo
+from pydantic_core import PydanticUndefined
+
+from labseq.config import Choice, settings
+from labseq.config.composer import compose
+from labseq.errors import ConfigError
+from labseq.units import EXAMPLES, format_quantity, parse_quantity
+
+_ALIASES: Final = {
+    "time": settings.Duration,
+    "length": settings.Length,
+    "frequency": settings.Frequency,
+    "speed": settings.Speed,
+    "voltage": settings.Voltage,
+    "temperature": settings.Temperature,
+    "angle": settings.Angle,
+    "fraction": settings.Fraction,
+}
+_DIMENSIONS: Final = {
+    found: dimension
+    for dimension, alias in _ALIASES.items()
+    for found in get_args(alias)
+    if isinstance(found, BeforeValidator)
+}
+"""What reads a quantity -> its dimension."""
+_NOUNS: Final = {
+    bool: "true or false",
+    int: "whole number",
+    float: "number",
+    str: "text",
+    Path: "path of a file",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Words:
+    """What a value may be.
+
+    Attributes:
+        noun: "whole number", "list of times".
+        limits: "at least 1", or "".
+    """
+
+    noun: str
+    limits: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.noun}; {self.limits}" if self.limits else self.noun
+
+
+def value_of(field: FieldInfo) -> str:
+    """What may be written for a field: its type, an example where no default shows one, its limits."""
+    words = _words(field.annotation, field.metadata)
+    dimension = dimension_of(field)
+    if dimension and field.is_required():
+        words = Words(f"{words.noun} such as `{EXAMPLES[dimension]}`", words.limits)
+    return str(words)
+
+
+def default_of(field: FieldInfo) -> str:
+    """The default as it would be written in a file; "required", or "none"."""
+    if field.is_required():
+        return "required"
+    default = field.get_default(call_default_factory=True)
+    if default is None:
+        return "none"
+    return f"`{_written(default, dimension_of(field))}`"
+
+
+def dimension_of(field: FieldInfo) -> str:
+    """The dimension of a quantity, or of a list of them; "" for anything else."""
+    return next(filter(None, map(_dimension, _parts(field.annotation, field.metadata))), "")
+
+
+def _dimension(part: Any) -> str:
+    return _DIMENSIONS.get(part, "") if isinstance(part, BeforeValidator) else ""
+
+
+def _parts(annotation: Any, metadata: Sequence[Any]) -> Iterable[Any]:
+    """Everything that annotates a type, at any depth."""
+    yield from metadata
+    inner = get_args(annotation)
+    if get_origin(annotation) is Annotated:
+        yield from _parts(inner[0], inner[1:])
+    elif get_origin(annotation) is not Literal:
+        for one in inner:
+            yield from _parts(one, ())
+
+
+def _words(annotation: Any, metadata: Sequence[Any]) -> Words:
+    if get_origin(annotation) is Annotated:
+        plain, *more = get_args(annotation)
+        return _words(plain, [*more, *metadata])
+    flat = [one for item in metadata for one in (item.metadata if isinstance(item, FieldInfo) else [item])]
+    dimension = next(filter(None, map(_dimension, flat)), "")
+    found = Words(dimension) if dimension else _noun(annotation)
+    limits = [found.limits, _limits(flat, dimension), _lengths(flat, annotation)]
+    return Words(found.noun, ", ".join(filter(None, limits)))
+
+
+def _noun(annotation: Any) -> Words:
+    origin, inner = get_origin(annotation), get_args(annotation)
+    if origin in (Union, types.UnionType):
+        return _union([_words(one, ()) for one in inner if one is not type(None)])
+    if origin is Literal:
+        return Words(_either([f"`{_written(one, '')}`" for one in inner]))
+    if origin is dict:
+        return Words(f"mapping of names to {_plural(_words(inner[1], ()).noun)}")
+    if origin is list or (origin is tuple and inner[-1] is Ellipsis):
+        return _list("", _words(inner[0], ()))
+    if origin is tuple:
+        return _list(f"{len(inner)} ", _words(inner[0], ()))
+    if isinstance(annotation, type) and issubclass(annotation, Choice):
+        return Words(f"mapping with `{annotation.key}`")
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return Words("mapping")
+    return Words(_NOUNS.get(annotation) or annotation.__name__.removesuffix("Spec").lower())
+
+
+def _list(length: str, one: Words) -> Words:
+    return Words(f"list of {length}{_plural(one.noun)}", f"each {one.limits}" if one.limits else "")
+
+
+def _union(found: Sequence[Words]) -> Words:
+    nouns = sorted(dict.fromkeys(words.noun for words in found), key=lambda noun: " or " not in noun)
+    if "number" in nouns and "whole number" in nouns:
+        nouns.remove("whole number")
+    limits = dict.fromkeys(words.limits.removeprefix("each ") for words in found if words.limits)
+    return Words(_either(nouns), "; ".join(limits))
+
+
+def _either(nouns: Sequence[str]) -> str:
+    return " or ".join(filter(None, (", ".join(nouns[:-1]), nouns[-1])))
+
+
+def _plural(noun: str) -> str:
+    if noun.startswith(("list ", "mapping ")):
+        return re.sub(r"^\w+", lambda word: f"{word[0]}s", noun)
+    if " or " in noun:
+        return noun
+    return f"{noun[:-1]}ies" if noun.endswith("y") else f"{noun}s"
+
+
+def _limits(metadata: Sequence[Any], dimension: str) -> str:
+    """Only the tightest of several limits counts."""
+    low = max(
+        [(i.ge, False) for i in metadata if isinstance(i, Ge)]
+        + [(i.gt, True) for i in metadata if isinstance(i, Gt)],
+        default=None,
+    )
+    high = min(
+        [(i.le, True) for i in metadata if isinstance(i, Le)]
+        + [(i.lt, False) for i in metadata if isinstance(i, Lt)],
+        default=None,
+    )
+    if low and high and not low[1] and high[1]:
+        return f"{_limit(low[0], dimension)} to {_limit(high[0], dimension)}"
+    texts: list[str] = []
+    if low:
+        texts.append(f"{'more than' if low[1] else 'at least'} {_limit(low[0], dimension)}")
+    if high:
+        texts.append(f"{'at most' if high[1] else 'less than'} {_limit(high[0], dimension)}")
+    return ", ".join(texts)
+
+
+def _limit(value: Any, dimension: str) -> str:
+    if dimension and value:
+        return format_quantity(value, dimension)
+    power = value.bit_length() - 1 if isinstance(value, int) else 0
+    return f"2^{power}" if power > 30 and value == 2**power else f"{value:,}"
+
+
+def _lengths(metadata: Sequence[Any], annotation: Any) -> str:
+    unit = "characters" if annotation is str else "entries"
+    least = max((i.min_length for i in metadata if isinstance(i, MinLen)), default=0)
+    most = min((i.max_length for i in metadata if isinstance(i, MaxLen)), default=0)
+    if most:
+        return f"{least} to {most} {unit}"
+    return "not empty" if least == 1 else f"at least {least} {unit}" if least else ""
+
+
+def _written(value: Any, dimension: str) -> str:
+    """A value as YAML; a quantity with its unit."""
+    if value is PydanticUndefined or value is None:
+        return ""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(_written(one, dimension) for one in value)}]"
+    if isinstance(value, int | float) and dimension:
+        return _quantity(value, dimension)
+    if isinstance(value, str):
+        return _text(value)
+    return str(int(value)) if isinstance(value, float) and value.is_integer() else str(value)
+
+
+def _text(value: str) -> str:
+    """In quotes where YAML would read something else without them."""
+    try:
+        read = compose(f"[{value}]", "")
+    except ConfigError:
+        read = None
+    return value if read is not None and read.plain() == [value] else f'"{value}"'
+
+
+def _quantity(value: float, dimension: str) -> str:
+    """With as many digits as it needs to be read back the same."""
+    texts = (format_quantity(value, dimension, digits) for digits in range(3, 16))
+    return next((t for t in texts if math.isclose(parse_quantity(t, dimension), value)), str(value))

@@ -1,0 +1,247 @@
+"""Nothing is undocumented: settings, plugins, commands, roles and errors are in the built reference."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from types import FunctionType
+from typing import Any
+from xml.etree.ElementTree import Element
+
+import pytest
+import typer
+from pydantic import BaseModel, create_model
+from pydantic.fields import FieldInfo
+
+import labseq
+from labseq import errors, hookspecs, roles, testing
+from labseq.builtins import labseq_register
+from labseq.cli.app import app
+from labseq.cli.failures import exit_code_of
+from labseq.config import (
+    Choice,
+    ProfileSpec,
+    SequenceSpec,
+    TimeoutSettings,
+    load_profile,
+    load_sequence,
+)
+from labseq.config.composer import compose
+from labseq.config.fields import PatternChoice
+from labseq.config.profile import GridSettings, MobileTweezersChoice
+from labseq.registry import Entry, Registry
+
+Pages = Mapping[str, Element]
+Tables = Mapping[str, Element]
+
+ROOT = Path(__file__).parents[2]
+SEQUENCE = {
+    "labseq": "1",
+    "name": "x",
+    "profile": "virtual",
+    "shots": "1",
+    "seed": "1",
+    "target": "{pattern: compact, rows: 5, cols: 5}",
+    "planner": "{use: psca}",
+    "record_frames": "all",
+    "attempts": "1",
+    "plugin_folders": "[]",
+    "shot": "[{image: {}}]",
+}
+PROFILE = {
+    "labseq": "1",
+    "name": "x",
+    "grid": "{rows: 5, cols: 5, spacing: 5 um}",
+    "camera": "{use: virtual}",
+    "static_tweezers": "{use: virtual}",
+    "mobile_tweezers": "{use: virtual}",
+    "detector": "{use: threshold}",
+    "devices": "{}",
+    "simulation": "{use: virtual}",
+    "plugin_folders": "[]",
+    "timeouts": "{}",
+}
+
+
+def own_entries() -> list[Entry]:
+    """What labseq and the plugins that it ships register."""
+    registry = Registry()
+    labseq_register(registry)
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    for module in project["project"]["entry-points"]["labseq"].values():
+        __import__(module, fromlist=["labseq_register"]).labseq_register(registry)
+    return registry.entries()
+
+
+SUBJECTS: dict[str, type[BaseModel] | None] = {
+    "profile-grid": GridSettings,
+    "profile-mobile_tweezers": MobileTweezersChoice,
+    "profile-timeouts": TimeoutSettings,
+    **{f"{entry.kind}-{entry.name}": entry.settings_model for entry in own_entries()},
+}
+"""Class of a table in the reference -> the model whose keys it lists, at any depth."""
+FILES: dict[str, type[BaseModel]] = {"sequence": SequenceSpec, "profile": ProfileSpec}
+MODELS = sorted({m for m in [*SUBJECTS.values(), *FILES.values(), Choice, PatternChoice] if m}, key=str)
+
+
+def settings_of(model: type[BaseModel] | None, prefix: str = "") -> Iterator[tuple[str, FieldInfo]]:
+    """Every key of a model and of the mappings in it, with its field."""
+    for name, field in (model.model_fields if model is not None else {}).items():
+        key = prefix + (field.alias or name)
+        yield key, field
+        inner = field.annotation
+        if isinstance(inner, type) and issubclass(inner, BaseModel) and not issubclass(inner, Choice):
+            yield from settings_of(inner, f"{key}.")
+
+
+@pytest.fixture(scope="session")
+def tables(pages: Pages) -> Tables:
+    """Everything that a directive of the reference shows, by the classes that it gave it."""
+    found: dict[str, Element] = {}
+    for page in (tree for name, tree in pages.items() if name.startswith("reference/")):
+        for element in [*page.iter("table"), *page.iter("paragraph")]:
+            classes = element.get("classes", "").removeprefix("colwidths-auto ")
+            found[f"{classes} {text(element.find('.//thead//entry'))}".strip()] = element
+    return found
+
+
+def rows_of(tables: Tables, subject: str) -> dict[str, list[str]]:
+    """Key -> the texts of its row, in the table of a subject."""
+    shown = tables.get(f"settings {subject} key") or tables.get(f"settings {subject}")
+    assert shown is not None, f"no {{settings}} or {{registered}} directive shows '{subject}'"
+    rows = [[text(cell) for cell in row.iter("entry")] for row in shown.iter("row")]
+    return {row[0]: row for row in rows[1:]}
+
+
+def text(element: Element | None) -> str:
+    return "" if element is None else "".join(element.itertext()).strip()
+
+
+@pytest.mark.parametrize("model", MODELS, ids=lambda model: f"{model.__module__}.{model.__name__}")
+def test_every_setting_says_what_it_is(model: type[BaseModel]) -> None:
+    assert model.__doc__
+    for key, field in settings_of(model):
+        assert field.description, f"'{key}' of {model.__name__} has no description"
+        assert re.fullmatch(r"(?s)[a-z0-9\[].*[^.\s]", field.description), field.description
+
+
+@pytest.mark.parametrize("subject", SUBJECTS)
+def test_every_setting_is_in_the_reference(tables: Tables, subject: str) -> None:
+    assert [*rows_of(tables, subject)] == [key for key, _ in settings_of(SUBJECTS[subject])]
+
+
+@pytest.mark.parametrize("kind", FILES)
+def test_every_key_of_a_file_is_in_the_reference(tables: Tables, kind: str) -> None:
+    assert [*rows_of(tables, kind)] == [*FILES[kind].model_fields]
+
+
+@pytest.mark.parametrize("subject", SUBJECTS)
+def test_a_default_may_be_written_as_the_reference_writes_it(tables: Tables, subject: str) -> None:
+    rows = rows_of(tables, subject)
+    for key, field in settings_of(SUBJECTS[subject]):
+        default = rows[key][2]
+        assert (default == "required") == field.is_required(), key
+        if default not in ("required", "none", "as below"):
+            node = compose(default, "the reference")
+            assert node is not None
+            read = read_as(field, node.plain())
+            assert read == (pytest.approx(field.default) if isinstance(read, float) else field.default), key
+
+
+def read_as(field: FieldInfo, value: object) -> object:
+    """The value of a field for what stands in a file."""
+    kind: Any = field.annotation
+    one: Any = create_model("One", it=(kind, field))
+    return one.model_validate({"it": value}, by_name=True).it
+
+
+def test_the_reference_says_which_keys_of_a_sequence_may_be_left_out(tables: Tables, tmp_path: Path) -> None:
+    for key, row in rows_of(tables, "sequence").items():
+        path = written(tmp_path, SEQUENCE, without=key)
+        if row[2] == "required":
+            with pytest.raises(labseq.ConfigError, match=f"'{key}' is missing"):
+                load_sequence(path)
+        else:
+            load_sequence(path)
+
+
+def test_the_reference_says_which_keys_of_a_profile_may_be_left_out(tables: Tables, tmp_path: Path) -> None:
+    for key, row in rows_of(tables, "profile").items():
+        path = written(tmp_path, PROFILE, without=key)
+        if row[2] == "required":
+            with pytest.raises(labseq.ConfigError, match=f"'{key}' is missing"):
+                load_profile(path, beside=tmp_path)
+        else:
+            load_profile(path, beside=tmp_path)
+
+
+def written(folder: Path, content: Mapping[str, str], *, without: str) -> Path:
+    """A file with all keys but one."""
+    path = folder / "x.yaml"
+    path.write_text("".join(f"{key}: {value}\n" for key, value in content.items() if key != without))
+    return path
+
+
+def test_every_command_and_option_is_in_the_reference(tables: Tables) -> None:
+    for name, command in commands_in(typer.main.get_command(app)):
+        for parameter in command.params:
+            kind = parameter.param_type_name
+            shown = tables.get(f"{f'command {name}'.strip()} {kind}")
+            assert shown is not None, f"the reference has no {{command}} {name}"
+            words = {word for code in shown.iter("literal") for word in re.split(r"[\s,\[\]=]+", text(code))}
+            assert {*(parameter.opts if kind == "option" else [parameter.metavar])} <= words, parameter.name
+            assert parameter.help, f"{name}: {parameter.name} has no help"
+
+
+def commands_in(group: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """The group itself, and all commands in it at any depth: "bench-planners"."""
+    yield prefix.rstrip("-"), group
+    for name, command in getattr(group, "commands", {}).items():
+        yield from commands_in(command, f"{prefix}{name}-")
+
+
+def test_every_hook_is_in_the_reference(pages: Pages) -> None:
+    hooks = [name for name in vars(hookspecs) if name.startswith("labseq_")]
+    assert [term.partition("(")[0] for term in terms_of(pages, "plugin-api") if "labseq_" in term] == hooks
+
+
+def test_every_role_and_method_is_in_the_reference(pages: Pages) -> None:
+    every = [one for name, one in vars(roles).items() if name in dir(labseq) and isinstance(one, type)]
+    shown = {re.split(r"[(:]", term)[0] for term in terms_of(pages, "plugin-api")}
+    for role in (one for one in every if one.__module__ == roles.__name__):
+        members = {name for name, one in vars(role).items() if isinstance(one, FunctionType | property)}
+        about = (role.__doc__ or "?").partition("\n")[0].replace("``", "")
+        assert about in text_of(pages, "plugin-api"), role
+        assert {name for name in members if not name.startswith("_")} <= shown, role
+
+
+def test_every_contract_suite_is_in_the_reference(pages: Pages) -> None:
+    for suite in (name for name in dir(testing) if name.endswith("Contract")):
+        assert suite in text_of(pages, "plugin-api")
+
+
+def test_every_error_and_exit_code_is_in_the_reference(pages: Pages) -> None:
+    classes = [one for one in vars(errors).values() if isinstance(one, type)]
+    every = [one for one in classes if issubclass(one, errors.LabseqError)]
+    assert {*terms_of(pages, "errors")} == {*(one.__name__ for one in every), "Problem"}
+    codes = {one.exit_code for one in every} | {exit_code_of(errors.StopRequested(n)) for n in (2, 15)}
+    table = next(pages["reference/errors"].iter("tbody"))
+    shown = {int(code) for row in table.iter("row") for code in re.findall(r"\d+", text(row[0]))}
+    assert shown == codes | {0}
+
+
+def test_every_environment_variable_is_in_the_reference(pages: Pages) -> None:
+    sources = "".join(path.read_text() for path in (ROOT / "labseq").rglob("*.py"))
+    for name in {*re.findall(r'"(LABSEQ_[A-Z_]+)"', sources)} - {"LABSEQ_API"}:
+        assert name in terms_of(pages, "cli")
+
+
+def terms_of(pages: Pages, page: str) -> list[str]:
+    """What the definition lists of a page define."""
+    return [text(term) for term in pages[f"reference/{page}"].iter("term")]
+
+
+def text_of(pages: Pages, page: str) -> str:
+    return text(pages[f"reference/{page}"])
