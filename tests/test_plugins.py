@@ -60,11 +60,28 @@ def test_a_package_in_a_folder_is_a_plugin(host, tmp_path):
 
 
 def test_hidden_files_and_other_files_are_left_alone(host, tmp_path):
-    for name in ("_private.py", ".hidden.py", "notes.txt", "not-an-identifier.py", "data.json"):
+    for name in ("_private.py", ".hidden.py", "notes.txt", "data.json"):
         (tmp_path / name).write_text("raise SystemExit(1)")
     (tmp_path / "empty_folder").mkdir()
     host.load_folders([tmp_path])
     assert host.infos == []
+
+
+def test_a_file_whose_name_cannot_be_imported_is_reported(host, tmp_path):
+    info = load(host, tmp_path, GOOD, "my-planner")
+    assert (info.name, info.state) == ("my-planner", "failed")
+    assert "rename it" in info.reason
+
+
+def test_ctrl_c_while_a_plugin_loads_goes_through(host, tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        load(host, tmp_path, "raise KeyboardInterrupt\n")
+
+
+def test_a_file_in_place_of_a_folder_is_the_users_mistake(host, tmp_path):
+    (tmp_path / "mine.py").write_text(GOOD)
+    with pytest.raises(ConfigError, match="cannot be read: Not a directory"):
+        host.load_folders([tmp_path / "mine.py"])
 
 
 def test_the_environment_names_folders_too(host, tmp_path, monkeypatch):
@@ -93,7 +110,16 @@ def test_a_missing_folder_is_the_users_mistake(host, tmp_path):
         ("LABSEQ_API = 1\nraise SystemExit(2)\n", "SystemExit: 2"),
         ("x = 1\n", "does not state LABSEQ_API"),
         ("LABSEQ_API = 99\n", "was written for LABSEQ_API 99"),
-        (GOOD.replace("def labseq_register(registry)", "def labseq_register(register)"), "Argument"),
+        ("LABSEQ_API = '1'\n", "was written for LABSEQ_API '1'; this labseq has LABSEQ_API = 1"),
+        ("class Odd(BaseException): pass\nraise Odd('no')\n", "Odd: no"),
+        ("raise ValueError('two\\nlines\\x1b[31m')\n", "ValueError: two lines?[31m"),
+        (GOOD.replace('"mine", Mine', '"mine", Mine, dict'), "expected a subclass of labseq.Settings"),
+        (
+            GOOD.replace("def labseq_register(registry)", "def labseq_register(register)"),
+            "an argument 'register'",
+        ),
+        (GOOD.replace("def labseq_register(registry)", "def labseq_register()"), "has no argument"),
+        (GOOD.replace("@hookimpl\n", ""), "it implements no hook; write '@hookimpl'"),
         (GOOD.replace("def labseq_register", "def labseq_regster"), "unknown hook"),
         (GOOD.replace('"mine", Mine', '"", Mine'), "a planner needs a name"),
         (GOOD.replace('"mine", Mine', '"mine", 5'), "cannot be called"),
@@ -129,6 +155,8 @@ def test_a_name_taken_twice_names_both_origins(host, tmp_path):
     info = load(host, other, GOOD, "second")
     assert info.state == "failed"
     assert "planner 'mine' is offered by 'first' already" in info.reason
+    with pytest.raises(PluginLoadError, match="offered by 'first' already"):
+        host.get("planner", "mine")
 
 
 def test_two_files_of_one_name_in_two_folders(host, tmp_path):

@@ -1,3 +1,5 @@
+from contextlib import suppress
+
 import pytest
 
 from labseq.errors import PluginLoadError, UnknownPluginError
@@ -25,6 +27,20 @@ def test_a_name_that_is_taken_names_both_origins():
     with pytest.raises(PluginLoadError, match="planner 'mine' is offered by 'first' already") as caught:
         registry.planner("mine", factory)
     assert caught.value.plugin == "second"
+
+
+def test_a_name_that_is_taken_is_contested():
+    registry = Registry()
+    for origin in ("first", "second"):
+        registry.set_origin(origin)
+        with suppress(PluginLoadError):
+            registry.planner("mine", factory)
+    assert list(registry.contested) == [("planner", "mine")]
+
+
+def test_a_settings_model_is_a_class_of_settings():
+    with pytest.raises(PluginLoadError, match=r"settings model of planner 'mine' is 5; expected a subclass"):
+        Registry().planner("mine", factory, 5)  # pyright: ignore[reportArgumentType]
 
 
 def test_the_same_name_may_serve_several_kinds():

@@ -9,6 +9,8 @@ from typing import Annotated
 import typer
 
 from labseq import __version__
+from labseq.cli import plan_options
+from labseq.cli.bench_app import bench
 
 app = typer.Typer(
     name="labseq",
@@ -17,6 +19,7 @@ app = typer.Typer(
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
+app.add_typer(bench)
 
 RUN_EXAMPLES = """\b
 Examples:
@@ -95,10 +98,11 @@ def run(
     profile: Profile = None,
     dry_run: DryRun = None,
     shots: Annotated[
-        int | None, typer.Option(min=1, help="Number of shots, instead of the sequence's own.")
+        int | None, typer.Option(metavar="N", min=1, help="Number of shots, instead of the sequence's own.")
     ] = None,
     seed: Annotated[
-        int | None, typer.Option(min=0, help="Seed of all random numbers: the same seed, the same run.")
+        int | None,
+        typer.Option(metavar="N", min=0, help="Seed of all random numbers: the same seed, the same run."),
     ] = None,
     overrides: Overrides = None,
     output: Annotated[
@@ -141,13 +145,42 @@ def check(
     check_sequence(sequence, profile, overrides or (), mode, as_json=as_json)
 
 
+@app.command(epilog=plan_options.EXAMPLES, short_help="Plan the moves for one occupancy; print or draw them.")
+def plan(
+    occupancy: plan_options.Occupancy,
+    target: plan_options.Target = None,
+    planner: plan_options.Planner = "psca",
+    dop: plan_options.Dop = None,
+    seed: plan_options.Seed = None,
+    origin: plan_options.Origin = None,
+    profile: plan_options.Profile = None,
+    overrides: plan_options.Overrides = None,
+    step: plan_options.Step = False,
+    json: plan_options.Json = None,
+    png: plan_options.Png = None,
+) -> None:
+    """Plan the moves for one occupancy, check the plan as a run does, and print or draw it."""
+    from labseq.cli.plan import PlanOutput, plan_once
+    from labseq.session import PlanRequest
+
+    request = PlanRequest(
+        occupancy=occupancy,
+        target=target,
+        planner=planner,
+        degree_of_parallelism=dop,
+        overrides=tuple(overrides or ()),
+        seed=seed,
+        origin=origin,
+        profile=profile,
+    )
+    plan_once(request, PlanOutput(step=step, json=json, png=png))
+
+
 @app.command()
 def show(
     run: Annotated[
         Path | None,
-        typer.Argument(
-            metavar="[RUN]", help="A run's folder; the newest run by default.", show_default=False
-        ),
+        typer.Argument(metavar="RUN", help="A run's folder; the newest run by default.", show_default=False),
     ] = None,
     as_json: Json = False,
 ) -> None:

@@ -41,6 +41,7 @@ UNUSED_DAYS: Final = 30
 
 _FOLDER_NAME = re.compile(r"[0-9a-f]{24}")
 _LOCK = threading.RLock()
+_INTERPRETED = threading.Event()
 _MODULES: set[str] = set()
 _KERNELS: dict[int, tuple[Any, str]] = {}  # id of a compiled kernel -> itself, its digest
 
@@ -75,6 +76,16 @@ def kernel(signature: str | Sequence[str]) -> Callable[[F], F]:
     return decorate
 
 
+def interpret() -> None:
+    """Leave all kernels from now on plain Python: for a process that calls them only a few times.
+
+    To load numba takes longer than that. Does nothing where numba is loaded
+    already, or where ``NUMBA_DISABLE_JIT`` is set, to 0 as well as to 1.
+    """
+    if "numba" not in sys.modules and "NUMBA_DISABLE_JIT" not in os.environ:
+        _INTERPRETED.set()
+
+
 @contextmanager
 def announcing(announce: Callable[[str], None]) -> Generator[None]:
     """Call ``announce(module_name)`` before a module's first kernel is compiled.
@@ -82,6 +93,10 @@ def announcing(announce: Callable[[str], None]) -> Generator[None]:
     Modules whose kernels all come from the cache are not announced. Import the
     kernels (for a planner: ``warm()``) inside the ``with`` block.
     """
+    if _INTERPRETED.is_set():
+        yield
+        return
+
     from numba.core import event
 
     announced: set[str] = set()
@@ -125,6 +140,8 @@ def _numba() -> Any:
 
 
 def _compile(function: FunctionType, signatures: list[str]) -> Any:
+    if _INTERPRETED.is_set():
+        return function
     numba = _numba()
     if numba.config.DISABLE_JIT:
         return function

@@ -2,7 +2,10 @@
 
 from labseq.session.assembly import Assembly, Bench, assemble, load_plugins, set_up_bench
 from labseq.session.checking import CheckReport, check
+from labseq.session.occupancies import Source, read_source
 from labseq.session.options import Options
+from labseq.session.plan_inputs import PlanRequest
+from labseq.session.planning import PlannedMoves, plan_moves
 from labseq.session.provenance import gather_provenance
 from labseq.session.safe import make_profile_safe
 from labseq.session.session import Session
@@ -12,11 +15,16 @@ __all__ = [
     "Bench",
     "CheckReport",
     "Options",
+    "PlanRequest",
+    "PlannedMoves",
     "Session",
+    "Source",
     "assemble",
     "check",
     "gather_provenance",
     "load_plugins",
     "make_profile_safe",
+    "plan_moves",
+    "read_source",
     "set_up_bench",
 ]

@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import Any, BinaryIO, Final, cast
 
 import numpy as np
+from numpy.lib.format import read_array
 from numpy.typing import NDArray
 
-from labseq.config.reading import decode, is_file, is_folder
-from labseq.config.wording import clean, shown, visible
+from labseq.config.reading import decode, files_in, is_file, is_folder
+from labseq.config.wording import clean, did_you_mean, shown, visible
 from labseq.errors import ConfigError, Problem, RecordingError
 from labseq.model import CycleRecord, ImageRecord, Occupancy, TargetPattern, as_occupancy
 from labseq.units import parse_quantity
@@ -22,6 +23,8 @@ MAX_SITES: Final = 1000
 """Most rows, and most columns, as in a hardware profile."""
 MAX_BYTES: Final = 4 << 20
 """Largest text, in bytes."""
+MAX_NPY_BYTES: Final = 32 << 20
+"""Largest .npy file, in bytes."""
 FORMS: Final = (
     "a .npy file, a text file of 0 and 1, '-' for standard input, a shot file such as "
     "shots/shot_000003.h5#2, or random:20x20@0.75"
@@ -71,11 +74,14 @@ def read_source(text: str, seed: int | None = None, stdin: BinaryIO | None = Non
         return Source(parse_text(data, "standard input"), "standard input")
     if text.startswith("random:"):
         return _random(text, seed)
+    if not text:
+        raise ConfigError(Problem("the occupancy is an empty text", expected=FORMS))
     match = _SHOT.fullmatch(text)
     path = Path(match[1] if match else text)
     if not is_file(path):
-        problem = "this is a folder" if is_folder(path) else "there is no such file"
-        raise ConfigError(Problem(problem, visible(str(path)), expected=FORMS))
+        what = "this is a folder" if is_folder(path) else "there is no such file"
+        hint = did_you_mean(path.name, files_in(path.parent, (".npy", ".txt", ".h5")))
+        raise ConfigError(Problem(what, clean(str(path)), expected=FORMS, hint=hint))
     if match:
         return _shot(path, match[2])
     if path.suffix.lower() == ".npy":
@@ -146,13 +152,15 @@ def _random(text: str, seed: int | None) -> Source:
 def _npy(path: Path) -> Occupancy:
     name = visible(str(path))
     expected = "a two-dimensional array of bool, or of 0 and 1, saved by numpy.save"
+    if path.stat().st_size > MAX_NPY_BYTES:
+        raise ConfigError(Problem("it is larger than 32 MiB", name, expected=_size_limit()))
     try:
-        array = cast("object", np.load(path, mmap_mode="r", allow_pickle=False))
-    except (OSError, ValueError, EOFError) as error:
-        what = f"it cannot be read: {visible(str(error).splitlines()[0])}" if str(error) else "it is damaged"
+        with path.open("rb") as file:
+            array = read_array(file, allow_pickle=False)
+    except (OSError, ValueError, EOFError, MemoryError, OverflowError, TypeError) as error:
+        reason = visible(str(error).partition(";")[0].partition("\n")[0])
+        what = f"it cannot be read: {reason}" if reason else "it is damaged"
         raise ConfigError(Problem(what, name, expected=expected)) from error
-    if not isinstance(array, np.ndarray):
-        raise ConfigError(Problem("it is an archive of arrays", name, expected=expected))
     if array.ndim != 2 or array.dtype.kind not in "biuf":
         what = f"it holds an array of shape {array.shape} and type {array.dtype}"
         raise ConfigError(Problem(what, name, expected=expected))
@@ -160,7 +168,7 @@ def _npy(path: Path) -> Occupancy:
 
 
 def _checked(array: NDArray[Any], name: str) -> Occupancy:
-    if max(array.shape) > MAX_SITES:
+    if not 1 <= min(array.shape) <= max(array.shape) <= MAX_SITES:
         what = f"it has {array.shape[0]} x {array.shape[1]} sites"
         raise ConfigError(Problem(what, name, expected=_size_limit()))
     try:

@@ -17,6 +17,7 @@ from labseq.config import (
     load_profile,
     load_sequence,
     plugin_paths,
+    split_overrides,
     validate_values,
 )
 from labseq.config.fields import PatternChoice
@@ -51,7 +52,8 @@ class PlanRequest:
             for the target that a shot was taken with.
         planner: Its name.
         degree_of_parallelism: The planner's setting of that name; None for its default.
-        overrides: Further settings of the planner, ``"key=value"`` each.
+        overrides: ``"key=value"`` each: further settings of the planner, with or
+            without "planner." before the key; after "profile.", values of the profile.
         seed: Seed of a drawn occupancy; None for a fresh one.
         origin: "R,C", the top left site of the target; None for the pattern's own.
         profile: Name or path of a profile for grid, motion and plugin folders.
@@ -95,20 +97,25 @@ def read_inputs(request: PlanRequest, source: Source) -> PlanInputs:
         ConfigError: Something is wrong; says what was expected.
         PluginLoadError: A plugin that is named failed to load.
     """
-    machine, folders = _machine(request, source)
+    for_planner, for_profile = split_overrides(request.overrides)
+    machine, folders = _machine(request, for_profile, source)
     document, choice, more_folders = _target_choice(request, source)
     host = load_plugins([*folders, *more_folders])
     target = source.target if choice is None else _make_target(host, document, choice, machine.grid)
     assert target is not None  # see _target_choice
-    return PlanInputs(machine, target, _planner(host, request))
+    return PlanInputs(machine, target, _planner(host, request, for_planner))
 
 
-def _machine(request: PlanRequest, source: Source) -> tuple[Machine, list[Path]]:
+def _machine(
+    request: PlanRequest, overrides: Sequence[Override], source: Source
+) -> tuple[Machine, list[Path]]:
     """Grid and motion, and the profile's plugin folders."""
     shape = source.occupancy.shape
     if request.profile is None:
+        if overrides:
+            raise ConfigError(Problem("there is no --profile to change", overrides[0].source))
         return _default_machine(source), []
-    document, spec = load_profile(request.profile, beside=Path())
+    document, spec = load_profile(request.profile, beside=Path(), overrides=overrides)
     grid = spec.grid_model()
     if grid.shape != shape:
         what = f"the occupancy has {shape[0]} x {shape[1]} sites"
@@ -123,9 +130,10 @@ def _default_machine(source: Source) -> Machine:
         n_rows, n_cols = source.occupancy.shape
         return Machine(SiteGrid(n_rows, n_cols), MotionSpec())
     called = "the profile in the shot's file"
-    motion = {key: source.machine["mobile_tweezers"][key] for key in MOTION_KEYS}
+    tweezers = source.machine.get("mobile_tweezers", {})
+    motion = {key: tweezers[key] for key in MOTION_KEYS if key in tweezers}
     return Machine(
-        validate_values(GridSettings, source.machine["grid"], called).model(),
+        validate_values(GridSettings, source.machine.get("grid", {}), called).model(),
         validate_values(MotionSettings, motion, called).spec(),
     )
 
@@ -205,7 +213,7 @@ def _make_target(
         raise document.error(choice.loc, str(error)) from error
 
 
-def _planner(host: PluginHost, request: PlanRequest) -> Chosen:
+def _planner(host: PluginHost, request: PlanRequest, settings: Sequence[Override]) -> Chosen:
     option = f"--planner {request.planner}"
     if not _NAME.fullmatch(request.planner):
         raise ConfigError(Problem("this is no name of a planner", clean(option), expected="a name"))
@@ -213,11 +221,10 @@ def _planner(host: PluginHost, request: PlanRequest) -> Chosen:
     if request.degree_of_parallelism is not None:
         dop = str(request.degree_of_parallelism)
         overrides.append(Override("planner.degree_of_parallelism", dop, f"--dop {dop}"))
-    for text in request.overrides:
-        key, equals, value = text.partition("=")
-        if not equals or not key.strip():
-            expected = "key=value, for example --set degree_of_parallelism=5"
-            raise ConfigError(Problem("this is no setting", clean(f"--set {text}"), expected=expected))
-        overrides.append(Override(f"planner.{key.strip().removeprefix('planner.')}", value, f"--set {text}"))
-    document = Document.parse("{}", "the command line").override_all(overrides, may_add=("planner",))
+    for setting in settings:
+        address = f"planner.{setting.address.removeprefix('planner.')}"
+        overrides.append(Override(address, setting.value, setting.source))
+    parts = [override.address.split(".") for override in overrides]
+    parents = {".".join(path[:n]) for path in parts for n in range(1, len(path))}
+    document = Document.parse("{}", "the command line").override_all(overrides, may_add=parents)
     return resolve(host, document, "planner", Choice(use=request.planner).placed("planner"))

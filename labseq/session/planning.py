@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from labseq.config import Settings
 from labseq.errors import LabseqError, PlanError
 from labseq.model import MotionSpec, Occupancy, Plan, PlanReport, SiteGrid, TargetPattern
 from labseq.motion import check_plan
 from labseq.roles import NeverStopped, Planner
-from labseq.session.choosing import construct, dump
-from labseq.session.occupancies import read_source
+from labseq.session.choosing import construct
+from labseq.session.occupancies import Source, read_source
 from labseq.session.plan_inputs import PlanRequest, read_inputs
 
 
@@ -29,9 +30,9 @@ class PlannedMoves:
         grid: The grid of sites.
         motion: How the mobile tweezers move.
         planner: Name of the planner.
-        settings: Its settings.
+        settings: Those of its settings that are not the defaults, SI, JSON-ready.
         degree_of_parallelism: Most tweezers on at once that the plan was checked for.
-        seed: Seed that the occupancy was drawn with; None if it was not drawn.
+        seed: Seed of all random numbers, drawn or given; None if there is none.
         plan: The plan.
         report: What the check says of it.
     """
@@ -47,6 +48,16 @@ class PlannedMoves:
     seed: int | None
     plan: Plan
     report: PlanReport
+
+    @property
+    def n_missing_atoms(self) -> int:
+        """How many atoms are too few to fill the target."""
+        return max(0, self.target.n_atoms - int(self.occupancy.sum()))
+
+    @property
+    def n_filled(self) -> int:
+        """Target sites that hold an atom after the plan."""
+        return self.target.n_atoms - self.report.n_defects
 
     @property
     def n_ejected(self) -> int:
@@ -87,15 +98,15 @@ class PlannedMoves:
 
 def plan_moves(
     request: PlanRequest,
+    source: Source | None = None,
     *,
-    stdin: BinaryIO | None = None,
     announce: Callable[[str], None] = lambda _: None,
 ) -> PlannedMoves:
     """Plan once, and check the plan as a run does.
 
     Args:
         request: What is to be planned.
-        stdin: What an occupancy "-" is read from; standard input if None.
+        source: Its occupancy, if it has been read already.
         announce: Called with the name of a module before its kernels are compiled.
 
     Raises:
@@ -105,11 +116,11 @@ def plan_moves(
     """
     from labseq.kernels.compile import announcing
 
-    source = read_source(request.occupancy, request.seed, stdin)
-    occupancy = source.occupancy
+    source = source or read_source(request.occupancy, request.seed)
+    occupancy, seed = source.occupancy, request.seed if source.seed is None else source.seed
     inputs = read_inputs(request, source)
     grid, motion, target = inputs.machine.grid, inputs.machine.motion, inputs.target
-    made, _ = construct({"planner": inputs.planner}, grid, motion, NeverStopped(), request.seed or 0)
+    made, _ = construct({"planner": inputs.planner}, grid, motion, NeverStopped(), seed or 0)
     planner: Planner = made["planner"]
     dop = getattr(planner, "degree_of_parallelism", None)
     dop = dop if isinstance(dop, int) else motion.max_tweezers
@@ -123,9 +134,9 @@ def plan_moves(
         grid=grid,
         motion=motion,
         planner=request.planner,
-        settings=dump(inputs.planner.settings),
+        settings=_changed(inputs.planner.settings),
         degree_of_parallelism=dop,
-        seed=source.seed,
+        seed=seed,
         plan=plan,
         report=report,
     )
@@ -141,6 +152,10 @@ def _plan(planner: Planner, name: str, occupancy: Occupancy, target: TargetPatte
         raise
     except Exception as error:
         raise PlanError(f"plan() raised {type(error).__name__}: {error}", name) from error
+
+
+def _changed(settings: Settings | None) -> dict[str, Any]:
+    return {} if settings is None else settings.model_dump(mode="json", exclude_defaults=True)
 
 
 def _bits(sites: NDArray[np.bool_]) -> list[list[int]]:

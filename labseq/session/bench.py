@@ -1,0 +1,197 @@
+"""Planners compared on the same random loadings."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Generator, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from types import FrameType
+from typing import Final
+
+from labseq.errors import ConfigError, LabseqError, Problem, StopRequested
+from labseq.session.bench_courses import set_up, warm
+from labseq.session.bench_crew import work_through
+from labseq.session.bench_figures import Figure, find_figure
+from labseq.session.bench_report import Report, Tally
+from labseq.session.bench_spec import (
+    BARE_MOTION,
+    Comparison,
+    Condition,
+    parse_entrants,
+    parse_grid,
+    parse_loading,
+    parse_overrides,
+)
+from labseq.session.bench_work import Done, Job
+
+DEFAULTS: Final = {"planners": "psca", "grid": "20x20", "target": "compact:15x15", "loading": "75 %"}
+MOST_AT_ONCE: Final = 50
+"""Most loadings of a job: what is lost of each process when a comparison is stopped."""
+ALONE_S: Final = 2.0
+"""How long one process works before it starts others: about what their start takes."""
+
+
+@dataclass(frozen=True, slots=True)
+class BenchRequest:
+    """What is to be compared, in the words of the command line; None for the default.
+
+    Attributes:
+        figure: A figure of the paper, which says all but what follows ``dop``.
+        planners: See :func:`labseq.session.bench_spec.parse_entrants`.
+        grid: "20x20".
+        target: "compact:15x15".
+        loading: "75 %".
+        dop: Degree of parallelism, for every planner that has such a setting.
+        loadings: Number of loadings of each condition.
+        seed: What all of them are drawn from.
+        overrides: See :func:`labseq.session.bench_spec.parse_overrides`.
+        workers: Number of processes; as many as there are cores, if there is work enough, if None.
+    """
+
+    figure: str | None = None
+    planners: str | None = None
+    grid: str | None = None
+    target: str | None = None
+    loading: str | None = None
+    dop: int | None = None
+    loadings: int = 1000
+    seed: int = 1
+    overrides: Sequence[str] = ()
+    workers: int | None = None
+
+
+def read_request(request: BenchRequest) -> tuple[Comparison, Figure | None]:
+    """Read what is to be compared.
+
+    Raises:
+        ConfigError: Something in it is wrong; says what was expected.
+    """
+    settings, motion = parse_overrides(request.overrides)
+    if request.figure is None:
+        given = {name: getattr(request, name) or default for name, default in DEFAULTS.items()}
+        shape, loading = parse_grid(given["grid"]), parse_loading(given["loading"])
+        condition = Condition(shape, given["target"], loading, request.dop, (*BARE_MOTION, *motion))
+        entrants = parse_entrants(given["planners"])
+        called = f"--planners {given['planners']}"
+        return Comparison(entrants, (condition,), request.loadings, request.seed, settings, called), None
+    figure = find_figure(request.figure)
+    _check_figure_alone(request, figure, bool(settings))
+    conditions = tuple(figure.with_motion(motion))
+    called = f"figure {figure.name}"
+    return Comparison(figure.entrants, conditions, request.loadings, request.seed, (), called), figure
+
+
+def compare(
+    comparison: Comparison,
+    n_workers: int | None = None,
+    *,
+    announce: Callable[[str], None] = lambda _: None,
+    progress: Callable[[int, int], None] = lambda _done, _wanted: None,
+) -> Report:
+    """Let all planners plan all loadings, check every plan, and sum up.
+
+    The same comparison gives the same report, times aside, whatever the number of
+    processes. Ctrl-C or SIGTERM ends it early with what is done until then.
+
+    Args:
+        comparison: What is to be compared.
+        n_workers: Number of processes; as many as there are cores, if there is work enough, if None.
+        announce: Called with the name of a module before its kernels are compiled.
+        progress: Called with the numbers of loadings that are done and wanted.
+
+    Raises:
+        ConfigError: Something in the comparison is wrong; says what was expected.
+        PluginLoadError: A plugin that is named failed to load.
+    """
+    from labseq.kernels.compile import announcing
+
+    start_s = time.perf_counter()
+    courses = set_up(comparison)
+    tally = Tally(comparison, courses)
+    wanted = comparison.n_loadings * len(courses)
+    ended_by: LabseqError | None = None
+    received: list[int] = []
+    try:
+        with _interrupted_by_signals(received):
+            with announcing(announce):
+                warm(courses)
+            progress(0, wanted)
+            with closing(_results(comparison, n_workers)) as results:
+                for done in results:
+                    tally.add(done)
+                    progress(tally.n_done, wanted)
+    except KeyboardInterrupt:
+        ended_by = StopRequested(received[0] if received else signal.SIGINT)
+    except LabseqError as error:
+        ended_by = error
+    duration_s = time.perf_counter() - start_s
+    return Report(comparison, tally.rows(), tally.n_done, duration_s, ended_by)
+
+
+def _results(comparison: Comparison, n_workers: int | None) -> Generator[Done]:
+    """What comes of all loadings, the order aside."""
+    todo = _jobs(comparison, n_workers or _n_cores())
+    if n_workers is None:
+        start_s, n_done = time.perf_counter(), 0
+        for done in work_through(comparison, todo, 1):
+            yield done
+            n_done += 1
+            if time.perf_counter() - start_s > ALONE_S:
+                break
+        todo = todo[n_done:]
+    if todo:
+        yield from work_through(comparison, todo, min(n_workers or _n_cores(), len(todo)))
+
+
+def _check_figure_alone(request: BenchRequest, figure: Figure, has_settings: bool) -> None:
+    names = [*DEFAULTS, "dop"]
+    given = [f"--{name}" for name in names if getattr(request, name) is not None]
+    given += ["--set planner.*"] if has_settings else []
+    if given:
+        what = f"{' and '.join(given)} cannot be given besides: figure {figure.name} says that itself"
+        expected = "--loadings, --seed and --set profile.mobile_tweezers.KEY=VALUE at most"
+        raise ConfigError(Problem(what, f"--figure {figure.name}", expected=expected))
+
+
+def _jobs(comparison: Comparison, n_workers: int) -> list[Job]:
+    """The work in pieces, some for every process.
+
+    The first loadings of all conditions come first, so that what is done at any
+    time is about the same share of each.
+    """
+    n_loadings, n_conditions = comparison.n_loadings, len(comparison.conditions)
+    size = min(MOST_AT_ONCE, n_loadings, -(-n_loadings * n_conditions // (4 * n_workers)))
+    return [
+        Job(condition, start, min(start + size, n_loadings))
+        for start in range(0, n_loadings, size)
+        for condition in range(n_conditions)
+    ]
+
+
+def _n_cores() -> int:
+    if hasattr(os, "sched_getaffinity"):  # not on Windows or macOS
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+@contextmanager
+def _interrupted_by_signals(received: list[int]) -> Generator[None]:
+    """Let SIGTERM interrupt as Ctrl-C does, and note which it was."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def interrupt(number: int, _frame: FrameType | None) -> None:
+        received.append(number)
+        raise KeyboardInterrupt
+
+    before = {number: signal.signal(number, interrupt) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

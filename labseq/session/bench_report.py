@@ -1,0 +1,254 @@
+"""What came of a comparison: a row per planner and condition."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq.errors import LabseqError
+from labseq.session.bench_courses import Course
+from labseq.session.bench_spec import Comparison, Condition, Entrant
+from labseq.session.bench_statistics import Estimate, mean, ratio_of_means
+from labseq.session.bench_work import LOADING, RESULT, Done, Failure
+
+ESTIMATES: Final = (
+    "n_batches",
+    "n_atoms_moved",
+    "distance_m",
+    "motion_s",
+    "n_scans",
+    "scan_s",
+    "filling_fraction",
+    "target_met",
+    "bound",
+    "ratio_to_bound",
+)
+"""The means of a :class:`Row`."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Row:
+    """What one planner made of the loadings of one condition.
+
+    The means are over the loadings whose plan was right.
+
+    Attributes:
+        entrant: The planner.
+        condition: What it was given.
+        settings: All its settings, JSON-ready.
+        degree_of_parallelism: Most tweezers on at once that its plans were checked for.
+        n_target_atoms: Atoms in the target.
+        n_loadings: Number of loadings.
+        n_short: How many of them hold fewer atoms than the target.
+        n_failed: For how many of them the planner raised or its plan broke a rule.
+        first_failure: The first of these, or None.
+        n_batches: Mean number of batches, linked ones counted as one.
+        n_atoms_moved: Mean number of atoms moved; one that is picked up again counts again.
+        distance_m: Mean of the distances of all atom moves together, in metres.
+        motion_s: Mean time of ramps and transport, in seconds, with the overheads
+            that the condition names.
+        n_scans: Mean number of scans, which the source of some planners counts
+            instead of batches; NaN for all others.
+        scan_s: Mean time of the scans, in seconds.
+        planning_median_s: Median time of a call of ``plan()``, in seconds.
+        planning_p99_s: The time within which 99 % of the calls return, in seconds.
+        filling_fraction: Mean fraction of the target's sites that hold an atom after the plan.
+        target_met: Fraction of the loadings whose plan ends with the target exactly met.
+        bound: Mean number of lines that cover the vacancies, see
+            :func:`labseq.session.bench_work.lines_to_cover`.
+        ratio_to_bound: Mean number of batches over mean bound, both over the loadings
+            whose target was filled.
+        counts: int64 (most batches + 1,), number of plans with so many batches.
+    """
+
+    entrant: Entrant
+    condition: Condition
+    settings: Mapping[str, Any]
+    degree_of_parallelism: int
+    n_target_atoms: int
+    n_loadings: int
+    n_short: int
+    n_failed: int
+    first_failure: Failure | None
+    n_batches: Estimate
+    n_atoms_moved: Estimate
+    distance_m: Estimate
+    motion_s: Estimate
+    n_scans: Estimate
+    scan_s: Estimate
+    planning_median_s: float
+    planning_p99_s: float
+    filling_fraction: Estimate
+    target_met: Estimate
+    bound: Estimate
+    ratio_to_bound: Estimate
+    counts: NDArray[np.int64]
+
+    @property
+    def scans(self) -> bool:
+        """Whether the planner's source counts scans."""
+        return not math.isnan(self.n_scans.value)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Everything but the failure's words, JSON-ready, SI; None for what is not known."""
+        rows, cols = self.condition.shape
+        values: dict[str, Any] = {
+            "planner": self.entrant.planner,
+            "label": self.entrant.label,
+            "settings": dict(self.settings),
+            "degree_of_parallelism": self.degree_of_parallelism,
+            "grid": {"rows": rows, "cols": cols},
+            "target": self.condition.target,
+            "n_target_atoms": self.n_target_atoms,
+            "loading": self.condition.loading,
+            "n_loadings": self.n_loadings,
+            "n_short": self.n_short,
+            "n_failed": self.n_failed,
+        }
+        for name in ESTIMATES:
+            estimate: Estimate = getattr(self, name)
+            values[name] = {"mean": _known(estimate.value), "error": _known(estimate.error)}
+        values["planning_s"] = {"median": _known(self.planning_median_s), "p99": _known(self.planning_p99_s)}
+        return values
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Report:
+    """What came of a comparison.
+
+    Attributes:
+        comparison: What was asked for.
+        rows: A row per condition and planner; a condition of which nothing was done has none.
+        n_done: Loadings that were done, over all conditions.
+        duration_s: How long it took, in seconds.
+        ended_by: What ended it before all was done, or None.
+    """
+
+    comparison: Comparison
+    rows: tuple[Row, ...]
+    n_done: int
+    duration_s: float
+    ended_by: LabseqError | None
+
+    @property
+    def n_wanted(self) -> int:
+        """Loadings that were asked for, over all conditions."""
+        return self.comparison.n_loadings * len(self.comparison.conditions)
+
+    def rows_of(self, entrant: Entrant) -> list[Row]:
+        """The rows of one planner, in the order of the conditions."""
+        return [row for row in self.rows if row.entrant == entrant]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Everything, JSON-ready."""
+        return {
+            "complete": self.ended_by is None,
+            "seed": self.comparison.seed,
+            "n_loadings": self.comparison.n_loadings,
+            "duration_s": self.duration_s,
+            "rows": [row.as_dict() for row in self.rows],
+        }
+
+    def as_csv(self) -> str:
+        """The rows as CSV, SI, a line per row."""
+        flat = [_flat(row.as_dict()) for row in self.rows]
+        text = io.StringIO()
+        writer = csv.DictWriter(text, list(flat[0]) if flat else [], lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(flat)
+        return text.getvalue()
+
+
+class Tally:
+    """Gathers what comes of the jobs of a comparison."""
+
+    def __init__(self, comparison: Comparison, courses: Sequence[Course]) -> None:
+        n_entrants, n_loadings = len(comparison.entrants), comparison.n_loadings
+        self._comparison = comparison
+        self._courses = courses
+        self._results = [np.empty((n_entrants, n_loadings), RESULT) for _ in courses]
+        self._loadings = [np.empty(n_loadings, LOADING) for _ in courses]
+        self._is_done = [np.zeros(n_loadings, np.bool_) for _ in courses]
+        self._failures: dict[tuple[int, int], Failure] = {}
+
+    @property
+    def n_done(self) -> int:
+        """Loadings that are done, over all conditions."""
+        return sum(int(np.count_nonzero(done)) for done in self._is_done)
+
+    def add(self, done: Done) -> None:
+        """Take in what came of a job."""
+        i, span = done.job.condition, slice(done.job.start, done.job.stop)
+        self._results[i][:, span] = done.results
+        self._loadings[i][span] = done.loadings
+        self._is_done[i][span] = True
+        for failure in done.failures:
+            key = (i, failure.entrant)
+            if key not in self._failures or failure.loading < self._failures[key].loading:
+                self._failures[key] = failure
+
+    def rows(self) -> tuple[Row, ...]:
+        """A row per condition and planner, of what is done."""
+        return tuple(
+            self._row(i, entrant)
+            for i, done in enumerate(self._is_done)
+            if done.any()
+            for entrant in range(len(self._comparison.entrants))
+        )
+
+    def _row(self, i: int, entrant: int) -> Row:
+        course, done = self._courses[i], self._is_done[i]
+        results, loadings = self._results[i][entrant, done], self._loadings[i][done]
+        right = ~results["failed"]
+        good, n_atoms = results[right], course.target.n_atoms
+        filled = good["n_defects"] == 0
+        planning_s = good["planning_s"] if len(good) else np.array([math.nan])
+        runner = course.runners[entrant]
+        return Row(
+            entrant=self._comparison.entrants[entrant],
+            condition=self._comparison.conditions[i],
+            settings=runner.settings,
+            degree_of_parallelism=runner.degree_of_parallelism,
+            n_target_atoms=n_atoms,
+            n_loadings=len(results),
+            n_short=int(np.count_nonzero(loadings["n_atoms"] < n_atoms)),
+            n_failed=int(np.count_nonzero(~right)),
+            first_failure=self._failures.get((i, entrant)),
+            n_batches=mean(good["n_batches"]),
+            n_atoms_moved=mean(good["n_atoms_moved"]),
+            distance_m=mean(good["distance_m"]),
+            motion_s=mean(good["motion_s"]),
+            n_scans=mean(good["n_scans"]),
+            scan_s=mean(good["scan_s"]),
+            planning_median_s=float(np.median(planning_s)),
+            planning_p99_s=float(np.quantile(planning_s, 0.99)),
+            filling_fraction=mean(1.0 - good["n_defects"] / max(1, n_atoms)),
+            target_met=mean((good["n_defects"] == 0) & (good["n_surplus"] == 0)),
+            bound=mean(loadings["n_lines"]),
+            ratio_to_bound=ratio_of_means(good["n_batches"][filled], loadings["n_lines"][right][filled]),
+            counts=np.bincount(good["n_batches"]),
+        )
+
+
+def _known(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _flat(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Nested values beside one another: n_batches_mean, n_batches_error, ..."""
+    flat: dict[str, Any] = {}
+    for key, value in values.items():
+        if key == "settings":
+            flat[key] = " ".join(f"{name}={inner}" for name, inner in value.items())
+        elif isinstance(value, dict):
+            flat |= {f"{key}_{name}": inner for name, inner in value.items()}
+        else:
+            flat[key] = value
+    return flat

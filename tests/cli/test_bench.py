@@ -1,0 +1,175 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from labseq.cli import main
+from labseq.session.plan_inputs import PlanRequest
+from labseq.session.planning import plan_moves
+
+SMALL = ("--grid", "8x8", "--target", "compact:5x5", "--loadings", "20", "--workers", "1")
+
+MOODY = """
+import labseq
+
+LABSEQ_API = 1
+
+
+class Moody:
+    degree_of_parallelism = 1
+
+    def __init__(self, settings, context): ...
+
+    def plan(self, occupancy, target):
+        if occupancy[0, 0]:
+            return labseq.Plan.from_batches([([(0, 0)], [(0, 0)])])
+        return labseq.Plan.from_batches([])
+
+
+@labseq.hookimpl
+def labseq_register(registry):
+    registry.planner("moody", Moody)
+"""
+
+
+def code_of(*arguments: str) -> Any:
+    with pytest.raises(SystemExit) as leaving:
+        main(["bench", "planners", *arguments])
+    return leaving.value.code
+
+
+def test_a_table_with_a_line_per_planner(capsys: pytest.CaptureFixture[str]) -> None:
+    assert code_of(*SMALL, "--planners", "psca,psca:degree_of_parallelism=2", "--dop", "4") == 0
+    out, err = capsys.readouterr()
+    header, first, second, blank, extent = out.splitlines()
+    assert header.split()[:4] == ["planner", "DOP", "batches", "atoms"]
+    assert first.split()[:2] == ["psca", "4"]
+    assert second.split()[:3] == ["psca", "degree_of_parallelism=2", "2"]
+    assert blank == ""
+    assert extent.startswith("20 loadings; bound ")
+    assert "seed 1; " in extent
+    assert [line for line in err.splitlines() if not line.startswith("compiling")][-1] == "20 of 20 loadings"
+
+
+def test_files_hold_what_the_table_does(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    paths = {kind: tmp_path / f"out.{kind}" for kind in ("json", "csv", "png")}
+    options = [word for kind, path in paths.items() for word in (f"--{kind}", str(path))]
+    assert code_of(*SMALL, "--seed", "3", *options) == 0
+    values = json.loads(paths["json"].read_text("utf-8"))
+    assert (values["complete"], values["seed"], values["n_loadings"]) == (True, 3, 20)
+    (row,) = values["rows"]
+    assert (row["planner"], row["n_target_atoms"], row["n_failed"]) == ("psca", 25, 0)
+    assert len(paths["csv"].read_text("utf-8").splitlines()) == 2
+    assert paths["png"].read_bytes().startswith(b"\x89PNG")
+    assert "written: " in capsys.readouterr().out
+
+
+def test_a_figure_is_drawn_where_one_stands(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from dataclasses import replace
+
+    from labseq.session import bench_figures
+    from labseq.session.bench_spec import Condition, Entrant
+
+    conditions = tuple(Condition((4 * n, 4 * n), f"compact:{3 * n}x{3 * n}", 0.75, 5) for n in (1, 2, 3))
+    figure = replace(bench_figures.FIGURES["2b"], entrants=(Entrant("psca"),), conditions=conditions)
+    monkeypatch.setattr(bench_figures, "FIGURES", {"2b": figure})
+    monkeypatch.chdir(tmp_path)
+    assert code_of("--figure", "2b", "--loadings", "10", "--workers", "1", "--json", "figure.json") == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "figure-2b.csv",
+        "figure-2b.png",
+        "figure.json",
+    ]
+    values = json.loads((tmp_path / "figure.json").read_text("utf-8"))
+    assert [fit["label"] for fit in values["fits"]] == ["psca", "bound"]
+    out = capsys.readouterr().out
+    assert "psca: number ~ N^" in out
+    assert "the paper, figure 2b: PSCA 0.48(2), modified LSAP 1.16(1)" in out
+
+
+def test_wrong_plans_are_told_with_a_way_to_see_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "moody.py").write_text(MOODY, "utf-8")
+    monkeypatch.setenv("LABSEQ_PLUGIN_PATH", str(tmp_path))
+    assert code_of(*SMALL, "--planners", "moody,psca", "--dop", "4") == 1
+    out, err = capsys.readouterr()
+    assert "of 20 plans are wrong; the first, of loading " in out
+    assert "breaks the rule 'straight'" in out
+    assert err.splitlines()[-1].startswith("error: ")
+    assert "plans of 'moody' are wrong" in err
+    command = next(line for line in out.splitlines() if "see it with" in line).split()
+    words = {key: command[command.index(key) + 1] for key in ("plan", "--seed", "--target", "--planner")}
+    request = PlanRequest(words["plan"], words["--target"], words["--planner"], seed=int(words["--seed"]))
+    with pytest.raises(Exception, match="breaks the rule 'straight'"):
+        plan_moves(request)
+
+
+def test_too_few_atoms_are_told(capsys: pytest.CaptureFixture[str]) -> None:
+    assert code_of(*SMALL, "--loading", "30 %") == 0
+    assert "loadings hold fewer atoms than compact:5x5 has sites" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--planners", "psac"], "--planners psac: unknown planner 'psac'"),
+        (["--target", "compact:30x30"], "--target compact:30x30: "),
+        (["--figure", "2d"], "--figure 2d: there is no such figure; expected one of '2b', '2c', '3a', '3b'"),
+        (["--figure", "2c", "--dop", "3"], "--dop cannot be given besides"),
+        (["--loadings", "0"], "--loadings"),
+        (["--loading", "1.5"], "--loading 1.5: this is no probability"),
+        (["--dop", "0"], "--dop 0: "),
+        (["--dop", "x"], "--dop"),
+        (["--workers", "0"], "--workers"),
+        (["--png", "figure.jpg"], "a file that ends in .png"),
+        (["--csv", "nowhere/out.csv"], "it cannot be written"),
+        (["--json", "."], "it cannot be written"),
+    ],
+)
+def test_wrong_words_are_refused_before_the_work(
+    arguments: list[str],
+    words: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert code_of(*arguments) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert words in err
+    assert "Traceback" not in err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_that_was_there_is_not_lost_to_a_mistake(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("old.csv").write_text("old\n", "utf-8")
+    assert code_of("--csv", "old.csv", "--png", "nowhere/x.png") == 2
+    assert Path("old.csv").read_text("utf-8") == "old\n"
+
+
+def test_help_names_every_option(capsys: pytest.CaptureFixture[str]) -> None:
+    assert code_of("--help") == 0
+    out = capsys.readouterr().out
+    options = ("figure", "planners", "grid", "target", "loading", "dop", "loadings", "seed", "set", "workers")
+    assert all(f"--{option} " in out for option in (*options, "json", "csv", "png"))
+
+
+def test_the_same_seed_gives_the_same_numbers(tmp_path: Path) -> None:
+    found: list[Any] = []
+    for name, seed in (("a", "7"), ("b", "7"), ("c", "8")):
+        assert code_of(*SMALL, "--seed", seed, "--json", str(tmp_path / name)) == 0
+        (row,) = json.loads((tmp_path / name).read_text("utf-8"))["rows"]
+        found.append(np.array([row["n_batches"]["mean"], row["distance_m"]["mean"], row["bound"]["mean"]]))
+    assert np.array_equal(found[0], found[1])
+    assert not np.array_equal(found[0], found[2])

@@ -1,0 +1,202 @@
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import numba
+import numpy as np
+import pytest
+from rich.text import Text
+
+from labseq.cli import main
+from labseq.cli.plan import PlanOutput, plan_once, warnings
+from labseq.cli.plan_report import print_plan, title, totals
+from labseq.cli.plan_steps import move_words
+from labseq.errors import ConfigError
+from labseq.model import Batch
+from labseq.session import PlannedMoves, PlanRequest, plan_moves
+
+assert numba  # loaded already, so that the command does not turn compiling off for the tests after it
+
+REQUEST = PlanRequest("random:6x6@0.7", "checkerboard:4x4", seed=3)
+
+
+class Terminal(io.StringIO):
+    """A text stream that says it is a terminal."""
+
+    encoding = "utf-8"  # pyright: ignore[reportAssignmentType,reportIncompatibleVariableOverride]
+
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.fixture(scope="module")
+def moves() -> PlannedMoves:
+    return plan_moves(REQUEST)
+
+
+def printed(moves: PlannedMoves, stream: io.StringIO | None = None, *, step: bool = False) -> str:
+    stream = stream or io.StringIO()
+    print_plan(moves, stream, step=step)
+    return stream.getvalue()
+
+
+def test_a_plan_without_a_terminal_is_plain_text(moves: PlannedMoves) -> None:
+    text = printed(moves)
+    assert "\x1b" not in text
+    lines = text.splitlines()
+    assert lines[0] == "occupancy  random:6x6@0.7, seed 3: 27 atoms on 6 x 6 sites, triangular, 4.49 um"
+    assert lines[1] == "target     checkerboard 4 x 4: 8 atoms, 8 sites to be empty"
+    assert lines[2] == "planner    psca, degree of parallelism 7"
+    assert "before" in lines[4]
+    assert "after" in lines[4]
+    assert f"atom moves  {moves.plan.n_atom_moves}" in lines
+    assert f"ejected     {moves.n_ejected} atoms" in lines
+    assert lines[-1] == "filled      8 of 8 (100.0 %) target sites"
+    assert all(line == line.rstrip() for line in lines)
+
+
+def test_each_batch_is_told_on_request(moves: PlannedMoves) -> None:
+    text = printed(moves, step=True)
+    n = moves.plan.n_batches
+    assert [f"batch {i + 1} of {n}  " in text for i in range(n)] == [True] * n
+    assert text.count("before") == n + 1
+    assert "ejected" in text
+    assert "Enter" not in text
+
+
+@pytest.mark.parametrize(
+    ("keys", "n_shown"), [("\n\nq\n", 3), ("\n", 2), ("", 1), ("q\n", 1), ("\n" * 99, 99)]
+)
+def test_in_a_terminal_each_batch_waits_for_enter(
+    moves: PlannedMoves, monkeypatch: pytest.MonkeyPatch, keys: str, n_shown: int
+) -> None:
+    monkeypatch.setattr("sys.stdin", Terminal(keys))
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "100")
+    text = printed(moves, Terminal(), step=True)
+    assert text.count(f" of {moves.plan.n_batches}") == min(n_shown, moves.plan.n_batches)
+    assert text.count("Enter: next batch, q: skip the rest") == min(n_shown, moves.plan.n_batches)
+    assert "filled" in text
+
+
+def test_a_pipe_as_keyboard_does_not_wait(moves: PlannedMoves, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.stdin", io.StringIO(""))
+    text = printed(moves, Terminal(), step=True)
+    assert "Enter" not in text
+    assert f"batch {moves.plan.n_batches} of {moves.plan.n_batches}" in text
+
+
+@pytest.mark.parametrize("width", ["16", "40", "80", "200"])
+def test_a_plan_fits_the_terminal(moves: PlannedMoves, monkeypatch: pytest.MonkeyPatch, width: str) -> None:
+    monkeypatch.setenv("COLUMNS", width)
+    monkeypatch.setenv("TERM", "xterm")
+    lines = [Text.from_ansi(line).plain for line in printed(moves, Terminal()).splitlines()]
+    rows = [line for line in lines if line.lstrip()[:1].isdigit()]
+    assert len(rows) == (14 if width == "16" else 7)
+    assert all(len(line) <= int(width) for line in rows)
+
+
+def test_move_words_name_every_line() -> None:
+    batch = Batch(
+        np.array([(0, 1), (0, 4), (3, 1), (3, 4)], np.int16),
+        np.array([(0, 2), (0, 5), (3, 2), (3, 5)], np.int16),
+    )
+    assert move_words(batch, (4, 5), "to") == [
+        "row 0: columns 1to2, 4toejected",
+        "row 3: columns 1to2, 4toejected",
+    ]
+    column = Batch(np.array([(2, 1)], np.int16), np.array([(-1, 1)], np.int16))
+    assert move_words(column, (4, 5)) == ["column 1: row 2->ejected"]
+
+
+def test_the_title_of_a_picture(moves: PlannedMoves) -> None:
+    assert title(moves).startswith("psca, degree of parallelism 7: checkerboard 4 x 4, ")
+    nothing = plan_moves(PlanRequest("random:3x3@1", "compact:3x3", seed=1))
+    assert title(nothing).endswith("compact 3 x 3, 0 batches, 0 atom moves, 0 s")
+
+
+def test_what_falls_short_is_told() -> None:
+    short = PlanRequest("random:6x6@0.2", "compact:4x4", seed=3, degree_of_parallelism=30)
+    moves = plan_moves(short)
+    n_atoms = int(moves.occupancy.sum())
+    assert warnings(moves, short) == [
+        "--dop 30: planned with 20, the most that the planner and the machine allow",
+        f"{n_atoms} atoms for 16 target sites, {16 - n_atoms} too few; the plan fills {n_atoms}",
+    ]
+    assert warnings(plan_moves(REQUEST), REQUEST) == []
+
+
+LAZY = """
+import labseq
+
+LABSEQ_API = 1
+
+
+class Lazy:
+    def __init__(self, settings, context): ...
+    def plan(self, occupancy, target):
+        return labseq.Plan.from_batches([])
+
+
+@labseq.hookimpl
+def labseq_register(registry):
+    registry.planner("lazy", Lazy)
+"""
+
+
+def test_a_planner_that_leaves_defects_and_surplus_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "lazy.py").write_text(LAZY, "utf-8")
+    monkeypatch.setenv("LABSEQ_PLUGIN_PATH", str(tmp_path))
+    request = PlanRequest("random:6x6@0.7", "checkerboard:4x4", "lazy", seed=3)
+    moves = plan_moves(request)
+    assert warnings(moves, request) == [
+        f"the plan leaves {moves.report.n_defects} target sites empty, with atoms enough",
+        f"the plan leaves {moves.report.n_surplus} atoms on sites that must be empty",
+    ]
+    assert ("surplus", f"{moves.report.n_surplus} atoms on sites that must be empty") in totals(moves)
+
+
+def test_json_in_a_file_stands_beside_the_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "plan.json"
+    plan_once(REQUEST, PlanOutput(json=str(path)))
+    out, err = capsys.readouterr()
+    assert "atom moves" in out
+    assert err == ""
+    assert json.loads(path.read_text("utf-8"))["seed"] == 3
+    assert path.read_text("utf-8").count("\n") == 1
+
+
+@pytest.mark.parametrize(("name", "reason"), [("", "Is a directory"), ("gone/plan.json", "No such file")])
+def test_json_that_cannot_be_written_is_told(tmp_path: Path, name: str, reason: str) -> None:
+    with pytest.raises(ConfigError, match=f"the JSON cannot be written: {reason}"):
+        plan_once(REQUEST, PlanOutput(json=str(tmp_path / name)))
+
+
+def code_of(*arguments: str) -> Any:
+    with pytest.raises(SystemExit) as leaving:
+        main(arguments)
+    return leaving.value.code
+
+
+def test_the_command_passes_every_option_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    got: list[Any] = []
+    monkeypatch.setattr("labseq.cli.plan.plan_once", lambda *arguments: got.extend(arguments))
+    target = ["--target", "a:3x3", "--origin", "-1,2"]
+    planner = ["--planner", "p", "--dop", "4", "--set", "a=1", "--set", "b=2"]
+    output = ["--step", "--json", "-", "--png", "x.png"]
+    assert code_of("plan", "-", *target, *planner, "--seed", "5", "-p", "lab", *output) == 0
+    request = PlanRequest("-", "a:3x3", "p", 4, ("a=1", "b=2"), 5, "-1,2", "lab")
+    assert got == [request, PlanOutput(step=True, json="-", png=Path("x.png"))]
+
+
+@pytest.mark.parametrize("wrong", [["--seed", "-1"], ["--seed", "x"], ["--dop", "x"], ["--tagret", "a"], []])
+def test_wrong_usage(wrong: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert code_of("plan", *(["random:3x3@1"] if wrong else []), *wrong) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert "Traceback" not in err

@@ -1,0 +1,65 @@
+from __future__ import annotations
+
+import pytest
+
+from labseq.errors import ConfigError
+from labseq.session.bench_spec import (
+    Entrant,
+    parse_entrants,
+    parse_grid,
+    parse_loading,
+    parse_overrides,
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "entrants"),
+    [
+        ("psca", [Entrant("psca")]),
+        (" psca , lsap_squared", [Entrant("psca"), Entrant("lsap_squared")]),
+        ("psca:a=1,b=2,lsap", [Entrant("psca", (("a", "1"), ("b", "2"))), Entrant("lsap")]),
+        ("psca:a=1,psca:a=2", [Entrant("psca", (("a", "1"),)), Entrant("psca", (("a", "2"),))]),
+        ("psca:max_tones={row: 16, col: 5},lsap", [
+            Entrant("psca", (("max_tones", "{row: 16, col: 5}"),)), Entrant("lsap"),
+        ]),
+    ],
+)  # fmt: skip
+def test_planners_and_their_settings_are_parted_by_commas(text: str, entrants: list[Entrant]) -> None:
+    assert list(parse_entrants(text)) == entrants
+
+
+@pytest.mark.parametrize("text", ["", ",", "psca,", "psca,,lsap", "psca:a", "psca:a=", "1", "a b", "psca:=1"])
+def test_what_is_no_list_of_planners_is_said(text: str) -> None:
+    with pytest.raises(ConfigError, match="this is no list of planners; expected names"):
+        parse_entrants(text)
+
+
+def test_a_planner_is_named_once() -> None:
+    with pytest.raises(ConfigError, match="'psca a=1' is named twice"):
+        parse_entrants("psca:a=1,psca,psca:a=1")
+
+
+@pytest.mark.parametrize("text", ["20", "20x", "x20", "0x5", "20x1001", "-2x2", "20x20x20", "20 by 20", ""])
+def test_what_is_no_size_of_a_grid_is_said(text: str) -> None:
+    with pytest.raises(ConfigError, match="this is no size of a grid; expected ROWSxCOLS"):
+        parse_grid(text)
+
+
+@pytest.mark.parametrize("text", ["-0.1", "1.01", "101 %", "nan", "half", "0.5 ms", ""])
+def test_what_is_no_probability_is_said(text: str) -> None:
+    with pytest.raises(ConfigError, match="this is no probability; expected a number from 0 to 1"):
+        parse_loading(text)
+
+
+def test_probabilities() -> None:
+    assert [parse_loading(text) for text in ("0", "1", "0.75", "75%", "55 %")] == [0, 1, 0.75, 0.75, 0.55]
+
+
+def test_settings_of_planners_need_no_prefix() -> None:
+    assert parse_overrides(["a=1", "planner.b=x=y"]) == ((("a", "1"), ("b", "x=y")), ())
+
+
+@pytest.mark.parametrize("text", ["speed", "=1", "planner.=1", "profile.speed=1", "grid.rows=3", "a.b.c=1"])
+def test_what_nothing_can_be_set_by_is_said(text: str) -> None:
+    with pytest.raises(ConfigError, match=r"nothing to set here; expected planner\.KEY=VALUE"):
+        parse_overrides([text])

@@ -1,0 +1,249 @@
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+
+import labseq
+from labseq.errors import ConfigError
+from labseq.model import Occupancy
+from labseq.session import read_source
+from labseq.session.occupancies import MAX_BYTES, MAX_NPY_BYTES, parse_text
+from labseq.testing.strategies import occupancies
+
+ROOT = Path(__file__).parents[2]
+ARRAY = np.array([[1, 0, 1], [0, 0, 1]], np.bool_)
+
+
+def message(text: Any, **options: Any) -> str:
+    with pytest.raises(ConfigError) as caught:
+        read_source(str(text), **options)
+    return str(caught.value)
+
+
+def test_random_is_drawn_as_documented() -> None:
+    source = read_source("random:20x30@0.75", 5)
+    assert np.array_equal(source.occupancy, np.random.default_rng(5).random((20, 30)) < 0.75)
+    assert (source.seed, source.label) == (5, "random:20x30@0.75, seed 5")
+
+
+@pytest.mark.parametrize("text", ["random:3x4@0", "random:3x4@1", "random: 3 x 4@100 %", "random:3X4@1.0"])
+def test_random_takes_sizes_and_fractions_as_people_write_them(text: str) -> None:
+    occupancy = read_source(text).occupancy
+    assert occupancy.shape == (3, 4)
+    assert occupancy.all() == (text != "random:3x4@0")
+
+
+def test_a_fresh_seed_is_told_and_repeats_the_draw() -> None:
+    first, second = read_source("random:20x20@0.5"), read_source("random:20x20@0.5")
+    assert first.seed != second.seed
+    assert f"seed {first.seed}" in first.label
+    assert np.array_equal(read_source("random:20x20@0.5", first.seed).occupancy, first.occupancy)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("random:", "expected random:ROWSxCOLS@P"),
+        ("random:20@0.75", "expected random:ROWSxCOLS@P"),
+        ("random:20x20", "expected random:ROWSxCOLS@P"),
+        ("random:20x-2@0.75", "expected random:ROWSxCOLS@P"),
+        ("random:20x20@1.5", "the filling fraction is '1.5'; expected a number from 0 to 1"),
+        ("random:20x20@75", "the filling fraction is '75'"),
+        ("random:20x20@-0.1", "the filling fraction is '-0.1'"),
+        ("random:20x20@nan", "the filling fraction is 'nan'"),
+        ("random:20x20@x", "the filling fraction is 'x'"),
+        ("random:0x20@0.75", "0 x 20 sites; expected 1 to 1000"),
+        ("random:20x1001@0.75", "20 x 1001 sites; expected 1 to 1000"),
+        ("random:999999999x999999999@0.75", "expected 1 to 1000"),
+        ("", "the occupancy is an empty text; expected a .npy file"),
+        ("nowhere.npy", "nowhere.npy: there is no such file; expected a .npy file, a text file"),
+        ("nowhere.h5#2", "nowhere.h5: there is no such file"),
+        ("a\0b", "there is no such file"),
+        ("x" * 5000, "there is no such file"),
+    ],
+)
+def test_what_is_no_occupancy_is_refused(text: str, words: str) -> None:
+    assert words in message(text)
+    assert len(message(text)) < 400
+
+
+def test_a_folder_is_no_occupancy(tmp_path: Path) -> None:
+    assert "this is a folder" in message(tmp_path)
+
+
+def test_a_misspelt_file_is_guessed(tmp_path: Path) -> None:
+    np.save(tmp_path / "loading.npy", ARRAY)
+    assert "did you mean 'loading.npy'?" in message(tmp_path / "laoding.npy")
+
+
+@pytest.mark.parametrize("dtype", [np.bool_, np.uint8, np.int64, np.float32, ">i4"])
+@pytest.mark.parametrize("order", ["C", "F"])
+def test_npy_of_any_number_type(tmp_path: Path, dtype: Any, order: Any) -> None:
+    np.save(tmp_path / "a.npy", np.asarray(ARRAY.astype(dtype), order=order))
+    source = read_source(str(tmp_path / "a.npy"), 3)
+    assert np.array_equal(source.occupancy, ARRAY)
+    assert source.occupancy.dtype == np.bool_
+    assert source.occupancy.flags.c_contiguous
+    assert (source.seed, source.target, source.label) == (None, None, str(tmp_path / "a.npy"))
+
+
+@pytest.mark.parametrize(
+    ("array", "words"),
+    [
+        (np.array([0, 1]), "an array of shape (2,) and type int64"),
+        (np.zeros((2, 3, 4)), "an array of shape (2, 3, 4)"),
+        (np.array(1), "an array of shape ()"),
+        (np.array([["1", "0"]]), "type <U1"),
+        (np.array([[1j, 0]]), "type complex128"),
+        (np.array([[1, 2]]), "only 0 and 1"),
+        (np.array([[0.5, 1.0]]), "only 0 and 1"),
+        (np.array([[np.nan, 1.0]]), "only 0 and 1"),
+        (np.zeros((0, 5), np.bool_), "0 x 5 sites; expected 1 to 1000"),
+        (np.zeros((1001, 1), np.bool_), "1001 x 1 sites; expected 1 to 1000"),
+        (np.array([[None, {}]], dtype=object), "it cannot be read"),
+    ],
+)
+def test_npy_of_other_content_is_refused(tmp_path: Path, array: Any, words: str) -> None:
+    np.save(tmp_path / "a.npy", array, allow_pickle=True)
+    text = message(tmp_path / "a.npy")
+    assert words in text
+    assert "expected" in text
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"1 0 1", b"\x93NUMPY", b"\x93NUMPY\x01\x00\xff\xff{", b"PK\x03\x04"]
+)
+def test_a_file_that_is_no_npy_is_refused(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "a.npy").write_bytes(content)
+    assert "expected a two-dimensional array" in message(tmp_path / "a.npy")
+
+
+def test_a_header_that_promises_too_much_is_refused(tmp_path: Path) -> None:
+    with (tmp_path / "a.npy").open("wb") as file:
+        header = {"descr": "<f8", "fortran_order": False, "shape": (1 << 40, 1 << 20)}
+        np.lib.format.write_array_header_2_0(file, header)
+    assert "it cannot be read" in message(tmp_path / "a.npy")
+
+
+def test_a_huge_npy_is_not_even_opened(tmp_path: Path) -> None:
+    with (tmp_path / "a.npy").open("wb") as file:
+        file.truncate(MAX_NPY_BYTES + 1)
+    assert "it is larger than 32 MiB" in message(tmp_path / "a.npy")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        b"101\n001\n",
+        b"1 0 1\n0 0 1",
+        b"1,0,1\r\n0,0,1\r\n",
+        b"#.#\r..#",
+        b"\n  \n1\t0\t1\n0;0;1\n\n",
+        b"\xef\xbb\xbf101\n001",
+    ],
+)
+def test_texts_in_any_usual_form(text: bytes) -> None:
+    assert np.array_equal(parse_text(text, "mine"), ARRAY)
+
+
+@settings(deadline=None)
+@given(occupancies(), st.sampled_from(["01", ".#"]), st.sampled_from(["", " ", ", ", "\t"]))
+def test_texts_are_read_as_they_were_written(occupancy: Occupancy, signs: str, between: str) -> None:
+    text = "\n".join(between.join(signs[int(site)] for site in row) for row in occupancy)
+    assert np.array_equal(parse_text(text.encode(), "mine"), occupancy)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (b"", "mine: it is empty"),
+        (b" \n\n", "mine: it is empty"),
+        (b"101\n01\n", "mine:2:1: this row has 2 sites; expected 3, as in line 1"),
+        (b"\n101\n\n101", "mine:3:1: this row has 0 sites; expected 3, as in line 2"),
+        (b"102\n", "mine:1:3: '2' is no site; expected 0 or '.'"),
+        (b"10\n1\x00\n", r"mine:2:2: '\x00' is no site"),
+        (b"10\n1\xff\n", "mine:2:2: byte 0xFF at offset 4 is not UTF-8"),
+        (b"1" * 1001, "1 x 1001 sites"),
+        (b"1" * (MAX_BYTES + 1), "it is larger than 4 MiB"),
+    ],
+)
+def test_other_texts_are_refused_with_their_place(text: bytes, words: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        parse_text(text, "mine")
+    assert words in str(caught.value)
+
+
+@settings(deadline=None)
+@given(st.binary(max_size=60))
+def test_no_text_is_a_surprise(text: bytes) -> None:
+    try:
+        assert parse_text(text, "mine").size > 0
+    except ConfigError as error:
+        assert str(error).startswith("mine")
+
+
+def test_a_text_file_and_standard_input(tmp_path: Path) -> None:
+    (tmp_path / "a.txt").write_text("101\n001\n", "utf-8")
+    assert np.array_equal(read_source(str(tmp_path / "a.txt")).occupancy, ARRAY)
+    from_pipe = read_source("-", stdin=io.BytesIO(b"101\n001\n"))
+    assert np.array_equal(from_pipe.occupancy, ARRAY)
+    assert from_pipe.label == "standard input"
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> labseq.Run:
+    folder = tmp_path_factory.mktemp("data")
+    sequence = ROOT / "sequences" / "compact_225.yaml"
+    overrides = ["shot.2.rearrange.cycles=3"]
+    with labseq.Session.open(sequence, shots=1, seed=1, output=folder, overrides=overrides) as session:
+        return session.run()
+
+
+def shot_file(run: labseq.Run) -> Path:
+    return next((run.path / "shots").glob("*.h5"))
+
+
+def test_a_shot_gives_the_image_that_each_cycle_was_planned_on(run: labseq.Run) -> None:
+    shot, path = run.shots[0], shot_file(run)
+    for cycle in range(1, len(shot.plans) + 1):
+        source = read_source(f"{path}#{cycle}")
+        assert np.array_equal(source.occupancy, shot.occupancies[cycle - 1])
+        assert source.label == f"{path}, before cycle {cycle} of {len(shot.plans)}"
+    first = read_source(str(path))
+    assert np.array_equal(first.occupancy, shot.occupancies[0])
+    assert first.target is not None
+    assert first.target.n_atoms == 225
+    assert first.machine is not None
+    assert first.machine["grid"]["rows"] == 20
+
+
+@pytest.mark.parametrize("cycle", ["0", "4", "99", "x", "-1", "", "²"])
+def test_a_shot_has_only_the_cycles_it_has(run: labseq.Run, cycle: str) -> None:
+    assert f"there is no cycle '{cycle}'; expected a cycle from 1 to 3" in message(
+        f"{shot_file(run)}#{cycle}"
+    )
+
+
+def test_a_file_that_is_no_shot_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.h5"
+    path.write_bytes(b"no HDF5")
+    assert str(path) in message(path)
+    assert "expected a shot's file" in message(path)
+    h5py.File(path, "w").close()
+    assert "expected a shot's file" in message(f"{path}#1")
+
+
+def test_a_shot_without_cycles_is_refused(tmp_path: Path) -> None:
+    sequence = tmp_path / "load.yaml"
+    lines = (ROOT / "sequences" / "compact_225.yaml").read_text("utf-8").splitlines()
+    kept = [line for line in lines if "rearrange" not in line]
+    sequence.write_text("\n".join(kept), "utf-8")
+    with labseq.Session.open(sequence, profile="virtual", shots=1, seed=1, output=tmp_path) as session:
+        path = shot_file(session.run())
+    assert "this shot has no cycles" in message(path)

@@ -1,0 +1,198 @@
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+
+from labseq.errors import ConfigError
+from labseq.session import PlanRequest, read_source
+from labseq.session.occupancies import Source
+from labseq.session.plan_inputs import PlanInputs, parse_target, read_inputs
+
+ROOT = Path(__file__).parents[2]
+SEQUENCE = ROOT / "sequences" / "compact_225.yaml"
+FULL = "random:20x20@1"
+
+
+def inputs(target: str | None = "compact:15x15", occupancy: str = FULL, **options: Any) -> PlanInputs:
+    request = PlanRequest(occupancy, target, **options)
+    return read_inputs(request, read_source(occupancy, 1))
+
+
+def message(*arguments: Any, **options: Any) -> str:
+    with pytest.raises(ConfigError) as caught:
+        inputs(*arguments, **options)
+    return str(caught.value)
+
+
+def first_site(found: PlanInputs) -> tuple[int, int]:
+    row, col = np.argwhere(found.target.fill)[0].tolist()
+    return row, col
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("compact:15x15", ("compact", {"rows": "15", "cols": "15"})),
+        ("compact: 3 X 4 ", ("compact", {"rows": "3", "cols": "4"})),
+        ("kagome:15x15,clear=none", ("kagome", {"rows": "15", "cols": "15", "clear": "none"})),
+        ("ring:radius=4,width=2", ("ring", {"radius": "4", "width": "2"})),
+        ("a:origin=[2, 3], clear=none", ("a", {"origin": "[2, 3]", "clear": "none"})),
+        ("bitmap:file=a=b,c.txt", ("bitmap", {"file": "a=b,c.txt"})),
+        ("my_pattern", ("my_pattern", {})),
+    ],
+)
+def test_targets_in_words(text: str, expected: Any) -> None:
+    assert parse_target(text) == expected
+
+
+@pytest.mark.parametrize(
+    "text", ["", ":", ":3x3", "compact:", "compact:15", "compact:3x3,4x4", "compact:,", "3x3", "a b"]
+)
+def test_what_is_no_target_is_refused(text: str) -> None:
+    with pytest.raises(ConfigError, match="this is no target; expected a pattern such as kagome:15x15"):
+        parse_target(text)
+
+
+@settings(deadline=None)
+@given(st.text(max_size=30))
+def test_no_target_is_a_surprise(text: str) -> None:
+    try:
+        name, values = parse_target(text)
+    except ConfigError:
+        return
+    assert name
+    assert all(key.isidentifier() for key in values)
+
+
+def test_a_target_is_centred_or_at_its_origin() -> None:
+    assert first_site(inputs()) == (2, 2)
+    assert first_site(inputs(origin="0,5")) == (0, 5)
+    assert first_site(inputs("compact:15x15,origin=[5, 0]")) == (5, 0)
+    assert first_site(inputs("compact:15x15,origin=[5, 0]", origin=" 1 , 2 ")) == (1, 2)
+
+
+def test_the_target_of_a_sequence() -> None:
+    found = inputs(str(SEQUENCE))
+    assert found.target.n_atoms == 225
+    assert first_site(found) == (2, 2)
+    assert first_site(inputs(str(SEQUENCE), origin="4,1")) == (4, 1)
+
+
+@pytest.mark.parametrize(
+    ("target", "options", "words"),
+    [
+        (None, {}, "--target is missing; expected a pattern such as kagome:15x15"),
+        (None, {"origin": "1,1"}, "--target is missing"),
+        ("compakt:3x3", {}, "--target compakt:3x3: unknown pattern 'compakt'; expected one of"),
+        ("compakt:3x3", {}, "did you mean 'compact'?"),
+        ("compact", {}, "'rows' is missing from pattern 'compact'"),
+        ("compact:0x3", {}, "--target compact:0x3: rows is 0; expected at least 1"),
+        ("compact:3x3,orign=[1, 1]", {}, "'orign' is not a setting of pattern 'compact'"),
+        ("compact:21x20", {}, "21 rows x 20 columns; the limit is the grid of 20 rows x 20 columns"),
+        ("compact:15x15", {"origin": "6,0"}, "row 6, column 0; the limit is rows 0 to 5 and columns 0 to 5"),
+        ("compact:15x15", {"origin": "-1,0"}, "--origin -1,0"),
+        ("compact:15x15", {"origin": "1"}, "--origin 1: this is no site; expected row and column"),
+        ("compact:15x15", {"origin": "1,x"}, "this is no site"),
+        ("nowhere.yaml", {}, "nowhere.yaml: there is no such file"),
+        ("bitmap:file=nowhere.txt", {}, "nowhere.txt"),
+        ("compact:3x3", {"planner": "pcsa"}, "--planner pcsa: unknown planner 'pcsa'; expected"),
+        ("compact:3x3", {"planner": "pcsa"}, "did you mean 'psca'?"),
+        ("compact:3x3", {"planner": "a b"}, "this is no name of a planner"),
+        ("compact:3x3", {"planner": ""}, "this is no name of a planner"),
+        (
+            "compact:3x3",
+            {"degree_of_parallelism": 0},
+            "--dop 0: degree_of_parallelism is 0; expected at least 1",
+        ),
+        ("compact:3x3", {"overrides": ["x"]}, "--set x: this is not of the form address=value"),
+        ("compact:3x3", {"overrides": ["dop=3"]}, "--set dop=3: 'dop' is not a setting of planner 'psca'"),
+        (
+            "compact:3x3",
+            {"overrides": ["degree_of_parallelism=x"]},
+            "degree_of_parallelism is 'x'; expected a whole",
+        ),
+        ("compact:3x3", {"overrides": ["degree_of_parallelism.x=3"]}, "degree_of_parallelism is a mapping"),
+        ("compact:3x3", {"overrides": ["profile.grid.rows=3"]}, "there is no --profile to change"),
+        ("compact:3x3", {"profile": "virtul"}, "did you mean 'virtual'?"),
+    ],
+)
+def test_what_cannot_be_planned_is_refused(target: Any, options: Any, words: str) -> None:
+    assert words in message(target, **options)
+
+
+def test_all_that_is_wrong_with_a_target_is_told_at_once() -> None:
+    text = message("compact:0x0,width=3")
+    assert text.count("\n") == 2
+    assert all(word in text for word in ("rows is 0", "cols is 0", "'width' is not a setting"))
+
+
+def test_settings_of_the_planner() -> None:
+    def dop(**options: Any) -> int:
+        return inputs(**options).planner.dump()["degree_of_parallelism"]
+
+    assert dop() == 7
+    assert dop(degree_of_parallelism=3) == 3
+    assert dop(overrides=["degree_of_parallelism=4"]) == 4
+    assert dop(overrides=["planner.degree_of_parallelism=5"], degree_of_parallelism=3) == 5
+    assert inputs(overrides=["max_tones.row=3"]).planner.dump()["max_tones"]["row"] == 3
+
+
+def test_a_profile_gives_grid_and_motion() -> None:
+    found = inputs(profile="virtual", overrides=["profile.mobile_tweezers.speed=75 um/ms"])
+    assert found.machine.grid.shape == (20, 20)
+    assert found.machine.motion.speed_m_s == pytest.approx(0.075)
+    assert inputs().machine.motion.speed_m_s == pytest.approx(0.13)
+
+
+def test_a_profile_of_another_grid_is_refused() -> None:
+    text = message("compact:3x3", "random:5x6@1", profile="virtual")
+    assert "random:5x6@1, seed 1: the occupancy has 5 x 6 sites; expected 20 x 20, as in" in text
+
+
+def test_a_shot_brings_its_target_and_its_machine() -> None:
+    target = inputs("compact:2x2", "random:4x5@1").target
+    machine = {
+        "grid": {"rows": 4, "cols": 5, "spacing": 3e-6, "lattice": "square"},
+        "mobile_tweezers": inputs_motion(speed=0.2),
+    }
+    source = Source(np.ones((4, 5), np.bool_), "a shot", target=target, machine=machine)
+    found = read_inputs(PlanRequest("a shot"), source)
+    assert found.target is target
+    assert (found.machine.grid.lattice, found.machine.grid.spacing_m) == ("square", 3e-6)
+    assert found.machine.motion.speed_m_s == pytest.approx(0.2)
+    other = read_inputs(PlanRequest("a shot", "compact:4x4"), source)
+    assert other.target.n_atoms == 16
+    with pytest.raises(ConfigError, match="there is no --target to move"):
+        read_inputs(PlanRequest("a shot", origin="1,1"), source)
+
+
+def inputs_motion(**changes: Any) -> dict[str, Any]:
+    from labseq.config import MOTION_KEYS, MotionSettings
+
+    values = MotionSettings().model_dump(mode="json", include=set(MOTION_KEYS))
+    return values | changes
+
+
+@pytest.mark.parametrize("machine", [{}, {"grid": {"rows": 0, "cols": 5}}, {"grid": {"rows": 4}}])
+def test_a_damaged_profile_in_a_shot_is_told(machine: Any) -> None:
+    source = Source(np.ones((4, 5), np.bool_), "a shot", machine=machine)
+    with pytest.raises(ConfigError, match="the profile in the shot's file"):
+        read_inputs(PlanRequest("a shot", "compact:2x2"), source)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(1, 6), st.integers(1, 6), st.integers(0, 6), st.integers(0, 6))
+def test_an_origin_is_where_it_says_or_refused(rows: int, cols: int, row: int, col: int) -> None:
+    fits = row + rows <= 6 and col + cols <= 6
+    try:
+        found = inputs(f"compact:{rows}x{cols}", "random:6x6@1", origin=f"{row},{col}")
+    except ConfigError:
+        assert not fits
+    else:
+        assert fits
+        assert first_site(found) == (row, col)
+        assert found.target.n_atoms == rows * cols

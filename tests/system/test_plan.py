@@ -1,0 +1,182 @@
+"""``labseq plan`` as users call it, in processes of its own."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from labseq.session import PlanRequest, plan_moves
+
+pytestmark = pytest.mark.system
+
+ROOT = Path(__file__).resolve().parents[2]
+SEQUENCE = ROOT / "sequences" / "compact_225.yaml"
+RANDOM = "random:20x20@0.75"
+COMPACT = ("--target", "compact:15x15")
+
+
+def call(
+    *arguments: str | Path, cwd: Path, stdin: str = "", stdout: Any = subprocess.PIPE, **environment: str
+) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "labseq", "plan", *map(str, arguments)],
+        stdout=stdout,
+        stderr=subprocess.PIPE,
+        input=stdin,
+        encoding="utf-8",
+        cwd=cwd,
+        env={**os.environ, "PYTHONUTF8": "1", **environment},
+        timeout=120,
+        check=False,
+    )
+
+
+def plan_json(cwd: Path, *arguments: str | Path, **options: Any) -> dict[str, Any]:
+    done = call(*arguments, "--json", "-", cwd=cwd, **options)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("\n") == 1
+    return json.loads(done.stdout)
+
+
+@pytest.mark.parametrize(
+    ("pattern", "dop"),
+    [("compact:15x15", 2), ("kagome:15x15", 7), ("sierpinski:16x16", 15), ("ring:radius=5", 20)],
+)
+def test_the_json_is_the_plan_of_a_run(tmp_path: Path, pattern: str, dop: int) -> None:
+    """The command interprets the kernels; a run, like this process, compiles them."""
+    document = plan_json(tmp_path, RANDOM, "--seed", "11", "--target", pattern, "--dop", str(dop))
+    request = PlanRequest(RANDOM, pattern, degree_of_parallelism=dop, seed=11)
+    assert document == plan_moves(request).as_dict()
+    fill, clear, predicted = (np.array(a) for a in (*document["target"].values(), document["predicted"]))
+    assert predicted[fill == 1].all()
+    assert not predicted[clear == 1].any()
+
+
+def test_json_alone_on_stdout_and_all_else_on_stderr(tmp_path: Path) -> None:
+    words = ("random:6x6@0.2", "--seed", "3", "--target", "compact:4x4", "--step", "--json", "-")
+    done = call(*words, cwd=tmp_path)
+    assert done.returncode == 0
+    assert json.loads(done.stdout)["n_batches"] > 0
+    assert "batch 1 of" in done.stderr
+    assert "warning: 7 atoms for 16 target sites, 9 too few; the plan fills 7" in done.stderr
+
+
+def test_a_report_a_file_and_a_picture(tmp_path: Path) -> None:
+    words = (RANDOM, "--seed", "1", *COMPACT, "--dop", "15", "--json", "a.json", "--png", "a.png")
+    done = call(*words, cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "\x1b" not in done.stdout
+    assert f"occupancy  {RANDOM}, seed 1: " in done.stdout
+    assert "filled      225 of 225 (100.0 %) target sites" in done.stdout
+    assert json.loads((tmp_path / "a.json").read_text("utf-8"))["degree_of_parallelism"] == 15
+    assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "cp1252"])
+def test_a_poor_terminal_gets_poor_characters(tmp_path: Path, encoding: str) -> None:
+    environment = {"PYTHONUTF8": "0", "PYTHONIOENCODING": encoding}
+    done = call(
+        "random:6x6@0.7", "--seed", "3", "--target", "kagome:4x4", "--step", cwd=tmp_path, **environment
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "@ atom on a target site" in done.stdout
+    assert "->" in done.stdout
+
+
+def test_occupancies_of_every_kind(tmp_path: Path) -> None:
+    atoms = np.random.default_rng(4).random((6, 7)) < 0.7
+    rows = atoms.astype(int).tolist()
+    text = "\n".join("".join(map(str, row)) for row in rows)
+    np.save(tmp_path / "a.npy", atoms)
+    (tmp_path / "a.txt").write_text(text, "utf-8")
+    target = ("--target", "compact:3x3")
+    drawn = plan_json(tmp_path, "random:6x7@0.7", "--seed", "4", *target)
+    assert (drawn.pop("seed"), drawn["occupancy"]) == (4, rows)
+    for source, stdin in (("a.npy", ""), ("a.txt", ""), ("-", text)):
+        read = plan_json(tmp_path, source, *target, stdin=stdin)
+        assert (read.pop("seed"), read) == (None, drawn)
+
+
+def test_a_shot_is_planned_again_as_it_was(tmp_path: Path) -> None:
+    run = [sys.executable, "-m", "labseq", "run", str(SEQUENCE), "--shots", "1", "--seed", "1", "--json"]
+    environment = {**os.environ, "LABSEQ_DATA": str(tmp_path / "data")}
+    done = subprocess.run(run, capture_output=True, check=True, env=environment, cwd=tmp_path)
+    path = tmp_path / json.loads(done.stdout)["run_dir"] / "shots" / "shot_000000.h5"
+    import labseq
+
+    shot = labseq.open_run(path).shots[0]
+    for cycle, plan in enumerate(shot.plans, start=1):
+        document = plan_json(tmp_path, f"{path}#{cycle}")
+        moves = [
+            [*a, *b] for batch in document["batches"] for a, b in zip(batch["from"], batch["to"], strict=True)
+        ]
+        assert moves == plan.moves.tolist()
+    other = plan_json(tmp_path, path, "--target", "ring:radius=3")
+    assert sum(map(sum, other["target"]["fill"])) < 225
+    missing = call(f"{path}#99", cwd=tmp_path)
+    assert missing.returncode == 2
+    assert f"{path}: there is no cycle '99'; expected a cycle from 1 to" in missing.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["nowhere.npy", *COMPACT], "nowhere.npy: there is no such file; expected a .npy file, a text file"),
+        (["random:20x20@1.2", *COMPACT], "the filling fraction is '1.2'; expected a number from 0 to 1"),
+        ([RANDOM, "--target", "kagomee:5x5"], "did you mean 'kagome'?"),
+        (
+            [RANDOM, *COMPACT, "--json", "-", "--dop", "0"],
+            "--dop 0: degree_of_parallelism is 0; expected at least 1",
+        ),
+        ([RANDOM, *COMPACT, "--json", "gone/a.json"], "gone/a.json: the JSON cannot be written"),
+    ],
+)
+def test_a_mistake_is_told_in_words(tmp_path: Path, arguments: list[str], words: str) -> None:
+    done = call(*arguments, cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert words in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_without_matplotlib_everything_else_works(tmp_path: Path) -> None:
+    (tmp_path / "without.py").write_text(
+        "import sys\nsys.modules['matplotlib'] = None\nfrom labseq.cli import main\nmain(sys.argv[1:])\n",
+        "utf-8",
+    )
+
+    def without(*arguments: str) -> subprocess.CompletedProcess[str]:
+        command = [
+            sys.executable,
+            "without.py",
+            "plan",
+            "random:5x5@0.7",
+            "--target",
+            "compact:3x3",
+            *arguments,
+        ]
+        return subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, check=False)
+
+    assert without("--json", "-").returncode == 0
+    done = without("--png", "a.png")
+    assert done.returncode == 2
+    assert "needs matplotlib, which is not installed; pip install 'labseq[plot]'" in done.stderr
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such pipes")
+@pytest.mark.parametrize("output", [["--json", "-"], ["--step"], []])
+def test_a_reader_that_goes_away_is_no_error(tmp_path: Path, output: list[str]) -> None:
+    read, write = os.pipe()
+    os.close(read)
+    try:
+        done = call(RANDOM, *COMPACT, *output, cwd=tmp_path, stdout=write)
+    finally:
+        os.close(write)
+    assert done.stderr == ""
+    assert done.returncode == 1

@@ -1,0 +1,156 @@
+"""Every pattern through ``labseq plan``, and its plans through a replay that uses nothing of labseq.
+
+A few plans in the suite; LABSEQ_PLANS=200 makes 200 for each pattern.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import runpy
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from labseq.session import load_plugins
+
+pytestmark = pytest.mark.system
+
+ROOT = Path(__file__).parents[2]
+N_PLANS = int(os.environ.get("LABSEQ_PLANS", "1"))
+TARGETS = (
+    "compact:15x15",
+    "kagome:15x15",
+    "honeycomb:15x15",
+    "link_kagome:15x15",
+    "checkerboard:15x15",
+    "sierpinski:15x15",
+    "ring:15x15",
+    "interleaved:8x15",
+    "sequences/lion_head.yaml",
+)
+
+REPLAY = runpy.run_path(str(Path(__file__).parent / "replay.py"))
+replay: Callable[[dict[str, Any]], None] = REPLAY["replay"]
+Broken: type[Exception] = REPLAY["Broken"]
+
+
+def plan(target: str, *arguments: str, occupancy: str = "random:20x20@0.75") -> dict[str, Any]:
+    command = [
+        sys.executable,
+        "-m",
+        "labseq",
+        "plan",
+        occupancy,
+        "--target",
+        target,
+        *arguments,
+        "--json",
+        "-",
+    ]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False, timeout=120)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+@pytest.mark.parametrize("seed", range(N_PLANS))
+@pytest.mark.parametrize("target", TARGETS)
+def test_every_pattern_ends_full_and_clear(target: str, seed: int) -> None:
+    document = plan(target, "--seed", str(seed))
+    assert sum(map(sum, document["occupancy"])) >= sum(map(sum, document["target"]["fill"]))
+    replay(document)
+
+
+def test_no_pattern_is_left_out() -> None:
+    named = {target.partition(":")[0] for target in TARGETS if ":" in target}
+    entries = load_plugins().registry.entries()
+    shipped = {e.name for e in entries if e.kind == "pattern" and e.origin.startswith("labseq")}
+    assert named | {"bitmap"} == shipped
+
+
+@pytest.mark.parametrize("dop", ["1", "20"])
+def test_a_full_array_ends_full_and_clear(dop: str) -> None:
+    replay(plan("sierpinski:16x16", "--dop", dop, occupancy="random:20x20@1"))
+
+
+def a_document(**changes: Any) -> dict[str, Any]:
+    """A plan of two batches that is right: (0, 0) leaves, then (0, 1) and (0, 2) move up by a site."""
+    return {
+        "planner": "by hand",
+        "grid": {"n_rows": 2, "n_cols": 4},
+        "degree_of_parallelism": 2,
+        "seed": None,
+        "occupancy": [[1, 1, 1, 0], [0, 0, 1, 0]],
+        "target": {"fill": [[0, 0, 1, 1], [0, 0, 0, 0]], "clear": [[1, 1, 0, 0], [0, 0, 0, 0]]},
+        "n_batches": 2,
+        "n_atom_moves": 3,
+        "batches": [
+            {"from": [[0, 0]], "to": [[0, -1]], "linked": False},
+            {"from": [[0, 1], [0, 2]], "to": [[0, 2], [0, 3]], "linked": False},
+        ],
+        "predicted": [[0, 0, 1, 1], [0, 0, 1, 0]],
+        **changes,
+    }
+
+
+def batches(*moves: list[tuple[tuple[int, int], tuple[int, int]]], linked: bool = False) -> dict[str, Any]:
+    made = [
+        {"from": [[*a] for a, _ in batch], "to": [[*b] for _, b in batch], "linked": linked and i > 0}
+        for i, batch in enumerate(moves)
+    ]
+    return {"batches": made, "n_batches": len(made), "n_atom_moves": sum(map(len, moves))}
+
+
+def test_the_replay_lets_a_right_plan_pass() -> None:
+    replay(a_document())
+
+
+@pytest.mark.parametrize(
+    ("changes", "verdict"),
+    [
+        (batches(), "1 of 2 fill sites are empty"),
+        (batches([((0, 1), (0, 2)), ((0, 2), (0, 3))]), "1 clear sites hold an atom"),
+        (batches([((1, 3), (0, 3))]), "an atom is picked up where there is none"),
+        (batches([((0, 0), (0, 1))]), "a tweezer meets an atom"),
+        (batches([((0, 0), (0, 3))]), "a tweezer meets an atom"),
+        (batches([((0, 1), (0, -1))]), "a tweezer meets an atom"),
+        (batches([((0, 0), (0, -2))]), "an atom from (0, 0) is ejected to (0, -2)"),
+        (batches([((0, 0), (0, -1)), ((0, 1), (0, -1))]), "a site is named twice"),
+        (batches([((0, 0), (1, 1))]), "tones of both axes move"),
+        (batches([((0, 0), (1, 0)), ((0, 2), (0, 3))]), "a tone would have to go two ways"),
+        (batches([((0, 0), (0, 1)), ((0, 1), (0, 2)), ((0, 2), (0, 3))]), "3 tweezers are on"),
+        (batches([((0, 1), (0, 3)), ((0, 2), (0, 1))]), "two tones come closer than a site"),
+        (batches([((0, 2), (0, 3))], [((0, 1), (0, 2))], linked=True), "goes on from other sites"),
+        (batches([((0, 0), (0, -1))], [((0, -1), (0, 3))], linked=True), "is moved on"),
+        (batches([]), "a batch without moves"),
+        ({"predicted": [[0, 0, 1, 1], [1, 0, 0, 0]]}, "another array was predicted"),
+        ({"n_batches": 3}, "the number of batches is another"),
+        ({"n_atom_moves": 2}, "the number of atom moves is another"),
+        ({"degree_of_parallelism": 1}, "2 tweezers are on"),
+    ],
+)
+def test_the_replay_finds_what_is_wrong(changes: dict[str, Any], verdict: str) -> None:
+    with pytest.raises(Broken, match=re.escape(verdict)):
+        replay(a_document(**changes))
+
+
+def test_a_crossing_that_is_not_named_may_not_pick_up_an_atom() -> None:
+    occupancy = [[1, 0, 1, 0], [1, 0, 1, 0]]
+    moves = batches([((0, 0), (0, 1)), ((1, 2), (1, 3))])
+    document = a_document(occupancy=occupancy, degree_of_parallelism=4, **moves)
+    with pytest.raises(Broken, match="a tweezer meets an atom"):
+        replay(document)
+
+
+def test_the_replay_reads_plans_from_a_pipe() -> None:
+    wrong = a_document(n_batches=7)
+    lines = "".join(json.dumps(document) + "\n" for document in (a_document(), wrong))
+    command = [sys.executable, "-S", str(Path(__file__).parent / "replay.py")]
+    done = subprocess.run(command, input=lines, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert done.stdout == "plan 2, seed None: the number of batches is another\n2 plans, 1 broken\n"
