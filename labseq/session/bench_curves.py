@@ -79,7 +79,7 @@ def figure_drawing(report: Report, figure: Figure) -> ComparisonDrawing:
     ]
     return ComparisonDrawing(
         title=f"figure {figure.name}: {figure.title}",
-        note=f"{_extent(report)}; the paper: {figure.paper}",
+        note=f"{_extent(report)}\nthe paper: {figure.paper}",
         x_label=AXES[figure.x],
         y_label=AXES[figure.y],
         counted=f"batches of {_plain(first.label)}",
