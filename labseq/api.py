@@ -13,7 +13,8 @@ from labseq.model import MotionSpec, SiteGrid, TargetPattern
 from labseq.registry import Entry
 from labseq.roles import Context, Planner
 from labseq.session import load_plugins
-from labseq.session.choosing import Chosen, construct_one, construct_target
+from labseq.session.choosing import Chosen
+from labseq.session.constructing import construct_one, construct_target
 
 Folders: TypeAlias = str | Path | Sequence[str | Path]
 """A folder, or several."""

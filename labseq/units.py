@@ -56,6 +56,9 @@ EXAMPLES: Final[Mapping[str, str]] = MappingProxyType(
 )
 """Dimension -> what a quantity of it looks like."""
 
+_READABLE: Final = 1e9
+"""Numbers from here on are written with an exponent."""
+
 _NUMBER = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(\S.*?)?\s*\Z")
 
 
@@ -140,11 +143,15 @@ def _a(dimension: str) -> str:
 def format_quantity(value: float, dimension: str, digits: int = 3) -> str:
     """Write an SI value with the unit that a physicist would choose.
 
+    What no unit makes readable keeps its exponent.
+
     Example:
         >>> format_quantity(0.045, "time")
         '45 ms'
         >>> format_quantity(4.49e-6, "length")
         '4.49 um'
+        >>> format_quantity(1e300, "time")
+        '1e+300 s'
     """
     ladders = {
         "time": ("s", "ms", "us", "ns"),
@@ -162,7 +169,8 @@ def format_quantity(value: float, dimension: str, digits: int = 3) -> str:
     unit = next((u for u in ladder if abs(value) >= units[u] * (1 - 1e-9)), ladder[-1])
     if value == 0:
         unit = next((u for u in ladder if units[u] == 1.0), ladder[-1])
-    number = f"{value / units[unit]:.{digits}g}"
-    if "e" in number:
-        number = f"{value / units[unit]:.0f}"
+    amount = value / units[unit]
+    number = f"{amount:.{digits}g}"
+    if "e" in number and abs(amount) < _READABLE:
+        number = f"{amount:.0f}"
     return f"{number} {unit}"

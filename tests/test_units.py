@@ -55,6 +55,14 @@ def test_any_text_is_a_number_or_a_value_error(text, dimension):
         assert "expected" in str(error)
 
 
+@pytest.mark.parametrize(
+    ("value", "shown"),
+    [(1e300, "1e+300 s"), (-2e9, "-2e+09 s"), (123456789.0, "123456789 s"), (1e-20, "0 ns")],
+)
+def test_absurd_values_stay_short(value, shown):
+    assert format_quantity(value, "time") == shown
+
+
 @given(st.floats(1e-9, 1e3), st.sampled_from(["time", "length"]))
 def test_what_is_shown_reads_back(value, dimension):
     shown = format_quantity(value, dimension, digits=9)

@@ -98,11 +98,11 @@ def run(
     profile: Profile = None,
     dry_run: DryRun = None,
     shots: Annotated[
-        int | None, typer.Option(metavar="N", min=1, help="Number of shots, instead of the sequence's own.")
+        int | None, typer.Option(metavar="N", help="Number of shots, instead of the sequence's own.")
     ] = None,
     seed: Annotated[
         int | None,
-        typer.Option(metavar="N", min=0, help="Seed of all random numbers: the same seed, the same run."),
+        typer.Option(metavar="N", help="Seed of all random numbers: the same seed, the same run."),
     ] = None,
     overrides: Overrides = None,
     output: Annotated[

@@ -56,7 +56,7 @@ def check_sequence(
         checked = check(session)
     except BaseException as error:
         if answer is not None:
-            answer(as_line({"problems": [asdict(p) for p in _problems(error)], "warnings": []}))
+            answer(refusal(error))
         raise
     if answer is not None:
         answer(as_line(_as_values(checked)))
@@ -64,8 +64,10 @@ def check_sequence(
         _print(session.assembly, checked)
 
 
-def _problems(error: BaseException) -> Sequence[Problem]:
-    return error.problems if isinstance(error, ConfigError) else [Problem(text) for text in lines_of(error)]
+def refusal(error: BaseException) -> str:
+    """What is wrong with a sequence, as one line of JSON."""
+    problems = error.problems if isinstance(error, ConfigError) else [Problem(t) for t in lines_of(error)]
+    return as_line({"problems": [asdict(problem) for problem in problems], "warnings": []})
 
 
 def _print(assembly: Assembly, checked: CheckReport) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import sys
 import traceback
 from contextlib import suppress
@@ -67,6 +68,8 @@ def lines_of(error: BaseException) -> list[str]:
         return [f"error: {error}"]
     if isinstance(error, KeyboardInterrupt):
         return ["stopped by Ctrl-C"]
+    if isinstance(error, OSError) and error.errno == errno.ENOSPC:
+        return [f"error: {error.filename or 'output'} cannot be written: {error.strerror}"]
     text = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
     return [f"internal error: {text}; please report it; run again with --debug to see where"]
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import io
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
+from contextlib import contextmanager, suppress
 from typing import TextIO
 
 from labseq.errors import RecordingError
@@ -32,7 +33,8 @@ def divert_stdout() -> Callable[[str], None]:
     reaches a program that reads stdout.
 
     Returns:
-        Prints a line to the real stdout, and closes it.
+        Prints a line to the real stdout, and closes it; nothing happens where nobody reads
+        it any more. It raises ``RecordingError`` if it cannot be written.
     """
     sys.stdout.flush()
     real, sys.stdout = os.dup(1), sys.stderr
@@ -42,9 +44,9 @@ def divert_stdout() -> Callable[[str], None]:
         try:
             with os.fdopen(real, "wb", buffering=0) as stream:
                 stream.write(f"{line}\n".encode())
+        except BrokenPipeError:
+            pass
         except OSError as error:
-            if isinstance(error, BrokenPipeError):
-                raise
             raise RecordingError("<stdout>", f"cannot be written: {error.strerror}") from error
 
     return answer
@@ -53,22 +55,51 @@ def divert_stdout() -> Callable[[str], None]:
 def say(*lines: str, stream: TextIO | None = None) -> None:
     """Print lines, at once.
 
+    Where nobody reads them any more, as behind ``| head``, they go nowhere: that ends no
+    command and changes no exit code.
+
     Args:
         *lines: Without line ends.
         stream: Where to; stdout by default.
 
     Raises:
-        BrokenPipeError: Nobody reads it any more.
         RecordingError: It cannot be written, for example to a full disk.
     """
     out = sys.stdout if stream is None else stream
-    try:
+    with writing_to(out):
         out.write("".join(f"{line}\n" for line in lines))
         out.flush()
+
+
+@contextmanager
+def writing_to(stream: TextIO) -> Generator[None]:
+    """What is done here writes to a stream; it is broken off where nobody reads that any more.
+
+    Raises:
+        RecordingError: It cannot be written, for example to a full disk.
+    """
+    try:
+        yield
     except BrokenPipeError:
-        raise
+        _lead_nowhere(stream)
     except OSError as error:
-        raise RecordingError(out.name, f"cannot be written: {error.strerror}") from error
+        raise RecordingError(stream.name, f"cannot be written: {error.strerror}") from error
+
+
+def give_up_unwritten() -> None:
+    """Drop what stdout and stderr could not take, else Python tries again as it ends, and complains."""
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except OSError:
+            _lead_nowhere(stream)
+
+
+def _lead_nowhere(stream: TextIO) -> None:
+    with suppress(OSError):  # a stream that is no file of the system
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, stream.fileno())
+        os.close(nowhere)
 
 
 def encodes(encoding: str | None, characters: str) -> bool:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterable
-from typing import Final, TextIO
+from typing import Final, NoReturn, TextIO
 
 from rich.console import Console
 from rich.text import Text
 
 from labseq.cli.glyphs import glyphs_for
-from labseq.cli.output import columns, encodes
+from labseq.cli.output import columns, encodes, writing_to
 from labseq.cli.plan_canvas import Canvas
 from labseq.cli.plan_steps import Steps
 from labseq.cli.words import count_of, plural
@@ -21,6 +21,13 @@ PLAIN_WIDTH: Final = 132
 """Characters per line where there is no terminal."""
 
 
+class _Console(Console):
+    """One that leaves it to others what a closed pipe means, where rich would end the process."""
+
+    def on_broken_pipe(self) -> NoReturn:
+        raise  # noqa: PLE0704 - rich calls this while it handles the error
+
+
 def print_plan(moves: PlannedMoves, stream: TextIO, *, step: bool) -> None:
     """Print a plan.
 
@@ -29,8 +36,16 @@ def print_plan(moves: PlannedMoves, stream: TextIO, *, step: bool) -> None:
         stream: Where to; if it is a terminal, and the keyboard is there too, the
             batches wait for Enter.
         step: Whether to print it batch by batch first.
+
+    Raises:
+        RecordingError: It cannot be written, for example to a full disk.
     """
-    console = Console(file=stream, highlight=False, soft_wrap=True)
+    console = _Console(file=stream, highlight=False, soft_wrap=True)
+    with writing_to(stream):
+        _print_all(console, moves, step=step)
+
+
+def _print_all(console: Console, moves: PlannedMoves, *, step: bool) -> None:
     width = console.width if console.is_terminal else PLAIN_WIDTH
     shear = moves.grid.shear if moves.grid.lattice == "triangular" else 0
     canvas = Canvas(moves.target, shear, width, glyphs_for(console.encoding))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -11,7 +12,7 @@ from labseq.cli.failures import lines_of
 from labseq.cli.live import observer_for
 from labseq.cli.output import divert_stdout, say
 from labseq.cli.show import as_line, json_summary, summary_lines
-from labseq.errors import LabseqError, StopRequested
+from labseq.errors import LabseqError, RecordingError, StopRequested
 from labseq.recording import Run, open_run
 from labseq.session import Options, Session
 
@@ -43,9 +44,9 @@ def run_sequence(sequence: Path, options: Options, *, as_json: bool) -> None:
             observer.close()
         run = _read_back(session)
         if run is not None:
-            say(*summary_lines(run))
+            _tell(run)
         if answer is not None:
-            answer(outcome(session, run, failure))
+            _answer(answer, outcome(session, run, failure), failure)
 
 
 def outcome(session: Session | None, run: Run | None, failure: BaseException | None) -> str:
@@ -63,6 +64,25 @@ def outcome(session: Session | None, run: Run | None, failure: BaseException | N
         values["status"] = "stopped" if isinstance(failure, StopRequested | KeyboardInterrupt) else "failed"
         values["error"] = "\n".join(lines_of(failure))
     return as_line(values)
+
+
+def _tell(run: Run) -> None:
+    """Print the summary; a full disk behind stdout takes nothing from the run."""
+    lines = summary_lines(run)
+    try:
+        say(*lines)
+    except RecordingError as error:
+        with suppress(RecordingError):
+            say(f"warning: {error}; the run is not touched by that", *lines, stream=sys.stderr)
+
+
+def _answer(answer: Callable[[str], None], line: str, failure: BaseException | None) -> None:
+    """Print the outcome; where that fails, what ended the run is still the first to be told."""
+    try:
+        answer(line)
+    except RecordingError:
+        if failure is None:
+            raise
 
 
 def _read_back(session: Session | None) -> Run | None:

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from labseq.cli.failures import report
 from labseq.cli.output import say
-from labseq.errors import DeviceError
+from labseq.errors import ConfigError, DeviceError
 from labseq.session import make_profile_safe
 
 
@@ -18,13 +19,18 @@ def secure_profile(profile: str, overrides: Sequence[str]) -> int:
         overrides: ``"address=value"`` strings.
 
     Returns:
-        The exit code: 0 if every device is safe.
+        The exit code: 0 if every device is safe and the profile right, 3 if a device
+        failed, else 2.
 
     Raises:
-        LabseqError: The profile is wrong; no device was touched.
+        ConfigError: The profile cannot be read; no device was touched.
     """
-    outcome = make_profile_safe(profile, overrides, _Lines())
-    return DeviceError.exit_code if any(outcome.values()) else 0
+    secured = make_profile_safe(profile, overrides, _Lines())
+    if secured.problems is not None:
+        report(secured.problems)
+    if any(secured.tried.values()):
+        return DeviceError.exit_code
+    return ConfigError.exit_code if secured.refused or secured.problems else 0
 
 
 class _Lines:
@@ -36,3 +42,5 @@ class _Lines:
             say(f"{values['device']:<20} {state}")
         elif name == "closed" and not values["ok"]:
             say(f"{values['device']:<20} could not be closed: {values['error']}")
+        elif name == "warning":
+            say(f"warning: {values['text']}")

@@ -9,11 +9,14 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, Final
 
+from labseq.cli.failures import lines_of
 from labseq.cli.output import columns, say
 from labseq.cli.telling import outcome
 from labseq.cli.words import count_of, percent, plural
-from labseq.errors import RecordingError
+from labseq.config.wording import clean
+from labseq.errors import ConfigError, LabseqError, Problem, RecordingError
 from labseq.recording import Run, Shot, data_root, open_run
+from labseq.recording.folders import find_run
 from labseq.units import format_quantity
 
 MAX_ROWS: Final = 40
@@ -28,24 +31,41 @@ def show_run(path: Path | None, *, as_json: bool) -> None:
         as_json: Whether to print one line of JSON instead.
 
     Raises:
-        RecordingError: There is no such run, or it is damaged.
+        ConfigError: There is no such run.
+        RecordingError: It is damaged.
     """
-    run = open_run(newest_run(data_root()) if path is None else path)
+    try:
+        run = open_run(newest_run(data_root()) if path is None else _existing(path))
+    except LabseqError as error:
+        if as_json:
+            say(as_line(json_summary(None) | {"error": "\n".join(lines_of(error))}))
+        raise
     if as_json:
         say(as_line(json_summary(run)))
     else:
         say(*shot_table(run), "", *summary_lines(run))
 
 
+def _existing(path: Path) -> Path:
+    """The run's folder; a path that is no run's is a mistake of the user, not of the data."""
+    try:
+        return find_run(path)
+    except RecordingError as error:
+        raise ConfigError(str(error)) from error
+    except OSError as error:
+        reason = str(error.strerror or error).lower()
+        raise ConfigError(Problem(f"the folder cannot be read: {reason}", clean(str(path)))) from error
+
+
 def newest_run(root: Path) -> Path:
     """The folder of the run that was started last: newest day, highest counter.
 
     Raises:
-        RecordingError: There is none.
+        ConfigError: There is none.
     """
     folders = [file.parent for file in root.glob("*-*-*/*_*/run.json")]
     if not folders:
-        raise RecordingError(root, "holds no runs; give a run's folder, or set LABSEQ_DATA")
+        raise ConfigError(f"{root} holds no runs; give a run's folder, or set LABSEQ_DATA")
     return max(folders, key=lambda folder: (folder.parent.name, _counter(folder)))
 
 

@@ -1,6 +1,6 @@
 """YAML to frozen, validated specs, with errors that name file, line and column."""
 
-from labseq.config.addresses import Override, split_overrides
+from labseq.config.addresses import Override, profile_overrides, split_overrides
 from labseq.config.collect import Collected
 from labseq.config.document import Document
 from labseq.config.fields import Choice, plugin_paths
@@ -49,6 +49,7 @@ __all__ = [
     "load_sequence",
     "packaged_profiles_dir",
     "plugin_paths",
+    "profile_overrides",
     "split_overrides",
     "validate_values",
 ]

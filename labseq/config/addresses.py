@@ -72,6 +72,33 @@ def split_overrides(options: Sequence[str]) -> tuple[list[Override], list[Overri
     return sequence, profile
 
 
+def profile_overrides(options: Sequence[str]) -> list[Override]:
+    """Read the values of ``--set`` of a command that knows a profile and no sequence.
+
+    Returns:
+        Those of the profile, without "profile.".
+
+    Raises:
+        ConfigError: Not of the form ``profile.address=value``.
+    """
+    others, profile = split_overrides(options)
+    if others:
+        what = "there is no sequence here whose values could be changed"
+        hint = "write --set profile.{}=..."
+        raise ConfigError(
+            [
+                Problem(
+                    what,
+                    o.source,
+                    expected="an address that begins with 'profile.'",
+                    hint=hint.format(clean(o.address)),
+                )
+                for o in others
+            ]
+        )
+    return profile
+
+
 def find(root: Node, address: str, name: str, source: str, may_add: Collection[str] = ()) -> Loc:
     """Turn an address into a location; the last key of a mapping need not exist yet.
 

@@ -17,6 +17,9 @@ from labseq.geometry import DrawingError, read_bitmap
 MAX_PIXELS: Final = 1024
 """Longest side of a picture, in pixels: far more than any grid has sites."""
 
+MAX_BYTES: Final = 1 << 20
+"""Largest file with a drawing, in bytes."""
+
 _HALF: Final = 128
 _SUFFIXES: Final = (".txt", ".png")
 
@@ -36,7 +39,7 @@ def read_drawing(path: Path, fill: str = "#") -> NDArray[np.bool_]:
     Raises:
         ConfigError: It cannot be read, or it is no drawing; with the line that is wrong.
     """
-    data = read_bytes(path, "a text file or a PNG", _SUFFIXES)
+    data = read_bytes(path, "a text file or a PNG", _SUFFIXES, MAX_BYTES)
     name = visible(str(path))
     if path.suffix.lower() == ".png":
         return _picture(data, name)

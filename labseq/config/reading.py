@@ -14,8 +14,8 @@ from labseq.config.nodes import Mark
 from labseq.config.wording import clean, closest, visible
 from labseq.errors import ConfigError, Problem
 
-MAX_BYTES: Final = 1 << 20
-"""Largest file, in bytes."""
+MAX_BYTES: Final = 1 << 18
+"""Largest YAML file, in bytes; reading it takes a quarter of a second."""
 
 YAML_SUFFIXES: Final = (".yaml", ".yml")
 
@@ -31,20 +31,26 @@ _UTF16: Final = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 _UTF32: Final = (codecs.BOM_UTF32_LE, codecs.BOM_UTF32_BE)
 
 
-def read_bytes(path: Path, expected: str = "a YAML file", suffixes: Collection[str] = YAML_SUFFIXES) -> bytes:
-    """Read a file of at most :data:`MAX_BYTES`.
+def read_bytes(
+    path: Path,
+    expected: str = "a YAML file",
+    suffixes: Collection[str] = YAML_SUFFIXES,
+    max_bytes: int = MAX_BYTES,
+) -> bytes:
+    """Read a file of limited size.
 
     Args:
         path: The file.
         expected: What it should be, in words.
         suffixes: Endings of the names that come into question if there is no such file.
+        max_bytes: Most bytes that it may have.
 
     Raises:
         ConfigError: Missing, a folder, no regular file, unreadable or too large.
     """
     name = visible(str(path))
     try:
-        data = _bytes_of(path)
+        data = _bytes_of(path, max_bytes)
     except (FileNotFoundError, NotADirectoryError):
         hint = alike_file(path, suffixes)
         raise ConfigError(Problem("there is no such file", name, hint=hint)) from None
@@ -54,12 +60,13 @@ def read_bytes(path: Path, expected: str = "a YAML file", suffixes: Collection[s
         raise ConfigError(Problem(what, name)) from error
     if isinstance(data, str):
         raise ConfigError(Problem(data, name, expected=expected))
-    if len(data) > MAX_BYTES:
-        raise ConfigError(Problem("the file is larger than 1 MiB", name, expected="a few kilobytes"))
+    if len(data) > max_bytes:
+        what = f"the file is larger than {max_bytes >> 10} KiB"
+        raise ConfigError(Problem(what, name, expected="a few kilobytes"))
     return data
 
 
-def _bytes_of(path: Path) -> bytes | str:
+def _bytes_of(path: Path, max_bytes: int) -> bytes | str:
     """The first bytes of a file, one more than allowed; or why this is none."""
     mode = path.stat().st_mode
     if stat.S_ISDIR(mode):
@@ -67,7 +74,7 @@ def _bytes_of(path: Path) -> bytes | str:
     if not stat.S_ISREG(mode):  # reading a pipe could wait for ever
         return "this is not an ordinary file"
     with path.open("rb") as file:
-        return file.read(MAX_BYTES + 1)
+        return file.read(max_bytes + 1)
 
 
 def decode(data: bytes, name: str) -> str:

@@ -14,6 +14,9 @@ from labseq.units import expected, parse_quantity
 FOLDER: Final = "folder"
 """Key of the validation context: the folder of the file that the settings stand in."""
 
+MAX_DURATION_S: Final = 30 * 86_400.0
+"""Longest time that anything may take: far more than any run, and every clock can count it."""
+
 
 class Settings(BaseModel):
     """Base of every settings model: frozen, strict about keys, SI inside.
@@ -46,6 +49,12 @@ def _quantity(dimension: str) -> BeforeValidator:
     return BeforeValidator(read)
 
 
+def _not_too_long(duration_s: float) -> float:
+    if duration_s > MAX_DURATION_S:
+        raise ValueError("expected at most 720 h, which is 30 days")
+    return duration_s
+
+
 def _beside_its_file(path: Path, info: ValidationInfo) -> Path:
     context = cast("Mapping[str, Path]", info.context or {})
     return beside(context.get(FOLDER, Path()), str(path))
@@ -53,8 +62,8 @@ def _beside_its_file(path: Path, info: ValidationInfo) -> Path:
 
 FilePath: TypeAlias = Annotated[Path, AfterValidator(_beside_its_file)]
 """A file, relative to the sequence or profile that names it; in Python, to the working folder."""
-Duration: TypeAlias = Annotated[float, _quantity("time"), Field(ge=0)]
-"""Seconds, at least 0; "45 ms"."""
+Duration: TypeAlias = Annotated[float, _quantity("time"), Field(ge=0), AfterValidator(_not_too_long)]
+"""Seconds, 0 to :data:`MAX_DURATION_S`; "45 ms"."""
 Length: TypeAlias = Annotated[float, _quantity("length")]
 """Metres; "4.49 um"."""
 Frequency: TypeAlias = Annotated[float, _quantity("frequency")]

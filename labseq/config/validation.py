@@ -6,7 +6,7 @@ import json
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, Final, TypeVar, cast
 
 from pydantic import BaseModel, ValidationError
 
@@ -25,6 +25,10 @@ from labseq.config.wording import (
 )
 
 M = TypeVar("M", bound=BaseModel)
+
+MAX_HINTS: Final = 50
+"""Unknown keys of a mapping that known ones are compared with: a file with more is not what it was
+taken for, and comparing takes time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,10 +133,12 @@ def _findings(error: ValidationError, model: type[BaseModel], top: Node, asked: 
         else:
             chosen += _best_branch(union)
     missing = {one.loc for one in chosen if one.error["type"] == "missing"}
-    misspelt = {_meant_key(one, model, asked) for one in chosen if one.error["type"] == "extra_forbidden"}
+    unknown = [one for one in chosen if one.error["type"] == "extra_forbidden"]
+    meant = {one.loc: _meant_key(one, model, asked) for one in unknown[:MAX_HINTS]}
+    misspelt = {(*loc[:-1], key) for loc, key in meant.items()}
     for one in chosen:
         if one.error["type"] == "extra_forbidden":
-            findings.append(_unknown_key(one, model, top, asked))
+            findings.append(_unknown_key(one, meant.get(one.loc, ""), model, top, asked))
         elif one.error["type"] != "missing":
             findings.append(_wrong_value(one, top, asked))
         elif isinstance(index := one.loc[-1], int):
@@ -195,7 +201,7 @@ def _wrong_value(one: _Placed, top: Node, asked: Asked) -> Finding:
     return Finding(loc, put_in_words(one.error, name, node.plain(), node.raw), bool(context.get("key")))
 
 
-def _unknown_key(one: _Placed, model: type[BaseModel], top: Node, asked: Asked) -> Finding:
+def _unknown_key(one: _Placed, meant: str, model: type[BaseModel], top: Node, asked: Asked) -> Finding:
     loc, key = one.loc, clean(str(one.loc[-1]))
     node = top.at(loc)
     comma = comma_hint(key, node.value) if node is not None else ""
@@ -204,7 +210,6 @@ def _unknown_key(one: _Placed, model: type[BaseModel], top: Node, asked: Asked) 
     if not known:
         words = Words(f"{owner} takes no settings, but '{key}' is given", "", comma or "remove it")
         return Finding(loc, words, key=True)
-    meant = closest(key, known)
     hint = "put a space after the ':'" if ":" in key else f"did you mean '{meant}'?" if meant else ""
     words = Words(f"'{key}' is not a setting of {owner}", listing(known), comma or hint)
     return Finding(loc, words, key=True)
@@ -235,8 +240,8 @@ def _known_keys(loc: Loc, model: type[BaseModel], asked: Asked) -> list[str]:
     return known if loc else [*known, *(key for key in asked.also_known if key not in known)]
 
 
-def _meant_key(one: _Placed, model: type[BaseModel], asked: Asked) -> Loc:
-    return (*one.loc[:-1], closest(str(one.loc[-1]), _known_keys(one.loc[:-1], model, asked)))
+def _meant_key(one: _Placed, model: type[BaseModel], asked: Asked) -> str:
+    return closest(str(one.loc[-1]), _known_keys(one.loc[:-1], model, asked))
 
 
 def _called(loc: Loc, asked: Asked) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NoReturn, cast
+from typing import Any, Final, NoReturn
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,6 +11,8 @@ from labseq.errors import InvalidPlanError, LimitError
 from labseq.model import MotionSpec, Plan, PlanReport, SiteGrid, TargetPattern, as_occupancy
 from labseq.motion.rules import FAULTS
 from labseq.motion.timing import default_grid, site_time_s
+
+_INTEGERS: Final = (int, np.integer)
 
 
 def check_plan(
@@ -48,9 +50,10 @@ def check_plan(
         Predicted occupancy, times and numbers of tweezers.
 
     Raises:
-        InvalidPlanError: The plan breaks a rule; it says which, where and how.
-        LimitError: The degree of parallelism is below 1, or the speed profile is
-            none that exists.
+        InvalidPlanError: The plan breaks a rule; it says which, where and how. Or plan,
+            target, grid or motion is something else.
+        LimitError: The degree of parallelism is no whole number or below 1, or the speed
+            profile is none that exists.
 
     Example:
         >>> target = TargetPattern(fill=[[False, True]], clear=[[True, False]])
@@ -60,10 +63,9 @@ def check_plan(
     """
     from labseq.kernels.plan_check import check, count_wrong
 
+    _check_types(plan, target, degree_of_parallelism, grid, motion, planner)
     if degree_of_parallelism < 1:
         raise LimitError("the degree of parallelism", degree_of_parallelism, "at least 1")
-    if not isinstance(cast("object", plan), Plan):
-        raise InvalidPlanError("shape", f"a Plan was expected, {type(plan).__name__} came", planner=planner)
     motion = motion or MotionSpec()
     try:
         atoms = as_occupancy(occupancy, target.shape if grid is None else grid.shape).copy()
@@ -99,6 +101,23 @@ def check_plan(
     for array in (atoms, end_s, n_tweezers):
         array.flags.writeable = False
     return PlanReport(atoms, end_s, n_tweezers, n_defects, n_surplus)
+
+
+def _check_types(plan: Any, target: Any, dop: Any, grid: Any, motion: Any, planner: str) -> None:
+    """Refuse what a script may mix up, before anything is asked of it."""
+    if not isinstance(dop, _INTEGERS):
+        raise LimitError("the degree of parallelism", repr(dop), "a whole number, at least 1")
+    if not isinstance(plan, Plan):
+        what, came = "a Plan", plan
+    elif not isinstance(target, TargetPattern):
+        what, came = "a TargetPattern as target", target
+    elif grid is not None and not isinstance(grid, SiteGrid):
+        what, came = "a SiteGrid as grid", grid
+    elif motion is not None and not isinstance(motion, MotionSpec):
+        what, came = "a MotionSpec as motion", motion
+    else:
+        return
+    raise InvalidPlanError("shape", f"{what} was expected, {type(came).__name__} came", planner=planner)
 
 
 def _refuse(

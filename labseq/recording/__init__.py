@@ -1,8 +1,18 @@
 """Runs on disk: a folder per run, one HDF5 file per shot, and the way back."""
 
-from labseq.recording.active import clear_active, died, mark_active
+from labseq.recording.active import clear_active, died, mark_active, marker_roots
 from labseq.recording.folders import data_root
 from labseq.recording.reader import Run, Shot, open_run
 from labseq.recording.writer import RunWriter
 
-__all__ = ["Run", "RunWriter", "Shot", "clear_active", "data_root", "died", "mark_active", "open_run"]
+__all__ = [
+    "Run",
+    "RunWriter",
+    "Shot",
+    "clear_active",
+    "data_root",
+    "died",
+    "mark_active",
+    "marker_roots",
+    "open_run",
+]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+import sys
 import unicodedata
 from datetime import datetime
 from pathlib import Path
@@ -31,6 +32,25 @@ _MAX_SLUG: Final = 60
 def data_root() -> Path:
     """Where runs are kept if nothing else is said: LABSEQ_DATA, else ``./data``."""
     return Path(os.environ.get("LABSEQ_DATA") or "data").expanduser()
+
+
+def state_root() -> Path | None:
+    """Folder of what labseq remembers for this user between runs, wherever their data lie.
+
+    ``LABSEQ_STATE`` if set, else the platform's place for such things; None for a
+    user who has no home.
+    """
+    environ = os.environ
+    try:
+        if own := environ.get("LABSEQ_STATE"):
+            return Path(own).expanduser()
+        if sys.platform == "win32":
+            return Path(environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local") / "labseq" / "State"
+        if sys.platform == "darwin":
+            return Path.home() / "Library" / "Application Support" / "labseq"
+        return Path(environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "labseq"
+    except RuntimeError:
+        return None
 
 
 def slug(name: str) -> str:

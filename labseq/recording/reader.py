@@ -35,7 +35,11 @@ def open_run(path: str | Path) -> Run:
     Raises:
         RecordingError: It is no run, is damaged, or is of a newer labseq.
     """
-    folder = folders.find_run(Path(path))
+    try:
+        path = Path(path)
+    except TypeError:
+        raise RecordingError(repr(path), "is no path; give a run's folder or a file in it") from None
+    folder = folders.find_run(path)
     record = read_run(folder)
     status, error = read_state(folder)
     rows, damaged = read_lines(folder / folders.INDEX_FILE)

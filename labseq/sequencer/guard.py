@@ -95,7 +95,7 @@ class Guard:
     def call_to_the_end(
         self, owner: str, timeout_s: float, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs
     ) -> T:
-        """The same, whether or not the run is asked to stop; for safe states and closing."""
+        """The same, whether or not the run is asked to stop; for opening, safe states and closing."""
         return self._wait(owner, self._submit(owner, partial(function, *args, **kwargs)), timeout_s)
 
     def end(self) -> None:

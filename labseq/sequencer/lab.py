@@ -80,12 +80,14 @@ class Lab:
 def in_safe_order(devices: Mapping[str, Hardware]) -> Iterator[tuple[str, Hardware]]:
     """Name and device, in the order of the safe state.
 
-    Mobile tweezers ramp down first, then devices and camera, static tweezers last.
+    Mobile tweezers ramp down first, then devices and camera, static tweezers last; what is
+    missing is left out.
     """
     ends = ("mobile_tweezers", "camera", "static_tweezers")
     others = tuple(name for name in devices if name not in ends)
     for name in (ends[0], *others, *ends[1:]):
-        yield name, devices[name]
+        if name in devices:
+            yield name, devices[name]
 
 
 Outcome = dict[str, LabseqError | None]

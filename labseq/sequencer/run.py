@@ -9,9 +9,9 @@ from functools import partial
 from typing import Any, Protocol
 
 from labseq.errors import LabseqError, StopRequested, TransientError
-from labseq.model import ShotRecord
+from labseq.model import ShotRecord, TimelineEntry
 from labseq.model.records import ShotStatus
-from labseq.roles import RunObserver, Step
+from labseq.roles import RunObserver, Step, StepContext
 from labseq.sequencer.clock import StopFlag
 from labseq.sequencer.guard import Guard
 from labseq.sequencer.lab import Lab, Outcome, close_all, make_safe
@@ -81,10 +81,11 @@ class Sequencer:
         """Open the simulation, then each device, and turn the static tweezers on."""
         self._states.to(State.OPENING)
         lab, timeout_s = self.lab, self.lab.timeouts.call_s
-        if lab.simulation is not None:
-            self.guard.call("simulation", timeout_s, lab.simulation.open)
-        for name, device in lab.hardware():
-            self.guard.call(name, timeout_s, device.open)
+        simulation = () if lab.simulation is None else (("simulation", lab.simulation),)
+        for name, part in (*simulation, *lab.hardware()):
+            self._stop.check()
+            # Nothing is made safe beside an open() that is only slow: what that does last would undo it.
+            self.guard.call_to_the_end(name, timeout_s, part.open)
         self.guard.call("static_tweezers", timeout_s, lab.static_tweezers.load, None)
         self.guard.call("static_tweezers", timeout_s, lab.static_tweezers.start)
         self._states.to(State.IDLE)
@@ -194,6 +195,12 @@ class Sequencer:
 
     def _emit(self, name: str, values: Mapping[str, Any]) -> None:
         self._observer.event(name, values)
+
+
+def lay_out(step: Step, number: int, name: str, context: StepContext) -> list[TimelineEntry]:
+    """A step's timeline; what the step raises is named. For a guarded call."""
+    with _named(number, name):
+        return list(step.plan_timeline(context))
 
 
 def _budget(step: Step, number: int, name: str, lab: Lab) -> float:

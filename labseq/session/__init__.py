@@ -7,7 +7,7 @@ from labseq.session.options import Options
 from labseq.session.plan_inputs import PlanRequest
 from labseq.session.planning import PlannedMoves, plan_moves
 from labseq.session.provenance import gather_provenance
-from labseq.session.safe import make_profile_safe
+from labseq.session.safe import Secured, make_profile_safe
 from labseq.session.session import Session
 
 __all__ = [
@@ -17,6 +17,7 @@ __all__ = [
     "Options",
     "PlanRequest",
     "PlannedMoves",
+    "Secured",
     "Session",
     "Source",
     "assemble",

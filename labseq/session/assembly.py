@@ -10,6 +10,7 @@ from typing import Any
 from labseq import builtins
 from labseq.config import (
     ROLES,
+    Choice,
     Collected,
     Document,
     Override,
@@ -23,9 +24,20 @@ from labseq.config import (
 from labseq.errors import ConfigError
 from labseq.model import TargetPattern
 from labseq.plugins import PluginHost
+from labseq.registry import VIRTUAL_TWIN
 from labseq.roles import Clock, Step
 from labseq.sequencer.lab import Lab, Timeouts
-from labseq.session.choosing import Bench, Chosen, DryRun, check_dry_run, choose, construct, resolve, validate
+from labseq.session.choosing import (
+    Bench,
+    Chosen,
+    DryRun,
+    blamed,
+    check_dry_run,
+    choose,
+    resolve,
+    validate,
+)
+from labseq.session.constructing import construct
 from labseq.session.contents import make_steps, make_target
 
 
@@ -166,24 +178,67 @@ def set_up_bench(
     document, spec = load_profile(profile, beside=beside, overrides=overrides, named_in=named_in, found=found)
     host = load_plugins([*plugin_paths(document, spec.plugin_folders), *plugin_folders])
     problems = Collected() if found is None else found
-    chosen: dict[str, Chosen] = {}
-    warnings: list[str] = []
-    for role, choice in {**spec.choices, **spec.devices}.items():
-        kind = role if role in ROLES else "device"
-        with problems:
-            chosen[role], warning = choose(host, document, kind, choice, dry_run)
-            warnings += [f"{role}: {warning}"] if warning else []
+    bench = choose_all(document, spec, host, dry_run, problems)
     if found is None:
         problems.raise_any()
-    return Bench(document, spec, host, spec.grid_model(), chosen, tuple(warnings))
+    return bench
 
 
-def load_plugins(folders: Sequence[Path] = ()) -> PluginHost:
-    """Load labseq's own, the installed and the folders' plugins."""
+def choose_all(
+    document: Document, spec: ProfileSpec, host: PluginHost, dry_run: DryRun, found: Collected
+) -> Bench:
+    """Choose what plays each role of a profile.
+
+    Args:
+        document: The profile's file.
+        spec: What it says; stand-ins for what was wrong, if anything was found.
+        host: The plugins.
+        dry_run: "off", "full" or "fast".
+        found: Where the problems go.
+    """
+    mended = bool(found.problems)
+    chosen: dict[str, Chosen] = {}
+    warnings: list[str] = []
+    refused: dict[str, ConfigError] = {}
+    for role, choice in {**spec.choices, **spec.devices}.items():
+        kind = role if role in ROLES else "device"
+        if mended and _is_stand_in(document, choice):
+            refused[role] = ConfigError("what the profile says of it is wrong")
+            continue
+        try:
+            chosen[role], warning = choose(host, document, kind, choice, dry_run)
+            warnings += [f"{role}: {warning}"] if warning else []
+        except ConfigError as error:
+            refused[role] = error
+            found.add(error)
+    return Bench(document, spec, host, spec.grid_model(), chosen, tuple(warnings), refused)
+
+
+def _is_stand_in(document: Document, choice: Choice) -> bool:
+    """Whether nobody wrote this, in a profile of which something was wrong: it has no place of its own."""
+    here, around = document.locate(choice.loc), document.locate(choice.loc[:-1])
+    return choice.use == VIRTUAL_TWIN and here == around
+
+
+def load_plugins(folders: Sequence[Path] = (), found: Collected | None = None) -> PluginHost:
+    """Load labseq's own, the installed and the folders' plugins.
+
+    Args:
+        folders: Folders with plugins, beside those of LABSEQ_PLUGIN_PATH.
+        found: Where the problem of a folder that cannot be read goes; without it it is raised.
+
+    Raises:
+        ConfigError: A folder does not exist, or cannot be read.
+    """
     host = PluginHost()
     host.load_builtin(builtins)
     host.load_entry_points()
-    host.load_folders(folders)
+    try:
+        host.load_folders(folders)
+    except ConfigError as error:
+        if found is None:
+            raise
+        found.add(error)
     return host
 
 
@@ -202,7 +257,8 @@ def build_lab(assembly: Assembly, clock: Clock, seed: int) -> Lab:
     profile, motion = bench.profile, bench.profile.motion
     chosen = {**bench.chosen, "planner": assembly.planner}
     made, streams = construct(chosen, bench.grid, motion, clock, seed)
-    dop = getattr(made["planner"], "degree_of_parallelism", motion.max_tweezers)
+    with blamed(assembly.planner.entry, "its degree_of_parallelism"):
+        dop = getattr(made["planner"], "degree_of_parallelism", motion.max_tweezers)
     return Lab(
         grid=bench.grid,
         motion=motion,

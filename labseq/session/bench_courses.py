@@ -15,7 +15,8 @@ from labseq.plugins import PluginHost
 from labseq.roles import NeverStopped, Planner, Warmable
 from labseq.session.assembly import load_plugins
 from labseq.session.bench_spec import Comparison, Condition, Entrant
-from labseq.session.choosing import Chosen, construct, construct_target, dump, resolve
+from labseq.session.choosing import Chosen, dump, resolve
+from labseq.session.constructing import construct, construct_target
 from labseq.session.plan_inputs import parse_target
 
 _DOP: Final = "degree_of_parallelism"
@@ -157,4 +158,4 @@ def _runner(chosen: Chosen, grid: SiteGrid, motion: MotionSpec, seed: int) -> Ru
     planner: Planner = construct({"planner": chosen}, grid, motion, NeverStopped(), seed)[0]["planner"]
     dop = getattr(planner, _DOP, None)
     dop = dop if isinstance(dop, int) else motion.max_tweezers
-    return Runner(planner, chosen.entry.name, dump(chosen.settings), dop)
+    return Runner(planner, chosen.entry.name, dump(chosen.entry, chosen.settings), dop)

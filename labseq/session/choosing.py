@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Generator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 from typing import Any, Final, Literal, get_args
 
 from labseq.config import MOTION_KEYS, Choice, Document, Loc, ProfileSpec
@@ -12,40 +13,18 @@ from labseq.config.wording import clean
 from labseq.errors import (
     ConfigError,
     LabseqError,
-    LimitError,
     PluginLoadError,
     Problem,
     UnknownPluginError,
     one_of,
 )
-from labseq.model import MotionSpec, RandomStream, SiteGrid, TargetPattern
+from labseq.model import SiteGrid
 from labseq.plugins import PluginHost
 from labseq.registry import VIRTUAL_TWIN, Entry
-from labseq.roles import (
-    Camera,
-    Clock,
-    Context,
-    Detector,
-    Device,
-    MobileTweezers,
-    Planner,
-    Simulation,
-    StaticTweezers,
-)
 
 DryRun = Literal["off", "full", "fast"]
 
 HARDWARE_KINDS: Final = frozenset({"camera", "static_tweezers", "mobile_tweezers", "device"})
-
-_ROLES: Final[Mapping[str, type]] = {
-    "camera": Camera,
-    "static_tweezers": StaticTweezers,
-    "mobile_tweezers": MobileTweezers,
-    "device": Device,
-    "detector": Detector,
-    "planner": Planner,
-    "simulation": Simulation,
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,10 +45,10 @@ class Chosen:
 
     def dump(self) -> dict[str, Any]:
         """Settings for the record, SI, JSON-ready."""
-        return {"use": self.entry.name, **dump(self.settings)}
+        return {"use": self.entry.name, **dump(self.entry, self.settings)}
 
-    def placed(self, error: ConfigError | LimitError) -> LabseqError:
-        """What its constructor says of its settings, with the place that they stand in."""
+    def placed(self, error: LabseqError) -> LabseqError:
+        """Why it cannot be constructed, with the place that its settings stand in."""
         is_placed = isinstance(error, ConfigError) and any(problem.source for problem in error.problems)
         if self.document is None or is_placed:
             return error
@@ -87,6 +66,7 @@ class Bench:
         grid: The grid of sites.
         chosen: Role or device name -> what plays it; no planner.
         warnings: What the user should know although it is no error.
+        refused: Role or device name -> why nothing could be chosen.
     """
 
     document: Document
@@ -95,6 +75,12 @@ class Bench:
     grid: SiteGrid
     chosen: Mapping[str, Chosen]
     warnings: tuple[str, ...]
+    refused: Mapping[str, ConfigError] = field(default_factory=dict[str, ConfigError])
+
+    @property
+    def hardware_key(self) -> str:
+        """What its hardware is known by in the markers of runs."""
+        return str(self.document.path.resolve())
 
     @property
     def virtual_time(self) -> bool:
@@ -151,10 +137,20 @@ def named(
 def validate(
     document: Document, entry: Entry, loc: tuple[str | int, ...], drop: frozenset[str] = frozenset()
 ) -> Settings | None:
-    """Validate the settings of an entry; None if it takes none."""
+    """Validate the settings of an entry; None if it takes none.
+
+    Raises:
+        ConfigError: They are wrong, or the plugin's own validators fail; with their place.
+    """
     also_known = sorted(drop - {"use", "pattern"})
     called = f"{entry.kind.replace('_', ' ')} '{entry.name}'"
-    return document.validate(entry.settings_model, loc, drop=drop, also_known=also_known, called=called)
+    try:
+        with blamed(entry, f"the settings model of {called}"):
+            return document.validate(
+                entry.settings_model, loc, drop=drop, also_known=also_known, called=called
+            )
+    except PluginLoadError as error:
+        raise document.error(loc, str(error)) from error
 
 
 def choose(
@@ -172,78 +168,54 @@ def choose(
     drop = frozenset(MOTION_KEYS) if kind == "mobile_tweezers" else frozenset[str]()
     if dry_run == "off" or kind not in HARDWARE_KINDS or choice.use == VIRTUAL_TWIN:
         return resolve(host, document, kind, choice, drop), ""
-    twin = host.registry.get(kind, VIRTUAL_TWIN)
+    entry = host.registry.get(kind, VIRTUAL_TWIN)
+    twin = Chosen(entry, _defaults(entry), document, choice.loc)
     if dry_run == "fast":
-        return Chosen(twin, _defaults(twin)), ""
-    if host.registry.find(kind, choice.use) is None:
-        text = f"plugin '{choice.use}' is not installed; its virtual twin takes its place"
-        return Chosen(twin, _defaults(twin)), f"{text} and its settings were not checked"
+        return twin, ""
+    if absence := _absence(host, kind, choice.use):
+        return twin, f"{absence}; its virtual twin takes its place and its settings were not checked"
     chosen = resolve(host, document, kind, choice, drop)
     if chosen.entry.virtual_time:
         return chosen, ""
     if chosen.entry.simulated is not None and chosen.settings is not None:
         settings = chosen.settings.model_copy(update=dict(chosen.entry.simulated))
         return replace(chosen, settings=settings), ""
-    return Chosen(twin, _defaults(twin)), ""
+    return twin, ""
 
 
-def construct(
-    chosen: Mapping[str, Chosen], grid: SiteGrid, motion: MotionSpec, clock: Clock, seed: int
-) -> tuple[dict[str, Any], tuple[RandomStream, ...]]:
-    """Construct the object of every role; constructors do no I/O, so nothing is open yet.
-
-    Returns:
-        Role -> object, and the random streams that were handed out.
-
-    Raises:
-        ConfigError: A constructor refuses its settings; with their place.
-        PluginLoadError: A constructor raised, or made no object of that role; names the plugin.
-    """
-    made: dict[str, Any] = {}
-    streams: list[RandomStream] = []
-    simulation: Simulation | None = None
-    for role in sorted(chosen, key=lambda role: role != "simulation"):  # the world comes first
-        stream = RandomStream(seed, "" if role == "simulation" else role)
-        streams.append(stream)
-        context = Context(role, grid, motion, clock, stream, {}, simulation)
-        made[role] = construct_one(chosen[role], context)
-        if role == "simulation":
-            simulation = made[role]
-    return made, tuple(streams)
-
-
-def construct_one(chosen: Chosen, context: Context) -> Any:
-    """Construct the object of one role.
-
-    Raises:
-        ConfigError: Its constructor refuses its settings; with their place.
-        PluginLoadError: Its constructor raised, or made no object of that role; names the plugin.
-    """
-    entry = chosen.entry
+def _absence(host: PluginHost, kind: str, name: str) -> str:
+    """Why nothing offers a name: its plugin did not load, or there is none; "" if something does."""
+    if host.registry.find(kind, name) is not None:
+        return ""
     try:
-        made = entry.factory(chosen.settings, context)
-    except (ConfigError, LimitError) as error:
-        raise chosen.placed(error) from error
+        host.get(kind, name)
+    except PluginLoadError as error:
+        return str(error)
+    except UnknownPluginError as error:
+        hint = f" ({error.hint})" if error.hint else ""
+        return f"plugin '{clean(name)}' is not installed{hint}"
+    return ""
+
+
+@contextmanager
+def blamed(entry: Entry, what: str) -> Generator[None]:
+    """Name the plugin in whatever its code raises; labseq's own errors pass as they are.
+
+    Args:
+        entry: Whose code runs in the block.
+        what: What runs, for the message.
+
+    Raises:
+        PluginLoadError: The block raised; a ``SystemExit`` counts, or a plugin could end
+            labseq as if all were well.
+    """
+    try:
+        yield
     except LabseqError:
         raise
-    except Exception as error:
-        text = f"the constructor of {entry.kind} '{entry.name}' raised {type(error).__name__}: {error}"
+    except (Exception, SystemExit) as error:
+        text = f"{what} raised {type(error).__name__}: {error}"
         raise PluginLoadError(entry.origin, text) from error
-    _check_role(entry, made)
-    return made
-
-
-def _check_role(entry: Entry, made: object) -> None:
-    """Refuse an object that lacks a method or attribute of its role.
-
-    Raises:
-        PluginLoadError: With what is missing.
-    """
-    role = _ROLES[entry.kind]
-    missing = [name for name in dir(role) if not name.startswith("_") and not hasattr(made, name)]
-    if missing:
-        text = f"{entry.kind} '{entry.name}' has no {', '.join(missing)}; see labseq.{role.__name__}"
-        raise PluginLoadError(entry.origin, text)
 
 
 def check_dry_run(dry_run: object) -> None:
@@ -258,30 +230,14 @@ def check_dry_run(dry_run: object) -> None:
         )
 
 
-def construct_target(chosen: Chosen, grid: SiteGrid) -> TargetPattern:
-    """Make a target of its pattern.
+def dump(entry: Entry, settings: Settings | None) -> dict[str, Any]:
+    """Settings for the record, SI, JSON-ready.
 
     Raises:
-        LabseqError: The pattern refuses, for example because it does not fit on the grid.
-        PluginLoadError: The pattern's plugin is at fault; names it.
+        PluginLoadError: The plugin's own serializers fail.
     """
-    entry = chosen.entry
-    try:
-        target = entry.factory(chosen.settings, grid)
-    except LabseqError:
-        raise
-    except Exception as error:
-        text = f"pattern '{entry.name}' raised {type(error).__name__}: {error}"
-        raise PluginLoadError(entry.origin, text) from error
-    if not isinstance(target, TargetPattern) or target.shape != grid.shape:
-        text = f"pattern '{entry.name}' made no TargetPattern of shape {grid.shape}"
-        raise PluginLoadError(entry.origin, text)
-    return target
-
-
-def dump(settings: Settings | None) -> dict[str, Any]:
-    """Settings for the record, SI, JSON-ready."""
-    return {} if settings is None else settings.model_dump(mode="json")
+    with blamed(entry, f"the settings of {entry.kind} '{entry.name}'"):
+        return {} if settings is None else settings.model_dump(mode="json")
 
 
 def _defaults(entry: Entry) -> Settings | None:

@@ -10,7 +10,8 @@ from labseq.config.settings import Settings
 from labseq.errors import ConfigError, LabseqError, PluginLoadError, one_of
 from labseq.model import TargetPattern
 from labseq.roles import Step
-from labseq.session.choosing import Bench, construct_target, dump, named, resolve, validate
+from labseq.session.choosing import Bench, blamed, dump, named, resolve, validate
+from labseq.session.constructing import check_role, construct_target
 
 
 def make_target(
@@ -31,7 +32,7 @@ def make_target(
     except LabseqError as error:
         problem = document.problem(choice.loc, str(error))
         raise ConfigError(replace(problem, notes=(_grid_note(bench),))) from error
-    return target, {"pattern": chosen.entry.name, **dump(chosen.settings)}
+    return target, {"pattern": chosen.entry.name, **dump(chosen.entry, chosen.settings)}
 
 
 def make_steps(
@@ -51,9 +52,9 @@ def make_steps(
     for spec in sequence.shot:
         step: Step | None = None
         with found:
-            step, settings = _make_step(bench, document, spec)
+            step, dumped = _make_step(bench, document, spec)
             steps.append((spec.name or spec.kind, step))
-            dumps.append({spec.kind: dump(settings), **({"name": spec.name} if spec.name else {})})
+            dumps.append({spec.kind: dumped, **({"name": spec.name} if spec.name else {})})
             if step.needs_image and not image_seen:
                 what = f"'{spec.kind}' needs an image before it in the shot"
                 raise document.error(spec.loc, what, "an 'image' step before it", key=True)
@@ -62,14 +63,17 @@ def make_steps(
     return steps, dumps
 
 
-def _make_step(bench: Bench, document: Document, spec: StepSpec) -> tuple[Step, Settings | None]:
+def _make_step(bench: Bench, document: Document, spec: StepSpec) -> tuple[Step, dict[str, Any]]:
     entry = named(bench.host, document, "step", spec.kind, spec.loc, key=True)
     settings = validate(document, entry, spec.loc)
     if spec.kind == "device":
         _check_device_name(bench, document, settings, spec)
     try:
-        return entry.factory(settings), settings
-    except ConfigError as error:
+        with blamed(entry, f"the constructor of step '{spec.kind}'"):
+            step = entry.factory(settings)
+            check_role(entry, step)
+        return step, dump(entry, settings)
+    except (ConfigError, PluginLoadError) as error:
         raise document.error(spec.loc, str(error)) from error
 
 

@@ -8,7 +8,21 @@ from pathlib import Path
 from typing import Any
 
 from labseq.config import Override
+from labseq.config.wording import clean
+from labseq.errors import ConfigError, Problem
 from labseq.session.choosing import DryRun
+
+
+def path_of(value: Any, name: str) -> Path:
+    """A path that somebody gave.
+
+    Raises:
+        ConfigError: It is none.
+    """
+    try:
+        return Path(value)
+    except TypeError:
+        raise ConfigError(Problem(f"{name} is {clean(repr(value))}", expected="a path")) from None
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +46,11 @@ class Options:
     output: Path | None = None
     dry_run: DryRun = "off"
     realtime: bool = False
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.profile, str | Path | None):  # pyright: ignore[reportUnnecessaryIsInstance]
+            what = f"profile is {clean(repr(self.profile))}"
+            raise ConfigError(Problem(what, expected="the name or the path of a hardware profile"))
 
     def own(self) -> list[Override]:
         """``shots`` and ``seed`` as overrides that know which option they came from."""

@@ -29,7 +29,8 @@ from labseq.errors import ConfigError, LimitError, Problem
 from labseq.model import MotionSpec, SiteGrid, TargetPattern
 from labseq.plugins import PluginHost
 from labseq.session.assembly import load_plugins
-from labseq.session.choosing import Chosen, construct_target, resolve
+from labseq.session.choosing import Chosen, resolve
+from labseq.session.constructing import construct_target
 from labseq.session.occupancies import Source
 
 _TARGET: Final = re.compile(r"([^\W\d][\w-]*)(?::(.*))?", re.DOTALL)

@@ -14,7 +14,7 @@ from labseq.errors import LabseqError, PlanError
 from labseq.model import MotionSpec, Occupancy, Plan, PlanReport, SiteGrid, TargetPattern
 from labseq.motion import check_plan
 from labseq.roles import NeverStopped, Planner
-from labseq.session.choosing import construct
+from labseq.session.constructing import construct
 from labseq.session.occupancies import Source, read_source
 from labseq.session.plan_inputs import PlanRequest, read_inputs
 

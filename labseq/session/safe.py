@@ -2,16 +2,44 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
 
-from labseq.config import split_overrides
-from labseq.errors import LabseqError, StopRequested
+from labseq.config import Collected, load_profile, plugin_paths, profile_overrides
+from labseq.errors import ConfigError, LabseqError, RecordingError, StopRequested
+from labseq.recording import clear_active, data_root, marker_roots
 from labseq.roles import Hardware, RunObserver, Simulation
 from labseq.sequencer import Guard, RealClock, StopFlag, VirtualClock
 from labseq.sequencer.lab import Timeouts, in_safe_order
-from labseq.session.assembly import set_up_bench, timeouts_of
-from labseq.session.choosing import HARDWARE_KINDS, construct
+from labseq.session.assembly import choose_all, load_plugins, timeouts_of
+from labseq.session.choosing import HARDWARE_KINDS, Bench
+from labseq.session.constructing import construct_each
 from labseq.session.signals import stop_on_signals
+
+_NEEDED_KINDS: Final = HARDWARE_KINDS | {"simulation"}
+
+
+@dataclass(frozen=True, slots=True)
+class Secured:
+    """What became of the devices of a profile.
+
+    Attributes:
+        tried: Name of each device that could be constructed -> why it is not safe, or None.
+        refused: Name of each other -> why not, with its place in the profile.
+        problems: What else is wrong with the profile, or None.
+    """
+
+    tried: Mapping[str, LabseqError | None]
+    refused: Mapping[str, LabseqError]
+    problems: ConfigError | None = None
+
+    @property
+    def failures(self) -> list[LabseqError]:
+        """Why devices are not safe, those that were tried first; empty if all are."""
+        return [error for error in [*self.tried.values(), *self.refused.values()] if error is not None]
 
 
 def secure(
@@ -58,36 +86,74 @@ def _try(guard: Guard, name: str, timeout_s: float, method: Callable[[], None]) 
     return None
 
 
+def secure_bench(bench: Bench, stop: StopFlag, observer: RunObserver | None = None) -> Secured:
+    """Construct each device of a profile, open it, make it safe and close it.
+
+    One that cannot be constructed never keeps the others from it; it is told at the end.
+
+    Args:
+        bench: The profile.
+        stop: The request to stop; not obeyed here.
+        observer: Told each device's outcome.
+    """
+    clock = VirtualClock(stop) if bench.virtual_time else RealClock(stop)
+    chosen = {role: c for role, c in bench.chosen.items() if c.entry.kind in _NEEDED_KINDS}
+    made, _, failures = construct_each(chosen, bench.grid, bench.profile.motion, clock, seed=0)
+    simulation = made.pop("simulation", None)
+    with stop.held():
+        tried = secure(in_safe_order(made), timeouts_of(bench.profile), simulation, observer)
+    refused: dict[str, LabseqError] = {role: e for role, e in bench.refused.items() if role != "detector"}
+    refused |= {role: chosen[role].placed(error) for role, error in failures.items()}
+    if observer is not None:
+        for role, error in refused.items():
+            observer.event("safe_state", {"device": role, "ok": False, "error": str(error)})
+    return Secured(tried, refused)
+
+
 def make_profile_safe(
     profile: str, overrides: Sequence[str] = (), observer: RunObserver | None = None
-) -> dict[str, LabseqError | None]:
+) -> Secured:
     """Bring every device of a profile to its safe state.
+
+    Ctrl-C does not leave it half done: it is obeyed once every device has been tried. If
+    all are safe, nothing is left to do for the next run, whatever became of the last one.
 
     Args:
         profile: Name or path of the profile.
         overrides: ``"profile.address=value"`` strings, as given to ``--set``.
-        observer: Told each device's outcome.
-
-    Ctrl-C does not leave it half done: it is obeyed once every device has been tried.
-
-    Returns:
-        Device name -> what went wrong, or None.
+        observer: Told each device's outcome, and warnings.
 
     Raises:
-        ConfigError: The profile is wrong or does not exist.
-        PluginLoadError: A plugin that it names failed to load.
+        ConfigError: The profile cannot be read, or does not exist; no device was touched.
         StopRequested: Ctrl-C or SIGTERM came meanwhile.
     """
-    _, for_profile = split_overrides(overrides)
-    bench = set_up_bench(profile, overrides=for_profile)
-    stop = StopFlag()
-    clock = VirtualClock(stop) if bench.virtual_time else RealClock(stop)
-    needed = HARDWARE_KINDS | {"simulation"}
-    chosen = {role: c for role, c in bench.chosen.items() if c.entry.kind in needed}
-    made, _ = construct(chosen, bench.grid, bench.profile.motion, clock, seed=0)
-    simulation = made.pop("simulation", None)
-    with stop_on_signals(stop), stop.held():
-        outcome = secure(in_safe_order(made), timeouts_of(bench.profile), simulation, observer)
+    found, roots = Collected(), marker_roots(data_root())  # now: vendors' libraries change the folder
+    bench = _read(profile, overrides, found)
+    key, stop = bench.hardware_key, StopFlag()
+    with stop_on_signals(stop):
+        secured = secure_bench(bench, stop, observer)
+    told = [problem for error in bench.refused.values() for problem in error.problems]
+    others = [problem for problem in found.problems if problem not in told]
+    # A problem or an override may have left a device out, or put another in its place.
+    if not (secured.failures or others or overrides):
+        try:
+            clear_active(roots, key)
+        except RecordingError as failure:
+            if observer is not None:
+                observer.event("warning", {"text": str(failure)})
     if stop.is_set:
         raise StopRequested(stop.signal_number)
-    return outcome
+    return replace(secured, problems=ConfigError(others) if others else None)
+
+
+def _read(profile: str, overrides: Sequence[str], found: Collected) -> Bench:
+    """Read a profile and choose its devices, past everything that is wrong but can be gone past."""
+    for_profile = profile_overrides(overrides)
+    document, spec = load_profile(profile, beside=Path(), overrides=for_profile, found=found)
+    with found:
+        plugin_paths(document, spec.plugin_folders)
+    folders: list[Path] = []
+    for folder in spec.plugin_folders:
+        with suppress(ConfigError):  # told already
+            folders += plugin_paths(document, [folder])
+    return choose_all(document, spec, load_plugins(folders, found), "off", found)

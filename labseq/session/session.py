@@ -15,16 +15,26 @@ from labseq.errors import ConfigError, DeviceError, LabseqError, PlanError, Stop
 from labseq.kernels.compile import announcing
 from labseq.model import RunRecord, TimelineEntry
 from labseq.model.records import RunStatus
-from labseq.recording import Run, RunWriter, clear_active, data_root, died, mark_active, open_run
+from labseq.recording import (
+    Run,
+    RunWriter,
+    clear_active,
+    data_root,
+    died,
+    mark_active,
+    marker_roots,
+    open_run,
+)
 from labseq.roles import RunObserver, Warmable
 from labseq.sequencer import Guard, PacedClock, RealClock, Sequencer, StopFlag, VirtualClock
 from labseq.sequencer.lab import Lab, describe
+from labseq.sequencer.run import lay_out
 from labseq.session.assembly import Assembly, assemble, build_lab
 from labseq.session.choosing import DryRun
 from labseq.session.observers import Observers
-from labseq.session.options import Options
+from labseq.session.options import Options, path_of
 from labseq.session.provenance import gather_provenance
-from labseq.session.safe import secure
+from labseq.session.safe import secure_bench
 from labseq.session.signals import stop_on_signals
 
 P = ParamSpec("P")
@@ -50,7 +60,7 @@ class Session:
             self.seed = secrets.randbits(63)
         self.run_dir: Path | None = None
         # What the hardware is known by; a dry run touches none, and says nothing about it.
-        profile = str(assembly.bench.document.path.resolve())  # now: vendors' libraries change the folder
+        profile = assembly.bench.hardware_key  # now: vendors' libraries change the folder
         self._profile_key = profile if options.dry_run == "off" else f"{profile} (dry run)"
         self.stop_flag = StopFlag()
         self._observers = Observers(assembly.bench.host, observer)
@@ -88,10 +98,14 @@ class Session:
             UnknownPluginError: A plugin that is named does not exist.
             PluginLoadError: A plugin that is named failed to load.
         """
-        folder = Path(output) if output is not None else None
+        folder = None if output is None else path_of(output, "output")
         options = Options(profile, shots, seed, tuple(overrides), folder, dry_run, realtime)
         assembly = assemble(
-            Path(sequence), profile=profile, overrides=overrides, given=options.own(), dry_run=dry_run
+            path_of(sequence, "sequence"),
+            profile=profile,
+            overrides=overrides,
+            given=options.own(),
+            dry_run=dry_run,
         )
         return cls(assembly, options, observer)
 
@@ -109,8 +123,13 @@ class Session:
 
     def timeline(self) -> list[tuple[str, list[TimelineEntry]]]:
         """What a shot will do: name of each step and its bars."""
-        context = self.build_lab().step_context
-        return [(name, list(step.plan_timeline(context))) for name, step in self.assembly.steps]
+        lab, guard = self.build_lab(), Guard(self.stop_flag)
+        timeline = [
+            (name, guard.call("step", lab.timeouts.call_s, lay_out, step, number, name, lab.step_context))
+            for number, (name, step) in enumerate(self.assembly.steps)
+        ]
+        guard.end()
+        return timeline
 
     def run(self) -> Run:
         """Take all shots.
@@ -124,13 +143,14 @@ class Session:
         """
         if self.run_dir is not None:
             raise ConfigError("a session runs once; open another for the next run")
-        root = (self.options.output or data_root()).absolute()  # some vendors' libraries change the folder
+        roots = marker_roots(self.options.output or data_root())
         for text in self.assembly.bench.warnings:
             self._observers.event("warning", {"text": text})
         with stop_on_signals(self.stop_flag):
+            self._secure_after_crash(roots)
             lab = self.build_lab()
             self.warm(lab)
-            return self._run(lab, root)
+            return self._run(lab, roots)
 
     def build_lab(self) -> Lab:
         """Construct every role's object on the clock that the run will have; nothing is opened."""
@@ -169,15 +189,14 @@ class Session:
             self.stop_flag.check()
         guard.end()
 
-    def _run(self, lab: Lab, root: Path) -> Run:
-        self._secure_after_crash(lab, root)
+    def _run(self, lab: Lab, roots: Sequence[Path]) -> Run:
         record = self._record(lab)
-        writer = RunWriter.create(root, record)
+        writer = RunWriter.create(roots[0], record)
         self.run_dir = writer.run_dir
         self._observers.log = writer.event
         error: BaseException | None = None
         try:
-            self._take_shots(lab, root, writer, record)
+            self._take_shots(lab, roots, writer, record)
         except BaseException as failure:  # noqa: BLE001 - raised again once the run is over
             error = failure
         unsafe = self._shut_down()
@@ -186,13 +205,13 @@ class Session:
             error = DeviceError(next(iter(unsafe)), f"not in its safe state after the run: {reasons}")
         self._finish(writer, record, error)
         if not unsafe:
-            self._try(clear_active, root, self._profile_key)
+            self._try(clear_active, roots, self._profile_key)
         self._observers.end()
         if error is not None:
             raise error
         return open_run(writer.run_dir)
 
-    def _take_shots(self, lab: Lab, root: Path, writer: RunWriter, record: RunRecord) -> None:
+    def _take_shots(self, lab: Lab, roots: Sequence[Path], writer: RunWriter, record: RunRecord) -> None:
         spec = self.assembly.sequence
         about = {"record": record, "run_dir": str(writer.run_dir)}
         sequencer = self._sequencer = Sequencer(
@@ -205,7 +224,7 @@ class Session:
             attempts=spec.attempts,
             parameters=self.options.changes(),
         )
-        mark_active(root, self._profile_key, writer.run_dir)
+        mark_active(roots, self._profile_key, writer.run_dir)
         self._observers.event("run_starting", about)
         sequencer.open()
         writer.set_devices(describe(lab, sequencer.guard))
@@ -232,19 +251,19 @@ class Session:
         except LabseqError as failure:
             self._observers.event("warning", {"text": str(failure)})
 
-    def _secure_after_crash(self, lab: Lab, root: Path) -> None:
-        """If the last run on this profile died, its devices may still be on."""
-        dead = died(root, self._profile_key)
+    def _secure_after_crash(self, roots: Sequence[Path]) -> None:
+        """If the last run on this profile died, its devices may still be on.
+
+        They are made safe before anything else is constructed or compiled, which may fail.
+        """
+        dead = died(roots, self._profile_key)
         if dead is None:
             return
         text = f"the last run on this profile ({dead}) died; its devices are made safe first"
         self._observers.event("warning", {"text": text})
-        with self.stop_flag.held():
-            outcome = secure(lab.safe_order(), lab.timeouts, lab.simulation, self._observers)
-        for failure in outcome.values():
-            if failure is not None:
-                raise failure
-        clear_active(root, self._profile_key)
+        for failure in secure_bench(self.assembly.bench, self.stop_flag, self._observers).failures:
+            raise failure
+        self._try(clear_active, roots, self._profile_key)
         self.stop_flag.check()
 
     def _record(self, lab: Lab) -> RunRecord:

@@ -44,7 +44,7 @@ class VirtualCamera(VirtualDriver):
     @property
     def facts(self) -> CameraFacts:
         """Read-out time, longest exposure, shape of the simulated frames."""
-        shape = getattr(self._simulation, "frame_shape", None)
+        shape = getattr(self._world, "frame_shape", None)
         return CameraFacts(self._settings.readout, self._settings.max_exposure, shape)
 
     def arm(self, n_frames: int, exposure_s: float, trigger: Trigger) -> None:

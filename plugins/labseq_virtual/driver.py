@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 
-from labseq import Context, DeviceError, Simulation
+from labseq import ConfigError, Context, DeviceError
 
 
 class VirtualDriver(ABC):
@@ -13,26 +13,24 @@ class VirtualDriver(ABC):
     Args:
         context: Name, clock, random numbers and the simulated world.
         role: Name to use where the context has none.
+
+    Raises:
+        ConfigError: There is no simulated world.
     """
 
     def __init__(self, context: Context, role: str) -> None:
         self._name = context.name or role
         self._clock = context.clock
         self._random = context.random
-        self._simulation = context.simulation
+        if context.simulation is None:
+            raise ConfigError(
+                "virtual hardware needs a simulated world; add `simulation: {use: virtual}` to the profile"
+            )
+        self._world = context.simulation
         self._is_open = False
 
     def open(self) -> None:
-        """Connect to the simulated world.
-
-        Raises:
-            DeviceError: There is none.
-        """
-        if self._simulation is None:
-            raise DeviceError(
-                self._name,
-                "virtual hardware needs a simulated world; add `simulation: {use: virtual}` to the profile",
-            )
+        """Connect to the simulated world."""
         self._is_open = True
 
     def close(self) -> None:
@@ -43,11 +41,6 @@ class VirtualDriver(ABC):
     @abstractmethod
     def safe_state(self) -> None:
         """Make the output harmless; legal in any state."""
-
-    @property
-    def _world(self) -> Simulation:
-        assert self._simulation is not None  # open() has checked it
-        return self._simulation
 
     def _check_open(self) -> None:
         if not self._is_open:

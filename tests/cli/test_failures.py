@@ -1,3 +1,5 @@
+import errno
+
 import pytest
 
 from labseq.cli.failures import MAX_TOLD, exit_code_of, lines_of, report
@@ -52,6 +54,14 @@ def test_an_internal_error_says_how_to_report_it(capsys: pytest.CaptureFixture[s
     out, err = capsys.readouterr()
     assert out == ""
     assert err == "internal error: KeyError: 'lost'; please report it; run again with --debug to see where\n"
+
+
+def test_a_full_disk_is_no_internal_error() -> None:
+    text = "cannot be written: No space left on device"
+    full = OSError(errno.ENOSPC, "No space left on device")
+    assert lines_of(full) == [f"error: output {text}"]
+    full.filename = "a.npy"
+    assert lines_of(full) == [f"error: a.npy {text}"]
 
 
 @pytest.mark.parametrize("debug", [False, True])

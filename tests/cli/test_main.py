@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -10,6 +11,7 @@ import labseq
 from labseq.cli import main
 from labseq.errors import ConfigError, DeviceError, PlanError, Problem, StopRequested
 
+SEQUENCE = Path(__file__).parents[2] / "sequences" / "compact_225.yaml"
 HEAVY = ("numpy", "pydantic", "yaml", "rich", "h5py", "numba", "scipy", "pluggy")
 
 
@@ -46,9 +48,7 @@ def test_help_names_every_command_and_option(capsys: pytest.CaptureFixture[str])
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        (["run", "a.yaml", "--shots", "0"], "--shots"),
         (["run", "a.yaml", "--shots", "x"], "--shots"),
-        (["run", "a.yaml", "--seed", "-1"], "--seed"),
         (["run", "a.yaml", "--dry-run=quick"], "--dry-run"),
         (["run", "a.yaml", "--shot", "3"], "--shot"),
         (["run"], "SEQUENCE"),
@@ -104,12 +104,27 @@ def test_ctrl_c_outside_of_a_run(monkeypatch: pytest.MonkeyPatch) -> None:
     assert code_of("show", "x") == 130
 
 
-def test_a_reader_that_went_away_is_no_error(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_wrong_numbers_of_shots_and_seeds_are_told_as_all_other_settings(
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    def break_pipe(*_: Any, **__: Any) -> None:
-        raise BrokenPipeError(32, "Broken pipe")
+    assert code_of("run", str(SEQUENCE), "--shots", "0", "--seed", "-1") == 2
+    assert capsys.readouterr().err == (
+        "--shots 0: shots is 0; expected at least 1\n--seed -1: seed is -1; expected at least 0\n"
+    )
 
-    monkeypatch.setattr("labseq.cli.show.show_run", break_pipe)
-    assert code_of("show", "x") == 1
-    assert capsys.readouterr().err == ""
+
+def test_safe_changes_no_sequence(capsys: pytest.CaptureFixture[str]) -> None:
+    assert code_of("safe", "virtual", "--set", "camera.gain=1") == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith("--set camera.gain=1: there is no sequence here")
+
+
+@pytest.mark.parametrize(
+    ("path", "said"), [("nope", "nope: no such file or folder"), ("x" * 5000, "xxx...: the folder cannot be")]
+)
+def test_a_run_that_is_not_there_is_a_mistake_of_the_user(
+    path: str, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert code_of("show", path) == 2
+    assert said in capsys.readouterr().err

@@ -1,4 +1,5 @@
 import io
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -6,8 +7,19 @@ from pathlib import Path
 import pytest
 from hypothesis import given, strategies as st
 
-from labseq.cli.output import columns, say
+from labseq.cli.output import columns, give_up_unwritten, say
 from labseq.errors import RecordingError
+
+FULL = Path("/dev/full")
+SEQUENCE = Path(__file__).parents[2] / "sequences" / "compact_225.yaml"
+PLAN = "plan random:8x8@0.75 --target compact:4x4 --step"
+COMMANDS = [  # and whether Python keeps what is printed in a buffer
+    ("plugins", False),
+    ("plugins", True),
+    (f"check {SEQUENCE}", True),
+    (PLAN, False),
+    (f"{PLAN} --json -", True),
+]
 
 CELLS = st.text(st.characters(min_codepoint=33, max_codepoint=126), max_size=8)
 
@@ -47,3 +59,44 @@ def test_closed_streams_change_no_exit_code(tmp_path: Path, closed: str) -> None
     assert done.returncode == 2
     assert "internal error" not in done.stderr
     assert list(tmp_path.iterdir()) == []
+
+
+def perform(command: str, stdout: int, buffered: bool) -> subprocess.CompletedProcess[str]:
+    environment = {**os.environ, "PYTHONUNBUFFERED": "" if buffered else "1"}
+    arguments = [sys.executable, "-m", "labseq", *command.split()]
+    return subprocess.run(
+        arguments, stdout=stdout, stderr=subprocess.PIPE, env=environment, text=True, check=False
+    )
+
+
+@pytest.mark.parametrize(("command", "buffered"), COMMANDS)
+def test_a_reader_that_went_away_is_no_error(command: str, buffered: bool) -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    done = perform(command, writer, buffered)
+    os.close(writer)
+    assert done.returncode == 0
+    assert "Error" not in done.stderr
+    assert "error" not in done.stderr
+
+
+@pytest.mark.skipif(not FULL.exists(), reason="no full device")
+@pytest.mark.parametrize(("command", "buffered"), [*COMMANDS, ("--help", True)])
+def test_a_full_disk_is_told_in_a_line(command: str, buffered: bool) -> None:
+    with FULL.open("w", encoding="utf-8") as full:
+        done = perform(command, full.fileno(), buffered)
+    assert done.returncode == 1
+    assert done.stderr.splitlines()[-1].endswith("cannot be written: No space left on device")
+    assert "internal" not in done.stderr
+    assert "Exception" not in done.stderr
+
+
+def test_what_cannot_be_written_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    with os.fdopen(writer, "w", encoding="utf-8") as stream:
+        monkeypatch.setattr(sys, "stdout", stream)
+        say("nobody reads this")
+        say("nor this")
+        stream.write("nor what a plugin left in the buffer")
+        give_up_unwritten()

@@ -11,8 +11,9 @@ from typing import Any
 
 import pytest
 
+from labseq.cli.output import give_up_unwritten
 from labseq.cli.run import run_sequence
-from labseq.errors import ConfigError, DeviceError, Problem, StopRequested
+from labseq.errors import ConfigError, DeviceError, Problem, RecordingError, StopRequested
 from labseq.recording import RunWriter
 from labseq.session import Options
 
@@ -181,6 +182,38 @@ def test_a_broken_screen_does_not_hide_the_outcome(perform: Any, monkeypatch: py
     _, out, _, caught = perform()
     assert caught is None
     assert json.loads(out)["status"] == "complete"
+
+
+FULL = Path("/dev/full")
+
+
+@pytest.mark.skipif(not FULL.exists(), reason="no full device")
+def test_a_full_disk_behind_stdout_takes_nothing_from_the_run(perform: Any) -> None:
+    with FULL.open("w", encoding="utf-8") as full, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "stdout", full)
+        patch.setattr("labseq.cli.log_lines.LogLines.event", lambda *_: None)  # a session gives it up
+        session, _, err, caught = perform(as_json=False)
+        give_up_unwritten()
+    assert caught is None
+    lines = err.splitlines()
+    assert lines[0] == (
+        "warning: /dev/full: cannot be written: No space left on device; the run is not touched by that"
+    )
+    assert lines[1] == f"run               {session.run_dir}"
+
+
+@pytest.mark.skipif(not FULL.exists(), reason="no full device")
+@pytest.mark.parametrize("error", [DeviceError("camera", "mute"), None])
+def test_an_answer_that_cannot_be_given_hides_no_failure(perform: Any, error: BaseException | None) -> None:
+    stdout = os.dup(1)
+    try:
+        with FULL.open("wb") as full:
+            os.dup2(full.fileno(), 1)
+        *_, caught = perform(error)
+    finally:
+        os.dup2(stdout, 1)
+        os.close(stdout)
+    assert caught is error if error is not None else isinstance(caught, RecordingError)
 
 
 LATE_PRINTS = """

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from labseq.cli.show import MAX_ROWS, newest_run, shot_table, show_run, summary_lines
-from labseq.errors import RecordingError
+from labseq.errors import ConfigError
 from labseq.recording import RunWriter, open_run
 
 
@@ -87,8 +87,9 @@ def test_show_finds_the_newest_run_itself(
     fake: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("LABSEQ_DATA", str(tmp_path))
-    with pytest.raises(RecordingError, match="holds no runs"):
+    with pytest.raises(ConfigError, match="holds no runs"):
         show_run(None, as_json=True)
+    assert json.loads(capsys.readouterr().out)["error"].startswith(f"error: {tmp_path} holds no runs")
     write_run(tmp_path, fake, [])
     folder = write_run(tmp_path, fake, [fake.shot(0)])
     show_run(None, as_json=True)

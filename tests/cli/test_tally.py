@@ -53,7 +53,7 @@ def test_unknown_events_and_stages_are_ignored() -> None:
 
 def test_over_budget_is_counted() -> None:
     tally = Tally(lambda: 0.0)
-    for duration_s in (59e-3, 60e-3, 61e-3):
+    for duration_s in (59e-3, 60e-3, 62e-3):
         tally.note("stage", {"timing": StageTiming("move", 2, 1, 0.0, duration_s, 1e-3, 60e-3)})
     assert tally.stages["move"].n_over == 1
 

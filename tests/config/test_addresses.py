@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from labseq.config import Document, Loc, Override, split_overrides
+from labseq.config import Document, Loc, Override, profile_overrides, split_overrides
 from labseq.config.addresses import find
 from labseq.errors import ConfigError
 
@@ -97,6 +97,19 @@ def test_split_names_every_wrong_option() -> None:
     assert str(caught.value.problems[0]) == (
         "--set shots: this is not of the form address=value; "
         "expected for example --set planner.degree_of_parallelism=5"
+    )
+
+
+def test_where_only_a_profile_can_be_changed() -> None:
+    assert profile_overrides(["profile.grid.rows=3"]) == [
+        Override("grid.rows", "3", "--set profile.grid.rows=3")
+    ]
+    with pytest.raises(ConfigError) as caught:
+        profile_overrides(["camera.x=1", "profile.camera.x=1", "shots=3"])
+    assert [problem.source for problem in caught.value.problems] == ["--set camera.x=1", "--set shots=3"]
+    assert str(caught.value.problems[0]) == (
+        "--set camera.x=1: there is no sequence here whose values could be changed; "
+        "expected an address that begins with 'profile.'; write --set profile.camera.x=..."
     )
 
 

@@ -77,7 +77,7 @@ def test_the_lion_head_is_a_drawing_without_margins() -> None:
         ("\n\n#.#\n##\n", r"drawing\.txt:4:1: row 2 of the drawing"),
         ("", "the drawing is empty"),
         ("...\n...\n", "the drawing holds no atom; draw an atom as one of '#'"),
-        ("#\n" * 600_000, "the file is larger than 1 MiB"),
+        ("#\n" * 600_000, "the file is larger than 1024 KiB"),
     ],
 )
 def test_a_wrong_text_is_an_error_with_its_line(content: str, message: str, tmp_path: Path) -> None:

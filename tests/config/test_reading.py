@@ -79,7 +79,7 @@ def test_size_limit() -> None:
     assert Document.read(Path("f.yaml")).data == {"a": "b"}
     with Path("f.yaml").open("ab") as file:
         file.write(b" ")
-    assert message_of(Path("f.yaml")) == ("f.yaml: the file is larger than 1 MiB; expected a few kilobytes")
+    assert message_of(Path("f.yaml")) == ("f.yaml: the file is larger than 256 KiB; expected a few kilobytes")
 
 
 def test_path_is_kept_as_given() -> None:

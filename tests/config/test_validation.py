@@ -12,6 +12,7 @@ from pydantic import Field
 
 from labseq.config import Document, Settings
 from labseq.config.settings import Duration, Fraction, Length
+from labseq.config.validation import MAX_HINTS
 from labseq.errors import ConfigError
 
 LENGTH = "a length such as '4.49 um' (m, mm, um, nm) or a plain number in m"
@@ -258,3 +259,11 @@ def test_thousands_of_problems() -> None:
     with pytest.raises(ConfigError) as caught:
         Document.parse(text, "f.yaml").validate(Inner)
     assert len(caught.value.problems) == 3000
+
+
+def test_of_very_many_unknown_keys_only_the_first_are_compared_with_the_known_ones() -> None:
+    text = "".join(f"width{i}: 1\n" for i in range(MAX_HINTS + 2))
+    with pytest.raises(ConfigError) as caught:
+        Document.parse(text, "f.yaml").validate(Inner)
+    hints = [problem.hint for problem in caught.value.problems]
+    assert hints == ["did you mean 'width'?"] * MAX_HINTS + ["", ""]

@@ -56,6 +56,8 @@ def test_python_and_numpy_values() -> None:
         ({"sizes": (1, None)}, "sizes.1 is empty; expected a number"),
         ({"sizes": [float("nan")]}, "sizes.0 is nan; expected a finite number"),
         ({"rows": object()}, "a value of type object is no setting; expected a number, text, list or dict"),
+        ({"window": 1e300}, "window is 1e+300; expected at most 720 h, which is 30 days"),
+        ({"window": "721 h"}, "window is '721 h'; expected at most 720 h, which is 30 days"),
         ({"window": "1 K"}, "window: '1 K' is a temperature, not a time"),
     ],
 )

@@ -113,3 +113,8 @@ def test_a_stage_without_budget_is_never_over_it():
     assert not StageTiming("plan", 0, 1, 0.0, 9.0, 9.0).over_budget
     assert StageTiming("move", 0, 1, 0.0, 0.07, 0.0, 0.06).over_budget
     assert not StageTiming("move", 0, 1, 0.0, 0.06, 0.0, 0.06).over_budget
+
+
+def test_what_a_clock_overshoots_is_not_over_budget():
+    assert not StageTiming("move", 0, 1, 0.0, 0.0609, 0.0, 0.06).over_budget
+    assert StageTiming("move", 0, 1, 0.0, 0.0611, 0.0, 0.06).over_budget

@@ -239,6 +239,26 @@ class TestShape:
             check_plan([], grid_of("#."), self.TARGET, 1)  # pyright: ignore[reportArgumentType]
 
     @pytest.mark.parametrize(
+        ("given", "message"),
+        [
+            ({"target": None}, "'shape': a TargetPattern as target was expected, NoneType came"),
+            ({"target": grid_of("#.")}, "'shape': a TargetPattern as target was expected, ndarray came"),
+            ({"grid": (1, 2)}, "'shape': a SiteGrid as grid was expected, tuple came"),
+            ({"motion": 5}, "'shape': a MotionSpec as motion was expected, int came"),
+        ],
+    )
+    def test_arguments_that_were_mixed_up(self, given: dict[str, Any], message: str) -> None:
+        arguments: dict[str, Any] = {"target": self.TARGET, "degree_of_parallelism": 1, **given}
+        with pytest.raises(InvalidPlanError, match=message):
+            check_plan(self.PLAN, grid_of("#."), **arguments)
+
+    @pytest.mark.parametrize("dop", [None, "7", 1.5, [1]])
+    def test_the_degree_of_parallelism_is_a_whole_number(self, dop: Any) -> None:
+        with pytest.raises(LimitError, match=r"degree of parallelism is .*; the limit is a whole"):
+            check_plan(self.PLAN, grid_of("#."), self.TARGET, dop)
+        assert check_plan(self.PLAN, grid_of("#."), self.TARGET, np.int64(1))  # pyright: ignore[reportArgumentType]
+
+    @pytest.mark.parametrize(
         ("occupancy", "grid"),
         [
             (grid_of("#.."), None),

@@ -18,6 +18,7 @@ from labseq_virtual.static_tweezers import VirtualStaticTweezers
 from labseq_virtual.world import World
 
 from labseq import (
+    ConfigError,
     Context,
     DeviceError,
     DeviceTimeoutError,
@@ -38,7 +39,7 @@ class Lab:
     def __init__(self) -> None:
         self.clock = FakeClock()
         self.random = RandomStream(0)
-        physics = {"loading": 1.0, "lifetime": 1e12, "imaging_loss": 0.0, "transport_loss": 0.0}
+        physics = {"loading": 1.0, "lifetime": 2e6, "imaging_loss": 0.0, "transport_loss": 0.0}
         settings = WorldSettings.model_validate(
             {**physics, "image": {"frame": (64, 64), "centre_px": (31.5, 31.5)}}
         )
@@ -243,5 +244,5 @@ def test_closing_makes_safe(lab: Lab) -> None:
 
 @pytest.mark.parametrize("driver", [VirtualCamera, VirtualStaticTweezers, VirtualMobileTweezers])
 def test_virtual_hardware_needs_a_world(driver: Any) -> None:
-    with pytest.raises(DeviceError, match=r"simulation: \{use: virtual\}"):
-        driver(object(), Context("camera")).open()
+    with pytest.raises(ConfigError, match=r"simulation: \{use: virtual\}"):
+        driver(object(), Context("camera"))

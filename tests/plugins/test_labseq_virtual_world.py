@@ -29,7 +29,7 @@ TINY_IMAGE = {"frame": (2, 2), "background": 0.0}
 
 def new_world(seed: int = 0, *, on: bool = True, **physics: Any) -> World:
     """A world without losses but those that are asked for, in its first shot, with small frames."""
-    calm = {"lifetime": 1e12, "imaging_loss": 0.0, "transport_loss": 0.0, "image": TINY_IMAGE}
+    calm = {"lifetime": 2e6, "imaging_loss": 0.0, "transport_loss": 0.0, "image": TINY_IMAGE}
     random = RandomStream(seed)
     world = World(WorldSettings.model_validate(calm | physics), Context("simulation", GRID, random=random))
     world.open()

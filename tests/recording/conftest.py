@@ -112,7 +112,7 @@ def _shot(
         cycles=[_cycle(i, sizes, rng) for i, sizes in enumerate(batches, start=1)],
         timing=[
             StageTiming("load", 0, 0, 0.0, 0.5, 0.001),
-            StageTiming("plan", 2, 1, 0.5, 0.002, 0.002, 0.001),
+            StageTiming("plan", 2, 1, 0.5, 0.003, 0.003, 0.001),
             StageTiming("plan", 2, 2, 0.6, 0.001, 0.003, 0.001),
             StageTiming("prüfen", 2, 1, 0.5, 1e-9, 0.0, 0.01),
         ],

@@ -231,3 +231,9 @@ def test_several_values_of_a_shot_read_its_file_once(run_dir: Path) -> None:
 def test_importing_the_package_is_light() -> None:
     code = "import sys, labseq.recording; assert 'h5py' not in sys.modules and 'pydantic' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.mark.parametrize("path", [None, 5, b"data"])
+def test_what_is_no_path_is_no_run(path: Any) -> None:
+    with pytest.raises(RecordingError, match="is no path; give a run's folder or a file in it"):
+        open_run(path)

@@ -1,5 +1,6 @@
 """Whole runs on fakes: order of calls, retries, and every way out."""
 
+import threading
 from types import SimpleNamespace
 from typing import Any
 
@@ -69,6 +70,32 @@ def test_devices_open_before_and_are_safe_and_closed_after():
     assert rig.made_safe() == SAFE_ORDER
     assert not rig.unsafe
     assert rig.sequencer.state is State.CLOSED
+
+
+def test_no_device_is_made_safe_beside_an_open_that_is_only_slow(monkeypatch):
+    rig, looks, release = Rig(), [], threading.Event()
+    camera, opened = rig.lab.camera, rig.lab.camera.open
+
+    def now():
+        if rig.lab.stop.is_set:
+            looks.append(None)
+        if len(looks) == 3:  # by now the stop request has been seen
+            release.set()
+        return 0.0
+
+    def slow():
+        rig.lab.stop.request(15)
+        assert release.wait(30.0)
+        opened()
+
+    monkeypatch.setattr(camera, "open", slow)
+    monkeypatch.setattr("labseq.sequencer.guard.GRACE_S", 0.0)
+    monkeypatch.setattr("labseq.sequencer.guard.time", SimpleNamespace(monotonic=now))
+    with pytest.raises(StopRequested):
+        rig.run()
+    names = rig.lab.calls.names()
+    assert names[:3] == ["static_tweezers.open", "camera.open", "mobile_tweezers.safe_state"]
+    assert rig.made_safe() == SAFE_ORDER
 
 
 def test_a_complete_shot_is_judged_on_its_last_image():

@@ -375,6 +375,18 @@ def test_a_damaged_plan_is_stopped_before_anything_plays(tmp_path, damage):
             "constructor of planner 'mine' raised OSError: no",
         ),
         (
+            "def __init__(self, settings, context):",
+            "def __init__(self, settings, context):\n        __import__('sys').exit(0)",
+            labseq.PluginLoadError,
+            "constructor of planner 'mine' raised SystemExit: 0",
+        ),
+        (
+            "        self.degree_of_parallelism = 1\n",
+            "        pass\n\n    degree_of_parallelism = property(lambda self: __import__('sys').exit(0))\n",
+            labseq.PluginLoadError,
+            "degree_of_parallelism raised SystemExit: 0",
+        ),
+        (
             "import labseq\n",
             "import labseq\nimport nothing_like_it\n",
             labseq.ConfigError,

@@ -137,6 +137,22 @@ def test_after_a_run_that_was_killed_the_next_makes_the_devices_safe_first(bench
     assert safe_calls(bench.calls()) == SAFE_ORDER
 
 
+@pytest.mark.parametrize("by_hand", [False, True])
+def test_a_run_that_was_killed_is_known_wherever_its_data_lie(bench, by_hand):
+    bench.write_sequence("  - load: {duration: 600 s}\n")
+    process = bench.start("run", "sequence.yaml", "--realtime", "--output", "here")
+    bench.await_calls(process, "static_tweezers.start", 2)
+    process.kill()
+    process.communicate()
+    bench.write_sequence("  - image: {exposure: 45 ms}\n")
+    if by_hand:
+        assert bench.run("safe", "watched.yaml").returncode == 0
+    bench.log.unlink()
+    done = bench.run("run", "sequence.yaml", "--shots", "1", "--output", "there")
+    assert done.returncode == 0, done.stderr
+    assert safe_calls(bench.calls()) == SAFE_ORDER * (1 if by_hand else 2)
+
+
 def test_the_safe_command(bench):
     done = bench.run("safe", "watched.yaml")
     assert done.returncode == 0, done.stderr

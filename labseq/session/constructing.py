@@ -1,0 +1,121 @@
+"""From a chosen entry and its settings to the object, without opening anything."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+from labseq.errors import ConfigError, LabseqError, LimitError, PluginLoadError
+from labseq.model import MotionSpec, RandomStream, SiteGrid, TargetPattern
+from labseq.registry import Entry
+from labseq.roles import (
+    Camera,
+    Clock,
+    Context,
+    Detector,
+    Device,
+    MobileTweezers,
+    Planner,
+    Simulation,
+    StaticTweezers,
+    Step,
+)
+from labseq.session.choosing import Chosen, blamed
+
+_ROLES: Final[Mapping[str, type]] = {
+    "camera": Camera,
+    "static_tweezers": StaticTweezers,
+    "mobile_tweezers": MobileTweezers,
+    "device": Device,
+    "detector": Detector,
+    "planner": Planner,
+    "simulation": Simulation,
+    "step": Step,
+}
+
+
+def construct(
+    chosen: Mapping[str, Chosen], grid: SiteGrid, motion: MotionSpec, clock: Clock, seed: int
+) -> tuple[dict[str, Any], tuple[RandomStream, ...]]:
+    """Construct the object of every role; constructors do no I/O, so nothing is open yet.
+
+    Returns:
+        Role -> object, and the random streams that were handed out.
+
+    Raises:
+        ConfigError: A constructor refuses its settings; with their place.
+        PluginLoadError: A constructor raised, or made no object of that role; names the plugin.
+    """
+    made, streams, refused = construct_each(chosen, grid, motion, clock, seed)
+    for error in refused.values():
+        raise error
+    return made, streams
+
+
+def construct_each(
+    chosen: Mapping[str, Chosen], grid: SiteGrid, motion: MotionSpec, clock: Clock, seed: int
+) -> tuple[dict[str, Any], tuple[RandomStream, ...], dict[str, LabseqError]]:
+    """The same, but one that cannot be constructed never keeps the others from it.
+
+    Returns:
+        Role -> object, the random streams, and role -> why it could not be constructed.
+    """
+    made: dict[str, Any] = {}
+    streams: list[RandomStream] = []
+    refused: dict[str, LabseqError] = {}
+    for role in sorted(chosen, key=lambda role: role != "simulation"):  # the world comes first
+        stream = RandomStream(seed, "" if role == "simulation" else role)
+        streams.append(stream)
+        context = Context(role, grid, motion, clock, stream, {}, made.get("simulation"))
+        try:
+            made[role] = construct_one(chosen[role], context)
+        except LabseqError as error:
+            refused[role] = error
+    return made, tuple(streams), refused
+
+
+def construct_one(chosen: Chosen, context: Context) -> Any:
+    """Construct the object of one role.
+
+    Raises:
+        ConfigError: Its constructor refuses its settings; with their place.
+        PluginLoadError: Its constructor raised, or made no object of that role; names the plugin.
+    """
+    entry = chosen.entry
+    try:
+        with blamed(entry, f"the constructor of {entry.kind} '{entry.name}'"):
+            made = entry.factory(chosen.settings, context)
+            check_role(entry, made)
+    except (ConfigError, LimitError) as error:
+        raise chosen.placed(error) from error
+    return made
+
+
+def construct_target(chosen: Chosen, grid: SiteGrid) -> TargetPattern:
+    """Make a target of its pattern.
+
+    Raises:
+        LabseqError: The pattern refuses, for example because it does not fit on the grid.
+        PluginLoadError: The pattern's plugin is at fault; names it.
+    """
+    entry = chosen.entry
+    with blamed(entry, f"pattern '{entry.name}'"):
+        target = entry.factory(chosen.settings, grid)
+    if not isinstance(target, TargetPattern) or target.shape != grid.shape:
+        text = f"pattern '{entry.name}' made no TargetPattern of shape {grid.shape}"
+        raise PluginLoadError(entry.origin, text)
+    return target
+
+
+def check_role(entry: Entry, made: object) -> None:
+    """Refuse an object that lacks a method or attribute of its role.
+
+    Raises:
+        PluginLoadError: With what is missing.
+    """
+    role = _ROLES[entry.kind]
+    names = [name for name in [*role.__annotations__, *dir(role)] if not name.startswith("_")]
+    missing = [name for name in names if not hasattr(made, name)]
+    if missing:
+        text = f"{entry.kind} '{entry.name}' has no {', '.join(missing)}; see labseq.{role.__name__}"
+        raise PluginLoadError(entry.origin, text)

@@ -1,0 +1,49 @@
+"""The end of the process, with plugins that leave threads behind."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+PLUGIN = """
+import threading
+from labseq import hookimpl
+
+LABSEQ_API = 1
+threading.Thread(target={target}, name="labseq test poller", daemon={daemon}).start()
+
+@hookimpl
+def labseq_register(registry):
+    print("still in the buffer", end="")
+"""
+
+
+def leave(tmp_path: Path, command: str, **plugin: object) -> subprocess.CompletedProcess[str]:
+    (tmp_path / "poller.py").write_text(PLUGIN.format(**plugin), "utf-8")
+    environment = {**os.environ, "LABSEQ_PLUGIN_PATH": str(tmp_path)}
+    environment.pop("PYTHONUNBUFFERED", None)
+    arguments = [sys.executable, "-m", "labseq", *command.split()]
+    return subprocess.run(
+        arguments, env=environment, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=60
+    )
+
+
+@pytest.mark.parametrize(("command", "code"), [("plugins", 0), ("plan random:4x4@0.75 --target no:2x2", 2)])
+def test_a_thread_that_never_ends_does_not_keep_the_process(tmp_path: Path, command: str, code: int) -> None:
+    done = leave(tmp_path, command, target="threading.Event().wait", daemon=False)
+    assert done.returncode == code
+    assert "a thread of a plugin would not end: labseq test poller; " in done.stderr
+    assert "still in the buffer" in done.stdout
+
+
+@pytest.mark.parametrize(("target", "daemon"), [("threading.Event().wait", True), ("(lambda: None)", False)])
+def test_of_threads_that_python_does_not_wait_for_nothing_is_said(
+    tmp_path: Path, target: str, daemon: bool
+) -> None:
+    done = leave(tmp_path, "plugins", target=target, daemon=daemon)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "still in the buffer" in done.stdout

@@ -1,0 +1,57 @@
+"""The page with the measured tables can be written again by its script."""
+
+from __future__ import annotations
+
+import re
+import sys
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from labseq.session.bench_figures import FIGURES
+
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "docs" / "explanation" / "planners.md").read_text(encoding="utf-8")
+
+
+def load_script() -> ModuleType:
+    spec = spec_from_file_location("make_planner_tables", ROOT / "docs" / "make_planner_tables.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+SCRIPT = load_script()
+
+
+def test_every_figure_has_a_measured_part_and_a_picture() -> None:
+    parts = re.findall(r"<!-- measured: (.+?) -->", PAGE)
+    assert sorted(parts) == sorted(["planners", "sizes", *(f"figure {name}" for name in FIGURES)])
+    for name in FIGURES:
+        assert f"(../_static/planners/figure-{name}.png)" in PAGE
+        assert (ROOT / "docs" / "_static" / "planners" / f"figure-{name}.png").is_file()
+
+
+def test_only_the_measured_part_is_replaced() -> None:
+    page = "before\n<!-- measured: a -->\nold\n<!-- end -->\nafter\n<!-- measured: b -->\n<!-- end -->\n"
+    once = SCRIPT.replaced(page, "a", ["new"])
+    assert once == page.replace("old", "\nnew\n")
+    assert SCRIPT.replaced(once, "a", ["new"]) == once
+
+
+def test_a_part_that_is_not_on_the_page_is_named() -> None:
+    with pytest.raises(LookupError, match="no part <!-- measured: c -->"):
+        SCRIPT.replaced("", "c", [])
+
+
+def test_the_sizes_are_measured_as_told() -> None:
+    lines = SCRIPT.sizes(2)
+    assert lines[1].endswith("--loadings 2 --workers 1")
+    assert [line.split("|")[1].strip() for line in lines[6:]] == [
+        f"{grid} x {grid} to {side} x {side}" for grid, side in SCRIPT.SIZES
+    ]

@@ -1,0 +1,205 @@
+"""Making a profile's devices safe, whatever else is wrong with it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import labseq
+from labseq.errors import ConfigError, DeviceError
+from labseq.recording import died, mark_active, marker_roots
+from labseq.session import Secured, make_profile_safe
+from labseq.testing.fakes import RecordingObserver
+
+PROFILE = """labseq: 1
+name: bench
+grid: {rows: 10, cols: 10, spacing: 4.49 um}
+camera: {use: virtual}
+static_tweezers: {use: virtual}
+mobile_tweezers: {use: virtual}
+detector: {use: threshold}
+simulation: {use: virtual}
+plugin_folders: [plugins]
+devices:
+  shutter: SHUTTER
+"""
+SAFE_ORDER = ["mobile_tweezers", "shutter", "camera", "static_tweezers"]
+
+PLUGIN = """
+import labseq
+
+LABSEQ_API = 1
+
+
+class Mine:
+    def __init__(self, settings, context): pass
+    def open(self): pass
+    def close(self): pass
+    def safe_state(self): pass
+    def describe(self): return {}
+    def command(self, name, **arguments): pass
+    def read(self, name): pass
+
+
+@labseq.hookimpl
+def labseq_register(registry):
+    registry.device("mine", Mine)
+"""
+
+INIT = "def __init__(self, settings, context): "
+INIT_FAILS = f"{INIT}raise OSError('no card')"
+INIT_LEAVES = f"{INIT}__import__('sys').exit(0)"
+BROKEN = {  # what is wrong -> old and new text of the plugin, the shutter's entry, what is said
+    "import": ("import labseq\n", "import nothing_like_it\n", "{use: mine}", "nothing_like_it"),
+    "exit on import": ("import labseq\n", "raise SystemExit(0)\n", "{use: mine}", "SystemExit: 0"),
+    "unknown name": ("", "", "{use: mein}", "unknown device 'mein'"),
+    "settings": ("", "", "{use: mine, gain: 5}", "device 'mine' takes no settings, but 'gain' is given"),
+    "constructor": (f"{INIT}pass", INIT_FAILS, "{use: mine}", "raised OSError: no card"),
+    "exit": (f"{INIT}pass", INIT_LEAVES, "{use: mine}", "raised SystemExit: 0"),
+    "not its role": ("def read(", "def raed(", "{use: mine}", "device 'mine' has no read"),
+    "not a mapping": ("", "", "5", "what the profile says of it is wrong"),
+}
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def write(shutter: str, old: str = "", new: str = "", profile: str = PROFILE) -> None:
+    Path("plugins").mkdir(exist_ok=True)
+    Path("plugins/mine.py").write_text(PLUGIN.replace(old, new, 1), encoding="utf-8")
+    Path("p.yaml").write_text(profile.replace("SHUTTER", shutter), encoding="utf-8")
+
+
+def secured(*overrides: str) -> tuple[Secured, list[Any]]:
+    seen = RecordingObserver()
+    outcome = make_profile_safe("./p.yaml", overrides, seen)
+    return outcome, seen.of("safe_state")
+
+
+@pytest.mark.parametrize("what", BROKEN)
+def test_one_broken_device_never_keeps_the_others_from_being_made_safe(what: str) -> None:
+    old, new, shutter, says = BROKEN[what]
+    write(shutter, old, new)
+    outcome, told = secured()
+    assert outcome.tried == dict.fromkeys(["mobile_tweezers", "camera", "static_tweezers"])
+    assert [t["device"] for t in told] == ["mobile_tweezers", "camera", "static_tweezers", "shutter"]
+    assert [t["ok"] for t in told] == [True, True, True, False]
+    (error,) = outcome.failures
+    assert says in str(error)
+    problems = outcome.problems.problems if outcome.problems is not None else ()
+    placed = [str(error), *map(str, problems)]
+    assert any(text.startswith("p.yaml:11:") for text in placed)
+
+
+def test_all_are_safe_in_order() -> None:
+    write("{use: mine}")
+    outcome, told = secured()
+    assert [t["device"] for t in told] == list(outcome.tried) == SAFE_ORDER
+    assert (outcome.failures, outcome.problems) == ([], None)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ("spacing: 4.49 um", "spacing: 0", "p.yaml:3:37: spacing is 0"),
+        ("name: bench", "name: 5", "p.yaml:2:7: name is 5"),
+        ("[plugins]", "[gone, plugins]", "there is no plugin folder 'gone'"),
+    ],
+)
+def test_what_concerns_no_device_is_told_at_the_end(old: str, new: str, says: str) -> None:
+    assert old in PROFILE
+    write("{use: mine}", profile=PROFILE.replace(old, new, 1))
+    outcome, _ = secured()
+    assert "shutter" in outcome.tried
+    assert outcome.problems is not None
+    assert says in str(outcome.problems)
+
+
+def test_a_detector_is_not_needed() -> None:
+    write("{use: mine}", profile=PROFILE.replace("use: threshold", "use: gone"))
+    outcome, _ = secured()
+    assert (list(outcome.tried), outcome.failures, outcome.problems) == (SAFE_ORDER, [], None)
+
+
+def test_without_its_world_nothing_virtual_can_be_made_safe() -> None:
+    write("{use: mine}", profile=PROFILE.replace("simulation: {use: virtual}", "simulation: {use: gone}"))
+    outcome, _ = secured()
+    assert list(outcome.tried) == ["shutter"]
+    assert set(outcome.refused) == {"mobile_tweezers", "camera", "static_tweezers", "simulation"}
+
+
+def test_a_profile_that_cannot_be_read_stops_it() -> None:
+    Path("p.yaml").write_text("camera: [", encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"p\.yaml:1:"):
+        secured()
+
+
+def marked_as_dead() -> tuple[tuple[Path, ...], str]:
+    """Markers of a run on the profile that another computer has not ended."""
+    roots, key = marker_roots(Path("data")), str(Path("p.yaml").resolve())
+    mark_active(roots, key, Path("data/run"))
+    for marker in (path for root in roots for path in (root / ".active").iterdir()):
+        marker.write_text("{}", encoding="utf-8")
+    assert died(roots, key) is not None
+    return roots, key
+
+
+def test_a_run_that_died_is_forgotten_once_all_is_safe() -> None:
+    write("{use: mine}")
+    roots, key = marked_as_dead()
+    secured("profile.devices.shutter.use=mine")
+    assert died(roots, key) is not None  # another device may have been named in its place
+    secured()
+    assert died(roots, key) is None
+
+
+def test_a_run_that_died_is_remembered_as_long_as_a_device_is_not_safe() -> None:
+    write("{use: mine}", "safe_state(self): pass", "safe_state(self): raise OSError('jammed')")
+    roots, key = marked_as_dead()
+    outcome, _ = secured()
+    assert isinstance(outcome.tried["shutter"], DeviceError)
+    assert died(roots, key) is not None
+
+
+def test_a_run_that_died_is_remembered_as_long_as_a_device_may_have_been_left_out() -> None:
+    write("", profile=PROFILE.replace("devices:\n  shutter: SHUTTER", "devices: 5"))
+    roots, key = marked_as_dead()
+    outcome, _ = secured()
+    assert (outcome.failures, "shutter" in outcome.tried) == ([], False)
+    assert "p.yaml:10:10: devices is 5" in str(outcome.problems)
+    assert died(roots, key) is not None
+
+
+SEQUENCE = """
+labseq: 1
+name: look
+profile: ./p.yaml
+shots: 1
+target: {pattern: compact, rows: 2, cols: 2}
+shot:
+  - image: {}
+"""
+
+
+def test_a_run_makes_safe_what_it_can_before_anything_of_it_can_fail() -> None:
+    write("{use: mine}", f"{INIT}pass", INIT_FAILS)
+    Path("s.yaml").write_text(SEQUENCE, encoding="utf-8")
+    roots, key = marked_as_dead()
+    seen = RecordingObserver()
+    with (
+        labseq.Session.open("s.yaml", output="elsewhere", observer=seen) as session,
+        pytest.raises(ConfigError, match=r"p\.yaml:11:12: .*raised OSError: no card"),
+    ):
+        session.run()
+    assert [t["device"] for t in seen.of("safe_state") if t["ok"]] == [
+        "mobile_tweezers", "camera", "static_tweezers"
+    ]  # fmt: skip
+    assert died(roots, key) is not None
+    write("{use: mine}")
+    with labseq.Session.open("s.yaml", output="elsewhere", observer=seen) as session:
+        session.run()
+    assert died(marker_roots(Path("elsewhere")), key) is None
