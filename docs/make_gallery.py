@@ -19,7 +19,8 @@ from labseq.config import Document
 from labseq.config.fields import PatternChoice
 from labseq.drawing import save_target
 from labseq.session import load_plugins
-from labseq.session.choosing import construct_target, resolve
+from labseq.session.choosing import resolve
+from labseq.session.constructing import construct_target
 
 DOCS = Path(__file__).parent
 PAGE = DOCS / "reference" / "patterns.md"

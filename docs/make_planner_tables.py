@@ -145,7 +145,7 @@ def replaced(page: str, name: str, lines: Sequence[str]) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description="Rewrite the measured tables and figures.")
     parser.add_argument("--loadings", type=int, default=10_000)
     n_loadings: int = parser.parse_args().loadings
     parts: dict[str, Callable[[int], list[str]]] = {"planners": planners, "sizes": sizes}
