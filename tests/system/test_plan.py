@@ -179,4 +179,4 @@ def test_a_reader_that_goes_away_is_no_error(tmp_path: Path, output: list[str]) 
     finally:
         os.close(write)
     assert done.stderr == ""
-    assert done.returncode == 1
+    assert done.returncode == 0
