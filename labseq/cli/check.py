@@ -16,7 +16,7 @@ from labseq.cli.failures import lines_of
 from labseq.cli.log_lines import LogLines
 from labseq.cli.output import columns, divert_stdout, encodes, say
 from labseq.cli.show import as_line
-from labseq.cli.words import clock_time, plural
+from labseq.cli.words import clock_time, plural, settings_text
 from labseq.errors import ConfigError, Problem
 from labseq.model import TimelineEntry
 from labseq.session import Assembly, CheckReport, Session, check
@@ -142,8 +142,7 @@ def _bar(start_s: float, duration_s: float, total_s: float, block: str, width: i
 def _what(assembly: Assembly) -> list[tuple[str, str]]:
     target, spec = assembly.target, assembly.sequence
     grid, document = assembly.bench.grid, assembly.bench.document
-    settings = {k: v for k, v in assembly.planner.dump().items() if k != "use"}
-    listed = ", ".join(f"{key} {value}" for key, value in settings.items())
+    listed = settings_text({k: v for k, v in assembly.planner.dump().items() if k != "use"})
     n_clear = int(target.clear.sum())
     return [
         ("sequence", f"{spec.name} ({assembly.document.path})"),

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from typing import Any, cast
 
 
 def percent(fraction: float | None, digits: int = 1) -> str:
@@ -63,3 +65,20 @@ def plural(n: int, noun: str) -> str:
         ('1 defect', '2 defects')
     """
     return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
+
+
+def settings_text(settings: Mapping[str, Any]) -> str:
+    """Settings that are given, in one line.
+
+    Example:
+        >>> settings_text({"degree_of_parallelism": 7, "max_tones": {"row": 16, "col": None}, "file": None})
+        'degree_of_parallelism 7, max_tones (row 16)'
+    """
+    words: list[str] = []
+    for key, value in settings.items():
+        if isinstance(value, Mapping):
+            within = settings_text(cast("Mapping[str, Any]", value))
+            words += [f"{key} ({within})"] if within else []
+        elif value is not None:
+            words.append(f"{key} {value}")
+    return ", ".join(words)
