@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from labseq.kernels.compile import kernel
-from labseq_psca._kernels import (
+from labseq_psca._kernels import compress_columns, count_columns
+from labseq_psca._kernels_build import (
     GRID,
     GROWING,
     PLAN,
@@ -15,8 +16,6 @@ from labseq_psca._kernels import (
     Moves,
     Offsets,
     add_line,
-    compress_columns,
-    count_columns,
     empty_plan,
     ended,
 )

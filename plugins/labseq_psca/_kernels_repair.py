@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 
 from labseq.kernels.compile import kernel
-from labseq_psca._kernels import GRID, Bools, Ints, Moves, Offsets, add_line, empty_plan, ended
+from labseq_psca._kernels_build import GRID, Bools, Ints, Moves, Offsets, add_line, empty_plan, ended
 
 # What a shift costs: moving an atom loses 1.8 % of one, and the about 1 ms of a batch 0.7 % of one out of
 # 225 atoms of 33 s lifetime (physics of the paper's experiment).

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings, strategies as st
-from labseq_psca import _kernels, _kernels_lines, _kernels_paper, _kernels_repair, _kernels_rows
+from labseq_psca import _kernels_build, _kernels_lines, _kernels_paper, _kernels_repair, _kernels_rows
 from numpy.typing import NDArray
 
 Sites = list[int]
@@ -236,7 +236,7 @@ def test_a_growing_plan_is_lengthened() -> None:
     moves, offsets = np.zeros((1, 4), np.int16), np.zeros(2, np.int32)
     n_batches = 0
     for line in range(4):
-        moves, offsets, n_batches = _kernels.add_line(
+        moves, offsets, n_batches = _kernels_build.add_line(
             moves, offsets, n_batches, ints([0, 1]), ints([1, 2]), 2, 3, line, line % 2 == 0, 1, 0
         )
     assert n_batches == 8
@@ -246,7 +246,7 @@ def test_a_growing_plan_is_lengthened() -> None:
 
 @pytest.mark.parametrize("slots", [1, 2])
 def test_ejection_slots_are_used_from_the_outermost_atom_on(slots: int) -> None:
-    moves, offsets, n_batches = _kernels.add_line(
+    moves, offsets, n_batches = _kernels_build.add_line(
         np.zeros((9, 4), np.int16),
         np.zeros(10, np.int32),
         0,
