@@ -11,7 +11,7 @@ from typing import Any, Final
 
 _HOMES: Final = {
     "labseq._markers": ("hookimpl",),
-    "labseq.api": ("make_planner", "make_target"),
+    "labseq.api": ("make_planner", "make_target", "tone_program"),
     "labseq.config.settings": (
         "Angle",
         "Duration",
@@ -48,6 +48,7 @@ _HOMES: Final = {
         "Plan",
         "PlanReport",
         "RandomStream",
+        "RfSpec",
         "RunRecord",
         "ShotRecord",
         "SiteGrid",
@@ -57,7 +58,7 @@ _HOMES: Final = {
         "Waveform",
         "as_occupancy",
     ),
-    "labseq.motion": ("check_plan", "tone_program"),
+    "labseq.motion": ("check_plan",),
     "labseq.recording": ("Run", "open_run"),
     "labseq.registry": ("Registry",),
     "labseq.roles": (

@@ -6,6 +6,7 @@ from labseq._markers import (
 from labseq.api import (
     make_planner as make_planner,
     make_target as make_target,
+    tone_program as tone_program,
 )
 from labseq.config.settings import (
     Angle as Angle,
@@ -45,6 +46,7 @@ from labseq.model import (
     Plan as Plan,
     PlanReport as PlanReport,
     RandomStream as RandomStream,
+    RfSpec as RfSpec,
     RunRecord as RunRecord,
     ShotRecord as ShotRecord,
     SiteGrid as SiteGrid,
@@ -56,7 +58,6 @@ from labseq.model import (
 )
 from labseq.motion import (
     check_plan as check_plan,
-    tone_program as tone_program,
 )
 from labseq.recording import (
     Run as Run,

@@ -1,4 +1,4 @@
-"""Planners and targets by name, without a sequence: for notebooks and scripts."""
+"""Planners, targets and tone programs by name, without a sequence: for notebooks and scripts."""
 
 from __future__ import annotations
 
@@ -7,9 +7,11 @@ from operator import index
 from pathlib import Path
 from typing import Any, Final, TypeAlias
 
+from labseq import motion as _motion
+from labseq.config import load_profile
 from labseq.config.values import validate_values
 from labseq.errors import ConfigError, Problem
-from labseq.model import MotionSpec, SiteGrid, TargetPattern
+from labseq.model import MotionSpec, Plan, SiteGrid, TargetPattern, ToneProgram
 from labseq.registry import Entry
 from labseq.roles import Context, Planner
 from labseq.session import load_plugins
@@ -84,6 +86,43 @@ def make_target(
     entry = _find("pattern", pattern, plugin_folders)
     made = validate_values(entry.settings_model, settings, f"pattern '{pattern}'")
     return construct_target(Chosen(entry, made), _grid(grid))
+
+
+def tone_program(
+    plan: Plan,
+    grid: SiteGrid | None = None,
+    motion: MotionSpec | None = None,
+    n_batches: int | None = None,
+    *,
+    profile: str | Path | None = None,
+) -> ToneProgram:
+    """Turn a checked plan into a tone program; see :func:`labseq.motion.tone_program`.
+
+    Args:
+        plan: A plan that :func:`check_plan` accepted.
+        grid: The grid of sites; by default the profile's, or else the paper's.
+        motion: How the tweezers move; by default as in the profile, or else in the paper.
+        n_batches: How many batches to play, from the first; by default all.
+        profile: Name or path of a hardware profile.
+
+    Returns:
+        The tones of both axes; ``program.tones_at(t_s)`` says what is intended at a time.
+
+    Raises:
+        ConfigError: The profile is not there, or wrong.
+        PlanError: The plan does not fit onto the grid, or has fewer batches than asked for.
+        LimitError: AOD or amplifier would not bear the tones.
+
+    Example:
+        >>> plan = Plan.from_batches([([(0, 0)], [(0, 3)])])
+        >>> program = tone_program(plan, profile="virtual")
+        >>> program.tones_at(560e-6).column.frequency_hz.tolist()
+        [84800000.0]
+    """
+    if profile is not None:
+        spec = load_profile(profile, beside=Path())[1]
+        grid, motion = grid or spec.grid_model(), motion or spec.motion
+    return _motion.tone_program(plan, grid, motion, n_batches)
 
 
 def _find(kind: str, name: str, folders: Folders) -> Entry:

@@ -1,4 +1,4 @@
-"""Planners and targets by name, and what is said of wrong arguments."""
+"""Planners, targets and tone programs by name, and what is said of wrong arguments."""
 
 from pathlib import Path
 from typing import Any
@@ -68,3 +68,14 @@ def test_a_constructor_that_raises_is_named(tmp_path: Path):
     (tmp_path / "mine.py").write_text(PLUGIN.format(body="raise OSError('no')"))
     with pytest.raises(PluginLoadError, match="the constructor of planner 'mine' raised OSError: no"):
         labseq.make_planner("mine", plugin_folders=tmp_path)
+
+
+def test_a_tone_program_for_the_machine_of_a_profile():
+    plan = labseq.Plan.from_batches([([(0, 0)], [(0, 3)])])
+    program, same = labseq.tone_program(plan, profile="virtual"), labseq.tone_program(plan)
+    assert program.column.end_hz.tolist() == same.column.end_hz.tolist()
+    assert program.duration_s.tolist() == same.duration_s.tolist()
+    bare = labseq.MotionSpec(overhead_per_batch_s=0.0)
+    assert labseq.tone_program(plan, motion=bare, profile="virtual").n_segments == program.n_segments - 1
+    with pytest.raises(ConfigError, match="there is no hardware profile 'virtuel'"):
+        labseq.tone_program(plan, profile="virtuel")

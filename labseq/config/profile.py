@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Final, Literal, Self, TypeAlias
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from labseq.config.addresses import Override
@@ -25,6 +27,7 @@ from labseq.config.fields import (
 )
 from labseq.config.find import find_profile
 from labseq.config.mending import StandIns, load_checked
+from labseq.config.rf import RfSettings
 from labseq.config.settings import Duration, Frequency, Length, Settings, Speed
 from labseq.config.wording import clean
 from labseq.model import MotionSpec, SiteGrid
@@ -34,7 +37,7 @@ from labseq.units import format_quantity
 
 _MOTION: Final = MotionSpec()
 _DEVICE_NAME: Final = re.compile(r"[^\W\d][\w-]*")
-_MAY_ADD: Final = ("timeouts", "grid.row_frequency", "grid.column_frequency")
+_MAY_ADD: Final = ("timeouts", "grid.row_frequency", "grid.column_frequency", "mobile_tweezers.rf")
 ROLES: Final = ("camera", "static_tweezers", "mobile_tweezers", "detector", "simulation")
 """The roles of a profile that are one plugin each."""
 
@@ -43,11 +46,14 @@ Timeout: TypeAlias = Annotated[Duration, Field(gt=0)]
 
 
 class FrequencyComb(Settings):
-    """Equally spaced tones, one per row or column of the grid."""
+    """Tones of the rows or columns of the grid: equally spaced, or a table from a calibration."""
 
     centre: Frequency = Field(default=100e6, gt=0, description="frequency of the grid's centre")
     step: Frequency = Field(
         default=1.6e6, description="frequency from one row or column to the next; negative if it falls"
+    )
+    table: tuple[Annotated[Frequency, Field(gt=0)], ...] = Field(
+        default=(), description="calibrated frequency of each row or column, in place of centre and step"
     )
 
     @field_validator("step")
@@ -57,9 +63,17 @@ class FrequencyComb(Settings):
             raise ValueError("a step of 0 puts all tones at one frequency; expected another value")
         return step
 
-    def lowest(self, n_sites: int) -> float:
-        """Frequency of the lowest tone of so many sites, in Hz."""
-        return self.centre - abs(self.step) * (n_sites - 1) / 2
+    @field_validator("table")
+    @classmethod
+    def _tones_in_order(cls, table: tuple[float, ...]) -> tuple[float, ...]:
+        steps_hz = np.diff(table)
+        if not (np.all(steps_hz > 0) or np.all(steps_hz < 0)):
+            raise ValueError("the tones neither rise nor fall all along; expected the sites' in order")
+        return table
+
+    def tones(self, n_sites: int) -> NDArray[np.float64]:
+        """Frequencies of the tones of so many sites, in Hz."""
+        return np.array(self.table) if self.table else centred_comb(n_sites, self.centre, self.step)
 
 
 class GridSettings(Settings):
@@ -80,13 +94,16 @@ class GridSettings(Settings):
     )
 
     @model_validator(mode="after")
-    def _tones_are_positive(self) -> Self:
+    def _tones_fit(self) -> Self:
         combs = (
             ("row_frequency", self.row_frequency, self.rows),
             ("column_frequency", self.column_frequency, self.cols),
         )
         for name, comb, n_sites in combs:
-            lowest = comb.lowest(n_sites)
+            if comb.table and len(comb.table) != n_sites:
+                what = f"there are {len(comb.table)} tones for {n_sites} sites"
+                raise misfit(what, f"{n_sites} frequencies", at=(name, "table"))
+            lowest = float(comb.tones(n_sites).min())
             if lowest <= 0:
                 what = f"the lowest of the {n_sites} tones is at {format_quantity(lowest, 'frequency')}"
                 raise misfit(what, "all tones above 0 Hz", "choose a smaller step", at=(name,))
@@ -94,15 +111,14 @@ class GridSettings(Settings):
 
     def model(self) -> SiteGrid:
         """The grid."""
-        rows, columns = self.row_frequency, self.column_frequency
         return SiteGrid(
             self.rows,
             self.cols,
             self.spacing,
             self.lattice,
             self.shear,
-            centred_comb(self.rows, rows.centre, rows.step),
-            centred_comb(self.cols, columns.centre, columns.step),
+            self.row_frequency.tones(self.rows),
+            self.column_frequency.tones(self.cols),
         )
 
 
@@ -114,7 +130,8 @@ class MotionSettings(Settings):
     speed: Speed = Field(default=_MOTION.speed_m_s, description="transport speed")
     speed_profile: SpeedProfile = Field(
         default=_MOTION.speed_profile,
-        description="course of the speed during a transport; none but constant can be played so far",
+        description="course of the speed during a transport; `speed` is the mean on the longest way of a "
+        "batch, and with a course other than constant all atoms of a batch start and arrive together",
     )
     overhead_per_batch: Duration = Field(
         default=_MOTION.overhead_per_batch_s, description="time that passes before each batch, tweezers off"
@@ -135,6 +152,9 @@ class MotionSettings(Settings):
         le=100,
         description="how many sites beyond the grid the tones reach, on each side",
     )
+    rf: Annotated[RfSettings, empty_is({})] = Field(
+        default=RfSettings(), description="what drives the AODs, and what they bear"
+    )
 
     def spec(self) -> MotionSpec:
         """The same for the core."""
@@ -149,6 +169,7 @@ class MotionSettings(Settings):
             max_row_tones=self.max_row_tones,
             max_column_tones=self.max_column_tones,
             eject_slots=self.eject_slots,
+            rf=self.rf.spec(),
         )
 
 

@@ -72,6 +72,8 @@ Speed: TypeAlias = Annotated[float, _quantity("speed"), Field(gt=0)]
 """Metres per second, more than 0; "130 um/ms"."""
 Voltage: TypeAlias = Annotated[float, _quantity("voltage")]
 """Volts; "200 mV"."""
+Power: TypeAlias = Annotated[float, _quantity("power")]
+"""Watts; "10 mW"."""
 Temperature: TypeAlias = Annotated[float, _quantity("temperature")]
 """Kelvins; "300 uK"."""
 Angle: TypeAlias = Annotated[float, _quantity("angle")]

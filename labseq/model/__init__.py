@@ -3,7 +3,7 @@
 from labseq.model.arrays import Occupancy, as_occupancy, read_only
 from labseq.model.frame import CameraFacts, Frame
 from labseq.model.grid import SiteGrid
-from labseq.model.motion import MotionSpec
+from labseq.model.motion import MotionSpec, RfSpec
 from labseq.model.plan import Batch, Plan, PlanReport
 from labseq.model.random import RandomStream
 from labseq.model.records import (
@@ -13,7 +13,16 @@ from labseq.model.records import (
     ShotRecord,
     StageTiming,
 )
-from labseq.model.signals import AxisTones, DepthRamp, SegmentKind, ToneProgram, Waveform
+from labseq.model.signals import (
+    AxisTones,
+    DepthRamp,
+    FrequencyCourse,
+    SegmentKind,
+    ToneProgram,
+    TonesAt,
+    TonesNow,
+    Waveform,
+)
 from labseq.model.target import TargetPattern
 from labseq.model.timeline import TimelineEntry
 
@@ -24,12 +33,14 @@ __all__ = [
     "CycleRecord",
     "DepthRamp",
     "Frame",
+    "FrequencyCourse",
     "ImageRecord",
     "MotionSpec",
     "Occupancy",
     "Plan",
     "PlanReport",
     "RandomStream",
+    "RfSpec",
     "RunRecord",
     "SegmentKind",
     "ShotRecord",
@@ -38,6 +49,8 @@ __all__ = [
     "TargetPattern",
     "TimelineEntry",
     "ToneProgram",
+    "TonesAt",
+    "TonesNow",
     "Waveform",
     "as_occupancy",
     "read_only",

@@ -2,10 +2,75 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, field
 from typing import Literal
 
 SpeedProfile = Literal["constant", "minimum_jerk", "constant_jerk"]
+PhaseChoice = Literal["random", "low_crest"]
+
+LOAD_OHM = 50.0
+"""What the output drives; full scale is given across it."""
+
+
+@dataclass(frozen=True, slots=True)
+class RfSpec:
+    """What drives the two AODs of the mobile tweezers: bands, amplitudes, phases, limits.
+
+    Random phases and amplitudes preassigned per tone are the paper's ("RF
+    intermodulation"). All numbers are ours, because the paper is silent. Amplifiers of this kind
+    die above 2 V at their input.
+
+    Attributes:
+        row_band_hz: Lowest and highest frequency of the row axis' AOD.
+        column_band_hz: The same for the columns.
+        least_spacing_hz: Least distance of two tones of an axis.
+        row_amplitudes: Amplitude of each row's tone as a fraction of full scale;
+            empty: all equal, such that the most tones of the axis reach full scale together.
+        column_amplitudes: The same for each column.
+        phases: "random": preassigned to each tone; "low_crest": chosen for each batch
+            by Schroeder's rule, for a low crest factor.
+        phase_seed: Seed of the preassigned phases.
+        full_scale_v: Peak voltage of a sum of amplitudes of 1, across 50 Ohm.
+        max_peak_v: Greatest peak voltage that the amplifiers bear.
+        amplifier_gain_db: Power gain between the output and each AOD, in dB.
+        max_mean_power_w: Greatest mean RF power at each AOD.
+        snap_within_m: How far, in the atom plane, a calibrated tone may be from an
+            equally spaced comb to be played on the comb; 0: none is moved.
+    """
+
+    row_band_hz: tuple[float, float] = (82e6, 118e6)
+    column_band_hz: tuple[float, float] = (82e6, 118e6)
+    least_spacing_hz: float = 0.5e6
+    row_amplitudes: tuple[float, ...] = ()
+    column_amplitudes: tuple[float, ...] = ()
+    phases: PhaseChoice = "random"
+    phase_seed: int = 20220711
+    full_scale_v: float = 1.6
+    max_peak_v: float = 2.0
+    amplifier_gain_db: float = 20.0
+    max_mean_power_w: float = 3.0
+    snap_within_m: float = 20e-9
+
+    def __post_init__(self) -> None:
+        for name in ("row_band_hz", "column_band_hz", "row_amplitudes", "column_amplitudes"):
+            object.__setattr__(self, name, tuple(float(value) for value in getattr(self, name)))
+        for low, high in (self.row_band_hz, self.column_band_hz):
+            if not 0 <= low < high:
+                raise ValueError(f"a band goes from {low} to {high} Hz; expected 0 <= lowest < highest")
+        if any(not 0 < a <= 1 for a in (*self.row_amplitudes, *self.column_amplitudes)):
+            raise ValueError("an amplitude is a fraction of full scale, above 0 and at most 1")
+        if any(not value > 0 for value in (self.full_scale_v, self.max_peak_v, self.max_mean_power_w)):
+            raise ValueError("voltages and powers must be above 0")
+        if any(not value >= 0 for value in (self.least_spacing_hz, self.snap_within_m, self.phase_seed)):
+            raise ValueError("least spacing, snapping distance and seed cannot be negative")
+        if not math.isfinite(self.amplifier_gain_db):
+            raise ValueError(f"the amplifier's gain is {self.amplifier_gain_db} dB; expected a number")
+
+    @property
+    def full_scale_power_w(self) -> float:
+        """Mean power at an AOD of one tone at full scale, in watts."""
+        return self.full_scale_v**2 / (2 * LOAD_OHM) * 10 ** (self.amplifier_gain_db / 10)
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,8 +85,10 @@ class MotionSpec:
     Attributes:
         pick_up_s: Pick-up ramp, in seconds.
         drop_off_s: Drop-off ramp, in seconds.
-        speed_m_s: Transport speed, in m/s.
-        speed_profile: Course of the speed during a transport.
+        speed_m_s: Transport speed, in m/s; its mean over the longest way of a batch.
+        speed_profile: Course of the speed during a transport. At "constant" speed all
+            atoms of a batch are equally fast, and those with a shorter way arrive earlier.
+            With "minimum_jerk" and "constant_jerk" they start and arrive together.
         overhead_per_batch_s: Time that passes before each batch, tweezers off.
         overhead_per_cycle_s: Time that passes before the first batch of a cycle
             (planning, rendering, upload); not spent on an empty plan.
@@ -30,6 +97,7 @@ class MotionSpec:
         max_row_tones: Most tones on the row axis at once.
         max_column_tones: Most tones on the column axis at once.
         eject_slots: Sites beyond the grid that the AOD band reaches, each side.
+        rf: What drives the AODs.
     """
 
     pick_up_s: float = 60e-6
@@ -42,6 +110,7 @@ class MotionSpec:
     max_row_tones: int = 20
     max_column_tones: int = 20
     eject_slots: int = 1
+    rf: RfSpec = field(default_factory=RfSpec)
 
     def __post_init__(self) -> None:
         if not self.speed_m_s > 0:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+import math
+from dataclasses import dataclass, field, fields
 from enum import IntEnum
 
 import numpy as np
@@ -20,9 +21,85 @@ class SegmentKind(IntEnum):
     DROP_OFF = 3
 
 
+class FrequencyCourse(IntEnum):
+    """How the frequencies go from start to end within a segment, the same way for all its tones.
+
+    In a segment of duration T a tone is at
+    ``f(t) = start_hz + (end_hz - start_hz) s(t / T)``, and its phase is
+    ``phase_rad`` plus 2 pi times the integral of f from 0 to t. The course s
+    rises from 0 to 1 and is symmetric, s(1 - u) = 1 - s(u), so that a tone's mean
+    frequency in a segment is that of start and end.
+
+    Attributes:
+        LINEAR: s(u) = u: constant speed.
+        MINIMUM_JERK: s(u) = 10 u^3 - 15 u^4 + 6 u^5, the course with the least
+            mean square jerk that starts and ends at rest without acceleration
+            (Flash and Hogan, J. Neurosci. 5, 1688, 1985). The greatest speed is 15/8 of the mean.
+        CONSTANT_JERK: jerk +j in the first quarter, -j in the two quarters of the
+            middle, +j in the last. Integrated three times from rest, the first
+            quarter is j u^3 / 6 and ends with acceleration j/4, speed j/32 and
+            place j/384; going on from there, the middle reaches j/64, which
+            must be s(1/2) = 1/2, so j = 32: s(u) = 16/3 u^3 for u <= 1/4,
+            s(u) = 1/6 - 2 u + 8 u^2 - 16/3 u^3 for 1/4 <= u <= 3/4, and
+            s(u) = 1 - 16/3 (1 - u)^3 above. The greatest speed is twice the mean.
+    """
+
+    LINEAR = 0
+    MINIMUM_JERK = 1
+    CONSTANT_JERK = 2
+
+    def fraction(self, u: float) -> float:
+        """The course s(u): the fraction of its way that a tone has made.
+
+        Args:
+            u: Fraction of the segment's duration that has passed, 0 to 1.
+
+        Example:
+            >>> FrequencyCourse.CONSTANT_JERK.fraction(0.25)
+            0.08333333333333333
+        """
+        if self is FrequencyCourse.LINEAR:
+            return u
+        if self is FrequencyCourse.MINIMUM_JERK:
+            return u**3 * (10.0 - 15.0 * u + 6.0 * u**2)
+        if u > 0.5:
+            return 1.0 - self.fraction(1.0 - u)
+        if u <= 0.25:
+            return 16.0 / 3.0 * u**3
+        return 1.0 / 6.0 - 2.0 * u + 8.0 * u**2 - 16.0 / 3.0 * u**3
+
+    def integral(self, u: float) -> float:
+        """Integral of the course from 0 to u; 1/2 at 1 for every course.
+
+        In a segment of duration T a tone's phase has advanced by
+        ``2 pi T (start_hz u + (end_hz - start_hz) integral(u))``.
+
+        Args:
+            u: Fraction of the segment's duration that has passed, 0 to 1.
+
+        Example:
+            >>> FrequencyCourse.LINEAR.integral(0.5)
+            0.125
+        """
+        if self is FrequencyCourse.LINEAR:
+            return 0.5 * u**2
+        if self is FrequencyCourse.MINIMUM_JERK:
+            return u**4 * (2.5 - 3.0 * u + u**2)
+        if u > 0.5:
+            return u - 0.5 + self.integral(1.0 - u)
+        if u <= 0.25:
+            return 4.0 / 3.0 * u**4
+        return -1.0 / 96.0 + u / 6.0 - u**2 + 8.0 / 3.0 * u**3 - 4.0 / 3.0 * u**4
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class AxisTones:
     """The tones of one AOD axis, segment by segment, held as flat arrays.
+
+    Within a segment the frequency follows :class:`FrequencyCourse`. The depth of a
+    tone, which goes as its amplitude squared, is linear in time: in a segment of
+    duration T, a tone that goes from amplitude a0 to a1 has
+    ``a(t) = sqrt(a0^2 + (a1^2 - a0^2) t / T)``. So ramps are linear in trap depth.
 
     Attributes:
         offsets: int32 (n_segments + 1,); segment i has tones ``offsets[i]:offsets[i + 1]``.
@@ -30,7 +107,7 @@ class AxisTones:
         end_hz: float64 (n_tones,), frequency at its end.
         start_amplitude: float64 (n_tones,), fraction of full scale at its start.
         end_amplitude: float64 (n_tones,), fraction of full scale at its end.
-        phase_rad: float64 (n_tones,), phase at its start.
+        phase_rad: float64 (n_tones,), phase at its start, of cos(2 pi f t + phase).
     """
 
     offsets: NDArray[np.int32]
@@ -50,6 +127,35 @@ class AxisTones:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class TonesNow:
+    """The tones of one axis at one time.
+
+    Attributes:
+        frequency_hz: float64 (n_tones,).
+        amplitude: float64 (n_tones,), fraction of full scale.
+        phase_rad: float64 (n_tones,), from 0 to 2 pi; the axis plays the sum of
+            ``amplitude cos(phase)``.
+    """
+
+    frequency_hz: NDArray[np.float64]
+    amplitude: NDArray[np.float64]
+    phase_rad: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class TonesAt:
+    """The tones of both axes at one time.
+
+    Attributes:
+        row: Those of the row axis.
+        column: Those of the column axis.
+    """
+
+    row: TonesNow
+    column: TonesNow
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class ToneProgram:
     """What the mobile tweezers shall play in one cycle, independent of the hardware.
 
@@ -61,6 +167,7 @@ class ToneProgram:
         duration_s: float64 (n_segments,).
         kind: int8 (n_segments,), values of :class:`SegmentKind`.
         batch: int32 (n_segments,), the batch of the plan that a segment belongs to.
+        course: int8 (n_segments,), values of :class:`FrequencyCourse`; LINEAR by default.
     """
 
     row: AxisTones
@@ -68,9 +175,12 @@ class ToneProgram:
     duration_s: NDArray[np.float64]
     kind: NDArray[np.int8]
     batch: NDArray[np.int32]
+    course: NDArray[np.int8] = field(default_factory=lambda: np.zeros(0, np.int8))
 
     def __post_init__(self) -> None:
         n_segments = len(self.duration_s)
+        course = self.course if len(self.course) else np.zeros(n_segments, np.int8)
+        object.__setattr__(self, "course", read_only(course, np.int8, (n_segments,), "course"))
         for name, dtype in (("duration_s", np.float64), ("kind", np.int8), ("batch", np.int32)):
             values = read_only(getattr(self, name), dtype, (n_segments,), name)
             object.__setattr__(self, name, values)
@@ -87,6 +197,49 @@ class ToneProgram:
     def total_duration_s(self) -> float:
         """Playing time of the whole program."""
         return float(self.duration_s.sum())
+
+    @property
+    def joint_s(self) -> NDArray[np.float64]:
+        """float64 (n_segments + 1,): when each segment starts, and when the last one ends."""
+        return np.concatenate([[0.0], np.cumsum(self.duration_s)])
+
+    def tones_at(self, t_s: float) -> TonesAt:
+        """What shall be played at a time.
+
+        At a joint it is the start of the segment that begins there. Before the
+        program and from its end on there are no tones.
+
+        Args:
+            t_s: Time from the start of the program, in seconds.
+
+        Raises:
+            ValueError: The time is not a number.
+        """
+        if math.isnan(t_s):
+            raise ValueError("the time is not a number; expected seconds from the start of the program")
+        joint_s = self.joint_s
+        segment = int(np.searchsorted(joint_s, t_s, side="right")) - 1
+        if not 0 <= segment < self.n_segments:
+            nothing = np.empty(0)
+            silent = TonesNow(nothing, nothing, nothing)
+            return TonesAt(silent, silent)
+        passed_s, duration_s = t_s - joint_s[segment], float(self.duration_s[segment])
+        course = FrequencyCourse(int(self.course[segment]))
+        at = course, passed_s, duration_s
+        return TonesAt(_tones_at(self.row, segment, *at), _tones_at(self.column, segment, *at))
+
+
+def _tones_at(
+    axis: AxisTones, segment: int, course: FrequencyCourse, passed_s: float, duration_s: float
+) -> TonesNow:
+    """The tones of an axis, some time after the start of a segment."""
+    part = slice(axis.offsets[segment], axis.offsets[segment + 1])
+    u = min(passed_s / duration_s, 1.0)
+    start_hz, sweep_hz = axis.start_hz[part], axis.end_hz[part] - axis.start_hz[part]
+    start, end = axis.start_amplitude[part] ** 2, axis.end_amplitude[part] ** 2
+    cycles = start_hz * passed_s + sweep_hz * (duration_s * course.integral(u))
+    phase_rad = (axis.phase_rad[part] + 2 * np.pi * (cycles % 1.0)) % (2 * np.pi)
+    return TonesNow(start_hz + sweep_hz * course.fraction(u), np.sqrt(start + (end - start) * u), phase_rad)
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,15 +6,38 @@ with :func:`warm`.
 
 import importlib
 
+from labseq.motion.axes import Drive, drive
+from labseq.motion.calibration import (
+    AffineCalibration,
+    Calibration,
+    CombFit,
+    TableCalibration,
+    calibrated,
+    fit_comb,
+)
 from labseq.motion.check import check_plan
 from labseq.motion.rules import RULES
 from labseq.motion.timing import fitting_batches
 from labseq.motion.tones import tone_program
 
-__all__ = ["RULES", "check_plan", "fitting_batches", "tone_program", "warm"]
+__all__ = [
+    "RULES",
+    "AffineCalibration",
+    "Calibration",
+    "CombFit",
+    "Drive",
+    "TableCalibration",
+    "calibrated",
+    "check_plan",
+    "drive",
+    "fit_comb",
+    "fitting_batches",
+    "tone_program",
+    "warm",
+]
 
 
 def warm() -> None:
     """Compile the kernels of this package, or load them from the cache."""
-    for module in ("plan_check", "tone_build"):
+    for module in ("plan_check", "tone_build", "tone_limits"):
         importlib.import_module(f"labseq.kernels.{module}")

@@ -34,7 +34,9 @@ def check_plan(
     monotonically until the second has. Where both move the same way, the gap is
     constant until the first arrival and monotonic from then on. So the gap is
     monotonic from start to end and never below the smaller of the two, which are
-    whole numbers of sites: it is at least one site if the order is kept.
+    whole numbers of sites: it is at least one site if the order is kept. With a course
+    of the speed other than constant all tones have made the same fraction of their
+    ways at any time, so the gap goes evenly from the one at the start to the one at the end.
 
     Args:
         plan: The plan.

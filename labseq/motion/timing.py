@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import Final, get_args
 
 import numpy as np
 
-from labseq.errors import LimitError
+from labseq.errors import LimitError, one_of
 from labseq.model import MotionSpec, Plan, PlanReport, SiteGrid
+from labseq.model.motion import SpeedProfile
+
+SPEED_PROFILES: Final[tuple[SpeedProfile, ...]] = get_args(SpeedProfile)
+"""Every course of the speed; the index is the course's :class:`labseq.model.FrequencyCourse`."""
 
 WINDOW_TOLERANCE_S = 1e-9
 """A batch may end later than its window by this much: what rounding of sums can do, and no more."""
@@ -16,17 +21,18 @@ WINDOW_TOLERANCE_S = 1e-9
 def site_time_s(grid: SiteGrid, motion: MotionSpec) -> float:
     """Time to move an atom by one site, in seconds.
 
+    With a course of the speed other than constant, that of the mean over the longest
+    way of a batch, so that a batch takes the same time whatever the course.
+
     Raises:
-        LimitError: The speed profile is not "constant", the only one there is.
+        LimitError: The speed profile is none that exists.
 
     Example:
         >>> round(site_time_s(SiteGrid(), MotionSpec()), 9)
         3.4538e-05
     """
-    if motion.speed_profile != "constant":
-        raise LimitError(
-            "the speed profile", f"'{motion.speed_profile}'", "'constant', the only one there is"
-        )
+    if motion.speed_profile not in SPEED_PROFILES:
+        raise LimitError("the speed profile", f"'{motion.speed_profile}'", one_of(SPEED_PROFILES))
     return grid.spacing_m / motion.speed_m_s
 
 

@@ -19,7 +19,9 @@ Rules, in the order in which they act on a segment:
    there, less the transport loss, which is drawn then; two atoms on one site are
    both lost; outside of the grid the atom is gone (ejected), between sites it is lost.
 
-Atoms still held when the program ends are lost.
+Atoms still held when the program ends are lost. The course of the speed within a
+segment changes nothing here: all tones follow the same one, so what meets, and in which
+order, is the same.
 """
 
 from __future__ import annotations

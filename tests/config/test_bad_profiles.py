@@ -76,7 +76,7 @@ CASES = [
         "comb key misspelt",
         "{centre: 100",
         "{center: 100",
-        "p.yaml:10:19: 'center' is not a setting of 'row_frequency'; expected one of centre, step; did you mean 'centre'?",
+        "p.yaml:10:19: 'center' is not a setting of 'row_frequency'; expected one of centre, step, table; did you mean 'centre'?",
     ),
     (
         "comb as a number",

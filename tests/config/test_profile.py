@@ -61,7 +61,7 @@ def test_default_motion_is_the_core_s() -> None:
 
 @pytest.mark.parametrize("key", MOTION_KEYS)
 def test_every_motion_key_reaches_the_core(key: str) -> None:
-    value: dict[str, Any] = {"speed_profile": "minimum_jerk"}
+    value: dict[str, Any] = {"speed_profile": "minimum_jerk", "rf": {"phases": "low_crest"}}
     changed = MotionSettings.model_validate({key: value.get(key, 7)}).spec()
     different = [
         field.name

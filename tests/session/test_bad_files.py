@@ -67,7 +67,7 @@ CASES: list[tuple[str, dict[str, str], list[str]]] = [
             "shutter: {use: virtual": "laser: 5\n  shutter: {use: virtual",
             "- image: {exposure: 45 ms}": "- device: {name: shutter, do: open}\n  - image: {exposure: 45 ms}",
         },
-        ["p.yaml:68:10: laser is 5; expected a mapping (key: value)"],
+        ["p.yaml:79:10: laser is 5; expected a mapping (key: value)"],
     ),
     (
         "one wrong step among right ones",
@@ -193,7 +193,7 @@ def test_overrides_of_the_wrong_type_are_refused(overrides: Any) -> None:
 def test_what_a_constructor_refuses_has_its_place(old: str, new: str, words: str) -> None:
     write({old: new})
     (message,) = messages()
-    assert message.startswith("p.yaml:56:3: ")
+    assert message.startswith("p.yaml:67:3: ")
     assert words in message
 
 

@@ -26,6 +26,7 @@ _ALIASES: Final = {
     "frequency": settings.Frequency,
     "speed": settings.Speed,
     "voltage": settings.Voltage,
+    "power": settings.Power,
     "temperature": settings.Temperature,
     "angle": settings.Angle,
     "fraction": settings.Fraction,

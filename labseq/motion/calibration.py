@@ -1,0 +1,171 @@
+"""Where a tone puts its tweezer: position <-> frequency, per axis.
+
+Positions are along the axis in the atom plane, from the grid's centre: along a1 for
+the columns' tones, along a2 for the rows'.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from labseq.errors import LimitError
+from labseq.model import SiteGrid, read_only
+
+Floats = NDArray[np.float64]
+
+ON_THE_COMB_HZ = 1e-6
+"""Distance from the comb below which frequencies are left as they are: rounding."""
+
+
+class Calibration(Protocol):
+    """Position <-> frequency along one axis; both ways, and beyond the grid too."""
+
+    def frequency_hz(self, position_m: ArrayLike) -> Floats:
+        """Frequencies of the tones that put tweezers at some positions."""
+        ...
+
+    def position_m(self, frequency_hz: ArrayLike) -> Floats:
+        """Positions at which tones of some frequencies put their tweezers."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class AffineCalibration:
+    """Frequency that changes evenly with the position.
+
+    Attributes:
+        centre_hz: Frequency of a tweezer at the grid's centre.
+        slope_hz_per_m: Change of the frequency with the position, not 0.
+
+    Example:
+        >>> axis = AffineCalibration(centre_hz=100e6, slope_hz_per_m=1.6e6 / 4.5e-6)
+        >>> axis.frequency_hz([0.0, 9e-6]).tolist()
+        [100000000.0, 103200000.0]
+    """
+
+    centre_hz: float
+    slope_hz_per_m: float
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.centre_hz) and np.isfinite(self.slope_hz_per_m) and self.slope_hz_per_m):
+            raise ValueError("a calibration has a finite centre and a finite slope other than 0")
+
+    def frequency_hz(self, position_m: ArrayLike) -> Floats:
+        """Frequencies of the tones that put tweezers at some positions."""
+        return self.centre_hz + self.slope_hz_per_m * np.asarray(position_m, np.float64)
+
+    def position_m(self, frequency_hz: ArrayLike) -> Floats:
+        """Positions at which tones of some frequencies put their tweezers."""
+        return (np.asarray(frequency_hz, np.float64) - self.centre_hz) / self.slope_hz_per_m
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TableCalibration:
+    """A frequency measured at each site; linear between sites and, by the outermost step, beyond.
+
+    Attributes:
+        site_m: float64 (n_sites,), positions of at least two sites, rising.
+        site_hz: float64 (n_sites,), their frequencies, all rising or all falling.
+    """
+
+    site_m: Floats
+    site_hz: Floats
+
+    def __post_init__(self) -> None:
+        site_m = read_only(self.site_m, np.float64, (-1,), "site_m")
+        site_hz = read_only(self.site_hz, np.float64, (len(site_m),), "site_hz")
+        steps = np.diff(site_hz)
+        if len(site_m) < 2 or not np.all(np.diff(site_m) > 0):
+            raise ValueError("a table needs at least two sites, with rising positions")
+        if not (np.all(steps > 0) or np.all(steps < 0)):
+            raise ValueError("the frequencies of a table all rise or all fall from site to site")
+        object.__setattr__(self, "site_m", site_m)
+        object.__setattr__(self, "site_hz", site_hz)
+
+    def frequency_hz(self, position_m: ArrayLike) -> Floats:
+        """Frequencies of the tones that put tweezers at some positions."""
+        return _along(np.asarray(position_m, np.float64), self.site_m, self.site_hz)
+
+    def position_m(self, frequency_hz: ArrayLike) -> Floats:
+        """Positions at which tones of some frequencies put their tweezers."""
+        rising = 1 if self.site_hz[-1] > self.site_hz[0] else -1
+        return _along(np.asarray(frequency_hz, np.float64), self.site_hz[::rising], self.site_m[::rising])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CombFit:
+    """The equally spaced comb nearest to the tones of an axis, and how far they are from it.
+
+    Attributes:
+        frequency_hz: float64 (n_sites,), frequencies of the comb.
+        error_m: float64 (n_sites,), how far the comb puts each tweezer from where its
+            own frequency would, in the atom plane, in metres.
+    """
+
+    frequency_hz: Floats
+    error_m: Floats
+
+    @property
+    def worst_m(self) -> float:
+        """Greatest distance of a tone from the comb, in metres."""
+        return float(np.abs(self.error_m).max(initial=0.0))
+
+
+def fit_comb(site_hz: Floats, spacing_m: float) -> CombFit:
+    """Find the comb with the least squared distance to the tones of an axis.
+
+    Args:
+        site_hz: float64 (n_sites,), frequency of each site.
+        spacing_m: Distance between neighbouring sites, in metres.
+
+    Example:
+        >>> fit = fit_comb(np.array([98e6, 100.012e6, 102e6]), spacing_m=4.5e-6)
+        >>> [round(error * 1e9) for error in fit.error_m]
+        [9, -18, 9]
+    """
+    n_sites = len(site_hz)
+    if n_sites < 3:
+        return CombFit(site_hz, np.zeros(n_sites))
+    site = np.arange(n_sites) - (n_sites - 1) / 2
+    step_hz = float(site @ site_hz / (site @ site))
+    comb_hz = site_hz.mean() + step_hz * site
+    off_hz = comb_hz - site_hz
+    if np.abs(off_hz).max() <= ON_THE_COMB_HZ:
+        return CombFit(site_hz, np.zeros(n_sites))
+    return CombFit(comb_hz, off_hz / step_hz * spacing_m)
+
+
+def calibrated(grid: SiteGrid, row: Calibration, column: Calibration) -> SiteGrid:
+    """The same grid, with the tones that calibrations give for its rows and columns.
+
+    Raises:
+        LimitError: A tone is not above 0 Hz.
+    """
+    row_hz = row.frequency_hz(axis_positions_m(grid.n_rows, grid.spacing_m))
+    column_hz = column.frequency_hz(axis_positions_m(grid.n_cols, grid.spacing_m))
+    for name, hz in (("row", row_hz), ("column", column_hz)):
+        if not np.all(hz > 0):
+            raise LimitError(f"the lowest {name} frequency", f"{hz.min()} Hz", "above 0 Hz")
+    return replace(grid, row_frequency_hz=row_hz, column_frequency_hz=column_hz)
+
+
+def axis_positions_m(n_sites: int, spacing_m: float) -> Floats:
+    """Positions of the sites along an axis from the grid's centre, float64 (n_sites,).
+
+    Example:
+        >>> axis_positions_m(3, 4e-6).tolist()
+        [-4e-06, 0.0, 4e-06]
+    """
+    sites = np.arange(n_sites, dtype=np.float64)
+    return (sites - (n_sites - 1) / 2) * spacing_m
+
+
+def _along(x: Floats, knots: Floats, values: Floats) -> Floats:
+    """Interpolate linearly; beyond the ends go on by the outermost step. ``knots`` rise."""
+    i = np.clip(np.searchsorted(knots, x) - 1, 0, len(knots) - 2)
+    slope = np.diff(values) / np.diff(knots)
+    return values[i] + slope[i] * (x - knots[i])

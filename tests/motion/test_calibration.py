@@ -1,0 +1,124 @@
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, strategies as st
+from numpy.typing import NDArray
+
+from labseq.errors import LimitError
+from labseq.model import MotionSpec, Plan, RfSpec, SiteGrid
+from labseq.model.grid import centred_comb
+from labseq.motion import (
+    AffineCalibration,
+    Calibration,
+    TableCalibration,
+    calibrated,
+    drive,
+    fit_comb,
+    tone_program,
+)
+from labseq.motion.calibration import axis_positions_m
+
+SPACING_M = 4.49e-6
+SLOPE = 1.6e6 / SPACING_M
+SITES_M = axis_positions_m(20, SPACING_M)
+COMB_HZ = centred_comb(20)
+
+
+def bent(worst_m: float) -> NDArray[np.float64]:
+    """Frequencies that are off the comb, the outermost and the middle ones most."""
+    sites = np.linspace(-1.0, 1.0, 20)
+    off = sites**2 - (sites**2).mean()
+    return COMB_HZ + SLOPE * worst_m * off / np.abs(off).max()
+
+
+CALIBRATIONS = pytest.mark.parametrize(
+    "calibration",
+    [
+        AffineCalibration(100e6, SLOPE),
+        AffineCalibration(100e6, -SLOPE),
+        TableCalibration(SITES_M, bent(0.5e-6)),
+        TableCalibration(SITES_M, bent(0.5e-6)[::-1]),
+    ],
+    ids=["affine", "affine falling", "table", "table falling"],
+)
+
+
+@CALIBRATIONS
+@given(position_m=st.floats(-100e-6, 100e-6))
+def test_there_and_back(calibration: Calibration, position_m: float) -> None:
+    hz = calibration.frequency_hz([position_m])
+    assert calibration.position_m(hz) == pytest.approx([position_m], abs=1e-13)
+
+
+def test_a_table_is_met_at_its_sites_and_goes_on_by_the_outermost_step() -> None:
+    hz = bent(0.5e-6)
+    table = TableCalibration(SITES_M, hz)
+    assert table.frequency_hz(SITES_M) == pytest.approx(hz, abs=1e-3)
+    outside = table.frequency_hz([SITES_M[0] - SPACING_M, SITES_M[-1] + 2 * SPACING_M])
+    assert outside == pytest.approx([2 * hz[0] - hz[1], 3 * hz[-1] - 2 * hz[-2]])
+    between = table.frequency_hz(0.5 * (SITES_M[3] + SITES_M[4]))
+    assert between == pytest.approx(0.5 * (hz[3] + hz[4]))
+
+
+def test_a_grid_with_calibrated_tones() -> None:
+    column = TableCalibration(SITES_M, bent(0.5e-6))
+    grid = calibrated(SiteGrid(), AffineCalibration(95e6, -SLOPE), column)
+    assert grid.row_frequency_hz == pytest.approx(centred_comb(20, 95e6, -1.6e6))
+    assert grid.column_frequency_hz == pytest.approx(column.site_hz)
+    with pytest.raises(LimitError, match="the lowest row frequency is "):
+        calibrated(grid, AffineCalibration(1e6, SLOPE), column)
+
+
+@pytest.mark.parametrize(
+    ("site_m", "site_hz", "message"),
+    [
+        ([0.0], [1e8], "at least two sites"),
+        ([1.0, 0.0], [1e8, 2e8], "with rising positions"),
+        ([0.0, 1.0, 2.0], [1e8, 3e8, 2e8], "all rise or all fall"),
+        ([0.0, 1.0], [1e8, np.nan], "all rise or all fall|cannot represent"),
+        ([0.0, 1.0], [1e8], "site_hz has shape"),
+    ],
+)
+def test_tables_that_make_no_sense(site_m: Any, site_hz: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        TableCalibration(np.array(site_m), np.array(site_hz))
+
+
+@pytest.mark.parametrize("wrong", [(np.nan, 1.0), (1e8, 0.0), (1e8, np.inf)])
+def test_affine_calibrations_that_make_no_sense(wrong: tuple[float, float]) -> None:
+    with pytest.raises(ValueError, match="a finite centre and a finite slope other than 0"):
+        AffineCalibration(*wrong)
+
+
+def test_tones_on_a_comb_are_left_as_they_are() -> None:
+    assert fit_comb(COMB_HZ, SPACING_M).frequency_hz is COMB_HZ
+    assert fit_comb(COMB_HZ, SPACING_M).worst_m == 0.0
+    assert fit_comb(np.array([1e8, 1.1e8]), SPACING_M).worst_m == 0.0
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+@given(worst_m=st.floats(1e-12, 1e-6))
+def test_the_error_of_a_comb_is_where_it_puts_the_tweezers(direction: int, worst_m: float) -> None:
+    hz = bent(worst_m)[::direction]
+    fit = fit_comb(hz, SPACING_M)
+    assert np.diff(fit.frequency_hz, n=2) == pytest.approx(0.0, abs=1e-6)
+    assert fit.error_m == pytest.approx((fit.frequency_hz - hz) / (direction * SLOPE), abs=1e-14)
+    assert fit.worst_m == pytest.approx(worst_m, rel=1e-4)
+
+
+@pytest.mark.parametrize(("worst_m", "snapped"), [(19e-9, True), (21e-9, False)])
+def test_tones_within_20_nm_are_snapped_to_the_comb(worst_m: float, snapped: bool) -> None:
+    grid = SiteGrid(column_frequency_hz=bent(worst_m))
+    driven = drive(grid, MotionSpec(), 1)
+    expected = fit_comb(bent(worst_m), SPACING_M)
+    assert np.abs(driven.comb_error_m).max() == pytest.approx(worst_m if snapped else 0.0, rel=1e-3)
+    program = tone_program(Plan.from_batches([([(0, 3)], [(0, 9)])]), grid)
+    frequencies = expected.frequency_hz if snapped else bent(worst_m)
+    assert program.column.end_hz[-1] == frequencies[9]
+    unsnapped = tone_program(
+        Plan.from_batches([([(0, 3)], [(0, 9)])]), grid, MotionSpec(rf=RfSpec(snap_within_m=0.0))
+    )
+    assert unsnapped.column.end_hz[-1] == bent(worst_m)[9]
