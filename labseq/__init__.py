@@ -58,7 +58,7 @@ _HOMES: Final = {
         "Waveform",
         "as_occupancy",
     ),
-    "labseq.motion": ("check_plan",),
+    "labseq.motion": ("check_plan", "render"),
     "labseq.recording": ("Run", "open_run"),
     "labseq.registry": ("Registry",),
     "labseq.roles": (

@@ -58,6 +58,7 @@ from labseq.model import (
 )
 from labseq.motion import (
     check_plan as check_plan,
+    render as render,
 )
 from labseq.recording import (
     Run as Run,

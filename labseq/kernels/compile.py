@@ -59,7 +59,7 @@ def const(dtype: str, ndim: int) -> str:
     return f"Array({dtype}, {ndim}, 'C', readonly=True)"
 
 
-def kernel(signature: str | Sequence[str]) -> Callable[[F], F]:
+def kernel(signature: str | Sequence[str], *, fused: bool = False) -> Callable[[F], F]:
     """Compile a function for the given signatures, without the GIL, into the cache.
 
     With ``NUMBA_DISABLE_JIT=1`` the function stays plain Python.
@@ -67,11 +67,13 @@ def kernel(signature: str | Sequence[str]) -> Callable[[F], F]:
     Args:
         signature: numba signature such as ``f"int64({const('bool_', 2)}, float64)"``,
             or several of them.
+        fused: Let ``a * b + c`` be rounded once instead of twice, where the processor
+            can. That is faster, but the last digit may differ between processors.
     """
     signatures = [signature] if isinstance(signature, str) else list(signature)
 
     def decorate(function: F) -> F:
-        return cast("F", _compile(cast("FunctionType", function), signatures))
+        return cast("F", _compile(cast("FunctionType", function), signatures, fused))
 
     return decorate
 
@@ -139,7 +141,7 @@ def _numba() -> Any:
     return numba  # as Any: it ships no types
 
 
-def _compile(function: FunctionType, signatures: list[str]) -> Any:
+def _compile(function: FunctionType, signatures: list[str], fused: bool) -> Any:
     if _INTERPRETED.is_set():
         return function
     numba = _numba()
@@ -151,24 +153,29 @@ def _compile(function: FunctionType, signatures: list[str]) -> Any:
         folder = _folder(digest) if in_file else None
         _MODULES.add(function.__module__)
         try:
-            compiled = _jit(function, signatures, folder)
+            compiled = _jit(function, signatures, folder, fused)
         except (OSError, EOFError, pickle.UnpicklingError):
             # a full disk, or files that a crash cut short: do without the cache
             if folder is not None:
                 shutil.rmtree(folder, ignore_errors=True)
-            compiled = _jit(function, signatures, None)
+            compiled = _jit(function, signatures, None, fused)
         _KERNELS[id(compiled)] = compiled, digest
     return compiled
 
 
-def _jit(function: FunctionType, signatures: list[str], folder: Path | None) -> Any:
+def _jit(function: FunctionType, signatures: list[str], folder: Path | None, fused: bool) -> Any:
     """Compile, keeping the machine code in a folder (None: nowhere)."""
     numba = _numba()
     before = numba.config.CACHE_DIR
     numba.config.CACHE_DIR = "" if folder is None else str(folder)  # others' kernels stay where they are
     try:
         return numba.njit(
-            signatures, cache=folder is not None, nogil=True, error_model="numpy", no_cfunc_wrapper=True
+            signatures,
+            cache=folder is not None,
+            nogil=True,
+            error_model="numpy",
+            no_cfunc_wrapper=True,
+            fastmath={"contract"} if fused else False,
         )(function)
     finally:
         numba.config.CACHE_DIR = before

@@ -16,6 +16,8 @@ from labseq.motion.calibration import (
     fit_comb,
 )
 from labseq.motion.check import check_plan
+from labseq.motion.render_comb import comb_sample_rate
+from labseq.motion.rendering import Renderer, RenderPath, render, render_chunks
 from labseq.motion.rules import RULES
 from labseq.motion.timing import fitting_batches
 from labseq.motion.tones import tone_program
@@ -26,12 +28,17 @@ __all__ = [
     "Calibration",
     "CombFit",
     "Drive",
+    "RenderPath",
+    "Renderer",
     "TableCalibration",
     "calibrated",
     "check_plan",
+    "comb_sample_rate",
     "drive",
     "fit_comb",
     "fitting_batches",
+    "render",
+    "render_chunks",
     "tone_program",
     "warm",
 ]

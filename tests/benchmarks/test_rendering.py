@@ -1,0 +1,74 @@
+"""Rendering 17 ms of playing time, beside the paper's way and plain numpy.
+
+The goals are in ratios of one run: playing time over rendering time at least 3 with one
+group of tones, 2 with three, 2.5 for a plan; 20 tones at most 1.3 times 5 tones; 5 times
+the stored waveforms, 100 times numpy; the direct way in real time for 7 tones.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from labseq_psca.planner import PscaPlanner, PscaSettings
+
+from labseq.model import FrequencyCourse, MotionSpec, SiteGrid, TargetPattern, ToneProgram
+from labseq.motion import Renderer, comb_sample_rate, tone_program
+from labseq.motion.render_reference import render_reference
+from labseq.roles import Context
+from labseq.session.bench_waveform import (
+    STORED,
+    bench_waveform,
+    render_all,
+    stored_waveforms,
+    sum_all_stored,
+    uniform_program,
+)
+
+GRID = SiteGrid()
+RATE_HZ = comb_sample_rate(GRID)
+
+
+def measure(benchmark: Any, program: ToneProgram) -> None:
+    renderer = Renderer(program, RATE_HZ)
+    benchmark.extra_info["playing_s"] = renderer.n_samples / RATE_HZ
+    benchmark(render_all, renderer)
+
+
+@pytest.mark.parametrize("n_tones", [5, 20])
+@pytest.mark.parametrize("directions", [(0,), (1,), (1, 0, -1)])
+def test_tones_on_the_comb(benchmark: Any, n_tones: int, directions: tuple[int, ...]) -> None:
+    measure(benchmark, uniform_program(GRID, n_tones, directions))
+
+
+@pytest.mark.parametrize("course", [FrequencyCourse.MINIMUM_JERK, FrequencyCourse.CONSTANT_JERK])
+def test_seven_tones_the_direct_way(benchmark: Any, course: FrequencyCourse) -> None:
+    measure(benchmark, uniform_program(GRID, 7, (1,), course))
+
+
+def test_a_plan_of_20_to_15(benchmark: Any) -> None:
+    fill = np.zeros(GRID.shape, np.bool_)
+    fill[2:17, 2:17] = True
+    target = TargetPattern(fill, np.zeros_like(fill))
+    planner = PscaPlanner(PscaSettings(degree_of_parallelism=7), Context(grid=GRID))
+    plan = planner.plan(np.random.default_rng(1).random(GRID.shape) < 0.75, target)
+    measure(benchmark, tone_program(plan, GRID, MotionSpec(overhead_per_batch_s=0.0)))
+
+
+@pytest.mark.parametrize("n_tones", [5, 20])
+def test_stored_waveforms(benchmark: Any, n_tones: int) -> None:
+    benchmark.extra_info["playing_s"] = STORED / RATE_HZ
+    benchmark(sum_all_stored, stored_waveforms(GRID, RATE_HZ), n_tones)
+
+
+def test_numpy(benchmark: Any) -> None:
+    program = uniform_program(GRID, 20, (1,))
+    benchmark.extra_info["playing_s"] = 20_000 / RATE_HZ
+    benchmark(render_reference, program, RATE_HZ, 0, 20_000)
+
+
+def test_the_table_has_a_row_for_everything() -> None:
+    rows = {row.name: row for row in bench_waveform(repeats=1)}
+    assert len(rows) == 8
+    assert all(row.gigasamples_per_s > 0 and row.playing_over_rendering > 0 for row in rows.values())

@@ -1,0 +1,308 @@
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+from numpy.typing import NDArray
+
+import labseq
+from labseq.errors import LimitError
+from labseq.model import (
+    AxisTones,
+    Batch,
+    FrequencyCourse,
+    MotionSpec,
+    Plan,
+    SiteGrid,
+    ToneProgram,
+)
+from labseq.motion import Renderer, RenderPath, comb_sample_rate, render, render_chunks, tone_program
+from labseq.motion.render_reference import render_reference
+
+SILENT, COMB, BLENDED, DIRECT = RenderPath
+STEP_HZ = 1.6e6
+COMB_HZ = 624e6
+LIMIT = 0.51
+
+
+def comb(n: int, start_hz: float, step_hz: float) -> NDArray[np.float64]:
+    return (start_hz + step_hz * np.arange(n)).astype(np.float64)
+
+
+Segment = tuple[float, Sequence[tuple[float, float, float, float, float]]]
+
+
+def program_of(*segments: Segment, course: int = 0, still: bool = True) -> ToneProgram:
+    """A program from (duration in s, [(start, end in Hz, start, end amplitude, phase)]) on the row axis.
+
+    The column axis plays the same, or nothing if ``still``.
+    """
+    tones = np.array([tone for _, tones in segments for tone in tones]).reshape(-1, 5)
+    offsets = np.cumsum([0, *(len(tones) for _, tones in segments)]).astype(np.int32)
+    row = AxisTones(offsets, *tones.T)
+    column = AxisTones(np.zeros_like(offsets), *np.empty((5, 0))) if still else row
+    n = len(segments)
+    duration_s = np.array([duration_s for duration_s, _ in segments])
+    kinds, batches = np.full(n, 2, np.int8), np.arange(n, dtype=np.int32)
+    return ToneProgram(row, column, duration_s, kinds, batches, np.full(n, course, np.int8))
+
+
+def site(index: float) -> float:
+    return 84.8e6 + STEP_HZ * index
+
+
+def path_of(program: ToneProgram, sample_rate_hz: float = COMB_HZ) -> list[int]:
+    return Renderer(program, sample_rate_hz).path[0].tolist()
+
+
+def check(program: ToneProgram, sample_rate_hz: float = COMB_HZ) -> NDArray[np.int16]:
+    """Render, and compare every sample with the definition."""
+    samples = render(program, sample_rate_hz).samples
+    expected = render_reference(program, sample_rate_hz)
+    assert samples.shape == expected.shape
+    assert np.abs(samples - expected).max(initial=0.0) <= LIMIT
+    return samples
+
+
+def move(n: int, by: list[int], duration_s: float = 34.538e-6, amplitude: float | None = None) -> Segment:
+    a = amplitude or 1 / n
+    rng = np.random.default_rng(n)
+    ends = [by[k % len(by)] for k in range(n)]
+    return duration_s, [(site(k), site(k + ends[k]), a, a, rng.uniform(0, 6)) for k in range(n)]
+
+
+@pytest.mark.parametrize("sample_rate_hz", [COMB_HZ, 625e6, 400e6, 312.5e6, 500_000_008.0])
+@pytest.mark.parametrize("n", [1, 7, 20])
+@pytest.mark.parametrize("by", [[0], [1], [-1, 0], [1, -1, 0]])
+def test_every_sample_of_a_comb_is_right(n: int, by: list[int], sample_rate_hz: float) -> None:
+    check(program_of((0.1e-6, []), move(n, by)), sample_rate_hz)
+
+
+@pytest.mark.parametrize("n", [1, 2, 20])
+@pytest.mark.parametrize("course", FrequencyCourse)
+def test_full_scale_is_reached_and_not_exceeded(n: int, course: int) -> None:
+    aligned = [(site(k), site(k + 5), 1 / n, 1 / n, 0.0) for k in range(n)]
+    samples = check(program_of((173e-6, aligned), course=course))
+    assert samples.max() >= 32766
+    assert samples.min() >= -32767
+
+
+@pytest.mark.parametrize("course", [FrequencyCourse.MINIMUM_JERK, FrequencyCourse.CONSTANT_JERK])
+@pytest.mark.parametrize("sites", [1, 3, 19])
+def test_jerk_profiles_go_the_direct_way(course: int, sites: int) -> None:
+    program = program_of(move(7, [sites, -1, 0], 34.538e-6 * sites), course=course)
+    assert path_of(program) == [DIRECT]
+    check(program)
+
+
+def test_tones_off_the_comb_go_the_direct_way() -> None:
+    rng = np.random.default_rng(0)
+    tones = [(site(k) + 20e3 * rng.normal(), site(k + 2), 0.05, 0.05, 1.0) for k in range(12)]
+    program = program_of(move(12, [1]), (69e-6, tones))
+    assert path_of(program)[1] == DIRECT
+    check(program)
+
+
+@pytest.mark.parametrize(("start", "end"), [(0.0, 1.0), (1.0, 0.0), (0.5, 1.0), (1.0, 1.0)])
+@pytest.mark.parametrize("off_hz", [0.0, 5e3])
+def test_ramps_are_linear_in_depth(start: float, end: float, off_hz: float) -> None:
+    tones = [(site(k) + off_hz * k**2, site(k) + off_hz * k**2, start / 7, end / 7, k) for k in range(7)]
+    for duration_s in (60e-6, 60.0003e-6, 60.0007e-6):
+        program = program_of((1.3e-9, []), (duration_s, tones))
+        assert path_of(program)[1] == (DIRECT if off_hz else COMB)
+        check(program)
+
+
+def test_amplitudes_that_change_differently_are_blended_or_else_rendered_directly() -> None:
+    rng = np.random.default_rng(1)
+    before, after = 0.045 * (1 + 0.02 * rng.normal(size=(2, 20)))
+    tones = [(site(k), site(k + 1), before[k], after[k], k) for k in range(20)]
+    program = program_of((34.538e-6, tones))
+    assert path_of(program) == [BLENDED]
+    check(program)
+    tones = [(site(k), site(k + 1), 0.05 * (k % 2), 0.04, k) for k in range(20)]
+    program = program_of((34.538e-6, tones))
+    assert path_of(program) == [DIRECT]
+    check(program)
+
+
+def test_a_sample_rate_that_misses_the_comb_by_a_clock_step_is_made_up_for() -> None:
+    step_hz = 1_623_457.1
+    grid = SiteGrid(row_frequency_hz=comb(20, 100e6, step_hz), column_frequency_hz=comb(20, 90e6, step_hz))
+    rate_hz = comb_sample_rate(grid)
+    assert rate_hz % 8 == 0
+    assert rate_hz != round(rate_hz / step_hz) * step_hz
+    plan = Plan.from_batches(
+        [Batch(np.array([[0, k] for k in range(9)]), np.array([[0, k + 3] for k in range(9)]))]
+    )
+    program = tone_program(plan, grid, MotionSpec(overhead_per_batch_s=1e-6))
+    assert set(Renderer(program, rate_hz).path[1].tolist()) == {SILENT, COMB, BLENDED} - {COMB}
+    check(program, rate_hz)
+
+
+TONE = st.tuples(
+    st.integers(0, 21), st.integers(-3, 3), st.sampled_from([0.0, 0.03, 0.0301, 0.05]), st.floats(-7, 7)
+)
+
+
+@given(
+    segments=st.lists(
+        st.tuples(st.floats(0, 8e-6), st.lists(TONE, max_size=6), st.booleans()), min_size=1, max_size=5
+    ),
+    course=st.sampled_from(FrequencyCourse),
+    off_hz=st.sampled_from([0.0, 0.3, 40.0, 1e4]),
+    sample_rate_hz=st.sampled_from([COMB_HZ, 625e6, 300e6]),
+    chunk_samples=st.integers(50, 9000),
+)
+@settings(max_examples=150, deadline=None)
+def test_any_program_is_rendered_right_in_chunks_of_any_size(
+    segments: Any, course: int, off_hz: float, sample_rate_hz: float, chunk_samples: int
+) -> None:
+    made: list[Segment] = []
+    for duration_s, tones, ramped in segments:
+        rows: list[tuple[float, float, float, float, float]] = []
+        for index, by, amplitude, phase_rad in tones:
+            start_hz = site(index) + off_hz * phase_rad
+            rows.append((start_hz, start_hz + by * STEP_HZ, 0.0 if ramped else amplitude, 0.05, phase_rad))
+        made.append((duration_s, rows))
+    program = program_of(*made, course=course, still=False)
+    samples = check(program, sample_rate_hz)
+    chunks = [chunk.copy() for chunk in render_chunks(program, sample_rate_hz, chunk_samples)]
+    streamed = np.concatenate([np.zeros((2, 0), np.int16), *chunks], axis=1)
+    assert np.array_equal(streamed[:, : samples.shape[1]], samples)
+    assert not streamed[:, samples.shape[1] :].any()
+    assert streamed.shape[1] - samples.shape[1] < chunk_samples
+
+
+def fitted(
+    samples: NDArray[Any], hz: NDArray[Any], rate_hz: NDArray[Any], time_s: NDArray[Any]
+) -> NDArray[Any]:
+    """Complex amplitude of each tone at time 0, by least squares."""
+    cycles = np.outer(time_s, hz) + 0.5 * np.outer(time_s**2, rate_hz)
+    basis = np.exp(2j * np.pi * cycles)
+    matrix = np.concatenate([np.real(basis), -np.imag(basis)], axis=1)
+    found = np.linalg.lstsq(matrix, samples.astype(float), rcond=None)[0]
+    return found[: len(hz)] + 1j * found[len(hz) :]
+
+
+def test_phase_and_amplitude_go_on_at_every_joint() -> None:
+    moves = np.array([[0, 2, 0, 3], [0, 5, 0, 9], [0, 11, 0, 10], [0, 13, 0, 13]])
+    plan = Plan.from_batches([Batch(moves[:, :2], moves[:, 2:])])
+    program = tone_program(plan, motion=MotionSpec(overhead_per_batch_s=0.0))
+    axis, rate_hz = program.column, COMB_HZ
+    samples = render(program, rate_hz).samples[1]
+    joints = np.cumsum(program.duration_s)[:-1]
+    n = 3000
+    for i, joint_s in enumerate(joints):
+        first = Renderer(program, rate_hz).first_sample[i + 1]
+        sides: list[NDArray[Any]] = []
+        for segment, start, hz in ((i, first - n, axis.end_hz), (i + 1, first, axis.start_hz)):
+            tones = slice(axis.offsets[segment], axis.offsets[segment + 1])
+            chirp = (axis.end_hz[tones] - axis.start_hz[tones]) / program.duration_s[segment]
+            time_s = np.arange(start, start + n) / rate_hz - joint_s
+            depth = axis.end_amplitude[tones] ** 2 - axis.start_amplitude[tones] ** 2
+            assert np.all(hz[tones] > 0)
+            here = samples[start : start + n].astype(float)
+            if depth.any():  # undo the ramp
+                at = segment_time(program, segment, time_s, joint_s)
+                here = here / np.sqrt(np.abs(at if depth[0] > 0 else 1 - at))
+            sides.append(fitted(here, hz[tones], chirp, time_s))
+        before, after = sides
+        assert np.abs(np.angle(after / before)).max() < 0.005
+        assert np.abs(np.abs(after / before) - 1).max() < 1e-3
+
+
+def segment_time(program: ToneProgram, i: int, time_s: NDArray[Any], joint_s: float) -> NDArray[Any]:
+    start_s = float(program.duration_s[:i].sum())
+    return (time_s + joint_s - start_s) / program.duration_s[i]
+
+
+def test_segments_own_the_samples_from_the_rounded_start_on() -> None:
+    tone = (site(3), site(3), 1.0, 1.0, 0.0)
+    program = program_of((10.4e-9, [tone]), (10.2e-9, []), (0.1e-9, [tone]), (9e-9, [tone]))
+    renderer = Renderer(program, 1e9)
+    assert renderer.first_sample.tolist() == [0, 10, 21, 21, 30]
+    samples = check(program, 1e9)
+    assert samples[0, :10].all()
+    assert not samples[0, 10:21].any()
+
+
+def test_what_is_silent_is_zero_and_the_empty_program_has_no_samples() -> None:
+    off = [(site(1), site(2), 0.0, 0.0, 0.0)]
+    program = program_of((1e-6, off), (1e-6, []))
+    assert path_of(program) == [SILENT, SILENT]
+    assert not render(program, COMB_HZ).samples.any()
+    assert render(program_of()).samples.shape == (2, 0)
+    assert list(render_chunks(program_of())) == []
+
+
+def test_row_tones_are_channel_0_and_column_tones_channel_1() -> None:
+    waveform = labseq.render(program_of(move(2, [0])))
+    assert waveform.sample_rate_hz == 625e6
+    assert waveform.samples[0].any()
+    assert not waveform.samples[1].any()
+    assert not waveform.samples.flags.writeable
+
+
+def test_two_threads_render_at_the_same_time_into_the_callers_buffers() -> None:
+    program = program_of(*(move(9, [1, -1]) for _ in range(20)), still=False)
+    whole = render(program, COMB_HZ).samples
+    renderer = Renderer(program, COMB_HZ)
+    out = np.empty_like(whole)
+    workers = [threading.Thread(target=renderer.write, args=(c, 0, out[c], c)) for c in (0, 1)]
+    for worker in workers:
+        worker.start()
+    for worker in workers:
+        worker.join()
+    assert np.array_equal(out, whole)
+
+
+def test_chunks_come_in_the_callers_buffers_in_turn() -> None:
+    buffers = tuple(np.empty((2, 2000), np.int16) for _ in range(3))
+    chunks = list(render_chunks(program_of(move(2, [1])), 200e6, 2000, buffers))
+    assert [any(chunk is buffer for buffer in buffers) for chunk in chunks] == [True] * 4
+    assert chunks[3] is buffers[0]
+
+
+@pytest.mark.parametrize(
+    ("tone", "message"),
+    [
+        (
+            (320e6, 1e8, 0.1, 0.1, 0.0),
+            r"start_hz of a row tone in batch 0 is 320000000.0; the limit is 0 to 312500000",
+        ),
+        ((1e8, -1.0, 0.1, 0.1, 0.0), "end_hz of a row tone in batch 0 is -1.0"),
+        ((1e8, 1e8, float("nan"), 0.1, 0.0), "start_amplitude of a row tone in batch 0 is nan"),
+        ((1e8, 1e8, 0.1, -0.1, 0.0), "end_amplitude of a row tone in batch 0 is -0.1"),
+        ((1e8, 1e8, 0.1, 0.1, float("inf")), "phase_rad of a row tone in batch 0 is inf"),
+        (
+            (1e8, 1e8, 0.1, 0.96, 0.0),
+            "sum of the amplitudes of the row tones in batch 0 is 1.01; the limit is 1",
+        ),
+    ],
+)
+def test_what_cannot_be_played_is_refused(tone: Any, message: str) -> None:
+    program = program_of((1e-6, [(1e8, 1e8, 0.05, 0.05, 0.0), tone]))
+    with pytest.raises(LimitError, match=message):
+        render(program)
+
+
+@pytest.mark.parametrize("duration_s", [-1e-6, float("nan"), float("inf")])
+def test_wrong_durations_are_refused(duration_s: float) -> None:
+    with pytest.raises(LimitError, match="duration of segment 0 in batch 0"):
+        render(program_of((duration_s, [])))
+
+
+@pytest.mark.parametrize("sample_rate_hz", [0.0, -1.0, float("nan"), float("inf")])
+def test_wrong_sample_rates_are_refused(sample_rate_hz: float) -> None:
+    with pytest.raises(LimitError, match="sample rate"):
+        render(program_of((1e-6, [])), sample_rate_hz)
+
+
+def test_chunks_have_samples() -> None:
+    with pytest.raises(LimitError, match="samples in a chunk is 0"):
+        next(render_chunks(program_of((1e-6, [])), chunk_samples=0))
