@@ -65,8 +65,9 @@ def start(folder: Path, *arguments: str) -> subprocess.Popen[str]:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no signals between processes")
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-@pytest.mark.parametrize(("n_workers", "n_done"), [(1, 50), (2, 100)])
+@pytest.mark.parametrize(
+    ("n_workers", "n_done", "number", "code"), [(2, 100, signal.SIGINT, 130), (1, 50, signal.SIGTERM, 143)]
+)
 def test_what_is_done_is_kept(tmp_path: Path, n_workers: int, n_done: int, number: int, code: int) -> None:
     arguments = ("--planners", "stuck", "--workers", str(n_workers), "--csv", "out.csv", "--json", "-")
     with start(tmp_path, *arguments) as child:

@@ -129,12 +129,7 @@ def test_a_shot_is_planned_again_as_it_was(tmp_path: Path) -> None:
     ("arguments", "words"),
     [
         (["nowhere.npy", *COMPACT], "nowhere.npy: there is no such file; expected a .npy file, a text file"),
-        (["random:20x20@1.2", *COMPACT], "the filling fraction is '1.2'; expected a number from 0 to 1"),
         ([RANDOM, "--target", "kagomee:5x5"], "did you mean 'kagome'?"),
-        (
-            [RANDOM, *COMPACT, "--json", "-", "--dop", "0"],
-            "--dop 0: degree_of_parallelism is 0; expected at least 1",
-        ),
         ([RANDOM, *COMPACT, "--json", "gone/a.json"], "gone/a.json: the JSON cannot be written"),
     ],
 )
