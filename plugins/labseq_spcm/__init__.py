@@ -1,0 +1,15 @@
+"""Mobile tweezers on a Spectrum M4i.66xx arbitrary waveform generator."""
+
+from labseq import Registry, hookimpl
+
+LABSEQ_API = 1
+
+
+@hookimpl
+def labseq_register(registry: Registry) -> None:
+    """Offer the mobile tweezers ``spcm``; in a dry run they play on a simulated card."""
+    from labseq_spcm.mobile_tweezers import SpcmMobileTweezers
+    from labseq_spcm.settings import SIMULATED, SpcmSettings
+
+    simulated = {"card": SIMULATED, "trigger": "software", "serial": 0}
+    registry.mobile_tweezers("spcm", SpcmMobileTweezers, SpcmSettings, simulated=simulated)

@@ -1,0 +1,207 @@
+"""What the card puts out: spans of samples or of DDS tones, and the amplifier behind them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq_spcm.simulator.facts import CardModel
+
+FULL_SCALE = 32767
+"""Sample that stands for the amplitude that is set."""
+ROUNDING = 0.01
+"""Fraction of a sample that is rounding of time."""
+
+
+@dataclass(frozen=True, slots=True)
+class SampleSpan:
+    """Samples that one channel played without a break.
+
+    Attributes:
+        start_s: When the first sample was at the output, on the session's clock.
+        sample_rate_hz: Sample rate.
+        samples: int16 (n,): one period of what was played; it repeats.
+        first: Index in ``samples`` of the first sample played.
+        n_samples: How many samples were played.
+        amplitude_v: Volts into 50 Ohm that a sample of 32767 stands for.
+    """
+
+    start_s: float
+    sample_rate_hz: float
+    samples: NDArray[np.int16]
+    first: int
+    n_samples: int
+    amplitude_v: float
+
+    @property
+    def end_s(self) -> float:
+        """When the last sample ended."""
+        return self.start_s + self.n_samples / self.sample_rate_hz
+
+    def values(self) -> NDArray[np.int16]:
+        """The samples as played, int16 (n_samples,)."""
+        if self.first + self.n_samples <= len(self.samples):
+            return self.samples[self.first : self.first + self.n_samples]
+        return self.samples[np.arange(self.first, self.first + self.n_samples) % len(self.samples)]
+
+    def volts(self) -> NDArray[np.float64]:
+        """The voltage into 50 Ohm at each sample, float64 (n_samples,)."""
+        return self.values().astype(np.float64) * (self.amplitude_v / FULL_SCALE)
+
+    def between(self, start_s: float, end_s: float) -> SampleSpan:
+        """The samples of the span that were at the output within a time."""
+        first, last = (self._at(time_s) for time_s in (start_s, end_s))
+        return replace(
+            self,
+            start_s=self.start_s + first / self.sample_rate_hz,
+            first=(self.first + first) % max(1, len(self.samples)),
+            n_samples=last - first,
+        )
+
+    def _at(self, time_s: float) -> int:
+        """Index of the first sample of the span that starts at or after a time."""
+        samples = (time_s - self.start_s) * self.sample_rate_hz
+        return math.ceil(min(max(samples - ROUNDING, 0), self.n_samples))
+
+
+@dataclass(frozen=True, slots=True)
+class Tone:
+    """What one DDS core does from a moment on.
+
+    Attributes:
+        core: Index of the core.
+        frequency_hz: Frequency at that moment.
+        frequency_slope: Its change in Hz/s.
+        amplitude: Amplitude at that moment, -1 to 1 of full scale.
+        amplitude_slope: Its change in 1/s.
+        phase_rad: Phase at that moment; the tone is amplitude * sin(phase).
+    """
+
+    core: int
+    frequency_hz: float = 0.0
+    frequency_slope: float = 0.0
+    amplitude: float = 0.0
+    amplitude_slope: float = 0.0
+    phase_rad: float = 0.0
+
+    @property
+    def silent(self) -> bool:
+        """Whether the core puts nothing out, and will not."""
+        return self.amplitude == 0.0 and self.amplitude_slope == 0.0
+
+    def after(self, duration_s: float) -> Tone:
+        """The tone some time later."""
+        turns = (self.frequency_hz + 0.5 * self.frequency_slope * duration_s) * duration_s
+        return replace(
+            self,
+            frequency_hz=self.frequency_hz + self.frequency_slope * duration_s,
+            amplitude=self._amplitude(duration_s),
+            phase_rad=math.remainder(self.phase_rad + math.tau * math.remainder(turns, 1.0), math.tau),
+        )
+
+    def _amplitude(self, duration_s: float) -> float:
+        return min(1.0, max(-1.0, self.amplitude + self.amplitude_slope * duration_s))
+
+    def values(self, t_s: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The tone at some times after its moment, fractions of full scale, float64 (n,)."""
+        turns = (self.frequency_hz + 0.5 * self.frequency_slope * t_s) * t_s
+        amplitude = np.clip(self.amplitude + self.amplitude_slope * t_s, -1.0, 1.0)
+        return amplitude * np.sin(self.phase_rad + math.tau * turns)
+
+
+@dataclass(frozen=True, slots=True)
+class ToneSpan:
+    """DDS tones that one channel played between two of its events.
+
+    Attributes:
+        start_s: When they were first at the output, on the session's clock.
+        end_s: When the next event changed them.
+        amplitude_v: Volts into 50 Ohm that full scale stands for.
+        tones: The tones as they were at ``start_s``; silent cores are left out.
+    """
+
+    start_s: float
+    end_s: float
+    amplitude_v: float
+    tones: tuple[Tone, ...]
+
+    def volts(self, sample_rate_hz: float) -> NDArray[np.float64]:
+        """The voltage into 50 Ohm, float64 (n,), clipped where the tones add up to more than 1."""
+        t_s = np.arange(math.floor((self.end_s - self.start_s) * sample_rate_hz)) / sample_rate_hz
+        total = np.zeros(len(t_s))
+        for tone in self.tones:
+            total += tone.values(t_s)
+        return np.clip(total, -1.0, 1.0) * self.amplitude_v
+
+    def between(self, start_s: float, end_s: float) -> ToneSpan:
+        """The part of the span within a time."""
+        start_s, end_s = max(start_s, self.start_s), min(end_s, self.end_s)
+        tones = tuple(tone.after(start_s - self.start_s) for tone in self.tones)
+        return replace(self, start_s=start_s, end_s=max(start_s, end_s), tones=tones)
+
+
+Span = SampleSpan | ToneSpan
+
+
+S = TypeVar("S", SampleSpan, ToneSpan)
+
+
+@dataclass(slots=True)
+class Amplifier:
+    """The output stage of one channel: on or off, amplitude, the relay between its two paths.
+
+    The settings act at once, also while the card plays. When an amplitude needs the other
+    path, the output is off for a while.
+
+    Attributes:
+        model: The card.
+        changes: (time, volts) from when on the output has had which amplitude; 0 is off.
+    """
+
+    model: CardModel
+    amplitude_mv: int = 1000
+    enabled: bool = False
+    changes: list[tuple[float, float]] = field(default_factory=lambda: [(-math.inf, 0.0)])
+    _high: bool = True
+    _ready_s: float = -math.inf
+
+    def set_amplitude(self, amplitude_mv: int, now_s: float) -> None:
+        """Change the amplitude, through the relay if it must be."""
+        low, high = self.model.low_path_mv
+        needs_high = amplitude_mv > high if not self._high else amplitude_mv >= low
+        if needs_high != self._high:
+            self._high = needs_high
+            self._ready_s = now_s + self.model.relay_s
+        self.amplitude_mv = amplitude_mv
+        self._note(now_s)
+
+    def enable(self, on: bool, now_s: float) -> None:
+        """Close or open the output relay."""
+        self.enabled = on
+        self._note(now_s)
+
+    def _note(self, now_s: float) -> None:
+        volts = self.amplitude_mv / 1000 if self.enabled else 0.0
+        self.changes = [change for change in self.changes if change[0] < now_s]
+        if now_s < self._ready_s:
+            self.changes += [(now_s, 0.0), (self._ready_s, volts)]
+        else:
+            self.changes.append((now_s, volts))
+
+    def cut(self, span: S) -> list[S]:
+        """The parts of a span that reached the connector, with their volts."""
+        ends = [*(start_s for start_s, _ in self.changes[1:]), math.inf]
+        parts: list[S] = []
+        for (start_s, volts), end_s in zip(self.changes, ends, strict=True):
+            if volts and start_s < span.end_s and end_s > span.start_s:
+                parts.append(replace(span.between(start_s, end_s), amplitude_v=volts))
+        return parts
+
+    def forget(self, before_s: float) -> None:
+        """Drop the changes that no longer matter after a time."""
+        last = max(i for i, (start_s, _) in enumerate(self.changes) if start_s <= before_s)
+        self.changes = self.changes[last:]

@@ -1,0 +1,288 @@
+"""Which values the card takes: refused outside of the range, rounded where only the step is wrong.
+
+A refused value leaves the old one in place, as the card does. What the simulator does not
+model is refused as well, with a text that says so, rather than taken without effect.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+from labseq_spcm.simulator import facts, registers as r
+from labseq_spcm.simulator.facts import CardModel
+
+Number = int | float
+
+
+class Refusal(Exception):  # noqa: N818 - it is what the card answers, not a fault of the program
+    """The card refuses a call.
+
+    Attributes:
+        code: The vendor's error code.
+        text: What was wrong.
+    """
+
+    def __init__(self, code: int, text: str) -> None:
+        super().__init__(text)
+        self.code = code
+        self.text = text
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorInfo:
+    """The error that locks the driver.
+
+    Attributes:
+        code: The vendor's code; 0: none.
+        register: The register where it came up.
+        value: The value that was meant for it.
+        text: What was wrong.
+    """
+
+    code: int = r.ERR_OK
+    register: int = 0
+    value: Number = 0
+    text: str = ""
+
+
+class Setup:
+    """The set-up registers of one card.
+
+    Args:
+        model: The card.
+    """
+
+    def __init__(self, model: CardModel) -> None:
+        self.model = model
+        self._values: dict[int, Number] = {**_DEFAULTS, **_fixed(model)}
+        self._values[r.SPC_SAMPLERATE] = int(model.sample_rate_hz[1])
+
+    def __contains__(self, register: int) -> bool:
+        return register in self._values
+
+    def __getitem__(self, register: int) -> int:
+        return int(self._values[register])
+
+    @property
+    def mode(self) -> int:
+        """The card mode."""
+        return self[r.SPC_CARDMODE]
+
+    @property
+    def channels(self) -> list[int]:
+        """The active channels."""
+        return [channel for channel in (0, 1) if self[r.SPC_CHENABLE] >> channel & 1]
+
+    @property
+    def frame_bytes(self) -> int:
+        """Bytes of one sample of all active channels."""
+        return 2 * len(self.channels)
+
+    def write(self, register: int, value: Number, *, running: bool) -> None:
+        """Take a value, or refuse it.
+
+        Raises:
+            Refusal: Unknown or fixed register, value out of range, or not while running.
+        """
+        rule = _RULES.get(register)
+        if rule is None:
+            if register in self._values:
+                raise Refusal(r.ERR_NOWRITEALLOWED, "this register can only be read")
+            raise Refusal(r.ERR_REG, "the simulator does not know this register")
+        if running and register not in _WHILE_RUNNING:
+            raise Refusal(r.ERR_RUNNING, "card is still running, access not possible")
+        self._values[register] = rule(self, value)
+
+
+Rule = Callable[[Setup, Number], Number]
+
+
+def refuse(value: Number, expected: str) -> Refusal:
+    """The card's answer to a value out of range."""
+    return Refusal(r.ERR_VALUE, f"value {value} not allowed; expected {expected}")
+
+
+def within(low: float, high: float, step: float = 1, *, rounded: bool = False) -> Rule:
+    """A range and a step; a value between two steps is refused, or rounded."""
+
+    def rule(_setup: Setup, value: Number) -> Number:
+        if not low <= value <= high:
+            raise refuse(value, f"{low:g} to {high:g}")
+        if not rounded and value % step:
+            raise refuse(value, f"a multiple of {step:g}")
+        return round(value / step) * step
+
+    return rule
+
+
+def one_of(*allowed: int) -> Rule:
+    """Some values, and no others."""
+
+    def rule(_setup: Setup, value: Number) -> Number:
+        if value not in allowed:
+            raise refuse(value, " or ".join(map(str, allowed)))
+        return int(value)
+
+    return rule
+
+
+def modelled(*allowed: int) -> Rule:
+    """Values that the simulator models; the real card may know more."""
+
+    def rule(_setup: Setup, value: Number) -> Number:
+        if value not in allowed:
+            known = ", ".join(hex(int(known)) for known in allowed)
+            raise Refusal(r.ERR_FNCNOTSUPPORTED, f"the simulator models only {known}")
+        return int(value)
+
+    return rule
+
+
+def power_of_two(low: int, high: int) -> Rule:
+    """Powers of two within a range."""
+
+    def rule(_setup: Setup, value: Number) -> Number:
+        whole = int(value)
+        if not low <= whole <= high or whole & (whole - 1):
+            raise refuse(value, f"a power of two from {low} to {high}")
+        return whole
+
+    return rule
+
+
+def _sample_rate(setup: Setup, value: Number) -> Number:
+    model = setup.model
+    low, high = model.sample_rate_hz
+    if not low <= value <= high:
+        raise refuse(value, f"{low:g} to {high:g} S/s")
+    for start, end in model.rate_gaps_hz:
+        if start < value < end:
+            raise refuse(value, f"a rate outside of the clock's gap from {start:g} to {end:g} S/s")
+    return round(value / model.rate_step_hz) * model.rate_step_hz
+
+
+def _memory_size(setup: Setup, value: Number) -> Number:
+    most = setup.model.memory_samples // len(setup.channels)
+    return within(facts.MEMORY_STEP, most, facts.MEMORY_STEP)(setup, value)
+
+
+def _segment_size(setup: Setup, value: Number) -> Number:
+    n_channels = len(setup.channels)
+    most = setup.model.memory_samples // n_channels // setup[r.SPC_SEQMODE_MAXSEGMENTS]
+    return within(facts.SEGMENT_MIN // n_channels, most, facts.MEMORY_STEP)(setup, value)
+
+
+def _segment(setup: Setup, value: Number) -> Number:
+    return within(0, setup[r.SPC_SEQMODE_MAXSEGMENTS] - 1)(setup, value)
+
+
+def _amplitude(setup: Setup, value: Number) -> Number:
+    return within(*setup.model.amplitude_mv)(setup, value)
+
+
+_SWITCH: Final = one_of(0, 1)
+_STOP_LEVELS: Final = (r.SPCM_STOPLVL_ZERO, r.SPCM_STOPLVL_LOW, r.SPCM_STOPLVL_HIGH, r.SPCM_STOPLVL_HOLDLAST)
+_MODES: Final = (
+    r.SPC_REP_STD_SINGLE,
+    r.SPC_REP_STD_SINGLERESTART,
+    r.SPC_REP_FIFO_SINGLE,
+    r.SPC_REP_STD_SEQUENCE,
+    r.SPC_REP_STD_DDS,
+)
+
+_RULES: Final[dict[int, Rule]] = {
+    r.SPC_TIMEOUT: within(0, 2**31 - 1),
+    r.SPC_CARDMODE: modelled(*_MODES),
+    r.SPC_CHENABLE: one_of(1, 2, 3),
+    r.SPC_MEMSIZE: _memory_size,
+    r.SPC_SEGMENTSIZE: within(16, 8 * 1024**3 - 16, 16),
+    r.SPC_LOOPS: within(0, facts.MAX_LOOPS),
+    r.SPC_SAMPLERATE: _sample_rate,
+    r.SPC_CLOCKMODE: modelled(r.SPC_CM_INTPLL, r.SPC_CM_EXTREFCLOCK),
+    r.SPC_REFERENCECLOCK: within(10e6, 1.25e9),
+    r.SPC_CLOCKOUT: _SWITCH,
+    r.SPC_SPECIALCLOCK: modelled(0),
+    r.SPC_OFFS0: one_of(0),
+    r.SPC_OFFS1: one_of(0),
+    r.SPC_AMP0: _amplitude,
+    r.SPC_AMP1: _amplitude,
+    r.SPC_FILTER0: _SWITCH,
+    r.SPC_FILTER1: _SWITCH,
+    r.SPC_ENABLEOUT0: _SWITCH,
+    r.SPC_ENABLEOUT1: _SWITCH,
+    r.SPC_DIFF0: modelled(0),
+    r.SPC_DOUBLEOUT0: modelled(0),
+    r.SPC_CH0_STOPLEVEL: one_of(*_STOP_LEVELS),
+    r.SPC_CH1_STOPLEVEL: one_of(*_STOP_LEVELS),
+    r.SPC_TRIG_ORMASK: modelled(r.SPC_TMASK_NONE, r.SPC_TMASK_SOFTWARE, r.SPC_TMASK_EXT0),
+    r.SPC_TRIG_ANDMASK: modelled(r.SPC_TMASK_NONE),
+    r.SPC_TRIG_TERM: _SWITCH,
+    r.SPC_TRIG_EXT0_ACDC: _SWITCH,
+    r.SPC_TRIG_EXT0_MODE: modelled(r.SPC_TM_NONE, r.SPC_TM_POS, r.SPC_TM_NEG, r.SPC_TM_BOTH),
+    r.SPC_TRIG_EXT0_LEVEL0: within(-10_000, 10_000, 10, rounded=True),
+    r.SPC_TRIG_DELAY: within(0, 8 * 1024**3 - 32, 32),
+    r.SPC_DATA_OUTBUFSIZE: power_of_two(1024, 4 * 1024**3),
+    r.SPC_SEQMODE_MAXSEGMENTS: power_of_two(2, facts.MAX_SEGMENTS),
+    r.SPC_SEQMODE_WRITESEGMENT: _segment,
+    r.SPC_SEQMODE_SEGMENTSIZE: _segment_size,
+    r.SPC_SEQMODE_STARTSTEP: within(0, facts.MAX_STEPS - 1),
+}
+
+_WHILE_RUNNING: Final = {
+    r.SPC_TIMEOUT,
+    r.SPC_AMP0,
+    r.SPC_AMP1,
+    r.SPC_ENABLEOUT0,
+    r.SPC_ENABLEOUT1,
+    r.SPC_SEQMODE_WRITESEGMENT,
+    r.SPC_SEQMODE_SEGMENTSIZE,
+}
+
+_DEFAULTS: Final[dict[int, Number]] = {
+    **dict.fromkeys(_RULES, 0),
+    r.SPC_CARDMODE: r.SPC_REP_STD_SINGLE,
+    r.SPC_CHENABLE: 3,
+    r.SPC_MEMSIZE: 32,
+    r.SPC_SEGMENTSIZE: 16,
+    r.SPC_LOOPS: 1,
+    r.SPC_CLOCKMODE: r.SPC_CM_INTPLL,
+    r.SPC_REFERENCECLOCK: 10_000_000,
+    r.SPC_AMP0: 1000,
+    r.SPC_AMP1: 1000,
+    r.SPC_CH0_STOPLEVEL: r.SPCM_STOPLVL_ZERO,
+    r.SPC_CH1_STOPLEVEL: r.SPCM_STOPLVL_ZERO,
+    r.SPC_DATA_OUTBUFSIZE: 4 * 1024**3,
+    r.SPC_SEQMODE_MAXSEGMENTS: 2,
+}
+
+
+def _fixed(model: CardModel) -> dict[int, Number]:
+    return {
+        r.SPC_PCITYP: model.card_type,
+        r.SPC_FNCTYPE: r.SPCM_TYPE_AO,
+        r.SPC_PCIMEMSIZE: 2 * model.memory_samples,
+        r.SPC_PCIFEATURES: r.SPCM_FEAT_SEQUENCE,
+        r.SPC_PCIEXTFEATURES: r.SPCM_FEAT_EXTFW_DDS20 | r.SPCM_FEAT_EXTFW_AWG,
+        r.SPC_MIINST_MODULES: 1,
+        r.SPC_MIINST_CHPERMODULE: 2,
+        r.SPC_MIINST_BYTESPERSAMPLE: 2,
+        r.SPC_MIINST_BITSPERSAMPLE: 16,
+        r.SPC_MIINST_MAXADCVALUE: 32767,
+        r.SPC_MIINST_MINADCLOCK: int(model.sample_rate_hz[0]),
+        r.SPC_MIINST_MAXADCLOCK: int(model.sample_rate_hz[1]),
+        r.SPC_MIINST_ISDEMOCARD: 0,
+        r.SPC_READAOGAINMIN: model.amplitude_mv[0],
+        r.SPC_READAOGAINMAX: model.amplitude_mv[1],
+        r.SPC_AVAILCARDMODES: sum(_MODES),
+        r.SPC_AVAILMEMSIZE_MIN: facts.MEMORY_STEP,
+        r.SPC_AVAILMEMSIZE_MAX: model.memory_samples,
+        r.SPC_AVAILMEMSIZE_STEP: facts.MEMORY_STEP,
+        r.SPC_TRIG_AVAILORMASK: r.SPC_TMASK_SOFTWARE | r.SPC_TMASK_EXT0,
+        r.SPC_TRIG_AVAILDELAY: 8 * 1024**3 - 32,
+        r.SPC_TRIG_AVAILDELAY_STEP: 32,
+        r.SPC_SEQMODE_AVAILMAXSEGMENT: facts.MAX_SEGMENTS,
+        r.SPC_SEQMODE_AVAILMAXSTEPS: facts.MAX_STEPS,
+        r.SPC_SEQMODE_AVAILMAXLOOP: r.SPCSEQ_LOOPMASK,
+    }
