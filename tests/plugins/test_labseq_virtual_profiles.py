@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from labseq_virtual.settings import (
     WorldSettings,
 )
 
-from labseq import MotionSpec, Registry, Settings, SiteGrid
+from labseq import MotionSpec, Registry, RfSpec, Settings, SiteGrid
 from labseq.config import MOTION_KEYS, load_profile
 from labseq.config.detectors import ThresholdSettings
 from labseq.config.patterns import BitmapSettings, CompactSettings
@@ -58,7 +59,7 @@ def test_the_virtual_profile_states_the_defaults() -> None:
 def test_the_profiles_describe_the_papers_machine(name: str) -> None:
     document, profile = load_profile(name, beside=Path())
     grid, paper = profile.grid_model(), SiteGrid()
-    assert profile.motion == MotionSpec()
+    assert replace(profile.motion, rf=RfSpec()) == MotionSpec()  # volts are each lab's own
     np.testing.assert_allclose(grid.positions_m, paper.positions_m)
     np.testing.assert_allclose(grid.row_frequency_hz, paper.row_frequency_hz)
     np.testing.assert_allclose(grid.column_frequency_hz, paper.column_frequency_hz)
