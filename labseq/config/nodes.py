@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple, TypeAlias
 
+from labseq.config.wording import visible
 from labseq.errors import Problem
 
 Loc: TypeAlias = tuple[str | int, ...]
@@ -28,7 +29,11 @@ class Mark(NamedTuple):
     origin: str = ""
 
     def problem(self, name: str, what: str, expected: str = "", hint: str = "") -> Problem:
-        """Say that something is wrong here, in the file called ``name`` or in the option."""
+        """Say that something is wrong here, in the file called ``name`` or in the option.
+
+        What cannot be seen becomes visible: validators, those of plugins too, quote values as they are.
+        """
+        what, expected, hint = visible(what), visible(expected), visible(hint)
         if self.origin:
             return Problem(what, self.origin, expected=expected, hint=hint)
         return Problem(what, name, self.line, self.column, expected, hint)

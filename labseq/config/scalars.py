@@ -7,9 +7,10 @@ Under YAML 1.1, PyYAML's default, ``do: off`` is False, ``10:30`` is 630 and
 from __future__ import annotations
 
 import re
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
-from labseq.config.nodes import Scalar
+if TYPE_CHECKING:
+    from labseq.config.nodes import Scalar
 
 _WORDS: Final[dict[str, Scalar]] = {
     **dict.fromkeys(("", "~", "null", "Null", "NULL")),

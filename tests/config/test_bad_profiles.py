@@ -91,6 +91,12 @@ CASES = [
         "p.yaml:18:10: speed is 0; expected more than 0",
     ),
     (
+        "motion with what cannot be seen",
+        "speed: 130 um/ms",
+        'speed: "130\\0"',
+        r"p.yaml:18:10: speed: '\x00' in '130\x00' is not a unit of speed; expected a speed such as '130 um/ms' (m/s, mm/s, mm/ms, um/ms, um/us, um/s) or a plain number in m/s",
+    ),
+    (
         "motion in the wrong unit",
         "speed: 130 um/ms",
         "speed: 130 um",
