@@ -20,6 +20,7 @@ from labseq.drawing.paint import (
     paint_sites,
 )
 from labseq.drawing.panels import Panel, make_panels
+from labseq.drawing.saving import make_figure, save_figure
 from labseq.drawing.sheet import Sheet, extent_of, lay_out, place_sites
 from labseq.errors import ConfigError, Problem
 from labseq.model import Occupancy, Plan, PlanReport, SiteGrid, TargetPattern
@@ -94,26 +95,15 @@ def save_plan(path: Path, drawing: PlanDrawing) -> None:
     Raises:
         ConfigError: The file cannot be written.
     """
-    from matplotlib import style
-
-    with style.context("default"):  # whatever the user's matplotlibrc says
-        figure = _draw(drawing)
-        try:
-            figure.savefig(path, dpi=DPI, metadata={"Title": drawing.title, "Software": None})
-        except OSError as error:
-            problem = Problem(f"the picture cannot be written: {error.strerror or error}", str(path))
-            raise ConfigError(problem) from error
+    told = {"Title": drawing.title, "Software": None}
+    save_figure(path, lambda: _draw(drawing), dpi=DPI, metadata=told)
 
 
 def _draw(drawing: PlanDrawing) -> Figure:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     plan, grid = drawing.plan, drawing.grid
     panels = make_panels(tell_batches(plan, grid.shape))
     sheet = lay_out(extent_of(plan, grid), len(panels) + 2)
-    figure = Figure(figsize=(sheet.width_in, sheet.height_in))
-    FigureCanvasAgg(figure)
+    figure = make_figure(sheet.width_in, sheet.height_in)
     looks = _fill(figure, sheet, drawing, panels)
     _write_head(figure, sheet, drawing, looks)
     if len(panels) < plan.n_batches:

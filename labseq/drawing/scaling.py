@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.errors import ConfigError, Problem
+from labseq.drawing.saving import make_figure, save_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -93,24 +93,12 @@ def save_comparison(path: Path, drawing: ComparisonDrawing) -> None:
     Raises:
         ConfigError: The file cannot be written.
     """
-    from matplotlib import style
-
-    with style.context("default"):  # whatever the user's matplotlibrc says
-        figure = _draw(drawing)
-        try:
-            figure.savefig(path, dpi=DPI)
-        except OSError as error:
-            problem = Problem(f"the picture cannot be written: {error.strerror or error}", str(path))
-            raise ConfigError(problem) from error
+    save_figure(path, lambda: _draw(drawing), dpi=DPI)
 
 
 def _draw(drawing: ComparisonDrawing) -> Figure:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     n_panels = max(1, bool(drawing.curves) + bool(drawing.histograms))
-    figure = Figure(figsize=(n_panels * PANEL_IN[0], PANEL_IN[1]), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = make_figure(n_panels * PANEL_IN[0], PANEL_IN[1], layout="constrained")
     panels = list(figure.subplots(1, n_panels, squeeze=False)[0])
     if drawing.histograms:
         _draw_histograms(panels[0], drawing)

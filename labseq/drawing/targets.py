@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from labseq.drawing.paint import Look
+from labseq.drawing.saving import make_figure, save_figure
 from labseq.drawing.sheet import MARGIN, place_sites
-from labseq.errors import ConfigError, Problem
 from labseq.model import SiteGrid, TargetPattern
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 DPI: Final = 100
 SITE_IN: Final = 0.18
@@ -63,21 +64,15 @@ def save_target(path: Path, target: TargetPattern, grid: SiteGrid) -> None:
     Raises:
         ConfigError: The file cannot be written.
     """
-    from matplotlib import style
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    left, right, top, bottom = _extent(grid)
     told = {"Title": target.name, "Description": target_text(target), "Software": None}
-    with style.context("default"):  # whatever the user's matplotlibrc says
-        figure = Figure(figsize=((right - left) * SITE_IN, (bottom - top) * SITE_IN))
-        FigureCanvasAgg(figure)
-        draw_target(figure.add_axes((0.0, 0.0, 1.0, 1.0)), target, grid)
-        try:
-            figure.savefig(path, dpi=DPI, metadata=told, pil_kwargs={"optimize": True})
-        except OSError as error:
-            problem = Problem(f"the picture cannot be written: {error.strerror or error}", str(path))
-            raise ConfigError(problem) from error
+    save_figure(path, lambda: _draw(target, grid), dpi=DPI, metadata=told, pil_kwargs={"optimize": True})
+
+
+def _draw(target: TargetPattern, grid: SiteGrid) -> Figure:
+    left, right, top, bottom = _extent(grid)
+    figure = make_figure((right - left) * SITE_IN, (bottom - top) * SITE_IN)
+    draw_target(figure.add_axes((0.0, 0.0, 1.0, 1.0)), target, grid)
+    return figure
 
 
 def target_text(target: TargetPattern) -> str:

@@ -51,9 +51,8 @@ def nearest_to_centre(fill: NDArray[np.bool_], n_sites: int, grid: SiteGrid) -> 
         >>> nearest_to_centre(np.ones((1, 5), np.bool_), 2, SiteGrid()).tolist()
         [[False, True, True, False, False]]
     """
-    order = from_the_centre(fill, grid)
-    if len(order) <= n_sites:
+    if np.count_nonzero(fill) <= n_sites:
         return fill
     nearest = np.zeros(fill.shape, np.bool_)
-    nearest.reshape(-1)[order[:n_sites]] = True
+    nearest.reshape(-1)[from_the_centre(fill, grid)[:n_sites]] = True
     return nearest

@@ -261,8 +261,9 @@ class Session:
             return
         text = f"the last run on this profile ({dead}) died; its devices are made safe first"
         self._observers.event("warning", {"text": text})
-        for failure in secure_bench(self.assembly.bench, self.stop_flag, self._observers).failures:
-            raise failure
+        failures = secure_bench(self.assembly.bench, self.stop_flag, self._observers).failures
+        if failures:
+            raise failures[0]
         self._try(clear_active, roots, self._profile_key)
         self.stop_flag.check()
 

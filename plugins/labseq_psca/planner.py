@@ -121,14 +121,11 @@ class PscaPlanner:
             occupied = as_occupancy(occupancy, target.shape)
         except (TypeError, ValueError) as error:
             raise PlanError(str(error), "psca") from error
-        fill, n_wanted = target.fill, target.n_atoms
-        n_atoms = int(np.count_nonzero(occupied))
-        if n_atoms < n_wanted:
-            fill = nearest_to_centre(fill, n_atoms, self._grid)
+        fill = nearest_to_centre(target.fill, int(np.count_nonzero(occupied)), self._grid)
         moves, offsets = self._sort_and_compress(occupied, fill, target.clear)
         if self._settings.variant == "fewest" and self._settings.repair_below > 0:
             n_defects = int(np.count_nonzero(fill > occupied))
-            if 0 < n_defects <= self._settings.repair_below * n_wanted:
+            if 0 < n_defects <= self._settings.repair_below * target.n_atoms:
                 repaired = self._repair(occupied, fill, target.clear)
                 moves, offsets = min((moves, offsets), repaired, key=_cost)
         moves.flags.writeable = offsets.flags.writeable = False  # else Plan would copy them
@@ -154,6 +151,8 @@ class PscaPlanner:
 
 
 def _cost(plan: tuple[NDArray[np.int16], NDArray[np.int32]]) -> int:
-    """What a plan of few moves loses; see ``_kernels_repair``."""
+    """What a plan of few moves loses."""
+    from labseq_psca._kernels_repair import ATOM_MOVE, BATCH
+
     moves, offsets = plan
-    return 3 * len(moves) + len(offsets)
+    return ATOM_MOVE * len(moves) + BATCH * (len(offsets) - 1)

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from labseq.session import load_plugins
 from labseq.session.bench import compare
 from labseq.session.bench_courses import set_up
 from labseq.session.bench_curves import figure_drawing, fits_as_dicts, histogram_drawing, points_of
@@ -131,9 +130,6 @@ def test_a_plain_comparison_shows_how_batches_spread() -> None:
 @pytest.mark.parametrize("name", FIGURES)
 def test_every_figure_has_targets_that_its_loadings_can_mostly_fill(name: str) -> None:
     conditions = FIGURES[name].conditions
-    patterns = {condition.target.partition(":")[0] for condition in conditions}
-    if missing := patterns - {*load_plugins().registry.names("pattern")}:
-        pytest.skip(f"{', '.join(missing)} is not installed")
     for course in set_up(Comparison((Entrant("psca"),), conditions, 1, 1)):
         n_sites = course.grid.n_rows * course.grid.n_cols
         mean, spread = course.loading * n_sites, (course.loading * (1 - course.loading) * n_sites) ** 0.5
