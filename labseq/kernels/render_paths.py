@@ -188,22 +188,26 @@ def choose(
     tones: Floats, start: int, stop: int, length: float, step: float, tooth: Ints, group: Bytes
 ) -> int:
     """Choose between COMB, BLENDED and DIRECT for a segment whose tones have all found a group."""
-    re, im = np.empty(N_COEFFICIENTS), np.empty(N_COEFFICIENTS)
     anchors = np.full(MAX_GROUPS, -1, np.int64)
+    for k in range(stop - 1, start - 1, -1):
+        anchors[group[k]] = k
     shared, _, _ = envelope(tones, start, stop)
-    exact, error = shared, 0.0
+    exact = shared
     for k in range(start, stop):
-        if anchors[group[k]] < 0:
-            anchors[group[k]] = k
         anchor = int(anchors[group[k]])
         drift, bend = off_tooth(tones, k, anchor, tooth[k], tooth[anchor], step, length)
         exact = exact and abs(drift) + abs(bend) <= ON_TOOTH
+    if exact:
+        return COMB
+    re, im = np.empty(N_COEFFICIENTS), np.empty(N_COEFFICIENTS)
+    error = 0.0
+    for k in range(start, stop):
+        anchor = int(anchors[group[k]])
+        drift, bend = off_tooth(tones, k, anchor, tooth[k], tooth[anchor], step, length)
         a, b = tones[START_AMPLITUDE, k], tones[END_AMPLITUDE, k]
         if shared:
             a = b = max(a, b)
         error += fit_cubic(a, b, drift, bend, re, im)
-    if exact:
-        return COMB
     return BLENDED if error <= BLENDING else DIRECT
 
 

@@ -17,8 +17,8 @@ Complex = tuple[float, float]
 LANES: Final = 32
 """Samples that are worked on together."""
 
-N_CHIRPS: Final = 4
-"""Chirps that are kept: to the right, to the left, parked, and one to spare."""
+N_CHIRPS: Final = 8
+"""Chirps that are kept: to the right, to the left and parked, on two axes, and two to spare."""
 
 FREQUENCY_GRID: Final = 2.0**44
 CHIRP_GRID: Final = 2.0**62

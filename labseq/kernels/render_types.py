@@ -42,7 +42,7 @@ the time from its start to there and its length, both in samples, the spacing of
 per sample, and the samples of a block."""
 
 Room: TypeAlias = tuple[Floats, Singles, Singles, Floats, Floats, Singles, Floats, Ints, Samples]
-"""Room for one thread to work in, see :func:`room`."""
+"""Room for one thread to work in, see :func:`new_room`."""
 
 AXIS: Final = (
     f"Tuple(({const('float64', 2)}, {const('int32', 1)}, {const('int8', 1)}, {const('int8', 1)},"
@@ -61,8 +61,8 @@ def strip_samples(block: int) -> int:
     return max(1, STRIP // block) * block
 
 
-def room(block: int) -> Room:
-    """Room for one thread to work in, for blocks of so many samples.
+def new_room(block: int) -> Room:
+    """Make room for one thread to work in, for blocks of so many samples.
 
     Returns:
         float64 (N_ROWS64, width): sums over a period, coefficients of a cubic.

@@ -1,7 +1,7 @@
 """From a plan to what the mobile tweezers play.
 
 Importing this package imports no numba: the kernels come with the first call, or
-with :func:`warm`.
+with :func:`warm` and :func:`warm_rendering`.
 """
 
 import importlib
@@ -41,10 +41,20 @@ __all__ = [
     "render_chunks",
     "tone_program",
     "warm",
+    "warm_rendering",
 ]
 
 
 def warm() -> None:
-    """Compile the kernels of this package, or load them from the cache."""
-    for module in ("plan_check", "tone_build", "tone_limits"):
+    """Compile the kernels of checks and tone programs, or load them from the cache."""
+    _load("plan_check", "tone_build", "tone_limits")
+
+
+def warm_rendering() -> None:
+    """The same for those of rendering, which only drivers need that play samples."""
+    _load("render_axis", "render_paths", "render_teeth", "render_tones")
+
+
+def _load(*kernels: str) -> None:
+    for module in kernels:
         importlib.import_module(f"labseq.kernels.{module}")

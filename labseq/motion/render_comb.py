@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -19,12 +20,8 @@ CLOCK_STEP_HZ: Final = 8
 MAX_PERIOD: Final = 4096
 """Longest period of a comb, in samples, that is worth its tables."""
 
-MAX_TEETH: Final = 64
 BLOCK: Final = 1536
 """Blocks have at least so many samples."""
-
-TOLERANCE_HZ: Final = 100.0
-"""Tones nearer than this to a tooth count as standing on it when the comb is looked for."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,41 +96,37 @@ def comb_sample_rate(
 
 def find_comb(axis: AxisTones, sample_rate_hz: float) -> Comb:
     """Find the comb that most tones of an axis stand on, if there is one that suits the sample rate."""
-    tones_hz = np.unique(np.round(axis.start_hz))
-    gaps = np.diff(tones_hz)
-    gaps = gaps[gaps > TOLERANCE_HZ]
-    if len(gaps):
-        spacing = _common_spacing(gaps)
-    elif len(tones_hz):  # then it may as well be on a tooth of 0 Hz's comb, and repeat itself
-        whole = Fraction(float(axis.start_hz.min()) / sample_rate_hz).limit_denominator(MAX_PERIOD)
-        spacing = sample_rate_hz / whole.denominator
-    else:
+    from labseq.kernels.render_teeth import MAX_TEETH, MAX_TONES, TOLERANCE_HZ, common_spacing, distinct_tones
+
+    tones_hz = np.empty(MAX_TONES)
+    n_tones = distinct_tones(axis.start_hz, tones_hz)
+    spacing = common_spacing(tones_hz[:n_tones]) if n_tones > 0 else -1.0
+    if spacing < 0.0:
         return NO_COMB
+    origin = float(axis.start_hz.min()) / sample_rate_hz
+    if spacing == 0.0:  # then it may as well be on a tooth of 0 Hz's comb, and repeat itself
+        spacing = sample_rate_hz / Fraction(origin).limit_denominator(MAX_PERIOD).denominator
     ratio = Fraction(spacing / sample_rate_hz).limit_denominator(MAX_PERIOD)
     period, step = ratio.denominator, float(ratio)
-    span = (tones_hz[-1] - tones_hz[0]) / sample_rate_hz
+    span = (tones_hz[n_tones - 1] - tones_hz[0]) / sample_rate_hz
     near = abs(step * sample_rate_hz - spacing) <= TOLERANCE_HZ
     if step <= 0.0 or not near or round(span / step) >= MAX_TEETH:
         return NO_COMB
     n_teeth = round(span / step) + 1
-    turns = np.outer(np.arange(n_teeth) * ratio.numerator, np.arange(period)) % period
-    angles = 2 * np.pi / period * turns
-    teeth = np.stack([np.cos(angles), np.sin(angles)], axis=1).reshape(2 * n_teeth, period)
+    teeth = _teeth(ratio.numerator, period, 1 << (n_teeth - 1).bit_length())
+    return Comb(origin, step, teeth[: 2 * n_teeth], period * math.ceil(BLOCK / period))
+
+
+@lru_cache(maxsize=8)
+def _teeth(numerator: int, period: int, n_teeth: int) -> NDArray[np.float64]:
+    """What :attr:`Comb.teeth` holds, kept for the next program."""
+    from labseq.kernels.render_teeth import fill_teeth
+
+    angles = 2 * np.pi / period * np.arange(period)
+    teeth = np.empty((2 * n_teeth, period))
+    fill_teeth(np.cos(angles), np.sin(angles), numerator, teeth)
     teeth.flags.writeable = False
-    return Comb(float(axis.start_hz.min()) / sample_rate_hz, step, teeth, period * math.ceil(BLOCK / period))
-
-
-def _common_spacing(gaps: NDArray[np.float64]) -> float:
-    """The largest spacing of which most gaps are a multiple."""
-    apart = np.abs(gaps[:, None] - gaps[None, :]).ravel()
-    candidates = np.unique(np.round(np.concatenate([gaps, apart[apart > TOLERANCE_HZ]]), -1))
-    multiples = np.round(gaps[None, :] / candidates[:, None])
-    fits = np.abs(gaps[None, :] - multiples * candidates[:, None]) <= TOLERANCE_HZ
-    n_fitting = (fits & (multiples > 0)).sum(axis=1)
-    best = candidates[n_fitting == n_fitting.max()].max()
-    whole = np.round(gaps / best)
-    held = (np.abs(gaps - whole * best) <= TOLERANCE_HZ) & (whole > 0)
-    return float(gaps[held].sum() / whole[held].sum())
+    return teeth
 
 
 def _spacing(site_hz: NDArray[np.float64]) -> float:

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from enum import IntEnum
-from typing import TYPE_CHECKING, Final
+from functools import lru_cache
+from typing import TYPE_CHECKING, Final, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
 from labseq.errors import LimitError
-from labseq.model import AxisTones, ToneProgram, Waveform
+from labseq.model import ToneProgram, Waveform
 from labseq.motion.render_comb import find_comb
 
 if TYPE_CHECKING:
-    from labseq.kernels.render_types import Axis
+    from labseq.kernels.render_types import Axis, Room
 
 FULL_SCALE: Final = 32767
 """Sample at which the amplitudes of an axis add up to 1."""
@@ -23,11 +25,8 @@ FULL_SCALE: Final = 32767
 N_CHANNELS: Final = 2
 """Channel 0 plays the row tones, channel 1 the column tones."""
 
-N_WORKERS: Final = 2
-"""Threads that can render at the same time."""
-
-ROUNDING: Final = 1e-9
-"""By how much a sum of amplitudes may exceed full scale."""
+MAX_ROOMS: Final = 8
+"""Rooms that are kept for threads to render in, of 2 MB each."""
 
 
 class RenderPath(IntEnum):
@@ -81,9 +80,9 @@ class Renderer:
             LimitError: A value is not finite, a duration or an amplitude is negative, a
                 sum of amplitudes exceeds full scale, or a frequency half the sample rate.
         """
-        from labseq.kernels.render_types import room
-
-        _check(program, sample_rate_hz)
+        if not 0 < sample_rate_hz < np.inf:
+            raise LimitError("the sample rate", f"{sample_rate_hz} Hz", "more than 0 and finite")
+        _check_durations(program)
         starts = np.concatenate([[0.0], np.cumsum(program.duration_s)]) * sample_rate_hz
         self.sample_rate_hz = float(sample_rate_hz)
         self.first_sample = np.rint(starts).astype(np.int64)
@@ -92,31 +91,40 @@ class Renderer:
         length = program.duration_s * sample_rate_hz
         for array in (self.first_sample, delta, length):
             array.flags.writeable = False
-        axes: list[Axis] = [
-            _prepare(axis, program.course, self.first_sample, delta, length, self.sample_rate_hz)
-            for axis in (program.row, program.column)
-        ]
-        self._axes = axes
-        self._rooms = [[room(axis[-1]) for axis in axes] for _ in range(N_WORKERS)]
+        times = self.first_sample, delta, length
+        axes = [_prepare(program, channel, times, self.sample_rate_hz) for channel in range(N_CHANNELS)]
+        self._axes: list[Axis] = axes
         self.path = np.stack([axis[3] for axis in axes])
         self.path.flags.writeable = False
 
-    def write(self, channel: int, start: int, out: NDArray[np.int16], worker: int = 0) -> None:
+    def write(self, channel: int, start: int, out: NDArray[np.int16]) -> None:
         """Render samples ``start`` to ``start + len(out)`` of a channel; after the end there is silence.
 
-        Allocates nothing and holds no lock of Python. Two threads can render at the same
-        time, each as a worker of its own. The samples depend neither on where a stretch
-        starts nor on the worker.
+        Holds no lock of Python, and any number of threads can render at the same time.
+        The samples do not depend on where a stretch starts.
 
         Args:
             channel: 0 for the row tones, 1 for the column tones.
             start: First sample, counted from the start of the program.
             out: Result, int16 (n,), contiguous.
-            worker: 0 or 1: which room to work in.
         """
         from labseq.kernels.render_axis import render
+        from labseq.kernels.render_types import new_room
 
-        render(self._axes[channel], start, out, self._rooms[worker][channel])
+        axis = self._axes[channel]
+        free = _free_rooms(axis[-1])
+        try:
+            room = free.pop()
+        except IndexError:
+            room = new_room(axis[-1])
+        render(axis, start, out, room)
+        free.append(room)
+
+
+@lru_cache(maxsize=4)
+def _free_rooms(block: int) -> deque[Room]:  # noqa: ARG001 - the key of the cache
+    """Rooms for blocks of so many samples that no thread works in; fresh memory would cost a millisecond."""
+    return deque(maxlen=MAX_ROOMS)
 
 
 def render(program: ToneProgram, sample_rate_hz: float = 625e6) -> Waveform:
@@ -140,8 +148,11 @@ def render(program: ToneProgram, sample_rate_hz: float = 625e6) -> Waveform:
     """
     renderer = Renderer(program, sample_rate_hz)
     samples = np.empty((N_CHANNELS, renderer.n_samples), np.int16)
+    half = renderer.n_samples // 2
     with ThreadPoolExecutor(1) as other:
-        _write_both(renderer, 0, samples, other)
+        later = other.submit(_write_channels, renderer, half, samples[:, half:])
+        _write_channels(renderer, 0, samples[:, :half])
+        later.result()
     samples.flags.writeable = False
     return Waveform(samples, renderer.sample_rate_hz)
 
@@ -152,7 +163,9 @@ def render_chunks(
     chunk_samples: int = 1 << 20,
     buffers: tuple[NDArray[np.int16], ...] = (),
 ) -> Iterator[NDArray[np.int16]]:
-    """Render a tone program chunk by chunk, one thread per channel.
+    """Render a tone program chunk by chunk, in the calling thread.
+
+    Chunks of a streaming driver are rendered in less time than it takes to wake another thread.
 
     Args:
         program: The tone program.
@@ -171,99 +184,84 @@ def render_chunks(
     renderer = Renderer(program, sample_rate_hz)
     shape = (N_CHANNELS, chunk_samples)
     buffers = buffers or (np.empty(shape, np.int16), np.empty(shape, np.int16))
-    with ThreadPoolExecutor(1) as other:
-        for n, start in enumerate(range(0, renderer.n_samples, chunk_samples)):
-            out = buffers[n % len(buffers)]
-            _write_both(renderer, start, out, other)
-            yield out
+    for n, start in enumerate(range(0, renderer.n_samples, chunk_samples)):
+        out = buffers[n % len(buffers)]
+        _write_channels(renderer, start, out)
+        yield out
 
 
-def _write_both(renderer: Renderer, start: int, out: NDArray[np.int16], other: ThreadPoolExecutor) -> None:
-    """Let two threads render one half of a stretch each, whichever axis has more tones."""
-    half = out.shape[1] // 2
-    later = other.submit(_write_half, renderer, start + half, out[:, half:], 1)
-    _write_half(renderer, start, out[:, :half], 0)
-    later.result()
-
-
-def _write_half(renderer: Renderer, start: int, out: NDArray[np.int16], worker: int) -> None:
+def _write_channels(renderer: Renderer, start: int, out: NDArray[np.int16]) -> None:
     for channel in range(N_CHANNELS):
-        renderer.write(channel, start, out[channel], worker)
+        renderer.write(channel, start, out[channel])
 
 
 def _prepare(
-    axis: AxisTones,
-    course: NDArray[np.int8],
-    first_sample: NDArray[np.int64],
-    delta: NDArray[np.float64],
-    length: NDArray[np.float64],
+    program: ToneProgram,
+    channel: int,
+    times: tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]],
     sample_rate_hz: float,
 ) -> Axis:
-    """Bring an axis into the kernels' units, and choose the path of each segment."""
-    from labseq.kernels.render_paths import choose_paths
-
-    comb = find_comb(axis, sample_rate_hz)
-    tones = np.stack(
-        [
-            axis.start_hz / sample_rate_hz,
-            axis.end_hz / sample_rate_hz,
-            axis.start_amplitude,
-            axis.end_amplitude,
-            axis.phase_rad / (2 * np.pi),
-        ]
-    )
-    path, group = np.empty(len(length), np.int8), np.zeros(tones.shape[1], np.int8)
-    tooth = np.zeros(tones.shape[1], np.int32)
-    choose_paths(
-        tones, axis.offsets, length, course, comb.origin, comb.step, comb.n_teeth, path, tooth, group
-    )
-    for array in (tones, path, tooth, group):
-        array.flags.writeable = False
-    return (
-        tones, axis.offsets, course, path, tooth, group, comb.teeth, first_sample, delta, length,
-        comb.step, comb.block,
-    )  # fmt: skip
-
-
-def _check(program: ToneProgram, sample_rate_hz: float) -> None:
-    """Refuse what cannot be played.
+    """Bring an axis into the kernels' units, and choose the path of each segment.
 
     Raises:
         LimitError: See :class:`Renderer`.
     """
-    if not 0 < sample_rate_hz < np.inf:
-        raise LimitError("the sample rate", f"{sample_rate_hz} Hz", "more than 0 and finite")
+    from labseq.kernels.render_paths import choose_paths
+    from labseq.kernels.render_tones import FINE, N_FIELDS, take_tones
+
+    axis, (first_sample, delta, length) = (program.row, program.column)[channel], times
+    n_tones = len(axis.start_hz)
+    tones = np.empty((N_FIELDS, n_tones))
+    fault, where = take_tones(
+        axis.start_hz,
+        axis.end_hz,
+        axis.start_amplitude,
+        axis.end_amplitude,
+        axis.phase_rad,
+        axis.offsets,
+        sample_rate_hz,
+        tones,
+    )
+    if fault != FINE:
+        _refuse(fault, where, program, channel, sample_rate_hz)
+    comb = find_comb(axis, sample_rate_hz)
+    path, group = np.empty(len(length), np.int8), np.zeros(n_tones, np.int8)
+    tooth = np.zeros(n_tones, np.int32)
+    choose_paths(
+        tones, axis.offsets, length, program.course, comb.origin, comb.step, comb.n_teeth, path, tooth, group
+    )
+    for array in (tones, path, tooth, group):
+        array.flags.writeable = False
+    return (
+        tones, axis.offsets, program.course, path, tooth, group, comb.teeth, first_sample, delta, length,
+        comb.step, comb.block,
+    )  # fmt: skip
+
+
+def _check_durations(program: ToneProgram) -> None:
     wrong = np.flatnonzero(~((program.duration_s >= 0) & (program.duration_s < np.inf)))
     if len(wrong):
         which = f"the duration of segment {wrong[0]} in batch {program.batch[wrong[0]]}"
         raise LimitError(which, f"{program.duration_s[wrong[0]]} s", "0 or more and finite")
-    for name, axis in (("row", program.row), ("column", program.column)):
-        for field, most in (
-            ("start_hz", sample_rate_hz / 2),
-            ("end_hz", sample_rate_hz / 2),
-            ("start_amplitude", 1.0 + ROUNDING),
-            ("end_amplitude", 1.0 + ROUNDING),
-            ("phase_rad", np.inf),
-        ):
-            values = getattr(axis, field)
-            least = -np.inf if field == "phase_rad" else 0.0
-            fine = (values >= least) & (values <= most) & np.isfinite(values)
-            if not fine.all():
-                tone = int(fine.argmin())
-                which = f"{field} of a {name} tone in batch {_batch_of(program, axis, tone)}"
-                raise LimitError(which, values[tone], f"{least:.9g} to {most:.9g}")
-        _check_sums(program, axis, name)
 
 
-def _check_sums(program: ToneProgram, axis: AxisTones, name: str) -> None:
-    for values in (axis.start_amplitude, axis.end_amplitude):
-        sums = np.diff(np.concatenate([[0.0], np.cumsum(values)])[axis.offsets])
-        if len(sums) and sums.max() > 1.0 + ROUNDING:
-            worst = int(sums.argmax())
-            which = f"the sum of the amplitudes of the {name} tones in batch {program.batch[worst]}"
-            raise LimitError(which, f"{sums[worst]:.9g}", "1, full scale")
+def _refuse(fault: int, where: int, program: ToneProgram, channel: int, sample_rate_hz: float) -> NoReturn:
+    """Put into words what cannot be played."""
+    from labseq.kernels.render_tones import SUM
 
-
-def _batch_of(program: ToneProgram, axis: AxisTones, tone: int) -> int:
-    segment = int(np.searchsorted(axis.offsets, tone, "right")) - 1
-    return int(program.batch[segment])
+    axis, name = ((program.row, "row"), (program.column, "column"))[channel]
+    if fault == SUM:
+        tones = slice(axis.offsets[where], axis.offsets[where + 1])
+        largest = max(axis.start_amplitude[tones].sum(), axis.end_amplitude[tones].sum())
+        which = f"the sum of the amplitudes of the {name} tones in batch {program.batch[where]}"
+        raise LimitError(which, f"{largest:.9g}", "1, full scale")
+    field, limit = (
+        ("start_hz", f"0 to {sample_rate_hz / 2:.9g}"),
+        ("end_hz", f"0 to {sample_rate_hz / 2:.9g}"),
+        ("start_amplitude", "0 to 1"),
+        ("end_amplitude", "0 to 1"),
+        ("phase_rad", "finite"),
+    )[fault]
+    segment = int(np.searchsorted(axis.offsets, where, "right")) - 1
+    which = f"{field} of a {name} tone in batch {program.batch[segment]}"
+    raise LimitError(which, getattr(axis, field)[where], limit)

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.model import AxisTones, FrequencyCourse, MotionSpec, Plan, SiteGrid, ToneProgram
-from labseq.motion import Renderer, comb_sample_rate, tone_program
+from labseq.model import AxisTones, FrequencyCourse, SiteGrid, ToneProgram
+from labseq.motion import Renderer, comb_sample_rate, tone_program, warm_rendering
 from labseq.motion.render_reference import render_reference
+from labseq.session.plan_inputs import PlanRequest
+from labseq.session.planning import PlannedMoves, plan_moves
 
 N_CHANNELS: Final = 2
 CHUNK: Final = 1 << 18
@@ -23,9 +25,17 @@ CHUNK: Final = 1 << 18
 STORED: Final = 1 << 21
 """Samples of each stored waveform: 84 MB in all."""
 
+STORED_5: Final = "stored waveforms, 5 tones"
+STORED_20: Final = "stored waveforms, 20 tones"
+NUMPY_20: Final = "numpy, 20 tones"
+
 SITE_S: Final = 4.49e-6 / 0.130
 SITES: Final = 5
 """Sites per transport of the programs that stand for one kind of segment: about a plan's mean."""
+
+
+PLAN: Final = PlanRequest("random:20x20@75%", "compact:15x15", "psca", 7, seed=1)
+"""A plan as it is played: 225 atoms out of 20 x 20 sites, seven at a time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,47 +46,101 @@ class Row:
         name: What was rendered, and how.
         gigasamples_per_s: Samples of both channels per second, in 1e9.
         playing_over_rendering: Playing time over rendering time.
+        goal: Least value of that; None if there is none.
     """
 
     name: str
     gigasamples_per_s: float
     playing_over_rendering: float
+    goal: float | None = None
 
 
-def bench_waveform(plan: Plan | None = None, repeats: int = 5, grid: SiteGrid | None = None) -> list[Row]:
-    """Measure rendering into buffers that are used again, two threads, the best of some repeats.
+@dataclass(frozen=True, slots=True)
+class Ratio:
+    """Two rendering times in relation.
+
+    Attributes:
+        name: Which.
+        value: The ratio.
+        goal: What it should be, at most or at least.
+        at_most: Which of both.
+    """
+
+    name: str
+    value: float
+    goal: float
+    at_most: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class WaveformReport:
+    """What came of it.
+
+    Attributes:
+        rows: A row for each kind of segment and for a plan; the stored-waveform way and numpy last.
+        ratios: Those that there are goals for.
+        sample_rate_hz: Sample rate of all rows.
+        repeats: How often everything was rendered; the best one counts.
+    """
+
+    rows: tuple[Row, ...]
+    ratios: tuple[Ratio, ...]
+    sample_rate_hz: float
+    repeats: int
+
+    def as_dict(self) -> dict[str, Any]:
+        """Everything, JSON-ready."""
+        return asdict(self)
+
+
+def bench_waveform(repeats: int = 5, *, announce: Callable[[str], None] = lambda _: None) -> WaveformReport:
+    """Measure rendering into buffers that are used again, in two threads, the best of some repeats.
 
     Args:
-        plan: A plan whose program is measured too, pauses left out.
         repeats: How often everything is rendered.
-        grid: The grid of sites; by default the paper's.
-
-    Returns:
-        A row for each kind of segment and for the plan; the stored-waveform way and numpy last.
+        announce: Called with the name of a module before its kernels are compiled.
     """
-    grid = grid or SiteGrid()
-    rate_hz = comb_sample_rate(grid)
-    programs = {
-        "1 group, 5 tones": uniform_program(grid, 5, (1,)),
-        "1 group, 20 tones": uniform_program(grid, 20, (1,)),
-        "3 groups, 7 tones": uniform_program(grid, 7, (1, 0, -1)),
-        "3 groups, 20 tones": uniform_program(grid, 20, (1, 0, -1)),
-        "minimum jerk, 7 tones": uniform_program(grid, 7, (1,), FrequencyCourse.MINIMUM_JERK),
-    }
-    if plan is not None:
-        programs["plan"] = tone_program(plan, grid, MotionSpec(overhead_per_batch_s=0.0))
-    rows: list[Row] = []
-    for name, program in programs.items():
+    from labseq.kernels.compile import announcing
+
+    moves = plan_moves(PLAN, announce=announce)
+    grid, rate_hz = moves.grid, comb_sample_rate(moves.grid)
+    with announcing(announce):
+        warm_rendering()
+        rows = [*_comb_rows(moves, rate_hz, repeats), *_other_ways(grid, rate_hz, repeats)]
+    time_of = {row.name: 1.0 / row.gigasamples_per_s for row in rows}
+    fast, stored, numpy = (time_of[name] for name in ("1 group, 20 tones", STORED_20, NUMPY_20))
+    ratios = (
+        Ratio("20 tones over 5 tones", fast / time_of["1 group, 5 tones"], 1.3, at_most=True),
+        Ratio("stored waveforms over comb, 20 tones", stored / fast, 5.0),
+        Ratio("numpy over comb, 20 tones", numpy / fast, 100.0),
+    )
+    return WaveformReport(tuple(rows), ratios, rate_hz, repeats)
+
+
+def _comb_rows(moves: PlannedMoves, rate_hz: float, repeats: int) -> Generator[Row]:
+    grid = moves.grid
+    bare = replace(moves.motion, overhead_per_batch_s=0.0)
+    plan = tone_program(moves.plan, grid, bare)
+    jerk = uniform_program(grid, 7, (1,), FrequencyCourse.MINIMUM_JERK)
+    for name, program, goal in (
+        ("1 group, 5 tones", uniform_program(grid, 5, (1,)), 3.0),
+        ("1 group, 20 tones", uniform_program(grid, 20, (1,)), 3.0),
+        ("3 groups, 7 tones", uniform_program(grid, 7, (1, 0, -1)), 2.0),
+        ("3 groups, 20 tones", uniform_program(grid, 20, (1, 0, -1)), 2.0),
+        ("minimum jerk, 7 tones", jerk, 1.0),
+        ("plan 20 -> 15 at 7, pauses left out", plan, 2.5),
+    ):
         renderer = Renderer(program, rate_hz)
-        rows.append(_row(name, renderer.n_samples, rate_hz, _best(partial(render_all, renderer), repeats)))
+        taken_s = _best(partial(render_all, renderer), repeats)
+        yield _row(name, renderer.n_samples, rate_hz, taken_s, goal)
+
+
+def _other_ways(grid: SiteGrid, rate_hz: float, repeats: int) -> Generator[Row]:
     stored = stored_waveforms(grid, rate_hz)
-    for n_tones in (5, 20):
-        taken_s = _best(partial(sum_all_stored, stored, n_tones), repeats)
-        rows.append(_row(f"stored waveforms, {n_tones} tones", STORED, rate_hz, taken_s))
-    n = CHUNK // 8
-    taken_s = _best(partial(render_reference, programs["1 group, 20 tones"], rate_hz, 0, n), 1)
-    rows.append(_row("numpy, 20 tones", n, rate_hz, taken_s))
-    return rows
+    for name, n_tones in ((STORED_5, 5), (STORED_20, 20)):
+        yield _row(name, STORED, rate_hz, _best(partial(sum_all_stored, stored, n_tones), repeats))
+    n, program = CHUNK // 8, uniform_program(grid, 20, (1,))
+    yield _row(NUMPY_20, n, rate_hz, _best(partial(render_reference, program, rate_hz, 0, n), 1))
 
 
 def uniform_program(
@@ -108,16 +172,16 @@ def uniform_program(
 def render_all(renderer: Renderer) -> None:
     """Render a whole program in two threads, each into a buffer of its own, half of the time each."""
 
-    def work(worker: int, start: int, stop: int) -> None:
+    def work(start: int, stop: int) -> None:
         out = np.empty(CHUNK, np.int16)
         for at in range(start, stop, CHUNK):
             for channel in range(N_CHANNELS):
-                renderer.write(channel, at, out[: min(CHUNK, stop - at)], worker)
+                renderer.write(channel, at, out[: min(CHUNK, stop - at)])
 
     half = renderer.n_samples // 2
     with ThreadPoolExecutor(1) as other:
-        later = other.submit(work, 1, half, renderer.n_samples)
-        work(0, 0, half)
+        later = other.submit(work, half, renderer.n_samples)
+        work(0, half)
         later.result()
 
 
@@ -166,5 +230,5 @@ def _best(call: Callable[[], object], repeats: int) -> float:
     return min(taken)
 
 
-def _row(name: str, n_samples: int, sample_rate_hz: float, taken_s: float) -> Row:
-    return Row(name, N_CHANNELS * n_samples / taken_s / 1e9, n_samples / sample_rate_hz / taken_s)
+def _row(name: str, n_samples: int, sample_rate_hz: float, taken_s: float, goal: float | None = None) -> Row:
+    return Row(name, N_CHANNELS * n_samples / taken_s / 1e9, n_samples / sample_rate_hz / taken_s, goal)

@@ -19,7 +19,6 @@ from labseq.motion.render_reference import render_reference
 from labseq.roles import Context
 from labseq.session.bench_waveform import (
     STORED,
-    bench_waveform,
     render_all,
     stored_waveforms,
     sum_all_stored,
@@ -66,9 +65,3 @@ def test_numpy(benchmark: Any) -> None:
     program = uniform_program(GRID, 20, (1,))
     benchmark.extra_info["playing_s"] = 20_000 / RATE_HZ
     benchmark(render_reference, program, RATE_HZ, 0, 20_000)
-
-
-def test_the_table_has_a_row_for_everything() -> None:
-    rows = {row.name: row for row in bench_waveform(repeats=1)}
-    assert len(rows) == 8
-    assert all(row.gigasamples_per_s > 0 and row.playing_over_rendering > 0 for row in rows.values())

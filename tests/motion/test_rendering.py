@@ -1,7 +1,7 @@
 from __future__ import annotations
 
-import threading
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,7 @@ from labseq.model import (
 )
 from labseq.motion import Renderer, RenderPath, comb_sample_rate, render, render_chunks, tone_program
 from labseq.motion.render_reference import render_reference
+from labseq.motion.rendering import MAX_ROOMS
 
 SILENT, COMB, BLENDED, DIRECT = RenderPath
 STEP_HZ = 1.6e6
@@ -248,16 +249,16 @@ def test_row_tones_are_channel_0_and_column_tones_channel_1() -> None:
     assert not waveform.samples.flags.writeable
 
 
-def test_two_threads_render_at_the_same_time_into_the_callers_buffers() -> None:
+def test_many_threads_render_at_the_same_time_into_the_callers_buffers() -> None:
     program = program_of(*(move(9, [1, -1]) for _ in range(20)), still=False)
     whole = render(program, COMB_HZ).samples
     renderer = Renderer(program, COMB_HZ)
-    out = np.empty_like(whole)
-    workers = [threading.Thread(target=renderer.write, args=(c, 0, out[c], c)) for c in (0, 1)]
-    for worker in workers:
-        worker.start()
-    for worker in workers:
-        worker.join()
+    out, n = np.empty_like(whole), 40_000
+    stretches = [(channel, start) for channel in (0, 1) for start in range(0, renderer.n_samples, n)]
+    assert len(stretches) > 2 * MAX_ROOMS
+    with ThreadPoolExecutor(len(stretches)) as workers:
+        for channel, start in stretches:
+            workers.submit(renderer.write, channel, start, out[channel, start : start + n])
     assert np.array_equal(out, whole)
 
 

@@ -1,0 +1,25 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+
+FIRST_PLAN = """
+import sys
+import labseq.motion as motion
+from labseq import Plan, SiteGrid, TargetPattern
+
+motion.warm()
+motion.warm_rendering()
+warm = set(sys.modules)
+target = TargetPattern([[False, True]], [[True, False]])
+plan = Plan.from_batches([([(0, 0)], [(0, 1)])])
+motion.check_plan(plan, [[True, False]], target, 1)
+program = motion.tone_program(plan, SiteGrid(1, 2))
+motion.render(program)
+print(sorted(name for name in set(sys.modules) - warm if name.startswith("labseq")))
+"""
+
+
+def test_after_warming_the_first_plan_loads_no_kernels() -> None:
+    done = subprocess.run([sys.executable, "-c", FIRST_PLAN], capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"
