@@ -42,8 +42,9 @@ class Entry:
         origin: Name of the plugin that registered it.
         virtual_time: Whether it keeps to the session's clock only, so that a run
             need not wait in real time.
-        simulated: Settings that turn a driver into its own simulated counterpart
-            in a dry run, for example ``{"card": "simulated"}``; None if it has none.
+        simulated: Settings that turn a driver into its own simulated counterpart, for
+            example ``{"card": "simulated"}``; None if it has none. A dry run gives them;
+            a driver that has them keeps to the session's clock.
     """
 
     kind: str

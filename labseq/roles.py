@@ -29,6 +29,7 @@ from labseq.model import (
     Occupancy,
     Plan,
     RandomStream,
+    RfSpan,
     SiteGrid,
     TargetPattern,
     TimelineEntry,
@@ -271,6 +272,44 @@ class TruthTeller(Protocol):
 
     def truth(self) -> Occupancy:
         """The true occupancy now, bool (n_rows, n_cols)."""
+        ...
+
+
+@runtime_checkable
+class Storyteller(Protocol):
+    """A simulation that tells, for the record, what happened to the atoms."""
+
+    def story(self, since_s: float) -> Mapping[str, NDArray[Any]]:
+        """What happened since the shot began: name -> structured array, with a field for each column.
+
+        Args:
+            since_s: Time on the session's clock from which times are counted.
+        """
+        ...
+
+
+class RfSource(Protocol):
+    """The two outputs of a simulated device that drives the mobile tweezers."""
+
+    def played(self, until_s: float) -> tuple[Sequence[RfSpan], Sequence[RfSpan]]:
+        """What the row output and the column output played since the last call, in time's order.
+
+        Args:
+            until_s: Time on the session's clock at which to stop for now.
+        """
+        ...
+
+
+@runtime_checkable
+class Listening(Protocol):
+    """A simulation that acts on what a device's outputs really play, rather than on what it is told."""
+
+    def warm(self) -> None:
+        """Compile the kernels for that; a driver that will be listened to calls it in its own ``warm``."""
+        ...
+
+    def listen(self, role: str, source: RfSource) -> None:
+        """From now on listen to these outputs of a role, in the place of earlier ones."""
         ...
 
 

@@ -4,6 +4,7 @@ from labseq.model.arrays import Occupancy, as_occupancy, read_only
 from labseq.model.frame import CameraFacts, Frame
 from labseq.model.grid import SiteGrid
 from labseq.model.motion import MotionSpec, RfSpec
+from labseq.model.output import RfSamples, RfSpan, RfTones
 from labseq.model.plan import Batch, Plan, PlanReport
 from labseq.model.random import RandomStream
 from labseq.model.records import (
@@ -40,7 +41,10 @@ __all__ = [
     "Plan",
     "PlanReport",
     "RandomStream",
+    "RfSamples",
+    "RfSpan",
     "RfSpec",
+    "RfTones",
     "RunRecord",
     "SegmentKind",
     "ShotRecord",

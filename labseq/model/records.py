@@ -124,6 +124,7 @@ class ShotRecord:
         n_missing_atoms: Atoms that the loading fell short of the target.
         readings: Values read from devices during the shot.
         parameters: What differs from the files in this shot: address -> value.
+        story: What the simulation tells of the atoms: name -> structured array.
     """
 
     shot_index: int
@@ -142,6 +143,7 @@ class ShotRecord:
     n_missing_atoms: int = 0
     readings: dict[str, Any] = field(default_factory=dict[str, Any])
     parameters: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    story: dict[str, NDArray[Any]] = field(default_factory=dict[str, NDArray[Any]])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -9,6 +9,7 @@ The tree, with n images, a grid of (row, col) sites and frames of (y, x) pixels:
       target                    fill, clear (row, col)
       rearrangement             tables moves, batches, cycles; predicted (cycle, row, col)
       timing                    table of the stages
+      story                     tables of what a simulation did to the atoms, where it tells
       parameters, readings      JSON
       devices/<name>            JSON
       provenance                attributes, texts and JSON
@@ -23,7 +24,7 @@ from typing import Any, Final
 import numpy as np
 
 FORMAT: Final = "labseq-shot"
-FORMAT_VERSION: Final = "1.0"
+FORMAT_VERSION: Final = "1.1"
 """major.minor; a newer minor version only adds things, a newer major version cannot be read."""
 
 RUN_FORMAT: Final = "labseq-run"
@@ -100,10 +101,13 @@ def timing_dtype(stage: Any) -> np.dtype[Any]:
 
 
 def units_of(table: np.dtype[Any]) -> list[str]:
-    """Unit of each column of a table, "" where there is none.
+    """Unit of each column of a table, as its name ends, "" where there is none.
 
     Example:
         >>> units_of(IMAGES)
         ['', '', 's', 's', '']
     """
-    return ["s" if name.endswith("_s") else "" for name in table.names or ()]
+    return [next((u for u in _UNITS if name.endswith(f"_{u}")), "") for name in table.names or ()]
+
+
+_UNITS: Final = ("s", "m", "K", "Hz", "rad", "V")

@@ -91,6 +91,8 @@ class ShotEncoder:
         _write_detection(entry.create_group("detection"), shot.images, grid_shape)
         _write_cycles(entry.create_group("rearrangement"), shot.cycles, grid_shape)
         _write_table(entry, "timing", tables.timing_table(shot.timing))
+        if shot.story:
+            _write_story(entry.create_group("story"), shot.story)
         write_json(entry, "parameters", shot.parameters)
         write_json(entry, "readings", shot.readings)
 
@@ -194,6 +196,13 @@ def _write_detection(group: h5py.Group, images: Sequence[ImageRecord], shape: tu
     _write_array(group, "t_s", [image.t_start_s for image in images], "f8", "s")
     rows = [(i.step, i.cycle, i.t_start_s, i.exposure_s, _event(i)) for i in images]
     _write_table(group, "images", np.array(rows, layout.IMAGES))
+
+
+def _write_story(group: h5py.Group, story: Mapping[str, NDArray[Any]]) -> None:
+    names: list[str] = []
+    for name, table in story.items():
+        names.append(link_name(name, names))
+        _write_table(group, names[-1], table)
 
 
 def _write_cycles(group: h5py.Group, cycles: Sequence[CycleRecord], shape: tuple[int, int]) -> None:

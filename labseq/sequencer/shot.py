@@ -11,7 +11,7 @@ import numpy as np
 
 from labseq.errors import ConfigError, DeviceError
 from labseq.model import CycleRecord, Frame, ImageRecord, Occupancy, ShotRecord, StageTiming
-from labseq.roles import Device, TruthTeller
+from labseq.roles import Device, Storyteller, TruthTeller
 from labseq.sequencer.guard import Guard
 from labseq.sequencer.lab import Lab
 
@@ -143,6 +143,9 @@ class RunningShot:
             truth = self.call("simulation", self.call_timeout_s, self.simulation.truth)
             self.record.readings["simulation.n_atoms_true"] = int(np.count_nonzero(truth))
             self.record.readings["simulation.n_defects_true"] = self.target.n_defects(truth)
+        if isinstance(self.simulation, Storyteller):
+            story = self.call("simulation", self.call_timeout_s, self.simulation.story, self.start_s)
+            self.record.story.update(story)
 
     def _detected(self, answer: Any) -> tuple[Occupancy, Any]:
         shape = self.grid.shape

@@ -43,6 +43,14 @@ class Chosen:
     document: Document | None = None
     loc: Loc = ()
 
+    @property
+    def virtual_time(self) -> bool:
+        """Whether it keeps to the session's clock only: always, or with the settings of a dry run."""
+        simulated = self.entry.simulated
+        if self.entry.virtual_time or simulated is None or self.settings is None:
+            return self.entry.virtual_time
+        return self.settings.model_copy(update=dict(simulated)) == self.settings
+
     def dump(self) -> dict[str, Any]:
         """Settings for the record, SI, JSON-ready."""
         return {"use": self.entry.name, **dump(self.entry, self.settings)}
@@ -85,7 +93,7 @@ class Bench:
     @property
     def virtual_time(self) -> bool:
         """Whether no device needs real time."""
-        return all(c.entry.virtual_time for c in self.chosen.values() if c.entry.kind in HARDWARE_KINDS)
+        return all(c.virtual_time for c in self.chosen.values() if c.entry.kind in HARDWARE_KINDS)
 
 
 def resolve(

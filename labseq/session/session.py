@@ -40,7 +40,7 @@ from labseq.session.signals import stop_on_signals
 P = ParamSpec("P")
 
 WARM_S: Final = 300.0
-"""How long a planner or detector may compile; a slow computer needs half a minute."""
+"""How long a plugin may compile; a slow computer needs half a minute."""
 
 
 class Session:
@@ -180,7 +180,8 @@ class Session:
 
     def _warm_plugins(self, lab: Lab) -> None:
         guard = Guard(self.stop_flag)
-        for name, part in (("planner", lab.planner), ("detector", lab.detector)):
+        parts = (("planner", lab.planner), ("detector", lab.detector))
+        for name, part in (*parts, *lab.hardware()):
             if isinstance(part, Warmable):
                 try:
                     guard.call(name, WARM_S, part.warm)

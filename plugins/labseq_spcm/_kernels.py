@@ -7,17 +7,19 @@ from numpy.typing import NDArray
 
 from labseq.kernels.compile import const, kernel
 
+Words = NDArray[np.uint16]
 
-@kernel(f"void({const('int16', 2)}, int64, int16[:, ::1])")
-def interleave(chunk: NDArray[np.int16], row_channel: int, out: NDArray[np.int16]) -> None:
-    """Put the samples of both axes side by side, as the card wants them.
+
+@kernel(f"void({const('uint16', 1)}, {const('uint16', 1)}, uint32[::1])")
+def interleave(first: Words, second: Words, out: NDArray[np.uint32]) -> None:
+    """Put the samples of both outputs side by side, as the card wants them.
+
+    Whole frames are written, and the signs do not matter: both let the processor do many at a time.
 
     Args:
-        chunk: int16 (2, n): row axis, column axis.
-        row_channel: The output of the row axis, 0 or 1.
-        out: Result, int16 (m, 2) with m <= n: a column per output.
+        first: uint16 (n,): the samples of output 0, bit by bit.
+        second: uint16 (n,): of output 1.
+        out: Result, uint32 (n,): the frames; output 0 comes first in the memory of a little-endian computer.
     """
-    first, second = chunk[row_channel], chunk[1 - row_channel]
     for i in range(len(out)):
-        out[i, 0] = first[i]
-        out[i, 1] = second[i]
+        out[i] = np.uint32(first[i]) | (np.uint32(second[i]) << np.uint32(16))

@@ -16,7 +16,7 @@ ARRIVAL_S: Final = 20e-6
 COMMANDS_PER_S: Final = 10e6
 """What commands take to the card by DMA (ColdMatter/EDMSuite, on an M4i.9622)."""
 PORTION: Final = 1000
-"""Most commands that are sent in one call."""
+"""Commands that are sent in one call, when the queue has room for them; no block has as many."""
 
 
 class Dds:
@@ -132,12 +132,12 @@ class Dds:
         entries, ends = self._commands.entries, self._commands.ends
         fed = False
         while self._n_sent < len(entries):
-            room = min(PORTION, self._most - card.read(spcm.SPC_DDS_QUEUE_CMD_COUNT))
-            last = int(np.searchsorted(ends, self._n_sent + room, "right")) - 1
-            if last < 0 or ends[last] <= self._n_sent:
+            portion = min(PORTION, len(entries) - self._n_sent)
+            if portion > self._most - card.read(spcm.SPC_DDS_QUEUE_CMD_COUNT):
                 return fed
-            portion = np.append(entries[self._n_sent : ends[last]], self._send())
-            card.write_list(portion, "DDS commands")
+            last = int(np.searchsorted(ends, self._n_sent + portion, "right")) - 1
+            commands = np.append(entries[self._n_sent : ends[last]], self._send())
+            card.write_list(commands, "DDS commands")
             self._n_sent = int(ends[last])
             fed = True
         return fed

@@ -3,21 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from typing import Final
 
-import numpy as np
-from numpy.typing import NDArray
-
 from labseq import DeviceError, DeviceTimeoutError, ToneProgram, TransientError
-from labseq.motion.rendering import render_chunks
 from labseq_spcm.card import POLL_S, TRANSFER_TIMEOUT_S, AwgCard, Buffer
-from labseq_spcm.replay import n_samples_of
+from labseq_spcm.interleaved import CHUNK, InterleavedRenderer
 from labseq_spcm.settings import SpcmSettings
 
-CHUNK: Final = 1 << 17
-"""Samples that are rendered and handed over at a time: 0.2 ms at 625 MS/s."""
-RING_CHUNKS: Final = 8
+RING_CHUNKS: Final = 4
 FRAME_BYTES: Final = 4
 """A sample of both outputs."""
 LEAST_FILL: Final = 1 << 20
@@ -38,7 +31,7 @@ class Fifo:
         sample_rate_hz: What the card's clock really makes.
 
     Attributes:
-        patience_s: How long the card can be left alone while it plays.
+        patience_s: How long the card can now be left alone while it plays; 0: not at all.
     """
 
     def __init__(self, card: AwgCard, settings: SpcmSettings, sample_rate_hz: float) -> None:
@@ -46,15 +39,16 @@ class Fifo:
         self._row_channel = settings.row_channel
         self._rate_hz = sample_rate_hz
         self._ring = Buffer().reserve(RING_CHUNKS * CHUNK)
-        self._chunks: Iterator[NDArray[np.int16]] = iter(())
+        self._half_ring_s = RING_CHUNKS / 2 * CHUNK / sample_rate_hz
+        self._renderer: InterleavedRenderer | None = None
         self._n_handed = self._n_samples = 0
+        self.patience_s = 0.0
         spcm = card.spcm
         card.set(spcm.SPC_CARDMODE, spcm.SPC_REP_FIFO_SINGLE, "card mode")
         card.set(spcm.SPC_LOOPS, 1, "loops")
         ahead = int(settings.fill * sample_rate_hz) * FRAME_BYTES - self._ring.nbytes
         self._fill = 1 << round(math.log2(max(LEAST_FILL, ahead)))
         card.set(spcm.SPC_DATA_OUTBUFSIZE, self._fill, "size of the card's FIFO in bytes")
-        self.patience_s = self._fill / FRAME_BYTES / sample_rate_hz / 4
 
     def prepare(self, program: ToneProgram) -> float:
         """Render the beginning, and fill ring and card with it.
@@ -65,11 +59,11 @@ class Fifo:
         Raises:
             DeviceTimeoutError: The card does not fetch the data.
         """
-        n_samples = n_samples_of(program, self._rate_hz)
         card, spcm = self._card, self._card.spcm
+        self._renderer = InterleavedRenderer(program, self._rate_hz, self._row_channel)
+        n_samples = self._renderer.n_samples
         card.set(spcm.SPC_SEGMENTSIZE, n_samples, "number of samples")
         card.define_transfer(self._ring, CHUNK * FRAME_BYTES)
-        self._chunks = render_chunks(program, self._rate_hz, CHUNK)
         self._n_samples, self._n_handed = n_samples, 0
         self._feed()
         card.command(spcm.M2CMD_DATA_STARTDMA, "transfer")
@@ -94,10 +88,11 @@ class Fifo:
             TransientError: The card ran out of data.
         """
         try:
-            self._feed()
+            is_full = self._feed() < RING_CHUNKS
         except DeviceError:  # the card may have stopped since it was asked for room
             self._check_supply()
             raise
+        self.patience_s = self._half_ring_s if is_full else 0.0
         return self._check_supply()
 
     def _check_supply(self) -> bool:
@@ -116,20 +111,19 @@ class Fifo:
 
     def give_up(self) -> None:
         """Drop what was not rendered."""
-        self._chunks = iter(())
+        self._renderer = None
         self._n_handed = self._n_samples
 
-    def _feed(self) -> bool:
-        """Render into the ring while there is room, once around at most; returns whether there was any."""
-        from labseq_spcm._kernels import interleave
-
-        card, spcm = self._card, self._card.spcm
+    def _feed(self) -> int:
+        """Render into the ring while there is room, once around at most; returns how many chunks."""
+        card, spcm, renderer = self._card, self._card.spcm, self._renderer
         for n_fed in range(RING_CHUNKS):
-            done = self._n_handed >= self._n_samples
-            if done or card.read(spcm.SPC_DATA_AVAIL_USER_LEN) < CHUNK * FRAME_BYTES:
-                return n_fed > 0
+            if renderer is None or self._n_handed >= self._n_samples:
+                return n_fed
+            if card.read(spcm.SPC_DATA_AVAIL_USER_LEN) < CHUNK * FRAME_BYTES:
+                return n_fed
             first = self._n_handed % len(self._ring)
-            interleave(next(self._chunks), self._row_channel, self._ring[first : first + CHUNK])
+            renderer.write(self._n_handed, self._ring[first : first + CHUNK])
             card.write(spcm.SPC_DATA_AVAIL_CARD_LEN, CHUNK * FRAME_BYTES, "handing samples over")
             self._n_handed += CHUNK
-        return True
+        return RING_CHUNKS

@@ -44,4 +44,4 @@ def _no_library(name: str, reason: str) -> DeviceError:
 
 
 def _first_line(error: Exception) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0]
+    return (str(error).splitlines() or [type(error).__name__])[0].partition(". ")[0].rstrip(".")

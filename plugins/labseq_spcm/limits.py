@@ -82,6 +82,21 @@ def amplitude_mv(name: str, rf: RfSpec) -> int:
     return wanted_mv
 
 
+def check_rate(name: str, sample_rate_hz: float, rf: RfSpec) -> None:
+    """Refuse a sample rate at which tones in the AODs' bands would come out mirrored.
+
+    Raises:
+        LimitError: It is not above twice the highest frequency.
+    """
+    most_hz = max(*rf.row_band_hz, *rf.column_band_hz)
+    if sample_rate_hz <= 2 * most_hz:
+        rate, highest = (format_quantity(hz, "frequency") for hz in (sample_rate_hz, most_hz))
+        least = format_quantity(2 * most_hz, "frequency")
+        raise LimitError(
+            f"{name}: sample_rate", rate, f"above {least}, twice the end of the AODs' band, {highest}"
+        )
+
+
 def refuse_excess(name: str, program: ToneProgram, rf: RfSpec) -> None:
     """Refuse what must not come to the output, whatever made the program.
 

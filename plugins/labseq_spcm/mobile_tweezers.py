@@ -4,12 +4,18 @@ from __future__ import annotations
 
 import importlib
 import math
-from collections.abc import Callable, Mapping
-from contextlib import suppress
-from functools import partial
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Protocol
 
-from labseq import Context, DeviceError, DeviceTimeoutError, LabseqError, ToneProgram, TransientError
+from labseq import (
+    Context,
+    DeviceError,
+    DeviceTimeoutError,
+    Listening,
+    ToneProgram,
+    TransientError,
+)
+from labseq.motion import warm_rendering
 from labseq.units import format_quantity
 from labseq_spcm import limits
 from labseq_spcm.card import POLL_S, AwgCard
@@ -18,23 +24,19 @@ from labseq_spcm.dds_program import choose_cores
 from labseq_spcm.fifo import Fifo
 from labseq_spcm.library import load_spcm
 from labseq_spcm.replay import Replay
+from labseq_spcm.safety import make_safe
 from labseq_spcm.settings import SIMULATED, SpcmSettings
 from labseq_spcm.setup import output_registers, set_up
-from labseq_spcm.world import Stage
 
 if TYPE_CHECKING:
     from labseq_spcm.simulator import SimulatedCard
-
-RAMP_S: Final = 0.3e-3
-"""How long the amplifiers take to ramp a program down that is cut short."""
-RAMP_STEPS: Final = 15
 
 
 class PlayMode(Protocol):
     """How a program gets to the outputs.
 
     Attributes:
-        patience_s: How long the card can be left alone while it plays.
+        patience_s: How long the card can now be left alone while it plays; 0: not at all.
     """
 
     patience_s: float
@@ -72,7 +74,8 @@ class SpcmMobileTweezers:
         simulated_card: The simulated card, while it is open; None for a real one.
 
     Raises:
-        LimitError: The card or the amplifiers cannot do the profile's ``rf.full_scale``.
+        LimitError: The card or the amplifiers cannot do the profile's ``rf.full_scale``, or the sample
+            rate is too low for its bands.
         ConfigError: The mode is ``dds``, and the profile allows more tones than it has.
     """
 
@@ -82,12 +85,14 @@ class SpcmMobileTweezers:
         self._clock = context.clock
         self._rf = context.motion.rf
         self._amplitude_mv = limits.amplitude_mv(self._name, self._rf)
+        if settings.mode != "dds":
+            limits.check_rate(self._name, settings.sample_rate, self._rf)
         dds = settings.mode == "dds"
         self._cores = choose_cores(self._name, settings, context.motion) if dds else None
         self._card: AwgCard | None = None
         self._mode: PlayMode | None = None
         self._facts: dict[str, Any] = {}
-        self._stage = Stage(context.simulation if settings.card == SIMULATED else None)
+        self._world = context.simulation
         self._identifier = settings.card
         self._duration_s: float | None = None
         self._due_s: float | None = None
@@ -122,9 +127,13 @@ class SpcmMobileTweezers:
     def _insert_simulated_card(self) -> None:
         if self._settings.card == SIMULATED:
             from labseq_spcm.simulator import SimulatedCard, install
+            from labseq_spcm.world import CardOutputs
 
             self.simulated_card = SimulatedCard(self._clock)
             self._identifier = install(self.simulated_card)
+            if isinstance(self._world, Listening):
+                outputs = CardOutputs(self.simulated_card, self._settings.row_channel)
+                self._world.listen("mobile_tweezers", outputs)
 
     def close(self) -> None:
         """Make the outputs harmless and let the card go; legal in any state."""
@@ -144,11 +153,14 @@ class SpcmMobileTweezers:
             self.simulated_card = None
 
     def warm(self) -> None:
-        """Compile the kernels of rendering, or load them from the cache."""
-        own = ("_kernels_dds",) if self._settings.mode == "dds" else ("_kernels",)
-        rendering = ("render_axis", "render_paths")
-        for module in (*(f"labseq_spcm.{name}" for name in own), *(f"labseq.kernels.{n}" for n in rendering)):
-            importlib.import_module(module)
+        """Compile the kernels of the mode, or load them from the cache."""
+        if self._settings.mode == "dds":
+            importlib.import_module("labseq_spcm._kernels_dds")
+        else:
+            importlib.import_module("labseq_spcm._kernels")
+            warm_rendering()
+        if self._settings.card == SIMULATED and isinstance(self._world, Listening):
+            self._world.warm()
 
     def prepare(self, program: ToneProgram) -> float:
         """Render a program and bring it onto the card.
@@ -165,12 +177,11 @@ class SpcmMobileTweezers:
         self._duration_s = None
         limits.refuse_excess(self._name, program, self._rf)
         card.stop()
-        if self.simulated_card is not None:
+        if self.simulated_card is not None and not isinstance(self._world, Listening):
             self.simulated_card.forget(self._clock.now())
         playing_s = mode.prepare(program)
         duration_s = max(playing_s, program.total_duration_s) + float(self._facts["trigger_delay_s"])
         self._duration_s = duration_s
-        self._stage.prepare(program)
         return duration_s
 
     def play(self) -> None:
@@ -192,8 +203,6 @@ class SpcmMobileTweezers:
         external = self._settings.trigger == "external"
         self._due_s = math.inf if external else self._clock.now() + duration_s
         mode.start(command if external else command | spcm.M2CMD_CARD_FORCETRIGGER)
-        if not external:
-            self._stage.play(self._clock.now())
 
     def wait(self, timeout_s: float) -> None:
         """Wait until the program has been played to its end; at once if none is playing.
@@ -214,8 +223,8 @@ class SpcmMobileTweezers:
                 now_s = self._clock.now()
                 if now_s >= deadline_s:
                     raise self._late(timeout_s)
-                idle_s = min(due_s - now_s, mode.patience_s) if math.isfinite(due_s) else 0.0
-                self._clock.sleep(min(deadline_s - now_s, max(POLL_S, idle_s)))
+                idle_s = max(POLL_S, due_s - now_s) if math.isfinite(due_s) else POLL_S
+                self._clock.sleep(min(deadline_s - now_s, mode.patience_s, idle_s))
                 if self._due_s is None:
                     raise DeviceError(self._name, "stopped by safe_state() while it played")
         except (DeviceError, TransientError):
@@ -241,37 +250,11 @@ class SpcmMobileTweezers:
         Raises:
             DeviceError: The card refused something; all the rest was done nevertheless.
         """
-        if self._due_s is not None:
-            self._stage.cut(self._clock.now())
         self._duration_s = self._due_s = None
         card, mode = self._card, self._mode
         if card is None:
             return
-        registers = output_registers(card.spcm)
-        actions: list[Callable[[], object]] = [card.stop]
-        actions += [partial(card.set, register, 0, "output") for register in registers]
-        actions.append(partial(self._set_amplitudes, card, self._amplitude_mv))
-        actions += [] if mode is None else [mode.give_up]
-        with suppress(LabseqError):
-            card.clear_error()
-            if card.running:
-                self._ramp_down(card)
-        failures = [failure for action in actions if (failure := _attempt(action)) is not None]
-        if failures:
-            raise failures[0]
-
-    def _ramp_down(self, card: AwgCard) -> None:
-        """Lower the amplitude in steps, within the amplifier's path."""
-        low_mv, gap = limits.AMPLITUDE_MV[0], limits.RELAY_MV[1] + 1
-        end_mv = gap if self._amplitude_mv >= gap else low_mv
-        for step in range(1, RAMP_STEPS + 1):
-            self._clock.sleep(RAMP_S / RAMP_STEPS)
-            way_mv = (self._amplitude_mv - end_mv) * step / RAMP_STEPS
-            self._set_amplitudes(card, round(self._amplitude_mv - way_mv))
-
-    def _set_amplitudes(self, card: AwgCard, amplitude_mv: int) -> None:
-        for register in (card.spcm.SPC_AMP0, card.spcm.SPC_AMP1):
-            card.set(register, amplitude_mv, "output amplitude in mV")
+        make_safe(card, self._amplitude_mv, mode.give_up if mode is not None else lambda: None)
 
     def describe(self) -> Mapping[str, Any]:
         """Settings; once opened, also the card and every value that it read back."""
@@ -285,15 +268,3 @@ class SpcmMobileTweezers:
     def _check_idle(self, call: str) -> None:
         if self._due_s is not None:
             raise DeviceError(self._name, f"{call} while a program plays; call wait() first")
-
-
-def _attempt(action: Callable[[], object]) -> LabseqError | None:
-    """Do something, once more if an earlier error still locked the driver; returns what failed for good."""
-    with suppress(LabseqError):
-        action()
-        return None
-    try:
-        action()
-    except LabseqError as failure:
-        return failure
-    return None

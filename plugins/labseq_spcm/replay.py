@@ -3,24 +3,11 @@
 from __future__ import annotations
 
 import math
-from typing import Final
-
-import numpy as np
 
 from labseq import LimitError, ToneProgram
-from labseq.motion.rendering import render_chunks
 from labseq_spcm.card import AwgCard, Buffer
-from labseq_spcm.limits import SAMPLE_STEP
+from labseq_spcm.interleaved import InterleavedRenderer
 from labseq_spcm.settings import SpcmSettings
-
-CHUNK: Final = 1 << 17
-"""Samples that are rendered at a time: few enough to stay in the cache until they are interleaved."""
-
-
-def n_samples_of(program: ToneProgram, sample_rate_hz: float) -> int:
-    """Samples per channel, silence up to the card's granularity included."""
-    n_samples = int(np.rint(program.joint_s[-1] * sample_rate_hz))
-    return max(1, math.ceil(n_samples / SAMPLE_STEP)) * SAMPLE_STEP
 
 
 class Replay:
@@ -56,18 +43,15 @@ class Replay:
         Raises:
             LimitError: It does not fit into the card's memory.
         """
-        from labseq_spcm._kernels import interleave
-
-        n_samples = n_samples_of(program, self._rate_hz)
+        rendered = InterleavedRenderer(program, self._rate_hz, self._row_channel)
+        n_samples = rendered.n_samples
         if n_samples > self._most:
             what = f"{self._card.name}: length of the program"
             asked, most = (f"{n / self._rate_hz:.4g} s" for n in (n_samples, self._most))
             hint = "use mode: fifo, or a lower sample_rate"
             raise LimitError(what, asked, f"{most}: the card's memory", hint)
         frames = self._buffer.reserve(n_samples)
-        frames[-SAMPLE_STEP:] = 0
-        for n, chunk in enumerate(render_chunks(program, self._rate_hz, CHUNK)):
-            interleave(chunk, self._row_channel, frames[n * CHUNK : (n + 1) * CHUNK])
+        rendered.write(0, frames)
         self._card.set(self._card.spcm.SPC_MEMSIZE, n_samples, "memory size")
         self._card.upload(frames)
         return n_samples / self._rate_hz

@@ -74,9 +74,10 @@ class SpcmSettings(Settings):
         if self.row_channel == self.column_channel:
             raise ValueError(f"row_channel and column_channel are both {self.row_channel}; expected 0 and 1")
         if self.mode == "fifo" and self.sample_rate > limits.FIFO_RATE_HZ:
-            most = _hz(limits.FIFO_RATE_HZ)
+            rate, most = _hz(self.sample_rate), _hz(limits.FIFO_RATE_HZ)
             raise ValueError(
-                f"the bus carries at most {most} on two channels; lower sample_rate, or use replay"
+                f"sample_rate is {rate}, but the bus carries at most {most} on two channels; lower it, or "
+                "use mode: replay"
             )
         return self
 

@@ -11,10 +11,11 @@ from typing import Annotated
 
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
-from labseq import Angle, Duration, Fraction, Frequency, Length, Settings
+from labseq import Angle, Duration, Fraction, Frequency, Length, Settings, Temperature, Voltage
 
 PositiveDuration = Annotated[Duration, Field(gt=0)]
 PositiveLength = Annotated[Length, Field(gt=0)]
+PositiveTemperature = Annotated[Temperature, Field(gt=0)]
 
 
 class ImageSettings(Settings):
@@ -66,6 +67,31 @@ class ImageSettings(Settings):
     offset: NonNegativeFloat = Field(default=500.0, description="counts of a dark pixel (ours)")
 
 
+class MobileLightSettings(Settings):
+    """The light of the mobile tweezers, where the world hears what a driver's outputs really play."""
+
+    depth: PositiveTemperature = Field(
+        default=2.1e-3, description="depth of a tweezer whose two tones have the amplitude meant (paper)"
+    )
+    waist: PositiveLength = Field(default=0.98e-6, description="1/e^2 radius of the intensity (paper)")
+    wavelength: PositiveLength = Field(default=852e-9, description="wavelength (paper)")
+    transit_time: Annotated[Duration, Field(ge=1e-6, le=50e-6)] = Field(
+        default=10e-6,
+        description="time that the sound takes across the beam in an AOD (1/e^2 of the intensity at both "
+        "ends): every jump of a tone is as soft as this (ours: 6 mm of slow TeO2)",
+    )
+    tone_voltage: Annotated[Voltage, Field(gt=0)] | None = Field(
+        default=None,
+        description="peak voltage of a tone at the driver's output that gives the depth (ours; none: that "
+        "of the profile, `rf.full_scale` over the most tones of the axis)",
+    )
+    offset: tuple[Length, Length] = Field(
+        default=(0.0, 0.0),
+        description="[along a row, from row to row]: how far the mobile tweezers stand beside the sites that "
+        "they are meant for, an error of the calibration (ours)",
+    )
+
+
 class WorldSettings(Settings):
     """The virtual lab's atoms and light."""
 
@@ -107,6 +133,21 @@ class WorldSettings(Settings):
     )
     depth_disorder: Fraction = Field(
         default=0.04, description="relative s.d. of the static tweezers' depths, fixed for a seed (paper)"
+    )
+    static_depth: PositiveTemperature = Field(
+        default=300e-6, description="mean depth of the static tweezers (paper)"
+    )
+    static_waist: PositiveLength = Field(
+        default=0.98e-6, description="1/e^2 radius of their intensity (paper)"
+    )
+    static_wavelength: PositiveLength = Field(default=808e-9, description="their wavelength (paper)")
+    temperature: PositiveTemperature = Field(
+        default=15e-6,
+        description="temperature of the atoms in the static tweezers (ours: typical of gray molasses)",
+    )
+    mobile_light: MobileLightSettings = Field(
+        default=MobileLightSettings(),
+        description="the mobile tweezers' light, for drivers whose outputs are heard",
     )
     lost_below_depth: Fraction = Field(
         default=0.1,

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 import math
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
@@ -10,9 +12,20 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq import Context, DepthRamp, DeviceError, Frame, LimitError, Occupancy, ToneProgram
+from labseq import (
+    Context,
+    DepthRamp,
+    DeviceError,
+    Frame,
+    LimitError,
+    Occupancy,
+    RfSource,
+    ToneProgram,
+)
 from labseq.imaging import site_pixels
 from labseq_virtual import emccd
+from labseq_virtual.flight import Flight
+from labseq_virtual.hearing import Ear
 from labseq_virtual.settings import WorldSettings
 from labseq_virtual.transport import Transport
 
@@ -35,11 +48,15 @@ class _Playing:
 class World:
     """Atoms in static tweezers, what light does to them, and what a camera sees of it.
 
-    Implements ``labseq.Simulation`` and ``labseq.TruthTeller``. Events come in the
-    order of time. A program of the mobile tweezers is carried out when it has
-    ended, or as far as it came when another program takes its place: playing a
-    program without segments cuts it short, and atoms in flight are lost. A ramp of
-    the static tweezers that comes during a program or an exposure acts at its end.
+    Implements ``labseq.Simulation``, ``labseq.TruthTeller``, ``labseq.Listening`` and
+    ``labseq.Storyteller``. Events come in the order of time. A program of the mobile
+    tweezers is carried out when it has ended, or as far as it came when another program takes
+    its place: playing a program without segments cuts it short, and atoms in flight are lost. A
+    ramp of the static tweezers that comes during a program or an exposure acts at its end.
+
+    Mobile tweezers come in two kinds. A driver may tell its program, which is taken at its
+    word and without physics (``transport.py``). Or the world listens to the driver's outputs, finds the
+    tones in what they play, and lets atoms fly in the light (``flight.py``).
 
     Args:
         settings: Every constant of the model.
@@ -51,7 +68,10 @@ class World:
         self._name = context.name or "simulation"
         self._grid = context.grid
         self._random = context.random
+        self._clock = context.clock
         self._transport = Transport(context.grid, settings)
+        self._flight = Flight(context.grid, context.motion, settings)
+        self._ear: Ear | None = None
         image = settings.image
         self._pixels = site_pixels(context.grid, image.pixel_size, image.centre_px, image.angle)
         self._imaging_rate_hz = -math.log1p(-settings.imaging_loss) / settings.imaging_loss_exposure
@@ -81,16 +101,25 @@ class World:
         self._depth = 0.0
         self._forget()
 
+    def warm(self) -> None:
+        """Compile the kernels of what is heard and of flying atoms, or load them from the cache."""
+        importlib.import_module("labseq_virtual._kernels_tones")
+        importlib.import_module("labseq_virtual._kernels_atoms")
+
     def close(self) -> None:
         """Forget everything."""
         self._is_open = False
         self._depth = 0.0
+        self._ear = None
         self._forget()
 
     def begin_shot(self) -> None:
         """Remove all atoms and draw the shot's factor on the transport loss."""
         self._check_open()
         self._forget()
+        if self._ear is not None:
+            deque(self._ear.hear(self._clock.now()), maxlen=0)  # light without atoms
+        self._flight.begin_shot()
         spread = self._settings.transport_loss_spread
         self._loss_factor = math.exp(spread * self._random.shot.standard_normal() - spread**2 / 2)
 
@@ -129,6 +158,18 @@ class World:
                 "or 'static_tweezers' with a DepthRamp",
             )
 
+    def listen(self, role: str, source: RfSource) -> None:
+        """From now on listen to the outputs of the mobile tweezers' driver.
+
+        Raises:
+            DeviceError: Another role wants to be heard.
+        """
+        self._check_open()
+        if role != "mobile_tweezers":
+            text = f"'{role}' wants to be heard; expected 'mobile_tweezers', the only role that plays RF"
+            raise DeviceError(self._name, text)
+        self._ear = Ear(source, 2 * self._flight.margin_s)
+
     def expose(self, t_start_s: float, exposure_s: float) -> Frame:
         """Take a frame; the imaging light heats some atoms out, and they shine until they are lost.
 
@@ -154,7 +195,20 @@ class World:
     def truth(self) -> Occupancy:
         """The true occupancy now, bool (n_rows, n_cols); after the program that is on its way."""
         self._finish_program()
+        self._hear(self._clock.now())
         return self._occupied.copy()
+
+    def story(self, since_s: float) -> Mapping[str, NDArray[Any]]:
+        """What the mobile tweezers did to atoms in this shot, as far as the world heard them play.
+
+        Returns:
+            "flights" (:data:`labseq_virtual.flight.FLIGHTS`) and "jumps"
+            (:data:`labseq_virtual.jumps.JUMPS`); nothing if it listens to nobody.
+        """
+        if self._ear is None:
+            return {}
+        self._hear(self._clock.now())
+        return self._flight.tables(since_s)
 
     def describe(self) -> Mapping[str, Any]:
         """Every constant of the model, in SI, and the seed of its disorder."""
@@ -173,6 +227,7 @@ class World:
 
     def _play_ramp(self, ramp: DepthRamp, t_start_s: float) -> None:
         self._finish_program()
+        self._hear(t_start_s)
         self._advance(max(t_start_s, self._now_s), "a ramp of the static tweezers")
         for depth in (ramp.start, ramp.end):
             self._depth = depth
@@ -190,9 +245,26 @@ class World:
         self._transport.carry(self._occupied, program, n_played, self._random.shot, self._loss_factor)
         self._let_pass(max(t_start_s, min(t_end_s, until_s)))
 
+    def _hear(self, until_s: float) -> None:
+        """Carry out what was heard from the mobile tweezers' outputs until a time."""
+        if self._ear is None:
+            return
+        for episode in self._ear.hear(until_s):
+            if episode.continued:
+                raise DeviceError(
+                    self._name,
+                    f"the mobile tweezers were on at {episode.start_s:.6f} s, when something else began; "
+                    "wait for their end (mobile_tweezers.wait) first",
+                )
+            self._let_pass(episode.start_s)
+            depth = self._depth * self._site_depth
+            self._flight.carry(self._occupied, episode, depth, self._random.shot, self._loss_factor)
+            self._let_pass(episode.end_s)
+
     def _advance(self, t_s: float, what: str) -> None:
         """Let time pass until an event."""
         self._check_open()
+        self._hear(t_s)
         if self._playing is not None and t_s >= self._playing.t_end_s - ROUNDING_S:
             self._finish_program()
         busy_until_s = self._now_s if self._playing is None else self._playing.t_end_s

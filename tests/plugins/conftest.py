@@ -1,15 +1,22 @@
-"""A bench for the tests of the Spectrum plugin: a simulated card, opened by the real ``spcm``."""
+"""For the tests of the Spectrum plugin: a simulated card, opened by the real ``spcm`` or by the driver."""
 
 from __future__ import annotations
 
 import importlib
-from collections.abc import Iterator
+from collections.abc import Callable, Generator, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import pytest
-from labseq_spcm.simulator import SimulatedCard, installed
+from labseq_spcm.mobile_tweezers import SpcmMobileTweezers
+from labseq_spcm.settings import SpcmSettings
+from labseq_spcm.simulator import M4I6631, CardModel, SampleSpan, SimulatedCard, installed
+from numpy.typing import NDArray
 
+from labseq import Context, MotionSpec, Plan, ToneProgram
+from labseq.motion import tone_program
 from labseq.testing.fakes import FakeClock
 
 
@@ -66,3 +73,79 @@ def bench() -> Iterator[Bench]:
         yield bench
         sim.take_error()
         bench.card.close()
+
+
+RATE_HZ = 250e6
+"""Sample rate of the driver's tests, which is enough and renders fast."""
+DDS_MOTION = MotionSpec(max_row_tones=16, max_column_tones=5)
+
+
+@dataclass
+class Lab:
+    """The driver, open, on a simulated card.
+
+    Attributes:
+        tweezers: The driver.
+        card: The card.
+        clock: The clock of both.
+        motion: How the tweezers move.
+    """
+
+    tweezers: SpcmMobileTweezers
+    card: SimulatedCard
+    clock: FakeClock
+    motion: MotionSpec
+
+    @property
+    def rate_hz(self) -> float:
+        return float(self.tweezers.describe()["sample_rate_hz"])
+
+    def program(self, n_batches: int = 2) -> ToneProgram:
+        batches: list[Any] = [
+            ([(0, 0), (0, 3), (0, 7)], [(0, 2), (0, 6), (0, 8)]),
+            ([(2, 1), (4, 1)], [(3, 1), (7, 1)]),
+        ]
+        plan = Plan.from_batches([batches[n % 2] for n in range(n_batches)])
+        return tone_program(plan, motion=self.motion)
+
+    def play(self, program: ToneProgram) -> None:
+        duration_s = self.tweezers.prepare(program)
+        self.tweezers.play()
+        self.tweezers.wait(duration_s + 1.0)
+
+    def samples(self, channel: int) -> NDArray[np.int16]:
+        spans = self.card.played(channel)
+        assert all(isinstance(span, SampleSpan) for span in spans)
+        return np.concatenate([span.values() for span in spans if isinstance(span, SampleSpan)])
+
+    def written(self, register: int) -> list[float]:
+        return [entry.value for entry in self.card.log if entry.register == register]
+
+
+@contextmanager
+def open_driver(
+    mode: str = "replay",
+    motion: MotionSpec | None = None,
+    model: CardModel = M4I6631,
+    clock: FakeClock | None = None,
+    **settings: Any,
+) -> Generator[Lab]:
+    """Within the block the driver is open on a simulated card."""
+    clock = clock or FakeClock()
+    card = SimulatedCard(clock, model=model)
+    motion = motion or (DDS_MOTION if mode == "dds" else MotionSpec())
+    with installed(card) as name:
+        chosen = {"card": name, "mode": mode, "sample_rate": RATE_HZ, **settings}
+        context = Context("mobile_tweezers", clock=clock, motion=motion)
+        tweezers = SpcmMobileTweezers(SpcmSettings.model_validate(chosen), context)
+        tweezers.open()
+        try:
+            yield Lab(tweezers, card, clock, motion)
+        finally:
+            tweezers.close()
+
+
+@pytest.fixture(scope="session")
+def driver() -> Callable[..., AbstractContextManager[Lab]]:
+    """``with driver(mode, **settings) as lab``: see :func:`open_driver`."""
+    return open_driver

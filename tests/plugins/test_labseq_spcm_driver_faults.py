@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from labseq_spcm.card import AwgCard
 from labseq_spcm.dds_program import ENTRY, TYPE_INT64
+from labseq_spcm.library import load_spcm
 from labseq_spcm.mobile_tweezers import SpcmMobileTweezers
 from labseq_spcm.settings import SpcmSettings
 from labseq_spcm.simulator import SimulatedCard, ToneSpan, installed, vendor_library_found
@@ -211,6 +212,14 @@ class TestWithoutTheLibrary:
         assert run.stdout.startswith("3 mobile_tweezers: the Python package 'spcm' finds no driver library")
         assert "`card: simulated`" in run.stdout
         assert not run.stderr
+
+
+def test_a_package_that_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "spcm", None)
+    with pytest.raises(
+        DeviceError, match=r"'spcm' cannot be imported .* `pip install spcm`; .* `card: simulated`"
+    ):
+        load_spcm("mobile_tweezers")
 
 
 def test_closing_goes_through_even_if_the_card_is_broken() -> None:

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, strategies as st
 from labseq_spcm.simulator.fifo import Fifo
 from labseq_spcm.simulator.memory import Buffer
+from labseq_spcm.simulator.store import Store
 
 BUS = 2.8e9
 NOTIFY = 4096
@@ -200,9 +201,10 @@ def test_looking_more_often_changes_nothing(pauses_s, n_frames, room_bytes):
     """The flow of bytes depends on time alone, not on how often somebody asks."""
     ring = np.zeros(3 * 4096, np.int16)
     start = -ring.ctypes.data % 4096
+    store = Store()
 
     def stream() -> Fifo:
-        fifo = Fifo(Buffer(ring.ctypes.data + start, 0, 8192, 0), 2, 625e6, room_bytes, BUS)
+        fifo = Fifo(Buffer(ring.ctypes.data + start, 0, 8192, 0), 2, 625e6, room_bytes, BUS, store)
         fifo.hand_over(n_frames * 128)
         fifo.start_dma(0.0)
         fifo.trigger(1e-6)

@@ -20,6 +20,7 @@ from labseq.errors import RecordingError
 from labseq.model import Frame, RunRecord, ShotRecord
 from labseq.recording.layout import FORMAT_VERSION
 from labseq.recording.shot_file import ShotEncoder
+from labseq.recording.shot_reader import read_content
 
 MakeRun = Callable[..., RunRecord]
 MakeShot = Callable[..., ShotRecord]
@@ -122,6 +123,28 @@ def test_stages_over_budget_are_marked(make_run: MakeRun, make_shot: MakeShot) -
         timing = file["entry/timing"][()]
         assert [stage.decode() for stage in timing["stage"]] == ["load", "plan", "plan", "prüfen"]
         assert list(timing["over_budget"]) == [False, True, False, False]
+
+
+def test_what_a_simulation_tells_is_kept_as_tables(
+    make_run: MakeRun, make_shot: MakeShot, tmp_path: Path
+) -> None:
+    flights = np.array([(0.5, b"kept", 2e-9)], [("held_s", "f8"), ("fate", "S8"), ("offset_m", "f4")])
+    shot = make_shot()
+    shot.story = {"flights": flights, "a/b": flights[:0]}
+    path = tmp_path / "shot.h5"
+    path.write_bytes(ShotEncoder(make_run(), "day/run").encode(shot))
+    with h5py.File(path) as file:
+        units: Any = file["entry/story/flights"].attrs["units"]
+        assert list(units) == ["s", "", "m"]
+    story = read_content(path).record.story
+    assert list(story) == ["a_b", "flights"]
+    assert story["flights"].tobytes() == flights.tobytes()
+    assert story["a_b"].dtype == flights.dtype
+
+
+def test_a_shot_without_a_story_has_no_group_for_it(make_run: MakeRun, make_shot: MakeShot) -> None:
+    with opened(ShotEncoder(make_run(), "day/run").encode(make_shot())) as file:
+        assert "story" not in file["entry"]
 
 
 def test_provenance_and_devices_stand_in_every_file(make_run: MakeRun, make_shot: MakeShot) -> None:

@@ -44,6 +44,18 @@ def test_the_same_seed_gives_the_same_data(tmp_path, options):
     assert first.path != again.path
 
 
+def test_what_has_kernels_compiles_before_anything_is_opened(tmp_path, monkeypatch):
+    from labseq_virtual import camera, mobile_tweezers
+
+    told: list[str] = []
+    for driver in (camera.VirtualCamera, mobile_tweezers.VirtualMobileTweezers):
+        driver_open = driver.open
+        monkeypatch.setattr(driver, "warm", lambda self: told.append("warm"), raising=False)
+        monkeypatch.setattr(driver, "open", lambda self, do=driver_open: (told.append("open"), do(self)))
+    run(tmp_path, shots=1, seed=1)
+    assert told == ["warm"] * 2 + ["open"] * 2
+
+
 def test_a_run_reads_back(tmp_path):
     done = run(tmp_path, shots=2, seed=3)
     assert (done.status, len(done.shots), done.seed, done.simulated) == ("complete", 2, 3, True)

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from labseq_spcm.simulator import registers as r
 from labseq_spcm.simulator.rules import Number
@@ -67,13 +68,23 @@ def put_text(address: int, text: str, n_bytes: int) -> None:
     ctypes.memmove(address, raw, len(raw))
 
 
-def list_entries(address: int, n_bytes: int) -> Iterator[tuple[int, Number]]:
-    """The (register, value) of a register list."""
+def list_entries(address: int, n_bytes: int) -> NDArray[np.void]:
+    """A copy of a register list, ``LIST_PARAM`` (n,)."""
     raw = (ctypes.c_char * n_bytes).from_address(address)
-    entries = np.frombuffer(memoryview(raw), LIST_PARAM)
-    registers: list[int] = entries["register"].tolist()
+    return np.frombuffer(memoryview(raw), LIST_PARAM).copy()
+
+
+def real_values(entries: NDArray[np.void]) -> NDArray[np.float64]:
+    """The values of a register list, float64 (n,), whether they are integers or real numbers."""
+    whole = entries["value"]
+    return np.where(entries["type"] == r.TYPE_DOUBLE, whole.copy().view(np.float64), whole)
+
+
+def list_writes(entries: NDArray[np.void]) -> Iterator[tuple[int, Number]]:
+    """The (register, value) of a register list."""
     doubles: list[bool] = (entries["type"] == r.TYPE_DOUBLE).tolist()
     whole: list[int] = entries["value"].tolist()
     real: list[float] = entries["value"].copy().view(np.float64).tolist()
+    registers: list[int] = entries["register"].tolist()
     for i, register in enumerate(registers):
         yield register, real[i] if doubles[i] else whole[i]

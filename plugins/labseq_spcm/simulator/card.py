@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from collections import deque
 from collections.abc import Callable, Iterable
 from typing import Final
 
@@ -13,11 +12,12 @@ from numpy.typing import NDArray
 from labseq.errors import LabseqError
 from labseq.roles import Clock
 from labseq_spcm.simulator import registers as r
+from labseq_spcm.simulator.calls import list_writes, real_values
 from labseq_spcm.simulator.facts import M4I6631, CardModel
 from labseq_spcm.simulator.machine import Machine
 from labseq_spcm.simulator.memory import Buffer
 from labseq_spcm.simulator.output import Span
-from labseq_spcm.simulator.records import LogEntry, Record
+from labseq_spcm.simulator.records import Log, Record
 from labseq_spcm.simulator.rules import ErrorInfo, Number, Refusal
 
 LOOK_S: Final = 0.05
@@ -59,7 +59,7 @@ class SimulatedCard:
     ) -> None:
         self.model = model
         self.serial_number = serial_number
-        self.log: deque[LogEntry] = deque(maxlen=log_size)
+        self.log = Log(log_size)
         self._clock = clock
         self._changed = threading.Condition(threading.RLock())
         self._machine = Machine(model)
@@ -94,13 +94,13 @@ class SimulatedCard:
             if machine.run is not None:
                 stretches = machine.run.played(now_s)
                 records += [Record(stretch, channels, machine.sample_rate_hz) for stretch in stretches]
-            tones = machine.records.tones + machine.dds.played(now_s)
+            chords = machine.records.chords + machine.dds.played(now_s)
             parts: list[Span] = []
             for record in records:
                 if channel in record.channels:
                     parts += amplifier.cut(record.span(channel))
-            for owner, span in tones:
-                if owner == channel:
+            for chord in chords:
+                for span in chord.spans(channel):
                     parts += amplifier.cut(span)
             return sorted(parts, key=lambda part: part.start_s)
 
@@ -168,7 +168,7 @@ class SimulatedCard:
             now_s = self._advance()
             code, n_stops = r.ERR_OK, self._machine.n_stops
             for register, value in writes:
-                self.log.append(LogEntry(now_s, register, value))
+                self.log.add(now_s, [register], [value])
                 try:
                     if register == r.SPC_M2CMD:
                         self._command(int(value), now_s)
@@ -183,6 +183,22 @@ class SimulatedCard:
         if busy_s:
             self._pause(busy_s)
         return code or self._wait(waits, n_stops)
+
+    def write_list(self, entries: NDArray[np.void]) -> int:
+        """Write a register list, ``LIST_PARAM`` (n,); returns the vendor's error code."""
+        with self._changed:
+            if self._error.code:
+                return r.ERR_LASTERR
+            now_s, values = self._advance(), real_values(entries)
+            try:
+                busy_s = self._machine.dds.write_many(entries["register"], values, now_s)
+            except Refusal:  # one by one it is told what is wrong, if anything is
+                return self.write_all(list_writes(entries))
+            self.log.add(now_s, entries["register"].tolist(), values.tolist())
+            self._changed.notify_all()
+        if busy_s:
+            self._pause(busy_s)
+        return r.ERR_OK
 
     def read(self, register: int) -> tuple[int, Number]:
         """Read one register; returns the vendor's error code and the value."""

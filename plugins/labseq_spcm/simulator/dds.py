@@ -10,12 +10,15 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Final
 
+import numpy as np
+from numpy.typing import NDArray
+
 from labseq_spcm.simulator import facts, registers as r
-from labseq_spcm.simulator.dds_values import KINDS, DdsValues
-from labseq_spcm.simulator.output import Tone, ToneSpan
+from labseq_spcm.simulator.dds_cores import Chord, Cores
+from labseq_spcm.simulator.dds_values import LONE_CORE, DdsValues
 from labseq_spcm.simulator.rules import Number, Refusal
 
 QUEUED: Final = (r.SPC_DDS_TRG_SRC, r.SPC_DDS_TRG_TIMER, r.SPC_DDS_PHASE_BEHAVIOUR)
@@ -50,7 +53,6 @@ class Dds:
         running: Whether the card is started.
         free_running: Whether the software trigger burns the blocks.
         n_queued: Commands in the queue, without those that wait in the shadow registers.
-        spans: What was put out between events since the start, with its channel.
     """
 
     def __init__(self, values: DdsValues, queue_length: int) -> None:
@@ -58,7 +60,7 @@ class Dds:
         self._queue_length = queue_length
         self.running = False
         self.free_running = False
-        self.spans: list[tuple[int, ToneSpan]] = []
+        self._cores = Cores(max(values.n_cores, LONE_CORE.bit_length()))
         self.reset()
 
     def reset(self) -> None:
@@ -80,15 +82,13 @@ class Dds:
         self._timer_s = facts.DDS_TIMER_S[0]
         self._shift = False
         self._tick_s = math.inf
-        self._tones: dict[int, Tone] = {}
-        self._phase_deg: dict[int, float] = {}
-        self._since_s = math.inf
+        self._cores.silence()
         self._retrigger_s = -math.inf
 
     def start(self) -> None:
         """The card starts: silent until the first event; what is queued stays."""
         self._silence()
-        self.spans = []
+        self._cores.chords = []
         self.running = True
         self._primed = bool(self._shadow or self._queue)
 
@@ -97,17 +97,18 @@ class Dds:
         self.free_running = True
         self._retrigger_s = max(self._retrigger_s, now_s)
 
-    def stop(self, now_s: float) -> list[tuple[int, ToneSpan]]:
+    def stop(self, now_s: float) -> list[Chord]:
         """The card stops; what is queued stays.
 
         Returns:
-            All that was put out since the start, with its channel.
+            All that was put out since the start.
         """
         self.advance(now_s)
-        spans, self.spans = self.played(now_s), []
+        chords = self.played(now_s)
+        self._cores.chords = []
         self.running = self.free_running = False
         self._silence()
-        return spans
+        return chords
 
     def write(self, register: int, value: Number, now_s: float) -> float:
         """Take a command.
@@ -126,9 +127,38 @@ class Dds:
             self._list.n_commands += 1
         return 0.0
 
+    def write_many(self, registers: NDArray[np.int32], values: NDArray[np.float64], now_s: float) -> float:
+        """Take many commands in a row, faster than one by one.
+
+        Args:
+            registers: int32 (n,).
+            values: float64 (n,).
+            now_s: The time.
+
+        Returns:
+            Seconds that the call takes.
+
+        Raises:
+            Refusal: There is anything but values of cores, trigger sources, timers, EXEC_AT_TRG and
+                WRITE_TO_CARD, or a value is out of range: nothing is taken.
+        """
+        is_command = registers == r.SPC_DDS_CMD
+        if not set(values[is_command].tolist()) <= {r.SPCM_DDS_CMD_EXEC_AT_TRG, r.SPCM_DDS_CMD_WRITE_TO_CARD}:
+            raise Refusal(r.ERR_VALUE, "an unusual command")
+        exact = values.copy()
+        exact[~is_command] = self._values.write_many(registers[~is_command], values[~is_command])
+        names, numbers, first, busy_s = registers.tolist(), exact.tolist(), 0, 0.0
+        for last in [*np.flatnonzero(is_command).tolist(), len(names)]:
+            self._list.writes.update(zip(names[first:last], numbers[first:last], strict=True))
+            self._list.n_commands += last - first
+            first = last + 1
+            if last < len(names):
+                busy_s = max(busy_s, self._command(int(numbers[last]), now_s))
+        return busy_s
+
     def _command(self, command: int, now_s: float) -> float:
         if command & r.SPCM_DDS_CMD_RESET:
-            self._end_span(now_s)
+            self._cores.go_on(now_s, self._values.masks)
             self.reset()
         if command & r.SPCM_DDS_CMD_EXEC_NOW and not (self.running and self._primed):
             raise Refusal(
@@ -177,11 +207,10 @@ class Dds:
     def advance(self, now_s: float) -> None:
         """Let everything happen that is due: arrivals, ticks, free-running triggers."""
         while True:
-            self._load()
             tick_s = self._tick_s
             if self.free_running and self._source == r.SPCM_DDS_TRG_SRC_CARD:
                 tick_s = self._retrigger_s if self._shadow is None else self._ready_s(self._shadow)
-            if self._queue and self._shadow is None and self._queue[0].arrival_s <= min(now_s, tick_s):
+            if self._arrived(min(now_s, tick_s)):
                 self._take(self._next())
             elif self.running and tick_s <= now_s:
                 if not self._event(tick_s):
@@ -189,9 +218,11 @@ class Dds:
             else:
                 return
 
-    def _load(self) -> None:
-        if not self.running and self._queue and self._shadow is None and not self._queue[0].at_once:
-            self._shadow = self._next()
+    def _arrived(self, now_s: float) -> bool:
+        """Whether the next block is on the card, and the place where it would wait is free."""
+        if not self._queue or self._shadow is not None or self._queue[0].arrival_s > now_s:
+            return False
+        return self.running or not self._queue[0].at_once
 
     def _next(self) -> Block:
         block = self._queue.popleft()
@@ -224,7 +255,7 @@ class Dds:
     def _event(self, at_s: float) -> bool:
         if self._source == r.SPCM_DDS_TRG_SRC_TIMER:
             self._tick_s = at_s + self._timer_s
-        if self._shadow is None or self._shadow.arrival_s > at_s:
+        if self._shadow is None:
             self._flags |= r.SPCM_DDS_STAT_QUEUE_UNDERRUN
             return False
         block, self._shadow = self._shadow, None
@@ -235,43 +266,20 @@ class Dds:
         self._n_events += 1
         self._retrigger_s = at_s + facts.DDS_RETRIGGER_S
         out_s = at_s + facts.DDS_TRIGGER_DELAY_S
-        self._end_span(out_s)
-        self._tones = {core: tone.after(out_s - self._since_s) for core, tone in self._tones.items()}
-        self._since_s = out_s
+        self._cores.go_on(out_s, self._values.masks)
         self._shift = bool(block.writes.get(r.SPC_DDS_PHASE_BEHAVIOUR, self._shift))
         for register, value in block.writes.items():
             if register < r.SPC_DDS_TRG_SRC:
-                self._write_core(register, value)
+                self._cores.write(register, value, shift=self._shift)
         self._source = int(block.writes.get(r.SPC_DDS_TRG_SRC, self._source))
         self._timer_s = block.writes.get(r.SPC_DDS_TRG_TIMER, self._timer_s)
         self._tick_s = at_s + self._timer_s if self._source == r.SPCM_DDS_TRG_SRC_TIMER else math.inf
 
-    def _write_core(self, register: int, value: float) -> None:
-        kind, core = register // 1000 * 1000, register % 1000
-        tone = self._tones.get(core, Tone(core))
-        if kind == r.SPC_DDS_CORE0_PHASE:
-            shift_deg = value - self._phase_deg.get(core, 0.0)
-            phase_rad = tone.phase_rad + math.radians(shift_deg) if self._shift else math.radians(value)
-            self._phase_deg[core] = value
-            self._tones[core] = replace(tone, phase_rad=phase_rad)
-        else:
-            self._tones[core] = replace(tone, **{KINDS[kind]: value})
+    def played(self, now_s: float) -> list[Chord]:
+        """All that was put out since the start, up to now."""
+        ended = [chord.until(now_s) for chord in self._cores.chords if chord.start_s < now_s]
+        return ended + self._cores.sounding(now_s, self._values.masks)
 
-    def _sounding(self, end_s: float) -> list[tuple[int, ToneSpan]]:
-        """What has been put out since the last event, by channel."""
-        spans: list[tuple[int, ToneSpan]] = []
-        for channel in (0, 1) if self._since_s < end_s else ():
-            tones = [tone for core, tone in self._tones.items() if self._values.channel_of(core) == channel]
-            loud = tuple(tone for tone in tones if not tone.silent)
-            if loud:
-                spans.append((channel, ToneSpan(self._since_s, end_s, 0.0, loud)))
-        return spans
-
-    def _end_span(self, end_s: float) -> None:
-        self.spans += self._sounding(end_s)
-
-    def played(self, now_s: float) -> list[tuple[int, ToneSpan]]:
-        """All that was put out since the start, up to now, with its channel."""
-        ended = [(channel, span) for channel, span in self.spans if span.start_s < now_s]
-        cut = [(channel, span.between(span.start_s, now_s)) for channel, span in ended]
-        return cut + self._sounding(now_s)
+    def forget(self, before_s: float) -> None:
+        """Drop what ended before a time."""
+        self._cores.chords = [chord for chord in self._cores.chords if chord.end_s > before_s]

@@ -7,6 +7,7 @@ import math
 from labseq_spcm.simulator.memory import Buffer
 from labseq_spcm.simulator.replay import Stretch, cut
 from labseq_spcm.simulator.rules import refuse
+from labseq_spcm.simulator.store import Store
 
 SMALL: float = 1e-3
 """Bytes that are rounding of time."""
@@ -25,12 +26,20 @@ class Fifo:
         sample_rate_hz: Sample rate.
         room_bytes: How much of the on-board memory is used.
         bus_bytes_per_s: Speed of the bus.
+        store: Memory for what was handed over.
     """
 
     def __init__(
-        self, buffer: Buffer, n_channels: int, sample_rate_hz: float, room_bytes: int, bus_bytes_per_s: float
+        self,
+        buffer: Buffer,
+        n_channels: int,
+        sample_rate_hz: float,
+        room_bytes: int,
+        bus_bytes_per_s: float,
+        store: Store,
     ) -> None:
         self._buffer = buffer
+        self._store = store
         self._frame = 2 * n_channels
         self._rate = sample_rate_hz
         self._room = room_bytes
@@ -61,7 +70,9 @@ class Fifo:
         if n_bytes % self._frame:
             raise refuse(n_bytes, f"a multiple of {self._frame} bytes")
         if n_bytes:
-            data = self._buffer.copy(self._handed, n_bytes).reshape(-1, self._frame // 2)
+            data = self._store.take(n_bytes // 2)
+            self._buffer.fetch(self._handed, data)
+            data = data.reshape(-1, self._frame // 2)
             self._pieces.append((self._handed // self._frame, Stretch(0.0, data, len(data))))
             self._handed += n_bytes
 

@@ -115,7 +115,7 @@ class Library:
             return r.ERR_INVALIDHANDLE
         if register != r.SPC_REGISTER_LIST:
             return r.ERR_REG
-        return card.write_all(list_entries(address, n_bytes))
+        return card.write_list(list_entries(address, n_bytes))
 
     def _read(self, handle: int | None, register: int) -> tuple[int, Number]:
         card = self._open.get(handle or 0)

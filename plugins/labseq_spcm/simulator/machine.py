@@ -15,6 +15,7 @@ from labseq_spcm.simulator.output import Amplifier
 from labseq_spcm.simulator.records import Records
 from labseq_spcm.simulator.replay import Run, Sequence, Step
 from labseq_spcm.simulator.rules import Number, Refusal, Setup, refuse
+from labseq_spcm.simulator.store import Store
 
 AMPLITUDES: Final = {r.SPC_AMP0: 0, r.SPC_AMP1: 1}
 OUTPUTS: Final = {r.SPC_ENABLEOUT0: 0, r.SPC_ENABLEOUT1: 1}
@@ -33,6 +34,7 @@ class Machine:
         self.dds_values = DdsValues(model.n_dds_cores)
         self.dds = Dds(self.dds_values, model.dds_queue)
         self.records = Records()
+        self.store = Store()
         self.n_stops = 0
         self._power_on()
 
@@ -83,7 +85,7 @@ class Machine:
     def _end_run(self, now_s: float) -> None:
         if self.run is not None:
             self.records.keep(self.run.played(now_s), self.setup.channels, self.sample_rate_hz)
-        self.records.tones += self.dds.stop(now_s)
+        self.records.chords += self.dds.stop(now_s)
         self.run = self.fifo = None
         self.running = self.trigger_enabled = False
 
@@ -178,10 +180,10 @@ class Machine:
         if self.setup.mode == r.SPC_REP_FIFO_SINGLE:
             if self.running:
                 raise Refusal(r.ERR_RUNNING, "card is still running, access not possible")
-            outbuf = self.setup[r.SPC_DATA_OUTBUFSIZE]
-            n_channels = len(self.setup.channels)
+            outbuf, n_channels = self.setup[r.SPC_DATA_OUTBUFSIZE], len(self.setup.channels)
             bus = self.model.bus_bytes_per_s
-            self.fifo = Fifo(buffer, n_channels, self.sample_rate_hz, outbuf, bus)
+            self.store.reserve(self.setup[r.SPC_LOOPS] * self.setup[r.SPC_SEGMENTSIZE] * n_channels)
+            self.fifo = Fifo(buffer, n_channels, self.sample_rate_hz, outbuf, bus, self.store)
         elif buffer.offset + buffer.n_bytes > room:
             raise refuse(buffer.offset + buffer.n_bytes, f"at most {room} bytes; set the memory size first")
         self.buffer = buffer
@@ -205,7 +207,7 @@ class Machine:
         sequence = self.setup.mode == r.SPC_REP_STD_SEQUENCE
         segment = self.setup[r.SPC_SEQMODE_WRITESEGMENT] if sequence else None
         n_samples = self._area_samples() * len(self.setup.channels)
-        data = self.buffer.copy(0, self.buffer.n_bytes)
+        data = self.buffer.content()
         self.memory.send(now_s, segment, n_samples, self.buffer.offset // 2, data)
         self.buffer = None
 
@@ -258,10 +260,8 @@ class Machine:
         if self.run is None:
             self.dds.trigger(now_s)
         else:
-            delay_s = (
-                trigger_delay_s(self.sample_rate_hz) + self.setup[r.SPC_TRIG_DELAY] / self.sample_rate_hz
-            )
-            self.run.trigger(now_s + delay_s)
+            rate_hz = self.sample_rate_hz
+            self.run.trigger(now_s + trigger_delay_s(rate_hz) + self.setup[r.SPC_TRIG_DELAY] / rate_hz)
 
     def pulse(self, voltage_v: float, now_s: float) -> bool:
         """A pulse from 0 V at the input Ext0.
@@ -291,7 +291,7 @@ class Machine:
     def forget(self, before_s: float) -> None:
         """Drop what was played before a time."""
         self.records.forget(before_s)
-        self.dds.spans = [(channel, span) for channel, span in self.dds.spans if span.end_s > before_s]
+        self.dds.forget(before_s)
         if self.fifo is not None:
             self.fifo.forget(before_s)
         for amplifier in self.amplifiers:

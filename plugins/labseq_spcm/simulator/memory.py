@@ -54,15 +54,20 @@ class Buffer:
         if not self.address or self.address % PAGE:
             raise Refusal(r.ERR_INVALIDPARAM, "the buffer must be aligned to 4096 bytes")
 
-    def copy(self, start: int, n_bytes: int) -> Samples:
-        """A copy of some of its bytes, which may go around its end: int16 (n_bytes / 2,)."""
-        start %= self.n_bytes
+    def content(self) -> Samples:
+        """A copy of all of it, int16 (n_bytes / 2,)."""
+        out = np.empty(self.n_bytes // 2, np.int16)
+        self.fetch(0, out)
+        return out
+
+    def fetch(self, start: int, out: Samples) -> None:
+        """Copy some of its samples, which may go around its end, from byte ``start`` on."""
         whole = (ctypes.c_char * self.n_bytes).from_address(self.address)
         samples = np.frombuffer(memoryview(whole), np.int16)
-        first, last = start // 2, (start + n_bytes) // 2
-        if last <= len(samples):
-            return samples[first:last].copy()
-        return np.concatenate([samples[first:], samples[: last - len(samples)]])
+        first = start % self.n_bytes // 2
+        n = min(len(out), len(samples) - first)
+        out[:n] = samples[first : first + n]
+        out[n:] = samples[: len(out) - n]
 
 
 @dataclass(frozen=True, slots=True)

@@ -139,8 +139,9 @@ class ToneSpan:
 
     def between(self, start_s: float, end_s: float) -> ToneSpan:
         """The part of the span within a time."""
-        start_s, end_s = max(start_s, self.start_s), min(end_s, self.end_s)
-        tones = tuple(tone.after(start_s - self.start_s) for tone in self.tones)
+        later_s, end_s = max(0.0, start_s - self.start_s), min(end_s, self.end_s)
+        start_s = max(start_s, self.start_s)
+        tones = tuple(tone.after(later_s) for tone in self.tones) if later_s else self.tones
         return replace(self, start_s=start_s, end_s=max(start_s, end_s), tones=tones)
 
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
-from labseq_spcm.simulator.output import SampleSpan, ToneSpan
+from labseq_spcm.simulator.dds_cores import Chord
+from labseq_spcm.simulator.output import SampleSpan
 from labseq_spcm.simulator.replay import Stretch
 from labseq_spcm.simulator.rules import Number
 
@@ -23,6 +25,41 @@ class LogEntry:
     time_s: float
     register: int
     value: Number
+
+
+class Log:
+    """The writes of late, in order.
+
+    Those of one call are kept as they came, and told apart only when somebody looks.
+
+    Args:
+        size: How many writes are kept, about.
+    """
+
+    def __init__(self, size: int) -> None:
+        self._size = size
+        self._n = 0
+        self._calls: deque[tuple[float, Sequence[int], Sequence[Number]]] = deque()
+
+    def add(self, time_s: float, registers: Sequence[int], values: Sequence[Number]) -> None:
+        """Note the writes of one call."""
+        self._calls.append((time_s, registers, values))
+        self._n += len(registers)
+        while self._n - len(self._calls[0][1]) >= self._size:
+            self._n -= len(self._calls.popleft()[1])
+
+    def clear(self) -> None:
+        """Forget everything."""
+        self._calls.clear()
+        self._n = 0
+
+    def __len__(self) -> int:
+        return self._n
+
+    def __iter__(self) -> Iterator[LogEntry]:
+        for time_s, registers, values in self._calls:
+            for register, value in zip(registers, values, strict=True):
+                yield LogEntry(time_s, register, value)
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,12 +87,12 @@ class Records:
 
     Attributes:
         samples: Stretches of samples, in time's order.
-        tones: DDS tones with their channel, in time's order.
+        chords: What the DDS put out, in time's order.
     """
 
     def __init__(self) -> None:
         self.samples: list[Record] = []
-        self.tones: list[tuple[int, ToneSpan]] = []
+        self.chords: list[Chord] = []
 
     def keep(self, stretches: Iterable[Stretch], channels: Sequence[int], sample_rate_hz: float) -> None:
         """Add what a run has played."""
@@ -64,4 +101,4 @@ class Records:
     def forget(self, before_s: float) -> None:
         """Drop what ended before a time."""
         self.samples = [record for record in self.samples if record.span(record.channels[0]).end_s > before_s]
-        self.tones = [(channel, span) for channel, span in self.tones if span.end_s > before_s]
+        self.chords = [chord for chord in self.chords if chord.end_s > before_s]

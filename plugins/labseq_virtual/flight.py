@@ -1,0 +1,246 @@
+"""Where played waveforms take the atoms: tones, tweezers, and Newton's law."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq import MotionSpec
+from labseq.model import SiteGrid
+from labseq_virtual.envelope import Band
+from labseq_virtual.hearing import Episode
+from labseq_virtual.jumps import JUMPS, depth_jumps, phase_jumps
+from labseq_virtual.settings import WorldSettings
+from labseq_virtual.thermal import draw_atoms
+from labseq_virtual.tones import HOPS, WINDOW, Tracks, follow_tones
+from labseq_virtual.transport import frequency_maps
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+BOLTZMANN: Final = 1.380649e-23
+RB87_KG: Final = 86.909180531 * 1.66053906660e-27
+KELVIN: Final = BOLTZMANN / RB87_KG
+"""m^2/s^2 per kelvin: energies here are per mass of 87Rb (AME2020, CODATA 2018)."""
+
+STEP_S: Final = 0.1e-6
+"""Step of the integration: a seventieth of a period in a tweezer of 2.1 mK."""
+BAND_HZ: Final = 50e6
+"""Least width of the AODs' band."""
+LEAST_DEPTH: Final = 2e-3
+"""Fraction of the full depth of an axis below which a tone is not heard."""
+SLEW_HZ: Final = 4e6
+"""Most that a tone's frequency leaves its course in a transit time: 1100 um/ms at 1.6 MHz per site."""
+
+FLIGHTS: Final = np.dtype(
+    [
+        ("held_s", np.float64),
+        ("from_row", np.int16),
+        ("from_col", np.int16),
+        ("to_row", np.int16),
+        ("to_col", np.int16),
+        ("offset_m", np.float32),
+        ("depth_K", np.float32),
+        ("fate", "S8"),
+        ("lost_s", np.float64),
+        ("lost_row", np.float32),
+        ("lost_col", np.float32),
+    ]
+)
+"""What happened to an atom that a mobile tweezer held, or that was lost.
+
+``held_s`` is when it was first held (nan: never), ``offset_m`` how far the tweezer then was from the
+site, ``depth_K`` its greatest depth. ``fate`` is "kept" (on the site ``to``), "ejected" (beyond the
+grid), "paired" (came too near to another atom), "spilled" (fell out of its tweezer) or "drawn" (by the
+transport loss). ``lost_s`` is when, and ``lost_row`` and ``lost_col``, in sites, where.
+"""
+
+
+class Flight:
+    """Carries atoms by what the mobile tweezers' outputs played.
+
+    Args:
+        grid: The grid of sites, with its frequencies.
+        motion: What drives the AODs: the amplitudes that are meant to give the full depth.
+        settings: The constants of the model.
+    """
+
+    def __init__(self, grid: SiteGrid, motion: MotionSpec, settings: WorldSettings) -> None:
+        light = settings.mobile_light
+        self._grid, self._settings, self._light = grid, settings, light
+        self._maps = frequency_maps(grid)
+        self._offset = np.array([light.offset[1], light.offset[0]]) / grid.spacing_m
+        most = (motion.max_row_tones, motion.max_column_tones)
+        self._full_v = [light.tone_voltage or motion.rf.full_scale_v / n for n in most]
+        self._bands = [_band(hz) for hz in (grid.row_frequency_hz, grid.column_frequency_hz)]
+        a1, a2 = grid.axes
+        inverse = np.linalg.inv(np.stack([a2, a1], axis=1))
+        self._plane = np.ascontiguousarray(np.vstack([grid.positions_m[0, 0], a2, a1, inverse]))
+        waists = settings.static_waist, light.waist
+        rayleigh = [
+            math.pi * w**2 / wavelength
+            for w, wavelength in zip(waists, (settings.static_wavelength, light.wavelength), strict=True)
+        ]
+        self._beams = np.array([waists[0], rayleigh[0], waists[1], rayleigh[1]])
+        self.margin_s = (WINDOW + 0.5) * light.transit_time
+        self._flights: list[NDArray[Any]] = []
+        self._jumps: list[tuple[Any, ...]] = []
+
+    def begin_shot(self) -> None:
+        """Forget the flights of the last shot."""
+        self._flights, self._jumps = [], []
+
+    def tables(self, since_s: float) -> dict[str, NDArray[Any]]:
+        """What happened since the shot began: "flights" and "jumps", times counted from ``since_s``."""
+        flights = np.concatenate([np.empty(0, FLIGHTS), *self._flights])
+        jumps = np.array(sorted(self._jumps, key=lambda jump: jump[0]), JUMPS)
+        for name in ("held_s", "lost_s"):
+            flights[name] -= since_s
+        jumps["t_s"] -= since_s
+        return {"flights": flights, "jumps": jumps}
+
+    def carry(
+        self, occupied: Mask, episode: Episode, depth: Floats, rng: np.random.Generator, loss_factor: float
+    ) -> None:
+        """Let an episode act on the atoms.
+
+        Args:
+            occupied: bool (n_rows, n_cols), sites that hold an atom; changed in place.
+            episode: What was played.
+            depth: float64 (n_rows, n_cols), depths of the static tweezers, of the nominal one.
+            rng: Random numbers of the shot.
+            loss_factor: The shot's factor on the transport loss.
+        """
+        from labseq_virtual._kernels_atoms import DEPTH, HELD_S, LOST_S, N_DIARY, OFFSET, PAIRED, follow_atoms
+
+        tones = self._listen(episode)
+        if tones is None:
+            return
+        (rows, row_depth, cols, col_depth), t_s = tones
+        row, col = np.nonzero(occupied & self._near(rows, cols))
+        static = KELVIN * self._settings.static_depth * np.ascontiguousarray(depth)
+        kt = KELVIN * self._settings.temperature
+        state = draw_atoms(static[row, col], kt, self._beams[0], self._beams[1], rng)
+        state[:, :2] += self._grid.positions_m[row, col]
+        alive = np.ones(len(row), np.bool_)
+        diary = np.full((len(row), N_DIARY), np.nan)
+        n_steps = math.ceil((t_s[1] - t_s[0]) / STEP_S)
+        full = KELVIN * self._light.depth
+        follow_atoms(
+            state, alive, diary, rows, row_depth, cols, col_depth, t_s,
+            static, full, self._plane, self._beams, n_steps,
+        )  # fmt: skip
+        to_row, to_col, bound = self._arrivals(state, static)
+        held = ~np.isnan(diary[:, HELD_S])
+        flights = np.zeros(len(row), FLIGHTS)
+        flights["held_s"], flights["offset_m"] = diary[:, HELD_S], diary[:, OFFSET]
+        flights["depth_K"] = diary[:, DEPTH] / KELVIN
+        flights["from_row"], flights["from_col"] = row, col
+        flights["to_row"], flights["to_col"] = to_row, to_col
+        flights["lost_s"], flights["lost_row"], flights["lost_col"] = diary[:, LOST_S:PAIRED].T
+        n_tones = max(0, _most_on(rows) + _most_on(cols) - 2)
+        loss = self._settings.transport_loss + n_tones * self._settings.transport_loss_per_tone
+        drawn = held & (rng.random(len(row)) < loss * loss_factor)
+        self._judge(flights, alive, diary[:, PAIRED] == 1, bound, drawn, float(t_s[-1]))
+        kept = flights["fate"] == b"kept"
+        occupied[row, col] = False
+        occupied[to_row[kept], to_col[kept]] = True
+        self._flights.append(flights[held | ~kept])
+
+    def _listen(self, episode: Episode) -> tuple[tuple[Floats, Floats, Floats, Floats], Floats] | None:
+        """Places (in sites) and depth factors of the row and column tones, and the times of the frames."""
+        found: list[Tracks] = []
+        for axis, spans in enumerate((episode.rows, episode.columns)):
+            if not spans:
+                return None
+            start_s, end_s = episode.start_s - self.margin_s, episode.end_s + 2 * self.margin_s
+            least_v = self._full_v[axis] * math.sqrt(LEAST_DEPTH)
+            transit_s = self._light.transit_time
+            found.append(follow_tones(spans, start_s, end_s, self._bands[axis], transit_s, least_v, SLEW_HZ))
+        n_frames = min(len(tracks.t_s) for tracks in found)
+        sites: list[Floats] = []
+        depths: list[Floats] = []
+        for axis, tracks in enumerate(found):
+            hz, volts = tracks.frequency_hz[:n_frames], tracks.amplitude_v[:n_frames]
+            sites.append(self._maps[axis].sites(hz) + self._offset[axis])
+            depths.append((volts / self._full_v[axis]) ** 2)
+        self._note_jumps(found, sites, depths)
+        return (sites[0], depths[0], sites[1], depths[1]), found[0].t_s[:n_frames]
+
+    def _note_jumps(self, found: list[Tracks], sites: list[Floats], depths: list[Floats]) -> None:
+        for axis, tracks in enumerate(found):
+            for j in range(sites[axis].shape[1]):
+                for time_s, k, size in phase_jumps(tracks, j):
+                    place = sites[axis][min(k, len(sites[axis]) - 1), j]
+                    where = (place, math.nan) if axis == 0 else (math.nan, place)
+                    self._jumps.append((time_s, b"phase", *where, size))
+        rows, cols = (np.nan_to_num(depth) for depth in depths)
+        for i in range(rows.shape[1]):
+            for j in range(cols.shape[1]):
+                for k, size in depth_jumps(rows[:, i] * cols[:, j]):
+                    near = slice(max(0, k - HOPS), k + HOPS + 1)
+                    where = (_known(sites[0][near, i]), _known(sites[1][near, j]))
+                    self._jumps.append((float(found[0].t_s[k]), b"depth", *where, size))
+
+    def _near(self, rows: Floats, cols: Floats) -> Mask:
+        """Sites that a tweezer comes near to, bool (n_rows, n_cols)."""
+        near = np.zeros(self._grid.shape, np.bool_)
+        for k in np.flatnonzero(~(np.isnan(rows).all(axis=1) | np.isnan(cols).all(axis=1))):
+            lines: list[NDArray[np.intp]] = []
+            for places, n_sites in zip((rows[k], cols[k]), self._grid.shape, strict=True):
+                known = places[~np.isnan(places)]
+                sites = (np.floor(known)[:, None] + np.array([0, 1])).astype(np.intp).ravel()
+                lines.append(sites[(sites >= 0) & (sites < n_sites)])
+            near[np.ix_(*lines)] = True
+        return near
+
+    def _arrivals(self, state: Floats, static: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp], Mask]:
+        """The sites that are nearest to some atoms, -1 beyond the grid, and whether they bind the atoms."""
+        from labseq_virtual._kernels_atoms import energies
+
+        waist, rayleigh = self._beams[:2]
+        place = np.rint((state[:, :2] - self._plane[0]) @ self._plane[3:].T).astype(np.intp)
+        inside = ((place >= 0) & (place < self._grid.shape)).all(axis=1)
+        row, col = np.where(inside[:, None], place, 0).T
+        sites = self._grid.positions_m[row, col]
+        bound = inside & (energies(state, sites, static[row, col], waist, rayleigh) < 0)
+        return np.where(inside, row, -1), np.where(inside, col, -1), bound
+
+    def _judge(
+        self, flights: NDArray[Any], alive: Mask, paired: Mask, bound: Mask, drawn: Mask, end_s: float
+    ) -> None:
+        """Write down the fates; what is lost without a time is lost at the end, where it then is."""
+        flights["fate"] = b"spilled"
+        flights["fate"][alive & bound] = b"kept"
+        flights["fate"][alive & bound & drawn] = b"drawn"
+        to_row, to_col = flights["to_row"], flights["to_col"]
+        kept = np.flatnonzero(flights["fate"] == b"kept")
+        _, index, count = np.unique(
+            np.stack([to_row[kept], to_col[kept]]), axis=1, return_inverse=True, return_counts=True
+        )
+        flights["fate"][kept[count[index.ravel()] > 1]] = b"paired"
+        flights["fate"][paired] = b"paired"
+        flights["fate"][(to_row < 0) & ~paired] = b"ejected"
+        lost = flights["fate"] != b"kept"
+        late = lost & np.isnan(flights["lost_s"])
+        flights["lost_s"][late] = end_s
+        flights["lost_row"][late], flights["lost_col"][late] = to_row[late], to_col[late]
+        to_row[lost] = to_col[lost] = -1
+
+
+def _band(hz: Floats) -> Band:
+    width_hz = max(BAND_HZ, 1.4 * float(np.ptp(hz)))
+    middle_hz = float(hz.max() + hz.min()) / 2
+    return Band(max(0.0, middle_hz - width_hz / 2), middle_hz + width_hz / 2)
+
+
+def _most_on(tracks: Floats) -> int:
+    return int((~np.isnan(tracks)).sum(axis=1).max(initial=0))
+
+
+def _known(values: Floats) -> float:
+    known = values[~np.isnan(values)]
+    return float(known[0]) if len(known) else math.nan
