@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from labseq import __version__
-from labseq.cli import plan_options
+from labseq.cli import plan_options, waveform_options
 from labseq.cli.bench_app import bench
 
 app = typer.Typer(
@@ -174,6 +174,41 @@ def plan(
         profile=profile,
     )
     plan_once(request, PlanOutput(step=step, json=json, png=png))
+
+
+@app.command(epilog=waveform_options.EXAMPLES, short_help="Show what the AWG would play for a plan.")
+def waveform(
+    plan: waveform_options.Plan,
+    target: plan_options.Target = None,
+    planner: plan_options.Planner = "psca",
+    dop: plan_options.Dop = None,
+    seed: plan_options.Seed = None,
+    origin: plan_options.Origin = None,
+    profile: plan_options.Profile = None,
+    overrides: plan_options.Overrides = None,
+    batches: waveform_options.Batches = None,
+    sample_rate: waveform_options.SampleRate = None,
+    json: waveform_options.Json = None,
+    png: waveform_options.Png = None,
+    npz: waveform_options.Npz = None,
+) -> None:
+    """Show what the AWG would play for a plan: voltages, powers, spectrogram, samples."""
+    from labseq.cli.waveform import WaveformOutput, show_waveform
+    from labseq.session import PlanRequest
+    from labseq.session.waveform import WaveformRequest
+
+    request = PlanRequest(
+        occupancy=plan,
+        target=target,
+        planner=planner,
+        degree_of_parallelism=dop,
+        overrides=tuple(overrides or ()),
+        seed=seed,
+        origin=origin,
+        profile=profile,
+    )
+    output = WaveformOutput(json=json, png=png, npz=npz)
+    show_waveform(WaveformRequest(request, batches, sample_rate), output)
 
 
 @app.command()

@@ -2,27 +2,20 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable, Generator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
+from labseq.cli.bench_output import STDOUT, progress_of, prove_writable, tell_compiling, write_text
 from labseq.cli.bench_table import notes, table
 from labseq.cli.output import divert_stdout, say
 from labseq.cli.show import as_line
-from labseq.config.wording import visible
 from labseq.drawing import check_picture, save_comparison
-from labseq.errors import ConfigError, PlanError, Problem
+from labseq.errors import PlanError
 from labseq.session.bench import BenchRequest, compare, read_request
 from labseq.session.bench_curves import figure_drawing, fits_as_dicts, histogram_drawing, points_of
 from labseq.session.bench_figures import Figure
 from labseq.session.bench_report import Report
-
-STDOUT: Final = "-"
-_STEPS: Final = 10
-"""How often progress is told where there is no terminal."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,9 +52,9 @@ def bench_planners(request: BenchRequest, output: BenchOutput) -> None:
     for kind, path in files.items():
         if kind == "png":
             check_picture(path, (1, 1))
-        _prove_writable(path)
-    with _progress() as progress:
-        report = compare(comparison, request.workers, announce=_tell_compiling, progress=progress)
+        prove_writable(path)
+    with progress_of("loadings") as progress:
+        report = compare(comparison, request.workers, announce=tell_compiling, progress=progress)
     say(*table(report), *notes(report, figure))
     if report.rows:
         _write_files(files, report, figure)
@@ -82,33 +75,12 @@ def _files(output: BenchOutput, figure: Figure | None) -> dict[str, Path]:
     return {kind: path for kind, path in named.items() if path is not None}
 
 
-def _prove_writable(path: Path) -> None:
-    """Find out that a file cannot be written before hours are spent."""
-    is_new = not path.exists()
-    try:
-        with path.open("ab"):
-            pass
-        if is_new:
-            path.unlink()
-    except (OSError, ValueError) as error:
-        raise _unwritten(path, error) from error
-
-
-def _unwritten(path: Path, error: Exception) -> ConfigError:
-    reason = error.strerror if isinstance(error, OSError) else str(error)
-    return ConfigError(Problem(f"it cannot be written: {reason}", visible(str(path))))
-
-
 def _write_files(files: dict[str, Path], report: Report, figure: Figure | None) -> None:
     for kind, path in files.items():
         if kind == "png":
             save_comparison(path, figure_drawing(report, figure) if figure else histogram_drawing(report))
             continue
-        text = report.as_csv() if kind == "csv" else f"{as_line(_as_dict(report, figure))}\n"
-        try:
-            path.write_text(text, encoding="utf-8")
-        except OSError as error:
-            raise _unwritten(path, error) from error
+        write_text(path, report.as_csv() if kind == "csv" else f"{as_line(_as_dict(report, figure))}\n")
     if files:
         say(f"written: {', '.join(map(str, files.values()))}")
 
@@ -126,30 +98,3 @@ def _raise_failures(report: Report) -> None:
         n, of = sum(row.n_failed for row in failed), sum(row.n_loadings for row in failed)
         names = ", ".join(dict.fromkeys(f"'{row.entrant.planner}'" for row in failed))
         raise PlanError(f"{n} of {of} plans of {names} are wrong; they do not count in the table")
-
-
-def _tell_compiling(module: str) -> None:
-    say(f"compiling {module}; later runs find it in the cache", stream=sys.stderr)
-
-
-@contextmanager
-def _progress() -> Generator[Callable[[int, int], None]]:
-    """A bar on stderr if that is a terminal, else a line now and then."""
-    if not sys.stderr.isatty():
-        told = 0
-
-        def tell(done: int, wanted: int) -> None:
-            nonlocal told
-            if done * _STEPS // wanted > told:
-                told = done * _STEPS // wanted
-                say(f"{done} of {wanted} loadings", stream=sys.stderr)
-
-        yield tell
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    parts = (TextColumn("loadings"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*parts, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("loadings", total=None)
-        yield lambda done, wanted: bar.update(task, completed=done, total=wanted)

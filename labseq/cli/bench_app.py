@@ -10,7 +10,7 @@ import typer
 bench = typer.Typer(
     name="bench",
     help="Measure and compare parts of labseq.",
-    short_help="Compare planners.",
+    short_help="Compare planners; measure rendering, and the time to the light.",
     no_args_is_help=True,
     rich_markup_mode=None,
 )
@@ -23,6 +23,20 @@ Examples:
   labseq bench planners --figure 2b --loadings 10000
   labseq bench planners --figure 3b --set profile.mobile_tweezers.speed="130 um/ms"
 """
+
+LATENCY_EXAMPLES = """\b
+Examples:
+  labseq bench latency sequences/compact_225.yaml --profile bench_awg
+  labseq bench latency sequences/compact_225.yaml --set planner.degree_of_parallelism=15 --json latency.json
+  labseq bench latency sequences/compact_225.yaml --profile bench_awg --set profile.mobile_tweezers.mode=fifo
+"""
+
+JsonFile = Annotated[
+    str | None,
+    typer.Option(
+        metavar="FILE|-", help="Write the result as JSON; with '-' to stdout, and all else to stderr."
+    ),
+]
 
 
 @bench.command(epilog=PLANNERS_EXAMPLES, short_help="Compare planners on the same random loadings.")
@@ -79,12 +93,7 @@ def planners(
         int | None,
         typer.Option(metavar="N", min=1, help="Processes that share the work; all cores if left out."),
     ] = None,
-    json: Annotated[
-        str | None,
-        typer.Option(
-            metavar="FILE|-", help="Write the result as JSON; with '-' to stdout, and all else to stderr."
-        ),
-    ] = None,
+    json: JsonFile = None,
     csv: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write the table as CSV, in SI units.")
     ] = None,
@@ -110,3 +119,53 @@ def planners(
         workers=workers,
     )
     bench_planners(request, BenchOutput(json=json, csv=csv, png=png))
+
+
+@bench.command(epilog=LATENCY_EXAMPLES, short_help="Measure the time from a frame to the light.")
+def latency(
+    sequence: Annotated[
+        Path,
+        typer.Argument(
+            metavar="SEQUENCE",
+            help="A sequence: its target, its planner, and how its first image is taken.",
+            show_default=False,
+        ),
+    ],
+    profile: Annotated[
+        str | None,
+        typer.Option(
+            "--profile",
+            "-p",
+            metavar="NAME|FILE",
+            help="Hardware profile, instead of the one that the sequence names.",
+        ),
+    ] = None,
+    loadings: Annotated[int, typer.Option(metavar="N", min=1, help="Random loadings.")] = 200,
+    seed: Annotated[int, typer.Option(metavar="N", min=0, help="Seed of all loadings.")] = 1,
+    overrides: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="ADDRESS=VALUE", help="As for run; may be given several times."),
+    ] = None,
+    json: JsonFile = None,
+) -> None:
+    """Measure what passes between the end of an exposure and the first light of the mobile tweezers.
+
+    Shots are taken in a dry run up to the first image, and carried on to the start of the moves.
+    """
+    from labseq.cli.bench_latency import bench_latency
+    from labseq.session.bench_latency import LatencyRequest
+
+    bench_latency(LatencyRequest(sequence, profile, tuple(overrides or ()), loadings, seed), json)
+
+
+@bench.command(short_help="Measure how fast tones become samples.")
+def waveform(
+    repeats: Annotated[
+        int, typer.Option(metavar="N", min=1, help="How often everything is rendered; the best one counts.")
+    ] = 5,
+    json: JsonFile = None,
+) -> None:
+    """Measure rendering: by kind of segment, for a plan, and beside the stored-waveform way and numpy."""
+    from labseq.cli.bench_waveform import bench_rendering
+
+    bench_rendering(repeats, json)

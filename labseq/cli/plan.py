@@ -55,11 +55,11 @@ def plan_once(request: PlanRequest, output: PlanOutput) -> None:
         check_picture(output.png, source.occupancy.shape)
     if source.occupancy.size <= INTERPRETED_SITES:
         interpret()
-    moves = plan_moves(request, source, announce=_tell_compiling)
+    moves = plan_moves(request, source, announce=tell_compiling)
     if output.png is not None:
         _draw(moves, output.png)
     if output.json not in (None, STDOUT):
-        _write(Path(output.json), as_line(moves.as_dict()))
+        write_json(Path(output.json), as_line(moves.as_dict()))
     if output.step or answer is None:
         from labseq.cli.plan_report import print_plan
 
@@ -89,7 +89,8 @@ def warnings(moves: PlannedMoves, request: PlanRequest) -> list[str]:
     return texts
 
 
-def _tell_compiling(module: str) -> None:
+def tell_compiling(module: str) -> None:
+    """Say on stderr why it takes longer this time."""
     say(f"compiling {module}; later plans find it in the cache", stream=sys.stderr)
 
 
@@ -103,7 +104,12 @@ def _draw(moves: PlannedMoves, path: Path) -> None:
     save_plan(path, drawing)
 
 
-def _write(path: Path, line: str) -> None:
+def write_json(path: Path, line: str) -> None:
+    """Write a line of JSON to a file.
+
+    Raises:
+        ConfigError: It cannot be written.
+    """
     try:
         path.write_text(f"{line}\n", encoding="utf-8")
     except (OSError, ValueError) as error:

@@ -8,6 +8,7 @@ from labseq.drawing.panels import MAX_PANELS, Panel, make_panels
 from labseq.drawing.picture import PlanDrawing, check_picture, save_plan
 from labseq.drawing.scaling import ComparisonDrawing, Curve, Histogram, save_comparison
 from labseq.drawing.targets import draw_target, save_target, target_text
+from labseq.drawing.waveform import WaveformDrawing, save_waveform
 
 __all__ = [
     "MAX_PANELS",
@@ -17,6 +18,7 @@ __all__ = [
     "Histogram",
     "Panel",
     "PlanDrawing",
+    "WaveformDrawing",
     "check_picture",
     "draw_target",
     "line_words",
@@ -26,6 +28,7 @@ __all__ = [
     "save_comparison",
     "save_plan",
     "save_target",
+    "save_waveform",
     "target_text",
     "tell_batches",
 ]

@@ -99,7 +99,7 @@ def read_inputs(request: PlanRequest, source: Source) -> PlanInputs:
         PluginLoadError: A plugin that is named failed to load.
     """
     for_planner, for_profile = split_overrides(request.overrides)
-    machine, folders = _machine(request, for_profile, source)
+    machine, folders = read_machine(request, for_profile, source)
     document, choice, more_folders = _target_choice(request, source)
     host = load_plugins([*folders, *more_folders])
     target = source.target if choice is None else _make_target(host, document, choice, machine.grid)
@@ -107,10 +107,19 @@ def read_inputs(request: PlanRequest, source: Source) -> PlanInputs:
     return PlanInputs(machine, target, _planner(host, request, for_planner))
 
 
-def _machine(
+def read_machine(
     request: PlanRequest, overrides: Sequence[Override], source: Source
 ) -> tuple[Machine, list[Path]]:
-    """Grid and motion, and the profile's plugin folders."""
+    """Read grid and motion, and the profile's plugin folders.
+
+    Args:
+        request: Names the profile, if there is one.
+        overrides: Values that replace those of the profile.
+        source: The occupancy; without a profile it brings its machine.
+
+    Raises:
+        ConfigError: Something is wrong with the profile, or its grid is of another shape.
+    """
     shape = source.occupancy.shape
     if request.profile is None:
         if overrides:

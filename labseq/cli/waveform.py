@@ -1,0 +1,186 @@
+"""``labseq waveform``: what the AWG would play, in numbers, as a picture and as samples."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from labseq.cli.check import size_text
+from labseq.cli.output import columns, divert_stdout, say
+from labseq.cli.plan import STDOUT, tell_compiling, warnings, write_json
+from labseq.cli.plan_report import what
+from labseq.cli.show import as_line
+from labseq.cli.words import percent, plural
+from labseq.model import RfSpec
+from labseq.session.waveform import PlannedWaveform, WaveformRequest, plan_waveform
+from labseq.session.waveform_statistics import AxisStatistics
+from labseq.units import format_quantity
+
+Both = tuple[AxisStatistics, AxisStatistics]
+
+
+@dataclass(frozen=True, slots=True)
+class WaveformOutput:
+    """What is written besides the report.
+
+    Attributes:
+        json: Name of the file for the numbers as JSON; "-" for stdout, which then holds nothing else.
+        png: The file for the picture.
+        npz: The file for the samples.
+    """
+
+    json: str | None = None
+    png: Path | None = None
+    npz: Path | None = None
+
+
+def show_waveform(request: WaveformRequest, output: WaveformOutput) -> None:
+    """Render the waveform of a plan, print what it is, and write it on request.
+
+    Args:
+        request: Which waveform.
+        output: What is written.
+
+    Raises:
+        ConfigError: Something in the request is wrong, there is nothing to play, or a file
+            cannot be written.
+        PluginLoadError: A plugin that is named failed to load.
+        PlanError: The planner failed, or its plan breaks a rule.
+        LimitError: The tones break a limit of AOD or amplifier.
+    """
+    answer = divert_stdout() if output.json == STDOUT else None
+    _check_files(output)
+    waveform = plan_waveform(request, announce=tell_compiling)
+    both = waveform.statistics()
+    if output.npz is not None:
+        from labseq.session.waveform_file import save_samples
+
+        save_samples(output.npz, waveform)
+    if output.png is not None:
+        _draw(waveform, both, output.png)
+    values = waveform.as_dict() | {axis.name: axis.as_dict() for axis in both}
+    if output.json not in (None, STDOUT):
+        write_json(Path(output.json), as_line(values))
+    say(*report(waveform, both))
+    texts = (*warnings(waveform.moves, request.plan), *waveform.warnings)
+    say(*(f"warning: {text}" for text in texts), stream=sys.stderr)
+    if answer is not None:
+        answer(as_line(values))
+
+
+def _check_files(output: WaveformOutput) -> None:
+    if output.png is not None:
+        from labseq.drawing import check_picture
+
+        check_picture(output.png, (1, 1))
+    if output.npz is not None:
+        from labseq.session.waveform_file import check_samples_file
+
+        check_samples_file(output.npz)
+
+
+def _draw(waveform: PlannedWaveform, both: Both, path: Path) -> None:
+    from labseq.drawing import WaveformDrawing, save_waveform
+
+    drawing = WaveformDrawing(
+        title(waveform),
+        waveform.moves.source,
+        (note(both[0]), note(both[1])),
+        waveform.program,
+        waveform.renderer,
+        waveform.segments,
+        waveform.moves.motion.rf,
+    )
+    save_waveform(path, drawing)
+
+
+def report(waveform: PlannedWaveform, both: Both) -> list[str]:
+    """The waveform in numbers, in lines."""
+    duration, on = (format_quantity(s, "time") for s in (waveform.duration_s, waveform.tones_on_s))
+    n, rate = len(waveform.samples), _rate(waveform)
+    rows = [
+        *what(waveform.moves),
+        ("batches", _batches(waveform)),
+        ("duration", f"{duration}, {on} of it with tones on"),
+        ("samples", f"{n} per channel at {rate}, {size_text(waveform.n_bytes)}"),
+    ]
+    return [*columns(rows), "", *columns(_table(both, waveform.moves.motion.rf))]
+
+
+def title(waveform: PlannedWaveform) -> str:
+    """The waveform in a line."""
+    duration, on = (format_quantity(s, "time") for s in (waveform.duration_s, waveform.tones_on_s))
+    n = len(waveform.batches)
+    which = plural(n, "batch") if n == 1 else f"{n} batches"
+    if n < waveform.moves.plan.n_batches:
+        which = f"batch {_batches(waveform)}" if n == 1 else f"batches {_batches(waveform)}"
+    dop = waveform.moves.degree_of_parallelism
+    planner = f"{waveform.moves.planner}, degree of parallelism {dop}"
+    return f"{planner}: {which}, {duration}, {on} of it with tones on, at {_rate(waveform)}"
+
+
+def note(axis: AxisStatistics) -> str:
+    """An axis in a line."""
+    parts = [
+        f"{axis.name} axis: at most {plural(axis.max_tones, 'tone')}",
+        _span(axis.lowest_hz, axis.highest_hz),
+        f"peak {format_quantity(axis.peak_v, 'voltage')}",
+        f"crest factor {_crest(axis).partition(',')[0]}",
+        f"mean power {format_quantity(axis.aod_mean_power_w, 'power')} at the AOD",
+    ]
+    return ", ".join(parts)
+
+
+def _table(both: Both, rf: RfSpec) -> list[tuple[str, str, str]]:
+    """What both axes play, side by side."""
+    row, column = (_axis_rows(axis, rf) for axis in both)
+    return [(label, left, right) for (label, left), (_, right) in zip(row, column, strict=True)]
+
+
+def _axis_rows(axis: AxisStatistics, rf: RfSpec) -> list[tuple[str, str]]:
+    volts, watts = format_quantity(rf.max_peak_v, "voltage"), format_quantity(rf.max_mean_power_w, "power")
+    paths = [f"{name} {percent(share)}" for name, share in axis.path_share.items() if share]
+    return [
+        ("", f"{axis.name} axis"),
+        ("tones at once", f"at most {axis.max_tones}"),
+        ("frequencies", _span(axis.lowest_hz, axis.highest_hz)),
+        ("band of the AOD", _span(*axis.band_hz)),
+        ("moved onto a comb", f"by at most {1e9 * axis.snapped_m:.3g} nm" if axis.snapped_m else "-"),
+        ("sum of amplitudes", f"at most {axis.amplitude_sum:.3g} of full scale"),
+        (
+            f"peak voltage (limit {volts})",
+            f"{format_quantity(axis.peak_v, 'voltage')}, in batch {axis.peak_batch + 1}",
+        ),
+        ("  behind the amplifier", format_quantity(axis.aod_peak_v, "voltage")),
+        ("crest factor", _crest(axis)),
+        ("mean power into 50 Ohm", _power(axis.mean_power_w, axis.highest_power_w)),
+        (f"  at the AOD (limit {watts})", _power(axis.aod_mean_power_w, axis.aod_highest_power_w)),
+        ("rendered", ", ".join(paths)),
+    ]
+
+
+def _power(mean_w: float, highest_w: float) -> str:
+    return f"{format_quantity(mean_w, 'power')}, at most {format_quantity(highest_w, 'power')}"
+
+
+def _span(low_hz: float, high_hz: float) -> str:
+    low, high = f"{low_hz / 1e6:.6g}", f"{high_hz / 1e6:.6g}"
+    return f"{low} MHz" if low == high else f"{low} to {high} MHz"
+
+
+def _crest(axis: AxisStatistics) -> str:
+    if axis.crest_factor is None:
+        return "-"
+    return f"{axis.crest_factor:.2f}, in batch {axis.crest_batch + 1}"
+
+
+def _batches(waveform: PlannedWaveform) -> str:
+    first, last, n = waveform.batches.start + 1, waveform.batches.stop, waveform.moves.plan.n_batches
+    if last - first + 1 == n:
+        return str(n)
+    return f"{first} of {n}" if first == last else f"{first} to {last} of {n}"
+
+
+def _rate(waveform: PlannedWaveform) -> str:
+    return format_quantity(waveform.renderer.sample_rate_hz, "frequency", digits=9)

@@ -1,0 +1,186 @@
+"""A plan out of the JSON that ``labseq plan --json`` writes."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, Final, Literal, NoReturn, Self, TypeAlias, cast
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ConfigDict, Field, model_validator
+
+from labseq.config.fields import Text, misfit
+from labseq.config.profile import Sites
+from labseq.config.reading import decode
+from labseq.config.settings import Settings
+from labseq.config.values import validate_values
+from labseq.errors import ConfigError, Problem
+from labseq.model import Batch, Occupancy, Plan, SiteGrid, TargetPattern
+
+MAX_BYTES: Final = 4 << 20
+"""Largest plan, in bytes: one for 500 x 500 sites."""
+
+_EXPECTED: Final = "what 'labseq plan --json' writes"
+
+Bit: TypeAlias = Annotated[int, Field(ge=0, le=1)]
+Rows: TypeAlias = tuple[tuple[Bit, ...], ...]
+Index: TypeAlias = Annotated[int, Field(ge=-1000, le=2000)]
+"""Of a row or column; an ejection ends off the grid."""
+
+
+class GridFile(Settings):
+    """The sites that a plan is for."""
+
+    n_rows: Sites = Field(description="number of rows")
+    n_cols: Sites = Field(description="number of columns")
+    spacing_m: float = Field(gt=0, description="distance between neighbouring sites, in metres")
+    lattice: Literal["triangular", "square"] = Field(description="kind of lattice")
+    shear: Literal[1, -1] = Field(
+        description="1 if rows shift to the right on the way down, -1 if to the left"
+    )
+
+    def model(self) -> SiteGrid:
+        """The grid, with the tones of the paper's spacing."""
+        return SiteGrid(self.n_rows, self.n_cols, self.spacing_m, self.lattice, self.shear)
+
+
+class TargetFile(Settings):
+    """What the array shall look like."""
+
+    fill: Rows = Field(description="sites that must hold an atom")
+    clear: Rows = Field(description="sites that must be empty")
+
+
+class BatchFile(Settings):
+    """A batch of a plan."""
+
+    from_sites: tuple[tuple[Index, Index], ...] = Field(
+        alias="from", description="[row, column] of each atom"
+    )
+    to_sites: tuple[tuple[Index, Index], ...] = Field(alias="to", description="[row, column] of each goal")
+    linked: bool = Field(default=False, description="whether the tweezers stay on from the batch before")
+
+    @model_validator(mode="after")
+    def _has_a_goal_for_each_atom(self) -> Self:
+        if len(self.from_sites) != len(self.to_sites):
+            what = f"'from' has {len(self.from_sites)} sites, 'to' has {len(self.to_sites)}"
+            raise misfit(what, "as many of both")
+        return self
+
+    def model(self) -> Batch:
+        """The batch."""
+        from_sites, to_sites = (
+            np.array(sites, np.int16).reshape(-1, 2) for sites in (self.from_sites, self.to_sites)
+        )
+        return Batch(from_sites, to_sites, self.linked)
+
+
+class _Header(Settings):
+    """A plan's file but for its batches; what follows from the rest is not read."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    planner: Text = Field(description="what planned")
+    grid: GridFile = Field(description="the sites that it is for")
+    degree_of_parallelism: int = Field(ge=1, description="most mobile tweezers on at once")
+    seed: int | None = Field(
+        default=None, ge=0, description="seed of all random numbers; null if there were none"
+    )
+    occupancy: Rows = Field(description="before the plan, rows of 0 and 1")
+    target: TargetFile = Field(description="what the array shall look like")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlanFile:
+    """A plan and what it was made for, as a file says; not checked yet.
+
+    Attributes:
+        planner: What planned.
+        degree_of_parallelism: Most tweezers on at once that the planner was allowed.
+        seed: Seed of all random numbers; None if there were none.
+        grid: The grid of sites, with the tones that a grid of its size has by default.
+        occupancy: bool (n_rows, n_cols), before the plan.
+        target: What the array shall look like.
+        plan: The batches.
+    """
+
+    planner: str
+    degree_of_parallelism: int
+    seed: int | None
+    grid: SiteGrid
+    occupancy: Occupancy
+    target: TargetPattern
+    plan: Plan
+
+
+def parse_plan(data: bytes, name: str) -> PlanFile:
+    """Read the JSON of a plan.
+
+    Args:
+        data: UTF-8.
+        name: What messages call it.
+
+    Raises:
+        ConfigError: It is no JSON, no plan, or a value in it is wrong; says what was expected.
+    """
+    if len(data) > MAX_BYTES:
+        raise ConfigError(Problem(f"it is larger than {MAX_BYTES >> 20} MiB", name, expected=_EXPECTED))
+    document = _parse_json(decode(data, name), name)
+    if not isinstance(document, dict) or "batches" not in document:
+        raise ConfigError(Problem("this is no plan", name, expected=_EXPECTED))
+    values = cast("Mapping[str, Any]", document)
+    header = validate_values(_Header, values, name)
+    batches = values["batches"]
+    if not isinstance(batches, list):
+        raise ConfigError(Problem("'batches' is no list", name, expected=_EXPECTED))
+    grid = header.grid.model()
+    return PlanFile(
+        planner=header.planner,
+        degree_of_parallelism=header.degree_of_parallelism,
+        seed=header.seed,
+        grid=grid,
+        occupancy=_bits(header.occupancy, "occupancy", grid.shape, name),
+        target=_target(header.target, grid.shape, name),
+        plan=Plan.from_batches(_batches(cast("list[object]", batches), name)),
+    )
+
+
+def _batches(batches: list[object], name: str) -> list[Batch]:
+    made: list[Batch] = []
+    for i, batch in enumerate(batches):
+        where = f"{name}, batch {i}"
+        if not isinstance(batch, dict):
+            raise ConfigError(Problem("this is no batch", where, expected='{"from": [...], "to": [...]}'))
+        made.append(validate_values(BatchFile, cast("Mapping[str, Any]", batch), where).model())
+    return made
+
+
+def _parse_json(text: str, name: str) -> object:
+    try:
+        return json.loads(text, parse_constant=_refuse_constant)
+    except json.JSONDecodeError as error:
+        what = f"this is no JSON: {error.msg[:1].lower()}{error.msg[1:]}"
+        raise ConfigError(Problem(what, name, error.lineno, error.colno, _EXPECTED)) from error
+    except (ValueError, RecursionError) as error:  # NaN, numbers of thousands of digits, deep nesting
+        raise ConfigError(Problem(f"this is no plan: {error}", name, expected=_EXPECTED)) from error
+
+
+def _refuse_constant(constant: str) -> NoReturn:
+    raise ValueError(f"{constant} stands in it")
+
+
+def _target(target: TargetFile, shape: tuple[int, int], name: str) -> TargetPattern:
+    fill, clear = _bits(target.fill, "fill", shape, name), _bits(target.clear, "clear", shape, name)
+    try:
+        return TargetPattern(fill, clear)
+    except ValueError as error:
+        raise ConfigError(Problem(str(error), name)) from error
+
+
+def _bits(rows: Rows, key: str, shape: tuple[int, int], name: str) -> NDArray[np.bool_]:
+    if len(rows) != shape[0] or any(len(row) != shape[1] for row in rows):
+        expected = f"{shape[0]} rows of {shape[1]} sites, as in 'grid'"
+        raise ConfigError(Problem(f"'{key}' is not of the grid's shape", name, expected=expected))
+    return np.array(rows, np.bool_)

@@ -1,0 +1,100 @@
+"""What passes between a frame in memory and the first samples, part by part, called directly.
+
+``labseq bench latency`` measures the same as a run calls it. The goals: 2 ms from the frame to
+the first chunk, and 5 ms from the plan to the first block of the DDS.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from labseq_psca.planner import PscaPlanner, PscaSettings
+from labseq_spcm.dds_program import choose_cores, compile_commands
+from labseq_spcm.settings import SpcmSettings
+from labseq_virtual.settings import WorldSettings
+from labseq_virtual.world import World
+
+from labseq import Context, DepthRamp, Frame, MotionSpec, RandomStream, SiteGrid, TargetPattern
+from labseq.config.detectors import ThresholdSettings
+from labseq.imaging import ThresholdDetector
+from labseq.model import ToneProgram
+from labseq.motion import Renderer, check_plan, comb_sample_rate, render_chunks, tone_program
+from labseq.session.bench_latency import CHUNK
+
+GRID = SiteGrid()
+RATE_HZ = comb_sample_rate(GRID)
+DDS_LIMITS = MotionSpec(max_row_tones=16, max_column_tones=5)
+
+
+class Case:
+    """A frame, and all that turns it into samples."""
+
+    def __init__(self, dop: int, motion: MotionSpec) -> None:
+        self.dop, self.motion = dop, motion
+        fill = np.zeros(GRID.shape, np.bool_)
+        fill[2:17, 2:17] = True
+        self.target = TargetPattern(fill, np.zeros_like(fill))
+        context = Context(grid=GRID, motion=motion)
+        self.planner = PscaPlanner(PscaSettings(degree_of_parallelism=dop), context)
+        self.detector = ThresholdDetector(ThresholdSettings(), Context("detector", GRID))
+        self.frame = take_frame()
+        self.out = np.empty((2, CHUNK), np.int16)
+
+    def program(self) -> ToneProgram:
+        occupancy, _ = self.detector.detect(self.frame)
+        plan = self.planner.plan(occupancy, self.target)
+        check_plan(plan, occupancy, self.target, self.dop, GRID, self.motion)
+        return tone_program(plan, GRID, self.motion)
+
+    def first_chunk(self) -> Renderer:
+        renderer = Renderer(self.program(), RATE_HZ)
+        for channel, samples in enumerate(self.out):
+            renderer.write(channel, 0, samples)
+        return renderer
+
+
+def take_frame() -> Frame:
+    random = RandomStream(0)
+    world = World(WorldSettings(), Context("simulation", GRID, random=random))
+    world.open()
+    world.play("static_tweezers", DepthRamp(0.0, 1.0), 0.0)
+    random.begin_shot(0, 0)
+    world.begin_shot()
+    world.load(0.0, 0.5)
+    return world.expose(1.0, 45e-3)
+
+
+@pytest.mark.parametrize("dop", [7, 15])
+def test_from_a_frame_to_the_first_chunk(benchmark: Any, dop: int) -> None:
+    case = Case(dop, MotionSpec(overhead_per_batch_s=0.0))  # else the first chunk would be silent
+    case.first_chunk()
+    renderer = benchmark(case.first_chunk)
+    assert case.out.any()
+    assert renderer.n_samples > CHUNK
+
+
+@pytest.mark.parametrize("rate_hz", [RATE_HZ, 625e6])
+def test_a_look_at_a_program(benchmark: Any, rate_hz: float) -> None:
+    program = Case(7, MotionSpec()).program()
+    assert benchmark(Renderer, program, rate_hz).n_samples > CHUNK
+
+
+@pytest.mark.parametrize("dop", [7, 15])
+def test_a_whole_program(benchmark: Any, dop: int) -> None:
+    program = Case(dop, MotionSpec()).program()
+    benchmark.extra_info["playing_s"] = program.total_duration_s
+
+    def render_it() -> int:
+        return sum(chunk.shape[1] for chunk in render_chunks(program, RATE_HZ, CHUNK))
+
+    assert benchmark(render_it) >= program.total_duration_s * RATE_HZ
+
+
+def test_commands_for_the_dds(benchmark: Any) -> None:
+    program = Case(7, DDS_LIMITS).program()
+    cores = choose_cores("dds", SpcmSettings(mode="dds"), DDS_LIMITS)
+    commands = benchmark(compile_commands, "dds", program, cores)
+    benchmark.extra_info["commands"] = len(commands.entries)
+    assert len(commands.ends) >= program.n_segments

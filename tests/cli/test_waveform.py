@@ -1,0 +1,177 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numba
+import numpy as np
+import pytest
+
+from labseq.cli import main
+from labseq.cli.waveform import WaveformOutput, note, report, show_waveform, title
+from labseq.session import PlanRequest
+from labseq.session.waveform import PlannedWaveform, WaveformRequest, plan_waveform
+
+assert numba  # loaded already, so that a command does not turn compiling off for the tests after it
+
+REQUEST = WaveformRequest(PlanRequest("random:6x6@0.7", "checkerboard:4x4", seed=3), None, "250 MHz")
+WORDS = ["random:6x6@0.7", "--seed", "3", "--target", "checkerboard:4x4", "--sample-rate", "250 MHz"]
+
+
+@pytest.fixture(scope="module")
+def made() -> PlannedWaveform:
+    return plan_waveform(REQUEST)
+
+
+def code_of(*arguments: str) -> Any:
+    with pytest.raises(SystemExit) as leaving:
+        main(arguments)
+    return leaving.value.code
+
+
+def test_the_report_tells_what_is_played(made: PlannedWaveform) -> None:
+    lines = report(made, made.statistics())
+    n = made.moves.plan.n_batches
+    assert lines[0] == "occupancy  random:6x6@0.7, seed 3: 27 atoms on 6 x 6 sites, triangular, 4.49 um"
+    assert f"batches    {n}" in lines
+    assert any(line.startswith("samples    ") and " per channel at 250 MHz, " in line for line in lines)
+    labels = [line.partition("  ")[0] for line in lines[lines.index("") + 2 :]]
+    assert labels == [
+        "tones at once",
+        "frequencies",
+        "band of the AOD",
+        "moved onto a comb",
+        "sum of amplitudes",
+        "peak voltage (limit 2 V)",
+        "",
+        "crest factor",
+        "mean power into 50 Ohm",
+        "",
+        "rendered",
+    ]
+    assert lines[-1].count("comb 100.0 %") == 2
+
+
+@pytest.mark.parametrize(
+    ("batches", "words", "told"),
+    [
+        ("1", "batch 1 of 5, ", "batches    1 of 5"),
+        ("2-3", "batches 2 to 3 of 5, ", "batches    2 to 3 of 5"),
+    ],
+)
+def test_some_batches_are_named_in_report_and_title(batches: str, words: str, told: str) -> None:
+    made = plan_waveform(WaveformRequest(REQUEST.plan, batches, REQUEST.sample_rate))
+    n = made.moves.plan.n_batches
+    assert title(made).startswith(f"psca, degree of parallelism 7: {words.replace('of 5', f'of {n}')}")
+    assert told.replace("of 5", f"of {n}") in report(made, made.statistics())
+
+
+def test_an_axis_in_a_line(made: PlannedWaveform) -> None:
+    row, _ = made.statistics()
+    assert note(row).startswith(f"row axis: at most {row.max_tones} tone")
+    assert " MHz, peak " in note(row)
+    assert note(row).endswith(" at the AOD")
+
+
+def test_samples_that_are_all_zero_have_no_crest_factor(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    faint = [f"profile.mobile_tweezers.rf.row_amplitudes={[1e-9] * 20}"]
+    plan = PlanRequest("random:20x20@0.75", "compact:3x3", seed=1, profile="virtual", overrides=faint)
+    request = WaveformRequest(plan, "1", "250 MHz")
+    made = plan_waveform(request)
+    row, column = made.statistics()
+    assert (row.crest_factor, row.peak_v, row.mean_power_w) == (None, 0.0, 0.0)
+    assert column.crest_factor is not None
+    assert "crest factor -," in note(row)
+    show_waveform(request, WaveformOutput(str(tmp_path / "a.json"), tmp_path / "a.png"))
+    assert json.loads((tmp_path / "a.json").read_text("utf-8"))["row"]["crest_factor"] is None
+
+
+def test_everything_can_be_written_at_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("matplotlib")
+    output = WaveformOutput(str(tmp_path / "a.json"), tmp_path / "a.png", tmp_path / "a.npz")
+    show_waveform(REQUEST, output)
+    out, err = capsys.readouterr()
+    assert "crest factor" in out
+    assert err == ""
+    document = json.loads((tmp_path / "a.json").read_text("utf-8"))
+    assert list(document)[-2:] == ["row", "column"]
+    assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
+    with np.load(tmp_path / "a.npz") as file:
+        assert file["samples"].shape == (2, document["n_samples"])
+        largest = np.abs(file["samples"]).max(axis=1) * file["volts_per_sample"]
+    assert largest.tolist() == pytest.approx([document["row"]["peak_v"], document["column"]["peak_v"]])
+
+
+def test_what_falls_short_is_told_as_plan_tells_it(capsys: pytest.CaptureFixture[str]) -> None:
+    few = PlanRequest("random:6x6@0.2", "compact:4x4", seed=3)
+    show_waveform(WaveformRequest(few, None, "250 MHz"), WaveformOutput())
+    assert "warning: 7 atoms for 16 target sites, 9 too few; the plan fills 7" in capsys.readouterr().err
+
+
+def test_the_command_passes_every_option_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    got: list[Any] = []
+    monkeypatch.setattr("labseq.cli.waveform.show_waveform", lambda *arguments: got.extend(arguments))
+    planned = ["--target", "a:3x3", "--origin", "-1,2", "--planner", "p", "--dop", "4", "--set", "a=1"]
+    rest = ["--seed", "5", "-p", "lab", "--batches", "1-3", "--sample-rate", "5 MHz"]
+    files = ["--json", "-", "--png", "x.png", "--npz", "x.npz"]
+    assert code_of("waveform", "-", *planned, *rest, *files) == 0
+    request = PlanRequest("-", "a:3x3", "p", 4, ("a=1",), 5, "-1,2", "lab")
+    output = WaveformOutput(json="-", png=Path("x.png"), npz=Path("x.npz"))
+    assert got == [WaveformRequest(request, "1-3", "5 MHz"), output]
+
+
+BAD = [
+    (["gone.json"], "gone.json: there is no such file; did you mean 'one.json'?"),
+    (["one.json"], "one.json: this is no plan; expected what 'labseq plan --json' writes"),
+    (["half.json"], "half.json:1:13: this is no JSON: expecting value"),
+    (["folder.json"], "folder.json: this is a folder; expected a plan"),
+    (["gone.npy", "--target", "compact:3x3"], "gone.npy: there is no such file"),
+    (["random:6x6@0.7"], "--target is missing"),
+    (
+        [*WORDS, "--batches", "9-99"],
+        "--batches 9-99: there are no such batches; expected a number from 1 to ",
+    ),
+    ([*WORDS, "--batches", "3-2"], "--batches 3-2: there are no such batches"),
+    ([*WORDS, "--batches", "first"], "--batches first: these are no batches"),
+    ([*WORDS, "--sample-rate", "5 s"], "--sample-rate 5 s: '5 s' is a time, not a frequency"),
+    ([*WORDS, "--png", "a.jpg"], "a.jpg: this is no name of a PNG file"),
+    ([*WORDS, "--png", "gone/a.png"], "gone: there is no such folder; expected one that exists"),
+    ([*WORDS, "--npz", "a.npy"], "a.npy: this is no name of an NPZ file"),
+    ([*WORDS, "--npz", "gone/a.npz"], "gone: there is no such folder; expected one that exists"),
+    ([*WORDS, "--json", "gone/a.json"], "gone/a.json: the JSON cannot be written"),
+    ([*WORDS, "--profile", "virtul"], "did you mean 'virtual'?"),
+    ([*WORDS, "--planner", "pcsa"], "unknown planner 'pcsa'"),
+    (["random:3x3@1", "--seed", "1", "--target", "compact:3x3"], "there is nothing to play"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "words"), BAD)
+def test_every_mistake_is_told_in_words(
+    tmp_path: Path,
+    arguments: list[str],
+    words: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "one.json").write_text("{}", "utf-8")
+    (tmp_path / "half.json").write_text('{"batches": ', "utf-8")
+    (tmp_path / "folder.json").mkdir()
+    before = sorted(path.name for path in tmp_path.iterdir())
+    assert code_of("waveform", *arguments) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert words in err
+    assert "Traceback" not in err
+    assert "internal error" not in err
+    assert sorted(path.name for path in tmp_path.iterdir()) == before
+
+
+def test_a_picture_without_matplotlib_is_refused_before_anything_is_done(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    monkeypatch.setattr("labseq.drawing.picture.find_spec", lambda _: None)
+    assert code_of("waveform", *WORDS, "--png", str(tmp_path / "a.png")) == 2
+    assert "needs matplotlib, which is not installed; pip install 'labseq[plot]'" in capsys.readouterr().err

@@ -1,0 +1,111 @@
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, strategies as st
+
+from labseq.config.plan_file import MAX_BYTES, parse_plan
+from labseq.errors import ConfigError
+
+
+def document() -> dict[str, Any]:
+    """A plan for 2 x 3 sites: one atom goes right, then another is ejected."""
+    return {
+        "planner": "mine",
+        "grid": {"n_rows": 2, "n_cols": 3, "spacing_m": 4.49e-6, "lattice": "square", "shear": 1},
+        "degree_of_parallelism": 4,
+        "seed": None,
+        "occupancy": [[1, 0, 0], [0, 0, 1]],
+        "target": {"fill": [[0, 1, 0], [0, 0, 0]], "clear": [[0, 0, 0], [0, 0, 1]]},
+        "n_batches": 2,
+        "batches": [
+            {"from": [[0, 0]], "to": [[0, 1]], "linked": False},
+            {"from": [[1, 2]], "to": [[1, 3]], "linked": False},
+        ],
+    }
+
+
+def parse(change: Callable[[dict[str, Any]], object]) -> None:
+    values = document()
+    change(values)
+    parse_plan(json.dumps(values).encode(), "plan.json")
+
+
+def test_a_plan_is_read_as_it_stands() -> None:
+    file = parse_plan(json.dumps(document()).encode(), "plan.json")
+    assert (file.planner, file.degree_of_parallelism, file.seed) == ("mine", 4, None)
+    assert (file.grid.shape, file.grid.lattice, file.grid.spacing_m) == ((2, 3), "square", 4.49e-6)
+    assert file.occupancy.tolist() == [[True, False, False], [False, False, True]]
+    assert np.argwhere(file.target.fill).tolist() == [[0, 1]]
+    assert np.argwhere(file.target.clear).tolist() == [[1, 2]]
+    assert file.plan.moves.tolist() == [[0, 0, 0, 1], [1, 2, 1, 3]]
+    assert file.plan.batch_offsets.tolist() == [0, 1, 2]
+
+
+BAD: list[tuple[Callable[[dict[str, Any]], object], str]] = [
+    (lambda v: v.pop("batches"), "plan.json: this is no plan; expected what 'labseq plan --json' writes"),
+    (lambda v: v.pop("grid"), "plan.json: 'grid' is missing (the sites that it is for)"),
+    (lambda v: v.update(batches=7), "plan.json: 'batches' is no list"),
+    (lambda v: v["batches"].append(7), "plan.json, batch 2: this is no batch"),
+    (lambda v: v["batches"][1].pop("to"), "plan.json, batch 1: 'to' is missing"),
+    (lambda v: v["batches"][1]["to"].append([0, 0]), "batch 1: 'from' has 1 sites, 'to' has 2"),
+    (lambda v: v["batches"][0]["to"][0].pop(), "plan.json, batch 0: to.0 has 1 entry; expected at least 2"),
+    (lambda v: v["batches"][0].update(to=[[0, 1.5]]), "batch 0: to.0.1 is 1.5; expected a whole number"),
+    (lambda v: v["batches"][0].update(to=[[0, 99999]]), "batch 0: to.0.1 is 99999; expected at most 2000"),
+    (lambda v: v["batches"][0].update(form=[]), "'form' is not a setting of it"),
+    (lambda v: v["grid"].update(n_rows=3), "'occupancy' is not of the grid's shape; expected 3 rows of 3"),
+    (lambda v: v["target"].update(fill=[[0, 1], [0]]), "'fill' is not of the grid's shape; expected 2 rows"),
+    (lambda v: v["target"].update(clear=v["target"]["fill"]), "a site cannot be in both fill and clear"),
+    (lambda v: v["occupancy"][0].__setitem__(0, 2), "occupancy.0.0 is 2; expected at most 1"),
+    (lambda v: v["occupancy"][0].__setitem__(0, True), "occupancy.0.0 is true; expected a whole number"),
+    (lambda v: v["grid"].update(lattice="cubic"), "lattice is 'cubic'; expected 'triangular' or 'square'"),
+    (lambda v: v["grid"].update(spacing_m=0), "spacing_m is 0; expected more than 0"),
+    (lambda v: v["grid"].update(spacing_m=float("nan")), "plan.json: this is no plan: NaN stands in it"),
+    (lambda v: v["grid"].update(spacing_m=float("-inf")), "this is no plan: -Infinity stands in it"),
+    (lambda v: v.update(degree_of_parallelism=0), "degree_of_parallelism is 0; expected at least 1"),
+]
+
+
+@pytest.mark.parametrize(("change", "words"), BAD, ids=[words for _, words in BAD])
+def test_what_is_wrong_in_a_plan_is_told_with_its_batch(
+    change: Callable[[dict[str, Any]], object], words: str
+) -> None:
+    with pytest.raises(ConfigError) as caught:
+        parse(change)
+    assert words in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        (b"", "plan.json:1:1: this is no JSON: expecting value"),
+        (b'{\n"batches": [1,\n', "plan.json:3:1: this is no JSON: expecting value"),
+        (b"[]", "this is no plan"),
+        (b"\xff", "byte 0xFF at offset 0 is not UTF-8"),
+        (b"[" * 100_000, "this is no plan"),
+        (b"1" * 10_000, "this is no plan"),
+        (b" " * (MAX_BYTES + 1), "it is larger than 4 MiB"),
+        (json.dumps(document()).replace("4.49e-06", "1e999").encode(), "expected a finite number"),
+    ],
+)
+def test_what_is_no_plan_at_all_is_told(data: bytes, words: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        parse_plan(data, "plan.json")
+    assert words in str(caught.value)
+
+
+SCALARS = st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5)
+VALUES = st.recursive(SCALARS, lambda inner: st.lists(inner, max_size=3), max_leaves=5)
+
+
+@given(st.sampled_from([*document()]), VALUES)
+def test_no_value_makes_it_fail_otherwise(key: str, value: object) -> None:
+    values = document() | {key: value}
+    try:
+        parse_plan(json.dumps(values).encode("utf-8", "backslashreplace"), "plan.json")
+    except ConfigError as error:
+        assert str(error)

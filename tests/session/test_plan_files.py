@@ -1,0 +1,89 @@
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+
+from labseq.errors import ConfigError
+from labseq.session import PlanRequest, plan_moves
+from labseq.session.plan_files import read_plan
+
+
+def planned(**options: Any) -> dict[str, Any]:
+    return plan_moves(PlanRequest("random:8x9@0.7", "compact:4x4", **options)).as_dict()
+
+
+def read(document: dict[str, Any], **options: Any) -> dict[str, Any]:
+    return read_plan(
+        json.dumps(document).encode(), "plan.json", PlanRequest("plan.json", **options)
+    ).as_dict()
+
+
+@settings(max_examples=20)
+@given(
+    st.integers(0, 1000), st.sampled_from(["compact:4x4", "kagome:5x5", "ring:radius=3"]), st.integers(1, 9)
+)
+def test_a_plan_that_was_written_is_the_same_when_it_is_read(seed: int, target: str, dop: int) -> None:
+    request = PlanRequest("random:8x9@0.7", target, degree_of_parallelism=dop, seed=seed)
+    moves = plan_moves(request)
+    document = moves.as_dict()
+    again = read_plan(json.dumps(document).encode(), "plan.json", PlanRequest("plan.json"))
+    assert again.as_dict() == document
+    assert (again.source, again.motion) == ("plan.json", moves.motion)
+    assert np.array_equal(again.report.n_tweezers, moves.report.n_tweezers)
+
+
+def test_a_plan_that_breaks_a_rule_is_refused_with_the_files_name() -> None:
+    document = planned(seed=1)
+    row, col = np.argwhere(np.array(document["occupancy"]) == 0)[0].tolist()
+    document["batches"] = [{"from": [[row, col]], "to": [[row, col - 1 if col else 1]], "linked": False}]
+    words = (
+        rf"^plan\.json: batch 0, atom move 0 breaks the rule 'source': there is no atom on \({row}, {col}\)"
+    )
+    with pytest.raises(ConfigError, match=words):
+        read(document)
+
+
+def test_more_tweezers_than_the_plan_says_are_refused() -> None:
+    document = planned(seed=1, degree_of_parallelism=5) | {"degree_of_parallelism": 1}
+    with pytest.raises(ConfigError, match="breaks the rule 'parallelism'"):
+        read(document)
+
+
+def test_a_profile_brings_motion_and_tones() -> None:
+    document = plan_moves(PlanRequest("random:20x20@0.75", "compact:6x6", seed=1)).as_dict()
+    data = json.dumps(document).encode()
+    slow = PlanRequest("plan.json", profile="virtual", overrides=["profile.mobile_tweezers.speed=65 um/ms"])
+    fast, slower = read_plan(data, "plan.json", PlanRequest("plan.json")), read_plan(data, "plan.json", slow)
+    assert slower.motion.speed_m_s == pytest.approx(0.065)
+    assert slower.report.duration_s > fast.report.duration_s
+
+
+def test_a_plan_for_another_grid_than_the_profiles_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"has 8 x 9 sites; expected 20 x 20, as in .*virtual"):
+        read(planned(seed=1), profile="virtual")
+
+
+@pytest.mark.parametrize(
+    ("options", "option"),
+    [
+        ({"target": "compact:3x3"}, "--target"),
+        ({"planner": "lsap"}, "--planner"),
+        ({"degree_of_parallelism": 3}, "--dop"),
+        ({"seed": 3}, "--seed"),
+        ({"origin": "1,1"}, "--origin"),
+        ({"overrides": ["degree_of_parallelism=3"]}, "--set degree_of_parallelism=3"),
+    ],
+)
+def test_options_that_only_planning_takes_are_refused(options: dict[str, Any], option: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        read(planned(seed=1), **options)
+    assert str(caught.value).startswith(f"{option}: plan.json is a plan already: there is nothing to plan")
+
+
+def test_values_of_a_profile_need_a_profile() -> None:
+    with pytest.raises(ConfigError, match="there is no --profile to change"):
+        read(planned(seed=1), overrides=["profile.mobile_tweezers.speed=65 um/ms"])

@@ -1,0 +1,269 @@
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+
+import labseq
+from labseq.errors import ConfigError, LimitError
+from labseq.model import Plan, SegmentKind
+from labseq.session import PlanRequest, plan_moves
+from labseq.session.waveform import PlannedWaveform, WaveformRequest, plan_waveform
+from labseq.session.waveform_inputs import DEFAULT_RATE_HZ, read_batches, read_sample_rate
+
+RATE = "250 MHz"
+ONE_ATOM = json.dumps(
+    {
+        "planner": "by hand",
+        "grid": {"n_rows": 1, "n_cols": 3, "spacing_m": 4.49e-6, "lattice": "square", "shear": 1},
+        "degree_of_parallelism": 1,
+        "occupancy": [[1, 0, 0]],
+        "target": {"fill": [[0, 0, 1]], "clear": [[0, 0, 0]]},
+        "batches": [{"from": [[0, 0]], "to": [[0, 2]]}],
+    }
+).encode()
+REQUEST = PlanRequest("random:6x6@0.7", "checkerboard:4x4", seed=3)
+
+
+def waveform(
+    request: PlanRequest = REQUEST, batches: str | None = None, rate: str | None = RATE
+) -> PlannedWaveform:
+    return plan_waveform(WaveformRequest(request, batches, rate))
+
+
+@pytest.fixture(scope="module")
+def whole() -> PlannedWaveform:
+    return waveform()
+
+
+@pytest.fixture
+def plan_json(tmp_path: Path) -> Path:
+    path = tmp_path / "plan.JSON"
+    path.write_text(json.dumps(plan_moves(REQUEST).as_dict()), "utf-8")
+    return path
+
+
+def samples_of(made: PlannedWaveform) -> np.ndarray[Any, np.dtype[np.int16]]:
+    part = slice(made.samples.start, made.samples.stop)
+    return labseq.render(made.program, made.renderer.sample_rate_hz).samples[:, part]
+
+
+def test_a_plan_in_a_file_sounds_like_the_one_just_made(whole: PlannedWaveform, plan_json: Path) -> None:
+    read = waveform(PlanRequest(str(plan_json)))
+    assert np.array_equal(samples_of(read), samples_of(whole))
+    assert read.as_dict() | {"source": ""} == whole.as_dict() | {"source": ""}
+
+
+@pytest.mark.parametrize("as_plan", [True, False])
+def test_standard_input_holds_a_plan_or_an_occupancy(whole: PlannedWaveform, as_plan: bool) -> None:
+    rows = whole.moves.occupancy.astype(int).tolist()
+    text = json.dumps(whole.moves.as_dict()) if as_plan else "\n".join(str(row)[1:-1] for row in rows)
+    request = PlanRequest("-") if as_plan else PlanRequest("-", "checkerboard:4x4")
+    made = plan_waveform(WaveformRequest(request, None, RATE), io.BytesIO(text.encode()))
+    assert made.moves.source == "standard input"
+    assert np.array_equal(made.program.column.phase_rad, whole.program.column.phase_rad)
+
+
+@pytest.mark.parametrize("batches", [None, "1", "2-3"])
+def test_the_numbers_are_those_of_the_samples(batches: str | None) -> None:
+    made = waveform(batches=batches)
+    samples, rf = samples_of(made), made.moves.motion.rf
+    starts = made.renderer.first_sample
+    on = np.concatenate(
+        [
+            np.arange(starts[i], starts[i + 1]) - made.samples.start
+            for i in made.segments
+            if made.program.kind[i] != SegmentKind.IDLE
+        ]
+    )
+    for channel, axis in enumerate(made.statistics()):
+        volts = samples[channel, on] * (rf.full_scale_v / 32767)
+        rms_v = float(np.sqrt(np.mean(volts**2)))
+        assert axis.peak_v == pytest.approx(np.abs(volts).max())
+        assert axis.crest_factor == pytest.approx(crest(made, channel))
+        assert axis.mean_power_w == pytest.approx(rms_v**2 / 50)
+        assert axis.aod_mean_power_w == pytest.approx(100 * axis.mean_power_w)  # 20 dB
+        assert axis.aod_peak_v == pytest.approx(10 * axis.peak_v)
+        assert axis.peak_v <= axis.amplitude_sum * rf.full_scale_v * (1 + 1e-4)
+        assert axis.mean_power_w <= axis.highest_power_w * (1 + 1e-4)
+        assert sum(axis.path_share.values()) == pytest.approx(1.0)
+        low_hz, high_hz = axis.band_hz
+        assert low_hz <= axis.lowest_hz <= axis.highest_hz <= high_hz
+        json.dumps(axis.as_dict(), allow_nan=False)
+    assert made.tones_on_s == pytest.approx(len(on) / made.renderer.sample_rate_hz, rel=1e-4)
+    assert made.n_bytes == samples.nbytes
+
+
+def crest(made: PlannedWaveform, channel: int) -> float:
+    starts, whole = made.renderer.first_sample, labseq.render(made.program, 250e6).samples[channel]
+    carried = [i for i in made.segments if made.program.kind[i] == SegmentKind.TRANSPORT]
+    parts = [whole[starts[i] : starts[i + 1]].astype(float) for i in carried]
+    return max(float(np.abs(part).max() / np.sqrt(np.mean(part**2))) for part in parts)
+
+
+def test_n_equal_tones_have_no_higher_crest_than_all_in_phase(whole: PlannedWaveform) -> None:
+    for axis in whole.statistics():
+        assert axis.crest_factor is not None
+        assert np.sqrt(2) * 0.99 < axis.crest_factor < np.sqrt(2 * axis.max_tones) * 1.01
+
+
+def test_one_tone_has_the_numbers_of_a_sine() -> None:
+    made = plan_waveform(WaveformRequest(PlanRequest("-"), None, "617 MHz"), io.BytesIO(ONE_ATOM))
+    row, _ = made.statistics()
+    amplitude_v = 1.6 / 20
+    assert (row.max_tones, row.lowest_hz, row.highest_hz) == (1, 100e6, 100e6)
+    assert row.peak_v == pytest.approx(amplitude_v, rel=1e-3)
+    assert row.crest_factor == pytest.approx(np.sqrt(2), rel=1e-3)
+    assert row.mean_power_w == pytest.approx(amplitude_v**2 / 100, rel=1e-3)
+    assert row.highest_power_w == pytest.approx(amplitude_v**2 / 100)
+    assert row.amplitude_sum == pytest.approx(0.05)
+
+
+def test_the_peak_is_in_the_batch_that_is_named(whole: PlannedWaveform) -> None:
+    for axis in whole.statistics():
+        alone = waveform(batches=str(axis.peak_batch + 1))
+        same = next(other for other in alone.statistics() if other.name == axis.name)
+        assert (same.peak_v, same.peak_batch) == (axis.peak_v, axis.peak_batch)
+
+
+def test_tones_moved_onto_a_comb_are_told(tmp_path: Path) -> None:
+    table = [99.2, 100.804, 102.4, 104.0, 105.6, 107.2]
+    profile = Path("hardware_profiles/virtual.yaml")
+    text = (Path(__file__).parents[2] / profile).read_text("utf-8")
+    text = text.replace("rows: 20 ", "rows: 6 ").replace("cols: 20 ", "cols: 6 ")
+    path = tmp_path / "mine.yaml"
+    path.write_text(text, "utf-8")
+    overrides = [f"profile.grid.row_frequency.table={[hz * 1e6 for hz in table]}"]
+    made = waveform(
+        PlanRequest(REQUEST.occupancy, REQUEST.target, seed=3, profile=str(path), overrides=overrides)
+    )
+    row, column = made.statistics()
+    assert 5e-9 < row.snapped_m < 20e-9
+    assert column.snapped_m == 0.0
+
+
+@settings(max_examples=30)
+@given(st.lists(st.booleans(), min_size=1, max_size=6), st.integers(1, 6), st.integers(1, 6))
+def test_a_range_of_batches_never_cuts_a_chain(linked: list[bool], first: int, last: int) -> None:
+    linked[0] = False
+    sites = [(0, i) for i in range(len(linked) + 1)]
+    batches = [
+        labseq.Batch(np.array([a], np.int16), np.array([b], np.int16), on)
+        for a, b, on in zip(sites, sites[1:], linked, strict=False)
+    ]
+    plan = Plan.from_batches(batches)
+    fine = first <= last <= len(linked) and not linked[first - 1] and not any(linked[last : last + 1])
+    if fine:
+        assert read_batches(f"{first}-{last}", plan) == range(first - 1, last)
+    else:
+        with pytest.raises(ConfigError):
+            read_batches(f"{first}-{last}", plan)
+
+
+def test_the_range_that_cuts_no_chain_is_named() -> None:
+    made = [([(0, i)], [(0, i + 1)]) for i in range(4)]
+    batches = [
+        labseq.Batch(np.array(a, np.int16), np.array(b, np.int16), i in (1, 2))
+        for i, (a, b) in enumerate(made)
+    ]
+    with pytest.raises(ConfigError, match="expected --batches 1-3"):
+        read_batches("2", Plan.from_batches(batches))
+
+
+@pytest.mark.parametrize(
+    ("rate", "words"),
+    [
+        ("200 MHz", "MHz cannot be sampled at 200 MHz; expected more than 211.2 MHz"),
+        ("0", "this is no sample rate; expected more than 0 Hz, at most 10 GHz"),
+        ("-625e6", "this is no sample rate"),
+        ("1e12", "this is no sample rate"),
+        ("1e999", "this is no sample rate"),
+        ("nan", "'nan' is not a frequency"),
+        ("5 parsec", "'parsec' in '5 parsec' is not a unit of frequency"),
+    ],
+)
+def test_a_sample_rate_that_makes_no_sense_is_refused(rate: str, words: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        waveform(rate=rate)
+    assert str(caught.value).startswith(f"--sample-rate {rate}: ")
+    assert words in str(caught.value)
+
+
+def test_without_a_profile_the_sample_rate_is_the_papers() -> None:
+    assert waveform(rate=None).renderer.sample_rate_hz == DEFAULT_RATE_HZ
+    assert waveform(rate="300e6").renderer.sample_rate_hz == 300e6
+
+
+PROFILE = """
+labseq: 1
+name: mine
+grid: {{rows: 6, cols: 6, spacing: 4.49 um}}
+camera: {{use: no_such_camera}}
+static_tweezers: {{use: virtual}}
+mobile_tweezers: {tweezers}
+detector: {{use: threshold}}
+"""
+
+
+@pytest.mark.parametrize(
+    ("tweezers", "rate_hz", "n_warnings"),
+    [
+        ("{use: spcm, sample_rate: 500 MHz}", 500e6, 0),
+        ("{use: spcm}", 625e6, 0),
+        ("{use: virtual}", 625e6, 0),
+        ("{use: not_installed, sample_rate: 500 MHz}", 625e6, 1),
+    ],
+)
+def test_the_profiles_mobile_tweezers_choose_the_sample_rate(
+    tmp_path: Path, tweezers: str, rate_hz: float, n_warnings: int
+) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text(PROFILE.format(tweezers=tweezers), "utf-8")
+    request = PlanRequest(REQUEST.occupancy, REQUEST.target, seed=3, profile=str(path))
+    made = waveform(request, rate=None)
+    assert made.renderer.sample_rate_hz == rate_hz
+    assert len(made.warnings) == n_warnings
+    assert waveform(request, rate=RATE).renderer.sample_rate_hz == 250e6
+
+
+def test_a_shot_brings_the_sample_rate_that_it_was_taken_with() -> None:
+    machine = {"mobile_tweezers": {"use": "spcm", "sample_rate": 5e8}}
+    assert read_sample_rate(None, REQUEST, machine).hz == 5e8
+    assert read_sample_rate("300 MHz", REQUEST, machine).hz == 300e6
+    assert read_sample_rate(None, REQUEST, {"mobile_tweezers": {"use": "virtual"}}).hz == DEFAULT_RATE_HZ
+
+
+def test_the_share_of_each_render_path_is_told() -> None:
+    jerk = ["profile.mobile_tweezers.speed_profile=minimum_jerk"]
+    made = waveform(
+        PlanRequest("random:20x20@0.75", "compact:6x6", seed=1, profile="virtual", overrides=jerk)
+    )
+    row, column = made.statistics()
+    assert 0.0 < max(row.path_share["direct"], column.path_share["direct"]) < 1.0
+    assert sum(row.path_share.values()) == pytest.approx(1.0) == sum(column.path_share.values())
+
+
+def test_a_profile_with_too_low_a_sample_rate_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text(PROFILE.format(tweezers="{use: spcm, sample_rate: 200 MHz}"), "utf-8")
+    request = PlanRequest(REQUEST.occupancy, REQUEST.target, seed=3, profile=str(path))
+    with pytest.raises(ConfigError, match=r"mine\.yaml: tones up to .* cannot be sampled at 200 MHz"):
+        waveform(request, rate=None)
+
+
+def test_where_nothing_is_to_be_done_there_is_nothing_to_play() -> None:
+    with pytest.raises(ConfigError, match="there is nothing to play: the plan has no batches"):
+        waveform(PlanRequest("random:3x3@1", "compact:3x3", seed=1))
+
+
+def test_a_grid_wider_than_the_band_points_to_the_profile() -> None:
+    request = PlanRequest("random:30x30@0.6", "compact:20x20", seed=1)
+    with pytest.raises(
+        LimitError, match=r"the limit is the band of 82 to 118 MHz; name the machine with --profile"
+    ):
+        waveform(request)
