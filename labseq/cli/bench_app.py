@@ -162,7 +162,7 @@ def latency(
 def waveform(
     repeats: Annotated[
         int, typer.Option(metavar="N", min=1, help="How often everything is rendered; the best one counts.")
-    ] = 5,
+    ] = 15,
     json: JsonFile = None,
 ) -> None:
     """Measure rendering: by kind of segment, for a plan, and beside the stored-waveform way and numpy."""

@@ -97,7 +97,7 @@ def check(session: Session) -> CheckReport:
     timeline = session.timeline()
     windows = _windows(assembly.steps)
     if windows:
-        session.warm(lab)
+        session.warm(lab, devices=False)
     rehearsal, failure = _rehearse(lab) if windows else (None, "")
     warnings = [Problem(text) for text in assembly.bench.warnings]
     document = assembly.document

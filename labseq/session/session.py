@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
+import gc
 import secrets
-import time
 from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from types import TracebackType
-from typing import Final, ParamSpec, Self
+from typing import ParamSpec, Self
 
-from labseq import motion
-from labseq.errors import ConfigError, DeviceError, LabseqError, PlanError, StopRequested
-from labseq.kernels.compile import announcing
+from labseq.errors import ConfigError, DeviceError, LabseqError, StopRequested
 from labseq.model import RunRecord, TimelineEntry
 from labseq.model.records import RunStatus
 from labseq.recording import (
@@ -25,7 +23,7 @@ from labseq.recording import (
     marker_roots,
     open_run,
 )
-from labseq.roles import RunObserver, Warmable
+from labseq.roles import RunObserver
 from labseq.sequencer import Guard, PacedClock, RealClock, Sequencer, StopFlag, VirtualClock
 from labseq.sequencer.lab import Lab, describe
 from labseq.sequencer.run import lay_out
@@ -36,11 +34,9 @@ from labseq.session.options import Options, path_of
 from labseq.session.provenance import gather_provenance
 from labseq.session.safe import secure_bench
 from labseq.session.signals import stop_on_signals
+from labseq.session.warming import warm
 
 P = ParamSpec("P")
-
-WARM_S: Final = 300.0
-"""How long a plugin may compile; a slow computer needs half a minute."""
 
 
 class Session:
@@ -150,6 +146,8 @@ class Session:
             self._secure_after_crash(roots)
             lab = self.build_lab()
             self.warm(lab)
+            gc.collect()
+            gc.freeze()  # what is loaded by now stays: going through it all would take 0.1 s of a shot
             return self._run(lab, roots)
 
     def build_lab(self) -> Lab:
@@ -163,32 +161,9 @@ class Session:
             clock = VirtualClock(self.stop_flag)
         return build_lab(self.assembly, clock, self.seed)
 
-    def warm(self, lab: Lab) -> None:
-        """Compile before the first shot: a compile in mid-shot would cost the atoms."""
-        start_s, compiled = time.monotonic(), list[str]()
-
-        def announce(module: str) -> None:
-            self.stop_flag.check()
-            compiled.append(module)
-            self._observers.event("compiling", {"module": module})
-
-        with announcing(announce):
-            motion.warm()
-            self._warm_plugins(lab)
-        if compiled:
-            self._observers.event("compiled", {"duration_s": time.monotonic() - start_s})
-
-    def _warm_plugins(self, lab: Lab) -> None:
-        guard = Guard(self.stop_flag)
-        parts = (("planner", lab.planner), ("detector", lab.detector))
-        for name, part in (*parts, *lab.hardware()):
-            if isinstance(part, Warmable):
-                try:
-                    guard.call(name, WARM_S, part.warm)
-                except PlanError as error:
-                    raise error if error.planner else PlanError(str(error), lab.planner_name) from error
-            self.stop_flag.check()
-        guard.end()
+    def warm(self, lab: Lab, *, devices: bool = True) -> None:
+        """Compile what a lab will need; see :func:`labseq.session.warming.warm`."""
+        warm(lab, self.stop_flag, self._observers, devices=devices)
 
     def _run(self, lab: Lab, roots: Sequence[Path]) -> Run:
         record = self._record(lab)
