@@ -151,8 +151,7 @@ class Run:
 class Shot:
     """A shot on disk. What the index holds costs nothing; the rest reads the shot's file.
 
-    Every property from ``occupancies`` on raises ``RecordingError`` if the file
-    is missing or damaged.
+    Every property from ``occupancies`` on raises ``RecordingError`` if the file is missing or damaged.
 
     Attributes:
         file: The shot's HDF5 file.
@@ -233,6 +232,11 @@ class Shot:
     def readings(self) -> dict[str, Any]:
         """Values read from devices during the shot."""
         return dict(self._content.record.readings)
+
+    @property
+    def story(self) -> dict[str, NDArray[Any]]:
+        """What the simulation told of the atoms: name -> structured array; empty if it told nothing."""
+        return dict(self._content.record.story)
 
     @property
     def provenance(self) -> dict[str, Any]:
