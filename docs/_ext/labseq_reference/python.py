@@ -68,9 +68,10 @@ def walk(error: type[LabseqError]) -> Iterator[type[LabseqError]]:
 
 
 def public(module: Any, is_kind: Callable[[object], bool]) -> list[Any]:
-    """What a module defines for others, in the order of the source."""
+    """What a module, or a package with its modules, defines for others, in the order of the source."""
     found = [one for name, one in vars(module).items() if is_kind(one) and not name.startswith("_")]
-    return [one for one in found if one.__module__ == module.__name__]
+    home = module.__name__
+    return [one for one in found if one.__module__ == home or one.__module__.startswith(f"{home}.")]
 
 
 def _exit_code(error: type[LabseqError]) -> str:

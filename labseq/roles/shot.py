@@ -1,0 +1,221 @@
+"""What plugins are given, and the role of a step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+from typing import Any, ParamSpec, Protocol, TypeVar
+
+from labseq.model import (
+    CameraFacts,
+    CycleRecord,
+    MotionSpec,
+    Occupancy,
+    RandomStream,
+    SiteGrid,
+    TargetPattern,
+    TimelineEntry,
+)
+from labseq.roles.clock import Clock, NeverStopped
+from labseq.roles.deciding import Planner
+from labseq.roles.hardware import Device, MobileTweezers, StaticTweezers
+from labseq.roles.simulation import Simulation
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class Context:
+    """What a plugin's factory is given besides its settings.
+
+    Attributes:
+        name: Role or device name in the profile: "camera", "planner", "shutter".
+        grid: The grid of sites.
+        motion: How the mobile tweezers move.
+        clock: The session's time; drivers wait by ``clock.sleep``.
+        random: The plugin's own random numbers.
+        calibrations: Active calibrations: kind -> value.
+        simulation: The world, in every context; None where the profile has none.
+    """
+
+    name: str = ""
+    grid: SiteGrid = field(default_factory=SiteGrid)
+    motion: MotionSpec = field(default_factory=MotionSpec)
+    clock: Clock = field(default_factory=NeverStopped)
+    random: RandomStream = field(default_factory=lambda: RandomStream(0))
+    calibrations: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    simulation: Simulation | None = None
+
+
+class Shot(Protocol):
+    """What a step works with: the devices, guarded, and the shot's state."""
+
+    @property
+    def index(self) -> int:
+        """Index of the shot in the run."""
+        ...
+
+    @property
+    def grid(self) -> SiteGrid:
+        """The grid of sites."""
+        ...
+
+    @property
+    def motion(self) -> MotionSpec:
+        """How the mobile tweezers move."""
+        ...
+
+    @property
+    def target(self) -> TargetPattern:
+        """What the array shall look like."""
+        ...
+
+    @property
+    def clock(self) -> Clock:
+        """The session's time."""
+        ...
+
+    @property
+    def simulation(self) -> Simulation | None:
+        """The simulated world, if there is one."""
+        ...
+
+    @property
+    def static_tweezers(self) -> StaticTweezers:
+        """The static array."""
+        ...
+
+    @property
+    def mobile_tweezers(self) -> MobileTweezers:
+        """The moving tweezers."""
+        ...
+
+    @property
+    def planner(self) -> Planner:
+        """The planner."""
+        ...
+
+    @property
+    def occupancy(self) -> Occupancy | None:
+        """Occupancy on the last image of this shot; None before the first."""
+        ...
+
+    @property
+    def planner_name(self) -> str:
+        """Name of the planner, for messages."""
+        ...
+
+    @property
+    def degree_of_parallelism(self) -> int:
+        """Most mobile tweezers that a batch of this run may use."""
+        ...
+
+    @property
+    def step(self) -> int:
+        """Index of the running step."""
+        ...
+
+    @property
+    def start_s(self) -> float:
+        """Start of the shot on the session's clock."""
+        ...
+
+    @property
+    def call_timeout_s(self) -> float:
+        """How long a device call may take beyond its own duration, from the profile."""
+        ...
+
+    @property
+    def plan_timeout_s(self) -> float:
+        """How long one plan may take, from the profile."""
+        ...
+
+    def device(self, name: str) -> Device:
+        """A named device of the profile."""
+        ...
+
+    def judge(self) -> None:
+        """Judge the shot's success on the image just taken."""
+        ...
+
+    def call(
+        self, owner: str, timeout_s: float, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs
+    ) -> T:
+        """Call a device or plugin so that neither a hang nor a stop request is lost.
+
+        Args:
+            owner: Role or device name, for the error message.
+            timeout_s: How long the call may take before the device counts as hung.
+            function: For example ``shot.mobile_tweezers.play``.
+            *args: Passed on to it.
+            **kwargs: Passed on to it.
+
+        Raises:
+            DeviceTimeoutError: The call did not return in time.
+            StopRequested: The operator asked the run to stop.
+            DeviceError: The call raised anything that is not a ``LabseqError``.
+        """
+        ...
+
+    def stage(self, name: str, budget_s: float = ..., cycle: int = 0) -> AbstractContextManager[None]:
+        """Context manager that times a stage against its budget."""
+        ...
+
+    def take_image(self, exposure_s: float, cycle: int = 0) -> Occupancy:
+        """Expose, read, detect and record an image."""
+        ...
+
+    def record_cycle(self, cycle: CycleRecord) -> None:
+        """Add a rearrangement cycle to the shot's record."""
+        ...
+
+    def log(self, event: str, **values: Any) -> None:
+        """Add a line to the run's event log."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class StepContext:
+    """What a step needs to know to lay out its timeline before anything is opened.
+
+    Attributes:
+        grid: The grid of sites.
+        motion: How the mobile tweezers move.
+        target: What the array shall look like.
+        camera: What the camera says of itself before it is opened.
+    """
+
+    grid: SiteGrid
+    motion: MotionSpec
+    target: TargetPattern
+    camera: CameraFacts = field(default_factory=CameraFacts)
+
+
+class Step(Protocol):
+    """One step of a shot.
+
+    Attributes:
+        needs_image: Whether an image must have been taken before it in the shot.
+        takes_image: Whether later steps find an image of it.
+    """
+
+    needs_image: bool
+    takes_image: bool
+
+    def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:
+        """What the step will do, at most, for ``labseq check``."""
+        ...
+
+    def run(self, shot: Shot) -> None:
+        """Do it."""
+        ...
+
+
+class RunObserver(Protocol):
+    """Somebody who watches a run: the live view, a log. Failures never stop the run."""
+
+    def event(self, name: str, values: Mapping[str, Any]) -> None:
+        """Something happened: "run_started", "shot_started", "stage", "image", ..."""
+        ...
