@@ -119,9 +119,9 @@ def link_tones(centroid: Floats, count: Ints, slew: float) -> tuple[Floats, int]
     return tracks, used
 
 
-@kernel(f"Tuple(({TABLE}, {TABLE}))({SPECTRA}, {TABLE}, int64, float64, float64)")
+@kernel(f"Tuple(({TABLE}, {TABLE}))({SPECTRA}, {TABLE}, int64, int64, float64, float64)")
 def measure_tones(
-    spectra: NDArray[np.complex64], tracks: Floats, reach: int, width: float, hop: float
+    spectra: NDArray[np.complex64], tracks: Floats, first: int, reach: int, width: float, hop: float
 ) -> tuple[Floats, Floats]:
     """Amplitude and phase of followed tones: their overlap with a tone that chirps as they do.
 
@@ -132,7 +132,8 @@ def measure_tones(
 
     Args:
         spectra: (n_frames, n_bins), phases as of the middle of the frames.
-        tracks: (n_frames, n_tracks), in bins.
+        tracks: (at least first + n_frames, n_tracks), in bins.
+        first: Which frame of the tracks the first spectrum is.
         reach: Half the width of a tone's part of a spectrum, in bins.
         width: The window's tau times the width of a bin: a number without a unit.
         hop: From frame to frame, in units of one over the width of a bin.
@@ -147,11 +148,12 @@ def measure_tones(
     phase = np.full((n_frames, n_tracks), np.nan)
     for k in range(n_frames):
         for j in range(n_tracks):
-            here = tracks[k, j]
+            at = first + k
+            here = tracks[at, j]
             if math.isnan(here):
                 continue
-            before = tracks[k - 1, j] if k > 0 else np.nan
-            after = tracks[k + 1, j] if k + 1 < n_frames else np.nan
+            before = tracks[at - 1, j] if at > 0 else np.nan
+            after = tracks[at + 1, j] if at + 1 < len(tracks) else np.nan
             chirp = 0.0
             if not math.isnan(before) and not math.isnan(after):
                 chirp = (after - before) / (2 * hop)
@@ -159,7 +161,7 @@ def measure_tones(
             scale = np.sqrt(1.0 / (width**2 * p))
             product, norm = 0j, 0.0
             low, high = max(here - reach, 0.0), min(here + reach, n_bins - 1.0)
-            for other in tracks[k]:
+            for other in tracks[at]:
                 if other < here:
                     low = max(low, (here + other) / 2)
                 elif other > here:

@@ -21,10 +21,16 @@ EDGE: Final = 0.05
 
 @dataclass(frozen=True, slots=True)
 class Band:
-    """The frequencies that an AOD deflects."""
+    """The frequencies that an AOD deflects.
+
+    Attributes:
+        low_hz: The lowest one.
+        width_hz: From there to the highest. It sets the rate of the envelope: bands of the same
+            width have their values at the same times.
+    """
 
     low_hz: float
-    high_hz: float
+    width_hz: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,7 +98,7 @@ def _of_samples(spans: Sequence[RfSamples], start_s: float, end_s: float, band: 
             volts[low:high] *= span.volts_per_step
     spectrum = cast("NDArray[np.complex64]", fft.rfft(volts, overwrite_x=True))
     bottom = math.floor(band.low_hz * n / rate_hz)
-    n_values = cast("int", fft.next_fast_len(math.ceil((band.high_hz - band.low_hz) * n / rate_hz)))
+    n_values = cast("int", fft.next_fast_len(math.ceil(band.width_hz * n / rate_hz)))
     part = np.zeros(n_values, np.complex64)
     inside = spectrum[bottom : bottom + n_values]
     part[: len(inside)] = inside
@@ -102,7 +108,7 @@ def _of_samples(spans: Sequence[RfSamples], start_s: float, end_s: float, band: 
 
 
 def _of_tones(spans: Sequence[RfTones], start_s: float, end_s: float, band: Band) -> Envelope:
-    rate_hz = band.high_hz - band.low_hz
+    rate_hz = band.width_hz
     n_values = math.ceil((end_s - start_s) * rate_hz)
     values = np.zeros(n_values, np.complex64)
     for span in spans:
@@ -118,7 +124,7 @@ def _of_tones(spans: Sequence[RfTones], start_s: float, end_s: float, band: Band
             span.phase_rad,
             strict=True,
         ):
-            inside = (hz > band.low_hz) & (hz < band.high_hz)
+            inside = (hz > band.low_hz) & (hz < band.low_hz + band.width_hz)
             turns = (hz - band.low_hz + 0.5 * slope * t_s) * t_s + shift
             wave = np.exp((2j * np.pi * (turns % 1.0) + 1j * phase_rad).astype(np.complex64))
             values[first:last] += inside * (volts + rise * t_s).astype(np.float32) * wave

@@ -15,7 +15,7 @@ from labseq_virtual.hearing import Episode
 from labseq_virtual.jumps import JUMPS, depth_jumps, phase_jumps
 from labseq_virtual.settings import WorldSettings
 from labseq_virtual.thermal import draw_atoms
-from labseq_virtual.tones import HOPS, WINDOW, Tracks, follow_tones
+from labseq_virtual.tones import HOPS, WINDOW, Tracks, follow_tones, refuse_blur
 from labseq_virtual.transport import frequency_maps
 
 Floats = NDArray[np.float64]
@@ -70,12 +70,11 @@ class Flight:
 
     def __init__(self, grid: SiteGrid, motion: MotionSpec, settings: WorldSettings) -> None:
         light = settings.mobile_light
-        self._grid, self._settings, self._light = grid, settings, light
+        self._grid, self._motion, self._settings, self._light = grid, motion, settings, light
         self._maps = frequency_maps(grid)
         self._offset = np.array([light.offset[1], light.offset[0]]) / grid.spacing_m
-        most = (motion.max_row_tones, motion.max_column_tones)
-        self._full_v = [light.tone_voltage or motion.rf.full_scale_v / n for n in most]
-        self._bands = [_band(hz) for hz in (grid.row_frequency_hz, grid.column_frequency_hz)]
+        self._full_v = _full_volts(grid, motion, light.tone_voltage)
+        self._bands = _bands(grid)
         a1, a2 = grid.axes
         inverse = np.linalg.inv(np.stack([a2, a1], axis=1))
         self._plane = np.ascontiguousarray(np.vstack([grid.positions_m[0, 0], a2, a1, inverse]))
@@ -88,6 +87,14 @@ class Flight:
         self.margin_s = (WINDOW + 0.5) * light.transit_time
         self._flights: list[NDArray[Any]] = []
         self._jumps: list[tuple[Any, ...]] = []
+
+    def refuse_blur(self) -> None:
+        """Refuse tones that :func:`labseq_virtual.tones.follow_tones` cannot tell apart.
+
+        Raises:
+            LimitError: They are too near, or too fast, for the time that the sound takes across the beam.
+        """
+        refuse_blur(self._grid, self._motion, self._light.transit_time)
 
     def begin_shot(self) -> None:
         """Forget the flights of the last shot."""
@@ -120,7 +127,7 @@ class Flight:
         if tones is None:
             return
         (rows, row_depth, cols, col_depth), t_s = tones
-        row, col = np.nonzero(occupied & self._near(rows, cols))
+        row, col = np.nonzero(occupied & self._near(rows, cols) & (depth > 0))
         static = KELVIN * self._settings.static_depth * np.ascontiguousarray(depth)
         kt = KELVIN * self._settings.temperature
         state = draw_atoms(static[row, col], kt, self._beams[0], self._beams[1], rng)
@@ -157,7 +164,7 @@ class Flight:
             if not spans:
                 return None
             start_s, end_s = episode.start_s - self.margin_s, episode.end_s + 2 * self.margin_s
-            least_v = self._full_v[axis] * math.sqrt(LEAST_DEPTH)
+            least_v = float(self._full_v[axis].min()) * math.sqrt(LEAST_DEPTH)
             transit_s = self._light.transit_time
             found.append(follow_tones(spans, start_s, end_s, self._bands[axis], transit_s, least_v, SLEW_HZ))
         n_frames = min(len(tracks.t_s) for tracks in found)
@@ -165,8 +172,9 @@ class Flight:
         depths: list[Floats] = []
         for axis, tracks in enumerate(found):
             hz, volts = tracks.frequency_hz[:n_frames], tracks.amplitude_v[:n_frames]
-            sites.append(self._maps[axis].sites(hz) + self._offset[axis])
-            depths.append((volts / self._full_v[axis]) ** 2)
+            places, full_v = self._maps[axis].sites(hz), self._full_v[axis]
+            sites.append(places + self._offset[axis])
+            depths.append((volts / np.interp(places, np.arange(len(full_v)), full_v)) ** 2)
         self._note_jumps(found, sites, depths)
         return (sites[0], depths[0], sites[1], depths[1]), found[0].t_s[:n_frames]
 
@@ -187,15 +195,8 @@ class Flight:
 
     def _near(self, rows: Floats, cols: Floats) -> Mask:
         """Sites that a tweezer comes near to, bool (n_rows, n_cols)."""
-        near = np.zeros(self._grid.shape, np.bool_)
-        for k in np.flatnonzero(~(np.isnan(rows).all(axis=1) | np.isnan(cols).all(axis=1))):
-            lines: list[NDArray[np.intp]] = []
-            for places, n_sites in zip((rows[k], cols[k]), self._grid.shape, strict=True):
-                known = places[~np.isnan(places)]
-                sites = (np.floor(known)[:, None] + np.array([0, 1])).astype(np.intp).ravel()
-                lines.append(sites[(sites >= 0) & (sites < n_sites)])
-            near[np.ix_(*lines)] = True
-        return near
+        n_rows, n_cols = self._grid.shape
+        return _lines(rows, n_rows).T.astype(np.float32) @ _lines(cols, n_cols).astype(np.float32) > 0
 
     def _arrivals(self, state: Floats, static: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp], Mask]:
         """The sites that are nearest to some atoms, -1 beyond the grid, and whether they bind the atoms."""
@@ -231,10 +232,30 @@ class Flight:
         to_row[lost] = to_col[lost] = -1
 
 
-def _band(hz: Floats) -> Band:
-    width_hz = max(BAND_HZ, 1.4 * float(np.ptp(hz)))
-    middle_hz = float(hz.max() + hz.min()) / 2
-    return Band(max(0.0, middle_hz - width_hz / 2), middle_hz + width_hz / 2)
+def _full_volts(grid: SiteGrid, motion: MotionSpec, tone_v: float | None) -> list[Floats]:
+    """Volts of the tones that are meant to give the full depth: for each axis, one per site."""
+    rf, most = motion.rf, (motion.max_row_tones, motion.max_column_tones)
+    given = (rf.row_amplitudes, rf.column_amplitudes)
+    if tone_v is not None:
+        return [np.full(n, tone_v) for n in grid.shape]
+    return [
+        rf.full_scale_v * np.array(given[axis] or [1 / most[axis]] * n) for axis, n in enumerate(grid.shape)
+    ]
+
+
+def _bands(grid: SiteGrid) -> list[Band]:
+    axes = (grid.row_frequency_hz, grid.column_frequency_hz)
+    width_hz = max(BAND_HZ, *(1.4 * float(np.ptp(hz)) for hz in axes))  # of both, for common frames
+    return [Band(max(0.0, float(hz.max() + hz.min() - width_hz) / 2), width_hz) for hz in axes]
+
+
+def _lines(tracks: Floats, n_sites: int) -> Mask:
+    """The rows or columns on both sides of the tones of each frame, bool (n_frames, n_sites)."""
+    frame, tone = np.nonzero(~np.isnan(tracks))
+    below = np.clip(np.floor(tracks[frame, tone]).astype(np.intp), -2, n_sites) + 2
+    lines = np.zeros((len(tracks), n_sites + 4), np.bool_)
+    lines[frame, below] = lines[frame, below + 1] = True
+    return lines[:, 2 : n_sites + 2]
 
 
 def _most_on(tracks: Floats) -> int:

@@ -7,11 +7,12 @@ choice where it is silent.
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Self
 
-from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
 
 from labseq import Angle, Duration, Fraction, Frequency, Length, Settings, Temperature, Voltage
+from labseq.units import format_quantity
 
 PositiveDuration = Annotated[Duration, Field(gt=0)]
 PositiveLength = Annotated[Length, Field(gt=0)]
@@ -83,7 +84,7 @@ class MobileLightSettings(Settings):
     tone_voltage: Annotated[Voltage, Field(gt=0)] | None = Field(
         default=None,
         description="peak voltage of a tone at the driver's output that gives the depth (ours; none: that "
-        "of the profile, `rf.full_scale` over the most tones of the axis)",
+        "of the profile, `rf.full_scale` times the site's preassigned amplitude or over its axis' tones)",
     )
     offset: tuple[Length, Length] = Field(
         default=(0.0, 0.0),
@@ -143,7 +144,8 @@ class WorldSettings(Settings):
     static_wavelength: PositiveLength = Field(default=808e-9, description="their wavelength (paper)")
     temperature: PositiveTemperature = Field(
         default=15e-6,
-        description="temperature of the atoms in the static tweezers (ours: typical of gray molasses)",
+        description="temperature of the atoms in the static tweezers, at most half of `static_depth` (ours: "
+        "typical of gray molasses)",
     )
     mobile_light: MobileLightSettings = Field(
         default=MobileLightSettings(),
@@ -168,6 +170,14 @@ class WorldSettings(Settings):
         description="amplitude, as a fraction of full scale, above which a tone makes light (ours)",
     )
     image: ImageSettings = Field(default=ImageSettings(), description="what the camera sees")
+
+    @model_validator(mode="after")
+    def _holds_atoms(self) -> Self:
+        if self.temperature > self.static_depth / 2:
+            hot, depth = (format_quantity(k, "temperature") for k in (self.temperature, self.static_depth))
+            text = f"temperature is {hot}, too hot for tweezers with a static_depth of {depth}"
+            raise ValueError(f"{text}; expected at most half of it: hotter atoms evaporate")
+        return self
 
 
 class CameraFaults(Settings):

@@ -23,11 +23,12 @@ def draw_atoms(
     Positions have the density ``exp(a) P(a)``, where ``a = -U / kT`` and
     ``P(a) = erf(sqrt(a)) - 2 sqrt(a / pi) exp(-a)`` is the part of the Maxwell law that is slow enough
     to be bound there. They are drawn by rejection from a wider Gaussian. Atoms drawn so stay
-    distributed as they are; those of the harmonic law would breathe.
+    distributed as they are; those of the harmonic law would breathe. In tweezers that are too shallow for
+    the temperature they are as hot as half of the depth: hotter ones have evaporated.
 
     Args:
-        depth: Depth of each atom's tweezer per mass, (n_atoms,).
-        temperature: kT per mass, less than the depths.
+        depth: Depth of each atom's tweezer per mass, (n_atoms,), above 0.
+        temperature: kT per mass.
         waist: 1/e^2 radius of the intensity.
         rayleigh: Rayleigh length.
         rng: Random numbers.
@@ -37,7 +38,8 @@ def draw_atoms(
     """
     from scipy.special import erf
 
-    most = depth / temperature
+    kt = np.minimum(temperature, depth / 2)
+    most = depth / kt
     size = np.array([waist, waist, rayleigh])
     spread = WIDER / np.sqrt(np.array([4.0, 4.0, 2.0]) * most[:, None])
     atoms = np.empty((len(depth), 6))
@@ -60,6 +62,6 @@ def draw_atoms(
     while len(left):
         velocity = rng.standard_normal((len(left), 3))
         slow = 0.5 * (velocity**2).sum(axis=1) < bound[left]
-        atoms[left[slow], 3:] = np.sqrt(temperature) * velocity[slow]
+        atoms[left[slow], 3:] = np.sqrt(kt[left[slow], None]) * velocity[slow]
         left = left[~slow]
     return atoms

@@ -159,15 +159,17 @@ class World:
             )
 
     def listen(self, role: str, source: RfSource) -> None:
-        """From now on listen to the outputs of the mobile tweezers' driver.
+        """From now on listen to the outputs of the mobile tweezers' driver, after the last of earlier ones.
 
         Raises:
             DeviceError: Another role wants to be heard.
+            LimitError: What will be heard would be too blurred to tell the tones apart.
         """
         self._check_open()
         if role != "mobile_tweezers":
-            text = f"'{role}' wants to be heard; expected 'mobile_tweezers', the only role that plays RF"
-            raise DeviceError(self._name, text)
+            raise DeviceError(self._name, f"'{role}' wants to be heard; only 'mobile_tweezers' plays RF")
+        self._flight.refuse_blur()
+        self._hear(self._clock.now())
         self._ear = Ear(source, 2 * self._flight.margin_s)
 
     def expose(self, t_start_s: float, exposure_s: float) -> Frame:
@@ -250,12 +252,9 @@ class World:
         if self._ear is None:
             return
         for episode in self._ear.hear(until_s):
-            if episode.continued:
-                raise DeviceError(
-                    self._name,
-                    f"the mobile tweezers were on at {episode.start_s:.6f} s, when something else began; "
-                    "wait for their end (mobile_tweezers.wait) first",
-                )
+            if episode.continued or episode.start_s < self._now_s - ROUNDING_S:
+                text = f"the mobile tweezers were on at {episode.start_s:.6f} s, together with something else"
+                raise DeviceError(self._name, f"{text}; wait (mobile_tweezers.wait, camera.read) first")
             self._let_pass(episode.start_s)
             depth = self._depth * self._site_depth
             self._flight.carry(self._occupied, episode, depth, self._random.shot, self._loss_factor)

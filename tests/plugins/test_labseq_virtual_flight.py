@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 import pytest
-from labseq_virtual.flight import Flight
+from hypothesis import given, strategies as st
+from hypothesis.extra.numpy import arrays
+from labseq_virtual._kernels_atoms import energies
+from labseq_virtual.flight import KELVIN, Flight
 from labseq_virtual.hearing import Ear
 from labseq_virtual.settings import MobileLightSettings, WorldSettings
+from labseq_virtual.thermal import draw_atoms
 from numpy.typing import NDArray
 
-from labseq.model import ToneProgram
+from labseq.model import SiteGrid, ToneProgram
 from labseq.testing.rf import FULL_SCALE_V, GRID, START_S, Recording, SitePairs, played, program_of, spec
+
+Floats = NDArray[np.float64]
 
 SURE = WorldSettings(transport_loss=0.0)
 
@@ -111,6 +118,39 @@ def test_hotter_atoms_are_lost_more_often() -> None:
         for settings in (SURE, WorldSettings(transport_loss=0.0, temperature=150e-6))
     ]
     assert kept[0] == 40 > kept[1]
+
+
+@pytest.mark.parametrize(("temperature", "fine"), [(150e-6, True), (151e-6, False), (1.0, False)])
+def test_a_temperature_that_the_tweezers_cannot_hold_is_refused(temperature: float, fine: bool) -> None:
+    if fine:
+        assert WorldSettings(temperature=temperature).temperature == temperature
+    else:
+        with pytest.raises(
+            ValueError, match="too hot for tweezers with a static_depth of 300 uK; expected at"
+        ):
+            WorldSettings(temperature=temperature)
+
+
+@pytest.mark.parametrize("depth", [1e-9, 15e-6, 30e-6, 300e-6])
+def test_atoms_are_bound_and_no_hotter_than_their_tweezer_allows(depth: float) -> None:
+    waist, rayleigh, n = 0.98e-6, 3.7e-6, 2000
+    depths, kt = np.full(n, KELVIN * depth), KELVIN * 15e-6
+    state = draw_atoms(depths, kt, waist, rayleigh, np.random.default_rng(1))
+    assert (energies(state, np.zeros((n, 2)), depths, waist, rayleigh) < 0).all()
+    assert state[:, 3:].var() < 1.1 * min(kt, KELVIN * depth / 2)
+
+
+@given(
+    arrays(np.float64, (5, 3), elements=st.one_of(st.just(np.nan), st.floats(-30, 30))),
+    arrays(np.float64, (5, 2), elements=st.one_of(st.just(np.nan), st.floats(-2, 6))),
+)
+def test_near_a_tweezer_are_the_sites_around_it(rows: Floats, cols: Floats) -> None:
+    grid = SiteGrid(4, 3)
+    near = np.zeros(grid.shape, np.bool_)
+    for row, col in ((r, c) for k in range(5) for r in rows[k] for c in cols[k] if r == r and c == c):
+        for site in np.ndindex(*grid.shape):
+            near[site] |= site[0] - math.floor(row) in (0, 1) and site[1] - math.floor(col) in (0, 1)
+    np.testing.assert_array_equal(Flight(grid, spec(), SURE)._near(rows, cols), near)
 
 
 def test_the_same_seed_gives_the_same_flights() -> None:

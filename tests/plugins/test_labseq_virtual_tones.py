@@ -13,7 +13,7 @@ from labseq_virtual.tones import Tracks, follow_tones
 from labseq.model import RfSamples, RfSpan, RfTones, TonesNow
 from labseq.testing.rf import FULL_SCALE_V, RATE_HZ, START_S, played, program_of
 
-BAND = Band(75e6, 125e6)
+BAND = Band(75e6, 50e6)
 TRANSIT_S = 10e-6
 LEAST_V = FULL_SCALE_V / 20 * 0.045
 
