@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from labseq.cli.bench_output import STDOUT, progress_of, prove_writable, tell_compiling, write_text
+from labseq.cli.bench_output import progress_of
 from labseq.cli.bench_table import notes, table
-from labseq.cli.output import divert_stdout, say
+from labseq.cli.files import STDOUT, check_different, prove_writable, write_text
+from labseq.cli.output import divert_stdout, say, tell_compiling
 from labseq.cli.show import as_line
 from labseq.drawing import check_picture, save_comparison
 from labseq.errors import PlanError
@@ -49,6 +50,7 @@ def bench_planners(request: BenchRequest, output: BenchOutput) -> None:
     answer = divert_stdout() if output.json == STDOUT else None
     comparison, figure = read_request(request)
     files = _files(output, figure)
+    check_different(*files.values())
     for kind, path in files.items():
         if kind == "png":
             check_picture(path, (1, 1))

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import sys
-from pathlib import Path
 
-from labseq.cli.bench_output import STDOUT, progress_of, prove_writable, tell_compiling, write_text
-from labseq.cli.output import columns, divert_stdout, say
-from labseq.cli.show import as_line
+from labseq.cli.bench_output import progress_of
+from labseq.cli.files import json_writer
+from labseq.cli.output import columns, say, tell_compiling
 from labseq.cli.words import percent, plural
 from labseq.session.bench_latency import LatencyRequest, measure_latency
 from labseq.session.bench_latency_report import GOAL_S, LatencyReport, Stage
@@ -26,19 +25,12 @@ def bench_latency(request: LatencyRequest, json: str | None = None) -> None:
         PluginLoadError: A plugin that is named failed to load.
         LabseqError: Whatever ended a shot.
     """
-    answer = divert_stdout() if json == STDOUT else None
-    path = None if json in (None, STDOUT) else Path(json)
-    if path is not None:
-        prove_writable(path)
+    write = json_writer(json)
     with progress_of("loadings") as progress:
         report = measure_latency(request, announce=tell_compiling, progress=progress)
     say(*table(report), "", *light_table(report), "", *notes(report))
     say(*(f"warning: {text}" for text in report.warnings), stream=sys.stderr)
-    if path is not None:
-        write_text(path, f"{as_line(report.as_dict())}\n")
-        say(f"written: {path}")
-    if answer is not None:
-        answer(as_line(report.as_dict()))
+    write(report.as_dict())
 
 
 def table(report: LatencyReport) -> list[str]:

@@ -1,58 +1,16 @@
-"""What the commands of ``labseq bench`` write besides their tables."""
+"""How far the commands of ``labseq bench`` are."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Final
 
 from labseq.cli.output import say
-from labseq.config.wording import visible
-from labseq.errors import ConfigError, Problem
 
-STDOUT: Final = "-"
 _STEPS: Final = 10
 """How often progress is told where there is no terminal."""
-
-
-def prove_writable(path: Path) -> None:
-    """Find out that a file cannot be written before hours are spent.
-
-    Raises:
-        ConfigError: It cannot be written.
-    """
-    is_new = not path.exists()
-    try:
-        with path.open("ab"):
-            pass
-        if is_new:
-            path.unlink()
-    except (OSError, ValueError) as error:
-        raise _unwritten(path, error) from error
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a file.
-
-    Raises:
-        ConfigError: It cannot be written.
-    """
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise _unwritten(path, error) from error
-
-
-def _unwritten(path: Path, error: Exception) -> ConfigError:
-    reason = error.strerror if isinstance(error, OSError) else str(error)
-    return ConfigError(Problem(f"it cannot be written: {reason}", visible(str(path))))
-
-
-def tell_compiling(module: str) -> None:
-    """Say on stderr why it takes longer this time."""
-    say(f"compiling {module}; later runs find it in the cache", stream=sys.stderr)
 
 
 @contextmanager

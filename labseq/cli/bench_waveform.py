@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
-from labseq.cli.bench_output import STDOUT, prove_writable, tell_compiling, write_text
-from labseq.cli.output import columns, divert_stdout, say
-from labseq.cli.show import as_line
+from labseq.cli.files import json_writer
+from labseq.cli.output import columns, say, tell_compiling
 from labseq.session.bench_waveform import WaveformReport, bench_waveform
 from labseq.units import format_quantity
 
@@ -21,17 +18,10 @@ def bench_rendering(repeats: int, json: str | None = None) -> None:
     Raises:
         ConfigError: The file cannot be written.
     """
-    answer = divert_stdout() if json == STDOUT else None
-    path = None if json in (None, STDOUT) else Path(json)
-    if path is not None:
-        prove_writable(path)
+    write = json_writer(json)
     report = bench_waveform(repeats, announce=tell_compiling)
     say(*table(report), "", *ratios(report), "", _extent(report))
-    if path is not None:
-        write_text(path, f"{as_line(report.as_dict())}\n")
-        say(f"written: {path}")
-    if answer is not None:
-        answer(as_line(report.as_dict()))
+    write(report.as_dict())
 
 
 def table(report: WaveformReport) -> list[str]:

@@ -52,6 +52,11 @@ def divert_stdout() -> Callable[[str], None]:
     return answer
 
 
+def tell_compiling(module: str) -> None:
+    """Say on stderr why it takes longer this time."""
+    say(f"compiling {module}; later runs find it in the cache", stream=sys.stderr)
+
+
 def say(*lines: str, stream: TextIO | None = None) -> None:
     """Print lines, at once.
 

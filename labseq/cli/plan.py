@@ -7,15 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from labseq.cli.output import divert_stdout, say
-from labseq.cli.show import as_line
+from labseq.cli.files import STDOUT, check_different, json_writer
+from labseq.cli.output import say, tell_compiling
 from labseq.cli.words import plural
-from labseq.config.wording import visible
-from labseq.errors import ConfigError, Problem
 from labseq.kernels.compile import interpret
 from labseq.session import PlannedMoves, PlanRequest, plan_moves, read_source
 
-STDOUT: Final = "-"
 INTERPRETED_SITES: Final = 64 * 64
 """Up to this size a plan in plain Python takes less time than numba to load."""
 
@@ -47,7 +44,8 @@ def plan_once(request: PlanRequest, output: PlanOutput) -> None:
         PluginLoadError: A plugin that is named failed to load.
         PlanError: The planner failed, or its plan breaks a rule.
     """
-    answer = divert_stdout() if output.json == STDOUT else None
+    check_different(request.occupancy, output.json, output.png)
+    write = json_writer(output.json)
     source = read_source(request.occupancy, request.seed)
     if output.png is not None:
         from labseq.drawing import check_picture
@@ -58,15 +56,15 @@ def plan_once(request: PlanRequest, output: PlanOutput) -> None:
     moves = plan_moves(request, source, announce=tell_compiling)
     if output.png is not None:
         _draw(moves, output.png)
-    if output.json not in (None, STDOUT):
-        write_json(Path(output.json), as_line(moves.as_dict()))
-    if output.step or answer is None:
+    if output.json != STDOUT:
+        write(moves.as_dict())
+    if output.step or output.json != STDOUT:
         from labseq.cli.plan_report import print_plan
 
         print_plan(moves, sys.stdout, step=output.step)
     say(*(f"warning: {text}" for text in warnings(moves, request)), stream=sys.stderr)
-    if answer is not None:
-        answer(as_line(moves.as_dict()))
+    if output.json == STDOUT:
+        write(moves.as_dict())
 
 
 def warnings(moves: PlannedMoves, request: PlanRequest) -> list[str]:
@@ -89,11 +87,6 @@ def warnings(moves: PlannedMoves, request: PlanRequest) -> list[str]:
     return texts
 
 
-def tell_compiling(module: str) -> None:
-    """Say on stderr why it takes longer this time."""
-    say(f"compiling {module}; later plans find it in the cache", stream=sys.stderr)
-
-
 def _draw(moves: PlannedMoves, path: Path) -> None:
     from labseq.cli.plan_report import title
     from labseq.drawing import PlanDrawing, save_plan
@@ -102,17 +95,3 @@ def _draw(moves: PlannedMoves, path: Path) -> None:
         title(moves), moves.source, moves.grid, moves.occupancy, moves.target, moves.plan, moves.report
     )
     save_plan(path, drawing)
-
-
-def write_json(path: Path, line: str) -> None:
-    """Write a line of JSON to a file.
-
-    Raises:
-        ConfigError: It cannot be written.
-    """
-    try:
-        path.write_text(f"{line}\n", encoding="utf-8")
-    except (OSError, ValueError) as error:
-        reason = error.strerror if isinstance(error, OSError) else str(error)
-        problem = Problem(f"the JSON cannot be written: {reason}", visible(str(path)))
-        raise ConfigError(problem) from error

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from labseq.cli.check import size_text
-from labseq.cli.output import columns, divert_stdout, say
-from labseq.cli.plan import STDOUT, tell_compiling, warnings, write_json
+from labseq.cli.files import check_different, json_writer
+from labseq.cli.output import columns, say, tell_compiling
+from labseq.cli.plan import warnings
 from labseq.cli.plan_report import what
-from labseq.cli.show import as_line
 from labseq.cli.words import percent, plural
 from labseq.model import RfSpec
 from labseq.session.waveform import PlannedWaveform, WaveformRequest, plan_waveform
@@ -49,7 +49,8 @@ def show_waveform(request: WaveformRequest, output: WaveformOutput) -> None:
         PlanError: The planner failed, or its plan breaks a rule.
         LimitError: The tones break a limit of AOD or amplifier.
     """
-    answer = divert_stdout() if output.json == STDOUT else None
+    check_different(request.plan.occupancy, output.json, output.png, output.npz)
+    write = json_writer(output.json)
     _check_files(output)
     waveform = plan_waveform(request, announce=tell_compiling)
     both = waveform.statistics()
@@ -59,14 +60,10 @@ def show_waveform(request: WaveformRequest, output: WaveformOutput) -> None:
         save_samples(output.npz, waveform)
     if output.png is not None:
         _draw(waveform, both, output.png)
-    values = waveform.as_dict() | {axis.name: axis.as_dict() for axis in both}
-    if output.json not in (None, STDOUT):
-        write_json(Path(output.json), as_line(values))
     say(*report(waveform, both))
     texts = (*warnings(waveform.moves, request.plan), *waveform.warnings)
     say(*(f"warning: {text}" for text in texts), stream=sys.stderr)
-    if answer is not None:
-        answer(as_line(values))
+    write(waveform.as_dict() | {axis.name: axis.as_dict() for axis in both})
 
 
 def _check_files(output: WaveformOutput) -> None:

@@ -11,11 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, model_validator
 
-from labseq.config.fields import Text, misfit
+from labseq.config.fields import Name, misfit
 from labseq.config.profile import Sites
 from labseq.config.reading import decode
 from labseq.config.settings import Settings
 from labseq.config.values import validate_values
+from labseq.config.wording import shown
 from labseq.errors import ConfigError, Problem
 from labseq.model import Batch, Occupancy, Plan, SiteGrid, TargetPattern
 
@@ -35,7 +36,7 @@ class GridFile(Settings):
 
     n_rows: Sites = Field(description="number of rows")
     n_cols: Sites = Field(description="number of columns")
-    spacing_m: float = Field(gt=0, description="distance between neighbouring sites, in metres")
+    spacing_m: float = Field(gt=0, le=1e-3, description="distance between neighbouring sites, in metres")
     lattice: Literal["triangular", "square"] = Field(description="kind of lattice")
     shear: Literal[1, -1] = Field(
         description="1 if rows shift to the right on the way down, -1 if to the left"
@@ -82,9 +83,9 @@ class _Header(Settings):
 
     model_config = ConfigDict(extra="ignore")
 
-    planner: Text = Field(description="what planned")
+    planner: Name = Field(description="what planned")
     grid: GridFile = Field(description="the sites that it is for")
-    degree_of_parallelism: int = Field(ge=1, description="most mobile tweezers on at once")
+    degree_of_parallelism: int = Field(ge=1, le=1_000_000, description="most mobile tweezers on at once")
     seed: int | None = Field(
         default=None, ge=0, description="seed of all random numbers; null if there were none"
     )
@@ -159,16 +160,34 @@ def _batches(batches: list[object], name: str) -> list[Batch]:
 
 def _parse_json(text: str, name: str) -> object:
     try:
-        return json.loads(text, parse_constant=_refuse_constant)
+        return json.loads(text, parse_constant=_refuse_constant, object_pairs_hook=_without_repeats)
     except json.JSONDecodeError as error:
         what = f"this is no JSON: {error.msg[:1].lower()}{error.msg[1:]}"
         raise ConfigError(Problem(what, name, error.lineno, error.colno, _EXPECTED)) from error
-    except (ValueError, RecursionError) as error:  # NaN, numbers of thousands of digits, deep nesting
-        raise ConfigError(Problem(f"this is no plan: {error}", name, expected=_EXPECTED)) from error
+    except _NoPlanError as error:
+        what = f"this is no plan: {error}"
+    except RecursionError:
+        what = "this is no plan: it is nested too deeply"
+    except ValueError:  # Python reads no number of thousands of digits
+        what = "this is no plan: a number in it has too many digits"
+    raise ConfigError(Problem(what, name, expected=_EXPECTED))
+
+
+class _NoPlanError(Exception):
+    """JSON that a plan does not consist of."""
 
 
 def _refuse_constant(constant: str) -> NoReturn:
-    raise ValueError(f"{constant} stands in it")
+    raise _NoPlanError(f"{constant} stands in it")
+
+
+def _without_repeats(pairs: list[tuple[str, object]]) -> dict[str, object]:
+    values = dict(pairs)
+    if len(values) < len(pairs):
+        keys = [key for key, _ in pairs]
+        twice = next(key for key in keys if keys.count(key) > 1)
+        raise _NoPlanError(f"{shown(twice)} stands in it twice")
+    return values
 
 
 def _target(target: TargetFile, shape: tuple[int, int], name: str) -> TargetPattern:

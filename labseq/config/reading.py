@@ -68,13 +68,24 @@ def read_bytes(
 
 def _bytes_of(path: Path, max_bytes: int) -> bytes | str:
     """The first bytes of a file, one more than allowed; or why this is none."""
-    mode = path.stat().st_mode
-    if stat.S_ISDIR(mode):
-        return "this is a folder"
-    if not stat.S_ISREG(mode):  # reading a pipe could wait for ever
-        return "this is not an ordinary file"
+    if what := _no_file(path.stat().st_mode):  # reading a pipe could wait for ever
+        return what
     with path.open("rb") as file:
         return file.read(max_bytes + 1)
+
+
+def _no_file(mode: int) -> str:
+    if stat.S_ISDIR(mode):
+        return "this is a folder"
+    return "" if stat.S_ISREG(mode) else "this is not an ordinary file"
+
+
+def something_else(path: Path) -> str:
+    """What there is in place of a file, in words; "" for a file, for nothing, and if it cannot be told."""
+    try:
+        return _no_file(path.stat().st_mode)
+    except (OSError, ValueError):
+        return ""
 
 
 def decode(data: bytes, name: str) -> str:
@@ -149,7 +160,7 @@ def files_in(folder: Path, suffixes: Collection[str] = YAML_SUFFIXES) -> list[st
 
 def alike_file(path: Path, suffixes: Collection[str] = YAML_SUFFIXES) -> str:
     """A hint at the file in the same folder that is spelled most alike, whatever its suffix, or ""."""
-    names = {Path(name).stem: name for name in files_in(path.parent, suffixes)}
+    names = {Path(name).stem: name for name in files_in(path.parent, suffixes) if name != path.name}
     stem = path.stem if path.suffix in suffixes else path.name
     meant = closest(stem, names)
     return f"did you mean '{clean(names[meant])}'?" if meant else ""

@@ -73,10 +73,16 @@ def check_picture(path: Path, shape: tuple[int, int]) -> None:
     name = str(path)
     if path.suffix.lower() != ".png":
         raise ConfigError(Problem("this is no name of a PNG file", name, expected="a file that ends in .png"))
-    if not path.parent.is_dir():
+    try:
+        has_folder, is_folder = path.parent.is_dir(), path.is_dir()
+        is_odd = path.exists() and not path.is_file()
+    except OSError as error:  # a name that is too long
+        raise ConfigError(Problem(f"this is no name of a file: {error.strerror}", name)) from error
+    if not has_folder:
         raise ConfigError(Problem("there is no such folder", str(path.parent), expected="one that exists"))
-    if path.is_dir():
-        raise ConfigError(Problem("this is a folder", name, expected="a file that ends in .png"))
+    if is_odd:
+        what = "this is a folder" if is_folder else "this is not an ordinary file"
+        raise ConfigError(Problem(what, name, expected="a file that ends in .png"))
     if max(shape) > MAX_SITES:
         what = f"{shape[0]} x {shape[1]} sites are too many for a picture"
         raise ConfigError(Problem(what, name, expected=f"at most {MAX_SITES} rows and columns"))

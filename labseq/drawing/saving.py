@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import io
+import os
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,7 +32,9 @@ def make_figure(width_in: float, height_in: float, **options: Any) -> Figure:
 
 
 def save_figure(path: Path, draw: Callable[[], Figure], **options: Any) -> None:
-    """Draw a picture and save it, whatever the user's matplotlibrc says.
+    """Draw a picture and save it as PNG, whatever the user's matplotlibrc says.
+
+    The file is there whole or not at all, and an older one stays until then.
 
     Args:
         path: The file.
@@ -42,9 +47,16 @@ def save_figure(path: Path, draw: Callable[[], Figure], **options: Any) -> None:
     from matplotlib import style
 
     with style.context("default"):
-        figure = draw()
-        try:
-            figure.savefig(path, **options)
-        except OSError as error:
-            problem = Problem(f"the picture cannot be written: {error.strerror or error}", str(path))
-            raise ConfigError(problem) from error
+        data = io.BytesIO()
+        draw().savefig(data, format="png", **options)
+    real = Path(os.path.realpath(path))
+    part = real.with_name(f"{real.name}.part")
+    try:
+        part.write_bytes(data.getbuffer())
+        part.replace(real)
+    except OSError as error:
+        problem = Problem(f"the picture cannot be written: {error.strerror or error}", str(path))
+        raise ConfigError(problem) from error
+    finally:
+        with suppress(OSError):
+            part.unlink(missing_ok=True)

@@ -25,6 +25,9 @@ FULL_SCALE: Final = 32767
 N_CHANNELS: Final = 2
 """Channel 0 plays the row tones, channel 1 the column tones."""
 
+MAX_SAMPLES: Final = 2**53
+"""So many can be counted in float64."""
+
 MAX_ROOMS: Final = 8
 """Rooms that are kept for threads to render in, of 2 MB each."""
 
@@ -78,11 +81,12 @@ class Renderer:
 
         Raises:
             LimitError: A value is not finite, a duration or an amplitude is negative, a
-                sum of amplitudes exceeds full scale, or a frequency half the sample rate.
+                sum of amplitudes exceeds full scale, a frequency half the sample rate, or the
+                samples can no longer be counted.
         """
         if not 0 < sample_rate_hz < np.inf:
             raise LimitError("the sample rate", f"{sample_rate_hz} Hz", "more than 0 and finite")
-        _check_durations(program)
+        _check_durations(program, sample_rate_hz)
         starts = np.concatenate([[0.0], np.cumsum(program.duration_s)]) * sample_rate_hz
         self.sample_rate_hz = float(sample_rate_hz)
         self.first_sample = np.rint(starts).astype(np.int64)
@@ -238,11 +242,15 @@ def _prepare(
     )  # fmt: skip
 
 
-def _check_durations(program: ToneProgram) -> None:
+def _check_durations(program: ToneProgram, sample_rate_hz: float) -> None:
     wrong = np.flatnonzero(~((program.duration_s >= 0) & (program.duration_s < np.inf)))
     if len(wrong):
         which = f"the duration of segment {wrong[0]} in batch {program.batch[wrong[0]]}"
         raise LimitError(which, f"{program.duration_s[wrong[0]]} s", "0 or more and finite")
+    with np.errstate(over="ignore"):
+        n_samples = float(program.duration_s.sum()) * sample_rate_hz
+    if not n_samples < MAX_SAMPLES:
+        raise LimitError("the number of samples", f"{n_samples:.3g}", f"less than {MAX_SAMPLES:.3g}")
 
 
 def _refuse(fault: int, where: int, program: ToneProgram, channel: int, sample_rate_hz: float) -> NoReturn:

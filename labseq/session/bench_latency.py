@@ -13,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.errors import ConfigError, LimitError
+from labseq.errors import ConfigError, LimitError, Problem
 from labseq.model import Frame, Occupancy, Plan, ShotRecord, StageTiming, TargetPattern, TimelineEntry
 from labseq.motion import Renderer, RenderPath, check_plan, comb_sample_rate, tone_program
 from labseq.roles import Detector, Planner, Shot, Step, StepContext
@@ -178,7 +178,8 @@ class _Measured:
             seen = occupancy.copy()
             plan = shot.call("planner", shot.plan_timeout_s, shot.planner.plan, seen, shot.target)
         if plan.n_batches == 0:
-            raise ConfigError("there is nothing to move: choose a target that a random loading does not meet")
+            what = "there is nothing to move: a random loading needs no moves, or has no atoms to move"
+            raise ConfigError(Problem(what, "shot", hint="choose another target or loading"))
         with shot.stage("check"):
             dop = shot.degree_of_parallelism
             check_plan(plan, occupancy, shot.target, dop, shot.grid, shot.motion, shot.planner_name)

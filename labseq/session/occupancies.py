@@ -13,7 +13,7 @@ import numpy as np
 from numpy.lib.format import read_array
 from numpy.typing import NDArray
 
-from labseq.config.reading import decode, files_in, is_file, is_folder
+from labseq.config.reading import decode, files_in, is_file, something_else
 from labseq.config.wording import clean, did_you_mean, shown, visible
 from labseq.errors import ConfigError, Problem, RecordingError
 from labseq.model import CycleRecord, ImageRecord, Occupancy, TargetPattern, as_occupancy
@@ -79,14 +79,16 @@ def read_source(text: str, seed: int | None = None, stdin: BinaryIO | None = Non
     match = _SHOT.fullmatch(text)
     path = Path(match[1] if match else text)
     if not is_file(path):
-        what = "this is a folder" if is_folder(path) else "there is no such file"
-        hint = did_you_mean(path.name, files_in(path.parent, (".npy", ".txt", ".h5")))
+        what = something_else(path) or "there is no such file"
+        names = [name for name in files_in(path.parent, (".npy", ".txt", ".h5")) if name != path.name]
+        hint = did_you_mean(path.name, names)
         raise ConfigError(Problem(what, clean(str(path)), expected=FORMS, hint=hint))
     if match:
         return _shot(path, match[2])
+    label = visible(str(path))
     if path.suffix.lower() == ".npy":
-        return Source(_npy(path), str(path))
-    return Source(parse_text(_read(path), visible(str(path))), str(path))
+        return Source(_npy(path), label)
+    return Source(parse_text(_read(path), label), label)
 
 
 def parse_text(data: bytes, name: str) -> Occupancy:
@@ -196,7 +198,7 @@ def _shot(path: Path, cycle: str | None) -> Source:
     seen = _image_before(cycles[number - 1], images)
     if seen is None:
         raise ConfigError(Problem(f"there is no image before cycle {number}", name, expected="one"))
-    label = f"{path}, before cycle {number} of {len(cycles)}"
+    label = f"{name}, before cycle {number} of {len(cycles)}"
     machine = cast("dict[str, Any]", content.provenance.get("resolved", {})).get("profile")
     return Source(seen.occupancy, label, target=content.target, machine=machine)
 

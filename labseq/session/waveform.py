@@ -13,9 +13,13 @@ from labseq.session.plan_inputs import PlanRequest
 from labseq.session.planning import PlannedMoves
 from labseq.session.waveform_inputs import SampleRate, read_batches, read_moves, read_sample_rate
 from labseq.session.waveform_statistics import AxisStatistics, measure
+from labseq.units import format_quantity
 
 FRAME_BYTES: Final = 4
 """Size of a sample of both channels."""
+
+MAX_DURATION_S: Final = 60.0
+"""Far longer than any cycle; more is a mistake that would take hours to render."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +129,10 @@ def plan_waveform(
     moves, machine = read_moves(request.plan, stdin, announce)
     rate = read_sample_rate(request.sample_rate, request.plan, machine)
     if moves.plan.n_batches == 0:
-        raise ConfigError(Problem("there is nothing to play: the plan has no batches", moves.source))
+        hint = "choose an occupancy and a target that need moves"
+        raise ConfigError(
+            Problem("there is nothing to play: the plan has no batches", moves.source, hint=hint)
+        )
     batches = read_batches(request.batches, moves.plan)
     with announcing(announce):
         program = _tones(moves, request.plan)
@@ -143,6 +150,11 @@ def plan_waveform(
     if not made.tones_on_s * rate.hz >= 1:
         what = f"there is nothing to play: tones are on for {made.tones_on_s} s"
         raise ConfigError(Problem(what, moves.source))
+    if made.duration_s > MAX_DURATION_S:
+        what = f"the waveform is {format_quantity(made.duration_s, 'time')} long"
+        most = f"at most {format_quantity(MAX_DURATION_S, 'time')}"
+        hint = "look at the grid's spacing and at the speed, or choose some of the batches with --batches"
+        raise ConfigError(Problem(what, moves.source, expected=most, hint=hint))
     return made
 
 
@@ -162,5 +174,8 @@ def _refuse_slow(rate: SampleRate, program: ToneProgram) -> None:
         hz.max() for axis in (program.row, program.column) for hz in (axis.start_hz, axis.end_hz)
     )
     if rate.hz <= 2 * highest_hz:
-        what = f"tones up to {highest_hz / 1e6:.6g} MHz cannot be sampled at {rate.hz / 1e6:.6g} MHz"
-        raise ConfigError(Problem(what, rate.source, expected=f"more than {2 * highest_hz / 1e6:.6g} MHz"))
+        tones, sampled, least = (
+            format_quantity(hz, "frequency", digits=6) for hz in (highest_hz, rate.hz, 2 * highest_hz)
+        )
+        what = f"tones up to {tones} cannot be sampled at {sampled}"
+        raise ConfigError(Problem(what, rate.source, expected=f"more than {least}"))

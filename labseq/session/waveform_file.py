@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import zipfile
 from collections.abc import Mapping
-from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any, Final
 
@@ -13,7 +11,9 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
+from labseq.config.reading import is_folder, something_else
 from labseq.config.wording import visible
+from labseq.config.writing import whole_file
 from labseq.errors import ConfigError, Problem
 from labseq.model import SegmentKind
 from labseq.motion.rendering import FULL_SCALE, N_CHANNELS
@@ -34,11 +34,10 @@ def check_samples_file(path: Path) -> None:
     name, expected = visible(str(path)), f"a file that ends in {SUFFIX}"
     if path.suffix.lower() != SUFFIX:
         raise ConfigError(Problem("this is no name of an NPZ file", name, expected=expected))
-    if not path.parent.is_dir():
+    if not is_folder(path.parent):
         folder = visible(str(path.parent))
         raise ConfigError(Problem("there is no such folder", folder, expected="one that exists"))
-    if path.exists() and not path.is_file():
-        what = "this is a folder" if path.is_dir() else "this is not an ordinary file"
+    if what := something_else(path):
         raise ConfigError(Problem(what, name, expected=expected))
 
 
@@ -58,20 +57,13 @@ def save_samples(path: Path, waveform: PlannedWaveform) -> None:
             refuses it.
     """
     check_samples_file(path)
-    part = path.with_name(f"{path.name}.part")
     try:
-        with part.open("wb") as file:
+        with whole_file(path) as file:
             _write(file, waveform)
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(path)
     except OSError as error:
         what = f"the samples cannot be written: {error.strerror or error}"
         expected = f"{waveform.n_bytes / 1e6:.1f} MB of room and the right to write there"
         raise ConfigError(Problem(what, visible(str(path)), expected=expected)) from error
-    finally:
-        with suppress(OSError):
-            part.unlink(missing_ok=True)
 
 
 def arrays_of(waveform: PlannedWaveform) -> Mapping[str, NDArray[Any]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import re
 import sys
+from codecs import BOM_UTF8
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,7 +34,7 @@ MAX_RATE_HZ: Final = 10e9
 PLAN_SUFFIX: Final = ".json"
 
 _OF_SHOT: Final = "the profile in the shot's file"
-_NUMBER: Final = re.compile(r"[+-]?[\d.]+([eE][+-]?\d+)?")
+_NUMBER: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 _BATCHES: Final = re.compile(r"\s*(\d{1,6})\s*(?:-\s*(\d{1,6})\s*)?")
 
 
@@ -72,7 +73,7 @@ def read_moves(
     """
     if request.occupancy == "-":
         data = (stdin or sys.stdin.buffer).read(MAX_BYTES + 1)
-        if data.lstrip()[:1] == b"{":
+        if data.removeprefix(BOM_UTF8).lstrip()[:1] == b"{":
             return read_plan(data, "standard input", request, announce=announce), {}
         source = read_source("-", request.seed, io.BytesIO(data))
     elif request.occupancy.lower().endswith(PLAN_SUFFIX):

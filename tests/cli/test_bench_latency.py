@@ -37,7 +37,6 @@ def test_two_tables_and_what_was_measured(tmp_path: Path, capsys: pytest.Capture
     assert "the goal is 2 ms" in notes
     assert "2 loadings, seed 3; " in notes
     assert "psca, degree of parallelism 7: " in notes
-    assert f"written: {path}" in notes
     assert [line for line in err.splitlines() if not line.startswith("compiling")][-1] == "2 of 2 loadings"
     values = json.loads(path.read_text("utf-8"))
     assert (values["n_loadings"], values["seed"], values["profile"]) == (2, 3, "virtual")

@@ -173,7 +173,7 @@ def test_json_in_a_file_stands_beside_the_report(tmp_path: Path, capsys: pytest.
 
 @pytest.mark.parametrize(("name", "reason"), [("", "Is a directory"), ("gone/plan.json", "No such file")])
 def test_json_that_cannot_be_written_is_told(tmp_path: Path, name: str, reason: str) -> None:
-    with pytest.raises(ConfigError, match=f"the JSON cannot be written: {reason}"):
+    with pytest.raises(ConfigError, match=f"it cannot be written: {reason}"):
         plan_once(REQUEST, PlanOutput(json=str(tmp_path / name)))
 
 

@@ -45,8 +45,8 @@ BAD = [
     ([RANDOM, *COMPACT, "--profile", "virtul"], "did you mean 'virtual'?"),
     ([RANDOM, *COMPACT, "--png", "a.jpg"], "a.jpg: this is no name of a PNG file"),
     ([RANDOM, *COMPACT, "--png", "gone/a.png"], "gone: there is no such folder; expected one that exists"),
-    ([RANDOM, *COMPACT, "--json", "gone/a.json"], "gone/a.json: the JSON cannot be written"),
-    ([RANDOM, *COMPACT, "--json", "."], "the JSON cannot be written"),
+    ([RANDOM, *COMPACT, "--json", "gone/a.json"], "gone/a.json: it cannot be written"),
+    ([RANDOM, *COMPACT, "--json", "."], "it cannot be written"),
 ]
 
 

@@ -66,6 +66,10 @@ BAD: list[tuple[Callable[[dict[str, Any]], object], str]] = [
     (lambda v: v["grid"].update(spacing_m=0), "spacing_m is 0; expected more than 0"),
     (lambda v: v["grid"].update(spacing_m=float("nan")), "plan.json: this is no plan: NaN stands in it"),
     (lambda v: v["grid"].update(spacing_m=float("-inf")), "this is no plan: -Infinity stands in it"),
+    (lambda v: v["grid"].update(spacing_m=4.49), "spacing_m is 4.49; expected at most 0.001"),
+    (lambda v: v.update(planner="\x1b[31mred"), "name is '\\x1b[31mred', with '\\x1b' in it"),
+    (lambda v: v.update(planner="x" * 1000), "planner has 1000 characters; expected at most 80"),
+    (lambda v: v.update(degree_of_parallelism=10**30), "expected at most 1000000"),
     (lambda v: v.update(degree_of_parallelism=0), "degree_of_parallelism is 0; expected at least 1"),
 ]
 
@@ -109,3 +113,17 @@ def test_no_value_makes_it_fail_otherwise(key: str, value: object) -> None:
         parse_plan(json.dumps(values).encode("utf-8", "backslashreplace"), "plan.json")
     except ConfigError as error:
         assert str(error)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ('{"batches": [], "batches": []}', "this is no plan: 'batches' stands in it twice"),
+        ('{"batches": ' + "9" * 5000 + "}", "this is no plan: a number in it has too many digits"),
+        ("[" * 100_000, "this is no plan: it is nested too deeply"),
+    ],
+)
+def test_json_that_is_no_plan_is_told_in_our_words(text: str, words: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        parse_plan(text.encode(), "plan.json")
+    assert str(caught.value) == f"plan.json: {words}; expected what 'labseq plan --json' writes"

@@ -100,3 +100,11 @@ def test_the_same_waveform_gives_the_same_bytes_whatever_the_users_style(
 def test_a_picture_that_cannot_be_written_is_told(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="the picture cannot be written"):
         save_waveform(tmp_path / "gone" / "a.png", drawing(there_and_back(1)))
+
+
+def test_a_picture_that_cannot_be_written_leaves_the_older_one(tmp_path: Path) -> None:
+    (tmp_path / "a.png").write_bytes(b"an older one")
+    (tmp_path / "a.png.part").mkdir()
+    with pytest.raises(ConfigError, match="the picture cannot be written"):
+        save_waveform(tmp_path / "a.png", drawing(there_and_back(1)))
+    assert (tmp_path / "a.png").read_bytes() == b"an older one"

@@ -298,6 +298,13 @@ def test_wrong_durations_are_refused(duration_s: float) -> None:
         render(program_of((duration_s, [])))
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("durations_s", [(1e300,), (1e308, 1e308), (1e9,)])
+def test_more_samples_than_can_be_counted_are_refused(durations_s: tuple[float, ...]) -> None:
+    with pytest.raises(LimitError, match=r"the number of samples is .*; the limit is less than 9\.01e\+15"):
+        Renderer(program_of(*((duration_s, []) for duration_s in durations_s)), 10e9)
+
+
 @pytest.mark.parametrize("sample_rate_hz", [0.0, -1.0, float("nan"), float("inf")])
 def test_wrong_sample_rates_are_refused(sample_rate_hz: float) -> None:
     with pytest.raises(LimitError, match="sample rate"):

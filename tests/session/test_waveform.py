@@ -59,12 +59,15 @@ def test_a_plan_in_a_file_sounds_like_the_one_just_made(whole: PlannedWaveform, 
     assert read.as_dict() | {"source": ""} == whole.as_dict() | {"source": ""}
 
 
+@pytest.mark.parametrize("mark", ["", "\ufeff"], ids=["plain", "marked"])
 @pytest.mark.parametrize("as_plan", [True, False])
-def test_standard_input_holds_a_plan_or_an_occupancy(whole: PlannedWaveform, as_plan: bool) -> None:
+def test_standard_input_holds_a_plan_or_an_occupancy(
+    whole: PlannedWaveform, as_plan: bool, mark: str
+) -> None:
     rows = whole.moves.occupancy.astype(int).tolist()
     text = json.dumps(whole.moves.as_dict()) if as_plan else "\n".join(str(row)[1:-1] for row in rows)
     request = PlanRequest("-") if as_plan else PlanRequest("-", "checkerboard:4x4")
-    made = plan_waveform(WaveformRequest(request, None, RATE), io.BytesIO(text.encode()))
+    made = plan_waveform(WaveformRequest(request, None, RATE), io.BytesIO((mark + text).encode()))
     assert made.moves.source == "standard input"
     assert np.array_equal(made.program.column.phase_rad, whole.program.column.phase_rad)
 
@@ -259,6 +262,13 @@ def test_a_profile_with_too_low_a_sample_rate_is_named(tmp_path: Path) -> None:
 def test_where_nothing_is_to_be_done_there_is_nothing_to_play() -> None:
     with pytest.raises(ConfigError, match="there is nothing to play: the plan has no batches"):
         waveform(PlanRequest("random:3x3@1", "compact:3x3", seed=1))
+
+
+def test_a_waveform_that_would_take_hours_is_refused() -> None:
+    slow = "profile.mobile_tweezers.speed=0.5 um/s"
+    virtual = PlanRequest("random:20x20@0.75", "compact:6x6", seed=1, profile="virtual", overrides=[slow])
+    with pytest.raises(ConfigError, match=r"the waveform is .* s long; expected at most 60 s; look"):
+        waveform(virtual)
 
 
 def test_a_grid_wider_than_the_band_points_to_the_profile() -> None:

@@ -130,7 +130,7 @@ def test_a_shot_is_planned_again_as_it_was(tmp_path: Path) -> None:
     [
         (["nowhere.npy", *COMPACT], "nowhere.npy: there is no such file; expected a .npy file, a text file"),
         ([RANDOM, "--target", "kagomee:5x5"], "did you mean 'kagome'?"),
-        ([RANDOM, *COMPACT, "--json", "gone/a.json"], "gone/a.json: the JSON cannot be written"),
+        ([RANDOM, *COMPACT, "--json", "gone/a.json"], "gone/a.json: it cannot be written"),
     ],
 )
 def test_a_mistake_is_told_in_words(tmp_path: Path, arguments: list[str], words: str) -> None:
