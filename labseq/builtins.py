@@ -13,8 +13,8 @@ LABSEQ_API: Final = _API
 
 @hookimpl
 def labseq_register(registry: Registry) -> None:
-    """Offer the built-in steps, patterns and detector."""
-    from labseq.config.detectors import ThresholdSettings
+    """Offer the built-in steps, patterns and detectors."""
+    from labseq.config.detectors import ThresholdSettings, WeightedSettings
     from labseq.config.patterns import BitmapSettings, CompactSettings
     from labseq.config.steps import (
         DeviceSettings,
@@ -24,7 +24,7 @@ def labseq_register(registry: Registry) -> None:
         WaitSettings,
     )
     from labseq.geometry import bitmap, compact
-    from labseq.imaging import ThresholdDetector
+    from labseq.imaging import ThresholdDetector, WeightedDetector
     from labseq.sequencer.rearrange import RearrangeStep
     from labseq.sequencer.steps import DeviceStep, ImageStep, LoadStep, WaitStep
 
@@ -36,3 +36,4 @@ def labseq_register(registry: Registry) -> None:
     registry.pattern("compact", compact, CompactSettings)
     registry.pattern("bitmap", bitmap, BitmapSettings)
     registry.detector("threshold", ThresholdDetector, ThresholdSettings)
+    registry.detector("weighted", WeightedDetector, WeightedSettings)

@@ -1,0 +1,205 @@
+"""Weights in the shape of the spots: the light of each pixel counts for as much as it says."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq.imaging.photoelectrons import SensorLike, evidence
+from labseq.imaging.regions import (
+    ContextLike,
+    PerSite,
+    RegionsLike,
+    checked_image,
+    region_corners,
+    site_thresholds,
+    sites_on_frame,
+)
+from labseq.imaging.spots import pairs_within, spot_light
+from labseq.model import Frame, Occupancy, SiteGrid
+
+Floats = NDArray[np.float64]
+
+SPOT_REACH: Final = 4.0
+"""Widths of a spot beyond which its light is not looked for."""
+
+
+class WeightedLike(RegionsLike, SensorLike, Protocol):
+    """Settings of :class:`WeightedDetector`; SI and pixels."""
+
+    @property
+    def spot(self) -> float:
+        """Width of a spot (1 sigma) in the atom plane, in metres."""
+        ...
+
+    @property
+    def photoelectrons(self) -> float:
+        """Mean photoelectrons of an atom."""
+        ...
+
+    @property
+    def background(self) -> float:
+        """Mean photoelectrons of a pixel without atoms, more than 0."""
+        ...
+
+    @property
+    def filling(self) -> float:
+        """Fraction of the sites that hold atoms."""
+        ...
+
+    @property
+    def threshold(self) -> PerSite:
+        """Log-odds above which there is an atom."""
+        ...
+
+    @property
+    def width(self) -> float:
+        """Log-odds from the threshold at which the confidence is tanh(1) = 0.76."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Weights:
+    """What is worked out once.
+
+    Attributes:
+        pixels: float32 (n_sites, region, region), weight of each pixel.
+        curve: float32 (65536,), worth of counts in photoelectrons.
+        constant: float64 (n_sites,), log-odds of a site whose pixels are at the offset
+            and whose neighbours have their mean light.
+        starts: int64 (n_sites + 1,), where a site's neighbours start in the lists.
+        neighbours: int64 (n,), sites whose light reaches it.
+        effects: float64 (n,), log-odds that an atom there adds.
+        expected: float64 (n_sites,), log-odds that its neighbours add on average.
+    """
+
+    pixels: NDArray[np.float32]
+    curve: NDArray[np.float32]
+    constant: Floats
+    starts: NDArray[np.int64]
+    neighbours: NDArray[np.int64]
+    effects: Floats
+    expected: Floats
+
+
+class WeightedDetector:
+    """Adds up the log-odds of an atom, pixel by pixel, and compares with a threshold.
+
+    The optimum is that of Neyman and Pearson (Phil. Trans. R. Soc. A 231, 289, 1933):
+    among all detectors with as many false positives, the likelihood ratio misses the
+    fewest atoms. The counts of a pixel are turned by a curve into what they are worth:
+    linear for a few photoelectrons, flatter for many, because the EM register makes
+    large counts say less. A weight per site and pixel multiplies that: the difference
+    of the log-likelihoods of the pixel's light with and without the site's atom, at the
+    site's true place between the pixels (see :func:`labseq.imaging.photoelectrons.evidence`).
+
+    Neighbours' light is part of both cases with its mean, so that a pixel in their light
+    weighs less. Then what they add beyond the mean is undone: with the neighbours as found
+    in the first pass, the mean effect of each is taken off, as in the detection of many
+    senders on one channel (Verdu, Multiuser Detection, 1998, chapter 7). Neighbours are
+    those within the reach of spot and region, on any lattice.
+
+    The confidence is ``tanh(|log-odds - T_ij| / width)``; at T = 0 and the width of 2 it is the
+    probability of being right, scaled to 0..1, if half of the sites hold atoms.
+
+    Args:
+        settings: See :class:`WeightedLike`. A threshold given as text is the path
+            of a .npy file of floats (n_rows, n_cols), read here.
+        context: Grid and name; a ``labseq.Context``.
+
+    Raises:
+        LimitError: A region reaches over the edge of the frame, or the thresholds do
+            not have one value per site.
+        ConfigError: The thresholds' file cannot be read.
+    """
+
+    def __init__(self, settings: WeightedLike, context: ContextLike) -> None:
+        self._name = context.name or "detector"
+        self._settings, self._grid = settings, context.grid
+        self._corners = region_corners(settings, context.grid)
+        self._thresholds = site_thresholds(settings.threshold, context.grid.shape)
+        self._weights: Weights | None = None
+        self._kernels: Any = None
+
+    def warm(self) -> None:
+        """Work out the weights; compile the kernels, or load them from the cache."""
+        self._ready()
+
+    def detect(self, frame: Frame) -> tuple[Occupancy, NDArray[np.float32]]:
+        """Find the atoms.
+
+        Returns:
+            The occupancy, bool (n_rows, n_cols), and the confidence per site,
+            float32 (n_rows, n_cols), 0 at the threshold and 1 for certainty.
+
+        Raises:
+            DeviceError: The frame is not of the size that the sites belong to.
+        """
+        distance = self.log_odds(frame) - self._thresholds
+        confidence = np.tanh(np.abs(distance) / self._settings.width).astype(np.float32)
+        return distance > 0.0, confidence
+
+    def log_odds(self, frame: Frame) -> Floats:
+        """Log-likelihood ratio of an atom against none, float64 (n_rows, n_cols).
+
+        Raises:
+            DeviceError: The frame is not of the size that the sites belong to.
+        """
+        image = checked_image(frame, self._settings.frame, self._name)
+        weights = self._ready()
+        odds = np.empty(len(self._corners))
+        self._kernels.weigh_sites(image, self._corners, weights.pixels, weights.curve, weights.constant, odds)
+        if len(weights.neighbours):
+            first, odds = odds, np.empty_like(odds)
+            self._kernels.undo_neighbours(weights.starts, weights.neighbours, weights.effects, first, odds)
+            odds += weights.expected
+        return odds.reshape(self._grid.shape)
+
+    def _ready(self) -> Weights:
+        if self._weights is None:
+            from labseq.kernels import weigh_sites
+
+            self._kernels = weigh_sites
+            self._weights = site_weights(self._settings, self._grid, self._corners)
+        return self._weights
+
+
+def site_weights(settings: WeightedLike, grid: SiteGrid, corners: NDArray[np.int64]) -> Weights:
+    """Work out the weights of all sites.
+
+    Args:
+        settings: See :class:`WeightedLike`.
+        grid: The grid of sites.
+        corners: int64 (n_sites, 2), (y, x) of the first pixel of each region.
+    """
+    sites = sites_on_frame(settings, grid)
+    spot_px, region, filling = settings.spot / settings.pixel_size, settings.region, settings.filling
+    own = settings.photoelectrons * spot_light(sites, corners, region, spot_px)
+    pairs = pairs_within(sites, (region / 2 + SPOT_REACH * spot_px) * np.sqrt(2))
+    lit = settings.photoelectrons * spot_light(sites[pairs[:, 1]], corners[pairs[:, 0]], region, spot_px)
+    dark = np.full_like(own, settings.background)
+    np.add.at(dark, pairs[:, 0], filling * lit)
+    law = evidence(settings, settings.background, float((dark + own).max() + lit.max(initial=0.0)))
+
+    def gained(values: Floats, before: Floats, light: Floats) -> Floats:
+        return np.interp(before + light, law.light, values) - np.interp(before, law.light, values)
+
+    pixels = gained(law.weight, dark, own)
+    effects = np.zeros(len(pairs))
+    without = dark[pairs[:, 0]] - filling * lit
+    for before in (without, without + own[pairs[:, 0]]):  # whether the site holds an atom or not
+        effects += (pixels[pairs[:, 0]] * gained(law.mean, before, lit)).sum(axis=(1, 2)) / 2
+    felt = effects > 1e-3
+    pairs, effects = pairs[felt], effects[felt]
+    return Weights(
+        pixels=pixels.astype(np.float32),
+        curve=law.curve,
+        constant=gained(law.constant, dark, own).sum(axis=(1, 2)),
+        starts=np.searchsorted(pairs[:, 0], np.arange(len(sites) + 1)),
+        neighbours=np.ascontiguousarray(pairs[:, 1]),
+        effects=effects,
+        expected=np.asarray(filling * np.bincount(pairs[:, 0], effects, len(sites)), np.float64),
+    )
