@@ -17,6 +17,8 @@ from labseq.cli.log_lines import LogLines
 from labseq.cli.output import columns, divert_stdout, encodes, say
 from labseq.cli.show import as_line
 from labseq.cli.words import clock_time, plural, settings_text
+from labseq.config import Axis
+from labseq.config.wording import clean
 from labseq.errors import ConfigError, Problem
 from labseq.model import TimelineEntry
 from labseq.session import Assembly, CheckReport, Session, check
@@ -96,7 +98,8 @@ def _as_values(checked: CheckReport) -> dict[str, Any]:
         ],
         "shots": checked.n_shots,
         "shot_s": [checked.shortest_shot_s, checked.longest_shot_s],
-        "run_s": [checked.n_shots * checked.shortest_shot_s, checked.n_shots * checked.longest_shot_s],
+        "points": checked.n_points,
+        "run_s": list(checked.run_s),
         "n_images": checked.n_images,
         "shot_bytes": checked.shot_bytes,
         "run_bytes": None if checked.shot_bytes is None else checked.n_shots * checked.shot_bytes,
@@ -153,7 +156,29 @@ def _what(assembly: Assembly) -> list[tuple[str, str]]:
         ),
         ("target", f"{target.name}, {plural(target.n_atoms, 'atom')}, {plural(n_clear, 'site')} to be empty"),
         ("planner", assembly.planner.entry.name + (f" ({listed})" if listed else "")),
+        *(("scan", text) for text in _scanned(assembly)),
     ]
+
+
+def _scanned(assembly: Assembly) -> list[str]:
+    """A line for each group of the scan, the slowest first."""
+    if assembly.scanned is None:
+        return []
+    scan = assembly.scanned.scan
+    lines: list[str] = []
+    for group in scan.groups:
+        axes = (f"{axis.address} {_ends(axis)}" for axis in group)
+        lines.append(f"{plural(len(group[0].values), 'value')} of {' together with '.join(axes)}")
+    repeats = f", {plural(scan.repeats, 'shot')} of each" if scan.repeats > 1 else ""
+    return [
+        *lines,
+        f"{plural(scan.n_points, 'point')}{repeats}, {scan.order}; all else here is of the first one",
+    ]
+
+
+def _ends(axis: Axis) -> str:
+    first, last = (clean(str(axis.values[i].raw or axis.values[i].plain())) for i in (0, -1))
+    return f"{first} to {last}" if len(axis.values) > 1 else first
 
 
 def _simulation(assembly: Assembly) -> str:
@@ -165,12 +190,13 @@ def _simulation(assembly: Assembly) -> str:
 def _sums(checked: CheckReport) -> list[tuple[str, str]]:
     shot = [format_quantity(t, "time") for t in (checked.shortest_shot_s, checked.longest_shot_s)]
     n = checked.n_shots
-    run = [clock_time(n * t) for t in (checked.shortest_shot_s, checked.longest_shot_s)]
+    run = [clock_time(t) for t in checked.run_s]
+    points = "" if checked.n_points is None else f"{plural(checked.n_points, 'point')}, "
     size = "of unknown size" if checked.shot_bytes is None else f"{size_text(checked.shot_bytes)} each"
     disk = "unknown" if checked.shot_bytes is None else f"{size_text(n * checked.shot_bytes)} at most"
     return [
         ("shot", f"{shot[0]} to {shot[1]}, {plural(checked.n_images, 'image')} at most, {size}"),
-        ("run", f"{plural(n, 'shot')}, {run[0]} to {run[1]}, {disk} on disk"),
+        ("run", f"{points}{plural(n, 'shot')}, {run[0]} to {run[1]}, {disk} on disk"),
     ]
 
 

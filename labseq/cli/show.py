@@ -17,10 +17,11 @@ from labseq.config.wording import clean
 from labseq.errors import ConfigError, LabseqError, Problem, RecordingError
 from labseq.recording import Run, Shot, data_root, open_run
 from labseq.recording.folders import find_run
+from labseq.recording.points import scan_points
 from labseq.units import format_quantity
 
 MAX_ROWS: Final = 40
-"""Rows of the table of shots; of a longer run the first and the last are shown."""
+"""Rows of a table; of a longer one the first and the last are shown."""
 
 
 def show_run(path: Path | None, *, as_json: bool) -> None:
@@ -43,7 +44,8 @@ def show_run(path: Path | None, *, as_json: bool) -> None:
     if as_json:
         say(as_line(json_summary(run)))
     else:
-        say(*shot_table(run), "", *summary_lines(run))
+        points = point_table(run)
+        say(*shot_table(run), "", *points, *([""] if points else []), *summary_lines(run))
 
 
 def _existing(path: Path) -> Path:
@@ -79,7 +81,18 @@ def json_summary(run: Run | None) -> dict[str, Any]:
     if run is None:
         nothing = {"defect_free": None, "filling_fraction": None}
         return {"run_dir": None, "shots": 0, **nothing, "status": "failed"}
-    return run.summary() | ({"error": run.error} if run.error else {})
+    points = [
+        {
+            "parameters": dict(point.parameters),
+            "shots": len(point.shots),
+            "defect_free": point.n_defect_free / len(point.shots),
+            "filling_fraction": None if math.isnan(point.filling_fraction) else point.filling_fraction,
+        }
+        for point in scan_points(run)
+    ]
+    return (
+        run.summary() | ({"points": points} if points else {}) | ({"error": run.error} if run.error else {})
+    )
 
 
 def as_line(values: Mapping[str, Any]) -> str:
@@ -87,16 +100,38 @@ def as_line(values: Mapping[str, Any]) -> str:
     return json.dumps(values)
 
 
+def point_table(run: Run) -> list[str]:
+    """A table of the scan's points; nothing without a scan."""
+    points = scan_points(run)
+    if not points:
+        return []
+    rows = [
+        (
+            *map(clean, point.written.values()),
+            str(len(point.shots)),
+            percent(point.filling_fraction, 2),
+            count_of(point.n_defect_free, len(point.shots)),
+        )
+        for point in points
+    ]
+    header = (*map(clean, points[0].written), "shots", "filling", "defect-free")
+    return _shortened(columns([header, *rows], right=tuple(range(len(header) - 1))))
+
+
+def _shortened(lines: list[str]) -> list[str]:
+    """The first and the last rows of a long table."""
+    if len(lines) - 1 <= MAX_ROWS:
+        return lines
+    half = MAX_ROWS // 2
+    return [*lines[: half + 1], "...", *lines[-half:]]
+
+
 def shot_table(run: Run) -> list[str]:
     """A table of the shots that count."""
     n_atoms = run.target.n_atoms
     rows = [_shot_row(shot, n_atoms) for shot in run.shots]
     header = ("shot", "outcome", "filling", "cycles", "atom moves", "shot time")
-    lines = columns([header, *rows], right=(0, 2, 3, 4, 5))
-    if len(rows) > MAX_ROWS:
-        half = MAX_ROWS // 2
-        lines = [*lines[: half + 1], "...", *lines[-half:]]
-    return lines
+    return _shortened(columns([header, *rows], right=(0, 2, 3, 4, 5)))
 
 
 def _shot_row(shot: Shot, n_atoms: int) -> tuple[str, ...]:

@@ -3,17 +3,18 @@
 from labseq.config.addresses import Override, profile_overrides, split_overrides
 from labseq.config.collect import Collected
 from labseq.config.document import Document
-from labseq.config.fields import Choice, plugin_paths
+from labseq.config.fields import ROLES, Choice, plugin_paths
 from labseq.config.find import find_profile, packaged_profiles_dir
 from labseq.config.nodes import Loc
 from labseq.config.profile import (
     MOTION_KEYS,
-    ROLES,
     MotionSettings,
     ProfileSpec,
     TimeoutSettings,
     load_profile,
 )
+from labseq.config.scan import Axis, Scan
+from labseq.config.scan_reading import bind_scan, read_scan
 from labseq.config.sequence import SequenceSpec, StepSpec, load_sequence
 from labseq.config.settings import Settings
 from labseq.config.steps import (
@@ -28,6 +29,7 @@ from labseq.config.values import validate_values
 __all__ = [
     "MOTION_KEYS",
     "ROLES",
+    "Axis",
     "Choice",
     "Collected",
     "DeviceSettings",
@@ -39,17 +41,20 @@ __all__ = [
     "Override",
     "ProfileSpec",
     "RearrangeSettings",
+    "Scan",
     "SequenceSpec",
     "Settings",
     "StepSpec",
     "TimeoutSettings",
     "WaitSettings",
+    "bind_scan",
     "find_profile",
     "load_profile",
     "load_sequence",
     "packaged_profiles_dir",
     "plugin_paths",
     "profile_overrides",
+    "read_scan",
     "split_overrides",
     "validate_values",
 ]

@@ -22,20 +22,23 @@ MAX_DEPTH: Final = 32
 
 
 class Mark(NamedTuple):
-    """A place: line and column from 1, or an option such as ``--set shots=5``."""
+    """A place: line and column from 1, or an option such as ``--set shots=5``.
+
+    With both, ``origin`` is the file of a value that was put into another one.
+    """
 
     line: int
     column: int
     origin: str = ""
 
     def problem(self, name: str, what: str, expected: str = "", hint: str = "") -> Problem:
-        """Say that something is wrong here, in the file called ``name`` or in the option.
+        """Say that something is wrong here, in the file called ``name`` or in the origin.
 
         What cannot be seen becomes visible: validators, those of plugins too, quote values as they are.
         """
         what, expected, hint = visible(what), visible(expected), visible(hint)
         if self.origin:
-            return Problem(what, self.origin, expected=expected, hint=hint)
+            return Problem(what, self.origin, self.line, self.column, expected, hint)
         return Problem(what, name, self.line, self.column, expected, hint)
 
     @property

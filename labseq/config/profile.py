@@ -16,6 +16,8 @@ from labseq.config.collect import Collected
 from labseq.config.document import Document
 from labseq.config.fields import (
     FORMAT,
+    MAY_ADD,
+    ROLES,
     Choice,
     Folders,
     FormatVersion,
@@ -28,6 +30,8 @@ from labseq.config.fields import (
 from labseq.config.find import find_profile
 from labseq.config.mending import StandIns, load_checked
 from labseq.config.rf import RfSettings
+from labseq.config.scan import Scan
+from labseq.config.scan_reading import bind_scan
 from labseq.config.settings import Duration, Frequency, Length, Settings, Speed
 from labseq.config.wording import clean
 from labseq.model import MotionSpec, SiteGrid
@@ -37,9 +41,6 @@ from labseq.units import format_quantity
 
 _MOTION: Final = MotionSpec()
 _DEVICE_NAME: Final = re.compile(r"[^\W\d][\w-]*")
-_MAY_ADD: Final = ("timeouts", "grid.row_frequency", "grid.column_frequency", "mobile_tweezers.rf")
-ROLES: Final = ("camera", "static_tweezers", "mobile_tweezers", "detector", "simulation")
-"""The roles of a profile that are one plugin each."""
 
 Sites: TypeAlias = Annotated[int, Field(ge=1, le=1000)]
 Timeout: TypeAlias = Annotated[Duration, Field(gt=0)]
@@ -266,6 +267,7 @@ def load_profile(
     beside: Path,
     overrides: Sequence[Override | tuple[str, str]] = (),
     named_in: Document | None = None,
+    scan: Scan | None = None,
     found: Collected | None = None,
 ) -> tuple[Document, ProfileSpec]:
     """Find and read a hardware profile.
@@ -275,6 +277,7 @@ def load_profile(
         beside: Folder of the file that names the profile.
         overrides: Values that replace those of the file, addresses without "profile.".
         named_in: The sequence whose key ``profile`` names it, for messages.
+        scan: The sequence's scan; the values of its first point count.
         found: Where the problems of a file that can be read go; without it they are raised.
 
     Returns:
@@ -287,7 +290,8 @@ def load_profile(
     document = Document.read(find_profile(name_or_path, beside, named_in=named_in))
     check_kind(document, "hardware profile")
     placed = [_of_profile(Override(*override)) for override in overrides]
-    document = document.override_all(placed, may_add=_MAY_ADD, found=found)
+    document = document.override_all(placed, may_add=MAY_ADD, found=found)
+    document = document if scan is None else bind_scan(scan, document).put(document, 0, profile=True)
     return load_checked(document, ProfileSpec, "a hardware profile", _STAND_INS, found)
 
 

@@ -27,6 +27,8 @@ from labseq.config.fields import (
 )
 from labseq.config.mending import StandIns, load_checked
 from labseq.config.nodes import Loc
+from labseq.config.scan import Scan, ScanOrder
+from labseq.config.scan_reading import read_scan
 from labseq.config.settings import Settings
 from labseq.config.wording import clean, shown
 
@@ -111,6 +113,11 @@ class SequenceSpec(Settings):
         default=3, ge=1, le=100, description="how often a shot is tried before the run stops"
     )
     plugin_folders: Folders = Field(default=[], description="folders with plugins, relative to this file")
+    scan: dict[str, Any] | list[dict[str, Any]] | None = Field(
+        default=None, description="addresses whose values change from shot to shot"
+    )
+    repeats: int = Field(default=1, ge=1, le=1_000_000, description="shots of each point of the scan")
+    order: ScanOrder = Field(default="sequential", description="order of the scan's shots")
     shot: Steps = Field(description="the steps of a shot")
 
 
@@ -128,18 +135,23 @@ _STAND_INS: Final = StandIns(
 
 
 def load_sequence(
-    path: Path, overrides: Sequence[Override | tuple[str, str]] = (), *, found: Collected | None = None
+    path: Path,
+    overrides: Sequence[Override | tuple[str, str]] = (),
+    *,
+    profile_set: Sequence[Override] = (),
+    found: Collected | None = None,
 ) -> tuple[Document, SequenceSpec]:
     """Read a sequence file.
 
     Args:
         path: The file.
         overrides: Values that replace those of the file: (address, value) each.
+        profile_set: Overrides of the profile, with their "profile.": a scan of theirs is replaced.
         found: Where the problems of a file that can be read go; without it they are raised.
 
     Returns:
-        The document, overrides and the default planner included, and what it says; stand-ins
-        for everything of which a problem was found.
+        The document, overrides, the default planner and the first point of its scan included,
+        and what it says; stand-ins for everything of which a problem was found.
 
     Raises:
         ConfigError: Everything that is wrong, but for the settings of plugins.
@@ -149,4 +161,35 @@ def load_sequence(
     if document.data.get("planner") is None:
         document = document.override("planner", f"{{use: {DEFAULT_PLANNER}}}", "the default planner")
     document = document.override_all(overrides, found=found)
+    problems = Collected() if found is None else found
+    document = _at_first_point(document, [Override(*one) for one in overrides], profile_set, problems)
+    if found is None:
+        problems.raise_any()
     return load_checked(document, SequenceSpec, "a sequence", _STAND_INS, found)
+
+
+def _at_first_point(
+    document: Document, overrides: Sequence[Override], profile_set: Sequence[Override], found: Collected
+) -> Document:
+    """The first point's values in their places, and ``shots`` as the scan has them."""
+    scan: Scan | None = None
+    with found:
+        scan = read_scan(document, [*overrides, *profile_set])
+    if scan is None:  # there is none, or it is wrong
+        return document if document.data.get("scan") is None else _without_scan(document)
+    n_shots, shots = scan.n_points * scan.repeats, document.data.get("shots")
+    is_option = any(override.address == "shots" for override in overrides)
+    if shots is None:
+        document = document.override("shots", str(n_shots), "the scan")
+    elif type(shots) is int and (shots > n_shots if is_option else shots != n_shots):
+        what = f"shots is {shots}, but the scan has {scan.n_points} x {scan.repeats} = {n_shots}"
+        expected = f"at most {n_shots}" if is_option else ""
+        hint = "write 'repeats' for more" if is_option else "leave 'shots' out, it follows from the scan"
+        found.add(document.error(("shots",), what + " (points x repeats)", expected, hint))
+    return scan.put(document, 0, profile=False)
+
+
+def _without_scan(document: Document) -> Document:
+    for key, value in (("scan", "~"), ("shots", str(document.data.get("shots") or 1))):
+        document = document.override(key, value, "the scan")
+    return document

@@ -22,6 +22,7 @@ class RandomStream:
 
     def __init__(self, seed: int, name: str = "") -> None:
         self.seed = seed
+        self.name = name
         self._key = (zlib.crc32(name.encode()),) if name else ()
         self._shot = self.machine()
 

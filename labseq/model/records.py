@@ -169,6 +169,7 @@ class RunRecord:
         record_frames: Which frames are kept: "all", "last" or "none".
         grid_spacing_m: Spacing of the sites, in metres.
         lattice: Lattice of the grid.
+        scan: What was scanned: "addresses", "points", "point_of_shot", ...; empty without a scan.
     """
 
     name: str
@@ -189,3 +190,4 @@ class RunRecord:
     record_frames: Literal["all", "last", "none"]
     grid_spacing_m: float
     lattice: str
+    scan: Mapping[str, Any] = field(default_factory=dict[str, Any])

@@ -225,8 +225,8 @@ class Shot:
 
     @property
     def parameters(self) -> dict[str, Any]:
-        """Resolved values of this shot: overrides, scan point."""
-        return dict(self._content.record.parameters)
+        """What differs from the files in this shot: address -> value; those of a scan in SI."""
+        return dict(self.row.get("parameters") or {})
 
     @property
     def readings(self) -> dict[str, Any]:

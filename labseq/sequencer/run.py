@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Collection, Generator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from functools import partial
@@ -67,10 +67,7 @@ class Sequencer:
         self._parameters = dict(parameters or {})
         self._states = StateTable(lambda state: self._emit("state", {"state": state.value}))
         self._unsafe: dict[str, LabseqError] = {}
-        self._budgets = [
-            self.guard.call("step", lab.timeouts.call_s, _budget, step, number, name, lab)
-            for number, (name, step) in enumerate(steps)
-        ]
+        self._budgets = self._lay_out()
 
     @property
     def state(self) -> State:
@@ -80,15 +77,67 @@ class Sequencer:
     def open(self) -> None:
         """Open the simulation, then each device, and turn the static tweezers on."""
         self._states.to(State.OPENING)
+        self._open({"simulation", *dict(self.lab.hardware())})
+        self._states.to(State.IDLE)
+
+    def change(
+        self,
+        lab: Lab,
+        steps: Sequence[tuple[str, Step]],
+        parameters: Mapping[str, Any],
+        reopened: Collection[str] = (),
+    ) -> None:
+        """Go on with other settings, between two shots.
+
+        Args:
+            lab: What the next shots are made with; of the devices that are not reopened, the same.
+            steps: Their steps, with their names.
+            parameters: What differs from the files in them: address -> value.
+            reopened: Devices, "simulation" among them, that ``lab`` has anew: the present ones are
+                made safe and closed, then those opened.
+
+        Raises:
+            LabseqError: A device fails; the caller must call :meth:`shut_down`.
+        """
+        if reopened:
+            self._states.to(State.REOPENING)
+            self._close(reopened)
+        self.lab, self._steps, self._parameters = lab, steps, dict(parameters)
+        if reopened:
+            self._open(reopened)
+            self._states.to(State.IDLE)
+        self._budgets = self._lay_out()
+
+    def _open(self, names: Collection[str]) -> None:
+        """Open the simulation and the devices of these names; static tweezers among them are turned on."""
         lab, timeout_s = self.lab, self.lab.timeouts.call_s
         simulation = () if lab.simulation is None else (("simulation", lab.simulation),)
         for name, part in (*simulation, *lab.hardware()):
-            self._stop.check()
-            # Nothing is made safe beside an open() that is only slow: what that does last would undo it.
-            self.guard.call_to_the_end(name, timeout_s, part.open)
-        self.guard.call("static_tweezers", timeout_s, lab.static_tweezers.load, None)
-        self.guard.call("static_tweezers", timeout_s, lab.static_tweezers.start)
-        self._states.to(State.IDLE)
+            if name in names:
+                self._stop.check()
+                # Nothing is made safe beside an open() that is only slow: what that does last would undo it.
+                self.guard.call_to_the_end(name, timeout_s, part.open)
+        if "static_tweezers" in names:
+            self.guard.call("static_tweezers", timeout_s, lab.static_tweezers.load, None)
+            self.guard.call("static_tweezers", timeout_s, lab.static_tweezers.start)
+
+    def _close(self, names: Collection[str]) -> None:
+        """Make the devices of these names safe, all of them first, then close them."""
+        lab, timeout_s = self.lab, self.lab.timeouts.safe_state_s
+        devices = [(name, device) for name, device in lab.safe_order() if name in names]
+        for name, device in devices:
+            self.guard.call_to_the_end(name, timeout_s, device.safe_state)
+        for name, device in devices:
+            self.guard.call_to_the_end(name, timeout_s, device.close)
+        if lab.simulation is not None and "simulation" in names:
+            self.guard.call_to_the_end("simulation", timeout_s, lab.simulation.close)
+
+    def _lay_out(self) -> list[float]:
+        """What each step may take, in seconds."""
+        return [
+            self.guard.call("step", self.lab.timeouts.call_s, _budget, step, number, name, self.lab)
+            for number, (name, step) in enumerate(self._steps)
+        ]
 
     def run(self, shot_indices: Sequence[int]) -> None:
         """Take the shots, repeating each that fails with ``TransientError``.

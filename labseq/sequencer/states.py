@@ -19,6 +19,8 @@ class State(Enum):
     WRITING = "writing"
     RECOVERING = "recovering"
     """After a transient failure: back to idle, then the shot is repeated."""
+    REOPENING = "reopening"
+    """Between shots: devices whose settings change are closed through their safe state and opened anew."""
     MAKING_SAFE = "making safe"
     SAFE = "safe"
     CLOSING = "closing"
@@ -28,7 +30,8 @@ TRANSITIONS: Final = MappingProxyType(
     {
         State.CLOSED: frozenset({State.OPENING}),
         State.OPENING: frozenset({State.IDLE, State.MAKING_SAFE}),
-        State.IDLE: frozenset({State.SHOT, State.MAKING_SAFE}),
+        State.IDLE: frozenset({State.SHOT, State.REOPENING, State.MAKING_SAFE}),
+        State.REOPENING: frozenset({State.IDLE, State.MAKING_SAFE}),
         State.SHOT: frozenset({State.WRITING, State.RECOVERING, State.MAKING_SAFE}),
         State.RECOVERING: frozenset({State.WRITING, State.MAKING_SAFE}),
         State.WRITING: frozenset({State.IDLE, State.MAKING_SAFE}),

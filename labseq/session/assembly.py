@@ -15,30 +15,31 @@ from labseq.config import (
     Document,
     Override,
     ProfileSpec,
+    Scan,
     SequenceSpec,
+    bind_scan,
     load_profile,
     load_sequence,
     plugin_paths,
+    read_scan,
     split_overrides,
 )
 from labseq.errors import ConfigError
 from labseq.model import TargetPattern
 from labseq.plugins import PluginHost
 from labseq.registry import VIRTUAL_TWIN
-from labseq.roles import Clock, Step
-from labseq.sequencer.lab import Lab, Timeouts
+from labseq.roles import Step
 from labseq.session.choosing import (
     Bench,
     Chosen,
     DryRun,
-    blamed,
     check_dry_run,
     choose,
     resolve,
     validate,
 )
-from labseq.session.constructing import construct
 from labseq.session.contents import make_steps, make_target
+from labseq.session.scan import Point, Scanned
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +54,9 @@ class Assembly:
         planner: What plans the moves.
         steps: Name and step, in order.
         dry_run: "off", "full" or "fast".
-        resolved: Every setting after defaults and overrides, SI, JSON-ready.
+        resolved: Every setting after defaults and overrides, SI, JSON-ready; of a scan, at its first
+            point, as everything else here.
+        scanned: The points of the scan; None without one.
     """
 
     document: Document
@@ -64,11 +67,24 @@ class Assembly:
     steps: tuple[tuple[str, Step], ...]
     dry_run: DryRun
     resolved: Mapping[str, Any]
+    scanned: Scanned | None = None
 
     @property
     def virtual_time(self) -> bool:
         """Whether the run need not wait in real time."""
         return self.dry_run != "off" or self.bench.virtual_time
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What the user should know although it is no error."""
+        notes = () if self.scanned is None else self.scanned.scan.notes
+        return (*self.bench.warnings, *notes)
+
+    def at(self, point: int) -> Point:
+        """The settings of a point of the scan."""
+        if self.scanned is None:
+            return Point(self.planner, self.steps, self.bench, {})
+        return self.scanned.at(point, self.planner, self.steps)
 
 
 def assemble(
@@ -96,11 +112,15 @@ def assemble(
     """
     check_dry_run(dry_run)
     for_sequence, for_profile = split_overrides(overrides)
+    profile_set = [one._replace(address=f"profile.{one.address}") for one in for_profile]
     found = Collected()
     try:
-        document, sequence = load_sequence(sequence_path, [*given, *for_sequence], found=found)
+        document, sequence = load_sequence(
+            sequence_path, [*given, *for_sequence], profile_set=profile_set, found=found
+        )
     except ConfigError as error:
         raise found.stop(error) from None
+    scan = None if found.problems else read_scan(document, [*given, *for_sequence, *profile_set])
     try:
         bench = set_up_bench(
             sequence.profile if profile is None else profile,
@@ -109,28 +129,41 @@ def assemble(
             dry_run,
             named_in=document if profile is None else None,
             plugin_folders=plugin_paths(document, sequence.plugin_folders),
+            scan=scan,
             found=found,
         )
     except ConfigError as error:
         _check_alone(document, sequence, found)
-        raise found.stop(error) from None
+        raise _explained(found.stop(error), scan) from None
+    is_whole = not found.problems
     made: dict[str, Any] = {}
     with found:
         made["target"], made["target_dump"] = make_target(bench, document, sequence)
     with found:
         made["planner"] = resolve(bench.host, document, "planner", sequence.planner)
     steps, step_dumps = make_steps(bench, document, sequence, found)
-    found.raise_any()
+    scanned: Scanned | None = None
+    try:
+        if scan is not None and is_whole:
+            scanned = Scanned(bind_scan(scan, bench.document), document, sequence, bench, dry_run)
+            scanned.check(found)
+        found.raise_any()
+    except ConfigError as error:
+        raise _explained(error, scan) from None
     resolved = {
-        **sequence.model_dump(mode="json", exclude={"shot", "target", "planner"}),
+        **sequence.model_dump(mode="json", exclude={"shot", "target", "planner", "scan"}),
         "target": made["target_dump"],
         "planner": made["planner"].dump(),
         "shot": step_dumps,
         "profile": _profile_dump(bench),
     }
     return Assembly(
-        document, sequence, bench, made["target"], made["planner"], tuple(steps), dry_run, resolved
+        document, sequence, bench, made["target"], made["planner"], tuple(steps), dry_run, resolved, scanned
     )
+
+
+def _explained(error: ConfigError, scan: Scan | None) -> ConfigError:
+    return error if scan is None else scan.explained(error)
 
 
 def _check_alone(document: Document, sequence: SequenceSpec, found: Collected) -> None:
@@ -158,6 +191,7 @@ def set_up_bench(
     *,
     named_in: Document | None = None,
     plugin_folders: Sequence[Path] = (),
+    scan: Scan | None = None,
     found: Collected | None = None,
 ) -> Bench:
     """Read a profile, load the plugins and choose what plays each role.
@@ -169,13 +203,16 @@ def set_up_bench(
         dry_run: "off", "full" or "fast".
         named_in: The sequence that names the profile, for messages.
         plugin_folders: Folders with plugins beside those that the profile names.
+        scan: The sequence's scan; the profile's values are those of its first point.
         found: Where the problems of a profile that can be read go; without it they are raised.
 
     Raises:
         ConfigError: The profile is wrong.
         PluginLoadError: A plugin that it names failed to load.
     """
-    document, spec = load_profile(profile, beside=beside, overrides=overrides, named_in=named_in, found=found)
+    document, spec = load_profile(
+        profile, beside=beside, overrides=overrides, named_in=named_in, scan=scan, found=found
+    )
     host = load_plugins([*plugin_paths(document, spec.plugin_folders), *plugin_folders])
     problems = Collected() if found is None else found
     bench = choose_all(document, spec, host, dry_run, problems)
@@ -249,36 +286,3 @@ def _profile_dump(bench: Bench) -> dict[str, Any]:
     roles["mobile_tweezers"] |= spec.mobile_tweezers.model_dump(mode="json", exclude={"use"})
     devices = {name: bench.chosen[name].dump() for name in spec.devices}
     return {**core, **roles, "devices": devices}
-
-
-def build_lab(assembly: Assembly, clock: Clock, seed: int) -> Lab:
-    """Construct every role's object; nothing is opened."""
-    bench = assembly.bench
-    profile, motion = bench.profile, bench.profile.motion
-    chosen = {**bench.chosen, "planner": assembly.planner}
-    made, streams = construct(chosen, bench.grid, motion, clock, seed)
-    with blamed(assembly.planner.entry, "its degree_of_parallelism"):
-        dop = getattr(made["planner"], "degree_of_parallelism", motion.max_tweezers)
-    return Lab(
-        grid=bench.grid,
-        motion=motion,
-        target=assembly.target,
-        clock=clock,
-        camera=made["camera"],
-        static_tweezers=made["static_tweezers"],
-        mobile_tweezers=made["mobile_tweezers"],
-        detector=made["detector"],
-        planner=made["planner"],
-        planner_name=assembly.planner.entry.name,
-        degree_of_parallelism=dop if isinstance(dop, int) else motion.max_tweezers,
-        devices={name: made[name] for name in profile.devices},
-        simulation=made.get("simulation"),
-        random_streams=streams,
-        timeouts=timeouts_of(profile),
-    )
-
-
-def timeouts_of(profile: ProfileSpec) -> Timeouts:
-    """The profile's timeouts."""
-    timeouts = profile.timeouts
-    return Timeouts(timeouts.call, timeouts.safe_state, timeouts.plan)

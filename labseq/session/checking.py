@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import time
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -17,6 +18,7 @@ from labseq.motion import check_plan
 from labseq.roles import KnownLoading, Step
 from labseq.sequencer import Guard, StopFlag
 from labseq.sequencer.lab import Lab
+from labseq.sequencer.run import lay_out
 from labseq.session.session import Session
 from labseq.units import format_quantity
 
@@ -52,8 +54,10 @@ class CheckReport:
     """What a run will do and need.
 
     Attributes:
-        timeline: Name of each step and its bars.
+        timeline: Name of each step and its bars; of a scan, as all else but ``run_s``, at its first point.
         n_shots: Shots of the run.
+        n_points: Points of the scan that these shots are at; None without a scan.
+        run_s: Duration of the run, at least and at most.
         warnings: What is allowed but hardly meant, with its place in the files.
         rehearsal: What the planner made of random loadings; None without a rearrangement.
         shot_bytes: Size of a shot on disk at most; None if the camera does not tell its frames.
@@ -61,6 +65,8 @@ class CheckReport:
 
     timeline: Sequence[tuple[str, Sequence[TimelineEntry]]]
     n_shots: int
+    n_points: int | None
+    run_s: tuple[float, float]
     warnings: tuple[Problem, ...]
     rehearsal: Rehearsal | None
     shot_bytes: int | None
@@ -99,7 +105,7 @@ def check(session: Session) -> CheckReport:
     if windows:
         session.warm(lab, devices=False)
     rehearsal, failure = _rehearse(lab) if windows else (None, "")
-    warnings = [Problem(text) for text in assembly.bench.warnings]
+    warnings = [Problem(text) for text in assembly.warnings]
     document = assembly.document
     if failure:
         warnings.append(document.problem((*assembly.sequence.planner.loc, "use"), failure))
@@ -108,9 +114,35 @@ def check(session: Session) -> CheckReport:
     warnings += _exposure_warnings(session, lab, timeline)
     warnings += _judgement_warnings(session, [number for number, _ in windows])
     warnings += _parallelism_warnings(session)
+    for point in session.course.each_lab():
+        session.build_lab(point)  # whether the constructors accept the settings
     return CheckReport(
-        timeline, assembly.sequence.shots, tuple(warnings), rehearsal, _shot_bytes(session, lab, timeline)
+        timeline,
+        assembly.sequence.shots,
+        None if assembly.scanned is None else len({*session.course.points}),
+        _run_s(session, lab),
+        tuple(warnings),
+        rehearsal,
+        _shot_bytes(session, lab, timeline),
     )
+
+
+def _run_s(session: Session, lab: Lab) -> tuple[float, float]:
+    """Least and most duration of the run, each shot at its own point of the scan."""
+    guard, n_shots = Guard(StopFlag()), Counter(session.course.points)
+    least_s = most_s = 0.0
+    for index, n in n_shots.items():
+        point = session.assembly.at(index)
+        context = replace(lab.step_context, motion=point.bench.profile.motion)
+        bars = [
+            bar
+            for i, (name, step) in enumerate(point.steps)
+            for bar in guard.call("step", lab.timeouts.call_s, lay_out, step, i, name, context)
+        ]
+        least_s += n * sum(bar.least_s for bar in bars)
+        most_s += n * sum(bar.duration_s for bar in bars)
+    guard.end()
+    return least_s, most_s
 
 
 def _windows(steps: Sequence[tuple[str, Step]]) -> list[tuple[int, list[float]]]:

@@ -35,9 +35,22 @@ _ROLES: Final[Mapping[str, type]] = {
 
 
 def construct(
-    chosen: Mapping[str, Chosen], grid: SiteGrid, motion: MotionSpec, clock: Clock, seed: int
+    chosen: Mapping[str, Chosen],
+    grid: SiteGrid,
+    motion: MotionSpec,
+    clock: Clock,
+    seed: int,
+    simulation: Simulation | None = None,
 ) -> tuple[dict[str, Any], tuple[RandomStream, ...]]:
     """Construct the object of every role; constructors do no I/O, so nothing is open yet.
+
+    Args:
+        chosen: Role -> what plays it.
+        grid: The grid of sites.
+        motion: How the mobile tweezers move.
+        clock: The session's clock.
+        seed: The run's seed.
+        simulation: The world, where none is among the chosen.
 
     Returns:
         Role -> object, and the random streams that were handed out.
@@ -46,14 +59,19 @@ def construct(
         ConfigError: A constructor refuses its settings; with their place.
         PluginLoadError: A constructor raised, or made no object of that role; names the plugin.
     """
-    made, streams, refused = construct_each(chosen, grid, motion, clock, seed)
+    made, streams, refused = construct_each(chosen, grid, motion, clock, seed, simulation)
     for error in refused.values():
         raise error
     return made, streams
 
 
 def construct_each(
-    chosen: Mapping[str, Chosen], grid: SiteGrid, motion: MotionSpec, clock: Clock, seed: int
+    chosen: Mapping[str, Chosen],
+    grid: SiteGrid,
+    motion: MotionSpec,
+    clock: Clock,
+    seed: int,
+    simulation: Simulation | None = None,
 ) -> tuple[dict[str, Any], tuple[RandomStream, ...], dict[str, LabseqError]]:
     """The same, but one that cannot be constructed never keeps the others from it.
 
@@ -66,7 +84,7 @@ def construct_each(
     for role in sorted(chosen, key=lambda role: role != "simulation"):  # the world comes first
         stream = RandomStream(seed, "" if role == "simulation" else role)
         streams.append(stream)
-        context = Context(role, grid, motion, clock, stream, {}, made.get("simulation"))
+        context = Context(role, grid, motion, clock, stream, {}, made.get("simulation", simulation))
         try:
             made[role] = construct_one(chosen[role], context)
         except LabseqError as error:

@@ -52,7 +52,7 @@ def make_steps(
     for spec in sequence.shot:
         step: Step | None = None
         with found:
-            step, dumped = _make_step(bench, document, spec)
+            step, dumped = make_step(bench, document, spec)
             steps.append((spec.name or spec.kind, step))
             dumps.append({spec.kind: dumped, **({"name": spec.name} if spec.name else {})})
             if step.needs_image and not image_seen:
@@ -63,7 +63,12 @@ def make_steps(
     return steps, dumps
 
 
-def _make_step(bench: Bench, document: Document, spec: StepSpec) -> tuple[Step, dict[str, Any]]:
+def make_step(bench: Bench, document: Document, spec: StepSpec) -> tuple[Step, dict[str, Any]]:
+    """A step of a sequence, and its settings for the record.
+
+    Raises:
+        ConfigError: The step is unknown, or its settings are wrong; with their place.
+    """
     entry = named(bench.host, document, "step", spec.kind, spec.loc, key=True)
     settings = validate(document, entry, spec.loc)
     if spec.kind == "device":

@@ -14,9 +14,10 @@ from labseq.recording import clear_active, data_root, marker_roots
 from labseq.roles import Hardware, RunObserver, Simulation
 from labseq.sequencer import Guard, RealClock, StopFlag, VirtualClock
 from labseq.sequencer.lab import Timeouts, in_safe_order
-from labseq.session.assembly import choose_all, load_plugins, timeouts_of
+from labseq.session.assembly import choose_all, load_plugins
 from labseq.session.choosing import HARDWARE_KINDS, Bench
 from labseq.session.constructing import construct_each
+from labseq.session.labs import timeouts_of
 from labseq.session.signals import stop_on_signals
 
 _NEEDED_KINDS: Final = HARDWARE_KINDS | {"simulation"}

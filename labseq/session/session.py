@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import itertools
 import secrets
 from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
@@ -27,12 +28,15 @@ from labseq.roles import RunObserver
 from labseq.sequencer import Guard, PacedClock, RealClock, Sequencer, StopFlag, VirtualClock
 from labseq.sequencer.lab import Lab, describe
 from labseq.sequencer.run import lay_out
-from labseq.session.assembly import Assembly, assemble, build_lab
+from labseq.session.assembly import Assembly, assemble
 from labseq.session.choosing import DryRun
+from labseq.session.labs import build_lab
 from labseq.session.observers import Observers
 from labseq.session.options import Options, path_of
 from labseq.session.provenance import gather_provenance
 from labseq.session.safe import secure_bench
+from labseq.session.scan import Point
+from labseq.session.scan_run import Course
 from labseq.session.signals import stop_on_signals
 from labseq.session.warming import warm
 
@@ -54,6 +58,7 @@ class Session:
         self.seed = assembly.sequence.seed
         if self.seed is None:
             self.seed = secrets.randbits(63)
+        self.course = Course(assembly, self.seed)
         self.run_dir: Path | None = None
         # What the hardware is known by; a dry run touches none, and says nothing about it.
         profile = assembly.bench.hardware_key  # now: vendors' libraries change the folder
@@ -140,18 +145,24 @@ class Session:
         if self.run_dir is not None:
             raise ConfigError("a session runs once; open another for the next run")
         roots = marker_roots(self.options.output or data_root())
-        for text in self.assembly.bench.warnings:
+        for text in self.assembly.warnings:
             self._observers.event("warning", {"text": text})
         with stop_on_signals(self.stop_flag):
             self._secure_after_crash(roots)
-            lab = self.build_lab()
-            self.warm(lab)
+            labs = (self.build_lab(point) for point in self.course.each_lab())
+            lab = next(labs)
+            for one in itertools.chain([lab], labs):
+                self.warm(one)
             gc.collect()
             gc.freeze()  # what is loaded by now stays: going through it all would take 0.1 s of a shot
             return self._run(lab, roots)
 
-    def build_lab(self) -> Lab:
-        """Construct every role's object on the clock that the run will have; nothing is opened."""
+    def build_lab(self, point: Point | None = None) -> Lab:
+        """Construct every role's object on the clock that the run will have; nothing is opened.
+
+        Args:
+            point: Of the scan; None for the first one.
+        """
         assert self.seed is not None
         if not self.assembly.virtual_time:
             clock = RealClock(self.stop_flag)
@@ -159,7 +170,7 @@ class Session:
             clock = PacedClock(self.stop_flag)
         else:
             clock = VirtualClock(self.stop_flag)
-        return build_lab(self.assembly, clock, self.seed)
+        return build_lab(point or self.assembly.at(0), self.assembly.target, clock, self.seed)
 
     def warm(self, lab: Lab, *, devices: bool = True) -> None:
         """Compile what a lab will need; see :func:`labseq.session.warming.warm`."""
@@ -190,22 +201,23 @@ class Session:
     def _take_shots(self, lab: Lab, roots: Sequence[Path], writer: RunWriter, record: RunRecord) -> None:
         spec = self.assembly.sequence
         about = {"record": record, "run_dir": str(writer.run_dir)}
+        first, changes = self.course.first, self.options.changes()
         sequencer = self._sequencer = Sequencer(
             lab,
-            self.assembly.steps,
+            first.steps,
             self.stop_flag,
             writer,
             self._observers,
             seed=record.seed,
             attempts=spec.attempts,
-            parameters=self.options.changes(),
+            parameters={**changes, **first.parameters},
         )
         mark_active(roots, self._profile_key, writer.run_dir)
         self._observers.event("run_starting", about)
         sequencer.open()
         writer.set_devices(describe(lab, sequencer.guard))
         self._observers.event("run_started", about)
-        sequencer.run(range(spec.shots))
+        self.course.run(sequencer, lab, changes)
 
     def _shut_down(self) -> Mapping[str, LabseqError]:
         return self._sequencer.shut_down() if self._sequencer is not None else {}
@@ -272,4 +284,5 @@ class Session:
             record_frames=spec.record_frames,
             grid_spacing_m=lab.grid.spacing_m,
             lattice=lab.grid.lattice,
+            scan=self.course.record(),
         )

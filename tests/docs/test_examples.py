@@ -111,7 +111,8 @@ def test_every_yaml_example_is_valid(block: Block, tmp_path: Path) -> None:
     is_sequence = keys <= {*SequenceSpec.model_fields}
     assert is_sequence or keys <= {*ProfileSpec.model_fields}, f"neither sequence nor profile: {keys}"
     sequence, profile = tmp_path / "sequence.yaml", tmp_path / "profile.yaml"
-    write(sequence, SEQUENCE, block.text if is_sequence else "", keys if is_sequence else set())
+    own = keys | ({"shots"} if "scan" in keys else set())  # they follow from the scan
+    write(sequence, SEQUENCE, block.text if is_sequence else "", own if is_sequence else set())
     write(profile, PROFILE, "" if is_sequence else block.text, set() if is_sequence else keys)
     with labseq.Session.open(sequence, profile=str(profile)) as session:
         assert session.timeline()

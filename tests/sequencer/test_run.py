@@ -565,3 +565,44 @@ class TestRearrange:
             rig.run()
         release.set()
         assert rig.made_safe() == SAFE_ORDER
+
+
+def test_between_shots_a_device_is_closed_through_its_safe_state_and_opened_anew():
+    rig = Rig()
+    rig.sequencer.open()
+    rig.sequencer.run([0])
+    done = len(rig.lab.calls.names())
+    rig.sequencer.change(rig.lab, (LOAD, IMAGE), {"profile.camera.gain": 2}, {"camera", "static_tweezers"})
+    assert rig.lab.calls.names()[done:] == [
+        "camera.safe_state",
+        "static_tweezers.safe_state",
+        "camera.close",
+        "static_tweezers.close",
+        "static_tweezers.open",
+        "camera.open",
+        "static_tweezers.load",
+        "static_tweezers.start",
+    ]
+    rig.sequencer.run([1])
+    assert rig.record().parameters == {"profile.camera.gain": 2}
+    assert not rig.sequencer.shut_down()
+
+
+def test_a_change_of_planner_and_steps_touches_no_device():
+    rig = Rig()
+    rig.sequencer.open()
+    done = len(rig.lab.calls.names())
+    rig.sequencer.change(rig.lab, (LOAD,), {})
+    assert len(rig.lab.calls.names()) == done
+    rig.sequencer.run([0])
+    assert [t.stage for t in rig.record().timing if t.stage.startswith("step")] == ["step 0 load"]
+    assert not rig.sequencer.shut_down()
+
+
+def test_a_device_that_fails_to_reopen_leaves_all_devices_safe():
+    rig = Rig(fail_on={"camera.safe_state": DeviceError("camera", "stuck")})
+    rig.sequencer.open()
+    with pytest.raises(DeviceError, match="stuck"):
+        rig.sequencer.change(rig.lab, (LOAD,), {}, {"camera"})
+    assert rig.sequencer.shut_down().keys() == {"camera"}
+    assert rig.made_safe()[1:] == SAFE_ORDER

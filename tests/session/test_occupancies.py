@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import io
+import os
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -247,3 +249,16 @@ def test_a_shot_without_cycles_is_refused(tmp_path: Path) -> None:
     with labseq.Session.open(sequence, profile="virtual", shots=1, seed=1, output=tmp_path) as session:
         path = shot_file(session.run())
     assert "this shot has no cycles" in message(path)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere names of files are text")
+@pytest.mark.parametrize(
+    ("raw", "label"), [(b"a\xff.npy", "a\\udcff.npy"), (b"a\x1b[31m.npy", "a\\x1b[31m.npy")]
+)
+def test_a_file_with_an_odd_name_has_a_label_that_can_be_shown(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, raw: bytes, label: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with Path(os.fsdecode(raw)).open("wb") as file:
+        np.save(file, np.eye(3, dtype=np.bool_))
+    assert read_source(os.fsdecode(raw)).label == label

@@ -1,0 +1,65 @@
+"""The points of a scan, with what came of their shots."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from labseq.errors import RecordingError
+from labseq.recording.folders import RUN_FILE
+from labseq.recording.reader import Run, Shot
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScanPoint:
+    """A point of a scan and its shots.
+
+    Attributes:
+        parameters: Scanned address -> value, SI.
+        written: The same as the sequence has it: "60 ms".
+        shots: The shots there that count, in order.
+    """
+
+    parameters: Mapping[str, Any]
+    written: Mapping[str, str]
+    shots: tuple[Shot, ...]
+
+    @property
+    def n_defect_free(self) -> int:
+        """Shots that met the target."""
+        return sum(shot.success for shot in self.shots)
+
+    @property
+    def filling_fraction(self) -> float:
+        """Mean filling of the target over the shots that have one; nan without any."""
+        values = [f for shot in self.shots if not math.isnan(f := shot.filling_fraction)]
+        return math.fsum(values) / len(values) if values else math.nan
+
+
+def scan_points(run: Run) -> list[ScanPoint]:
+    """The points of a run's scan that have a shot, in the scan's own order; none without a scan.
+
+    Raises:
+        RecordingError: What run.json says of the scan is damaged.
+    """
+    scan: Mapping[str, Any] = run.record.get("scan") or {}
+    if not scan:
+        return []
+    shots: dict[int, list[Shot]] = {}
+    try:
+        for shot in run.shots:
+            shots.setdefault(int(scan["point_of_shot"][shot.index]), []).append(shot)
+        addresses = scan["addresses"]
+        return [
+            ScanPoint(
+                dict(zip(addresses, scan["points"][point], strict=True)),
+                dict(zip(addresses, scan["written"][point], strict=True)),
+                tuple(shots[point]),
+            )
+            for point in sorted(shots)
+        ]
+    except (KeyError, IndexError, TypeError, ValueError) as error:
+        reason = f"has a damaged scan: {error!r}; take it from a backup"
+        raise RecordingError(run.path / RUN_FILE, reason) from error

@@ -1,0 +1,123 @@
+"""From an assembled run to the lab that the sequencer works on, and from one scan point's lab to the next."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, Final
+
+from labseq.config import MotionSettings, ProfileSpec
+from labseq.model import MotionSpec, RandomStream, TargetPattern
+from labseq.roles import Clock
+from labseq.sequencer.lab import Lab, Timeouts
+from labseq.session.choosing import Bench, Chosen, blamed
+from labseq.session.constructing import construct
+from labseq.session.scan import Point
+
+DRIVERS_MOTION: Final = frozenset({"rf", "max_row_tones", "max_column_tones", "eject_slots"})
+"""Keys of the motion that the mobile tweezers are opened with; all others are the core's alone."""
+
+
+def build_lab(point: Point, target: TargetPattern, clock: Clock, seed: int) -> Lab:
+    """Construct every role's object; nothing is opened."""
+    bench = point.bench
+    profile, motion = bench.profile, bench.profile.motion
+    chosen = {**bench.chosen, "planner": point.planner}
+    made, streams = construct(chosen, bench.grid, motion, clock, seed)
+    return Lab(
+        grid=bench.grid,
+        motion=motion,
+        target=target,
+        clock=clock,
+        camera=made["camera"],
+        static_tweezers=made["static_tweezers"],
+        mobile_tweezers=made["mobile_tweezers"],
+        detector=made["detector"],
+        planner=made["planner"],
+        planner_name=point.planner.entry.name,
+        degree_of_parallelism=_parallelism(point.planner, made["planner"], motion),
+        devices={name: made[name] for name in profile.devices},
+        simulation=made.get("simulation"),
+        random_streams=streams,
+        timeouts=timeouts_of(profile),
+    )
+
+
+def rebuild_lab(lab: Lab, before: Point, after: Point, seed: int) -> tuple[Lab, frozenset[str]]:
+    """Construct anew what differs between two points; all else stays as it is, open.
+
+    A device of which a setting differs must be closed before and opened after. The mobile
+    tweezers stay open while only such motion differs as they are told with each program. A
+    simulated lab stays open only if nothing of its devices and of the motion differs: its devices hold
+    on to the simulation, and that to the motion.
+
+    Args:
+        lab: As it is at the point before.
+        before: The point that the lab is at.
+        after: The point that it shall be at.
+        seed: The run's seed.
+
+    Returns:
+        The lab, and the names of the devices that must be reopened, "simulation" among them.
+    """
+    reopened = _reopened(lab, before.bench, after.bench)
+    motion = after.bench.profile.motion
+    names = {*reopened, "planner"}
+    if _differs(before.bench, after.bench, "detector"):
+        names.add("detector")
+    chosen = {**after.bench.chosen, "planner": after.planner}
+    made, streams = construct(
+        {name: chosen[name] for name in chosen if name in names},
+        lab.grid,
+        motion,
+        lab.clock,
+        seed,
+        lab.simulation,
+    )
+    roles = ("camera", "static_tweezers", "mobile_tweezers", "detector", "planner", "simulation")
+    return replace(
+        lab,
+        **{role: made[role] for role in roles if role in made},
+        devices={name: made.get(name, device) for name, device in lab.devices.items()},
+        motion=motion,
+        planner_name=after.planner.entry.name,
+        degree_of_parallelism=_parallelism(after.planner, made["planner"], motion),
+        random_streams=_streams(lab.random_streams, streams),
+    ), reopened
+
+
+def _reopened(lab: Lab, before: Bench, after: Bench) -> frozenset[str]:
+    names = {name for name, _ in lab.hardware()} | ({"simulation"} if lab.simulation is not None else set())
+    changed = {name for name in names if _differs(before, after, name)}
+    moved = _changed_motion(before.profile.mobile_tweezers, after.profile.mobile_tweezers)
+    if lab.simulation is not None:
+        return frozenset(names if changed or moved else ())
+    if moved & DRIVERS_MOTION:
+        changed.add("mobile_tweezers")
+    return frozenset(changed)
+
+
+def _differs(before: Bench, after: Bench, name: str) -> bool:
+    old, new = before.chosen[name], after.chosen[name]
+    return (old.entry, old.settings) != (new.entry, new.settings)
+
+
+def _changed_motion(before: MotionSettings, after: MotionSettings) -> set[str]:
+    return {key for key in MotionSettings.model_fields if getattr(before, key) != getattr(after, key)}
+
+
+def _streams(old: tuple[RandomStream, ...], new: tuple[RandomStream, ...]) -> tuple[RandomStream, ...]:
+    """The streams of a lab: the new ones, and the old ones of what stays."""
+    names = {stream.name for stream in new}
+    return (*(stream for stream in old if stream.name not in names), *new)
+
+
+def _parallelism(planner: Chosen, made: Any, motion: MotionSpec) -> int:
+    with blamed(planner.entry, "its degree_of_parallelism"):
+        dop = getattr(made, "degree_of_parallelism", motion.max_tweezers)
+    return dop if isinstance(dop, int) else motion.max_tweezers
+
+
+def timeouts_of(profile: ProfileSpec) -> Timeouts:
+    """The profile's timeouts."""
+    timeouts = profile.timeouts
+    return Timeouts(timeouts.call, timeouts.safe_state, timeouts.plan)

@@ -1,0 +1,215 @@
+"""A run's scan: what each point changes, checked and put together before anything is opened.
+
+The points of a scan are many, what they are made of is little: a *part* is the settings
+of one plugin (the planner, a step, a role or device of the profile). A part is validated for
+every combination of the values that go into it, and for no others: what goes into different
+parts cannot contradict each other in a file. Not checked here, but before the run opens
+anything (and by ``labseq check``): whether the constructors accept their settings.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Final
+
+import numpy as np
+
+from labseq.config import ROLES, Axis, Choice, Collected, Document, Loc, Scan, SequenceSpec
+from labseq.config.nodes import Node
+from labseq.config.profile import MobileTweezersChoice
+from labseq.errors import ConfigError
+from labseq.roles import Step
+from labseq.session.choosing import HARDWARE_KINDS, Bench, Chosen, DryRun, choose, resolve
+from labseq.session.contents import make_step
+
+MAX_PROBLEMS: Final = 20
+"""Wrong values after which no more are looked for."""
+
+Part = tuple[bool, Loc]
+"""Whether it is the profile's, and where its settings are."""
+
+
+@dataclass(frozen=True, slots=True)
+class Made:
+    """A part with the settings of some of the points.
+
+    Attributes:
+        chosen: The plugin; None for a step.
+        step: The step; None for everything else.
+        choice: What the profile says of a role.
+        dump: The settings after defaults, SI, JSON-ready.
+    """
+
+    chosen: Chosen | None
+    step: Step | None
+    choice: Choice | None
+    dump: Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """A run's settings at one point.
+
+    Attributes:
+        planner: What plans the moves.
+        steps: Name and step, in order.
+        bench: The profile.
+        parameters: Scanned address -> value, SI, JSON-ready.
+    """
+
+    planner: Chosen
+    steps: tuple[tuple[str, Step], ...]
+    bench: Bench
+    parameters: Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scanned:
+    """The points of a run.
+
+    Attributes:
+        scan: The scan, its axes bound to the profile.
+        document: The sequence's file.
+        sequence: What it says.
+        bench: The profile.
+        dry_run: "off", "full" or "fast".
+    """
+
+    scan: Scan
+    document: Document
+    sequence: SequenceSpec
+    bench: Bench
+    dry_run: DryRun
+    _made: dict[tuple[Part, tuple[int, ...]], Made] = field(default_factory=dict[Any, Made], repr=False)
+    _benches: dict[tuple[int, ...], Bench] = field(default_factory=dict[Any, Bench], repr=False)
+
+    def check(self, found: Collected) -> None:
+        """Validate every part with every combination of the values that go into it.
+
+        Args:
+            found: Where the problems go, those of the first :data:`MAX_PROBLEMS` wrong values.
+        """
+        known, n_wrong = {*self.scan.explained(ConfigError(found.problems)).problems}, 0
+        for part in self._parts():
+            for point in self._points_of(part):
+                try:
+                    self._part(part, point)
+                except ConfigError as error:
+                    new = [problem for problem in self.scan.explained(error).problems if problem not in known]
+                    known.update(new)
+                    n_wrong += bool(new)
+                    if new:
+                        found.add(ConfigError(new))
+                if n_wrong == MAX_PROBLEMS:
+                    return
+
+    def at(self, point: int, planner: Chosen, steps: tuple[tuple[str, Step], ...]) -> Point:
+        """The settings of a point.
+
+        Args:
+            point: Its index.
+            planner: The planner where the scan does not change it.
+            steps: The steps where it does not change them.
+        """
+        parts = {part: self._part(part, point) for part in self._parts()}
+        changed = list(steps)
+        for (of_profile, loc), made in parts.items():
+            if not of_profile and loc == ("planner",):
+                assert made.chosen is not None
+                planner = made.chosen
+            elif not of_profile:
+                assert made.step is not None
+                number = int(loc[1])
+                changed[number] = (steps[number][0], made.step)
+        parameters = {axis.address: _resolved(axis, node, parts) for axis, node in self.scan.values(point)}
+        return Point(planner, tuple(changed), self._bench_at(point, parts), parameters)
+
+    def _bench_at(self, point: int, parts: Mapping[Part, Made]) -> Bench:
+        """The profile at a point; the same object wherever it is the same."""
+        positions = self.scan.positions(point)
+        touched = {g for (of_profile, loc) in parts if of_profile for g in self._groups_of((True, loc))}
+        if not touched:
+            return self.bench
+        key = tuple(positions[g] for g in sorted(touched))
+        if key not in self._benches:
+            chosen, profile = dict(self.bench.chosen), self.bench.profile
+            for (of_profile, loc), made in parts.items():
+                if of_profile:
+                    assert made.chosen is not None
+                    chosen[str(loc[-1])] = made.chosen
+                    if isinstance(made.choice, MobileTweezersChoice):
+                        profile = profile.model_copy(update={"mobile_tweezers": made.choice})
+            self._benches[key] = replace(self.bench, profile=profile, chosen=chosen)
+        return self._benches[key]
+
+    def _parts(self) -> list[Part]:
+        return list(dict.fromkeys(_part_of(axis) for axis in self.scan.axes))
+
+    def _groups_of(self, part: Part) -> list[int]:
+        """The groups whose values go into a part."""
+        return [
+            g for g, group in enumerate(self.scan.groups) if any(_part_of(axis) == part for axis in group)
+        ]
+
+    def _points_of(self, part: Part) -> Iterator[int]:
+        """A point for each combination of what goes into a part; all else as at the first point."""
+        shape, groups = self.scan.shape, self._groups_of(part)
+        for positions in itertools.product(*(range(shape[g]) for g in groups)):
+            whole = [0] * len(shape)
+            for g, position in zip(groups, positions, strict=True):
+                whole[g] = position
+            yield int(np.ravel_multi_index(whole, shape))
+
+    def _part(self, part: Part, point: int) -> Made:
+        positions = self.scan.positions(point)
+        key = (part, tuple(positions[g] for g in self._groups_of(part)))
+        if key not in self._made:
+            self._made[key] = self._make(part, point)
+        return self._made[key]
+
+    def _make(self, part: Part, point: int) -> Made:
+        of_profile, loc = part
+        base = self.bench.document if of_profile else self.document
+        document = self.scan.put(base, point, profile=of_profile)
+        if of_profile:
+            return self._make_role(document, loc)
+        if loc == ("planner",):
+            choice = document.validate(Choice, loc).placed("planner")
+            chosen = resolve(self.bench.host, document, "planner", choice)
+            return Made(chosen, None, choice, chosen.dump())
+        step, dumped = make_step(self.bench, document, self.sequence.shot[int(loc[1])])
+        return Made(None, step, None, dumped)
+
+    def _make_role(self, document: Document, loc: Loc) -> Made:
+        role = str(loc[-1])
+        kind = role if loc[0] in ROLES else "device"
+        model = MobileTweezersChoice if role == "mobile_tweezers" else Choice
+        choice = document.validate(model, loc).placed(*map(str, loc))
+        if kind in HARDWARE_KINDS and choice.use != self.bench.document.get((*loc, "use")):
+            what = f"a scan cannot change the driver of {role}"
+            raise document.error((*loc, "use"), what, "one driver for the whole run")
+        chosen, _ = choose(self.bench.host, document, kind, choice, self.dry_run)
+        if kind in HARDWARE_KINDS and chosen.virtual_time != self.bench.chosen[role].virtual_time:
+            what = f"the scan would change whether {role} is simulated"
+            raise document.error(loc, what, "all points simulated, or none")
+        dumped = chosen.dump()
+        if isinstance(choice, MobileTweezersChoice):
+            dumped |= choice.model_dump(mode="json", exclude={"use"})
+        return Made(chosen, None, choice, dumped)
+
+
+def _part_of(axis: Axis) -> Part:
+    if not axis.of_profile:
+        return False, axis.loc[:1] if axis.loc[0] == "planner" else axis.loc[:3]
+    return True, axis.loc[:2] if axis.loc[0] == "devices" else axis.loc[:1]
+
+
+def _resolved(axis: Axis, node: Node, parts: Mapping[Part, Made]) -> Any:
+    """A scanned value as the plugin understood it, in SI; a mapping as it is written."""
+    part = _part_of(axis)
+    value: Any = parts[part].dump
+    for step in axis.loc[len(part[1]) :]:
+        value = value.get(step) if isinstance(value, dict) else None
+    return node.plain() if value is None or isinstance(node.value, dict) else value

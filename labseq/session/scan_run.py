@@ -1,0 +1,87 @@
+"""A run goes from point to point of its scan."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from labseq.sequencer import Sequencer
+from labseq.sequencer.lab import Lab
+from labseq.session.assembly import Assembly
+from labseq.session.labs import rebuild_lab
+from labseq.session.scan import Point
+
+
+class Course:
+    """The point of each shot of a run.
+
+    Args:
+        assembly: The run; without a scan all shots are at one point.
+        seed: The run's seed.
+    """
+
+    def __init__(self, assembly: Assembly, seed: int) -> None:
+        self.assembly = assembly
+        self._seed = seed
+        scanned, n_shots = assembly.scanned, assembly.sequence.shots
+        self.points = [0] * n_shots
+        if scanned is not None:
+            self.points = [int(point) for point in scanned.scan.points_of_shots(seed)[:n_shots]]
+
+    @property
+    def first(self) -> Point:
+        """The settings of the first shot."""
+        return self.assembly.at(self.points[0])
+
+    def each(self) -> Iterator[Point]:
+        """The settings of each point that a shot is at."""
+        return map(self.assembly.at, dict.fromkeys(self.points))
+
+    def each_lab(self) -> Iterator[Point]:
+        """One point for each planner and profile that there are, the first shot's first."""
+        seen: set[tuple[int, int]] = set()
+        for point in self.each():
+            key = id(point.planner), id(point.bench)
+            if key not in seen:
+                seen.add(key)
+                yield point
+
+    def run(self, sequencer: Sequencer, lab: Lab, changes: Mapping[str, Any]) -> None:
+        """Take all shots.
+
+        Args:
+            sequencer: Open, at the point of the first shot.
+            lab: What it is open with.
+            changes: What differs from the files in every shot: address -> value.
+
+        Raises:
+            LabseqError: Whatever ended the run before its last shot.
+        """
+        now, before = self.points[0], self.first
+        for shot, point in enumerate(self.points):
+            if point != now:
+                after = self.assembly.at(point)
+                lab, reopened = rebuild_lab(lab, before, after, self._seed)
+                sequencer.change(lab, after.steps, {**changes, **after.parameters}, reopened)
+                now, before = point, after
+            sequencer.run([shot])
+
+    def record(self) -> dict[str, Any]:
+        """The scan for the run's record, JSON-ready; empty without one.
+
+        ``addresses``: what is scanned; ``points``: the values of each point, SI; ``written``: the
+        same as the sequence has them; ``point_of_shot``: the point of each shot, counted from 0.
+        """
+        scanned = self.assembly.scanned
+        if scanned is None:
+            return {}
+        scan = scanned.scan
+        points = range(scan.n_points)
+        return {
+            "addresses": [axis.address for axis in scan.axes],
+            "points": [list(self.assembly.at(point).parameters.values()) for point in points],
+            "written": [[str(node.raw or node.plain()) for _, node in scan.values(p)] for p in points],
+            "repeats": scan.repeats,
+            "order": scan.order,
+            "point_of_shot": self.points,
+        }

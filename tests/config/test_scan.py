@@ -1,0 +1,203 @@
+"""``scan:`` in a sequence: its values, its points, and everything that can be wrong with its form."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, strategies as st
+
+from labseq.config import Document, Override, Scan, load_sequence, read_scan
+from labseq.config.scan_values import MAX_POINTS, values_of
+from labseq.errors import ConfigError
+
+REST = """labseq: 1
+name: s
+target: {pattern: compact}
+shot:
+  - load: {duration: 500 ms}
+  - image: {}
+  - {name: sort, rearrange: {window: 60 ms}}
+"""
+N_REST = REST.count("\n")
+
+
+def scan_of(text: str, *fixed: Override) -> Scan:
+    scan = read_scan(Document.parse(REST + text, "s.yaml"), fixed)
+    assert scan is not None
+    return scan
+
+
+def points(scan: Scan) -> list[list[object]]:
+    return [[node.value for _, node in scan.values(point)] for point in range(scan.n_points)]
+
+
+def plain(text: str) -> list[object]:
+    node = Document.parse(f"it: {text}\n", "s.yaml").root.child("it")
+    assert node is not None
+    return [value.value for value in values_of(node, "a.b", "s.yaml")]
+
+
+@pytest.mark.parametrize(
+    ("text", "values"),
+    [
+        ("[3, 5]", [3, 5]),
+        ("{linspace: [50 um/ms, 200 um/ms, 4]}", ["50 um/ms", "100 um/ms", "150 um/ms", "200 um/ms"]),
+        ("{linspace: [0.05 ms, 60 us, 2]}", ["0.05 ms", "0.06 ms"]),
+        ("{linspace: [3, 15, 5]}", [3, 6, 9, 12, 15]),
+        ("{linspace: [1, 2, 3]}", [1, 1.5, 2]),
+        ("{linspace: [0, 0.3, 4]}", [0.0, 0.1, 0.2, 0.3]),
+        ("{range: [60 ms, 200 ms, 50 ms]}", ["60 ms", "110 ms", "160 ms"]),
+        ("{range: [60 ms, 0.2 s, 70 ms]}", ["60 ms", "130 ms", "200 ms"]),
+        ("{range: [0, 1, 0.1]}", [round(0.1 * i, 1) for i in range(11)]),
+        ("{range: [9, 3, -3]}", [9, 6, 3]),
+        ("{range: [3, 3, 1]}", [3]),
+    ],
+)
+def test_the_values_of_an_address(text: str, values: list[object]) -> None:
+    assert plain(text) == values
+
+
+@given(st.floats(-1e6, 1e6), st.floats(-1e6, 1e6), st.integers(2, 50))
+def test_linspace_gives_as_many_values_as_asked_and_both_ends(first: float, last: float, n: int) -> None:
+    found = plain(f"{{linspace: [{first!r}, {last!r}, {n}]}}")
+    assert len(found) == n
+    assert np.allclose(np.array(found, float), np.linspace(first, last, n), rtol=1e-11, atol=1e-6)
+
+
+@given(st.integers(-1000, 1000), st.integers(1, 100), st.integers(0, 99), st.sampled_from([1, 10, 1000]))
+def test_range_includes_its_stop_if_a_step_falls_on_it(start: int, step: int, n: int, per: int) -> None:
+    found = plain(f"{{range: [{start / per!r}, {(start + n * step) / per!r}, {step / per!r}]}}")
+    assert len(found) == n + 1
+    assert math.isclose(float(str(found[-1])), (start + n * step) / per, abs_tol=1e-9)
+
+
+def test_addresses_of_a_mapping_make_every_combination_the_first_slowest() -> None:
+    scan = scan_of("scan: {planner.dop: [3, 5], shot.sort.window: [1 ms, 2 ms]}\nplanner: {use: psca}\n")
+    assert scan.shape == (2, 2)
+    assert points(scan) == [[3, "1 ms"], [3, "2 ms"], [5, "1 ms"], [5, "2 ms"]]
+    assert [axis.loc for axis in scan.axes] == [("planner", "dop"), ("shot", 2, "rearrange", "window")]
+
+
+def test_addresses_of_one_mapping_of_a_list_go_together() -> None:
+    together = "{shot.0.load.duration: [1 s, 2 s], profile.camera.gain: [7, 8]}"
+    scan = scan_of(f"scan:\n  - {together}\n  - {{shot.sort.cycles: [1, 2]}}\n")
+    assert scan.shape == (2, 2)
+    assert points(scan) == [["1 s", 7, 1], ["1 s", 7, 2], ["2 s", 8, 1], ["2 s", 8, 2]]
+
+
+def test_the_first_point_stands_in_the_document_and_shots_follow_from_the_scan(tmp_path: Path) -> None:
+    path = tmp_path / "s.yaml"
+    path.write_text(REST + "scan: {shot.sort.window: [1 ms, 2 ms]}\nrepeats: 3\n")
+    document, spec = load_sequence(path)
+    assert spec.shots == 6
+    assert document.get(("shot", 2, "rearrange", "window")) == "1 ms"
+    path.write_text(path.read_text() + "shots: 6\n")
+    assert load_sequence(path)[1].shots == 6
+    assert load_sequence(path, [Override("shots", "4", "--shots 4")])[1].shots == 4
+
+
+@given(st.integers(1, 40), st.integers(1, 6), st.integers(0, 2**63 - 1))
+def test_each_round_of_a_shuffled_scan_takes_every_point_once(n: int, repeats: int, seed: int) -> None:
+    listed = ", ".join(f"{i + 1} ms" for i in range(n))
+    scan = scan_of(f"scan: {{shot.sort.window: [{listed}]}}\nrepeats: {repeats}\norder: shuffled\n")
+    order = scan.points_of_shots(seed)
+    assert np.array_equal(np.sort(order.reshape(repeats, n), axis=1), np.tile(np.arange(n), (repeats, 1)))
+    assert np.array_equal(order, scan.points_of_shots(seed))
+
+
+def test_a_sequential_scan_takes_all_shots_of_a_point_before_the_next() -> None:
+    scan = scan_of("scan: {shot.sort.window: [1 ms, 2 ms]}\nrepeats: 2\n")
+    assert scan.points_of_shots(1).tolist() == [0, 0, 1, 1]
+
+
+def test_an_option_replaces_the_scan_of_its_address_with_a_note() -> None:
+    text = "scan: {planner.dop: [3, 5], shot.sort.window: [1 ms, 2 ms]}\nplanner: {use: psca}\n"
+    for fixed in (Override("planner.dop", "7"), Override("planner", "{use: lsap}")):
+        scan = scan_of(text, fixed)
+        assert [axis.address for axis in scan.axes] == ["shot.sort.window"]
+        assert scan.notes == (f"--set {fixed.address}={fixed.value} replaces the scan of 'planner.dop'",)
+    both = scan_of(text, Override("planner.dop", "7"), Override("shot.2.rearrange.window", "7 ms"))
+    assert (both.n_points, points(both)) == (1, [[]])
+    profile = scan_of("scan: {profile.camera.gain: [3, 5]}\n", Override("profile.camera.gain", "1"))
+    assert not profile.axes
+
+
+BAD = [
+    ("scan: 5", "1:7: scan is 5; expected a mapping of addresses"),
+    ("scan: []", "1:7: scan is empty"),
+    ("scan: {}", "1:7: scan is empty"),
+    ("scan: [3]", "1:8: a group of the scan is 3"),
+    ("scan: {shot.sort.window: 5 ms}", "1:26: the scan of 'shot.sort.window' is '5 ms'; expected a list"),
+    ("scan: {shot.sort.window: []}", "1:26: the scan of 'shot.sort.window' has no values"),
+    ("scan: {shot.sort.window: {linspce: [1, 2, 3]}}", "1:27: 'linspce' is no way to give values"),
+    ("scan: {shot.sort.window: {linspace: [1, 2]}}", "1:37: linspace is"),
+    ("scan: {shot.sort.window: {linspace: [1 ms, 2 ms, 1]}}", "1:50: the number of values is 1"),
+    (
+        "scan: {shot.sort.window: {linspace: [1 ms, 2, 3]}}",
+        "1:44: 2 does not go with '1 ms'; expected a time",
+    ),
+    ("scan: {shot.sort.window: {linspace: [1, 2 ms, 3]}}", "1:41: '2 ms' does not go with 1"),
+    ("scan: {shot.sort.window: {linspace: [1 ms, 2 m, 3]}}", "1:44: '2 m' does not go with '1 ms'"),
+    ("scan: {shot.sort.window: {linspace: [.nan, 2, 3]}}", "1:38: .nan stands among the limits"),
+    ("scan: {shot.sort.window: {linspace: [true, 2, 3]}}", "1:38: true stands among the limits"),
+    ("scan: {shot.sort.window: {linspace: [1 elf, 2, 3]}}", "1:38: '1 elf' stands among the limits"),
+    ("scan: {shot.sort.window: {range: [1, 5, 0]}}", "1:41: the step 0 does not lead from start to stop"),
+    ("scan: {shot.sort.window: {range: [1, 5, -1]}}", "1:41: the step -1 does not lead"),
+    ("scan: {shot.sort.window: {range: [0, 1, 1e-9]}}", "1:34: the range has 1e+09 values"),
+    ("scan: {shot.sort.window: [1 ms, 1 ms]}", "1:33: '1 ms' stands twice in the scan"),
+    (
+        "scan: {shot.sort.window: [1], shot.2.rearrange.window: [2]}",
+        "1:31: 'shot.2.rearrange.window' is scanned",
+    ),
+    ("scan: {shot.sort: [{}], shot.sort.window: [2]}", "1:25: 'shot.sort.window' is scanned, and so is"),
+    ("scan: {shots: [1, 2]}", "1:8: a scan cannot change 'shots'; expected an address in 'planner'"),
+    ("scan: {target.rows: [1, 2]}", "1:8: a scan cannot change 'target.rows'"),
+    ("scan: {shot.2.name: [a, b]}", "1:8: a scan cannot change 'shot.2.name'"),
+    ("scan: {shot.2: [a, b]}", "1:8: a scan cannot change 'shot.2'"),
+    ("scan: {shot.2.wait: [{}]}", "1:8: a scan cannot change 'shot.2.wait'"),
+    ("scan: {shot.5.load.duration: [1, 2]}", "1:8: 'shot' has no item '5'"),
+    ("scan: {shot.srt.window: [1, 2]}", "1:8: 'shot' has no item 'srt'"),
+    (
+        "scan: [{shot.sort.window: [1, 2], shot.0.load.duration: [1]}]",
+        "1:35: 'shot.0.load.duration' has 1 value, but",
+    ),
+    ("repeats: 3", "1:1: 'repeats' is given without a scan"),
+    ("order: shuffled", "1:1: 'order' is given without a scan"),
+    ("scan: {shot.sort.window: [1, 2]}\nshots: 5", "2:8: shots is 5, but the scan has 2 x 1 = 2"),
+    ("scan: {shot.sort.window: [1, 2]}\nrepeats: 0", "2:10: repeats is 0"),
+    ("scan: {shot.sort.window: [1, 2]}\norder: random", "2:8: order is 'random'"),
+]
+
+
+@pytest.mark.parametrize(("text", "message"), BAD, ids=[text for text, _ in BAD])
+def test_what_is_wrong_is_told_with_its_place(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "s.yaml"
+    without = "scan" not in text
+    path.write_text(REST + text + "\n" + ("shots: 1\n" if without else ""))
+    with pytest.raises(ConfigError) as caught:
+        load_sequence(path)
+    line, rest = message.split(":", 1)
+    told = [str(problem) for problem in caught.value.problems]
+    assert len(told) == 1
+    assert told[0].startswith(f"{path}:{int(line) + N_REST}:{rest}")
+
+
+def test_an_option_for_more_shots_than_the_scan_has_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "s.yaml"
+    path.write_text(REST + "scan: {shot.sort.window: [1 ms, 2 ms]}\n")
+    with pytest.raises(ConfigError, match=r"--shots 3: shots is 3, .* expected at most 2"):
+        load_sequence(path, [Override("shots", "3", "--shots 3")])
+
+
+def test_an_option_within_what_the_scan_changes_as_a_whole_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"the scan changes the whole of 'shot\.sort'"):
+        scan_of("scan: {shot.sort: [{}, {cycles: 2}]}\n", Override("shot.sort.window", "1 ms"))
+
+
+def test_too_many_points_are_refused() -> None:
+    text = "scan: {shot.sort.window: {range: [1, 101, 1]}, shot.sort.exposure: {range: [1, 100, 1]}}\n"
+    with pytest.raises(ConfigError, match=f"101 x 100 = 10100 points; expected at most {MAX_POINTS}"):
+        scan_of(text)

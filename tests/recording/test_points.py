@@ -1,0 +1,72 @@
+"""The points of a scan, read back."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from labseq.errors import RecordingError
+from labseq.model import RunRecord, ShotRecord
+from labseq.recording import RunWriter, open_run
+from labseq.recording.points import scan_points
+
+SCAN: dict[str, Any] = {
+    "addresses": ["shot.sort.window", "planner"],
+    "points": [[0.06, {"use": "psca"}], [0.2, {"use": "lsap"}], [0.3, {"use": "psca"}]],
+    "written": [["60 ms", "{'use': 'psca'}"], ["0.2 s", "{'use': 'lsap'}"], ["0.3 s", "{'use': 'psca'}"]],
+    "repeats": 2,
+    "order": "shuffled",
+    "point_of_shot": [1, 0, 2, 0, 1, 2],
+}
+
+
+def write(
+    folder: Path, make_run: Callable[..., RunRecord], make_shot: Callable[..., ShotRecord], **changes: Any
+) -> Path:
+    writer = RunWriter.create(folder, make_run(n_shots=6, **changes))
+    fillings = [0.5, 1.0, None, 0.75, math.nan]
+    for index, filling in enumerate(fillings):
+        if filling is not None:
+            shot = make_shot(index, filling_fraction=filling, success=filling == 1.0)
+            writer.write_shot(shot)
+    writer.finish("stopped")
+    return writer.run_dir
+
+
+def test_a_point_knows_its_values_and_what_came_of_its_shots(
+    tmp_path: Path, make_run: Callable[..., RunRecord], make_shot: Callable[..., ShotRecord]
+) -> None:
+    run = open_run(write(tmp_path, make_run, make_shot, scan=SCAN))
+    assert run.record["scan"] == SCAN
+    first, second = scan_points(run)
+    assert first.parameters == {"shot.sort.window": 0.06, "planner": {"use": "psca"}}
+    assert first.written["shot.sort.window"] == "60 ms"
+    assert [shot.index for shot in first.shots] == [1, 3]
+    assert (first.n_defect_free, first.filling_fraction) == (1, 0.875)
+    assert [shot.index for shot in second.shots] == [0, 4]
+    assert (second.n_defect_free, second.filling_fraction) == (0, 0.5)
+
+
+def test_a_run_without_a_scan_has_no_points(
+    tmp_path: Path, make_run: Callable[..., RunRecord], make_shot: Callable[..., ShotRecord]
+) -> None:
+    assert scan_points(open_run(write(tmp_path, make_run, make_shot))) == []
+
+
+@pytest.mark.parametrize("damaged", [{"points": []}, {"point_of_shot": None}, {"addresses": ["one"]}])
+def test_a_damaged_scan_is_told(
+    tmp_path: Path,
+    make_run: Callable[..., RunRecord],
+    make_shot: Callable[..., ShotRecord],
+    damaged: dict[str, Any],
+) -> None:
+    folder = write(tmp_path, make_run, make_shot, scan=SCAN)
+    record = json.loads((folder / "run.json").read_text())
+    (folder / "run.json").write_text(json.dumps(record | {"scan": SCAN | damaged}))
+    with pytest.raises(RecordingError, match="damaged scan"):
+        scan_points(open_run(folder))

@@ -1,0 +1,204 @@
+"""Scans on the virtual lab: points checked, applied, recorded, and devices that stay open or are reopened."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import labseq
+from labseq.errors import ConfigError
+from labseq.recording.points import scan_points
+from labseq.session import check
+from labseq.session.labs import _reopened, rebuild_lab
+from labseq.testing.fakes import RecordingObserver
+
+ROOT = Path(__file__).parents[2]
+REST = """labseq: 1
+name: s
+profile: virtual
+seed: 5
+record_frames: none
+target: {pattern: compact, rows: 10, cols: 10}
+planner: {use: psca}
+shot:
+  - load: {duration: 500 ms}
+  - image: {}
+  - {name: sort, rearrange: {window: 100 ms}}
+  - image: {}
+"""
+N_REST = REST.count("\n")
+
+
+def open_scan(folder: Path, text: str, **options: Any) -> labseq.Session:
+    path = folder / "s.yaml"
+    path.write_text(REST + text)
+    profile = str(ROOT / "hardware_profiles" / "virtual.yaml")
+    return labseq.Session.open(path, profile=profile, output=folder / "data", **options)
+
+
+def run(folder: Path, text: str, **options: Any) -> labseq.Run:
+    with open_scan(folder, text, **options) as session:
+        return session.run()
+
+
+def refused(folder: Path, text: str, **options: Any) -> list[str]:
+    with pytest.raises(ConfigError) as caught:
+        open_scan(folder, text, **options)
+    problems = caught.value.problems
+    assert all(problem.notes for problem in problems)
+    return [f"{p.line - N_REST}:{p.column}: {p.what} ({p.notes[-1]})" for p in problems]
+
+
+def states(observer: RecordingObserver) -> list[str]:
+    return [values["state"] for name, values in observer.events if name == "state"]
+
+
+def test_every_shot_is_taken_at_its_point_and_says_which(tmp_path: Path) -> None:
+    text = "scan: {planner.degree_of_parallelism: [2, 5], shot.sort.window: [50 ms, 0.1 s]}\nrepeats: 2\n"
+    done = run(tmp_path, text)
+    assert done.status == "complete"
+    expected = [(dop, window) for dop in (2, 5) for window in (0.05, 0.1) for _ in range(2)]
+    for shot, (dop, window) in zip(done.shots, expected, strict=True):
+        assert shot.parameters["planner.degree_of_parallelism"] == dop
+        assert shot.parameters["shot.sort.window"] == window
+        assert shot.record().parameters == shot.parameters
+        assert shot.cycles[0].window_s == window
+        assert max(len(batch) for plan in shot.plans for batch in plan.batches) == dop
+    assert [p.parameters["shot.sort.window"] for p in scan_points(done)] == [0.05, 0.1] * 2
+    assert [p.written["shot.sort.window"] for p in scan_points(done)] == ["50 ms", "0.1 s"] * 2
+
+
+def test_devices_stay_open_while_only_planner_detector_and_steps_change(tmp_path: Path) -> None:
+    observer = RecordingObserver()
+    text = "scan: {planner: [{use: psca}, {use: lsap}], shot.sort.cycles: [1, 2]}\n"
+    done = run(tmp_path, text, observer=observer)
+    assert "reopening" not in states(observer)
+    assert states(observer).count("opening") == 1
+    assert done.shots[2].parameters["planner"] == {"use": "lsap"}
+    assert {cycle.report is not None for shot in done.shots for cycle in shot.cycles} == {True}
+
+
+def test_a_setting_of_the_motion_or_of_a_device_reopens_a_simulated_lab(tmp_path: Path) -> None:
+    observer = RecordingObserver()
+    speed = "profile.mobile_tweezers.speed: [50 um/ms, 200 um/ms]"
+    text = f"scan: {{{speed}, profile.simulation.loading: [0.6, 0.9]}}\n"
+    done = run(tmp_path, text, observer=observer)
+    assert states(observer).count("reopening") == 3
+    loaded = [shot.occupancies[0].mean() for shot in done.shots]
+    assert np.allclose(loaded, [0.6, 0.9, 0.6, 0.9], atol=0.1)
+    slow, fast = (shot.cycles[0].moves_s for shot in (done.shots[0], done.shots[2]))
+    assert slow > fast
+
+
+def test_a_shot_of_a_scan_is_the_same_as_in_a_run_with_its_values_set(tmp_path: Path) -> None:
+    speed = "profile.mobile_tweezers.speed: [50 um/ms, 130 um/ms]"
+    text = f"scan: {{{speed}, planner.degree_of_parallelism: [2, 5]}}\norder: shuffled\n"
+    scanned = run(tmp_path, text)
+    for shot in scanned.shots:
+        overrides = [f"{address}={value}" for address, value in shot.parameters.items()]
+        alone = run(tmp_path, "shots: 4\n", overrides=overrides).shots[shot.index]
+        assert np.array_equal(shot.occupancies, alone.occupancies)
+        assert [p.moves.tobytes() for p in shot.plans] == [p.moves.tobytes() for p in alone.plans]
+
+
+def test_a_shuffled_order_follows_from_the_seed_and_is_recorded(tmp_path: Path) -> None:
+    text = "scan: {shot.sort.window: {range: [50 ms, 100 ms, 10 ms]}}\nrepeats: 2\norder: shuffled\n"
+    done = run(tmp_path, text)
+    scan = json.loads((done.path / "run.json").read_text())["scan"]
+    assert scan["order"] == "shuffled"
+    order = scan["point_of_shot"]
+    assert sorted(order) == sorted([*range(6), *range(6)])
+    assert order != sorted(order)
+    assert [shot.parameters["shot.sort.window"] for shot in done.shots] == [
+        scan["points"][p][0] for p in order
+    ]
+    first = run(tmp_path, text, shots=3)
+    assert [s.parameters["shot.sort.window"] for s in first.shots] == [
+        s.parameters["shot.sort.window"] for s in done.shots[:3]
+    ]
+
+
+def test_an_option_replaces_the_scan_of_its_address(tmp_path: Path) -> None:
+    observer = RecordingObserver()
+    text = "scan: {profile.mobile_tweezers.speed: [50 um/ms, 130 um/ms], shot.sort.window: [50 ms, 60 ms]}\n"
+    done = run(tmp_path, text, overrides=["profile.mobile_tweezers.speed=100 um/ms"], observer=observer)
+    assert len(done.shots) == 2
+    assert done.record["resolved"]["profile"]["mobile_tweezers"]["speed"] == pytest.approx(0.1)
+    warnings = [values["text"] for name, values in observer.events if name == "warning"]
+    assert any("replaces the scan of 'profile.mobile_tweezers.speed'" in text for text in warnings)
+
+
+def test_every_wrong_value_is_told_with_its_place_and_address(tmp_path: Path) -> None:
+    text = """scan:
+  planner.degree_of_parallelism: [0, 3, x]
+  profile.mobile_tweezers.speed: [1 um/ms, -2 um/ms]
+"""
+    assert refused(tmp_path, text) == [
+        "2:35: degree_of_parallelism is 0 (the scan puts it into 'planner.degree_of_parallelism')",
+        "2:41: degree_of_parallelism is 'x' (the scan puts it into 'planner.degree_of_parallelism')",
+        "3:44: speed is '-2 um/ms' (the scan puts it into 'profile.mobile_tweezers.speed')",
+    ]
+
+
+def test_a_misspelt_setting_is_told_at_the_value(tmp_path: Path) -> None:
+    (told,) = refused(tmp_path, "scan: {profile.camera.gian: [3]}\n")
+    assert "'gian'" in told or "takes no settings" in told
+
+
+def test_values_that_do_not_go_together_in_one_step_are_found(tmp_path: Path) -> None:
+    text = "scan: {shot.sort.cycles: [2, 3], shot.sort.window: [[60 ms, 40 ms], 60 ms]}\n"
+    (told,) = refused(tmp_path, text)
+    assert told.startswith("1:53: the list has 2 entries, but cycles is 3")
+
+
+def test_the_driver_of_a_role_cannot_be_scanned(tmp_path: Path) -> None:
+    (tmp_path / "s.yaml").write_text(REST + "scan: {profile.mobile_tweezers.use: [spcm, virtual]}\n")
+    with pytest.raises(ConfigError, match=r"\d+:44: a scan cannot change the driver of mobile_tweezers"):
+        labseq.Session.open(tmp_path / "s.yaml", profile=str(ROOT / "hardware_profiles" / "bench_awg.yaml"))
+
+
+def test_without_a_simulation_only_what_changes_is_reopened(tmp_path: Path) -> None:
+    text = """scan:
+  - profile.mobile_tweezers.speed: [50 um/ms, 60 um/ms, 60 um/ms]
+    profile.mobile_tweezers.eject_slots: [1, 1, 2]
+"""
+    session = open_scan(tmp_path, text)
+    lab = replace(session.build_lab(), simulation=None)
+    points = [session.assembly.at(point) for point in range(3)]
+    after, reopened = rebuild_lab(lab, points[0], points[1], 5)
+    assert (reopened, after.motion.speed_m_s) == (frozenset(), 0.06)
+    assert after.mobile_tweezers is lab.mobile_tweezers
+    assert after.planner is not lab.planner
+    assert len(after.random_streams) == len(lab.random_streams)
+    assert _reopened(lab, points[1].bench, points[2].bench) == {"mobile_tweezers"}
+
+
+def test_what_a_profile_has_only_one_of_cannot_be_scanned(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r":8: a scan cannot change 'profile.grid.rows'"):
+        open_scan(tmp_path, "scan: {profile.grid.rows: [19, 20]}\n")
+
+
+def test_a_large_product_is_checked_part_by_part(tmp_path: Path) -> None:
+    text = """scan:
+  planner.degree_of_parallelism: {range: [1, 20, 1]}
+  profile.mobile_tweezers.speed: {linspace: [50 um/ms, 200 um/ms, 20]}
+  shot.sort.window: {linspace: [50 ms, 100 ms, 25]}
+"""
+    session = open_scan(tmp_path, text)
+    scanned = session.assembly.scanned
+    assert scanned is not None
+    assert (scanned.scan.n_points, session.assembly.sequence.shots) == (10_000, 10_000)
+    assert len(scanned._made) == 20 + 20 + 25
+
+
+def test_the_check_tells_points_and_the_time_of_all_of_them(tmp_path: Path) -> None:
+    report = check(open_scan(tmp_path, "scan: {shot.0.load.duration: [1 s, 3 s]}\nrepeats: 2\n"))
+    assert (report.n_points, report.n_shots) == (2, 4)
+    alone = check(open_scan(tmp_path, "shots: 4\n", overrides=["shot.0.load.duration=2 s"]))
+    assert alone.n_points is None
+    assert report.run_s == pytest.approx(alone.run_s)
