@@ -10,8 +10,8 @@ from labseq.cli.output import divert_stdout
 from labseq.cli.show import as_line
 from labseq.config.reading import is_file
 from labseq.config.wording import visible
-from labseq.config.writing import whole_file
 from labseq.errors import ConfigError, Problem
+from labseq.files import whole_file
 
 STDOUT: Final = "-"
 

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import io
-import os
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from labseq.errors import ConfigError, Problem
+from labseq.files import whole_file
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -49,14 +48,9 @@ def save_figure(path: Path, draw: Callable[[], Figure], **options: Any) -> None:
     with style.context("default"):
         data = io.BytesIO()
         draw().savefig(data, format="png", **options)
-    real = Path(os.path.realpath(path))
-    part = real.with_name(f"{real.name}.part")
     try:
-        part.write_bytes(data.getbuffer())
-        part.replace(real)
+        with whole_file(path) as file:
+            file.write(data.getbuffer())
     except OSError as error:
         problem = Problem(f"the picture cannot be written: {error.strerror or error}", str(path))
         raise ConfigError(problem) from error
-    finally:
-        with suppress(OSError):
-            part.unlink(missing_ok=True)

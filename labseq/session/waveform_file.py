@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from labseq.config.reading import is_folder, something_else
 from labseq.config.wording import visible
-from labseq.config.writing import whole_file
 from labseq.errors import ConfigError, Problem
+from labseq.files import whole_file
 from labseq.model import SegmentKind
 from labseq.motion.rendering import FULL_SCALE, N_CHANNELS
 from labseq.session.waveform import PlannedWaveform

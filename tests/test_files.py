@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from labseq.config.writing import whole_file
+from labseq.files import whole_file
 
 
 def test_an_older_file_stays_until_the_new_one_is_whole(tmp_path: Path) -> None:
