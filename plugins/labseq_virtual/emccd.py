@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq_virtual.settings import ImageSettings
+from labseq_virtual.image_settings import ImageSettings
 
 
 def render(

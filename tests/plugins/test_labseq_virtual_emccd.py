@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 from labseq_virtual import emccd
-from labseq_virtual.settings import ImageSettings, WorldSettings
+from labseq_virtual.image_settings import ImageSettings
+from labseq_virtual.settings import WorldSettings
 from labseq_virtual.world import World
 from numpy.typing import NDArray
 
