@@ -38,6 +38,7 @@ from labseq.hookspecs import (
 )
 from labseq.model import (
     Batch as Batch,
+    CalibrationEntry as CalibrationEntry,
     CameraFacts as CameraFacts,
     DepthRamp as DepthRamp,
     Frame as Frame,
@@ -56,6 +57,7 @@ from labseq.model import (
     TargetPattern as TargetPattern,
     TimelineEntry as TimelineEntry,
     ToneProgram as ToneProgram,
+    TweezerAmplitudes as TweezerAmplitudes,
     Waveform as Waveform,
     as_occupancy as as_occupancy,
 )
@@ -80,10 +82,12 @@ from labseq.roles import (
     KnownLoading as KnownLoading,
     Lines as Lines,
     Listening as Listening,
+    LossTeller as LossTeller,
     MobileTweezers as MobileTweezers,
     Planner as Planner,
     RfSource as RfSource,
     Shot as Shot,
+    SignalTeller as SignalTeller,
     Simulation as Simulation,
     StaticTweezers as StaticTweezers,
     Step as Step,

@@ -15,6 +15,7 @@ from labseq.model import MotionSpec, Plan, SiteGrid, TargetPattern, ToneProgram
 from labseq.registry import Entry
 from labseq.roles import Context, Planner
 from labseq.session import load_plugins
+from labseq.session.calibrating import calibrated_grid
 from labseq.session.choosing import Chosen
 from labseq.session.constructing import construct_one, construct_target
 
@@ -120,8 +121,8 @@ def tone_program(
         [84800000.0]
     """
     if profile is not None:
-        spec = load_profile(profile, beside=Path())[1]
-        grid, motion = grid or spec.grid_model(), motion or spec.motion
+        document, spec = load_profile(profile, beside=Path())
+        grid, motion = grid or calibrated_grid(document, spec), motion or spec.motion
     return _motion.tone_program(plan, grid, motion, n_batches)
 
 

@@ -17,23 +17,33 @@ def labseq_register(registry: Registry) -> None:
     from labseq.config.detectors import ThresholdSettings, WeightedSettings
     from labseq.config.patterns import BitmapSettings, CompactSettings
     from labseq.config.steps import (
+        CheckOverlaySettings,
+        CheckSitesSettings,
         DeviceSettings,
         ImageSettings,
         LoadSettings,
+        ProbeSettings,
         RearrangeSettings,
         WaitSettings,
     )
     from labseq.geometry import bitmap, compact
     from labseq.imaging import ThresholdDetector, WeightedDetector
+    from labseq.imaging.blind import BlindDetector
+    from labseq.sequencer.probe import ProbeStep
     from labseq.sequencer.rearrange import RearrangeStep
     from labseq.sequencer.steps import DeviceStep, ImageStep, LoadStep, WaitStep
+    from labseq.sequencer.watching import CheckOverlayStep, CheckSitesStep
 
     registry.step("load", LoadStep, LoadSettings)
     registry.step("image", ImageStep, ImageSettings)
     registry.step("rearrange", RearrangeStep, RearrangeSettings)
+    registry.step("probe", ProbeStep, ProbeSettings)
+    registry.step("check_sites", CheckSitesStep, CheckSitesSettings)
+    registry.step("check_overlay", CheckOverlayStep, CheckOverlaySettings)
     registry.step("wait", WaitStep, WaitSettings)
     registry.step("device", DeviceStep, DeviceSettings)
     registry.pattern("compact", compact, CompactSettings)
     registry.pattern("bitmap", bitmap, BitmapSettings)
     registry.detector("threshold", ThresholdDetector, ThresholdSettings)
     registry.detector("weighted", WeightedDetector, WeightedSettings)
+    registry.detector("blind", BlindDetector)

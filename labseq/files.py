@@ -10,7 +10,7 @@ from typing import IO
 
 
 @contextmanager
-def whole_file(path: Path) -> Generator[IO[bytes]]:
+def whole_file(path: Path, *, alone: bool = False) -> Generator[IO[bytes]]:
     """Write a file that gets its name only when it is whole and on the disk.
 
     Until then an older file of that name stays as it is; where a link stands, the file that it
@@ -18,8 +18,12 @@ def whole_file(path: Path) -> Generator[IO[bytes]]:
 
     Args:
         path: The file.
+        alone: Whether to refuse while another process writes the same file in this way; what is read
+            in the block is then still true when the file gets its name.
 
     Raises:
+        FileExistsError: ``alone``, and another process writes it; ``filename`` is what it writes to, which
+            a process that was killed leaves behind.
         OSError: It cannot be written; nothing is left of it.
     """
     if path.exists() and not path.is_file():
@@ -28,12 +32,16 @@ def whole_file(path: Path) -> Generator[IO[bytes]]:
         return
     real = Path(os.path.realpath(path))
     part = real.with_name(f"{real.name}.part")
-    try:
-        with part.open("wb") as file:
+    with part.open("xb" if alone else "wb") as file:
+        try:
             yield file
             file.flush()
             os.fsync(file.fileno())
-        part.replace(real)
-    finally:
-        with suppress(OSError):
-            part.unlink(missing_ok=True)
+            file.close()  # Windows renames no open file
+            part.replace(real)
+        except BaseException:
+            with suppress(OSError):  # of a full disk, which has been told
+                file.close()
+            with suppress(OSError):
+                part.unlink(missing_ok=True)
+            raise

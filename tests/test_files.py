@@ -50,3 +50,15 @@ def test_a_pipe_is_written_to_directly() -> None:
     finally:
         os.close(read)
         os.close(write)
+
+
+def test_who_writes_alone_refuses_a_second_one(tmp_path: Path) -> None:
+    path = tmp_path / "a.txt"
+    with whole_file(path, alone=True) as file:
+        with pytest.raises(FileExistsError, match=r"a\.txt\.part"), whole_file(path, alone=True):
+            pass
+        file.write(b"first")
+    with whole_file(path, alone=True) as file:
+        file.write(b"second")
+    assert path.read_bytes() == b"second"
+    assert [*tmp_path.iterdir()] == [path]

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from labseq import __version__
-from labseq.cli import plan_options, waveform_options
+from labseq.cli import plan_options, plot_options, waveform_options
 from labseq.cli.bench_app import bench
+from labseq.cli.calibration_app import CALIBRATE_EXAMPLES, calibrate, calibration
+from labseq.cli.shared_options import DryRun, Json, Overrides, Profile
 
 app = typer.Typer(
     name="labseq",
@@ -20,6 +21,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 app.add_typer(bench)
+app.add_typer(calibration)
+app.command(epilog=CALIBRATE_EXAMPLES, short_help="Calibrate sites, thresholds, tones or overlay.")(calibrate)
 
 RUN_EXAMPLES = """\b
 Examples:
@@ -30,46 +33,12 @@ Examples:
 """  # noqa: E501 - a command line that is to be copied
 
 
-class DryRunKind(StrEnum):
-    """What ``--dry-run`` may be followed by."""
-
-    FULL = "full"
-    FAST = "fast"
-
-
 SequenceFile = Annotated[
     Path, typer.Argument(metavar="SEQUENCE", help="The sequence file.", show_default=False)
 ]
-Profile = Annotated[
-    str | None,
-    typer.Option(
-        "--profile",
-        "-p",
-        metavar="NAME|FILE",
-        help="Hardware profile, instead of the one that the sequence names.",
-    ),
-]
-Overrides = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--set",
-        metavar="ADDRESS=VALUE",
-        help="Change one value, for example planner.degree_of_parallelism=2 or profile.mobile_tweezers.speed="
-        '"100 um/ms"; may be given several times.',
-    ),
-]
-DryRun = Annotated[
-    DryRunKind | None,
-    typer.Option(
-        "--dry-run",
-        metavar="[=fast]",
-        help="Open no hardware: every device is replaced by its driver's own simulation where it has one, "
-        "else by its virtual twin; with =fast by virtual twins only.",
-        show_choices=False,
-    ),
-]
-Json = Annotated[
-    bool, typer.Option("--json", help="Print the outcome as one line of JSON on stdout, all else on stderr.")
+RunFolder = Annotated[
+    Path | None,
+    typer.Argument(metavar="RUN", help="A run's folder; the newest run by default.", show_default=False),
 ]
 
 
@@ -213,16 +182,26 @@ def waveform(
 
 @app.command()
 def show(
-    run: Annotated[
-        Path | None,
-        typer.Argument(metavar="RUN", help="A run's folder; the newest run by default.", show_default=False),
-    ] = None,
+    run: RunFolder = None,
     as_json: Json = False,
 ) -> None:
     """Show what a run has recorded, finished or not."""
     from labseq.cli.show import show_run
 
     show_run(run, as_json=as_json)
+
+
+@app.command(epilog=plot_options.EXAMPLES, short_help="Draw a run as a figure of the paper.")
+def plot(
+    figure: plot_options.Figure,
+    run: RunFolder = None,
+    output: plot_options.Output = None,
+    compare: plot_options.Compare = None,
+) -> None:
+    """Draw a run as a figure of the paper, beside the paper's own points."""
+    from labseq.cli.plot import plot_run
+
+    plot_run(run, figure, output, compare)
 
 
 @app.command(short_help="List the plugins and what they offer.")

@@ -8,11 +8,11 @@ from typing import Final
 
 from labseq.cli.output import columns
 from labseq.cli.words import percent, plural
+from labseq.model.estimate import Estimate
 from labseq.session.bench_curves import points_of
 from labseq.session.bench_figures import Figure
 from labseq.session.bench_report import Report, Row
 from labseq.session.bench_spec import BARE_MOTION
-from labseq.session.bench_statistics import Estimate
 from labseq.session.bench_work import loading_seed
 from labseq.units import format_quantity
 

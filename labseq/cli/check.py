@@ -11,12 +11,13 @@ from typing import Any, Final, cast
 
 import numpy as np
 
+from labseq.cli.calibration import age_s, told_quality
 from labseq.cli.excerpt import excerpt
 from labseq.cli.failures import lines_of
 from labseq.cli.log_lines import LogLines
 from labseq.cli.output import columns, divert_stdout, encodes, say
 from labseq.cli.show import as_line
-from labseq.cli.words import clock_time, plural, settings_text
+from labseq.cli.words import age_text, clock_time, plural, settings_text
 from labseq.config import Axis
 from labseq.config.wording import clean
 from labseq.errors import ConfigError, Problem
@@ -61,7 +62,7 @@ def check_sequence(
             answer(refusal(error))
         raise
     if answer is not None:
-        answer(as_line(_as_values(checked)))
+        answer(as_line(_as_values(checked) | {"calibrations": _calibrations(session.assembly)}))
     else:
         _print(session.assembly, checked)
 
@@ -156,7 +157,23 @@ def _what(assembly: Assembly) -> list[tuple[str, str]]:
         ),
         ("target", f"{target.name}, {plural(target.n_atoms, 'atom')}, {plural(n_clear, 'site')} to be empty"),
         ("planner", assembly.planner.entry.name + (f" ({listed})" if listed else "")),
+        *(("calibration", text) for text in _calibrated(assembly)),
         *(("scan", text) for text in _scanned(assembly)),
+    ]
+
+
+def _calibrated(assembly: Assembly) -> list[str]:
+    """A line for each calibration in use."""
+    return [
+        f"{entry.kind} {entry.id}, {age_text(age_s(entry))} old, {told_quality(entry)}"
+        for entry in assembly.bench.calibrations.values()
+    ]
+
+
+def _calibrations(assembly: Assembly) -> list[dict[str, Any]]:
+    return [
+        {"kind": entry.kind, "id": entry.id, "taken_utc": entry.taken_utc, "age_s": age_s(entry)}
+        for entry in assembly.bench.calibrations.values()
     ]
 
 

@@ -12,8 +12,9 @@ from labseq.cli.array import Scale, draw_array, scales
 from labseq.cli.glyphs import Glyphs
 from labseq.cli.output import columns
 from labseq.cli.tally import StageTally, Tally
-from labseq.cli.words import clock_time, count_of, percent, plural, rate_interval
+from labseq.cli.words import clock_time, count_of, percent, plural
 from labseq.model import RunRecord
+from labseq.recording.rates import jeffreys
 from labseq.units import format_quantity
 
 SIDE_WIDTH: Final = 44
@@ -111,7 +112,7 @@ def _side(tally: Tally, glyphs: Glyphs) -> list[Text]:
 def _rates(tally: Tally, glyphs: Glyphs) -> list[Text]:
     rate = count_of(tally.n_defect_free, tally.n_done)
     if tally.n_done:
-        low, high = (100 * end for end in rate_interval(tally.n_defect_free, tally.n_done))
+        low, high = (100 * end for end in jeffreys(tally.n_defect_free, tally.n_done))
         rate += f", {low:.0f}{glyphs.to}{high:.0f} %"
     mean, error = tally.filling()
     filling = percent(mean, 2)

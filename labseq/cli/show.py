@@ -11,13 +11,16 @@ from typing import Any, Final
 
 from labseq.cli.failures import lines_of
 from labseq.cli.output import columns, say
+from labseq.cli.statistics import counted_text, cycle_table, share_text, statistics_rows
 from labseq.cli.telling import outcome
-from labseq.cli.words import count_of, percent, plural
+from labseq.cli.words import percent, plural
 from labseq.config.wording import clean
 from labseq.errors import ConfigError, LabseqError, Problem, RecordingError
 from labseq.recording import Run, Shot, data_root, open_run
 from labseq.recording.folders import find_run
+from labseq.recording.plain import to_plain
 from labseq.recording.points import scan_points
+from labseq.recording.statistics import statistics_of
 from labseq.units import format_quantity
 
 MAX_ROWS: Final = 40
@@ -36,7 +39,7 @@ def show_run(path: Path | None, *, as_json: bool) -> None:
         RecordingError: It is damaged.
     """
     try:
-        run = open_run(newest_run(data_root()) if path is None else _existing(path))
+        run = chosen_run(path)
     except LabseqError as error:
         if as_json:
             say(as_line(json_summary(None) | {"error": "\n".join(lines_of(error))}))
@@ -44,12 +47,23 @@ def show_run(path: Path | None, *, as_json: bool) -> None:
     if as_json:
         say(as_line(json_summary(run)))
     else:
-        points = point_table(run)
-        say(*shot_table(run), "", *points, *([""] if points else []), *summary_lines(run))
+        say(*shot_table(run), "", *summary_lines(run))
+
+
+def chosen_run(path: Path | None) -> Run:
+    """Open the run that a command is given.
+
+    Args:
+        path: The run's folder or any file in it; None for the newest run.
+
+    Raises:
+        ConfigError: There is no such run: a mistake of the user, not of the data.
+        RecordingError: It is damaged.
+    """
+    return open_run(newest_run(data_root()) if path is None else _existing(path))
 
 
 def _existing(path: Path) -> Path:
-    """The run's folder; a path that is no run's is a mistake of the user, not of the data."""
     try:
         return find_run(path)
     except RecordingError as error:
@@ -81,18 +95,21 @@ def json_summary(run: Run | None) -> dict[str, Any]:
     if run is None:
         nothing = {"defect_free": None, "filling_fraction": None}
         return {"run_dir": None, "shots": 0, **nothing, "status": "failed"}
-    points = [
-        {
-            "parameters": dict(point.parameters),
-            "shots": len(point.shots),
-            "defect_free": point.n_defect_free / len(point.shots),
-            "filling_fraction": None if math.isnan(point.filling_fraction) else point.filling_fraction,
-        }
-        for point in scan_points(run)
-    ]
-    return (
-        run.summary() | ({"points": points} if points else {}) | ({"error": run.error} if run.error else {})
-    )
+    target = run.target
+    values = run.summary() | {"statistics": statistics_of(run.shots, target).as_dict()}
+    points = [(point, statistics_of(point.shots, target)) for point in scan_points(run)]
+    if points:
+        values["points"] = [
+            {
+                "parameters": dict(point.parameters),
+                "shots": len(point.shots),
+                "defect_free": to_plain(statistics.defect_free.value),
+                "filling_fraction": to_plain(statistics.filling.value),
+                "statistics": statistics.as_dict(),
+            }
+            for point, statistics in points
+        ]
+    return values | ({"error": run.error} if run.error else {})
 
 
 def as_line(values: Mapping[str, Any]) -> str:
@@ -101,20 +118,23 @@ def as_line(values: Mapping[str, Any]) -> str:
 
 
 def point_table(run: Run) -> list[str]:
-    """A table of the scan's points; nothing without a scan."""
-    points = scan_points(run)
+    """A table of the scan's points; nothing without a scan.
+
+    Where no shot is judged, the images that ended the last cycles are.
+    """
+    points = [(point, statistics_of(point.shots, run.target)) for point in scan_points(run)]
     if not points:
         return []
-    rows = [
-        (
-            *map(clean, point.written.values()),
-            str(len(point.shots)),
-            percent(point.filling_fraction, 2),
-            count_of(point.n_defect_free, len(point.shots)),
-        )
-        for point in points
-    ]
-    header = (*map(clean, points[0].written), "shots", "filling", "defect-free")
+    judged = any(statistics.defect_free.n_trials for _, statistics in points)
+    rows: list[tuple[str, ...]] = []
+    for point, statistics in points:
+        shown = statistics if judged or not statistics.cycles else statistics.cycles[-1]
+        written = map(clean, point.written.values())
+        n_shots = str(len(point.shots))
+        rows.append((*written, n_shots, share_text(shown.filling), counted_text(shown.defect_free)))
+    names = ("filling", "defect-free")
+    last = names if judged else tuple(f"{name}, last cycle" for name in names)
+    header = (*map(clean, points[0][0].written), "shots", *last)
     return _shortened(columns([header, *rows], right=tuple(range(len(header) - 1))))
 
 
@@ -151,21 +171,19 @@ def _shot_row(shot: Shot, n_atoms: int) -> tuple[str, ...]:
 
 
 def summary_lines(run: Run) -> list[str]:
-    """The run in a few lines."""
-    n = len(run.shots)
-    seen = sum(shot.success or shot.seen_defect_free_cycle > 0 for shot in run.shots)
+    """What came of the run: a table of its points or cycles, and the whole of it in a few lines."""
+    statistics = statistics_of(run.shots, run.target)
+    table = point_table(run) or cycle_table(statistics)
     rows = [
         ("run", str(run.path)),
         ("status", f"{run.status}: {run.error}" if run.status == "failed" else run.status),
-        ("shots", f"{n} of {run.n_shots}" + (_repeated(run) if run.attempts else "")),
-        ("defect-free", count_of(sum(shot.success for shot in run.shots), n)),
-        ("seen defect-free", count_of(seen, n)),
-        ("filling", percent(run.filling_fraction, 2)),
+        ("shots", f"{len(run.shots)} of {run.n_shots}" + (_repeated(run) if run.attempts else "")),
+        *statistics_rows(statistics),
         ("duration", _duration(run)),
     ]
     if run.n_damaged_lines:
         rows.append(("warning", f"{plural(run.n_damaged_lines, 'line')} of the index cannot be read"))
-    return columns(rows)
+    return [*table, *([""] if table else []), *columns(rows)]
 
 
 def _repeated(run: Run) -> str:

@@ -19,22 +19,6 @@ def percent(fraction: float | None, digits: int = 1) -> str:
     return f"{100 * fraction:.{digits}f} %"
 
 
-def rate_interval(n_successes: int, n_trials: int) -> tuple[float, float]:
-    """The 68 % interval of a rate, after Wilson (J. Am. Stat. Assoc. 22, 209, 1927).
-
-    Returns:
-        Its lower and upper end, fractions.
-
-    Example:
-        >>> [round(end, 3) for end in rate_interval(5, 10)]
-        [0.349, 0.651]
-    """
-    k, n = n_successes, n_trials
-    centre = (k + 0.5) / (n + 1)
-    half = math.sqrt(k * (n - k) / n + 0.25) / (n + 1)
-    return max(0.0, centre - half), min(1.0, centre + half)
-
-
 def count_of(n: int, total: int) -> str:
     """Write a count, what it is of, and its fraction.
 
@@ -55,6 +39,19 @@ def clock_time(duration_s: float) -> str:
     minutes, seconds = divmod(round(duration_s), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02}:{seconds:02}" if hours else f"{minutes}:{seconds:02}"
+
+
+def age_text(duration_s: float) -> str:
+    """Write an age by its largest unit.
+
+    Example:
+        >>> age_text(90), age_text(3 * 3600), age_text(40 * 86_400)
+        ('1 minute', '3 hours', '40 days')
+    """
+    for unit, unit_s in (("day", 86_400), ("hour", 3600), ("minute", 60)):
+        if duration_s >= unit_s:
+            return plural(int(duration_s // unit_s), unit)
+    return plural(max(0, int(duration_s)), "second")
 
 
 def plural(n: int, noun: str) -> str:

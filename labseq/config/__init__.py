@@ -1,6 +1,7 @@
 """YAML to frozen, validated specs, with errors that name file, line and column."""
 
 from labseq.config.addresses import Override, profile_overrides, split_overrides
+from labseq.config.calibrations import CalibrationChoices, CalibrationSettings
 from labseq.config.collect import Collected
 from labseq.config.document import Document
 from labseq.config.fields import ROLES, Choice, plugin_paths
@@ -10,7 +11,6 @@ from labseq.config.profile import (
     MOTION_KEYS,
     MotionSettings,
     ProfileSpec,
-    TimeoutSettings,
     load_profile,
 )
 from labseq.config.scan import Axis, Scan
@@ -18,18 +18,26 @@ from labseq.config.scan_reading import bind_scan, read_scan
 from labseq.config.sequence import SequenceSpec, StepSpec, load_sequence
 from labseq.config.settings import Settings
 from labseq.config.steps import (
+    CheckOverlaySettings,
+    CheckSitesSettings,
     DeviceSettings,
     ImageSettings,
     LoadSettings,
+    ProbeSettings,
     RearrangeSettings,
     WaitSettings,
 )
+from labseq.config.timeouts import TimeoutSettings
 from labseq.config.values import validate_values
 
 __all__ = [
     "MOTION_KEYS",
     "ROLES",
     "Axis",
+    "CalibrationChoices",
+    "CalibrationSettings",
+    "CheckOverlaySettings",
+    "CheckSitesSettings",
     "Choice",
     "Collected",
     "DeviceSettings",
@@ -39,6 +47,7 @@ __all__ = [
     "Loc",
     "MotionSettings",
     "Override",
+    "ProbeSettings",
     "ProfileSpec",
     "RearrangeSettings",
     "Scan",

@@ -13,10 +13,20 @@ Thresholds: TypeAlias = float | FilePath | tuple[tuple[float, ...], ...]
 
 
 class _RegionSettings(Settings):
-    """Where the sites are on the frames."""
+    """Where the sites are on the frames.
 
+    The file in `sites` counts before a calibration of sites that is in use, and that
+    before the geometry that is set here.
+    """
+
+    sites: FilePath | None = Field(
+        default=None,
+        description="file with the place of each site, for an irregular array: .npy of (y, x), shape "
+        "[rows, cols, 2], or .csv with the columns row, col, y, x; in pixels",
+    )
     frame: tuple[PositiveInt, PositiveInt] = Field(
-        default=(512, 512), description="[height, width] in pixels of the frames that the sites were found on"
+        default=(512, 512),
+        description="[height, width] in pixels of the frames that `sites` and `centre_px` belong to",
     )
     centre_px: tuple[float, float] = Field(
         default=(255.5, 255.5),
@@ -49,8 +59,9 @@ class ThresholdSettings(_RegionSettings):
     offset: float = Field(default=500.0, description="counts of a dark pixel")
     threshold: Thresholds = Field(
         default=1630.0,
-        description="counts over the offset, summed over the region, above which there is an atom: "
-        "one number, one for each site (rows of numbers), or the path of a .npy file with one for each site",
+        description="counts over the offset, summed over the region, above which there is an atom, "
+        "unless a calibration of thresholds is in use: one number, one for each site (rows of numbers), or "
+        "the path of a .npy file with one for each site",
     )
     width: PositiveFloat = Field(
         default=130.0,
@@ -99,8 +110,9 @@ class WeightedSettings(_RegionSettings):
     )
     threshold: Thresholds = Field(
         default=0.0,
-        description="log-odds above which there is an atom; lower misses fewer atoms and imagines more: "
-        "one number, one for each site (rows of numbers), or the path of a .npy file with one for each site",
+        description="log-odds above which there is an atom; lower misses fewer atoms and imagines more; used "
+        "unless a calibration of thresholds is in use: one number, one for each site (rows of numbers), or "
+        "the path of a .npy file with one for each site",
     )
     width: PositiveFloat = Field(
         default=2.0,

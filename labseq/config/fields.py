@@ -34,7 +34,14 @@ _KINDS: Final = {"sequence": "shot", "hardware profile": "grid"}  # kind of file
 
 ROLES: Final = ("camera", "static_tweezers", "mobile_tweezers", "detector", "simulation")
 """The roles of a profile that are one plugin each."""
-MAY_ADD: Final = ("timeouts", "grid.row_frequency", "grid.column_frequency", "mobile_tweezers.rf")
+MAY_ADD: Final = (
+    "timeouts",
+    "grid.row_frequency",
+    "grid.column_frequency",
+    "mobile_tweezers.rf",
+    "calibrations",
+    "calibrations.use",
+)
 """Addresses of mappings that an option may set something in although the profile has none."""
 
 Text: TypeAlias = Annotated[str, Field(min_length=1)]

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from labseq.config.addresses import Override
+from labseq.config.calibrations import CalibrationSettings
 from labseq.config.collect import Collected
 from labseq.config.document import Document
 from labseq.config.fields import (
@@ -33,6 +34,7 @@ from labseq.config.rf import RfSettings
 from labseq.config.scan import Scan
 from labseq.config.scan_reading import bind_scan
 from labseq.config.settings import Duration, Frequency, Length, Settings, Speed
+from labseq.config.timeouts import TimeoutSettings
 from labseq.config.wording import clean
 from labseq.model import MotionSpec, SiteGrid
 from labseq.model.grid import centred_comb
@@ -43,7 +45,6 @@ _MOTION: Final = MotionSpec()
 _DEVICE_NAME: Final = re.compile(r"[^\W\d][\w-]*")
 
 Sites: TypeAlias = Annotated[int, Field(ge=1, le=1000)]
-Timeout: TypeAlias = Annotated[Duration, Field(gt=0)]
 
 
 class FrequencyComb(Settings):
@@ -182,14 +183,6 @@ class MobileTweezersChoice(MotionSettings, Choice):
     """The plugin of the mobile tweezers, and how they move."""
 
 
-class TimeoutSettings(Settings):
-    """How long plugins may take before they count as hung."""
-
-    call: Timeout = Field(default=10.0, description="longest device call, beyond what it does by itself")
-    safe_state: Timeout = Field(default=5.0, description="longest way of a device to its safe state")
-    plan: Timeout = Field(default=5.0, description="longest planning of a cycle")
-
-
 def _named(devices: dict[str, Choice]) -> dict[str, Choice]:
     for name in devices:
         if name in (*ROLES, "planner"):
@@ -217,6 +210,9 @@ class ProfileSpec(Settings):
     )
     simulation: Annotated[Choice, placed_by_field] | None = Field(
         default=None, description="the simulated world that virtual devices act on"
+    )
+    calibrations: Annotated[CalibrationSettings, empty_is({})] = Field(
+        default=CalibrationSettings(), description="which calibrations count: a mapping, a folder, or `off`"
     )
     plugin_folders: Folders = Field(default=[], description="folders with plugins, relative to this file")
     timeouts: Annotated[TimeoutSettings, empty_is({})] = Field(

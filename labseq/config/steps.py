@@ -7,10 +7,14 @@ from typing import Annotated, Literal, Self, TypeAlias
 from pydantic import Field, model_validator
 
 from labseq.config.fields import Text, empty_is, misfit
-from labseq.config.settings import Duration, Settings
+from labseq.config.settings import Duration, Length, Settings
 
 Exposure: TypeAlias = Annotated[Duration, Field(gt=0)]
 """Seconds, more than 0; "45 ms"."""
+
+
+PositiveLength: TypeAlias = Annotated[Length, Field(gt=0)]
+"""Metres, more than 0; "0.9 um"."""
 
 
 class LoadSettings(Settings):
@@ -57,6 +61,65 @@ class RearrangeSettings(Settings):
             cycle: Counted from 1.
         """
         return self.window[cycle - 1] if isinstance(self.window, tuple) else self.window
+
+
+class ProbeSettings(Settings):
+    """``probe``: pick atoms up, hold them and set them down, beside their sites."""
+
+    offset: tuple[Length, Length] = Field(
+        default=(0.0, 0.0),
+        description="[along a row, from row to row]: how far beside their sites the tweezers shall stand",
+    )
+    hold: Duration = Field(default=0.2e-3, description="time between pick-up and drop-off")
+    drop_off: Duration = Field(
+        default=5e-6, description="duration of the drop-off; a slow one leads atoms back to their sites"
+    )
+    pattern: Literal["same", "cross"] = Field(
+        default="same",
+        description="the offset of each site: the same for all, or in four groups of sites forwards and "
+        "backwards along a row, forwards and backwards from row to row",
+    )
+    sites: Literal["seen", "all"] = Field(
+        default="seen", description="which sites are probed: where the last image saw an atom, or all"
+    )
+
+
+class CheckSitesSettings(Settings):
+    """``check_sites``: see on the last image whether the sites have moved on the camera."""
+
+    every: int = Field(default=1, ge=1, description="check every so many shots, from the first")
+    limit_px: float = Field(default=0.5, gt=0, description="largest shift that is let pass, in pixels")
+    spot_px: float = Field(
+        default=1.2, gt=0, description="width (1 sigma of a Gaussian) of an atom's image, in pixels"
+    )
+    exceeded: Literal["warn", "stop"] = Field(
+        default="warn", description="whether a larger shift is a warning or stops the run"
+    )
+
+
+class CheckOverlaySettings(Settings):
+    """``check_overlay``: see by a probe whether the mobile tweezers still stand on the sites."""
+
+    every: int = Field(default=20, ge=1, description="check every so many shots, from the first")
+    offset: PositiveLength = Field(
+        default=0.9e-6, description="offset of the probe in each of four directions: on the bump's edge"
+    )
+    hold: Duration = Field(default=0.2e-3, description="time between pick-up and drop-off")
+    drop_off: Duration = Field(
+        default=5e-6, description="duration of the drop-off; a slow one leads atoms back to their sites"
+    )
+    exposure: Exposure = Field(default=45e-3, description="exposure time of the image after it")
+    limit: PositiveLength = Field(default=100e-9, description="largest offset that is let pass, on each axis")
+    exceeded: Literal["warn", "stop"] = Field(
+        default="warn", description="whether a larger offset is a warning or stops the run"
+    )
+    half_width: PositiveLength = Field(
+        default=0.93e-6,
+        description="distance at which half of the probed atoms survive, where no calibration tells it",
+    )
+    edge: PositiveLength = Field(
+        default=0.23e-6, description="width (1 sigma) of the bump's edge, where no calibration tells it"
+    )
 
 
 class WaitSettings(Settings):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -20,7 +19,7 @@ from labseq.drawing.paint import (
     paint_sites,
 )
 from labseq.drawing.panels import Panel, make_panels
-from labseq.drawing.saving import make_figure, save_figure
+from labseq.drawing.saving import check_place, make_figure, save_figure
 from labseq.drawing.sheet import Sheet, extent_of, lay_out, place_sites
 from labseq.errors import ConfigError, Problem
 from labseq.model import Occupancy, Plan, PlanReport, SiteGrid, TargetPattern
@@ -70,25 +69,10 @@ def check_picture(path: Path, shape: tuple[int, int]) -> None:
         ConfigError: The file has another ending than .png, its folder does not
             exist, the array is too large, or matplotlib is not installed.
     """
-    name = str(path)
-    if path.suffix.lower() != ".png":
-        raise ConfigError(Problem("this is no name of a PNG file", name, expected="a file that ends in .png"))
-    try:
-        has_folder, is_folder = path.parent.is_dir(), path.is_dir()
-        is_odd = path.exists() and not path.is_file()
-    except OSError as error:  # a name that is too long
-        raise ConfigError(Problem(f"this is no name of a file: {error.strerror}", name)) from error
-    if not has_folder:
-        raise ConfigError(Problem("there is no such folder", str(path.parent), expected="one that exists"))
-    if is_odd:
-        what = "this is a folder" if is_folder else "this is not an ordinary file"
-        raise ConfigError(Problem(what, name, expected="a file that ends in .png"))
     if max(shape) > MAX_SITES:
         what = f"{shape[0]} x {shape[1]} sites are too many for a picture"
-        raise ConfigError(Problem(what, name, expected=f"at most {MAX_SITES} rows and columns"))
-    if find_spec("matplotlib") is None:
-        what = "drawing a picture needs matplotlib, which is not installed"
-        raise ConfigError(Problem(what, hint="pip install 'labseq[plot]'"))
+        raise ConfigError(Problem(what, str(path), expected=f"at most {MAX_SITES} rows and columns"))
+    check_place(path, (".png",))
 
 
 def save_plan(path: Path, drawing: PlanDrawing) -> None:

@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from labseq.imaging.known_sites import ContextLike, KnownSites, known_sites
 from labseq.imaging.photoelectrons import SensorLike, evidence
-from labseq.imaging.regions import (
-    ContextLike,
-    PerSite,
-    RegionsLike,
-    checked_image,
-    region_corners,
-    site_thresholds,
-    sites_on_frame,
-)
+from labseq.imaging.regions import RegionsLike, checked_image, region_corners
 from labseq.imaging.spots import pairs_within, spot_light
-from labseq.model import Frame, Occupancy, SiteGrid
+from labseq.imaging.thresholds import PerSite, known_thresholds
+from labseq.model import Frame, Occupancy
 
 Floats = NDArray[np.float64]
 
@@ -105,24 +100,41 @@ class WeightedDetector:
     The confidence is ``tanh(|log-odds - T_ij| / width)``; at T = 0 and the width of 2 it is the
     probability of being right, scaled to 0..1, if half of the sites hold atoms.
 
+    Where the sites are is said by the file in ``sites``, else by the calibration of
+    sites in use, else by the geometry in the settings; the thresholds by the
+    calibration of thresholds in use, else by the settings.
+
     Args:
         settings: See :class:`WeightedLike`. A threshold given as text is the path
             of a .npy file of floats (n_rows, n_cols), read here.
-        context: Grid and name; a ``labseq.Context``.
+        context: Grid, calibrations and name; a ``labseq.Context``.
 
     Raises:
         LimitError: A region reaches over the edge of the frame, or the thresholds do
             not have one value per site.
-        ConfigError: The thresholds' file cannot be read.
+        ConfigError: A file cannot be read, or the calibrated thresholds are no log-odds.
     """
+
+    signal_unit: Final = "log-odds"
 
     def __init__(self, settings: WeightedLike, context: ContextLike) -> None:
         self._name = context.name or "detector"
         self._settings, self._grid = settings, context.grid
-        self._corners = region_corners(settings, context.grid)
-        self._thresholds = site_thresholds(settings.threshold, context.grid.shape)
+        self._known = known_sites(settings, context)
+        self._corners = region_corners(self._known, settings.region)
+        thresholds = known_thresholds(settings.threshold, self.signal_unit, context)
+        self._thresholds, self._thresholds_source = thresholds.values, thresholds.source
         self._weights: Weights | None = None
         self._kernels: Any = None
+
+    @property
+    def sites_px(self) -> Floats:
+        """(y, x) of each site in pixels, float64 (n_rows, n_cols, 2)."""
+        return self._known.positions_px
+
+    def describe(self) -> Mapping[str, str]:
+        """Where its sites and thresholds come from."""
+        return {"sites": self._known.source, "thresholds": self._thresholds_source}
 
     def warm(self) -> None:
         """Work out the weights; compile the kernels, or load them from the cache."""
@@ -138,17 +150,17 @@ class WeightedDetector:
         Raises:
             DeviceError: The frame is not of the size that the sites belong to.
         """
-        distance = self.log_odds(frame) - self._thresholds
+        distance = self.signals(frame) - self._thresholds
         confidence = np.tanh(np.abs(distance) / self._settings.width).astype(np.float32)
         return distance > 0.0, confidence
 
-    def log_odds(self, frame: Frame) -> Floats:
-        """Log-likelihood ratio of an atom against none, float64 (n_rows, n_cols).
+    def signals(self, frame: Frame) -> Floats:
+        """Log-odds of an atom against none, float64 (n_rows, n_cols).
 
         Raises:
             DeviceError: The frame is not of the size that the sites belong to.
         """
-        image = checked_image(frame, self._settings.frame, self._name)
+        image = checked_image(frame, self._known, self._name)
         weights = self._ready()
         odds = np.empty(len(self._corners))
         self._kernels.weigh_sites(image, self._corners, weights.pixels, weights.curve, weights.constant, odds)
@@ -163,19 +175,19 @@ class WeightedDetector:
             from labseq.kernels import weigh_sites
 
             self._kernels = weigh_sites
-            self._weights = site_weights(self._settings, self._grid, self._corners)
+            self._weights = site_weights(self._settings, self._known, self._corners)
         return self._weights
 
 
-def site_weights(settings: WeightedLike, grid: SiteGrid, corners: NDArray[np.int64]) -> Weights:
+def site_weights(settings: WeightedLike, known: KnownSites, corners: NDArray[np.int64]) -> Weights:
     """Work out the weights of all sites.
 
     Args:
         settings: See :class:`WeightedLike`.
-        grid: The grid of sites.
+        known: Where the sites are.
         corners: int64 (n_sites, 2), (y, x) of the first pixel of each region.
     """
-    sites = sites_on_frame(settings, grid)
+    sites = known.positions_px.reshape(-1, 2)
     spot_px, region, filling = settings.spot / settings.pixel_size, settings.region, settings.filling
     own = settings.photoelectrons * spot_light(sites, corners, region, spot_px)
     pairs = pairs_within(sites, (region / 2 + SPOT_REACH * spot_px) * np.sqrt(2))

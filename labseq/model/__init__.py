@@ -1,6 +1,13 @@
 """The frozen domain types: what the rest of labseq talks about."""
 
 from labseq.model.arrays import Occupancy, as_occupancy, read_only
+from labseq.model.calibration import (
+    CALIBRATION_KINDS,
+    CalibrationEntry,
+    CalibrationKind,
+    grid_facts,
+    same_grid,
+)
 from labseq.model.frame import CameraFacts, Frame
 from labseq.model.grid import SiteGrid
 from labseq.model.motion import MotionSpec, RfSpec
@@ -22,14 +29,18 @@ from labseq.model.signals import (
     ToneProgram,
     TonesAt,
     TonesNow,
+    TweezerAmplitudes,
     Waveform,
 )
 from labseq.model.target import TargetPattern
 from labseq.model.timeline import TimelineEntry
 
 __all__ = [
+    "CALIBRATION_KINDS",
     "AxisTones",
     "Batch",
+    "CalibrationEntry",
+    "CalibrationKind",
     "CameraFacts",
     "CycleRecord",
     "DepthRamp",
@@ -55,7 +66,10 @@ __all__ = [
     "ToneProgram",
     "TonesAt",
     "TonesNow",
+    "TweezerAmplitudes",
     "Waveform",
     "as_occupancy",
+    "grid_facts",
     "read_only",
+    "same_grid",
 ]

@@ -120,10 +120,11 @@ class ShotRecord:
         seen_defect_free_cycle: First cycle whose image met the target; 0 if none.
         success: Whether the last ``image`` step met the target.
         filling_fraction: Filling of the target on the last ``image`` step; nan
-            without one.
+            without one, or if a rearrangement follows it.
         n_missing_atoms: Atoms that the loading fell short of the target.
         readings: Values read from devices during the shot.
         parameters: What differs from the files in this shot: address -> value.
+        calibrations: Those in use: kind -> id.
         story: What the simulation tells of the atoms: name -> structured array.
     """
 
@@ -143,6 +144,7 @@ class ShotRecord:
     n_missing_atoms: int = 0
     readings: dict[str, Any] = field(default_factory=dict[str, Any])
     parameters: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    calibrations: Mapping[str, str] = field(default_factory=dict[str, str])
     story: dict[str, NDArray[Any]] = field(default_factory=dict[str, NDArray[Any]])
 
 
@@ -170,6 +172,7 @@ class RunRecord:
         grid_spacing_m: Spacing of the sites, in metres.
         lattice: Lattice of the grid.
         scan: What was scanned: "addresses", "points", "point_of_shot", ...; empty without a scan.
+        calibrations: Those in use: kind -> id.
     """
 
     name: str
@@ -191,3 +194,4 @@ class RunRecord:
     grid_spacing_m: float
     lattice: str
     scan: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    calibrations: Mapping[str, str] = field(default_factory=dict[str, str])

@@ -48,6 +48,11 @@ class FrequencyCourse(IntEnum):
     MINIMUM_JERK = 1
     CONSTANT_JERK = 2
 
+    @property
+    def fastest(self) -> float:
+        """Greatest speed over the mean speed: the greatest slope of s(u)."""
+        return (1.0, 15 / 8, 2.0)[self]
+
     def fraction(self, u: float) -> float:
         """The course s(u): the fraction of its way that a tone has made.
 
@@ -255,6 +260,23 @@ class DepthRamp:
     start: float
     end: float
     duration_s: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TweezerAmplitudes:
+    """Amplitudes of the static tweezers' tones, as fractions of full scale.
+
+    Attributes:
+        row: float64 (n_rows,).
+        column: float64 (n_cols,).
+    """
+
+    row: NDArray[np.float64]
+    column: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "row", read_only(self.row, np.float64, (-1,), "row"))
+        object.__setattr__(self, "column", read_only(self.column, np.float64, (-1,), "column"))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -14,11 +14,17 @@ from labseq.motion.calibration import (
     TableCalibration,
     calibrated,
     fit_comb,
+    standing_on_sites,
 )
 from labseq.motion.check import check_plan
+from labseq.motion.fast_overlay import FastOffset, fast_offset, group_counts
+from labseq.motion.frequencies import FrequenciesFit, fit_frequencies
+from labseq.motion.holding import cross_offsets_m, hold_program, hold_time_s
+from labseq.motion.overlay import OverlayFit, fit_overlay, overlay_offset
 from labseq.motion.render_comb import comb_sample_rate
 from labseq.motion.rendering import Renderer, RenderPath, render, render_chunks
 from labseq.motion.rules import RULES
+from labseq.motion.survival import SurvivalShape
 from labseq.motion.timing import fitting_batches
 from labseq.motion.tones import tone_program
 
@@ -28,17 +34,30 @@ __all__ = [
     "Calibration",
     "CombFit",
     "Drive",
+    "FastOffset",
+    "FrequenciesFit",
+    "OverlayFit",
     "RenderPath",
     "Renderer",
+    "SurvivalShape",
     "TableCalibration",
     "calibrated",
     "check_plan",
     "comb_sample_rate",
+    "cross_offsets_m",
     "drive",
+    "fast_offset",
     "fit_comb",
+    "fit_frequencies",
+    "fit_overlay",
     "fitting_batches",
+    "group_counts",
+    "hold_program",
+    "hold_time_s",
+    "overlay_offset",
     "render",
     "render_chunks",
+    "standing_on_sites",
     "tone_program",
     "warm",
     "warm_rendering",

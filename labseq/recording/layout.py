@@ -9,6 +9,7 @@ The tree, with n images, a grid of (row, col) sites and frames of (y, x) pixels:
       target                    fill, clear (row, col)
       rearrangement             tables moves, batches, cycles; predicted (cycle, row, col)
       timing                    table of the stages
+      calibrations              id of each one in use, by kind, as attributes
       story                     tables of what a simulation did to the atoms, where it tells
       parameters, readings      JSON
       devices/<name>            JSON
@@ -24,11 +25,11 @@ from typing import Any, Final
 import numpy as np
 
 FORMAT: Final = "labseq-shot"
-FORMAT_VERSION: Final = "1.1"
+FORMAT_VERSION: Final = "1.2"
 """major.minor; a newer minor version only adds things, a newer major version cannot be read."""
 
 RUN_FORMAT: Final = "labseq-run"
-RUN_FORMAT_VERSION: Final = "1.0"
+RUN_FORMAT_VERSION: Final = "1.1"
 
 LIBRARY_VERSIONS: Final = ("earliest", "v110")
 """File features that HDF5 may use: the widest reader support."""

@@ -1,8 +1,7 @@
-"""The points of a scan, with what came of their shots."""
+"""The points of a scan, with their shots."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -25,17 +24,6 @@ class ScanPoint:
     parameters: Mapping[str, Any]
     written: Mapping[str, str]
     shots: tuple[Shot, ...]
-
-    @property
-    def n_defect_free(self) -> int:
-        """Shots that met the target."""
-        return sum(shot.success for shot in self.shots)
-
-    @property
-    def filling_fraction(self) -> float:
-        """Mean filling of the target over the shots that have one; nan without any."""
-        values = [f for shot in self.shots if not math.isnan(f := shot.filling_fraction)]
-        return math.fsum(values) / len(values) if values else math.nan
 
 
 def scan_points(run: Run) -> list[ScanPoint]:

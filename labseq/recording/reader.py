@@ -15,10 +15,13 @@ from numpy.typing import NDArray
 
 from labseq.errors import RecordingError
 from labseq.model import CycleRecord, Plan, ShotRecord, StageTiming, TargetPattern
+from labseq.model.estimate import mean
 from labseq.model.records import RunStatus, ShotStatus
 from labseq.recording import folders
 from labseq.recording.durable import read_lines
+from labseq.recording.plain import to_plain
 from labseq.recording.run_file import is_index_row, read_run, read_state, target_of
+from labseq.recording.summaries import ShotSummary, summarise, summary_in
 
 if TYPE_CHECKING:
     from labseq.recording.shot_reader import ShotContent
@@ -70,14 +73,11 @@ class Run:
     Attributes:
         path: The run's folder.
         record: What run.json says: settings, devices, versions, ...
-        status: "running", "complete", "stopped" or "failed"; a run whose process
-            is gone without having said so has failed.
+        status: "running", "complete", "stopped" or "failed"; so is one whose process is gone without a word.
         error: Why it did not complete, or "".
         shots: The shots that count, in order.
-        attempts: Attempts at shots that failed or were interrupted, in the order
-            they were made.
-        n_damaged_lines: Lines of the index that cannot be read; 0 unless somebody
-            or something damaged the file.
+        attempts: Attempts at shots that failed or were interrupted, in the order they were made.
+        n_damaged_lines: Lines of the index that cannot be read; 0 unless the file was damaged.
     """
 
     path: Path
@@ -118,14 +118,13 @@ class Run:
 
     @property
     def defect_free(self) -> float:
-        """Fraction of the shots that met the target; nan without shots."""
-        return _mean([float(shot.success) for shot in self.shots])
+        """Fraction of the shots that met the target, of those that were judged; nan without any."""
+        return mean([shot.success for shot in self.shots if not math.isnan(shot.filling_fraction)]).value
 
     @property
     def filling_fraction(self) -> float:
         """Mean filling of the target over the shots that have one; nan without any."""
-        values = (shot.filling_fraction for shot in self.shots)
-        return _mean([value for value in values if not math.isnan(value)])
+        return mean([f for shot in self.shots if not math.isnan(f := shot.filling_fraction)]).value
 
     @property
     def events(self) -> tuple[dict[str, Any], ...]:
@@ -141,8 +140,8 @@ class Run:
         return {
             "run_dir": str(self.path),
             "shots": len(self.shots),
-            "defect_free": _or_none(self.defect_free),
-            "filling_fraction": _or_none(self.filling_fraction),
+            "defect_free": to_plain(self.defect_free),
+            "filling_fraction": to_plain(self.filling_fraction),
             "status": self.status,
         }
 
@@ -199,14 +198,18 @@ class Shot:
     @property
     def occupancies(self) -> NDArray[np.bool_]:
         """As detected, bool (n_images, n_rows, n_cols)."""
-        images = self._content.record.images
-        return np.array([i.occupancy for i in images], np.bool_).reshape(len(images), *self._grid_shape)
+        return self._of_each_image("occupancy", np.bool_)
+
+    @property
+    def summary(self) -> ShotSummary:
+        """What its images and cycles came to; the file is read for runs before format 1.1 only."""
+        found = summary_in(self.row)
+        return summarise(self._content.record, self._content.target) if found is None else found
 
     @property
     def confidences(self) -> NDArray[np.float32]:
         """The detector's confidence, float32 (n_images, n_rows, n_cols)."""
-        images = self._content.record.images
-        return np.array([i.confidence for i in images], np.float32).reshape(len(images), *self._grid_shape)
+        return self._of_each_image("confidence", np.float32)
 
     @property
     def plans(self) -> tuple[Plan, ...]:
@@ -227,6 +230,11 @@ class Shot:
     def parameters(self) -> dict[str, Any]:
         """What differs from the files in this shot: address -> value; those of a scan in SI."""
         return dict(self.row.get("parameters") or {})
+
+    @property
+    def calibrations(self) -> dict[str, str]:
+        """The calibrations in use: kind -> id."""
+        return dict(self._content.record.calibrations)
 
     @property
     def readings(self) -> dict[str, Any]:
@@ -277,9 +285,8 @@ class Shot:
         try:
             data = self.file.read_bytes()
         except OSError as error:
-            raise RecordingError(
-                self.file, f"cannot be read: {error.strerror}; take it from a backup"
-            ) from error
+            reason = f"cannot be read: {error.strerror}; take it from a backup"
+            raise RecordingError(self.file, reason) from error
         if hashlib.sha256(data).hexdigest() != self.row.get("sha256"):
             raise RecordingError(self.file, "has changed since it was written; take it from a backup")
 
@@ -287,14 +294,7 @@ class Shot:
     def _content(self) -> ShotContent:
         return self._load(self.file)
 
-    @property
-    def _grid_shape(self) -> tuple[int, int]:
-        return self._content.target.shape
-
-
-def _mean(values: Sequence[float]) -> float:
-    return math.fsum(values) / len(values) if values else math.nan
-
-
-def _or_none(value: float) -> float | None:
-    return None if math.isnan(value) else value
+    def _of_each_image(self, name: str, dtype: Any) -> NDArray[Any]:
+        images = self._content.record.images
+        shape = (len(images), *self._content.target.shape)
+        return np.array([getattr(image, name) for image in images], dtype).reshape(shape)

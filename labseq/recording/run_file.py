@@ -21,6 +21,7 @@ from labseq.recording.durable import parse_object
 from labseq.recording.folders import PROFILE_FILE, RUN_FILE, SEQUENCE_FILE, STATE_FILE
 from labseq.recording.plain import dumps, to_plain
 from labseq.recording.process import Owner
+from labseq.recording.summaries import summarise
 
 _IN_RUN: Final = {"name": str, "n_shots": int, "seed": int, "simulated": bool, "target": dict}
 _IN_INDEX: Final[Mapping[str, type | UnionType]] = {
@@ -147,7 +148,9 @@ def read_state(folder: Path) -> tuple[RunStatus, str]:
     return "running", ""
 
 
-def index_row(shot: ShotRecord, *, file: str, sha256: str, n_bytes: int) -> dict[str, Any]:
+def index_row(
+    shot: ShotRecord, target: TargetPattern, *, file: str, sha256: str, n_bytes: int
+) -> dict[str, Any]:
     """A shot's line in the index. ``n_batches`` and ``n_atom_moves`` count what was played."""
     stage_s: dict[str, float] = {}
     for timing in shot.timing:
@@ -172,6 +175,7 @@ def index_row(shot: ShotRecord, *, file: str, sha256: str, n_bytes: int) -> dict
         "n_missing_atoms": shot.n_missing_atoms,
         "stage_s": stage_s,
         "parameters": to_plain(shot.parameters),
+        **summarise(shot, target).as_row(),
         "sha256": sha256,
         "bytes": n_bytes,
     }

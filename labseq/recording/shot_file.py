@@ -91,6 +91,8 @@ class ShotEncoder:
         _write_detection(entry.create_group("detection"), shot.images, grid_shape)
         _write_cycles(entry.create_group("rearrangement"), shot.cycles, grid_shape)
         _write_table(entry, "timing", tables.timing_table(shot.timing))
+        if shot.calibrations:
+            set_attributes(entry.create_group("calibrations"), **shot.calibrations)
         if shot.story:
             _write_story(entry.create_group("story"), shot.story)
         write_json(entry, "parameters", shot.parameters)

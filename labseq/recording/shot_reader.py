@@ -122,6 +122,7 @@ def _record(entry: Any) -> ShotRecord:
         n_missing_atoms=values["n_missing_atoms"],
         readings=read_json(entry, "readings"),
         parameters=read_json(entry, "parameters"),
+        calibrations=dict(entry["calibrations"].attrs) if "calibrations" in entry else {},
         story={name: table[()] for name, table in entry["story"].items()} if "story" in entry else {},
     )
 

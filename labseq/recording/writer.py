@@ -128,7 +128,8 @@ class RunWriter:
         data = self._encoder.encode(shot)
         write_file(path, data)
         sha256 = hashlib.sha256(data).hexdigest()
-        self._index.append(index_row(shot, file=file, sha256=sha256, n_bytes=data.nbytes), sync=True)
+        row = index_row(shot, self._run.target, file=file, sha256=sha256, n_bytes=data.nbytes)
+        self._index.append(row, sync=True)
         self.n_written += counts
         return path
 

@@ -11,7 +11,7 @@ Failures: a device raises ``DeviceError`` (or ``DeviceTimeoutError``),
 """
 
 from labseq.roles.clock import Clock, NeverStopped
-from labseq.roles.deciding import Detector, Planner, Warmable
+from labseq.roles.deciding import Detector, Planner, SignalTeller, Warmable
 from labseq.roles.hardware import (
     Camera,
     Device,
@@ -23,7 +23,15 @@ from labseq.roles.hardware import (
     Trigger,
 )
 from labseq.roles.shot import Context, RunObserver, Shot, Step, StepContext
-from labseq.roles.simulation import KnownLoading, Listening, RfSource, Simulation, Storyteller, TruthTeller
+from labseq.roles.simulation import (
+    KnownLoading,
+    Listening,
+    LossTeller,
+    RfSource,
+    Simulation,
+    Storyteller,
+    TruthTeller,
+)
 
 __all__ = [
     "Camera",
@@ -36,12 +44,14 @@ __all__ = [
     "KnownLoading",
     "Lines",
     "Listening",
+    "LossTeller",
     "MobileTweezers",
     "NeverStopped",
     "Planner",
     "RfSource",
     "RunObserver",
     "Shot",
+    "SignalTeller",
     "Simulation",
     "StaticTweezers",
     "Step",

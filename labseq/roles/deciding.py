@@ -51,3 +51,22 @@ class Warmable(Protocol):
     def warm(self) -> None:
         """Compile (or load from the cache) every kernel that a shot will need."""
         ...
+
+
+@runtime_checkable
+class SignalTeller(Protocol):
+    """A detector that tells what it compares with its thresholds, so that they can be calibrated."""
+
+    @property
+    def signal_unit(self) -> str:
+        """Unit of the signals: "counts", "log-odds"."""
+        ...
+
+    @property
+    def sites_px(self) -> NDArray[np.float64]:
+        """Where it looks for the atoms, float64 (n_rows, n_cols, 2), (y, x) in pixels."""
+        ...
+
+    def signals(self, frame: Frame) -> NDArray[np.float64]:
+        """What is compared with the threshold of each site, float64 (n_rows, n_cols)."""
+        ...

@@ -8,8 +8,10 @@ from dataclasses import dataclass, field
 from typing import Any, ParamSpec, Protocol, TypeVar
 
 from labseq.model import (
+    CalibrationEntry,
     CameraFacts,
     CycleRecord,
+    Frame,
     MotionSpec,
     Occupancy,
     RandomStream,
@@ -18,7 +20,7 @@ from labseq.model import (
     TimelineEntry,
 )
 from labseq.roles.clock import Clock, NeverStopped
-from labseq.roles.deciding import Planner
+from labseq.roles.deciding import Detector, Planner
 from labseq.roles.hardware import Device, MobileTweezers, StaticTweezers
 from labseq.roles.simulation import Simulation
 
@@ -36,7 +38,7 @@ class Context:
         motion: How the mobile tweezers move.
         clock: The session's time; drivers wait by ``clock.sleep``.
         random: The plugin's own random numbers.
-        calibrations: Active calibrations: kind -> value.
+        calibrations: Calibrations in use: kind -> entry.
         simulation: The world, in every context; None where the profile has none.
     """
 
@@ -45,7 +47,7 @@ class Context:
     motion: MotionSpec = field(default_factory=MotionSpec)
     clock: Clock = field(default_factory=NeverStopped)
     random: RandomStream = field(default_factory=lambda: RandomStream(0))
-    calibrations: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    calibrations: Mapping[str, CalibrationEntry] = field(default_factory=dict[str, CalibrationEntry])
     simulation: Simulation | None = None
 
 
@@ -95,6 +97,21 @@ class Shot(Protocol):
     @property
     def planner(self) -> Planner:
         """The planner."""
+        ...
+
+    @property
+    def detector(self) -> Detector:
+        """The detector."""
+        ...
+
+    @property
+    def calibrations(self) -> Mapping[str, CalibrationEntry]:
+        """Calibrations in use: kind -> entry."""
+        ...
+
+    @property
+    def frame(self) -> Frame | None:
+        """Frame of the last image of this shot; None before the first."""
         ...
 
     @property
@@ -169,6 +186,10 @@ class Shot(Protocol):
 
     def record_cycle(self, cycle: CycleRecord) -> None:
         """Add a rearrangement cycle to the shot's record."""
+        ...
+
+    def note(self, name: str, value: float) -> None:
+        """Keep a value with the shot, among its readings: "overlay.error_m"."""
         ...
 
     def log(self, event: str, **values: Any) -> None:

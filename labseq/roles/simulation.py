@@ -13,6 +13,7 @@ from labseq.model import (
     Occupancy,
     RfSpan,
     ToneProgram,
+    TweezerAmplitudes,
 )
 
 
@@ -35,7 +36,7 @@ class Simulation(Protocol):
         """The atom source is on: loads every site whose static tweezer is on."""
         ...
 
-    def play(self, role: str, signal: ToneProgram | DepthRamp, t_start_s: float) -> None:
+    def play(self, role: str, signal: ToneProgram | DepthRamp | TweezerAmplitudes, t_start_s: float) -> None:
         """A device's output, from ``t_start_s`` on: role "mobile_tweezers" or "static_tweezers"."""
         ...
 
@@ -64,6 +65,15 @@ class TruthTeller(Protocol):
 
     def truth(self) -> Occupancy:
         """The true occupancy now, bool (n_rows, n_cols)."""
+        ...
+
+
+@runtime_checkable
+class LossTeller(Protocol):
+    """A simulation that knows, and tells for the record, what atoms were lost by."""
+
+    def losses(self) -> Mapping[str, int]:
+        """Atoms lost since the shot began: cause -> number."""
         ...
 
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from labseq.errors import LabseqError
-from labseq.model import CameraFacts, MotionSpec, RandomStream, SiteGrid, TargetPattern
+from labseq.model import CalibrationEntry, CameraFacts, MotionSpec, RandomStream, SiteGrid, TargetPattern
 from labseq.roles import (
     Camera,
     Clock,
@@ -58,6 +58,9 @@ class Lab:
     simulation: Simulation | None
     random_streams: tuple[RandomStream, ...]
     timeouts: Timeouts
+    calibrations: Mapping[str, CalibrationEntry] = field(
+        default_factory=dict[str, CalibrationEntry], kw_only=True
+    )
 
     @property
     def step_context(self) -> StepContext:

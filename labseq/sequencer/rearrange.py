@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from numbers import Real
 from typing import Protocol
 
-from labseq.errors import DeviceError, PlanError
+from labseq.errors import PlanError
 from labseq.model import CycleRecord, Plan, PlanReport, TimelineEntry
 from labseq.motion import check_plan, fitting_batches, tone_program
 from labseq.roles import Shot, StepContext
+from labseq.sequencer.playing import play
 
 
 class _Settings(Protocol):
@@ -119,21 +118,10 @@ class RearrangeStep:
             shot.log("window_too_short", cycle=cycle, n_batches=plan.n_batches, n_batches_played=n_played)
         if n_played == 0:
             return 0
-        mobile, limit_s = shot.mobile_tweezers, shot.call_timeout_s
-        with shot.stage("prepare", overhead_s, cycle):
-            program = tone_program(plan, grid=shot.grid, motion=shot.motion, n_batches=n_played)
-            duration_s = _duration(shot.call("mobile_tweezers", limit_s, mobile.prepare, program))
-            if shot.clock.virtual:  # what real hardware spends here, the model spends too
-                shot.clock.sleep(max(0.0, overhead_s - (shot.clock.now() - start_s)))
-        with shot.stage("play", duration_s, cycle):
-            shot.call("mobile_tweezers", limit_s, mobile.play)
-            shot.call("mobile_tweezers", duration_s + 2 * limit_s, mobile.wait, duration_s + limit_s)
+        play(
+            shot,
+            lambda: tone_program(plan, grid=shot.grid, motion=shot.motion, n_batches=n_played),
+            start_s,
+            cycle,
+        )
         return n_played
-
-
-def _duration(answer: object) -> float:
-    """The playing time that ``prepare`` returned; every wait for the device is reckoned from it."""
-    if not (isinstance(answer, Real) and 0 <= float(answer) < math.inf):
-        text = f"prepare() returned {answer!r}; expected the playing time in seconds, 0 or more"
-        raise DeviceError("mobile_tweezers", text)
-    return float(answer)

@@ -181,6 +181,7 @@ class Sequencer:
         """Take one attempt at a shot and write it; whether the shot is done."""
         self._states.to(State.SHOT)
         record = ShotRecord(index, attempt, self._seed, _utc_now(), parameters=self._parameters)
+        record.calibrations = {kind: entry.id for kind, entry in self.lab.calibrations.items()}
         failure: TransientError | None = None
         try:
             try:

@@ -11,7 +11,7 @@ import numpy as np
 
 from labseq.errors import ConfigError, DeviceError
 from labseq.model import CycleRecord, Frame, ImageRecord, Occupancy, ShotRecord, StageTiming
-from labseq.roles import Device, Storyteller, TruthTeller
+from labseq.roles import Device, LossTeller, Storyteller, TruthTeller
 from labseq.sequencer.guard import Guard
 from labseq.sequencer.lab import Lab
 
@@ -36,6 +36,7 @@ class RunningShot:
         self.record = record
         self.index = record.shot_index
         self.occupancy: Occupancy | None = None
+        self.frame: Frame | None = None
         self.grid = lab.grid
         self.motion = lab.motion
         self.target = lab.target
@@ -43,6 +44,8 @@ class RunningShot:
         self.simulation = lab.simulation
         self.static_tweezers = lab.static_tweezers
         self.mobile_tweezers = lab.mobile_tweezers
+        self.detector = lab.detector
+        self.calibrations = lab.calibrations
         self.planner = lab.planner
         self.planner_name = lab.planner_name
         self.degree_of_parallelism = lab.degree_of_parallelism
@@ -108,7 +111,7 @@ class RunningShot:
         with self.stage("detect", cycle=cycle):
             answer = self.call("detector", timeout_s, self.lab.detector.detect, frame)
         occupancy, confidence = self._detected(answer)
-        self.occupancy = occupancy
+        self.occupancy, self.frame = occupancy, frame
         image = ImageRecord(frame, occupancy, confidence, self.step, cycle, start_s, exposure_s)
         self.record.images.append(image)
         if cycle and not self.record.seen_defect_free_cycle and self.target.is_met_by(occupancy):
@@ -130,8 +133,13 @@ class RunningShot:
             self.record.n_missing_atoms = max(0, n_missing)
             if n_missing > 0:
                 self.log("too_few_atoms", n_missing_atoms=n_missing)
+        self.record.success, self.record.filling_fraction = False, float("nan")  # judged before the moves
         self.record.cycles.append(cycle)
         self._emit("cycle", {"cycle": cycle})
+
+    def note(self, name: str, value: float) -> None:
+        """Keep a value with the shot, among its readings."""
+        self.record.readings[name] = value
 
     def log(self, event: str, **values: Any) -> None:
         """Add a line to the run's event log."""
@@ -143,6 +151,9 @@ class RunningShot:
             truth = self.call("simulation", self.call_timeout_s, self.simulation.truth)
             self.record.readings["simulation.n_atoms_true"] = int(np.count_nonzero(truth))
             self.record.readings["simulation.n_defects_true"] = self.target.n_defects(truth)
+        if isinstance(self.simulation, LossTeller):
+            losses = self.call("simulation", self.call_timeout_s, self.simulation.losses)
+            self.record.readings.update({f"simulation.lost.{cause}": n for cause, n in losses.items()})
         if isinstance(self.simulation, Storyteller):
             story = self.call("simulation", self.call_timeout_s, self.simulation.story, self.start_s)
             self.record.story.update(story)

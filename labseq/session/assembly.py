@@ -29,6 +29,7 @@ from labseq.model import TargetPattern
 from labseq.plugins import PluginHost
 from labseq.registry import VIRTUAL_TWIN
 from labseq.roles import Step
+from labseq.session.calibrating import Calibrated, calibrated, with_tones
 from labseq.session.choosing import (
     Bench,
     Chosen,
@@ -248,7 +249,12 @@ def choose_all(
         except ConfigError as error:
             refused[role] = error
             found.add(error)
-    return Bench(document, spec, host, spec.grid_model(), chosen, tuple(warnings), refused)
+    detector = chosen["detector"].dump() if "detector" in chosen else {}
+    made = (
+        Calibrated({}, spec.grid_model()) if mended else calibrated(document, spec, found, dry_run, detector)
+    )
+    warnings += made.warnings
+    return Bench(document, spec, host, made.grid, chosen, tuple(warnings), refused, made.entries)
 
 
 def _is_stand_in(document: Document, choice: Choice) -> bool:
@@ -285,4 +291,5 @@ def _profile_dump(bench: Bench) -> dict[str, Any]:
     roles = {role: chosen.dump() for role, chosen in bench.chosen.items() if role in ROLES}
     roles["mobile_tweezers"] |= spec.mobile_tweezers.model_dump(mode="json", exclude={"use"})
     devices = {name: bench.chosen[name].dump() for name in spec.devices}
-    return {**core, **roles, "devices": devices}
+    grid = with_tones(core["grid"], bench.grid, spec.grid_model())
+    return {**core, "grid": grid, **roles, "devices": devices}

@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.drawing import ComparisonDrawing, Curve, Histogram
+from labseq.model.estimate import Estimate
 from labseq.session.bench_figures import Figure, Quantity
 from labseq.session.bench_report import Report, Row
-from labseq.session.bench_statistics import Estimate, PowerLaw, fit_power_law
+from labseq.session.bench_statistics import PowerLaw, fit_power_law
 
 AXES: Final[Mapping[Quantity, str]] = {
     "n_target_atoms": "atoms in the target, N",

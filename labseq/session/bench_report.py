@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.errors import LabseqError
+from labseq.model.estimate import Estimate, mean
 from labseq.session.bench_courses import Course
 from labseq.session.bench_spec import Comparison, Condition, Entrant
-from labseq.session.bench_statistics import Estimate, mean, ratio_of_means
+from labseq.session.bench_statistics import ratio_of_means
 from labseq.session.bench_work import LOADING, RESULT, Done, Failure
 
 ESTIMATES: Final = (

@@ -222,13 +222,16 @@ def _exposure_warnings(
 
 
 def _judgement_warnings(session: Session, rearrangements: Sequence[int]) -> list[Problem]:
-    """Success is judged on the last ``image`` step; one before the last rearrangement shows nothing of it."""
+    """Success is judged on an ``image`` step at the end; cycles that are all made are judged on their own."""
     assembly = session.assembly
     images = [n for n, (_, step) in enumerate(assembly.steps) if step.takes_image and n not in rearrangements]
     if not rearrangements or max(images, default=-1) > rearrangements[-1]:
         return []
+    settings: Any = getattr(assembly.steps[rearrangements[-1]][1], "settings", None)
+    if getattr(settings, "stop_when", "") == "never":
+        return []
     loc = assembly.sequence.shot[rearrangements[-1]].loc
-    what = "no image follows the last rearrangement, so the shot's success is judged without it"
+    what = "no image follows the last rearrangement, so the shots are not judged"
     return [assembly.document.problem(loc, what, "an 'image' step at the end of the shot", key=True)]
 
 

@@ -18,7 +18,7 @@ from labseq.errors import (
     UnknownPluginError,
     one_of,
 )
-from labseq.model import SiteGrid
+from labseq.model import CalibrationEntry, SiteGrid
 from labseq.plugins import PluginHost
 from labseq.registry import VIRTUAL_TWIN, Entry
 
@@ -71,10 +71,11 @@ class Bench:
         document: The profile's file.
         profile: What it says.
         host: The plugins.
-        grid: The grid of sites.
+        grid: The grid of sites, with calibrated tones.
         chosen: Role or device name -> what plays it; no planner.
         warnings: What the user should know although it is no error.
         refused: Role or device name -> why nothing could be chosen.
+        calibrations: Those in use: kind -> entry.
     """
 
     document: Document
@@ -84,6 +85,7 @@ class Bench:
     chosen: Mapping[str, Chosen]
     warnings: tuple[str, ...]
     refused: Mapping[str, ConfigError] = field(default_factory=dict[str, ConfigError])
+    calibrations: Mapping[str, CalibrationEntry] = field(default_factory=dict[str, CalibrationEntry])
 
     @property
     def hardware_key(self) -> str:

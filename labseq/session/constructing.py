@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 from labseq.errors import ConfigError, LabseqError, LimitError, PluginLoadError
-from labseq.model import MotionSpec, RandomStream, SiteGrid, TargetPattern
+from labseq.model import CalibrationEntry, MotionSpec, RandomStream, SiteGrid, TargetPattern
 from labseq.registry import Entry
 from labseq.roles import (
     Camera,
@@ -41,16 +41,21 @@ def construct(
     clock: Clock,
     seed: int,
     simulation: Simulation | None = None,
+    calibrations: Mapping[str, CalibrationEntry] | None = None,
+    world_grid: SiteGrid | None = None,
 ) -> tuple[dict[str, Any], tuple[RandomStream, ...]]:
     """Construct the object of every role; constructors do no I/O, so nothing is open yet.
 
     Args:
         chosen: Role -> what plays it.
-        grid: The grid of sites.
+        grid: The grid of sites, with calibrated tones.
         motion: How the mobile tweezers move.
         clock: The session's clock.
         seed: The run's seed.
         simulation: The world, where none is among the chosen.
+        calibrations: Those in use: kind -> entry.
+        world_grid: The grid without calibrations, for the simulation: it is the truth that they are
+            measured on; None where there are none.
 
     Returns:
         Role -> object, and the random streams that were handed out.
@@ -59,7 +64,9 @@ def construct(
         ConfigError: A constructor refuses its settings; with their place.
         PluginLoadError: A constructor raised, or made no object of that role; names the plugin.
     """
-    made, streams, refused = construct_each(chosen, grid, motion, clock, seed, simulation)
+    made, streams, refused = construct_each(
+        chosen, grid, motion, clock, seed, simulation, calibrations, world_grid
+    )
     for error in refused.values():
         raise error
     return made, streams
@@ -72,6 +79,8 @@ def construct_each(
     clock: Clock,
     seed: int,
     simulation: Simulation | None = None,
+    calibrations: Mapping[str, CalibrationEntry] | None = None,
+    world_grid: SiteGrid | None = None,
 ) -> tuple[dict[str, Any], tuple[RandomStream, ...], dict[str, LabseqError]]:
     """The same, but one that cannot be constructed never keeps the others from it.
 
@@ -82,9 +91,12 @@ def construct_each(
     streams: list[RandomStream] = []
     refused: dict[str, LabseqError] = {}
     for role in sorted(chosen, key=lambda role: role != "simulation"):  # the world comes first
-        stream = RandomStream(seed, "" if role == "simulation" else role)
+        is_world = role == "simulation"
+        stream = RandomStream(seed, "" if is_world else role)
         streams.append(stream)
-        context = Context(role, grid, motion, clock, stream, {}, made.get("simulation", simulation))
+        sites = world_grid if is_world and world_grid is not None else grid
+        world = made.get("simulation", simulation)
+        context = Context(role, sites, motion, clock, stream, calibrations or {}, world)
         try:
             made[role] = construct_one(chosen[role], context)
         except LabseqError as error:

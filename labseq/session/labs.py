@@ -22,7 +22,15 @@ def build_lab(point: Point, target: TargetPattern, clock: Clock, seed: int) -> L
     bench = point.bench
     profile, motion = bench.profile, bench.profile.motion
     chosen = {**bench.chosen, "planner": point.planner}
-    made, streams = construct(chosen, bench.grid, motion, clock, seed)
+    made, streams = construct(
+        chosen,
+        bench.grid,
+        motion,
+        clock,
+        seed,
+        calibrations=bench.calibrations,
+        world_grid=profile.grid_model(),
+    )
     return Lab(
         grid=bench.grid,
         motion=motion,
@@ -39,6 +47,7 @@ def build_lab(point: Point, target: TargetPattern, clock: Clock, seed: int) -> L
         simulation=made.get("simulation"),
         random_streams=streams,
         timeouts=timeouts_of(profile),
+        calibrations=bench.calibrations,
     )
 
 
@@ -72,6 +81,8 @@ def rebuild_lab(lab: Lab, before: Point, after: Point, seed: int) -> tuple[Lab, 
         lab.clock,
         seed,
         lab.simulation,
+        after.bench.calibrations,
+        after.bench.profile.grid_model(),
     )
     roles = ("camera", "static_tweezers", "mobile_tweezers", "detector", "planner", "simulation")
     return replace(

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from labseq.config import (
     MOTION_KEYS,
@@ -29,6 +29,7 @@ from labseq.errors import ConfigError, LimitError, Problem
 from labseq.model import MotionSpec, SiteGrid, TargetPattern
 from labseq.plugins import PluginHost
 from labseq.session.assembly import load_plugins
+from labseq.session.calibrating import calibrated_grid
 from labseq.session.choosing import Chosen, resolve
 from labseq.session.constructing import construct_target
 from labseq.session.occupancies import Source
@@ -126,7 +127,7 @@ def read_machine(
             raise ConfigError(Problem("there is no --profile to change", overrides[0].source))
         return _default_machine(source), []
     document, spec = load_profile(request.profile, beside=Path(), overrides=overrides)
-    grid = spec.grid_model()
+    grid = calibrated_grid(document, spec)
     if grid.shape != shape:
         what = f"the occupancy has {shape[0]} x {shape[1]} sites"
         expected = f"{grid.n_rows} x {grid.n_cols}, as in {visible(str(document.path))}"
@@ -139,11 +140,23 @@ def _default_machine(source: Source) -> Machine:
     if source.machine is None:
         n_rows, n_cols = source.occupancy.shape
         return Machine(SiteGrid(n_rows, n_cols), MotionSpec())
-    called = "the profile in the shot's file"
-    tweezers = source.machine.get("mobile_tweezers", {})
+    return recorded_machine(source.machine, "the profile in the shot's file")
+
+
+def recorded_machine(machine: Mapping[str, Any], called: str) -> Machine:
+    """What a run was taken with, the tones of calibrations included.
+
+    Args:
+        machine: The profile, as the run has it.
+        called: What to call it in messages.
+
+    Raises:
+        ConfigError: It makes no sense.
+    """
+    tweezers = machine.get("mobile_tweezers", {})
     motion = {key: tweezers[key] for key in MOTION_KEYS if key in tweezers}
     return Machine(
-        validate_values(GridSettings, source.machine.get("grid", {}), called).model(),
+        validate_values(GridSettings, machine.get("grid", {}), called).model(),
         validate_values(MotionSettings, motion, called).spec(),
     )
 

@@ -99,7 +99,15 @@ def secure_bench(bench: Bench, stop: StopFlag, observer: RunObserver | None = No
     """
     clock = VirtualClock(stop) if bench.virtual_time else RealClock(stop)
     chosen = {role: c for role, c in bench.chosen.items() if c.entry.kind in _NEEDED_KINDS}
-    made, _, failures = construct_each(chosen, bench.grid, bench.profile.motion, clock, seed=0)
+    made, _, failures = construct_each(
+        chosen,
+        bench.grid,
+        bench.profile.motion,
+        clock,
+        seed=0,
+        calibrations=bench.calibrations,
+        world_grid=bench.profile.grid_model(),
+    )
     simulation = made.pop("simulation", None)
     with stop.held():
         tried = secure(in_safe_order(made), timeouts_of(bench.profile), simulation, observer)

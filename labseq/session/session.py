@@ -11,6 +11,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import ParamSpec, Self
 
+from labseq.calibrations import encode_entry
 from labseq.errors import ConfigError, DeviceError, LabseqError, StopRequested
 from labseq.model import RunRecord, TimelineEntry
 from labseq.model.records import RunStatus
@@ -178,7 +179,9 @@ class Session:
 
     def _run(self, lab: Lab, roots: Sequence[Path]) -> Run:
         record = self._record(lab)
-        writer = RunWriter.create(roots[0], record)
+        calibrations = self.assembly.bench.calibrations
+        copies = {f"calibration_{kind}.json": encode_entry(e) for kind, e in calibrations.items()}
+        writer = RunWriter.create(roots[0], record, copies)
         self.run_dir = writer.run_dir
         self._observers.log = writer.event
         error: BaseException | None = None
@@ -285,4 +288,5 @@ class Session:
             grid_spacing_m=lab.grid.spacing_m,
             lattice=lab.grid.lattice,
             scan=self.course.record(),
+            calibrations={kind: entry.id for kind, entry in lab.calibrations.items()},
         )

@@ -43,9 +43,10 @@ class VirtualCamera(VirtualDriver):
 
     @property
     def facts(self) -> CameraFacts:
-        """Read-out time, longest exposure, shape of the simulated frames."""
+        """Read-out time (less for a part of the sensor), longest exposure, shape of the simulated frames."""
         shape = getattr(self._world, "frame_shape", None)
-        return CameraFacts(self._settings.readout, self._settings.max_exposure, shape)
+        readout_s = self._settings.readout * getattr(self._world, "readout_fraction", 1.0)
+        return CameraFacts(readout_s, self._settings.max_exposure, shape)
 
     def arm(self, n_frames: int, exposure_s: float, trigger: Trigger) -> None:
         """Get ready for a series of exposures; frames not yet read are dropped.
@@ -92,7 +93,7 @@ class VirtualCamera(VirtualDriver):
             return
         frame = self._world.expose(now_s, self._exposure_s)
         self._exposing_until_s = now_s + self._exposure_s
-        ready_s = self._exposing_until_s + self._settings.readout
+        ready_s = self._exposing_until_s + self.facts.readout_s
         self._frames.append((ready_s, replace(frame, camera=self._name)))
 
     def read(self, timeout_s: float) -> Frame:
@@ -123,7 +124,7 @@ class VirtualCamera(VirtualDriver):
 
     def describe(self) -> Mapping[str, Any]:
         """Model and settings."""
-        return {"model": "virtual EMCCD", **self._settings.model_dump(mode="json")}
+        return {"model": "virtual camera", **self._settings.model_dump(mode="json")}
 
     def _happens(self, probability: float) -> bool:
         """Draw a failure; no number is drawn for one that never comes."""

@@ -1,69 +1,139 @@
-"""The frame of an EMCCD camera, photoelectron by photoelectron."""
+"""The EMCCD camera: from photoelectrons to counts."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from labseq_virtual.em_register import Register, power_of_two
 from labseq_virtual.image_settings import ImageSettings
+from labseq_virtual.law import Law
+
+FULL_SCALE: Final = 65535
+"""Counts at which the converter of 16 bit ends."""
+
+MOST_WORK: Final = 2**23
+"""Outputs of the register times counts that the read noise reaches, above which no table is made."""
+
+MOST_ELECTRONS: Final = 300
+"""Mean electrons of a dark pixel above which none is made; fewer never fill a well."""
 
 
-def render(
-    settings: ImageSettings,
-    positions_px: NDArray[np.float64],
-    shining: NDArray[np.float64],
-    exposure_s: float,
-    rng: np.random.Generator,
-) -> NDArray[np.uint16]:
-    """Draw a frame.
+@dataclass(frozen=True)
+class Output:
+    """What comes behind the register.
 
-    Each photoelectron is drawn by itself: how many an atom gives (Poisson), where
-    each falls (Gaussian spot about the atom, sampled by the pixels without any
-    approximation), and what the EM register makes of it (exponential of mean
-    ``em_gain``: the law of a register of many stages with a high gain, which gives
-    the excess noise factor of 2). Stray light and clock-induced charge are
-    photoelectrons anywhere on the sensor; read noise and offset come last.
+    Attributes:
+        well: Electrons that the register holds.
+        read_noise: Electrons r.m.s.
+        electrons_per_adu: Electrons per count.
+        offset: Counts of a dark pixel.
+    """
+
+    well: float
+    read_noise: float
+    electrons_per_adu: float
+    offset: float
+
+    def counts(self, electrons: NDArray[np.int64], rng: np.random.Generator) -> NDArray[np.float64]:
+        """Counts of electrons behind the register, not yet rounded."""
+        counts = np.minimum(electrons, self.well) + self.read_noise * rng.standard_normal(len(electrons))
+        return counts / self.electrons_per_adu + self.offset
+
+
+class Emccd:
+    """An EMCCD camera.
+
+    The electrons of a pixel (photoelectrons, and the clock-induced charge of the sensor) pass the EM
+    register, then come read noise, offset and an analogue-to-digital converter of 16 bit. Pixels
+    without an atom's light all have one law, which is worked out once for an exposure time and
+    drawn from a table; the others are followed step by step.
 
     Args:
-        settings: Constants of optics and camera.
-        positions_px: float64 (n_atoms, 2), (y, x) of each atom.
-        shining: float64 (n_atoms,), how long each atom shines, as a fraction of
-            the exposure.
-        exposure_s: Exposure time, in seconds.
-        rng: Random numbers of the shot.
-
-    Returns:
-        uint16 (height, width), in counts.
+        settings: Constants of the camera.
     """
-    height, width = settings.frame
-    n_pixels = height * width
-    brightness = exposure_s / settings.exposure
-    dark_per_pixel = settings.background * brightness + settings.clock_induced_charge
-    anywhere = rng.integers(0, n_pixels, rng.poisson(dark_per_pixel * n_pixels), dtype=np.int32)
-    from_atoms = _fallen(settings, positions_px, settings.photoelectrons * brightness * shining, rng)
-    pixel = np.concatenate([from_atoms, anywhere])
-    gain_adu = settings.em_gain / settings.electrons_per_adu
-    signal = rng.standard_exponential(len(pixel), dtype=np.float32)
-    counts = rng.standard_normal(n_pixels, dtype=np.float32)
-    counts *= np.float32(settings.read_noise / settings.electrons_per_adu)
-    counts += np.float32(settings.offset + 0.5)  # the half turns the cut to integers into rounding
-    counts += np.bincount(pixel, signal, n_pixels) * gain_adu
-    return np.clip(counts, 0, 65535, out=counts).astype(np.uint16).reshape(height, width)
+
+    quantum_efficiency: Final = 1.0
+    """The photoelectrons of the settings are this camera's."""
+
+    def __init__(self, settings: ImageSettings) -> None:
+        self.binning = settings.binning
+        self._settings = settings
+        gain, spurious = settings.em_gain, settings.register_clock_induced_charge
+        self.register = Register(settings.register_stages, gain, spurious)
+        self._output = Output(
+            settings.register_well, settings.read_noise, settings.electrons_per_adu, settings.offset
+        )
+
+    def warm(self) -> None:
+        """Work out the tables for the exposure of the settings."""
+        _ = self.register.one
+        _dark_law(self.register, self._output, self._dark_electrons(self._settings.exposure))
+
+    def read(
+        self, light: NDArray[np.int32], exposure_s: float, rng: np.random.Generator
+    ) -> NDArray[np.uint16]:
+        """Draw the counts of a frame.
+
+        Args:
+            light: int32 (height, width), photoelectrons of the atoms on each pixel.
+            exposure_s: Exposure time, in seconds.
+            rng: Random numbers of the shot.
+
+        Returns:
+            uint16 (height, width).
+        """
+        dark_electrons = self._dark_electrons(exposure_s)
+        dark = _dark_law(self.register, self._output, dark_electrons)
+        image = np.empty(light.size, np.uint16)
+        if dark is None:
+            lit = slice(None)
+        else:
+            dark.draw(image, rng)
+            lit = np.flatnonzero(light > 0)
+        n_electrons = light.ravel()[lit].astype(np.int64)
+        n_electrons += rng.poisson(dark_electrons, len(n_electrons))
+        n_electrons = np.minimum(n_electrons, round(self._settings.full_well))
+        counts = self._output.counts(self.register.multiply(n_electrons, rng), rng)
+        image[lit] = np.clip(np.rint(counts), 0, FULL_SCALE)
+        return image.reshape(light.shape)
+
+    def _dark_electrons(self, exposure_s: float) -> float:
+        """Mean electrons of a pixel without an atom's light."""
+        settings = self._settings
+        per_pixel = settings.background * exposure_s / settings.exposure + settings.clock_induced_charge
+        return per_pixel * settings.binning**2
 
 
-def _fallen(
-    settings: ImageSettings,
-    positions_px: NDArray[np.float64],
-    mean: NDArray[np.float64],
-    rng: np.random.Generator,
-) -> NDArray[np.int32]:
-    """Flat pixel index of each photoelectron of the atoms; those beside the sensor are left out."""
-    height, width = settings.frame
-    n_electrons = rng.poisson(mean)
-    spot_px = np.float32(settings.spot / settings.pixel_size)
-    fallen = rng.standard_normal((2, int(n_electrons.sum())), dtype=np.float32)
-    fallen *= spot_px
-    fallen += np.repeat(positions_px.T.astype(np.float32), n_electrons, axis=1)
-    y, x = np.rint(fallen).astype(np.int32)
-    inside = (y >= 0) & (y < height) & (x >= 0) & (x < width)
-    return (y * np.int32(width) + x)[inside]
+@lru_cache(maxsize=64)
+def _dark_law(register: Register, output: Output, mean_electrons: float) -> Law | None:
+    """Law of the counts of a pixel without an atom's light; None where a table would be too long."""
+    most = mean_electrons + register.spurious
+    n_values = power_of_two((most + 9 * (2 * most) ** 0.5 + 45) * register.gain)
+    spread = output.read_noise / output.electrons_per_adu
+    reach = int(np.ceil(6.5 * spread)) + 1
+    if n_values * reach > MOST_WORK or mean_electrons > MOST_ELECTRONS:
+        return None
+    p = np.maximum(register.output(mean_electrons, n_values), 0.0)
+    p = p[: np.flatnonzero(p > 1e-15)[-1] + 1]
+    value = np.minimum(np.arange(len(p)), output.well) / output.electrons_per_adu + output.offset
+    nearest = np.rint(value).astype(np.int64)
+    law = np.zeros(FULL_SCALE + 1)
+    for beside in range(-reach, reach + 1):
+        count = nearest + beside
+        share = _rounded(count - value, spread) * p
+        law += np.bincount(np.clip(count, 0, FULL_SCALE), share, len(law))
+    return Law.of(law)
+
+
+def _rounded(distance: NDArray[np.float64], spread: float) -> NDArray[np.float64]:
+    """Probability that a normal number about 0 is rounded to a count at a distance."""
+    from scipy.special import ndtr
+
+    if spread == 0:
+        return (np.abs(distance) <= 0.5).astype(float)
+    return ndtr((distance + 0.5) / spread) - ndtr((distance - 0.5) / spread)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from typing import Any, Final
 
 import numpy as np
@@ -10,13 +11,14 @@ from numpy.typing import NDArray
 
 from labseq import MotionSpec
 from labseq.model import SiteGrid
+from labseq_virtual.axis_tones import full_amplitudes
 from labseq_virtual.envelope import Band
 from labseq_virtual.hearing import Episode
 from labseq_virtual.jumps import JUMPS, depth_jumps, phase_jumps
+from labseq_virtual.places import Places
 from labseq_virtual.settings import WorldSettings
 from labseq_virtual.thermal import draw_atoms
 from labseq_virtual.tones import HOPS, WINDOW, Tracks, follow_tones, refuse_blur
-from labseq_virtual.transport import frequency_maps
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -58,6 +60,14 @@ grid), "paired" (came too near to another atom), "spilled" (fell out of its twee
 transport loss). ``lost_s`` is when, and ``lost_row`` and ``lost_col``, in sites, where.
 """
 
+CAUSES: Final = {
+    b"paired": "collision",
+    b"spilled": "transport",
+    b"ejected": "ejected",
+    b"drawn": "hand_over",
+}
+"""The cause that a fate counts as."""
+
 
 class Flight:
     """Carries atoms by what the mobile tweezers' outputs played.
@@ -66,13 +76,15 @@ class Flight:
         grid: The grid of sites, with its frequencies.
         motion: What drives the AODs: the amplitudes that are meant to give the full depth.
         settings: The constants of the model.
+        places: Where the tones put their light; by default without errors of the tones.
     """
 
-    def __init__(self, grid: SiteGrid, motion: MotionSpec, settings: WorldSettings) -> None:
+    def __init__(
+        self, grid: SiteGrid, motion: MotionSpec, settings: WorldSettings, places: Places | None = None
+    ) -> None:
         light = settings.mobile_light
         self._grid, self._motion, self._settings, self._light = grid, motion, settings, light
-        self._maps = frequency_maps(grid)
-        self._offset = np.array([light.offset[1], light.offset[0]]) / grid.spacing_m
+        self._places = places or Places(grid, light)
         self._full_v = _full_volts(grid, motion, light.tone_voltage)
         self._bands = _bands(grid)
         a1, a2 = grid.axes
@@ -111,7 +123,7 @@ class Flight:
 
     def carry(
         self, occupied: Mask, episode: Episode, depth: Floats, rng: np.random.Generator, loss_factor: float
-    ) -> None:
+    ) -> Counter[str]:
         """Let an episode act on the atoms.
 
         Args:
@@ -120,12 +132,15 @@ class Flight:
             depth: float64 (n_rows, n_cols), depths of the static tweezers, of the nominal one.
             rng: Random numbers of the shot.
             loss_factor: The shot's factor on the transport loss.
+
+        Returns:
+            How many atoms were lost by each cause: hand_over, transport, collision, ejected.
         """
         from labseq_virtual._kernels_atoms import DEPTH, HELD_S, LOST_S, N_DIARY, OFFSET, PAIRED, follow_atoms
 
         tones = self._listen(episode)
         if tones is None:
-            return
+            return Counter()
         (rows, row_depth, cols, col_depth), t_s = tones
         row, col = np.nonzero(occupied & self._near(rows, cols) & (depth > 0))
         static = KELVIN * self._settings.static_depth * np.ascontiguousarray(depth)
@@ -156,6 +171,7 @@ class Flight:
         occupied[row, col] = False
         occupied[to_row[kept], to_col[kept]] = True
         self._flights.append(flights[held | ~kept])
+        return Counter(CAUSES[fate] for fate in flights["fate"][~kept].tolist())
 
     def _listen(self, episode: Episode) -> tuple[tuple[Floats, Floats, Floats, Floats], Floats] | None:
         """Places (in sites) and depth factors of the row and column tones, and the times of the frames."""
@@ -172,9 +188,9 @@ class Flight:
         depths: list[Floats] = []
         for axis, tracks in enumerate(found):
             hz, volts = tracks.frequency_hz[:n_frames], tracks.amplitude_v[:n_frames]
-            places, full_v = self._maps[axis].sites(hz), self._full_v[axis]
-            sites.append(places + self._offset[axis])
-            depths.append((volts / np.interp(places, np.arange(len(full_v)), full_v)) ** 2)
+            meant, full_v = self._places.meant(axis, hz), self._full_v[axis]
+            sites.append(self._places.sites(axis, hz))
+            depths.append((volts / np.interp(meant, np.arange(len(full_v)), full_v)) ** 2)
         self._note_jumps(found, sites, depths)
         return (sites[0], depths[0], sites[1], depths[1]), found[0].t_s[:n_frames]
 
@@ -234,13 +250,9 @@ class Flight:
 
 def _full_volts(grid: SiteGrid, motion: MotionSpec, tone_v: float | None) -> list[Floats]:
     """Volts of the tones that are meant to give the full depth: for each axis, one per site."""
-    rf, most = motion.rf, (motion.max_row_tones, motion.max_column_tones)
-    given = (rf.row_amplitudes, rf.column_amplitudes)
     if tone_v is not None:
         return [np.full(n, tone_v) for n in grid.shape]
-    return [
-        rf.full_scale_v * np.array(given[axis] or [1 / most[axis]] * n) for axis, n in enumerate(grid.shape)
-    ]
+    return [motion.rf.full_scale_v * full for full in full_amplitudes(grid, motion)]
 
 
 def _bands(grid: SiteGrid) -> list[Band]:

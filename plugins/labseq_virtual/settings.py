@@ -18,10 +18,12 @@ from labseq_virtual.image_settings import ImageSettings
 PositiveDuration = Annotated[Duration, Field(gt=0)]
 PositiveLength = Annotated[Length, Field(gt=0)]
 PositiveTemperature = Annotated[Temperature, Field(gt=0)]
+NonNegativeLength = Annotated[Length, Field(ge=0)]
+NonNegativeTemperature = Annotated[Temperature, Field(ge=0)]
 
 
 class MobileLightSettings(Settings):
-    """The light of the mobile tweezers, where the world hears what a driver's outputs really play."""
+    """The light of the mobile tweezers."""
 
     depth: PositiveTemperature = Field(
         default=2.1e-3, description="depth of a tweezer whose two tones have the amplitude meant (paper)"
@@ -41,7 +43,38 @@ class MobileLightSettings(Settings):
     offset: tuple[Length, Length] = Field(
         default=(0.0, 0.0),
         description="[along a row, from row to row]: how far the mobile tweezers stand beside the sites that "
-        "they are meant for, an error of the calibration (ours)",
+        "they are meant for, an error for a calibration to find (ours)",
+    )
+    magnification_error: float = Field(
+        default=0.0,
+        ge=-0.1,
+        le=0.1,
+        description="how much further apart than meant the mobile tweezers stand, as a fraction; likewise "
+        "(ours)",
+    )
+    tone_error: NonNegativeLength = Field(
+        default=0.0,
+        description="s.d. of the place of each row's and each column's tone about the one meant, fixed for a "
+        "seed; likewise (ours)",
+    )
+    depth_drop_per_tone: Fraction = Field(
+        default=0.0,
+        description="the depth is divided by 1 plus this for each tone on beyond one per axis (ours; the "
+        "paper sees a drop and gives no number). Drivers whose outputs are heard make their own",
+    )
+    intermodulation: Fraction = Field(
+        default=0.02,
+        description="relative s.d. of the depths of 20 tweezers in a line; that of n goes as the root of "
+        "n - 1 (paper: 2 %; the law is ours)",
+    )
+    adiabatic_depth: NonNegativeTemperature = Field(
+        default=0.0,
+        description="least depth of a tweezer that carries its atom at 130 um/ms; it goes as the speed "
+        "squared (ours; the paper suspects such a depth, passed at 13 tweezers; 0: there is none). For "
+        "drivers that are taken at their word; where outputs are heard, the atoms fly",
+    )
+    shallow_loss: Fraction = Field(
+        default=0.0, description="loss in tweezers that are shallower than that (ours)"
     )
 
 
@@ -70,8 +103,9 @@ class WorldSettings(Settings):
     )
     transport_loss: Fraction = Field(
         default=0.0188,
-        description="mean loss of an atom that is picked up, moved and dropped (derived: gives about the "
-        "paper's filling of 97.66 % after one cycle at a degree of parallelism of 7)",
+        description="mean loss of an atom that is picked up, moved and dropped, at the nominal depths; it "
+        "goes as the mobile depth over the static one (derived: gives about the paper's filling of 97.66 % "
+        "after one cycle at a degree of parallelism of 7; the law is ours)",
     )
     transport_loss_per_tone: Fraction = Field(
         default=0.0,
@@ -84,8 +118,20 @@ class WorldSettings(Settings):
         "factor with mean 1 (ours: independent losses would leave a third of the paper's defect-free shots "
         "after one cycle)",
     )
+    machine_seed: Annotated[int, Field(ge=0, lt=2**63)] | None = Field(
+        default=None,
+        description="seed of what does not change from run to run: depths, errors of tones, the camera's own "
+        "patterns; none: the seed of the run. Calibrations hold for one machine only (ours)",
+    )
     depth_disorder: Fraction = Field(
-        default=0.04, description="relative s.d. of the static tweezers' depths, fixed for a seed (paper)"
+        default=0.04,
+        description="relative s.d. of the static tweezers' own depths, fixed for a seed (paper)",
+    )
+    tone_response: Fraction = Field(
+        default=0.0,
+        lt=0.5,
+        description="relative s.d. of the depth that each row's and each column's tone of the static "
+        "tweezers gives at equal amplitude, fixed for a seed: what a calibration can equalise (ours)",
     )
     static_depth: PositiveTemperature = Field(
         default=300e-6, description="mean depth of the static tweezers (paper)"
@@ -100,8 +146,7 @@ class WorldSettings(Settings):
         "typical of gray molasses)",
     )
     mobile_light: MobileLightSettings = Field(
-        default=MobileLightSettings(),
-        description="the mobile tweezers' light, for drivers whose outputs are heard",
+        default=MobileLightSettings(), description="the mobile tweezers' light"
     )
     lost_below_depth: Fraction = Field(
         default=0.1,
@@ -112,8 +157,8 @@ class WorldSettings(Settings):
         default=0.25,
         gt=0,
         lt=0.5,
-        description="distance, in sites along each axis, within which a mobile tweezer is on a site, "
-        "hits the atom there, and is the same tweezer in the next segment (ours: the waist is 0.22 sites)",
+        description="distance, in sites along each axis, within which a mobile tweezer that passes hits an "
+        "atom, and is the same tweezer in the next segment (ours: the waist is 0.22 sites)",
     )
     on_amplitude: float = Field(
         default=1e-3,

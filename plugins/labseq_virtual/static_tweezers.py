@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq import Context, DepthRamp, LimitError
+from labseq import Context, DepthRamp, LimitError, TweezerAmplitudes
 from labseq_virtual.driver import VirtualDriver
 from labseq_virtual.settings import StaticTweezersSettings
 
@@ -18,8 +18,7 @@ Amplitudes = tuple[NDArray[np.float64], NDArray[np.float64]]
 class VirtualStaticTweezers(VirtualDriver):
     """The static array of the simulated world.
 
-    The tones' amplitudes are checked and kept for the record; the world's depths
-    follow ``start`` and ``ramp`` only.
+    The world's depths follow the tones' amplitudes, ``start`` and ``ramp``.
 
     Args:
         settings: Limits.
@@ -31,6 +30,7 @@ class VirtualStaticTweezers(VirtualDriver):
         self._settings = settings
         self._grid = context.grid
         self._amplitudes: Amplitudes | None = None
+        self._calibrated = _calibrated(context)
         self._depth = 0.0
 
     def load(self, amplitudes: Amplitudes | None) -> None:
@@ -45,11 +45,14 @@ class VirtualStaticTweezers(VirtualDriver):
             self._check_axis("row", rows, self._grid.n_rows)
             self._check_axis("column", cols, self._grid.n_cols)
         self._amplitudes = amplitudes
+        rows, cols = self._calibrated if amplitudes is None else amplitudes
+        self._world.play("static_tweezers", TweezerAmplitudes(rows, cols), self._clock.now())
 
     def start(self) -> None:
         """Turn the array on at its nominal depth; no effect if it is on."""
         self._check_open()
         if self._depth == 0.0:
+            self.load(self._amplitudes)
             self._play(1.0, 0.0)
 
     def ramp(self, depth: float, duration_s: float) -> None:
@@ -99,3 +102,12 @@ class VirtualStaticTweezers(VirtualDriver):
         total, most = float(amplitudes.sum()), self._settings.max_amplitude_sum
         if total > most + 1e-9:
             raise LimitError(f"{self._name}: sum of the {axis} amplitudes", f"{total:g}", f"{most:g}")
+
+
+def _calibrated(context: Context) -> Amplitudes:
+    """The amplitudes of the calibration in use; without one all equal, full scale together."""
+    found = context.calibrations.get("tweezers")
+    if found is None:
+        n_rows, n_cols = context.grid.shape
+        return np.full(n_rows, 1 / n_rows), np.full(n_cols, 1 / n_cols)
+    return found.values["row_amplitudes"], found.values["column_amplitudes"]

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import importlib
 import math
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -19,43 +18,34 @@ from labseq import (
     Frame,
     LimitError,
     Occupancy,
+    RandomStream,
     RfSource,
     ToneProgram,
+    TweezerAmplitudes,
 )
-from labseq.imaging import site_pixels
-from labseq_virtual import emccd
+from labseq_virtual.exposure import Exposure
 from labseq_virtual.flight import Flight
 from labseq_virtual.hearing import Ear
+from labseq_virtual.places import Places
 from labseq_virtual.settings import WorldSettings
-from labseq_virtual.transport import Transport
+from labseq_virtual.static_array import StaticArray
+from labseq_virtual.transport import CAUSES, Playing, Transport
 
 ROUNDING_S: Final = 1e-6
 """How far into the past an event may lie because sums of times were rounded."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Playing:
-    """A program on its way."""
-
-    program: ToneProgram
-    t_start_s: float
-
-    @property
-    def t_end_s(self) -> float:
-        return self.t_start_s + self.program.total_duration_s
-
-
 class World:
     """Atoms in static tweezers, what light does to them, and what a camera sees of it.
 
-    Implements ``labseq.Simulation``, ``labseq.TruthTeller``, ``labseq.Listening`` and
-    ``labseq.Storyteller``. Events come in the order of time. A program of the mobile
+    Implements ``labseq.Simulation``, ``labseq.TruthTeller``, ``labseq.LossTeller``, ``labseq.Listening``
+    and ``labseq.Storyteller``. Events come in the order of time. A program of the mobile
     tweezers is carried out when it has ended, or as far as it came when another program takes
     its place: playing a program without segments cuts it short, and atoms in flight are lost. A
     ramp of the static tweezers that comes during a program or an exposure acts at its end.
 
     Mobile tweezers come in two kinds. A driver may tell its program, which is taken at its
-    word and without physics (``transport.py``). Or the world listens to the driver's outputs, finds the
+    word (``transport.py``). Or the world listens to the driver's outputs, finds the
     tones in what they play, and lets atoms fly in the light (``flight.py``).
 
     Args:
@@ -69,18 +59,18 @@ class World:
         self._grid = context.grid
         self._random = context.random
         self._clock = context.clock
-        self._transport = Transport(context.grid, settings)
-        self._flight = Flight(context.grid, context.motion, settings)
+        self._places = Places(context.grid, settings.mobile_light)
+        self._transport = Transport(context.grid, context.motion, settings, self._places)
+        self._flight = Flight(context.grid, context.motion, settings, self._places)
+        self._static = StaticArray(context.grid, settings)
         self._ear: Ear | None = None
-        image = settings.image
-        self._pixels = site_pixels(context.grid, image.pixel_size, image.centre_px, image.angle)
-        self._imaging_rate_hz = -math.log1p(-settings.imaging_loss) / settings.imaging_loss_exposure
+        self._seed = context.random.seed if settings.machine_seed is None else settings.machine_seed
+        self._exposure = Exposure(context.grid, settings, self._seed)
         self._is_open = False
-        self._site_depth: NDArray[np.float64] = np.ones(context.grid.shape)
-        self._depth = 0.0
+        self._lost: Counter[str] = Counter()
         self._occupied: Occupancy = np.zeros(context.grid.shape, np.bool_)
         self._now_s = -math.inf
-        self._playing: _Playing | None = None
+        self._playing: Playing | None = None
         self._loss_factor = 1.0
 
     @property
@@ -91,25 +81,31 @@ class World:
     @property
     def frame_shape(self) -> tuple[int, int]:
         """(height, width) of its frames."""
-        return self._settings.image.frame
+        return self._exposure.images.frame_shape
+
+    @property
+    def readout_fraction(self) -> float:
+        """Time to read a frame, relative to that of the whole sensor."""
+        return self._exposure.images.readout_fraction
 
     def open(self) -> None:
         """Draw the machine's own disorder; no atoms, static tweezers off."""
-        disorder = self._random.machine().standard_normal(self._grid.shape)
-        self._site_depth = np.maximum(0.0, 1.0 + self._settings.depth_disorder * disorder)
+        machine = RandomStream(self._seed).machine()
+        self._static.draw(machine)
+        self._places.draw(machine)
         self._is_open = True
-        self._depth = 0.0
         self._forget()
 
     def warm(self) -> None:
-        """Compile the kernels of what is heard and of flying atoms, or load them from the cache."""
-        importlib.import_module("labseq_virtual._kernels_tones")
-        importlib.import_module("labseq_virtual._kernels_atoms")
+        """Compile the kernels of frames, of what is heard and of atoms on their way, or load them."""
+        self._exposure.images.warm()
+        for kernels in ("tones", "atoms", "transport"):
+            importlib.import_module(f"labseq_virtual._kernels_{kernels}")
 
     def close(self) -> None:
         """Forget everything."""
         self._is_open = False
-        self._depth = 0.0
+        self._static.switch_off()
         self._ear = None
         self._forget()
 
@@ -135,11 +131,11 @@ class World:
         self._advance(t_start_s, "loading")
         afresh = -math.expm1(-duration_s / self._settings.loading_time)
         draws = self._random.shot.random((2, *self._grid.shape))
-        reloaded = (draws[0] < afresh) & self._holds()
+        reloaded = (draws[0] < afresh) & self._static.holds()
         self._occupied = np.where(reloaded, draws[1] < self._settings.loading, self._occupied)
         self._now_s = t_start_s + duration_s
 
-    def play(self, role: str, signal: ToneProgram | DepthRamp, t_start_s: float) -> None:
+    def play(self, role: str, signal: ToneProgram | DepthRamp | TweezerAmplitudes, t_start_s: float) -> None:
         """Let a device's output act on the atoms, from ``t_start_s`` on.
 
         Raises:
@@ -151,11 +147,13 @@ class World:
             self._play_tones(signal, t_start_s)
         elif role == "static_tweezers" and isinstance(signal, DepthRamp):
             self._play_ramp(signal, t_start_s)
+        elif role == "static_tweezers" and isinstance(signal, TweezerAmplitudes):
+            self._static.drive(signal)
         else:
             raise DeviceError(
                 self._name,
                 f"'{role}' played a {type(signal).__name__}; expected 'mobile_tweezers' with a ToneProgram "
-                "or 'static_tweezers' with a DepthRamp",
+                "or 'static_tweezers' with a DepthRamp or TweezerAmplitudes",
             )
 
     def listen(self, role: str, source: RfSource) -> None:
@@ -182,15 +180,8 @@ class World:
         if not exposure_s > 0:
             raise LimitError("the exposure", f"{exposure_s} s", "more than 0")
         self._advance(t_start_s, "an exposure")
-        rng = self._random.shot
-        row, col = np.nonzero(self._occupied)
-        loss_rate_hz = self._imaging_rate_hz + 1.0 / self._settings.lifetime
-        life_s = rng.exponential(1.0 / loss_rate_hz, len(row))
-        shining = np.minimum(life_s / exposure_s, 1.0)
-        image = emccd.render(self._settings.image, self._pixels[row, col], shining, exposure_s, rng)
-        image.flags.writeable = False
-        lost = life_s < exposure_s
-        self._occupied[row[lost], col[lost]] = False
+        image, lost = self._exposure.take(self._occupied, exposure_s, self._random.shot)
+        self._lost += lost
         self._now_s = t_start_s + exposure_s
         return Frame(image, exposure_s, t_start_s)
 
@@ -199,6 +190,15 @@ class World:
         self._finish_program()
         self._hear(self._clock.now())
         return self._occupied.copy()
+
+    def losses(self) -> Mapping[str, int]:
+        """Atoms lost since the shot began: to vacuum, imaging and too weak light, and by being moved."""
+        return {cause: self._lost[cause] for cause in ("vacuum", "imaging", "light", *CAUSES)}
+
+    def spot_powers(self) -> NDArray[np.float64]:
+        """Power of each static tweezer now, float64 (n_rows, n_cols), over the nominal one."""
+        self._check_open()
+        return self._static.depth
 
     def story(self, since_s: float) -> Mapping[str, NDArray[Any]]:
         """What the mobile tweezers did to atoms in this shot, as far as the world heard them play.
@@ -214,38 +214,37 @@ class World:
 
     def describe(self) -> Mapping[str, Any]:
         """Every constant of the model, in SI, and the seed of its disorder."""
-        return {
-            "model": "labseq_virtual",
-            "seed": self._random.seed,
-            **self._settings.model_dump(mode="json"),
-        }
+        return {"model": "labseq_virtual", "seed": self._seed, **self._settings.model_dump(mode="json")}
 
     def _play_tones(self, program: ToneProgram, t_start_s: float) -> None:
         self._finish_program(t_start_s)
         if program.n_segments == 0:  # silence: legal at any time, it makes safe
             return
         self._advance(t_start_s, "a program of the mobile tweezers")
-        self._playing = _Playing(program, t_start_s)
+        self._playing = Playing(program, t_start_s)
 
     def _play_ramp(self, ramp: DepthRamp, t_start_s: float) -> None:
         self._finish_program()
         self._hear(t_start_s)
         self._advance(max(t_start_s, self._now_s), "a ramp of the static tweezers")
-        for depth in (ramp.start, ramp.end):
-            self._depth = depth
-            self._occupied &= self._holds()
+        self._lost["light"] += self._static.ramp(ramp, self._occupied)
         self._now_s += ramp.duration_s
 
     def _finish_program(self, until_s: float = math.inf) -> None:
         """Carry out the program on its way, as far as it comes until a time."""
         if self._playing is None:
             return
-        program, t_start_s, t_end_s = self._playing.program, self._playing.t_start_s, self._playing.t_end_s
-        self._playing = None
-        segment_end_s = t_start_s + np.cumsum(program.duration_s)
-        n_played = int(np.searchsorted(segment_end_s, until_s + ROUNDING_S, side="right"))
-        self._transport.carry(self._occupied, program, n_played, self._random.shot, self._loss_factor)
-        self._let_pass(max(t_start_s, min(t_end_s, until_s)))
+        playing, self._playing = self._playing, None
+        n_played = playing.n_segments_until(until_s + ROUNDING_S)
+        self._lost += self._transport.carry(
+            self._occupied,
+            playing.program,
+            n_played,
+            self._static.depth,
+            self._random.shot,
+            self._loss_factor,
+        )
+        self._let_pass(max(playing.t_start_s, min(playing.t_end_s, until_s)))
 
     def _hear(self, until_s: float) -> None:
         """Carry out what was heard from the mobile tweezers' outputs until a time."""
@@ -256,8 +255,8 @@ class World:
                 text = f"the mobile tweezers were on at {episode.start_s:.6f} s, together with something else"
                 raise DeviceError(self._name, f"{text}; wait (mobile_tweezers.wait, camera.read) first")
             self._let_pass(episode.start_s)
-            depth = self._depth * self._site_depth
-            self._flight.carry(self._occupied, episode, depth, self._random.shot, self._loss_factor)
+            depth, chance = self._static.depth, self._random.shot
+            self._lost += self._flight.carry(self._occupied, episode, depth, chance, self._loss_factor)
             self._let_pass(episode.end_s)
 
     def _advance(self, t_s: float, what: str) -> None:
@@ -282,17 +281,16 @@ class World:
         if not self._occupied.any():  # also before the first event, when the time since the last is infinite
             return
         stays = math.exp(-elapsed_s / self._settings.lifetime)
-        self._occupied &= self._random.shot.random(self._grid.shape) < stays
-
-    def _holds(self) -> NDArray[np.bool_]:
-        """Which static tweezers are deep enough to hold an atom, bool (n_rows, n_cols)."""
-        return self._depth * self._site_depth >= self._settings.lost_below_depth
+        gone = self._occupied & (self._random.shot.random(self._grid.shape) >= stays)
+        self._lost["vacuum"] += int(np.count_nonzero(gone))
+        self._occupied &= ~gone
 
     def _forget(self) -> None:
         self._occupied = np.zeros(self._grid.shape, np.bool_)
         self._playing = None
         self._now_s = -math.inf
         self._loss_factor = 1.0
+        self._lost = Counter()
 
     def _check_open(self) -> None:
         if not self._is_open:

@@ -40,7 +40,7 @@ def test_a_wide_terminal_shows_everything(fake: Any) -> None:
     text = "\n".join(lines)
     assert lines[0].startswith("compact-225  ━━━━━━╌")
     assert "2/20 shots" in lines[0]
-    assert f"defect-free       2 of 2 (100.0 %), 67{UNICODE.to}100 %" in text
+    assert f"defect-free       2 of 2 (100.0 %), 65{UNICODE.to}100 %" in text
     assert "filling           100.00 ± 0.00 %" in text
     assert text.count("● " * 14 + "●") == 15
     assert "shot 2, image of cycle 2:" in text

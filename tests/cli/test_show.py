@@ -36,14 +36,23 @@ def test_table_and_summary(fake: Any, tmp_path: Path, capsys: pytest.CaptureFixt
         ["3", "not", "judged:", "no", "image", "-", "0", "0", "1.9", "s"],
     ]
     assert "shots             3 of 3, 1 attempt kept that did not complete" in lines
-    assert "defect-free       1 of 3 (33.3 %)" in lines
-    assert "filling           99.56 %" in lines
+    assert "defect-free       1 of 2 (50.0 %), 21.6 to 78.4 %" in lines  # one was not judged
+    assert "filling           99.6(4) %" in lines
 
 
 def test_json(fake: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = write_run(tmp_path, fake, [fake.shot(0)])
     show_run(folder, as_json=True)
-    assert json.loads(capsys.readouterr().out) == {
+    answer = json.loads(capsys.readouterr().out)
+    statistics = answer.pop("statistics")
+    assert statistics["defect_free"] == {
+        "n": 1,
+        "n_trials": 1,
+        "rate": 1.0,
+        "interval": [pytest.approx(0.462, abs=1e-3), 1.0],
+    }
+    assert statistics["filling"] == {"mean": 1.0, "error": None}
+    assert answer == {
         "run_dir": str(folder),
         "shots": 1,
         "defect_free": 1.0,

@@ -184,6 +184,6 @@ def test_every_mistake_is_told_in_words(
 def test_a_picture_without_matplotlib_is_refused_before_anything_is_done(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    monkeypatch.setattr("labseq.drawing.picture.find_spec", lambda _: None)
+    monkeypatch.setattr("labseq.drawing.saving.find_spec", lambda _: None)
     assert code_of("waveform", *WORDS, "--png", str(tmp_path / "a.png")) == 2
     assert "needs matplotlib, which is not installed; pip install 'labseq[plot]'" in capsys.readouterr().err

@@ -9,10 +9,13 @@ from pathlib import Path
 import pytest
 
 from labseq.config import (
+    CheckOverlaySettings,
+    CheckSitesSettings,
     Collected,
     DeviceSettings,
     ImageSettings,
     LoadSettings,
+    ProbeSettings,
     RearrangeSettings,
     Settings,
     WaitSettings,
@@ -25,6 +28,9 @@ MODELS: dict[str, type[Settings]] = {
     "load": LoadSettings,
     "image": ImageSettings,
     "rearrange": RearrangeSettings,
+    "probe": ProbeSettings,
+    "check_sites": CheckSitesSettings,
+    "check_overlay": CheckOverlaySettings,
     "wait": WaitSettings,
     "device": DeviceSettings,
 }
@@ -200,6 +206,42 @@ CASES = [
         "stop_when: 'never'",
         "stop_when: nevr",
         "s.yaml:24:18: stop_when is 'nevr'; expected 'defect_free' or 'never'; did you mean 'never'?",
+    ),
+    (
+        "offset of a probe along one axis only",
+        "- image: {exposure: 45 ms}",
+        "- probe: {offset: 0.3 um}",
+        "s.yaml:16:21: offset is '0.3 um'; expected a list ([a, b], or lines that begin with '- ')",
+    ),
+    (
+        "offset of a probe in another unit",
+        "- image: {exposure: 45 ms}",
+        "- probe: {offset: [0.3 um, 2 MHz]}",
+        "s.yaml:16:30: offset.1: '2 MHz' is a frequency, not a length; expected a length such as '4.49 um' (m, mm, um, nm) or a plain number in m",
+    ),
+    (
+        "pattern of a probe misspelt",
+        "- image: {exposure: 45 ms}",
+        "- probe: {pattern: crss}",
+        "s.yaml:16:22: pattern is 'crss'; expected 'same' or 'cross'; did you mean 'cross'?",
+    ),
+    (
+        "limit of nothing",
+        "- image: {exposure: 45 ms}",
+        "- check_overlay: {limit: 0 nm}",
+        "s.yaml:16:28: limit is '0 nm'; expected more than 0",
+    ),
+    (
+        "check in no shot",
+        "- image: {exposure: 45 ms}",
+        "- check_overlay: {every: 0}",
+        "s.yaml:16:28: every is 0; expected at least 1",
+    ),
+    (
+        "limit with a unit that there is not",
+        "- image: {exposure: 45 ms}",
+        "- check_sites: {limit_px: 0.5 px}",
+        "s.yaml:16:29: limit_px is '0.5 px'; expected a number",
     ),
     (
         "argument as a list",

@@ -4,15 +4,27 @@ import pytest
 from pydantic import BaseModel
 
 from labseq.config import (
+    CheckOverlaySettings,
+    CheckSitesSettings,
     DeviceSettings,
     Document,
     ImageSettings,
     LoadSettings,
+    ProbeSettings,
     RearrangeSettings,
     WaitSettings,
 )
 
-STEPS: list[type[BaseModel]] = [LoadSettings, ImageSettings, RearrangeSettings, WaitSettings, DeviceSettings]
+STEPS: list[type[BaseModel]] = [
+    LoadSettings,
+    ImageSettings,
+    RearrangeSettings,
+    ProbeSettings,
+    CheckSitesSettings,
+    CheckOverlaySettings,
+    WaitSettings,
+    DeviceSettings,
+]
 
 
 def rearrange(text: str) -> RearrangeSettings:
@@ -40,6 +52,30 @@ def test_one_window_for_all_cycles() -> None:
 def test_a_window_for_each_cycle() -> None:
     settings = rearrange("cycles: 3, window: [60 ms, 0.05, 1e-2]")
     assert [settings.window_of(cycle) for cycle in (1, 2, 3)] == [0.06, 0.05, 0.01]
+
+
+def test_a_probe_reads_its_offset_with_units() -> None:
+    document = Document.parse("probe: {offset: [0.3 um, -50 nm], pattern: cross}", "f.yaml")
+    settings = document.validate(ProbeSettings, ("probe",))
+    assert settings.offset == (0.3e-6, -50e-9)
+    assert (settings.hold, settings.drop_off, settings.pattern, settings.sites) == (
+        0.2e-3,
+        5e-6,
+        "cross",
+        "seen",
+    )
+
+
+def test_checks_read_their_limits() -> None:
+    document = Document.parse("a: {limit_px: 0.3, exceeded: stop}\nb: {every: 5, limit: 80 nm}", "f.yaml")
+    assert document.validate(CheckSitesSettings, ("a",)).model_dump() == {
+        "every": 1,
+        "limit_px": 0.3,
+        "spot_px": 1.2,
+        "exceeded": "stop",
+    }
+    overlay = document.validate(CheckOverlaySettings, ("b",))
+    assert (overlay.every, overlay.limit, overlay.offset, overlay.exceeded) == (5, 80e-9, 0.9e-6, "warn")
 
 
 @pytest.mark.parametrize("value", ["2", "1.5", "true", "'on'", "null"])

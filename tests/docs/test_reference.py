@@ -21,6 +21,7 @@ from labseq.builtins import labseq_register
 from labseq.cli.app import app
 from labseq.cli.failures import exit_code_of
 from labseq.config import (
+    CalibrationSettings,
     Choice,
     ProfileSpec,
     SequenceSpec,
@@ -60,6 +61,7 @@ PROFILE = {
     "detector": "{use: threshold}",
     "devices": "{}",
     "simulation": "{use: virtual}",
+    "calibrations": "off",
     "plugin_folders": "[]",
     "timeouts": "{}",
 }
@@ -78,6 +80,7 @@ def own_entries() -> list[Entry]:
 SUBJECTS: dict[str, type[BaseModel] | None] = {
     "profile-grid": GridSettings,
     "profile-mobile_tweezers": MobileTweezersChoice,
+    "profile-calibrations": CalibrationSettings,
     "profile-timeouts": TimeoutSettings,
     **{f"{entry.kind}-{entry.name}": entry.settings_model for entry in own_entries()},
 }

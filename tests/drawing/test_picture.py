@@ -149,7 +149,7 @@ def test_what_cannot_be_drawn_is_told_before(tmp_path: Path, name: str, shape: A
 
 def test_without_matplotlib_there_is_a_hint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     check_picture(tmp_path / "a.PNG", (5, 5))
-    monkeypatch.setattr("labseq.drawing.picture.find_spec", lambda _: None)
+    monkeypatch.setattr("labseq.drawing.saving.find_spec", lambda _: None)
     with pytest.raises(
         ConfigError, match=r"needs matplotlib, which is not installed; pip install 'labseq\[plot\]'"
     ):

@@ -22,7 +22,8 @@ from scipy.sparse import csr_array
 from labseq import Context, DepthRamp, Frame, RandomStream, SiteGrid
 from labseq.config.detectors import ThresholdSettings, WeightedSettings
 from labseq.imaging import ThresholdDetector, WeightedDetector
-from labseq.imaging.regions import region_corners, sites_on_frame
+from labseq.imaging.known_sites import known_sites
+from labseq.imaging.regions import region_corners
 from labseq.imaging.spots import spot_light
 
 Floats = NDArray[np.float64]
@@ -95,8 +96,9 @@ class Ideal:
     N = 8192
 
     def __init__(self, spacing: float, spot: float) -> None:
-        grid, settings = SiteGrid(spacing_m=spacing), WeightedSettings(**PLACE, region=11)
-        sites, self.corners = sites_on_frame(settings, grid), region_corners(settings, grid)
+        settings = WeightedSettings(**PLACE, region=11)
+        known = known_sites(settings, Context("detector", SiteGrid(spacing_m=spacing)))
+        sites, self.corners = known.positions_px.reshape(-1, 2), region_corners(known, settings.region)
         n, w = len(sites), settings.region
         lit = [
             60.0 * spot_light(np.tile(site, (n, 1)), self.corners, w, spot / settings.pixel_size)
@@ -149,11 +151,6 @@ def sums(spacing: float) -> dict[str, ThresholdDetector]:
     }
 
 
-def counts_of(detector: ThresholdDetector, frame: Frame) -> Floats:
-    counts = frame.image.take(detector._pixels).sum(axis=0, dtype=np.uint32)
-    return counts.reshape(detector._grid_shape) - detector._levels
-
-
 def weights(spacing: float, spot: float, **settings: Any) -> WeightedDetector:
     given: dict[str, Any] = PLACE | {"spot": spot} | settings
     known = WeightedSettings(**given)
@@ -189,9 +186,9 @@ def test_weighted_makes_fewer_errors_than_the_best_threshold(case: str) -> None:
         survived.append(atoms)
         before_all.append(before)
         for name, region in regions.items():
-            found.setdefault(name, []).append(counts_of(region, frame))
+            found.setdefault(name, []).append(region.signals(frame))
         for name, detector in weighted.items():
-            found.setdefault(name, []).append(detector.log_odds(frame))
+            found.setdefault(name, []).append(detector.signals(frame))
         if ideal is not None:
             found.setdefault("ideal", []).append(ideal.log_odds(frame, before))
     truth = np.stack(survived), ~np.stack(before_all)

@@ -90,7 +90,7 @@ def test_bright_sites_hold_atoms(atoms: Bools, grid: SiteGrid) -> None:
 def test_the_log_odds_are_numpys(seed: int, brightest: int, grid: SiteGrid) -> None:
     image = np.random.default_rng(seed).integers(0, brightest, (60, 90), np.uint16)
     known = detector(grid)
-    np.testing.assert_allclose(known.log_odds(frame(image)), naive(known, image), rtol=1e-4, atol=1e-3)
+    np.testing.assert_allclose(known.signals(frame(image)), naive(known, image), rtol=1e-4, atol=1e-3)
 
 
 def test_neighbours_light_is_undone() -> None:
@@ -99,7 +99,7 @@ def test_neighbours_light_is_undone() -> None:
     alone, among = np.zeros((3, 4), np.bool_), np.ones((3, 4), np.bool_)
     among[1, 1] = False
     few, many = (
-        np.mean([known.log_odds(frame(noisy(mean_image(atoms, CLOSE), rng)))[1, 1] for _ in range(300)])
+        np.mean([known.signals(frame(noisy(mean_image(atoms, CLOSE), rng)))[1, 1] for _ in range(300)])
         for atoms in (alone, among)
     )
     weights = known._ready()
@@ -121,7 +121,7 @@ def test_the_place_between_the_pixels_counts() -> None:
 def test_the_confidence_is_the_probability_of_being_right() -> None:
     known = detector()
     image = np.random.default_rng(5).integers(480, 800, (60, 90), np.uint16)
-    log_odds = known.log_odds(frame(image))
+    log_odds = known.signals(frame(image))
     _, confidence = known.detect(frame(image))
     probability = 1 / (1 + np.exp(-np.abs(log_odds)))
     np.testing.assert_allclose(confidence, 2 * probability - 1, rtol=1e-5)
@@ -129,7 +129,7 @@ def test_the_confidence_is_the_probability_of_being_right() -> None:
 
 def test_log_odds_at_the_threshold_are_no_atom_and_no_confidence() -> None:
     image = mean_image(np.eye(3, 4, dtype=np.bool_))
-    log_odds = detector().log_odds(frame(image))
+    log_odds = detector().signals(frame(image))
     occupancy, confidence = detector(threshold=log_odds.tolist()).detect(frame(image))
     assert not occupancy.any()
     assert (confidence == 0).all()

@@ -17,6 +17,7 @@ from labseq.motion import (
     calibrated,
     drive,
     fit_comb,
+    standing_on_sites,
     tone_program,
 )
 from labseq.motion.calibration import axis_positions_m
@@ -122,3 +123,42 @@ def test_tones_within_20_nm_are_snapped_to_the_comb(worst_m: float, snapped: boo
         Plan.from_batches([([(0, 3)], [(0, 9)])]), grid, MotionSpec(rf=RfSpec(snap_within_m=0.0))
     )
     assert unsnapped.column.end_hz[-1] == bent(worst_m)[9]
+
+
+@given(
+    offset_m=st.tuples(st.floats(-2e-6, 2e-6), st.floats(-2e-6, 2e-6)),
+    bend_m=st.floats(0.0, 0.5e-6),
+    falling=st.booleans(),
+)
+def test_tweezers_beside_the_sites_come_to_stand_on_them(
+    offset_m: tuple[float, float], bend_m: float, falling: bool
+) -> None:
+    """In truth each tone's tweezer stands by the offset beside where the calibration has it."""
+    tones_hz = bent(bend_m)[:: -1 if falling else 1]
+    grid = SiteGrid(20, 20, SPACING_M, row_frequency_hz=tones_hz, column_frequency_hz=tones_hz)
+    corrected = standing_on_sites(grid, offset_m)
+    believed = TableCalibration(SITES_M, tones_hz)
+    along_row_m = believed.position_m(corrected.column_frequency_hz) + offset_m[0]
+    from_row_to_row_m = believed.position_m(corrected.row_frequency_hz) + offset_m[1]
+    assert along_row_m == pytest.approx(SITES_M, abs=1e-12)
+    assert from_row_to_row_m == pytest.approx(SITES_M, abs=1e-12)
+    assert np.array_equal(corrected.positions_m, grid.positions_m)
+
+
+def test_without_an_offset_the_tones_stay_as_they_are() -> None:
+    grid = SiteGrid(1, 4, SPACING_M)
+    assert standing_on_sites(grid, [0.0, 0.0]).row_frequency_hz is grid.row_frequency_hz
+    moved = standing_on_sites(grid, [1e-6, 0.0])
+    assert np.array_equal(moved.row_frequency_hz, grid.row_frequency_hz)
+    assert np.all(moved.column_frequency_hz < grid.column_frequency_hz)
+
+
+def test_a_single_row_tells_no_slope_to_move_it_by() -> None:
+    with pytest.raises(LimitError, match="the offset of a single row is 1e-06 m"):
+        standing_on_sites(SiteGrid(1, 4), [0.0, 1e-6])
+
+
+def test_tones_are_not_moved_below_zero() -> None:
+    grid = SiteGrid(3, 3, SPACING_M, column_frequency_hz=np.array([1e5, 2e6, 4e6]))
+    with pytest.raises(LimitError, match="the lowest column frequency"):
+        standing_on_sites(grid, [2e-6, 0.0])

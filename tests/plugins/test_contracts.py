@@ -23,15 +23,21 @@ from labseq_virtual.world import World
 from labseq import Context
 from labseq.config.detectors import ThresholdSettings
 from labseq.config.steps import (
+    CheckOverlaySettings,
+    CheckSitesSettings,
     DeviceSettings as DeviceStepSettings,
     ImageSettings,
     LoadSettings,
+    ProbeSettings,
     RearrangeSettings,
     WaitSettings,
 )
 from labseq.imaging import ThresholdDetector
+from labseq.model import SiteGrid
+from labseq.sequencer.probe import ProbeStep
 from labseq.sequencer.rearrange import RearrangeStep
 from labseq.sequencer.steps import DeviceStep, ImageStep, LoadStep, WaitStep
+from labseq.sequencer.watching import CheckOverlayStep, CheckSitesStep
 from labseq.testing import (
     CameraContract,
     DetectorContract,
@@ -41,6 +47,7 @@ from labseq.testing import (
     StaticTweezersContract,
     StepContract,
 )
+from labseq.testing.fakes import FakeLab, fake_lab
 
 Factory = Callable[..., Any]
 
@@ -140,6 +147,38 @@ class TestRearrangeInAFixedWindow(StepContract):
     def factory(self) -> Factory:
         settings = RearrangeSettings(cycles=2, window=0.06, exposure=0.045, window_mode="fixed")
         return partial(RearrangeStep, settings)
+
+
+class TestProbe(StepContract):
+    @pytest.fixture
+    def factory(self) -> Factory:
+        return partial(ProbeStep, ProbeSettings(offset=(0.3e-6, 0.0), sites="all"))
+
+
+class TestProbeInACross(StepContract):
+    @pytest.fixture
+    def factory(self) -> Factory:
+        return partial(ProbeStep, ProbeSettings(offset=(0.9e-6, 0.9e-6), pattern="cross"))
+
+
+class TestCheckSites(StepContract):
+    def lab(self) -> FakeLab:
+        settings = ThresholdSettings(frame=(64, 64), centre_px=(31.5, 31.5), offset=0.0, threshold=-1.0)
+        grid = SiteGrid(4, 4)
+        detector = ThresholdDetector(settings, Context("detector", grid))
+        lab = fake_lab(grid=grid, detector=detector, simulated=True)
+        vars(lab.camera)["frame_shape"] = settings.frame
+        return lab
+
+    @pytest.fixture
+    def factory(self) -> Factory:
+        return partial(CheckSitesStep, CheckSitesSettings())
+
+
+class TestCheckOverlay(StepContract):
+    @pytest.fixture
+    def factory(self) -> Factory:
+        return partial(CheckOverlayStep, CheckOverlaySettings())
 
 
 class TestWait(StepContract):

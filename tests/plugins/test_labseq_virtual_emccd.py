@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from labseq_virtual import emccd
+from labseq_virtual.emccd import Emccd
 from labseq_virtual.image_settings import ImageSettings
+from labseq_virtual.optics import photoelectrons
 from labseq_virtual.settings import WorldSettings
 from labseq_virtual.world import World
 from numpy.typing import NDArray
@@ -27,8 +28,10 @@ def render(
     **image: Any,
 ) -> NDArray[np.float64]:
     settings = ImageSettings.model_validate({"background": 0.0, "clock_induced_charge": 0.0} | image)
-    fraction = np.full(len(positions_px), shining)
-    frame = emccd.render(settings, positions_px, fraction, exposure_s, np.random.default_rng(0))
+    rng = np.random.default_rng(0)
+    mean = settings.photoelectrons * shining * exposure_s / settings.exposure
+    light = photoelectrons(settings, positions_px, np.full(len(positions_px), mean), rng)
+    frame = Emccd(settings).read(light, exposure_s, rng)
     assert frame.dtype == np.uint16
     assert frame.shape == settings.frame
     return frame.astype(float)
@@ -121,3 +124,39 @@ def test_the_shipped_detector_reaches_the_papers_fidelity() -> None:
     assert missed <= 6  # expected 1.0
     assert 0 < imagined <= 17  # expected 6.2
     assert n_atoms + n_empty > 23_000
+
+
+@pytest.mark.parametrize("gain", [1.0, 4.0, 300.0])
+def test_dark_pixels_from_the_table_are_like_pixels_followed_step_by_step(gain: float) -> None:
+    settings = ImageSettings(
+        background=1.5, em_gain=gain, read_noise=9.0, electrons_per_adu=3.0, register_clock_induced_charge=0.2
+    )
+    camera, rng = Emccd(settings), np.random.default_rng(4)
+    frame = camera.read(np.zeros((512, 512), np.int32), EXPOSURE_S, rng).ravel()
+    electrons = camera.register.multiply(rng.poisson(1.505, frame.size), rng)
+    followed = np.rint((electrons + 9.0 * rng.standard_normal(frame.size)) / 3.0 + 500)
+    edges = np.arange(frame.min(), frame.max() + 1)
+    below = [np.searchsorted(np.sort(x), edges, "right") / x.size for x in (frame, followed)]
+    assert np.abs(below[0] - below[1]).max() < 1.95 * np.sqrt(2 / frame.size)
+
+
+def test_light_too_bright_for_a_table_is_followed_step_by_step() -> None:
+    frame = render(background=400.0, em_gain=300.0, read_noise=0.0) - 500
+    assert frame.mean() == pytest.approx(400 * 60, rel=0.002)
+    assert frame.var() == pytest.approx(1.976 * 400 * 60**2, rel=0.02)
+
+
+def test_without_gain_it_is_a_plain_ccd() -> None:
+    frame = render(background=12.0, em_gain=1.0, read_noise=3.0, electrons_per_adu=0.5)
+    assert frame.mean() - 500 == pytest.approx(24.0, rel=0.005)
+    assert frame.var() == pytest.approx((12.0 + 3.0**2) / 0.5**2, rel=0.02)  # Poisson's, once
+
+
+def test_a_pixel_and_the_register_hold_only_so_many_electrons() -> None:
+    place = np.array([[100.0, 100.0]])
+    quiet: dict[str, Any] = {"photoelectrons": 1e6, "read_noise": 0.0, "electrons_per_adu": 20.0}
+    assert render(place, em_gain=1.0, full_well=30e3, **quiet).max() == 500 + 30e3 / 20
+    assert render(place, em_gain=100.0, register_well=400e3, **quiet).max() == 500 + 400e3 / 20
+    full = render(background=150.0, em_gain=100.0, register_well=10e3, read_noise=0.0)
+    assert full.max() == 500 + 10e3 / 5
+    assert (full == full.max()).mean() > 0.9

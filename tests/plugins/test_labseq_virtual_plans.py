@@ -22,8 +22,8 @@ PROFILES = pytest.mark.parametrize("profile", ["constant", "minimum_jerk", "cons
 def carried(plan: Plan, occupied: NDArray[np.bool_], profile: SpeedProfile = "constant") -> NDArray[np.bool_]:
     program = tone_program(plan, grid=GRID, motion=MotionSpec(speed_profile=profile))
     result = occupied.copy()
-    transport = Transport(GRID, WorldSettings(transport_loss=0.0))
-    transport.carry(result, program, program.n_segments, np.random.default_rng(0), 1.0)
+    transport = Transport(GRID, MotionSpec(), WorldSettings(transport_loss=0.0))
+    transport.carry(result, program, program.n_segments, np.ones(GRID.shape), np.random.default_rng(0), 1.0)
     return result
 
 

@@ -291,3 +291,10 @@ def test_the_description_is_ready_for_json() -> None:
     described = json.loads(json.dumps(dict(new_world(seed=7).describe())))
     assert described["seed"] == 7
     assert described["image"]["em_gain"] == 300.0
+
+
+def test_a_machine_with_a_seed_of_its_own_is_the_same_in_every_run() -> None:
+    assert np.array_equal(
+        new_world(1, machine_seed=9).spot_powers(), new_world(2, machine_seed=9).spot_powers()
+    )
+    assert not np.array_equal(new_world(1).spot_powers(), new_world(2).spot_powers())

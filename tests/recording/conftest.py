@@ -122,6 +122,7 @@ def _shot(
         n_missing_atoms=3,
         readings={"laser": {"power_w": 0.1, "locked": True}},
         parameters={"shot.2.rearrange.window": 0.06, "ümlaut": [1, None]},
+        calibrations={"sites": "f102b3cd999c", "overlay": "a18d1601661e"},
     )
     return dataclasses.replace(shot, **changes)
 

@@ -16,6 +16,7 @@ from hypothesis.extra import numpy as hnp
 
 from labseq.errors import RecordingError
 from labseq.model import (
+    CALIBRATION_KINDS,
     CycleRecord,
     Frame,
     ImageRecord,
@@ -100,6 +101,7 @@ def shots(draw: st.DrawFn, shape: tuple[int, int]) -> ShotRecord:
         n_missing_atoms=draw(small),
         readings=draw(values),
         parameters=draw(values),
+        calibrations=draw(st.dictionaries(st.sampled_from(list[str](CALIBRATION_KINDS)), text)),
     )
 
 
@@ -161,6 +163,7 @@ def test_a_rich_shot_comes_back_by_every_door(
     assert_same(found.timing, tuple(shot.timing))
     assert found.parameters == shot.parameters
     assert found.readings == shot.readings
+    assert found.calibrations == shot.calibrations
     assert found.provenance["packages"] == {"numpy": "2"}
     assert found.provenance["none"] is None
     assert found.provenance["resolved"] == make_run().resolved

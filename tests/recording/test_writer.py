@@ -17,6 +17,7 @@ import pytest
 from labseq.errors import RecordingError
 from labseq.model import RunRecord, ShotRecord
 from labseq.recording import RunWriter, open_run
+from labseq.recording.summaries import summarise
 
 MakeRun = Callable[..., RunRecord]
 MakeShot = Callable[..., ShotRecord]
@@ -103,6 +104,7 @@ def test_the_index_tells_each_shot_in_a_line(tmp_path: Path, make_run: MakeRun, 
         "n_missing_atoms": 3,
         "stage_s": {"load": 0.5, "plan": pytest.approx(0.004), "prüfen": 1e-9},
         "parameters": {"shot.2.rearrange.window": 0.06, "ümlaut": [1, None]},
+        **json.loads(json.dumps(summarise(make_shot(), make_run().target).as_row())),
         "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
         "bytes": path.stat().st_size,
     }

@@ -441,7 +441,7 @@ class TestRearrange:
     fill = np.array([[1, 1, 0], [0, 0, 0]], bool)
     done = np.array([[1, 1, 0], [0, 0, 0]], bool)
 
-    def rig(self, sights, planner=None, clock=None, **settings):
+    def rig(self, sights, planner=None, clock=None, after=(IMAGE,), **settings):
         from labseq.sequencer.rearrange import RearrangeStep
 
         defaults = {"cycles": 3, "exposure": 0.02, "stop_when": "defect_free", "window_mode": "early"}
@@ -451,7 +451,7 @@ class TestRearrange:
         return Rig(
             occupancies=sights,
             fill=self.fill,
-            steps=(LOAD, IMAGE, ("sort", RearrangeStep(settings_given)), IMAGE),
+            steps=(LOAD, IMAGE, ("sort", RearrangeStep(settings_given)), *after),
             **parts,
         )
 
@@ -470,6 +470,13 @@ class TestRearrange:
         rig.run()
         assert rig.record().seen_defect_free_cycle == 1
         assert not rig.record().success
+
+    def test_an_image_before_the_last_rearrangement_judges_nothing(self):
+        rig = self.rig([self.done, self.half, self.done], after=(), stop_when="never", cycles=2)
+        rig.run()
+        record = rig.record()
+        assert (record.status, record.success, record.seen_defect_free_cycle) == ("complete", False, 2)
+        assert np.isnan(record.filling_fraction)
 
     def test_nothing_moves_on_a_target_that_is_met(self):
         rig = self.rig([self.done])

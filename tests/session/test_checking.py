@@ -125,6 +125,10 @@ def test_a_rearrangement_that_no_image_follows():
     assert "no image follows the last rearrangement" in warning.what
 
 
+def test_cycles_that_are_all_made_need_no_image_after_them():
+    assert not checked("shot=[{load: {}}, {image: {}}, {rearrange: {cycles: 3, stop_when: never}}]").warnings
+
+
 def test_a_degree_of_parallelism_that_the_profile_does_not_allow():
     (warning,) = checked("planner.degree_of_parallelism=700").warnings
     assert warning.source == "--set planner.degree_of_parallelism=700"

@@ -1,5 +1,6 @@
 """Stand-ins for tests: a clock, devices that note every call, deciders that follow a script."""
 
+from labseq.testing.fakes.calibrations import fake_calibration
 from labseq.testing.fakes.calls import Call, Calls, Failure, Hang
 from labseq.testing.fakes.clock import FakeClock
 from labseq.testing.fakes.deciders import (
@@ -35,5 +36,6 @@ __all__ = [
     "RecordingStaticTweezers",
     "ScriptedDetector",
     "ScriptedPlanner",
+    "fake_calibration",
     "fake_lab",
 ]

@@ -9,7 +9,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from labseq.errors import DeviceError
-from labseq.model import DepthRamp, Frame, Occupancy, Plan, TargetPattern, ToneProgram, as_occupancy
+from labseq.model import (
+    DepthRamp,
+    Frame,
+    Occupancy,
+    Plan,
+    TargetPattern,
+    ToneProgram,
+    TweezerAmplitudes,
+    as_occupancy,
+)
 from labseq.testing.fakes.calls import Calls
 
 
@@ -103,7 +112,7 @@ class RecordingSimulation:
         """Note it."""
         self.calls.note("simulation", "load", t_start_s, duration_s)
 
-    def play(self, role: str, signal: ToneProgram | DepthRamp, t_start_s: float) -> None:
+    def play(self, role: str, signal: ToneProgram | DepthRamp | TweezerAmplitudes, t_start_s: float) -> None:
         """Note it."""
         self.calls.note("simulation", "play", role, signal, t_start_s)
 

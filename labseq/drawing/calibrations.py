@@ -1,0 +1,117 @@
+"""Calibrations to look at."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq.drawing.saving import make_figure
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Floats = NDArray[np.float64]
+
+WIDTH_IN: Final = 9.0
+N_BINS: Final = 120
+ARROW_SPACINGS: Final = 0.5
+"""Length of the longest arrow, in spacings."""
+MARGIN_SPACINGS: Final = 2.0
+"""Room around the outermost sites, in spacings."""
+SITE, ARROW = "#e8a33d", "#c8102e"
+
+
+def draw_sites(mean: Floats, positions_px: Floats, residuals_px: Floats) -> Figure:
+    """Draw an averaged frame with the sites on it, and how far each spot lies beside its site.
+
+    Args:
+        mean: float64 (height, width), the averaged frame, in counts.
+        positions_px: float64 (n_rows, n_cols, 2), (y, x) of each site in pixels.
+        residuals_px: float64 (n_rows, n_cols, 2), (y, x) of each spot less that; NaN where none was found.
+    """
+    spacing = _spacing_px(positions_px)
+    y, x = positions_px.reshape(-1, 2).T
+    room = MARGIN_SPACINGS * spacing
+    wide, high = np.ptp(x) + 2 * room, np.ptp(y) + 2 * room
+    figure = make_figure(WIDTH_IN, WIDTH_IN * high / wide + 0.6, layout="constrained")
+    axes = figure.add_subplot()
+    dark, bright = np.quantile(mean, [0.01, 0.999])
+    axes.imshow(mean, cmap="gray", vmin=dark, vmax=max(bright, dark + 1e-9), interpolation="nearest")
+    axes.set_xlim(x.min() - room, x.max() + room)
+    axes.set_ylim(y.max() + room, y.min() - room)
+    found = np.isfinite(residuals_px[..., 0]).ravel()
+    size = 0.6 * spacing / wide * WIDTH_IN * 72
+    for here, marker, label in ((found, "o", "site"), (~found, "x", "site without a spot")):
+        if here.any():
+            look: dict[str, Any] = {
+                "color": SITE,
+                "markersize": size,
+                "fillstyle": "none",
+                "markeredgewidth": 0.8,
+            }
+            axes.plot(x[here], y[here], marker, label=label, **look)
+    axes.plot(x[:1], y[:1], "s", color=SITE, markersize=1.4 * size, fillstyle="none", label="row 0, column 0")
+    longest = _draw_arrows(axes, x[found], y[found], residuals_px.reshape(-1, 2)[found], spacing)
+    axes.set_title(f"arrows: spots beside their sites, {longest:.2g} px at most")
+    axes.set_xlabel("x (px)")
+    axes.set_ylabel("y (px)")
+    axes.legend(loc="upper right", fontsize="small", markerscale=0.5)
+    return figure
+
+
+def _draw_arrows(axes: Axes, x: Floats, y: Floats, off_px: Floats, spacing_px: float) -> float:
+    """Draw how far spots lie beside their sites, enlarged; the longest distance, in pixels."""
+    longest = float(np.hypot(*off_px.T).max(initial=0.0))
+    if longest > 0:
+        along_y, along_x = ARROW_SPACINGS * spacing_px / longest * off_px.T
+        look: dict[str, Any] = {
+            "color": ARROW,
+            "angles": "xy",
+            "scale_units": "xy",
+            "scale": 1.0,
+            "width": 0.0015,
+        }
+        axes.quiver(x, y, along_x, along_y, **look)
+    return longest
+
+
+def draw_thresholds(signals: Floats, thresholds: Floats, unit: str) -> Figure:
+    """Draw the histogram of all signals, and each site's signals with its threshold.
+
+    Args:
+        signals: float64 (n_frames, n_rows, n_cols), what the detector compares.
+        thresholds: float64 (n_rows, n_cols).
+        unit: Of both: "counts", "log-odds".
+    """
+    figure = make_figure(WIDTH_IN, 7.0, layout="constrained")
+    above, below = figure.subplots(2, 1, height_ratios=[2, 3])
+    low, high = np.quantile(signals, [0.001, 0.999])
+    edges = np.linspace(low, high, N_BINS + 1)
+    above.hist(signals.ravel(), edges, color="0.6", log=True)
+    above.axvspan(float(thresholds.min()), float(thresholds.max()), color=SITE, alpha=0.5, label="thresholds")
+    above.set_xlabel(f"signal of all sites ({unit})")
+    above.set_ylabel("signals")
+    above.legend(loc="upper right", fontsize="small")
+    _draw_each(below, signals.reshape(len(signals), -1), thresholds.ravel(), edges)
+    below.set_ylabel(f"signal ({unit})")
+    return figure
+
+
+def _draw_each(axes: Axes, by_site: Floats, thresholds: Floats, edges: Floats) -> None:
+    n_sites = by_site.shape[1]
+    counts = np.stack([np.histogram(by_site[:, site], edges)[0] for site in range(n_sites)], axis=1)
+    extent = (-0.5, n_sites - 0.5, edges[0], edges[-1])
+    axes.imshow(np.log1p(counts), cmap="gray_r", aspect="auto", origin="lower", extent=extent)
+    axes.step(np.arange(n_sites), thresholds, where="mid", color=ARROW, linewidth=0.8, label="threshold")
+    axes.set_xlabel("site, row by row")
+    axes.legend(loc="upper right", fontsize="small")
+
+
+def _spacing_px(positions_px: Floats) -> float:
+    """Least distance of neighbours along rows and columns; that of a single site is a guess."""
+    steps = [np.diff(positions_px, axis=axis).reshape(-1, 2) for axis in (0, 1)]
+    lengths = np.hypot(*np.concatenate(steps).T)
+    return float(np.median(lengths)) if len(lengths) else 10.0

@@ -1,0 +1,180 @@
+"""What a calibration found: the values that the machine uses, how good they are, and where they come from."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import string
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from datetime import datetime
+from types import MappingProxyType
+from typing import Any, Final, Literal, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from labseq.model.arrays import read_only
+from labseq.model.grid import SiteGrid
+
+CalibrationKind = Literal["sites", "thresholds", "tweezers", "frequencies", "overlay"]
+CALIBRATION_KINDS: Final[tuple[CalibrationKind, ...]] = get_args(CalibrationKind)
+
+ID_DIGITS: Final = 12
+
+VALUE_SHAPES: Final[Mapping[str, Mapping[str, tuple[str | int, ...]]]] = MappingProxyType(
+    {
+        "sites": {"positions_px": ("rows", "cols", 2), "frame": (2,)},
+        "thresholds": {"thresholds": ("rows", "cols")},
+        "tweezers": {"row_amplitudes": ("rows",), "column_amplitudes": ("cols",)},
+        "frequencies": {"row_hz": ("rows",), "column_hz": ("cols",)},
+        "overlay": {"offset_m": (2,)},
+    }
+)
+"""Kind -> the values that it must have, and their shapes; "rows" and "cols" are the grid's."""
+
+_SPACING_TOLERANCE: Final = 1e-6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibrationEntry:
+    """One calibration, as it is kept. It never changes; a better one is another entry.
+
+    Values by kind, float64, (y, x) for pixels:
+
+    - sites: ``positions_px`` (n_rows, n_cols, 2), ``frame`` (2,) height and width of the frames.
+    - thresholds: ``thresholds`` (n_rows, n_cols), in what the detector in use compares: counts over the
+      offset, or log-odds.
+    - tweezers: ``row_amplitudes`` (n_rows,), ``column_amplitudes`` (n_cols,) of the static tweezers' tones,
+      fractions of full scale.
+    - frequencies: ``row_hz`` (n_rows,), ``column_hz`` (n_cols,): the mobile tweezers' tones at the sites.
+    - overlay: ``offset_m`` (2,): how far the mobile tweezers stand beside the sites, along a1 (along a
+      row) and a2 (from row to row).
+
+    Attributes:
+        kind: One of :data:`CALIBRATION_KINDS`.
+        values: What the machine uses; further values than those above may stand beside them.
+        quality: Figures of merit, in SI units and pixels; nan for one that is not known.
+        grid: ``rows``, ``cols``, ``spacing_m``, ``lattice`` and ``shear`` of the grid that it was made for.
+        origin: Where it comes from, JSON-ready: command, run, number of shots, profile, version of labseq,
+            ids of the other calibrations in use.
+        taken_utc: When it was made, ISO 8601, UTC.
+        id: From kind, grid and values alone: the digits of their SHA-256 in hexadecimal from the first
+            letter on, twelve of them. YAML would take digits without a letter before them for a number.
+
+    Raises:
+        ValueError: A value is missing, of another shape, not finite, or makes no sense.
+
+    Example:
+        >>> entry = CalibrationEntry("overlay", {"offset_m": [3e-8, 0.0]}, {"error_m": 1e-8},
+        ...                          grid_facts(SiteGrid()), {}, "2026-11-20T08:00:00+00:00")
+        >>> entry.id
+        'f102b3cd999c'
+    """
+
+    kind: CalibrationKind
+    values: Mapping[str, NDArray[np.float64]]
+    quality: Mapping[str, float]
+    grid: Mapping[str, Any]
+    origin: Mapping[str, Any]
+    taken_utc: str
+    id: str = field(init=False)
+
+    def __post_init__(self) -> None:
+        set_field = object.__setattr__
+        if self.kind not in CALIBRATION_KINDS:
+            raise ValueError(f"'{self.kind}' is no kind of calibration")
+        set_field(self, "grid", _facts(self.grid))
+        set_field(self, "values", {name: _finite(name, value) for name, value in self.values.items()})
+        set_field(self, "quality", {name: float(value) for name, value in self.quality.items()})
+        set_field(self, "origin", dict(self.origin))
+        self._check_shapes()
+        self._check_sense()
+        if datetime.fromisoformat(self.taken_utc).tzinfo is None:
+            raise ValueError(f"taken_utc is {self.taken_utc}, without a time zone")
+        set_field(self, "id", _content_id(self.kind, self.grid, self.values))
+
+    def is_for(self, grid: SiteGrid) -> bool:
+        """Whether it was made for a grid of these sites; the tones of rows and columns do not count."""
+        return same_grid(self.grid, grid_facts(grid))
+
+    def _check_shapes(self) -> None:
+        for name, symbols in VALUE_SHAPES[self.kind].items():
+            shape = tuple(symbol if isinstance(symbol, int) else self.grid[symbol] for symbol in symbols)
+            if name not in self.values:
+                raise ValueError(f"'{name}' is missing")
+            if self.values[name].shape != shape:
+                raise ValueError(f"'{name}' has shape {self.values[name].shape}; expected {shape}")
+
+    def _check_sense(self) -> None:
+        for name, value in self.values.items():
+            if name.endswith("_amplitudes") and not np.all((value >= 0) & (value <= 1)):
+                raise ValueError(f"'{name}' has values outside of 0 to 1")
+        if self.kind == "frequencies":
+            for name in VALUE_SHAPES[self.kind]:
+                steps = np.diff(self.values[name])
+                if not np.all(self.values[name] > 0):
+                    raise ValueError(f"'{name}' has frequencies that are not above 0 Hz")
+                if not (np.all(steps > 0) or np.all(steps < 0)):
+                    raise ValueError(f"'{name}' neither rises nor falls all along")
+
+
+def grid_facts(grid: SiteGrid) -> dict[str, Any]:
+    """What a calibration keeps of its grid.
+
+    Example:
+        >>> grid_facts(SiteGrid(2, 3))
+        {'rows': 2, 'cols': 3, 'spacing_m': 4.49e-06, 'lattice': 'triangular', 'shear': 1}
+    """
+    return {
+        "rows": grid.n_rows,
+        "cols": grid.n_cols,
+        "spacing_m": float(grid.spacing_m),
+        "lattice": grid.lattice,
+        "shear": int(grid.shear),
+    }
+
+
+def same_grid(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+    """Whether two grids have the same sites; the shear of a square lattice does not count.
+
+    Args:
+        one: As :func:`grid_facts` gives it.
+        other: Likewise.
+    """
+    keys = ("rows", "cols", "lattice", *(("shear",) if one["lattice"] == "triangular" else ()))
+    is_alike = math.isclose(one["spacing_m"], other["spacing_m"], rel_tol=_SPACING_TOLERANCE)
+    return is_alike and all(one[key] == other[key] for key in keys)
+
+
+def _facts(grid: Mapping[str, Any]) -> dict[str, Any]:
+    try:
+        facts: dict[str, Any] = {
+            "rows": int(grid["rows"]),
+            "cols": int(grid["cols"]),
+            "spacing_m": float(grid["spacing_m"]),
+            "lattice": str(grid["lattice"]),
+            "shear": int(grid["shear"]),
+        }
+    except KeyError as error:
+        raise ValueError(f"the grid has no {error}") from None
+    if facts["rows"] < 1 or facts["cols"] < 1 or not 0 < facts["spacing_m"] < math.inf:
+        raise ValueError("the grid has no sites, or no spacing")
+    return facts
+
+
+def _finite(name: str, value: ArrayLike) -> NDArray[np.float64]:
+    array = np.asarray(value)
+    if array.dtype.kind not in "fiu":
+        raise ValueError(f"'{name}' holds {array.dtype}, not numbers")
+    if not np.isfinite(array).all():
+        raise ValueError(f"'{name}' has values that are not finite")
+    return read_only(array, np.float64, (-1,) * array.ndim, name)
+
+
+def _content_id(kind: str, grid: Mapping[str, Any], values: Mapping[str, NDArray[np.float64]]) -> str:
+    plain = {name: value.tolist() for name, value in values.items()}
+    content = json.dumps([kind, grid, plain], sort_keys=True, separators=(",", ":"))
+    digest = hashlib.sha256(content.encode()).hexdigest()
+    return digest.lstrip(string.digits)[:ID_DIGITS]

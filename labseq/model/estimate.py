@@ -1,0 +1,57 @@
+"""Means with errors."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """A value with its standard error; NaN for what could not be determined."""
+
+    value: float
+    error: float
+
+    def __str__(self) -> str:
+        """The value with the error of its last digit in brackets.
+
+        Example:
+            >>> str(Estimate(29.6142, 0.031)), str(Estimate(5988.0, 12.0)), str(Estimate(1.0, 0.0))
+            ('29.61(3)', '5990(10)', '1')
+            >>> str(Estimate(0.4, 0.096)), str(Estimate(7.123456, math.nan))
+            ('0.4(1)', '7.123')
+        """
+        if math.isnan(self.value):
+            return "-"
+        if not math.isfinite(self.error) or self.error == 0.0:
+            return f"{self.value:.4g}"
+        digit = math.floor(math.log10(self.error))
+        if round(self.error / 10.0**digit) == 10:
+            digit += 1
+        error = round(self.error / 10.0**digit)
+        if digit >= 0:
+            return f"{round(self.value, -digit):.0f}({error * 10**digit})"
+        return f"{self.value:.{-digit}f}({error})"
+
+    def scaled(self, factor: float) -> Estimate:
+        """The same in another unit."""
+        return Estimate(self.value * factor, self.error * factor)
+
+
+def mean(values: ArrayLike) -> Estimate:
+    """The mean and its standard error, that of one value unknown.
+
+    Example:
+        >>> mean([1.0, 3.0])
+        Estimate(value=2.0, error=1.0)
+    """
+    array: NDArray[np.float64] = np.asarray(values, np.float64)
+    n = len(array)
+    if n == 0:
+        return Estimate(math.nan, math.nan)
+    error = float(array.std(ddof=1)) / math.sqrt(n) if n > 1 else math.nan
+    return Estimate(float(array.mean()), error)

@@ -1,0 +1,7 @@
+"""Calibrations made: a run, its analysis, and an entry in the profile's store."""
+
+from labseq.session.calibrate.kinds import METHODS
+from labseq.session.calibrate.making import CalibrationRequest, Outcome, calibrate
+from labseq.session.calibrate.method import Evidence, Finding, Method
+
+__all__ = ["METHODS", "CalibrationRequest", "Evidence", "Finding", "Method", "Outcome", "calibrate"]

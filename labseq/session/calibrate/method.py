@@ -1,0 +1,152 @@
+"""What a way to calibrate must offer, and what it is given."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from labseq.errors import ConfigError, DeviceError, Problem
+from labseq.model import CalibrationKind, Frame
+from labseq.recording import Run
+from labseq.roles import Detector
+from labseq.sequencer import StopFlag, VirtualClock
+from labseq.session.choosing import Bench
+from labseq.session.constructing import construct
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """What came of an analysis.
+
+    Attributes:
+        values: What the machine will use; see :class:`labseq.CalibrationEntry`.
+        quality: Figures of merit.
+        told: Lines for people.
+        origin: What else must be known of where it comes from, JSON-ready.
+        draw: Draws the picture to look at; None for none.
+    """
+
+    values: Mapping[str, ArrayLike]
+    quality: Mapping[str, float]
+    told: tuple[str, ...]
+    origin: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    draw: Callable[[], Figure] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """A run, and the profile that it is analysed for.
+
+    Attributes:
+        run: The run.
+        bench: The profile, with the calibrations that count in the analysis.
+    """
+
+    run: Run
+    bench: Bench
+
+    def frames(self) -> Iterator[Frame]:
+        """The frame of the first image of each shot: of randomly loaded atoms, before any move.
+
+        Raises:
+            ConfigError: The run has no shots, or kept no frames of them.
+            DeviceError: The frames differ in size.
+            RecordingError: A shot's file is damaged.
+        """
+        if not self.run.shots:
+            raise ConfigError(
+                Problem("the run has no shots", str(self.run.path), expected="a run with frames")
+            )
+        first: Frame | None = None
+        for shot in self.run.shots:
+            images = shot.record().images
+            frame = images[0].frame if images else None
+            if frame is None:
+                what = f"the first image of shot {shot.index + 1} was not kept"
+                hint = "take a run with 'record_frames: all'"
+                raise ConfigError(
+                    Problem(what, str(self.run.path), expected="a frame of each shot", hint=hint)
+                )
+            first = first or frame
+            if frame.image.shape != first.image.shape:
+                sizes = f"{first.image.shape} and {frame.image.shape}"
+                raise DeviceError(frame.camera, f"frames of the run differ in size: {sizes}")
+            yield frame
+
+    def detector(self) -> Detector:
+        """The profile's detector, with the calibrations that count in the analysis."""
+        bench = self.bench
+        chosen, clock = {"detector": bench.chosen["detector"]}, VirtualClock(StopFlag())
+        made, _ = construct(
+            chosen, bench.grid, bench.profile.motion, clock, 0, calibrations=bench.calibrations
+        )
+        return made["detector"]
+
+
+class Method(Protocol):
+    """How calibrations of a kind are made."""
+
+    @property
+    def kind(self) -> CalibrationKind:
+        """The kind."""
+        ...
+
+    @property
+    def sequence(self) -> Path:
+        """The sequence that is run."""
+        ...
+
+    @property
+    def aside(self) -> Collection[CalibrationKind]:
+        """Kinds that do not count, neither while it is measured nor in the analysis."""
+        ...
+
+    @property
+    def is_blind(self) -> bool:
+        """Whether the run needs no detector, which may not know yet where to look."""
+        ...
+
+    def analyse(self, evidence: Evidence) -> Finding:
+        """Make a calibration of a run.
+
+        Raises:
+            LabseqError: Nothing can be made of it; says why.
+        """
+        ...
+
+    def read(self, path: Path, bench: Bench) -> Finding:
+        """Make a calibration of a file with its values.
+
+        Raises:
+            ConfigError: The file is wrong, or calibrations of this kind come from runs only.
+        """
+        ...
+
+
+def from_runs_only(kind: CalibrationKind, path: Path) -> ConfigError:
+    """The error of a kind that comes from no file."""
+    what = f"a calibration of {kind} cannot be made of a file"
+    return ConfigError(Problem(what, str(path), expected="a run's folder"))
+
+
+def packaged(kind: CalibrationKind) -> Path:
+    """The sequence of a kind, as it comes with labseq."""
+    return Path(__file__).with_name(f"{kind}.yaml")
+
+
+def mean_of(frames: Iterator[Frame]) -> tuple[np.ndarray[tuple[int, int], np.dtype[np.float64]], int]:
+    """Mean of frames, float64 (height, width), and how many they are; one at a time is in memory."""
+    first = next(frames)
+    total, n = first.image.astype(np.float64), 1
+    for frame in frames:
+        total += frame.image
+        n += 1
+    return total / n, n

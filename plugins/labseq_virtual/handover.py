@@ -1,0 +1,114 @@
+"""How atoms change between static and mobile tweezers, and how they are lost on the way.
+
+Taken from the depths and places of the tweezers, without following the atoms; the constants are
+those of ``settings.py``. Energies are in kelvin. Here is why, and with which numbers; the formulas
+themselves are in ``_kernels_handover.py``.
+
+1. *Pick-up.* A static well of depth U_s and waist w_s and a mobile one of U_m and w_m at a distance d
+   are one well as long as d is below :func:`merging_distance`. Then the atom follows the mobile
+   tweezer, if that is the deeper one; else it stays.
+2. *Drop-off.* Slowly, an atom follows its well back; where the wells have parted in between (distances
+   above about a waist) it falls from one into the other and gains energy: :data:`SLOW`. At once, it has the
+   kinetic energy of an atom that the deeper well has compressed, kT sqrt(1 + U_m / U_s), beside the
+   potential energy U_s (1 - exp(-2 d^2 / w_s^2)) at its place; it is lost if the sum exceeds U_s. A ramp of
+   duration t is sudden to the part exp(-(t / 25 us)^2). All of this was held against atoms that move by
+   Newton's law (``flight.py``).
+3. *Hand-over loss.* Pick-up and drop-off together lose ``transport_loss`` at the nominal depths. The loss
+   goes as U_m / U_s: the deeper the mobile tweezer beside the static one, the less adiabatic the
+   change (the paper sees that, and gives no law).
+4. *Transport loss*: ``transport_loss_per_tone`` for each further tone; and where a mobile tweezer is
+   shallower than ``adiabatic_depth``, which goes as the speed squared (the kinetic energy), the part
+   ``shallow_loss`` of its atoms. Depths scatter with the intermodulation of the tones, so the threshold is
+   as wide as the scatter.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq.model import SiteGrid
+from labseq_virtual.settings import WorldSettings
+
+Floats = NDArray[np.float64]
+
+REFERENCE_SPEED_M_S: Final = 0.13
+"""Speed that the setting ``adiabatic_depth`` belongs to: the paper's."""
+REFERENCE_TONES: Final = 19
+"""Further tones that the setting ``intermodulation`` belongs to: the paper measured it on 20 tweezers."""
+SUDDEN_S: Final = 25e-6
+"""Duration of a drop-off between sudden and slow: 1.4 periods of a static tweezer of 300 uK."""
+SLOW: Final = np.array(
+    [
+        [0.0, 0.82, 0.92, 1.02, 1.12, 1.22, 1.33, 1.43, 1.53, 1.63, 1.84],
+        [0.0, 0.003, 0.018, 0.13, 0.25, 0.25, 0.23, 0.33, 0.54, 0.72, 1.0],
+    ]
+)
+"""Loss by slow pick-up and drop-off, against the distance in waists: 400 atoms each at 15 uK, moved by
+Newton's law in tweezers of 0.3 and 2.1 mK with ramps of 60 us. Further out nothing is picked up."""
+(
+    SPACING,
+    SKEW,
+    TOLERANCE,
+    STATIC_DEPTH,
+    STATIC_WAIST,
+    TEMPERATURE,
+    TRANSPORT_LOSS,
+    PER_TONE,
+    MOBILE_DEPTH,
+    DEPTH_DROP,
+    INTERMODULATION,
+    ADIABATIC_DEPTH,
+    SHALLOW_LOSS,
+) = range(13)
+"""Places of a world's constants in the array that the kernels take."""
+
+
+@lru_cache(maxsize=8)
+def merging_distance(static_waist_m: float, mobile_waist_m: float) -> tuple[Floats, Floats]:
+    """Distance below which a static and a mobile tweezer are one well, as a table.
+
+    Found by counting the minima of the sum of both wells on the line between them.
+
+    Returns:
+        Logarithm of the ratio of the mobile to the static depth, float64 (n,), rising, and the
+        distances, float64 (n,), in metres.
+    """
+    log_ratio = np.linspace(math.log(0.3), math.log(30.0), 24)
+    distance = np.linspace(0.0, 3.5, 176)[1:] * static_waist_m
+    x = np.linspace(0.0, 1.0, 401)[1:] * distance[:, None]  # (n_distances, n_places)
+    back = x * np.exp(-2 * x**2 / static_waist_m**2) / static_waist_m**2
+    left = distance[:, None] - x
+    on = left * np.exp(-2 * left**2 / mobile_waist_m**2) / mobile_waist_m**2
+    merged = np.empty(len(log_ratio))
+    for k, ratio in enumerate(np.exp(log_ratio)):
+        forward = ratio * on > back
+        n_minima = np.count_nonzero(forward[:, :-1] & ~forward[:, 1:], axis=1) + ~forward[:, 0]
+        merged[k] = distance[max(0, int(np.argmax(n_minima > 1)) - 1)]
+    return log_ratio, merged
+
+
+def constants(grid: SiteGrid, settings: WorldSettings) -> Floats:
+    """A world's constants for the kernels, float64 (13,), in the order of the names above, in SI."""
+    a1, a2 = grid.axes
+    light = settings.mobile_light
+    named = {
+        SPACING: grid.spacing_m,
+        SKEW: 2 * float(a1 @ a2),
+        TOLERANCE: settings.site_tolerance,
+        STATIC_DEPTH: settings.static_depth,
+        STATIC_WAIST: settings.static_waist,
+        TEMPERATURE: settings.temperature,
+        TRANSPORT_LOSS: settings.transport_loss,
+        PER_TONE: settings.transport_loss_per_tone,
+        MOBILE_DEPTH: light.depth,
+        DEPTH_DROP: light.depth_drop_per_tone,
+        INTERMODULATION: light.intermodulation,
+        ADIABATIC_DEPTH: light.adiabatic_depth,
+        SHALLOW_LOSS: light.shallow_loss,
+    }
+    return np.array([named[place] for place in range(len(named))])

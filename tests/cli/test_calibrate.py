@@ -1,0 +1,127 @@
+"""``labseq calibrate`` through the real command line."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from labseq.calibrations import Store
+from labseq.cli import main
+from labseq.model import SiteGrid
+from labseq.testing.fakes import fake_calibration
+
+PROFILE = """labseq: 1
+name: bench
+grid: {rows: 6, cols: 6, spacing: 4.49 um}
+camera: {use: virtual}
+static_tweezers: {use: virtual}
+mobile_tweezers: {use: virtual}
+detector: {use: threshold, frame: [160, 160], centre_px: [79.5, 79.5]}
+simulation:
+  use: virtual
+  image: {frame: [160, 160], centre_px: [79.5, 79.5]}
+"""
+GRID = SiteGrid(6, 6)
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("bench.yaml").write_text(PROFILE, "utf-8")
+
+
+@pytest.fixture
+def store() -> Store:
+    return Store(Path("calibrations/bench"))
+
+
+def call(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
+    with pytest.raises(SystemExit) as leaving:
+        main(["calibrate", *arguments, "--profile", "./bench.yaml", "--seed", "1", "--output", "data"])
+    code = leaving.value.code
+    assert isinstance(code, int)
+    out, err = capsys.readouterr()
+    return code, out, err
+
+
+def test_what_was_found_is_told_and_kept(store: Store, capsys: pytest.CaptureFixture[str]) -> None:
+    code, out, err = call(capsys, "sites", "--shots", "20")
+    stored = store.entry_in_use("sites")
+    assert code == 0
+    assert stored is not None
+    lines = out.splitlines()
+    assert lines[0] == f"sites {stored.entry.id}: in use from the next run on"
+    assert lines[1].startswith("36 of 36 sites found on the mean of 20 frames, ")
+    assert lines[-2:] == [f"kept as {stored.path}", f"look at {stored.picture}"]
+    assert "20 shots, seed 1, profile bench, simulated" in err
+    assert [line for line in err.splitlines() if line.endswith("of 20 shots")][-1] == "20 of 20 shots"
+    (run,) = Path("data").glob("*/*_calibrate-sites")
+    code, out, _ = call(capsys, "sites", "--from", str(run))
+    assert code == 0
+    assert f"against {stored.entry.id}, which was in use:" in out
+
+
+def test_a_worse_one_is_kept_and_told(store: Store, capsys: pytest.CaptureFixture[str]) -> None:
+    better = store.add(fake_calibration("sites", GRID, quality={"residual_px": 1e-3, "n_sites_found": 40}))
+    store.use(better, GRID)
+    code, out, err = call(capsys, "sites", "--shots", "20")
+    new = next(one for one in store.entries() if one.path != better.path)
+    assert code == 2
+    assert out.startswith(f"sites {new.path.stem[-12:]}: not in use")
+    assert "is kept but not in use: it found 36 sites, the one in use 40; look at it, then" in err
+
+
+def test_an_analysis_that_fails(store: Store, capsys: pytest.CaptureFixture[str]) -> None:
+    code, out, err = call(capsys, "sites", "--shots", "5", "--set", "profile.simulation.loading=0 %")
+    assert (code, out) == (3, "")
+    (run,) = Path("data").glob("*/*_calibrate-sites")
+    warning, error = err.splitlines()[-2:]
+    assert warning.endswith(f"the run is kept: --from {run.resolve()}")
+    assert error.startswith("error: camera: no lattice found: ")
+    assert store.entries() == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (
+            ("site",),
+            "'site' cannot be calibrated; expected one of sites, thresholds, ",
+        ),
+        (("sites", "--from", "nowhere"), "--from: "),
+        (("sites", "--set", "shot.7.image.exposure=1 ms"), "--set shot.7.image.exposure=1 ms: "),
+        (("sites", "--shots", "0"), "--shots 0: shots is 0; expected at least 1"),
+    ],
+)
+def test_what_makes_no_sense(
+    arguments: tuple[str, ...], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, out, err = call(capsys, *arguments)
+    assert (code, out) == (2, "")
+    assert message in err
+
+
+def test_the_outcome_as_json(store: Store) -> None:
+    command = [
+        sys.executable,
+        "-m",
+        "labseq",
+        "calibrate",
+        "sites",
+        "-p",
+        "./bench.yaml",
+        "--shots",
+        "20",
+        "--json",
+    ]
+    done = subprocess.run(command, capture_output=True, encoding="utf-8", check=True)
+    told = json.loads(done.stdout)
+    stored = store.entry_in_use("sites")
+    assert stored is not None
+    assert (told["id"], told["in_use"], told["refused"]) == (stored.entry.id, True, None)
+    assert told["quality"]["n_sites_found"] == 36
+    assert Path(told["run_dir"]).is_dir()

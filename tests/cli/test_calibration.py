@@ -1,0 +1,221 @@
+"""``labseq calibration`` through the real command line."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from labseq.calibrations import Store, Stored
+from labseq.cli import main
+from labseq.model import CalibrationKind, SiteGrid
+from labseq.testing.fakes import fake_calibration
+
+PROFILE = """labseq: 1
+name: bench
+grid: {rows: 4, cols: 5, spacing: 4.49 um}
+camera: {use: virtual}
+static_tweezers: {use: virtual}
+mobile_tweezers: {use: virtual}
+detector: {use: threshold}
+simulation: {use: virtual}
+"""
+GRID = SiteGrid(4, 5)
+SEQUENCE = """labseq: 1
+name: look
+profile: bench
+shots: 1
+target: {pattern: compact, rows: 2, cols: 2}
+shot: [{load: {}}, {image: {}}]
+"""
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("bench.yaml").write_text(PROFILE, "utf-8")
+
+
+@pytest.fixture
+def store() -> Store:
+    return Store(Path("calibrations/bench"))
+
+
+def add(store: Store, kind: CalibrationKind = "overlay", minute: int = 0, **given: Any) -> Stored:
+    taken = f"2026-11-20T08:{minute:02}:00+00:00"
+    return store.add(fake_calibration(kind, GRID, taken_utc=taken, **given), b"png")
+
+
+def call(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
+    with pytest.raises(SystemExit) as leaving:
+        main(["calibration", *arguments, "--profile", "./bench.yaml"])
+    code = leaving.value.code
+    assert isinstance(code, int)
+    out, err = capsys.readouterr()
+    return code, out, err
+
+
+def test_an_empty_store(capsys: pytest.CaptureFixture[str]) -> None:
+    code, out, _ = call(capsys, "list")
+    assert (code, out) == (0, "there are no calibrations in calibrations/bench\n")
+    assert not Path("calibrations").exists()
+
+
+def test_a_row_for_each_calibration_with_a_mark_at_those_in_use(
+    store: Store, capsys: pytest.CaptureFixture[str]
+) -> None:
+    one = add(store, origin={"run": "data/2026-11-20/0001_calibrate-overlay"})
+    other = add(store, values={"offset_m": [1e-7, 0.0]}, minute=5)
+    store.use(one, GRID)
+    other.path.write_text("{", "utf-8")
+    code, out, _ = call(capsys, "list")
+    lines = out.splitlines()
+    assert code == 0
+    assert lines[0].split() == ["kind", "id", "taken", "age", "quality", "from"]
+    assert lines[1].startswith(f"overlay  {one.entry.id}  2026-11-20 08:00 UTC  ")
+    assert lines[1].split("  ")[-3:] == ["error 20 nm", "in use", "data/2026-11-20/0001_calibrate-overlay"]
+    assert lines[2].split()[:5] == ["overlay", other.entry.id, "-", "-", "damaged"]
+    assert f"{other.path}: this file is damaged: it is no JSON" in lines[4]
+
+
+def test_a_damaged_note_of_what_is_in_use_does_not_hide_the_list(
+    store: Store, capsys: pytest.CaptureFixture[str]
+) -> None:
+    add(store)
+    Path("calibrations/bench/active.json").write_text("{", "utf-8")
+    code, out, _ = call(capsys, "list")
+    assert code == 0
+    assert "active.json: this file is damaged" in out
+    assert out.startswith("kind")
+
+
+def test_the_list_as_json(store: Store, capsys: pytest.CaptureFixture[str]) -> None:
+    one, other = add(store), add(store, "tweezers", quality={"separable_spread": float("nan")}, minute=5)
+    store.use(one, GRID)
+    other_bad = add(store, values={"offset_m": [1e-7, 0.0]}, minute=7)
+    other_bad.path.write_text("{", "utf-8")
+    _, out, _ = call(capsys, "list", "--json")
+    listed = json.loads(out)["calibrations"]
+    assert [row["id"] for row in listed] == [one.entry.id, other.entry.id, other_bad.entry.id]
+    assert [row["in_use"] for row in listed] == [True, False, False]
+    assert listed[0]["quality"] == {"error_m": 2e-8}
+    assert listed[1]["quality"] == {"separable_spread": None}
+    assert "damaged" in listed[2]["error"]
+
+
+def test_one_that_the_profile_chooses_is_marked(store: Store, capsys: pytest.CaptureFixture[str]) -> None:
+    chosen, active = add(store), add(store, values={"offset_m": [1e-7, 0.0]}, minute=5)
+    store.use(active, GRID)
+    Path("bench.yaml").write_text(
+        PROFILE + f"calibrations: {{use: {{overlay: {chosen.entry.id}}}}}\n", "utf-8"
+    )
+    _, out, _ = call(capsys, "list")
+    assert ["in use" in line for line in out.splitlines()[1:]] == [True, False]
+    _, out, _ = call(capsys, "use", active.entry.id)
+    assert f"the profile says 'calibrations.use.overlay: {chosen.entry.id}', and that counts" in out
+    Path("bench.yaml").write_text(PROFILE + "calibrations: {use: {overlay: off}}\n", "utf-8")
+    _, out, _ = call(capsys, "list")
+    assert "in use" not in out
+
+
+def test_one_in_detail(store: Store, capsys: pytest.CaptureFixture[str]) -> None:
+    origin = {"command": "labseq calibrate overlay", "calibrations": {"frequencies": "abc"}}
+    stored = add(store, values={"offset_m": [1.5e-7, -2e-8]}, origin=origin)
+    code, out, _ = call(capsys, "show", stored.entry.id[:4])
+    told = {line.split()[0]: line.split(maxsplit=1)[1] for line in out.splitlines()}
+    assert code == 0
+    assert told["calibration"] == f"overlay {stored.entry.id}"
+    assert told["offset_m"] == "150 nm, -20 nm"
+    assert told["quality.error_m"] == "20 nm"
+    assert told["origin.calibrations"] == "frequencies abc"
+    assert told["picture"] == str(stored.picture)
+    assert told["grid"] == "4 x 5 sites, triangular, 4.49 um, shear +1"
+
+
+def test_many_numbers_are_summed_up(store: Store, capsys: pytest.CaptureFixture[str]) -> None:
+    stored = add(store, "frequencies")
+    _, out, _ = call(capsys, "show", stored.entry.id)
+    assert "row_hz           97.6 MHz, 99.2 MHz, 100.8 MHz, 102.4 MHz" in out
+    assert "column_hz        5 numbers, 96.8 MHz to 103.2 MHz, mean 100 MHz" in out
+    _, out, _ = call(capsys, "show", stored.entry.id, "--json")
+    assert json.loads(out)["kind"] == "frequencies"
+
+
+def test_an_id_that_does_not_exist(store: Store, capsys: pytest.CaptureFixture[str]) -> None:
+    stored = add(store)
+    for command in (("show", "77"), ("use", "77"), ("diff", "77", stored.entry.id)):
+        code, out, err = call(capsys, *command)
+        assert (code, out) == (2, "")
+        assert (
+            err == f"error: there is no calibration '77' in calibrations/bench; expected {stored.entry.id}\n"
+        )
+
+
+def test_putting_to_use_and_aside(store: Store, capsys: pytest.CaptureFixture[str]) -> None:
+    good = add(store)
+    worse = add(store, values={"offset_m": [1e-7, 0.0]}, quality={"error_m": 1e-6}, minute=5)
+    assert call(capsys, "use", good.entry.id)[:2] == (
+        0,
+        f"overlay {good.entry.id} is in use from the next run on\n",
+    )
+    code, _, err = call(capsys, "use", worse.entry.id)
+    assert code == 2
+    assert "its error_m is 1e-06, that of the one in use 2e-08; use it nevertheless with --force" in err
+    assert call(capsys, "use", worse.entry.id, "--force")[0] == 0
+    assert call(capsys, "use", "overlay=off")[:2] == (0, "no calibration of overlay is in use any more\n")
+    assert [one.id for one in store.history()] == [good.entry.id, worse.entry.id, ""]
+
+
+@pytest.mark.parametrize(
+    ("choice", "message"),
+    [
+        (
+            "overly=off",
+            "'overly' is no kind of calibration; expected one of sites, .*; did you mean 'overlay'",
+        ),
+        ("overlay=on", "overlay is 'on'; expected 'off', or just an id"),
+    ],
+)
+def test_a_choice_that_is_none(choice: str, message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    code, _, err = call(capsys, "use", choice)
+    assert code == 2
+    assert re.search(message, err)
+
+
+def test_what_changed(store: Store, capsys: pytest.CaptureFixture[str]) -> None:
+    one = add(store)
+    other = add(store, values={"offset_m": [3e-8, -4e-8]}, quality={"error_m": 1e-8}, minute=5)
+    code, out, _ = call(capsys, "diff", one.entry.id, other.entry.id)
+    lines = [line.split() for line in out.splitlines()]
+    assert code == 0
+    assert lines[3] == ["offset_m", "40", "nm", "35.4", "nm", "30", "nm,", "-40", "nm"]
+    assert lines[6] == ["error_m", "20", "nm", "10", "nm"]
+    _, out, _ = call(capsys, "diff", one.entry.id, other.entry.id, "--json")
+    told = json.loads(out)
+    assert told["values"][0]["mean"] == pytest.approx([3e-8, -4e-8])
+    assert told["quality"][0]["after"] == 1e-8
+
+
+def test_different_kinds_are_not_compared(store: Store, capsys: pytest.CaptureFixture[str]) -> None:
+    one, other = add(store), add(store, "sites")
+    code, _, err = call(capsys, "diff", one.entry.id, other.entry.id)
+    assert code == 2
+    assert "expected two calibrations of one kind" in err
+
+
+def test_check_lists_what_is_in_use(store: Store) -> None:
+    stored = add(store)
+    store.use(stored, GRID)
+    Path("look.yaml").write_text(SEQUENCE, "utf-8")
+    command = [sys.executable, "-m", "labseq", "check", "look.yaml"]
+    told = subprocess.run(command, capture_output=True, encoding="utf-8", check=True).stdout
+    (line,) = (line for line in told.splitlines() if line.startswith("calibration "))
+    assert re.fullmatch(rf"calibration  overlay {stored.entry.id}, \d+ \w+ old, error 20 nm", line)
+    told = subprocess.run([*command, "--json"], capture_output=True, encoding="utf-8", check=True).stdout
+    (told_of,) = json.loads(told)["calibrations"]
+    assert (told_of["kind"], told_of["id"]) == ("overlay", stored.entry.id)

@@ -1,0 +1,121 @@
+"""What came of a run, as people read it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from labseq.cli.statistics import NOT_JUDGED, cycle_table, statistics_rows
+from labseq.model.estimate import Estimate
+from labseq.recording.rates import Rate
+from labseq.recording.statistics import CycleStatistics, Statistics
+
+UNKNOWN = Estimate(math.nan, math.nan)
+CYCLE = CycleStatistics(
+    cycle=1,
+    n_shots=20,
+    defect_free=Rate(1, 20),
+    seen=Rate(1, 20),
+    filling=Estimate(0.97664, 0.0004),
+    n_atom_moves=Estimate(185.2, 4.1),
+    n_batches=Estimate(33.6, 0.71),
+    n_left_out=Estimate(0.0, 0.0),
+    period_s=Estimate(0.08, 0.001),
+    defects=(1, 4, 15),
+)
+STATISTICS = Statistics(
+    n_shots=20,
+    unreadable=(),
+    defect_free=Rate(7, 20),
+    seen=Rate(18, 20),
+    filling=Estimate(0.993, 0.001),
+    cycles=(CYCLE,),
+    defects=(7, 9, 4),
+    too_short=Rate(0, 20),
+    losses={},
+    defects_true=UNKNOWN,
+    defects_seen=UNKNOWN,
+)
+
+
+def lines(**changes: Any) -> dict[str, str]:
+    return dict(statistics_rows(replace(STATISTICS, **changes)))
+
+
+def test_success_and_what_was_only_seen_stand_apart() -> None:
+    assert lines() == {
+        "defect-free": "7 of 20 (35.0 %), 25.3 to 46.2 %",
+        "seen defect-free": "18 of 20 (90.0 %)",
+        "filling": "99.3(1) %",
+        "defects": "none in 7, 1 in 9, 2 in 4 shots",
+    }
+
+
+def test_shots_that_are_not_judged_are_said_not_to_be() -> None:
+    told = lines(defect_free=Rate(0, 0), filling=UNKNOWN, defects=())
+    assert (told["defect-free"], told["filling"]) == (NOT_JUDGED, "-")
+    assert told["defects"] == "none in 1, 1 in 4, 2 in 15 shots, after cycle 1"
+
+
+def test_no_shots_are_no_reason_to_complain() -> None:
+    told = lines(n_shots=0, defect_free=Rate(0, 0), seen=Rate(0, 0), filling=UNKNOWN, cycles=(), defects=())
+    assert told == {"defect-free": "0 of 0", "seen defect-free": "0 of 0", "filling": "-"}
+
+
+def test_the_truth_of_a_simulation_is_told() -> None:
+    told = lines(
+        losses={"vacuum": Estimate(3.9, 0.6), "hand_over": Estimate(3.5, 0.5), "light": Estimate(0.0, 0.0)},
+        defects_true=Estimate(1.9, 0.3),
+        defects_seen=Estimate(1.3, 0.2),
+    )
+    assert told["lost in a shot"] == "vacuum 3.9(6), hand over 3.5(5)"
+    assert told["true defects"] == "1.9(3) in a shot, 1.3(2) on its last image"
+    assert lines(losses={"vacuum": Estimate(0.0, 0.0)})["lost in a shot"] == "no atoms"
+
+
+@pytest.mark.parametrize(
+    ("unreadable", "told"),
+    [
+        ((3,), "1 shot cannot be read and is left out of cycles and defects: 4"),
+        (
+            tuple(range(7)),
+            "7 shots cannot be read and are left out of cycles and defects: 1, 2, 3, 4, 5, ...",
+        ),
+    ],
+)
+def test_shots_that_cannot_be_read_are_named(unreadable: Sequence[int], told: str) -> None:
+    assert lines(unreadable=tuple(unreadable))["warning"] == told
+
+
+def test_windows_that_were_too_short_are_told() -> None:
+    assert lines(too_short=Rate(3, 20))["window"] == "too short in 3 of 20 (15.0 %)"
+
+
+def test_each_cycle_has_a_row() -> None:
+    header, row, note = cycle_table(STATISTICS)
+    assert header.split()[:3] == ["cycle", "shots", "defect-free"]
+    assert row.split() == [
+        "1",
+        "20",
+        "5.0",
+        "%",
+        "(2.1",
+        "to",
+        "12.3)",
+        "97.66(4)",
+        "%",
+        "185(4)",
+        "33.6(7)",
+        "0",
+    ]
+    assert note == "each cycle on its own image"
+    assert cycle_table(replace(STATISTICS, cycles=())) == []
+
+
+def test_cycles_that_not_all_shots_made_are_said_to_be() -> None:
+    *_, note = cycle_table(replace(STATISTICS, cycles=(CYCLE, replace(CYCLE, cycle=2, n_shots=12))))
+    assert "without the shots that had ended" in note

@@ -1,0 +1,286 @@
+"""The kernels of the transport against a naive one that works on whole segments with numpy."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from hypothesis import event, given, settings, strategies as st
+from labseq_virtual import _kernels_handover as laws
+from labseq_virtual._kernels_transport import most_let_go
+from labseq_virtual.axis_tones import (
+    AT_REST,
+    END,
+    MIXING,
+    ON_END,
+    ON_START,
+    POWER_END,
+    POWER_START,
+    START,
+)
+from labseq_virtual.settings import WorldSettings
+from labseq_virtual.transport import FASTEST, Transport
+from numpy.typing import NDArray
+
+from labseq import MotionSpec, SiteGrid, ToneProgram
+from labseq.testing.tape import ON, Tape
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+GRID = SiteGrid(5, 6)
+
+
+def count(mask: Mask) -> int:
+    return int(np.count_nonzero(mask))
+
+
+def crossings(row: Floats, col: Floats, column: int) -> Any:
+    """A product of row tones and column tones, (n_row_tones, n_column_tones)."""
+    return row[:, column, None] * col[:, column]
+
+
+def _followed(away: Floats, tolerance: float) -> Mask:
+    """Which tones go on from the segment before: of several with the same nearest one, only the nearest."""
+    nearest, least = away.argmin(axis=1), away.min(axis=1)
+    best = [int(np.argmin(np.where(nearest == other, least, np.inf))) for other in nearest]
+    return (least <= tolerance) & (np.array(best, np.int64) == np.arange(len(nearest)))
+
+
+@dataclass
+class Before:
+    """The crossings at the end of the segment before."""
+
+    row: Floats
+    col: Floats
+    lit: Mask
+    loaded: Mask
+    shallow: Floats
+
+
+class NaiveTransport:
+    """The rules of ``transport.py``, without any short cut, on a transport's own tables and laws."""
+
+    def __init__(self, transport: Transport, settings: WorldSettings, draws: Floats) -> None:
+        self.transport, self.settings, self.draws = transport, settings, draws
+        self.law, self.reach = transport._law, transport._reach
+        self.n_drawn = 0
+        self.lost: Counter[str] = Counter()
+
+    def carry(
+        self, occupied: Mask, program: ToneProgram, n_segments: int, depth: Floats, factor: float
+    ) -> Counter[str]:
+        self.occupied, self.depth, self.factor = occupied, depth * self.settings.static_depth, factor
+        before: Before | None = None
+        rows, cols = ([*self._segments(program, axis)][:n_segments] for axis in (0, 1))
+        fastest = FASTEST[program.course]
+        for k, (row, col) in enumerate(zip(rows, cols, strict=True)):
+            before = self._segment(before, row, col, float(program.duration_s[k]), float(fastest[k]))
+        self.lost["program"] += 0 if before is None else count(before.loaded)
+        return +self.lost
+
+    def _segments(self, program: ToneProgram, axis: int) -> list[Floats]:
+        tones = self.transport._tones(program, axis)
+        offsets = (program.row, program.column)[axis].offsets
+        return [tones[first:last] for first, last in pairwise(offsets)]
+
+    def _segment(
+        self, before: Before | None, row: Floats, col: Floats, duration_s: float, fastest: float
+    ) -> Before | None:
+        lit_start, lit_end = crossings(row, col, ON_START) > 0, crossings(row, col, ON_END) > 0
+        lit = lit_start | lit_end
+        self.lost["program"] += 0 if before is None else count(before.loaded)
+        if not lit.any():
+            return None
+        further = sum(count((tones[:, ON_START] + tones[:, ON_END]) > 0) for tones in (row, col)) - 2
+        on, loaded, shallow = self._continued(before, row, col)
+        loaded = loaded & lit_start
+        self.lost["program"] -= count(loaded)
+        power = np.maximum(crossings(row, col, POWER_START), crossings(row, col, POWER_END))
+        depth = np.vectorize(lambda each: laws.mobile_depth(each, further, self.law))(power)
+        taken = self._picked_up(lit & ~(on & lit_start), depth, row, col)
+        shallow[taken] = 0.0
+        loaded |= taken
+        mixed = self._mixed(row)[:, None] | self._mixed(col)
+        self.lost["collision"] += count(loaded & mixed)
+        loaded &= ~mixed
+        down, right = (row[:, END] - row[:, START])[:, None], (col[:, END] - col[:, START])[None, :]
+        if (np.abs(down) > AT_REST).any() or (np.abs(right) > AT_REST).any():
+            self._sweep(lit & (depth > self.settings.static_depth), loaded, row, col)
+            speed = np.hypot(down, right) * GRID.spacing_m * (fastest / max(duration_s, 1e-12))
+            fallen = np.vectorize(lambda u, v: laws.shallow(u, v, further, self.law))(depth, speed)
+            shallow = np.where(speed > 0, np.maximum(shallow, fallen), shallow)
+        self._set_down(loaded & ~lit_end, depth, shallow, row, col, further, duration_s)
+        return Before(row, col, lit_end, loaded & lit_end, shallow)
+
+    def _continued(self, before: Before | None, row: Floats, col: Floats) -> tuple[Mask, Mask, Floats]:
+        if before is None:
+            dark = np.zeros((len(row), len(col)), np.bool_)
+            return dark, dark.copy(), np.zeros(dark.shape)
+        pairs = (row, before.row), (col, before.col)
+        away: list[Any] = [np.abs(now[:, START, None] - then[:, END]) for now, then in pairs]
+        tolerance = self.settings.site_tolerance
+        in_order = all(e.shape[0] == e.shape[1] and (e.diagonal() <= tolerance).all() for e in away)
+        source: Any = np.ix_(*(np.arange(len(e)) if in_order else e.argmin(axis=1) for e in away))
+        close: Any = in_order or np.logical_and.outer(*(_followed(e, tolerance) for e in away))
+        return before.lit[source] & close, before.loaded[source] & close, before.shallow[source]
+
+    def _nearest(self, row: Floats, col: Floats) -> Any:
+        r, c = np.rint(row), np.rint(col)
+        down, right = row - r, col - c
+        a1, a2 = GRID.axes
+        square = (down**2 + right**2) * GRID.spacing_m**2 + down * right * 2 * float(a1 @ a2)
+        inside = (r >= 0) & (r < GRID.n_rows) & (c >= 0) & (c < GRID.n_cols)
+        r, c = np.clip(r, 0, GRID.n_rows - 1), np.clip(c, 0, GRID.n_cols - 1)
+        return r.astype(int), c.astype(int), np.sqrt(square), inside
+
+    def _picked_up(self, new: Mask, depth: Any, row: Floats, col: Floats) -> Mask:
+        r, c, away_m, inside = self._nearest(*np.broadcast_arrays(row[:, START, None], col[None, :, START]))
+        taken = new & inside & self.occupied[r, c]
+        for i, j in np.argwhere(taken):
+            site = r[i, j], c[i, j]
+            static = float(self.depth[site])
+            taken[i, j] = self.occupied[site] and laws.takes(depth[i, j], static, away_m[i, j], self.reach)
+            self.occupied[site] &= not taken[i, j]
+        return taken
+
+    def _mixed(self, tones: Floats) -> Any:
+        on = (tones[:, ON_START] + tones[:, ON_END]) > 0
+        before, after = (tones[:, at, None] - tones[:, at] for at in (START, END))
+        near = (np.abs(before) < MIXING) | (np.abs(after) < MIXING) | (before * after < 0)
+        near &= on[:, None] & on & ~np.eye(len(tones), dtype=np.bool_)
+        return near.any(axis=1)
+
+    def _sweep(self, strong: Mask, loaded: Mask, row: Floats, col: Floats) -> None:
+        row_step, col_step = row[:, END] - row[:, START], col[:, END] - col[:, START]
+        i, j = np.nonzero(strong & ((np.abs(row_step) > AT_REST)[:, None] | (np.abs(col_step) > AT_REST)))
+        r, c = np.nonzero(self.occupied)
+        if len(i) == 0 or len(r) == 0:
+            return
+        down, right = row_step[i, None], col_step[j, None]  # (n_crossings, 1), against (n_atoms,)
+        to_r, to_c = r - row[i, START, None], c - col[j, START, None]
+        when = np.clip((to_r * down + to_c * right) / (down**2 + right**2), 0.0, 1.0)
+        miss = (to_r - when * down) ** 2 + (to_c - when * right) ** 2
+        hit: Any = miss <= self.settings.site_tolerance**2
+        struck = hit.any(axis=0)
+        first = np.unique(np.where(hit, when, np.inf).argmin(axis=0)[struck])
+        self.lost["collision"] += count(struck) + count(loaded[i[first], j[first]])
+        loaded[i[first], j[first]] = False
+        self.occupied[r[struck], c[struck]] = False
+
+    def _set_down(
+        self,
+        let_go: Mask,
+        depth: Floats,
+        shallow: Floats,
+        row: Floats,
+        col: Floats,
+        further: int,
+        duration_s: float,
+    ) -> None:
+        i, j = np.nonzero(let_go)
+        r, c, away_m, inside = self._nearest(row[i, END], col[j, END])
+        args = zip(self.depth[r, c], depth[i, j], away_m, shallow[i, j], strict=True)
+        risks = [laws.risks(*each, further, duration_s, self.factor, self.law) for each in args]
+        draws = self.draws[self.n_drawn : self.n_drawn + len(i)]
+        self.n_drawn += len(i)
+        unlucky = draws < np.array(risks).reshape(-1, 3)
+        fallen = unlucky[:, 0] | unlucky[:, 1]
+        dropped = unlucky[:, 2] & ~fallen
+        n_atoms = self.occupied.astype(int)
+        np.add.at(n_atoms, (r[inside & ~fallen & ~dropped], c[inside & ~fallen & ~dropped]), 1)
+        self.lost.update(
+            ejected=count(~inside),
+            hand_over=count(inside & fallen),
+            transport=count(inside & dropped),
+            collision=int(n_atoms[n_atoms > 1].sum()),
+        )
+        self.occupied[...] = n_atoms == 1
+
+
+PLACES = st.one_of(st.integers(-4, 24).map(lambda n: n / 4), st.floats(-1.5, 6.5))
+SITES = st.sampled_from([*range(6)] * 5 + [0.1, 1.3, 1.7, 2.34, 2.64, 3.36])
+STEPS = st.sampled_from([0, 0, 1, 1, -1, 2, -2, 0.9, 0.5])
+LEVELS = st.sampled_from([ON, 1.3 * ON, 0.6 * ON, 0.4 * ON, 5e-4, 0.0])
+JUMPS = st.sampled_from([0.0, 0.1, 0.2, 0.25, -0.3])
+CHAOS = st.lists(st.tuples(PLACES, PLACES, LEVELS, LEVELS), min_size=1, max_size=3)
+SELDOM = st.sampled_from([False] * 7 + [True])
+Tones = list[tuple[float, float, float, float]]
+
+
+@st.composite
+def legs(draw: st.DrawFn, places: list[float]) -> Tones:
+    """Tones of an axis that go on from some places: mostly as they should."""
+    goals = [place + draw(STEPS) for place in places]
+    if draw(SELDOM):
+        goals = [draw(PLACES) for _ in places]
+    tones = [(place, goal, ON, ON) for place, goal in zip(places, goals, strict=True)]
+    if draw(SELDOM):
+        tones = [(a + draw(JUMPS), b, draw(LEVELS), draw(LEVELS)) for a, b, _, _ in tones]
+    if draw(SELDOM):
+        tones = draw(st.permutations(tones))[: draw(st.integers(1, 3))]
+    return tones
+
+
+@st.composite
+def strokes(draw: st.DrawFn) -> list[tuple[Tones, Tones]]:
+    """Pick-up, one or two ways, drop-off."""
+    axes = [sorted(draw(st.lists(SITES, min_size=1, max_size=most, unique=True))) for most in (2, 3)]
+    rows, cols = axes
+    segments: list[tuple[Tones, Tones]] = [([(x, x, ON, ON) for x in rows], [(x, x, 0.0, ON) for x in cols])]
+    for _ in range(draw(st.integers(1, 2))):
+        segments.append((draw(legs(rows)), draw(legs(cols))))
+        rows, cols = ([goal for _, goal, _, _ in tones] for tones in segments[-1])
+    return [*segments, ([(x, x, ON, ON) for x in rows], [(x, x, ON, 0.0) for x in cols])]
+
+
+PARTS = st.one_of(strokes(), strokes(), strokes(), st.tuples(CHAOS, CHAOS).map(lambda pair: [pair]))
+PROGRAMS = st.lists(PARTS, min_size=1, max_size=4)
+WORLDS = st.fixed_dictionaries(
+    {
+        "transport_loss": st.sampled_from([0.0, 0.3]),
+        "transport_loss_per_tone": st.sampled_from([0.0, 0.05]),
+        "temperature": st.sampled_from([1e-6, 60e-6]),
+        "site_tolerance": st.sampled_from([0.25, 0.1, 0.45]),
+        "mobile_light": st.fixed_dictionaries(
+            {
+                "adiabatic_depth": st.sampled_from([0.0, 1e-3, 3e-3]),
+                "shallow_loss": st.just(0.7),
+                "intermodulation": st.sampled_from([0.0, 0.05]),
+                "depth_drop_per_tone": st.sampled_from([0.0, 0.05]),
+                "offset": st.sampled_from([(0.0, 0.0), (0.5e-6, -0.3e-6)]),
+            }
+        ),
+    }
+)
+
+
+@given(PROGRAMS, WORLDS, st.sampled_from([0.1, 0.4, 1.0]), st.sampled_from([1e-5, 1e-4, 1e-3]), st.data())
+@settings(max_examples=150, deadline=None)
+def test_the_kernels_do_exactly_what_the_rules_say(
+    parts: list[Any], world: dict[str, Any], filling: float, segment_s: float, data: st.DataObject
+) -> None:
+    program = Tape(GRID, [segment for part in parts for segment in part]).program(segment_s)
+    n_segments = program.n_segments
+    if data.draw(SELDOM, "cut short"):
+        n_segments = data.draw(st.integers(0, n_segments), "segments")
+    seed = data.draw(st.integers(0, 2**32 - 1), "seed")
+    rng = np.random.default_rng(seed)
+    occupied = rng.random(GRID.shape) < filling
+    depth = rng.uniform(0.5, 1.5, GRID.shape)
+    physics = WorldSettings.model_validate(world)
+    transport = Transport(GRID, MotionSpec(), physics)
+    naive = NaiveTransport(transport, physics, np.random.default_rng(seed).random((2000, 3)))
+    expected, result = occupied.copy(), occupied.copy()
+    lost_naively = naive.carry(expected, program, n_segments, depth, 1.3)
+    lost = transport.carry(result, program, n_segments, depth, np.random.default_rng(seed), 1.3)
+    for cause in lost:
+        event(cause)
+    event(f"atoms set down: {min(naive.n_drawn, 3)}")
+    np.testing.assert_array_equal(result, expected)
+    assert lost == lost_naively
+    tones = transport._tones(program, 0), transport._tones(program, 1)
+    offsets = program.row.offsets, program.column.offsets
+    assert naive.n_drawn <= most_let_go(tones[0], offsets[0], tones[1], offsets[1], n_segments)

@@ -1,0 +1,205 @@
+"""What came of many shots, against numbers worked out by hand."""
+
+from __future__ import annotations
+
+import json
+import math
+import statistics as by_hand
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from labseq.model import CycleRecord, ImageRecord, Plan, PlanReport, RunRecord, ShotRecord
+from labseq.recording import Run, RunWriter, open_run
+from labseq.recording.rates import Rate
+from labseq.recording.statistics import statistics_of
+from labseq.recording.summaries import summarise, summary_in
+
+MakeRun = Callable[..., RunRecord]
+MakeShot = Callable[..., ShotRecord]
+Defects = Sequence[int | None]
+"""Empty target sites on the image of each cycle; None: full, but with an atom where none may be."""
+
+
+@pytest.fixture
+def of_defects(make_run: MakeRun, make_shot: MakeShot) -> Callable[..., ShotRecord]:
+    """Build a shot whose cycles leave so many defects; cycle k moves k atoms in k batches of k + 1."""
+    target = make_run().target
+
+    def image(n_defects: int | None, cycle: int, t_start_s: float) -> ImageRecord:
+        occupancy = target.fill.copy()
+        if n_defects is None:
+            occupancy |= target.clear
+        else:
+            occupancy[tuple(np.argwhere(target.fill)[:n_defects].T)] = False
+        return ImageRecord(None, occupancy, np.ones(target.shape, np.float32), 2, cycle, t_start_s, 0.045)
+
+    def cycle(k: int) -> CycleRecord:
+        offsets = np.arange(k + 2, dtype=np.int32)
+        plan = Plan(np.zeros((k + 1, 4), np.int16), offsets, np.zeros(k + 1, np.bool_))
+        report = PlanReport(target.fill, np.arange(1.0, k + 2), np.ones(k + 1, np.int32), 0, 0)
+        return CycleRecord(2, k, plan, report, k, 0.06, 0.5, 0.01)
+
+    def shot(index: int, cycles: Defects, last: int | None = None, **readings: float) -> ShotRecord:
+        images = [image(4, 0, 0.5), *(image(d, k, 0.5 + 0.1 * k) for k, d in enumerate(cycles, start=1))]
+        if last is not None:
+            images.append(image(last, 0, 2.0))
+        return make_shot(
+            index,
+            images=images,
+            cycles=[cycle(k) for k in range(1, len(cycles) + 1)],
+            success=last == 0,
+            filling_fraction=math.nan if last is None else 1 - last / 6,
+            seen_defect_free_cycle=cycles.index(0) + 1 if 0 in cycles else 0,
+            readings={f"simulation.{name.replace('__', '.')}": value for name, value in readings.items()},
+        )
+
+    return shot
+
+
+@pytest.fixture
+def recorded(tmp_path: Path, make_run: MakeRun) -> Callable[..., Run]:
+    """Write shots as a run, and read it back."""
+
+    def record(*shots: ShotRecord) -> Run:
+        writer = RunWriter.create(tmp_path, make_run())
+        for shot in shots:
+            writer.write_shot(shot)
+        writer.finish("complete")
+        return open_run(writer.run_dir)
+
+    return record
+
+
+def without_summaries(run: Run) -> Run:
+    """The run as labseq recorded it before format 1.1."""
+    index = run.path / "index.jsonl"
+    rows = [json.loads(line) for line in index.read_text("utf-8").splitlines()]
+    kept = [{k: v for k, v in row.items() if k not in ("images", "cycles", "simulation")} for row in rows]
+    index.write_text("".join(f"{json.dumps(row)}\n" for row in kept), "utf-8")
+    return open_run(run.path)
+
+
+def test_each_cycle_is_judged_on_its_own_image(of_defects: Any, recorded: Any) -> None:
+    run = recorded(
+        *(of_defects(i, one) for i, one in enumerate([(2, 0, 1), (1, 1, 0), (0, 0, 2), (3, 0, 0)]))
+    )
+    found = statistics_of(run.shots, run.target)
+    assert [cycle.defect_free for cycle in found.cycles] == [Rate(1, 4), Rate(3, 4), Rate(2, 4)]
+    assert [cycle.seen for cycle in found.cycles] == [Rate(1, 4), Rate(3, 4), Rate(4, 4)]
+    assert found.defect_free == Rate(0, 0)
+    assert math.isnan(found.filling.value)
+    assert found.seen == Rate(4, 4)
+    assert found.cycles[2].defects == (2, 1, 1)
+    assert found.defects == ()
+    fillings = [1 - n / 6 for n in (2, 1, 0, 3)]
+    assert found.cycles[0].filling.value == pytest.approx(by_hand.fmean(fillings))
+    assert found.cycles[0].filling.error == pytest.approx(by_hand.stdev(fillings) / 2)
+    assert [cycle.period_s.value for cycle in found.cycles] == pytest.approx([0.1, 0.1, 0.1])
+
+
+def test_only_what_was_played_counts_as_moved(of_defects: Any, recorded: Any) -> None:
+    run = recorded(of_defects(0, (2, 1)), of_defects(1, (2, 1)))
+    found = statistics_of(run.shots, run.target)
+    assert [cycle.n_batches.value for cycle in found.cycles] == [1, 2]
+    assert [cycle.n_atom_moves.value for cycle in found.cycles] == [1, 2]
+    assert [cycle.n_left_out.value for cycle in found.cycles] == [1, 1]
+    assert found.too_short == Rate(2, 2)
+
+
+def test_shots_that_ended_early_leave_later_cycles_to_the_others(of_defects: Any, recorded: Any) -> None:
+    run = recorded(of_defects(0, (0,), last=1), of_defects(1, (2, 0), last=0), of_defects(2, (1, 1), last=3))
+    found = statistics_of(run.shots, run.target)
+    assert [(cycle.n_shots, cycle.defect_free) for cycle in found.cycles] == [
+        (3, Rate(1, 3)),
+        (2, Rate(1, 2)),
+    ]
+    assert [cycle.seen for cycle in found.cycles] == [Rate(1, 3), Rate(2, 3)]
+    assert found.defect_free == Rate(1, 3)
+    assert found.seen == Rate(2, 3)
+    assert found.defects == (1, 1, 0, 1)
+
+
+def test_a_surplus_atom_is_no_success(of_defects: Any, recorded: Any) -> None:
+    run = recorded(of_defects(0, (None,)))
+    (cycle,) = statistics_of(run.shots, run.target).cycles
+    assert cycle.defect_free == Rate(0, 1)
+    assert (cycle.filling.value, cycle.defects) == (1.0, (1,))
+
+
+def test_the_truth_of_a_simulation_is_told_where_it_is_known(of_defects: Any, recorded: Any) -> None:
+    run = recorded(
+        of_defects(0, (2,), last=1, lost__vacuum=3, lost__imaging=0, n_defects_true=2),
+        of_defects(1, (2,), last=2, lost__vacuum=1, lost__imaging=0, n_defects_true=2),
+        of_defects(2, (2,), last=0),
+    )
+    found = statistics_of(run.shots, run.target)
+    assert {cause: loss.value for cause, loss in found.losses.items()} == {"vacuum": 2.0, "imaging": 0.0}
+    assert found.losses["vacuum"].error == 1.0
+    assert (found.defects_true.value, found.defects_seen.value) == (2.0, 1.5)
+
+
+def test_runs_of_before_tell_the_same_from_their_files(of_defects: Any, recorded: Any) -> None:
+    new = recorded(of_defects(0, (2, 0), last=0, lost__vacuum=3), of_defects(1, (None, 1), last=2))
+    told = statistics_of(new.shots, new.target)
+    old = without_summaries(new)
+    assert summary_in(old.shots[0].row) is None
+    assert statistics_of(old.shots, old.target).as_dict() == told.as_dict()
+
+
+def test_a_shot_that_cannot_be_read_is_left_out_and_told(of_defects: Any, recorded: Any) -> None:
+    run = without_summaries(recorded(*(of_defects(i, (1, 0), last=0) for i in range(3))))
+    run.shots[1].file.unlink()
+    run.shots[2].file.write_bytes(b"no HDF5")
+    found = statistics_of(run.shots, run.target)
+    assert found.unreadable == (1, 2)
+    assert found.cycles[0].n_shots == 1
+    assert found.defect_free == Rate(3, 3)  # the index knows
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        {"images": None},
+        {"images": {"cycle": [0, 1]}},
+        {"cycles": {"n_batches": [1], "n_batches_played": [], "n_atom_moves": []}},
+        {"simulation": [1]},
+        {"cycles": {"n_batches": ["1"], "n_batches_played": [1], "n_atom_moves": [1]}},
+    ],
+)
+def test_a_damaged_summary_is_none(of_defects: Any, recorded: Any, damage: dict[str, Any]) -> None:
+    (shot,) = recorded(of_defects(0, (1, 0))).shots
+    assert summary_in(shot.row) == shot.summary
+    assert summary_in({**shot.row, **damage}) is None
+
+
+def test_an_empty_run_has_nothing_to_tell(recorded: Any) -> None:
+    run = recorded()
+    found = statistics_of(run.shots, run.target)
+    assert (found.n_shots, found.cycles, found.defects) == (0, (), ())
+    assert found.seen == Rate(0, 0)
+    assert json.loads(json.dumps(found.as_dict()))["filling"] == {"mean": None, "error": None}
+
+
+def test_a_shot_with_images_alone_is_judged(of_defects: Any, recorded: Any) -> None:
+    run = recorded(of_defects(0, (), last=0))
+    found = statistics_of(run.shots, run.target)
+    assert (found.defect_free, found.cycles) == (Rate(1, 1), ())
+
+
+def test_many_shots_are_summed_up_from_the_index_alone(of_defects: Any, recorded: Any) -> None:
+    run = recorded(of_defects(0, (2, 0), last=0))
+    (line,) = (run.path / "index.jsonl").read_text("utf-8").splitlines()
+    rows = ({**json.loads(line), "shot": index} for index in range(2_000))
+    (run.path / "index.jsonl").write_text("".join(f"{json.dumps(row)}\n" for row in rows), "utf-8")
+    run.shots[0].file.unlink()
+    run = open_run(run.path)
+    assert statistics_of(run.shots, run.target).cycles[1].defect_free == Rate(2_000, 2_000)
+
+
+def test_a_summary_survives_the_index(of_defects: Any, make_run: MakeRun) -> None:
+    summary = summarise(of_defects(0, (2, None, 0), last=1, lost__vacuum=3), make_run().target)
+    assert summary_in(json.loads(json.dumps(summary.as_row()))) == summary

@@ -1,0 +1,78 @@
+"""The most that losses and detection leave of an array."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, strategies as st
+
+from labseq.session.ceiling import Losses, ceiling
+
+PAPER = Losses(lifetime_s=33.0, imaging_loss=0.00314, imaging_loss_exposure_s=0.045)
+TOLD: dict[str, Any] = {"lifetime": 33.0, "imaging_loss": 0.00314, "imaging_loss_exposure": 0.045}
+
+
+def perfect_rearrangement(
+    n_shots: int, n_atoms: int, period_s: float, losses: Losses, seed: int
+) -> float:  # fmt: skip
+    """Share of the shots seen defect-free in the end, if every move succeeds: atom by atom."""
+    rng = np.random.default_rng(seed)
+    there = np.ones((n_shots, n_atoms), np.bool_)
+    seen = there
+    for _ in range(6):
+        lost = rng.random(there.shape) < losses.imaging_loss
+        has_shone = ~lost | (rng.random(there.shape) > 0.4)  # lost atoms, until they were bright enough
+        missed = rng.random(there.shape) < (losses.false_negative or 0.0)
+        seen = there & has_shone & ~missed
+        there &= ~lost
+        there = np.where(seen, there, ~there)  # the second atom on a site takes the first with it
+        there &= rng.random(there.shape) < np.exp(-period_s / losses.lifetime_s)
+    return float(seen.all(axis=1).mean())
+
+
+@pytest.mark.parametrize("missed", [None, 5e-4])
+@pytest.mark.parametrize("period_s", [0.05, 0.2])
+def test_perfect_rearrangement_reaches_it(period_s: float, missed: float | None) -> None:
+    losses = replace(PAPER, false_negative=missed)
+    n_shots = 6_000
+    reached = perfect_rearrangement(n_shots, 225, period_s, losses, seed=3)
+    most = ceiling(225, period_s, 0.045, losses)
+    assert reached == pytest.approx(most, abs=4 * np.sqrt(most * (1 - most) / n_shots))
+
+
+def test_the_papers_constants_give_the_papers_ceiling() -> None:
+    assert ceiling(225, 0.045, 0.045, PAPER) == pytest.approx(0.9955**225, rel=0.01)
+
+
+@given(st.integers(1, 1000), st.floats(0.01, 1.0), st.floats(0.01, 0.2), st.floats(0.0, 1e-3))
+def test_it_falls_with_atoms_time_light_and_missed_atoms(n: int, t: float, s: float, missed: float) -> None:
+    losses = replace(PAPER, false_negative=missed)
+    most = ceiling(n, t, s, losses)
+    assert 0.0 < most < 1.0
+    assert ceiling(n + 1, t, s, losses) < most
+    assert ceiling(n, 1.1 * t, s, losses) < most
+    assert ceiling(n, t, 1.1 * s, losses) < most
+    assert most <= ceiling(n, t, s, PAPER)
+
+
+def test_the_losses_are_those_that_the_simulation_tells() -> None:
+    assert Losses.of({"simulation": TOLD}) == PAPER
+    assert Losses.of({"simulation": {**TOLD, "false_negative": 6e-5}}) == replace(PAPER, false_negative=6e-5)
+
+
+@pytest.mark.parametrize(
+    "devices",
+    [
+        {},
+        {"simulation": None},
+        {"simulation": {"model": "another"}},
+        {"simulation": {**TOLD, "lifetime": 0}},
+        {"simulation": {**TOLD, "imaging_loss": 1.0}},
+        {"simulation": {**TOLD, "imaging_loss_exposure": "45 ms"}},
+    ],
+)
+def test_what_is_not_told_is_not_made_up(devices: dict[str, Any]) -> None:
+    assert Losses.of(devices) is None
