@@ -20,6 +20,7 @@ def labseq_register(registry: Registry) -> None:
         CheckOverlaySettings,
         CheckSitesSettings,
         DeviceSettings,
+        EqualiseSettings,
         ImageSettings,
         LoadSettings,
         ProbeSettings,
@@ -29,6 +30,7 @@ def labseq_register(registry: Registry) -> None:
     from labseq.geometry import bitmap, compact
     from labseq.imaging import ThresholdDetector, WeightedDetector
     from labseq.imaging.blind import BlindDetector
+    from labseq.sequencer.equalise import EqualiseStep
     from labseq.sequencer.probe import ProbeStep
     from labseq.sequencer.rearrange import RearrangeStep
     from labseq.sequencer.steps import DeviceStep, ImageStep, LoadStep, WaitStep
@@ -40,6 +42,7 @@ def labseq_register(registry: Registry) -> None:
     registry.step("probe", ProbeStep, ProbeSettings)
     registry.step("check_sites", CheckSitesStep, CheckSitesSettings)
     registry.step("check_overlay", CheckOverlayStep, CheckOverlaySettings)
+    registry.step("equalise", EqualiseStep, EqualiseSettings)
     registry.step("wait", WaitStep, WaitSettings)
     registry.step("device", DeviceStep, DeviceSettings)
     registry.pattern("compact", compact, CompactSettings)

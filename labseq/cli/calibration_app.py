@@ -32,9 +32,7 @@ Examples:
   labseq calibrate sites --profile lab --from sites.csv
 """
 
-Profile = Annotated[
-    str, typer.Option("--profile", "-p", metavar="NAME|FILE", help="Hardware profile that they belong to.")
-]
+Profile = Annotated[str, typer.Option("--profile", "-p", metavar="NAME|FILE", help="Hardware profile.")]
 DryRun = Annotated[
     DryRunKind | None,
     typer.Option(

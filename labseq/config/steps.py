@@ -122,6 +122,28 @@ class CheckOverlaySettings(Settings):
     )
 
 
+class EqualiseSettings(Settings):
+    """``equalise``: make the static tweezers even, in a closed loop."""
+
+    device: Text = Field(
+        default="trap_camera", description="device of the profile that measures the power of each tweezer"
+    )
+    value: Text = Field(
+        default="spot_powers", description="its value with the powers, an array of rows and columns"
+    )
+    spread: Annotated[float, Field(gt=0, lt=1)] = Field(
+        default=0.005, description="rms of the part that rows and columns can even out, that is aimed at"
+    )
+    gain: Annotated[float, Field(gt=0, le=1)] = Field(
+        default=0.8, description="how much of it a round takes out"
+    )
+    max_sum: Annotated[float, Field(gt=0)] = Field(
+        default=1.0, description="most that the amplitudes of an axis may add up to, of full scale"
+    )
+    max_averages: int = Field(default=100, ge=2, description="most measurements that a round averages")
+    max_rounds: int = Field(default=25, ge=1, description="most rounds")
+
+
 class WaitSettings(Settings):
     """``wait``: let time pass."""
 

@@ -188,8 +188,8 @@ class Shot(Protocol):
         """Add a rearrangement cycle to the shot's record."""
         ...
 
-    def note(self, name: str, value: float) -> None:
-        """Keep a value with the shot, among its readings: "overlay.error_m"."""
+    def note(self, name: str, value: float | Sequence[Any]) -> None:
+        """Keep a value, or lists of them, with the shot, among its readings: "overlay.error_m"."""
         ...
 
     def log(self, event: str, **values: Any) -> None:

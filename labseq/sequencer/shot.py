@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, ParamSpec, TypeVar
 
@@ -137,7 +137,7 @@ class RunningShot:
         self.record.cycles.append(cycle)
         self._emit("cycle", {"cycle": cycle})
 
-    def note(self, name: str, value: float) -> None:
+    def note(self, name: str, value: float | Sequence[Any]) -> None:
         """Keep a value with the shot, among its readings."""
         self.record.readings[name] = value
 

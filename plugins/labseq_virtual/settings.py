@@ -234,3 +234,13 @@ class DeviceSettings(Settings):
     values: dict[str, bool | int | float | str] = Field(
         default={}, description="values that it can be asked for: name -> value at the start"
     )
+
+
+class SpotMeterSettings(Settings):
+    """A virtual camera on the static tweezers' own light."""
+
+    noise: Fraction = Field(
+        default=0.02,
+        description="relative s.d. of one measurement of one spot (ours)",
+    )
+    duration: Duration = Field(default=20e-3, description="time of a measurement (ours)")

@@ -10,10 +10,12 @@ from labseq.session.calibrate.method import Method
 from labseq.session.calibrate.overlay import OverlayMethod
 from labseq.session.calibrate.sites import SitesMethod
 from labseq.session.calibrate.thresholds import ThresholdsMethod
+from labseq.session.calibrate.tweezers import TweezersMethod
 
 _ALL: Final[tuple[Method, ...]] = (
     SitesMethod(),
     ThresholdsMethod(),
+    TweezersMethod(),
     FrequenciesMethod(),
     OverlayMethod(),
 )
