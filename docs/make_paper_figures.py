@@ -44,7 +44,7 @@ WINDOWS_MS = {2: 94, 3: 68}
 POINTS = [(dop, 200) for dop in range(2, 16)] + [(dop, WINDOWS_MS.get(dop, 60)) for dop in range(2, 16)]
 """Degree of parallelism and window in ms of each point of figure 4."""
 UNTUNED = (
-    "profile.simulation.transport_loss=1.88 %",
+    "profile.simulation.transport_loss=2.12 %",
     "profile.simulation.transport_loss_per_tone=0 %",
     "profile.simulation.transport_loss_spread=0",
     "profile.simulation.mobile_light.depth_drop_per_tone=0 %",
