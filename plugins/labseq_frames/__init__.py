@@ -1,0 +1,14 @@
+"""A camera that plays back frames from files."""
+
+from labseq import Registry, hookimpl
+
+LABSEQ_API = 1
+
+
+@hookimpl
+def labseq_register(registry: Registry) -> None:
+    """Offer the camera ``frames``; it keeps to the session's clock."""
+    from labseq_frames.camera import FramesCamera
+    from labseq_frames.settings import FramesSettings
+
+    registry.camera("frames", FramesCamera, FramesSettings, virtual_time=True)

@@ -1,0 +1,291 @@
+"""The camera that plays back frames: the promises of a camera, and what is its own."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from labseq_frames.camera import FramesCamera
+from labseq_frames.settings import FramesSettings
+from numpy.typing import NDArray
+
+from labseq import ConfigError, Context, DeviceError, DeviceTimeoutError, Frame, LimitError
+from labseq.model import ImageRecord, RunRecord, ShotRecord, TargetPattern
+from labseq.recording import RunWriter
+from labseq.testing import CameraContract
+from labseq.testing.fakes import FakeClock
+
+IMAGE = pytest.importorskip("PIL.Image")
+TIFFFILE = pytest.importorskip("tifffile")
+
+MEASURED = Path(
+    os.environ.get("LABSEQ_EMCCD_DATA") or Path(__file__).parents[3] / "shared" / "data" / "emccd"
+)
+STACK = MEASURED / "gain-GS__300x-gain.tif"
+UTC = "2026-11-20T10:00:00.000000+00:00"
+
+Stack = NDArray[np.uint16]
+
+
+def stack_of(n_frames: int, shape: tuple[int, int] = (4, 6)) -> Stack:
+    """Frame k begins with the count 1000 k."""
+    return (1000 * np.arange(n_frames)[:, None, None] + np.arange(np.prod(shape)).reshape(shape)).astype("u2")
+
+
+def write_run(root: Path, frames_of_shots: Sequence[Stack], exposure_s: float = 0.01) -> Path:
+    """A run with these frames; image i of shot k was taken at 100 k + i seconds."""
+    sites = np.ones((1, 2), np.bool_)
+    record: dict[Any, Any] = {**dict.fromkeys(RunRecord.__slots__)}
+    record |= {"name": "earlier", "n_shots": len(frames_of_shots), "seed": 1, "simulated": True}
+    record |= {"target": TargetPattern(sites, ~sites, "x"), "t_start_utc": UTC, "record_frames": "all"}
+    record |= {"sequence_text": "", "profile_text": "", "grid_spacing_m": 5e-6, "lattice": "square"}
+    record |= {"resolved": {}, "overrides": {}, "devices": {}, "plugins": (), "provenance": {}}
+    writer = RunWriter.create(root, RunRecord(**record))
+    for k, pixels in enumerate(frames_of_shots):
+        frames = [Frame(one, exposure_s, 100.0 * k + i, "emccd") for i, one in enumerate(pixels)]
+        confidence = np.ones(sites.shape, np.float32)
+        images = [ImageRecord(one, sites, confidence, 1, 0, 0.1, exposure_s) for one in frames]
+        shot = ShotRecord(k, 0, 1, UTC)
+        shot.images, shot.status, shot.t_end_utc = images, "complete", UTC
+        writer.write_shot(shot)
+    writer.finish("complete")
+    return writer.run_dir
+
+
+def write_pngs(folder: Path, frames: Stack) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    for i, pixels in enumerate(frames):
+        IMAGE.fromarray(pixels).save(folder / f"frame{i}.png")
+    return folder
+
+
+def write_tiff(file: Path, frames: Stack, **options: Any) -> Path:
+    TIFFFILE.imwrite(file, frames, photometric="minisblack", **options)
+    return file
+
+
+class FilesContract(CameraContract):
+    @pytest.fixture
+    def path(self, tmp_path: Path) -> Path:
+        raise NotImplementedError
+
+    @pytest.fixture
+    def factory(self, path: Path) -> Callable[[Context], FramesCamera]:
+        return partial(FramesCamera, FramesSettings(path=path))
+
+
+class TestFramesOfARun(FilesContract):
+    @pytest.fixture
+    def path(self, tmp_path: Path) -> Path:
+        return write_run(tmp_path, [stack_of(3)] * 5)
+
+
+class TestFramesOfAStack(FilesContract):
+    @pytest.fixture
+    def path(self, tmp_path: Path) -> Path:
+        return write_tiff(tmp_path / "stack.tif", stack_of(12))
+
+
+class TestFramesOfPngFiles(FilesContract):
+    @pytest.fixture
+    def path(self, tmp_path: Path) -> Path:
+        return write_pngs(tmp_path / "png", stack_of(12))
+
+
+del FilesContract  # it has no frames of its own
+
+
+class Player:
+    """A camera on a clock that costs no time."""
+
+    def __init__(self, path: Path, **settings: Any) -> None:
+        self.clock = FakeClock()
+        given = FramesSettings.model_validate({"path": str(path), **settings})
+        self.camera = FramesCamera(given, Context("imaging", clock=self.clock))
+
+    def open(self) -> Player:
+        self.camera.open()
+        return self
+
+    def take(self, exposure_s: float = 0.045) -> Frame:
+        self.camera.arm(1, exposure_s, "software")
+        self.camera.trigger()
+        return self.camera.read(10.0)
+
+    def firsts(self, n_frames: int) -> list[int]:
+        """First count of each frame."""
+        return [int(self.take().image[0, 0]) for _ in range(n_frames)]
+
+
+def test_all_frames_of_a_run_come_shot_by_shot(tmp_path: Path) -> None:
+    frames = stack_of(6)
+    player = Player(write_run(tmp_path, [frames[:3], frames[3:4], frames[4:]])).open()
+    assert player.firsts(6) == [0, 1000, 2000, 3000, 4000, 5000]
+
+
+def test_only_the_first_image_of_each_shot_may_be_played(tmp_path: Path) -> None:
+    frames = stack_of(6)
+    run = write_run(tmp_path, [frames[:3], frames[3:4], frames[4:]])
+    player = Player(run, images="first").open()
+    assert player.firsts(3) == [0, 3000, 4000]
+    with pytest.raises(DeviceError, match="all 3 frames"):
+        player.take()
+
+
+def test_a_frame_tells_the_exposure_that_it_was_recorded_with(tmp_path: Path) -> None:
+    player = Player(write_run(tmp_path, [stack_of(2)], exposure_s=0.02)).open()
+    player.clock.sleep(5.0)
+    frame = player.take(exposure_s=0.045)
+    assert (frame.exposure_s, frame.t_start_s, frame.camera) == (0.02, 5.0, "imaging")
+    assert player.clock.now() == pytest.approx(5.045)  # the session goes by the exposure that it asked for
+    assert frame.image.dtype == np.uint16
+    assert not frame.image.flags.writeable
+
+
+def test_time_stamps_may_be_those_of_the_recording(tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run", [stack_of(2), stack_of(1)])
+    player = Player(run, time_stamps="recorded").open()
+    assert [player.take().t_start_s for _ in range(3)] == [0.0, 1.0, 100.0]
+    unknown = Player(write_tiff(tmp_path / "x.tif", stack_of(1)), time_stamps="recorded").open()
+    unknown.clock.sleep(3.0)
+    assert unknown.take().t_start_s == 3.0
+
+
+def test_what_a_file_does_not_tell_is_what_was_asked_for(tmp_path: Path) -> None:
+    player = Player(write_pngs(tmp_path, stack_of(1))).open()
+    assert player.take(exposure_s=0.3).exposure_s == 0.3
+
+
+def test_a_frame_takes_exposure_and_read_out(tmp_path: Path) -> None:
+    player = Player(write_tiff(tmp_path / "x.tif", stack_of(2)), readout="5 ms").open()
+    player.take(exposure_s=0.045)
+    assert player.clock.now() == pytest.approx(0.05)
+    player.camera.arm(1, 0.045, "software")
+    player.camera.trigger()
+    with pytest.raises(DeviceTimeoutError, match="is not ready"):
+        player.camera.read(0.01)
+
+
+def test_files_are_played_in_the_natural_order_of_their_names(tmp_path: Path) -> None:
+    folder = write_pngs(tmp_path / "10 frames", stack_of(12))
+    assert Player(folder).open().firsts(12) == [1000 * i for i in range(12)]
+    assert Player(folder / "frame1*.png").open().firsts(3) == [1000, 10000, 11000]
+    assert Player(folder / "frame7.png").open().firsts(1) == [7000]
+
+
+def test_a_pattern_works_below_folders_with_brackets_in_their_names(tmp_path: Path) -> None:
+    write_pngs(tmp_path / "data [old]" / "b", stack_of(2))
+    assert Player(tmp_path / "data [old]" / "*" / "*.png").open().firsts(2) == [0, 1000]
+
+
+def test_several_stacks_are_played_one_after_the_other(tmp_path: Path) -> None:
+    frames = stack_of(5)
+    write_tiff(tmp_path / "x9.tif", frames[:2])
+    write_tiff(tmp_path / "x10.TIFF", frames[2:], compression="zlib")
+    (tmp_path / "notes.txt").write_text("not a frame")
+    (tmp_path / "._x1.tif").write_text("what some systems leave beside a file")
+    assert Player(tmp_path).open().firsts(5) == [0, 1000, 2000, 3000, 4000]
+
+
+@pytest.mark.parametrize(
+    "options", [{"imagej": True}, {"bigtiff": True}, {"byteorder": ">"}, {"tile": (16, 16)}]
+)
+def test_stacks_of_many_kinds_give_the_same_counts(tmp_path: Path, options: dict[str, Any]) -> None:
+    frames = stack_of(3, (20, 30))
+    file = tmp_path / "x.tif"
+    TIFFFILE.imwrite(
+        file, frames, **({} if "imagej" in options else {"photometric": "minisblack"}), **options
+    )
+    player = Player(file).open()
+    assert all(np.array_equal(player.take().image, pixels) for pixels in frames)
+
+
+def test_after_the_last_frame_the_run_ends_with_their_number(tmp_path: Path) -> None:
+    player = Player(write_tiff(tmp_path / "x.tif", stack_of(3))).open()
+    player.firsts(3)
+    for _ in range(2):
+        with pytest.raises(DeviceError, match=r"^imaging: all 3 frames of .*x.tif .*when_over: repeat"):
+            player.take()
+
+
+def test_or_it_begins_again(tmp_path: Path) -> None:
+    player = Player(write_tiff(tmp_path / "x.tif", stack_of(3)), when_over="repeat").open()
+    assert player.firsts(7) == [0, 1000, 2000, 0, 1000, 2000, 0]
+
+
+def test_a_camera_that_was_closed_begins_with_the_first_frame(tmp_path: Path) -> None:
+    player = Player(write_tiff(tmp_path / "x.tif", stack_of(3))).open()
+    assert player.firsts(2) == [0, 1000]
+    player.camera.open()  # it is open: nothing happens
+    assert player.firsts(1) == [2000]
+    player.camera.close()
+    assert player.open().firsts(3) == [0, 1000, 2000]
+
+
+def test_arming_and_the_safe_state_drop_frames(tmp_path: Path) -> None:
+    player = Player(write_tiff(tmp_path / "x.tif", stack_of(5))).open()
+    for drop in (lambda: player.camera.arm(1, 0.01, "software"), player.camera.safe_state):
+        player.camera.arm(1, 0.01, "software")
+        player.camera.trigger()
+        player.clock.sleep(1.0)
+        drop()
+        with pytest.raises(DeviceTimeoutError):
+            player.camera.read(0.0)
+    assert player.firsts(1) == [2000]
+
+
+def test_what_no_camera_can_do_is_refused(tmp_path: Path) -> None:
+    player = Player(write_tiff(tmp_path / "x.tif", stack_of(5))).open()
+    for exposure_s in (0.0, -1.0, 3601.0, float("nan")):
+        with pytest.raises(LimitError, match="imaging: exposure"):
+            player.camera.arm(1, exposure_s, "software")
+    with pytest.raises(DeviceError, match="external trigger; expected 'software'"):
+        player.camera.arm(1, 0.1, "external")
+    player.camera.arm(2, 0.1, "software")
+    player.camera.trigger()
+    with pytest.raises(DeviceError, match="during an exposure"):
+        player.camera.trigger()
+
+
+def test_the_size_of_the_frames_is_known_before_they_are_opened(tmp_path: Path) -> None:
+    for path in (
+        write_run(tmp_path / "run", [stack_of(2, (5, 7))]),
+        write_tiff(tmp_path / "x.tif", stack_of(2, (5, 7))),
+        write_pngs(tmp_path / "png", stack_of(2, (5, 7))),
+    ):
+        facts = Player(path, readout="5 ms").camera.facts
+        assert (facts.frame_shape, facts.readout_s) == ((5, 7), 5e-3)
+
+
+def test_facts_leave_it_to_opening_to_say_what_is_wrong(tmp_path: Path) -> None:
+    player = Player(tmp_path / "later.tif")
+    assert player.camera.facts.frame_shape is None
+    with pytest.raises(ConfigError, match="no such file"):
+        player.open()
+    write_tiff(tmp_path / "later.tif", stack_of(2))
+    assert player.open().camera.facts.frame_shape == (4, 6)
+
+
+def test_it_says_what_it_plays(tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run", [stack_of(1)] * 2)
+    about = Player(run).open().camera.describe()
+    assert (about["source"], about["n_shots"], about["frame_shape"]) == ("run", 2, (4, 6))
+    about = Player(write_tiff(tmp_path / "x.tif", stack_of(3))).open().camera.describe()
+    assert (about["source"], about["n_files"], about["n_frames"], about["images"]) == ("TIFF", 1, 3, "all")
+    assert Player(write_pngs(tmp_path / "png", stack_of(3))).open().camera.describe()["n_files"] == 3
+
+
+@pytest.mark.skipif(
+    not STACK.is_file(), reason="no measured frames: LABSEQ_EMCCD_DATA names no folder that holds them"
+)
+def test_frames_of_a_real_camera_are_played_as_they_are() -> None:
+    player = Player(STACK).open()
+    played = np.stack([player.take().image for _ in range(5000)])
+    assert np.array_equal(played, TIFFFILE.imread(STACK))
+    with pytest.raises(DeviceError, match="all 5000 frames"):
+        player.take()

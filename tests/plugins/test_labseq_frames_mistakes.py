@@ -1,0 +1,279 @@
+"""What can be wrong with files that shall be played, and what is said of it."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, strategies as st
+from labseq_frames.camera import FramesCamera
+from labseq_frames.settings import FramesSettings
+from labseq_frames.sources import natural
+
+from labseq import ConfigError, Context, DeviceError
+from labseq.model import Frame, ImageRecord, RunRecord, ShotRecord, TargetPattern
+from labseq.recording import RunWriter
+from labseq.testing.fakes import FakeClock
+
+IMAGE = pytest.importorskip("PIL.Image")
+TIFFFILE = pytest.importorskip("tifffile")
+
+UTC = "2026-11-20T10:00:00.000000+00:00"
+SITES = np.ones((1, 2), np.bool_)
+
+
+def pixels(height: int = 4, width: int = 6, dtype: str = "u2") -> Any:
+    return np.arange(height * width).reshape(height, width).astype(dtype)
+
+
+def camera_of(path: Path, **settings: Any) -> FramesCamera:
+    given = FramesSettings.model_validate({"path": str(path), **settings})
+    return FramesCamera(given, Context("camera", clock=FakeClock()))
+
+
+def play(camera: FramesCamera, n_frames: int) -> None:
+    camera.open()
+    for _ in range(n_frames):
+        camera.arm(1, 0.01, "software")
+        camera.trigger()
+        camera.read(1.0)
+
+
+def refusal(path: Path, **settings: Any) -> str:
+    """What open() says."""
+    camera = camera_of(path, **settings)
+    with pytest.raises(ConfigError):
+        camera.open()
+    with pytest.raises(ConfigError) as caught:  # one that failed leaves nothing behind
+        camera.open()
+    assert caught.value.exit_code == 2
+    assert str(caught.value).startswith("camera: ")
+    camera.safe_state()
+    camera.close()
+    return str(caught.value)
+
+
+def failure(path: Path, n_good: int, **settings: Any) -> str:
+    """What trigger() says after so many good frames, and says again."""
+    camera = camera_of(path, **settings)
+    play(camera, n_good)
+    messages: set[str] = set()
+    for _ in range(2):
+        camera.arm(1, 0.01, "software")
+        with pytest.raises(DeviceError) as caught:
+            camera.trigger()
+        messages.add(str(caught.value))
+    camera.close()
+    (message,) = messages
+    return message
+
+
+def writer_of(root: Path, record_frames: Any = "all", n_shots: int = 2, n_images: int = 2) -> RunWriter:
+    """A run that is being written."""
+    run: dict[Any, Any] = {**dict.fromkeys(RunRecord.__slots__)}
+    run |= {"n_shots": n_shots, "seed": 1, "simulated": True, "target": TargetPattern(SITES, ~SITES, "x")}
+    run |= {"resolved": {}, "overrides": {}, "devices": {}, "plugins": (), "provenance": {}, "scan": None}
+    run |= {"name": "x", "t_start_utc": UTC, "sequence_text": "", "profile_text": ""}
+    run |= {"record_frames": record_frames, "grid_spacing_m": 5e-6, "lattice": "square", "calibrations": {}}
+    writer = RunWriter.create(root, RunRecord(**run))
+    for k in range(n_shots):
+        shot = ShotRecord(k, 0, 1, UTC)
+        frames = [Frame(pixels(), 0.01, float(i)) for i in range(n_images)]
+        shot.images = [ImageRecord(f, SITES, np.ones((1, 2), np.float32), 1, 0, 0.1, 0.01) for f in frames]
+        shot.status, shot.t_end_utc = "complete", UTC
+        writer.write_shot(shot)
+    return writer
+
+
+def finished(root: Path, **options: Any) -> Path:
+    writer = writer_of(root, **options)
+    writer.finish("complete")
+    return writer.run_dir
+
+
+def test_a_path_that_does_not_exist_is_named_with_one_like_it(tmp_path: Path) -> None:
+    (tmp_path / "stack.tif").touch()
+    text = refusal(tmp_path / "stak.tif")
+    assert "stak.tif: no such file or folder; expected a run's folder, a TIFF" in text
+    assert text.endswith("did you mean 'stack.tif'?")
+    assert refusal(tmp_path / "a" / "b").endswith("check `path`; it is relative to the profile")
+    assert f"no file in {tmp_path} matches" in refusal(tmp_path / "*.png")
+    assert "no file in" in refusal(tmp_path / "nowhere" / "*.png")
+    assert "is no pattern" in refusal(tmp_path / "**x" / "*.png") or sys.version_info >= (3, 13)
+
+
+def test_an_empty_folder_holds_no_frames(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").touch()
+    text = refusal(tmp_path)
+    assert "holds no PNG or TIFF files, and is not a run: it has no run.json; give a run's folder" in text
+
+
+def test_a_folder_of_runs_names_one_of_them(tmp_path: Path) -> None:
+    run = finished(tmp_path)
+    assert f"holds 1 run and is none itself; give one of them, for example {run}" in refusal(tmp_path)
+
+
+def test_files_of_another_kind_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "x.sif").touch()
+    IMAGE.fromarray(pixels()).save(tmp_path / "x.png")
+    TIFFFILE.imwrite(tmp_path / "x.tif", pixels())
+    assert "x.sif: is neither a TIFF nor a PNG" in refusal(tmp_path / "x.sif")
+    assert "means 1 PNG and 1 TIFF files; expected files of one kind" in refusal(tmp_path)
+    assert "x.tif: is no run, so that `images: first` has no meaning" in refusal(
+        tmp_path / "x.tif", images="first"
+    )
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no named pipes in folders")
+def test_what_is_no_ordinary_file_is_not_read(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "x.tif")
+    assert "is neither a file nor a folder" in refusal(tmp_path / "x.tif")
+
+
+@pytest.mark.parametrize(
+    ("mode", "told"),
+    [
+        ("RGB", "8 bit colour;"),
+        ("L", "8 bit gray;"),
+        ("RGBA", "8 bit colour with transparency;"),
+        ("P", " bit palette colour;"),
+        ("LA", "8 bit gray with transparency;"),
+        ("1", "1 bit gray;"),
+    ],
+)
+def test_a_png_that_is_not_16_bit_gray_is_refused(tmp_path: Path, mode: str, told: str) -> None:
+    IMAGE.new(mode, (6, 4)).save(tmp_path / "x.png")
+    text = refusal(tmp_path)
+    assert "x.png: the picture is " in text
+    assert f"{told} expected 16 bit gray; save the camera's own counts" in text
+
+
+def test_a_png_of_another_size_is_found_before_anything_is_played(tmp_path: Path) -> None:
+    for i, height in enumerate((4, 4, 5)):
+        IMAGE.fromarray(pixels(height)).save(tmp_path / f"x{i}.png")
+    assert "x2.png: its frames have 5 x 6 pixels, those of x0.png 4 x 6" in refusal(tmp_path)
+
+
+def test_a_damaged_png_is_named(tmp_path: Path) -> None:
+    for i in range(3):
+        IMAGE.fromarray(np.random.default_rng(i).integers(0, 9999, (40, 40)).astype("u2")).save(
+            tmp_path / f"x{i}.png"
+        )
+    whole = (tmp_path / "x1.png").read_bytes()
+    (tmp_path / "x1.png").write_bytes(whole[: len(whole) // 2])
+    assert "x1.png: is damaged: " in failure(tmp_path, 1)
+    assert "x1.png: is damaged: " in failure(tmp_path, 1, when_over="repeat")
+    (tmp_path / "x1.png").write_bytes(b"\x89PNG")
+    assert "x1.png: is not a PNG; take it from a backup" in refusal(tmp_path)
+    (tmp_path / "x1.png").write_bytes(whole[:100])
+    assert "x1.png: is damaged: " in refusal(tmp_path / "x1.png")
+
+
+@pytest.mark.parametrize("dtype", ["u1", "i2", "u4", "f4"])
+def test_a_stack_of_other_numbers_is_refused(tmp_path: Path, dtype: str) -> None:
+    TIFFFILE.imwrite(tmp_path / "x.tif", pixels(dtype=dtype))
+    name = np.dtype(dtype).name
+    assert f"page 0 is {name}, 4 x 6; expected uint16, height x width" in refusal(tmp_path / "x.tif")
+
+
+def test_a_coloured_stack_is_refused(tmp_path: Path) -> None:
+    TIFFFILE.imwrite(tmp_path / "x.tif", np.zeros((4, 6, 3), "u2"), photometric="rgb")
+    assert "page 0 is uint16, 4 x 6 x 3; expected uint16, height x width" in refusal(tmp_path)
+
+
+def test_what_is_wrong_with_a_later_page_is_told_when_it_comes(tmp_path: Path) -> None:
+    for file, later, told in (
+        ("size.tif", pixels(5), "page 2: the frame has 5 x 6 pixels, the first one 4 x 6"),
+        ("dtype.tif", pixels(dtype="f4"), "page 2 is float32, 4 x 6; expected uint16"),
+    ):
+        with TIFFFILE.TiffWriter(tmp_path / file) as stack:
+            for page in (pixels(), pixels(), later):
+                stack.write(page, contiguous=False)
+        assert told in failure(tmp_path / file, 2)
+
+
+def test_stacks_of_different_sizes_are_found_before_anything_is_played(tmp_path: Path) -> None:
+    TIFFFILE.imwrite(tmp_path / "a.tif", pixels(4))
+    TIFFFILE.imwrite(tmp_path / "b.tif", pixels(5))
+    assert "b.tif: its frames have 5 x 6 pixels, those of a.tif 4 x 6" in refusal(tmp_path)
+
+
+def test_a_stack_that_is_cut_off_never_counts_as_a_shorter_one(tmp_path: Path) -> None:
+    file = tmp_path / "x.tif"
+    TIFFFILE.imwrite(file, np.stack([pixels(20, 20)] * 6), photometric="minisblack")
+    whole = file.read_bytes()
+    for length in range(0, len(whole), 97):
+        file.write_bytes(whole[:length])
+        camera = camera_of(file)
+        with pytest.raises((ConfigError, DeviceError), match=r"x\.tif: (is cut off|cannot be read|holds)"):
+            play(camera, 6)
+        camera.close()
+
+
+def test_a_stack_that_hides_its_frames_behind_one_page_is_refused(tmp_path: Path) -> None:
+    with TIFFFILE.TiffWriter(tmp_path / "x.tif") as stack:
+        stack.write(np.stack([pixels()] * 3), photometric="minisblack", truncate=True)
+    text = refusal(tmp_path / "x.tif")
+    assert "holds 3 x 4 x 6 counts behind a single page" in text
+    assert text.endswith("save it as BigTIFF, or in several files")
+
+
+def test_what_is_no_tiff_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "x.tif").write_text("version https://git-lfs.github.com/spec/v1")
+    assert "x.tif: cannot be read as a TIFF: not a TIFF file" in refusal(tmp_path / "x.tif")
+
+
+def test_a_run_that_is_being_written_is_refused(tmp_path: Path) -> None:
+    assert "the run is still being written; wait until it has ended" in refusal(writer_of(tmp_path).run_dir)
+
+
+def test_a_run_without_frames_is_refused(tmp_path: Path) -> None:
+    text = refusal(finished(tmp_path / "none", record_frames="none"))
+    assert "the run holds no frames; expected one that was made with `record_frames: all`" in text
+    assert "the run holds no complete shot" in refusal(finished(tmp_path / "empty", n_shots=0))
+    assert "holds no frames; expected at least one" in refusal(finished(tmp_path / "dark", n_images=0))
+
+
+def test_a_first_image_that_was_not_kept_is_not_replaced_by_another(tmp_path: Path) -> None:
+    run = finished(tmp_path, record_frames="last")
+    assert "the first image of the shot was not kept; record with" in refusal(run, images="first")
+    camera_of(run).open()
+
+
+def test_a_shot_that_is_damaged_or_gone_is_named(tmp_path: Path) -> None:
+    run = finished(tmp_path)
+    second = sorted((run / "shots").iterdir())[1]
+    whole = second.read_bytes()
+    second.write_bytes(whole[: len(whole) // 2])
+    assert f"{second}: is damaged: " in failure(run, 2)
+    second.unlink()
+    assert f"{second}: is missing; take it from a backup" in failure(run, 2)
+    (run / "run.json").write_text("{}")
+    assert f"{run / 'run.json'}: is damaged" in refusal(run)
+
+
+@pytest.mark.parametrize(
+    ("module", "write", "name"),
+    [
+        ("tifffile", lambda file: TIFFFILE.imwrite(file, pixels()), "x.tif"),
+        ("PIL.Image", lambda file: IMAGE.fromarray(pixels()).save(file), "x.png"),
+    ],
+)
+def test_a_package_that_is_missing_is_named_with_the_command_that_installs_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, module: str, write: Callable[[Path], None], name: str
+) -> None:
+    write(tmp_path / name)
+    monkeypatch.setitem(sys.modules, module, None)
+    assert refusal(tmp_path / name).endswith('install it with `pip install "labseq[frames]"`')
+
+
+@given(st.lists(st.tuples(st.text("ab", max_size=2), st.integers(0, 10**6)), unique=True))
+def test_numbers_in_names_count_as_numbers(names: list[tuple[str, int]]) -> None:
+    files = [Path(f"x{number}_{word}.png") for word, number in names]
+    by_hand = [Path(f"x{number}_{word}.png") for number, word in sorted((n, w) for w, n in names)]
+    assert sorted(files, key=natural) == by_hand
