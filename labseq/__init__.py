@@ -80,6 +80,7 @@ _HOMES: Final = {
         "MobileTweezers",
         "Planner",
         "RfSource",
+        "SelfTesting",
         "Shot",
         "SignalTeller",
         "Simulation",

@@ -86,6 +86,7 @@ from labseq.roles import (
     MobileTweezers as MobileTweezers,
     Planner as Planner,
     RfSource as RfSource,
+    SelfTesting as SelfTesting,
     Shot as Shot,
     SignalTeller as SignalTeller,
     Simulation as Simulation,

@@ -231,3 +231,20 @@ def safe(
     from labseq.cli.safe import secure_profile
 
     raise typer.Exit(secure_profile(profile, overrides or ()))
+
+
+@app.command(short_help="Test every device of a profile: the first command of the day.")
+def devices(
+    profile: Annotated[
+        str,
+        typer.Argument(metavar="PROFILE", help="Name or file of the hardware profile.", show_default=False),
+    ],
+    dry_run: DryRun = None,
+    overrides: Overrides = None,
+    as_json: Json = False,
+) -> None:
+    """Open each device of a profile in turn, identify and test it, make it safe and close it."""
+    from labseq.cli.devices import show_devices
+
+    mode = "off" if dry_run is None else dry_run.value
+    raise typer.Exit(show_devices(profile, overrides or (), mode, as_json=as_json))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Mapping
+from shlex import quote
 from typing import Any, Final
 
 from labseq.cli.calibration import difference_table, quantity
@@ -46,7 +47,9 @@ def calibrate_kind(kind: str, request: CalibrationRequest, *, as_json: bool) -> 
     if outcome.refused:
         entry = outcome.stored.entry
         what = f"{entry.kind} {entry.id} is kept but not in use: {outcome.refused}"
-        hint = f"look at it, then 'labseq calibration use {entry.id} --force'"
+        options = f"--force --profile {quote(request.profile)}"
+        options += "" if request.dry_run == "off" else " --dry-run"
+        hint = f"look at it, then 'labseq calibration use {entry.id} {options}'"
         raise ConfigError(Problem(what, hint=hint))
 
 

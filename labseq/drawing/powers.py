@@ -11,6 +11,7 @@ from labseq.drawing.saving import make_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
 Floats = NDArray[np.float64]
@@ -18,6 +19,9 @@ Floats = NDArray[np.float64]
 SIZE_IN: Final = (8.4, 5.6)
 LEAST_RANGE: Final = 0.05
 """Least deviation from the mean that the colours go to."""
+TITLE_PT: Final = 10
+LABEL_PT: Final = 9
+TICK_PT: Final = 8
 
 
 def draw_powers(before: Floats, after: Floats, rows: Floats, cols: Floats) -> Figure:
@@ -35,18 +39,28 @@ def draw_powers(before: Floats, after: Floats, rows: Floats, cols: Floats) -> Fi
     most = max(LEAST_RANGE, *(float(np.nanmax(np.abs(each))) for each in maps))
     for axes, each, title in zip(panels[0], maps, ("before", "after"), strict=True):
         axes.imshow(100 * each, cmap="RdBu_r", vmin=-100 * most, vmax=100 * most)
-        axes.set_title(f"{title}: {100 * float(np.nanstd(each)):.1f} % r.m.s.", fontsize=9)
-        axes.set_xlabel("column", fontsize=8)
-        axes.set_ylabel("row", fontsize=8)
-    figure.colorbar(panels[0][0].images[0], ax=panels[0], label="power beside the mean (%)", shrink=0.9)
+        axes.set_title(f"{title}: {100 * float(np.nanstd(each)):.1f} % r.m.s.", fontsize=TITLE_PT)
+        _label(axes, "column", "row")
+        _count(axes.xaxis)
+        _count(axes.yaxis)
+    bar = figure.colorbar(panels[0][0].images[0], ax=panels[0], shrink=0.9)
+    _label(bar.ax, "", "power beside the mean (%)")
     for axes, amplitudes, name in zip(panels[1], (rows, cols), ("row", "column"), strict=True):
-        _draw_amplitudes(axes, amplitudes, name)
+        axes.bar(np.arange(len(amplitudes)), 100 * amplitudes, color="#1f4e8c")
+        axes.set_ylim(0, 115 * float(amplitudes.max()))
+        _label(axes, name, "tone (% of full scale)")
+        _count(axes.xaxis)
     return figure
 
 
-def _draw_amplitudes(axes: Axes, amplitudes: Floats, name: str) -> None:
-    axes.bar(np.arange(len(amplitudes)), 100 * amplitudes, color="#1f4e8c")
-    axes.set_ylim(0, 115 * float(amplitudes.max()))
-    axes.set_xlabel(name, fontsize=8)
-    axes.set_ylabel("amplitude (% of full scale)", fontsize=8)
-    axes.tick_params(labelsize=8)
+def _label(axes: Axes, x: str, y: str) -> None:
+    axes.set_xlabel(x, fontsize=LABEL_PT)
+    axes.set_ylabel(y, fontsize=LABEL_PT)
+    axes.tick_params(labelsize=TICK_PT)
+
+
+def _count(axis: Axis) -> None:
+    """Let an axis tick at whole numbers only."""
+    from matplotlib.ticker import MaxNLocator
+
+    axis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))

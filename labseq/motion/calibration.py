@@ -158,13 +158,14 @@ def standing_on_sites(grid: SiteGrid, offset_m: ArrayLike) -> SiteGrid:
 
     A tweezer that its tone should put at a position stands ``offset_m`` beside it; so
     the tone of the position that lies ``offset_m`` before the site puts it onto the site.
+    An axis of one site takes the mean step of the other axis.
 
     Args:
         grid: The grid, with the tones that put the tweezers beside the sites.
         offset_m: float64 (2,), how far beside: along a1 (along a row) and a2 (from row to row), in metres.
 
     Raises:
-        LimitError: There is an offset along an axis of one site, whose tone cannot tell how
+        LimitError: There is an offset on a grid of one site, whose tones cannot tell how
             frequency and position belong together; or a tone is not above 0 Hz.
 
     Example:
@@ -173,20 +174,24 @@ def standing_on_sites(grid: SiteGrid, offset_m: ArrayLike) -> SiteGrid:
         [-400000.0, -400000.0, -400000.0]
     """
     along_row_m, along_column_m = np.asarray(offset_m, np.float64)
+    row_hz, column_hz = grid.row_frequency_hz, grid.column_frequency_hz
     return replace(
         grid,
-        row_frequency_hz=_moved_back("row", grid.row_frequency_hz, grid.spacing_m, along_column_m),
-        column_frequency_hz=_moved_back("column", grid.column_frequency_hz, grid.spacing_m, along_row_m),
+        row_frequency_hz=_moved_back("row", row_hz, column_hz, grid.spacing_m, along_column_m),
+        column_frequency_hz=_moved_back("column", column_hz, row_hz, grid.spacing_m, along_row_m),
     )
 
 
-def _moved_back(name: str, site_hz: Floats, spacing_m: float, offset_m: float) -> Floats:
+def _moved_back(name: str, site_hz: Floats, other_hz: Floats, spacing_m: float, offset_m: float) -> Floats:
     if offset_m == 0:
         return site_hz
-    if len(site_hz) < 2:
+    if len(site_hz) < 2 and len(other_hz) < 2:
         raise LimitError(f"the offset of a single {name}", f"{offset_m} m", "0 m: one tone tells no slope")
     site_m = axis_positions_m(len(site_hz), spacing_m)
-    moved_hz = TableCalibration(site_m, site_hz).frequency_hz(site_m - offset_m)
+    if len(site_hz) < 2:
+        moved_hz = site_hz - offset_m * np.diff(other_hz).mean() / spacing_m
+    else:
+        moved_hz = TableCalibration(site_m, site_hz).frequency_hz(site_m - offset_m)
     if not np.all(moved_hz > 0):
         raise LimitError(f"the lowest {name} frequency", f"{moved_hz.min()} Hz", "above 0 Hz")
     return moved_hz

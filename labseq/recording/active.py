@@ -85,6 +85,18 @@ def died(roots: Sequence[Path], profile_key: str) -> Path | None:
     return None
 
 
+def in_progress(roots: Sequence[Path], profile_key: str) -> Path | None:
+    """The run, if there is one, that a living process here has in progress on a profile's hardware.
+
+    Returns:
+        Its folder, or the marker itself if that tells none.
+    """
+    for marker, owner, run_dir in _markers(roots, profile_key):
+        if owner is not None and not _is_gone(owner):
+            return run_dir or marker
+    return None
+
+
 def _mark(root: Path, profile_key: str, run_dir: Path) -> None:
     owner = Owner.current()
     marker = root / _FOLDER / f"{_stem(profile_key)}.{owner.pid}.json"

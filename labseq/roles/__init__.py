@@ -19,6 +19,7 @@ from labseq.roles.hardware import (
     KnownCamera,
     Lines,
     MobileTweezers,
+    SelfTesting,
     StaticTweezers,
     Trigger,
 )
@@ -50,6 +51,7 @@ __all__ = [
     "Planner",
     "RfSource",
     "RunObserver",
+    "SelfTesting",
     "Shot",
     "SignalTeller",
     "Simulation",

@@ -38,6 +38,19 @@ class Hardware(Protocol):
         ...
 
 
+@runtime_checkable
+class SelfTesting(Protocol):
+    """A device that can tell whether it works, for ``labseq devices``."""
+
+    def self_test(self) -> None:
+        """Check what can be checked without harm: no light, nothing that moves; the device is open.
+
+        Raises:
+            DeviceError: With what is wrong.
+        """
+        ...
+
+
 class Camera(Hardware, Protocol):
     """Takes frames."""
 

@@ -98,9 +98,9 @@ class EqualiseStep:
         try:
             power = np.asarray(answer, np.float64)
         except (TypeError, ValueError):
-            power = np.empty(0)
+            power = np.array(np.nan)
         if power.shape != shot.grid.shape:
-            came = np.shape(answer) if power.size else type(answer).__name__
+            came = power.shape if power.ndim else type(answer).__name__
             text = f"its value '{value}' is {came}; expected the power of each of {shot.grid.shape} tweezers"
             raise DeviceError(name, text)
         return power

@@ -92,7 +92,11 @@ class CheckSitesStep:
                     "detector", limit_s, measure_shift, image, sites_px, settings.spot_px
                 )
         if not error <= settings.limit_px:
-            _warn(shot, "check_sites saw too few atoms to tell where the sites are")
+            _warn(
+                shot,
+                f"check_sites cannot tell where the sites are with {len(sites_px)} atoms seen on them: "
+                "few were loaded, or the sites are far from where the detector looks",
+            )
             return
         for name, value in (("shift_y_px", dy), ("shift_x_px", dx), ("shift_error_px", error)):
             shot.note(f"sites.{name}", value)

@@ -2,6 +2,7 @@
 
 from labseq.session.assembly import Assembly, Bench, assemble, load_plugins, set_up_bench
 from labseq.session.checking import CheckReport, check
+from labseq.session.devices import CheckedDevice, DevicesReport, check_devices
 from labseq.session.occupancies import Source, read_source
 from labseq.session.options import Options
 from labseq.session.plan_inputs import PlanRequest
@@ -14,6 +15,8 @@ __all__ = [
     "Assembly",
     "Bench",
     "CheckReport",
+    "CheckedDevice",
+    "DevicesReport",
     "Options",
     "PlanRequest",
     "PlannedMoves",
@@ -22,6 +25,7 @@ __all__ = [
     "Source",
     "assemble",
     "check",
+    "check_devices",
     "gather_provenance",
     "load_plugins",
     "make_profile_safe",

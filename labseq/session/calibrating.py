@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from shlex import quote
 from typing import Any, Final, Literal
 
 from labseq.calibrations import Store, Stored, check_grid
@@ -155,21 +156,33 @@ def _chosen(document: Document, profile: ProfileSpec, store: Store, kind: Calibr
     except ConfigError as error:
         where = document.problem(("calibrations", "use", kind), "").source
         note = (
-            f"it is in use as the calibration '{kind}'; 'labseq calibration use {kind}=off' puts it aside"
+            f"it is in use as the calibration '{kind}'; "
+            f"'labseq calibration use {kind}=off --profile {quote(document.name)}' puts it aside"
             if pin is None
             else f"asked for by the key 'calibrations.use.{kind}' of {where or document.name}"
         )
         raise ConfigError([replace(one, notes=(*one.notes, note)) for one in error.problems]) from error
 
 
+def why_left_out(entry: CalibrationEntry, entries: Mapping[str, CalibrationEntry]) -> str:
+    """Why runs would leave out a calibration although it is in use; "" if they would not.
+
+    Args:
+        entry: The calibration.
+        entries: Kind -> those that count beside it.
+    """
+    if entry.kind != "overlay" or _stands_on(entry, entries):
+        return ""
+    return "it was measured with other frequencies of the mobile tweezers"
+
+
 def _dropped(entries: dict[str, CalibrationEntry]) -> list[str]:
     """Leave out an overlay that was measured with other frequencies: their tones hold it already, or not."""
     overlay = entries.get("overlay")
-    if overlay is None or _stands_on(overlay, entries):
+    if overlay is None or not (reason := why_left_out(overlay, entries)):
         return []
     del entries["overlay"]
-    what = f"calibration overlay {overlay.id} was measured with other frequencies of the mobile tweezers"
-    return [f"{what} and is not used; measure it again"]
+    return [f"calibration overlay {overlay.id} is not used: {reason}; measure it again"]
 
 
 def _doubtful(entries: Mapping[str, CalibrationEntry], detector: Mapping[str, Any]) -> list[str]:

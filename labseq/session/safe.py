@@ -6,12 +6,12 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from labseq.config import Collected, load_profile, plugin_paths, profile_overrides
 from labseq.errors import ConfigError, LabseqError, RecordingError, StopRequested
 from labseq.recording import clear_active, data_root, marker_roots
-from labseq.roles import Hardware, RunObserver, Simulation
+from labseq.roles import Clock, Hardware, RunObserver, Simulation
 from labseq.sequencer import Guard, RealClock, StopFlag, VirtualClock
 from labseq.sequencer.lab import Timeouts, in_safe_order
 from labseq.session.assembly import choose_all, load_plugins
@@ -66,9 +66,10 @@ def secure(
     if simulation is not None:
         guard.call_to_the_end("simulation", timeouts.call_s, simulation.open)
     for name, device in devices:
-        opened = _try(guard, name, timeouts.call_s, device.open)
-        safe = _try(guard, name, timeouts.safe_state_s, device.safe_state)  # perhaps even if it did not open
-        closed = _try(guard, name, timeouts.safe_state_s, device.close)
+        opened = attempt(guard, name, timeouts.call_s, device.open)
+        # Perhaps it can be made safe even if it did not open.
+        safe = attempt(guard, name, timeouts.safe_state_s, device.safe_state)
+        closed = attempt(guard, name, timeouts.safe_state_s, device.close)
         outcome[name] = opened or safe
         if observer is not None:
             for event, failure in (("safe_state", outcome[name]), ("closed", closed)):
@@ -79,12 +80,36 @@ def secure(
     return outcome
 
 
-def _try(guard: Guard, name: str, timeout_s: float, method: Callable[[], None]) -> LabseqError | None:
+def attempt(guard: Guard, name: str, timeout_s: float, method: Callable[[], None]) -> LabseqError | None:
+    """Call a device to the end, stop request or not; returns why it failed, or None."""
     try:
         guard.call_to_the_end(name, timeout_s, method)
     except LabseqError as failure:
         return failure
     return None
+
+
+def construct_hardware(bench: Bench, clock: Clock) -> tuple[dict[str, Any], dict[str, LabseqError]]:
+    """Construct the devices of a profile, and the simulation if there is one; nothing is opened.
+
+    Args:
+        bench: The profile.
+        clock: What they keep to.
+
+    Returns:
+        Role or device name -> object, and -> why it could not be constructed, with its place.
+    """
+    chosen = {role: c for role, c in bench.chosen.items() if c.entry.kind in _NEEDED_KINDS}
+    made, _, failures = construct_each(
+        chosen,
+        bench.grid,
+        bench.profile.motion,
+        clock,
+        seed=0,
+        calibrations=bench.calibrations,
+        world_grid=bench.profile.grid_model(),
+    )
+    return made, {role: chosen[role].placed(error) for role, error in failures.items()}
 
 
 def secure_bench(bench: Bench, stop: StopFlag, observer: RunObserver | None = None) -> Secured:
@@ -98,21 +123,12 @@ def secure_bench(bench: Bench, stop: StopFlag, observer: RunObserver | None = No
         observer: Told each device's outcome.
     """
     clock = VirtualClock(stop) if bench.virtual_time else RealClock(stop)
-    chosen = {role: c for role, c in bench.chosen.items() if c.entry.kind in _NEEDED_KINDS}
-    made, _, failures = construct_each(
-        chosen,
-        bench.grid,
-        bench.profile.motion,
-        clock,
-        seed=0,
-        calibrations=bench.calibrations,
-        world_grid=bench.profile.grid_model(),
-    )
+    made, failures = construct_hardware(bench, clock)
     simulation = made.pop("simulation", None)
     with stop.held():
         tried = secure(in_safe_order(made), timeouts_of(bench.profile), simulation, observer)
     refused: dict[str, LabseqError] = {role: e for role, e in bench.refused.items() if role != "detector"}
-    refused |= {role: chosen[role].placed(error) for role, error in failures.items()}
+    refused |= failures
     if observer is not None:
         for role, error in refused.items():
             observer.event("safe_state", {"device": role, "ok": False, "error": str(error)})

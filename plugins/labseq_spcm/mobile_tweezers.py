@@ -25,6 +25,7 @@ from labseq_spcm.fifo import Fifo
 from labseq_spcm.library import load_spcm
 from labseq_spcm.replay import Replay
 from labseq_spcm.safety import make_safe
+from labseq_spcm.self_test import check_card
 from labseq_spcm.settings import SIMULATED, SpcmSettings
 from labseq_spcm.setup import output_registers, set_up
 
@@ -255,6 +256,17 @@ class SpcmMobileTweezers:
         if card is None:
             return
         make_safe(card, self._amplitude_mv, mode.give_up if mode is not None else lambda: None)
+
+    def self_test(self) -> None:
+        """See whether the card is cool, and its clock and memory are right; the prepared program is dropped.
+
+        Raises:
+            DeviceError: Not open, still playing, or something is wrong.
+        """
+        card, _ = self._opened()
+        self._check_idle("self_test()")
+        self._duration_s = None
+        check_card(card, self._settings, self._facts["sample_rate_hz"])
 
     def describe(self) -> Mapping[str, Any]:
         """Settings; once opened, also the card and every value that it read back."""

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import importlib
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, Final
 
 from labseq import (
     CameraFacts,
@@ -20,6 +21,8 @@ from labseq import (
 from labseq.units import format_quantity
 from labseq_virtual.driver import VirtualDriver
 from labseq_virtual.settings import CameraSettings
+
+TEST_EXPOSURE_S: Final = 10e-3
 
 
 class VirtualCamera(VirtualDriver):
@@ -47,6 +50,10 @@ class VirtualCamera(VirtualDriver):
         shape = getattr(self._world, "frame_shape", None)
         readout_s = self._settings.readout * getattr(self._world, "readout_fraction", 1.0)
         return CameraFacts(readout_s, self._settings.max_exposure, shape)
+
+    def warm(self) -> None:
+        """Compile the kernels of the simulated frames, or load them from the cache."""
+        importlib.import_module("labseq_virtual._kernels_image")
 
     def arm(self, n_frames: int, exposure_s: float, trigger: Trigger) -> None:
         """Get ready for a series of exposures; frames not yet read are dropped.
@@ -121,6 +128,20 @@ class VirtualCamera(VirtualDriver):
         self._frames.clear()
         self._n_triggers_left = 0
         self._exposing_until_s = 0.0
+
+    def self_test(self) -> None:
+        """Take a frame; those not yet read are dropped.
+
+        Raises:
+            DeviceError: Not open, no frame came, or it has another shape than the camera says.
+            TransientError: The frame was lost (a failure to rehearse).
+        """
+        exposure_s = min(TEST_EXPOSURE_S, self._settings.max_exposure)
+        self.arm(1, exposure_s, "software")
+        self.trigger()
+        shape, told = self.read(exposure_s + self.facts.readout_s + 1.0).image.shape, self.facts.frame_shape
+        if told is not None and shape != told:
+            raise DeviceError(self._name, f"a frame has the shape {shape}; expected {told}")
 
     def describe(self) -> Mapping[str, Any]:
         """Model and settings."""

@@ -79,7 +79,7 @@ def merging_distance(static_waist_m: float, mobile_waist_m: float) -> tuple[Floa
         distances, float64 (n,), in metres.
     """
     log_ratio = np.linspace(math.log(0.3), math.log(30.0), 24)
-    distance = np.linspace(0.0, 3.5, 176)[1:] * static_waist_m
+    distance = np.linspace(0.0, 3.5, 176)[1:] * max(static_waist_m, mobile_waist_m)
     x = np.linspace(0.0, 1.0, 401)[1:] * distance[:, None]  # (n_distances, n_places)
     back = x * np.exp(-2 * x**2 / static_waist_m**2) / static_waist_m**2
     left = distance[:, None] - x
@@ -88,7 +88,8 @@ def merging_distance(static_waist_m: float, mobile_waist_m: float) -> tuple[Floa
     for k, ratio in enumerate(np.exp(log_ratio)):
         forward = ratio * on > back
         n_minima = np.count_nonzero(forward[:, :-1] & ~forward[:, 1:], axis=1) + ~forward[:, 0]
-        merged[k] = distance[max(0, int(np.argmax(n_minima > 1)) - 1)]
+        parted = np.append(n_minima > 1, True)  # beyond the table at the latest
+        merged[k] = distance[max(0, int(np.argmax(parted)) - 1)]
     return log_ratio, merged
 
 

@@ -31,12 +31,13 @@ class VirtualMobileTweezers(VirtualDriver):
 
     Args:
         settings: The limits.
-        context: Clock and the simulated world.
+        context: Grid, clock and the simulated world.
     """
 
     def __init__(self, settings: MobileTweezersSettings, context: Context) -> None:
         super().__init__(context, "mobile_tweezers")
         self._settings = settings
+        self._grid = context.grid
         self._prepared: ToneProgram | None = None
         self._playing_until_s: float | None = None
 
@@ -101,9 +102,28 @@ class VirtualMobileTweezers(VirtualDriver):
             self._playing_until_s = None
             self._world.play("mobile_tweezers", SILENCE, self._clock.now())
 
+    def self_test(self) -> None:
+        """See whether the tones of all sites are in the AOD's band; nothing is played.
+
+        Raises:
+            DeviceError: Not open, or a site is out of reach.
+        """
+        self._check_open()
+        low, high = self._band_hz
+        tones = (("row", self._grid.row_frequency_hz), ("column", self._grid.column_frequency_hz))
+        for axis, hz in tones:
+            for line, value in _first_outside(hz[:, np.newaxis], low, high):
+                text = f"{axis} {line} is out of reach: its tone of {value / 1e6:.6g} MHz is not in the band"
+                raise DeviceError(self._name, f"{text} of {low / 1e6:.6g} to {high / 1e6:.6g} MHz")
+
     def describe(self) -> Mapping[str, Any]:
         """Model and settings."""
         return {"model": "virtual mobile tweezers", **self._settings.model_dump(mode="json")}
+
+    @property
+    def _band_hz(self) -> tuple[float, float]:
+        centre, reach = self._settings.band_centre, self._settings.band_half_width
+        return centre - reach, centre + reach
 
     def _check_idle(self, call: str) -> None:
         if self._playing_until_s is not None and self._clock.now() < self._playing_until_s - 1e-9:
@@ -120,8 +140,7 @@ class VirtualMobileTweezers(VirtualDriver):
             raise LimitError(f"{self._name}: length of the program", "0 s", "more than 0 s")
 
     def _check_axis(self, axis: str, tones: AxisTones, program: ToneProgram) -> None:
-        low = self._settings.band_centre - self._settings.band_half_width
-        high = self._settings.band_centre + self._settings.band_half_width
+        low, high = self._band_hz
         hz = np.stack([tones.start_hz, tones.end_hz], axis=1)
         for tone, value in _first_outside(hz, low, high):
             raise LimitError(

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq import Context, DepthRamp, LimitError, TweezerAmplitudes
+from labseq import Context, DepthRamp, DeviceError, LimitError, TweezerAmplitudes
 from labseq_virtual.driver import VirtualDriver
 from labseq_virtual.settings import StaticTweezersSettings
 
@@ -41,9 +41,7 @@ class VirtualStaticTweezers(VirtualDriver):
         """
         self._check_open()
         if amplitudes is not None:
-            rows, cols = amplitudes
-            self._check_axis("row", rows, self._grid.n_rows)
-            self._check_axis("column", cols, self._grid.n_cols)
+            self._check(amplitudes)
         self._amplitudes = amplitudes
         rows, cols = self._calibrated if amplitudes is None else amplitudes
         self._world.play("static_tweezers", TweezerAmplitudes(rows, cols), self._clock.now())
@@ -77,6 +75,18 @@ class VirtualStaticTweezers(VirtualDriver):
         if self._depth > 0.0:
             self._play(0.0, 0.0)
 
+    def self_test(self) -> None:
+        """See whether the array can have the calibrated amplitudes; no light goes on.
+
+        Raises:
+            DeviceError: Not open, or it cannot.
+        """
+        self._check_open()
+        try:
+            self._check(self._calibrated)
+        except LimitError as error:
+            raise DeviceError(self._name, f"it cannot have the calibrated amplitudes: {error}") from error
+
     def describe(self) -> Mapping[str, Any]:
         """Model, settings, depth and amplitudes in force."""
         tones = self._amplitudes
@@ -93,6 +103,11 @@ class VirtualStaticTweezers(VirtualDriver):
     def _play(self, depth: float, duration_s: float) -> None:
         start, self._depth = self._depth, depth
         self._world.play("static_tweezers", DepthRamp(start, depth, duration_s), self._clock.now())
+
+    def _check(self, amplitudes: Amplitudes) -> None:
+        rows, cols = amplitudes
+        self._check_axis("row", rows, self._grid.n_rows)
+        self._check_axis("column", cols, self._grid.n_cols)
 
     def _check_axis(self, axis: str, amplitudes: NDArray[np.float64], n_tones: int) -> None:
         if amplitudes.shape != (n_tones,):

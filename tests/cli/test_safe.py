@@ -50,7 +50,9 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 MOBILE, SHUTTER, CAMERA, STATIC = (
     f"{device:<20} safe" for device in ("mobile_tweezers", "shutter", "camera", "static_tweezers")
 )
-NO_CAMERA = "camera               NOT SAFE: p.yaml:4:15: unknown camera 'ixon'; expected 'virtual'"
+NO_CAMERA = (
+    "camera               NOT SAFE: p.yaml:4:15: unknown camera 'ixon'; expected one of 'frames', 'virtual'"
+)
 JAM = "shutter              NOT SAFE: shutter: safe_state() raised OSError: jammed"
 TO_IXON = {"camera: {use: virtual": "camera: {use: ixon"}
 TO_JAMMED = {"shutter: {use: virtual": "shutter: {use: jammed"}

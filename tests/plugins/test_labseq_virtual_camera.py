@@ -8,7 +8,15 @@ import pytest
 from labseq_virtual.camera import VirtualCamera
 from labseq_virtual.settings import CameraSettings
 
-from labseq import Context, DeviceError, DeviceTimeoutError, LimitError, RandomStream, TransientError
+from labseq import (
+    Context,
+    DeviceError,
+    DeviceTimeoutError,
+    LimitError,
+    RandomStream,
+    SelfTesting,
+    TransientError,
+)
 from labseq.testing.fakes import FakeClock, RecordingSimulation
 
 
@@ -123,3 +131,20 @@ def test_a_missed_trigger_ends_in_a_timeout_and_leaves_the_atoms_in_the_dark() -
     with pytest.raises(DeviceTimeoutError):
         deaf.camera.read(1.0)
     assert deaf.world.calls.names() == []
+
+
+def test_the_self_test_takes_a_frame_and_leaves_none(lab: Lab) -> None:
+    assert isinstance(lab.camera, SelfTesting)
+    lab.camera.self_test()
+    assert lab.clock.now() == pytest.approx(15e-3)
+    lab.camera.arm(1, 10e-3, "software")
+    with pytest.raises(DeviceTimeoutError, match="was not triggered"):
+        lab.camera.read(0.1)
+
+
+@pytest.mark.parametrize(
+    ("fault", "error"), [("missed_trigger", DeviceTimeoutError), ("transient", TransientError)]
+)
+def test_the_self_test_tells_when_no_frame_comes(fault: str, error: type[Exception]) -> None:
+    with pytest.raises(error, match="frame"):
+        Lab(faults={fault: 1.0}).camera.self_test()

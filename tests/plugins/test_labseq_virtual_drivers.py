@@ -246,3 +246,38 @@ def test_closing_makes_safe(lab: Lab) -> None:
 def test_virtual_hardware_needs_a_world(driver: Any) -> None:
     with pytest.raises(ConfigError, match=r"simulation: \{use: virtual\}"):
         driver(object(), Context("camera"))
+
+
+def test_the_self_tests_of_the_tweezers_pass_and_change_nothing(lab: Lab) -> None:
+    for device in (lab.static, lab.mobile):
+        before = device.describe()
+        device.self_test()
+        assert device.describe() == before
+    assert lab.n_atoms == 6
+
+
+def test_self_tests_need_an_open_device(lab: Lab) -> None:
+    for device in (lab.static, lab.mobile, lab.camera):
+        device.close()
+        with pytest.raises(DeviceError, match="not open"):
+            device.self_test()
+
+
+def test_the_static_tweezers_tell_amplitudes_that_they_cannot_have(lab: Lab) -> None:
+    settings = StaticTweezersSettings(max_amplitude_sum=0.5)
+    static = VirtualStaticTweezers(settings, lab.context("static_tweezers"))
+    static.open()
+    with pytest.raises(
+        DeviceError, match=r"cannot have the calibrated amplitudes: .* is 1; the limit is 0\.5"
+    ):
+        static.self_test()
+
+
+def test_the_mobile_tweezers_tell_a_site_that_is_out_of_reach(lab: Lab) -> None:
+    settings = MobileTweezersSettings(band_half_width=1e6)
+    mobile = VirtualMobileTweezers(settings, lab.context("mobile_tweezers"))
+    mobile.open()
+    with pytest.raises(
+        DeviceError, match=r"column 0 is out of reach: its tone of .* is not in the band of 99 to"
+    ):
+        mobile.self_test()

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from labseq.errors import RecordingError
-from labseq.recording import clear_active, died, mark_active, marker_roots
+from labseq.recording import clear_active, died, in_progress, mark_active, marker_roots
 
 MARK = """
 import sys
@@ -130,3 +130,11 @@ def test_a_marker_that_cannot_be_removed_keeps_no_other(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="data"):
         clear_active(roots, "lab")
     assert list((roots[1] / ".active").iterdir()) == []
+
+
+def test_a_run_of_a_living_process_is_in_progress(tmp_path: Path) -> None:
+    mark_in_a_process_that_ends(tmp_path, "lab", tmp_path / "dead")
+    assert in_progress([tmp_path], "lab") is None
+    mark_active([tmp_path], "lab", tmp_path / "run")
+    assert in_progress([tmp_path], "lab") == tmp_path / "run"
+    assert in_progress([tmp_path], "virtual") is None

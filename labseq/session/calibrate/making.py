@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 
 import labseq
-from labseq.calibrations import Difference, Store, Stored, compare
+from labseq.calibrations import Difference, Store, Stored, compare, grid_text
 from labseq.config import Override, ProfileSpec, load_profile, split_overrides
 from labseq.config.calibrations import OFF
 from labseq.config.wording import clean
@@ -23,8 +23,9 @@ from labseq.recording import Run, open_run
 from labseq.roles import RunObserver
 from labseq.session.assembly import set_up_bench
 from labseq.session.calibrate.method import Evidence, Finding, Method
-from labseq.session.calibrating import store_of
+from labseq.session.calibrating import store_of, why_left_out
 from labseq.session.choosing import Bench, DryRun
+from labseq.session.plan_inputs import recorded_machine
 from labseq.session.session import Session
 
 PICTURE_DPI: Final = 110
@@ -112,7 +113,7 @@ def calibrate(method: Method, request: CalibrationRequest, observer: RunObserver
     store = store_of(document, spec, request.dry_run)
     before, (picture, warnings) = _in_use(store, entry), _picture(finding)
     stored = store.add(entry, picture)
-    refused = "" if request.force else store.why_worse(entry)
+    refused = "" if request.force else why_left_out(entry, bench.calibrations) or store.why_worse(entry)
     if not refused:
         store.use(stored, bench.grid, force=True)
         warnings += _put_aside(store, entry)
@@ -170,6 +171,10 @@ def _open(source: Path, request: CalibrationRequest, bench: Bench) -> Run:
         came = " x ".join(map(str, run.target.shape))
         expected = f"{bench.grid.n_rows} x {bench.grid.n_cols}, as in the profile"
         raise ConfigError(Problem(f"the run has a grid of {came} sites", str(source), expected=expected))
+    taken_on = grid_facts(recorded_machine(run.record["resolved"]["profile"], "the profile of the run").grid)
+    if not same_grid(taken_on, own := grid_facts(bench.grid)):
+        what = f"the run has a grid of {grid_text(taken_on)}"
+        raise ConfigError(Problem(what, str(source), expected=f"{grid_text(own)}, as in the profile"))
     if run.simulated != (request.dry_run != "off" or bench.virtual_time):
         what = f"the run was {'simulated' if run.simulated else 'taken with real devices'}"
         expected = (
@@ -185,7 +190,8 @@ def _aside(folder: Path, spec: ProfileSpec, method: Method) -> str:
     pins = {kind: spec.calibrations.use.of(kind) for kind in CALIBRATION_KINDS}
     use = {kind: OFF if kind in method.aside else pin for kind, pin in pins.items()}
     chosen = {kind: pin for kind, pin in use.items() if pin is not None}
-    return f"profile.calibrations={json.dumps({'folder': str(folder.resolve()), 'use': chosen})}"
+    text = json.dumps({"folder": str(folder.resolve()), "use": chosen}, ensure_ascii=False)
+    return f"profile.calibrations={text}"
 
 
 def _of_profile(overrides: Sequence[str]) -> list[Override]:

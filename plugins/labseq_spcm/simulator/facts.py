@@ -29,6 +29,7 @@ class CardModel:
         relay_s: How long the output is off when the path changes.
         bus_bytes_per_s: Transfer from the PC; PCIe x8 Gen 2.
         n_dds_cores: DDS cores on the chip; that a 6631 has 23 is not measured.
+        temperature_c: What its sensors read, in degrees Celsius (ours).
         dds_queue: Commands that the DDS queue holds (an M4i.9622 reads 4098).
     """
 
@@ -43,6 +44,7 @@ class CardModel:
     relay_s: float = 10e-3
     bus_bytes_per_s: float = 2.8e9
     n_dds_cores: int = 23
+    temperature_c: int = 45
     dds_queue: int = 4096
 
 

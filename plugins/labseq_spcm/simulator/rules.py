@@ -275,6 +275,8 @@ def _fixed(model: CardModel) -> dict[int, Number]:
         r.SPC_MIINST_ISDEMOCARD: 0,
         r.SPC_READAOGAINMIN: model.amplitude_mv[0],
         r.SPC_READAOGAINMAX: model.amplitude_mv[1],
+        r.SPC_MON_TC_BASE_CTRL: model.temperature_c,
+        r.SPC_MON_TC_MODULE_0: model.temperature_c,
         r.SPC_AVAILCARDMODES: sum(_MODES),
         r.SPC_AVAILMEMSIZE_MIN: facts.MEMORY_STEP,
         r.SPC_AVAILMEMSIZE_MAX: model.memory_samples,
