@@ -55,7 +55,7 @@ def store_of(
     """
     folder = profile.calibrations.folder or document.path.parent / FOLDER / document.path.stem
     choices = [profile.camera, profile.static_tweezers, profile.mobile_tweezers, *profile.devices.values()]
-    is_other = dry_run != "off" and any(choice.use != VIRTUAL_TWIN for choice in choices)
+    is_other = dry_run != "off" and any(not choice.use.startswith(VIRTUAL_TWIN) for choice in choices)
     return Store(Path(folder) / DRY_RUN_FOLDER if is_other else Path(folder))
 
 

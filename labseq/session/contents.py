@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, Final
 
 from labseq.config import Collected, Document, SequenceSpec, StepSpec
 from labseq.config.settings import Settings
@@ -12,6 +12,9 @@ from labseq.model import TargetPattern
 from labseq.roles import Step
 from labseq.session.choosing import Bench, blamed, dump, named, resolve, validate
 from labseq.session.constructing import check_role, construct_target
+
+DEVICE_KEYS: Final = {"device": "name", "equalise": "device"}
+"""Steps that need a device of the profile -> the setting that names it."""
 
 
 def make_target(
@@ -71,7 +74,7 @@ def make_step(bench: Bench, document: Document, spec: StepSpec) -> tuple[Step, d
     """
     entry = named(bench.host, document, "step", spec.kind, spec.loc, key=True)
     settings = validate(document, entry, spec.loc)
-    if spec.kind == "device":
+    if spec.kind in DEVICE_KEYS:
         _check_device_name(bench, document, settings, spec)
     try:
         with blamed(entry, f"the constructor of step '{spec.kind}'"):
@@ -83,10 +86,11 @@ def make_step(bench: Bench, document: Document, spec: StepSpec) -> tuple[Step, d
 
 
 def _check_device_name(bench: Bench, document: Document, settings: Settings | None, spec: StepSpec) -> None:
-    name = getattr(settings, "name", None)
+    key = DEVICE_KEYS[spec.kind]
+    name = getattr(settings, key, None)
     if name not in bench.profile.devices:
         what = f"the profile '{bench.profile.name}' has no device '{name}'"
-        problem = document.problem((*spec.loc, "name"), what, one_of(sorted(bench.profile.devices)))
+        problem = document.problem((*spec.loc, key), what, one_of(sorted(bench.profile.devices)))
         raise ConfigError(replace(problem, notes=(_place(bench.document, "devices"),)))
 
 

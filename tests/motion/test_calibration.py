@@ -153,9 +153,15 @@ def test_without_an_offset_the_tones_stay_as_they_are() -> None:
     assert np.all(moved.column_frequency_hz < grid.column_frequency_hz)
 
 
-def test_a_single_row_tells_no_slope_to_move_it_by() -> None:
+def test_a_single_row_is_moved_by_the_step_of_the_columns() -> None:
+    grid = SiteGrid(1, 4, SPACING_M)
+    (moved_hz,) = standing_on_sites(grid, [0.0, 1e-6]).row_frequency_hz - grid.row_frequency_hz
+    assert moved_hz == pytest.approx(-1e-6 * np.diff(grid.column_frequency_hz).mean() / SPACING_M)
+
+
+def test_a_single_site_tells_no_slope_to_move_it_by() -> None:
     with pytest.raises(LimitError, match="the offset of a single row is 1e-06 m"):
-        standing_on_sites(SiteGrid(1, 4), [0.0, 1e-6])
+        standing_on_sites(SiteGrid(1, 1), [0.0, 1e-6])
 
 
 def test_tones_are_not_moved_below_zero() -> None:

@@ -5,6 +5,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, ClassVar
 
+import numpy as np
 import pytest
 from labseq_psca.planner import PscaPlanner, PscaSettings
 from labseq_virtual.camera import VirtualCamera
@@ -26,6 +27,7 @@ from labseq.config.steps import (
     CheckOverlaySettings,
     CheckSitesSettings,
     DeviceSettings as DeviceStepSettings,
+    EqualiseSettings,
     ImageSettings,
     LoadSettings,
     ProbeSettings,
@@ -34,6 +36,7 @@ from labseq.config.steps import (
 )
 from labseq.imaging import ThresholdDetector
 from labseq.model import SiteGrid
+from labseq.sequencer.equalise import EqualiseStep
 from labseq.sequencer.probe import ProbeStep
 from labseq.sequencer.rearrange import RearrangeStep
 from labseq.sequencer.steps import DeviceStep, ImageStep, LoadStep, WaitStep
@@ -179,6 +182,17 @@ class TestCheckOverlay(StepContract):
     @pytest.fixture
     def factory(self) -> Factory:
         return partial(CheckOverlayStep, CheckOverlaySettings())
+
+
+class TestEqualise(StepContract):
+    def lab(self) -> FakeLab:
+        lab = fake_lab(devices=("trap_camera",), simulated=True)
+        vars(lab.devices["trap_camera"])["read"] = lambda _name: np.ones((4, 4))
+        return lab
+
+    @pytest.fixture
+    def factory(self) -> Factory:
+        return partial(EqualiseStep, EqualiseSettings())
 
 
 class TestWait(StepContract):

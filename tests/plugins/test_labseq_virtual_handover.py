@@ -46,6 +46,15 @@ def test_wells_merge_where_the_middle_minimum_vanishes(ratio: float, side: int) 
     assert n_minima == (1 if side < 0 else 2)
 
 
+@pytest.mark.parametrize("mobile_waists", [1.0, 1.5, 2.5, 3.5])
+def test_the_deeper_and_the_wider_the_mobile_well_the_further_it_reaches(mobile_waists: float) -> None:
+    log_ratio, merged_m = merging_distance(WAIST_M, mobile_waists * WAIST_M)
+    reach_m = merged_m[log_ratio > math.log(2 * mobile_waists**2)]
+    assert np.all(np.diff(reach_m) >= 0)
+    assert len(reach_m) > 0
+    assert np.all(reach_m > 0.9 * mobile_waists * WAIST_M)
+
+
 def test_equal_wells_merge_at_two_standard_deviations() -> None:
     log_ratio, merged_m = merging_distance(WAIST_M, WAIST_M)
     assert np.interp(0.0, log_ratio, merged_m) == pytest.approx(WAIST_M, rel=0.03)

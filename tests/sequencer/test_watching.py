@@ -229,7 +229,10 @@ def test_too_few_atoms_are_no_drift(n_atoms: int) -> None:
     occupied.flat[: 7 * n_atoms : 7] = True
     shots, observer = sites_run((0.9, 0.0), occupied, exceeded="stop")
     (warning,) = observer.of("warning")
-    assert warning["text"] == "shot 1: check_sites saw too few atoms to tell where the sites are"
+    assert warning["text"] == (
+        f"shot 1: check_sites cannot tell where the sites are with {n_atoms} atoms seen on them: "
+        "few were loaded, or the sites are far from where the detector looks"
+    )
     assert "sites.shift_y_px" not in shots[0].readings
 
 

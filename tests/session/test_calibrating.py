@@ -97,7 +97,10 @@ def test_an_overlay_of_other_frequencies_is_left_out_with_a_warning(bench: Bench
     bench.use("frequencies")
     assembly = bench.session().assembly
     assert {*assembly.bench.calibrations} == {"frequencies"}
-    assert f"calibration overlay {overlay.id} was measured with other frequencies" in assembly.warnings[0]
+    assert (
+        f"calibration overlay {overlay.id} is not used: it was measured with other frequencies"
+        in assembly.warnings[0]
+    )
     assert np.array_equal(assembly.bench.grid.column_frequency_hz, GRID.column_frequency_hz)
 
 
@@ -175,7 +178,8 @@ def test_a_damaged_one_that_is_in_use_is_refused(bench: Bench, kind: Calibration
         bench.session()
     (problem,) = caught.value.problems
     assert problem.source == str(path)
-    assert f"'labseq calibration use {kind}=off' puts it aside" in problem.notes[0]
+    assert f"'labseq calibration use {kind}=off --profile " in problem.notes[0]
+    assert "bench.yaml' puts it aside" in problem.notes[0]
 
 
 def test_a_damaged_note_of_what_is_in_use_is_told_once(bench: Bench) -> None:

@@ -47,7 +47,8 @@ class TweezersMethod:
             "noise": float(found["noise"]),
             "n_measured": float(found["n_measured"]),
         }
-        work = f"{len(found['spreads'])} rounds, {found['n_measured']} measurements"
+        n_rounds = len(found["spreads"])
+        work = f"{n_rounds} round{'s' * (n_rounds > 1)}, {found['n_measured']} measurements"
         even = f"{quality['separable_spread']:.2%} (before: {found['spreads'][0]:.2%})"
         told = (
             f"{work}: rows and columns are even to {even}",

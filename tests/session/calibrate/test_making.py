@@ -230,6 +230,20 @@ def test_a_run_of_another_lab_is_refused(lab: Lab, tmp_path: Path) -> None:
     assert outcome.stored.path.parent == lab.store.folder / "dry-run"
 
 
+def test_a_run_on_another_lattice_is_refused(lab: Lab) -> None:
+    run = lab.calibrate("sites", shots=10).run
+    assert run is not None
+    lab.profile.write_text(PROFILE.replace("4.49 um}", "4.49 um, shear: -1}"), "utf-8")
+    with pytest.raises(ConfigError, match=r"grid of 6 x 6 sites.*shear \+1; expected 6 x 6 .*shear -1"):
+        lab.calibrate("sites", source=run.path)
+
+
+def test_any_name_of_a_folder_will_do(tmp_path: Path) -> None:
+    folder = tmp_path / "Prüfung \U0001f600 = #1"
+    folder.mkdir()
+    assert Lab(folder).calibrate("sites").stored.path.is_file()
+
+
 def test_a_run_without_frames_is_refused(lab: Lab) -> None:
     with pytest.raises(ConfigError, match="the first image of shot 1 was not kept"):
         lab.calibrate("sites", shots=1, overrides=["record_frames=none"])

@@ -65,7 +65,8 @@ def test_a_hidden_offset_is_found_and_undone(lab: Lab) -> None:
 
 
 def test_frequencies_hold_the_offset_and_put_the_overlay_aside(lab: Lab) -> None:
-    overlay = lab.calibrate("overlay", shots=N_POINTS).stored.entry
+    first = lab.calibrate("overlay", shots=N_POINTS)
+    overlay, run = first.stored.entry, first.run
     outcome = lab.calibrate("frequencies", seed=2, shots=2 * N_POINTS)
     entry = outcome.stored.entry
     assert entry.origin["calibrations"] == {"overlay": overlay.id}
@@ -82,6 +83,10 @@ def test_frequencies_hold_the_offset_and_put_the_overlay_aside(lab: Lab) -> None
         moved_m = (own_hz - hz) / step_hz_per_m
         assert moved_m.mean() == pytest.approx(hidden_m, abs=100e-9)
         assert moved_m == pytest.approx(np.full(8, hidden_m), abs=150e-9)
+    assert run is not None
+    old = lab.calibrate("overlay", source=run.path)
+    assert old.refused == "it was measured with other frequencies of the mobile tweezers"
+    assert {*lab.store.active()} == {"frequencies"}
     left = lab.calibrate("overlay", seed=3, shots=N_POINTS).stored.entry
     assert left.origin["calibrations"] == {"frequencies": entry.id}
     assert left.values["offset_m"] == pytest.approx([0.0, 0.0], abs=100e-9)
@@ -109,5 +114,5 @@ def test_a_run_without_a_probe_is_refused(lab: Lab) -> None:
 def test_every_sequence_can_be_run_on_every_profile_with_virtual_devices(method: Any) -> None:
     assembly = assemble(method.sequence, profile="virtual")
     assert assembly.sequence.name == f"calibrate-{method.kind}"
-    assert assembly.sequence.record_frames == "all"
+    assert assembly.sequence.record_frames == ("none" if method.kind == "tweezers" else "all")
     assert not assembly.warnings
