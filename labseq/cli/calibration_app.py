@@ -106,7 +106,7 @@ def calibrate(
         str,
         typer.Argument(
             metavar="KIND",
-            help="What is calibrated: sites, thresholds, frequencies or overlay.",
+            help="What is calibrated: sites, thresholds, tweezers, frequencies or overlay.",
             show_default=False,
         ),
     ],

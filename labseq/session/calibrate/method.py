@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,6 +20,9 @@ from labseq.session.constructing import construct
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+LEAST_FULL: Final = 20
+"""Saturated pixels that a frame may have whatever its size: hot ones, cosmic rays."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +61,7 @@ class Evidence:
 
         Raises:
             ConfigError: The run has no shots, or kept no frames of them.
-            DeviceError: The frames differ in size.
+            DeviceError: The frames differ in size, or one is saturated.
             RecordingError: A shot's file is damaged.
         """
         if not self.run.shots:
@@ -79,7 +82,14 @@ class Evidence:
             if frame.image.shape != first.image.shape:
                 sizes = f"{first.image.shape} and {frame.image.shape}"
                 raise DeviceError(frame.camera, f"frames of the run differ in size: {sizes}")
+            self._refuse_saturated(frame, shot.index)
             yield frame
+
+    def _refuse_saturated(self, frame: Frame, shot: int) -> None:
+        n_full = int(np.count_nonzero(frame.image == np.iinfo(frame.image.dtype).max))
+        if n_full > max(LEAST_FULL, self.bench.grid.n_rows * self.bench.grid.n_cols // 20):
+            text = f"{n_full} pixels of the first frame of shot {shot + 1} are saturated"
+            raise DeviceError(frame.camera, f"{text}; use less light, gain or exposure")
 
     def detector(self) -> Detector:
         """The profile's detector, with the calibrations that count in the analysis."""

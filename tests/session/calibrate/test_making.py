@@ -253,3 +253,11 @@ def test_a_choice_in_the_profile_is_told(lab: Lab) -> None:
     lab.profile.write_text(PROFILE + "calibrations: {use: {sites: off}}\n", "utf-8")
     (warning,) = lab.calibrate("sites").warnings
     assert warning == "the profile says 'calibrations.use.sites: off', and that counts"
+
+
+@pytest.mark.parametrize("kind", ["sites", "thresholds"])
+def test_saturated_frames_are_refused(lab: Lab, kind: Any) -> None:
+    with pytest.raises(
+        DeviceError, match=r"pixels of the first frame of shot 1 are saturated; use less light"
+    ):
+        lab.calibrate(kind, shots=3, overrides=["profile.simulation.image.photoelectrons=200000"])
