@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Final, Literal, Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.imaging.known_sites import ContextLike, KnownSites, known_sites
-from labseq.imaging.regions import RegionsLike, checked_image, region_corners
-from labseq.imaging.thresholds import PerSite, known_thresholds
-from labseq.model import Frame, Occupancy
+from labseq.imaging.comparing import ComparingDetector, ComparingLike
+from labseq.imaging.known_sites import ContextLike, KnownSites
+from labseq.imaging.regions import checked_image
+from labseq.model import Frame
 
 
-class ThresholdLike(RegionsLike, Protocol):
+class ThresholdLike(ComparingLike, Protocol):
     """Settings of :class:`ThresholdDetector`; SI and pixels."""
 
     @property
@@ -27,18 +26,8 @@ class ThresholdLike(RegionsLike, Protocol):
         """Counts of a dark pixel."""
         ...
 
-    @property
-    def threshold(self) -> PerSite:
-        """Counts over the offset, summed over the region, above which there is an atom."""
-        ...
 
-    @property
-    def width(self) -> float:
-        """Counts from the threshold at which the confidence is tanh(1) = 0.76."""
-        ...
-
-
-class ThresholdDetector:
+class ThresholdDetector(ComparingDetector):
     """Sums a region of interest around each site and compares with a threshold.
 
     There is an atom on site (i, j) if the counts of its region, less the offset
@@ -61,39 +50,12 @@ class ThresholdDetector:
         ConfigError: A file cannot be read, or the calibrated thresholds are no counts.
     """
 
-    signal_unit: Final = "counts"
+    signal_unit = "counts"
 
     def __init__(self, settings: ThresholdLike, context: ContextLike) -> None:
-        self._name = context.name or "detector"
-        self._width = settings.width
-        self._known = known_sites(settings, context)
-        self._pixels = _region_pixels(settings, self._known)
+        super().__init__(settings, context)
+        self._pixels = _region_pixels(settings, self._known, self._corners)
         self._dark = len(self._pixels) * settings.offset
-        thresholds = known_thresholds(settings.threshold, self.signal_unit, context)
-        self._thresholds, self._thresholds_source = thresholds.values, thresholds.source
-
-    @property
-    def sites_px(self) -> NDArray[np.float64]:
-        """(y, x) of each site in pixels, float64 (n_rows, n_cols, 2)."""
-        return self._known.positions_px
-
-    def describe(self) -> Mapping[str, str]:
-        """Where its sites and thresholds come from."""
-        return {"sites": self._known.source, "thresholds": self._thresholds_source}
-
-    def detect(self, frame: Frame) -> tuple[Occupancy, NDArray[np.float32]]:
-        """Find the atoms.
-
-        Returns:
-            The occupancy, bool (n_rows, n_cols), and the confidence per site,
-            float32 (n_rows, n_cols), 0 at the threshold and 1 for certainty.
-
-        Raises:
-            DeviceError: The frame is not of the size that the sites belong to.
-        """
-        distance = self.signals(frame) - self._thresholds
-        confidence = np.tanh(np.abs(distance) / self._width).astype(np.float32)
-        return distance > 0.0, confidence
 
     def signals(self, frame: Frame) -> NDArray[np.float64]:
         """Counts over the offset, summed over each region, float64 (n_rows, n_cols).
@@ -106,9 +68,10 @@ class ThresholdDetector:
         return counts.reshape(self._thresholds.shape) - self._dark
 
 
-def _region_pixels(settings: ThresholdLike, known: KnownSites) -> NDArray[np.int64]:
+def _region_pixels(
+    settings: ThresholdLike, known: KnownSites, corners: NDArray[np.int64]
+) -> NDArray[np.int64]:
     """Flat indices of the regions' pixels, (pixels of a region, n_sites): summed along rows of memory."""
-    corners = region_corners(known, settings.region)
     dy, dx = np.indices((settings.region, settings.region)).reshape(2, -1, 1)
     if settings.shape == "disc":
         half = settings.region // 2

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.imaging.known_sites import ContextLike, KnownSites, known_sites
+from labseq.imaging.comparing import ComparingDetector, ComparingLike
+from labseq.imaging.known_sites import ContextLike, KnownSites
 from labseq.imaging.photoelectrons import SensorLike, evidence
-from labseq.imaging.regions import RegionsLike, checked_image, region_corners
+from labseq.imaging.regions import checked_image
 from labseq.imaging.spots import pairs_within, spot_light
-from labseq.imaging.thresholds import PerSite, known_thresholds
-from labseq.model import Frame, Occupancy
+from labseq.model import Frame
 
 Floats = NDArray[np.float64]
 
@@ -22,7 +21,7 @@ SPOT_REACH: Final = 4.0
 """Widths of a spot beyond which its light is not looked for."""
 
 
-class WeightedLike(RegionsLike, SensorLike, Protocol):
+class WeightedLike(ComparingLike, SensorLike, Protocol):
     """Settings of :class:`WeightedDetector`; SI and pixels."""
 
     @property
@@ -43,16 +42,6 @@ class WeightedLike(RegionsLike, SensorLike, Protocol):
     @property
     def filling(self) -> float:
         """Fraction of the sites that hold atoms."""
-        ...
-
-    @property
-    def threshold(self) -> PerSite:
-        """Log-odds above which there is an atom."""
-        ...
-
-    @property
-    def width(self) -> float:
-        """Log-odds from the threshold at which the confidence is tanh(1) = 0.76."""
         ...
 
 
@@ -80,7 +69,7 @@ class Weights:
     expected: Floats
 
 
-class WeightedDetector:
+class WeightedDetector(ComparingDetector):
     """Adds up the log-odds of an atom, pixel by pixel, and compares with a threshold.
 
     The optimum is that of Neyman and Pearson (Phil. Trans. R. Soc. A 231, 289, 1933):
@@ -115,44 +104,17 @@ class WeightedDetector:
         ConfigError: A file cannot be read, or the calibrated thresholds are no log-odds.
     """
 
-    signal_unit: Final = "log-odds"
+    signal_unit = "log-odds"
 
     def __init__(self, settings: WeightedLike, context: ContextLike) -> None:
-        self._name = context.name or "detector"
+        super().__init__(settings, context)
         self._settings, self._grid = settings, context.grid
-        self._known = known_sites(settings, context)
-        self._corners = region_corners(self._known, settings.region)
-        thresholds = known_thresholds(settings.threshold, self.signal_unit, context)
-        self._thresholds, self._thresholds_source = thresholds.values, thresholds.source
         self._weights: Weights | None = None
         self._kernels: Any = None
-
-    @property
-    def sites_px(self) -> Floats:
-        """(y, x) of each site in pixels, float64 (n_rows, n_cols, 2)."""
-        return self._known.positions_px
-
-    def describe(self) -> Mapping[str, str]:
-        """Where its sites and thresholds come from."""
-        return {"sites": self._known.source, "thresholds": self._thresholds_source}
 
     def warm(self) -> None:
         """Work out the weights; compile the kernels, or load them from the cache."""
         self._ready()
-
-    def detect(self, frame: Frame) -> tuple[Occupancy, NDArray[np.float32]]:
-        """Find the atoms.
-
-        Returns:
-            The occupancy, bool (n_rows, n_cols), and the confidence per site,
-            float32 (n_rows, n_cols), 0 at the threshold and 1 for certainty.
-
-        Raises:
-            DeviceError: The frame is not of the size that the sites belong to.
-        """
-        distance = self.signals(frame) - self._thresholds
-        confidence = np.tanh(np.abs(distance) / self._settings.width).astype(np.float32)
-        return distance > 0.0, confidence
 
     def signals(self, frame: Frame) -> Floats:
         """Log-odds of an atom against none, float64 (n_rows, n_cols).
