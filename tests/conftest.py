@@ -2,9 +2,15 @@
 
 import itertools
 import os
+import shutil
+import sys
+import tempfile
+from pathlib import Path
 
 import pytest
 from hypothesis import settings
+
+from labseq.kernels.compile import cache_root
 
 # A busy computer is no failure, and what passed once passes again; ``poe fuzz`` looks for new examples.
 settings.register_profile("labseq", deadline=None, derandomize=True)
@@ -14,6 +20,12 @@ settings.load_profile("labseq")
 for _name in ("LABSEQ_DATA", "LABSEQ_PLUGIN_PATH"):  # the user's own must not reach the tests
     os.environ.pop(_name, None)
 os.environ["LABSEQ_STATE"] = os.devnull  # for fixtures that outlive a test: leads nowhere
+
+if sys.dont_write_bytecode:  # else each process that a test starts would compile numba's source anew
+    _BYTECODE, _TEMPORARY = cache_root() / "bytecode", Path(tempfile.gettempdir())
+    shutil.rmtree(_BYTECODE / _TEMPORARY.relative_to(_TEMPORARY.anchor), ignore_errors=True)  # of past tests
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+    os.environ["PYTHONPYCACHEPREFIX"] = str(_BYTECODE)
 
 _NUMBERS = itertools.count()
 

@@ -6,6 +6,7 @@ no constructor, so no tag can run code, and the limits hold before anything grow
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any, Final, cast
 
 from yaml.error import MarkedYAMLError
@@ -34,6 +35,7 @@ from labseq.errors import ConfigError, Problem
 _FLOW: Final = "one value: 5, '45 ms', [a, b] or {key: value}"
 
 
+@lru_cache(maxsize=8)  # nobody changes a tree, and most sessions of a process read the same profile
 def compose(text: str, name: str, origin: str = "") -> Node | None:
     """Read YAML text.
 

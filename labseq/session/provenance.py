@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import getpass
 import importlib.metadata
 import os
@@ -38,11 +39,7 @@ def gather_provenance(sequence_folder: Path) -> dict[str, Any]:
             "code": git_state(Path(labseq.__file__).parent, of="__init__.py"),
             "sequence": git_state(sequence_folder),
         },
-        "packages": {
-            name: distribution.version
-            for distribution in importlib.metadata.distributions()
-            if (name := distribution.metadata["Name"])
-        },
+        "packages": dict(_packages()),
     }
 
 
@@ -79,6 +76,13 @@ def _git(folder: Path, *arguments: str) -> str | None:
     except (OSError, subprocess.SubprocessError):
         return None
     return done.stdout.decode(errors="replace").strip()
+
+
+@functools.cache
+def _packages() -> dict[str, str]:
+    """Name -> version of all that is installed, read once: it takes as long as a quick shot."""
+    about = [distribution.metadata for distribution in importlib.metadata.distributions()]
+    return {name: one["Version"] for one in about if (name := one["Name"])}
 
 
 def _user() -> str:

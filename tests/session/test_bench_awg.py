@@ -7,10 +7,13 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from labseq import Run, Session
 from labseq.recording.reader import Shot
@@ -27,6 +30,18 @@ def run(tmp_path: Path, profile: str, *overrides: str, shots: int = N_SHOTS) -> 
         return session.run()
 
 
+@pytest.fixture(scope="module")
+def ideal(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., NDArray[np.float64]]:
+    """Filling after the first cycle of each shot on the virtual profile, made once for equal settings."""
+
+    @cache
+    def filled(*overrides: str) -> NDArray[np.float64]:
+        done = run(tmp_path_factory.mktemp("ideal"), "virtual", *overrides, shots=20 * N_SHOTS)
+        return np.array([filled_once(shot, done) for shot in done.shots])
+
+    return filled
+
+
 def filled_once(shot: Shot, done: Run) -> float:
     """Filling after the first cycle."""
     first = next(i for i, image in enumerate(shot.record().images) if image.cycle == 1)
@@ -34,11 +49,12 @@ def filled_once(shot: Shot, done: Run) -> float:
 
 
 @pytest.mark.parametrize("mode", ["replay", "fifo", "dds"])
-def test_filling_agrees_with_the_virtual_profile(tmp_path: Path, mode: str) -> None:
+def test_filling_agrees_with_the_virtual_profile(
+    tmp_path: Path, ideal: Callable[..., NDArray[np.float64]], mode: str
+) -> None:
     overrides = DDS if mode == "dds" else ()
-    ideal = run(tmp_path, "virtual", *overrides, shots=20 * N_SHOTS)
     played = run(tmp_path, "bench_awg", f"profile.mobile_tweezers.mode={mode}", *overrides)
-    expected = np.array([filled_once(shot, ideal) for shot in ideal.shots])
+    expected = ideal(*overrides)
     found = np.array([filled_once(shot, played) for shot in played.shots])
     error = float(expected.std()) * math.sqrt(1 / len(found) + 1 / len(expected))
     print(f"{mode}: {found.mean():.4f}, virtual {expected.mean():.4f}, error of the difference {error:.4f}")

@@ -76,7 +76,7 @@ def mutated(draw: st.DrawFn, text: str) -> str:
 
 
 @pytest.mark.parametrize("which", ["sequence", "profile"])
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_a_mutated_file_is_a_run_or_the_users_mistake(tmp_path: Path, which: str, data: st.DataObject):
     sequence, profile = SEQUENCE, PROFILE

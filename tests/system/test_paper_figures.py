@@ -17,7 +17,7 @@ from labseq.recording.statistics import Statistics, statistics_of
 from labseq.session.ceiling import Losses, after_moves, ceiling
 
 SEQUENCES = Path(__file__).parents[2] / "sequences"
-N_SHOTS = int(os.environ.get("LABSEQ_FIGURE_SHOTS", "400"))
+N_SHOTS = int(os.environ.get("LABSEQ_FIGURE_SHOTS", "250"))
 MISSED = 5e-5
 """Atoms that the detector misses, as docs/explanation/virtual-images.md has them."""
 

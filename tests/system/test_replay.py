@@ -15,9 +15,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numba
 import pytest
 
+from labseq.cli import main
 from labseq.session import load_plugins
+
+assert numba  # loaded already, so that the command does not turn compiling off for the tests after it
 
 pytestmark = pytest.mark.system
 
@@ -38,29 +42,27 @@ TARGETS = (
 REPLAY = runpy.run_path(str(Path(__file__).parent / "replay.py"))
 replay: Callable[[dict[str, Any]], None] = REPLAY["replay"]
 Broken: type[Exception] = REPLAY["Broken"]
+Planning = Callable[..., dict[str, Any]]
 
 
-def plan(target: str, *arguments: str, occupancy: str = "random:20x20@0.75") -> dict[str, Any]:
-    command = [
-        sys.executable,
-        "-m",
-        "labseq",
-        "plan",
-        occupancy,
-        "--target",
-        target,
-        *arguments,
-        "--json",
-        "-",
-    ]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False, timeout=120)
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
+@pytest.fixture
+def plan(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Planning:
+    """The document that ``labseq plan`` prints; tests/system/test_plan.py asks processes for the same."""
+    monkeypatch.chdir(ROOT)
+
+    def plan(target: str, *arguments: str, occupancy: str = "random:20x20@0.75") -> dict[str, Any]:
+        with pytest.raises(SystemExit) as leaving:
+            main(["plan", occupancy, "--target", target, *arguments, "--json", "-"])
+        out, err = capfd.readouterr()
+        assert leaving.value.code == 0, err
+        return json.loads(out)
+
+    return plan
 
 
 @pytest.mark.parametrize("seed", range(N_PLANS))
 @pytest.mark.parametrize("target", TARGETS)
-def test_every_pattern_ends_full_and_clear(target: str, seed: int) -> None:
+def test_every_pattern_ends_full_and_clear(plan: Planning, target: str, seed: int) -> None:
     document = plan(target, "--seed", str(seed))
     assert sum(map(sum, document["occupancy"])) >= sum(map(sum, document["target"]["fill"]))
     replay(document)
@@ -74,7 +76,7 @@ def test_no_pattern_is_left_out() -> None:
 
 
 @pytest.mark.parametrize("dop", ["1", "20"])
-def test_a_full_array_ends_full_and_clear(dop: str) -> None:
+def test_a_full_array_ends_full_and_clear(plan: Planning, dop: str) -> None:
     replay(plan("sierpinski:16x16", "--dop", dop, occupancy="random:20x20@1"))
 
 

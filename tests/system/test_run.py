@@ -13,32 +13,12 @@ from typing import Any
 import pytest
 
 import labseq
+from labseq.cli import main
 
 pytestmark = pytest.mark.system
 
 ROOT = Path(__file__).resolve().parents[2]
 SEQUENCE = ROOT / "sequences" / "compact_225.yaml"
-
-JAMMED_SHUTTER = """
-import labseq
-
-LABSEQ_API = 1
-
-
-class Jammed:
-    def __init__(self, settings, context): ...
-    def open(self): ...
-    def close(self): ...
-    def describe(self): return {}
-    def command(self, name, **arguments): ...
-    def read(self, name): ...
-    def safe_state(self): raise labseq.DeviceError("shutter", "jammed")
-
-
-@labseq.hookimpl
-def labseq_register(registry):
-    registry.device("jammed", Jammed)
-"""
 
 
 def labseq_command(*arguments: str | Path) -> list[str]:
@@ -65,7 +45,7 @@ def run_json(cwd: Path, *arguments: str | Path) -> dict[str, Any]:
     return json.loads(done.stdout)
 
 
-def test_run_then_show(tmp_path: Path) -> None:
+def test_run_then_show(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     answer = run_json(tmp_path, "--shots", "2", "--seed", "1")
     run_dir = Path(answer["run_dir"])
     assert (answer["shots"], answer["status"]) == (2, "complete")
@@ -76,9 +56,9 @@ def test_run_then_show(tmp_path: Path) -> None:
 
     shown = call("show", "--json", cwd=tmp_path)
     assert Path(json.loads(shown.stdout).pop("run_dir")) == (tmp_path / run_dir)
-    table = call("show", run_dir, cwd=tmp_path)
-    assert table.returncode == 0
-    assert "shots             2 of 2" in table.stdout
+    with pytest.raises(SystemExit, match=r"^0$"):
+        main(["show", str(tmp_path / run_dir)])
+    assert "shots             2 of 2" in capsys.readouterr().out
 
 
 def test_without_a_terminal_there_are_plain_lines(tmp_path: Path) -> None:
@@ -94,8 +74,7 @@ def test_without_a_terminal_there_are_plain_lines(tmp_path: Path) -> None:
 def test_the_lab_in_a_dry_run(tmp_path: Path) -> None:
     done = call("run", SEQUENCE, "--profile", "lab", "--dry-run", "--shots", "1", "--json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert "plugin 'andor' is not installed" in done.stderr
-    assert "plugin 'spcm'" not in done.stderr  # its own code plays, on a simulated card
+    assert "virtual twin" not in done.stderr  # every driver's own code runs, on its simulated counterpart
     run = labseq.open_run(tmp_path / json.loads(done.stdout)["run_dir"])
     assert run.simulated
     assert run.shots[0].frames.shape[1:] == (512, 512)
@@ -129,22 +108,6 @@ def test_plugins_are_listed_with_their_faults(tmp_path: Path) -> None:
     assert "ModuleNotFoundError: No module named 'no_such_package'" in rows["broken:"]
 
 
-def test_safe_tells_each_device(tmp_path: Path) -> None:
-    done = call("safe", "virtual", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    lines = [line.split() for line in done.stdout.splitlines()]
-    assert lines == [[name, "safe"] for name in ("mobile_tweezers", "shutter", "camera", "static_tweezers")]
-
-
-def test_safe_fails_if_one_device_does(tmp_path: Path) -> None:
-    (tmp_path / "jammed.py").write_text(JAMMED_SHUTTER, "utf-8")
-    profile = ["--set", "profile.devices.shutter={use: jammed}"]
-    done = call("safe", "virtual", *profile, cwd=tmp_path, LABSEQ_PLUGIN_PATH=str(tmp_path))
-    assert done.returncode == 3, done.stderr
-    assert "NOT SAFE: shutter: jammed" in done.stdout
-    assert "static_tweezers      safe" in done.stdout
-
-
 def test_a_wrong_sequence(tmp_path: Path) -> None:
     wrong = tmp_path / "wrong.yaml"
     wrong.write_text(SEQUENCE.read_text("utf-8").replace("shots: 20", "shoots: 20"), "utf-8")
@@ -157,17 +120,6 @@ def test_a_wrong_sequence(tmp_path: Path) -> None:
     message, _, excerpt = done.stderr.strip().partition("\n")
     assert answer["error"] == message
     assert "^^^^^^" in excerpt
-
-
-@pytest.mark.parametrize(
-    "arguments", [["missing.yaml"], [SEQUENCE, "--set", "planner.speed=1"], [SEQUENCE, "-p", "x"]]
-)
-def test_other_wrong_input(tmp_path: Path, arguments: list[str | Path]) -> None:
-    done = call("check", *arguments, cwd=tmp_path)
-    assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr
-    assert "Traceback" not in done.stderr
-    assert "internal error" not in done.stderr
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no signals between processes")

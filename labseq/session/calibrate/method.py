@@ -68,10 +68,11 @@ class Evidence:
             raise ConfigError(
                 Problem("the run has no shots", str(self.run.path), expected="a run with frames")
             )
+        from labseq.recording.shot_reader import read_frames  # h5py takes 0.1 s to import
+
         first: Frame | None = None
         for shot in self.run.shots:
-            images = shot.record().images
-            frame = images[0].frame if images else None
+            frame = read_frames(shot.file).get(0)
             if frame is None:
                 what = f"the first image of shot {shot.index + 1} was not kept"
                 hint = "take a run with 'record_frames: all'"

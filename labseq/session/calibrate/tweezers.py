@@ -68,7 +68,7 @@ def _readings(run: Run) -> dict[str, Any]:
     for shot in reversed(run.shots):
         found = {
             name.removeprefix(READINGS): value
-            for name, value in shot.record().readings.items()
+            for name, value in shot.readings.items()
             if name.startswith(READINGS)
         }
         if found:
