@@ -8,9 +8,14 @@ from labseq.api import (
     make_target as make_target,
     tone_program as tone_program,
 )
+from labseq.config.cameras import (
+    CameraSettings as CameraSettings,
+    CoolingSettings as CoolingSettings,
+)
 from labseq.config.settings import (
     Angle as Angle,
     Duration as Duration,
+    FilePath as FilePath,
     Fraction as Fraction,
     Frequency as Frequency,
     Length as Length,
@@ -18,6 +23,15 @@ from labseq.config.settings import (
     Speed as Speed,
     Temperature as Temperature,
     Voltage as Voltage,
+)
+from labseq.drivers import (
+    CameraDriver as CameraDriver,
+    Cooling as Cooling,
+    Series as Series,
+    SimulatedSensor as SimulatedSensor,
+    Taken as Taken,
+    settle as settle,
+    wait_for as wait_for,
 )
 from labseq.errors import (
     ConfigError as ConfigError,
@@ -42,6 +56,9 @@ from labseq.model import (
     CameraFacts as CameraFacts,
     DepthRamp as DepthRamp,
     Frame as Frame,
+    LineProgram as LineProgram,
+    LinesFacts as LinesFacts,
+    LineSpec as LineSpec,
     MotionSpec as MotionSpec,
     Occupancy as Occupancy,
     Plan as Plan,
@@ -52,6 +69,7 @@ from labseq.model import (
     RfSpec as RfSpec,
     RfTones as RfTones,
     RunRecord as RunRecord,
+    SensorMode as SensorMode,
     ShotRecord as ShotRecord,
     SiteGrid as SiteGrid,
     TargetPattern as TargetPattern,
@@ -78,15 +96,21 @@ from labseq.roles import (
     Context as Context,
     Detector as Detector,
     Device as Device,
+    Interlocked as Interlocked,
     KnownCamera as KnownCamera,
+    KnownCommands as KnownCommands,
+    KnownLines as KnownLines,
     KnownLoading as KnownLoading,
+    KnownSensor as KnownSensor,
     Lines as Lines,
     Listening as Listening,
     LossTeller as LossTeller,
     MobileTweezers as MobileTweezers,
     Planner as Planner,
+    Polled as Polled,
     RfSource as RfSource,
     SelfTesting as SelfTesting,
+    Settling as Settling,
     Shot as Shot,
     SignalTeller as SignalTeller,
     Simulation as Simulation,
@@ -94,9 +118,11 @@ from labseq.roles import (
     Step as Step,
     StepContext as StepContext,
     Storyteller as Storyteller,
+    ToneSource as ToneSource,
     Trigger as Trigger,
     TruthTeller as TruthTeller,
     Warmable as Warmable,
+    Wired as Wired,
 )
 from labseq.session import (
     Session as Session,

@@ -16,6 +16,7 @@ KINDS: Final = (
     "mobile_tweezers",
     "detector",
     "device",
+    "lines",
     "step",
     "pattern",
     "simulation",
@@ -150,6 +151,12 @@ class Registry:
     ) -> None:
         """Offer any other instrument. Options as for :meth:`camera`."""
         self._add("device", name, factory, settings_model, **options)
+
+    def lines(
+        self, name: str, factory: Factory, settings_model: type[Any] | None = None, **options: Any
+    ) -> None:
+        """Offer a timing box that switches lines. Options as for :meth:`camera`."""
+        self._add("lines", name, factory, settings_model, **options)
 
     def get(self, kind: str, name: str) -> Entry:
         """Find an entry.

@@ -59,6 +59,9 @@ EXAMPLES: Final[Mapping[str, str]] = MappingProxyType(
 _READABLE: Final = 1e9
 """Numbers from here on are written with an exponent."""
 
+ZERO_CELSIUS_K: Final = 273.15
+"""0 degC in kelvins; degC is the one unit with a zero of its own."""
+
 _NUMBER = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(\S.*?)?\s*\Z")
 
 
@@ -86,6 +89,8 @@ def parse_quantity(text: str, dimension: str) -> float:
     if match is None:
         raise ValueError(f"'{text}' is not {_a(dimension)}; expected {expected(dimension)}")
     unit = match[2] or ""
+    if unit == "degC" and dimension == "temperature":
+        return float(match[1]) + ZERO_CELSIUS_K
     if unit not in units:
         other = next((name for name, known in UNITS.items() if unit in known and unit), None)
         if not unit:

@@ -20,6 +20,9 @@ from labseq.units import UNITS, expected, format_quantity, parse_quantity
         ("75 %", "fraction", 0.75),
         ("0.75", "fraction", 0.75),
         ("300 uK", "temperature", 300e-6),
+        ("0 degC", "temperature", 273.15),
+        ("-70 degC", "temperature", -70 + 273.15),
+        ("20degC", "temperature", 20 + 273.15),
     ],
 )
 def test_quantities_become_si(text, dimension, value):
@@ -34,6 +37,9 @@ def test_quantities_become_si(text, dimension, value):
         ("45 lightyears", "length", "'lightyears' in '45 lightyears' is not a unit of length"),
         ("steep", "angle", "'steep' is not an angle"),
         ("45 deg", "time", "'45 deg' is an angle, not a time"),
+        ("45 deg", "temperature", "'45 deg' is an angle, not a temperature"),
+        ("20 degC", "time", "'degC' in '20 degC' is not a unit of time"),
+        ("20 degc", "temperature", "'degc' in '20 degc' is not a unit of temperature"),
         ("fast", "speed", "'fast' is not a speed"),
         ("", "time", "'' is not a time"),
         ("1.2.3 ms", "time", "is not a unit of time"),

@@ -17,20 +17,17 @@ from labseq.cli.failures import lines_of
 from labseq.cli.log_lines import LogLines
 from labseq.cli.output import columns, divert_stdout, encodes, say
 from labseq.cli.show import as_line
+from labseq.cli.timeline import BAR_WIDTH, lines_table, timeline_table
 from labseq.cli.words import age_text, clock_time, plural, settings_text
 from labseq.config import Axis
 from labseq.config.wording import clean
 from labseq.errors import ConfigError, Problem
-from labseq.model import TimelineEntry
 from labseq.session import Assembly, CheckReport, Session, check
 from labseq.session.checking import Rehearsal
 from labseq.session.choosing import DryRun
 from labseq.units import format_quantity
 
-BAR_WIDTH: Final = 30
 _TEXT_WIDTH: Final = 48  # of the timeline without its bars
-
-Timeline = Sequence[tuple[str, Sequence[TimelineEntry]]]
 
 
 def check_sequence(
@@ -76,13 +73,15 @@ def refusal(error: BaseException) -> str:
 def _print(assembly: Assembly, checked: CheckReport) -> None:
     block = "█" if encodes(sys.stdout.encoding, "█") else "#"
     room = shutil.get_terminal_size((_TEXT_WIDTH + BAR_WIDTH, 24)).columns - _TEXT_WIDTH
+    width = max(0, min(BAR_WIDTH, room))
     parts = (
         columns(_what(assembly)),
-        timeline_table(checked.timeline, block, max(0, min(BAR_WIDTH, room))),
+        timeline_table(checked.timeline, block, width),
+        lines_table(checked.lines, checked.longest_shot_s, block, width),
         columns([*_sums(checked), *_rehearsed(checked)]),
         columns(_limits(assembly)),
     )
-    say("\n\n".join("\n".join(lines) for lines in parts))
+    say("\n\n".join("\n".join(lines) for lines in parts if lines))
     for warning in checked.warnings:
         notes = (f"      = {note}" for note in warning.notes)
         say(f"warning: {warning}", *excerpt(warning), *notes, stream=sys.stderr)
@@ -101,6 +100,7 @@ def _as_values(checked: CheckReport) -> dict[str, Any]:
         "shot_s": [checked.shortest_shot_s, checked.longest_shot_s],
         "points": checked.n_points,
         "run_s": list(checked.run_s),
+        "lines": {line: [list(span) for span in spans] for line, spans in checked.lines.items()},
         "n_images": checked.n_images,
         "shot_bytes": checked.shot_bytes,
         "run_bytes": None if checked.shot_bytes is None else checked.n_shots * checked.shot_bytes,
@@ -111,36 +111,6 @@ def _as_values(checked: CheckReport) -> dict[str, Any]:
 def _quantiles(rehearsal: Rehearsal) -> dict[str, float]:
     median, p95 = np.quantile(rehearsal.duration_s, [0.5, 0.95])
     return {"median": float(median), "p95": float(p95), "n_loadings": rehearsal.n_loadings}
-
-
-def timeline_table(timeline: Timeline, block: str, width: int = BAR_WIDTH) -> list[str]:
-    """A row per bar of the timeline: step, start, length, and the bar itself.
-
-    Args:
-        timeline: Name of each step and its bars.
-        block: What bars are made of.
-        width: Characters of the longest bar; 0 for none.
-    """
-    total_s = sum(bar.duration_s for _, bars in timeline for bar in bars)
-    rows = [("step", "", "start", "at most", "")]
-    start_s = 0.0
-    for number, (name, bars) in enumerate(timeline):
-        for i, bar in enumerate(bars):
-            label = bar.label if bar.label != name else ""
-            length = format_quantity(bar.duration_s, "time")
-            drawn = _bar(start_s, bar.duration_s, total_s, block, width)
-            step = f"{number} {name}" if i == 0 else ""
-            rows.append((step, label, format_quantity(start_s, "time"), length, drawn))
-            start_s += bar.duration_s
-    return columns(rows, right=(2, 3))
-
-
-def _bar(start_s: float, duration_s: float, total_s: float, block: str, width: int) -> str:
-    if not total_s or not width:
-        return ""
-    first, last = (round(width * t / total_s) for t in (start_s, start_s + duration_s))
-    first = min(first, width - 1)
-    return " " * first + block * max(1, last - first)
 
 
 def _what(assembly: Assembly) -> list[tuple[str, str]]:

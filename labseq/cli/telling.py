@@ -12,7 +12,7 @@ from labseq.model import RunRecord, ShotRecord
 from labseq.units import format_quantity
 
 LASTING: Final = frozenset(
-    {"compiling", "compiled", "warning", "run_starting", "shot_repeated", "safe_state", "closed"}
+    {"settling", "compiling", "compiled", "warning", "run_starting", "shot_repeated", "safe_state", "closed"}
 )
 """Events that must not scroll out of the live view unseen."""
 
@@ -39,6 +39,9 @@ def tell(name: str, values: Mapping[str, Any], run: RunRecord | None) -> str:
         case "safe_state" | "closed" if not values["ok"]:
             task = "brought to its safe state" if name == "safe_state" else "closed"
             return f"warning: {values['device']} could not be {task}: {values['error']}"
+        case "settling":
+            longest = format_quantity(values["timeout_s"], "time")
+            return f"waiting for {values['device']} to settle, at most {longest}"
         case "compiling":
             return f"compiling {values['module']}; later runs find it in the cache"
         case "compiled":

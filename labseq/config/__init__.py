@@ -3,9 +3,11 @@
 from labseq.config.addresses import Override, profile_overrides, split_overrides
 from labseq.config.calibrations import CalibrationChoices, CalibrationSettings
 from labseq.config.collect import Collected
+from labseq.config.devices import DEVICE_KEYS
 from labseq.config.document import Document
 from labseq.config.fields import ROLES, Choice, plugin_paths
 from labseq.config.find import find_profile, packaged_profiles_dir
+from labseq.config.lines import LINES_KEYS
 from labseq.config.nodes import Loc
 from labseq.config.profile import (
     MOTION_KEYS,
@@ -32,6 +34,8 @@ from labseq.config.timeouts import TimeoutSettings
 from labseq.config.values import validate_values
 
 __all__ = [
+    "DEVICE_KEYS",
+    "LINES_KEYS",
     "MOTION_KEYS",
     "ROLES",
     "Axis",

@@ -32,7 +32,7 @@ FORMAT: Final = 1
 
 _KINDS: Final = {"sequence": "shot", "hardware profile": "grid"}  # kind of file: a key that only it has
 
-ROLES: Final = ("camera", "static_tweezers", "mobile_tweezers", "detector", "simulation")
+ROLES: Final = ("camera", "static_tweezers", "mobile_tweezers", "detector", "lines", "simulation")
 """The roles of a profile that are one plugin each."""
 MAY_ADD: Final = (
     "timeouts",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Final, Literal, Self, TypeAlias
@@ -14,6 +13,7 @@ from pydantic import AfterValidator, Field, field_validator, model_validator
 from labseq.config.addresses import Override
 from labseq.config.calibrations import CalibrationSettings
 from labseq.config.collect import Collected
+from labseq.config.devices import DeviceChoice, named
 from labseq.config.document import Document
 from labseq.config.fields import (
     FORMAT,
@@ -29,20 +29,20 @@ from labseq.config.fields import (
     placed_by_field,
 )
 from labseq.config.find import find_profile
+from labseq.config.lines import LinesChoice
 from labseq.config.mending import StandIns, load_checked
 from labseq.config.rf import RfSettings
 from labseq.config.scan import Scan
 from labseq.config.scan_reading import bind_scan
 from labseq.config.settings import Duration, Frequency, Length, Settings, Speed
 from labseq.config.timeouts import TimeoutSettings
-from labseq.config.wording import clean
 from labseq.model import MotionSpec, SiteGrid
 from labseq.model.grid import centred_comb
+from labseq.model.lines import LineSpec
 from labseq.model.motion import SpeedProfile
 from labseq.units import format_quantity
 
 _MOTION: Final = MotionSpec()
-_DEVICE_NAME: Final = re.compile(r"[^\W\d][\w-]*")
 
 Sites: TypeAlias = Annotated[int, Field(ge=1, le=1000)]
 
@@ -183,16 +183,6 @@ class MobileTweezersChoice(MotionSettings, Choice):
     """The plugin of the mobile tweezers, and how they move."""
 
 
-def _named(devices: dict[str, Choice]) -> dict[str, Choice]:
-    for name in devices:
-        if name in (*ROLES, "planner"):
-            raise misfit(f"a device is called '{name}', like a role", "another name", at=(name,), key=True)
-        if not _DEVICE_NAME.fullmatch(name):
-            expected = "a word of letters, digits, '_' and '-' that begins with a letter"
-            raise misfit(f"a device is called '{clean(name)}'", expected, at=(name,), key=True)
-    return {name: choice.placed("devices", name) for name, choice in devices.items()}
-
-
 class ProfileSpec(Settings):
     """A hardware profile, checked but for the settings of its plugins."""
 
@@ -205,8 +195,11 @@ class ProfileSpec(Settings):
         description="what moves the atoms, and how"
     )
     detector: Annotated[Choice, placed_by_field] = Field(description="what finds the atoms on an image")
-    devices: Annotated[dict[str, Choice], empty_is({}), AfterValidator(_named)] = Field(
+    devices: Annotated[dict[str, DeviceChoice], empty_is({}), AfterValidator(named)] = Field(
         default={}, description="further instruments, by name"
+    )
+    lines: Annotated[LinesChoice, placed_by_field] | None = Field(
+        default=None, description="the timing box that switches light and sends triggers, and its lines"
     )
     simulation: Annotated[Choice, placed_by_field] | None = Field(
         default=None, description="the simulated world that virtual devices act on"
@@ -221,7 +214,7 @@ class ProfileSpec(Settings):
 
     @property
     def choices(self) -> dict[str, Choice]:
-        """The plugins chosen in this file, by role; the simulation only if there is one."""
+        """The plugins chosen in this file, by role; lines and simulation only if there are any."""
         chosen = {role: getattr(self, role) for role in ROLES}
         return {role: choice for role, choice in chosen.items() if choice is not None}
 
@@ -229,6 +222,11 @@ class ProfileSpec(Settings):
     def motion(self) -> MotionSpec:
         """How the mobile tweezers move."""
         return self.mobile_tweezers.spec()
+
+    @property
+    def line_specs(self) -> tuple[LineSpec, ...]:
+        """The lines, in the order of their channels."""
+        return () if self.lines is None else self.lines.specs()
 
     def grid_model(self) -> SiteGrid:
         """The grid of sites, with the tones of its rows and columns."""

@@ -8,8 +8,9 @@ from labseq.model.calibration import (
     grid_facts,
     same_grid,
 )
-from labseq.model.frame import CameraFacts, Frame
+from labseq.model.frame import CameraFacts, Frame, SensorMode
 from labseq.model.grid import SiteGrid
+from labseq.model.lines import LineProgram, LinesFacts, LineSpec
 from labseq.model.motion import MotionSpec, RfSpec
 from labseq.model.output import RfSamples, RfSpan, RfTones
 from labseq.model.plan import Batch, Plan, PlanReport
@@ -47,6 +48,9 @@ __all__ = [
     "Frame",
     "FrequencyCourse",
     "ImageRecord",
+    "LineProgram",
+    "LineSpec",
+    "LinesFacts",
     "MotionSpec",
     "Occupancy",
     "Plan",
@@ -58,6 +62,7 @@ __all__ = [
     "RfTones",
     "RunRecord",
     "SegmentKind",
+    "SensorMode",
     "ShotRecord",
     "SiteGrid",
     "StageTiming",

@@ -15,6 +15,7 @@ class TimelineEntry:
         least_s: How long it takes at least; 0 if it may be left out.
         n_images: Images that it takes at most.
         exposure_s: Exposure of each image, in seconds.
+        kind: Kind of step that the profile's lines know it by, "image"; "" for one that they do not go with.
     """
 
     label: str
@@ -22,3 +23,4 @@ class TimelineEntry:
     least_s: float
     n_images: int = 0
     exposure_s: float = 0.0
+    kind: str = ""

@@ -3,7 +3,7 @@
 The tree, with n images, a grid of (row, col) sites and frames of (y, x) pixels::
 
     /entry                      what came of the shot, as attributes
-      camera/<name>             images (n, y, x) and, per frame, t_s, exposure_s, step, cycle, event, ...
+      camera/<name>             images (n, y, x) and, per frame, t_s, exposure_s, number, step, cycle, ...
       images_view               NXdata: what viewers open by default
       detection                 occupancy (n, row, col), confidence, and the table of all images
       target                    fill, clear (row, col)
@@ -25,7 +25,7 @@ from typing import Any, Final
 import numpy as np
 
 FORMAT: Final = "labseq-shot"
-FORMAT_VERSION: Final = "1.2"
+FORMAT_VERSION: Final = "1.3"
 """major.minor; a newer minor version only adds things, a newer major version cannot be read."""
 
 RUN_FORMAT: Final = "labseq-run"

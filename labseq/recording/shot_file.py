@@ -131,6 +131,8 @@ class ShotEncoder:
         set_attributes(stack, units="adu", interpretation="image", long_name=f"{camera} (ADU)")
         _write_array(group, "t_s", [image.t_start_s for image in chosen], "f8", "s")
         _write_array(group, "t_clock_s", [frame.t_start_s for frame in frames], "f8", "s")
+        _write_array(group, "t_device_s", [frame.device_time_s for frame in frames], "f8", "s")
+        _write_array(group, "number", [frame.number for frame in frames], "i4")
         _write_array(group, "exposure_s", [frame.exposure_s for frame in frames], "f8", "s")
         _write_array(group, "image", indices, "i4")
         _write_array(group, "step", [image.step for image in chosen], "i4")

@@ -72,13 +72,22 @@ def read_frames(path: Path) -> dict[int, Frame]:
                 group["images"][()],
                 group["exposure_s"][()],
                 group["t_clock_s"][()],
+                *_as_counted(group),
             )
-            for index, pixels, exposure_s, t_start_s in zip(*columns, strict=True):
+            name = str(group.attrs["name"])
+            for index, pixels, exposure_s, t_start_s, number, device_s in zip(*columns, strict=True):
                 pixels.flags.writeable = False
                 frames[int(index)] = Frame(
-                    pixels, float(exposure_s), float(t_start_s), str(group.attrs["name"])
+                    pixels, float(exposure_s), float(t_start_s), name, int(number), float(device_s)
                 )
     return dict(sorted(frames.items()))
+
+
+def _as_counted(group: Any) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Number and time stamp that the camera gave each frame; files before format 1.3 have none."""
+    n_frames = len(group["image"])
+    number = group["number"][()] if "number" in group else np.zeros(n_frames, np.int32)
+    return number, group["t_device_s"][()] if "t_device_s" in group else np.full(n_frames, np.nan)
 
 
 def with_frames(record: ShotRecord, frames: dict[int, Frame]) -> ShotRecord:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from labseq.model import (
     CameraFacts,
     Frame,
-    TimelineEntry,
+    LineProgram,
+    LinesFacts,
     ToneProgram,
 )
 
@@ -51,15 +52,72 @@ class SelfTesting(Protocol):
         ...
 
 
+@runtime_checkable
+class Settling(Protocol):
+    """A device that needs time after ``open()`` until it works as it shall: a camera that cools."""
+
+    @property
+    def settling_timeout_s(self) -> float:
+        """How long that may take, in seconds; 0 if there is nothing to wait for."""
+        ...
+
+    def settle(self) -> None:
+        """Wait for it on the session's clock; all devices are open.
+
+        Raises:
+            DeviceTimeoutError: It takes longer than it may.
+        """
+        ...
+
+
+@runtime_checkable
+class Polled(Protocol):
+    """A device some of whose values are read at the start of each shot and kept with it."""
+
+    def poll(self) -> Mapping[str, bool | int | float | str]:
+        """Name -> value; they stand among the shot's readings as "device.name"."""
+        ...
+
+
+@runtime_checkable
+class Interlocked(Protocol):
+    """A device that tells when something is so far off that no atom may be picked up."""
+
+    def check_interlocks(self) -> None:
+        """Read what is watched; asked at the start of each shot and before each pick-up.
+
+        Raises:
+            DeviceError: A value is past its limit; the run ends safely.
+        """
+        ...
+
+
+@runtime_checkable
+class KnownCommands(Protocol):
+    """A device that knows its commands before it is opened, for ``labseq check`` and the start of a run."""
+
+    def check_command(self, name: str, **arguments: Any) -> None:
+        """Check a command and its arguments; nothing is sent.
+
+        Raises:
+            DeviceError: It has no such command, or other arguments.
+            LimitError: An argument is past its limit.
+        """
+        ...
+
+
 class Camera(Hardware, Protocol):
-    """Takes frames."""
+    """Takes frames, in series.
+
+    Its ``safe_state`` ends the acquisition, closes the shutter and sets the EM gain to 1.
+    """
 
     def arm(self, n_frames: int, exposure_s: float, trigger: Trigger) -> None:
-        """Get ready for a series of ``n_frames`` exposures."""
+        """Get ready for a series of ``n_frames`` exposures; the internal trigger starts them at once."""
         ...
 
     def trigger(self) -> None:
-        """Start the next exposure of the series (software trigger)."""
+        """Start the next exposure of the series (software trigger); returns at once."""
         ...
 
     def read(self, timeout_s: float) -> Frame:
@@ -67,6 +125,7 @@ class Camera(Hardware, Protocol):
 
         Raises:
             DeviceTimeoutError: No frame came within ``timeout_s``.
+            TransientError: A frame of the series was lost; a repeated shot may mend it.
         """
         ...
 
@@ -77,7 +136,7 @@ class KnownCamera(Protocol):
 
     @property
     def facts(self) -> CameraFacts:
-        """Read-out time, longest exposure, shape of its frames."""
+        """Read-out time, longest exposure, shape of its frames, EM gain, triggers."""
         ...
 
 
@@ -140,20 +199,43 @@ class Device(Hardware, Protocol):
 
 
 class Lines(Hardware, Protocol):
-    """The timing box that switches light and sends triggers."""
+    """The timing box that switches light and sends triggers; ``context.lines`` says what is wired to it.
 
-    def compile(self, timeline: Sequence[TimelineEntry]) -> None:
-        """Work out the edges of a shot."""
+    Between steps the lines are idle: on where :data:`labseq.model.lines.IDLE` says so. ``open()``
+    puts them there, ``safe_state`` turns all of them off.
+    """
+
+    def compile(self, program: LineProgram) -> None:
+        """Take a program for the next firing; one that it knows already costs no time.
+
+        Raises:
+            LimitError: More edges, or nearer to one another, than the box can make.
+        """
         ...
 
     def arm(self) -> None:
-        """Get ready to fire."""
+        """Get ready to fire what was compiled last."""
         ...
 
     def fire(self) -> None:
-        """Start the compiled timeline."""
+        """Start the program; returns at once."""
         ...
 
     def wait(self, timeout_s: float) -> None:
-        """Wait for its end."""
+        """Wait for its end.
+
+        Raises:
+            DeviceTimeoutError: It did not end within ``timeout_s``.
+            DeviceError: The box did something else, for example a reset.
+        """
+        ...
+
+
+@runtime_checkable
+class KnownLines(Protocol):
+    """A timing box that tells its limits before it is opened, for ``labseq check``."""
+
+    @property
+    def lines_facts(self) -> LinesFacts:
+        """Channels, edges, resolution."""
         ...

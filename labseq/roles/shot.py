@@ -12,6 +12,7 @@ from labseq.model import (
     CameraFacts,
     CycleRecord,
     Frame,
+    LineSpec,
     MotionSpec,
     Occupancy,
     RandomStream,
@@ -40,6 +41,7 @@ class Context:
         random: The plugin's own random numbers.
         calibrations: Calibrations in use: kind -> entry.
         simulation: The world, in every context; None where the profile has none.
+        lines: What is wired to the timing box.
     """
 
     name: str = ""
@@ -49,6 +51,7 @@ class Context:
     random: RandomStream = field(default_factory=lambda: RandomStream(0))
     calibrations: Mapping[str, CalibrationEntry] = field(default_factory=dict[str, CalibrationEntry])
     simulation: Simulation | None = None
+    lines: tuple[LineSpec, ...] = ()
 
 
 class Shot(Protocol):
@@ -176,6 +179,27 @@ class Shot(Protocol):
         """
         ...
 
+    def check_interlocks(self) -> None:
+        """Ask every device that watches something; before atoms are picked up.
+
+        Raises:
+            DeviceError: A value is past its limit.
+        """
+        ...
+
+    def margin_s(self, kind: str) -> float:
+        """How much longer a kind of step takes for the leads and lags of its lines, in seconds."""
+        ...
+
+    def lit(self, kind: str, duration_s: float) -> AbstractContextManager[None]:
+        """Context manager around what a step does: its lines go on before it and off after it.
+
+        Args:
+            kind: Kind of the step, as the profile's lines name it: "image".
+            duration_s: How long the step takes, in seconds.
+        """
+        ...
+
     def stage(self, name: str, budget_s: float = ..., cycle: int = 0) -> AbstractContextManager[None]:
         """Context manager that times a stage against its budget."""
         ...
@@ -206,12 +230,14 @@ class StepContext:
         motion: How the mobile tweezers move.
         target: What the array shall look like.
         camera: What the camera says of itself before it is opened.
+        lines: What is wired to the timing box.
     """
 
     grid: SiteGrid
     motion: MotionSpec
     target: TargetPattern
     camera: CameraFacts = field(default_factory=CameraFacts)
+    lines: tuple[LineSpec, ...] = ()
 
 
 class Step(Protocol):

@@ -7,7 +7,15 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from labseq.errors import LabseqError
-from labseq.model import CalibrationEntry, CameraFacts, MotionSpec, RandomStream, SiteGrid, TargetPattern
+from labseq.model import (
+    CalibrationEntry,
+    CameraFacts,
+    LineSpec,
+    MotionSpec,
+    RandomStream,
+    SiteGrid,
+    TargetPattern,
+)
 from labseq.roles import (
     Camera,
     Clock,
@@ -15,6 +23,7 @@ from labseq.roles import (
     Device,
     Hardware,
     KnownCamera,
+    Lines,
     MobileTweezers,
     Planner,
     Simulation,
@@ -22,6 +31,7 @@ from labseq.roles import (
     StepContext,
 )
 from labseq.sequencer.guard import Guard
+from labseq.sequencer.interlock import Blinding
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,18 +71,23 @@ class Lab:
     calibrations: Mapping[str, CalibrationEntry] = field(
         default_factory=dict[str, CalibrationEntry], kw_only=True
     )
+    blinding: Mapping[str, Blinding] = field(default_factory=dict[str, Blinding], kw_only=True)
+    lines: Lines | None = field(default=None, kw_only=True)
+    line_specs: tuple[LineSpec, ...] = field(default=(), kw_only=True)
 
     @property
     def step_context(self) -> StepContext:
         """What steps need to lay out their timelines."""
         facts = self.camera.facts if isinstance(self.camera, KnownCamera) else CameraFacts()
-        return StepContext(self.grid, self.motion, self.target, facts)
+        return StepContext(self.grid, self.motion, self.target, facts, self.line_specs)
 
     def hardware(self) -> Iterator[tuple[str, Hardware]]:
         """Name and device, in the order of opening: static tweezers first."""
         yield "static_tweezers", self.static_tweezers
         yield "camera", self.camera
         yield from self.devices.items()
+        if self.lines is not None:
+            yield "lines", self.lines
         yield "mobile_tweezers", self.mobile_tweezers
 
     def safe_order(self) -> Iterator[tuple[str, Hardware]]:
@@ -83,8 +98,8 @@ class Lab:
 def in_safe_order(devices: Mapping[str, Hardware]) -> Iterator[tuple[str, Hardware]]:
     """Name and device, in the order of the safe state.
 
-    Mobile tweezers ramp down first, then devices and camera, static tweezers last; what is
-    missing is left out.
+    Mobile tweezers ramp down first, then devices, lines and camera, static tweezers last; what
+    is missing is left out.
     """
     ends = ("mobile_tweezers", "camera", "static_tweezers")
     others = tuple(name for name in devices if name not in ends)

@@ -24,7 +24,7 @@ def play(shot: Shot, build: Callable[[], ToneProgram], start_s: float, cycle: in
 
     Raises:
         LimitError: The program breaks a limit.
-        DeviceError: The mobile tweezers fail.
+        DeviceError: The mobile tweezers fail, or a watched value is past its limit.
     """
     overhead_s = shot.motion.overhead_per_cycle_s
     mobile, limit_s = shot.mobile_tweezers, shot.call_timeout_s
@@ -32,7 +32,9 @@ def play(shot: Shot, build: Callable[[], ToneProgram], start_s: float, cycle: in
         duration_s = _duration(shot.call("mobile_tweezers", limit_s, mobile.prepare, build()))
         if shot.clock.virtual:
             shot.clock.sleep(max(0.0, overhead_s - (shot.clock.now() - start_s)))
-    with shot.stage("play", duration_s, cycle):
+    shot.check_interlocks()
+    budget_s = duration_s + shot.margin_s("rearrange")
+    with shot.stage("play", budget_s, cycle), shot.lit("rearrange", duration_s):
         shot.call("mobile_tweezers", limit_s, mobile.play)
         shot.call("mobile_tweezers", duration_s + 2 * limit_s, mobile.wait, duration_s + limit_s)
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Protocol
 
 from labseq.errors import PlanError
+from labseq.lines import margin_s
 from labseq.model import CycleRecord, Plan, PlanReport, TimelineEntry
 from labseq.motion import check_plan, fitting_batches, tone_program
 from labseq.roles import Shot, StepContext
@@ -41,16 +42,16 @@ class RearrangeStep:
     def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:
         """Two bars per cycle, the moves at their window."""
         exposure_s = self.settings.exposure
-        image_s = exposure_s + context.camera.readout_s
+        image_s = exposure_s + context.camera.readout_s + margin_s(context.lines, "image")
         all_made = self.settings.stop_when == "never"
         waited_out = all_made and self.settings.window_mode == "fixed"
         bars: list[TimelineEntry] = []
         for cycle in range(1, self.settings.cycles + 1):
             window_s = self.settings.window_of(cycle)
-            bars.append(TimelineEntry(f"cycle {cycle}: move", window_s, window_s if waited_out else 0.0))
-            bars.append(
-                TimelineEntry(f"cycle {cycle}: image", image_s, image_s if all_made else 0.0, 1, exposure_s)
-            )
+            least_s, least_image_s = window_s if waited_out else 0.0, image_s if all_made else 0.0
+            moves = TimelineEntry(f"cycle {cycle}: move", window_s, least_s, kind="rearrange")
+            image = TimelineEntry(f"cycle {cycle}: image", image_s, least_image_s, 1, exposure_s, "image")
+            bars += [moves, image]
         return bars
 
     def run(self, shot: Shot) -> None:
@@ -112,7 +113,7 @@ class RearrangeStep:
         if plan.n_batches == 0:
             return 0
         overhead_s = shot.motion.overhead_per_cycle_s
-        late_s = max(0.0, shot.clock.now() - start_s - overhead_s)
+        late_s = max(0.0, shot.clock.now() - start_s - overhead_s) + shot.margin_s("rearrange")
         n_played = fitting_batches(report, plan, window_s - late_s)
         if n_played < plan.n_batches:
             shot.log("window_too_short", cycle=cycle, n_batches=plan.n_batches, n_batches_played=n_played)

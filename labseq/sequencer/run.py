@@ -11,11 +11,11 @@ from typing import Any, Protocol
 from labseq.errors import LabseqError, StopRequested, TransientError
 from labseq.model import ShotRecord, TimelineEntry
 from labseq.model.records import ShotStatus
-from labseq.roles import RunObserver, Step, StepContext
+from labseq.roles import RunObserver, Settling, Step, StepContext
 from labseq.sequencer.clock import StopFlag
 from labseq.sequencer.guard import Guard
 from labseq.sequencer.lab import Lab, Outcome, close_all, make_safe
-from labseq.sequencer.shot import RunningShot
+from labseq.sequencer.shot import LATE_S, RunningShot
 from labseq.sequencer.states import State, StateTable
 
 
@@ -109,7 +109,10 @@ class Sequencer:
         self._budgets = self._lay_out()
 
     def _open(self, names: Collection[str]) -> None:
-        """Open the simulation and the devices of these names; static tweezers among them are turned on."""
+        """Open the simulation and the devices of these names; then wait for those that need time.
+
+        Static tweezers among them are turned on.
+        """
         lab, timeout_s = self.lab, self.lab.timeouts.call_s
         simulation = () if lab.simulation is None else (("simulation", lab.simulation),)
         for name, part in (*simulation, *lab.hardware()):
@@ -120,6 +123,14 @@ class Sequencer:
         if "static_tweezers" in names:
             self.guard.call("static_tweezers", timeout_s, lab.static_tweezers.load, None)
             self.guard.call("static_tweezers", timeout_s, lab.static_tweezers.start)
+        for name, device in lab.hardware():
+            if (
+                name in names
+                and isinstance(device, Settling)
+                and (longest_s := device.settling_timeout_s) > 0
+            ):
+                self._emit("settling", {"device": name, "timeout_s": longest_s})
+                self.guard.call(name, longest_s + LATE_S, device.settle)
 
     def _close(self, names: Collection[str]) -> None:
         """Make the devices of these names safe, all of them first, then close them."""
@@ -209,6 +220,8 @@ class Sequencer:
             self.guard.call("simulation", self.lab.timeouts.call_s, self.lab.simulation.begin_shot)
         self._emit("shot_started", {"shot": record.shot_index, "attempt": record.attempt})
         shot = RunningShot(self.lab, self.guard, record, self._emit)
+        shot.poll()
+        shot.check_interlocks()
         for number, (name, step) in enumerate(self._steps):
             self._stop.check()
             shot.begin_step(number)

@@ -10,9 +10,11 @@ from typing import Any, ParamSpec, TypeVar
 import numpy as np
 
 from labseq.errors import ConfigError, DeviceError
+from labseq.lines import line_program, margin_s, trigger_line
 from labseq.model import CycleRecord, Frame, ImageRecord, Occupancy, ShotRecord, StageTiming
-from labseq.roles import Device, LossTeller, Storyteller, TruthTeller
+from labseq.roles import Device, Interlocked, LossTeller, Polled, Storyteller, TruthTeller
 from labseq.sequencer.guard import Guard
+from labseq.sequencer.interlock import check_blinding
 from labseq.sequencer.lab import Lab
 
 P = ParamSpec("P")
@@ -79,6 +81,40 @@ class RunningShot:
         """Call a device or plugin; see ``labseq.roles.Shot``."""
         return self._guard.call(owner, timeout_s, function, *args, **kwargs)
 
+    def poll(self) -> None:
+        """Keep with the shot what devices are read for at its start."""
+        for name, device in self.lab.hardware():
+            if isinstance(device, Polled):
+                values = self.call(name, self.call_timeout_s, device.poll)
+                self.record.readings.update({f"{name}.{value}": read for value, read in values.items()})
+
+    def check_interlocks(self) -> None:
+        """Ask every device that watches something; see ``labseq.roles.Shot``."""
+        for name, device in self.lab.hardware():
+            if isinstance(device, Interlocked):
+                self.call(name, self.call_timeout_s, device.check_interlocks)
+
+    def margin_s(self, kind: str) -> float:
+        """How much longer a kind of step takes for its lines."""
+        return margin_s(self.lab.line_specs, kind)
+
+    @contextmanager
+    def lit(self, kind: str, duration_s: float) -> Generator[None]:
+        """Fire the lines of a kind of step around it; see ``labseq.roles.Shot``."""
+        lines, timeout_s = self.lab.lines, self.call_timeout_s
+        if lines is None:
+            yield
+            return
+        program = line_program(self.lab.line_specs, kind, duration_s)
+        self.call("lines", timeout_s, lines.compile, program)
+        self.call("lines", timeout_s, lines.arm)
+        fired_s = self.clock.now()
+        self.call("lines", timeout_s, lines.fire)
+        self.clock.sleep(max(0.0, program.begin_s - (self.clock.now() - fired_s)))
+        yield
+        left_s = max(0.0, program.duration_s - (self.clock.now() - fired_s)) + timeout_s
+        self.call("lines", left_s + LATE_S, lines.wait, left_s)
+
     @contextmanager
     def stage(self, name: str, budget_s: float = float("nan"), cycle: int = 0) -> Generator[None]:
         """Time a stage against its budget; it is recorded however it ends."""
@@ -96,16 +132,21 @@ class RunningShot:
         """Expose, read, detect and record an image.
 
         Raises:
-            DeviceError: Camera or detector delivered something of the wrong kind.
+            DeviceError: Camera or detector delivered something of the wrong kind, or a light is on that
+                would blind the camera.
         """
         camera, timeout_s = self.lab.camera, self.call_timeout_s
         start_s = self.elapsed_s
-        budget_s = exposure_s + self.lab.step_context.camera.readout_s
+        specs, limit_s = self.lab.line_specs, timeout_s + exposure_s
+        budget_s = exposure_s + self.lab.step_context.camera.readout_s + margin_s(specs, "image")
+        check_blinding(self.lab, self._guard)
+        by_line = trigger_line(specs, "camera") is not None
         with self.stage("expose", budget_s, cycle):
-            self.call("camera", timeout_s, camera.arm, 1, exposure_s, "software")
-            self.call("camera", timeout_s + exposure_s, camera.trigger)
-            limit_s = timeout_s + exposure_s
-            frame = self.call("camera", limit_s + LATE_S, camera.read, limit_s)
+            self.call("camera", timeout_s, camera.arm, 1, exposure_s, "external" if by_line else "software")
+            with self.lit("image", exposure_s):
+                if not by_line:
+                    self.call("camera", limit_s, camera.trigger)
+                frame = self.call("camera", limit_s + LATE_S, camera.read, limit_s)
         if not isinstance(frame, Frame):  # pyright: ignore[reportUnnecessaryIsInstance]
             raise DeviceError("camera", f"read() returned {type(frame).__name__}; expected a Frame")
         with self.stage("detect", cycle=cycle):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
+from labseq.lines import margin_s
 from labseq.model import TimelineEntry
 from labseq.roles import Shot, StepContext
 from labseq.units import format_quantity
@@ -40,18 +41,20 @@ class LoadStep:
     def __init__(self, settings: _Duration) -> None:
         self.duration_s = settings.duration
 
-    def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:  # noqa: ARG002 - Protocol
+    def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:
         """One bar."""
-        return [TimelineEntry("load", self.duration_s, self.duration_s)]
+        duration_s = self.duration_s + margin_s(context.lines, "load")
+        return [TimelineEntry("load", duration_s, duration_s, kind="load")]
 
     def run(self, shot: Shot) -> None:
         """Start the array, then wait while the atom source is on."""
         tweezers = shot.static_tweezers
         shot.call("static_tweezers", shot.call_timeout_s, tweezers.start)
-        start_s = shot.clock.now()
-        shot.clock.sleep(self.duration_s)
-        if shot.simulation is not None:
-            shot.call("simulation", shot.call_timeout_s, shot.simulation.load, start_s, self.duration_s)
+        with shot.lit("load", self.duration_s):
+            start_s = shot.clock.now()
+            shot.clock.sleep(self.duration_s)
+            if shot.simulation is not None:
+                shot.call("simulation", shot.call_timeout_s, shot.simulation.load, start_s, self.duration_s)
 
 
 class ImageStep:
@@ -65,8 +68,8 @@ class ImageStep:
 
     def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:
         """One bar, read-out included."""
-        image_s = self.exposure_s + context.camera.readout_s
-        return [TimelineEntry("image", image_s, image_s, n_images=1, exposure_s=self.exposure_s)]
+        image_s = self.exposure_s + context.camera.readout_s + margin_s(context.lines, "image")
+        return [TimelineEntry("image", image_s, image_s, 1, self.exposure_s, "image")]
 
     def run(self, shot: Shot) -> None:
         """Take the image and judge the shot on it."""
@@ -83,14 +86,16 @@ class WaitStep:
     def __init__(self, settings: _Duration) -> None:
         self.duration_s = settings.duration
 
-    def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:  # noqa: ARG002 - Protocol
+    def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:
         """One bar."""
         text = f"wait {format_quantity(self.duration_s, 'time')}"
-        return [TimelineEntry(text, self.duration_s, self.duration_s)]
+        duration_s = self.duration_s + margin_s(context.lines, "wait")
+        return [TimelineEntry(text, duration_s, duration_s, kind="wait")]
 
     def run(self, shot: Shot) -> None:
         """Wait on the session's clock."""
-        shot.clock.sleep(self.duration_s)
+        with shot.lit("wait", self.duration_s):
+            shot.clock.sleep(self.duration_s)
 
 
 class DeviceStep:

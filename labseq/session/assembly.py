@@ -41,6 +41,7 @@ from labseq.session.choosing import (
 )
 from labseq.session.contents import make_steps, make_target
 from labseq.session.scan import Point, Scanned
+from labseq.session.wiring import check_kinds
 
 
 @dataclass(frozen=True, slots=True)
@@ -249,6 +250,7 @@ def choose_all(
         except ConfigError as error:
             refused[role] = error
             found.add(error)
+    check_kinds(document, spec, host, found)
     detector = chosen["detector"].dump() if "detector" in chosen else {}
     made = (
         Calibrated({}, spec.grid_model()) if mended else calibrated(document, spec, found, dry_run, detector)

@@ -5,20 +5,22 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from labseq.errors import LabseqError, Problem
+from labseq.lines import spans_on
 from labseq.model import TimelineEntry
 from labseq.motion import check_plan
 from labseq.roles import KnownLoading, Step
 from labseq.sequencer import Guard, StopFlag
 from labseq.sequencer.lab import Lab
 from labseq.sequencer.run import lay_out
+from labseq.session.commands import check_commands
 from labseq.session.session import Session
 from labseq.units import format_quantity
 
@@ -61,6 +63,7 @@ class CheckReport:
         warnings: What is allowed but hardly meant, with its place in the files.
         rehearsal: What the planner made of random loadings; None without a rearrangement.
         shot_bytes: Size of a shot on disk at most; None if the camera does not tell its frames.
+        lines: Name of each line -> when it is on in the longest shot, as (start, end) in seconds.
     """
 
     timeline: Sequence[tuple[str, Sequence[TimelineEntry]]]
@@ -70,6 +73,7 @@ class CheckReport:
     warnings: tuple[Problem, ...]
     rehearsal: Rehearsal | None
     shot_bytes: int | None
+    lines: Mapping[str, Sequence[tuple[float, float]]] = field(default_factory=dict[str, Any])
 
     @property
     def bars(self) -> list[TimelineEntry]:
@@ -97,8 +101,12 @@ def check(session: Session) -> CheckReport:
 
     Args:
         session: An opened session; its sequence and profile have no errors.
+
+    Raises:
+        ConfigError: A step sends a command that its device does not know.
     """
     assembly = session.assembly
+    check_commands(assembly, session.course.each(), session.build_lab)
     lab = session.build_lab()
     timeline = session.timeline()
     windows = _windows(assembly.steps)
@@ -124,6 +132,7 @@ def check(session: Session) -> CheckReport:
         tuple(warnings),
         rehearsal,
         _shot_bytes(session, lab, timeline),
+        spans_on(lab.line_specs, (bar for _, bars in timeline for bar in bars)),
     )
 
 

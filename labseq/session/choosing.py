@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any, Final, Literal, get_args
 
-from labseq.config import MOTION_KEYS, Choice, Document, Loc, ProfileSpec
+from labseq.config import DEVICE_KEYS, LINES_KEYS, MOTION_KEYS, Choice, Document, Loc, ProfileSpec
 from labseq.config.settings import Settings
 from labseq.config.wording import clean
 from labseq.errors import (
@@ -24,7 +24,14 @@ from labseq.registry import VIRTUAL_TWIN, Entry
 
 DryRun = Literal["off", "full", "fast"]
 
-HARDWARE_KINDS: Final = frozenset({"camera", "static_tweezers", "mobile_tweezers", "device"})
+_CORE_KEYS: Final = {
+    "mobile_tweezers": frozenset(MOTION_KEYS),
+    "device": frozenset(DEVICE_KEYS),
+    "lines": frozenset(LINES_KEYS),
+}
+"""Keys that stand beside a plugin's own, and belong to the core."""
+
+HARDWARE_KINDS: Final = frozenset({"camera", "static_tweezers", "mobile_tweezers", "device", "lines"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,7 +182,7 @@ def choose(
     Returns:
         The choice, and a warning for the user or "".
     """
-    drop = frozenset(MOTION_KEYS) if kind == "mobile_tweezers" else frozenset[str]()
+    drop = _CORE_KEYS.get(kind, frozenset[str]())
     if dry_run == "off" or kind not in HARDWARE_KINDS or choice.use == VIRTUAL_TWIN:
         return resolve(host, document, kind, choice, drop), ""
     entry = host.registry.get(kind, VIRTUAL_TWIN)

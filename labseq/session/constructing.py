@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 from labseq.errors import ConfigError, LabseqError, LimitError, PluginLoadError
-from labseq.model import CalibrationEntry, MotionSpec, RandomStream, SiteGrid, TargetPattern
+from labseq.model import CalibrationEntry, LineSpec, MotionSpec, RandomStream, SiteGrid, TargetPattern
 from labseq.registry import Entry
 from labseq.roles import (
     Camera,
@@ -14,6 +14,7 @@ from labseq.roles import (
     Context,
     Detector,
     Device,
+    Lines,
     MobileTweezers,
     Planner,
     Simulation,
@@ -27,6 +28,7 @@ _ROLES: Final[Mapping[str, type]] = {
     "static_tweezers": StaticTweezers,
     "mobile_tweezers": MobileTweezers,
     "device": Device,
+    "lines": Lines,
     "detector": Detector,
     "planner": Planner,
     "simulation": Simulation,
@@ -43,6 +45,7 @@ def construct(
     simulation: Simulation | None = None,
     calibrations: Mapping[str, CalibrationEntry] | None = None,
     world_grid: SiteGrid | None = None,
+    lines: tuple[LineSpec, ...] = (),
 ) -> tuple[dict[str, Any], tuple[RandomStream, ...]]:
     """Construct the object of every role; constructors do no I/O, so nothing is open yet.
 
@@ -56,6 +59,7 @@ def construct(
         calibrations: Those in use: kind -> entry.
         world_grid: The grid without calibrations, for the simulation: it is the truth that they are
             measured on; None where there are none.
+        lines: What is wired to the timing box.
 
     Returns:
         Role -> object, and the random streams that were handed out.
@@ -65,7 +69,7 @@ def construct(
         PluginLoadError: A constructor raised, or made no object of that role; names the plugin.
     """
     made, streams, refused = construct_each(
-        chosen, grid, motion, clock, seed, simulation, calibrations, world_grid
+        chosen, grid, motion, clock, seed, simulation, calibrations, world_grid, lines
     )
     for error in refused.values():
         raise error
@@ -81,6 +85,7 @@ def construct_each(
     simulation: Simulation | None = None,
     calibrations: Mapping[str, CalibrationEntry] | None = None,
     world_grid: SiteGrid | None = None,
+    lines: tuple[LineSpec, ...] = (),
 ) -> tuple[dict[str, Any], tuple[RandomStream, ...], dict[str, LabseqError]]:
     """The same, but one that cannot be constructed never keeps the others from it.
 
@@ -96,7 +101,7 @@ def construct_each(
         streams.append(stream)
         sites = world_grid if is_world and world_grid is not None else grid
         world = made.get("simulation", simulation)
-        context = Context(role, sites, motion, clock, stream, calibrations or {}, world)
+        context = Context(role, sites, motion, clock, stream, calibrations or {}, world, lines)
         try:
             made[role] = construct_one(chosen[role], context)
         except LabseqError as error:

@@ -8,17 +8,23 @@ from typing import Any, Final
 from labseq.config import MotionSettings, ProfileSpec
 from labseq.model import MotionSpec, RandomStream, TargetPattern
 from labseq.roles import Clock
+from labseq.sequencer.interlock import Blinding
 from labseq.sequencer.lab import Lab, Timeouts
 from labseq.session.choosing import Bench, Chosen, blamed
 from labseq.session.constructing import construct
 from labseq.session.scan import Point
+from labseq.session.wiring import refuse_wrong_wiring
 
 DRIVERS_MOTION: Final = frozenset({"rf", "max_row_tones", "max_column_tones", "eject_slots"})
 """Keys of the motion that the mobile tweezers are opened with; all others are the core's alone."""
 
 
 def build_lab(point: Point, target: TargetPattern, clock: Clock, seed: int) -> Lab:
-    """Construct every role's object; nothing is opened."""
+    """Construct every role's object; nothing is opened.
+
+    Raises:
+        ConfigError: A constructor refuses its settings, or the lines do not go with the devices.
+    """
     bench = point.bench
     profile, motion = bench.profile, bench.profile.motion
     chosen = {**bench.chosen, "planner": point.planner}
@@ -30,8 +36,9 @@ def build_lab(point: Point, target: TargetPattern, clock: Clock, seed: int) -> L
         seed,
         calibrations=bench.calibrations,
         world_grid=profile.grid_model(),
+        lines=profile.line_specs,
     )
-    return Lab(
+    lab = Lab(
         grid=bench.grid,
         motion=motion,
         target=target,
@@ -48,7 +55,12 @@ def build_lab(point: Point, target: TargetPattern, clock: Clock, seed: int) -> L
         random_streams=streams,
         timeouts=timeouts_of(profile),
         calibrations=bench.calibrations,
+        blinding=_blinding(profile),
+        lines=made.get("lines"),
+        line_specs=profile.line_specs,
     )
+    refuse_wrong_wiring(bench.document, lab)
+    return lab
 
 
 def rebuild_lab(lab: Lab, before: Point, after: Point, seed: int) -> tuple[Lab, frozenset[str]]:
@@ -83,8 +95,9 @@ def rebuild_lab(lab: Lab, before: Point, after: Point, seed: int) -> tuple[Lab, 
         lab.simulation,
         after.bench.calibrations,
         after.bench.profile.grid_model(),
+        after.bench.profile.line_specs,
     )
-    roles = ("camera", "static_tweezers", "mobile_tweezers", "detector", "planner", "simulation")
+    roles = ("camera", "static_tweezers", "mobile_tweezers", "detector", "planner", "lines", "simulation")
     return replace(
         lab,
         **{role: made[role] for role in roles if role in made},
@@ -120,6 +133,11 @@ def _streams(old: tuple[RandomStream, ...], new: tuple[RandomStream, ...]) -> tu
     """The streams of a lab: the new ones, and the old ones of what stays."""
     names = {stream.name for stream in new}
     return (*(stream for stream in old if stream.name not in names), *new)
+
+
+def _blinding(profile: ProfileSpec) -> dict[str, Blinding]:
+    marks = {name: device.blinding for name, device in profile.devices.items()}
+    return {name: Blinding(mark.value, mark.when) for name, mark in marks.items() if mark is not None}
 
 
 def _parallelism(planner: Chosen, made: Any, motion: MotionSpec) -> int:

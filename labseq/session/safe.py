@@ -108,6 +108,7 @@ def construct_hardware(bench: Bench, clock: Clock) -> tuple[dict[str, Any], dict
         seed=0,
         calibrations=bench.calibrations,
         world_grid=bench.profile.grid_model(),
+        lines=bench.profile.line_specs,
     )
     return made, {role: chosen[role].placed(error) for role, error in failures.items()}
 

@@ -31,6 +31,7 @@ from labseq.sequencer.lab import Lab, describe
 from labseq.sequencer.run import lay_out
 from labseq.session.assembly import Assembly, assemble
 from labseq.session.choosing import DryRun
+from labseq.session.commands import check_commands
 from labseq.session.labs import build_lab
 from labseq.session.observers import Observers
 from labseq.session.options import Options, path_of
@@ -140,6 +141,7 @@ class Session:
             The finished run, read back from disk.
 
         Raises:
+            ConfigError: A step sends a command that its device does not know; nothing was opened.
             StopRequested: Ctrl-C or SIGTERM; devices are safe, the data is on disk.
             LabseqError: Whatever ended the run; devices are safe, the data is on disk.
         """
@@ -148,6 +150,7 @@ class Session:
         roots = marker_roots(self.options.output or data_root())
         for text in self.assembly.warnings:
             self._observers.event("warning", {"text": text})
+        check_commands(self.assembly, self.course.each(), self.build_lab)
         with stop_on_signals(self.stop_flag):
             self._secure_after_crash(roots)
             labs = (self.build_lab(point) for point in self.course.each_lab())

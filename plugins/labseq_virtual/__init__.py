@@ -8,7 +8,16 @@ LABSEQ_API = 1
 @hookimpl
 def labseq_register(registry: Registry) -> None:
     """Offer the world, and a virtual twin for each hardware role."""
-    from labseq_virtual import camera, device, mobile_tweezers, settings, spot_meter, static_tweezers, world
+    from labseq_virtual import (
+        camera,
+        device,
+        lines,
+        mobile_tweezers,
+        settings,
+        spot_meter,
+        static_tweezers,
+        world,
+    )
 
     mobile, static = mobile_tweezers.VirtualMobileTweezers, static_tweezers.VirtualStaticTweezers
     registry.simulation("virtual", world.World, settings.WorldSettings)
@@ -16,5 +25,6 @@ def labseq_register(registry: Registry) -> None:
     registry.static_tweezers("virtual", static, settings.StaticTweezersSettings, virtual_time=True)
     registry.mobile_tweezers("virtual", mobile, settings.MobileTweezersSettings, virtual_time=True)
     registry.device("virtual", device.VirtualDevice, settings.DeviceSettings, virtual_time=True)
+    registry.lines("virtual", lines.VirtualLines, settings.LinesSettings, virtual_time=True)
     spots, spot_settings = spot_meter.VirtualSpotMeter, settings.SpotMeterSettings
     registry.device("virtual_spot_meter", spots, spot_settings, virtual_time=True)

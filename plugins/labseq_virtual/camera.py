@@ -2,150 +2,173 @@
 
 from __future__ import annotations
 
-import importlib
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, Final
+from typing import Any
 
 from labseq import (
+    CameraDriver,
     CameraFacts,
+    ConfigError,
     Context,
-    DeviceError,
-    DeviceTimeoutError,
-    Frame,
-    LimitError,
-    TransientError,
-    Trigger,
+    KnownSensor,
+    SensorMode,
+    Series,
+    SimulatedSensor,
+    Taken,
+    Wired,
+    settle,
 )
-from labseq.units import format_quantity
-from labseq_virtual.driver import VirtualDriver
+from labseq.lines import trigger_line
+from labseq_virtual.cooler import ROOM_K, Cooler
+from labseq_virtual.driver import simulated_world
 from labseq_virtual.settings import CameraSettings
 
-TEST_EXPOSURE_S: Final = 10e-3
 
-
-class VirtualCamera(VirtualDriver):
+class VirtualCamera(CameraDriver):
     """Frames of the simulated world, with a real camera's manners.
 
-    It must be armed before it is triggered, exposes as often as it was armed for,
-    and delivers a frame when its exposure and read-out have passed on the clock.
+    A frame can be read when its exposure and read-out have passed on the clock. The shutter is open
+    and the EM gain is on in a series only. The cooler runs from the first ``open()`` on, also in the
+    safe state and when the camera is closed, as real ones do: to warm up takes longer than a run.
 
     Args:
-        settings: Read-out time, limits, failures to rehearse.
+        settings: Region, binning, read-out time, EM gain, cooling, failures to rehearse.
         context: Clock, random numbers and the simulated world.
+
+    Raises:
+        ConfigError: There is no simulated world, or its sensor has no such region.
+        LimitError: Its sensor has no EM register.
     """
 
     def __init__(self, settings: CameraSettings, context: Context) -> None:
-        super().__init__(context, "camera")
+        super().__init__(context)
         self._settings = settings
-        self._exposure_s = 0.0
-        self._n_triggers_left = 0
-        self._exposing_until_s = 0.0
-        self._frames: deque[tuple[float, Frame]] = deque()
+        self._random = context.random
+        self._world = simulated_world(context)
+        self._sensor = SimulatedSensor(self._world, context.clock)
+        self._is_wired = trigger_line(context.lines, "camera") is not None
+        self._mode = replace(settings.mode, em_gain=settings.em_gain)
+        self._idle = replace(
+            self._mode, em_gain=None if settings.em_gain is None else 1.0, shutter_open=False
+        )
+        self._in_force = self._idle
+        self._readout_s, self._frame_shape = settings.readout, None
+        if isinstance(self._world, KnownSensor):
+            if misfit := settings.misfit_on(self._world.sensor_shape):
+                raise ConfigError(misfit)
+            self._readout_s *= self._world.readout_fraction(self._mode)
+            self._frame_shape = self._mode.frame_shape(self._world.sensor_shape)
+        cooling = settings.cooling
+        self._cooling = None if cooling is None else cooling.spec()
+        self._cooler = None if cooling is None else Cooler(cooling.temperature, context.clock)
+        self._opened_s = 0.0
+        self._is_internal = False
+        self._coming: deque[tuple[int, bool]] = deque()
+        self._n_seen = 0
 
     @property
     def facts(self) -> CameraFacts:
-        """Read-out time (less for a part of the sensor), longest exposure, shape of the simulated frames."""
-        shape = getattr(self._world, "frame_shape", None)
-        readout_s = self._settings.readout * getattr(self._world, "readout_fraction", 1.0)
-        return CameraFacts(readout_s, self._settings.max_exposure, shape)
+        """Read-out time (less for a part of the sensor), longest exposure, shape of the frames, EM gain."""
+        em_gain = 1.0 if self._settings.em_gain is None else self._settings.em_gain
+        triggers = ("software", "internal", "external") if self._is_wired else ("software", "internal")
+        return CameraFacts(self._readout_s, self._settings.max_exposure, self._frame_shape, em_gain, triggers)
 
     def warm(self) -> None:
-        """Compile the kernels of the simulated frames, or load them from the cache."""
-        importlib.import_module("labseq_virtual._kernels_image")
+        """Work out what all frames have in common, and compile their kernels or load them."""
+        if isinstance(self._world, KnownSensor):
+            self._world.prepare_sensor(self._mode)
 
-    def arm(self, n_frames: int, exposure_s: float, trigger: Trigger) -> None:
-        """Get ready for a series of exposures; frames not yet read are dropped.
+    @property
+    def settling_timeout_s(self) -> float:
+        """How long cooling may take, in seconds; 0 without."""
+        return 0.0 if self._cooling is None else self._cooling.timeout_s
+
+    def settle(self) -> None:
+        """Wait until the sensor is cold.
 
         Raises:
-            LimitError: No frames, or an exposure that the camera cannot make.
-            DeviceError: Not open, or a trigger that needs a wire.
+            DeviceTimeoutError: It does not get there in time.
+            DeviceError: The camera is not open.
         """
         self._check_open()
-        if n_frames < 1:
-            raise LimitError(f"{self._name}: number of frames", n_frames, "at least 1")
-        longest_s = self._settings.max_exposure
-        if not 0 < exposure_s <= longest_s:
-            raise LimitError(
-                f"{self._name}: exposure",
-                format_quantity(exposure_s, "time"),
-                f"more than 0 and at most {format_quantity(longest_s, 'time')}",
-                "choose another exposure, or raise `max_exposure` of the camera",
-            )
-        if trigger != "software":
-            raise DeviceError(
-                self._name, f"a virtual camera has no wire for the {trigger} trigger; expected 'software'"
-            )
-        self._frames.clear()
-        self._exposure_s = exposure_s
-        self._n_triggers_left = n_frames
-
-    def trigger(self) -> None:
-        """Start the next exposure of the series; returns at once.
-
-        Raises:
-            DeviceError: Not armed, all exposures made, or still exposing.
-        """
-        self._check_open()
-        now_s = self._clock.now()
-        if self._n_triggers_left == 0:
-            raise DeviceError(self._name, "triggered, but not armed for another frame; call arm() first")
-        if now_s < self._exposing_until_s:
-            raise DeviceError(
-                self._name, f"triggered during an exposure that ends at {self._exposing_until_s:.6f} s"
-            )
-        self._n_triggers_left -= 1
-        if self._happens(self._settings.faults.missed_trigger):
-            return
-        frame = self._world.expose(now_s, self._exposure_s)
-        self._exposing_until_s = now_s + self._exposure_s
-        ready_s = self._exposing_until_s + self.facts.readout_s
-        self._frames.append((ready_s, replace(frame, camera=self._name)))
-
-    def read(self, timeout_s: float) -> Frame:
-        """Wait for the oldest frame not yet read.
-
-        Raises:
-            DeviceTimeoutError: No frame came within ``timeout_s``.
-            TransientError: The frame was lost (a failure to rehearse).
-        """
-        self._check_open()
-        missing_s = self._frames[0][0] - self._clock.now() if self._frames else float("inf")
-        if missing_s > timeout_s:
-            self._clock.sleep(timeout_s)
-            reason = "is not ready" if self._frames else "was not triggered"
-            text = f"no frame within {format_quantity(timeout_s, 'time')}: the next one {reason}"
-            raise DeviceTimeoutError(self._name, text, timeout_s)
-        self._clock.sleep(max(0.0, missing_s))
-        _, frame = self._frames.popleft()
-        if self._happens(self._settings.faults.transient):
-            raise TransientError("a frame was lost on its way (rehearsed failure)", self._name)
-        return frame
-
-    def safe_state(self) -> None:
-        """Stop exposing and drop all frames."""
-        self._frames.clear()
-        self._n_triggers_left = 0
-        self._exposing_until_s = 0.0
-
-    def self_test(self) -> None:
-        """Take a frame; those not yet read are dropped.
-
-        Raises:
-            DeviceError: Not open, no frame came, or it has another shape than the camera says.
-            TransientError: The frame was lost (a failure to rehearse).
-        """
-        exposure_s = min(TEST_EXPOSURE_S, self._settings.max_exposure)
-        self.arm(1, exposure_s, "software")
-        self.trigger()
-        shape, told = self.read(exposure_s + self.facts.readout_s + 1.0).image.shape, self.facts.frame_shape
-        if told is not None and shape != told:
-            raise DeviceError(self._name, f"a frame has the shape {shape}; expected {told}")
+        if self._cooling is not None:
+            settle(self._cooling, lambda: self._temperature_k, self._clock, self._name)
 
     def describe(self) -> Mapping[str, Any]:
-        """Model and settings."""
-        return {"model": "virtual camera", **self._settings.model_dump(mode="json")}
+        """Model, settings, and what is in force now: shutter, EM gain, temperature in kelvins."""
+        mode = self._in_force
+        return {
+            "model": "virtual camera",
+            **self._settings.model_dump(mode="json"),
+            "frame_shape": self._frame_shape,
+            "shutter": "open" if mode.shutter_open else "closed",
+            "em_gain_now": mode.em_gain,
+            "temperature_k": round(self._temperature_k, 2),
+        }
+
+    def _connect(self) -> None:
+        self._opened_s = self._clock.now()
+        if self._cooler is not None:
+            self._cooler.switch_on()
+
+    def _disconnect(self) -> None:
+        self._stop()
+
+    def _start(self, series: Series) -> None:
+        self._in_force = self._mode_of(series)
+        self._sensor.arm(series, self._in_force, self._readout_s)
+        self._is_internal = series.trigger == "internal"
+        self._coming.clear()
+        self._n_seen = 0
+        if series.trigger == "external" and isinstance(self._world, Wired):
+            self._world.wire("camera", self._expose)
+
+    def _fire(self) -> None:
+        if self._happens(self._settings.faults.missed_trigger):
+            self._sensor.skip()
+        else:
+            self._expose()
+
+    def _take(self, timeout_s: float) -> Taken | None:
+        until_s = self._clock.now() + timeout_s
+        while True:
+            if self._is_internal and not self._coming:
+                self._expose()
+            frame = self._sensor.take(max(0.0, until_s - self._clock.now()))
+            if frame is None:
+                return None
+            number, is_lost = self._coming.popleft()
+            if not is_lost:
+                break
+        if self._happens(self._settings.faults.transient):
+            return Taken(number, None, "it did not come over the wire whole (rehearsed failure)")
+        t_start_s = frame.t_start_s
+        return Taken(number, frame.image, t_start_s=t_start_s, device_time_s=t_start_s - self._opened_s)
+
+    def _stop(self) -> None:
+        self._sensor.clear()
+        self._coming.clear()
+        self._is_internal = False
+        self._in_force = self._idle
+
+    def _expose(self, t_start_s: float | None = None) -> None:
+        """Begin the next exposure; with the internal trigger only when somebody reads."""
+        faults = self._settings.faults
+        late_s = faults.late_by if self._happens(faults.late) else 0.0
+        is_lost = self._happens(faults.lost_in_series)
+        if self._sensor.expose(late_s, t_start_s) is not None:
+            self._coming.append((self._n_seen, is_lost))
+            self._n_seen += 1
+
+    def _mode_of(self, series: Series) -> SensorMode:
+        """The simulation's gain where the camera sets none."""
+        return self._mode if self._mode.em_gain is None else replace(self._mode, em_gain=series.em_gain)
+
+    @property
+    def _temperature_k(self) -> float:
+        return ROOM_K if self._cooler is None else self._cooler.temperature_k
 
     def _happens(self, probability: float) -> bool:
         """Draw a failure; no number is drawn for one that never comes."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 
-from labseq import ConfigError, Context, DeviceError
+from labseq import ConfigError, Context, DeviceError, Simulation
 
 
 class VirtualDriver(ABC):
@@ -22,11 +22,7 @@ class VirtualDriver(ABC):
         self._name = context.name or role
         self._clock = context.clock
         self._random = context.random
-        if context.simulation is None:
-            raise ConfigError(
-                "virtual hardware needs a simulated world; add `simulation: {use: virtual}` to the profile"
-            )
-        self._world = context.simulation
+        self._world = simulated_world(context)
         self._is_open = False
 
     def open(self) -> None:
@@ -45,3 +41,16 @@ class VirtualDriver(ABC):
     def _check_open(self) -> None:
         if not self._is_open:
             raise DeviceError(self._name, "not open; call open() first")
+
+
+def simulated_world(context: Context) -> Simulation:
+    """The world that virtual hardware acts on.
+
+    Raises:
+        ConfigError: There is none.
+    """
+    if context.simulation is None:
+        raise ConfigError(
+            "virtual hardware needs a simulated world; add `simulation: {use: virtual}` to the profile"
+        )
+    return context.simulation

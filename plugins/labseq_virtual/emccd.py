@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq_virtual.em_register import Register, power_of_two
-from labseq_virtual.image_settings import ImageSettings
 from labseq_virtual.law import Law
+from labseq_virtual.view import View
 
 FULL_SCALE: Final = 65535
 """Counts at which the converter of 16 bit ends."""
@@ -54,13 +54,13 @@ class Emccd:
     drawn from a table; the others are followed step by step.
 
     Args:
-        settings: Constants of the camera.
+        settings: Constants of the camera, and how it is read.
     """
 
     quantum_efficiency: Final = 1.0
     """The photoelectrons of the settings are this camera's."""
 
-    def __init__(self, settings: ImageSettings) -> None:
+    def __init__(self, settings: View) -> None:
         self.binning = settings.binning
         self._settings = settings
         gain, spurious = settings.em_gain, settings.register_clock_induced_charge

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal
 
-from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
 from labseq import Angle, Duration, Fraction, Length, Settings
 
@@ -56,16 +56,6 @@ class ImageSettings(Settings):
 
     frame: tuple[PositiveInt, PositiveInt] = Field(
         default=(512, 512), description="[height, width] of the sensor in pixels (ours: a common EMCCD)"
-    )
-    crop: tuple[NonNegativeInt, NonNegativeInt, PositiveInt, PositiveInt] | None = Field(
-        default=None,
-        description="[y, x, height, width] of the part of the sensor that is read, which takes less time; "
-        "the other settings stay relative to the whole sensor (ours: all of it)",
-    )
-    binning: PositiveInt = Field(
-        default=1,
-        description="pixels of the sensor per pixel of a frame along each axis: added up before the register "
-        "of an EMCCD, and after the read-out of a qCMOS camera (ours)",
     )
     pixel_size: PositiveLength = Field(
         default=0.35e-6,
@@ -141,7 +131,10 @@ class ImageSettings(Settings):
         "multiplied only by the stages after it (ours)",
     )
     em_gain: float = Field(
-        default=300.0, ge=1, le=2000, description="mean gain of the EM register; 1: a plain CCD (ours)"
+        default=300.0,
+        ge=1,
+        le=2000,
+        description="mean gain of the EM register where the camera sets none; 1: a plain CCD (ours)",
     )
     register_stages: int = Field(
         default=536,
@@ -166,19 +159,3 @@ class ImageSettings(Settings):
     qcmos: QcmosSettings = Field(
         default=QcmosSettings(), description="the camera where `sensor` is qcmos; else it plays no part"
     )
-
-    @property
-    def region(self) -> tuple[int, int, int, int]:
-        """(y, x, height, width) of the part of the sensor that is read."""
-        return self.crop or (0, 0, *self.frame)
-
-    @model_validator(mode="after")
-    def _region_fits(self) -> Self:
-        y, x, height, width = self.region
-        if y + height > self.frame[0] or x + width > self.frame[1]:
-            text = f"crop ends at row {y + height} and column {x + width}, beyond the frame"
-            raise ValueError(f"{text} of {list(self.frame)}; choose a smaller or another region")
-        if height % self.binning or width % self.binning:
-            text = f"{height} x {width} pixels cannot be binned by {self.binning}"
-            raise ValueError(f"{text}; choose a crop whose height and width are multiples of it")
-        return self

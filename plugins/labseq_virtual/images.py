@@ -5,46 +5,37 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq import RandomStream, SiteGrid
+from labseq import RandomStream, SensorMode, SiteGrid
+from labseq.roles import WHOLE_SENSOR
 from labseq_virtual.emccd import Emccd
 from labseq_virtual.image_settings import ImageSettings
 from labseq_virtual.optics import photoelectrons, site_brightness, site_spots
 from labseq_virtual.qcmos import Qcmos
+from labseq_virtual.view import View
 
 
 class Images:
-    """Draws frames of atoms on the sites.
+    """Draws frames of atoms on the sites, all in one mode of the sensor.
 
     Args:
         settings: Constants of optics and camera.
         grid: The sites.
         seed: Seed of what differs from site to site and from pixel to pixel.
+        mode: How the sensor is exposed and read.
+
+    Raises:
+        LimitError: The sensor cannot be used so.
     """
 
-    def __init__(self, settings: ImageSettings, grid: SiteGrid, seed: int) -> None:
+    def __init__(
+        self, settings: ImageSettings, grid: SiteGrid, seed: int, mode: SensorMode = WHOLE_SENSOR
+    ) -> None:
         rng = RandomStream(seed, "simulation.image").machine()
-        self._settings = settings
-        self._spots = site_spots(settings, grid)
-        self._brightness = site_brightness(settings, self._spots, rng)
-        self._sensor = Emccd(settings) if settings.sensor == "emccd" else Qcmos(settings, rng)
-
-    @property
-    def frame_shape(self) -> tuple[int, int]:
-        """(height, width) of the frames."""
-        _, _, height, width = self._settings.region
-        return height // self._settings.binning, width // self._settings.binning
-
-    @property
-    def readout_fraction(self) -> float:
-        """Time to read a frame, relative to that of the whole sensor without binning.
-
-        An EMCCD reads its pixels one after the other, a qCMOS camera its rows.
-        """
-        height, width = self._settings.frame
-        rows, cols = self._settings.region[2:]
-        if self._settings.sensor == "qcmos":
-            return rows / height
-        return rows * cols / (height * width * self._settings.binning**2)
+        self._view = view = View.of(settings, mode)
+        self._is_lit = mode.shutter_open
+        self._spots = site_spots(view, grid)
+        self._brightness = site_brightness(view, self._spots, rng)
+        self._sensor = Emccd(view) if view.sensor == "emccd" else Qcmos(view, rng)
 
     def warm(self) -> None:
         """Work out what all frames have in common."""
@@ -70,8 +61,8 @@ class Images:
         Returns:
             uint16 (height, width), in counts.
         """
-        settings = self._settings
-        full = settings.photoelectrons * self._sensor.quantum_efficiency * exposure_s / settings.exposure
-        mean = full * shining * self._brightness[row, col]
-        light = photoelectrons(settings, self._spots[row, col], mean, rng, self._sensor.binning)
+        view = self._view
+        full = view.photoelectrons * self._sensor.quantum_efficiency * exposure_s / view.exposure
+        mean = full * shining * self._brightness[row, col] * self._is_lit
+        light = photoelectrons(view, self._spots[row, col], mean, rng, self._sensor.binning)
         return self._sensor.read(light, exposure_s, rng)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from labseq import SiteGrid
 from labseq_virtual.image_settings import ImageSettings
+from labseq_virtual.view import View
 
 
 def site_spots(settings: ImageSettings, grid: SiteGrid) -> NDArray[np.float64]:
@@ -46,7 +47,7 @@ def site_brightness(
 
 
 def photoelectrons(
-    settings: ImageSettings,
+    settings: View,
     spots: NDArray[np.float64],
     mean: NDArray[np.float64],
     rng: np.random.Generator,
@@ -60,7 +61,7 @@ def photoelectrons(
     of an Airy pattern does.
 
     Args:
-        settings: Constants of the optics.
+        settings: Constants of the optics, and the part of the sensor that is read.
         spots: float64 (n_atoms, 2), (y, x) of each atom's spot on the sensor.
         mean: float64 (n_atoms,), mean photoelectrons of each.
         rng: Random numbers of the shot.

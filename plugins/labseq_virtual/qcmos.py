@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq_virtual.emccd import FULL_SCALE
-from labseq_virtual.image_settings import ImageSettings
 from labseq_virtual.law import Law
+from labseq_virtual.view import View
 
 Floats = NDArray[np.float32]
 
@@ -22,14 +22,14 @@ class Qcmos:
     then an analogue-to-digital converter of 16 bit. Binned pixels are added up after that.
 
     Args:
-        settings: Constants of the camera.
+        settings: Constants of the camera, and how it is read.
         rng: Random numbers of the machine, for what differs from pixel to pixel.
     """
 
     binning: Final = 1
     """Binning before the read-out."""
 
-    def __init__(self, settings: ImageSettings, rng: np.random.Generator) -> None:
+    def __init__(self, settings: View, rng: np.random.Generator) -> None:
         self.quantum_efficiency = settings.qcmos.quantum_efficiency
         self._settings = settings
         self._rng = rng

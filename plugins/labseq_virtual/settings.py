@@ -9,9 +9,10 @@ from __future__ import annotations
 
 from typing import Annotated, Self
 
-from pydantic import Field, NonNegativeFloat, PositiveFloat, model_validator
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
 
-from labseq import Duration, Fraction, Frequency, Length, Settings, Temperature, Voltage
+import labseq
+from labseq import CoolingSettings, Duration, Fraction, Frequency, Length, Settings, Temperature, Voltage
 from labseq.units import format_quantity
 from labseq_virtual.image_settings import ImageSettings
 
@@ -78,6 +79,16 @@ class MobileLightSettings(Settings):
     )
 
 
+class LightSettings(Settings):
+    """Which lines of the profile each kind of light needs, all of them at once."""
+
+    loading: tuple[str, ...] = Field(default=(), description="lines without which no atoms load (ours)")
+    cooling: tuple[str, ...] = Field(
+        default=(), description="lines without which atoms heat up while they are moved (ours)"
+    )
+    imaging: tuple[str, ...] = Field(default=(), description="lines without which atoms do not shine (ours)")
+
+
 class WorldSettings(Settings):
     """The virtual lab's atoms and light."""
 
@@ -117,6 +128,11 @@ class WorldSettings(Settings):
         description="spread of the transport loss from shot to shot: s.d. of the logarithm of a log-normal "
         "factor with mean 1 (ours: independent losses would leave a third of the paper's defect-free shots "
         "after one cycle)",
+    )
+    uncooled_transport: Annotated[float, Field(ge=1)] = Field(
+        default=3.0,
+        description="transport loss without cooling light, relative to that with it (ours; where lines "
+        "switch the light)",
     )
     machine_seed: Annotated[int, Field(ge=0, lt=2**63)] | None = Field(
         default=None,
@@ -166,6 +182,9 @@ class WorldSettings(Settings):
         lt=1,
         description="amplitude, as a fraction of full scale, above which a tone makes light (ours)",
     )
+    lights: LightSettings = Field(
+        default=LightSettings(), description="which lines each kind of light needs; none: it is always on"
+    )
     image: ImageSettings = Field(default=ImageSettings(), description="what the camera sees")
 
     @model_validator(mode="after")
@@ -187,15 +206,32 @@ class CameraFaults(Settings):
     missed_trigger: Fraction = Field(
         default=0.0, description="probability that a trigger is not seen, so that no frame comes"
     )
+    lost_in_series: Fraction = Field(
+        default=0.0,
+        description="probability that a frame never comes, which the number of the next one tells",
+    )
+    late: Fraction = Field(default=0.0, description="probability that a frame comes late")
+    late_by: Duration = Field(default=2.0, description="how late it comes then")
 
 
-class CameraSettings(Settings):
+class CameraSettings(labseq.CameraSettings):
     """The virtual camera; what it sees is set in the simulation."""
 
     readout: Duration = Field(
-        default=5e-3, description="time from the end of an exposure until its frame can be read (ours)"
+        default=5e-3,
+        description="time from the end of an exposure until its frame can be read, for the whole sensor "
+        "without binning (ours)",
     )
-    max_exposure: PositiveDuration = Field(default=10.0, description="longest exposure (ours)")
+    em_gain: float | None = Field(
+        default=None,
+        ge=1,
+        le=1000,
+        description="mean gain of the EM register in a series, 1 between them; none: the simulation's "
+        "`image.em_gain` at all times",
+    )
+    cooling: CoolingSettings | None = Field(
+        default=None, description="how cold the sensor is before the first shot; none: it is not cooled"
+    )
     faults: CameraFaults = Field(default=CameraFaults(), description="failures to rehearse")
 
 
@@ -234,6 +270,15 @@ class DeviceSettings(Settings):
     values: dict[str, bool | int | float | str] = Field(
         default={}, description="values that it can be asked for: name -> value at the start"
     )
+
+
+class LinesSettings(Settings):
+    """A virtual timing box."""
+
+    n_channels: PositiveInt = Field(default=32, description="number of outputs, counted from 0 (ours)")
+    resolution: Duration = Field(default=0.0, description="step of its clock; 0 for any time (ours)")
+    shortest: Duration = Field(default=1e-6, description="least time between two edges (ours)")
+    most_edges: PositiveInt = Field(default=1000, description="most edges of a program (ours)")
 
 
 class SpotMeterSettings(Settings):

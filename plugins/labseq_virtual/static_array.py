@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.model import DepthRamp, SiteGrid, TweezerAmplitudes
+from labseq.roles import ToneSource
 from labseq_virtual.settings import WorldSettings
 
 Floats = NDArray[np.float64]
@@ -30,6 +31,7 @@ class StaticArray:
         self._response: tuple[Floats, Floats] = np.ones(grid.n_rows), np.ones(grid.n_cols)
         self._power: tuple[Floats, Floats] = self._response
         self._level = 0.0
+        self._source: ToneSource | None = None
 
     def draw(self, random: np.random.Generator) -> None:
         """Draw the disorder of the machine; all light off, amplitudes equal."""
@@ -54,8 +56,27 @@ class StaticArray:
         return self.depth >= self._settings.lost_below_depth
 
     def switch_off(self) -> None:
-        """No light."""
+        """No light, and nobody to listen to."""
         self._level = 0.0
+        self._source = None
+
+    def listen(self, source: ToneSource) -> None:
+        """From now on the light is what these outputs play."""
+        rows, cols = self._grid.shape
+        self.drive(TweezerAmplitudes(np.zeros(rows), np.zeros(cols)))
+        self._source, self._level = source, 1.0
+
+    def hear(self, until_s: float, occupied: NDArray[np.bool_]) -> int:
+        """Follow what the outputs played; atoms in too shallow tweezers are gone from ``occupied``.
+
+        Returns:
+            How many were lost.
+        """
+        before = np.count_nonzero(occupied)
+        for amplitudes in () if self._source is None else self._source.played(until_s):
+            self.drive(amplitudes)
+            occupied &= self.holds()
+        return int(before - np.count_nonzero(occupied))
 
     def drive(self, amplitudes: TweezerAmplitudes) -> None:
         """Take over the amplitudes of the tones."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 import importlib
 import math
 from collections import Counter, deque
-from collections.abc import Mapping
-from typing import Any, Final
+from collections.abc import Callable, Mapping
+from typing import Any, Final, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,15 +17,20 @@ from labseq import (
     DeviceError,
     Frame,
     LimitError,
+    LineProgram,
     Occupancy,
     RandomStream,
     RfSource,
+    SensorMode,
     ToneProgram,
+    ToneSource,
     TweezerAmplitudes,
 )
-from labseq_virtual.exposure import Exposure
+from labseq.roles import WHOLE_SENSOR, Signal
+from labseq_virtual.exposure import Exposure, ShowsSensor
 from labseq_virtual.flight import Flight
 from labseq_virtual.hearing import Ear
+from labseq_virtual.lights import Lights
 from labseq_virtual.places import Places
 from labseq_virtual.settings import WorldSettings
 from labseq_virtual.static_array import StaticArray
@@ -35,18 +40,19 @@ ROUNDING_S: Final = 1e-6
 """How far into the past an event may lie because sums of times were rounded."""
 
 
-class World:
+class World(ShowsSensor):
     """Atoms in static tweezers, what light does to them, and what a camera sees of it.
 
-    Implements ``labseq.Simulation``, ``labseq.TruthTeller``, ``labseq.LossTeller``, ``labseq.Listening``
-    and ``labseq.Storyteller``. Events come in the order of time. A program of the mobile
+    Implements ``labseq.Simulation``, ``labseq.KnownSensor``, ``labseq.TruthTeller``, ``labseq.LossTeller``,
+    ``labseq.Listening`` and ``labseq.Storyteller``. Events come in the order of time. A program of the mobile
     tweezers is carried out when it has ended, or as far as it came when another program takes
     its place: playing a program without segments cuts it short, and atoms in flight are lost. A
     ramp of the static tweezers that comes during a program or an exposure acts at its end.
 
     Mobile tweezers come in two kinds. A driver may tell its program, which is taken at its
     word (``transport.py``). Or the world listens to the driver's outputs, finds the
-    tones in what they play, and lets atoms fly in the light (``flight.py``).
+    tones in what they play, and lets atoms fly in the light (``flight.py``). Static tweezers
+    likewise: they tell their ramps, or the world asks for the tones that they really play.
 
     Args:
         settings: Every constant of the model.
@@ -65,28 +71,15 @@ class World:
         self._static = StaticArray(context.grid, settings)
         self._ear: Ear | None = None
         self._seed = context.random.seed if settings.machine_seed is None else settings.machine_seed
+        self._lights = Lights(settings.lights, context.lines)
         self._exposure = Exposure(context.grid, settings, self._seed)
         self._is_open = False
-        self._lost: Counter[str] = Counter()
-        self._occupied: Occupancy = np.zeros(context.grid.shape, np.bool_)
-        self._now_s = -math.inf
-        self._playing: Playing | None = None
-        self._loss_factor = 1.0
+        self._forget()
 
     @property
     def loading_probability(self) -> float:
         """Probability that a site holds an atom after a long loading."""
         return self._settings.loading
-
-    @property
-    def frame_shape(self) -> tuple[int, int]:
-        """(height, width) of its frames."""
-        return self._exposure.images.frame_shape
-
-    @property
-    def readout_fraction(self) -> float:
-        """Time to read a frame, relative to that of the whole sensor."""
-        return self._exposure.images.readout_fraction
 
     def open(self) -> None:
         """Draw the machine's own disorder; no atoms, static tweezers off."""
@@ -97,8 +90,7 @@ class World:
         self._forget()
 
     def warm(self) -> None:
-        """Compile the kernels of frames, of what is heard and of atoms on their way, or load them."""
-        self._exposure.images.warm()
+        """Compile the kernels of what is heard and of atoms on their way, or load them."""
         for kernels in ("tones", "atoms", "transport"):
             importlib.import_module(f"labseq_virtual._kernels_{kernels}")
 
@@ -107,6 +99,7 @@ class World:
         self._is_open = False
         self._static.switch_off()
         self._ear = None
+        self._lights.forget()
         self._forget()
 
     def begin_shot(self) -> None:
@@ -129,13 +122,14 @@ class World:
             DeviceError: The world is further in time already.
         """
         self._advance(t_start_s, "loading")
-        afresh = -math.expm1(-duration_s / self._settings.loading_time)
+        lit_s = duration_s * self._lights.fraction_on("loading", t_start_s, t_start_s + duration_s)
+        afresh = -math.expm1(-lit_s / self._settings.loading_time)
         draws = self._random.shot.random((2, *self._grid.shape))
         reloaded = (draws[0] < afresh) & self._static.holds()
         self._occupied = np.where(reloaded, draws[1] < self._settings.loading, self._occupied)
         self._now_s = t_start_s + duration_s
 
-    def play(self, role: str, signal: ToneProgram | DepthRamp | TweezerAmplitudes, t_start_s: float) -> None:
+    def play(self, role: str, signal: Signal, t_start_s: float) -> None:
         """Let a device's output act on the atoms, from ``t_start_s`` on.
 
         Raises:
@@ -149,38 +143,46 @@ class World:
             self._play_ramp(signal, t_start_s)
         elif role == "static_tweezers" and isinstance(signal, TweezerAmplitudes):
             self._static.drive(signal)
+        elif role == "lines" and isinstance(signal, LineProgram):
+            self._lights.switch(signal, t_start_s)
         else:
-            raise DeviceError(
-                self._name,
-                f"'{role}' played a {type(signal).__name__}; expected 'mobile_tweezers' with a ToneProgram "
-                "or 'static_tweezers' with a DepthRamp or TweezerAmplitudes",
-            )
+            text = f"'{role}' played a {type(signal).__name__}; expected 'mobile_tweezers' with a ToneProgram"
+            text += ", 'static_tweezers' with a DepthRamp or TweezerAmplitudes, or 'lines' with a LineProgram"
+            raise DeviceError(self._name, text)
 
-    def listen(self, role: str, source: RfSource) -> None:
-        """From now on listen to the outputs of the mobile tweezers' driver, after the last of earlier ones.
+    def wire(self, role: str, on_edge: Callable[[float], object]) -> None:
+        """Tell a device of the edges of the line that triggers its role, from now on."""
+        self._lights.wire(role, on_edge)
+
+    def listen(self, role: str, source: RfSource | ToneSource) -> None:
+        """From now on listen to the outputs of a driver of tweezers, after the last of earlier ones.
 
         Raises:
             DeviceError: Another role wants to be heard.
             LimitError: What will be heard would be too blurred to tell the tones apart.
         """
         self._check_open()
+        if role == "static_tweezers":
+            self._static.listen(cast("ToneSource", source))
+            return
         if role != "mobile_tweezers":
-            raise DeviceError(self._name, f"'{role}' wants to be heard; only 'mobile_tweezers' plays RF")
+            raise DeviceError(self._name, f"'{role}' wants to be heard; only tweezers play RF")
         self._flight.refuse_blur()
         self._hear(self._clock.now())
-        self._ear = Ear(source, 2 * self._flight.margin_s)
+        self._ear = Ear(cast("RfSource", source), 2 * self._flight.margin_s)
 
-    def expose(self, t_start_s: float, exposure_s: float) -> Frame:
+    def expose(self, t_start_s: float, exposure_s: float, mode: SensorMode = WHOLE_SENSOR) -> Frame:
         """Take a frame; the imaging light heats some atoms out, and they shine until they are lost.
 
         Raises:
             DeviceError: The world is further in time already.
-            LimitError: The exposure is not longer than 0.
+            LimitError: The exposure is not longer than 0, or the sensor cannot be used so.
         """
         if not exposure_s > 0:
             raise LimitError("the exposure", f"{exposure_s} s", "more than 0")
         self._advance(t_start_s, "an exposure")
-        image, lost = self._exposure.take(self._occupied, exposure_s, self._random.shot)
+        lit = self._lights.fraction_on("imaging", t_start_s, t_start_s + exposure_s)
+        image, lost = self._exposure.take(self._occupied, exposure_s, self._random.shot, mode, lit)
         self._lost += lost
         self._now_s = t_start_s + exposure_s
         return Frame(image, exposure_s, t_start_s)
@@ -198,6 +200,7 @@ class World:
     def spot_powers(self) -> NDArray[np.float64]:
         """Power of each static tweezer now, float64 (n_rows, n_cols), over the nominal one."""
         self._check_open()
+        self._hear(self._clock.now())
         return self._static.depth
 
     def story(self, since_s: float) -> Mapping[str, NDArray[Any]]:
@@ -236,28 +239,28 @@ class World:
             return
         playing, self._playing = self._playing, None
         n_played = playing.n_segments_until(until_s + ROUNDING_S)
-        self._lost += self._transport.carry(
-            self._occupied,
-            playing.program,
-            n_played,
-            self._static.depth,
-            self._random.shot,
-            self._loss_factor,
-        )
+        factor = self._loss_factor * self._heating(playing.t_start_s, min(playing.t_end_s, until_s))
+        depth, chance = self._static.depth, self._random.shot
+        self._lost += self._transport.carry(self._occupied, playing.program, n_played, depth, chance, factor)
         self._let_pass(max(playing.t_start_s, min(playing.t_end_s, until_s)))
 
     def _hear(self, until_s: float) -> None:
-        """Carry out what was heard from the mobile tweezers' outputs until a time."""
-        if self._ear is None:
-            return
-        for episode in self._ear.hear(until_s):
+        """Carry out what was heard from the outputs of mobile and static tweezers until a time."""
+        for episode in () if self._ear is None else self._ear.hear(until_s):
             if episode.continued or episode.start_s < self._now_s - ROUNDING_S:
                 text = f"the mobile tweezers were on at {episode.start_s:.6f} s, together with something else"
                 raise DeviceError(self._name, f"{text}; wait (mobile_tweezers.wait, camera.read) first")
             self._let_pass(episode.start_s)
+            factor = self._loss_factor * self._heating(episode.start_s, episode.end_s)
             depth, chance = self._static.depth, self._random.shot
-            self._lost += self._flight.carry(self._occupied, episode, depth, chance, self._loss_factor)
+            self._lost += self._flight.carry(self._occupied, episode, depth, chance, factor)
             self._let_pass(episode.end_s)
+        self._lost["light"] += self._static.hear(until_s, self._occupied)
+
+    def _heating(self, start_s: float, end_s: float) -> float:
+        """Factor on the transport loss, for the part of the time without cooling light."""
+        lit = self._lights.fraction_on("cooling", start_s, end_s)
+        return lit + (1.0 - lit) * self._settings.uncooled_transport
 
     def _advance(self, t_s: float, what: str) -> None:
         """Let time pass until an event."""
@@ -267,11 +270,8 @@ class World:
             self._finish_program()
         busy_until_s = self._now_s if self._playing is None else self._playing.t_end_s
         if t_s < busy_until_s - ROUNDING_S:
-            raise DeviceError(
-                self._name,
-                f"{what} at {t_s:.6f} s, but what came before it lasts until {busy_until_s:.6f} s; "
-                "wait for its end (mobile_tweezers.wait, camera.read) first",
-            )
+            text = f"{what} at {t_s:.6f} s, but what came before it lasts until {busy_until_s:.6f} s; wait"
+            raise DeviceError(self._name, f"{text} for its end (mobile_tweezers.wait, camera.read) first")
         self._let_pass(t_s)
 
     def _let_pass(self, t_s: float) -> None:
@@ -286,11 +286,11 @@ class World:
         self._occupied &= ~gone
 
     def _forget(self) -> None:
-        self._occupied = np.zeros(self._grid.shape, np.bool_)
-        self._playing = None
+        self._occupied: Occupancy = np.zeros(self._grid.shape, np.bool_)
+        self._playing: Playing | None = None
         self._now_s = -math.inf
         self._loss_factor = 1.0
-        self._lost = Counter()
+        self._lost: Counter[str] = Counter()
 
     def _check_open(self) -> None:
         if not self._is_open:

@@ -1,10 +1,15 @@
 from __future__ import annotations
 
+from pathlib import Path
+
+import pytest
 from hypothesis import given, strategies as st
 
-from labseq.cli.check import BAR_WIDTH, timeline_table
+from labseq.cli import main
+from labseq.cli.timeline import BAR_WIDTH, lines_table, timeline_table
 from labseq.model import TimelineEntry
 
+SEQUENCE = str(Path(__file__).parents[2] / "sequences" / "compact_225.yaml")
 TIMELINE = [
     ("load", [TimelineEntry("load", 0.5, 0.5)]),
     ("image", [TimelineEntry("image", 0.045, 0.045, 1)]),
@@ -14,6 +19,16 @@ TIMELINE = [
     ),
     ("device", [TimelineEntry("shutter: open", 0.0, 0.0)]),
 ]
+
+
+def test_a_line_is_drawn_where_it_is_on() -> None:
+    lines = {"imaging": [(0.0, 0.25), (0.5, 0.75)], "mot": []}
+    assert [line.rstrip() for line in lines_table(lines, 1.0, "#", 8)] == [
+        "line       times on  at most",
+        "imaging           2   500 ms  ##  ##",
+        "mot               0      0 s",
+    ]
+    assert lines_table({}, 1.0, "#") == []
 
 
 def test_timeline_table() -> None:
@@ -58,3 +73,19 @@ def test_a_timeline_of_no_length() -> None:
         "0",
         "s",
     ]
+
+
+@pytest.mark.parametrize(
+    "arguments", [["missing.yaml"], [SEQUENCE, "--set", "planner.speed=1"], [SEQUENCE, "-p", "x"]]
+)
+def test_wrong_input_is_the_users_mistake(
+    arguments: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit, match=r"^2$"):
+        main(["check", *arguments])
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err
+    assert "Traceback" not in err
+    assert "internal error" not in err

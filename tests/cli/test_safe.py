@@ -50,9 +50,8 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 MOBILE, SHUTTER, CAMERA, STATIC = (
     f"{device:<20} safe" for device in ("mobile_tweezers", "shutter", "camera", "static_tweezers")
 )
-NO_CAMERA = (
-    "camera               NOT SAFE: p.yaml:4:15: unknown camera 'ixon'; expected one of 'frames', 'virtual'"
-)
+CAMERAS = "'andor', 'frames', 'genicam', 'pylon', 'virtual'"
+NO_CAMERA = f"camera               NOT SAFE: p.yaml:4:15: unknown camera 'ixon'; expected one of {CAMERAS}"
 JAM = "shutter              NOT SAFE: shutter: safe_state() raised OSError: jammed"
 TO_IXON = {"camera: {use: virtual": "camera: {use: ixon"}
 TO_JAMMED = {"shutter: {use: virtual": "shutter: {use: jammed"}

@@ -7,7 +7,7 @@ import tomllib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import FunctionType
-from typing import Any
+from typing import Any, get_args
 from xml.etree.ElementTree import Element
 
 import pytest
@@ -94,9 +94,10 @@ def settings_of(model: type[BaseModel] | None, prefix: str = "") -> Iterator[tup
     for name, field in (model.model_fields if model is not None else {}).items():
         key = prefix + (field.alias or name)
         yield key, field
-        inner = field.annotation
-        if isinstance(inner, type) and issubclass(inner, BaseModel) and not issubclass(inner, Choice):
-            yield from settings_of(inner, f"{key}.")
+        optional = get_args(field.annotation) if type(None) in get_args(field.annotation) else ()
+        for inner in (field.annotation, *optional):
+            if isinstance(inner, type) and issubclass(inner, BaseModel) and not issubclass(inner, Choice):
+                yield from settings_of(inner, f"{key}.")
 
 
 @pytest.fixture(scope="session")

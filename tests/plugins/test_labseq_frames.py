@@ -171,6 +171,21 @@ def test_a_frame_takes_exposure_and_read_out(tmp_path: Path) -> None:
         player.camera.read(0.01)
 
 
+def test_with_the_internal_trigger_each_reading_takes_a_frame(tmp_path: Path) -> None:
+    player = Player(write_tiff(tmp_path / "x.tif", stack_of(3)), readout="5 ms").open()
+    player.clock.sleep(1.0)
+    player.camera.arm(3, 0.045, "internal")
+    frames = [player.camera.read(1.0) for _ in range(2)]
+    assert [int(frame.image[0, 0]) for frame in frames] == [0, 1000]
+    assert [frame.t_start_s for frame in frames] == pytest.approx([1.0, 1.05])
+    assert [frame.number for frame in frames] == [0, 1]
+    assert player.clock.now() == pytest.approx(1.1)
+    assert player.firsts(1) == [2000]  # the third was not taken from the file
+    player.camera.arm(1, 0.045, "internal")
+    with pytest.raises(DeviceError, match="all 3 frames"):
+        player.camera.read(1.0)
+
+
 def test_files_are_played_in_the_natural_order_of_their_names(tmp_path: Path) -> None:
     folder = write_pngs(tmp_path / "10 frames", stack_of(12))
     assert Player(folder).open().firsts(12) == [1000 * i for i in range(12)]
@@ -244,7 +259,7 @@ def test_what_no_camera_can_do_is_refused(tmp_path: Path) -> None:
     for exposure_s in (0.0, -1.0, 3601.0, float("nan")):
         with pytest.raises(LimitError, match="imaging: exposure"):
             player.camera.arm(1, exposure_s, "software")
-    with pytest.raises(DeviceError, match="external trigger; expected 'software'"):
+    with pytest.raises(DeviceError, match="no external trigger; expected one of 'software', 'internal'"):
         player.camera.arm(1, 0.1, "external")
     player.camera.arm(2, 0.1, "software")
     player.camera.trigger()

@@ -33,6 +33,18 @@ class TestVirtualCamera(CameraContract):
         return partial(VirtualCamera, CameraSettings())
 
 
+class TestVirtualCameraWithEverything(CameraContract):
+    @pytest.fixture
+    def factory(self) -> Callable[[Context], VirtualCamera]:
+        settings = {
+            "region": {"y": 10, "x": 20, "height": 100, "width": 60},
+            "binning": 2,
+            "em_gain": 300,
+            "cooling": {"temperature": "-70 degC"},
+        }
+        return partial(VirtualCamera, CameraSettings.model_validate(settings))
+
+
 class TestVirtualStaticTweezers(StaticTweezersContract):
     @pytest.fixture
     def factory(self) -> Callable[[Context], VirtualStaticTweezers]:

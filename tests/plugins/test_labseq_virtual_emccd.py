@@ -10,6 +10,7 @@ from labseq_virtual.emccd import Emccd
 from labseq_virtual.image_settings import ImageSettings
 from labseq_virtual.optics import photoelectrons
 from labseq_virtual.settings import WorldSettings
+from labseq_virtual.view import View
 from labseq_virtual.world import World
 from numpy.typing import NDArray
 
@@ -27,7 +28,8 @@ def render(
     shining: float = 1.0,
     **image: Any,
 ) -> NDArray[np.float64]:
-    settings = ImageSettings.model_validate({"background": 0.0, "clock_induced_charge": 0.0} | image)
+    dark = {"background": 0.0, "clock_induced_charge": 0.0}
+    settings = View.of(ImageSettings.model_validate(dark | image))
     rng = np.random.default_rng(0)
     mean = settings.photoelectrons * shining * exposure_s / settings.exposure
     light = photoelectrons(settings, positions_px, np.full(len(positions_px), mean), rng)
@@ -131,7 +133,7 @@ def test_dark_pixels_from_the_table_are_like_pixels_followed_step_by_step(gain: 
     settings = ImageSettings(
         background=1.5, em_gain=gain, read_noise=9.0, electrons_per_adu=3.0, register_clock_induced_charge=0.2
     )
-    camera, rng = Emccd(settings), np.random.default_rng(4)
+    camera, rng = Emccd(View.of(settings)), np.random.default_rng(4)
     frame = camera.read(np.zeros((512, 512), np.int32), EXPOSURE_S, rng).ravel()
     electrons = camera.register.multiply(rng.poisson(1.505, frame.size), rng)
     followed = np.rint((electrons + 9.0 * rng.standard_normal(frame.size)) / 3.0 + 500)

@@ -7,16 +7,19 @@ from typing import Any
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st
+from labseq_virtual.camera import VirtualCamera
 from labseq_virtual.image_settings import ImageSettings
 from labseq_virtual.images import Images
 from labseq_virtual.optics import corner_distance, photoelectrons, site_brightness, site_spots
 from labseq_virtual.settings import CameraSettings, WorldSettings
+from labseq_virtual.view import View
 from labseq_virtual.world import World
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from labseq import Context, DepthRamp, RandomStream, SiteGrid
+from labseq import Context, DepthRamp, LimitError, RandomStream, SensorMode, SiteGrid
 from labseq.imaging import site_pixels
+from labseq.roles import WHOLE_SENSOR
 
 GRID = SiteGrid()
 Floats = NDArray[np.float64]
@@ -27,18 +30,23 @@ def spots(**image: Any) -> Floats:
     return site_spots(ImageSettings.model_validate(image), GRID)
 
 
-def light(positions_px: Floats, mean: float, **image: Any) -> NDArray[np.int32]:
-    settings = ImageSettings.model_validate(image)
+def light(
+    positions_px: Floats, mean: float, mode: SensorMode = WHOLE_SENSOR, **image: Any
+) -> NDArray[np.int32]:
+    view = View.of(ImageSettings.model_validate(image), mode)
     rng = np.random.default_rng(0)
-    return photoelectrons(settings, positions_px, np.full(len(positions_px), mean), rng, settings.binning)
+    return photoelectrons(view, positions_px, np.full(len(positions_px), mean), rng, mode.binning)
 
 
-def take(exposure_s: float = 45e-3, seed: int = 1, **image: Any) -> NDArray[np.uint16]:
+def take(
+    exposure_s: float = 45e-3, seed: int = 1, mode: SensorMode = WHOLE_SENSOR, **image: Any
+) -> NDArray[np.uint16]:
     """A frame with an atom on every site."""
-    images = Images(ImageSettings.model_validate(image), GRID, seed)
+    settings = ImageSettings.model_validate(image)
     row, col = np.indices(GRID.shape).reshape(2, -1)
+    images = Images(settings, GRID, seed, mode)
     frame = images.take(row, col, np.ones(len(row)), exposure_s, np.random.default_rng(2))
-    assert frame.shape == images.frame_shape
+    assert frame.shape == mode.frame_shape(settings.frame)
     return frame
 
 
@@ -128,43 +136,45 @@ def test_without_wings_neighbours_receive_nothing() -> None:
 
 
 @given(st.integers(0, 200), st.integers(0, 200), st.integers(1, 150), st.integers(1, 150))
-def test_a_crop_is_that_part_of_the_sensor(y: int, x: int, height: int, width: int) -> None:
+def test_a_region_is_that_part_of_the_sensor(y: int, x: int, height: int, width: int) -> None:
     whole = light(spots().reshape(-1, 2), 100.0)
-    part = light(spots().reshape(-1, 2), 100.0, crop=(y, x, height, width))
+    part = light(spots().reshape(-1, 2), 100.0, SensorMode((y, x, height, width)))
     np.testing.assert_array_equal(part, whole[y : y + height, x : x + width])
 
 
 def test_binning_adds_pixels_up() -> None:
     whole = light(spots().reshape(-1, 2), 100.0)
-    binned = light(spots().reshape(-1, 2), 100.0, binning=4)
+    binned = light(spots().reshape(-1, 2), 100.0, SensorMode(binning=4))
     np.testing.assert_array_equal(binned, whole.reshape(128, 4, 128, 4).sum(axis=(1, 3)))
 
 
 @pytest.mark.parametrize("sensor", ["emccd", "qcmos"])
 def test_binned_frames_hold_the_same_light(sensor: str) -> None:
     settings: dict[str, Any] = {"sensor": sensor, "offset": 0.0, "qcmos": {"offset": 0.0}, "read_noise": 0.0}
-    plain, binned = (take(binning=b, **settings, crop=(10, 20, 400, 440)) for b in (1, 2))
+    plain, binned = (take(mode=SensorMode((10, 20, 400, 440), b), **settings) for b in (1, 2))
     assert binned.shape == (200, 220)
     assert binned.sum() == pytest.approx(plain.sum(), rel=0.03)
 
 
 def test_a_part_of_the_sensor_reads_out_faster() -> None:
-    def fraction(**image: Any) -> float:
-        return Images(ImageSettings.model_validate(image), GRID, 0).readout_fraction
+    def fraction(mode: SensorMode, **image: Any) -> float:
+        return View.of(ImageSettings.model_validate(image), mode).readout_fraction
 
-    assert fraction() == 1.0
-    assert fraction(crop=(0, 0, 256, 128)) == 0.125
-    assert fraction(binning=2) == 0.25
-    assert fraction(sensor="qcmos", crop=(0, 0, 256, 128)) == 0.5
-    assert fraction(sensor="qcmos", binning=2) == 1.0
+    part, binned = SensorMode((0, 0, 256, 128)), SensorMode(binning=2)
+    assert fraction(WHOLE_SENSOR) == 1.0
+    assert fraction(part) == 0.125
+    assert fraction(binned) == 0.25
+    assert fraction(part, sensor="qcmos") == 0.5
+    assert fraction(binned, sensor="qcmos") == 1.0
 
 
-def test_camera_and_frames_of_a_world_with_a_crop_agree() -> None:
-    from labseq_virtual.camera import VirtualCamera
+REGION = {"y": 56, "x": 6, "height": 400, "width": 500}
 
-    settings = WorldSettings.model_validate({"image": {"crop": (56, 6, 400, 500), "binning": 2}})
-    world = World(settings, Context("simulation", random=RandomStream(0)))
-    camera = VirtualCamera(CameraSettings(readout=8e-3), Context("camera", simulation=world))
+
+def test_a_camera_delivers_the_region_that_it_tells_of() -> None:
+    world = World(WorldSettings(), Context("simulation", random=RandomStream(0)))
+    settings = CameraSettings.model_validate({"region": REGION, "binning": 2, "readout": 8e-3})
+    camera = VirtualCamera(settings, Context("camera", simulation=world))
     world.open()
     camera.open()
     world.play("static_tweezers", DepthRamp(0.0, 1.0), 0.0)
@@ -178,11 +188,6 @@ def test_camera_and_frames_of_a_world_with_a_crop_agree() -> None:
 @pytest.mark.parametrize(
     ("image", "reason"),
     [
-        ({"crop": (500, 0, 20, 20)}, r"beyond the frame of \[512, 512\]"),
-        ({"crop": (0, 500, 20, 20)}, r"beyond the frame of \[512, 512\]"),
-        ({"crop": (0, 0, 21, 20), "binning": 2}, "cannot be binned by 2"),
-        ({"binning": 3}, "512 x 512 pixels cannot be binned by 3"),
-        ({"crop": (-1, 0, 20, 20)}, "greater than or equal to 0"),
         ({"stretch": -0.9}, "greater than -0.5"),
         ({"em_gain": 0.5}, "greater than or equal to 1"),
         ({"sensor": "film"}, "'emccd' or 'qcmos'"),
@@ -191,6 +196,29 @@ def test_camera_and_frames_of_a_world_with_a_crop_agree() -> None:
 def test_impossible_settings_are_refused(image: dict[str, Any], reason: str) -> None:
     with pytest.raises(ValidationError, match=reason):
         ImageSettings.model_validate(image)
+
+
+@pytest.mark.parametrize(
+    ("mode", "image", "reason"),
+    [
+        (SensorMode((500, 0, 20, 20)), {}, r"the limit is its 512 x 512 pixels"),
+        (SensorMode((0, 500, 20, 20)), {}, r"\[0, 500, 20, 20\]; the limit is its 512 x 512 pixels"),
+        (SensorMode((-1, 0, 20, 20)), {}, "the region of the sensor"),
+        (SensorMode((0, 0, 20, 0)), {}, "the region of the sensor"),
+        (SensorMode((0, 0, 21, 20), 2), {}, "the binning is 2; the limit is what divides the 21 x 20 pixels"),
+        (SensorMode(binning=3), {}, "divides the 512 x 512 pixels"),
+        (
+            SensorMode(em_gain=30.0),
+            {"sensor": "qcmos"},
+            "30; the limit is 1: a qCMOS sensor has no EM register",
+        ),
+    ],
+)
+def test_a_sensor_refuses_what_it_cannot_do(mode: SensorMode, image: dict[str, Any], reason: str) -> None:
+    world = World(WorldSettings.model_validate({"image": image}), Context("simulation"))
+    for use in (world.readout_fraction, world.prepare_sensor):
+        with pytest.raises(LimitError, match=reason):
+            use(mode)
 
 
 def test_the_same_seed_gives_the_same_frame() -> None:

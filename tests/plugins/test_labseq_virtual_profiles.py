@@ -85,7 +85,7 @@ def test_the_plugin_registers_a_virtual_twin_for_each_role() -> None:
     labseq_virtual.labseq_register(registry)
     entries = registry.entries()
     kinds = [entry.kind for entry in entries if entry.name == "virtual"]
-    assert kinds == ["camera", "static_tweezers", "mobile_tweezers", "device", "simulation"]
+    assert kinds == ["camera", "static_tweezers", "mobile_tweezers", "device", "lines", "simulation"]
     assert [entry.name for entry in entries if entry.name != "virtual"] == ["virtual_spot_meter"]
     for entry in entries:
         assert entry.virtual_time

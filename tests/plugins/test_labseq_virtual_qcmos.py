@@ -9,24 +9,33 @@ import pytest
 from labseq_virtual.image_settings import ImageSettings
 from labseq_virtual.qcmos import Qcmos
 from labseq_virtual.settings import WorldSettings
+from labseq_virtual.view import View
 from labseq_virtual.world import World
 from numpy.typing import NDArray
 
-from labseq import Context, DepthRamp, RandomStream
+from labseq import Context, DepthRamp, RandomStream, SensorMode
 from labseq.config.detectors import ThresholdSettings, WeightedSettings
 from labseq.imaging import ThresholdDetector, WeightedDetector
+from labseq.roles import WHOLE_SENSOR
 
 Floats = NDArray[np.float64]
 EXPOSURE_S = 45e-3
 EVEN: dict[str, Any] = {"read_noise_spread": 0.0, "offset_spread": 0.0, "gain_spread": 0.0}
 
 
-def read(electrons: int = 0, n_frames: int = 1, image: dict[str, Any] | None = None, **qcmos: Any) -> Floats:
+def read(
+    electrons: int = 0,
+    n_frames: int = 1,
+    mode: SensorMode = WHOLE_SENSOR,
+    background: float = 0.0,
+    **qcmos: Any,
+) -> Floats:
     """Frames of even light (n_frames, height, width)."""
-    dark = {"background": 0.0, "frame": (256, 256)}
-    settings = ImageSettings.model_validate(dark | (image or {}) | {"qcmos": {"dark_current": 0.0} | qcmos})
-    camera, rng = Qcmos(settings, np.random.default_rng(1)), np.random.default_rng(2)
-    light = np.full(settings.frame, electrons, np.int32)
+    image = {"sensor": "qcmos", "background": background, "frame": (256, 256)}
+    settings = ImageSettings.model_validate(image | {"qcmos": {"dark_current": 0.0} | qcmos})
+    view = View.of(settings, mode)
+    camera, rng = Qcmos(view, np.random.default_rng(1)), np.random.default_rng(2)
+    light = np.full(view.region[2:], electrons, np.int32)
     return np.stack([camera.read(light, EXPOSURE_S, rng) for _ in range(n_frames)]).astype(float)
 
 
@@ -37,7 +46,7 @@ def test_a_dark_frame_is_offset_and_read_noise() -> None:
 
 
 def test_electrons_are_counted_without_excess_noise() -> None:
-    frame = read(image={"background": 2.0 / 0.6}, read_noise=0.0, electrons_per_adu=0.1, offset=0.0, **EVEN)
+    frame = read(background=2.0 / 0.6, read_noise=0.0, electrons_per_adu=0.1, offset=0.0, **EVEN)
     assert set(np.unique(frame)) <= {10.0 * k for k in range(20)}
     assert frame.mean() == pytest.approx(20.0, rel=0.01)
     assert frame.var() == pytest.approx(200.0, rel=0.02)  # Poisson's
@@ -62,12 +71,9 @@ def test_offset_and_gain_have_a_fixed_pattern() -> None:
     assert bright.std() / bright.mean() == pytest.approx(0.02, rel=0.05)
 
 
-def test_a_crop_keeps_the_pixels_own_pattern() -> None:
+def test_a_region_keeps_the_pixels_own_pattern() -> None:
     whole = read(read_noise=0.0, offset_spread=5.0)[0]
-    settings: dict[str, Any] = {"frame": (256, 256), "crop": (30, 70, 100, 90), "background": 0.0}
-    quiet = {"read_noise": 0.0, "offset_spread": 5.0, "dark_current": 0.0}
-    camera = Qcmos(ImageSettings.model_validate(settings | {"qcmos": quiet}), np.random.default_rng(1))
-    part = camera.read(np.zeros((100, 90), np.int32), EXPOSURE_S, np.random.default_rng(3))
+    part = read(mode=SensorMode((30, 70, 100, 90)), read_noise=0.0, offset_spread=5.0)[0]
     np.testing.assert_array_equal(part, whole[30:130, 70:160])
 
 
@@ -78,7 +84,7 @@ def test_wells_and_converter_saturate() -> None:
 
 
 def test_binned_pixels_are_added_up_after_the_read_out() -> None:
-    frame = read(image={"binning": 2}, read_noise=0.3, electrons_per_adu=0.1, offset=200.0, **EVEN)[0]
+    frame = read(mode=SensorMode(binning=2), read_noise=0.3, electrons_per_adu=0.1, offset=200.0, **EVEN)[0]
     assert frame.shape == (128, 128)
     assert frame.mean() == pytest.approx(800.0, abs=0.2)
     assert frame.std() == pytest.approx(2 * np.sqrt(3.0**2 + 1 / 12), rel=0.02)

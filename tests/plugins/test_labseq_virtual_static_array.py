@@ -65,6 +65,50 @@ def test_atoms_are_lost_where_the_light_is_too_weak() -> None:
     assert not static.holds().any()
 
 
+class Outputs:
+    """A ``ToneSource`` that answers what is put into it."""
+
+    def __init__(self) -> None:
+        self.heard: list[TweezerAmplitudes] = []
+
+    def played(self, until_s: float) -> list[TweezerAmplitudes]:
+        heard, self.heard = self.heard, []
+        return heard
+
+
+def test_outputs_that_are_listened_to_make_the_light_and_nothing_else_does() -> None:
+    static, outputs = array(), Outputs()
+    static.listen(outputs)
+    occupied = np.zeros(GRID.shape, np.bool_)
+    assert static.hear(0.0, occupied) == 0
+    assert not static.holds().any()
+    outputs.heard = [equal()]
+    static.hear(1.0, occupied)
+    np.testing.assert_allclose(static.depth, np.ones(GRID.shape))
+    static.hear(2.0, occupied)
+    np.testing.assert_allclose(static.depth, np.ones(GRID.shape))
+
+
+def test_atoms_are_lost_in_a_dark_moment_between_two_looks_at_the_outputs() -> None:
+    static, outputs = array(), Outputs()
+    static.listen(outputs)
+    occupied = np.ones(GRID.shape, np.bool_)
+    outputs.heard = [equal(), equal(0.9)]
+    assert static.hear(0.0, occupied) == 0
+    outputs.heard = [equal(0.0), equal()]
+    assert static.hear(1.0, occupied) == 12 * 15
+    assert static.holds().all()
+
+
+def test_nobody_is_listened_to_after_the_light_was_switched_off() -> None:
+    static, outputs = array(), Outputs()
+    static.listen(outputs)
+    static.switch_off()
+    outputs.heard = [equal()]
+    static.hear(0.0, np.zeros(GRID.shape, np.bool_))
+    assert not static.holds().any()
+
+
 def test_the_same_machine_has_the_same_disorder() -> None:
     physics = {"depth_disorder": 0.04, "tone_response": 0.05}
     np.testing.assert_array_equal(array(**physics).depth, array(**physics).depth)

@@ -100,7 +100,7 @@ def test_every_time_has_its_unit(make_run: MakeRun, make_shot: MakeShot) -> None
     with opened(ShotEncoder(make_run(), "day/run").encode(make_shot())) as file:
         file.visititems(check)
         assert file["entry/images_view/images"].attrs["units"] == "adu"
-    assert len(checked) == 9
+    assert len(checked) == 10
 
 
 def test_the_tables_hold_every_move(make_run: MakeRun, make_shot: MakeShot) -> None:

@@ -68,7 +68,7 @@ def test_a_simulated_card_takes_modelled_time_too() -> None:
 
 
 def test_a_profile_whose_hardware_is_not_there_is_measured_with_warnings() -> None:
-    report = measure(profile="lab")
+    report = measure("profile.camera={use: cannon}")
     assert any("camera" in text for text in report.warnings)
 
 

@@ -77,7 +77,7 @@ def test_a_target_that_most_loadings_cannot_fill():
 
 
 def test_a_dry_run_tells_what_was_not_checked():
-    report = checked(profile="lab", dry_run="full")
+    report = checked("profile.camera={use: cannon}", dry_run="full")
     assert any("settings were not checked" in warning.what for warning in report.warnings)
 
 

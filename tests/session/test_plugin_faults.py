@@ -143,12 +143,14 @@ def warnings_of_a_dry_run(camera: str) -> str:
 
 
 def test_a_dry_run_tells_why_a_plugin_failed_to_load() -> None:
-    Path("plugins/andor.py").write_text("LABSEQ_API = 1\nimport no_such_sdk\n", encoding="utf-8")
-    text = warnings_of_a_dry_run("andor")
-    assert "camera: plugin 'andor' failed to load: ModuleNotFoundError: No module named 'no_such_sdk'" in text
+    Path("plugins/cannon.py").write_text("LABSEQ_API = 1\nimport no_such_sdk\n", encoding="utf-8")
+    text = warnings_of_a_dry_run("cannon")
+    assert (
+        "camera: plugin 'cannon' failed to load: ModuleNotFoundError: No module named 'no_such_sdk'" in text
+    )
     assert "its virtual twin takes its place and its settings were not checked" in text
     text = warnings_of_a_dry_run("ixon")
-    assert "plugin 'ixon' is not installed (plugin 'andor' did not load (ModuleNotFoundError" in text
+    assert "plugin 'ixon' is not installed (plugin 'cannon' did not load (ModuleNotFoundError" in text
 
 
 def test_a_dry_run_tells_of_a_plugin_that_is_not_there() -> None:

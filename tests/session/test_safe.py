@@ -55,7 +55,7 @@ BROKEN = {  # what is wrong -> old and new text of the plugin, the shutter's ent
     "import": ("import labseq\n", "import nothing_like_it\n", "{use: mine}", "nothing_like_it"),
     "exit on import": ("import labseq\n", "raise SystemExit(0)\n", "{use: mine}", "SystemExit: 0"),
     "unknown name": ("", "", "{use: mein}", "unknown device 'mein'"),
-    "settings": ("", "", "{use: mine, gain: 5}", "device 'mine' takes no settings, but 'gain' is given"),
+    "settings": ("", "", "{use: mine, gain: 5}", "'gain' is not a setting of device 'mine'"),
     "constructor": (f"{INIT}pass", INIT_FAILS, "{use: mine}", "raised OSError: no card"),
     "exit": (f"{INIT}pass", INIT_LEAVES, "{use: mine}", "raised SystemExit: 0"),
     "not its role": ("def read(", "def raed(", "{use: mine}", "device 'mine' has no read"),

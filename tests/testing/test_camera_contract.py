@@ -1,11 +1,12 @@
 """Each promise of a camera is broken once, and the suite names it and no other."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from labseq.model import Frame
+from labseq.model import CameraFacts, Frame
 from labseq.roles import Context, Trigger
 from labseq.testing import CameraContract
 from labseq.testing.fakes import RecordingCamera
@@ -35,7 +36,7 @@ class GivesEmptyImages(RecordingCamera):
 class TellsAnotherExposure(RecordingCamera):
     def read(self, timeout_s: float) -> Frame:
         frame = super().read(timeout_s)
-        return Frame(frame.image, frame.exposure_s * 1000, frame.t_start_s)
+        return replace(frame, exposure_s=frame.exposure_s * 1000)
 
 
 class ExposesOnceMore(RecordingCamera):
@@ -59,13 +60,13 @@ class ChangesItsShape(RecordingCamera):
 class TellsTheWallClock(RecordingCamera):
     def read(self, timeout_s: float) -> Frame:
         frame = super().read(timeout_s)
-        return Frame(frame.image, frame.exposure_s, frame.t_start_s + 1.7e9)
+        return replace(frame, t_start_s=frame.t_start_s + 1.7e9)
 
 
 class TellsTheTimeOfOpening(RecordingCamera):
     def read(self, timeout_s: float) -> Frame:
         frame = super().read(timeout_s)
-        return Frame(frame.image, frame.exposure_s, 0.0)
+        return replace(frame, t_start_s=0.0)
 
 
 class SharesItsBuffer(RecordingCamera):
@@ -78,7 +79,7 @@ class SharesItsBuffer(RecordingCamera):
         self.buffer[...] = frame.image
         view = self.buffer[:]
         view.flags.writeable = False
-        return Frame(view, frame.exposure_s, frame.t_start_s)
+        return replace(frame, image=view)
 
 
 class TriggersUnarmed(RecordingCamera):
@@ -94,6 +95,33 @@ class StaysArmed(RecordingCamera):
         self._n_left = n_left
 
 
+class CountsOnFromTheLastSeries(RecordingCamera):
+    n_taken = 0
+
+    def read(self, timeout_s: float) -> Frame:
+        frame = super().read(timeout_s)
+        self.n_taken += 1
+        return replace(frame, number=self.n_taken - 1)
+
+
+class StampsBackwards(RecordingCamera):
+    def read(self, timeout_s: float) -> Frame:
+        frame = super().read(timeout_s)
+        return replace(frame, device_time_s=-frame.t_start_s)
+
+
+class TakesAnyTrigger(RecordingCamera):
+    def arm(self, n_frames: int, exposure_s: float, trigger: Trigger) -> None:
+        super().arm(n_frames, exposure_s, "software")
+
+
+class SaysItExposesByItself(RecordingCamera):
+    facts = CameraFacts(triggers=("software", "internal"))
+
+    def arm(self, n_frames: int, exposure_s: float, trigger: Trigger) -> None:
+        super().arm(n_frames, exposure_s, "software" if trigger == "internal" else trigger)
+
+
 @pytest.mark.parametrize(
     ("camera", "test"),
     [
@@ -105,6 +133,10 @@ class StaysArmed(RecordingCamera):
         (ChangesItsShape, "test_gives_as_many_frames_as_armed_for"),
         (TellsTheWallClock, "test_tells_when_it_exposed"),
         (TellsTheTimeOfOpening, "test_tells_when_it_exposed"),
+        (CountsOnFromTheLastSeries, "test_numbers_its_frames"),
+        (StampsBackwards, "test_numbers_its_frames"),
+        (TakesAnyTrigger, "test_refuses_unknown_triggers"),
+        (SaysItExposesByItself, "test_exposes_by_itself"),
         (SharesItsBuffer, "test_frames_do_not_change"),
         (TriggersUnarmed, "test_refuses_trigger_without_arm"),
         (StaysArmed, "test_refuses_trigger_without_arm"),

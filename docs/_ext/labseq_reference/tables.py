@@ -108,6 +108,6 @@ def _attributes(classes: Sequence[str]) -> list[str]:
 
 
 def _default(owner: type[BaseModel], name: str, field: FieldInfo) -> str:
-    if inner_model(field) is not None and not field.is_required():
+    if inner_model(field) is not None and not field.is_required() and field.default is not None:
         return "as below"
     return _ADDED_BY_LOADER.get((owner, name)) or default_of(field)

@@ -4,6 +4,7 @@ from labseq.testing.contracts.camera import CameraContract
 from labseq.testing.contracts.detector import DetectorContract
 from labseq.testing.contracts.device import DeviceContract
 from labseq.testing.contracts.hardware import HardwareContract, Wait
+from labseq.testing.contracts.lines import LinesContract
 from labseq.testing.contracts.mobile_tweezers import MobileTweezersContract
 from labseq.testing.contracts.planner import PlannerContract
 from labseq.testing.contracts.promises import BrokenPromise
@@ -16,6 +17,7 @@ __all__ = [
     "DetectorContract",
     "DeviceContract",
     "HardwareContract",
+    "LinesContract",
     "MobileTweezersContract",
     "PlannerContract",
     "StaticTweezersContract",

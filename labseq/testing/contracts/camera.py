@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from functools import partial
+from itertools import pairwise
+from typing import Any, ClassVar, get_args
 
 import numpy as np
 
 from labseq.errors import DeviceError
 from labseq.model import Frame
-from labseq.roles import Camera
+from labseq.roles import Camera, KnownCamera, Trigger
 from labseq.testing.contracts.hardware import Action, Factory, HardwareContract, Wait
 from labseq.testing.contracts.promises import promise, refusal
 
 
 class CameraContract(HardwareContract[Camera]):
-    """Promises of a camera; software triggers.
+    """Promises of a camera that takes software triggers, and of its other triggers where it has them.
 
     Attributes:
         exposure_s: Exposure of the test frames, in seconds.
@@ -73,9 +75,20 @@ class CameraContract(HardwareContract[Camera]):
         }
 
     def waits(self) -> Mapping[str, Wait[Camera]]:
-        """For a frame that was never triggered."""
-        arm: Action[Camera] = lambda camera: camera.arm(1, self.exposure_s, "software")  # noqa: E731 - as in uses()
-        return {"read() without a trigger": Wait(0.1, arm, lambda camera: camera.read(0.1))}
+        """For a frame that was never triggered, by nobody or by no wire."""
+
+        def arm(trigger: Trigger) -> Action[Camera]:
+            def enter(camera: Camera) -> None:
+                has_it = trigger in triggers_of(camera)
+                camera.arm(1, self.exposure_s, trigger if has_it else "software")
+
+            return enter
+
+        read: Action[Camera] = lambda camera: camera.read(0.1)  # noqa: E731 - as in uses()
+        return {
+            "read() without a trigger": Wait(0.1, arm("software"), read),
+            "read() while no external trigger comes": Wait(0.1, arm("external"), read),
+        }
 
     def take(self, camera: Camera, n_frames: int = 1) -> list[Any]:
         """Arm, then trigger and read each frame."""
@@ -112,6 +125,43 @@ class CameraContract(HardwareContract[Camera]):
             self.take(camera)
             refusal(DeviceError, "a second trigger after arm(1)", camera.trigger)
 
+    @promise("frames are numbered from 0 in each series, and later ones have later time stamps")
+    def test_numbers_its_frames(self, factory: Factory[Camera]) -> None:
+        """A gap tells that a frame was lost; time stamps are the camera's own, and it need not give any."""
+        with self.opened(factory) as (camera, _):
+            for _ in range(2):
+                frames = [frame for frame in self.take(camera, 3) if isinstance(frame, Frame)]
+                if len(frames) < 3:  # what a frame is has a test of its own
+                    return
+                numbers = [frame.number for frame in frames]
+                assert numbers == [0, 1, 2], f"the frames of a series of 3 have the numbers {numbers}"
+                stamps = [frame.device_time_s for frame in frames]
+                rising = all(b > a for a, b in pairwise(stamps) if not np.isnan([a, b]).any())
+                assert rising, f"the time stamps are {stamps}"
+
+    @promise("arm() refuses a trigger that the camera does not tell of in its facts")
+    def test_refuses_unknown_triggers(self, factory: Factory[Camera]) -> None:
+        """Else the run would wait for an edge that no wire brings."""
+        with self.opened(factory) as (camera, _):
+            for trigger in get_args(Trigger):
+                if trigger not in triggers_of(camera):
+                    arm = partial(camera.arm, 1, self.exposure_s, trigger)
+                    refusal(DeviceError, f"arm() for the {trigger} trigger", arm)
+            self.take(camera)
+
+    @promise("with the internal trigger the frames of a series come by themselves")
+    def test_exposes_by_itself(self, factory: Factory[Camera]) -> None:
+        """For a camera that has it: n frames, and none of them by trigger()."""
+        with self.opened(factory) as (camera, _):
+            if "internal" not in triggers_of(camera):
+                return
+            camera.arm(3, self.exposure_s, "internal")
+            refusal(DeviceError, "trigger() in a series with the internal trigger", camera.trigger)
+            starts = [camera.read(self.exposure_s + self.timeout_s).t_start_s for _ in range(3)]
+            apart = min(b - a for a, b in pairwise(starts))
+            assert apart >= self.exposure_s * (1 - self.exposure_tolerance), f"they start at {starts} s"
+            self.take(camera)
+
     @promise("t_start_s is the start of the exposure on the session's clock")
     def test_tells_when_it_exposed(self, factory: Factory[Camera]) -> None:
         """Later frames start later, and each between its trigger and its reading."""
@@ -146,3 +196,8 @@ class CameraContract(HardwareContract[Camera]):
             camera.arm(1, self.exposure_s, "software")
             camera.safe_state()
             refusal(DeviceError, "trigger() after safe_state()", camera.trigger)
+
+
+def triggers_of(camera: Camera) -> tuple[str, ...]:
+    """What may start its exposures: what it tells, or software triggers."""
+    return camera.facts.triggers if isinstance(camera, KnownCamera) else ("software",)

@@ -12,6 +12,7 @@ from labseq.testing.fakes.deciders import (
 from labseq.testing.fakes.devices import (
     RecordingCamera,
     RecordingDevice,
+    RecordingLines,
     RecordingMobileTweezers,
     RecordingStaticTweezers,
 )
@@ -30,6 +31,7 @@ __all__ = [
     "OneByOnePlanner",
     "RecordingCamera",
     "RecordingDevice",
+    "RecordingLines",
     "RecordingMobileTweezers",
     "RecordingObserver",
     "RecordingSimulation",

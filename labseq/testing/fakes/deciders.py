@@ -10,15 +10,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from labseq.errors import DeviceError
 from labseq.model import (
-    DepthRamp,
     Frame,
     Occupancy,
     Plan,
+    SensorMode,
     TargetPattern,
-    ToneProgram,
-    TweezerAmplitudes,
     as_occupancy,
 )
+from labseq.roles import WHOLE_SENSOR, Signal
 from labseq.testing.fakes.calls import Calls
 
 
@@ -112,14 +111,27 @@ class RecordingSimulation:
         """Note it."""
         self.calls.note("simulation", "load", t_start_s, duration_s)
 
-    def play(self, role: str, signal: ToneProgram | DepthRamp | TweezerAmplitudes, t_start_s: float) -> None:
+    def play(self, role: str, signal: Signal, t_start_s: float) -> None:
         """Note it."""
         self.calls.note("simulation", "play", role, signal, t_start_s)
 
-    def expose(self, t_start_s: float, exposure_s: float) -> Frame:
+    @property
+    def sensor_shape(self) -> tuple[int, int]:
+        """(height, width) of the sensor."""
+        return self._frame_shape
+
+    def readout_fraction(self, mode: SensorMode) -> float:
+        """Every frame takes as long to read as any other."""
+        del mode
+        return 1.0
+
+    def prepare_sensor(self, mode: SensorMode) -> None:
+        """Nothing to work out."""
+
+    def expose(self, t_start_s: float, exposure_s: float, mode: SensorMode = WHOLE_SENSOR) -> Frame:
         """A black frame."""
         self.calls.note("simulation", "expose", t_start_s, exposure_s)
-        return Frame(np.zeros(self._frame_shape, np.uint16), exposure_s, t_start_s)
+        return Frame(np.zeros(mode.frame_shape(self._frame_shape), np.uint16), exposure_s, t_start_s)
 
     def describe(self) -> Mapping[str, Any]:
         """Say that it is a fake."""

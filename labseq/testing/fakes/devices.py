@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.errors import DeviceError, DeviceTimeoutError, one_of
-from labseq.model import DepthRamp, Frame, ToneProgram
+from labseq.lines import idle_program, off_program
+from labseq.model import DepthRamp, Frame, LineProgram, ToneProgram
 from labseq.roles import Context, Trigger
 from labseq.testing.fakes.base import RecordingHardware, require_within
 from labseq.testing.fakes.calls import Calls, Failure, Hang
@@ -32,7 +33,7 @@ class RecordingCamera(RecordingHardware):
 
     def reset(self) -> None:
         """Forget the series and its frames."""
-        self._n_left = 0
+        self._n_left = self._n_in_series = 0
         self._exposure_s = 0.0
         self._frames: deque[Frame] = deque()
 
@@ -41,6 +42,8 @@ class RecordingCamera(RecordingHardware):
         self.use("arm", n_frames, exposure_s, trigger)
         require_within("the number of frames", n_frames, 1, 1e6)
         require_within("the exposure in seconds", exposure_s, 1e-6, MAX_EXPOSURE_S)
+        if trigger != "software":
+            raise DeviceError(self.name, f"has no {trigger} trigger; expected 'software'")
         self.reset()
         self._n_left, self._exposure_s = n_frames, exposure_s
 
@@ -52,7 +55,8 @@ class RecordingCamera(RecordingHardware):
         self._n_left -= 1
         image = np.full(self.frame_shape, self._n_taken, np.uint16)
         self._n_taken += 1
-        self._frames.append(Frame(image, self._exposure_s, self.clock.now(), self.name))
+        self._frames.append(Frame(image, self._exposure_s, self.clock.now(), self.name, self._n_in_series))
+        self._n_in_series += 1
 
     def read(self, timeout_s: float) -> Frame:
         """Wait for the oldest frame."""
@@ -163,6 +167,76 @@ class RecordingMobileTweezers(RecordingHardware):
             self.clock.sleep(timeout_s)
             raise DeviceTimeoutError(self.name, f"it still plays after {timeout_s} s", timeout_s)
         self.clock.sleep(max(0.0, left_s))
+
+
+class RecordingLines(RecordingHardware):
+    """A timing box whose programs take their time, and that tells the simulation of them.
+
+    Attributes:
+        programs: Every program that was fired, in order.
+    """
+
+    role: ClassVar[str] = "lines"
+
+    def __init__(self, context: Context | None = None, calls: Calls | None = None, **faults: Any) -> None:
+        super().__init__(context, calls, **faults)
+        self.programs: list[LineProgram] = []
+        self._specs = () if context is None else context.lines
+        self.reset()
+
+    def open(self) -> None:
+        """Idle."""
+        super().open()
+        self._tell(idle_program(self._specs))
+
+    def safe_state(self) -> None:
+        """All off."""
+        super().safe_state()
+        if self.is_open:
+            self._tell(off_program(self._specs))
+
+    def reset(self) -> None:
+        """Nothing compiled, nothing armed."""
+        self._compiled: LineProgram | None = None
+        self._is_armed = False
+        self._over_s = 0.0
+
+    def compile(self, program: LineProgram) -> None:
+        """Keep a program."""
+        self.use("compile", program)
+        require_within("the number of edges", len(program.t_s), 1, 1000)
+        shortest_s = float(np.diff(program.t_s).min()) if len(program.t_s) > 1 else 1.0
+        require_within("the time between two edges", shortest_s, 1e-6, 1e6)
+        self._compiled, self._is_armed = program, False
+
+    def arm(self) -> None:
+        """Allow one firing."""
+        self.use("arm")
+        if self._compiled is None:
+            raise DeviceError(self.name, "arm() needs compile()")
+        self._is_armed = True
+
+    def fire(self) -> None:
+        """Start what was compiled."""
+        self.use("fire")
+        if not self._is_armed or self._compiled is None:
+            raise DeviceError(self.name, "fire() needs arm()")
+        self._is_armed = False
+        self.programs.append(self._compiled)
+        self._tell(self._compiled)
+        self._over_s = self.clock.now() + self._compiled.duration_s
+
+    def wait(self, timeout_s: float) -> None:
+        """Wait for its end."""
+        self.use("wait", timeout_s)
+        left_s = self._over_s - self.clock.now()
+        self.clock.sleep(max(0.0, min(left_s, timeout_s)))
+        if left_s > timeout_s:
+            raise DeviceTimeoutError(self.name, f"it still runs after {timeout_s} s", timeout_s)
+
+    def _tell(self, program: LineProgram) -> None:
+        if self.simulation is not None:
+            self.simulation.play(self.name, program, self.clock.now())
 
 
 class RecordingDevice(RecordingHardware):

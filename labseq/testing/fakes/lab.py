@@ -9,7 +9,7 @@ from typing import Any, Final, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from labseq.model import RandomStream, ShotRecord, SiteGrid, TargetPattern, as_occupancy
+from labseq.model import LineSpec, RandomStream, ShotRecord, SiteGrid, TargetPattern, as_occupancy
 from labseq.roles import Clock, Context
 from labseq.sequencer.clock import StopFlag
 from labseq.sequencer.lab import Lab, Timeouts
@@ -20,6 +20,7 @@ from labseq.testing.fakes.deciders import RecordingSimulation, ScriptedDetector
 from labseq.testing.fakes.devices import (
     RecordingCamera,
     RecordingDevice,
+    RecordingLines,
     RecordingMobileTweezers,
     RecordingStaticTweezers,
 )
@@ -31,7 +32,11 @@ _FAKE_OF_ROLE: Final = {
     "camera": RecordingCamera,
     "static_tweezers": RecordingStaticTweezers,
     "mobile_tweezers": RecordingMobileTweezers,
+    "lines": RecordingLines,
 }
+
+
+_ALWAYS: Final = ("camera", "static_tweezers", "mobile_tweezers")
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +63,7 @@ def fake_lab(
     fail_on: Mapping[str, Failure] | None = None,
     hang_on: Iterable[str] = (),
     simulated: bool = False,
+    line_specs: Sequence[LineSpec] = (),
     clock: Clock | None = None,
     stop: StopFlag | None = None,
     **parts: Any,
@@ -74,6 +80,7 @@ def fake_lab(
         fail_on: Call -> what it raises, for example ``{"camera.read": DeviceError(...)}``.
         hang_on: Calls that hang, for example ``{"mobile_tweezers.wait"}``; see
             :attr:`FakeLab.hangs`.
+        line_specs: What is wired to a timing box; none: there is no box.
         simulated: Whether there is a :class:`RecordingSimulation`.
         clock: By default a :class:`FakeClock` that looks for ``stop``.
         stop: The request to stop; by default one of its own.
@@ -96,11 +103,14 @@ def fake_lab(
     clock = clock or FakeClock(stop)
     calls = Calls(clock)
     simulation = RecordingSimulation(calls) if simulated else None
-    context = Context("", grid, clock=clock, simulation=simulation)
+    specs = tuple(line_specs)
+    context = Context("", grid, clock=clock, simulation=simulation, lines=specs)
     hangs = {call: Hang() for call in hang_on}
-    made = _make_hardware(context, calls, tuple(devices), fail_on or {}, hangs)
+    names = (*devices, "lines") if specs else tuple(devices)
+    made = _make_hardware(context, calls, names, fail_on or {}, hangs)
     fields: dict[str, Any] = {
-        **{role: made.pop(role) for role in _FAKE_OF_ROLE},
+        **{role: made.pop(role) for role in _FAKE_OF_ROLE if role in made},
+        "line_specs": specs,
         "devices": made,
         "grid": grid,
         "motion": context.motion,
@@ -125,7 +135,7 @@ def _make_hardware(
     hang_on: Mapping[str, Hang],
 ) -> dict[str, RecordingHardware]:
     made: dict[str, RecordingHardware] = {}
-    for name in (*_FAKE_OF_ROLE, *names):
+    for name in (*_ALWAYS, *names):
         fake = _FAKE_OF_ROLE.get(name, RecordingDevice)
         failures, hangs = _of_device(name, fail_on), _of_device(name, hang_on)
         made[name] = fake(replace(context, name=name), calls, fail_on=failures, hang_on=hangs)

@@ -1,0 +1,87 @@
+"""Settings that cameras have in common."""
+
+from __future__ import annotations
+
+from typing import Annotated, Self
+
+from pydantic import Field, NonNegativeInt, PositiveInt, model_validator
+
+from labseq.config.settings import Duration, Settings, Temperature
+from labseq.drivers import Cooling
+from labseq.model import SensorMode
+from labseq.units import ZERO_CELSIUS_K, format_quantity
+
+
+class RegionSettings(Settings):
+    """The part of the sensor that is read, in pixels of the sensor."""
+
+    y: NonNegativeInt = Field(default=0, description="first row")
+    x: NonNegativeInt = Field(default=0, description="first column")
+    height: PositiveInt = Field(description="number of rows")
+    width: PositiveInt = Field(description="number of columns")
+
+
+class CameraSettings(Settings):
+    """What every camera can be told of its sensor; a plugin's own settings come on top."""
+
+    region: RegionSettings | None = Field(
+        default=None, description="the part of the sensor that is read; none: all of it"
+    )
+    binning: PositiveInt = Field(
+        default=1, description="pixels of the sensor per pixel of a frame, along each axis"
+    )
+    max_exposure: Annotated[Duration, Field(gt=0)] = Field(default=10.0, description="longest exposure")
+
+    @property
+    def mode(self) -> SensorMode:
+        """How the sensor is read."""
+        region = self.region
+        place = None if region is None else (region.y, region.x, region.height, region.width)
+        return SensorMode(place, self.binning)
+
+    def misfit_on(self, sensor_shape: tuple[int, int]) -> str:
+        """Why region and binning do not go with a sensor of (height, width) pixels; "" if they do."""
+        y, x, height, width = self.mode.region or (0, 0, *sensor_shape)
+        if y + height > sensor_shape[0] or x + width > sensor_shape[1]:
+            rows, cols = sensor_shape
+            ends = f"`region` ends at row {y + height} and column {x + width}"
+            return f"{ends}, beyond the sensor of {rows} x {cols} pixels; choose a smaller or another one"
+        return _unbinnable(height, width, self.binning)
+
+    @model_validator(mode="after")
+    def _region_can_be_binned(self) -> Self:
+        if self.region is not None and (
+            text := _unbinnable(self.region.height, self.region.width, self.binning)
+        ):
+            raise ValueError(text)
+        return self
+
+
+class CoolingSettings(Settings):
+    """How cold the sensor shall be."""
+
+    temperature: Temperature = Field(description='of the sensor, "-70 degC"')
+    tolerance: Annotated[float, Field(gt=0, le=20)] = Field(
+        default=1.0, description="how far from it the sensor may be, in kelvins"
+    )
+    steady: Duration = Field(default=5.0, description="how long it must have been within that")
+    timeout: Annotated[Duration, Field(gt=0)] = Field(default=900.0, description="how long it may take")
+
+    def spec(self) -> Cooling:
+        """The same for drivers."""
+        return Cooling(self.temperature, self.tolerance, self.steady, self.timeout)
+
+    @model_validator(mode="after")
+    def _is_a_temperature_of_sensors(self) -> Self:
+        if not 150.0 <= self.temperature <= 323.0:
+            came = format_quantity(self.temperature, "temperature")
+            celsius = f"{self.temperature - ZERO_CELSIUS_K:.0f} degC"
+            raise ValueError(f"temperature is {came} ({celsius}); expected -123 to 50 degC, as '-70 degC'")
+        return self
+
+
+def _unbinnable(height: int, width: int, binning: int) -> str:
+    if height % binning == 0 and width % binning == 0:
+        return ""
+    text = f"{height} x {width} pixels cannot be binned by {binning}"
+    return f"{text}; choose a `region` whose height and width are multiples of it"

@@ -1,0 +1,174 @@
+"""What a timing box promises."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import ClassVar, Final
+
+import numpy as np
+
+from labseq.errors import DeviceError
+from labseq.lines import line_program
+from labseq.model import LineProgram, LineSpec
+from labseq.roles import Context, Lines
+from labseq.testing.contracts.hardware import Action, Factory, HardwareContract, Wait
+from labseq.testing.contracts.promises import doing, promise, refusal
+from labseq.testing.fakes import RecordingSimulation
+
+SPECS: Final = (
+    LineSpec("cooling", 2, frozenset({"load", "rearrange", "idle"})),
+    LineSpec("mot", 3, frozenset({"load"}), lag_s=2e-3, blinding=True),
+    LineSpec("imaging", 4, frozenset({"image"}), lead_s=1e-3, lag_s=0.5e-3),
+    LineSpec("camera", 5, frozenset({"image"}), pulse_s=0.2e-3, triggers="camera"),
+    LineSpec("shutter", 6, frozenset({"image"}), lead_s=2e-3, active_low=True),
+)
+
+
+class LinesContract(HardwareContract[Lines]):
+    """Promises of a timing box.
+
+    Attributes:
+        specs: What is wired to it; the channels must exist.
+        tolerance_s: How far an edge may be from its place, relative to the first one, in seconds.
+    """
+
+    role: ClassVar[str] = "lines"
+    specs: ClassVar[tuple[LineSpec, ...]] = SPECS
+    tolerance_s: ClassVar[float] = 1e-6
+
+    def context(self) -> Context:
+        """With what is wired to it."""
+        return replace(super().context(), lines=self.specs)
+
+    def program(self, kind: str = "image", duration_s: float = 10e-3) -> LineProgram:
+        """What the lines do around a step."""
+        return line_program(self.specs, kind, duration_s)
+
+    def ready(self, device: Lines) -> None:
+        """A program that can be fired."""
+        device.compile(self.program())
+
+    def work(self, device: Lines) -> None:
+        """One step, as the sequencer lets the lines go with it."""
+        device.compile(self.program())
+        device.arm()
+        device.fire()
+        device.wait(5.0)
+
+    def uses(self) -> Mapping[str, Action[Lines]]:
+        """Compile, arm, fire, wait."""
+        return {
+            "compile()": lambda lines: lines.compile(self.program()),
+            "arm()": lambda lines: lines.arm(),
+            "fire()": lambda lines: lines.fire(),
+            "wait()": lambda lines: lines.wait(0.1),
+        }
+
+    def states(self) -> Mapping[str, Action[Lines]]:
+        """Compiled, armed, and in the middle of a program."""
+
+        def arm(lines: Lines) -> None:
+            lines.compile(self.program("load", 50e-3))
+            lines.arm()
+
+        def fire(lines: Lines) -> None:
+            arm(lines)
+            lines.fire()
+
+        return {"with a program": self.ready, "while armed": arm, "while a program runs": fire}
+
+    def excesses(self) -> Mapping[str, Action[Lines]]:
+        """More edges, and nearer to one another, than any box can make."""
+        return {
+            "a program of 1 000 000 edges": lambda lines: lines.compile(self._many(1_000_000, 1e-3)),
+            "edges a picosecond apart": lambda lines: lines.compile(self._many(3, 1e-12)),
+        }
+
+    def waits(self) -> Mapping[str, Wait[Lines]]:
+        """For the end of a long program."""
+
+        def enter(lines: Lines) -> None:
+            lines.compile(self.program("load", 20.0))
+            lines.arm()
+            lines.fire()
+
+        return {"wait() for a program of 20 s": Wait(0.1, enter, lambda lines: lines.wait(0.1))}
+
+    @promise("what is compiled, armed and fired is what the lines do")
+    def test_does_what_was_compiled(self, factory: Factory[Lines]) -> None:
+        """Step after step; programs come back, and change their length."""
+        steps = (("load", 20e-3), ("image", 5e-3), ("rearrange", 8e-3), ("image", 5e-3), ("image", 7e-3))
+        with self.opened(factory) as (lines, context):
+            for kind, duration_s in steps:
+                program, n_before = self.program(kind, duration_s), len(_played(context))
+                with doing(f"`{kind}` for {duration_s} s"):
+                    lines.compile(program)
+                    lines.arm()
+                    lines.fire()
+                    lines.wait(5.0)
+                for played in _played(context)[n_before:]:
+                    self._compare(played, program)
+
+    @promise("fire() returns at once, and wait() comes back at the end of the program")
+    def test_waits_for_the_end(self, factory: Factory[Lines]) -> None:
+        """So that the next step does not begin before the lags are over."""
+        with self.opened(factory) as (lines, context):
+            program = self.program("load", 30e-3)
+            lines.compile(program)
+            lines.arm()
+            fired_s = context.clock.now()
+            lines.fire()
+            assert context.clock.now() - fired_s < program.duration_s, "fire() waited for the end"
+            lines.wait(5.0)
+            waited_s = context.clock.now() - fired_s
+            assert waited_s >= program.duration_s - 1e-6, f"wait() came back after {waited_s} s of 32 ms"
+
+    @promise("a firing needs an arm() of its own")
+    def test_refuses_fire_without_arm(self, factory: Factory[Lines]) -> None:
+        """Nothing is fired twice by mistake, nor after safe_state()."""
+        with self.opened(factory) as (lines, _):
+            refusal(DeviceError, "arm() before compile()", lines.arm)
+            lines.compile(self.program())
+            refusal(DeviceError, "fire() before arm()", lines.fire)
+            self.work(lines)
+            refusal(DeviceError, "a second fire() after one arm()", lines.fire)
+            lines.arm()
+            lines.safe_state()
+            refusal(DeviceError, "fire() after safe_state()", lines.fire)
+
+    @promise("lines are idle after open(), and all off after safe_state()")
+    def test_rests(self, factory: Factory[Lines]) -> None:
+        """Where the context has a simulation that notes it."""
+        idle = line_program(self.specs, "idle", 0.0).on[-1]
+        with self.opened(factory) as (lines, context):
+            for state, wanted in (("open()", idle), ("safe_state()", np.zeros_like(idle))):
+                if state == "safe_state()":
+                    lines.safe_state()
+                if played := _played(context):
+                    assert np.array_equal(played[-1].on[-1], wanted), f"after {state}: {played[-1].on[-1]}"
+
+    def _many(self, n_edges: int, apart_s: float) -> LineProgram:
+        on = np.zeros((n_edges, len(self.specs)), np.bool_)
+        on[::2, 0] = True
+        names = tuple(spec.name for spec in self.specs)
+        return LineProgram(
+            "image", names, np.arange(n_edges, dtype=np.float64) * apart_s, on, 0.0, n_edges * apart_s
+        )
+
+    def _compare(self, played: LineProgram, wanted: LineProgram) -> None:
+        told = f"`{wanted.kind}`: edges at {played.t_s} s; expected {wanted.t_s} s"
+        assert played.t_s.shape == wanted.t_s.shape, told
+        assert np.abs(played.t_s - wanted.t_s).max() <= self.tolerance_s, told
+        assert np.array_equal(played.on, wanted.on), (
+            f"`{wanted.kind}`: states {played.on}; expected {wanted.on}"
+        )
+
+
+def _played(context: Context) -> Sequence[LineProgram]:
+    """What the simulation was told of the lines; nothing for one that does not note it."""
+    simulation = context.simulation
+    if not isinstance(simulation, RecordingSimulation):
+        return []
+    plays = [call.args for call in simulation.calls if call.method == "play"]
+    return [args[1] for args in plays if args[0] == "lines"]

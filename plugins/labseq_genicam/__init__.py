@@ -1,0 +1,15 @@
+"""Cameras that speak GenICam: GigE Vision and USB3 Vision, through Aravis."""
+
+from labseq import Registry, hookimpl
+
+LABSEQ_API = 1
+
+
+@hookimpl
+def labseq_register(registry: Registry) -> None:
+    """Offer the camera ``genicam``; in a dry run a simulated GigE Vision camera shows the simulated atoms."""
+    from labseq_genicam.camera import GenicamCamera
+    from labseq_genicam.settings import SIMULATED, GenicamSettings
+
+    simulated = {"camera": SIMULATED, "model": None, "serial": None}
+    registry.camera("genicam", GenicamCamera, GenicamSettings, simulated=simulated)

@@ -1,0 +1,206 @@
+"""Taking frames with an open camera."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Final, Literal, TypeAlias
+
+from labseq import DeviceError, LimitError, Series, Taken
+from labseq.units import format_quantity
+from labseq_genicam.aravis import Buffer, Camera, Stream, StreamOptions
+from labseq_genicam.counting import FrameCounter
+from labseq_genicam.link import Link
+from labseq_genicam.settings import GenicamSettings
+
+BUFFER_BYTES: Final = 256 * 2**20
+"""Memory for frames that were not read yet; a series that needs more uses its buffers again."""
+
+FAULTS: Final[Mapping[str, str]] = dict.fromkeys(
+    ("missing packets", "timeout"), "some of its network packets are missing"
+)
+"""What it means that a buffer has another status than success."""
+
+RATE: Final = "AcquisitionFrameRate"
+ROUNDING: Final = 1e-6
+
+Start: TypeAlias = Literal["software", "line", "free"]
+"""What starts the exposures, as the camera is set."""
+
+
+class Acquisition:
+    """The series of an open camera.
+
+    A camera that waits for software triggers goes on waiting from one series to the next: to start
+    it anew can take as long as an exposure. What was triggered before is told by its number.
+
+    Args:
+        link: The open camera, set up.
+        settings: The driver's settings.
+    """
+
+    def __init__(self, link: Link, settings: GenicamSettings) -> None:
+        self._link = link
+        self._settings = settings
+        self._options = StreamOptions(settings.packet_timeout, settings.frame_timeout)
+        self._stream: Stream | None = None
+        self._start: Start | None = None
+        self._counter = FrameCounter()
+        self._n_buffers = self._n_triggered = self._first = self._n_frames = 0
+        self._exposure_s = math.nan
+
+    def prepare(self, series: Series, start: Start) -> float:
+        """Get ready for a series; nothing is exposed yet.
+
+        Args:
+            series: The series.
+            start: What starts its exposures.
+
+        Returns:
+            From one exposure to the next with the internal trigger, in seconds; else nan.
+
+        Raises:
+            LimitError: The camera cannot expose so long, so briefly or so often.
+            DeviceError: It has no such trigger, or is gone.
+        """
+        goes_on = start == self._start == "software" and self._is_in_step()
+        if not goes_on:
+            self.stop()
+        period_s = math.nan
+        with self._link.doing("prepare the series") as camera:
+            self._set_exposure(camera, series.exposure_s)
+            if not goes_on:
+                self._set_trigger(camera, start)
+            if series.trigger == "internal":
+                period_s = self._set_period(camera, series.exposure_s, start)
+            self._provide(camera, series.n_frames)
+        self._first, self._n_frames = self._n_triggered, series.n_frames
+        return period_s
+
+    def begin(self, start: Start) -> None:
+        """Start what was prepared, unless the camera waits already.
+
+        Raises:
+            DeviceError: It cannot, or is gone.
+        """
+        if self._start is None:
+            with self._link.doing("start the series") as camera:
+                camera.start()
+            self._start = start
+
+    def fire(self) -> None:
+        """Start an exposure.
+
+        Raises:
+            DeviceError: The camera refuses, or is gone.
+        """
+        with self._link.doing("trigger it") as camera:
+            camera.trigger()
+        self._n_triggered += 1
+
+    def poll(self, seconds: float) -> Taken | None:
+        """Wait for the next frame of the series, for at most so long; None if none came.
+
+        Raises:
+            DeviceError: The camera is gone, or sends what cannot be read.
+        """
+        buffer = self._pop(seconds)
+        if buffer is None:
+            return None
+        number = self._counter.number(buffer.frame_id if buffer.image is not None else None) - self._first
+        if number < 0:  # of an earlier series
+            return None
+        fault = (
+            "" if buffer.image is not None else FAULTS.get(buffer.status, f"its buffer is '{buffer.status}'")
+        )
+        if self._start == "free" and number >= self._n_frames - 1:
+            self.stop()
+        time_s = 1e-9 * buffer.camera_time_ns if buffer.camera_time_ns else math.nan
+        return Taken(number, buffer.image, fault, self._exposure_s, device_time_s=time_s)
+
+    def ask(self) -> None:
+        """Ask the camera for a sign of life.
+
+        Raises:
+            DeviceError: It is gone.
+        """
+        self._link.ask()
+
+    def stop(self) -> None:
+        """End the acquisition; frames that were not read are dropped, also those on their way.
+
+        Raises:
+            DeviceError: The camera is gone, which was not known yet.
+        """
+        stream, start = self._stream, self._start
+        self._stream = self._start = None
+        if self._link.is_gone:
+            return  # the link closes the stream
+        if start is not None:
+            with self._link.doing("stop the series") as camera:
+                camera.stop()
+        if stream is not None:
+            stream.close()
+
+    def _is_in_step(self) -> bool:
+        """Whether all frames came that were triggered; those that nobody read are dropped."""
+        while (buffer := self._pop(0.0)) is not None:
+            self._counter.number(buffer.frame_id if buffer.image is not None else None)
+        return self._counter.n_frames == self._n_triggered
+
+    def _pop(self, seconds: float) -> Buffer | None:
+        if self._stream is None:
+            raise DeviceError(self._link.name, "not acquiring; call arm() first")
+        with self._link.doing("read a frame"):
+            return self._stream.pop(seconds)
+
+    def _set_exposure(self, camera: Camera, exposure_s: float) -> None:
+        shortest_s, longest_s = camera.exposure_bounds_s
+        if not shortest_s <= exposure_s <= longest_s:
+            came, low, high = (format_quantity(t, "time") for t in (exposure_s, shortest_s, longest_s))
+            limit = f"{low} to {high}, which the camera can do"
+            raise LimitError(f"{self._link.name}: exposure", came, limit)
+        camera.set_exposure_s(exposure_s)
+        self._exposure_s = camera.exposure_s
+
+    def _set_trigger(self, camera: Camera, start: Start) -> None:
+        if start == "free":
+            camera.set_trigger(None)
+            return
+        source = "Software" if start == "software" else self._settings.trigger_line
+        if source not in (offered := camera.trigger_sources):
+            text = f"its trigger source cannot be {source}; the camera offers {', '.join(offered) or 'none'}"
+            raise DeviceError(self._link.name, text)
+        camera.set_trigger(source)
+        if start == "line" and self._settings.trigger_edge == "falling":
+            camera.set_string("TriggerActivation", "FallingEdge")
+
+    def _set_period(self, camera: Camera, exposure_s: float, start: Start) -> float:
+        """Set how often the camera exposes where it runs freely; returns its period."""
+        wanted_hz, natural_s = self._settings.frame_rate, exposure_s + self._settings.readout
+        if not camera.is_available(RATE):
+            if wanted_hz is None:
+                return natural_s
+            text = "the camera has no frame rate that could be set; leave out `frame_rate`"
+            raise DeviceError(self._link.name, text)
+        low_hz, high_hz = camera.float_bounds(RATE)
+        rate_hz = wanted_hz or min(max(1.0 / natural_s, low_hz), high_hz)
+        high_hz = min(high_hz, 1.0 / exposure_s)
+        if not low_hz <= rate_hz <= high_hz * (1.0 + ROUNDING):
+            limit = f"{low_hz:g} to {high_hz:g} per second at this exposure"
+            raise LimitError(f"{self._link.name}: frame rate", f"{rate_hz:g}", limit)
+        if start != "free":
+            return 1.0 / rate_hz
+        camera.set_frame_rate_hz(rate_hz)
+        return 1.0 / camera.frame_rate_hz
+
+    def _provide(self, camera: Camera, n_frames: int) -> None:
+        """Have buffers for as many frames, as far as the memory goes."""
+        if self._stream is None:
+            self._n_buffers = self._n_triggered = 0
+            self._counter = FrameCounter()
+            self._stream = camera.create_stream(0, self._options)
+        payload = camera.payload
+        n_missing = max(2, min(n_frames, BUFFER_BYTES // payload)) - self._n_buffers
+        self._stream.allocate(n_missing, payload)
+        self._n_buffers += max(0, n_missing)

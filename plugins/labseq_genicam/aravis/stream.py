@@ -1,0 +1,203 @@
+"""Frames of a camera, as they come."""
+
+from __future__ import annotations
+
+import ctypes
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+from labseq_genicam.aravis.errors import AravisError
+from labseq_genicam.aravis.library import G_TYPE_INT, G_TYPE_UINT, Library
+from labseq_genicam.aravis.pixels import NAMES, unpacked
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+STATUS_NAMES: Final = (
+    "success",
+    "cleared",
+    "timeout",
+    "missing packets",
+    "wrong packet id",
+    "size mismatch",
+    "filling",
+    "aborted",
+)
+"""Names of the library's ``ArvBufferStatus``, from 0."""
+
+FRAMES_IN_SOCKET: Final = 4
+LEAST_SOCKET_BUFFER: Final = 2**20
+"""Size of the socket's buffer, in frames, and its least size, in bytes. That of one frame, the
+library's own choice, loses packets: the kernel counts each with its overhead, up to twice its size."""
+
+
+@dataclass(frozen=True, slots=True)
+class StreamOptions:
+    """How a GigE stream receives; of USB, none counts. None leaves the library's value.
+
+    Attributes:
+        packet_timeout_s: After which time a missing packet is asked for again.
+        frame_retention_s: After which time without a packet an incomplete frame is given up.
+        resend: Whether missing packets are asked for again.
+        socket_buffer_bytes: Size of the socket's buffer; None for four frames, and at least 1 MiB.
+            The system may give less: on Linux, twice ``net.core.rmem_max``.
+        packet_socket: Whether Linux's packet sockets are used where the program may
+            (CAP_NET_RAW): faster, but it hears every packet of the machine.
+    """
+
+    packet_timeout_s: float | None = None
+    frame_retention_s: float | None = None
+    resend: bool = True
+    socket_buffer_bytes: int | None = None
+    packet_socket: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Buffer:
+    """A frame, or what came of it.
+
+    Attributes:
+        status: "success", or why there is no image: one of :data:`STATUS_NAMES`, or "unknown".
+        frame_id: Number that the camera gave it; GigE cameras count 1 to 65535 and again from 1.
+        camera_time_ns: Start of its transfer or exposure on the camera's clock, in nanoseconds.
+        system_time_ns: When its first packet came, on this machine's clock, in nanoseconds
+            since 1970.
+        pixel_format: Name of its pixel format; "" if there is no image.
+        image: uint16 (height, width), a copy; None unless the status is "success".
+    """
+
+    status: str
+    frame_id: int
+    camera_time_ns: int
+    system_time_ns: int
+    pixel_format: str
+    image: NDArray[np.uint16] | None
+
+
+@dataclass(frozen=True, slots=True)
+class Statistics:
+    """What has come since the stream was made.
+
+    Attributes:
+        n_completed: Frames that are whole.
+        n_failed: Frames that are not.
+        n_underruns: Frames that came when there was no free buffer.
+        n_resent: Packets that came after they were asked for again; GigE only.
+        n_missing: Packets that never came; GigE only.
+    """
+
+    n_completed: int
+    n_failed: int
+    n_underruns: int
+    n_resent: int
+    n_missing: int
+
+
+class Stream:
+    """Receives frames in the background; made by :meth:`Camera.create_stream`."""
+
+    def __init__(self, library: Library, handle: int, is_ethernet: bool, streams: list[Stream]) -> None:
+        self._library = library
+        self._handle: int | None = handle
+        self._is_ethernet = is_ethernet
+        self._streams = streams
+        streams.append(self)
+
+    def apply(self, options: StreamOptions, payload: int) -> None:
+        """Set the options, for frames of ``payload`` bytes."""
+        if not self._is_ethernet:
+            return
+        lib = self._library
+        self._set("packet-resend", int(options.resend), lib.arv_gv_stream_packet_resend_get_type())
+        for name, time_s in (
+            ("packet-timeout", options.packet_timeout_s),
+            ("frame-retention", options.frame_retention_s),
+        ):
+            if time_s is not None:
+                self._set(name, round(time_s * 1e6), G_TYPE_UINT)
+        self._set("socket-buffer", 0, lib.arv_gv_stream_socket_buffer_get_type())  # fixed
+        size = options.socket_buffer_bytes or max(FRAMES_IN_SOCKET * payload, LEAST_SOCKET_BUFFER)
+        self._set("socket-buffer-size", size, G_TYPE_INT)
+
+    def allocate(self, n_buffers: int, payload: int) -> None:
+        """Add buffers of ``payload`` bytes each."""
+        for _ in range(n_buffers):
+            buffer = self._library.arv_buffer_new_allocate(payload)
+            self._library.arv_stream_push_buffer(self._open_handle(), buffer)
+
+    def close(self) -> None:
+        """Stop receiving and free the buffers; legal at any time, and again."""
+        if self._handle is not None:
+            self._library.g_object_unref(self._handle)
+            self._handle = None
+            self._streams.remove(self)
+
+    def __enter__(self) -> Stream:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def pop(self, timeout_s: float) -> Buffer | None:
+        """Wait for the next frame, or for what came of it.
+
+        Args:
+            timeout_s: How long; other threads run meanwhile.
+
+        Returns:
+            The frame; None if none came in time.
+
+        Raises:
+            AravisError: It cannot be read: see :func:`unpacked`. The buffer is used again all the same.
+        """
+        handle = self._open_handle()
+        buffer = self._library.arv_stream_timeout_pop_buffer(handle, max(0, round(timeout_s * 1e6)))
+        if buffer is None:
+            return None
+        try:
+            return self._read(buffer)
+        finally:
+            self._library.arv_stream_push_buffer(handle, buffer)
+
+    @property
+    def statistics(self) -> Statistics:
+        """What has come so far."""
+        values = [ctypes.c_uint64() for _ in range(5)]
+        places = [ctypes.byref(value) for value in values]
+        self._library.arv_stream_get_statistics(self._open_handle(), *places[:3])
+        if self._is_ethernet:
+            self._library.arv_gv_stream_get_statistics(self._open_handle(), *places[3:])
+        return Statistics(*(value.value for value in values))
+
+    def _read(self, buffer: int) -> Buffer:
+        lib = self._library
+        code = lib.arv_buffer_get_status(buffer)
+        status = STATUS_NAMES[code] if 0 <= code < len(STATUS_NAMES) else "unknown"
+        return Buffer(
+            status,
+            lib.arv_buffer_get_frame_id(buffer),
+            lib.arv_buffer_get_timestamp(buffer),
+            lib.arv_buffer_get_system_timestamp(buffer),
+            *(self._image(buffer) if status == "success" else ("", None)),
+        )
+
+    def _image(self, buffer: int) -> tuple[str, NDArray[np.uint16]]:
+        lib = self._library
+        n_bytes, x_padding, y_padding = ctypes.c_size_t(), ctypes.c_int(), ctypes.c_int()
+        address = lib.arv_buffer_get_image_data(buffer, ctypes.byref(n_bytes))
+        if not address:
+            raise AravisError("a buffer holds no image", "no image")
+        lib.arv_buffer_get_image_padding(buffer, ctypes.byref(x_padding), ctypes.byref(y_padding))
+        shape = lib.arv_buffer_get_image_height(buffer), lib.arv_buffer_get_image_width(buffer)
+        pixel_format = lib.arv_buffer_get_image_pixel_format(buffer)
+        image = unpacked(address, n_bytes.value, pixel_format, shape, x_padding.value)
+        return NAMES[pixel_format], image
+
+    def _set(self, name: str, value: int, type_: Any) -> None:
+        self._library.set_property(self._open_handle(), name, value, type_)
+
+    def _open_handle(self) -> int:
+        if self._handle is None:
+            raise AravisError("the stream is closed; make another one", "closed")
+        return self._handle

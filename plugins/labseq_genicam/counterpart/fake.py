@@ -1,0 +1,245 @@
+"""The parent's side of the simulated camera."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Callable
+from typing import IO, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq_genicam.aravis.errors import AravisError
+from labseq_genicam.aravis.library import library
+from labseq_genicam.counterpart.faults import Faults, Setup, to_json
+from labseq_genicam.counterpart.images import Request, made
+from labseq_genicam.counterpart.messages import (
+    DONE,
+    EXPOSE,
+    FAULTS,
+    IMAGE,
+    NO_IMAGE,
+    READY,
+    REFUSED,
+    SETUP,
+    Channel,
+    Exposure,
+)
+
+START_TIMEOUT_S: Final = 30.0
+"""How long a camera may take to start; it takes half a second on an idle machine."""
+
+STOP_TIMEOUT_S: Final = 5.0
+"""How long an exposure that is being made may take to end."""
+
+
+class FakeCamera:
+    """A simulated GigE Vision camera whose pixels come from a function.
+
+    Args:
+        expose: Makes the image of an exposure, uint16 (height, width), clipped to what the pixel
+            format holds. A thread of this object calls it, one exposure at a time.
+        serial: Its serial number, at most 15 characters.
+        sensor_shape: Height and width of the sensor, in pixels.
+        faults: What goes wrong.
+
+    Attributes:
+        address: What it is opened by; "" before it has started.
+    """
+
+    def __init__(
+        self,
+        expose: Callable[[Request], NDArray[np.uint16]],
+        *,
+        serial: str = "SIM1",
+        sensor_shape: tuple[int, int] = (2048, 2048),
+        faults: Faults = Faults(),  # noqa: B008 - frozen
+    ) -> None:
+        self._expose = expose
+        self._serial = serial
+        self._sensor_shape = sensor_shape
+        self._faults = faults
+        self._process: subprocess.Popen[bytes] | None = None
+        self._errors: list[Exception] = []
+        self._news = threading.Condition()
+        self._n_begun = 0
+        self._n_answered = 0
+        self._n_done = 0
+        self._is_ready = False
+        self._has_ended = False
+        self.address = ""
+
+    def start(self) -> None:
+        """Start the process and wait until the camera answers.
+
+        Raises:
+            LibraryMissingError: There is no library.
+            AravisError: It cannot start; says why.
+        """
+        if self.is_running:
+            return
+        self.stop()
+        library()  # a missing one is told here
+        self._log: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 - closed by stop()
+        self._n_begun = self._n_answered = 0
+        self._is_ready = self._has_ended = False
+        self._process = subprocess.Popen(
+            [sys.executable, "-P", "-m", "labseq_genicam.counterpart"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=self._log,
+            bufsize=0,
+            start_new_session=True,  # Ctrl-C is for the parent
+        )
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._channel = Channel(self._process.stdout, self._process.stdin)
+        self._service = threading.Thread(
+            target=self._serve, args=(self._channel,), name=f"camera {self._serial}", daemon=True
+        )
+        self._service.start()
+        setup = Setup(self._serial, self._sensor_shape, self.address, self._faults)
+        try:
+            self._send(SETUP, to_json(setup))
+            if not self._wait(lambda: self._is_ready or self._has_ended, START_TIMEOUT_S):
+                raise AravisError(
+                    f"the simulated camera did not start within {START_TIMEOUT_S:g} s", "timeout"
+                )
+            if not self._is_ready:
+                raise self._errors.pop() if self._errors else AravisError(self._reason(), "not connected")
+        except BaseException:
+            self.stop()
+            raise
+
+    def stop(self) -> None:
+        """End the process; legal at any time, and again."""
+        if self._process is None:
+            return
+        self.unplug()
+        self._service.join(STOP_TIMEOUT_S)
+        for pipe in (self._process.stdin, self._process.stdout, self._log):
+            assert pipe is not None
+            pipe.close()
+        self._process = None
+
+    def __enter__(self) -> FakeCamera:
+        self.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    @property
+    def is_running(self) -> bool:
+        """Whether the camera's process is alive."""
+        return self._process is not None and not self._has_ended and self._process.poll() is None
+
+    @property
+    def n_begun(self) -> int:
+        """How many exposures the camera has begun: the number that the next one will have."""
+        with self._news:
+            return self._n_begun
+
+    def wait_for_request(self, n: int, timeout_s: float, *, answered: bool = False) -> bool:
+        """Wait until the camera has begun an exposure.
+
+        Args:
+            n: Number of the exposure, from 0.
+            timeout_s: How long.
+            answered: Whether to wait until its image has been made, too.
+
+        Returns:
+            Whether it has.
+        """
+        return self._wait(lambda: n < (self._n_answered if answered else self._n_begun), timeout_s)
+
+    def set_faults(self, faults: Faults) -> None:
+        """Change what goes wrong; in force for frames begun from now on.
+
+        Raises:
+            AravisError: The camera does not take them.
+        """
+        self._faults = faults
+        if not self.is_running:
+            return
+        n = self._n_done
+        self._send(FAULTS, to_json(faults))
+        if not self._wait(lambda: self._n_done > n or self._has_ended, STOP_TIMEOUT_S) or self._n_done == n:
+            raise AravisError(self._reason(), "not connected")
+
+    def unplug(self) -> None:
+        """Let the camera vanish, whatever it is doing; :meth:`start` plugs it in again, at its address."""
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+
+    def raise_pending(self) -> None:
+        """Raise the first error of ``expose`` that was not raised yet."""
+        if self._errors:
+            raise self._errors.pop(0)
+
+    def _serve(self, channel: Channel) -> None:
+        """Answer the camera until it is gone."""
+        while (message := _received(channel)) is not None:
+            kind, data = message
+            if kind == EXPOSE:
+                self._answer(channel, Exposure.unpacked(data))
+            with self._news:
+                if kind == READY:
+                    self.address, self._is_ready = data.decode(), True
+                elif kind == REFUSED:
+                    self._errors.append(AravisError(data.decode(), "refused"))
+                elif kind == DONE:
+                    self._n_done += 1
+                self._news.notify_all()
+        with self._news:
+            self._has_ended = self._has_ended or channel is self._channel
+            self._news.notify_all()
+
+    def _answer(self, channel: Channel, exposure: Exposure) -> None:
+        with self._news:
+            self._n_begun += 1
+            self._news.notify_all()
+        try:
+            image = made(self._expose, exposure)
+        except Exception as error:  # noqa: BLE001 - kept for raise_pending
+            self._errors.append(error)
+            image = None
+        with self._news:
+            self._n_answered += 1
+            self._news.notify_all()
+        try:
+            channel.send(NO_IMAGE if image is None else IMAGE, b"" if image is None else image)
+        except (OSError, ValueError):
+            return  # the camera is gone
+
+    def _send(self, kind: bytes, data: bytes) -> None:
+        try:
+            if not self.is_running:
+                raise OSError
+            self._channel.send(kind, data)
+        except (OSError, ValueError) as error:
+            raise AravisError(self._reason(), "not connected") from error
+
+    def _wait(self, condition: Callable[[], bool], timeout_s: float) -> bool:
+        with self._news:
+            return self._news.wait_for(condition, timeout_s)
+
+    def _reason(self) -> str:
+        """Why the camera is gone, as far as its process told."""
+        if self._process is None:
+            return "the simulated camera is not running; call start() first"
+        self._log.seek(0)
+        lines = self._log.read().decode(errors="replace").split("\n")
+        said = next((line for line in reversed(lines) if line.strip()), "it said nothing")
+        return f"the process of the simulated camera has ended: {said}"
+
+
+def _received(channel: Channel) -> tuple[bytes, bytearray] | None:
+    try:
+        return channel.receive()
+    except (OSError, ValueError):  # closed meanwhile
+        return None

@@ -1,0 +1,181 @@
+"""Setting a camera up: what stays the same from one series to the next."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from labseq import DeviceError, LimitError
+from labseq.errors import one_of
+from labseq.units import ZERO_CELSIUS_K
+from labseq_genicam.aravis import Camera
+from labseq_genicam.link import Link
+from labseq_genicam.settings import FORMATS, GenicamSettings, PixelFormat
+
+
+def identify(link: Link, settings: GenicamSettings) -> dict[str, Any]:
+    """What an open camera is: JSON-ready.
+
+    Raises:
+        DeviceError: It is another than the settings say.
+    """
+    with link.doing("ask the camera what it is") as camera:
+        found = {
+            "vendor": camera.vendor,
+            "model": camera.model,
+            "serial_number": camera.serial,
+            "firmware": camera.firmware,
+            "connection": "GigE Vision" if camera.is_ethernet else "USB3 Vision",
+        }
+    for key, wanted in (("model", settings.model), ("serial_number", settings.serial)):
+        if wanted is not None and found[key] != wanted:
+            what = key.replace("_", " ")
+            text = f"the camera {found['serial_number']} ({found['model']}) has the {what} {found[key]}"
+            raise DeviceError(link.name, f"{text}; expected {wanted}: name another one as `camera`")
+    return found
+
+
+def set_up(link: Link, settings: GenicamSettings) -> dict[str, Any]:
+    """Bring a camera from any state into the driver's.
+
+    Args:
+        link: The open camera.
+        settings: The driver's settings.
+
+    Returns:
+        What it is set to: JSON-ready.
+
+    Raises:
+        LimitError: It does not go so far as the settings do.
+        DeviceError: It does not have what they set.
+    """
+    with link.doing("set the camera up") as camera:
+        camera.stop()
+        for feature, value in (("ExposureAuto", "Off"), ("GainAuto", "Off"), ("ExposureMode", "Timed")):
+            if camera.is_available(feature):
+                camera.set_string(feature, value)
+        pixel_format = _set_pixel_format(link.name, camera, settings.pixel_format)
+        sensor_shape = _set_binning(link.name, camera, settings.binning)
+        frame_shape = _set_region(link.name, camera, settings, sensor_shape)
+        _set_gain(link.name, camera, settings.gain)
+        _set_packets(link.name, camera, settings)
+        return {
+            "pixel_format": pixel_format,
+            "sensor_shape": sensor_shape,
+            "frame_shape": frame_shape,
+            "gain_now": camera.gain if camera.has_gain else None,
+            "exposure_bounds_s": camera.exposure_bounds_s,
+        }
+
+
+def temperature_k(camera: Camera) -> float | None:
+    """Temperature of camera or sensor, whichever is selected, in kelvins; None if it does not tell."""
+    if not camera.is_available("DeviceTemperature"):
+        return None
+    return round(camera.get_float("DeviceTemperature") + ZERO_CELSIUS_K, 2)
+
+
+def nearest(value: int, low: int, high: int, step: int) -> int:
+    """The number nearest to a value, from low to high in steps.
+
+    Example:
+        >>> nearest(37, 0, 100, 4), nearest(39, 2, 100, 4), nearest(200, 0, 99, 4)
+        (36, 38, 96)
+    """
+    n_steps = (min(max(value, low), high) - low + step // 2) // step
+    return low + step * min(n_steps, (high - low) // step)
+
+
+def _set_pixel_format(name: str, camera: Camera, wanted: PixelFormat | None) -> str:
+    offered = camera.pixel_formats
+    chosen = wanted or next((one for one in FORMATS if one in offered), None)
+    if chosen is None or chosen not in offered:
+        text = f"its pixel format cannot be {wanted or one_of(FORMATS)}"
+        raise DeviceError(name, f"{text}; the camera offers {', '.join(offered) or 'none'}")
+    camera.set_pixel_format(chosen)
+    return chosen
+
+
+def _set_binning(name: str, camera: Camera, binning: int) -> tuple[int, int]:
+    """Set the binning; returns (height, width) of the sensor, which some cameras tell after binning."""
+    can_bin = camera.is_available("BinningHorizontal") and camera.is_available("BinningVertical")
+    if not can_bin and binning > 1:
+        raise LimitError(f"{name}: binning", binning, "1, as the camera does not bin", "leave out `binning`")
+    if not can_bin:
+        return camera.sensor_shape
+    camera.set_binning(1, 1)
+    sensor_shape = camera.sensor_shape
+    for axis in ("Horizontal", "Vertical") if binning > 1 else ():
+        _check(name, "binning", binning, camera.integer_bounds(f"Binning{axis}"))
+        if camera.is_available(f"Binning{axis}Mode"):
+            camera.set_string(f"Binning{axis}Mode", "Sum")
+    camera.set_binning(binning, binning)
+    return sensor_shape
+
+
+def _set_region(
+    name: str, camera: Camera, settings: GenicamSettings, sensor_shape: tuple[int, int]
+) -> tuple[int, int]:
+    """Set the region; returns (height, width) of the frames."""
+    y, x, height, width = settings.mode.region or (0, 0, *sensor_shape)
+    if y + height > sensor_shape[0] or x + width > sensor_shape[1]:
+        end, size = f"row {y + height}, column {x + width}", "{} x {} pixels".format(*sensor_shape)
+        hint = "choose a smaller or another one"
+        raise LimitError(f"{name}: end of the region", end, f"the sensor's {size}", hint)
+    can_move = camera.is_available("OffsetX") and camera.is_available("OffsetY")
+    for axis, size in (("Y", "Height"), ("X", "Width")):  # where it begins limits its size, and the reverse
+        camera.set_integer(size, camera.integer_bounds(size)[0])
+        if can_move:
+            camera.set_integer(f"Offset{axis}", 0)
+    shape: list[int] = []
+    for axis, size, start, extent in (("Y", "Height", y, height), ("X", "Width", x, width)):
+        binning, (low, high, step) = settings.binning, camera.integer_bounds(size)
+        n_pixels = extent // binning
+        if settings.region is None:
+            n_pixels = nearest(n_pixels, low, high, step)
+        _check(name, f"region's {size.lower()}", n_pixels * binning, (low, high, step), binning)
+        camera.set_integer(size, n_pixels)
+        bounds = camera.integer_bounds(f"Offset{axis}") if can_move else (0, 0, 1)
+        _check(name, f"region's {axis.lower()}", start, bounds, binning)
+        if can_move:
+            camera.set_integer(f"Offset{axis}", start // binning)
+        shape.append(n_pixels)
+    return shape[0], shape[1]
+
+
+def _check(name: str, what: str, value: int, bounds: tuple[int, int, int], unit: int = 1) -> None:
+    """Refuse a number that the camera does not take; names the nearest good one.
+
+    Args:
+        name: Name of the camera.
+        what: What the number is.
+        value: The number, in pixels of the sensor.
+        bounds: Least, greatest and increment, in the camera's own pixels.
+        unit: Pixels of the sensor per pixel of the camera: the binning.
+    """
+    low, high, step = (unit * bound for bound in bounds)
+    good = nearest(value, low, high, step)
+    if good != value:
+        limit = f"{low} to {high}, in steps of {step}, which the camera can do"
+        raise LimitError(f"{name}: {what}", value, limit, f"the nearest good one is {good}")
+
+
+def _set_gain(name: str, camera: Camera, gain: float | None) -> None:
+    if gain is None:
+        return
+    if not camera.has_gain:
+        raise LimitError(f"{name}: gain", f"{gain:g}", "none, as the camera has none", "leave out `gain`")
+    low, high = camera.gain_bounds
+    if not low <= gain <= high:
+        limit = f"{low:g} to {high:g}, which the camera can do"
+        raise LimitError(f"{name}: gain", f"{gain:g}", limit)
+    camera.set_gain(gain)
+
+
+def _set_packets(name: str, camera: Camera, settings: GenicamSettings) -> None:
+    for key in ("packet_size", "packet_delay"):
+        if getattr(settings, key) is not None and not camera.is_ethernet:
+            raise DeviceError(name, f"only GigE cameras have packets: leave out `{key}`")
+    if settings.packet_size is not None:
+        camera.set_packet_size(settings.packet_size)
+    if settings.packet_delay is not None:
+        camera.set_packet_delay_s(settings.packet_delay)

@@ -1,0 +1,164 @@
+"""Taking frames with an open camera, as pylon does it."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Final
+
+import numpy as np
+
+from labseq import Clock, DeviceError, DeviceTimeoutError, LimitError, Taken, Trigger, wait_for
+from labseq.units import format_quantity
+from labseq_pylon import nodes as n
+from labseq_pylon.library import Sdk
+from labseq_pylon.nodes import Nodes
+from labseq_pylon.setup import ticks_per_s
+
+BUFFER_BYTES: Final = 256 * 2**20
+"""Memory for frames that were not read yet; a series that needs more uses its buffers again."""
+GIGE: Final = "BaslerGigE"
+MAX_GIGE_FRAMES: Final = 65535
+"""GigE cameras number their frames from 1, with 16 bits."""
+NO_NUMBER: Final = 2**64 - 1
+READY_S: Final = 1.0
+"""How long a camera may take until it would see a trigger, in seconds."""
+
+
+class Acquisition:
+    """The series of an open camera.
+
+    Args:
+        sdk: pylon.
+        camera: pylon's ``InstantCamera``, open.
+        nodes: Its nodes.
+        clock: The session's clock: looked at for stop requests.
+    """
+
+    def __init__(self, sdk: Sdk, camera: Any, nodes: Nodes, clock: Clock) -> None:
+        self._sdk = sdk
+        self._camera = camera
+        self._nodes = nodes
+        self._clock = clock
+        self._is_gige = camera.GetDeviceInfo().GetDeviceClass() == GIGE
+        self._ticks_per_s = ticks_per_s(nodes)
+        self._exposure_s = math.nan
+
+    def set_exposure(self, exposure_s: float) -> None:
+        """Set the exposure time; frames tell the one that the camera took.
+
+        Raises:
+            LimitError: The camera cannot expose so long or so briefly.
+            DeviceError: The camera is gone.
+        """
+        self._check_connected()
+        node = self._nodes.get(n.EXPOSURE, "exposure time")
+        taken_us = self._nodes.set_real(node, "exposure", 1e6 * exposure_s, _microseconds)
+        self._exposure_s = 1e-6 * taken_us
+
+    def set_trigger(self, trigger: Trigger, line: str, edge: str) -> None:
+        """Choose what starts the exposures.
+
+        Args:
+            trigger: The trigger.
+            line: Input of the external one.
+            edge: Its edge, "rising" or "falling".
+
+        Raises:
+            DeviceError: The camera has no such trigger.
+        """
+        choose = self._nodes.choose
+        choose(("TriggerSelector",), "trigger", "FrameStart", if_there=True)
+        choose(("TriggerMode",), "trigger mode", "Off" if trigger == "internal" else "On")
+        if trigger == "software":
+            choose(("TriggerSource",), "trigger source", "Software")
+        if trigger == "external":
+            choose(("TriggerSource",), "trigger source", line)
+            activation = {"rising": "RisingEdge", "falling": "FallingEdge"}[edge]
+            choose(("TriggerActivation",), "trigger edge", activation)
+
+    def start(self, n_frames: int) -> None:
+        """Queue the buffers and start; with the internal trigger the first exposure begins.
+
+        Raises:
+            LimitError: A GigE camera cannot number so many frames.
+            DeviceError: pylon cannot start.
+        """
+        if self._is_gige and n_frames > MAX_GIGE_FRAMES:
+            what = f"{self._sdk.name}: number of frames"
+            raise LimitError(what, n_frames, f"{MAX_GIGE_FRAMES}, as far as GigE cameras count")
+        with self._sdk.doing("start the series"):
+            n_buffers = BUFFER_BYTES // max(1, self._camera.PayloadSize.GetValue())
+            self._camera.MaxNumBuffer.SetValue(max(2, min(n_frames, n_buffers)))
+            self._camera.StartGrabbingMax(n_frames, self._sdk.pylon.GrabStrategy_OneByOne)
+
+    def wait_until_ready(self) -> None:
+        """Wait until the camera would see a trigger.
+
+        Raises:
+            DeviceTimeoutError: It does not get there.
+            DeviceError: The camera is gone.
+        """
+        camera, pylon = self._camera, self._sdk.pylon
+
+        def ready(seconds: float) -> bool | None:
+            self._check_connected()
+            milliseconds = _milliseconds(seconds)
+            return camera.WaitForFrameTriggerReady(milliseconds, pylon.TimeoutHandling_Return) or None
+
+        with self._sdk.doing("trigger"):
+            can_tell = camera.CanWaitForFrameTriggerReady()
+            if can_tell and wait_for(ready, READY_S, self._clock) is None:
+                text = f"not ready for a trigger within {format_quantity(READY_S, 'time')}"
+                hint = "leave more time between exposures than the camera needs to read one out"
+                raise DeviceTimeoutError(self._sdk.name, f"{text}; {hint}", READY_S)
+
+    def trigger(self) -> None:
+        """Start an exposure."""
+        with self._sdk.doing("trigger"):
+            self._camera.ExecuteSoftwareTrigger()
+
+    def poll(self, seconds: float) -> Taken | None:
+        """Wait for the next buffer, for at most so long; None if none came.
+
+        Raises:
+            DeviceError: The camera is gone, and nothing is left to be read.
+        """
+        camera, pylon = self._camera, self._sdk.pylon
+        with self._sdk.doing("read a frame"):
+            result = camera.RetrieveResult(_milliseconds(seconds), pylon.TimeoutHandling_Return)
+            if not result.IsValid():
+                self._check_connected()
+                return None
+            try:
+                return self._taken(result)
+            finally:
+                result.Release()
+
+    def stop(self) -> None:
+        """End the series; frames that were not read are dropped."""
+        with self._sdk.doing("stop"):
+            self._camera.StopGrabbing()
+
+    def _check_connected(self) -> None:
+        """Not every call of pylon fails when a camera is gone."""
+        if self._camera.IsCameraDeviceRemoved():
+            raise DeviceError(self._sdk.name, "the camera is gone; look after its cable and power")
+
+    def _taken(self, result: Any) -> Taken:
+        number = result.BlockID - int(self._is_gige)
+        if result.BlockID == NO_NUMBER:
+            number = result.ImageNumber - 1
+        if not result.GrabSucceeded():
+            code = f" (0x{result.ErrorCode:08X})" if result.ErrorCode else ""
+            return Taken(number, None, f"{result.ErrorDescription.rstrip('. ')}{code}")
+        image = np.asarray(result.Array).astype(np.uint16, copy=False)
+        device_time_s = result.TimeStamp / self._ticks_per_s if result.TimeStamp else math.nan
+        return Taken(number, image, exposure_s=self._exposure_s, device_time_s=device_time_s)
+
+
+def _milliseconds(seconds: float) -> int:
+    return max(1, round(1e3 * seconds))
+
+
+def _microseconds(value: float) -> str:
+    return format_quantity(1e-6 * value, "time")

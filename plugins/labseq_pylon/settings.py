@@ -1,0 +1,73 @@
+"""Settings of the driver."""
+
+from __future__ import annotations
+
+from typing import Annotated, Final, Literal, Self, TypeAlias
+
+from pydantic import Field, field_validator, model_validator
+
+from labseq import CameraSettings, Duration
+
+PixelFormat: TypeAlias = Literal["Mono8", "Mono10", "Mono12", "Mono16"]
+
+BITS: Final[dict[PixelFormat, int]] = {"Mono16": 16, "Mono12": 12, "Mono10": 10, "Mono8": 8}
+"""Bits of a pixel, the most first."""
+
+SIMULATED: Final = "simulated"
+"""The camera that needs no camera."""
+
+
+class PylonSettings(CameraSettings):
+    """A Basler camera."""
+
+    camera: str | None = Field(
+        default=None,
+        min_length=1,
+        description="serial number of the camera; none: the only one that is connected; `simulated`: pylon's "
+        "emulated camera, which shows the simulated atoms",
+    )
+    model: str | None = Field(
+        default=None, description='model that the camera must be, "acA1920-40um"; none: any'
+    )
+    pixel_format: PixelFormat | None = Field(
+        default=None, description="bits of a pixel; none: as many as the camera has"
+    )
+    gain: float | None = Field(
+        default=None, ge=-100, le=100, description="analogue gain in dB; none: as the camera is set"
+    )
+    gain_raw: int | None = Field(
+        default=None,
+        ge=0,
+        description="analogue gain in steps of the camera, for older cameras that have no gain in dB",
+    )
+    readout: Duration = Field(
+        default=5e-3,
+        description="time from the end of an exposure until its frame can be read, for budgets; the "
+        "simulated camera takes so long",
+    )
+    trigger_line: str = Field(
+        default="Line1", min_length=1, description="input of the external trigger, as the camera calls it"
+    )
+    trigger_edge: Literal["rising", "falling"] = Field(
+        default="rising", description="edge of the external trigger that starts an exposure"
+    )
+    packet_size: Annotated[int, Field(ge=220, le=16404)] | None = Field(
+        default=None, description="bytes of a network packet (GigE); none: as the camera is set"
+    )
+    packet_delay: Duration | None = Field(
+        default=None,
+        description="pause between two network packets (GigE), for cameras that share a cable; none: as the "
+        "camera is set",
+    )
+
+    @field_validator("camera", mode="before")
+    @classmethod
+    def _number_is_text(cls, camera: object) -> object:
+        """YAML takes a serial number without quotes for a number."""
+        return str(camera) if type(camera) is int else camera
+
+    @model_validator(mode="after")
+    def _one_gain(self) -> Self:
+        if self.gain is not None and self.gain_raw is not None:
+            raise ValueError("gain and gain_raw are both set; set one of them")
+        return self

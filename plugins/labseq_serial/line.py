@@ -1,0 +1,135 @@
+"""The line: what is sent, what comes back, and everything that can be wrong with it."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Generator
+from contextlib import contextmanager, suppress
+from typing import Final
+
+from labseq import Clock, DeviceError, DeviceTimeoutError, TransientError, wait_for
+from labseq.config.wording import clean
+from labseq.units import format_quantity
+from labseq_serial.ports import BROKEN, Port, is_write_timeout
+from labseq_serial.settings import SerialSettings
+
+MAX_REPLY: Final = 4096
+"""Longest reply in bytes; more is noise."""
+
+
+class Line:
+    """An open port, and one exchange on it after the other.
+
+    Args:
+        port: The port, open.
+        settings: How the instrument speaks.
+        device: Its name, for messages.
+        clock: The session's clock.
+
+    Attributes:
+        broken: Whether the port was lost; it must be opened anew.
+        given_up: Set by another thread to end a wait for a reply.
+    """
+
+    def __init__(self, port: Port, settings: SerialSettings, device: str, clock: Clock) -> None:
+        self.broken = False
+        self.given_up = threading.Event()
+        self._port = port
+        self._settings = settings
+        self._device = device
+        self._clock = clock
+        self._free_s = clock.now() + settings.wait_after_open
+
+    def exchange(self, text: str, timeout_s: float, *, answered: bool = True) -> str:
+        """Send a text and wait for the reply; what came before, late or unasked, is dropped.
+
+        Args:
+            text: What is sent, without its end.
+            timeout_s: How long the reply may take, in seconds.
+            answered: Whether a reply comes at all.
+
+        Returns:
+            The reply without its end and without spaces around it; "" if none is waited for.
+
+        Raises:
+            DeviceTimeoutError: No reply, or one without an end.
+            DeviceError: A reply that cannot be read.
+            TransientError: The line is broken.
+            StopRequested: The operator asked the run to stop.
+        """
+        settings = self._settings
+        if (wait_s := self._free_s - self._clock.now()) > 0:
+            self._clock.sleep(wait_s)
+        sent = (text + settings.write_ends_with).encode(settings.encoding)
+        end = settings.read_ends_with.encode(settings.encoding) if answered else b""
+        try:
+            with self._unbroken(text, timeout_s):
+                self._port.reset_input_buffer()
+                self._port.write(sent)
+            came = self._receive(text, sent if settings.echo else b"", end, timeout_s)
+        finally:
+            self._free_s = self._clock.now() + settings.pause
+        try:
+            return came.decode(settings.encoding).strip()
+        except UnicodeDecodeError:
+            what = f"the reply to '{clean(text)}', '{_visible(came)}', is not {settings.encoding}"
+            raise DeviceError(self._device, f"{what}; check 'baud_rate', 'parity' and 'encoding'") from None
+
+    def close(self) -> None:
+        """Close the port; legal in any state."""
+        with suppress(*BROKEN):
+            self._port.close()
+
+    def _receive(self, text: str, echo: bytes, end: bytes, timeout_s: float) -> bytes:
+        """What comes between the echo and the end; nothing is read if both are empty."""
+        came = bytearray()
+
+        def look(_: float) -> int | None:
+            if self.given_up.is_set():
+                raise DeviceError(self._device, f"'{clean(text)}' was given up for the safe state")
+            came.extend(self._port.read(min(max(1, self._port.in_waiting), MAX_REPLY)))
+            at = came.find(end, len(echo))
+            return at if at >= 0 or len(came) > len(echo) + MAX_REPLY else None
+
+        if not echo and not end:
+            return b""
+        with self._unbroken(text, timeout_s):
+            at = wait_for(look, timeout_s, self._clock)
+        if at is None:
+            raise DeviceTimeoutError(self._device, self._incomplete(text, bytes(came), timeout_s), timeout_s)
+        if not came.startswith(echo):
+            what = f"'{clean(text)}' was echoed as '{_visible(bytes(came))}'"
+            raise DeviceError(self._device, f"{what}; check 'echo', 'write_ends_with' and 'baud_rate'")
+        if at < 0:
+            what = f"the reply to '{clean(text)}' does not end: '{_visible(bytes(came))}'"
+            raise DeviceError(self._device, f"{what}; check 'read_ends_with' and 'baud_rate'")
+        return bytes(came[len(echo) : at])
+
+    def _incomplete(self, text: str, came: bytes, timeout_s: float) -> str:
+        waited = format_quantity(timeout_s, "time")
+        if not came:
+            what = f"no reply to '{clean(text)}' within {waited}"
+            return f"{what}; is it switched on? check 'baud_rate' and 'write_ends_with', or raise 'timeout'"
+        end = clean(self._settings.read_ends_with)
+        what = f"the reply to '{clean(text)}', '{_visible(came)}', did not end with '{end}' within {waited}"
+        return f"{what}; check 'read_ends_with', 'echo' and 'baud_rate', or raise 'timeout'"
+
+    @contextmanager
+    def _unbroken(self, text: str, timeout_s: float) -> Generator[None]:
+        """Put what a port raises in words."""
+        try:
+            yield
+        except BROKEN as error:
+            if isinstance(error, DeviceTimeoutError):  # an OSError too
+                raise
+            if is_write_timeout(error):
+                waited = format_quantity(timeout_s, "time")
+                what = f"'{clean(text)}' could not be sent within {waited}; see 'flow_control'"
+                raise DeviceTimeoutError(self._device, what, timeout_s) from error
+            self.broken = True
+            what = f"the line broke at '{clean(text)}' ({' '.join(str(error).split())}); unplugged?"
+            raise TransientError(what, self._device) from error
+
+
+def _visible(came: bytes) -> str:
+    return clean(came.decode("ascii", "backslashreplace"))

@@ -1,0 +1,240 @@
+// A software-defined radio that keeps what it is sent: the SoapySDR device "capture".
+//
+// It has transmit channels only, plays by the computer's clock from a buffer of finite length, and reports
+// an underflow when that ran dry. What it was sent stands in a file that others map into their memory
+// (struct Header, then a ring of samples for each channel); its faults are switched on there.
+//
+// Arguments: folder (where its files are), channels, buffer (s), patience (s: how long its clock waits for
+// samples that are late), speed (of its clock), coerce_rate (Hz), record (samples kept in files), fault=absent.
+
+#include <SoapySDR/Device.hpp>
+#include <SoapySDR/Errors.hpp>
+#include <SoapySDR/Formats.hpp>
+#include <SoapySDR/Registry.hpp>
+
+#include <algorithm>
+#include <chrono>
+#include <cstdint>
+#include <cstdio>
+#include <cstring>
+#include <stdexcept>
+#include <string>
+#include <thread>
+#include <vector>
+
+#include <fcntl.h>
+#include <sys/file.h>
+#include <sys/mman.h>
+#include <time.h>
+#include <unistd.h>
+
+namespace {
+
+constexpr uint64_t MAGIC = 0x3170616371657362ull;  // changes with the layout below
+constexpr size_t RING = 1u << 18;                  // samples of each channel
+constexpr size_t CHANNELS = 2;
+constexpr size_t MTU = 16384;
+
+enum Fault : uint64_t { UNDERFLOW_ONCE = 1, STREAM_ERROR = 2, MUTE_0 = 4, MUTE_1 = 8, STALL = 16 };
+
+struct Header {
+    uint64_t magic, ring, sent, underflows, is_active, fault;
+    double rate_hz, speed, patience_s, t0_s;  // sample n is played at t0 + n / (rate speed), CLOCK_MONOTONIC
+    double frequency_hz[CHANNELS], gain_db[CHANNELS];
+};
+
+using Sample = uint64_t;  // two floats, never looked into
+
+double now_s() {
+    timespec t;
+    clock_gettime(CLOCK_MONOTONIC, &t);
+    return double(t.tv_sec) + 1e-9 * double(t.tv_nsec);
+}
+
+std::string text(const SoapySDR::Kwargs &args, const std::string &key, const std::string &otherwise) {
+    const auto found = args.find(key);
+    return found == args.end() ? otherwise : found->second;
+}
+
+double number(const SoapySDR::Kwargs &args, const std::string &key, double otherwise) {
+    const auto found = args.find(key);
+    return found == args.end() ? otherwise : std::stod(found->second);
+}
+
+class Capture : public SoapySDR::Device {
+public:
+    explicit Capture(const SoapySDR::Kwargs &args)
+        : folder_(text(args, "folder", ".")), n_channels_(size_t(number(args, "channels", CHANNELS))),
+          buffer_s_(number(args, "buffer", 0.05)), coerced_hz_(number(args, "coerce_rate", 0.0)),
+          n_record_(size_t(number(args, "record", 0.0))) {
+        const std::string path = folder_ + "/ring";
+        const size_t size = sizeof(Header) + CHANNELS * RING * sizeof(Sample);
+        file_ = open(path.c_str(), O_RDWR | O_CREAT | O_CLOEXEC, 0600);
+        if (file_ < 0) throw std::runtime_error("cannot open " + path);
+        if (flock(file_, LOCK_EX | LOCK_NB) != 0) {
+            close(file_);
+            throw std::runtime_error("the device is busy: another program has opened it");
+        }
+        if (ftruncate(file_, off_t(size)) != 0) throw std::runtime_error("cannot enlarge " + path);
+        void *place = mmap(nullptr, size, PROT_READ | PROT_WRITE, MAP_SHARED, file_, 0);
+        if (place == MAP_FAILED) throw std::runtime_error("cannot map " + path);
+        header_ = static_cast<Header *>(place);
+        ring_ = reinterpret_cast<Sample *>(header_ + 1);
+        std::memset(place, 0, size);
+        header_->ring = RING;
+        header_->speed = number(args, "speed", 1.0);
+        header_->patience_s = number(args, "patience", 0.0);
+        header_->magic = MAGIC;
+    }
+
+    ~Capture() override {
+        header_->is_active = 0;
+        munmap(header_, sizeof(Header) + CHANNELS * RING * sizeof(Sample));
+        close(file_);
+    }
+
+    std::string getDriverKey() const override { return "capture"; }
+    std::string getHardwareKey() const override { return "capture"; }
+    SoapySDR::Kwargs getHardwareInfo() const override { return {{"serial", "simulated"}}; }
+
+    size_t getNumChannels(const int direction) const override {
+        return direction == SOAPY_SDR_TX ? n_channels_ : 0;
+    }
+    std::vector<std::string> getStreamFormats(const int, const size_t) const override { return {SOAPY_SDR_CF32}; }
+
+    void setSampleRate(const int, const size_t, const double rate) override {
+        header_->rate_hz = coerced_hz_ > 0.0 ? coerced_hz_ : rate;
+    }
+    double getSampleRate(const int, const size_t) const override { return header_->rate_hz; }
+
+    void setFrequency(const int, const size_t channel, const double frequency, const SoapySDR::Kwargs &) override {
+        header_->frequency_hz[channel] = frequency;
+    }
+    double getFrequency(const int, const size_t channel) const override { return header_->frequency_hz[channel]; }
+
+    void setGain(const int, const size_t channel, const double gain) override {
+        const SoapySDR::Range range = getGainRange(SOAPY_SDR_TX, channel);
+        header_->gain_db[channel] = std::min(std::max(gain, range.minimum()), range.maximum());
+    }
+    double getGain(const int, const size_t channel) const override { return header_->gain_db[channel]; }
+    SoapySDR::Range getGainRange(const int, const size_t) const override { return SoapySDR::Range(0.0, 60.0); }
+
+    SoapySDR::Stream *setupStream(const int direction, const std::string &format,
+                                  const std::vector<size_t> &channels, const SoapySDR::Kwargs &) override {
+        if (direction != SOAPY_SDR_TX || format != SOAPY_SDR_CF32) throw std::runtime_error("TX of CF32 only");
+        for (const size_t channel : channels)
+            if (channel >= n_channels_) throw std::runtime_error("no such channel");
+        channels_ = channels;
+        for (const size_t channel : channels)
+            if (n_record_ > 0)
+                records_.push_back(std::fopen((folder_ + "/channel" + std::to_string(channel)).c_str(), "wb"));
+        return reinterpret_cast<SoapySDR::Stream *>(this);
+    }
+
+    void closeStream(SoapySDR::Stream *) override {
+        for (std::FILE *record : records_)
+            if (record) std::fclose(record);
+        records_.clear();
+    }
+
+    size_t getStreamMTU(SoapySDR::Stream *) const override { return MTU; }
+
+    int activateStream(SoapySDR::Stream *, const int, const long long, const size_t) override {
+        header_->sent = 0;
+        header_->t0_s = now_s();
+        header_->is_active = 1;
+        return 0;
+    }
+
+    int deactivateStream(SoapySDR::Stream *, const int, const long long) override {
+        header_->is_active = 0;
+        return 0;
+    }
+
+    int writeStream(SoapySDR::Stream *, const void *const *buffers, const size_t n, int &, const long long,
+                    const long timeout_us) override {
+        if (!header_->is_active || (header_->fault & STREAM_ERROR)) return SOAPY_SDR_STREAM_ERROR;
+        const size_t buffer = size_t(std::max(1.0, buffer_s_ * header_->rate_hz));
+        const size_t room = wait_for_room(std::min(std::min(n, MTU), buffer), 1e-6 * double(timeout_us));
+        if (room == 0) return SOAPY_SDR_TIMEOUT;
+        for (size_t i = 0; i < channels_.size(); i++) keep(i, static_cast<const Sample *>(buffers[i]), room);
+        __atomic_store_n(&header_->sent, header_->sent + room, __ATOMIC_RELEASE);
+        return int(room);
+    }
+
+    int readStreamStatus(SoapySDR::Stream *, size_t &, int &, long long &, const long) override {
+        if (n_told_ == header_->underflows) return SOAPY_SDR_TIMEOUT;
+        n_told_++;
+        return SOAPY_SDR_UNDERFLOW;
+    }
+
+private:
+    double clock_hz() const { return header_->rate_hz * header_->speed; }
+
+    // Samples that were played so far; an underflow, or a wait for late samples, sets the clock back.
+    double played() {
+        const double played = (now_s() - header_->t0_s) * clock_hz();
+        const double late_s = header_->sent > 0 ? (played - double(header_->sent)) / clock_hz() : 0.0;
+        const bool forced = header_->fault & UNDERFLOW_ONCE;
+        if (late_s <= 0.0 && header_->sent > 0 && !forced) return played;
+        if (forced || late_s > header_->patience_s) {
+            header_->underflows++;
+            header_->fault &= ~uint64_t(UNDERFLOW_ONCE);
+        }
+        header_->t0_s = now_s() - double(header_->sent) / clock_hz();
+        return double(header_->sent);
+    }
+
+    // How many of n samples the buffer takes; waits for all of them as long as it may.
+    size_t wait_for_room(const size_t n, const double timeout_s) {
+        const double deadline_s = now_s() + timeout_s, size = buffer_s_ * header_->rate_hz;
+        for (;;) {
+            const bool stalled = header_->fault & STALL;
+            const double free = stalled ? 0.0 : size - (double(header_->sent) - played());
+            const double left_s = deadline_s - now_s();
+            if (free >= double(n)) return n;
+            if (left_s <= 0.0) return free >= 1.0 ? size_t(free) : 0;
+            const double wait_s = stalled ? 1e-3 : (double(n) - free) / clock_hz();
+            std::this_thread::sleep_for(std::chrono::duration<double>(std::min(std::min(wait_s, left_s), 0.05)));
+        }
+    }
+
+    void keep(const size_t i, const Sample *samples, const size_t n) {
+        const size_t channel = channels_[i], start = header_->sent % RING, head = std::min(n, RING - start);
+        Sample *ring = ring_ + channel * RING;
+        if (header_->fault & (channel == 0 ? MUTE_0 : MUTE_1)) {
+            std::memset(ring + start, 0, head * sizeof(Sample));
+            std::memset(ring, 0, (n - head) * sizeof(Sample));
+        } else {
+            std::memcpy(ring + start, samples, head * sizeof(Sample));
+            std::memcpy(ring, samples + head, (n - head) * sizeof(Sample));
+        }
+        if (i < records_.size() && records_[i] && header_->sent < n_record_)
+            std::fwrite(samples, sizeof(Sample), std::min(n, size_t(n_record_ - header_->sent)), records_[i]);
+    }
+
+    std::string folder_;
+    size_t n_channels_;
+    double buffer_s_, coerced_hz_;
+    size_t n_record_;
+    int file_ = -1;
+    Header *header_ = nullptr;
+    Sample *ring_ = nullptr;
+    std::vector<size_t> channels_;
+    std::vector<std::FILE *> records_;
+    uint64_t n_told_ = 0;
+};
+
+SoapySDR::KwargsList find(const SoapySDR::Kwargs &args) {
+    if (text(args, "driver", "") != "capture") return {};
+    return {args};
+}
+
+SoapySDR::Device *make(const SoapySDR::Kwargs &args) {
+    if (text(args, "fault", "") == "absent") throw std::runtime_error("no such radio");
+    return new Capture(args);
+}
+
+SoapySDR::Registry registered("capture", &find, &make, SOAPY_SDR_ABI_VERSION);
+
+}  // namespace

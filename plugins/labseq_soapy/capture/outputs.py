@@ -1,0 +1,83 @@
+"""What the simulated radio plays, for a simulated world that listens."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq import TweezerAmplitudes
+from labseq_soapy.capture.ring import Ring
+
+DECIMALS: Final = 6
+"""To which amplitudes are heard: far above the rounding of float32, far below what an atom feels."""
+
+Floats = NDArray[np.float64]
+
+
+class CapturedOutputs:
+    """The two connectors of a simulated radio.
+
+    Implements ``labseq.ToneSource``. It looks for the tones where they should be: what is played at
+    another frequency, because the local oscillator or the sample rate is wrong, makes no tweezers.
+
+    Args:
+        ring: What the radio was sent.
+        tones_hz: Tones of the rows and of the columns.
+        channels: Channel of the rows and of the columns.
+    """
+
+    def __init__(self, ring: Ring, tones_hz: tuple[Floats, Floats], channels: tuple[int, int]) -> None:
+        self._ring = ring
+        self._axes = tuple(zip(tones_hz, channels, strict=True))
+        self._heard: list[TweezerAmplitudes] = []
+        self._last = tuple(np.zeros(len(tones)) for tones in tones_hz)
+        self._underflows = int(ring["underflows"])
+        self._filters: dict[tuple[int, float, float], NDArray[np.complex128]] = {}
+
+    def look(self) -> None:
+        """Note the amplitudes if they have changed; the driver calls it whenever it has changed them."""
+        underflows = int(self._ring["underflows"])
+        if underflows != self._underflows:
+            self._underflows = underflows
+            self._note(tuple(np.zeros_like(values) for values in self._last))
+        self._note(self._now())
+
+    def played(self, until_s: float) -> Sequence[TweezerAmplitudes]:  # noqa: ARG002 - they lag behind nothing
+        """What the tones' amplitudes were since the last call, in time's order; nothing if unchanged."""
+        self.look()
+        heard, self._heard = self._heard, []
+        return heard
+
+    def _note(self, amplitudes: tuple[Floats, ...]) -> None:
+        if all(np.array_equal(now, last) for now, last in zip(amplitudes, self._last, strict=True)):
+            return
+        self._last = amplitudes
+        self._heard.append(TweezerAmplitudes(*amplitudes))
+
+    def _now(self) -> tuple[Floats, ...]:
+        if not self._ring.is_playing:
+            return tuple(np.zeros_like(values) for values in self._last)
+        return tuple(self._amplitudes(tones_hz, channel) for tones_hz, channel in self._axes)
+
+    def _amplitudes(self, tones_hz: Floats, channel: int) -> Floats:
+        rate_hz, oscillator_hz = float(self._ring["rate_hz"]), float(self._ring["frequency_hz"][channel])
+        spacing_hz = float(np.diff(np.sort(tones_hz)).min()) if len(tones_hz) > 1 else rate_hz / 100
+        n = int(np.clip(8 * rate_hz / spacing_hz, 2048, 1 << 16))
+        key = channel, rate_hz, oscillator_hz
+        if key not in self._filters:
+            self._filters[key] = _least_squares(tones_hz - oscillator_hz, n, rate_hz)
+        samples = self._ring.latest(n)[channel]
+        if len(samples) < n:
+            return np.zeros(len(tones_hz))
+        heard = np.einsum("ij,j", self._filters[key], samples)  # BLAS would wake its threads for this
+        return np.round(np.abs(heard), DECIMALS)
+
+
+def _least_squares(offsets_hz: Floats, n: int, rate_hz: float) -> NDArray[np.complex128]:
+    """What samples are multiplied by to find the amplitudes of tones in them, complex128 (n_tones, n)."""
+    waves = np.exp(-2j * np.pi * np.outer(offsets_hz, np.arange(n) / rate_hz))
+    overlaps = np.einsum("it,jt", waves, waves.conj())
+    return np.einsum("ij,jt", np.linalg.inv(overlaps), waves)

@@ -1,0 +1,87 @@
+"""What the capture module was sent, as it stands in the file that it shares."""
+
+from __future__ import annotations
+
+import enum
+import time
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+MAGIC: Final = 0x3170616371657362
+CHANNELS: Final = 2
+
+_HEADER: Final = np.dtype(
+    [
+        *((name, np.uint64) for name in ("magic", "ring", "sent", "underflows", "is_active", "fault")),
+        *((name, np.float64) for name in ("rate_hz", "speed", "patience_s", "t0_s")),
+        *((name, np.float64, CHANNELS) for name in ("frequency_hz", "gain_db")),
+    ]
+)
+
+
+class Fault(enum.IntFlag):
+    """What goes wrong with the radio while it is set; of the first, once."""
+
+    NONE = 0
+    UNDERFLOW = 1
+    STREAM_ERROR = 2
+    MUTE_0 = 4
+    MUTE_1 = 8
+    STALL = 16
+
+
+class Ring:
+    """The latest samples of both channels.
+
+    Args:
+        folder: Folder of the capture module's files.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / "ring"
+        memory = np.memmap(self._path, np.uint8, "r+")
+        self._header: Any = memory[: _HEADER.itemsize].view(_HEADER)[0]
+        if self._header["magic"] != MAGIC:
+            raise ValueError(f"{self._path} is not of this version of the capture module")
+        samples = memory[_HEADER.itemsize :].view(np.complex64)
+        self._samples: NDArray[np.complex64] = samples.reshape(CHANNELS, int(self._header["ring"]))
+
+    def __getitem__(self, name: str) -> Any:
+        """A value of the header; see ``struct Header`` in capture.cpp."""
+        return self._header[name]
+
+    def set_fault(self, fault: Fault) -> None:
+        """Let something go wrong from now on."""
+        self._header["fault"] = int(fault)
+
+    @property
+    def is_playing(self) -> bool:
+        """Whether anything comes out: somebody has the radio open, and its buffer has not run dry."""
+        header = self._header
+        if not header["is_active"] or not self._is_held():
+            return False
+        late_s = time.monotonic() - header["t0_s"] - header["sent"] / (header["rate_hz"] * header["speed"])
+        return bool(late_s <= header["patience_s"])
+
+    def latest(self, n: int) -> NDArray[np.complex64]:
+        """The latest samples that it was sent, complex64 (2, n); fewer if there were fewer."""
+        size = self._samples.shape[1]
+        while True:
+            end = int(self._header["sent"])
+            places = np.arange(max(0, end - n), end) % size
+            found = self._samples[:, places]
+            if int(self._header["sent"]) - end < size - n - (1 << 16):  # not written over meanwhile
+                return found
+
+    def _is_held(self) -> bool:
+        import fcntl
+
+        with self._path.open("rb") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            except BlockingIOError:
+                return True
+            return False

@@ -1,0 +1,298 @@
+"""The C interface of SoapySDR 0.8, as far as it is needed to transmit; loaded on first use."""
+
+from __future__ import annotations
+
+import ctypes
+import sys
+from collections.abc import Mapping, Sequence
+from ctypes import POINTER, byref, c_char_p, c_double, c_int, c_long, c_longlong, c_size_t, c_void_p
+from functools import cache
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+TX: Final = 0
+FORMAT: Final = b"CF32"
+TIMEOUT: Final = -1
+NOT_SUPPORTED: Final = -5
+UNDERFLOW: Final = -7
+
+STREAM_ERRORS: Final[Mapping[int, str]] = {
+    TIMEOUT: "it took no samples in time",
+    -2: "the stream failed",
+    -3: "samples were corrupted on the way",
+    -4: "a buffer overflowed",
+    NOT_SUPPORTED: "it does not support this",
+    -6: "a sample came too late for its time",
+    UNDERFLOW: "it ran out of samples",
+}
+
+INSTALL: Final = {
+    "linux": "install it with `apt-get install libsoapysdr0.8` and the module of your radio, for example "
+    "soapysdr-module-uhd",
+    "darwin": "install it with `brew install soapysdr` and the module of your radio",
+    "win32": "install PothosSDR, which has it and the modules of many radios, and add its bin folder to PATH",
+}
+
+_NAMES: Final = {
+    "linux": ("libSoapySDR.so.0.8", "libSoapySDR.so"),
+    "darwin": (
+        "libSoapySDR.0.8.dylib",
+        "libSoapySDR.dylib",
+        "/opt/homebrew/lib/libSoapySDR.dylib",
+        "/usr/local/lib/libSoapySDR.dylib",
+    ),
+    "win32": ("SoapySDR.dll",),
+}
+
+
+class SoapyError(Exception):
+    """The library, the radio's module or the radio refused something; the text says what."""
+
+
+class _Range(ctypes.Structure):
+    _fields_ = (("minimum", c_double), ("maximum", c_double), ("step", c_double))
+
+
+class _Kwargs(ctypes.Structure):
+    _fields_ = (("size", c_size_t), ("keys", POINTER(c_char_p)), ("vals", POINTER(c_char_p)))
+
+
+_DEVICE: Final = (c_void_p,)
+_CHANNEL: Final = (c_void_p, c_int, c_size_t)
+_STREAM: Final = (c_void_p, c_void_p)
+
+_SIGNATURES: Final[Mapping[str, tuple[Any, tuple[Any, ...]]]] = {
+    "SoapySDRDevice_lastStatus": (c_int, ()),
+    "SoapySDRDevice_lastError": (c_char_p, ()),
+    "SoapySDRDevice_makeStrArgs": (c_void_p, (c_char_p,)),
+    "SoapySDRDevice_unmake": (c_int, _DEVICE),
+    "SoapySDRDevice_getDriverKey": (c_void_p, _DEVICE),
+    "SoapySDRDevice_getHardwareKey": (c_void_p, _DEVICE),
+    "SoapySDRDevice_getHardwareInfo": (_Kwargs, _DEVICE),
+    "SoapySDRDevice_getNumChannels": (c_size_t, (c_void_p, c_int)),
+    "SoapySDRDevice_setClockSource": (c_int, (c_void_p, c_char_p)),
+    "SoapySDRDevice_setAntenna": (c_int, (*_CHANNEL, c_char_p)),
+    "SoapySDRDevice_setSampleRate": (c_int, (*_CHANNEL, c_double)),
+    "SoapySDRDevice_getSampleRate": (c_double, _CHANNEL),
+    "SoapySDRDevice_setBandwidth": (c_int, (*_CHANNEL, c_double)),
+    "SoapySDRDevice_setFrequency": (c_int, (*_CHANNEL, c_double, POINTER(_Kwargs))),
+    "SoapySDRDevice_getFrequency": (c_double, _CHANNEL),
+    "SoapySDRDevice_setGain": (c_int, (*_CHANNEL, c_double)),
+    "SoapySDRDevice_getGain": (c_double, _CHANNEL),
+    "SoapySDRDevice_getGainRange": (_Range, _CHANNEL),
+    "SoapySDRDevice_setupStream": (
+        c_void_p,
+        (c_void_p, c_int, c_char_p, POINTER(c_size_t), c_size_t, POINTER(_Kwargs)),
+    ),
+    "SoapySDRDevice_closeStream": (c_int, _STREAM),
+    "SoapySDRDevice_activateStream": (c_int, (*_STREAM, c_int, c_longlong, c_size_t)),
+    "SoapySDRDevice_deactivateStream": (c_int, (*_STREAM, c_int, c_longlong)),
+    "SoapySDRDevice_writeStream": (
+        c_int,
+        (*_STREAM, POINTER(c_void_p), c_size_t, POINTER(c_int), c_longlong, c_long),
+    ),
+    "SoapySDRDevice_readStreamStatus": (
+        c_int,
+        (*_STREAM, POINTER(c_size_t), POINTER(c_int), POINTER(c_longlong), c_long),
+    ),
+    "SoapySDRKwargs_fromString": (_Kwargs, (c_char_p,)),
+    "SoapySDRKwargs_clear": (None, (POINTER(_Kwargs),)),
+    "SoapySDR_free": (None, (c_void_p,)),
+}
+
+
+@cache
+def library() -> Any:
+    """The library, its functions with their signatures.
+
+    Raises:
+        SoapyError: It cannot be found; says how to install it.
+    """
+    reason = ""
+    for name in _NAMES.get(sys.platform, _NAMES["linux"]):
+        try:
+            found = ctypes.CDLL(name)
+        except OSError as error:
+            reason = reason or str(error)
+            continue
+        for function, (result, arguments) in _SIGNATURES.items():
+            getattr(found, function).restype = result
+            getattr(found, function).argtypes = arguments
+        return found
+    advice = INSTALL.get(sys.platform, INSTALL["linux"])
+    raise SoapyError(f"the library SoapySDR cannot be loaded ({reason}); {advice}")
+
+
+class Radio:
+    """One open device; all its calls come from one thread.
+
+    Args:
+        arguments: What opens it, for example "driver=uhd,serial=30AD123".
+
+    Raises:
+        SoapyError: There is no library, no such device, or it cannot be opened.
+    """
+
+    def __init__(self, arguments: str) -> None:
+        self._library = library()
+        self._device = self._call("makeStrArgs", arguments.encode())
+        if not self._device:
+            raise SoapyError(f"no device answers to '{arguments}'")
+
+    def identify(self) -> dict[str, str]:
+        """Driver, hardware, and what else the device tells of itself."""
+        info = self._call("getHardwareInfo", self._device)
+        told = {info.keys[i].decode(): info.vals[i].decode() for i in range(info.size)}
+        self._library.SoapySDRKwargs_clear(byref(info))
+        return {"driver": self._text("getDriverKey"), "hardware": self._text("getHardwareKey"), **told}
+
+    @property
+    def n_channels(self) -> int:
+        """Number of channels that transmit."""
+        return int(self._call("getNumChannels", self._device, TX))
+
+    def gain_range(self, channel: int) -> tuple[float, float]:
+        """Lowest and highest gain in dB."""
+        gains = self._call("getGainRange", self._device, TX, channel)
+        return gains.minimum, gains.maximum
+
+    def set(self, what: str, channel: int, value: float | str) -> None:
+        """Set a value of a channel.
+
+        Args:
+            what: "Antenna", "SampleRate", "Bandwidth", "Frequency" or "Gain".
+            channel: The channel.
+            value: In Hz, or dB.
+        """
+        plain = value.encode() if isinstance(value, str) else value
+        extra = (None,) if what == "Frequency" else ()
+        self._call(f"set{what}", self._device, TX, channel, plain, *extra)
+
+    def get(self, what: str, channel: int) -> float:
+        """Read a value of a channel back: "SampleRate", "Frequency" or "Gain"."""
+        return float(self._call(f"get{what}", self._device, TX, channel))
+
+    def set_clock_source(self, source: str) -> None:
+        """Choose the reference of its clocks."""
+        self._call("setClockSource", self._device, source.encode())
+
+    def stream(self, channels: Sequence[int], arguments: str = "") -> Stream:
+        """Set up a stream to these channels, in rising order."""
+        kwargs = self._library.SoapySDRKwargs_fromString(arguments.encode())
+        numbers = (c_size_t * len(channels))(*channels)
+        try:
+            handle = self._call(
+                "setupStream", self._device, TX, FORMAT, numbers, len(channels), byref(kwargs)
+            )
+        finally:
+            self._library.SoapySDRKwargs_clear(byref(kwargs))
+        return Stream(self._library, self._device, handle, len(channels))
+
+    def close(self) -> None:
+        """Let the device go."""
+        self._call("unmake", self._device)
+
+    def _text(self, getter: str) -> str:
+        place = self._call(getter, self._device)
+        text = ctypes.string_at(place).decode() if place else ""
+        self._library.SoapySDR_free(place)
+        return text
+
+    def _call(self, name: str, *arguments: Any) -> Any:
+        return call(self._library, name, *arguments)
+
+
+class Stream:
+    """A stream of complex samples to all channels at once."""
+
+    def __init__(self, found: Any, device: Any, handle: Any, n_channels: int) -> None:
+        self._library, self._device, self._handle = found, device, handle
+        self._buffers = (c_void_p * n_channels)()
+        self._flags, self._mask, self._time = c_int(0), c_size_t(0), c_longlong(0)
+        self._knows_status = True
+
+    def activate(self) -> None:
+        """Start to play."""
+        call(self._library, "activateStream", self._device, self._handle, 0, 0, 0)
+
+    def write(self, samples: NDArray[np.float32], start: int, timeout_s: float) -> int:
+        """Hand over samples.
+
+        Args:
+            samples: float32 (n_channels, 2 n), I and Q in turn; each row in one piece.
+            start: Index of the first sample to hand over.
+            timeout_s: How long to wait for room.
+
+        Returns:
+            How many samples were taken; 0 if there was no room in time.
+
+        Raises:
+            SoapyError: The stream is broken.
+        """
+        n_samples = samples.shape[1] // 2 - start
+        for i, row in enumerate(samples):
+            self._buffers[i] = row.ctypes.data + 8 * start
+        self._flags.value = 0
+        n_taken = self._library.SoapySDRDevice_writeStream(
+            self._device,
+            self._handle,
+            self._buffers,
+            n_samples,
+            byref(self._flags),
+            0,
+            round(timeout_s * 1e6),
+        )
+        if n_taken >= 0 or n_taken in {TIMEOUT, UNDERFLOW}:
+            return max(0, n_taken)
+        raise SoapyError(f"writing to the stream: {stream_error(n_taken)}")
+
+    def underflows(self) -> int:
+        """How often the device ran out of samples since the last call, as far as it tells.
+
+        Raises:
+            SoapyError: The stream is broken.
+        """
+        count = 0
+        while self._knows_status:
+            code = self._library.SoapySDRDevice_readStreamStatus(
+                self._device, self._handle, byref(self._mask), byref(self._flags), byref(self._time), 0
+            )
+            if code == UNDERFLOW:
+                count += 1
+                continue
+            if code == NOT_SUPPORTED:
+                self._knows_status = False
+            elif code < 0 and code != TIMEOUT:
+                raise SoapyError(f"the stream's status: {stream_error(code)}")
+            break
+        return count
+
+    def close(self) -> None:
+        """Stop playing and give the stream back."""
+        call(self._library, "deactivateStream", self._device, self._handle, 0, 0)
+        call(self._library, "closeStream", self._device, self._handle)
+
+
+def call(found: Any, name: str, *arguments: Any) -> Any:
+    """Call a function of a device.
+
+    Raises:
+        SoapyError: It failed, with what the library says of it.
+    """
+    result = getattr(found, f"SoapySDRDevice_{name}")(*arguments)
+    if found.SoapySDRDevice_lastStatus() != 0:
+        text = (found.SoapySDRDevice_lastError() or b"").decode(errors="replace")
+        raise SoapyError(f"{name}: {text or 'it failed and does not say why'}")
+    return result
+
+
+def stream_error(code: int) -> str:
+    """What a negative result of a stream means.
+
+    Example:
+        >>> stream_error(-7)
+        'it ran out of samples (-7)'
+    """
+    return f"{STREAM_ERRORS.get(code, 'an unknown error')} ({code})"

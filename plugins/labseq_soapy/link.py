@@ -1,0 +1,217 @@
+"""labseq's end of the streaming process: starts it, tells it what to do, and knows how it is."""
+
+from __future__ import annotations
+
+import contextlib
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from labseq import Clock, DeviceError, wait_for
+from labseq_soapy.messages import Setup, received, send
+from labseq_soapy.output import Samples
+from labseq_soapy.radio import Facts
+
+OPEN_S: Final = 60.0
+"""How long a radio may take to open: some load their firmware."""
+SILENT_S: Final = 10.0
+"""A streaming process that says nothing for so long hangs."""
+END_S: Final = 3.0
+"""How long it may take to end beside its ramp."""
+
+
+class Link:
+    """One streaming process.
+
+    Args:
+        name: Name of the device, for messages.
+        clock: The session's clock.
+        setup: What the process is told first.
+        log: File for what the radio's module prints.
+        environment: Environment of the process.
+    """
+
+    def __init__(
+        self, name: str, clock: Clock, setup: Setup, log: Path, environment: Mapping[str, str]
+    ) -> None:
+        self._name, self._clock, self._setup, self._log = name, clock, setup, log
+        self._news = threading.Condition()
+        self._sending = threading.Lock()
+        self._facts: Facts | None = None
+        self._ended = ""
+        self._done = self._asked = 0
+        self._status = {"underflows": 0, "dark": 0}
+        self._heard_s = time.monotonic()
+        self._closing = threading.Event()
+        with log.open("wb") as file:
+            self._process = subprocess.Popen(
+                [sys.executable, "-P", "-m", "labseq_soapy.streamer"],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=file,
+                bufsize=0,
+                env=dict(environment),
+                start_new_session=True,  # what ends a terminal's programs does not end it before labseq
+            )
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._in, self._out = self._process.stdin, self._process.stdout
+        self._threads = [
+            threading.Thread(target=work, name=f"{name} {work.__name__}", daemon=True)
+            for work in (self._listen, self._beat)
+        ]
+        with contextlib.suppress(OSError):  # it has ended already; why is told below
+            self._say(setup.as_message())
+        for thread in self._threads:
+            thread.start()
+
+    @property
+    def pid(self) -> int:
+        """Number of the process."""
+        return self._process.pid
+
+    @property
+    def underflows(self) -> int:
+        """How often the radio has run out of samples."""
+        return self._status["underflows"]
+
+    @property
+    def dark(self) -> int:
+        """How often it has while the array was on."""
+        return self._status["dark"]
+
+    @property
+    def hangs(self) -> bool:
+        """Whether the process is there, but silent."""
+        return not self._ended and time.monotonic() - self._heard_s > SILENT_S
+
+    def facts(self) -> Facts:
+        """Wait until the radio is open and streams silence; what it says of itself.
+
+        Raises:
+            DeviceError: It cannot be opened or set up.
+        """
+        self._wait(lambda: self._facts is not None, OPEN_S, "open the radio")
+        assert self._facts is not None
+        return self._facts
+
+    def load(self, loop: Samples, fade_s: float) -> None:
+        """Play another loop, and wait until it is at the connectors.
+
+        Args:
+            loop: float32 (2, 2 n), I and Q in turn, by the channels' numbers.
+            fade_s: Time in which it takes the place of the one before.
+
+        Raises:
+            DeviceError: The stream is dead.
+        """
+        with tempfile.TemporaryDirectory(prefix="labseq-") as folder:
+            file = Path(folder) / "loop.npy"
+            np.save(file, loop)
+            self._do("loop", file=str(file), fade_s=fade_s)
+
+    def ramp(self, depth: float, duration_s: float) -> None:
+        """Change the depth, and wait until its end is at the connectors.
+
+        Raises:
+            DeviceError: The stream is dead.
+        """
+        self._do("ramp", depth=depth, duration_s=duration_s)
+
+    def check(self) -> None:
+        """Refuse to go on with a stream that is dead.
+
+        Raises:
+            DeviceError: With what is known of its end.
+        """
+        if self._ended:
+            dark = "" if self._facts is None else "; the array is dark"
+            raise DeviceError(self._name, f"{self._ended}{dark}")
+        if self.hangs:
+            text = f"its streaming process (number {self.pid}) hangs: it said nothing for {SILENT_S:g} s"
+            raise DeviceError(self._name, text)
+
+    def close(self) -> None:
+        """Let the process ramp down and end; one that does not is killed. Legal in any state."""
+        self._closing.set()
+        with contextlib.suppress(OSError):
+            self._say({"do": "end"})
+        try:
+            self._process.wait(END_S + self._setup.ramp_s)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        for thread in self._threads:
+            thread.join()
+        for pipe in (self._in, self._out):
+            with contextlib.suppress(OSError):
+                pipe.close()
+
+    def _do(self, what: str, **values: Any) -> None:
+        self.check()
+        self._asked += 1
+        task = self._asked
+        try:
+            self._say({"do": what, "id": task, **values})
+        except OSError:
+            self._wait(lambda: False, END_S, "say why it has ended")
+        self._wait(lambda: self._done >= task, float("inf"), what)
+
+    def _wait(self, come: Any, timeout_s: float, what: str) -> None:
+        """Wait for something as long as the process lives.
+
+        Raises:
+            DeviceError: It has ended, or hangs, or it takes too long.
+        """
+
+        def poll(longest_s: float) -> bool | None:
+            with self._news:
+                self._news.wait_for(lambda: come() or self._ended, longest_s)
+                if come():
+                    return True
+            self.check()
+            return None
+
+        if not wait_for(poll, timeout_s, self._clock):
+            raise DeviceError(self._name, f"the streaming process did not {what} within {timeout_s:g} s")
+
+    def _listen(self) -> None:
+        why = ""
+        for message in received(self._out.fileno()):
+            with self._news:
+                self._heard_s = time.monotonic()
+                if facts := message.get("facts"):
+                    self._facts = Facts.from_message(facts)
+                self._status = message.get("status", self._status)
+                self._done = max(self._done, message.get("done", 0))
+                why = message.get("failed") or message.get("ended") or why
+                self._news.notify_all()
+        code = self._process.wait()
+        with self._news:
+            self._ended = why or f"its streaming process ended with code {code}{self._last_words()}"
+            self._news.notify_all()
+
+    def _last_words(self) -> str:
+        with contextlib.suppress(OSError):
+            lines = self._log.read_text("utf-8", "replace").split("\n")
+            words = [line.strip() for line in lines if line.strip()]
+            return f", with the last words: {words[-1][:200]}" if words else ""
+        return ""
+
+    def _beat(self) -> None:
+        while not self._closing.wait(self._setup.patience_s / 8):
+            try:
+                self._say({"do": "beat"})
+            except OSError:
+                return
+
+    def _say(self, message: Mapping[str, Any]) -> None:
+        with self._sending:
+            send(self._in.fileno(), message)

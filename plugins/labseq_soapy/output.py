@@ -1,0 +1,134 @@
+"""What is sent to the radio, block by block: a loop, its depth, and the fades from one loop to the next."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+Samples = NDArray[np.float32]
+
+BLOCK: Final = 1 << 15
+"""Most samples that are made at once: below a millisecond at any rate that 20 tones need."""
+
+
+class Output:
+    """The signal of both channels.
+
+    At full depth the samples are those of the loop itself, at depth 0 of a buffer of zeros; only ramps
+    and fades cost work. The depth of a tweezer goes as the product of the powers of its row's and its
+    column's tone, so that both amplitudes go as its fourth root. The loop runs on whatever happens, so no
+    phase ever jumps.
+
+    Attributes:
+        depth: Depth at the end of the last block, as a fraction of the nominal depth.
+    """
+
+    def __init__(self) -> None:
+        self.depth = 0.0
+        self._silence = np.zeros((2, 2 * BLOCK), np.float32)
+        self._loop = self._silence
+        self._next: Samples | None = None
+        self._n_fade = self._n_faded = 0
+        self._ramp = _Course(0.0, 0.0, 0)
+        self._at = 0
+        self._steps = np.arange(1, BLOCK + 1, dtype=np.float32).repeat(2)
+        self._factor = np.empty(2 * BLOCK, np.float32)
+        self._made = np.empty((2, 2 * BLOCK), np.float32)
+
+    def load(self, loop: Samples, n_fade: int) -> None:
+        """Play another loop: at once where nothing is on, else faded in.
+
+        Args:
+            loop: float32 (2, 2 n), I and Q in turn; each loop as long as the first.
+            n_fade: Length of the fade in samples.
+        """
+        if self._loop is self._silence:
+            self._loop, self._at = loop, 0
+        elif self.depth == 0.0 and not self._ramp.left:
+            self._loop, self._next = loop, None
+        else:
+            if self._next is not None:  # the fade before is cut short where it is
+                self._loop = self._mixed_loop(self._next)
+            self._next, self._n_fade, self._n_faded = loop, max(1, n_fade), 0
+
+    def ramp(self, depth: float, n_samples: int) -> None:
+        """Change the depth linearly, from where it is; the last sample has the new depth."""
+        self._ramp = _Course(self.depth, depth, max(1, n_samples))
+
+    @property
+    def steady(self) -> bool:
+        """Whether no ramp or fade is under way."""
+        return self._ramp.left == 0 and self._next is None
+
+    def block(self) -> Samples:
+        """The next samples, float32 (2, 2 n) with n from 1 to :data:`BLOCK`; valid until the next call."""
+        n = min(BLOCK, self._loop.shape[1] // 2 - self._at)
+        if self._ramp.left:
+            n = min(n, self._ramp.left)
+        if self._next is not None:
+            n = min(n, self._n_fade - self._n_faded)
+        samples = self._shaped(n)
+        self._at = (self._at + n) % (self._loop.shape[1] // 2)
+        self._finish_fade(n)
+        return samples
+
+    def _shaped(self, n: int) -> Samples:
+        part = slice(2 * self._at, 2 * (self._at + n))
+        if self.depth == 0.0 and not self._ramp.left:
+            return self._silence[:, : 2 * n]
+        samples = self._loop[:, part]
+        made = self._made[:, : 2 * n]
+        if self._next is not None:
+            weight = self._steps[: 2 * n] * np.float32(1 / self._n_fade)
+            weight += np.float32(self._n_faded / self._n_fade)
+            np.subtract(self._next[:, part], samples, out=made)
+            made *= weight
+            made += samples
+            samples = made
+        if self._ramp.left:
+            factor = self._factor[: 2 * n]
+            np.multiply(self._steps[: 2 * n], np.float32(self._ramp.slope), out=factor)
+            factor += np.float32(self._ramp.now)
+            np.maximum(factor, 0.0, out=factor)
+            np.sqrt(factor, out=factor)
+            np.sqrt(factor, out=factor)
+            self.depth = self._ramp.advance(n)
+            return np.multiply(samples, factor, out=made)
+        if self.depth != 1.0:
+            return np.multiply(samples, np.float32(self.depth**0.25), out=made)
+        return samples
+
+    def _finish_fade(self, n: int) -> None:
+        if self._next is None:
+            return
+        self._n_faded += n
+        if self._n_faded >= self._n_fade:
+            self._loop, self._next = self._next, None
+
+    def _mixed_loop(self, coming: Samples) -> Samples:
+        weight = np.float32(self._n_faded / self._n_fade)
+        return (self._loop + weight * (coming - self._loop)).astype(np.float32, copy=False)
+
+
+class _Course:
+    """A linear course of the depth, sample by sample."""
+
+    def __init__(self, start: float, end: float, n_samples: int) -> None:
+        self._start, self._end, self._n_samples = start, end, n_samples
+        self.left = n_samples
+
+    @property
+    def now(self) -> float:
+        done = self._n_samples - self.left
+        return self._start + self.slope * done
+
+    @property
+    def slope(self) -> float:
+        return (self._end - self._start) / max(1, self._n_samples)
+
+    def advance(self, n: int) -> float:
+        """Go on by n samples; the depth there."""
+        self.left -= n
+        return self.now if self.left else self._end

@@ -1,0 +1,273 @@
+"""The process that keeps the radio supplied: ``python -m labseq_soapy.streamer``.
+
+It is a process of its own so that nothing that labseq does can make the stream run dry, and so that the light
+is ramped down when labseq is killed or hangs. It speaks with labseq as :mod:`labseq_soapy.messages` tells.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import os
+import queue
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from labseq_soapy.library import SoapyError, Stream
+from labseq_soapy.messages import Setup, received, send
+from labseq_soapy.output import BLOCK, Output, Samples
+from labseq_soapy.radio import Facts, open_radio, set_up
+
+STALL_S: Final = 2.0
+"""A radio that takes no samples for so long is given up."""
+STATUS_S: Final = 0.2
+WRITE_S: Final = 0.1
+MARKER_S: Final = 0.1
+
+
+class Ear:
+    """Reads what labseq says, in a thread, and the loops that it names from their files."""
+
+    def __init__(self, pipe: int) -> None:
+        self.heard: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
+        self.last_s = time.monotonic()
+        self.closed = False
+        self._messages = received(pipe)
+        self.setup = Setup.from_message(next(self._messages))
+        threading.Thread(target=self._listen, daemon=True).start()
+
+    def _listen(self) -> None:
+        for message in self._messages:
+            self.last_s = time.monotonic()
+            if message["do"] == "loop":
+                try:
+                    message["loop"] = repeated(np.load(message["file"]))
+                except (OSError, ValueError) as error:
+                    message = {"do": "fail", "why": f"a loop cannot be read: {error}"}
+            self.heard.put(message)
+        self.closed = True
+
+
+class Mouth:
+    """Tells labseq things, in a thread: a labseq that hangs must not hold up the stream."""
+
+    def __init__(self, pipe: int) -> None:
+        self._pipe = pipe
+        self._said: queue.SimpleQueue[Mapping[str, Any] | threading.Event] = queue.SimpleQueue()
+        threading.Thread(target=self._talk, daemon=True).start()
+
+    def say(self, message: Mapping[str, Any]) -> None:
+        """Say something, soon."""
+        self._said.put(message)
+
+    def finish(self) -> None:
+        """Wait until all was said, if anybody listens."""
+        said = threading.Event()
+        self._said.put(said)
+        said.wait(1.0)
+
+    def _talk(self) -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                message = self._said.get()
+                if isinstance(message, threading.Event):
+                    message.set()
+                else:
+                    send(self._pipe, message)
+
+
+class Streamer:
+    """Keeps a stream supplied until it is told to end, or labseq is gone.
+
+    Args:
+        stream: The stream, active.
+        setup: How labseq wants it.
+        rate_hz: Samples per second.
+        ear: What labseq says.
+        say: Tells labseq something.
+    """
+
+    def __init__(
+        self, stream: Stream, setup: Setup, rate_hz: float, ear: Ear, say: Callable[[Any], None]
+    ) -> None:
+        self._stream, self._setup, self._rate_hz, self._ear, self._say = stream, setup, rate_hz, ear, say
+        self._output = Output()
+        self._written = self._buffered = self._due = 0
+        self._task: int | None = None
+        self._settling = False
+        self._underflows = self._dark = 0
+        self._told_s = self._looked_s = 0.0
+        self._alone = self._leaving = False
+        self._terminated = False
+
+    def fill(self) -> int:
+        """Fill the radio's buffer with silence; how many samples it holds."""
+        silence, first = self._output.block(), 0
+        while self._written < self._rate_hz:
+            taken = self._stream.write(silence, 0, 0.0)
+            self._written += taken
+            first = first or taken
+            if 2 * taken <= first:  # full, but for what it has played meanwhile
+                break
+        self._buffered = self._written
+        return self._buffered
+
+    def run(self) -> None:
+        """Stream until the end; the light is then off.
+
+        Raises:
+            SoapyError: The stream is broken.
+        """
+        while not (self._leaving and self._task is None):
+            while not self._ear.heard.empty():
+                self._obey(self._ear.heard.get())
+            self._write(self._output.block())
+            self._look()
+
+    def terminate(self, *_: object) -> None:
+        """Ramp down and end; a signal's handler."""
+        self._terminated = True
+
+    def _obey(self, message: dict[str, Any]) -> None:
+        if self._leaving:  # too late
+            return
+        match message["do"]:
+            case "loop":
+                self._output.load(message["loop"], round(message["fade_s"] * self._rate_hz))
+                self._begin(message["id"])
+            case "ramp":
+                self._output.ramp(message["depth"], round(message["duration_s"] * self._rate_hz))
+                self._begin(message["id"])
+            case "end":
+                self._leave("")
+            case "fail":
+                raise SoapyError(message["why"])
+            case _:  # a beat
+                pass
+
+    def _begin(self, task: int) -> None:
+        self._task, self._settling = task, True
+
+    def _write(self, samples: Samples) -> None:
+        n, done, waited_s = samples.shape[1] // 2, 0, 0.0
+        while done < n:
+            taken = self._stream.write(samples, done, WRITE_S)
+            done += taken
+            waited_s = 0.0 if taken else waited_s + WRITE_S
+            if waited_s > STALL_S:
+                raise SoapyError(f"the radio took no samples for {STALL_S:g} s")
+        self._written += n
+        if self._settling and self._output.steady:
+            self._settling, self._due = False, self._written + self._buffered
+        if self._task is not None and not self._settling and self._written >= self._due:
+            self._say({"done": self._task})
+            self._task = None
+
+    def _look(self) -> None:
+        found = self._stream.underflows()
+        if found:
+            self._underflows += found
+            self._dark += found if self._output.depth > 0.0 else 0
+        now_s = time.monotonic()
+        if found or now_s - self._told_s > STATUS_S:
+            self._told_s = now_s
+            if not self._alone:
+                self._say({"status": {"underflows": self._underflows, "dark": self._dark}})
+        if self._leaving:
+            return
+        if self._terminated:
+            self._leave("it was asked to end by a signal")
+        elif self._alone:
+            self._look_at_marker(now_s)
+        elif self._ear.closed:
+            self._part("labseq is gone")
+        elif not self._setup.hold and now_s - self._ear.last_s > self._setup.patience_s:
+            self._part(f"labseq said nothing for {self._setup.patience_s:g} s")
+
+    def _part(self, why: str) -> None:
+        self._alone = True
+        marker = Path(self._setup.marker)
+        with contextlib.suppress(OSError):
+            marker.parent.mkdir(parents=True, exist_ok=True)
+            marker.write_text(str(os.getpid()), "ascii")
+        if not self._setup.hold:
+            self._leave(why)
+
+    def _look_at_marker(self, now_s: float) -> None:
+        if now_s - self._looked_s > MARKER_S:
+            self._looked_s = now_s
+            if not Path(self._setup.marker).exists():
+                self._leave("")
+
+    def _leave(self, why: str) -> None:
+        self._leaving = True
+        if why:
+            self._say({"ended": why})
+        self._output.ramp(0.0, round(self._setup.ramp_s * self._rate_hz))
+        self._begin(0)
+
+
+def repeated(loop: Samples) -> Samples:
+    """A loop as often as makes a block or more, float32 (2, 2 n)."""
+    n = loop.shape[1] // 2
+    return np.tile(loop, (1, -(-BLOCK // n)))
+
+
+def stream_to(ear: Ear, mouth: Mouth) -> None:
+    """Open the radio, stream, close it.
+
+    Raises:
+        SoapyError: It cannot be opened or set up, or the stream broke; labseq was not told.
+    """
+    setup = ear.setup
+    radio = open_radio(setup)
+    try:
+        facts = set_up(radio, setup)
+        stream = radio.stream(sorted(setup.channels), setup.stream)
+        stream.activate()
+        streamer = Streamer(stream, setup, facts.rate_hz, ear, mouth.say)
+        signal.signal(signal.SIGTERM, streamer.terminate)
+        told = Facts(facts.radio, facts.rate_hz, facts.oscillator_hz, facts.gain_db, streamer.fill())
+        mouth.say({"facts": told.as_message()})
+        try:
+            streamer.run()
+        finally:
+            with contextlib.suppress(SoapyError):  # what broke it is told
+                stream.close()
+    finally:
+        with contextlib.suppress(SoapyError):
+            radio.close()
+        with contextlib.suppress(OSError):
+            own = Path(setup.marker)
+            if own.read_text("ascii") == str(os.getpid()):
+                own.unlink()
+
+
+def main() -> int:
+    """Run the process; its exit code."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for labseq, which then ramps down
+    pipe = os.dup(1)
+    os.dup2(2, 1)  # whatever a radio's module prints goes to the log
+    ear, mouth = Ear(0), Mouth(pipe)
+    gc.disable()  # nothing here makes cycles
+    try:
+        stream_to(ear, mouth)
+    except SoapyError as error:
+        mouth.say({"failed": str(error)})
+        mouth.finish()
+        return 3
+    mouth.finish()
+    return 0
+
+
+if __name__ == "__main__":
+    code = main()
+    sys.stderr.flush()
+    os._exit(code)  # the threads wait for labseq

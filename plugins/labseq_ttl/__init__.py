@@ -1,0 +1,14 @@
+"""A timing box with open firmware, on a serial line."""
+
+from labseq import Registry, hookimpl
+
+LABSEQ_API = 1
+
+
+@hookimpl
+def labseq_register(registry: Registry) -> None:
+    """Offer the lines ``ttl``; in a dry run the box is simulated."""
+    from labseq_ttl.lines import TtlLines
+    from labseq_ttl.settings import SIMULATED, TtlSettings
+
+    registry.lines("ttl", TtlLines, TtlSettings, simulated={"port": SIMULATED, "start": "serial"})

@@ -1,0 +1,75 @@
+"""From a line program to the edges of the box, and back from what it played."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+
+from labseq import LimitError, LineProgram, LineSpec
+from labseq.units import format_quantity
+from labseq_ttl.protocol import EDGES, LONGEST, SHORTEST, TICK_S, Edge
+
+MOST_EDGES: Final = EDGES - 1
+"""Edges of a program; one more marks its end."""
+
+
+def edges_of(program: LineProgram, specs: Sequence[LineSpec], device: str) -> tuple[Edge, ...]:
+    """What the box is told of a program.
+
+    An edge without a change marks its end, so that the box itself says when all is over.
+
+    Args:
+        program: What the lines shall do.
+        specs: The lines, in the program's order.
+        device: Name of the box, for messages.
+
+    Raises:
+        LimitError: More edges, or nearer to one another, than the box can make.
+    """
+    what = f"{device}: `{program.kind}`"
+    if len(program.t_s) > MOST_EDGES:
+        raise LimitError(f"{what}: number of edges", len(program.t_s), f"at most {MOST_EDGES}")
+    ticks = np.rint(program.t_s / TICK_S)
+    masks = [mask_of(row, specs) for row in program.on.tolist()]
+    apart = np.diff(ticks)
+    for i in np.flatnonzero((apart < SHORTEST) | (apart > LONGEST)).tolist():
+        shortest, longest = (format_quantity(n * TICK_S, "time") for n in (SHORTEST, LONGEST))
+        limit = f"at least {shortest}" if apart[i] < SHORTEST else f"at most {longest}"
+        between = f"time between the edges {_edge(program, i)} and {_edge(program, i + 1)}"
+        came = format_quantity(float(program.t_s[i + 1] - program.t_s[i]), "time")
+        raise LimitError(f"{what}: {between}", came, limit, "change a lead, a lag or a pulse")
+    end = float(np.rint(program.duration_s / TICK_S)) - float(ticks[-1])
+    steps = [0, *apart.astype(int).tolist()]
+    if SHORTEST <= end <= LONGEST:
+        steps, masks = [*steps, int(end)], [*masks, masks[-1]]
+    return tuple(zip(steps, masks, strict=True))
+
+
+def as_played(edges: Sequence[Edge], program: LineProgram, specs: Sequence[LineSpec]) -> LineProgram:
+    """What the lines did, as a program; edges at which nothing changed are left out.
+
+    Args:
+        edges: Ticks since the first edge, and what was on from then on.
+        program: What they should have done.
+        specs: The lines, in the program's order.
+    """
+    changes = [edge for i, edge in enumerate(edges) if i == 0 or edge[1] != edges[i - 1][1]]
+    on = [[bool(mask >> spec.channel & 1) for spec in specs] for _, mask in changes]
+    t_s = np.array([tick for tick, _ in changes], np.float64) * TICK_S
+    states = np.array(on, np.bool_).reshape(len(changes), len(specs))
+    return LineProgram(program.kind, program.lines, t_s, states, program.begin_s, program.duration_s)
+
+
+def mask_of(row: Sequence[bool], specs: Sequence[LineSpec]) -> int:
+    """What is on, as the box counts it: bit n is channel n."""
+    return sum(1 << spec.channel for spec, is_on in zip(specs, row, strict=True) if is_on)
+
+
+def _edge(program: LineProgram, i: int) -> str:
+    """An edge in words: who changes, and when."""
+    now = program.on[i]
+    before = program.on[i - 1] if i else np.zeros_like(now)
+    names = ", ".join(f"'{line}'" for line, new in zip(program.lines, now != before, strict=True) if new)
+    return f"of {names or 'no line'} at {format_quantity(float(program.t_s[i]), 'time', 7)}"

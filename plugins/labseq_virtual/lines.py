@@ -1,0 +1,123 @@
+"""The virtual timing box."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from labseq import Context, DeviceError, DeviceTimeoutError, LimitError, LineProgram, LinesFacts
+from labseq.lines import idle_program, off_program
+from labseq.units import format_quantity
+from labseq_virtual.driver import VirtualDriver
+from labseq_virtual.settings import LinesSettings
+
+ROUNDING_S = 1e-9
+"""How far from its limit a time may be because sums were rounded."""
+
+
+class VirtualLines(VirtualDriver):
+    """Ideal lines: the simulated world feels exactly what was compiled.
+
+    A firing needs a compiled program and an ``arm`` of its own, so that nothing is ever
+    fired by mistake.
+
+    Args:
+        settings: The limits.
+        context: Lines, clock and the simulated world.
+    """
+
+    def __init__(self, settings: LinesSettings, context: Context) -> None:
+        super().__init__(context, "lines")
+        self._settings = settings
+        self._specs = context.lines
+        self._compiled: LineProgram | None = None
+        self._is_armed = False
+        self._over_s = 0.0
+
+    @property
+    def lines_facts(self) -> LinesFacts:
+        """Channels and limits."""
+        settings = self._settings
+        channels = tuple(range(settings.n_channels))
+        return LinesFacts(channels, settings.resolution, settings.shortest, settings.most_edges)
+
+    def open(self) -> None:
+        """Connect to the simulated world; the lines are idle."""
+        if not self._is_open:
+            super().open()
+            self._play(idle_program(self._specs))
+
+    def compile(self, program: LineProgram) -> None:
+        """Take a program for the next firing.
+
+        Raises:
+            LimitError: More edges, or nearer to one another, than the settings allow.
+            DeviceError: Not open, or lines that nobody declared.
+        """
+        self._check_open()
+        known = tuple(spec.name for spec in self._specs)
+        if program.lines != known:
+            raise DeviceError(self._name, f"a program has the lines {program.lines}; expected {known}")
+        n_edges, most = len(program.t_s), self._settings.most_edges
+        what = f"{self._name}: `{program.kind}`"
+        if n_edges > most:
+            raise LimitError(f"{what}: number of edges", n_edges, f"at most {most}")
+        shortest_s = min((program.t_s[1:] - program.t_s[:-1]).tolist(), default=float("inf"))
+        if shortest_s < self._settings.shortest - ROUNDING_S:
+            limit = f"at least {format_quantity(self._settings.shortest, 'time')}"
+            raise LimitError(f"{what}: time between two edges", format_quantity(shortest_s, "time"), limit)
+        self._compiled, self._is_armed = program, False
+
+    def arm(self) -> None:
+        """Get ready to fire what was compiled last.
+
+        Raises:
+            DeviceError: Not open, or nothing was compiled.
+        """
+        self._check_open()
+        if self._compiled is None:
+            raise DeviceError(self._name, "armed, but nothing was compiled; call compile() first")
+        self._is_armed = True
+
+    def fire(self) -> None:
+        """Start the program; returns at once.
+
+        Raises:
+            DeviceError: Not armed, or the last program is not over.
+        """
+        self._check_open()
+        now_s = self._clock.now()
+        if not self._is_armed or self._compiled is None:
+            raise DeviceError(self._name, "fired, but not armed; call arm() before each fire()")
+        if now_s < self._over_s - ROUNDING_S:
+            raise DeviceError(self._name, f"fired during a program that ends at {self._over_s:.6f} s")
+        self._is_armed = False
+        self._play(self._compiled)
+        self._over_s = now_s + self._compiled.duration_s
+
+    def wait(self, timeout_s: float) -> None:
+        """Wait for the end of the program.
+
+        Raises:
+            DeviceTimeoutError: It did not end within ``timeout_s``.
+        """
+        self._check_open()
+        left_s = self._over_s - self._clock.now()
+        self._clock.sleep(max(0.0, min(left_s, timeout_s)))
+        if left_s > timeout_s:
+            text = f"the lines' program is not over after {format_quantity(timeout_s, 'time')}"
+            raise DeviceTimeoutError(self._name, text, timeout_s)
+
+    def safe_state(self) -> None:
+        """Turn all lines off and forget what was compiled."""
+        self._compiled, self._is_armed, self._over_s = None, False, 0.0
+        if self._is_open:
+            self._play(off_program(self._specs))
+
+    def describe(self) -> Mapping[str, Any]:
+        """Model, lines and limits."""
+        lines = {spec.name: spec.channel for spec in self._specs}
+        return {"model": "virtual lines", "lines": lines, **self._settings.model_dump(mode="json")}
+
+    def _play(self, program: LineProgram) -> None:
+        self._world.play("lines", program, self._clock.now())

@@ -1,0 +1,70 @@
+"""Waiting until a sensor is cold, and stays so."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+from hypothesis import given, strategies as st
+
+from labseq import Cooling, DeviceTimeoutError, StopRequested, settle
+from labseq.drivers.cooling import LOOK_S
+from labseq.testing.fakes import FakeClock
+
+COOLING = Cooling(203.15, tolerance_k=1.0, steady_s=5.0, timeout_s=100.0)
+
+
+def wait(temperature_at: Callable[[float], float], cooling: Cooling = COOLING) -> float:
+    """How long it takes."""
+    clock = FakeClock()
+    clock.sleep(1000.0)
+    settle(cooling, lambda: temperature_at(clock.now() - 1000.0), clock, "camera")
+    return clock.now() - 1000.0
+
+
+def test_a_sensor_that_is_cold_is_watched_for_a_while() -> None:
+    assert wait(lambda _t: 203.15) == 5.0
+
+
+def test_without_that_it_is_taken_at_once() -> None:
+    assert wait(lambda _t: 203.15, Cooling(203.15, steady_s=0.0)) == 0.0
+
+
+def test_time_counts_from_when_it_is_within_the_tolerance() -> None:
+    assert wait(lambda t: 293.15 - 9.0 * min(t, 10.0)) == 15.0
+
+
+def test_an_overshoot_begins_the_count_anew() -> None:
+    assert wait(lambda t: 201.0 if 3.0 <= t < 20.0 else 203.0) == 25.0
+
+
+def test_it_may_stay_anywhere_within_the_tolerance() -> None:
+    assert wait(lambda t: 203.15 + (1.0 if t % 2 else -1.0)) == 5.0
+
+
+@given(st.floats(0.0, 90.0))
+def test_it_is_seen_within_a_look_of_being_steady(cold_s: float) -> None:
+    assert cold_s + 5.0 <= wait(lambda t: 203.15 if t >= cold_s else 293.15) <= cold_s + 5.0 + LOOK_S
+
+
+def test_a_sensor_that_stays_warm_times_out_with_its_temperature() -> None:
+    said = r"^camera: the sensor is at -69.0 degC after 100 s; expected -70.0 degC within 0.5 K; look after"
+    with pytest.raises(DeviceTimeoutError, match=said) as caught:
+        wait(lambda _t: 204.15, Cooling(203.15, tolerance_k=0.5, timeout_s=100.0))
+    assert caught.value.timeout_s == 100.0
+
+
+def test_a_sensor_that_is_never_steady_times_out() -> None:
+    with pytest.raises(DeviceTimeoutError, match="after 100 s"):
+        wait(lambda t: 203.15 if t % 4 else 210.0)
+
+
+def test_a_stop_request_ends_the_wait() -> None:
+    clock = FakeClock()
+
+    def read_k() -> float:
+        clock.stop.request()
+        return 293.15
+
+    with pytest.raises(StopRequested):
+        settle(COOLING, read_k, clock, "camera")

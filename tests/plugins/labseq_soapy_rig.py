@@ -1,0 +1,152 @@
+"""For the tests of the SoapySDR plugin: the driver, open, on a simulated radio; or in a labseq of its own."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from labseq_soapy.capture import Ring, built
+from labseq_soapy.settings import SoapySettings
+from labseq_soapy.static_tweezers import SoapyStaticTweezers
+from numpy.typing import NDArray
+
+from labseq import Clock, Context, Simulation, SiteGrid, wait_for
+from labseq.roles import NeverStopped
+from labseq.testing.fakes import FakeClock
+
+from .needs import need_library
+
+GRID = SiteGrid(3, 4)
+COMB = {"centre": 100e6, "step": 60e3}
+SMALL: dict[str, Any] = {
+    "device": "simulated,speed=1,buffer=0.02",
+    "sample_rate": 1.2e6,
+    "row_frequency": COMB,
+    "column_frequency": COMB,
+}
+"""Few tones at a low rate, in real time: little work."""
+WAIT_S = 20.0
+"""Longer than anything takes that comes at all."""
+
+
+def need_radio() -> None:
+    """Skip without the library, the compiler or the headers."""
+    need_library(built)
+
+
+@dataclass
+class Rig:
+    """The driver and what it works with."""
+
+    tweezers: SoapyStaticTweezers
+    clock: FakeClock
+
+    @property
+    def ring(self) -> Ring:
+        radio = self.tweezers.simulated_radio
+        assert radio is not None
+        return radio.ring
+
+    def described(self, name: str) -> Any:
+        return self.tweezers.describe()[name]
+
+
+def made(
+    grid: SiteGrid = GRID,
+    world: Simulation | None = None,
+    clock: FakeClock | None = None,
+    arguments: str = "",
+    **settings: Any,
+) -> Rig:
+    """The driver, closed."""
+    need_radio()
+    clock = clock or FakeClock()
+    chosen = {**SMALL, **settings}
+    chosen["device"] += f",{arguments}" if arguments else ""
+    context = Context("static_tweezers", grid, clock=clock, simulation=world)
+    return Rig(SoapyStaticTweezers(SoapySettings.model_validate(chosen), context), clock)
+
+
+@contextmanager
+def opened(*args: Any, **settings: Any) -> Generator[Rig]:
+    """The driver, open; see :func:`made`."""
+    rig = made(*args, **settings)
+    rig.tweezers.open()
+    try:
+        yield rig
+    finally:
+        rig.tweezers.close()
+
+
+def until(condition: Callable[[], bool]) -> None:
+    """Wait until something has come about."""
+    pause = threading.Event()
+    clock: Clock = NeverStopped()
+
+    def poll(longest_s: float) -> bool | None:
+        if condition():
+            return True
+        pause.wait(longest_s)
+        return None
+
+    assert wait_for(poll, WAIT_S, clock), "it did not come about"
+
+
+def recorded(folder: Path, channel: int = 0) -> NDArray[np.complex64]:
+    """All that a channel was sent, with ``record=n`` among the simulated radio's arguments."""
+    return np.fromfile(folder / f"channel{channel}", np.complex64)
+
+
+def depth(samples: NDArray[np.complex64], n_loop: int, full: slice) -> NDArray[np.float64]:
+    """Depth at each sample, by the loop that is found in a stretch at full depth.
+
+    Where the samples are not the loop times a real factor, as after a jump of a phase, it is nan.
+    """
+    start = full.start - full.start % n_loop + n_loop
+    loop = samples[start : start + n_loop].astype(np.complex128)
+    course = samples / np.resize(loop, len(samples))
+    factor = np.where(np.abs(course.imag) < 1e-3, np.abs(course.real), np.nan)
+    return np.where(np.abs(np.resize(loop, len(samples))) > 0.05 * np.abs(loop).max(), factor, 0.0) ** 4
+
+
+LABSEQ = """
+import sys, time
+from labseq import Context, SiteGrid
+from labseq_soapy.settings import SoapySettings
+from labseq_soapy.static_tweezers import SoapyStaticTweezers
+context = Context("static_tweezers", SiteGrid(3, 4))
+tweezers = SoapyStaticTweezers(SoapySettings.model_validate_json(sys.argv[1]), context)
+tweezers.open()
+tweezers.start()
+print("on", flush=True)
+sys.stdin.read()
+tweezers.close()
+"""
+
+
+@contextmanager
+def another_labseq(folder: Path, **settings: Any) -> Generator[subprocess.Popen[str]]:
+    """A process that has the array on; it turns it off when its standard input closes."""
+    need_radio()
+    device = f"{SMALL['device']},folder={folder},record=10000000"
+    chosen = SoapySettings.model_validate({**SMALL, "device": device, **settings})
+    process = subprocess.Popen(
+        [sys.executable, "-c", LABSEQ, chosen.model_dump_json()],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    try:
+        assert process.stdout.readline() == "on\n"
+        yield process
+    finally:
+        process.kill()
+        process.communicate()

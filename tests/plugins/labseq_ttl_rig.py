@@ -1,0 +1,143 @@
+"""For the tests of the timing box: simulated boxes, a driver on one, and what its outputs did."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from labseq_ttl.connection import Connection
+from labseq_ttl.counterpart.build import runner
+from labseq_ttl.counterpart.simavr import SimavrBox
+from labseq_ttl.lines import TtlLines
+from labseq_ttl.protocol import framed, unframed
+from labseq_ttl.settings import TtlSettings
+
+from labseq import Context, LineProgram, LineSpec
+from labseq.lines import line_program
+from labseq.roles.clock import NeverStopped
+from labseq.testing.contracts.lines import SPECS
+from labseq.testing.fakes import Calls, FakeClock, RecordingSimulation
+
+from .needs import need_library
+
+PATIENCE_S = 60.0
+
+
+def need_simavr() -> None:
+    """Skip where the firmware cannot be run."""
+    need_library(lambda: runner("lines"))
+
+
+@dataclass
+class Rig:
+    """A driver in a world that notes everything, on a virtual clock.
+
+    Attributes:
+        lines: The driver.
+        clock: The clock.
+        world: The world.
+        specs: What is wired to the box.
+    """
+
+    lines: TtlLines
+    clock: FakeClock
+    world: RecordingSimulation
+    specs: tuple[LineSpec, ...] = SPECS
+
+    @property
+    def played(self) -> list[tuple[LineProgram, float]]:
+        """What the world was told of the lines, and when."""
+        plays = [call.args for call in self.world.calls if call.method == "play"]
+        return [(args[1], args[2]) for args in plays]
+
+    @property
+    def connection(self) -> Connection:
+        return self.lines._opened()
+
+    @property
+    def box(self) -> Any:
+        """The simulated box."""
+        return self.connection.counterpart
+
+    def program(self, kind: str = "image", duration_s: float = 10e-3) -> LineProgram:
+        return line_program(self.specs, kind, duration_s)
+
+    def fire(self, kind: str = "image", duration_s: float = 10e-3) -> LineProgram:
+        """Compile, arm and fire."""
+        program = self.program(kind, duration_s)
+        self.lines.compile(program)
+        self.lines.arm()
+        self.lines.fire()
+        return program
+
+
+def make_rig(specs: tuple[LineSpec, ...] = SPECS, **settings: Any) -> Rig:
+    """A driver that is not open."""
+    clock = FakeClock()
+    world = RecordingSimulation(Calls(clock))
+    context = Context("lines", clock=clock, simulation=world, lines=specs)
+    return Rig(TtlLines(TtlSettings.model_validate(settings), context), clock, world, specs)
+
+
+@contextmanager
+def rig(**settings: Any) -> Generator[Rig]:
+    """A driver, open."""
+    made = make_rig(**settings)
+    made.lines.open()
+    try:
+        yield made
+    finally:
+        made.lines.close()
+
+
+def works(lab: Rig) -> None:
+    """A shot's worth of it."""
+    program = lab.fire("load", 20e-3)
+    lab.lines.wait(60.0)
+    if lab.connection.counterpart is not None:
+        np.testing.assert_allclose(lab.played[-1][0].t_s, program.t_s, atol=1e-12)
+
+
+class Firmware:
+    """The firmware on its simulated processor, spoken to line by line.
+
+    Attributes:
+        simavr: The simulator.
+    """
+
+    def __init__(self) -> None:
+        self.simavr = SimavrBox("lines", NeverStopped())
+        self._port: Any = self.simavr.port
+        self._port.timeout = PATIENCE_S
+
+    def write(self, data: bytes) -> None:
+        self._port.write(data)
+
+    def line(self) -> str | None:
+        """The next line that it says; None for a damaged one."""
+        came = self._port.read_until(b"\n")
+        assert came.endswith(b"\n"), f"only {came!r} came"
+        return unframed(came[:-1])
+
+    def ask(self, question: str) -> str:
+        """Say something and read the answer, past what nobody asked for."""
+        self.write(framed(question))
+        while True:
+            said = self.line()
+            if said is not None and said.startswith(question[:2]):
+                return said
+
+    def put(self, slot: int, edges: list[tuple[int, int]]) -> None:
+        for i, (ticks, mask) in enumerate(edges):
+            assert self.ask(f"a put {slot:x} {i:x} {ticks:x} {mask:x}") == f"a ok {i + 1:02x}"
+
+    def drop_course(self) -> None:
+        """Forget what the outputs did until now."""
+        while self.simavr._look(0.0) is not None:
+            pass
+
+    def close(self) -> None:
+        self.simavr.close()

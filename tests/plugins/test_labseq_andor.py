@@ -1,0 +1,237 @@
+"""The Andor camera, on the stand-in of the SDK below the real pylablib."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+from labseq_andor.camera import AndorCamera
+from labseq_andor.library import load_pylablib
+from labseq_andor.settings import AndorSettings
+
+from labseq import Context, LimitError
+from labseq.roles import NeverStopped, Trigger
+from labseq.testing import CameraContract
+
+from .labseq_andor_rig import Rig, rig
+from .needs import need_library
+
+
+@pytest.fixture(autouse=True, scope="module")
+def pylablib() -> None:
+    need_library(lambda: load_pylablib("camera"))
+
+
+class TestAndorCamera(CameraContract):
+    @pytest.fixture
+    def factory(self) -> Callable[[Context], AndorCamera]:
+        return partial(AndorCamera, AndorSettings(camera="simulated", em_gain=300))
+
+
+class TestAndorCameraWithFrameTransfer(CameraContract):
+    exposure_s = 0.02
+
+    @pytest.fixture
+    def factory(self) -> Callable[[Context], AndorCamera]:
+        given: Any = {"camera": "simulated", "frame_transfer": True, "binning": 2, "shutter": "auto"}
+        return partial(AndorCamera, AndorSettings.model_validate(given))
+
+
+@pytest.mark.parametrize("trigger", ["software", "internal", "external"])
+def test_frames_come_in_order_and_pixel_for_pixel(trigger: Trigger) -> None:
+    with rig() as lab:
+        frames = lab.take(20, 1e-3, trigger)
+    assert [frame.number for frame in frames] == list(range(20))
+    for frame, shown in zip(frames, lab.world.shown, strict=True):
+        np.testing.assert_array_equal(frame.image, shown)
+
+
+@settings(max_examples=25)
+@given(data=st.data(), binning=st.integers(1, 4), isolated=st.booleans())
+def test_region_and_binning_are_those_of_the_settings(data: Any, binning: int, isolated: bool) -> None:
+    height, width = (binning * data.draw(st.integers(1, 96 // binning)) for _ in range(2))
+    y, x = data.draw(st.integers(0, 96 - height)), data.draw(st.integers(0, 128 - width))
+    region = {"y": y, "x": x, "height": height, "width": width}
+    with rig(region=region, binning=binning, isolated_crop=isolated, frame_transfer=isolated) as lab:
+        frame = lab.take(1, 0.1)[0]
+        assert frame.image.shape == lab.camera.facts.frame_shape == (height // binning, width // binning)
+    assert (lab.world.modes[0].region or (0, 0, 96, 128)) == (y, x, height, width)
+    assert lab.world.modes[0].binning == binning
+    np.testing.assert_array_equal(frame.image, lab.world.shown[0])
+
+
+@settings(max_examples=25)
+@given(
+    rate=st.sampled_from([None, "17 MHz", "10 MHz", "1 MHz"]),
+    shift=st.sampled_from([None, "0.3 us", "3.3 us"]),
+    isolated=st.booleans(),
+    binning=st.sampled_from([1, 2, 8]),
+)
+def test_the_read_out_time_before_opening_is_that_of_the_simulated_camera(
+    rate: str | None, shift: str | None, isolated: bool, binning: int
+) -> None:
+    chosen: dict[str, Any] = {"readout_rate": rate, "vertical_shift_speed": shift, "binning": binning}
+    region = {"y": 8, "x": 16, "height": 64, "width": 64}
+    lab = Rig(region=region, isolated_crop=isolated, frame_transfer=isolated, **chosen)
+    estimate = lab.camera.facts.readout_s
+    lab.camera.open()
+    try:
+        assert lab.camera.facts.readout_s == estimate
+        start_s = lab.clock.now()
+        frame = lab.take(1, 0.1)[0]
+        assert lab.clock.now() == pytest.approx(frame.t_start_s + 0.1 + estimate)
+        assert frame.t_start_s >= start_s
+    finally:
+        lab.camera.close()
+
+
+def test_smaller_regions_and_isolated_crop_are_read_faster() -> None:
+    region = {"y": 0, "x": 0, "height": 32, "width": 32}
+    whole, part = Rig((512, 512)), Rig((512, 512), region=region)
+    crop = Rig((512, 512), region=region, isolated_crop=True, frame_transfer=True)
+    times = [lab.camera.facts.readout_s for lab in (whole, part, crop)]
+    assert times[0] > 5 * times[1] > 25 * times[2]
+
+
+def test_a_known_model_tells_sensor_and_read_out_before_it_is_opened() -> None:
+    settings = AndorSettings.model_validate({"model": "DU-888", "readout_rate": "10 MHz"})
+    facts = AndorCamera(settings, Context("camera")).facts
+    assert facts.frame_shape == (1024, 1024)
+    assert facts.readout_s == pytest.approx(0.109, rel=0.02)
+    assert AndorCamera(AndorSettings(), Context("camera")).facts.frame_shape is None
+
+
+def test_em_gain_is_on_in_a_series_only() -> None:
+    with rig(em_gain=250) as lab:
+        assert lab.camera.facts.em_gain == 250
+        assert lab.sim.register.gain == 0
+        lab.take(1)
+        assert lab.world.modes[-1].em_gain == 250
+        lab.camera.safe_state()
+        assert lab.sim.register.gain == 0
+        lab.camera.self_test()
+        assert lab.world.modes[-1].em_gain == 1
+
+
+def test_a_high_gain_reaches_the_camera_if_it_is_allowed() -> None:
+    with rig(em_gain=800, allow_high_gain=True) as lab:
+        lab.take(1)
+    assert lab.world.modes[0].em_gain == 800
+
+
+def test_the_conventional_amplifier_has_no_gain() -> None:
+    with rig(amplifier="conventional", readout_rate="1 MHz") as lab:
+        lab.take(1)
+        assert lab.camera.describe()["readout_rate_hz"] == pytest.approx(1e6)
+    assert lab.world.modes[0].em_gain == 1
+
+
+def test_the_shutter_is_open_from_opening_to_the_safe_state() -> None:
+    with rig() as lab:
+        lab.clock.sleep(1.0)
+        start_s = lab.clock.now()
+        lab.take(1)
+        lab.take(1)
+        assert all(mode.shutter_open for mode in lab.world.modes)
+        took_s = lab.clock.now() - start_s
+        assert took_s == pytest.approx(2 * (0.01 + lab.camera.facts.readout_s))
+        lab.camera.safe_state()
+        assert lab.camera.describe()["shutter_now"] == "closed"
+        start_s = lab.clock.now()
+        frame = lab.take(1)[0]
+        assert lab.world.modes[-1].shutter_open
+        assert frame.t_start_s - start_s == pytest.approx(0.027)
+
+
+def test_the_automatic_shutter_needs_no_wait() -> None:
+    with rig(shutter="auto") as lab:
+        assert lab.take(1)[0].t_start_s == 0.0
+        assert lab.world.modes[0].shutter_open
+
+
+def test_with_the_internal_trigger_the_camera_keeps_the_time() -> None:
+    with rig() as lab:
+        lab.clock.sleep(1.0)
+        frames = lab.take(4, 0.02, "internal")
+        period_s = 0.02 + lab.camera.facts.readout_s
+        starts = [frame.t_start_s for frame in frames]
+        assert starts == pytest.approx([1.0 + k * period_s for k in range(4)])
+        assert [frame.device_time_s for frame in frames] == pytest.approx([k * period_s for k in range(4)])
+
+
+def test_frame_transfer_exposes_while_it_reads() -> None:
+    with rig(frame_transfer=True) as lab:
+        lab.clock.sleep(1.0)
+        frames = lab.take(4, 0.02, "internal")
+        assert [frame.t_start_s for frame in frames] == pytest.approx([1.0 + k * 0.02 for k in range(4)])
+        assert lab.clock.now() == pytest.approx(1.08 + lab.camera.facts.readout_s)
+
+
+def test_an_exposure_shorter_than_frame_transfer_allows_is_refused() -> None:
+    with rig((512, 512), frame_transfer=True) as lab:
+        with pytest.raises(LimitError, match=r"1 ms.*at least 17.5 ms.*read-out"):
+            lab.camera.arm(1, 1e-3, "software")
+        assert lab.take(1, 0.02)
+
+
+@pytest.mark.parametrize("frame_transfer", [False, True])
+def test_the_self_test_takes_a_frame(frame_transfer: bool) -> None:
+    with rig((512, 512), frame_transfer=frame_transfer, em_gain=300) as lab:
+        lab.camera.self_test()
+    assert [mode.em_gain for mode in lab.world.modes] == [1.0]
+
+
+def test_external_triggers_may_come_before_anybody_reads() -> None:
+    with rig() as lab:
+        lab.camera.arm(5, 0.01, "external")
+        for _ in range(5):
+            assert lab.sim.trigger()
+            lab.clock.sleep(0.05)
+        frames = [lab.camera.read(1.0) for _ in range(5)]
+    assert np.diff([frame.t_start_s for frame in frames]) == pytest.approx(0.05)
+    np.testing.assert_array_equal(frames[4].image, lab.world.shown[4])
+
+
+def test_it_works_in_real_time_too() -> None:
+    with rig(clock=NeverStopped()) as lab:
+        frames = [*lab.take(2, 1e-3), *lab.take(2, 1e-3, "internal")]
+    for frame, shown in zip(frames, lab.world.shown, strict=True):
+        np.testing.assert_array_equal(frame.image, shown)
+
+
+def test_the_baseline_clamp_and_speeds_reach_the_camera() -> None:
+    chosen: dict[str, Any] = {"readout_rate": "5 MHz", "preamp_gain": 2, "vertical_shift_speed": "0.9 us"}
+    with rig(baseline_clamp=False, fast_trigger=True, trigger_edge="falling", fan="low", **chosen) as lab:
+        amplifiers = lab.sim.amplifiers
+        assert (amplifiers.rate_hz, amplifiers.preamp_gain, amplifiers.shift_s) == (5e6, 2.0, 0.9e-6)
+        assert not amplifiers.baseline_clamp
+    with rig() as lab:
+        assert lab.sim.amplifiers.baseline_clamp
+
+
+def test_it_describes_the_camera_also_while_it_acquires() -> None:
+    with rig() as lab:
+        lab.camera.arm(1, 0.01, "software")
+        described = lab.camera.describe()
+        json.dumps(dict(described), allow_nan=False)
+        assert (described["model"], described["serial_number"], described["firmware"]) == (
+            "DU-897",
+            "10001",
+            "2.1",
+        )
+        assert described["temperature_k"] is None
+        lab.camera.safe_state()
+        assert lab.camera.describe()["temperature_k"] == pytest.approx(293.15)
+
+
+def test_two_simulated_cameras_work_side_by_side() -> None:
+    with rig() as one, rig((64, 64), model="DU-888") as other:
+        for _ in range(2):
+            assert one.take(1)[0].image.shape == (96, 128)
+            assert other.take(1)[0].image.shape == (64, 64)
+        assert (one.camera.describe()["model"], other.camera.describe()["model"]) == ("DU-897", "DU-888")

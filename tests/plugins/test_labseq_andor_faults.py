@@ -1,0 +1,292 @@
+"""What a user reads when something is wrong with an Andor camera; each fault is made by the stand-in."""
+
+from __future__ import annotations
+
+import builtins
+import sys
+import threading
+from typing import Any
+
+import pytest
+from labseq_andor.camera import AndorCamera
+from labseq_andor.counterpart import SimulatedCamera
+from labseq_andor.counterpart.optics import CLOSED
+from labseq_andor.heads import IXON_888, IXON_897
+from labseq_andor.library import load_pylablib
+from labseq_andor.settings import AndorSettings
+
+from labseq import ConfigError, Context, DeviceError, DeviceTimeoutError, TransientError
+from labseq.errors import StopRequested
+
+from .labseq_andor_rig import Rig, rig
+from .needs import need_library
+
+
+@pytest.fixture(autouse=True, scope="module")
+def pylablib() -> None:
+    need_library(lambda: load_pylablib("camera"))
+
+
+def refusal(lab: Rig) -> str:
+    with pytest.raises(DeviceError) as caught:
+        lab.camera.open()
+    assert caught.value.device == "camera"
+    return str(caught.value)
+
+
+def test_no_camera_is_connected() -> None:
+    lab = Rig()
+    lab.sim.faults.not_connected = True
+    assert "no Andor camera is connected; look at its power and its cable" in refusal(lab)
+    lab.sim.faults.not_connected = False
+    lab.camera.open()
+    assert lab.take(1)
+    lab.camera.close()
+
+
+def test_another_program_holds_the_camera() -> None:
+    lab = Rig()
+    lab.sim.faults.held = True
+    text = refusal(lab)
+    assert "close Solis and every other program" in text
+    assert "(Initialize gave 20003, DRV_VXDNOTINSTALLED)" in text
+
+
+def test_another_model_answers() -> None:
+    lab = Rig(model="DU-888")
+    lab.sim.identity._head = IXON_897
+    assert "connected camera is a DU-897; expected a model that begins with DU-888" in refusal(lab)
+
+
+def test_another_serial_number_answers() -> None:
+    assert "has the serial number 10001; expected 4711" in refusal(Rig(serial=4711))
+
+
+def two_cameras(**settings: Any) -> tuple[Rig, SimulatedCamera]:
+    lab = Rig(**settings)
+    other = SimulatedCamera(lab.world, lab.clock, IXON_888, (96, 128), serial=10002)
+    lab.camera.beside.append(other)
+    return lab, other
+
+
+def test_with_two_cameras_the_serial_number_decides() -> None:
+    lab, _ = two_cameras()
+    assert "2 Andor cameras are connected; say which by `serial`" in refusal(lab)
+    lab, _ = two_cameras(serial=4711)
+    assert "10001 and 10002; expected 4711" in refusal(lab)
+    lab, _ = two_cameras(serial=10002)
+    lab.camera.open()
+    assert lab.camera.describe()["model"] == "DU-888"
+    lab.camera.close()
+
+
+def test_a_camera_that_pylablib_cannot_open(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("labseq_andor.counterpart.identity.READ_MODES", 3)
+    assert "pylablib cannot open this camera: invalid value None for the read_mode" in refusal(Rig())
+
+
+def test_unplugged_in_a_series() -> None:
+    with rig() as lab:
+        lab.sim.faults.unplugged_at = 3
+        lab.camera.arm(4, 0.01, "internal")
+        assert [lab.camera.read(1.0).number for _ in range(2)] == [0, 1]
+        with pytest.raises(DeviceError, match=r"does not answer any more; look at its power.*20013"):
+            lab.camera.read(1.0)
+        with pytest.raises(DeviceError, match="does not answer any more"):
+            lab.camera.safe_state()
+        with pytest.raises(DeviceError, match="does not answer any more"):
+            lab.camera.close()
+        lab.sim.faults.unplugged, lab.sim.faults.unplugged_at = False, 0
+        lab.camera.open()
+        assert lab.take(1)
+
+
+def test_unplugged_while_it_waits_for_a_trigger() -> None:
+    with rig() as lab:
+        lab.camera.arm(1, 0.01, "external")
+        lab.sim.faults.unplugged = True
+        with pytest.raises(DeviceError, match="does not answer any more"):
+            lab.camera.read(0.1)
+        lab.sim.faults.unplugged = False
+
+
+def test_a_frame_later_than_the_timeout() -> None:
+    with rig() as lab:
+        lab.sim.faults.late_s = 0.5
+        lab.camera.arm(1, 0.01, "software")
+        lab.camera.trigger()
+        with pytest.raises(DeviceTimeoutError, match="no frame within 200 ms: frame 1 of 1 is not ready"):
+            lab.camera.read(0.2)
+        assert lab.clock.now() == pytest.approx(0.027 + 0.2)
+        assert lab.camera.read(0.5).number == 0
+
+
+def test_an_external_trigger_that_never_comes() -> None:
+    with rig() as lab:
+        lab.camera.arm(2, 0.01, "external")
+        with pytest.raises(DeviceTimeoutError, match="frame 1 of 2 waits for its external trigger"):
+            lab.camera.read(0.1)
+        assert lab.sim.trigger()
+        assert lab.camera.read(0.1).number == 0
+
+
+def test_a_trigger_that_the_camera_does_not_see() -> None:
+    with rig() as lab:
+        lab.sim.faults.missed_triggers = 1
+        lab.camera.arm(1, 0.01, "software")
+        lab.camera.trigger()
+        with pytest.raises(DeviceTimeoutError, match="frame 1 of 1 is not ready"):
+            lab.camera.read(0.1)
+
+
+def test_external_triggers_that_come_too_fast_start_nothing() -> None:
+    with rig() as lab:
+        lab.camera.arm(2, 0.01, "external")
+        assert lab.sim.trigger()
+        assert not lab.sim.trigger()
+        assert lab.camera.read(1.0).number == 0
+        with pytest.raises(DeviceTimeoutError, match="frame 2 of 2 waits for its external trigger"):
+            lab.camera.read(0.1)
+
+
+def test_a_software_trigger_during_the_read_out() -> None:
+    with rig() as lab:
+        lab.camera.arm(2, 0.01, "software")
+        lab.camera.trigger()
+        lab.clock.sleep(0.0101)
+        with pytest.raises(DeviceError, match="still reads the last frame; read that first"):
+            lab.camera.trigger()
+
+
+def test_the_computer_is_too_slow_for_the_data() -> None:
+    with rig() as lab:
+        lab.sim.faults.buffer_error_at = 2
+        lab.camera.arm(3, 0.01, "internal")
+        assert lab.camera.read(1.0).number == 0
+        with pytest.raises(TransientError, match=r"frame 2 was lost.*did not take the camera's data over"):
+            lab.camera.read(1.0)
+        lab.sim.faults.buffer_error_at = 0
+        assert len(lab.take(3, 0.01, "internal")) == 3
+
+
+def test_frames_overwritten_in_the_ring_buffer() -> None:
+    with rig() as lab:
+        lab.sim.faults.buffer_frames = 3
+        lab.camera.arm(6, 0.01, "external")
+        for _ in range(5):
+            lab.sim.trigger()
+            lab.clock.sleep(0.05)
+        with pytest.raises(TransientError, match="frames 1 to 2 were lost, of a series of 6"):
+            lab.camera.read(1.0)
+        assert [lab.camera.read(1.0).number for _ in range(3)] == [2, 3, 4]
+        lab.sim.trigger()
+        frame = lab.camera.read(1.0)
+        assert (frame.number, frame.t_start_s) == (5, pytest.approx(0.027 + 0.25))
+
+
+@pytest.mark.parametrize(
+    ("chosen", "text"),
+    [
+        ({"readout_rate": "12 MHz"}, "`readout_rate` is 12 MHz.*has .*17 MHz.*10 MHz"),
+        ({"preamp_gain": 5}, "`preamp_gain` is 5, which this camera does not have.*1.*2.*3"),
+        ({"vertical_shift_speed": "1 us"}, "`vertical_shift_speed` is 1 us.*0.5 us.*0.9 us"),
+        ({"cooling": {"temperature": "-123 degC"}}, "-123 degC; this camera takes -120 to 20 degC"),
+    ],
+)
+def test_a_setting_that_the_camera_does_not_have(chosen: dict[str, Any], text: str) -> None:
+    with pytest.raises(DeviceError, match=text):
+        Rig(**chosen).camera.open()
+
+
+@pytest.mark.parametrize(
+    ("chosen", "text"),
+    [
+        ({"em_gain": 301}, "em_gain is 301: above 300 the EM register ages fast.*allow_high_gain: true"),
+        ({"em_gain": 2, "amplifier": "conventional"}, "conventional amplifier has no EM register"),
+        ({"isolated_crop": True}, "isolated_crop needs a `region`"),
+        (
+            {"isolated_crop": True, "region": {"height": 8, "width": 8}},
+            "isolated_crop needs `frame_transfer: true`",
+        ),
+    ],
+)
+def test_settings_that_do_not_go_together(chosen: dict[str, Any], text: str) -> None:
+    with pytest.raises(ValueError, match=text):
+        AndorSettings.model_validate(chosen)
+
+
+@pytest.mark.parametrize("camera", [{"camera": "simulated"}, {"model": "DU-897"}])
+def test_a_region_outside_of_the_sensor_is_found_before_anything_is_opened(camera: dict[str, Any]) -> None:
+    region = {"y": 500, "x": 0, "height": 64, "width": 64}
+    settings = AndorSettings.model_validate({**camera, "region": region})
+    with pytest.raises(ConfigError, match="`region` ends at row 564 and column 64, beyond the sensor"):
+        AndorCamera(settings, Rig((512, 512)).context)
+
+
+def test_a_region_outside_of_a_sensor_that_is_known_only_when_it_is_open() -> None:
+    lab = Rig()
+    lab.sim.optics.sensor_shape = (48, 48)
+    lab.camera._settings = AndorSettings.model_validate({"region": {"height": 64, "width": 64}})
+    with pytest.raises(ConfigError, match="beyond the sensor of 48 x 48 pixels"):
+        lab.camera.open()
+
+
+def test_the_simulated_camera_needs_a_simulated_world() -> None:
+    with pytest.raises(ConfigError, match=r"add `simulation: \{use: virtual\}` to the profile"):
+        AndorCamera(AndorSettings(camera="simulated"), Context("camera"))
+
+
+def test_the_safe_state_comes_through_while_a_call_hangs() -> None:
+    with rig(em_gain=100) as lab:
+        lab.camera.arm(1, 0.01, "software")
+        lab.camera.trigger()
+        lab.sim.faults.hang = threading.Event()
+        seen: list[Exception] = []
+
+        def read() -> None:
+            try:
+                lab.camera.read(1.0)
+            except Exception as error:  # noqa: BLE001 - whatever comes of a call that hung
+                seen.append(error)
+
+        reader = threading.Thread(target=read)
+        reader.start()
+        assert lab.sim.acquisition.hangs.wait(10.0)
+        lab.camera.safe_state()
+        assert lab.sim.optics.shutter == CLOSED
+        assert (lab.sim.register.gain, lab.sim.acquisition.is_acquiring) == (0, False)
+        lab.sim.faults.hang.set()
+        reader.join(10.0)
+        assert not reader.is_alive()
+
+
+def test_a_stop_request_ends_the_wait() -> None:
+    with rig() as lab:
+        lab.camera.arm(1, 0.01, "external")
+        lab.clock.stop.request()  # type: ignore[attr-defined]
+        with pytest.raises(StopRequested):
+            lab.camera.read(60.0)
+        lab.clock.stop = type(lab.clock.stop)()  # type: ignore[attr-defined]
+
+
+def test_without_pylablib_the_error_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pylablib.devices.Andor.AndorSDK2", None)
+    assert 'install it with `pip install "labseq[andor]"`; to try things without a camera' in refusal(Rig())
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there Andor's library may be installed")
+def test_without_andors_library_the_error_says_what_to_install() -> None:
+    camera = AndorCamera(AndorSettings(sdk="/nowhere/libandor.so"), Context("camera"))
+    with pytest.raises(DeviceError, match=r"'/nowhere/libandor.so' cannot be loaded.*install Andor SDK2 or"):
+        camera.open()
+
+
+def test_a_real_camera_does_not_take_the_place_of_an_open_simulated_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("labseq_andor.library._load", lambda path: builtins.object())
+    with rig() as lab:
+        camera = AndorCamera(AndorSettings(sdk="libandor.so"), Context("camera_2"))
+        with pytest.raises(DeviceError, match="camera_2: another Andor camera is open in this process"):
+            camera.open()
+        assert lab.take(1)

@@ -1,0 +1,267 @@
+"""The GenICam camera: what the simulated world shows comes through GigE Vision, every pixel of it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+from labseq_genicam.aravis.library import library
+from labseq_genicam.camera import GenicamCamera
+from labseq_genicam.counterpart.images import Request
+from labseq_genicam.counting import LAST_ID, FrameCounter
+from labseq_genicam.settings import FORMATS, GenicamSettings
+from labseq_genicam.setup import nearest
+from numpy.typing import NDArray
+
+from labseq import ConfigError, Context
+from labseq.errors import DeviceTimeoutError, StopRequested
+from labseq.roles import NeverStopped
+from labseq.testing import CameraContract
+from labseq.testing.fakes import FakeClock
+
+from .labseq_genicam_rig import PACKET_SIZE, WAIT_S, Rig, assert_shown, plugged_in, rig
+from .needs import need_library
+
+
+@pytest.fixture(autouse=True, scope="module")
+def aravis() -> None:
+    need_library(library)
+
+
+class TestGenicamCamera(CameraContract):
+    @pytest.fixture
+    def factory(self) -> Callable[[Context], GenicamCamera]:
+        return partial(GenicamCamera, GenicamSettings(camera="simulated"))
+
+
+def test_frames_come_in_order_and_pixel_for_pixel() -> None:
+    with rig(sensor_shape=(512, 512)) as lab:
+        frames = lab.take(20)
+        assert_shown(frames, lab)
+    assert [frame.number for frame in frames] == list(range(20))
+
+
+def test_frames_that_wait_to_be_read_do_not_change_places() -> None:
+    with rig() as lab:
+        lab.camera.arm(12, 1e-3, "software")
+        for _ in range(12):
+            lab.camera.trigger()
+            lab.clock.sleep(1e-3)
+        frames = [lab.camera.read(1.0) for _ in range(12)]
+        assert_shown(frames, lab)
+    assert [frame.t_start_s for frame in frames] == pytest.approx([k * 1e-3 for k in range(12)])
+
+
+def test_the_camera_goes_on_waiting_from_one_series_to_the_next() -> None:
+    with rig() as lab:
+        frames = lab.take(1)
+        acquisition = lab.camera._opened()
+        stream = acquisition._stream
+        for n_frames in (3, 1, 12, 2):
+            series = lab.take(n_frames)
+            assert [frame.number for frame in series] == list(range(n_frames))
+            frames += series
+        assert acquisition._stream is stream
+        assert_shown(frames, lab)
+
+
+def test_frames_that_nobody_read_are_dropped() -> None:
+    with rig() as lab:
+        lab.camera.arm(3, 0.01, "software")
+        for _ in range(3):
+            lab.camera.trigger()
+            lab.clock.sleep(0.01)
+        del lab.world.shown[:]
+        assert_shown(lab.take(2), lab)
+
+
+def test_the_simulated_camera_runs_by_itself_too() -> None:
+    with rig(readout="5 ms") as lab:
+        lab.camera.arm(3, 0.01, "internal")
+        frames = [lab.camera.read(1.0) for _ in range(3)]
+        assert_shown(frames, lab)
+    assert [frame.t_start_s for frame in frames] == pytest.approx([0.0, 0.015, 0.03])
+
+
+def test_exposures_may_follow_one_another_at_a_rate() -> None:
+    with rig(readout="5 ms", frame_rate="100 Hz") as lab:
+        lab.camera.arm(3, 0.01, "internal")
+        frames = [lab.camera.read(1.0) for _ in range(3)]
+    assert [frame.t_start_s for frame in frames] == pytest.approx([0.0, 0.01, 0.02])
+
+
+def test_on_a_real_clock_it_runs_freely_and_shows_no_more_than_was_armed() -> None:
+    with rig(clock=NeverStopped(), readout="1 ms", frame_rate="200 Hz") as lab:
+        for n_frames in (4, 10):
+            del lab.world.shown[:]
+            lab.camera.arm(n_frames, 0.002, "internal")
+            frames = [lab.camera.read(WAIT_S) for _ in range(n_frames)]
+            assert [frame.number for frame in frames] == list(range(n_frames))
+            assert np.diff([frame.t_start_s for frame in frames]) == pytest.approx(0.005)
+            assert_shown(frames, lab)
+        del lab.world.shown[:]
+        assert_shown(lab.take(1), lab)
+
+
+def test_an_edge_of_a_line_that_is_wired_to_it_starts_an_exposure() -> None:
+    with rig(is_wired=True, readout="5 ms") as lab:
+        for _ in range(2):
+            lab.camera.arm(2, 0.01, "external")
+            start_s = lab.clock.now()
+            lab.world.edge(start_s + 0.002)
+            lab.world.edge(start_s + 0.1)
+            frames = [lab.camera.read(1.0) for _ in range(2)]
+            assert [frame.t_start_s - start_s for frame in frames] == pytest.approx([0.002, 0.1])
+            assert lab.clock.now() - start_s == pytest.approx(0.115)
+            assert_shown(frames, lab)
+            lab.world.edge(lab.clock.now())
+            assert_shown(frames, lab)
+            del lab.world.shown[:]
+
+
+@st.composite
+def sensors(draw: st.DrawFn) -> dict[str, Any]:
+    """Region, binning and pixel format that go with a sensor of 96 x 128 pixels."""
+    binning = draw(st.integers(1, 4))
+    region: dict[str, int] = {}
+    for start, extent, size in (("y", "height", 96), ("x", "width", 128)):
+        n_before = draw(st.integers(0, size // binning - 1))
+        region[start] = binning * n_before
+        region[extent] = binning * draw(st.integers(1, size // binning - n_before))
+    pixel_format = draw(st.sampled_from([name for name in FORMATS if name != "Mono14"]))
+    made: dict[str, Any] = {"pixel_format": pixel_format, "binning": binning}
+    return made if draw(st.booleans()) else made | {"region": region}
+
+
+@settings(max_examples=6)
+@given(sensor=sensors())
+def test_the_world_shows_the_region_that_the_camera_reads(sensor: dict[str, Any]) -> None:
+    with rig(**sensor) as lab:
+        told = lab.camera.facts.frame_shape
+        (frame,) = lab.take(1)
+        assert lab.camera._link is not None
+        read = lab.camera._link.camera.region
+    wanted = sensor.get("region") or {"y": 0, "x": 0, "height": 96, "width": 128}
+    binned = [wanted[key] // sensor["binning"] for key in ("y", "x", "height", "width")]
+    assert [read.y, read.x, read.height, read.width] == binned
+    assert told == tuple(binned[2:])
+    largest = 2 ** int(sensor["pixel_format"].removeprefix("Mono")) - 1
+    np.testing.assert_array_equal(frame.image, np.minimum(lab.world.shown[0], largest))
+
+
+def test_a_frame_is_due_when_a_real_camera_would_have_it() -> None:
+    with rig(readout="5 ms") as lab:
+        lab.camera.arm(1, 0.045, "software")
+        lab.camera.trigger()
+        with pytest.raises(DeviceTimeoutError, match="frame 1 of 1 is not ready"):
+            lab.camera.read(0.04)
+        assert lab.clock.now() == pytest.approx(0.04)
+        frame = lab.camera.read(0.02)
+        assert lab.clock.now() == pytest.approx(0.05)
+    assert frame.exposure_s == pytest.approx(0.045)
+    assert frame.t_start_s == 0.0
+
+
+def test_it_says_what_it_is_and_what_it_took() -> None:
+    with rig(gain=6.0, packet_size=9000, packet_delay="1 us", binning=2, serial="SIM1") as lab:
+        lab.take(1, 0.02)
+        told = json.loads(json.dumps(dict(lab.camera.describe()), allow_nan=False))
+        assert lab.camera.facts.max_exposure_s == 10.0
+        assert lab.camera._link is not None
+        assert lab.camera._link.camera.packet_size == 9000
+        assert lab.camera._link.camera.packet_delay_s == pytest.approx(1e-6)
+    assert (told["vendor"], told["model"], told["serial_number"]) == ("labseq", "Simulated", "SIM1")
+    assert (told["pixel_format"], told["frame_shape"], told["connection"]) == (
+        "Mono16",
+        [48, 64],
+        "GigE Vision",
+    )
+    assert told["firmware"]
+    assert told["gain_now"] == pytest.approx(6.0)
+    assert told["exposure_now_s"] == pytest.approx(0.02)
+
+
+def test_a_camera_with_an_address_is_used_as_a_real_one() -> None:
+    """No simulated world: region, all triggers, a rate, frame numbers that begin anew after 65535."""
+    region = {"y": 8, "x": 16, "height": 24, "width": 32}
+    settings = {"region": region, "packet_size": PACKET_SIZE, "readout": "1 ms", "frame_rate": "500 Hz"}
+
+    def expose(request: Request) -> NDArray[np.uint16]:
+        return np.full((request.height, request.width), request.n, np.uint16)
+
+    with (
+        plugged_in(expose, sensor_shape=(64, 64)) as fake,
+        rig(fake.address, clock=NeverStopped(), **settings) as lab,
+    ):
+        assert lab.camera.facts.frame_shape == (24, 32)
+        lab.camera.self_test()
+        lab.camera.arm(150, 1e-3, "internal")
+        frames = [lab.camera.read(WAIT_S) for _ in range(150)]
+        assert [frame.number for frame in frames] == list(range(150))
+        assert [frame.image[0, 0] for frame in frames] == list(range(1, 151))
+        assert [frame.number for frame in lab.take(3, 2e-5)] == [0, 1, 2]
+        lab.camera.arm(1, 1e-3, "external")
+        with pytest.raises(DeviceTimeoutError, match="waits for its external trigger"):
+            lab.camera.read(0.05)
+        assert [frame.number for frame in lab.take(1)] == [0]
+
+
+def test_a_stop_request_ends_a_wait_for_a_wire() -> None:
+    with rig() as lab:
+        lab.camera.arm(1, 0.01, "external")
+        assert isinstance(lab.clock, FakeClock)
+        lab.clock.stop.request()
+        with pytest.raises(StopRequested):
+            lab.camera.read(60.0)
+
+
+def test_a_simulated_camera_needs_a_simulated_world() -> None:
+    with pytest.raises(ConfigError, match=r"add `simulation: \{use: virtual\}`"):
+        GenicamCamera(GenicamSettings(camera="simulated"), Context("camera"))
+
+
+def test_a_region_beyond_the_simulated_sensor_is_refused_before_anything_is_opened() -> None:
+    with pytest.raises(ConfigError, match="beyond the sensor of 96 x 128 pixels"):
+        Rig(region={"y": 60, "x": 0, "height": 48, "width": 64})
+
+
+@given(
+    first=st.integers(0, LAST_ID),
+    steps=st.lists(st.integers(1, 1000), min_size=1, max_size=50),
+    is_ethernet=st.booleans(),
+)
+def test_numbers_tell_how_many_frames_never_came(first: int, steps: list[int], is_ethernet: bool) -> None:
+    frame_id, number, counter = first + is_ethernet * (first == 0), 0, FrameCounter()
+    assert counter.number(frame_id) == 0
+    for step in steps:
+        frame_id, number = frame_id + step, number + step
+        if is_ethernet:
+            frame_id = (frame_id - 1) % LAST_ID + 1
+        assert counter.number(frame_id) == number
+
+
+@given(
+    value=st.integers(-50, 200),
+    low=st.integers(0, 20),
+    n_steps=st.integers(0, 20),
+    step=st.integers(1, 16),
+    rest=st.integers(0, 15),
+)
+def test_no_good_number_is_nearer_than_the_nearest(
+    value: int, low: int, n_steps: int, step: int, rest: int
+) -> None:
+    high = low + n_steps * step + rest % step
+    good = range(low, high + 1, step)
+    found = nearest(value, low, high, step)
+    assert found in good
+    assert abs(found - value) == min(abs(one - value) for one in good)
+
+
+def test_a_serial_number_may_be_written_as_a_number() -> None:
+    settings = GenicamSettings.model_validate({"camera": 22345678, "serial": 22345678})
+    assert settings.camera == settings.serial == "22345678"

@@ -1,0 +1,229 @@
+"""What can go wrong with a GenICam camera; the simulated one really fails, unless a test says otherwise."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import pytest
+from labseq_genicam import simulated
+from labseq_genicam.aravis import library as aravis_library
+from labseq_genicam.aravis.library import library
+from labseq_genicam.setup import _check
+
+from labseq import DeviceError, LimitError, TransientError
+from labseq.errors import DeviceTimeoutError
+
+from .labseq_genicam_rig import WAIT_S, Rig, assert_shown, plugged_in, rig
+from .needs import need_library
+
+LARGE = (512, 512)
+"""A sensor whose frames have so many packets that some of a failed one always come."""
+GONE = "camera: the camera is gone: it does not answer; look after its cable and power"
+
+
+@pytest.fixture(autouse=True, scope="module")
+def aravis() -> None:
+    need_library(library)
+
+
+def opening(**settings: Any) -> DeviceError | LimitError:
+    made = Rig(**settings)
+    with pytest.raises((DeviceError, LimitError)) as caught:
+        made.camera.open()
+    made.camera.close()
+    return caught.value
+
+
+def test_an_address_where_nobody_is_is_told() -> None:
+    error = str(opening(camera="127.255.0.9"))
+    assert "camera: cannot open the camera" in error
+    assert "127.255.0.9" in error
+    assert "look after its cable, power and network address" in error
+
+
+def test_a_camera_that_another_program_has_is_told() -> None:
+    error = str(opening(faults={"busy": True}))
+    assert "camera: cannot open the camera: another program controls it; close that one" in error
+
+
+@pytest.mark.parametrize(
+    ("settings", "text"),
+    [
+        ({"model": "BFS-1"}, r"SIM1 (Simulated) has the model Simulated; expected BFS-1"),
+        ({"serial": "7"}, r"SIM1 (Simulated) has the serial number SIM1; expected 7"),
+        ({"pixel_format": "Mono14"}, "pixel format cannot be Mono14; the camera offers Mono8, Mono10"),
+        ({"gain": 2000.0}, "gain is 2000; the limit is 0 to 1000, which the camera can do"),
+        (
+            {"binning": 16},
+            "binning is 16; the limit is 1 to 8, in steps of 1, which the camera can do; the n",
+        ),
+        (
+            {"binning": 2, "region": {"y": 3, "x": 0, "height": 32, "width": 32}},
+            "region's y is 3; the limit is 0 to 64, in steps of 2, which the camera can do; the nearest good",
+        ),
+    ],
+)
+def test_what_the_camera_is_not_or_cannot_is_refused_when_it_is_opened(
+    settings: dict[str, Any], text: str
+) -> None:
+    assert text in str(opening(**settings))
+
+
+def test_a_region_beyond_the_cameras_sensor_is_refused() -> None:
+    region = {"y": 0, "x": 2000, "height": 64, "width": 100}
+    with plugged_in() as fake:
+        error = str(opening(camera=fake.address, region=region))
+    assert "end of the region is row 64, column 2100; the limit is the sensor's 2048 x 2048 pixels" in error
+
+
+def test_a_region_between_the_cameras_steps_is_refused_with_the_nearest_good_one() -> None:
+    """Without a camera: the simulated one takes steps of one pixel."""
+    with pytest.raises(LimitError, match=r"width is 500; .*in steps of 32.*the nearest good one is 512"):
+        _check("camera", "region's width", 500, (16, 1024, 16), 2)
+
+
+def test_a_failed_buffer_is_a_lost_frame_and_the_series_goes_on() -> None:
+    faults = {"failed_frames": [1]}
+    with rig(sensor_shape=LARGE, faults=faults, frame_timeout="50 ms") as lab:
+        lab.camera.arm(3, 0.01, "software")
+        lab.camera.trigger()
+        frames = [lab.camera.read(1.0)]
+        lab.camera.trigger()
+        with pytest.raises(
+            TransientError,
+            match="frame 2 was lost, of a series of 3: some of its network packets are missing",
+        ):
+            lab.camera.read(1.0)
+        del lab.world.shown[1]
+        lab.camera.trigger()
+        frames.append(lab.camera.read(1.0))
+        assert [frame.number for frame in frames] == [0, 2]
+        assert_shown(frames, lab)
+
+
+def test_frames_of_which_nothing_comes_are_missed_by_their_numbers() -> None:
+    """The second and third frame: for the camera, not for the world, the line is cut between them."""
+    with rig(sensor_shape=LARGE) as lab:
+        lab.camera.arm(4, 0.01, "software")
+        lab.camera.trigger()
+        first = lab.camera.read(1.0)
+        assert lab.camera._acquisition is not None
+        for _ in range(2):
+            lab.camera.trigger()
+            lab.clock.sleep(0.01)
+            assert lab.camera._acquisition._stream is not None
+            assert lab.camera._acquisition._stream.pop(WAIT_S) is not None
+        lab.camera.trigger()
+        with pytest.raises(TransientError, match=r"frames 2 to 3 were lost, of a series of 4: .* have a gap"):
+            lab.camera.read(1.0)
+        last = lab.camera.read(1.0)
+        assert (last.number, last.t_start_s) == (3, pytest.approx(first.t_start_s + 0.035))
+        assert [call.number for call in lab.take(2)] == [0, 1]
+
+
+def test_a_frame_that_comes_too_late_is_a_timeout_and_does_not_turn_up_in_the_next_series() -> None:
+    with rig(faults={"late_by": "100 ms"}) as lab:
+        lab.camera.arm(1, 0.01, "software")
+        lab.camera.trigger()
+        with pytest.raises(DeviceTimeoutError, match=r"no frame within 50 ms: frame 1 of 1 is not ready"):
+            lab.camera.read(0.05)
+        lab.camera.safe_state()
+        del lab.world.shown[:]
+        assert_shown(lab.take(2), lab)
+
+
+def test_an_unplugged_camera_is_told_once_and_nothing_waits_for_it_again() -> None:
+    made = Rig(faults={"unplugged_at": 1})
+    made.camera.open()
+    made.camera.arm(3, 0.01, "software")
+    made.camera.trigger()
+    made.camera.read(1.0)
+    made.camera.trigger()
+    with pytest.raises(DeviceError, match=GONE):
+        made.camera.read(1.0)
+    for use in (
+        lambda: made.camera.read(60.0),
+        lambda: made.camera.arm(1, 0.01, "software"),
+        made.camera.describe,
+    ):
+        with pytest.raises(DeviceError, match=GONE):
+            use()
+    made.camera.safe_state()
+    made.camera.close()
+    made.camera.open()
+    del made.world.shown[:]
+    assert_shown(made.take(1), made)
+    made.camera.close()
+
+
+def test_a_loss_that_the_library_notices_ends_a_wait() -> None:
+    """It takes the library 6 s; here the loss is told to it."""
+    with rig() as lab:
+        lab.camera.arm(1, 0.01, "external")
+        assert lab.camera._link is not None
+        lab.camera._link.camera._lost.set()
+        with pytest.raises(DeviceError, match=GONE):
+            lab.camera.read(60.0)
+
+
+def test_a_wire_that_never_comes_is_a_timeout() -> None:
+    with rig() as lab:
+        lab.camera.arm(2, 0.01, "external")
+        with pytest.raises(DeviceTimeoutError, match="frame 1 of 2 waits for its external trigger; check"):
+            lab.camera.read(0.05)
+        assert len(lab.take(1)) == 1
+
+
+def test_a_software_trigger_that_is_not_seen_is_a_timeout(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(simulated, "PATIENCE_S", 0.1)
+    with rig(faults={"ignores_triggers": True}) as lab:
+        lab.camera.arm(1, 0.01, "software")
+        lab.camera.trigger()
+        with pytest.raises(DeviceTimeoutError, match="frame 1 of 1 is not ready"):
+            lab.camera.read(1.0)
+
+
+@pytest.mark.parametrize(
+    ("settings", "text"),
+    [
+        ({"trigger_line": "Line9"}, "trigger source cannot be Line9; the camera offers Software, Line1"),
+        ({"trigger_edge": "falling"}, "cannot prepare the series: .*FallingEdge"),
+    ],
+)
+def test_a_trigger_that_the_camera_does_not_have_is_refused(settings: dict[str, Any], text: str) -> None:
+    with rig(**settings) as lab:
+        with pytest.raises(DeviceError, match=text):
+            lab.camera.arm(1, 0.01, "external")
+        assert len(lab.take(1)) == 1
+
+
+def test_exposures_beyond_the_cameras_limits_are_refused() -> None:
+    with rig(max_exposure="60 s", frame_rate="200 Hz") as lab:
+        with pytest.raises(LimitError, match="exposure is 20 s; the limit is more than 0 and at most 10 s"):
+            lab.camera.arm(1, 20.0, "software")
+        with pytest.raises(LimitError, match="exposure is 1 us; the limit is 10 us to 10 s"):
+            lab.camera.arm(1, 1e-6, "software")
+        with pytest.raises(
+            LimitError, match=r"frame rate is 200; the limit is 0\.1 to 100 per second at this"
+        ):
+            lab.camera.arm(2, 0.01, "internal")
+        assert len(lab.take(1)) == 1
+
+
+def test_a_camera_that_reads_another_region_than_it_was_told_is_noticed() -> None:
+    with rig(region={"y": 0, "x": 0, "height": 32, "width": 32}) as lab:
+        assert lab.camera._link is not None
+        lab.camera._link.camera.set_integer("OffsetX", 5)
+        lab.camera.arm(1, 0.01, "software")
+        with pytest.raises(DeviceError, match=r"the camera reads .*\(0, 5, 32, 32, \(1, 1\)\); expected"):
+            lab.camera.trigger()
+
+
+def test_without_the_library_the_error_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(aravis_library, "_library", None)
+    monkeypatch.setattr(aravis_library, "NAMES", {sys.platform: (("libnone.so.1", "none"),)})
+    error = str(opening())
+    assert "camera: the library libaravis 0.8 cannot be loaded" in error
+    assert "apt-get install libaravis-0.8-0" in error
+    assert "use: virtual" in error

@@ -1,0 +1,212 @@
+"""The pylon camera: what the simulated world shows comes through pylon, every pixel of it."""
+
+from __future__ import annotations
+
+import json
+import math
+import tempfile
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+from labseq_pylon.camera import PylonCamera
+from labseq_pylon.library import load_pypylon
+from labseq_pylon.nodes import nearest
+from labseq_pylon.settings import BITS, PylonSettings
+
+from labseq import ConfigError, Context
+from labseq.errors import DeviceTimeoutError, StopRequested
+from labseq.testing import CameraContract
+
+from .labseq_pylon_rig import Rig, rig, serial_numbers
+from .needs import need_library
+
+
+@pytest.fixture(autouse=True, scope="module")
+def pypylon() -> None:
+    need_library(lambda: load_pypylon("camera"))
+
+
+class TestPylonCamera(CameraContract):
+    @pytest.fixture
+    def factory(self) -> Callable[[Context], PylonCamera]:
+        return partial(PylonCamera, PylonSettings(camera="simulated"))
+
+
+def test_fifty_frames_come_in_order_and_pixel_for_pixel() -> None:
+    with rig(sensor_shape=(512, 512)) as lab:
+        frames = lab.take(50)
+    assert [frame.number for frame in frames] == list(range(50))
+    for frame, shown in zip(frames, lab.world.shown, strict=True):
+        np.testing.assert_array_equal(frame.image, shown)
+
+
+def test_frames_that_wait_to_be_read_do_not_change_places() -> None:
+    with rig() as lab:
+        lab.camera.arm(20, 1e-3, "software")
+        for _ in range(20):
+            lab.camera.trigger()
+            lab.clock.sleep(1e-3)
+        frames = [lab.camera.read(1.0) for _ in range(20)]
+        starts = [frame.t_start_s for frame in frames]
+    assert starts == pytest.approx([k * 1e-3 for k in range(20)])
+    assert all(np.array_equal(a.image, b) for a, b in zip(frames, lab.world.shown, strict=True))
+
+
+def test_every_series_begins_with_its_own_frames() -> None:
+    with rig() as lab:
+        for n_frames in (3, 1, 12, 2):
+            del lab.world.shown[:]
+            frames = lab.take(n_frames)
+            assert [frame.number for frame in frames] == list(range(n_frames))
+            assert all(np.array_equal(a.image, b) for a, b in zip(frames, lab.world.shown, strict=True))
+
+
+def test_the_simulated_camera_runs_by_itself_too() -> None:
+    with rig(readout="5 ms") as lab:
+        lab.camera.arm(3, 0.01, "internal")
+        frames = [lab.camera.read(1.0) for _ in range(3)]
+    assert [frame.t_start_s for frame in frames] == pytest.approx([0.0, 0.015, 0.03])
+    assert all(np.array_equal(a.image, b) for a, b in zip(frames, lab.world.shown, strict=True))
+
+
+@st.composite
+def sensors(draw: st.DrawFn) -> dict[str, Any]:
+    """Region, binning and pixel format that go with a sensor of 96 x 128 pixels."""
+    binning = draw(st.integers(1, 4))
+    region: dict[str, int] = {}
+    for start, extent, size in (("y", "height", 96), ("x", "width", 128)):
+        n_before = draw(st.integers(0, size // binning - 1))
+        region[start] = binning * n_before
+        region[extent] = binning * draw(st.integers(1, size // binning - n_before))
+    made: dict[str, Any] = {"pixel_format": draw(st.sampled_from(list(BITS))), "binning": binning}
+    is_whole = binning != 3 and draw(st.booleans())
+    return made if is_whole else made | {"region": region}
+
+
+@settings(max_examples=25)
+@given(sensor=sensors())
+def test_the_camera_cuts_its_region_and_saturates_as_its_pixel_format_does(sensor: dict[str, Any]) -> None:
+    with rig(**sensor) as lab:
+        frames = lab.take(2)
+        told = lab.camera.facts.frame_shape
+        nodes = lab.pylon.GetNodeMap()
+        place = [nodes.GetNode(name).GetValue() for name in ("OffsetY", "OffsetX", "Height", "Width")]
+    wanted = sensor.get("region") or {"y": 0, "x": 0, "height": 96, "width": 128}
+    binned = [wanted[key] // sensor["binning"] for key in ("y", "x", "height", "width")]
+    assert place == binned
+    assert told == tuple(binned[2:])
+    for frame, shown in zip(frames, lab.world.shown, strict=True):
+        assert frame.image.dtype == np.uint16
+        np.testing.assert_array_equal(frame.image, np.minimum(shown, 2 ** BITS[sensor["pixel_format"]] - 1))
+
+
+def test_a_frame_is_due_when_a_real_camera_would_have_it() -> None:
+    with rig(readout="5 ms") as lab:
+        lab.camera.arm(1, 0.045, "software")
+        lab.camera.trigger()
+        with pytest.raises(DeviceTimeoutError, match="frame 1 of 1 is not ready"):
+            lab.camera.read(0.04)
+        assert lab.clock.now() == pytest.approx(0.04)
+        frame = lab.camera.read(0.02)
+        assert lab.clock.now() == pytest.approx(0.05)
+    assert frame.exposure_s == pytest.approx(0.045)
+    assert frame.t_start_s == 0.0
+    assert math.isnan(frame.device_time_s)  # the emulated camera has no clock
+
+
+def test_it_says_what_it_is_and_what_it_took() -> None:
+    with rig(gain=6.0, packet_size=9000, packet_delay="1 us", binning=2) as lab:
+        told = json.loads(json.dumps(dict(lab.camera.describe()), allow_nan=False))
+    assert (told["model"], told["serial_number"]) == ("Emulation", "0815-0000")
+    assert told["firmware"]
+    assert told["gain_now"] == pytest.approx(6.0, abs=1e-3)
+    assert told["packet_size_now"] == 9000
+    assert told["pixel_format"] == "Mono16"
+    assert told["frame_shape"] == [48, 64]
+
+
+def test_emulated_cameras_never_stand_among_real_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("PYLON_CAMEMU", raising=False)
+    with rig():
+        assert "0815-0000" not in serial_numbers()
+
+
+def test_several_simulated_cameras_do_not_disturb_each_other() -> None:
+    with rig(sensor_shape=(64, 64)) as one, rig(sensor_shape=(32, 96)) as other:
+        for lab in (one, other, one):
+            np.testing.assert_array_equal(lab.take(1)[0].image, lab.world.shown[-1])
+
+
+def test_no_files_stay_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    with rig() as lab:
+        lab.take(2)
+        (folder,) = tmp_path.iterdir()
+        assert [file.stat().st_size for file in folder.iterdir()] == [0, 0]
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_stop_request_ends_a_wait_for_a_wire() -> None:
+    with rig() as lab:
+        lab.camera.arm(1, 0.01, "external")
+        lab.clock.stop.request()
+        with pytest.raises(StopRequested):
+            lab.camera.read(60.0)
+
+
+def test_the_camera_reads_its_own_pictures_where_it_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The way of a real camera: found by its number, whole sensor, all triggers, no simulated world."""
+    monkeypatch.setenv("PYLON_CAMEMU", "2")
+    with rig("0815-0001", pixel_format="Mono8", gain_raw=200) as lab:
+        assert lab.camera.describe()["serial_number"] == "0815-0001"
+        assert lab.camera.facts.frame_shape == (4096, 4096)
+        lab.camera.self_test()
+    region = {"y": 64, "x": 32, "height": 48, "width": 80}
+    with rig("0815-0001", region=region, readout="0 ms") as lab:
+        lab.camera.arm(3, 1e-3, "internal")
+        frames = [lab.camera.read(5.0) for _ in range(3)]
+        assert [frame.number for frame in frames] == [0, 1, 2]
+        assert {frame.image.shape for frame in frames} == {(48, 80)}
+        assert lab.take(1)[0].image.shape == (48, 80)
+    assert not lab.world.shown
+
+
+def test_a_simulated_camera_needs_a_simulated_world() -> None:
+    with pytest.raises(ConfigError, match=r"add `simulation: \{use: virtual\}`"):
+        PylonCamera(PylonSettings(camera="simulated"), Context("camera"))
+
+
+def test_a_region_beyond_the_simulated_sensor_is_refused_before_anything_is_opened() -> None:
+    with pytest.raises(ConfigError, match="beyond the sensor of 96 x 128 pixels"):
+        Rig(region={"y": 60, "x": 0, "height": 48, "width": 64})
+
+
+@given(
+    value=st.integers(-50, 200),
+    low=st.integers(0, 20),
+    n_steps=st.integers(0, 20),
+    step=st.integers(1, 16),
+    rest=st.integers(0, 15),
+)
+def test_no_good_number_is_nearer_than_the_nearest(
+    value: int, low: int, n_steps: int, step: int, rest: int
+) -> None:
+    high = low + n_steps * step + rest % step
+    good = range(low, high + 1, step)
+    found = nearest(value, low, high, step)
+    assert found in good
+    assert abs(found - value) == min(abs(one - value) for one in good)
+
+
+def test_a_serial_number_may_be_written_as_a_number() -> None:
+    assert PylonSettings.model_validate({"camera": 22345678}).camera == "22345678"
+
+
+def test_one_gain_is_enough() -> None:
+    with pytest.raises(ValueError, match="set one of them"):
+        PylonSettings(gain=3.0, gain_raw=200)

@@ -1,0 +1,203 @@
+"""What can go wrong with a pylon camera; pylon's emulated one really fails, unless a test says otherwise."""
+
+from __future__ import annotations
+
+import sys
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from labseq_pylon import finding
+from labseq_pylon.library import load_pypylon
+from labseq_pylon.settings import PylonSettings
+
+from labseq import DeviceError, LimitError, TransientError
+from labseq.errors import DeviceTimeoutError
+
+from .labseq_pylon_rig import Rig, rig
+from .needs import need_library
+
+
+@pytest.fixture(autouse=True, scope="module")
+def pypylon() -> None:
+    need_library(lambda: load_pypylon("camera"))
+
+
+def fail_buffers(lab: Rig, n_buffers: int) -> None:
+    lab.pylon.ForceFailedBufferCount.Value = n_buffers
+    lab.pylon.ForceFailedBuffer.Execute()
+
+
+def opening(**settings: Any) -> DeviceError | LimitError:
+    made = Rig(**settings)
+    with pytest.raises((DeviceError, LimitError)) as caught:
+        made.camera.open()
+    made.camera.close()
+    return caught.value
+
+
+def test_a_failed_buffer_is_a_lost_frame_and_the_series_goes_on() -> None:
+    with rig() as lab:
+        lab.camera.arm(4, 0.01, "software")
+        fail_buffers(lab, 2)
+        for number in (1, 2):
+            lab.camera.trigger()
+            with pytest.raises(
+                TransientError, match=f"frame {number} was lost, of a series of 4: .*incomplete"
+            ):
+                lab.camera.read(1.0)
+        for number in (2, 3):
+            lab.camera.trigger()
+            frame = lab.camera.read(1.0)
+            assert frame.number == number
+            np.testing.assert_array_equal(frame.image, lab.world.shown[number])
+
+
+def test_an_unplugged_camera_is_told_and_can_be_opened_again() -> None:
+    made = Rig()
+    made.camera.open()
+    made.camera.arm(3, 0.01, "software")
+    made.camera.trigger()
+    made.camera.read(1.0)
+    made.camera.trigger()
+    made.pylon.FirePnPCallback.Execute()
+    gone = "camera: the camera is gone; look after its cable and power"
+    made.camera.read(1.0)  # it was on its way
+    with pytest.raises(DeviceError, match=gone):
+        made.camera.trigger()
+    with pytest.raises(DeviceError, match=gone):
+        made.camera.arm(1, 0.01, "software")
+    made.camera.safe_state()
+    made.camera.close()
+    made.camera.open()
+    np.testing.assert_array_equal(made.take(1)[0].image, made.world.shown[-1])
+    made.camera.close()
+
+
+def test_a_camera_that_is_unplugged_while_it_waits_for_a_wire_is_no_timeout() -> None:
+    with rig() as lab:
+        lab.camera.arm(1, 0.01, "external")
+        lab.pylon.FirePnPCallback.Execute()
+        with pytest.raises(DeviceError, match="the camera is gone"):
+            lab.camera.read(60.0)
+
+
+def test_a_wire_that_never_comes_is_a_timeout() -> None:
+    with rig(trigger_line="Line2", trigger_edge="falling") as lab:
+        lab.camera.arm(2, 0.01, "external")
+        chosen = [lab.pylon.TriggerSource.Value, lab.pylon.TriggerActivation.Value]
+        assert chosen == ["Line2", "FallingEdge"]
+        with pytest.raises(DeviceTimeoutError, match="frame 1 of 2 waits for its external trigger; check"):
+            lab.camera.read(0.05)
+        assert len(lab.take(1)) == 1
+
+
+def test_a_line_that_is_not_there_is_refused() -> None:
+    with rig(trigger_line="Line9") as lab:
+        with pytest.raises(
+            DeviceError, match=r"its trigger source cannot be Line9; expected one of .*'Line1'"
+        ):
+            lab.camera.arm(1, 0.01, "external")
+        assert len(lab.take(1)) == 1
+
+
+def test_a_stream_that_breaks_off_is_told() -> None:
+    with rig() as lab:
+        lab.camera.arm(1, 0.01, "software")
+        lab.pylon.GetStreamGrabberNodeMap().GetNode("ImposedError").Value = "no bandwidth left"
+        lab.camera.trigger()
+        with pytest.raises(DeviceError, match="camera: cannot read a frame: no bandwidth left"):
+            lab.camera.read(1.0)
+        assert len(lab.take(1)) == 1
+
+
+@pytest.mark.parametrize(
+    ("exposure_s", "text"),
+    [(20.0, "exposure is 20 s; the limit is 1 us to 10 s"), (1e-7, "exposure is 100 ns; the limit is 1 us")],
+)
+def test_an_exposure_beyond_the_cameras_limits_is_refused(exposure_s: float, text: str) -> None:
+    with rig(max_exposure="60 s") as lab:
+        with pytest.raises(LimitError, match=text):
+            lab.camera.arm(1, exposure_s, "software")
+        assert len(lab.take(1)) == 1
+
+
+def test_a_region_beyond_the_cameras_sensor_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYLON_CAMEMU", "1")
+    region = {"y": 0, "x": 4000, "height": 64, "width": 100}
+    text = "end of the region is row 64, column 4100; the limit is the sensor's 4096 x 4096 pixels"
+    assert text in str(opening(camera="0815-0000", region=region))
+
+
+def test_a_region_between_binned_pixels_is_refused() -> None:
+    region = {"y": 3, "x": 0, "height": 32, "width": 32}
+    text = "region's y is 3; the limit is multiples of the binning, 2; the nearest good one is 4"
+    assert text in str(opening(region=region, binning=2))
+
+
+def test_more_binning_than_the_camera_has_is_refused() -> None:
+    text = (
+        "binning is 8; the limit is 1 to 4, in steps of 1, which the camera can do; the nearest good one is 4"
+    )
+    assert text in str(opening(binning=8))
+
+
+def test_a_gain_beyond_the_cameras_limits_is_refused() -> None:
+    assert "gain is 60 dB; the limit is 0 dB to 48 dB" in str(opening(gain=60.0))
+    assert "gain_raw is 100; the limit is 192 to 1023" in str(opening(gain_raw=100))
+
+
+def test_another_model_than_the_profile_says_is_refused() -> None:
+    text = "the camera 0815-0000 is an Emulation; expected an acA1920-40um"
+    assert text in str(opening(model="acA1920-40um"))
+
+
+def test_a_serial_number_that_nobody_has_is_told_with_those_that_are_there(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("PYLON_CAMEMU", "2")
+    error = opening(camera="22345678")
+    assert "camera: no camera has the serial number '22345678'; found" in str(error)
+    assert "Emulation '0815-0000', Emulation '0815-0001'" in str(error)
+
+
+@pytest.fixture
+def emulated_only(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """pylon, with two emulated cameras and whatever is plugged into this computer left out."""
+    monkeypatch.setenv("PYLON_CAMEMU", "2")
+    sdk = load_pypylon("camera")
+    layer: Any = sdk.pylon.TlFactory.GetInstance().CreateTl(finding.EMULATION)
+    factory = SimpleNamespace(GetInstance=lambda: layer)
+    monkeypatch.setattr(sdk.pylon, "TlFactory", factory)
+    return sdk
+
+
+def test_without_a_camera_it_says_so_and_does_not_take_an_emulated_one(emulated_only: Any) -> None:
+    with pytest.raises(DeviceError, match=r"no Basler camera was found; .*set `camera: simulated`"):
+        finding.find_camera(emulated_only, PylonSettings())
+
+
+def test_of_two_cameras_one_must_be_named(emulated_only: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(finding, "EMULATION", "no class")  # as if these two were real
+    text = "2 cameras were found: Emulation '0815-0000', Emulation '0815-0001'; name the serial number"
+    with pytest.raises(DeviceError, match=text):
+        finding.find_camera(emulated_only, PylonSettings())
+
+
+def test_a_camera_that_another_program_has_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stand-in: several programs may open an emulated camera, so it is never busy."""
+    sdk = load_pypylon("camera")
+
+    def refuse(_camera: Any) -> None:
+        raise sdk.genicam.RuntimeException("The device is controlled by another application.")
+
+    monkeypatch.setattr(sdk.pylon.InstantCamera, "Open", refuse)
+    error = str(opening())
+    assert "camera: cannot open the camera: The device is controlled by another application" in error
+    assert "close the pylon Viewer" in error
+
+
+def test_without_pypylon_the_error_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pypylon.pylon", None)
+    assert 'install it with `pip install "labseq[pylon]"`' in str(opening())

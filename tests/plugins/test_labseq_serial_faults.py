@@ -1,0 +1,274 @@
+"""Serial instruments that fail: each fault is made by a process that really behaves like this."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, given, settings as hypothesis_settings, strategies as st
+from labseq_serial.device import SerialDevice
+
+from labseq import Context, DeviceError, DeviceTimeoutError, LabseqError, StopRequested, TransientError
+from labseq.sequencer import RealClock, StopFlag
+
+from .labseq_serial_rig import Counterpart, opened, settings
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no ptys")
+
+
+@pytest.fixture
+def counterpart(tmp_path: Path) -> Iterator[Counterpart]:
+    with Counterpart(tmp_path) as counterpart:
+        yield counterpart
+
+
+@pytest.fixture
+def synth(counterpart: Counterpart) -> Iterator[SerialDevice]:
+    with opened(counterpart.port) as synth:
+        yield synth
+
+
+@pytest.mark.parametrize(
+    ("fault", "kind", "text"),
+    [
+        (
+            "silent",
+            DeviceTimeoutError,
+            "no reply to 'TEMP\\?' within 400 ms; is it switched on\\? check 'baud_rate'",
+        ),
+        (
+            "garbage",
+            DeviceError,
+            "the reply to 'TEMP\\?', '.*xff.*', is not ascii; check 'baud_rate', 'parity'",
+        ),
+        ("partial", DeviceTimeoutError, "'21', did not end with '.n' within 400 ms; check 'read_ends_with'"),
+        ("wrong_end", DeviceTimeoutError, "'21.50.r', did not end with '.n' within 400 ms"),
+        (
+            "other",
+            DeviceError,
+            "temperature: 'TEMP\\?' was answered by 'WHAT': its value is 'WHAT'; expected a number",
+        ),
+        ("echo", DeviceError, "'TEMP\\?' was answered by 'TEMP\\?'"),
+        ("endless", DeviceError, "the reply to 'TEMP\\?' does not end: 'xxx"),
+    ],
+)
+def test_a_bad_reply_is_asked_for_again_and_then_named(
+    counterpart: Counterpart, synth: SerialDevice, fault: str, kind: type[Exception], text: str
+) -> None:
+    counterpart.order("fault", fault, 1)
+    assert synth.read("temperature") == pytest.approx(294.65), "the second try"
+    counterpart.order("fault", fault, 2)
+    with pytest.raises(kind, match=f"synth: .*{text}"):
+        synth.read("temperature")
+    assert counterpart.log.count("TEMP?") == 4
+    assert synth.read("temperature") == pytest.approx(294.65), "nothing of it is left"
+
+
+def test_a_reply_that_comes_in_bits_is_put_together(counterpart: Counterpart, synth: SerialDevice) -> None:
+    counterpart.order("fault", "slow", 1)
+    assert synth.read("temperature") == pytest.approx(294.65)
+    assert counterpart.log.count("TEMP?") == 1
+
+
+def test_what_comes_unasked_is_dropped(counterpart: Counterpart, synth: SerialDevice) -> None:
+    counterpart.order("fault", "two", 1)
+    assert synth.read("temperature") == pytest.approx(294.65)
+    assert synth.read("is_open") is False
+    assert counterpart.log.count("STATE?") == 1
+
+
+def test_a_command_is_sent_again_only_if_the_profile_allows_it(
+    counterpart: Counterpart, synth: SerialDevice
+) -> None:
+    counterpart.order("fault", "silent", 1)
+    synth.command("open")
+    assert counterpart.log.count("OPEN") == 2
+    counterpart.order("fault", "silent", 1)
+    with pytest.raises(DeviceTimeoutError, match="no reply to 'OPEN'"):
+        synth.command("once")
+    assert counterpart.log.count("OPEN") == 3
+
+
+def test_an_error_of_the_instrument_is_told_and_not_repeated(
+    counterpart: Counterpart, synth: SerialDevice
+) -> None:
+    with pytest.raises(DeviceError, match="synth: 'NONSENSE' was refused: 'ERR -113,undefined header'"):
+        synth.command("nonsense")
+    assert counterpart.log.count("NONSENSE") == 1
+
+
+def test_a_wrong_baud_rate_is_suspected(counterpart: Counterpart) -> None:
+    device = SerialDevice(
+        settings(port=counterpart.port, baud_rate=19200, timeout="400 ms"), Context("synth")
+    )
+    with pytest.raises(DeviceError, match=r"synth: .*'\*IDN\?'.*check .*'baud_rate'"):
+        device.open()
+    counterpart.order("speed", 19200)
+    device.open()
+    device.close()
+
+
+def test_another_instrument_is_refused(counterpart: Counterpart) -> None:
+    identify = {"ask": "*IDN?", "reply": "THORLABS SC10.*"}
+    device = SerialDevice(settings(port=counterpart.port, identify=identify), Context("synth"))
+    text = "says that it is 'LAB,COUNTERPART,0042,1.7'; expected 'THORLABS SC10.*'; is it the right port"
+    with pytest.raises(DeviceError, match=text):
+        device.open()
+    assert {*counterpart.log} == {"*IDN?"}, "it was sent nothing else"
+
+
+def test_a_second_user_is_told_that_the_port_is_taken(counterpart: Counterpart, synth: SerialDevice) -> None:
+    del synth
+    second = SerialDevice(settings(port=counterpart.port), Context("laser"))
+    text = f"laser: cannot open {counterpart.port}: another program has it open, or another device"
+    with pytest.raises(DeviceError, match=text):
+        second.open()
+
+
+@pytest.mark.parametrize(
+    ("port", "text"),
+    [
+        ({"port": "/dev/ttyNOSUCH7"}, "cannot open /dev/ttyNOSUCH7: there is no such port; expected"),
+        (
+            {"port": None, "usb": {"vid": 0x0403, "serial": "NOSUCH"}},
+            "no USB adapter has vid 0x0403, serial_number",
+        ),
+        ({"port": "rfc2217://nonsense"}, "cannot open rfc2217://nonsense: "),
+    ],
+)
+def test_a_port_that_is_not_there_is_named(port: dict[str, Any], text: str) -> None:
+    with pytest.raises(DeviceError, match=f"synth: {text}"):
+        SerialDevice(settings(**port), Context("synth")).open()
+
+
+def test_an_adapter_is_found_by_its_numbers(
+    counterpart: Counterpart, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    adapters = [adapter(counterpart.port, "A1"), adapter("/dev/ttyUSB7", "A2")]
+    monkeypatch.setattr("serial.tools.list_ports.comports", lambda: adapters)
+    with opened(None, usb={"vid": 0x0403, "serial": "A1"}) as synth:
+        assert synth.read("is_open") is False
+    text = "synth: 2 adapters have vid 0x0403: .*/dev/ttyUSB7 .A2.*; add 'serial' to tell them apart"
+    with pytest.raises(DeviceError, match=text), opened(None, usb={"vid": 0x0403}):
+        pass
+    text = "no USB adapter has pid 0x0001; expected one of .*usb 0x0403 0x6001 A1.*; is it plugged in"
+    with pytest.raises(DeviceError, match=text), opened(None, usb={"pid": 1}):
+        pass
+
+
+def adapter(port: str, serial_number: str) -> Any:
+    found: Any = importlib.import_module("serial.tools.list_ports_common").ListPortInfo(port)
+    found.vid, found.pid, found.serial_number = 0x0403, 0x6001, serial_number
+    return found
+
+
+@pytest.mark.parametrize("instant", ["before", "during"])
+def test_an_unplugged_instrument_fails_the_shot_and_is_opened_again_in_the_next(
+    counterpart: Counterpart, synth: SerialDevice, instant: str
+) -> None:
+    if instant == "before":
+        counterpart.order("unplug")
+    else:
+        counterpart.order("fault", "unplug", 1)
+    with pytest.raises(TransientError, match=r"synth: the line broke at 'OPEN' \(.*\); unplugged\?"):
+        synth.command("open")
+    with pytest.raises(DeviceError, match="synth: the line broke and could not be opened again: cannot open"):
+        synth.command("open")
+    with pytest.raises(DeviceError, match="could not be opened again"):
+        synth.safe_state()
+    counterpart.order("plug")
+    synth.command("open")
+    assert synth.read("is_open") is True
+    assert counterpart.log.count("*IDN?") == 2, "it was asked again who it is"
+
+
+def test_a_broken_line_is_opened_again_for_the_safe_state_but_not_set_up(counterpart: Counterpart) -> None:
+    with opened(counterpart.port, on_open=["open"]) as synth:
+        counterpart.order("unplug")
+        with pytest.raises(TransientError):
+            synth.read("temperature")
+        counterpart.order("plug")
+        synth.safe_state()
+        assert counterpart.log[-3:] == ["*IDN?", "FREQ 1.000000", "CLOSE"]
+
+
+def test_the_safe_state_goes_on_after_a_command_that_fails(counterpart: Counterpart) -> None:
+    with opened(counterpart.port, safe_state=["nonsense", "once", "close"]) as synth:
+        with pytest.raises(DeviceError) as caught:
+            synth.safe_state()
+        assert str(caught.value) == "synth: 'NONSENSE' was refused: 'ERR -113,undefined header'"
+        assert counterpart.log[-3:] == ["NONSENSE", "OPEN", "CLOSE"]
+
+
+def test_an_instrument_that_takes_nothing_is_a_timeout(counterpart: Counterpart) -> None:
+    more: dict[str, Any] = {"flow_control": "xon_xoff", "timeout": "400 ms", "retries": 0}
+    with opened(counterpart.port, **more) as synth:
+        counterpart.order("answer", b"\x131\n".hex())  # XOFF, which holds from now or from the next on
+        text = r"synth: 'STATE\?' could not be sent within 400 ms; see 'flow_control'"
+        with pytest.raises(DeviceTimeoutError, match=text):
+            read_twice(synth)
+
+
+def read_twice(synth: SerialDevice) -> None:
+    for _ in range(2):
+        synth.read("is_open")
+
+
+def test_a_stop_request_ends_the_wait_for_a_reply(counterpart: Counterpart) -> None:
+    stop = StopFlag()
+    with opened(counterpart.port, RealClock(stop), timeout="60 s") as synth:
+        counterpart.order("fault", "silent", 1)
+        asking = Asking(synth)
+        stop.request()
+        assert isinstance(asking.outcome(), StopRequested)
+
+
+def test_the_safe_state_does_not_wait_for_somebody_elses_reply(counterpart: Counterpart) -> None:
+    with opened(counterpart.port, RealClock(StopFlag()), timeout="60 s") as synth:
+        counterpart.order("fault", "silent", 1)
+        asking = Asking(synth)
+        asking.has_begun(counterpart)
+        synth.safe_state()
+        assert "given up for the safe state" in str(asking.outcome())
+        assert counterpart.log[-2:] == ["FREQ 1.000000", "CLOSE"]
+
+
+class Asking:
+    """A thread that asks for the temperature."""
+
+    def __init__(self, synth: SerialDevice) -> None:
+        self._synth = synth
+        self._error: BaseException | None = None
+        self._thread = threading.Thread(target=self._ask)
+        self._thread.start()
+
+    def has_begun(self, counterpart: Counterpart) -> None:
+        while "TEMP?" not in counterpart.log:
+            pass
+
+    def outcome(self) -> BaseException | None:
+        self._thread.join(30.0)
+        assert not self._thread.is_alive(), "it still waits"
+        return self._error
+
+    def _ask(self) -> None:
+        try:
+            self._synth.read("temperature")
+        except LabseqError as error:
+            self._error = error
+
+
+@hypothesis_settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.binary(max_size=40))
+def test_whatever_comes_is_a_value_or_an_error(counterpart: Counterpart, noise: bytes) -> None:
+    with opened(counterpart.port, retries=0, identify=None) as synth:
+        counterpart.order("answer", (noise + b"\n").hex())
+        try:
+            assert isinstance(synth.read("temperature"), float)
+        except DeviceError as error:
+            assert str(error).isprintable()

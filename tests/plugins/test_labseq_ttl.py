@@ -1,0 +1,249 @@
+"""The timing box: the driver, with a model of the box and with its firmware."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Generator
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, strategies as st
+from labseq_ttl.lines import TtlLines
+from labseq_ttl.programs import MOST_EDGES, as_played, edges_of
+from labseq_ttl.protocol import CHANNELS, SHORTEST, SLOTS, TICK_S, unframed
+from labseq_ttl.settings import TtlSettings
+from labseq_ttl.slots import Slots
+from pydantic import ValidationError
+
+from labseq import ConfigError, Context, LineProgram, LineSpec
+from labseq.errors import DeviceError, DeviceTimeoutError, LimitError, StopRequested
+from labseq.lines import line_program
+from labseq.testing import LinesContract
+
+from .labseq_ttl_rig import make_rig, need_simavr, rig
+
+SIMULATED = pytest.mark.parametrize("simulated_by", ["python", "simavr"])
+
+
+@pytest.fixture(autouse=True)
+def simavr(request: pytest.FixtureRequest) -> None:
+    chosen = getattr(request.node, "callspec", None)
+    if request.cls is TestFirmware or (chosen is not None and "simavr" in chosen.params.values()):
+        need_simavr()
+
+
+class TestModel(LinesContract):
+    @pytest.fixture
+    def factory(self) -> Callable[[Context], TtlLines]:
+        return partial(TtlLines, TtlSettings())
+
+
+class TestFirmware(LinesContract):
+    @pytest.fixture
+    def factory(self) -> Generator[Callable[[Context], TtlLines]]:
+        made: list[TtlLines] = []
+
+        def make(context: Context) -> TtlLines:
+            made.append(TtlLines(TtlSettings(simulated_by="simavr"), context))
+            return made[-1]
+
+        yield make
+        for lines in made:  # not every promise closes what it opened
+            lines.close()
+
+
+@SIMULATED
+def test_the_world_feels_what_the_box_plays_from_the_firing_on(simulated_by: str) -> None:
+    with rig(simulated_by=simulated_by) as lab:
+        lab.clock.sleep(1.5)
+        program = lab.fire("load", 0.5)
+        played, t_start_s = lab.played[-1]
+        assert (t_start_s, lab.clock.now()) == (1.5, 1.5)
+        np.testing.assert_allclose(played.t_s, program.t_s, atol=1e-12)
+        np.testing.assert_array_equal(played.on, program.on)
+        lab.lines.wait(1.0)
+        assert lab.clock.now() == pytest.approx(1.5 + program.duration_s)
+
+
+@SIMULATED
+def test_the_same_programs_give_the_same_edges_again(simulated_by: str) -> None:
+    def run() -> list[list[float]]:
+        with rig(simulated_by=simulated_by) as lab:
+            for duration_s in (0.0450001, 0.06, 0.0123):
+                lab.fire("image", duration_s)
+                lab.lines.wait(1.0)
+            return [program.t_s.tolist() for program, _ in lab.played]
+
+    assert run() == run()
+
+
+@SIMULATED
+def test_the_self_test_changes_no_line(simulated_by: str) -> None:
+    with rig(simulated_by=simulated_by) as lab:
+        n_played = len(lab.played)
+        lab.lines.self_test()
+        assert len(lab.played) == n_played
+        assert lab.connection.box.state().on == 1 << 2  # cooling
+        lab.fire()
+        lab.lines.wait(1.0)
+
+
+@SIMULATED
+def test_it_says_what_it_is(simulated_by: str) -> None:
+    with rig(simulated_by=simulated_by) as lab:
+        told = json.loads(json.dumps(dict(lab.lines.describe()), allow_nan=False))
+    assert (told["firmware"], told["serial_number"], told["started_by"]) == ("protocol 1", 0, "power-up")
+    assert told["lines"] == {"cooling": 2, "mot": 3, "imaging": 4, "camera": 5, "shutter": 6}
+
+
+def test_a_known_program_is_not_sent_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    with rig() as lab:
+        sent: list[int] = []
+        put = lab.connection.box.put
+        monkeypatch.setattr(
+            lab.connection.box, "put", lambda slot, edges: (sent.append(slot), put(slot, edges))
+        )
+        for kind in ("load", "image", "load", "image"):
+            lab.fire(kind)
+            lab.lines.wait(1.0)
+    assert sent == [0, 1]
+
+
+def test_the_program_that_was_not_used_for_the_longest_time_gives_way() -> None:
+    slots = Slots()
+    programs = [((0, n),) for n in range(SLOTS + 1)]
+    for program in programs[:-1]:
+        slots.keep(program, slots.free())
+    assert slots.find(programs[0]) == 0
+    assert slots.free() == 1
+    slots.keep(programs[-1], 1)
+    assert slots.find(programs[1]) is None
+    assert [slots.find(program) for program in (programs[0], programs[2], programs[-1])] == [0, 2, 1]
+
+
+def test_more_programs_than_slots_all_play() -> None:
+    with rig() as lab:
+        for n in range(3 * SLOTS):
+            program = lab.fire("rearrange", 1e-3 * (1 + n % (SLOTS + 3)))
+            lab.lines.wait(1.0)
+            np.testing.assert_allclose(lab.played[-1][0].t_s, program.t_s, atol=1e-12)
+
+
+def two_edges_apart(apart_s: float) -> LineProgram:
+    on = np.array([[False, True], [True, True], [True, False]])
+    return LineProgram("image", ("a", "b"), np.array([0.0, 1e-3, 1e-3 + apart_s]), on, 0.0, 1.0)
+
+
+TWO = (LineSpec("a", 2, frozenset()), LineSpec("b", 9, frozenset()))
+
+
+def test_edges_too_near_to_one_another_are_named() -> None:
+    with pytest.raises(LimitError) as told:
+        edges_of(two_edges_apart(3e-6), TWO, "lines")
+    text = (
+        "lines: `image`: time between the edges of 'a' at 1 ms and of 'b' at 1.003 ms is 3 us; the limit is"
+    )
+    assert text in str(told.value)
+    assert "at least 5 us" in str(told.value)
+    edges_of(two_edges_apart(SHORTEST * TICK_S), TWO, "lines")
+
+
+def test_a_pause_too_long_for_the_box_is_refused() -> None:
+    with pytest.raises(LimitError, match="at most"):
+        edges_of(two_edges_apart(3000.0), TWO, "lines")
+
+
+@given(st.integers(0, 2**32), st.lists(st.tuples(st.integers(SHORTEST, 10**7), st.integers(1, 2**10 - 1))))
+def test_programs_come_back_from_their_edges(seed: int, steps: list[tuple[int, int]]) -> None:
+    specs = tuple(LineSpec(f"line {c}", c, frozenset(), active_low=c % 2 == 0) for c in CHANNELS)
+    rng, state = np.random.default_rng(seed), np.zeros(10, np.bool_)
+    t_s, on = [0.0], [state]
+    for ticks, change in steps[: MOST_EDGES - 1]:
+        t_s.append(t_s[-1] + ticks * TICK_S)
+        on.append(on[-1] ^ np.array([bool(change >> i & 1) for i in range(10)]))
+    names = tuple(spec.name for spec in specs)
+    program = LineProgram("image", names, np.array(t_s), np.array(on), 0.0, t_s[-1] + rng.uniform(0, 1))
+    edges = edges_of(program, specs, "lines")
+    ticks = np.cumsum([ticks for ticks, _ in edges])
+    back = as_played([(int(t), mask) for t, (_, mask) in zip(ticks, edges, strict=True)], program, specs)
+    np.testing.assert_allclose(back.t_s, program.t_s, atol=1e-9)
+    np.testing.assert_array_equal(back.on, program.on)
+
+
+@given(st.binary(max_size=40))
+def test_no_bytes_make_the_reader_of_lines_fail(line: bytes) -> None:
+    said = unframed(line)
+    assert said is None or isinstance(said, str)
+
+
+def test_a_line_on_a_channel_that_the_box_does_not_have_is_refused() -> None:
+    with pytest.raises(
+        ConfigError, match=r"the box has no channel 13 for 'mot'; expected one of '2', .*'12'"
+    ):
+        make_rig((LineSpec("mot", 13, frozenset()),)).lines.open()
+
+
+def test_nobody_starts_a_simulated_box_from_outside() -> None:
+    with pytest.raises(ValidationError, match="nobody gives a simulated box its external start"):
+        TtlSettings(start="external")
+    assert TtlSettings(port="/dev/ttyACM0", start="external").start == "external"
+
+
+def test_a_program_that_runs_is_waited_for_first() -> None:
+    with rig() as lab:
+        lab.fire("load", 0.1)
+        for use in (lambda: lab.lines.compile(lab.program()), lab.lines.arm, lab.lines.self_test):
+            with pytest.raises(DeviceError, match="while a program runs"):
+                use()
+        lab.lines.wait(1.0)
+        lab.fire()
+
+
+def test_a_wait_looks_for_a_request_to_stop() -> None:
+    with rig() as lab:
+        lab.fire("load", 0.1)
+        lab.clock.stop.request()
+        with pytest.raises(StopRequested):
+            lab.lines.wait(1.0)
+        with lab.clock.stop.held():
+            lab.lines.safe_state()
+            lab.lines.close()
+
+
+def test_a_program_without_an_end_in_time_is_too_late() -> None:
+    with rig() as lab:
+        lab.fire("load", 3.0)
+        with pytest.raises(DeviceTimeoutError, match="not over after 1 s"):
+            lab.lines.wait(1.0)
+        assert lab.clock.now() == pytest.approx(1.0)
+        lab.lines.safe_state()
+        assert not lab.played[-1][0].on.any()
+
+
+def test_facts_tell_what_the_box_can_do() -> None:
+    facts = make_rig().lines.lines_facts
+    assert facts.channels == CHANNELS
+    assert (facts.resolution_s, facts.shortest_s, facts.most_edges) == (0.5e-6, 5e-6, 23)
+    assert math.isfinite(facts.latency_s)
+
+
+def test_the_most_that_ten_lines_do_in_a_step_fits() -> None:
+    specs = tuple(
+        LineSpec(f"line {c}", c, frozenset({"image"}), lead_s=1e-4 * c, lag_s=1.1e-4 * c) for c in CHANNELS
+    )
+    program = line_program(specs, "image", 0.045)
+    assert len(program.t_s) == 20
+    assert len(edges_of(program, specs, "lines")) <= MOST_EDGES + 1
+
+
+def settings(**given: Any) -> TtlSettings:
+    return TtlSettings.model_validate(given)
+
+
+@pytest.mark.parametrize("wrong", [{"port": ""}, {"serial_number": 70000}, {"lights_out": "2 min"}])
+def test_settings_out_of_range_are_refused(wrong: dict[str, Any]) -> None:
+    with pytest.raises(ValidationError):
+        settings(**wrong)

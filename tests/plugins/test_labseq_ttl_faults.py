@@ -1,0 +1,250 @@
+"""The timing box: everything that can go wrong with it, made by a box that really does it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator
+from typing import Any
+
+import pytest
+from labseq_ttl import box as box_module
+from labseq_ttl.counterpart.build import SOURCE, runner
+from labseq_ttl.counterpart.emulator import EmulatedBox
+from labseq_ttl.protocol import framed
+
+from labseq.errors import DeviceError, DeviceTimeoutError
+
+from .labseq_ttl_rig import Rig, make_rig, need_simavr, rig, works
+
+MIDDLE = 10_000
+"""Ticks: 5 ms after the first edge."""
+
+
+@pytest.fixture(params=["python", "simavr"])
+def lab(request: pytest.FixtureRequest) -> Generator[Rig]:
+    """A driver, open, on a simulated box."""
+    if request.param == "simavr":
+        need_simavr()
+    with rig(simulated_by=request.param) as made:
+        yield made
+
+
+def test_a_reset_in_the_middle_of_a_program_turns_all_lines_off_and_is_told(lab: Rig) -> None:
+    lab.box.reset(MIDDLE)
+    lab.fire("load", 20e-3)
+    played = lab.played[-1][0]
+    assert played.t_s.tolist() == pytest.approx([0.0, 5e-3])
+    assert not played.on[-1].any()
+    with pytest.raises(DeviceError, match=r"the box was reset \(reason: reset input\)") as told:
+        lab.lines.wait(1.0)
+    assert told.value.device == "lines"
+    lab.lines.safe_state()
+    works(lab)
+
+
+def test_a_reset_between_two_steps_is_told_before_anything_is_fired(lab: Rig) -> None:
+    works(lab)
+    lab.box.reset()
+    with pytest.raises(DeviceError, match="the box was reset"):
+        lab.fire()
+    assert len(lab.played) == 2  # idle, and what worked
+    lab.lines.safe_state()
+    works(lab)
+
+
+def unplug(lab: Rig) -> None:
+    box = lab.box
+    if isinstance(box, EmulatedBox):
+        box.unplug()
+    else:
+        box._process.kill()
+        box._process.wait()
+
+
+@pytest.mark.parametrize("use", ["compile", "arm", "fire"])
+def test_an_unplugged_box_is_an_error_and_safe_again_once_it_is_back(lab: Rig, use: str) -> None:
+    steps: dict[str, Callable[[], None]] = {
+        "compile": lambda: lab.lines.compile(lab.program("image", 7e-3)),
+        "arm": lab.lines.arm,
+        "fire": lab.lines.fire,
+    }
+    for name, step in steps.items():
+        if name == use:
+            unplug(lab)
+            with pytest.raises(DeviceError, match="the line to the box broke"):
+                step()
+            break
+        step()
+    lab.lines.safe_state()
+    works(lab)
+
+
+class DamagesLines(EmulatedBox):
+    """Every other line is damaged on its way to the box."""
+
+    n_lines = 0
+
+    def write(self, data: bytes, /) -> int:
+        self.n_lines += 1
+        return super().write(data.replace(b" ", b"_", 1) if self.n_lines % 2 else data)
+
+
+class DamagesAnswers(EmulatedBox):
+    """Every other answer is damaged on its way back, but not that to `fire`, which is never sent twice."""
+
+    n_told = 0
+
+    def _tell(self, text: str) -> None:
+        self.n_told += 1
+        is_answer = not text.startswith("!") and text[1:] != " ok"
+        self._out += framed(text).replace(b"*", b"+") if is_answer and self.n_told % 2 else framed(text)
+
+
+def use_box(monkeypatch: pytest.MonkeyPatch, box: Any) -> None:
+    monkeypatch.setattr("labseq_ttl.connection.start_counterpart", lambda *_: box)
+
+
+@pytest.mark.parametrize("cable", [DamagesLines, DamagesAnswers])
+def test_what_came_damaged_is_sent_again(monkeypatch: pytest.MonkeyPatch, cable: type[EmulatedBox]) -> None:
+    use_box(monkeypatch, cable())
+    with rig() as lab:
+        for _ in range(5):
+            works(lab)
+        lab.lines.self_test()
+
+
+class KeepsQuiet(EmulatedBox):
+    """Nobody hears that its program is over."""
+
+    def _tell(self, text: str) -> None:
+        if not text.startswith("!done"):
+            super()._tell(text)
+
+
+def test_an_end_that_nobody_heard_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("labseq_ttl.lines.SIMULATED_PATIENCE_S", 0.01)
+    use_box(monkeypatch, KeepsQuiet())
+    with rig() as lab:
+        works(lab)
+        works(lab)
+
+
+class Dies(EmulatedBox):
+    """Plays nothing more, and does not say so."""
+
+    def _fire(self, words: list[str]) -> str:
+        self._armed = None
+        return ""
+
+    def _boot(self, cause: int) -> None:
+        if not hasattr(self, "_armed"):
+            super()._boot(cause)
+
+
+def test_a_program_that_never_ends_is_too_late(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("labseq_ttl.lines.SIMULATED_PATIENCE_S", 0.01)
+    use_box(monkeypatch, Dies())
+    with rig() as lab:
+        lab.connection.counterpart._edges = [(0, 0)]  # type: ignore[union-attr]
+        lab.fire()
+        with pytest.raises(DeviceTimeoutError, match="not over after"):
+            lab.lines.wait(1.0)
+
+
+class Other(EmulatedBox):
+    """Something else that speaks in lines."""
+
+    says = "shutter 01 0000 0000 01"
+
+    def _identify(self, words: list[str]) -> str:
+        return self.says
+
+
+@pytest.mark.parametrize(
+    ("says", "told"),
+    [
+        ("shutter 01 0000 0000 01", "'shutter 01 0000 0000 01' answers; expected 'labseq-ttl'"),
+        ("labseq-ttl 02 0000 0000 01", "speaks version 2 of the protocol; expected 1"),
+        ("labseq-ttl 01 what", "the box answers 'what'; expected 3 hexadecimal numbers"),
+        ("labseq-ttl nn", "the box answers 'nn'; expected 1 hexadecimal numbers"),
+        ("", "'' answers; expected 'labseq-ttl'"),
+    ],
+)
+def test_something_else_at_the_port_is_refused(monkeypatch: pytest.MonkeyPatch, says: str, told: str) -> None:
+    other = Other()
+    other.says = says
+    use_box(monkeypatch, other)
+    with pytest.raises(DeviceError, match=told):
+        make_rig().lines.open()
+
+
+class Babble(EmulatedBox):
+    """An instrument that does not speak the protocol at all."""
+
+    def _answer(self) -> None:
+        self._out += b"ERR -113\r\n"
+
+
+class Mute(EmulatedBox):
+    """Nobody is there."""
+
+    def _answer(self) -> None:
+        pass
+
+
+@pytest.mark.parametrize(("box", "told"), [(Babble, "but 'ERR -113"), (Mute, "is this the box's port")])
+def test_a_port_at_which_no_box_answers_is_told(
+    monkeypatch: pytest.MonkeyPatch, box: type[EmulatedBox], told: str
+) -> None:
+    monkeypatch.setattr(box_module, "BOOT_S", 0.0)
+    monkeypatch.setattr("labseq_ttl.connection.SIMULATED_PATIENCE_S", 0.01)
+    use_box(monkeypatch, box())
+    with pytest.raises(DeviceTimeoutError, match=told):
+        make_rig().lines.open()
+
+
+def test_garbage_that_nobody_asked_for_does_no_harm() -> None:
+    with rig() as lab:
+        for noise in (b"\xff\x00\n", b"!done 0000 0007*0000\n", b"a ok*dead\n", b"x" * 10_000, b"\n"):
+            lab.box.say(noise)
+            works(lab)
+
+
+@pytest.mark.parametrize(
+    ("says", "told"),
+    [("!off 0000", "told to turn all lines off"), ("!alone 0000", "heard nothing for 0 s")],
+)
+def test_a_box_that_turned_all_lines_off_by_itself_is_an_error(says: str, told: str) -> None:
+    with rig() as lab:
+        lab.box.say(framed(says))
+        with pytest.raises(DeviceError, match=told):
+            lab.fire()
+        lab.lines.safe_state()
+        works(lab)
+
+
+def test_a_bad_memory_is_found_by_the_self_test(monkeypatch: pytest.MonkeyPatch) -> None:
+    with rig() as lab:
+        get = lab.connection.box.get
+        monkeypatch.setattr(
+            lab.connection.box, "get", lambda slot, i: (get(slot, i)[0] ^ (i == 17), get(slot, i)[1])
+        )
+        with pytest.raises(DeviceError, match="edge 17 in slot 0 reads"):
+            lab.lines.self_test()
+
+
+def test_what_is_missing_for_simavr_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
+    monkeypatch.setenv("LABSEQ_CACHE", str(tmp_path))
+    monkeypatch.setenv("PATH", "")
+    with pytest.raises(DeviceError, match=r"there is no C compiler; `apt-get install .* libsimavr-dev"):
+        runner("lines")
+
+
+def test_a_compiler_without_the_library_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
+    need_simavr()
+    monkeypatch.setenv("LABSEQ_CACHE", str(tmp_path))
+    broken = tmp_path / "runner.c"
+    broken.write_text("#include <simavr/none.h>\n" + SOURCE.read_text())
+    monkeypatch.setattr("labseq_ttl.counterpart.build.SOURCE", broken)
+    with pytest.raises(DeviceError, match=r"none\.h: No such file .*`apt-get install .* libsimavr-dev"):
+        runner("lines")
+    assert not list(tmp_path.glob("ttl/*/runner"))

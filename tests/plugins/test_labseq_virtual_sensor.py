@@ -1,0 +1,257 @@
+"""What the virtual camera sets of the simulated sensor: region, binning, EM gain, shutter, temperature."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from labseq_virtual.camera import VirtualCamera
+from labseq_virtual.cooler import COLDEST_K, ROOM_K, Cooler
+from labseq_virtual.settings import CameraSettings, WorldSettings
+from labseq_virtual.world import World
+from numpy.typing import NDArray
+
+import labseq
+from labseq import (
+    ConfigError,
+    Context,
+    DepthRamp,
+    DeviceError,
+    DeviceTimeoutError,
+    KnownSensor,
+    LimitError,
+    RandomStream,
+    SensorMode,
+    Settling,
+    SiteGrid,
+)
+from labseq.testing.fakes import FakeClock
+
+EXPOSURE_S = 45e-3
+SMALL: dict[str, Any] = {"frame": (120, 120), "centre_px": (59.5, 59.5)}
+PROFILE = """labseq: 1
+name: p
+grid: {rows: 5, cols: 6, spacing: 4.49 um}
+camera: {use: virtual, CAMERA}
+static_tweezers: {use: virtual}
+mobile_tweezers: {use: virtual}
+detector: {use: threshold, frame: [128, 128], centre_px: [63.5, 63.5]}
+simulation: {use: virtual, image: {sensor: qcmos, frame: [128, 128], centre_px: [63.5, 63.5]}}
+"""
+SEQUENCE = """labseq: 1
+name: s
+profile: p.yaml
+target: {pattern: compact, rows: 2, cols: 2}
+planner: {use: psca}
+shot: [load: {duration: 500 ms}, image: {exposure: 45 ms}]
+"""
+
+
+class Lab:
+    """A camera before a real simulated world, with atoms on about all of 4 x 4 sites."""
+
+    def __init__(self, image: dict[str, Any] | None = None, **camera: Any) -> None:
+        self.clock = FakeClock()
+        random = RandomStream(1)
+        settings = WorldSettings.model_validate({"image": SMALL | (image or {}), "loading": 1.0})
+        grid = SiteGrid(4, 4)
+        self.world = World(settings, Context("simulation", grid, clock=self.clock, random=random))
+        context = Context("camera", grid, clock=self.clock, simulation=self.world)
+        self.camera = VirtualCamera(CameraSettings.model_validate(camera), context)
+        self.world.open()
+        self.world.play("static_tweezers", DepthRamp(0.0, 1.0), 0.0)
+        random.begin_shot(0, 0)
+        self.world.begin_shot()
+        self.world.load(0.0, 0.5)
+        self.clock.sleep(0.5)
+        self.camera.open()
+
+    def take(self) -> NDArray[np.float64]:
+        """A frame, as the camera takes it."""
+        self.camera.arm(1, EXPOSURE_S, "software")
+        self.camera.trigger()
+        return self.camera.read(1.0).image.astype(float)
+
+    def said(self, key: str) -> Any:
+        """What the camera says of itself now."""
+        return self.camera.describe()[key]
+
+
+def run(folder: Path) -> None:
+    """A shot with the sequence and the profile in a folder."""
+    with labseq.Session.open(folder / "s.yaml", shots=1, output=folder / "runs") as session:
+        session.run()
+
+
+def test_the_world_tells_of_its_sensor() -> None:
+    lab = Lab()
+    assert isinstance(lab.world, KnownSensor)
+    assert lab.world.sensor_shape == (120, 120)
+    assert lab.world.readout_fraction(SensorMode((0, 0, 60, 60), 2)) == pytest.approx(1 / 16)
+
+
+@pytest.mark.parametrize("sensor", ["emccd", "qcmos"])
+def test_a_region_of_a_bright_sensor_is_that_part_of_it(sensor: str) -> None:
+    image = {"sensor": sensor, "read_noise": 0.0, "em_gain": 1.0, "photoelectrons": 1e4}
+    region = {"y": 20, "x": 10, "height": 60, "width": 80}
+    whole, part = Lab(image).take(), Lab(image, region=region).take()
+    assert part.shape == (60, 80)
+    spots = part > part.mean() + part.std()
+    assert part[spots] == pytest.approx(whole[20:80, 10:90][spots], rel=0.02)
+
+
+def test_a_camera_without_a_gain_of_its_own_leaves_it_to_the_simulation() -> None:
+    lab = Lab({"em_gain": 100.0})
+    assert (lab.camera.facts.em_gain, lab.said("em_gain_now")) == (1.0, None)
+    np.testing.assert_array_equal(lab.take(), Lab({"em_gain": 7.0}, em_gain=100).take())
+
+
+def test_the_cameras_gain_wins_over_the_simulations() -> None:
+    frames = [Lab({"em_gain": 300.0}, em_gain=g).take() - 500 for g in (10, 100)]
+    assert frames[1].sum() / frames[0].sum() == pytest.approx(10.0, rel=0.25)
+    assert Lab(em_gain=10).camera.facts.em_gain == 10.0
+
+
+def test_gain_and_shutter_are_on_in_a_series_only() -> None:
+    lab = Lab(em_gain=300)
+
+    def state() -> tuple[Any, Any]:
+        return lab.said("em_gain_now"), lab.said("shutter")
+
+    assert state() == (1.0, "closed")
+    lab.camera.arm(1, EXPOSURE_S, "software")
+    assert state() == (300.0, "open")
+    lab.camera.safe_state()
+    assert state() == (1.0, "closed")
+    lab.take()
+    lab.camera.self_test()
+    assert state() == (1.0, "open")
+    lab.camera.close()
+    assert state() == (1.0, "closed")
+
+
+def test_the_self_test_takes_its_frame_without_gain() -> None:
+    image = {"background": 50.0, "read_noise": 1.0}
+    lab = Lab(image, em_gain=300)
+    taken = list[NDArray[np.float64]]()
+    expose = lab.world.expose
+
+    def noted(*arguments: Any) -> labseq.Frame:
+        frame = expose(*arguments)
+        taken.append(frame.image.astype(float))
+        return frame
+
+    vars(lab.world)["expose"] = noted
+    lab.camera.self_test()
+    lab.take()
+    assert taken[0].mean() < 510
+    assert taken[1].mean() > 2000
+
+
+@pytest.mark.parametrize("sensor", ["emccd", "qcmos"])
+def test_behind_a_closed_shutter_it_is_dark_and_the_light_still_takes_atoms(sensor: str) -> None:
+    bright = {
+        "sensor": sensor,
+        "background": 5.0,
+        "clock_induced_charge": 0.5,
+        "qcmos": {"dark_current": 10.0},
+    }
+    lab = Lab(bright)
+    frame = lab.world.expose(0.5, 20.0, SensorMode(shutter_open=False)).image
+    ground = {"emccd": 500 + 0.5 * 60, "qcmos": 200 + 200 / 0.11}[
+        sensor
+    ]  # dark counts: per frame, per second
+    assert frame.mean() == pytest.approx(ground, rel=0.03)
+    atoms = [lab.world.truth().sum(), lab.world.losses()["imaging"]]
+    assert atoms[0] < 16
+    assert atoms[1] > 0
+
+
+@pytest.mark.parametrize(
+    ("camera", "text"),
+    [
+        (
+            "region: {y: 100, height: 60, width: 60}",
+            "ends at row 160 and column 60, beyond the sensor of 128",
+        ),
+        ("binning: 3", "128 x 128 pixels cannot be binned by 3; choose a `region`"),
+        ("em_gain: 300", "the EM gain is 300; the limit is 1: a qCMOS sensor has no EM register; leave the"),
+        ("em_gain: 0.5", "em_gain is 0.5; expected"),
+        ("cooling: {temperature: -70}", "temperature is -70 K (-343 degC); expected -123 to 50 degC"),
+    ],
+)
+def test_what_the_sensor_cannot_do_is_told_with_its_line(tmp_path: Path, camera: str, text: str) -> None:
+    (tmp_path / "p.yaml").write_text(PROFILE.replace("CAMERA", camera), encoding="utf-8")
+    (tmp_path / "s.yaml").write_text(SEQUENCE, encoding="utf-8")
+    with pytest.raises(ConfigError) as caught:
+        run(tmp_path)
+    assert "p.yaml:4:" in str(caught.value)
+    assert text in str(caught.value)
+
+
+def test_a_driver_is_told_at_once_that_there_is_no_em_register() -> None:
+    with pytest.raises(LimitError, match="qCMOS sensor has no EM register"):
+        Lab({"sensor": "qcmos"}, em_gain=2)
+    assert Lab({"sensor": "qcmos"}, em_gain=1).take().shape == (120, 120)
+
+
+COLD: dict[str, Any] = {"temperature": "-70 degC"}
+
+
+def test_a_sensor_cools_from_room_temperature_past_its_set_point_and_back() -> None:
+    clock = FakeClock()
+    cooler = Cooler(203.15, clock)
+    assert cooler.temperature_k == ROOM_K
+    cooler.switch_on()
+    temperatures = list[float]()
+    for _ in range(1000):
+        temperatures.append(cooler.temperature_k)
+        clock.sleep(1.0)
+    assert temperatures[0] == ROOM_K
+    assert 202.15 < min(temperatures) < 203.0
+    assert temperatures[-1] == pytest.approx(203.15, abs=0.01)
+    cooler.switch_on()
+    assert cooler.temperature_k == pytest.approx(203.15, abs=0.01)
+
+
+def test_the_camera_waits_until_it_is_cold() -> None:
+    lab = Lab(cooling=COLD)
+    assert isinstance(lab.camera, Settling)
+    assert lab.camera.settling_timeout_s == 900.0
+    assert lab.said("temperature_k") == ROOM_K
+    start_s = lab.clock.now()
+    lab.camera.settle()
+    assert 120.0 < lab.clock.now() - start_s < 600.0
+    assert lab.said("temperature_k") == pytest.approx(203.15, abs=1.0)
+
+
+def test_it_stays_cold_in_the_safe_state_and_while_it_is_closed() -> None:
+    lab = Lab(cooling=COLD)
+    lab.camera.settle()
+    lab.camera.safe_state()
+    lab.camera.close()
+    lab.clock.sleep(100.0)
+    lab.camera.open()
+    start_s = lab.clock.now()
+    lab.camera.settle()
+    assert lab.clock.now() - start_s == 5.0
+
+
+def test_a_set_point_that_the_cooler_does_not_reach_times_out() -> None:
+    lab = Lab(cooling={"temperature": "-100 degC", "timeout": "20 min"})
+    with pytest.raises(
+        DeviceTimeoutError, match=r"the sensor is at -90.0 degC after 1200 s; expected -100.0"
+    ):
+        lab.camera.settle()
+    assert lab.said("temperature_k") == pytest.approx(COLDEST_K, abs=0.01)
+
+
+def test_without_cooling_there_is_nothing_to_wait_for() -> None:
+    lab = Lab()
+    lab.camera.settle()
+    assert (lab.camera.settling_timeout_s, lab.clock.now()) == (0.0, 0.5)
+    lab.camera.close()
+    with pytest.raises(DeviceError, match="not open"):
+        lab.camera.settle()

@@ -1,0 +1,88 @@
+"""The fake keeps every promise of a timing box; each is broken once, and the suite names it and no other."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from labseq.model import LineProgram
+from labseq.testing import LinesContract
+from labseq.testing.fakes import RecordingLines
+
+
+class TestRecordingLines(LinesContract):
+    @pytest.fixture
+    def factory(self):
+        return RecordingLines
+
+
+class LeavesALineOn(RecordingLines):
+    def compile(self, program: LineProgram) -> None:
+        on = np.array(program.on)
+        on[-1] = True
+        super().compile(replace(program, on=on))
+
+
+class RunsSlow(RecordingLines):
+    def compile(self, program: LineProgram) -> None:
+        super().compile(replace(program, t_s=np.array(program.t_s) * 1.01))
+
+
+class FiresTheFirstProgramAgain(RecordingLines):
+    first: LineProgram | None = None
+
+    def compile(self, program: LineProgram) -> None:
+        super().compile(program)
+        self.first = self._compiled = self.first or program
+
+
+class ComesBackAtOnce(RecordingLines):
+    def wait(self, timeout_s: float) -> None:
+        if self._over_s - self.clock.now() > 10.0:  # a timeout is kept
+            super().wait(timeout_s)
+        self.use("wait", timeout_s)
+
+
+class WaitsInFire(RecordingLines):
+    def fire(self) -> None:
+        super().fire()
+        if self.programs[-1].duration_s < 1.0:
+            self.clock.sleep(self.programs[-1].duration_s)
+
+
+class StaysArmed(RecordingLines):
+    def fire(self) -> None:
+        super().fire()
+        self._is_armed = True
+
+
+class LeavesLightOn(RecordingLines):
+    def safe_state(self) -> None:
+        self.note("safe_state")
+        self.reset()
+
+
+class StartsDark(RecordingLines):
+    def _tell(self, program: LineProgram) -> None:
+        if program.kind != "idle":
+            super()._tell(program)
+        else:
+            super()._tell(replace(program, on=np.zeros_like(program.on)))
+
+
+@pytest.mark.parametrize(
+    ("lines", "test"),
+    [
+        (LeavesALineOn, "test_does_what_was_compiled"),
+        (RunsSlow, "test_does_what_was_compiled"),
+        (FiresTheFirstProgramAgain, "test_does_what_was_compiled"),
+        (ComesBackAtOnce, "test_waits_for_the_end"),
+        (WaitsInFire, "test_waits_for_the_end"),
+        (StaysArmed, "test_refuses_fire_without_arm"),
+        (LeavesLightOn, "test_rests"),
+        (StartsDark, "test_rests"),
+    ],
+)
+def test_the_broken_promise_is_named_and_no_other(breaks_only, lines: Any, test: str) -> None:
+    breaks_only(LinesContract(), lines, test)
