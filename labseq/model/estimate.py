@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+_ROUNDING: Final = 1e-12
+"""Relative error below which equal numbers were only added up."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,10 +28,12 @@ class Estimate:
             ('29.61(3)', '5990(10)', '1')
             >>> str(Estimate(0.4, 0.096)), str(Estimate(7.123456, math.nan))
             ('0.4(1)', '7.123')
+            >>> str(Estimate(99.555555555555543, 8e-15))  # rounding is no error
+            '99.56'
         """
         if math.isnan(self.value):
             return "-"
-        if not math.isfinite(self.error) or self.error == 0.0:
+        if not math.isfinite(self.error) or self.error <= _ROUNDING * abs(self.value):
             return f"{self.value:.4g}"
         digit = math.floor(math.log10(self.error))
         if round(self.error / 10.0**digit) == 10:
