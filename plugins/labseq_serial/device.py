@@ -11,7 +11,7 @@ from labseq.config.wording import clean
 from labseq_serial.arguments import Scalar
 from labseq_serial.instrument import Instrument
 from labseq_serial.line import Line
-from labseq_serial.ports import open_port
+from labseq_serial.ports import open_line
 from labseq_serial.settings import SIMULATED, SerialSettings, known
 from labseq_serial.simulated import SimulatedPort
 
@@ -172,7 +172,7 @@ class SerialDevice:
         """The right instrument on an open line."""
         settings = self._settings
         is_simulated = settings.port == SIMULATED
-        port = SimulatedPort(settings, self._clock) if is_simulated else open_port(settings, self._name)
+        port = SimulatedPort(settings, self._clock) if is_simulated else open_line(settings, self._name)
         line = Line(port, settings, self._name, self._clock)
         instrument = Instrument(line, settings, self._name, self._clock)
         try:

@@ -9,8 +9,8 @@ from typing import Final
 
 from labseq import Clock, DeviceError, DeviceTimeoutError, TransientError, wait_for
 from labseq.config.wording import clean
+from labseq.drivers.serial_port import BROKEN, Port, is_write_timeout
 from labseq.units import format_quantity
-from labseq_serial.ports import BROKEN, Port, is_write_timeout
 from labseq_serial.settings import SerialSettings
 
 MAX_REPLY: Final = 4096

@@ -9,8 +9,8 @@ from typing import Final
 
 from labseq import Clock, DeviceError, DeviceTimeoutError
 from labseq.config.wording import clean
+from labseq.drivers.serial_port import Port
 from labseq_ttl.conversation import TRIES, Conversation
-from labseq_ttl.port import Port
 from labseq_ttl.protocol import NAME, PER_LINE, VERSION, Edge
 
 BOOT_S: Final = 3.0

@@ -8,7 +8,7 @@ from labseq import Clock, DeviceError
 from labseq_ttl.box import Box
 from labseq_ttl.counterpart import Counterpart, start_counterpart
 from labseq_ttl.heartbeat import Heartbeat
-from labseq_ttl.port import open_port
+from labseq_ttl.port import open_box
 from labseq_ttl.settings import TtlSettings
 
 PATIENCE_S: Final = 1.0
@@ -46,7 +46,7 @@ class Connection:
         else:
             patience_s = PATIENCE_S
         try:
-            port = open_port(settings.port, device) if self.counterpart is None else self.counterpart.port
+            port = open_box(settings.port, device) if self.counterpart is None else self.counterpart.port
             self.box = Box(port, device, clock, patience_s)
         except BaseException:
             if self.counterpart is not None:

@@ -10,8 +10,8 @@ from typing import Final, TypeVar
 
 from labseq import Clock, DeviceError, DeviceTimeoutError, wait_for
 from labseq.config.wording import clean
+from labseq.drivers.serial_port import BROKEN, Port
 from labseq.units import format_quantity
-from labseq_ttl.port import BROKEN, Port
 from labseq_ttl.protocol import STOP, framed, unframed
 
 T = TypeVar("T")

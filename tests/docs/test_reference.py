@@ -7,7 +7,7 @@ import tomllib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import FunctionType
-from typing import Any, get_args
+from typing import Any, get_args, get_origin
 from xml.etree.ElementTree import Element
 
 import pytest
@@ -95,6 +95,10 @@ def settings_of(model: type[BaseModel] | None, prefix: str = "") -> Iterator[tup
         key = prefix + (field.alias or name)
         yield key, field
         optional = get_args(field.annotation) if type(None) in get_args(field.annotation) else ()
+        by_name = get_args(field.annotation)[1:] if get_origin(field.annotation) is dict else ()
+        for inner in by_name:
+            if isinstance(inner, type) and issubclass(inner, BaseModel):
+                yield from settings_of(inner, f"{key}.NAME.")
         for inner in (field.annotation, *optional):
             if isinstance(inner, type) and issubclass(inner, BaseModel) and not issubclass(inner, Choice):
                 yield from settings_of(inner, f"{key}.")

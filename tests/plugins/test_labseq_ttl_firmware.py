@@ -291,7 +291,7 @@ def test_the_firmware_is_that_of_its_source(tmp_path: Path) -> None:
     version = subprocess.run(["avr-gcc", "-dumpversion"], capture_output=True, text=True, check=True).stdout
     if not version.startswith("5.4"):
         pytest.skip(f"labseq_ttl.hex was built by avr-gcc 5.4, not {version.strip()}")
-    for name in ("labseq_ttl.c", "Makefile"):
-        shutil.copy(FIRMWARE.with_name(name), tmp_path)
+    for source in (*FIRMWARE.parent.glob("*.[ch]"), FIRMWARE.with_name("Makefile")):
+        shutil.copy(source, tmp_path)
     subprocess.run(["make", "-s", "-C", str(tmp_path)], check=True)
     assert (tmp_path / FIRMWARE.name).read_bytes() == FIRMWARE.read_bytes(), "run `make` in its folder"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Final, get_args
+from typing import Final, get_args, get_origin
 
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
@@ -84,7 +84,8 @@ def keys_of(
         yield key, model, name, field
         inner = inner_model(field)
         if inner is not None and not top:
-            yield from keys_of(inner, prefix=f"{key}.")
+            named = ".NAME" if is_by_name(field) else ""
+            yield from keys_of(inner, prefix=f"{key}{named}.")
 
 
 def inner_model(field: FieldInfo) -> type[BaseModel] | None:
@@ -92,6 +93,11 @@ def inner_model(field: FieldInfo) -> type[BaseModel] | None:
     found = [field.annotation, *get_args(field.annotation)]
     models = [one for one in found if isinstance(one, type) and issubclass(one, BaseModel)]
     return next((one for one in models if not issubclass(one, Choice)), None)
+
+
+def is_by_name(field: FieldInfo) -> bool:
+    """Whether it is a mapping of names that the user chooses, to models."""
+    return any(get_origin(one) is dict for one in (field.annotation, *get_args(field.annotation)))
 
 
 def quantities_table() -> list[str]:

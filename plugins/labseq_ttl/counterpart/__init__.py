@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Protocol
 
 from labseq import Clock
-from labseq_ttl.port import Port
+from labseq.drivers.serial_port import Port
 from labseq_ttl.protocol import Edge
 
 

@@ -9,7 +9,7 @@ import threading
 from collections.abc import Callable, Mapping
 from typing import Final
 
-from labseq_ttl.port import Port
+from labseq.drivers.serial_port import Port
 from labseq_ttl.protocol import (
     EDGES,
     LINE,
@@ -92,6 +92,10 @@ class EmulatedBox:
         for byte in data:
             self._take(byte)
         return len(data)
+
+    def reset_input_buffer(self) -> None:
+        """Forget what the box said."""
+        self._out.clear()
 
     def close(self) -> None:
         """Nothing is open."""

@@ -9,8 +9,9 @@ from contextlib import suppress
 from typing import Final
 
 from labseq import Clock, DeviceError, wait_for
+from labseq.drivers.serial_port import BROKEN, Port
 from labseq_ttl.counterpart.build import FIRMWARE, runner
-from labseq_ttl.port import BROKEN, Port, open_port
+from labseq_ttl.port import open_box
 from labseq_ttl.protocol import OUTPUTS, Edge
 
 CYCLES_PER_TICK: Final = 8
@@ -61,7 +62,7 @@ class SimavrBox:
     def port(self) -> Port:
         """Its serial port, opened when it is first asked for."""
         if self._port is None:
-            self._port = open_port(self.name, self._device)
+            self._port = open_box(self.name, self._device)
         return self._port
 
     @property

@@ -1,0 +1,109 @@
+"""Serial ports of this computer, opened by pyserial."""
+
+from __future__ import annotations
+
+import errno
+import importlib
+import re
+from typing import Any, Final, Protocol
+
+from labseq.drivers.waiting import SLICE_S
+from labseq.errors import DeviceError
+
+
+class Port(Protocol):
+    """What drivers use of a port: a part of pyserial's ``Serial``."""
+
+    @property
+    def in_waiting(self) -> int:
+        """Bytes that have come and were not read."""
+        ...
+
+    def read(self, size: int = 1, /) -> bytes:
+        """What has come, at most ``size`` bytes; waits a little for the first."""
+        ...
+
+    def write(self, data: bytes, /) -> int | None:
+        """Send."""
+        ...
+
+    def reset_input_buffer(self) -> None:
+        """Drop what has come."""
+        ...
+
+    def close(self) -> None:
+        """Close."""
+        ...
+
+
+def _broken() -> tuple[type[BaseException], ...]:
+    try:
+        termios: Any = importlib.import_module("termios")
+    except ImportError:  # Windows
+        return (OSError,)
+    return (OSError, termios.error)
+
+
+BROKEN: Final = _broken()
+"""What a port raises when the line is gone; pyserial's own errors are OSErrors."""
+
+
+def open_port(port: str, device: str, baud_rate: int, **options: Any) -> Port:
+    """Open a port, alone.
+
+    Reads wait for the first byte for at most 20 ms, so that a driver sees a stop request.
+
+    Args:
+        port: "/dev/ttyUSB0", "COM3", or a URL that pyserial knows, which nobody can keep for himself.
+        device: Name of the instrument, for messages.
+        baud_rate: Bits per second.
+        **options: Further ones of pyserial.
+
+    Raises:
+        DeviceError: There is no such port, or somebody else has it open.
+    """
+    serial: Any = importlib.import_module("serial")
+    if "://" in port:
+        options.pop("write_timeout", None)
+    else:
+        options["exclusive"] = True
+    try:
+        return serial.serial_for_url(port, baudrate=baud_rate, timeout=SLICE_S, **options)
+    except (*BROKEN, ValueError, NotImplementedError) as error:
+        raise DeviceError(device, f"cannot open {port}: {_reason(error)}") from error
+
+
+def is_write_timeout(error: BaseException) -> bool:
+    """Whether a write only took too long: the line is not broken."""
+    serial: Any = importlib.import_module("serial")
+    return isinstance(error, serial.SerialTimeoutException)
+
+
+def ports_here() -> list[Any]:
+    """The ports of this computer, as pyserial describes them: device, vid, pid, serial_number."""
+    tools: Any = importlib.import_module("serial.tools.list_ports")
+    return sorted(tools.comports())
+
+
+def ports_in_words() -> str:
+    """The ports that there are, for a message."""
+    found = [
+        port.device
+        if port.vid is None
+        else f"{port.device} (usb {port.vid:#06x} {port.pid:#06x} {port.serial_number})"
+        for port in ports_here()
+    ]
+    return f"one of {', '.join(found)}" if found else "a port, but this computer has none"
+
+
+def _reason(error: BaseException) -> str:
+    """Why a port cannot be opened, and what to do."""
+    text = " ".join(str(error).split())
+    number = getattr(error, "errno", None)
+    if number in (errno.EAGAIN, errno.EWOULDBLOCK, errno.EBUSY) or "PermissionError(13" in text:
+        return "another program has it open, or another device of this profile; close that"
+    if number == errno.EACCES:
+        return "you may not; ask for membership of the group that it belongs to (often 'dialout')"
+    if number == errno.ENOENT or "FileNotFoundError" in text:
+        return f"there is no such port; expected {ports_in_words()}; is it plugged in, and switched on?"
+    return re.sub(r"^(\[Errno \d+\] )?[Cc]ould not [^:]*: ", "", text)
