@@ -16,10 +16,9 @@ from labseq_genicam.settings import GenicamSettings
 BUFFER_BYTES: Final = 256 * 2**20
 """Memory for frames that were not read yet; a series that needs more uses its buffers again."""
 
-FAULTS: Final[Mapping[str, str]] = dict.fromkeys(
-    ("missing packets", "timeout"), "some of its network packets are missing"
-)
-"""What it means that a buffer has another status than success."""
+INCOMPLETE: Final = "some of its network packets are missing"
+FAULTS: Final[Mapping[str, str]] = {"success": "", "missing packets": INCOMPLETE, "timeout": INCOMPLETE}
+"""What is wrong with a frame, by the status of its buffer."""
 
 RATE: Final = "AcquisitionFrameRate"
 ROUNDING: Final = 1e-6
@@ -110,12 +109,10 @@ class Acquisition:
         number = self._counter.number(buffer.frame_id if buffer.image is not None else None) - self._first
         if number < 0:  # of an earlier series
             return None
-        fault = (
-            "" if buffer.image is not None else FAULTS.get(buffer.status, f"its buffer is '{buffer.status}'")
-        )
         if self._start == "free" and number >= self._n_frames - 1:
             self.stop()
         time_s = 1e-9 * buffer.camera_time_ns if buffer.camera_time_ns else math.nan
+        fault = FAULTS.get(buffer.status, f"its buffer is '{buffer.status}'")
         return Taken(number, buffer.image, fault, self._exposure_s, device_time_s=time_s)
 
     def ask(self) -> None:

@@ -80,6 +80,18 @@ def test_frames_that_nobody_read_are_dropped() -> None:
         assert_shown(lab.take(2), lab)
 
 
+def test_a_series_that_is_broken_off_costs_the_next_one_no_packet() -> None:
+    """The first frame of a stream must fit into the buffer that a socket has by default."""
+    with rig(sensor_shape=(512, 512)) as lab:
+        for _ in range(8):
+            lab.camera.arm(2, 0.01, "software")
+            lab.camera.trigger()
+            lab.clock.sleep(0.01)
+            lab.camera.safe_state()
+            del lab.world.shown[:]
+            assert_shown(lab.take(1), lab)
+
+
 def test_the_simulated_camera_runs_by_itself_too() -> None:
     with rig(readout="5 ms") as lab:
         lab.camera.arm(3, 0.01, "internal")

@@ -15,7 +15,9 @@ from labseq_genicam.aravis.library import library
 from labseq_genicam.counterpart.images import Request
 from numpy.typing import NDArray
 
-from .labseq_genicam_rig import WAIT_S, opened, pattern, plugged_in
+from labseq.roles import NeverStopped
+
+from .labseq_genicam_rig import PACKET_SIZE, WAIT_S, opened, pattern, plugged_in, rig
 from .needs import need_library
 
 N_FRAMES = int(os.environ.get("LABSEQ_FRAMES", "25"))
@@ -75,3 +77,38 @@ def test_every_software_trigger_makes_a_frame() -> None:
             f"\ntrigger to {name}: median {np.median(column):.1f} ms, p99 {np.percentile(column, 99):.1f} ms"
         )
     print(f"first trigger after the start: {times_s[0][1] * 1e3:.0f} ms")
+
+
+@pytest.mark.parametrize("rate", ["100 Hz", "200 Hz"])
+def test_the_driver_loses_no_frame_either(rate: str) -> None:
+    settings = {"frame_rate": rate, "readout": "0 ms", "packet_size": PACKET_SIZE}
+    with (
+        plugged_in(_expose, sensor_shape=(512, 512)) as fake,
+        rig(fake.address, clock=NeverStopped(), **settings) as lab,
+    ):
+        lab.take(1, 1e-3)
+        lab.camera.arm(N_FRAMES, 1e-3, "internal")
+        frames = [lab.camera.read(WAIT_S)]
+        begun_s = time.perf_counter()
+        frames += [lab.camera.read(WAIT_S) for _ in range(N_FRAMES - 1)]
+        duration_s = time.perf_counter() - begun_s
+    print(f"\ndriver, {rate} asked: {(N_FRAMES - 1) / duration_s:.1f}/s came")
+    assert [frame.number for frame in frames] == list(range(N_FRAMES))
+    assert [frame.image[0, 0] for frame in frames] == list(range(1, N_FRAMES + 1))
+
+
+def test_one_series_after_the_other_costs_the_driver_no_more_than_a_frame() -> None:
+    settings = {"readout": "0 ms", "packet_size": PACKET_SIZE}
+    with (
+        plugged_in(_expose, sensor_shape=(512, 512)) as fake,
+        rig(fake.address, clock=NeverStopped(), **settings) as lab,
+    ):
+        lab.take(1, 1e-4)
+        times_s: list[float] = []
+        for n in range(N_FRAMES):
+            begun_s = time.perf_counter()
+            (frame,) = lab.take(1, 1e-4)
+            times_s.append(time.perf_counter() - begun_s)
+            assert frame.image[0, 0] == n + 1
+    median_s, late_s = np.quantile(times_s, [0.5, 0.99])
+    print(f"\ndriver, arm to frame: median {median_s * 1e3:.1f} ms, p99 {late_s * 1e3:.1f} ms")

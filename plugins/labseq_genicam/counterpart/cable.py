@@ -26,7 +26,7 @@ BREAK_S: Final = 2e-4
 """How long to wait before it is looked at again, in seconds."""
 
 MOST_BREAKS: Final = 1000
-"""After so many, packets are sent all the same."""
+"""After so many, packets are sent all the same, and no longer wait: a packet socket takes them elsewhere."""
 
 SOCKETS: Final = Path("/proc/net/udp")
 """Linux's table of UDP sockets."""
@@ -56,6 +56,7 @@ class Cable(threading.Thread):
         self._out = out
         self.address: str = out.getsockname()[0]
         self._aimed_at = self._destination = "", 0
+        self._is_read = True
 
     def aim(self, host: str, port: int) -> None:
         """Send the packets of later frames there; those of earlier ones go where they were meant to."""
@@ -70,19 +71,20 @@ class Cable(threading.Thread):
         while packet := self._own.recv(LARGEST_PACKET):
             if packet.startswith(AIM):
                 host, _, port = packet.removeprefix(AIM).decode().rpartition(":")
-                self._destination = host, int(port)
+                self._destination, self._is_read = (host, int(port)), True
                 continue
             self._out.sendto(packet, self._destination)
             n_bytes += len(packet) + OVERHEAD
-            if n_bytes >= BURST:
+            if n_bytes >= BURST and self._is_read:
                 n_bytes = 0
-                self._wait_for_room()
+                self._is_read = self._wait_for_room()
 
-    def _wait_for_room(self) -> None:
+    def _wait_for_room(self) -> bool:
         for _ in range(MOST_BREAKS):
             if n_waiting(self._destination[1]) < BURST:
-                return
+                return True
             time.sleep(BREAK_S)
+        return False
 
 
 def n_waiting(port: int) -> int:
