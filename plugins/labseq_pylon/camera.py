@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any, Final
 
@@ -17,7 +18,7 @@ from labseq import (
     wait_for,
 )
 from labseq_pylon.acquisition import Acquisition
-from labseq_pylon.emulation import EmulatedCamera
+from labseq_pylon.emulation import EmulatedCamera, shown
 from labseq_pylon.finding import find_camera, open_camera
 from labseq_pylon.library import Sdk, load_pypylon
 from labseq_pylon.nodes import Nodes
@@ -93,7 +94,8 @@ class PylonCamera(CameraDriver):
         self._nodes = self._acquisition = None
         try:
             if sdk is not None and camera is not None:
-                with sdk.doing("close the camera"):
+                # One that pylon does not show any more would leave its pipes open.
+                with sdk.doing("close the camera"), shown() if self._emulation else nullcontext():
                     camera.Close()
                     camera.DestroyDevice()
         finally:

@@ -88,7 +88,7 @@ class EmulatedCamera:
         Raises:
             DeviceError: pylon has none.
         """
-        with sdk.doing("make an emulated camera"), _shown():
+        with sdk.doing("make an emulated camera"), shown():
             factory = sdk.pylon.TlFactory.GetInstance()
             layer: Any = factory.CreateTl(EMULATION)
             if layer is None or not (infos := layer.EnumerateDevices()):
@@ -200,7 +200,7 @@ def tiff(image: NDArray[np.uint16]) -> bytes:
 
 
 @contextmanager
-def _shown() -> Generator[None]:
+def shown() -> Generator[None]:
     """Let pylon show emulated cameras; otherwise they never stand among real ones."""
     with _LOCK:
         before = os.environ.get(VARIABLE)
