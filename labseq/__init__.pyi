@@ -91,6 +91,7 @@ from labseq.registry import (
     Registry as Registry,
 )
 from labseq.roles import (
+    Analysis as Analysis,
     Camera as Camera,
     Clock as Clock,
     Context as Context,
@@ -102,12 +103,14 @@ from labseq.roles import (
     KnownLines as KnownLines,
     KnownLoading as KnownLoading,
     KnownSensor as KnownSensor,
+    Leading as Leading,
     Lines as Lines,
     Listening as Listening,
     LossTeller as LossTeller,
     MobileTweezers as MobileTweezers,
     Planner as Planner,
     Polled as Polled,
+    RecordedShot as RecordedShot,
     RfSource as RfSource,
     SelfTesting as SelfTesting,
     Settling as Settling,

@@ -13,7 +13,8 @@ LABSEQ_API: Final = _API
 
 @hookimpl
 def labseq_register(registry: Registry) -> None:
-    """Offer the built-in steps, patterns and detectors."""
+    """Offer the built-in steps, patterns, detectors and analyses."""
+    from labseq.config.analyses import SurvivalSettings
     from labseq.config.detectors import ThresholdSettings, WeightedSettings
     from labseq.config.patterns import BitmapSettings, CompactSettings
     from labseq.config.steps import (
@@ -30,10 +31,12 @@ def labseq_register(registry: Registry) -> None:
     from labseq.geometry import bitmap, compact
     from labseq.imaging import ThresholdDetector, WeightedDetector
     from labseq.imaging.blind import BlindDetector
+    from labseq.imaging.survival import SurvivalAnalysis
     from labseq.sequencer.equalise import EqualiseStep
+    from labseq.sequencer.leading import wait_step
     from labseq.sequencer.probe import ProbeStep
     from labseq.sequencer.rearrange import RearrangeStep
-    from labseq.sequencer.steps import DeviceStep, ImageStep, LoadStep, WaitStep
+    from labseq.sequencer.steps import DeviceStep, ImageStep, LoadStep
     from labseq.sequencer.watching import CheckOverlayStep, CheckSitesStep
 
     registry.step("load", LoadStep, LoadSettings)
@@ -43,10 +46,11 @@ def labseq_register(registry: Registry) -> None:
     registry.step("check_sites", CheckSitesStep, CheckSitesSettings)
     registry.step("check_overlay", CheckOverlayStep, CheckOverlaySettings)
     registry.step("equalise", EqualiseStep, EqualiseSettings)
-    registry.step("wait", WaitStep, WaitSettings)
+    registry.step("wait", wait_step, WaitSettings)
     registry.step("device", DeviceStep, DeviceSettings)
     registry.pattern("compact", compact, CompactSettings)
     registry.pattern("bitmap", bitmap, BitmapSettings)
     registry.detector("threshold", ThresholdDetector, ThresholdSettings)
     registry.detector("weighted", WeightedDetector, WeightedSettings)
     registry.detector("blind", BlindDetector)
+    registry.analysis("survival", SurvivalAnalysis, SurvivalSettings)

@@ -221,15 +221,18 @@ class TransientError(LabseqError):
 
 
 class StopRequested(LabseqError):  # noqa: N818 - a request, not an error
-    """The operator asked the run to stop; raised by every wait, within 50 ms.
+    """The operator asked the run to stop; raised by every wait, within 50 ms, or between two shots.
 
     Attributes:
-        signal_number: 2 for Ctrl-C (SIGINT), 15 for SIGTERM.
+        signal_number: 2 for Ctrl-C (SIGINT), 15 for SIGTERM and for ``labseq stop``.
+        after_shot: Whether ``labseq stop`` asked for it, and the shot at hand was taken to its end.
     """
 
-    def __init__(self, signal_number: int = 2) -> None:
+    def __init__(self, signal_number: int = 2, *, after_shot: bool = False) -> None:
         self.signal_number = signal_number
-        super().__init__("stopped by Ctrl-C" if signal_number == 2 else "stopped by SIGTERM")
+        self.after_shot = after_shot
+        by = "Ctrl-C" if signal_number == 2 else "SIGTERM"
+        super().__init__("stopped by 'labseq stop'" if after_shot else f"stopped by {by}")
 
 
 def one_of(names: Sequence[str]) -> str:

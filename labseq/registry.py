@@ -20,6 +20,7 @@ KINDS: Final = (
     "step",
     "pattern",
     "simulation",
+    "analysis",
 )
 """Kinds of plugin that the registry knows."""
 
@@ -127,6 +128,10 @@ class Registry:
     def simulation(self, name: str, factory: Factory, settings_model: type[Any] | None = None) -> None:
         """Offer a simulated world: ``factory(settings, context) -> Simulation``."""
         self._add("simulation", name, factory, settings_model, virtual_time=True)
+
+    def analysis(self, name: str, factory: Factory, settings_model: type[Any] | None = None) -> None:
+        """Offer an analysis of shots: ``factory(settings, context) -> Analysis``."""
+        self._add("analysis", name, factory, settings_model)
 
     def camera(
         self, name: str, factory: Factory, settings_model: type[Any] | None = None, **options: Any

@@ -103,6 +103,21 @@ def parse_quantity(text: str, dimension: str) -> float:
     return scaled(float(match[1]), units[unit])
 
 
+def si_unit_of(text: str) -> str:
+    """The SI unit that a quantity is read into, whatever its dimension; "" for a fraction or no quantity.
+
+    Example:
+        >>> si_unit_of("60 ms"), si_unit_of("130 um/ms"), si_unit_of("75 %"), si_unit_of("7")
+        ('s', 'm/s', '', '')
+    """
+    match = _NUMBER.match(text)
+    unit = "" if match is None else match[2] or ""
+    if unit == "degC":
+        return "K"
+    known = next((units for units in UNITS.values() if unit and unit in units), {})
+    return next((name for name, factor in known.items() if factor == 1.0), "")
+
+
 def scaled(number: float, factor: float) -> float:
     """Multiply so that powers of ten come out exact: 4.49 um is 4.49e-06, not 4.4899...e-06.
 

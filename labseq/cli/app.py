@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from labseq import __version__
-from labseq.cli import plan_options, plot_options, waveform_options
+from labseq.cli import plan_options, plot_options, show_options, waveform_options
 from labseq.cli.bench_app import bench
 from labseq.cli.calibration_app import CALIBRATE_EXAMPLES, calibrate, calibration
-from labseq.cli.shared_options import DryRun, Json, Overrides, Profile
+from labseq.cli.data_app import DOCTOR_EXAMPLES, EXPORT_EXAMPLES, doctor, export
+from labseq.cli.queue_app import queue
+from labseq.cli.replay_app import ANALYSE_EXAMPLES, REPLAY_EXAMPLES, analyse, replay
+from labseq.cli.run_app import RESUME_EXAMPLES, RUN_EXAMPLES, resume, run, stop
+from labseq.cli.shared_options import (
+    DryRun,
+    Json,
+    Overrides,
+    Profile,
+    RunFolder,
+    SequenceFile,
+)
 
 app = typer.Typer(
     name="labseq",
@@ -22,24 +32,8 @@ app = typer.Typer(
 )
 app.add_typer(bench)
 app.add_typer(calibration)
+app.add_typer(queue)
 app.command(epilog=CALIBRATE_EXAMPLES, short_help="Calibrate sites, thresholds, tones or overlay.")(calibrate)
-
-RUN_EXAMPLES = """\b
-Examples:
-  labseq run sequences/compact_225.yaml
-  labseq run sequences/compact_225.yaml --shots 5 --seed 1 --json
-  labseq run sequences/compact_225.yaml --profile lab --dry-run
-  labseq run sequences/compact_225.yaml --set planner.degree_of_parallelism=2 --set shot.2.rearrange.window="200 ms"
-"""  # noqa: E501 - a command line that is to be copied
-
-
-SequenceFile = Annotated[
-    Path, typer.Argument(metavar="SEQUENCE", help="The sequence file.", show_default=False)
-]
-RunFolder = Annotated[
-    Path | None,
-    typer.Argument(metavar="RUN", help="A run's folder; the newest run by default.", show_default=False),
-]
 
 
 def _print_version(wanted: bool) -> None:
@@ -61,42 +55,9 @@ def common(
     """Take the options that come before the command; ``main`` looks at ``--debug`` itself."""
 
 
-@app.command(epilog=RUN_EXAMPLES)
-def run(
-    sequence: SequenceFile,
-    profile: Profile = None,
-    dry_run: DryRun = None,
-    shots: Annotated[
-        int | None, typer.Option(metavar="N", help="Number of shots, instead of the sequence's own.")
-    ] = None,
-    seed: Annotated[
-        int | None,
-        typer.Option(metavar="N", help="Seed of all random numbers: the same seed, the same run."),
-    ] = None,
-    overrides: Overrides = None,
-    output: Annotated[
-        Path | None,
-        typer.Option(metavar="DIR", help="Folder for the data, instead of LABSEQ_DATA or ./data."),
-    ] = None,
-    as_json: Json = False,
-    realtime: Annotated[
-        bool, typer.Option("--realtime", help="Let a simulated run take as long as a real one.")
-    ] = False,
-) -> None:
-    """Run a sequence and record every shot."""
-    from labseq.cli.run import run_sequence
-    from labseq.session import Options
-
-    options = Options(
-        profile=profile,
-        shots=shots,
-        seed=seed,
-        overrides=tuple(overrides or ()),
-        output=output,
-        dry_run="off" if dry_run is None else dry_run.value,
-        realtime=realtime,
-    )
-    run_sequence(sequence, options, as_json=as_json)
+app.command(epilog=RUN_EXAMPLES, short_help="Run a sequence and record every shot.")(run)
+app.command(epilog=RESUME_EXAMPLES, short_help="Go on with a run that ended early.")(resume)
+app.command(short_help="End a run in progress after the shot at hand.")(stop)
 
 
 @app.command(short_help="Check a sequence; print its timeline and limits.")
@@ -180,28 +141,51 @@ def waveform(
     show_waveform(WaveformRequest(request, batches, sample_rate), output)
 
 
-@app.command()
+@app.command(short_help="Show what a run has recorded.")
 def show(
     run: RunFolder = None,
+    shots: show_options.Shots = False,
+    timing: show_options.Timing = False,
+    scan: show_options.Scan = False,
+    devices: show_options.Devices = False,
     as_json: Json = False,
 ) -> None:
-    """Show what a run has recorded, finished or not."""
-    from labseq.cli.show import show_run
+    """Show what a run has recorded, finished or not: its summary, or the tables that are asked for."""
+    from labseq.cli.show import Tables, show_run
 
-    show_run(run, as_json=as_json)
+    show_run(run, as_json=as_json, tables=Tables(shots, timing, scan, devices))
 
 
-@app.command(epilog=plot_options.EXAMPLES, short_help="Draw a run as a figure of the paper.")
+@app.command(short_help="Watch a run that goes on in another process.")
+def watch(run: RunFolder = None) -> None:
+    """Show a run that goes on in another process, until it ends; Ctrl-C ends only the view."""
+    from labseq.cli.watch import watch_run
+
+    watch_run(run)
+
+
+@app.command(epilog=plot_options.EXAMPLES, short_help="Draw a run, or one of its shots.")
 def plot(
-    figure: plot_options.Figure,
     run: RunFolder = None,
-    output: plot_options.Output = None,
+    what: plot_options.What = None,
+    shot: plot_options.Shot = None,
+    cycle: plot_options.Cycle = None,
+    figure: plot_options.Figure = None,
     compare: plot_options.Compare = None,
+    output: plot_options.Output = None,
 ) -> None:
-    """Draw a run as a figure of the paper, beside the paper's own points."""
-    from labseq.cli.plot import plot_run
+    """Draw a run, finished or not: all of it on one sheet, a part of it, a shot, or a figure of the paper."""
+    from labseq.cli.plot import PlotRequest, plot_run
 
-    plot_run(run, figure, output, compare)
+    plot_run(run, PlotRequest(what, figure, compare, shot, cycle), output)
+
+
+app.command(epilog=REPLAY_EXAMPLES, short_help="Try another planner or detector on a run's images.")(replay)
+app.command(epilog=ANALYSE_EXAMPLES, short_help="Analyse the shots of a run.")(analyse)
+
+
+app.command(epilog=EXPORT_EXAMPLES, short_help="Export a run as CSV, Parquet, netCDF or HDF5.")(export)
+app.command(epilog=DOCTOR_EXAMPLES, short_help="Find and repair damage in recorded data.")(doctor)
 
 
 @app.command(short_help="List the plugins and what they offer.")

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Final
+
+_PLAIN: Final = frozenset({"doctor"})
+"""Commands whose ``--dry-run`` has no value."""
 
 
 def arrange(arguments: Sequence[str]) -> list[str]:
@@ -18,5 +22,6 @@ def arrange(arguments: Sequence[str]) -> list[str]:
     end = arguments.index("--") if "--" in arguments else len(arguments)
     options, rest = arguments[:end], arguments[end:]
     debug = ["--debug"] if "--debug" in options else []
-    given = {"--dry-run": "--dry-run=full"}
+    command = next((option for option in options if not option.startswith("-")), "")
+    given = {} if command in _PLAIN else {"--dry-run": "--dry-run=full"}
     return [*debug, *(given.get(option, option) for option in options if option != "--debug"), *rest]

@@ -33,7 +33,7 @@ def show_devices(profile: str, overrides: Sequence[str], dry_run: DryRun, *, as_
 
     Raises:
         ConfigError: The profile is wrong; no device was touched.
-        DeviceError: A run is in progress on the same devices; none was touched.
+        DeviceError: Somebody else uses the same devices; none was touched.
         StopRequested: Ctrl-C or SIGTERM came meanwhile; told are the devices that were tried.
     """
     answer = divert_stdout() if as_json else None

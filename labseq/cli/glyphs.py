@@ -21,6 +21,7 @@ class Glyphs:
         left: Part of a bar that is left.
         plus_minus: Before an uncertainty.
         to: Between the ends of an interval.
+        levels: Parts of a cell that are filled from below, from the least to the whole.
         upper: Upper half of a cell; "" where there are no half blocks.
         lower: Lower half of a cell.
         both: A whole cell.
@@ -34,6 +35,7 @@ class Glyphs:
     left: str
     plus_minus: str
     to: str
+    levels: str
     upper: str = ""
     lower: str = ""
     both: str = ""
@@ -44,8 +46,8 @@ class Glyphs:
         return "".join(getattr(self, name) for name in self.__slots__)
 
 
-UNICODE: Final = Glyphs("●", "○", "×", "·", "━", "╌", "±", "–", "▀", "▄", "█")  # noqa: RUF001 - meant
-ASCII: Final = Glyphs("@", "o", "x", ".", "#", "-", "+-", "-")
+UNICODE: Final = Glyphs("●", "○", "×", "·", "━", "╌", "±", "–", "▁▂▃▄▅▆▇█", "▀", "▄", "█")  # noqa: RUF001 - meant
+ASCII: Final = Glyphs("@", "o", "x", ".", "#", "-", "+-", "-", ".:#")
 
 
 def glyphs_for(encoding: str | None) -> Glyphs:

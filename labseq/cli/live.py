@@ -26,21 +26,32 @@ from labseq.roles import RunObserver
 REDRAW_S: Final = 0.25
 """The view is drawn at most this often."""
 
-_BETWEEN_SHOTS: Final = frozenset({"run_started", "shot_finished", "shot_repeated", "run_finished"})
+_BETWEEN_SHOTS: Final = frozenset(
+    {"run_started", "leader_awaited", "shot_finished", "shot_repeated", "run_finished"}
+)
 
 
 class ClosingObserver(RunObserver, Protocol):
     """An observer that must be told when the run is over, in whatever way."""
+
+    def refresh(self) -> None:
+        """Show what has been told so far."""
+        ...
 
     def close(self) -> None:
         """Leave the screen in order."""
         ...
 
 
-def observer_for(stream: TextIO) -> ClosingObserver:
-    """The live view if the stream is a terminal that can show it, else plain lines."""
+def observer_for(stream: TextIO, run_now: Callable[[], float] | None = None) -> ClosingObserver:
+    """The live view if the stream is a terminal that can show it, else plain lines.
+
+    Args:
+        stream: Where it is shown.
+        run_now: Time of the run in seconds, where that is not the time of this process.
+    """
     if stream.isatty() and os.environ.get("TERM", "") not in {"dumb", "unknown"}:
-        return LiveView(Console(file=stream))
+        return LiveView(Console(file=stream), run_now=run_now)
     return LogLines(stream)
 
 
@@ -54,13 +65,19 @@ class LiveView:
     Args:
         console: The terminal.
         now: Monotonic time in seconds.
+        run_now: Time of the run in seconds; by default the same.
     """
 
-    def __init__(self, console: Console, now: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self,
+        console: Console,
+        now: Callable[[], float] = time.monotonic,
+        run_now: Callable[[], float] | None = None,
+    ) -> None:
         self._console = console
         self._now = now
         self._glyphs = glyphs_for(console.encoding)
-        self._tally = Tally(now)
+        self._tally = Tally(run_now or now)
         self._recent: deque[str] = deque(maxlen=3)
         self._live = Live(console=console, auto_refresh=False, vertical_overflow="crop")
         self._drawn_s = -math.inf
@@ -79,6 +96,11 @@ class LiveView:
         elif name == "run_finished":
             self.close()
         elif self._is_time(name):
+            self._draw()
+
+    def refresh(self) -> None:
+        """Draw now, as far as the view is on."""
+        if self._live.is_started:
             self._draw()
 
     def close(self) -> None:

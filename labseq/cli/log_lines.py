@@ -31,5 +31,8 @@ class LogLines:
         if text:
             say(text, stream=self._stream)
 
+    def refresh(self) -> None:
+        """Every line was printed at once."""
+
     def close(self) -> None:
         """Nothing to leave in order."""

@@ -11,14 +11,17 @@ from rich.text import Text
 from labseq.cli.array import Scale, draw_array, scales
 from labseq.cli.glyphs import Glyphs
 from labseq.cli.output import columns
+from labseq.cli.scan_plot import draw_scan
 from labseq.cli.tally import StageTally, Tally
 from labseq.cli.words import clock_time, count_of, percent, plural
 from labseq.model import RunRecord
 from labseq.recording.rates import jeffreys
 from labseq.units import format_quantity
 
-SIDE_WIDTH: Final = 44
+SIDE_WIDTH: Final = 48
 GAP: Final = 3
+SCAN_HEIGHT: Final = 8
+"""Most lines of the plot of a scan."""
 
 
 def draw(tally: Tally, recent: Sequence[str], width: int, height: int, glyphs: Glyphs) -> Text:
@@ -36,7 +39,7 @@ def draw(tally: Tally, recent: Sequence[str], width: int, height: int, glyphs: G
     """
     room = height - 1  # the cursor's line
     lines = [_progress(tally, width, glyphs)]
-    side = _side(tally, glyphs)
+    side = _side(tally, glyphs, room - 1)
     body = _beside(_array(tally, width, room - 1, glyphs), side)
     spare = room - len(body) - 4
     lines += [Text()] * (spare > 0) + body[: max(0, room - 1)] + [Text()] * (spare > 1)
@@ -49,14 +52,15 @@ def draw(tally: Tally, recent: Sequence[str], width: int, height: int, glyphs: G
 
 def _progress(tally: Tally, width: int, glyphs: Glyphs) -> Text:
     left_s = tally.time_left_s()
-    text = f"  {tally.n_done}/{tally.n_shots} shots"
+    n_on_disk = tally.n_before + tally.n_done
+    text = f"  {n_on_disk}/{tally.n_shots} shots"
     if tally.status:
         text += f"  {tally.status}"
     elif not math.isnan(left_s):
         text += f"  {clock_time(left_s)} left"
     name = tally.record.name if tally.record is not None else ""
     bar = min(60, max(0, width - len(name) - len(text) - 2))
-    n_done = min(bar, round(bar * tally.n_done / max(1, tally.n_shots)))
+    n_done = min(bar, round(bar * n_on_disk / max(1, tally.n_shots)))
     return Text.assemble(
         (f"{name}  ", "bold"), (glyphs.done * n_done, "green"), (glyphs.left * (bar - n_done), "dim"), text
     )
@@ -103,10 +107,14 @@ def _beside(array: list[Text], side: list[Text]) -> list[Text]:
     return lines
 
 
-def _side(tally: Tally, glyphs: Glyphs) -> list[Text]:
+def _side(tally: Tally, glyphs: Glyphs, room: int) -> list[Text]:
     lines = [*_rates(tally, glyphs), Text(), *_stages(tally)]
     caption = _caption(tally)
-    return [*lines, Text(), *caption] if caption else lines
+    if caption:
+        lines += [Text(), *caption]
+    free = room - len(lines) - 1
+    plot = [] if tally.scan is None else draw_scan(tally.scan, SIDE_WIDTH, min(free, SCAN_HEIGHT), glyphs)
+    return [*lines, Text(), *plot] if plot else lines
 
 
 def _rates(tally: Tally, glyphs: Glyphs) -> list[Text]:
@@ -131,18 +139,23 @@ def _rates(tally: Tally, glyphs: Glyphs) -> list[Text]:
 
 
 def _stages(tally: Tally) -> list[Text]:
-    session = "modelled" if tally.record is None or tally.record.simulated else "measured"
+    simulated = tally.record is None or tally.record.simulated
     seen = [(name, stage) for name, stage in tally.stages.items() if stage.host_s]
-    table = [("stage", "host", session, "budget", "over"), *(_stage_row(name, stage) for name, stage in seen)]
-    header, *rows = columns(table, right=(1, 2, 3, 4))
+    heads = ("host", "p99", "modelled") if simulated else ("p50", "p99")
+    table = [("stage", *heads, "budget", "over")]
+    table += [_stage_row(name, stage, simulated=simulated) for name, stage in seen]
+    header, *rows = columns(table, right=range(1, len(heads) + 3))
     styles = ["yellow" if stage.n_over else "" for _, stage in seen]
     return [Text(header, "bold"), *(Text(row, style) for row, style in zip(rows, styles, strict=True))]
 
 
-def _stage_row(name: str, stage: StageTally) -> tuple[str, ...]:
-    host_s, duration_s = (format_quantity(value, "time") for value in stage.medians_s())
+def _stage_row(name: str, stage: StageTally, *, simulated: bool) -> tuple[str, ...]:
+    """On real hardware both clocks are the same."""
+    host_s, session_s = stage.medians_s()
+    times_s = (host_s, stage.p99_s(), session_s) if simulated else (session_s, stage.p99_s())
     budget = "-" if math.isnan(stage.budget_s) else format_quantity(stage.budget_s, "time")
-    return name, host_s, duration_s, budget, str(stage.n_over) if stage.n_over else ""
+    over = str(stage.n_over) if stage.n_over else ""
+    return name, *(format_quantity(time_s, "time") for time_s in times_s), budget, over
 
 
 def _caption(tally: Tally) -> list[Text]:

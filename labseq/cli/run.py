@@ -1,4 +1,4 @@
-"""``labseq run``: a session with a view, and what came of it."""
+"""``labseq run`` and ``labseq resume``: a session with a view, and what came of it."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ from pathlib import Path
 from labseq.cli.failures import lines_of
 from labseq.cli.live import observer_for
 from labseq.cli.output import divert_stdout, say
-from labseq.cli.show import as_line, json_summary, summary_lines
+from labseq.cli.show import as_line, existing, json_summary, summary_lines
 from labseq.errors import LabseqError, RecordingError, StopRequested
 from labseq.recording import Run, open_run
+from labseq.roles import RunObserver
 from labseq.session import Options, Session
 
 
@@ -28,12 +29,49 @@ def run_sequence(sequence: Path, options: Options, *, as_json: bool) -> None:
     Raises:
         LabseqError: Whatever ended the run.
     """
+
+    def start(observer: RunObserver | None) -> Session:
+        return Session.open(sequence, **asdict(options), observer=observer)
+
+    run_session(start, as_json=as_json)
+
+
+def resume_run(path: Path, *, accept_changes: bool, realtime: bool, as_json: bool) -> None:
+    """Go on with a run that ended early, and say what came of it.
+
+    Args:
+        path: The run's folder or any file in it.
+        accept_changes: Whether to go on although something differs from then.
+        realtime: Let virtual time take as long as it says.
+        as_json: Whether to print the outcome as JSON, last and alone on stdout.
+
+    Raises:
+        LabseqError: Whatever ended the run.
+    """
+
+    def resume(observer: RunObserver | None) -> Session:
+        options = {"accept_changes": accept_changes, "realtime": realtime}
+        return Session.resume(existing(path), **options, observer=observer)
+
+    run_session(resume, as_json=as_json)
+
+
+def run_session(opening: Callable[[RunObserver | None], Session], *, as_json: bool) -> None:
+    """Run a session and say what came of it, also when it was stopped or failed.
+
+    Args:
+        opening: Opens the session; is given the observer that shows it.
+        as_json: Whether to print the outcome as JSON, last and alone on stdout.
+
+    Raises:
+        LabseqError: Whatever ended the run.
+    """
     answer = divert_stdout() if as_json else None
     observer = observer_for(sys.stdout)
     session: Session | None = None
     failure: BaseException | None = None
     try:
-        session = Session.open(sequence, **asdict(options), observer=observer)
+        session = opening(observer)
         with session:
             session.run()
     except BaseException as error:

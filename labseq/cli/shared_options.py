@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from enum import StrEnum
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -45,4 +46,21 @@ DryRun = Annotated[
 ]
 Json = Annotated[
     bool, typer.Option("--json", help="Print the outcome as one line of JSON on stdout, all else on stderr.")
+]
+SequenceFile = Annotated[
+    Path, typer.Argument(metavar="SEQUENCE", help="The sequence file.", show_default=False)
+]
+Shots = Annotated[
+    int | None, typer.Option(metavar="N", help="Number of shots, instead of the sequence's own.")
+]
+Seed = Annotated[
+    int | None, typer.Option(metavar="N", help="Seed of all random numbers: the same seed, the same run.")
+]
+Output = Annotated[
+    Path | None, typer.Option(metavar="DIR", help="Folder for the data, instead of LABSEQ_DATA or ./data.")
+]
+Realtime = Annotated[bool, typer.Option("--realtime", help="Let a simulated run take as long as a real one.")]
+RunFolder = Annotated[
+    Path | None,
+    typer.Argument(metavar="RUN", help="A run's folder; the newest run by default.", show_default=False),
 ]

@@ -3,14 +3,23 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Any, Final
 
 from labseq.cli.failures import lines_of
 from labseq.cli.output import columns, say
+from labseq.cli.show_tables import (
+    devices_table,
+    json_devices,
+    json_shots,
+    json_timing,
+    shot_time_s,
+    shots_table,
+    timing_table,
+)
 from labseq.cli.statistics import counted_text, cycle_table, share_text, statistics_rows
 from labseq.cli.telling import outcome
 from labseq.cli.words import percent, plural
@@ -27,27 +36,83 @@ MAX_ROWS: Final = 40
 """Rows of a table; of a longer one the first and the last are shown."""
 
 
-def show_run(path: Path | None, *, as_json: bool) -> None:
+@dataclass(frozen=True, slots=True)
+class Tables:
+    """Which tables are wanted; the summary if none is."""
+
+    shots: bool = False
+    timing: bool = False
+    scan: bool = False
+    devices: bool = False
+
+    @property
+    def any(self) -> bool:
+        """Whether one is."""
+        return self.shots or self.timing or self.scan or self.devices
+
+
+def show_run(path: Path | None, *, as_json: bool, tables: Tables | None = None) -> None:
     """Print what a run has recorded.
 
     Args:
         path: The run's folder or any file in it; None for the newest run.
         as_json: Whether to print one line of JSON instead.
+        tables: Which tables to print instead of the summary.
 
     Raises:
-        ConfigError: There is no such run.
+        ConfigError: There is no such run, or it has not what a table is to show.
         RecordingError: It is damaged.
     """
+    wanted = tables or Tables()
     try:
         run = chosen_run(path)
+        values = (_json_tables(run, wanted) if wanted.any else json_summary(run)) if as_json else {}
     except LabseqError as error:
         if as_json:
             say(as_line(json_summary(None) | {"error": "\n".join(lines_of(error))}))
         raise
     if as_json:
-        say(as_line(json_summary(run)))
+        say(as_line(values))
+    elif wanted.any:
+        say(*_told(run, wanted))
     else:
         say(*shot_table(run), "", *summary_lines(run))
+
+
+def _told(run: Run, wanted: Tables) -> list[str]:
+    """The tables that are wanted, with an empty line between them."""
+    found: list[list[str]] = []
+    if wanted.shots:
+        found.append(shots_table(run))
+    if wanted.timing:
+        found.append(timing_table(run))
+    if wanted.scan:
+        found.append(_points(run))
+    if wanted.devices:
+        found.append(devices_table(run))
+    return [line for table in found for line in ("", *table)][1:]
+
+
+def _points(run: Run) -> list[str]:
+    lines = point_table(run, whole=True)
+    if not lines:
+        what = "the run has no scan" if not run.record.get("scan") else "the scan has no shots yet"
+        raise ConfigError(Problem(what, clean(str(run.path)), expected="a run of a sequence with 'scan:'"))
+    return lines
+
+
+def _json_tables(run: Run, wanted: Tables) -> dict[str, Any]:
+    values: dict[str, Any] = {"run_dir": str(run.path), "status": run.status}
+    if wanted.shots:
+        values["shot_list"] = json_shots(run)
+    if wanted.timing:
+        values["timing"] = json_timing(run)
+    if wanted.scan:
+        _points(run)
+        values["points"] = _json_points(run)
+    if wanted.devices:
+        values["devices"] = json_devices(run)
+    return values
 
 
 def chosen_run(path: Path | None) -> Run:
@@ -60,10 +125,15 @@ def chosen_run(path: Path | None) -> Run:
         ConfigError: There is no such run: a mistake of the user, not of the data.
         RecordingError: It is damaged.
     """
-    return open_run(newest_run(data_root()) if path is None else _existing(path))
+    return open_run(newest_run(data_root()) if path is None else existing(path))
 
 
-def _existing(path: Path) -> Path:
+def existing(path: Path) -> Path:
+    """The folder of the run that a command is given.
+
+    Raises:
+        ConfigError: There is no such run: a mistake of the user, not of the data.
+    """
     try:
         return find_run(path)
     except RecordingError as error:
@@ -95,21 +165,24 @@ def json_summary(run: Run | None) -> dict[str, Any]:
     if run is None:
         nothing = {"defect_free": None, "filling_fraction": None}
         return {"run_dir": None, "shots": 0, **nothing, "status": "failed"}
-    target = run.target
-    values = run.summary() | {"statistics": statistics_of(run.shots, target).as_dict()}
-    points = [(point, statistics_of(point.shots, target)) for point in scan_points(run)]
-    if points:
-        values["points"] = [
-            {
-                "parameters": dict(point.parameters),
-                "shots": len(point.shots),
-                "defect_free": to_plain(statistics.defect_free.value),
-                "filling_fraction": to_plain(statistics.filling.value),
-                "statistics": statistics.as_dict(),
-            }
-            for point, statistics in points
-        ]
+    values = run.summary() | {"statistics": statistics_of(run.shots, run.target).as_dict()}
+    if points := _json_points(run):
+        values["points"] = points
     return values | ({"error": run.error} if run.error else {})
+
+
+def _json_points(run: Run) -> list[dict[str, Any]]:
+    points = [(point, statistics_of(point.shots, run.target)) for point in scan_points(run)]
+    return [
+        {
+            "parameters": dict(point.parameters),
+            "shots": len(point.shots),
+            "defect_free": to_plain(statistics.defect_free.value),
+            "filling_fraction": to_plain(statistics.filling.value),
+            "statistics": statistics.as_dict(),
+        }
+        for point, statistics in points
+    ]
 
 
 def as_line(values: Mapping[str, Any]) -> str:
@@ -117,10 +190,14 @@ def as_line(values: Mapping[str, Any]) -> str:
     return json.dumps(values)
 
 
-def point_table(run: Run) -> list[str]:
+def point_table(run: Run, *, whole: bool = False) -> list[str]:
     """A table of the scan's points; nothing without a scan.
 
     Where no shot is judged, the images that ended the last cycles are.
+
+    Args:
+        run: The run.
+        whole: Whether a long table is shown in full.
     """
     points = [(point, statistics_of(point.shots, run.target)) for point in scan_points(run)]
     if not points:
@@ -135,7 +212,8 @@ def point_table(run: Run) -> list[str]:
     names = ("filling", "defect-free")
     last = names if judged else tuple(f"{name}, last cycle" for name in names)
     header = (*map(clean, points[0][0].written), "shots", *last)
-    return _shortened(columns([header, *rows], right=tuple(range(len(header) - 1))))
+    lines = columns([header, *rows], right=tuple(range(len(header) - 1)))
+    return lines if whole else _shortened(lines)
 
 
 def _shortened(lines: list[str]) -> list[str]:
@@ -155,11 +233,7 @@ def shot_table(run: Run) -> list[str]:
 
 
 def _shot_row(shot: Shot, n_atoms: int) -> tuple[str, ...]:
-    row = shot.row
-    found = row.get("stage_s")
-    stages: Mapping[str, object] = found if isinstance(found, dict) else {}  # the line may be damaged
-    steps_s = [s for name, s in stages.items() if name.startswith("step ")]
-    duration_s = math.fsum(s for s in steps_s if isinstance(s, float | int))
+    row, duration_s = shot.row, shot_time_s(shot)
     return (
         str(shot.index + 1),
         outcome(shot.success, shot.seen_defect_free_cycle, shot.filling_fraction, n_atoms),

@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
+from labseq.cli.scan_plot import ScanTally
 from labseq.model import ImageRecord, RunRecord, ShotRecord, StageTiming
 
 STAGES: Final = ("expose", "detect", "plan", "check", "prepare", "play", "move")
@@ -45,6 +46,11 @@ class StageTally:
         """Median on this computer's clock, and on the session's."""
         return statistics.median(self.host_s), statistics.median(self.duration_s)
 
+    def p99_s(self) -> float:
+        """The 99th percentile on this computer's clock: the second longest of 200."""
+        longest = sorted(self.host_s)
+        return longest[math.ceil(0.99 * len(longest)) - 1]
+
 
 class Tally:
     """Sums up a run's events; unknown events are ignored.
@@ -55,7 +61,8 @@ class Tally:
     Attributes:
         record: The run, from "run_starting" on.
         run_dir: Its folder, or "".
-        n_done: Shots that are complete.
+        n_before: Shots that were complete when the run was resumed.
+        n_done: Shots that are complete since then.
         n_defect_free: How many of them met the target.
         n_seen: How many of them met it in some image.
         n_filled: How many of them have a filling fraction.
@@ -64,6 +71,7 @@ class Tally:
         image_shot: The shot that it is of.
         shot: The shot that runs, or the last one.
         stages: Stage -> its durations.
+        scan: The points of the scan; None without one.
         status: How the run ended, or "".
     """
 
@@ -72,6 +80,7 @@ class Tally:
         self._first_shot_s = math.nan
         self.record: RunRecord | None = None
         self.run_dir = ""
+        self.n_before = 0
         self.n_done = 0
         self.n_defect_free = 0
         self.n_seen = 0
@@ -83,6 +92,7 @@ class Tally:
         self.image_shot = 0
         self.shot = 0
         self.stages = {name: StageTally() for name in STAGES}
+        self.scan: ScanTally | None = None
         self.status = ""
 
     @property
@@ -109,6 +119,10 @@ class Tally:
                 self.n_repeated += 1
             case "run_starting":
                 self.record, self.run_dir = values["record"], values["run_dir"]
+                self.n_before = values.get("n_before", 0)
+                self.status = ""
+                if self.scan is None and values["record"].scan:  # a run that is resumed goes on with its own
+                    self.scan = ScanTally(values["record"].scan)
             case "run_finished":
                 self.status = values["status"]
             case _:
@@ -120,6 +134,8 @@ class Tally:
         self.n_done += 1
         self.n_defect_free += shot.success
         self.n_seen += shot.success or shot.seen_defect_free_cycle > 0
+        if self.scan is not None:
+            self.scan.add(shot)
         if not math.isnan(shot.filling_fraction):
             self._add_filling(shot.filling_fraction)
 
@@ -141,4 +157,4 @@ class Tally:
         """Expected time to the end of the run, by the shots so far; nan before the first is done."""
         if not self.n_done:
             return math.nan
-        return (self._now() - self._first_shot_s) / self.n_done * (self.n_shots - self.n_done)
+        return (self._now() - self._first_shot_s) / self.n_done * (self.n_shots - self.n_before - self.n_done)

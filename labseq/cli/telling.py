@@ -30,7 +30,7 @@ def tell(name: str, values: Mapping[str, Any], run: RunRecord | None) -> str:
     """
     match name:
         case "run_starting":
-            return tell_run(values["record"], values["run_dir"])
+            return tell_run(values["record"], values["run_dir"], values.get("n_before", 0))
         case "shot_finished":
             return tell_shot(values["shot"], run)
         case "shot_repeated":
@@ -51,17 +51,22 @@ def tell(name: str, values: Mapping[str, Any], run: RunRecord | None) -> str:
         case "window_too_short":
             where = f"shot {values['shot'] + 1}, cycle {values['cycle']}"
             return f"{where}: {values['n_batches_played']} of {values['n_batches']} batches fit the window"
+        case "leader_awaited":
+            longest = format_quantity(values["timeout_s"], "time")
+            who, signal = values["device"], values["signal"]
+            return f"shot {values['shot'] + 1}: waiting for '{signal}' from {who}, at most {longest}"
         case "device_command":
             return f"shot {values['shot'] + 1}: {values['device']}: {values['command']}"
         case _:
             return ""
 
 
-def tell_run(run: RunRecord, run_dir: str) -> str:
-    """A line about a run that starts."""
+def tell_run(run: RunRecord, run_dir: str, n_before: int = 0) -> str:
+    """A line about a run that starts, or goes on with so many shots taken before."""
     simulated = ", simulated" if run.simulated else ""
     profile = Path(run.profile_path).stem
-    return f"{run_dir}: {plural(run.n_shots, 'shot')}, seed {run.seed}, profile {profile}{simulated}"
+    before = f", {n_before} of them taken before" if n_before else ""
+    return f"{run_dir}: {plural(run.n_shots, 'shot')}{before}, seed {run.seed}, profile {profile}{simulated}"
 
 
 def tell_shot(shot: ShotRecord, run: RunRecord | None) -> str:

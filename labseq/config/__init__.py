@@ -4,7 +4,7 @@ from labseq.config.addresses import Override, profile_overrides, split_overrides
 from labseq.config.calibrations import CalibrationChoices, CalibrationSettings
 from labseq.config.collect import Collected
 from labseq.config.devices import DEVICE_KEYS
-from labseq.config.document import Document
+from labseq.config.document import Document, Kept
 from labseq.config.fields import ROLES, Choice, plugin_paths
 from labseq.config.find import find_profile, packaged_profiles_dir
 from labseq.config.lines import LINES_KEYS
@@ -49,6 +49,7 @@ __all__ = [
     "Document",
     "EqualiseSettings",
     "ImageSettings",
+    "Kept",
     "LoadSettings",
     "Loc",
     "MotionSettings",

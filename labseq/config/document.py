@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, TypeVar, cast, overload
+from typing import Any, NamedTuple, TypeVar, cast, overload
 
 from pydantic import BaseModel
 
@@ -20,6 +20,18 @@ from labseq.config.wording import shown, visible
 from labseq.errors import ConfigError, Problem
 
 M = TypeVar("M", bound=BaseModel)
+
+
+class Kept(NamedTuple):
+    """The text of a file as it was at another time; paths in it stay relative to the file.
+
+    Attributes:
+        text: The text.
+        name: What messages call it, for example the path of the copy.
+    """
+
+    text: str
+    name: str
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,13 +63,18 @@ class Document:
         object.__setattr__(self, "data", self.root.plain())
 
     @classmethod
-    def read(cls, path: Path) -> Document:
+    def read(cls, path: Path, kept: Kept | None = None) -> Document:
         """Read a file.
+
+        Args:
+            path: The file.
+            kept: What it says, in place of what it says today; it need not exist then.
 
         Raises:
             ConfigError: It cannot be read, or is no strict YAML 1.2 with a mapping at the top.
         """
-        return replace(cls.parse(read_bytes(path), visible(str(path))), path=path)
+        text, name = (read_bytes(path), str(path)) if kept is None else kept
+        return replace(cls.parse(text, visible(name)), path=path)
 
     @classmethod
     def parse(cls, text: str | bytes, name: str) -> Document:

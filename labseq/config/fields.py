@@ -83,7 +83,7 @@ class Choice(Settings):
         """Where its mapping is in the document."""
         return self._loc
 
-    def placed(self, *loc: str) -> Self:
+    def placed(self, *loc: str | int) -> Self:
         """A copy that says where its mapping is."""
         copy = self.model_copy()
         copy._loc = loc  # noqa: SLF001 - its own

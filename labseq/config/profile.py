@@ -14,7 +14,7 @@ from labseq.config.addresses import Override
 from labseq.config.calibrations import CalibrationSettings
 from labseq.config.collect import Collected
 from labseq.config.devices import DeviceChoice, named
-from labseq.config.document import Document
+from labseq.config.document import Document, Kept
 from labseq.config.fields import (
     FORMAT,
     MAY_ADD,
@@ -263,6 +263,7 @@ def load_profile(
     named_in: Document | None = None,
     scan: Scan | None = None,
     found: Collected | None = None,
+    kept: Kept | None = None,
 ) -> tuple[Document, ProfileSpec]:
     """Find and read a hardware profile.
 
@@ -272,6 +273,7 @@ def load_profile(
         overrides: Values that replace those of the file, addresses without "profile.".
         named_in: The sequence whose key ``profile`` names it, for messages.
         scan: The sequence's scan; the values of its first point count.
+        kept: What the file says, in place of what it says today.
         found: Where the problems of a file that can be read go; without it they are raised.
 
     Returns:
@@ -281,7 +283,7 @@ def load_profile(
     Raises:
         ConfigError: Everything that is wrong, but for the settings of plugins.
     """
-    document = Document.read(find_profile(name_or_path, beside, named_in=named_in))
+    document = Document.read(find_profile(name_or_path, beside, named_in=named_in), kept)
     check_kind(document, "hardware profile")
     placed = [_of_profile(Override(*override)) for override in overrides]
     document = document.override_all(placed, may_add=MAY_ADD, found=found)

@@ -11,8 +11,9 @@ from typing import Annotated, Any, Final, Literal, TypeAlias, cast
 from pydantic import AfterValidator, Field, PlainValidator
 
 from labseq.config.addresses import Override
+from labseq.config.analyses import Analyses
 from labseq.config.collect import Collected
-from labseq.config.document import Document
+from labseq.config.document import Document, Kept
 from labseq.config.fields import (
     FORMAT,
     Choice,
@@ -118,6 +119,7 @@ class SequenceSpec(Settings):
     )
     repeats: int = Field(default=1, ge=1, le=1_000_000, description="shots of each point of the scan")
     order: ScanOrder = Field(default="sequential", description="order of the scan's shots")
+    analysis: Analyses = Field(default=(), description="what is worked out from each shot, beside the run")
     shot: Steps = Field(description="the steps of a shot")
 
 
@@ -140,6 +142,7 @@ def load_sequence(
     *,
     profile_set: Sequence[Override] = (),
     found: Collected | None = None,
+    kept: Kept | None = None,
 ) -> tuple[Document, SequenceSpec]:
     """Read a sequence file.
 
@@ -147,6 +150,7 @@ def load_sequence(
         path: The file.
         overrides: Values that replace those of the file: (address, value) each.
         profile_set: Overrides of the profile, with their "profile.": a scan of theirs is replaced.
+        kept: What the file says, in place of what it says today.
         found: Where the problems of a file that can be read go; without it they are raised.
 
     Returns:
@@ -156,7 +160,7 @@ def load_sequence(
     Raises:
         ConfigError: Everything that is wrong, but for the settings of plugins.
     """
-    document = Document.read(path)
+    document = Document.read(path, kept)
     check_kind(document, "sequence")
     if document.data.get("planner") is None:
         document = document.override("planner", f"{{use: {DEFAULT_PLANNER}}}", "the default planner")

@@ -145,9 +145,36 @@ class EqualiseSettings(Settings):
 
 
 class WaitSettings(Settings):
-    """``wait``: let time pass."""
+    """``wait``: let time pass, or wait until another control system says to go on."""
 
-    duration: Duration = Field(description="how long to wait")
+    duration: Duration | None = Field(default=None, description="how long to wait")
+    signal: Literal["go"] | None = Field(
+        default=None, alias="for", description="what to wait for, in the place of `duration`"
+    )
+    timeout: Exposure | None = Field(
+        default=None, description="how long that may take; if it does not come, the run ends"
+    )
+    device: Text | None = Field(
+        default=None,
+        description="device of the profile that it comes through; needed if several could be meant",
+    )
+
+    @model_validator(mode="after")
+    def _is_for_one_thing(self) -> Self:
+        if self.signal is None:
+            if extra := next((key for key in ("timeout", "device") if key in self.model_fields_set), None):
+                raise misfit(
+                    f"'{extra}' stands here without 'for'", "'for: go' beside it", at=(extra,), key=True
+                )
+            if self.duration is None:
+                raise misfit(
+                    "a wait says neither how long nor for what", "'duration', or 'for' and 'timeout'"
+                )
+        elif self.duration is not None:
+            raise misfit("'duration' and 'for' stand together", "one of them", at=("duration",), key=True)
+        elif self.timeout is None:
+            raise misfit("a wait for 'go' has no 'timeout'", "how long it may take", at=("for",), key=True)
+        return self
 
 
 class DeviceSettings(Settings):

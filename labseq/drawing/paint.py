@@ -132,13 +132,13 @@ def paint_lines(axes: Axes, sheet: Sheet, grid: SiteGrid, moves: NDArray[np.int1
         axes.plot(x, y, color=BAND, linewidth=thick, solid_capstyle="round", zorder=0.5)
 
 
-def paint_numbers(axes: Axes, grid: SiteGrid) -> None:
+def paint_numbers(axes: Axes, grid: SiteGrid, colour: str = "0.4") -> None:
     """Number rows on the left and columns at the top, every one or every fifth."""
     rows = [(row, -1, row) for row in range(0, grid.n_rows, 1 if grid.n_rows < 10 else 5)]
     cols = [(-1, col, col) for col in range(0, grid.n_cols, 1 if grid.n_cols < 10 else 5)]
     for row, col, number in rows + cols:
         x, y = place_sites(np.array([row, col]), grid)
-        axes.text(x, y, str(number), fontsize=6, color="0.4", ha="center", va="center")
+        axes.text(x, y, str(number), fontsize=6, color=colour, ha="center", va="center")
 
 
 def frame(axes: Axes, sheet: Sheet, title: str, edge: NDArray[np.float64]) -> None:

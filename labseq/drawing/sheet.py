@@ -99,15 +99,20 @@ def place_sites(sites: NDArray[np.generic], grid: SiteGrid) -> NDArray[np.float6
 
 
 def extent_of(plan: Plan, grid: SiteGrid) -> Extent:
-    """What has to be seen: all sites, and where atoms are ejected to."""
+    """What has to be seen of a plan: all sites, and where atoms are ejected to."""
+    return extent_of_sites(plan.moves[:, 2:], grid)
+
+
+def extent_of_sites(others: NDArray[np.integer], grid: SiteGrid) -> Extent:
+    """What has to be seen: all sites of the grid, and others, int (n, 2), that may lie beside it."""
     rows, cols = np.mgrid[: grid.n_rows : max(1, grid.n_rows - 1), : grid.n_cols : max(1, grid.n_cols - 1)]
     corners = np.stack([rows.ravel(), cols.ravel()], axis=1)
-    places = place_sites(np.concatenate([corners, plan.moves[:, 2:]]), grid)
+    places = place_sites(np.concatenate([corners, others]), grid)
     (left, top), (right, bottom) = places.min(axis=0) - MARGIN, places.max(axis=0) + MARGIN
     return Extent(float(left), float(right), float(top), float(bottom))
 
 
-def lay_out(extent: Extent, n_panels: int) -> Sheet:
+def lay_out(extent: Extent, n_panels: int, panel_in: float = PANEL_IN) -> Sheet:
     """Choose the size of the panels, and how many stand side by side.
 
     The sheet shall be somewhat wider than high, and few of its places empty.
@@ -115,13 +120,14 @@ def lay_out(extent: Extent, n_panels: int) -> Sheet:
     Args:
         extent: What each panel shows.
         n_panels: How many there are.
+        panel_in: Width of a panel, in inches, as long as its sites are neither too small nor too large in it.
 
     Example:
         >>> sheet = lay_out(Extent(-1, 11, -1, 11), 6)
         >>> sheet.n_cols, sheet.n_rows, sheet.site_in
         (3, 2, 0.3)
     """
-    site_in = min(max(PANEL_IN / extent.width, SITE_IN[0]), SITE_IN[1])
+    site_in = min(max(panel_in / extent.width, SITE_IN[0]), SITE_IN[1])
     width, height = extent.width * site_in, extent.height * site_in + TITLE_IN
 
     def size(n_cols: int) -> tuple[float, float]:

@@ -173,6 +173,8 @@ class RunRecord:
         lattice: Lattice of the grid.
         scan: What was scanned: "addresses", "points", "point_of_shot", ...; empty without a scan.
         calibrations: Those in use: kind -> id.
+        resumed: How it was gone on with after it had ended early, in order: ``t_utc``, ``first_shot``,
+            ``changes`` that were accepted (each ``what``, ``was`` and ``now``) and ``provenance``.
     """
 
     name: str
@@ -195,3 +197,4 @@ class RunRecord:
     lattice: str
     scan: Mapping[str, Any] = field(default_factory=dict[str, Any])
     calibrations: Mapping[str, str] = field(default_factory=dict[str, str])
+    resumed: tuple[Mapping[str, Any], ...] = ()

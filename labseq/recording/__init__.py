@@ -1,8 +1,16 @@
 """Runs on disk: a folder per run, one HDF5 file per shot, and the way back."""
 
-from labseq.recording.active import clear_active, died, in_progress, mark_active, marker_roots
+from labseq.recording.active import (
+    clear_active,
+    died,
+    lock_files,
+    mark_active,
+    marker_roots,
+    runs_in_progress,
+)
 from labseq.recording.folders import data_root
-from labseq.recording.reader import Run, Shot, open_run
+from labseq.recording.reader import Run, open_run
+from labseq.recording.shot import Shot
 from labseq.recording.writer import RunWriter
 
 __all__ = [
@@ -12,8 +20,9 @@ __all__ = [
     "clear_active",
     "data_root",
     "died",
-    "in_progress",
+    "lock_files",
     "mark_active",
     "marker_roots",
     "open_run",
+    "runs_in_progress",
 ]

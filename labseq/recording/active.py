@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final
 
@@ -21,6 +21,28 @@ from labseq.recording.plain import dumps
 from labseq.recording.process import Owner
 
 _FOLDER: Final = ".active"
+
+
+@dataclass(frozen=True, slots=True)
+class Marker:
+    """A marker, as its file has it.
+
+    Attributes:
+        path: The file.
+        owner: The process; None if the file cannot be read.
+        run_dir: The run's folder; None likewise.
+        profile: What stands for the profile; "" likewise.
+    """
+
+    path: Path
+    owner: Owner | None
+    run_dir: Path | None
+    profile: str
+
+    @property
+    def is_active(self) -> bool:
+        """Whether its process is known to live; of one on another computer nobody knows."""
+        return self.owner is not None and self.owner.is_here and self.owner.lives
 
 
 def marker_roots(root: Path) -> tuple[Path, ...]:
@@ -59,12 +81,12 @@ def clear_active(roots: Sequence[Path], profile_key: str) -> None:
     """
     current = Owner.current()
     failures: list[RecordingError] = []
-    for marker, owner, _ in _markers(roots, profile_key):
-        if owner is None or owner.pid == current.pid or _is_gone(owner):
+    for marker in _markers(roots, profile_key):
+        if not marker.is_active or (marker.owner and marker.owner.pid == current.pid):
             try:
-                with explained(marker):
-                    marker.unlink(missing_ok=True)
-                    sync_folder(marker.parent)
+                with explained(marker.path):
+                    marker.path.unlink(missing_ok=True)
+                    sync_folder(marker.path.parent)
             except RecordingError as failure:
                 failures.append(failure)
     if failures:
@@ -79,22 +101,26 @@ def died(roots: Sequence[Path], profile_key: str) -> Path | None:
         computer counts as dead: nobody here can tell, and being safe twice harms
         nothing.
     """
-    for marker, owner, run_dir in _markers(roots, profile_key):
-        if owner is None or _is_gone(owner):
-            return run_dir or marker
+    for marker in _markers(roots, profile_key):
+        if not marker.is_active:
+            return marker.run_dir or marker.path
     return None
 
 
-def in_progress(roots: Sequence[Path], profile_key: str) -> Path | None:
-    """The run, if there is one, that a living process here has in progress on a profile's hardware.
+def lock_files(roots: Sequence[Path], profile_key: str) -> tuple[Path, ...]:
+    """What to lock so that nobody else uses a profile's hardware: one file in each root."""
+    return tuple(root / _FOLDER / f"{_stem(profile_key)}.lock" for root in roots)
 
-    Returns:
-        Its folder, or the marker itself if that tells none.
-    """
-    for marker, owner, run_dir in _markers(roots, profile_key):
-        if owner is not None and not _is_gone(owner):
-            return run_dir or marker
-    return None
+
+def runs_in_progress(roots: Sequence[Path]) -> dict[Path, str]:
+    """The runs that living processes here have in progress: folder -> what stands for the profile."""
+    markers = [marker for root in roots for marker in markers_in(root) if marker.is_active]
+    return {marker.run_dir: marker.profile for marker in markers if marker.run_dir is not None}
+
+
+def markers_in(root: Path) -> list[Marker]:
+    """The markers of all profiles in a data root."""
+    return [_read(path) for path in _files(root)]
 
 
 def _mark(root: Path, profile_key: str, run_dir: Path) -> None:
@@ -107,31 +133,31 @@ def _mark(root: Path, profile_key: str, run_dir: Path) -> None:
     write_file(marker, dumps(values).encode() + b"\n")
 
 
-def _is_gone(owner: Owner) -> bool:
-    return not (owner.is_here and owner.lives)
-
-
 def _stem(profile_key: str) -> str:
     digest = hashlib.sha256(profile_key.encode("utf-8", "backslashreplace")).hexdigest()[:12]
     return f"{slug(profile_key)[-40:]}-{digest}"
 
 
-def _markers(roots: Sequence[Path], profile_key: str) -> list[tuple[Path, Owner | None, Path | None]]:
-    """Each marker of a profile with the process and the run that it names, oldest name first."""
-    found: list[tuple[Path, Owner | None, Path | None]] = []
-    for marker in (path for root in roots for path in _files(root, _stem(profile_key))):
-        try:
-            values = parse_object(marker.read_bytes()) or {}
-        except FileNotFoundError:
-            continue  # its process has just ended
-        except OSError:
-            values = {}
-        run_dir = values.get("run_dir")
-        found.append((marker, Owner.from_plain(values), Path(run_dir) if isinstance(run_dir, str) else None))
-    return found
+def _markers(roots: Sequence[Path], profile_key: str) -> list[Marker]:
+    """The markers of a profile, oldest name first."""
+    return [_read(path) for root in roots for path in _files(root, _stem(profile_key)) if path.exists()]
 
 
-def _files(root: Path, stem: str) -> list[Path]:
+def _read(path: Path) -> Marker:
+    try:
+        values = parse_object(path.read_bytes()) or {}
+    except OSError:
+        values = {}
+    run_dir, profile = values.get("run_dir"), values.get("profile")
+    return Marker(
+        path,
+        Owner.from_plain(values),
+        Path(run_dir) if isinstance(run_dir, str) else None,
+        profile if isinstance(profile, str) else "",
+    )
+
+
+def _files(root: Path, stem: str = "") -> list[Path]:
     folder = root / _FOLDER
     try:
         names = sorted(entry.name for entry in folder.iterdir())

@@ -82,8 +82,9 @@ def sync_folder(folder: Path) -> None:
 class LineLog:
     """An append-only file of JSON lines that a torn last line does not confuse.
 
-    Only what ends with a newline counts. The rest of an append that failed, in
-    this process or in one that was killed, is overwritten by the next append.
+    Only what ends with a newline counts. What a process that was killed has left of a
+    line is kept, as a line of its own; the rest of an append that failed in this
+    process is overwritten by the next one.
 
     Args:
         path: The file; it is made if it does not exist.
@@ -94,9 +95,11 @@ class LineLog:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        with explained(path):
-            path.touch()
-            self._length = len(whole_lines(path.read_bytes()))
+        with explained(path), path.open("a+b", buffering=0) as file:
+            self._length = file.seek(0, os.SEEK_END)
+            file.seek(max(0, self._length - 1))
+            if file.read(1) not in (b"", b"\n"):
+                self._length += file.write(b"\n")
 
     def append(self, values: object, *, sync: bool) -> None:
         """Add a line; ``sync`` waits until it is on the disk.

@@ -21,8 +21,15 @@ EVENTS_FILE: Final = "events.jsonl"
 SEQUENCE_FILE: Final = "sequence.yaml"
 PROFILE_FILE: Final = "profile.yaml"
 SHOTS_FOLDER: Final = "shots"
+RESULTS_FOLDER: Final = "analysis"
+"""Results of analyses: a file of lines for each."""
+STOP_FILE: Final = "STOP"
+"""Stands in a run's folder while it is asked to end after the shot at hand."""
+LOCK_FILE: Final = ".lock"
+"""Locked by whoever goes on with a run."""
 OWN_NAMES: Final = frozenset(
-    {RUN_FILE, STATE_FILE, INDEX_FILE, EVENTS_FILE, SEQUENCE_FILE, PROFILE_FILE, SHOTS_FOLDER}
+    {RUN_FILE, STATE_FILE, INDEX_FILE, EVENTS_FILE, SEQUENCE_FILE, PROFILE_FILE, STOP_FILE}
+    | {SHOTS_FOLDER, RESULTS_FOLDER}
 )
 
 _COUNTER = re.compile(r"\.?(\d{4,})[_.]")
@@ -66,14 +73,23 @@ def slug(name: str) -> str:
     return words[:_MAX_SLUG].strip("._-") or "run"
 
 
-def shot_file_name(shot_index: int, attempt: int, *, counts: bool) -> str:
+def shot_file_name(shot_index: int, attempt: int, *, counts: bool, take: int = 1) -> str:
     """Path of a shot's file, relative to the run's folder.
+
+    Args:
+        shot_index: Index of the shot, from 0.
+        attempt: Which attempt it is, from 0.
+        counts: Whether the shot is done with it.
+        take: Counted up from 1 where a run was resumed and the file of an earlier take is kept.
 
     Example:
         >>> shot_file_name(17, 1, counts=False)
         'shots/shot_000017.attempt_1.h5'
+        >>> shot_file_name(17, 0, counts=True, take=2)
+        'shots/shot_000017.take_2.h5'
     """
     kept = "" if counts else f".attempt_{attempt}"
+    kept += "" if take == 1 else f".take_{take}"
     return f"{SHOTS_FOLDER}/shot_{shot_index:06d}{kept}.h5"
 
 

@@ -25,11 +25,11 @@ from typing import Any, Final
 import numpy as np
 
 FORMAT: Final = "labseq-shot"
-FORMAT_VERSION: Final = "1.3"
+FORMAT_VERSION: Final = "1.4"
 """major.minor; a newer minor version only adds things, a newer major version cannot be read."""
 
 RUN_FORMAT: Final = "labseq-run"
-RUN_FORMAT_VERSION: Final = "1.1"
+RUN_FORMAT_VERSION: Final = "1.2"
 
 LIBRARY_VERSIONS: Final = ("earliest", "v110")
 """File features that HDF5 may use: the widest reader support."""
@@ -108,7 +108,21 @@ def units_of(table: np.dtype[Any]) -> list[str]:
         >>> units_of(IMAGES)
         ['', '', 's', 's', '']
     """
-    return [next((u for u in _UNITS if name.endswith(f"_{u}")), "") for name in table.names or ()]
+    return [unit_of(name) for name in table.names or ()]
 
 
-_UNITS: Final = ("s", "m", "K", "Hz", "rad", "V")
+def unit_of(name: str) -> str:
+    """Unit of a value, as its name ends, "" where that tells none.
+
+    Example:
+        >>> unit_of("laser.power_w"), unit_of("spacing_m"), unit_of("seen"), unit_of("beat_hz")
+        ('W', 'm', '', 'Hz')
+    """
+    return _UNITS.get(name.rpartition("_")[2], "") if "_" in name else ""
+
+
+_UNITS: Final = {
+    **{unit: unit for unit in ("s", "m", "K", "Hz", "rad", "V", "W", "A", "px")},
+    **{unit.lower(): unit for unit in ("K", "Hz", "V", "W", "A")},
+}
+"""What names end in -> unit."""

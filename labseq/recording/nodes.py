@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Container, Mapping
+from collections.abc import Container, Mapping, Sequence
 from typing import Any, Final
 
 import h5py
 import numpy as np
+from h5py import h5a, h5s, h5t  # pyright: ignore[reportAttributeAccessIssue] - no stub knows h5a
 
+from labseq.recording.described import DATASETS, Described
 from labseq.recording.plain import dumps, plain_text, to_plain
 
 _MAX_ATTRIBUTE: Final = 256
@@ -16,20 +18,45 @@ _JSON: Final = "application/json"
 _TEXT: Final = "text/plain"
 
 
+_STRING: Final = h5py.string_dtype()
+_STRING_TYPE: Final = h5t.py_create(_STRING, logical=True)
+_SCALAR: Final = h5s.create(h5s.SCALAR)
+
+
 def set_attributes(node: Any, /, **values: Any) -> None:
-    """Set attributes of a group or dataset; text is made fit for HDF5."""
+    """Add attributes to a group or dataset that has none of these names; text is made fit for HDF5."""
     for name, value in values.items():
-        node.attrs[name] = plain_text(value) if isinstance(value, str) else value
+        if isinstance(value, str):
+            _add_text(node, name, np.array(plain_text(value), _STRING), _SCALAR)
+        else:
+            node.attrs[name] = value
 
 
-def write_json(group: h5py.Group, name: str, value: object) -> None:
+def describe(dataset: Any, what: Described) -> None:
+    """Say in its attributes what a dataset is, and in what unit."""
+    set_attributes(dataset, units=what.units, description=what.meaning)
+
+
+def describe_columns(dataset: Any, units: Sequence[str], descriptions: Sequence[str]) -> None:
+    """Say in the attributes of a table what each column is, and in what unit."""
+    space = h5s.create_simple((len(units),))
+    for name, texts in (("units", units), ("descriptions", descriptions)):
+        _add_text(dataset, name, np.array(list(map(plain_text, texts)), _STRING), space)
+
+
+def _add_text(node: Any, name: str, text: Any, space: Any) -> None:
+    h5a.create(node.id, name.encode(), _STRING_TYPE, space).write(text)  # attrs[...] takes twice the time
+
+
+def write_json(group: h5py.Group, name: str, value: object, what: Described) -> None:
     """Add a dataset that holds a value as JSON."""
-    _write_text(group, name, dumps(value), _JSON)
+    _write_text(group, name, dumps(value), _JSON, what)
 
 
-def _write_text(group: h5py.Group, name: str, text: str, content_type: str) -> None:
-    dataset = group.create_dataset(name, data=text, dtype=h5py.string_dtype())
+def _write_text(group: h5py.Group, name: str, text: str, content_type: str, what: Described) -> None:
+    dataset = group.create_dataset(name, data=text, dtype=_STRING)
     set_attributes(dataset, content_type=content_type)
+    describe(dataset, what)
 
 
 def read_json(group: Any, name: str) -> Any:
@@ -37,8 +64,14 @@ def read_json(group: Any, name: str) -> Any:
     return json.loads(group[name][()])
 
 
-def write_values(group: h5py.Group, values: Mapping[str, Any]) -> None:
-    """Add values of any kind: short ones as attributes, the rest as datasets of text or JSON."""
+def write_values(group: h5py.Group, values: Mapping[str, Any], kind: str) -> None:
+    """Add values of any kind: short ones as attributes, the rest as datasets of text or JSON.
+
+    Args:
+        group: Where to.
+        values: Name -> value.
+        kind: What the group is called in :data:`labseq.recording.described.DATASETS`.
+    """
     taken: set[str] = set()
     for key, value in values.items():
         plain = to_plain(value)
@@ -46,10 +79,12 @@ def write_values(group: h5py.Group, values: Mapping[str, Any]) -> None:
         taken.add(name)
         if _fits_attribute(plain):
             set_attributes(group, **{name: plain})
-        elif isinstance(plain, str):
-            _write_text(group, name, plain_text(plain), _TEXT)
+            continue
+        what = DATASETS.get(f"{kind}/{key}") or DATASETS[f"{kind}/<name>"]
+        if isinstance(plain, str):
+            _write_text(group, name, plain_text(plain), _TEXT, what)
         else:
-            write_json(group, name, plain)
+            write_json(group, name, plain, what)
 
 
 def read_values(group: Any) -> dict[str, Any]:

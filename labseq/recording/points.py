@@ -8,7 +8,8 @@ from typing import Any
 
 from labseq.errors import RecordingError
 from labseq.recording.folders import RUN_FILE
-from labseq.recording.reader import Run, Shot
+from labseq.recording.reader import Run
+from labseq.recording.shot import Shot
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -2,29 +2,27 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from labseq.errors import RecordingError
-from labseq.model import CycleRecord, Plan, ShotRecord, StageTiming, TargetPattern
+from labseq.model import TargetPattern
 from labseq.model.estimate import mean
-from labseq.model.records import RunStatus, ShotStatus
+from labseq.model.records import RunStatus
 from labseq.recording import folders
 from labseq.recording.durable import read_lines
 from labseq.recording.plain import to_plain
+from labseq.recording.results import rows_of
 from labseq.recording.run_file import is_index_row, read_run, read_state, target_of
-from labseq.recording.summaries import ShotSummary, summarise, summary_in
+from labseq.recording.shot import Shot, load_content
 
 if TYPE_CHECKING:
-    from labseq.recording.shot_reader import ShotContent
+    import pandas as pd
+    import xarray as xr
 
 
 def open_run(path: str | Path) -> Run:
@@ -47,7 +45,7 @@ def open_run(path: str | Path) -> Run:
     status, error = read_state(folder)
     rows, damaged = read_lines(folder / folders.INDEX_FILE)
     usable = [row for row in rows if is_index_row(row)]
-    load = lru_cache(maxsize=8)(_load)  # looking at several values of a shot reads its file once
+    load = lru_cache(maxsize=8)(load_content)  # looking at several values of a shot reads its file once
     counted = {row["shot"]: row for row in usable if row["counts"]}  # a shot written again: the last one
     return Run(
         path=folder,
@@ -58,12 +56,6 @@ def open_run(path: str | Path) -> Run:
         attempts=tuple(Shot(folder / row["file"], row, load) for row in usable if not row["counts"]),
         n_damaged_lines=len(damaged) + len(rows) - len(usable),
     )
-
-
-def _load(path: Path) -> ShotContent:
-    from labseq.recording.shot_reader import read_content  # h5py takes 0.1 s to import
-
-    return read_content(path)
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -135,6 +127,16 @@ class Run:
         """
         return tuple(read_lines(self.path / folders.EVENTS_FILE)[0])
 
+    def analysis(self, name: str) -> list[dict[str, Any]]:
+        """The results of an analysis: a row per shot, with "shot", its index, and what came of it.
+
+        A row with "error" says why there is nothing else in it.
+
+        Raises:
+            RecordingError: There are no results of that name, or they cannot be read.
+        """
+        return rows_of(self.path, name)
+
     def summary(self) -> dict[str, Any]:
         """The run in a few JSON-ready numbers; None where there is none."""
         return {
@@ -145,156 +147,40 @@ class Run:
             "status": self.status,
         }
 
+    def to_dataframe(self, *, attempts: bool = False) -> pd.DataFrame:
+        """The shots as a table of pandas: a row for each, from the index alone.
 
-@dataclass(frozen=True, slots=True, eq=False, repr=False)
-class Shot:
-    """A shot on disk. What the index holds costs nothing; the rest reads the shot's file.
+        The columns: ``attempt``, ``status``, times, ``success``, ``filling_fraction``, counts of cycles,
+        batches, atom moves and defects, ``duration_s``; what was scanned or set, by its address; ``stage.*``,
+        how long each stage took; ``reading.*``, values read from devices; ``calibration.*``, ids. Numbers
+        are SI, and nan where there is none. ``attrs`` has ``units`` and ``descriptions`` by column,
+        and what is true of the whole run.
 
-    Every property from ``occupancies`` on raises ``RecordingError`` if the file is missing or damaged.
-
-    Attributes:
-        file: The shot's HDF5 file.
-        row: Its line in the index.
-    """
-
-    file: Path
-    row: dict[str, Any]
-    _load: Callable[[Path], ShotContent] = field()
-
-    def __repr__(self) -> str:
-        return f"<Shot {self.index}: {self.status}, {self.file}>"
-
-    @property
-    def index(self) -> int:
-        """Index in the run, from 0."""
-        return int(self.row["shot"])
-
-    @property
-    def attempt(self) -> int:
-        """Which attempt this is, from 0."""
-        return int(self.row["attempt"])
-
-    @property
-    def status(self) -> ShotStatus:
-        """One of "complete", "interrupted" and "failed"."""
-        return self.row["status"]
-
-    @property
-    def success(self) -> bool:
-        """Whether the last ``image`` step met the target."""
-        return bool(self.row["success"])
-
-    @property
-    def filling_fraction(self) -> float:
-        """Filling of the target on the last ``image`` step; nan without one."""
-        value = self.row["filling_fraction"]
-        return math.nan if value is None else float(value)
-
-    @property
-    def seen_defect_free_cycle(self) -> int:
-        """First cycle whose image met the target; 0 if none."""
-        return int(self.row["seen_defect_free_cycle"])
-
-    @property
-    def occupancies(self) -> NDArray[np.bool_]:
-        """As detected, bool (n_images, n_rows, n_cols)."""
-        return self._of_each_image("occupancy", np.bool_)
-
-    @property
-    def summary(self) -> ShotSummary:
-        """What its images and cycles came to; the file is read for runs before format 1.1 only."""
-        found = summary_in(self.row)
-        return summarise(self._content.record, self._content.target) if found is None else found
-
-    @property
-    def confidences(self) -> NDArray[np.float32]:
-        """The detector's confidence, float32 (n_images, n_rows, n_cols)."""
-        return self._of_each_image("confidence", np.float32)
-
-    @property
-    def plans(self) -> tuple[Plan, ...]:
-        """The plan of each cycle."""
-        return tuple(cycle.plan for cycle in self.cycles)
-
-    @property
-    def cycles(self) -> tuple[CycleRecord, ...]:
-        """The rearrangement cycles."""
-        return tuple(self._content.record.cycles)
-
-    @property
-    def timing(self) -> tuple[StageTiming, ...]:
-        """The stages, in the order they ended."""
-        return tuple(self._content.record.timing)
-
-    @property
-    def parameters(self) -> dict[str, Any]:
-        """What differs from the files in this shot: address -> value; those of a scan in SI."""
-        return dict(self.row.get("parameters") or {})
-
-    @property
-    def calibrations(self) -> dict[str, str]:
-        """The calibrations in use: kind -> id."""
-        return dict(self._content.record.calibrations)
-
-    @property
-    def readings(self) -> dict[str, Any]:
-        """Values read from devices during the shot."""
-        return dict(self._content.record.readings)
-
-    @property
-    def story(self) -> dict[str, NDArray[Any]]:
-        """What the simulation told of the atoms: name -> structured array; empty if it told nothing."""
-        return dict(self._content.record.story)
-
-    @property
-    def provenance(self) -> dict[str, Any]:
-        """Seed, versions, texts and settings, as the shot's file has them."""
-        return dict(self._content.provenance)
-
-    @property
-    def devices(self) -> dict[str, Any]:
-        """What each device said of itself."""
-        return dict(self._content.devices)
-
-    @property
-    def frames(self) -> NDArray[np.uint16]:
-        """The frames that were kept, uint16 (n_frames, height, width); read anew each time.
+        Args:
+            attempts: Whether attempts that failed or were interrupted have rows, too.
 
         Raises:
-            RecordingError: The frames differ in size; :meth:`record` gives them one by one.
+            ConfigError: pandas is not installed.
         """
-        from labseq.recording.shot_reader import read_frames
+        from labseq.recording.tabular import dataframe_of
 
-        images = [frame.image for frame in read_frames(self.file).values()]
-        if len({image.shape for image in images}) > 1:
-            raise RecordingError(self.file, "holds frames of several sizes; use shot.record().images")
-        return np.stack(images) if images else np.empty((0, 0, 0), np.uint16)
+        return dataframe_of(self, attempts=attempts)
 
-    def record(self) -> ShotRecord:
-        """The whole record as it was written, frames included."""
-        from labseq.recording.shot_reader import read_frames, with_frames
+    def to_xarray(self, *, occupancies: bool = True) -> xr.Dataset:
+        """The shots that count as a dataset of xarray.
 
-        return with_frames(self._content.record, read_frames(self.file))
+        Its axes are those of the scan and ``repeat``; ``point`` and ``repeat`` where the scan is no
+        product of its addresses; ``shot`` without a scan. Variables are the columns of
+        :meth:`to_dataframe`, with nan for shots that are missing; and ``occupancy``, int8
+        (..., image, row, col), -1 where there is no such image, which is read from the shots' files.
 
-    def verify(self) -> None:
-        """Compare the file with the checksum in the index.
+        Args:
+            occupancies: Whether to read the occupancies.
 
         Raises:
-            RecordingError: A byte has changed since it was written.
+            ConfigError: xarray is not installed.
+            RecordingError: A shot's file is missing or damaged, or the scan is.
         """
-        try:
-            data = self.file.read_bytes()
-        except OSError as error:
-            reason = f"cannot be read: {error.strerror}; take it from a backup"
-            raise RecordingError(self.file, reason) from error
-        if hashlib.sha256(data).hexdigest() != self.row.get("sha256"):
-            raise RecordingError(self.file, "has changed since it was written; take it from a backup")
+        from labseq.recording.tabular import dataset_of
 
-    @property
-    def _content(self) -> ShotContent:
-        return self._load(self.file)
-
-    def _of_each_image(self, name: str, dtype: Any) -> NDArray[Any]:
-        images = self._content.record.images
-        shape = (len(images), *self._content.target.shape)
-        return np.array([getattr(image, name) for image in images], dtype).reshape(shape)
+        return dataset_of(self, occupancies=occupancies)

@@ -21,7 +21,7 @@ from labseq.recording.durable import parse_object
 from labseq.recording.folders import PROFILE_FILE, RUN_FILE, SEQUENCE_FILE, STATE_FILE
 from labseq.recording.plain import dumps, to_plain
 from labseq.recording.process import Owner
-from labseq.recording.summaries import summarise
+from labseq.recording.summaries import flat_readings, summarise
 
 _IN_RUN: Final = {"name": str, "n_shots": int, "seed": int, "simulated": bool, "target": dict}
 _IN_INDEX: Final[Mapping[str, type | UnionType]] = {
@@ -34,7 +34,11 @@ _IN_INDEX: Final[Mapping[str, type | UnionType]] = {
     "filling_fraction": float | int | None,
     "seen_defect_free_cycle": int,
 }
-_STATUSES: Final = ("running", "complete", "stopped", "failed")
+STATUSES: Final = ("running", "complete", "stopped", "failed")
+
+
+class NewerFormatError(RecordingError):
+    """A file was written by a newer labseq than this one."""
 
 
 def encode_text(text: str) -> bytes:
@@ -98,7 +102,8 @@ def check_version(path: Path, came: str, known: str) -> None:
             path, f"has the format version '{came}'; expected one like {known}; it is damaged"
         )
     if int(major) > int(known.partition(".")[0]):
-        raise RecordingError(path, f"has format version {came}, this labseq reads {known}; update labseq")
+        reason = f"has format version {came}, this labseq reads {known}; update labseq"
+        raise NewerFormatError(path, reason)
 
 
 def target_of(path: Path, record: Mapping[str, Any]) -> TargetPattern:
@@ -137,7 +142,7 @@ def read_state(folder: Path) -> tuple[RunStatus, str]:
         state = parse_object((folder / STATE_FILE).read_bytes())
     except OSError:
         state = None
-    if state is None or state.get("state") not in _STATUSES:
+    if state is None or state.get("state") not in STATUSES:
         return "failed", f"{STATE_FILE} is missing or damaged"
     status = cast("RunStatus", state["state"])
     if status != "running":
@@ -146,6 +151,14 @@ def read_state(folder: Path) -> tuple[RunStatus, str]:
     if owner is None or (owner.is_here and not owner.lives):
         return "failed", "the process that ran it is gone"
     return "running", ""
+
+
+def read_owner(folder: Path) -> Owner | None:
+    """The process that a run belongs to, or belonged to; None if that is not known."""
+    try:
+        return Owner.from_plain(parse_object((folder / STATE_FILE).read_bytes()) or {})
+    except OSError:
+        return None
 
 
 def index_row(
@@ -175,6 +188,8 @@ def index_row(
         "n_missing_atoms": shot.n_missing_atoms,
         "stage_s": stage_s,
         "parameters": to_plain(shot.parameters),
+        "readings": flat_readings(shot.readings),
+        "calibrations": to_plain(shot.calibrations),
         **summarise(shot, target).as_row(),
         "sha256": sha256,
         "bytes": n_bytes,

@@ -15,7 +15,15 @@ import labseq
 from labseq.errors import RecordingError
 from labseq.model import CycleRecord, ImageRecord, RunRecord, ShotRecord
 from labseq.recording import layout, tables
-from labseq.recording.nodes import link_name, set_attributes, write_json, write_values
+from labseq.recording.described import DATASETS, column_meanings
+from labseq.recording.nodes import (
+    describe,
+    describe_columns,
+    link_name,
+    set_attributes,
+    write_json,
+    write_values,
+)
 from labseq.recording.run_file import sha256_of_text
 
 
@@ -76,10 +84,10 @@ class ShotEncoder:
             set_attributes(
                 target, name=run.target.name, lattice=run.lattice, grid_spacing_m=run.grid_spacing_m
             )
-            target.create_dataset("fill", data=run.target.fill.view(np.uint8))
-            target.create_dataset("clear", data=run.target.clear.view(np.uint8))
-            write_values(entry.create_group("devices"), run.devices)
-            write_values(entry.create_group("provenance"), _provenance(run))
+            _write_array(target, "target/fill", run.target.fill.view(np.uint8))
+            _write_array(target, "target/clear", run.target.clear.view(np.uint8))
+            write_values(entry.create_group("devices"), run.devices, "devices")
+            write_values(entry.create_group("provenance"), _provenance(run), "provenance")
         return buffer.getvalue()
 
     def _write_shot(self, entry: Any, shot: ShotRecord) -> None:
@@ -95,8 +103,8 @@ class ShotEncoder:
             set_attributes(entry.create_group("calibrations"), **shot.calibrations)
         if shot.story:
             _write_story(entry.create_group("story"), shot.story)
-        write_json(entry, "parameters", shot.parameters)
-        write_json(entry, "readings", shot.readings)
+        write_json(entry, "parameters", shot.parameters, DATASETS["parameters"])
+        write_json(entry, "readings", shot.readings, DATASETS["readings"])
 
     def _write_frames(self, entry: h5py.Group, images: Sequence[ImageRecord], kept: Sequence[int]) -> None:
         series: dict[tuple[str, tuple[int, ...]], list[int]] = {}  # frames of one size share a dataset
@@ -128,16 +136,22 @@ class ShotEncoder:
             else:
                 stack[i] = frame.image
         set_attributes(group, NX_class="NXdetector", name=camera)
-        set_attributes(stack, units="adu", interpretation="image", long_name=f"{camera} (ADU)")
-        _write_array(group, "t_s", [image.t_start_s for image in chosen], "f8", "s")
-        _write_array(group, "t_clock_s", [frame.t_start_s for frame in frames], "f8", "s")
-        _write_array(group, "t_device_s", [frame.device_time_s for frame in frames], "f8", "s")
-        _write_array(group, "number", [frame.number for frame in frames], "i4")
-        _write_array(group, "exposure_s", [frame.exposure_s for frame in frames], "f8", "s")
-        _write_array(group, "image", indices, "i4")
-        _write_array(group, "step", [image.step for image in chosen], "i4")
-        _write_array(group, "cycle", [image.cycle for image in chosen], "i4")
-        _write_array(group, "event", [_event(image) for image in chosen], layout.EVENT)
+        describe(stack, DATASETS["camera/<name>/images"])
+        set_attributes(stack, interpretation="image", long_name=f"{camera} (ADU)")
+        columns = {
+            "t_s": [image.t_start_s for image in chosen],
+            "t_clock_s": [frame.t_start_s for frame in frames],
+            "t_device_s": [frame.device_time_s for frame in frames],
+            "number": [frame.number for frame in frames],
+            "exposure_s": [frame.exposure_s for frame in frames],
+            "image": indices,
+            "step": [image.step for image in chosen],
+            "cycle": [image.cycle for image in chosen],
+        }
+        for name, values in columns.items():
+            path = f"camera/<name>/{name}"
+            _write_array(group, path, np.array(values, DATASETS[path].dtype))
+        _write_array(group, "camera/<name>/event", np.array(list(map(_event, chosen)), layout.EVENT))
 
 
 def _provenance(run: RunRecord) -> dict[str, Any]:
@@ -195,36 +209,39 @@ def _write_detection(group: h5py.Group, images: Sequence[ImageRecord], shape: tu
         auxiliary_signals=["confidence"],
         axes=["t_s", ".", "."],
     )
-    for name, values in (("occupancy", occupancy), ("confidence", confidence)):
-        set_attributes(group.create_dataset(name, data=values), interpretation="image")
-    _write_array(group, "t_s", [image.t_start_s for image in images], "f8", "s")
+    for path, values in (("detection/occupancy", occupancy), ("detection/confidence", confidence)):
+        set_attributes(_write_array(group, path, values), interpretation="image")
+    _write_array(group, "detection/t_s", np.array([image.t_start_s for image in images], np.float64))
     rows = [(i.step, i.cycle, i.t_start_s, i.exposure_s, _event(i)) for i in images]
-    _write_table(group, "images", np.array(rows, layout.IMAGES))
+    _write_table(group, "detection/images", np.array(rows, layout.IMAGES))
 
 
 def _write_story(group: h5py.Group, story: Mapping[str, NDArray[Any]]) -> None:
     names: list[str] = []
     for name, table in story.items():
         names.append(link_name(name, names))
-        _write_table(group, names[-1], table)
+        _write_table(group, "story/<name>", table, names[-1])
 
 
 def _write_cycles(group: h5py.Group, cycles: Sequence[CycleRecord], shape: tuple[int, int]) -> None:
-    _write_table(group, "moves", tables.moves_table(cycles))
-    _write_table(group, "batches", tables.batches_table(cycles))
-    _write_table(group, "cycles", tables.cycles_table(cycles))
+    _write_table(group, "rearrangement/moves", tables.moves_table(cycles))
+    _write_table(group, "rearrangement/batches", tables.batches_table(cycles))
+    _write_table(group, "rearrangement/cycles", tables.cycles_table(cycles))
     predicted = np.array([c.report.predicted for c in cycles], np.uint8).reshape(len(cycles), *shape)
-    group.create_dataset("predicted", data=predicted)
+    _write_array(group, "rearrangement/predicted", predicted)
 
 
-def _write_table(group: h5py.Group, name: str, table: NDArray[Any]) -> None:
-    set_attributes(group.create_dataset(name, data=table), units=layout.units_of(table.dtype))
+def _write_table(group: h5py.Group, path: str, table: NDArray[Any], name: str = "") -> None:
+    dataset = group.create_dataset(name or path.rpartition("/")[2], data=table)
+    describe_columns(dataset, layout.units_of(table.dtype), column_meanings(path, table.dtype))
+    set_attributes(dataset, description=DATASETS[path].meaning)
 
 
-def _write_array(group: h5py.Group, name: str, values: Sequence[Any], dtype: str, units: str = "") -> None:
-    dataset = group.create_dataset(name, data=np.array(values, dtype))
-    if units:
-        set_attributes(dataset, units=units)
+def _write_array(group: h5py.Group, path: str, values: NDArray[Any]) -> Any:
+    """Add an array under the last part of its path in :data:`DATASETS`."""
+    dataset = group.create_dataset(path.rpartition("/")[2], data=values)
+    describe(dataset, DATASETS[path])
+    return dataset
 
 
 def _bitshuffle() -> Mapping[str, Any]:

@@ -28,12 +28,14 @@ class ShotContent:
         provenance: Seed, versions, texts and settings of the run.
         devices: What each device said of itself.
         target: The target of the run.
+        run_id: The run's folder, relative to the data root that it was written to.
     """
 
     record: ShotRecord
     provenance: dict[str, Any]
     devices: dict[str, Any]
     target: TargetPattern
+    run_id: str
 
 
 def read_content(path: Path) -> ShotContent:
@@ -53,7 +55,18 @@ def read_content(path: Path) -> ShotContent:
                 target["clear"][()].astype(np.bool_),
                 str(target.attrs["name"]),
             ),
+            run_id=str(entry.attrs["run_id"]),
         )
+
+
+def read_occupancies(path: Path) -> NDArray[np.uint8]:
+    """Read the occupancies of a shot's file and nothing else: uint8 (n_images, n_rows, n_cols).
+
+    Raises:
+        RecordingError: As for :func:`read_content`.
+    """
+    with _opened(path) as entry:
+        return entry["detection/occupancy"][()]
 
 
 def read_frames(path: Path) -> dict[int, Frame]:
@@ -66,7 +79,7 @@ def read_frames(path: Path) -> dict[int, Frame]:
     frames: dict[int, Frame] = {}
     with _opened(path) as entry:
         for group in entry["camera"].values() if "camera" in entry else ():
-            _allow_filter(path, group["images"])
+            allow_filter(path, group["images"])
             columns = (
                 group["image"][()],
                 group["images"][()],
@@ -153,7 +166,12 @@ def _images(group: Any) -> list[ImageRecord]:
     ]
 
 
-def _allow_filter(path: Path, dataset: Any) -> None:
+def allow_filter(path: Path, dataset: Any) -> None:
+    """Get ready to read what may be compressed.
+
+    Raises:
+        RecordingError: It is, and the package for it is missing.
+    """
     if dataset.id.get_create_plist().get_nfilters() == 0:
         return
     try:

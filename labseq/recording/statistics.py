@@ -15,7 +15,7 @@ from labseq.model import TargetPattern
 from labseq.model.estimate import Estimate, mean
 from labseq.recording.plain import to_plain
 from labseq.recording.rates import Rate
-from labseq.recording.reader import Shot
+from labseq.recording.shot import Shot
 from labseq.recording.summaries import ShotSummary
 
 LOST: Final = "lost."

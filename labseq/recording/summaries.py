@@ -6,15 +6,19 @@ up without opening their files.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, fields
 from numbers import Real
 from typing import Any, Final, cast
 
 from labseq.model import ShotRecord, TargetPattern
+from labseq.recording.plain import to_plain
 
 SIMULATION: Final = "simulation."
 """What the names of readings begin with that only a simulation can know."""
+
+_MAX_TEXT: Final = 80
+_MAX_DEPTH: Final = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,6 +111,25 @@ def summarise(shot: ShotRecord, target: TargetPattern) -> ShotSummary:
         if name.startswith(SIMULATION) and isinstance(value, Real)
     }
     return ShotSummary(images, cycles, told)
+
+
+def flat_readings(readings: Mapping[str, Any]) -> dict[str, Any]:
+    """The readings that are single values, by dotted names; those of a simulation stand in its summary.
+
+    Example:
+        >>> flat_readings({"laser": {"power_w": 0.1, "trace": [1, 2]}, "simulation.lost.vacuum": 2.0})
+        {'laser.power_w': 0.1}
+    """
+    told = {name: value for name, value in readings.items() if not name.startswith(SIMULATION)}
+    return dict(_flat("", to_plain(told), _MAX_DEPTH))
+
+
+def _flat(prefix: str, values: Mapping[str, Any], depth: int) -> Iterator[tuple[str, Any]]:
+    for name, value in values.items():
+        if isinstance(value, dict) and depth:
+            yield from _flat(f"{prefix}{name}.", cast("dict[str, Any]", value), depth - 1)
+        elif isinstance(value, bool | int | float) or (isinstance(value, str) and len(value) <= _MAX_TEXT):
+            yield f"{prefix}{name}", value
 
 
 def summary_in(row: Mapping[str, Any]) -> ShotSummary | None:

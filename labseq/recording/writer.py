@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import shutil
 import threading
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -16,14 +18,15 @@ from labseq.model import RunRecord, ShotRecord
 from labseq.model.records import RunStatus
 from labseq.recording import folders
 from labseq.recording.durable import LineLog, explained, sync_folder, write_file
-from labseq.recording.run_file import encode_run, encode_state, encode_text, index_row
+from labseq.recording.plain import dumps
+from labseq.recording.run_file import encode_run, encode_state, encode_text, index_row, read_run
 
 if TYPE_CHECKING:
     from labseq.recording.shot_file import ShotEncoder
 
 
 class RunWriter:
-    """The folder of a run in progress; made by :meth:`create`, used by one process.
+    """The folder of a run in progress; made by :meth:`create` or :meth:`reopen`, used by one process.
 
     A shot is on the disk, whole, before its line is in the index. Whatever
     happens, also a kill or a full disk, the shots in the index stay whole.
@@ -43,6 +46,8 @@ class RunWriter:
         self._events = LineLog(run_dir / folders.EVENTS_FILE)
         self._events_lock = threading.Lock()
         self._n_events_lost = 0
+        self._before: dict[str, Any] | None = None  # run.json, if the run was begun by another process
+        self._kept: frozenset[str] = frozenset()
 
     @classmethod
     def create(
@@ -94,6 +99,29 @@ class RunWriter:
             sync_folder(run_dir)
         return writer
 
+    @classmethod
+    def reopen(cls, run_dir: Path, run: RunRecord, *, n_written: int, compress: bool = False) -> RunWriter:
+        """Go on with a run that ended before its last shot; nobody else may write to it.
+
+        Args:
+            run_dir: Its folder.
+            run: What is known of it now, for the next shots' files; only its ``resumed`` goes into run.json.
+            n_written: Shots written before that count.
+            compress: Whether frames are compressed; needs ``labseq[compress]``.
+
+        Raises:
+            RecordingError: The folder cannot be written to, the disk is full, or run.json is damaged.
+        """
+        before = {**read_run(run_dir), "resumed": run.resumed}
+        with explained(run_dir):
+            (run_dir / folders.STOP_FILE).unlink(missing_ok=True)
+            kept = frozenset(path.name for path in (run_dir / folders.SHOTS_FOLDER).iterdir())
+        writer = cls(run_dir, run, compress=compress)
+        writer.n_written, writer._before, writer._kept = n_written, before, kept
+        write_file(run_dir / folders.RUN_FILE, dumps(before, indent=1).encode() + b"\n")
+        write_file(run_dir / folders.STATE_FILE, encode_state("running"))
+        return writer
+
     def set_devices(self, devices: Mapping[str, Mapping[str, Any]]) -> None:
         """Add what the devices say of themselves; before the first shot, once they are open.
 
@@ -105,7 +133,11 @@ class RunWriter:
         """
         self._run = replace(self._run, devices=devices)
         self._encoder = self._make_encoder()
-        write_file(self.run_dir / folders.RUN_FILE, encode_run(self._run, _run_id(self.run_dir)))
+        if self._before is None:
+            write_file(self.run_dir / folders.RUN_FILE, encode_run(self._run, _run_id(self.run_dir)))
+        elif not self._before.get("devices"):  # it had not come so far
+            self._before["devices"] = devices
+            write_file(self.run_dir / folders.RUN_FILE, dumps(self._before, indent=1).encode() + b"\n")
 
     def _make_encoder(self) -> ShotEncoder:
         from labseq.recording.shot_file import ShotEncoder  # h5py takes 0.1 s to import
@@ -123,7 +155,7 @@ class RunWriter:
                 The shots written before are whole, and this one may be written again.
         """
         counts = shot.status == "complete"
-        file = folders.shot_file_name(shot.shot_index, shot.attempt, counts=counts)
+        file = self._free_name(shot, counts=counts)
         path = self.run_dir / file
         data = self._encoder.encode(shot)
         write_file(path, data)
@@ -132,6 +164,14 @@ class RunWriter:
         self._index.append(row, sync=True)
         self.n_written += counts
         return path
+
+    def _free_name(self, shot: ShotRecord, *, counts: bool) -> str:
+        """The name of a shot's file; none that the run had before it was resumed."""
+        for take in itertools.count(1):
+            file = folders.shot_file_name(shot.shot_index, shot.attempt, counts=counts, take=take)
+            if Path(file).name not in self._kept:
+                return file
+        raise AssertionError
 
     def event(self, name: str, /, **values: Any) -> None:
         """Add a line to the event log; never raises, from any thread.
@@ -159,6 +199,8 @@ class RunWriter:
             RecordingError: The disk is full. The run counts as failed as soon as
                 this process is gone.
         """
+        with suppress(OSError):
+            (self.run_dir / folders.STOP_FILE).unlink(missing_ok=True)
         self.event("run_finished", status=status, error=error, n_shots=self.n_written)
         write_file(self.run_dir / folders.STATE_FILE, encode_state(status, error))
 

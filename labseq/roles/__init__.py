@@ -11,7 +11,7 @@ Failures: a device raises ``DeviceError`` (or ``DeviceTimeoutError``),
 """
 
 from labseq.roles.clock import Clock, NeverStopped
-from labseq.roles.deciding import Detector, Planner, SignalTeller, Warmable
+from labseq.roles.deciding import Analysis, Detector, Planner, RecordedShot, SignalTeller, Warmable
 from labseq.roles.hardware import (
     Camera,
     Device,
@@ -20,6 +20,7 @@ from labseq.roles.hardware import (
     KnownCamera,
     KnownCommands,
     KnownLines,
+    Leading,
     Lines,
     MobileTweezers,
     Polled,
@@ -46,6 +47,7 @@ from labseq.roles.simulation import (
 
 __all__ = [
     "WHOLE_SENSOR",
+    "Analysis",
     "Camera",
     "Clock",
     "Context",
@@ -58,6 +60,7 @@ __all__ = [
     "KnownLines",
     "KnownLoading",
     "KnownSensor",
+    "Leading",
     "Lines",
     "Listening",
     "LossTeller",
@@ -65,6 +68,7 @@ __all__ = [
     "NeverStopped",
     "Planner",
     "Polled",
+    "RecordedShot",
     "RfSource",
     "RunObserver",
     "SelfTesting",

@@ -1,16 +1,20 @@
-"""The roles that decide: planner and detector."""
+"""The roles that decide, and those that look at what came of it: planner, detector, analysis."""
 
 from __future__ import annotations
 
-from typing import Protocol, runtime_checkable
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from labseq.model import (
+    CycleRecord,
     Frame,
+    ImageRecord,
     Occupancy,
     Plan,
+    StageTiming,
     TargetPattern,
 )
 
@@ -40,6 +44,86 @@ class Detector(Protocol):
         Returns:
             The occupancy, bool (n_rows, n_cols), and the confidence per site,
             float32 (n_rows, n_cols), 0 at the threshold and 1 for certainty.
+        """
+        ...
+
+
+class RecordedShot(Protocol):
+    """A shot that was taken, read back from disk: a ``Shot`` of ``labseq.open_run``, which tells more."""
+
+    @property
+    def index(self) -> int:
+        """Index of the shot in the run, from 0."""
+        ...
+
+    @property
+    def target(self) -> TargetPattern:
+        """What the array was to look like."""
+        ...
+
+    @property
+    def success(self) -> bool:
+        """Whether its last ``image`` step met the target."""
+        ...
+
+    @property
+    def filling_fraction(self) -> float:
+        """Filling of the target on its last ``image`` step; nan without one."""
+        ...
+
+    @property
+    def images(self) -> Sequence[ImageRecord]:
+        """The images without their frames, in the order they were taken."""
+        ...
+
+    @property
+    def occupancies(self) -> NDArray[np.bool_]:
+        """As detected, bool (n_images, n_rows, n_cols)."""
+        ...
+
+    @property
+    def confidences(self) -> NDArray[np.float32]:
+        """The detector's confidence, float32 (n_images, n_rows, n_cols)."""
+        ...
+
+    @property
+    def frames(self) -> NDArray[np.uint16]:
+        """The frames that were kept, uint16 (n_frames, height, width)."""
+        ...
+
+    @property
+    def cycles(self) -> Sequence[CycleRecord]:
+        """The rearrangement cycles."""
+        ...
+
+    @property
+    def timing(self) -> Sequence[StageTiming]:
+        """The stages, in the order they ended."""
+        ...
+
+    @property
+    def readings(self) -> Mapping[str, Any]:
+        """Values read from devices, and noted by steps."""
+        ...
+
+    @property
+    def parameters(self) -> Mapping[str, Any]:
+        """What differs from the files in this shot: address -> value; those of a scan in SI."""
+        ...
+
+
+class Analysis(Protocol):
+    """Works something out of each shot, in a process of its own beside the run."""
+
+    def shot(self, shot: RecordedShot) -> Mapping[str, Any]:
+        """Analyse a shot.
+
+        Args:
+            shot: The shot, whole and on disk; shots come in the order they were taken.
+
+        Returns:
+            Name -> number, text, array, or lists and mappings of them: what the shot's line of
+            the results says. "shot" and "error" are no names of results.
         """
         ...
 

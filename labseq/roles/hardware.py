@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
@@ -89,6 +89,56 @@ class Interlocked(Protocol):
         Raises:
             DeviceError: A value is past its limit; the run ends safely.
         """
+        ...
+
+
+@runtime_checkable
+class Leading(Protocol):
+    """A device through which another control system leads: it says `go`, and is told what came of it.
+
+    For each `go` it gets exactly one answer, `ready` or `failed`, within the device's deadline, whatever
+    becomes of the shot: the device answers by itself where labseq does not in time.
+    """
+
+    @property
+    def deadline_s(self) -> float:
+        """Longest time from a signal to its answer, in seconds."""
+        ...
+
+    def wait_for(self, signal: str, timeout_s: float) -> str:
+        """Wait for a signal on the session's clock, and tell the leader that labseq is busy from now on.
+
+        A signal that came since the last answer counts. Looks for a stop request at least every 50 ms.
+
+        Args:
+            signal: "go".
+            timeout_s: How long to wait, in seconds.
+
+        Returns:
+            What the leader said with it; "" if nothing.
+
+        Raises:
+            DeviceTimeoutError: It did not come in time.
+            StopRequested: The operator asked the run to stop.
+        """
+        ...
+
+    def tell(self, state: Literal["ready", "failed"], about: Mapping[str, bool | int | float | str]) -> str:
+        """Answer the signal that was waited for; without one, nothing is said.
+
+        Args:
+            state: What came of it.
+            about: "shot"; of one that is ready and was judged, "success" and "filling" (of the target, 0 to
+                1); of a failure its "reason".
+
+        Returns:
+            What the leader was told: "ready", "failed"; "late" if it was told of a failure when the deadline
+            passed; "gone" if it is not there any more; "" if it is owed nothing.
+        """
+        ...
+
+    def news(self) -> Sequence[str]:
+        """What happened since the last call, for the log: who came and went, what was not understood."""
         ...
 
 

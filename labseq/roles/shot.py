@@ -187,6 +187,23 @@ class Shot(Protocol):
         """
         ...
 
+    def follow(self, signal: str, timeout_s: float, device: str = "") -> None:
+        """Wait until another control system says to go on; it is told what becomes of this shot.
+
+        At a second wait in a shot it is told first that labseq is ready.
+
+        Args:
+            signal: "go".
+            timeout_s: How long to wait, in seconds.
+            device: Name of the device through which it leads; "" for the only one that there is.
+
+        Raises:
+            ConfigError: There is no such device.
+            DeviceTimeoutError: The signal did not come in time.
+            StopRequested: The operator asked the run to stop.
+        """
+        ...
+
     def margin_s(self, kind: str) -> float:
         """How much longer a kind of step takes for the leads and lags of its lines, in seconds."""
         ...

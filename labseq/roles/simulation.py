@@ -137,6 +137,8 @@ class Storyteller(Protocol):
     def story(self, since_s: float) -> Mapping[str, NDArray[Any]]:
         """What happened since the shot began: name -> structured array, with a field for each column.
 
+        A dtype with ``metadata={"descriptions": {column: text}}`` takes its texts into the shot's file.
+
         Args:
             since_s: Time on the session's clock from which times are counted.
         """

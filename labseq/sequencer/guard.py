@@ -20,6 +20,8 @@ GRACE_S: Final = 1.0
 """How long a call may take to come back after a stop request."""
 STEP_GRACE_S: Final = 2.0
 """The same for a step, whose own call into a device has its grace first."""
+LATE_S: Final = 2.0
+"""A driver's own timeout comes first; only then does the guard count it as hung."""
 
 
 class _Job:

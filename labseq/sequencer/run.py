@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Generator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Collection, Mapping, Sequence
 from datetime import UTC, datetime
 from functools import partial
 from typing import Any, Protocol
 
 from labseq.errors import LabseqError, StopRequested, TransientError
-from labseq.model import ShotRecord, TimelineEntry
+from labseq.model import ShotRecord
 from labseq.model.records import ShotStatus
-from labseq.roles import RunObserver, Settling, Step, StepContext
+from labseq.roles import RunObserver, Settling, Step
+from labseq.sequencer.calling import budget_s, run_step
 from labseq.sequencer.clock import StopFlag
-from labseq.sequencer.guard import Guard
+from labseq.sequencer.guard import LATE_S, Guard
 from labseq.sequencer.lab import Lab, Outcome, close_all, make_safe
-from labseq.sequencer.shot import LATE_S, RunningShot
+from labseq.sequencer.leading import Leaders
+from labseq.sequencer.shot import RunningShot
 from labseq.sequencer.states import State, StateTable
 
 
@@ -145,8 +146,9 @@ class Sequencer:
 
     def _lay_out(self) -> list[float]:
         """What each step may take, in seconds."""
+        context, timeout_s = self.lab.step_context, self.lab.timeouts.call_s
         return [
-            self.guard.call("step", self.lab.timeouts.call_s, _budget, step, number, name, self.lab)
+            self.guard.call("step", timeout_s, budget_s, step, number, name, context)
             for number, (name, step) in enumerate(self._steps)
         ]
 
@@ -202,6 +204,7 @@ class Sequencer:
                     raise
                 failure = error
                 self._recover()
+                self._leaders(record).failed(error)
         except BaseException as error:  # KeyboardInterrupt too, where no signal handler could be set
             stopped = isinstance(error, StopRequested | KeyboardInterrupt)
             self._abort(record, "interrupted" if stopped else "failed", error)
@@ -226,7 +229,8 @@ class Sequencer:
             self._stop.check()
             shot.begin_step(number)
             with shot.stage(f"step {number} {name}", self._budgets[number]):
-                self.guard.run_step(partial(_run, step, number, name, shot))
+                self.guard.run_step(partial(run_step, step, number, name, shot))
+        shot.leaders.ready()  # before the shot is written: atoms do not wait for a disk
         shot.note_truth()
 
     def _recover(self) -> None:
@@ -238,14 +242,18 @@ class Sequencer:
             self.guard.call_to_the_end("camera", timeout_s, lab.camera.safe_state)
 
     def _abort(self, record: ShotRecord, status: ShotStatus, error: BaseException) -> None:
-        """Safety first; only then is what the shot has written down."""
+        """Safety first; only then is who leads told, and what the shot has written down."""
         self._secure()
+        self._leaders(record).failed(error)
         self._close_record(record, status, error)
         try:
             self._sink.write_shot(record)
         except LabseqError as failure:
             self._emit("warning", {"text": f"the interrupted shot could not be written: {failure}"})
         self._emit("shot_finished", {"shot": record})
+
+    def _leaders(self, record: ShotRecord) -> Leaders:
+        return Leaders(self.lab, self.guard, record, self._emit)
 
     def _close_record(self, record: ShotRecord, status: ShotStatus, error: BaseException | None) -> None:
         record.status = status
@@ -258,34 +266,6 @@ class Sequencer:
 
     def _emit(self, name: str, values: Mapping[str, Any]) -> None:
         self._observer.event(name, values)
-
-
-def lay_out(step: Step, number: int, name: str, context: StepContext) -> list[TimelineEntry]:
-    """A step's timeline; what the step raises is named. For a guarded call."""
-    with _named(number, name):
-        return list(step.plan_timeline(context))
-
-
-def _budget(step: Step, number: int, name: str, lab: Lab) -> float:
-    with _named(number, name):
-        return sum(entry.duration_s for entry in step.plan_timeline(lab.step_context))
-
-
-def _run(step: Step, number: int, name: str, shot: RunningShot) -> None:
-    with _named(number, name):
-        step.run(shot)
-
-
-@contextmanager
-def _named(number: int, name: str) -> Generator[None]:
-    """Name the step in whatever it raises; labseq's own errors pass as they are."""
-    try:
-        yield
-    except LabseqError:
-        raise
-    except BaseException as error:
-        text = f"step {number} ({name}) raised {type(error).__name__}: {error}"
-        raise LabseqError(text) from error
 
 
 def _utc_now() -> str:

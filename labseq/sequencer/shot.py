@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from typing import Any, ParamSpec, TypeVar
 
@@ -13,14 +13,13 @@ from labseq.errors import ConfigError, DeviceError
 from labseq.lines import line_program, margin_s, trigger_line
 from labseq.model import CycleRecord, Frame, ImageRecord, Occupancy, ShotRecord, StageTiming
 from labseq.roles import Device, Interlocked, LossTeller, Polled, Storyteller, TruthTeller
-from labseq.sequencer.guard import Guard
+from labseq.sequencer.guard import LATE_S, Guard
 from labseq.sequencer.interlock import check_blinding
 from labseq.sequencer.lab import Lab
+from labseq.sequencer.leading import Emit, Leaders
 
 P = ParamSpec("P")
 T = TypeVar("T")
-
-Emit = Callable[[str, Mapping[str, Any]], None]
 
 
 class RunningShot:
@@ -55,6 +54,7 @@ class RunningShot:
         self.plan_timeout_s = lab.timeouts.plan_s
         self.step = 0
         self.start_s = lab.clock.now()
+        self.leaders = Leaders(lab, guard, record, emit)
         self._guard = guard
         self._emit = emit
 
@@ -94,6 +94,10 @@ class RunningShot:
             if isinstance(device, Interlocked):
                 self.call(name, self.call_timeout_s, device.check_interlocks)
 
+    def follow(self, signal: str, timeout_s: float, device: str = "") -> None:
+        """Wait until another control system says to go on; see ``labseq.roles.Shot``."""
+        self.leaders.follow(signal, timeout_s, device)
+
     def margin_s(self, kind: str) -> float:
         """How much longer a kind of step takes for its lines."""
         return margin_s(self.lab.line_specs, kind)
@@ -108,8 +112,8 @@ class RunningShot:
         program = line_program(self.lab.line_specs, kind, duration_s)
         self.call("lines", timeout_s, lines.compile, program)
         self.call("lines", timeout_s, lines.arm)
-        fired_s = self.clock.now()
         self.call("lines", timeout_s, lines.fire)
+        fired_s = self.clock.now()  # now: on its way the command took a moment
         self.clock.sleep(max(0.0, program.begin_s - (self.clock.now() - fired_s)))
         yield
         left_s = max(0.0, program.duration_s - (self.clock.now() - fired_s)) + timeout_s
@@ -210,7 +214,3 @@ class RunningShot:
                 wanted = "bool" if kind == "b" else "float32"
                 raise DeviceError("detector", f"the {name} is {came}; expected {wanted} {shape}")
         return np.ascontiguousarray(occupancy), np.ascontiguousarray(confidence, np.float32)
-
-
-LATE_S = 2.0
-"""A driver's own timeout comes first; only then does the guard count it as hung."""

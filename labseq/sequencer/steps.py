@@ -16,6 +16,11 @@ class _Duration(Protocol):
     def duration(self) -> float: ...
 
 
+class _WaitTime(Protocol):
+    @property
+    def duration(self) -> float | None: ...
+
+
 class _Exposure(Protocol):
     @property
     def exposure(self) -> float: ...
@@ -83,8 +88,8 @@ class WaitStep:
     needs_image = False
     takes_image = False
 
-    def __init__(self, settings: _Duration) -> None:
-        self.duration_s = settings.duration
+    def __init__(self, settings: _WaitTime) -> None:
+        self.duration_s = settings.duration or 0.0
 
     def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:
         """One bar."""

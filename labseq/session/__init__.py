@@ -1,7 +1,8 @@
 """The composition root: sequence + profile + plugins -> open devices -> sequencer -> recorder."""
 
-from labseq.session.assembly import Assembly, Bench, assemble, load_plugins, set_up_bench
+from labseq.session.assembly import Assembly, assemble
 from labseq.session.checking import CheckReport, check
+from labseq.session.choosing import Bench
 from labseq.session.devices import CheckedDevice, DevicesReport, check_devices
 from labseq.session.occupancies import Source, read_source
 from labseq.session.options import Options
@@ -10,6 +11,7 @@ from labseq.session.planning import PlannedMoves, plan_moves
 from labseq.session.provenance import gather_provenance
 from labseq.session.safe import Secured, make_profile_safe
 from labseq.session.session import Session
+from labseq.session.setting_up import load_plugins, set_up_bench
 
 __all__ = [
     "Assembly",

@@ -10,15 +10,13 @@ from typing import Any
 from labseq import builtins
 from labseq.config import (
     ROLES,
-    Choice,
     Collected,
     Document,
+    Kept,
     Override,
-    ProfileSpec,
     Scan,
     SequenceSpec,
     bind_scan,
-    load_profile,
     load_sequence,
     plugin_paths,
     read_scan,
@@ -27,21 +25,19 @@ from labseq.config import (
 from labseq.errors import ConfigError
 from labseq.model import TargetPattern
 from labseq.plugins import PluginHost
-from labseq.registry import VIRTUAL_TWIN
 from labseq.roles import Step
-from labseq.session.calibrating import Calibrated, calibrated, with_tones
+from labseq.session.calibrating import with_tones
 from labseq.session.choosing import (
     Bench,
     Chosen,
     DryRun,
     check_dry_run,
-    choose,
     resolve,
     validate,
 )
-from labseq.session.contents import make_steps, make_target
+from labseq.session.contents import make_analyses, make_steps, make_target
 from labseq.session.scan import Point, Scanned
-from labseq.session.wiring import check_kinds
+from labseq.session.setting_up import Again, set_up_bench
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,10 +88,12 @@ class Assembly:
 def assemble(
     sequence_path: Path,
     *,
-    profile: str | None = None,
+    profile: str | Path | None = None,
     overrides: Sequence[str] = (),
     given: Sequence[Override] = (),
     dry_run: DryRun = "off",
+    kept: Kept | None = None,
+    again: Again | None = None,
 ) -> Assembly:
     """Read and validate everything that can be validated without opening a device.
 
@@ -106,6 +104,8 @@ def assemble(
         given: Values of other options.
         dry_run: "full": every device by its simulated counterpart where its plugin
             declares one, else its virtual twin; "fast": virtual twins only.
+        kept: What the sequence's file says, in place of what it says today.
+        again: Profile and calibrations, if the run was begun before.
 
     Raises:
         ConfigError: The sequence, the profile or an override is wrong.
@@ -118,7 +118,7 @@ def assemble(
     found = Collected()
     try:
         document, sequence = load_sequence(
-            sequence_path, [*given, *for_sequence], profile_set=profile_set, found=found
+            sequence_path, [*given, *for_sequence], profile_set=profile_set, found=found, kept=kept
         )
     except ConfigError as error:
         raise found.stop(error) from None
@@ -133,6 +133,7 @@ def assemble(
             plugin_folders=plugin_paths(document, sequence.plugin_folders),
             scan=scan,
             found=found,
+            again=again,
         )
     except ConfigError as error:
         _check_alone(document, sequence, found)
@@ -144,6 +145,7 @@ def assemble(
     with found:
         made["planner"] = resolve(bench.host, document, "planner", sequence.planner)
     steps, step_dumps = make_steps(bench, document, sequence, found)
+    analyses = make_analyses(bench, document, sequence, found)
     scanned: Scanned | None = None
     try:
         if scan is not None and is_whole:
@@ -157,6 +159,7 @@ def assemble(
         "target": made["target_dump"],
         "planner": made["planner"].dump(),
         "shot": step_dumps,
+        "analysis": analyses,
         "profile": _profile_dump(bench),
     }
     return Assembly(
@@ -183,108 +186,6 @@ def _check_alone(document: Document, sequence: SequenceSpec, found: Collected) -
         if entry is not None:
             with found:
                 validate(document, entry, spec.loc)
-
-
-def set_up_bench(
-    profile: str,
-    beside: Path = Path(),
-    overrides: Sequence[Override] = (),
-    dry_run: DryRun = "off",
-    *,
-    named_in: Document | None = None,
-    plugin_folders: Sequence[Path] = (),
-    scan: Scan | None = None,
-    found: Collected | None = None,
-) -> Bench:
-    """Read a profile, load the plugins and choose what plays each role.
-
-    Args:
-        profile: Name or path of the profile.
-        beside: Folder of the file that names it.
-        overrides: Values that replace those of the file.
-        dry_run: "off", "full" or "fast".
-        named_in: The sequence that names the profile, for messages.
-        plugin_folders: Folders with plugins beside those that the profile names.
-        scan: The sequence's scan; the profile's values are those of its first point.
-        found: Where the problems of a profile that can be read go; without it they are raised.
-
-    Raises:
-        ConfigError: The profile is wrong.
-        PluginLoadError: A plugin that it names failed to load.
-    """
-    document, spec = load_profile(
-        profile, beside=beside, overrides=overrides, named_in=named_in, scan=scan, found=found
-    )
-    host = load_plugins([*plugin_paths(document, spec.plugin_folders), *plugin_folders])
-    problems = Collected() if found is None else found
-    bench = choose_all(document, spec, host, dry_run, problems)
-    if found is None:
-        problems.raise_any()
-    return bench
-
-
-def choose_all(
-    document: Document, spec: ProfileSpec, host: PluginHost, dry_run: DryRun, found: Collected
-) -> Bench:
-    """Choose what plays each role of a profile.
-
-    Args:
-        document: The profile's file.
-        spec: What it says; stand-ins for what was wrong, if anything was found.
-        host: The plugins.
-        dry_run: "off", "full" or "fast".
-        found: Where the problems go.
-    """
-    mended = bool(found.problems)
-    chosen: dict[str, Chosen] = {}
-    warnings: list[str] = []
-    refused: dict[str, ConfigError] = {}
-    for role, choice in {**spec.choices, **spec.devices}.items():
-        kind = role if role in ROLES else "device"
-        if mended and _is_stand_in(document, choice):
-            refused[role] = ConfigError("what the profile says of it is wrong")
-            continue
-        try:
-            chosen[role], warning = choose(host, document, kind, choice, dry_run)
-            warnings += [f"{role}: {warning}"] if warning else []
-        except ConfigError as error:
-            refused[role] = error
-            found.add(error)
-    check_kinds(document, spec, host, found)
-    detector = chosen["detector"].dump() if "detector" in chosen else {}
-    made = (
-        Calibrated({}, spec.grid_model()) if mended else calibrated(document, spec, found, dry_run, detector)
-    )
-    warnings += made.warnings
-    return Bench(document, spec, host, made.grid, chosen, tuple(warnings), refused, made.entries)
-
-
-def _is_stand_in(document: Document, choice: Choice) -> bool:
-    """Whether nobody wrote this, in a profile of which something was wrong: it has no place of its own."""
-    here, around = document.locate(choice.loc), document.locate(choice.loc[:-1])
-    return choice.use == VIRTUAL_TWIN and here == around
-
-
-def load_plugins(folders: Sequence[Path] = (), found: Collected | None = None) -> PluginHost:
-    """Load labseq's own, the installed and the folders' plugins.
-
-    Args:
-        folders: Folders with plugins, beside those of LABSEQ_PLUGIN_PATH.
-        found: Where the problem of a folder that cannot be read goes; without it it is raised.
-
-    Raises:
-        ConfigError: A folder does not exist, or cannot be read.
-    """
-    host = PluginHost()
-    host.load_builtin(builtins)
-    host.load_entry_points()
-    try:
-        host.load_folders(folders)
-    except ConfigError as error:
-        if found is None:
-            raise
-        found.add(error)
-    return host
 
 
 def _profile_dump(bench: Bench) -> dict[str, Any]:

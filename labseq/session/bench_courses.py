@@ -13,11 +13,11 @@ from labseq.errors import ConfigError, LimitError, PlanError, Problem
 from labseq.model import MotionSpec, SiteGrid, TargetPattern
 from labseq.plugins import PluginHost
 from labseq.roles import NeverStopped, Planner, Warmable
-from labseq.session.assembly import load_plugins
 from labseq.session.bench_spec import Comparison, Condition, Entrant
 from labseq.session.choosing import Chosen, dump, resolve
 from labseq.session.constructing import construct, construct_target
 from labseq.session.plan_inputs import parse_target
+from labseq.session.setting_up import load_plugins
 
 _DOP: Final = "degree_of_parallelism"
 _MOTION_ADDRESS: Final = "profile.mobile_tweezers"

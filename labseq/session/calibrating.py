@@ -79,6 +79,7 @@ def calibrated(
     found: Collected,
     dry_run: Literal["off", "full", "fast"] = "off",
     detector: Mapping[str, Any] | None = None,
+    pins: Mapping[str, str] | None = None,
 ) -> Calibrated:
     """Read the calibrations that a profile goes by, and apply those of the tones.
 
@@ -88,10 +89,11 @@ def calibrated(
         found: Where the problems go; a calibration that has one is not used.
         dry_run: "off", "full" or "fast".
         detector: Settings of the detector in use, for the record; None where they do not matter.
+        pins: The ids of those that count, by kind, and no others; None for what profile and store say.
     """
     grid, store = profile.grid_model(), store_of(document, profile, dry_run)
     entries: dict[str, CalibrationEntry] = {}
-    if any(profile.calibrations.use.of(kind) is None for kind in CALIBRATION_KINDS):
+    if pins is None and any(profile.calibrations.use.of(kind) is None for kind in CALIBRATION_KINDS):
         try:
             store.active()
         except ConfigError as error:  # told once, not for each kind
@@ -99,7 +101,10 @@ def calibrated(
             return Calibrated(entries, grid)
     for kind in CALIBRATION_KINDS:
         with found:
-            stored = _chosen(document, profile, store, kind)
+            if pins is None:
+                stored = _chosen(document, profile, store, kind)
+            else:
+                stored = store.find(pins[kind], kind) if kind in pins else None
             if stored is not None:
                 check_grid(stored.entry, grid, str(stored.path))
                 entries[kind] = stored.entry

@@ -18,8 +18,9 @@ from labseq.model import TimelineEntry
 from labseq.motion import check_plan
 from labseq.roles import KnownLoading, Step
 from labseq.sequencer import Guard, StopFlag
+from labseq.sequencer.calling import lay_out
 from labseq.sequencer.lab import Lab
-from labseq.sequencer.run import lay_out
+from labseq.sequencer.leading import FollowStep, find_leader
 from labseq.session.commands import check_commands
 from labseq.session.session import Session
 from labseq.units import format_quantity
@@ -122,6 +123,7 @@ def check(session: Session) -> CheckReport:
     warnings += _exposure_warnings(session, lab, timeline)
     warnings += _judgement_warnings(session, [number for number, _ in windows])
     warnings += _parallelism_warnings(session)
+    warnings += _deadline_warnings(session, lab, timeline)
     for point in session.course.each_lab():
         session.build_lab(point)  # whether the constructors accept the settings
     return CheckReport(
@@ -253,6 +255,28 @@ def _parallelism_warnings(session: Session) -> list[Problem]:
     loc = (*assembly.sequence.planner.loc, "degree_of_parallelism")
     what = f"degree_of_parallelism is {asked}, but the profile allows {limit} mobile tweezers at once"
     return [assembly.document.problem(loc, what, f"at most {limit}")]
+
+
+def _deadline_warnings(
+    session: Session, lab: Lab, timeline: Sequence[tuple[str, Sequence[TimelineEntry]]]
+) -> list[Problem]:
+    """What comes after a wait for a leader, up to the next or the end, must fit into its deadline."""
+    problems: list[Problem] = []
+    steps = [step for _, step in session.assembly.steps]
+    for number, step in enumerate(steps):
+        if not isinstance(step, FollowStep):
+            continue
+        name, leader = find_leader(lab.devices, step.device)
+        until = next((n for n in range(number + 1, len(steps)) if isinstance(steps[n], FollowStep)), None)
+        longest_s = sum(bar.duration_s for _, bars in timeline[number + 1 : until] for bar in bars)
+        if longest_s > leader.deadline_s:
+            longest = format_quantity(longest_s, "time")
+            what = f"what follows takes up to {longest}, but '{name}' must be answered within "
+            what += format_quantity(leader.deadline_s, "time")
+            loc = (*session.assembly.sequence.shot[number].loc, "for")
+            hint = "raise 'deadline' in the profile, or it is told that the shot failed"
+            problems.append(session.assembly.document.problem(loc, what, hint=hint))
+    return problems
 
 
 def _shot_bytes(

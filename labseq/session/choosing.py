@@ -254,7 +254,7 @@ def dump(entry: Entry, settings: Settings | None) -> dict[str, Any]:
         PluginLoadError: The plugin's own serializers fail.
     """
     with blamed(entry, f"the settings of {entry.kind} '{entry.name}'"):
-        return {} if settings is None else settings.model_dump(mode="json")
+        return {} if settings is None else settings.model_dump(mode="json", by_alias=True)
 
 
 def _defaults(entry: Entry) -> Settings | None:

@@ -1,20 +1,24 @@
-"""Commands that steps send to devices, checked by the devices that know theirs before they are opened."""
+"""What steps ask of devices: commands, checked by devices that know theirs, and leaders to wait for."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 
+from labseq.config import Loc
 from labseq.errors import ConfigError, LabseqError, Problem
 from labseq.roles import KnownCommands
 from labseq.sequencer import Guard, StopFlag
 from labseq.sequencer.lab import Lab
+from labseq.sequencer.leading import FollowStep, find_leader, leaders
 from labseq.sequencer.steps import DeviceStep
 from labseq.session.assembly import Assembly
 from labseq.session.scan import Point
 
 
 def check_commands(assembly: Assembly, points: Iterable[Point], build: Callable[[Point], Lab]) -> None:
-    """Refuse commands that a device does not know, or whose arguments it would refuse; nothing is opened.
+    """Refuse what a device does not know, or would refuse, and waits for a leader that there is not.
+
+    Nothing is opened.
 
     Args:
         assembly: The run.
@@ -24,7 +28,7 @@ def check_commands(assembly: Assembly, points: Iterable[Point], build: Callable[
     Raises:
         ConfigError: Everything that is wrong with them, with its place.
     """
-    if not any(isinstance(step, DeviceStep) for _, step in assembly.steps):
+    if not any(isinstance(step, DeviceStep | FollowStep) for _, step in assembly.steps):
         return
     labs: dict[int, Lab] = {}
     problems: dict[str, Problem] = {}
@@ -32,9 +36,12 @@ def check_commands(assembly: Assembly, points: Iterable[Point], build: Callable[
     for point in points:
         lab = labs.get(id(point.bench)) or labs.setdefault(id(point.bench), build(point))
         for spec, (_, step) in zip(assembly.sequence.shot, point.steps, strict=True):
-            failure = _failure(guard, lab, step) if isinstance(step, DeviceStep) else None
-            if failure is not None:
+            problem: Problem | None = None
+            if isinstance(step, DeviceStep) and (failure := _failure(guard, lab, step)) is not None:
                 problem = assembly.document.problem((*spec.loc, "do"), str(failure))
+            elif isinstance(step, FollowStep):
+                problem = _leaderless(assembly, lab, spec.loc, step)
+            if problem is not None:
                 problems[str(problem)] = problem
     guard.end()
     if problems:
@@ -50,4 +57,19 @@ def _failure(guard: Guard, lab: Lab, step: DeviceStep) -> LabseqError | None:
         guard.call(step.device, timeout_s, check, step.command, **step.arguments)
     except LabseqError as failure:
         return failure
+    return None
+
+
+def _leaderless(assembly: Assembly, lab: Lab, loc: Loc, step: FollowStep) -> Problem | None:
+    """Why nobody can lead whom a step could wait for."""
+    try:
+        find_leader(lab.devices, step.device)
+    except ConfigError as error:
+        hint = ""
+        if assembly.dry_run == "fast":
+            hint = "virtual twins do not lead: '--dry-run' without 'fast' has one that says `go` by itself"
+        elif not dict(leaders(lab.devices)):
+            hint = "add one to its `devices`: `leader: {use: tcp_leader}`"
+        key = "device" if step.device else "for"
+        return assembly.document.problem((*loc, key), str(error), hint=hint)
     return None

@@ -9,6 +9,7 @@ from labseq.errors import ConfigError, LabseqError, LimitError, PluginLoadError
 from labseq.model import CalibrationEntry, LineSpec, MotionSpec, RandomStream, SiteGrid, TargetPattern
 from labseq.registry import Entry
 from labseq.roles import (
+    Analysis,
     Camera,
     Clock,
     Context,
@@ -33,6 +34,7 @@ _ROLES: Final[Mapping[str, type]] = {
     "planner": Planner,
     "simulation": Simulation,
     "step": Step,
+    "analysis": Analysis,
 }
 
 

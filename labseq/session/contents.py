@@ -6,15 +6,16 @@ from dataclasses import replace
 from typing import Any, Final
 
 from labseq.config import Collected, Document, SequenceSpec, StepSpec
+from labseq.config.analyses import ANALYSIS_KEYS
 from labseq.config.settings import Settings
 from labseq.errors import ConfigError, LabseqError, PluginLoadError, one_of
 from labseq.model import TargetPattern
-from labseq.roles import Step
+from labseq.roles import Context, Step
 from labseq.session.choosing import Bench, blamed, dump, named, resolve, validate
-from labseq.session.constructing import check_role, construct_target
+from labseq.session.constructing import check_role, construct_one, construct_target
 
-DEVICE_KEYS: Final = {"device": "name", "equalise": "device"}
-"""Steps that need a device of the profile -> the setting that names it."""
+DEVICE_KEYS: Final = {"device": "name", "equalise": "device", "wait": "device"}
+"""Steps that need a device of the profile -> the setting that names it; a wait need not name one."""
 
 
 def make_target(
@@ -85,10 +86,33 @@ def make_step(bench: Bench, document: Document, spec: StepSpec) -> tuple[Step, d
         raise document.error(spec.loc, str(error)) from error
 
 
+def make_analyses(
+    bench: Bench, document: Document, sequence: SequenceSpec, found: Collected
+) -> list[dict[str, Any]]:
+    """What is worked out from each shot: the settings of each analysis for the record.
+
+    Each is constructed once, to see whether it can be: those of the run live in processes of their own.
+
+    Args:
+        bench: The profile.
+        document: The sequence's file.
+        sequence: What it says.
+        found: Where the problems go.
+    """
+    dumps: list[dict[str, Any]] = []
+    for choice in sequence.analysis:
+        with found:
+            chosen = resolve(bench.host, document, "analysis", choice, ANALYSIS_KEYS)
+            context = Context(choice.use, bench.grid, bench.profile.motion, calibrations=bench.calibrations)
+            construct_one(chosen, context)
+            dumps.append({**chosen.dump(), "finish_within": choice.finish_within})
+    return dumps
+
+
 def _check_device_name(bench: Bench, document: Document, settings: Settings | None, spec: StepSpec) -> None:
     key = DEVICE_KEYS[spec.kind]
     name = getattr(settings, key, None)
-    if name not in bench.profile.devices:
+    if name is not None and name not in bench.profile.devices:
         what = f"the profile '{bench.profile.name}' has no device '{name}'"
         problem = document.problem((*spec.loc, key), what, one_of(sorted(bench.profile.devices)))
         raise ConfigError(replace(problem, notes=(_place(bench.document, "devices"),)))

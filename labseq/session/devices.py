@@ -5,19 +5,21 @@ from __future__ import annotations
 import statistics
 import time
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 from labseq.config import profile_overrides
 from labseq.errors import DeviceError, LabseqError, StopRequested
-from labseq.recording import data_root, in_progress, marker_roots
+from labseq.recording import data_root, marker_roots
 from labseq.roles import Hardware, Listening, SelfTesting, Simulation, Warmable
 from labseq.sequencer import Guard, RealClock, StopFlag, VirtualClock
 from labseq.sequencer.lab import Timeouts
-from labseq.session.assembly import set_up_bench
 from labseq.session.choosing import DryRun, check_dry_run
+from labseq.session.holding import devices_held
 from labseq.session.labs import timeouts_of
 from labseq.session.safe import attempt, construct_hardware
+from labseq.session.setting_up import set_up_bench
 from labseq.session.signals import stop_on_signals
 from labseq.session.warming import WARM_S
 
@@ -88,19 +90,19 @@ def check_devices(profile: str, overrides: Sequence[str] = (), dry_run: DryRun =
 
     Raises:
         ConfigError: The profile is wrong; no device was touched.
-        DeviceError: A run is in progress on the same devices; none was touched.
+        DeviceError: Somebody else uses the same devices, real ones; none was touched.
     """
     check_dry_run(dry_run)
     roots = marker_roots(data_root())
     bench = set_up_bench(profile, overrides=profile_overrides(overrides), dry_run=dry_run)
-    run_dir = in_progress(roots, bench.hardware_key) if dry_run == "off" else None
-    if run_dir is not None:
-        text = f"a run is in progress on its devices ({run_dir}); stop it, or wait for its end"
-        raise DeviceError(bench.profile.name, text)
     stop = StopFlag()
     is_virtual = dry_run != "off" or bench.virtual_time
     clock = VirtualClock(stop) if is_virtual else RealClock(stop)
-    with stop_on_signals(stop):
+    warnings = [*bench.warnings]
+    with ExitStack() as stack:
+        if not is_virtual:
+            stack.enter_context(devices_held(bench, roots, "labseq devices", warnings.append))
+        stack.enter_context(stop_on_signals(stop))
         made, refused = construct_hardware(bench, clock)
         simulation = made.pop("simulation", None)
         in_order = sorted(made.items(), key=lambda item: _OPENING.get(item[0], 2))
@@ -108,7 +110,7 @@ def check_devices(profile: str, overrides: Sequence[str] = (), dry_run: DryRun =
     devices += [CheckedDevice(name, constructed=False, failure=error) for name, error in refused.items()]
     plugins = {name: chosen.entry.name for name, chosen in bench.chosen.items()}
     stopped = StopRequested(stop.signal_number) if stop.is_set else None
-    return DevicesReport(devices, plugins, bench.warnings, stopped)
+    return DevicesReport(devices, plugins, warnings, stopped)
 
 
 def try_devices(

@@ -8,6 +8,7 @@ from typing import Any, Final
 from labseq.config import MotionSettings, ProfileSpec
 from labseq.model import MotionSpec, RandomStream, TargetPattern
 from labseq.roles import Clock
+from labseq.sequencer import PacedClock, RealClock, StopFlag, VirtualClock
 from labseq.sequencer.interlock import Blinding
 from labseq.sequencer.lab import Lab, Timeouts
 from labseq.session.choosing import Bench, Chosen, blamed
@@ -17,6 +18,19 @@ from labseq.session.wiring import refuse_wrong_wiring
 
 DRIVERS_MOTION: Final = frozenset({"rf", "max_row_tones", "max_column_tones", "eject_slots"})
 """Keys of the motion that the mobile tweezers are opened with; all others are the core's alone."""
+
+
+def clock_for(stop: StopFlag, *, virtual: bool, paced: bool = False) -> Clock:
+    """The clock that a run keeps to.
+
+    Args:
+        stop: The request to stop.
+        virtual: Whether time passes only when somebody waits.
+        paced: Whether virtual time takes as long as it says.
+    """
+    if not virtual:
+        return RealClock(stop)
+    return PacedClock(stop) if paced else VirtualClock(stop)
 
 
 def build_lab(point: Point, target: TargetPattern, clock: Clock, seed: int) -> Lab:
@@ -49,7 +63,7 @@ def build_lab(point: Point, target: TargetPattern, clock: Clock, seed: int) -> L
         detector=made["detector"],
         planner=made["planner"],
         planner_name=point.planner.entry.name,
-        degree_of_parallelism=_parallelism(point.planner, made["planner"], motion),
+        degree_of_parallelism=parallelism_of(point.planner, made["planner"], motion),
         devices={name: made[name] for name in profile.devices},
         simulation=made.get("simulation"),
         random_streams=streams,
@@ -104,7 +118,7 @@ def rebuild_lab(lab: Lab, before: Point, after: Point, seed: int) -> tuple[Lab, 
         devices={name: made.get(name, device) for name, device in lab.devices.items()},
         motion=motion,
         planner_name=after.planner.entry.name,
-        degree_of_parallelism=_parallelism(after.planner, made["planner"], motion),
+        degree_of_parallelism=parallelism_of(after.planner, made["planner"], motion),
         random_streams=_streams(lab.random_streams, streams),
     ), reopened
 
@@ -140,7 +154,8 @@ def _blinding(profile: ProfileSpec) -> dict[str, Blinding]:
     return {name: Blinding(mark.value, mark.when) for name, mark in marks.items() if mark is not None}
 
 
-def _parallelism(planner: Chosen, made: Any, motion: MotionSpec) -> int:
+def parallelism_of(planner: Chosen, made: Any, motion: MotionSpec) -> int:
+    """Most mobile tweezers that a batch of a planner may use, as it says, else what the motion bears."""
     with blamed(planner.entry, "its degree_of_parallelism"):
         dop = getattr(made, "degree_of_parallelism", motion.max_tweezers)
     return dop if isinstance(dop, int) else motion.max_tweezers

@@ -1,8 +1,9 @@
-"""Fans a run's events out: event log, plugins' observer hooks, live view."""
+"""Fans a run's events out: event log, plugins' observer hooks, live view; and watches its analyses."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, Final
 
 from labseq.errors import DeviceTimeoutError, LabseqError
@@ -10,6 +11,7 @@ from labseq.model import CycleRecord, ShotRecord, StageTiming
 from labseq.plugins import PluginHost
 from labseq.roles import RunObserver
 from labseq.sequencer import Guard, StopFlag
+from labseq.session.analysts import Analysts
 
 _QUIET: Final = frozenset({"image", "cycle", "state", "compiling", "compiled", "run_finished"})
 """Events that the shot files tell better than the log would, and the one that the writer logs itself."""
@@ -34,6 +36,7 @@ class Observers:
         self._observer = observer
         self._guard = Guard(StopFlag())
         self._given_up: set[str] = set()
+        self._analysts: Analysts | None = None
         self.log: Callable[..., None] | None = None
 
     def event(self, name: str, values: Mapping[str, Any]) -> None:
@@ -41,6 +44,17 @@ class Observers:
         self._write(name, values)
         self._notify(name, values)
         self._show(name, values)
+        if name == "shot_finished" and self._analysts is not None:
+            self._analysts.look()
+
+    def analyse(self, run_dir: Path, analyses: Sequence[Mapping[str, Any]]) -> None:
+        """Start what analyses the run's shots, each in a process of its own."""
+        self._analysts = Analysts(run_dir, analyses, lambda text: self.event("warning", {"text": text}))
+
+    def finish_analyses(self) -> None:
+        """Let the analyses finish; when the devices are safe."""
+        if self._analysts is not None:
+            self._analysts.finish()
 
     def end(self) -> None:
         """Let the plugins' threads end."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import secrets
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, Final, cast
@@ -195,7 +196,7 @@ def _shot(path: Path, cycle: str | None) -> Source:
     if not 1 <= number <= len(cycles):
         there_are = "1, the only one there is" if len(cycles) == 1 else f"a cycle from 1 to {len(cycles)}"
         raise ConfigError(Problem(f"there is no cycle '{clean(cycle or '')}'", name, expected=there_are))
-    seen = _image_before(cycles[number - 1], images)
+    seen = image_before(cycles[number - 1], images)
     if seen is None:
         raise ConfigError(Problem(f"there is no image before cycle {number}", name, expected="one"))
     label = f"{name}, before cycle {number} of {len(cycles)}"
@@ -203,7 +204,7 @@ def _shot(path: Path, cycle: str | None) -> Source:
     return Source(seen.occupancy, label, target=content.target, machine=machine)
 
 
-def _image_before(cycle: CycleRecord, images: list[ImageRecord]) -> ImageRecord | None:
+def image_before(cycle: CycleRecord, images: Sequence[ImageRecord]) -> ImageRecord | None:
     """The image that a cycle was planned on: cycle k ends with its own."""
     before = [image for image in images if (image.step, image.cycle) < (cycle.step, cycle.cycle)]
     return before[-1] if before else None

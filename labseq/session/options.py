@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final, Self
 
 from labseq.config import Override
 from labseq.config.wording import clean
 from labseq.errors import ConfigError, Problem
 from labseq.session.choosing import DryRun
+
+_NOT_SET: Final = ("profile", "dry_run")
+"""Options that are no values of the sequence."""
 
 
 def path_of(value: Any, name: str) -> Path:
@@ -51,6 +54,19 @@ class Options:
         if not isinstance(self.profile, str | Path | None):  # pyright: ignore[reportUnnecessaryIsInstance]
             what = f"profile is {clean(repr(self.profile))}"
             raise ConfigError(Problem(what, expected="the name or the path of a hardware profile"))
+
+    @classmethod
+    def of(cls, changes: Mapping[str, Any], *, realtime: bool = False) -> Self:
+        """The options that make these changes; the opposite of :meth:`changes`."""
+        own = {key: int(changes[key]) for key in ("shots", "seed") if str(changes.get(key)).isdecimal()}
+        return cls(
+            profile=changes.get("profile"),
+            shots=own.get("shots"),
+            seed=own.get("seed"),
+            overrides=tuple(f"{a}={v}" for a, v in changes.items() if a not in {*own, *_NOT_SET}),
+            dry_run=changes.get("dry_run", "off"),
+            realtime=realtime,
+        )
 
     def own(self) -> list[Override]:
         """``shots`` and ``seed`` as overrides that know which option they came from."""

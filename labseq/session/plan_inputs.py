@@ -28,11 +28,11 @@ from labseq.config.wording import clean, visible
 from labseq.errors import ConfigError, LimitError, Problem
 from labseq.model import MotionSpec, SiteGrid, TargetPattern
 from labseq.plugins import PluginHost
-from labseq.session.assembly import load_plugins
 from labseq.session.calibrating import calibrated_grid
 from labseq.session.choosing import Chosen, resolve
 from labseq.session.constructing import construct_target
 from labseq.session.occupancies import Source
+from labseq.session.setting_up import load_plugins
 
 _TARGET: Final = re.compile(r"([^\W\d][\w-]*)(?::(.*))?", re.DOTALL)
 _NAME: Final = re.compile(r"[^\W\d][\w.-]*")

@@ -15,6 +15,7 @@ from labseq.model import MotionSpec, Occupancy, Plan, PlanReport, SiteGrid, Targ
 from labseq.motion import check_plan
 from labseq.roles import NeverStopped, Planner
 from labseq.session.constructing import construct
+from labseq.session.labs import parallelism_of
 from labseq.session.occupancies import Source, read_source
 from labseq.session.plan_inputs import PlanRequest, read_inputs
 
@@ -122,10 +123,9 @@ def plan_moves(
     grid, motion, target = inputs.machine.grid, inputs.machine.motion, inputs.target
     made, _ = construct({"planner": inputs.planner}, grid, motion, NeverStopped(), seed or 0)
     planner: Planner = made["planner"]
-    dop = getattr(planner, "degree_of_parallelism", None)
-    dop = dop if isinstance(dop, int) else motion.max_tweezers
+    dop = parallelism_of(inputs.planner, planner, motion)
     with announcing(announce):
-        plan = _plan(planner, request.planner, occupancy, target)
+        plan = call_planner(planner, request.planner, occupancy, target)
         report = check_plan(plan, occupancy, target, dop, grid, motion, request.planner)
     return PlannedMoves(
         source=source.label,
@@ -134,7 +134,7 @@ def plan_moves(
         grid=grid,
         motion=motion,
         planner=request.planner,
-        settings=_changed(inputs.planner.settings),
+        settings=changed_settings(inputs.planner.settings),
         degree_of_parallelism=dop,
         seed=seed,
         plan=plan,
@@ -142,8 +142,12 @@ def plan_moves(
     )
 
 
-def _plan(planner: Planner, name: str, occupancy: Occupancy, target: TargetPattern) -> Plan:
-    """Call the planner with a copy, so that one that writes into its input harms only itself."""
+def call_planner(planner: Planner, name: str, occupancy: Occupancy, target: TargetPattern) -> Plan:
+    """Call a planner with a copy, so that one that writes into its input harms only itself.
+
+    Raises:
+        PlanError: It raised; with its name.
+    """
     try:
         return planner.plan(occupancy.copy(), target)
     except PlanError as error:
@@ -154,7 +158,8 @@ def _plan(planner: Planner, name: str, occupancy: Occupancy, target: TargetPatte
         raise PlanError(f"plan() raised {type(error).__name__}: {error}", name) from error
 
 
-def _changed(settings: Settings | None) -> dict[str, Any]:
+def changed_settings(settings: Settings | None) -> dict[str, Any]:
+    """Those settings that are not the defaults, SI, JSON-ready."""
     return {} if settings is None else settings.model_dump(mode="json", exclude_defaults=True)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import getpass
+import hashlib
 import importlib.metadata
 import os
 import platform
@@ -44,7 +45,7 @@ def gather_provenance(sequence_folder: Path) -> dict[str, Any]:
 
 
 def git_state(folder: Path, of: str = "") -> dict[str, Any] | None:
-    """Commit of the repository that a folder is in, and whether tracked files differ from it.
+    """Commit of the repository that a folder is in, and how tracked files differ from it.
 
     Args:
         folder: The folder.
@@ -52,8 +53,9 @@ def git_state(folder: Path, of: str = "") -> dict[str, Any] | None:
             inside of somebody's repository does not come from that.
 
     Returns:
-        ``{"commit": str, "dirty": bool}``, or None outside of a repository or
-        where git is not installed.
+        ``{"commit": str, "dirty": bool, "code_sha256": str}``, or None outside of a repository or
+        where git is not installed. ``dirty`` is whether any tracked file differs; ``code_sha256``
+        stands for what differs in Python files, "" for nothing.
     """
     if of and _git(folder, "ls-files", "--error-unmatch", of) is None:
         return None
@@ -61,7 +63,9 @@ def git_state(folder: Path, of: str = "") -> dict[str, Any] | None:
     if commit is None:
         return None
     changes = _git(folder, "status", "--porcelain", "--untracked-files=no")
-    return {"commit": commit, "dirty": bool(changes)}
+    code = _git(folder, "diff", "--no-ext-diff", "--no-color", "HEAD", "--", ":(top)*.py") if changes else ""
+    digest = hashlib.sha256(code.encode()).hexdigest() if code else ""
+    return {"commit": commit, "dirty": bool(changes), "code_sha256": digest}
 
 
 def _git(folder: Path, *arguments: str) -> str | None:

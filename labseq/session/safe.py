@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
 from labseq.config import Collected, load_profile, plugin_paths, profile_overrides
 from labseq.errors import ConfigError, LabseqError, RecordingError, StopRequested
-from labseq.recording import clear_active, data_root, marker_roots
+from labseq.recording import clear_active, data_root, died, marker_roots
 from labseq.roles import Clock, Hardware, RunObserver, Simulation
 from labseq.sequencer import Guard, RealClock, StopFlag, VirtualClock
 from labseq.sequencer.lab import Timeouts, in_safe_order
-from labseq.session.assembly import choose_all, load_plugins
 from labseq.session.choosing import HARDWARE_KINDS, Bench
 from labseq.session.constructing import construct_each
+from labseq.session.holding import devices_held
 from labseq.session.labs import timeouts_of
+from labseq.session.setting_up import choose_all, load_plugins
 from labseq.session.signals import stop_on_signals
 
 _NEEDED_KINDS: Final = HARDWARE_KINDS | {"simulation"}
@@ -136,12 +137,46 @@ def secure_bench(bench: Bench, stop: StopFlag, observer: RunObserver | None = No
     return Secured(tried, refused)
 
 
+def secure_after_crash(
+    bench: Bench, roots: Sequence[Path], key: str, stop: StopFlag, observer: RunObserver
+) -> None:
+    """If the last run on a profile died, its devices may still be on: make them safe.
+
+    Before anything else is constructed or compiled, which may fail.
+
+    Args:
+        bench: The profile.
+        roots: See :func:`labseq.recording.marker_roots`.
+        key: What its hardware is known by.
+        stop: The request to stop; obeyed once every device has been tried.
+        observer: Told each device's outcome, and warnings.
+
+    Raises:
+        LabseqError: The first device that is not safe.
+        StopRequested: Ctrl-C or SIGTERM came meanwhile.
+    """
+    dead = died(roots, key)
+    if dead is None:
+        return
+    text = f"the last run on this profile ({dead}) died; its devices are made safe first"
+    observer.event("warning", {"text": text})
+    failures = secure_bench(bench, stop, observer).failures
+    if failures:
+        raise failures[0]
+    try:
+        clear_active(roots, key)
+    except RecordingError as failure:
+        observer.event("warning", {"text": str(failure)})
+    stop.check()
+
+
 def make_profile_safe(
     profile: str, overrides: Sequence[str] = (), observer: RunObserver | None = None
 ) -> Secured:
     """Bring every device of a profile to its safe state.
 
-    Ctrl-C does not leave it half done: it is obeyed once every device has been tried. If
+    It does so whoever else uses them, and says who does: a run in progress fails, or is seen to be at
+    work again. Ctrl-C does not leave it half done: it is obeyed once every device has been tried. If
     all are safe, nothing is left to do for the next run, whatever became of the last one.
 
     Args:
@@ -156,7 +191,15 @@ def make_profile_safe(
     found, roots = Collected(), marker_roots(data_root())  # now: vendors' libraries change the folder
     bench = _read(profile, overrides, found)
     key, stop = bench.hardware_key, StopFlag()
-    with stop_on_signals(stop):
+
+    def warn(text: str) -> None:
+        if observer is not None:
+            observer.event("warning", {"text": text})
+
+    with ExitStack() as stack:
+        if not bench.virtual_time:
+            stack.enter_context(devices_held(bench, roots, "labseq safe", warn, in_spite=True))
+        stack.enter_context(stop_on_signals(stop))
         secured = secure_bench(bench, stop, observer)
     told = [problem for error in bench.refused.values() for problem in error.problems]
     others = [problem for problem in found.problems if problem not in told]
@@ -165,8 +208,7 @@ def make_profile_safe(
         try:
             clear_active(roots, key)
         except RecordingError as failure:
-            if observer is not None:
-                observer.event("warning", {"text": str(failure)})
+            warn(str(failure))
     if stop.is_set:
         raise StopRequested(stop.signal_number)
     return replace(secured, problems=ConfigError(others) if others else None)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from typing import Any
 
 from labseq.sequencer import Sequencer
@@ -13,29 +13,35 @@ from labseq.session.scan import Point
 
 
 class Course:
-    """The point of each shot of a run.
+    """The point of each shot of a run, and which shots are to be taken.
 
     Args:
         assembly: The run; without a scan all shots are at one point.
         seed: The run's seed.
+        done: Shots that were taken before.
+
+    Attributes:
+        points: The point of each shot of the run.
+        shots: Indices of the shots to take, in order.
     """
 
-    def __init__(self, assembly: Assembly, seed: int) -> None:
+    def __init__(self, assembly: Assembly, seed: int, done: Collection[int] = ()) -> None:
         self.assembly = assembly
         self._seed = seed
         scanned, n_shots = assembly.scanned, assembly.sequence.shots
         self.points = [0] * n_shots
         if scanned is not None:
             self.points = [int(point) for point in scanned.scan.points_of_shots(seed)[:n_shots]]
+        self.shots = [shot for shot in range(n_shots) if shot not in done]
 
     @property
     def first(self) -> Point:
-        """The settings of the first shot."""
-        return self.assembly.at(self.points[0])
+        """The settings of the first shot to take."""
+        return self.assembly.at(self.points[self.shots[0]])
 
     def each(self) -> Iterator[Point]:
-        """The settings of each point that a shot is at."""
-        return map(self.assembly.at, dict.fromkeys(self.points))
+        """The settings of each point that a shot to take is at."""
+        return map(self.assembly.at, dict.fromkeys(self.points[shot] for shot in self.shots))
 
     def each_lab(self) -> Iterator[Point]:
         """One point for each planner and profile that there are, the first shot's first."""
@@ -46,19 +52,24 @@ class Course:
                 seen.add(key)
                 yield point
 
-    def run(self, sequencer: Sequencer, lab: Lab, changes: Mapping[str, Any]) -> None:
+    def run(
+        self, sequencer: Sequencer, lab: Lab, changes: Mapping[str, Any], between: Callable[[], None]
+    ) -> None:
         """Take all shots.
 
         Args:
             sequencer: Open, at the point of the first shot.
             lab: What it is open with.
             changes: What differs from the files in every shot: address -> value.
+            between: Called before each shot; what it raises ends the run.
 
         Raises:
             LabseqError: Whatever ended the run before its last shot.
         """
-        now, before = self.points[0], self.first
-        for shot, point in enumerate(self.points):
+        now, before = self.points[self.shots[0]], self.first
+        for shot in self.shots:
+            between()
+            point = self.points[shot]
             if point != now:
                 after = self.assembly.at(point)
                 lab, reopened = rebuild_lab(lab, before, after, self._seed)

@@ -6,40 +6,41 @@ import gc
 import itertools
 import secrets
 from collections.abc import Callable, Mapping, Sequence
-from datetime import UTC, datetime
+from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import ParamSpec, Self
 
-from labseq.calibrations import encode_entry
-from labseq.errors import ConfigError, DeviceError, LabseqError, StopRequested
+from labseq.errors import ConfigError, DeviceError, LabseqError
 from labseq.model import RunRecord, TimelineEntry
-from labseq.model.records import RunStatus
 from labseq.recording import (
     Run,
     RunWriter,
     clear_active,
     data_root,
-    died,
     mark_active,
     marker_roots,
     open_run,
 )
 from labseq.roles import RunObserver
-from labseq.sequencer import Guard, PacedClock, RealClock, Sequencer, StopFlag, VirtualClock
+from labseq.sequencer import Guard, Sequencer, StopFlag
+from labseq.sequencer.calling import lay_out
 from labseq.sequencer.lab import Lab, describe
-from labseq.sequencer.run import lay_out
 from labseq.session.assembly import Assembly, assemble
 from labseq.session.choosing import DryRun
 from labseq.session.commands import check_commands
-from labseq.session.labs import build_lab
+from labseq.session.holding import devices_held
+from labseq.session.labs import build_lab, clock_for
 from labseq.session.observers import Observers
 from labseq.session.options import Options, path_of
-from labseq.session.provenance import gather_provenance
-from labseq.session.safe import secure_bench
+from labseq.session.resume import Earlier, reopened
+from labseq.session.run_record import copies, ending, run_record
+from labseq.session.safe import secure_after_crash
 from labseq.session.scan import Point
 from labseq.session.scan_run import Course
 from labseq.session.signals import stop_on_signals
+from labseq.session.stopping import look_for_stop
 from labseq.session.warming import warm
 
 P = ParamSpec("P")
@@ -54,19 +55,27 @@ class Session:
             run = session.run()
     """
 
-    def __init__(self, assembly: Assembly, options: Options, observer: RunObserver | None = None) -> None:
+    def __init__(
+        self,
+        assembly: Assembly,
+        options: Options,
+        observer: RunObserver | None = None,
+        earlier: Earlier | None = None,
+    ) -> None:
         self.assembly = assembly
         self.options = options
-        self.seed = assembly.sequence.seed
-        if self.seed is None:
-            self.seed = secrets.randbits(63)
-        self.course = Course(assembly, self.seed)
+        self.earlier = earlier
+        seed = assembly.sequence.seed if earlier is None else earlier.run.seed
+        self.seed = secrets.randbits(63) if seed is None else seed
+        self.course = Course(assembly, self.seed, () if earlier is None else earlier.done)
         self.run_dir: Path | None = None
+        self._folder = Path.cwd()  # now: vendors' libraries change it
         # What the hardware is known by; a dry run touches none, and says nothing about it.
-        profile = assembly.bench.hardware_key  # now: vendors' libraries change the folder
+        profile = assembly.bench.hardware_key
         self._profile_key = profile if options.dry_run == "off" else f"{profile} (dry run)"
         self.stop_flag = StopFlag()
         self._observers = Observers(assembly.bench.host, observer)
+        self._hold: Callable[[str], None] = lambda _: None
         self._sequencer: Sequencer | None = None
 
     @classmethod
@@ -112,6 +121,35 @@ class Session:
         )
         return cls(assembly, options, observer)
 
+    @classmethod
+    def resume(
+        cls,
+        run: str | Path,
+        *,
+        accept_changes: bool = False,
+        realtime: bool = False,
+        observer: RunObserver | None = None,
+    ) -> Session:
+        """Read a run back that ended before its last shot; it goes on with the shots that are missing.
+
+        It goes by the sequence, the profile, the calibrations and the options that it was begun with,
+        whatever the files say today. Until the session is closed, nobody else can resume the run.
+
+        Args:
+            run: The run's folder or any file in it.
+            accept_changes: Whether to go on although code, plugins or settings differ from then; run.json
+                tells of it.
+            realtime: Let virtual time take as long as it says.
+            observer: Told everything that happens.
+
+        Raises:
+            ConfigError: The run is complete or in progress, or something differs from then.
+            RecordingError: It is no run, is damaged, of a newer labseq, or cannot be written to.
+        """
+        path = path_of(run, "run")
+        assembly, options, earlier = reopened(path, accept_changes=accept_changes, realtime=realtime)
+        return cls(assembly, options, observer, earlier)
+
     def __enter__(self) -> Self:
         return self
 
@@ -123,6 +161,8 @@ class Session:
     def close(self) -> None:
         """Make every device safe and close it; legal at any time."""
         self._shut_down()
+        if self.earlier is not None:
+            self.earlier.release()
 
     def timeline(self) -> list[tuple[str, list[TimelineEntry]]]:
         """What a shot will do: name of each step and its bars."""
@@ -147,16 +187,27 @@ class Session:
         """
         if self.run_dir is not None:
             raise ConfigError("a session runs once; open another for the next run")
-        roots = marker_roots(self.options.output or data_root())
-        for text in self.assembly.warnings:
-            self._observers.event("warning", {"text": text})
+        root = self.options.output or data_root()
+        roots = marker_roots(root if self.earlier is None else self.earlier.root)
+        for text in (*self.assembly.warnings, *(() if self.earlier is None else self.earlier.warnings)):
+            self._warn(text)
         check_commands(self.assembly, self.course.each(), self.build_lab)
-        with stop_on_signals(self.stop_flag):
-            self._secure_after_crash(roots)
+        with ExitStack() as stack:
+            stack.enter_context(stop_on_signals(self.stop_flag))
+            if not self.assembly.virtual_time:
+                what = f"a run of {self.assembly.sequence.name}"
+                self._hold = stack.enter_context(devices_held(self.assembly.bench, roots, what, self._warn))
+            bench, key = self.assembly.bench, self._profile_key
+            secure_after_crash(bench, roots, key, self.stop_flag, self._observers)
+            if not self.course.shots:  # its process died between the last shot and the last word
+                _, writer = self._begin(roots[0])
+                writer.finish("complete")
+                return open_run(writer.run_dir)
             labs = (self.build_lab(point) for point in self.course.each_lab())
             lab = next(labs)
             for one in itertools.chain([lab], labs):
                 self.warm(one)
+            gc.unfreeze()  # what an earlier run in this process has left
             gc.collect()
             gc.freeze()  # what is loaded by now stays: going through it all would take 0.1 s of a shot
             return self._run(lab, roots)
@@ -167,13 +218,7 @@ class Session:
         Args:
             point: Of the scan; None for the first one.
         """
-        assert self.seed is not None
-        if not self.assembly.virtual_time:
-            clock = RealClock(self.stop_flag)
-        elif self.options.realtime:
-            clock = PacedClock(self.stop_flag)
-        else:
-            clock = VirtualClock(self.stop_flag)
+        clock = clock_for(self.stop_flag, virtual=self.assembly.virtual_time, paced=self.options.realtime)
         return build_lab(point or self.assembly.at(0), self.assembly.target, clock, self.seed)
 
     def warm(self, lab: Lab, *, devices: bool = True) -> None:
@@ -181,18 +226,14 @@ class Session:
         warm(lab, self.stop_flag, self._observers, devices=devices)
 
     def _run(self, lab: Lab, roots: Sequence[Path]) -> Run:
-        record = self._record(lab)
-        calibrations = self.assembly.bench.calibrations
-        copies = {f"calibration_{kind}.json": encode_entry(e) for kind, e in calibrations.items()}
-        writer = RunWriter.create(roots[0], record, copies)
-        self.run_dir = writer.run_dir
-        self._observers.log = writer.event
+        record, writer = self._begin(roots[0])
         error: BaseException | None = None
         try:
             self._take_shots(lab, roots, writer, record)
         except BaseException as failure:  # noqa: BLE001 - raised again once the run is over
             error = failure
         unsafe = self._shut_down()
+        self._observers.finish_analyses()
         if error is None and unsafe:
             reasons = "; ".join(str(failure) for failure in unsafe.values())
             error = DeviceError(next(iter(unsafe)), f"not in its safe state after the run: {reasons}")
@@ -206,7 +247,7 @@ class Session:
 
     def _take_shots(self, lab: Lab, roots: Sequence[Path], writer: RunWriter, record: RunRecord) -> None:
         spec = self.assembly.sequence
-        about = {"record": record, "run_dir": str(writer.run_dir)}
+        about = {"record": record, "run_dir": str(writer.run_dir), "n_before": writer.n_written}
         first, changes = self.course.first, self.options.changes()
         sequencer = self._sequencer = Sequencer(
             lab,
@@ -222,19 +263,31 @@ class Session:
         self._observers.event("run_starting", about)
         sequencer.open()
         writer.set_devices(describe(lab, sequencer.guard))
+        self._observers.analyse(writer.run_dir, self.assembly.resolved["analysis"])
         self._observers.event("run_started", about)
-        self.course.run(sequencer, lab, changes)
+        self.course.run(sequencer, lab, changes, partial(look_for_stop, writer.run_dir))
+
+    def _begin(self, root: Path) -> tuple[RunRecord, RunWriter]:
+        """The run's folder, a new one or that of the run that goes on."""
+        changes, scan, earlier = self.options.changes(), self.course.record(), self.earlier
+        record = run_record(self.assembly, self.seed, changes, scan, self._folder)
+        if earlier is None:
+            writer = RunWriter.create(root, record, copies(self.assembly.bench.calibrations))
+        else:
+            writer = earlier.reopen(record, next(iter(self.course.shots), None))
+        self.run_dir = writer.run_dir
+        self._observers.log = writer.event
+        self._hold(f"the run {writer.run_dir}")
+        return record, writer
+
+    def _warn(self, text: str) -> None:
+        self._observers.event("warning", {"text": text})
 
     def _shut_down(self) -> Mapping[str, LabseqError]:
         return self._sequencer.shut_down() if self._sequencer is not None else {}
 
     def _finish(self, writer: RunWriter, record: RunRecord, error: BaseException | None) -> None:
-        status: RunStatus = "complete"
-        if error is not None:
-            status = "stopped" if isinstance(error, StopRequested | KeyboardInterrupt) else "failed"
-        text = "" if error is None else f"{type(error).__name__}: {error}"
-        if isinstance(error, StopRequested):
-            text = str(error)
+        status, text = ending(error)
         self._try(writer.finish, status, text)
         self._observers.event("run_finished", {"record": record, "status": status, "error": text})
 
@@ -243,53 +296,4 @@ class Session:
         try:
             act(*args, **kwargs)
         except LabseqError as failure:
-            self._observers.event("warning", {"text": str(failure)})
-
-    def _secure_after_crash(self, roots: Sequence[Path]) -> None:
-        """If the last run on this profile died, its devices may still be on.
-
-        They are made safe before anything else is constructed or compiled, which may fail.
-        """
-        dead = died(roots, self._profile_key)
-        if dead is None:
-            return
-        text = f"the last run on this profile ({dead}) died; its devices are made safe first"
-        self._observers.event("warning", {"text": text})
-        failures = secure_bench(self.assembly.bench, self.stop_flag, self._observers).failures
-        if failures:
-            raise failures[0]
-        self._try(clear_active, roots, self._profile_key)
-        self.stop_flag.check()
-
-    def _record(self, lab: Lab) -> RunRecord:
-        assembly, spec = self.assembly, self.assembly.sequence
-        assert self.seed is not None
-        chosen = [*assembly.bench.chosen.values(), assembly.planner]
-        origins = {item.entry.origin for item in chosen}
-        plugins = tuple(
-            {"name": info.name, "origin": info.origin, "version": info.version}
-            for info in assembly.bench.host.infos
-            if info.name in origins
-        )
-        return RunRecord(
-            name=spec.name,
-            n_shots=spec.shots,
-            seed=self.seed,
-            simulated=assembly.virtual_time,
-            t_start_utc=datetime.now(UTC).isoformat(timespec="microseconds"),
-            target=assembly.target,
-            sequence_text=assembly.document.text,
-            profile_text=assembly.bench.document.text,
-            sequence_path=str(assembly.document.path),
-            profile_path=str(assembly.bench.document.path),
-            resolved=assembly.resolved,
-            overrides=self.options.changes(),
-            devices={},
-            plugins=plugins,
-            provenance=gather_provenance(assembly.document.path.resolve().parent),
-            record_frames=spec.record_frames,
-            grid_spacing_m=lab.grid.spacing_m,
-            lattice=lab.grid.lattice,
-            scan=self.course.record(),
-            calibrations={kind: entry.id for kind, entry in lab.calibrations.items()},
-        )
+            self._warn(str(failure))

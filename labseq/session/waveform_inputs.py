@@ -17,12 +17,12 @@ from labseq.config.reading import read_bytes
 from labseq.config.wording import clean, visible
 from labseq.errors import ConfigError, Problem
 from labseq.model import Plan
-from labseq.session.assembly import load_plugins
 from labseq.session.choosing import choose
 from labseq.session.occupancies import read_source
 from labseq.session.plan_files import read_plan
 from labseq.session.plan_inputs import PlanRequest
 from labseq.session.planning import PlannedMoves, plan_moves
+from labseq.session.setting_up import load_plugins
 from labseq.units import format_quantity, parse_quantity
 
 DEFAULT_RATE_HZ: Final = 625e6

@@ -50,7 +50,22 @@ FLIGHTS: Final = np.dtype(
         ("lost_s", np.float64),
         ("lost_row", np.float32),
         ("lost_col", np.float32),
-    ]
+    ],
+    metadata={
+        "descriptions": {
+            "held_s": "when a mobile tweezer first held the atom, from the start of the shot; nan: never",
+            "from_row": "row of its site before",
+            "from_col": "column of its site before",
+            "to_row": "row of the site that it came to, if it was kept",
+            "to_col": "column of the site that it came to, if it was kept",
+            "offset_m": "how far the tweezer was from the site when it first held the atom",
+            "depth_K": "greatest depth of the tweezer",
+            "fate": "kept, ejected, paired, spilled or drawn (by the transport loss)",
+            "lost_s": "when it was lost, from the start of the shot; nan: never",
+            "lost_row": "row where it was lost, in sites",
+            "lost_col": "column where it was lost, in sites",
+        }
+    },
 )
 """What happened to an atom that a mobile tweezer held, or that was lost.
 
@@ -119,7 +134,7 @@ class Flight:
         for name in ("held_s", "lost_s"):
             flights[name] -= since_s
         jumps["t_s"] -= since_s
-        return {"flights": flights, "jumps": jumps}
+        return {"flights": flights.view(FLIGHTS), "jumps": jumps.view(JUMPS)}  # with their descriptions
 
     def carry(
         self, occupied: Mask, episode: Episode, depth: Floats, rng: np.random.Generator, loss_factor: float

@@ -19,7 +19,16 @@ JUMPS: Final = np.dtype(
         ("row", np.float32),
         ("col", np.float32),
         ("size", np.float32),
-    ]
+    ],
+    metadata={
+        "descriptions": {
+            "t_s": "when, from the start of the shot",
+            "kind": "phase, of a tone; or depth, of a tweezer",
+            "row": "row in sites; nan for the phase of a column's tone",
+            "col": "column in sites; nan for the phase of a row's tone",
+            "size": "in rad, or as a fraction of the full depth",
+        }
+    },
 )
 """A jump: when, of which kind, where in sites, and how large.
 

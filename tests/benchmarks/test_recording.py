@@ -105,3 +105,14 @@ def test_open_a_run_of_ten_thousand_shots(benchmark: BenchmarkFixture, tmp_path:
     index.write_text("".join(json.dumps({**row, "shot": i}) + "\n" for i in range(10_000)), "utf-8")
     run = benchmark.pedantic(open_run, (writer.run_dir,), rounds=5)
     assert len(run.shots) == 10_000
+
+
+def test_table_of_ten_thousand_shots(benchmark: BenchmarkFixture, tmp_path: Path) -> None:
+    pytest.importorskip("pandas")
+    writer = RunWriter.create(tmp_path, a_run())
+    writer.write_shot(a_shot(0, np.zeros((12, 8, 8), np.uint16)))
+    index = writer.run_dir / "index.jsonl"
+    row = json.loads(index.read_text("utf-8"))
+    index.write_text("".join(json.dumps({**row, "shot": i}) + "\n" for i in range(10_000)), "utf-8")
+    table = benchmark.pedantic(open_run(writer.run_dir).to_dataframe, rounds=5, warmup_rounds=1)
+    assert len(table) == 10_000

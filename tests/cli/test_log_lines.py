@@ -83,6 +83,12 @@ def test_a_window_that_was_too_short(fake: Any) -> None:
     assert tell("window_too_short", values, fake.run()) == "shot 1, cycle 2: 12 of 40 batches fit the window"
 
 
+def test_whom_a_run_waits_for(fake: Any) -> None:
+    values = {"shot": 0, "device": "leader", "signal": "go", "timeout_s": 60.0}
+    text = "shot 1: waiting for 'go' from leader, at most 60 s"
+    assert tell("leader_awaited", values, fake.run()) == text
+
+
 def test_compiling_is_announced_module_by_module() -> None:
     stream = io.StringIO()
     log = LogLines(stream)

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -69,9 +70,13 @@ def test_the_array_shrinks_before_it_goes(fake: Any, size: tuple[int, int], draw
     assert "defect-free" in text
 
 
-def test_stage_times_are_called_measured_on_real_hardware(fake: Any) -> None:
-    for simulated, word in ((True, "modelled"), (False, "measured")):
-        assert word in "\n".join(picture(tally_of(fake, fake.run(simulated=simulated)), 120, 30))
+def test_on_real_hardware_there_is_one_clock(fake: Any) -> None:
+    for simulated, heads in (
+        (True, "stage host p99 modelled budget over"),
+        (False, "stage p50 p99 budget over"),
+    ):
+        lines = picture(tally_of(fake, fake.run(simulated=simulated)), 120, 30)
+        assert [line for line in lines if heads in " ".join(line.split())]
 
 
 def test_stage_table_shows_budgets(fake: Any) -> None:
@@ -80,7 +85,8 @@ def test_stage_table_shows_budgets(fake: Any) -> None:
         for line in picture(tally_of(fake, fake.run(lattice="square")), 60, 30)
         if line[:5] in {"plan ", "move "}
     }
-    assert rows == {"plan": ["800", "us", "7.5", "ms", "-"], "move": ["800", "us", "7.5", "ms", "60", "ms"]}
+    times = ["800", "us", "800", "us", "7.5", "ms"]
+    assert rows == {"plan": [*times, "-"], "move": [*times, "60", "ms"]}
 
 
 def test_before_the_first_image_there_is_no_array(fake: Any) -> None:
@@ -107,3 +113,16 @@ def test_the_status_takes_the_place_of_the_time_left(fake: Any) -> None:
     assert picture(tally, 80, 24)[0].endswith("20/20 shots  0:00 left")
     tally.note("run_finished", {"record": fake.run(), "status": "stopped", "error": ""})
     assert picture(tally, 80, 24)[0].endswith("20/20 shots  stopped")
+
+
+def test_a_scan_is_drawn_where_there_is_room(fake: Any) -> None:
+    scan = {
+        "addresses": ["dop"],
+        "points": [[3], [7]],
+        "written": [["3"], ["7"]],
+        "point_of_shot": [0, 1] * 10,
+    }
+    run = replace(fake.run(), scan=scan)
+    tally = tally_of(fake, run)
+    assert any("defect-free by dop" in line for line in picture(tally, 120, 36))
+    assert not any("defect-free by dop" in line for line in picture(tally, 120, 18))

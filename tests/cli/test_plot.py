@@ -8,7 +8,7 @@ import pytest
 
 import labseq
 from labseq.cli import main
-from labseq.cli.plot import plot_run
+from labseq.cli.plot import PlotRequest, plot_run
 from labseq.errors import ConfigError
 
 ROOT = Path(__file__).parents[2]
@@ -38,27 +38,51 @@ def test_the_newest_run_goes_to_the_current_folder(
 
 
 def test_two_runs_in_one_picture(run_dir: Path, tmp_path: Path) -> None:
-    plot_run(run_dir, "5", tmp_path / "both.svg", run_dir / "run.json")
+    plot_run(run_dir, PlotRequest(figure="5", compare=run_dir / "run.json"), tmp_path / "both.svg")
     assert "both.svg" in {path.name for path in tmp_path.iterdir()}
 
 
+def test_without_options_the_whole_run_is_drawn(run_dir: Path, tmp_path: Path) -> None:
+    plot_run(run_dir, PlotRequest(), tmp_path / "run.png")
+    assert (tmp_path / "run.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_each_picture_has_a_name_of_its_own(
+    run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    plot_run(run_dir, PlotRequest(what="defects"), None)
+    plot_run(run_dir, PlotRequest(shot=2, cycle=1), None)
+    assert {path.name for path in tmp_path.iterdir()} == {"defects.png", "shot-2-cycle-1.png"}
+
+
 @pytest.mark.parametrize(
-    ("figure", "output", "told"),
+    ("request_", "output", "told"),
     [
-        ("6", "a.png", "no figure '6' of a run; expected one of '4', '5'"),
-        ("5", "a.bmp", "no name of a PNG or SVG or PDF file"),
-        ("4", "a.png", "it does not scan planner.degree_of_parallelism; expected a run of a sequence like"),
+        (PlotRequest(figure="6"), "a.png", "no figure '6' of a run; expected one of '4', '5'"),
+        (PlotRequest(what="x"), "a.png", "no figure 'x' of a run; expected one of 'defects', 'filling'"),
+        (PlotRequest(figure="5"), "a.bmp", "no name of a PNG or SVG or PDF file"),
+        (
+            PlotRequest(figure="4"),
+            "a.png",
+            "it does not scan planner.degree_of_parallelism; expected a run of",
+        ),
+        (PlotRequest(what="scan"), "a.png", "nothing to show of the scan; expected a run of a sequence with"),
+        (PlotRequest(shot=9), "a.png", "--shot: the run has no shot 9; expected one from 1 to 2"),
+        (PlotRequest(shot=1, what="scan"), "a.png", "--what and --shot: these are different pictures"),
+        (PlotRequest(cycle=1), "a.png", "--cycle: a cycle is one of a shot; expected --shot as well"),
+        (PlotRequest(compare=Path("x")), "a.png", "--compare: only figures of the paper compare runs"),
     ],
 )
 def test_what_cannot_be_drawn_is_told(
-    run_dir: Path, tmp_path: Path, figure: str, output: str, told: str
+    run_dir: Path, tmp_path: Path, request_: PlotRequest, output: str, told: str
 ) -> None:
     with pytest.raises(ConfigError) as caught:
-        plot_run(run_dir, figure, tmp_path / output, None)
+        plot_run(run_dir, request_, tmp_path / output)
     assert told in str(caught.value)
     assert not list(tmp_path.iterdir())
 
 
 def test_what_is_no_run_is_told(tmp_path: Path) -> None:
     with pytest.raises(ConfigError):
-        plot_run(tmp_path, "5", tmp_path / "a.png", None)
+        plot_run(tmp_path, PlotRequest(figure="5"), tmp_path / "a.png")

@@ -260,7 +260,37 @@ CASES = [
         "required setting missing in an empty step",
         "wait: {duration: 1 ms}",
         "wait:",
-        "s.yaml:26:10: 'duration' is missing from 'wait' (how long to wait)",
+        "s.yaml:26:10: a wait says neither how long nor for what; expected 'duration', or 'for' and 'timeout'",
+    ),
+    (
+        "wait for a time and for a signal",
+        "wait: {duration: 1 ms}",
+        "wait: {duration: 1 ms, for: go, timeout: 1 s}",
+        "s.yaml:26:12: 'duration' and 'for' stand together; expected one of them",
+    ),
+    (
+        "wait for a signal without end",
+        "wait: {duration: 1 ms}",
+        "wait: {for: go}",
+        "s.yaml:26:12: a wait for 'go' has no 'timeout'; expected how long it may take",
+    ),
+    (
+        "timeout of a wait for a time",
+        "wait: {duration: 1 ms}",
+        "wait: {duration: 1 ms, timeout: 1 s}",
+        "s.yaml:26:28: 'timeout' stands here without 'for'; expected 'for: go' beside it",
+    ),
+    (
+        "wait for an unknown signal",
+        "wait: {duration: 1 ms}",
+        "wait: {for: start, timeout: 1 s}",
+        "s.yaml:26:17: for is 'start'; expected 'go'",
+    ),
+    (
+        "wait of a wrong type",
+        "wait: {duration: 1 ms}",
+        "wait: {duration: [1 ms]}",
+        "s.yaml:26:22: duration is a list; expected a time such as '45 ms' (s, ms, us, ns, min, h) or a plain number in s",
     ),
 ]
 

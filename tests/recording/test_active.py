@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from labseq.errors import RecordingError
-from labseq.recording import clear_active, died, in_progress, mark_active, marker_roots
+from labseq.recording import clear_active, died, mark_active, marker_roots, runs_in_progress
 
 MARK = """
 import sys
@@ -133,8 +133,13 @@ def test_a_marker_that_cannot_be_removed_keeps_no_other(tmp_path: Path) -> None:
 
 
 def test_a_run_of_a_living_process_is_in_progress(tmp_path: Path) -> None:
+    roots = marker_roots(tmp_path)
+    assert runs_in_progress(roots) == {}
     mark_in_a_process_that_ends(tmp_path, "lab", tmp_path / "dead")
-    assert in_progress([tmp_path], "lab") is None
-    mark_active([tmp_path], "lab", tmp_path / "run")
-    assert in_progress([tmp_path], "lab") == tmp_path / "run"
-    assert in_progress([tmp_path], "virtual") is None
+    assert runs_in_progress(roots) == {}
+    mark_active(roots, "lab", tmp_path / "run")
+    mark_active(roots, "virtual", tmp_path / "other")
+    assert runs_in_progress(roots) == {tmp_path / "run": "lab", tmp_path / "other": "virtual"}
+    for marker in (tmp_path / ".active").iterdir():
+        marker.write_bytes(b"damaged")
+    assert set(runs_in_progress(roots)) == {tmp_path / "run", tmp_path / "other"}  # of the user's own folder

@@ -74,7 +74,20 @@ def test_a_log_goes_on_after_a_torn_line(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes() + b'{"a": 2, "torn')
     assert read_lines(path) == ([{"a": 1}], [])
     LineLog(path).append({"a": 3}, sync=False)
-    assert read_lines(path) == ([{"a": 1}, {"a": 3}], [])
+    assert read_lines(path) == ([{"a": 1}, {"a": 3}], [2])
+    assert path.read_bytes() == b'{"a": 1}\n{"a": 2, "torn\n{"a": 3}\n'
+
+
+@given(st.binary(max_size=60).filter(lambda torn: b"\n" not in torn))
+def test_no_torn_line_of_a_process_that_is_gone_is_lost_or_glued(
+    tmp_path_factory: pytest.TempPathFactory, torn: bytes
+) -> None:
+    path = tmp_path_factory.mktemp("log") / "log"
+    path.write_bytes(b'{"a": 1}\n' + torn)
+    for b in (2, 3):
+        LineLog(path).append({"b": b}, sync=False)
+    rest = torn + b"\n" if torn else b""
+    assert path.read_bytes() == b'{"a": 1}\n' + rest + b'{"b": 2}\n{"b": 3}\n'
 
 
 @given(st.binary(max_size=60).filter(lambda torn: b"\n" not in torn))

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from labseq.recording import open_run
+from labseq.recording.doctor import examine
 
 WRITE_FOR_EVER = """
 import sys
@@ -56,3 +57,7 @@ def test_kill(tmp_path: Path, n_shots: int) -> None:
         shot.verify()
         assert shot.record().success
         assert shot.frames.shape == (4, 128, 128)
+    n_shots_found = len(run.shots)
+    assert not any(one.left for one in examine(run_dir).findings)
+    assert len(open_run(run_dir).shots) >= n_shots_found
+    assert examine(run_dir).findings == []

@@ -179,7 +179,7 @@ def test_a_run_of_a_newer_labseq_is_refused(run_dir: Path) -> None:
     open_run(run_dir)
     rewrite_json(run_dir / "run.json", format_version="2.0")
     with pytest.raises(
-        RecordingError, match=r"has format version 2\.0, this labseq reads 1\.1; update labseq"
+        RecordingError, match=r"has format version 2\.0, this labseq reads 1\.2; update labseq"
     ):
         open_run(run_dir)
 
@@ -187,8 +187,8 @@ def test_a_run_of_a_newer_labseq_is_refused(run_dir: Path) -> None:
 @pytest.mark.parametrize(
     ("attributes", "message"),
     [
-        ({"format_version": "2.0"}, r"has format version 2\.0, this labseq reads 1\.3; update labseq"),
-        ({"format_version": "x"}, "has the format version 'x'; expected one like 1.3"),
+        ({"format_version": "2.0"}, r"has format version 2\.0, this labseq reads 1\.4; update labseq"),
+        ({"format_version": "x"}, "has the format version 'x'; expected one like 1.4"),
         ({"format": "nexus"}, "is not a shot's file of labseq"),
     ],
 )

@@ -16,7 +16,7 @@ import pytest
 from numpy.typing import NDArray
 
 from labseq import Run, Session
-from labseq.recording.reader import Shot
+from labseq.recording.shot import Shot
 
 SEQUENCE = Path(__file__).parents[2] / "sequences" / "compact_225.yaml"
 N_SHOTS = int(os.environ.get("LABSEQ_SHOTS", "1"))

@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 
 from labseq.errors import ConfigError, DeviceError, DeviceTimeoutError, StopRequested
-from labseq.recording import mark_active, marker_roots
 from labseq.roles import Context
 from labseq.sequencer import StopFlag
 from labseq.sequencer.lab import Timeouts
@@ -177,10 +176,3 @@ def test_a_missing_plugin_is_replaced_in_a_dry_run(profile: Path) -> None:
     report = check_devices("./p.yaml", ["profile.camera.use=ixon"], "full")
     assert all(found.ok for found in report.devices)
     assert any("'ixon' is not installed" in warning for warning in report.warnings)
-
-
-def test_a_run_in_progress_on_the_same_devices_is_left_alone(profile: Path) -> None:
-    mark_active(marker_roots(Path("data")), str(profile.resolve()), Path("data/run"))
-    with pytest.raises(DeviceError, match=r"bench: a run is in progress on its devices \(.*run\)"):
-        check_devices("./p.yaml")
-    assert check_devices("./p.yaml", dry_run="fast").devices  # it touches none

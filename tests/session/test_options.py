@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from labseq.errors import ConfigError
-from labseq.session import Session
+from labseq.session import Options, Session
 
 SEQUENCE = Path(__file__).parents[2] / "sequences" / "compact_225.yaml"
 
@@ -30,3 +30,18 @@ def test_options_say_what_was_expected(given: dict[str, Any], message: str) -> N
     with pytest.raises(ConfigError) as caught:
         Session.open(SEQUENCE, **given)
     assert str(caught.value) == message
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        Options(),
+        Options(shots=5, seed=7, profile="lab", dry_run="full"),
+        Options(overrides=("shots=0x10", "seed=~", "planner={use: lsap}", "planner.x=a=b", "attempts=1")),
+    ],
+)
+def test_options_come_back_from_what_they_changed(options: Options) -> None:
+    again = Options.of(options.changes(), realtime=True)
+    assert again.changes() == options.changes()
+    assert list(again.changes()) == list(options.changes())
+    assert again.realtime

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 import labseq
-from labseq.session.assembly import set_up_bench
+from labseq.session.setting_up import set_up_bench
 
 PROFILE = """
 labseq: 1

@@ -8,6 +8,7 @@ Each makes Markdown, which the page's own parser then reads:
 - ``{registered} planner``: everything that is registered for a role, with its keys
 - ``{quantities}``: the quantities and their units
 - ``{command} run``, ``{command} bench planners``: one command; without a name, the options of all
+- ``{shot-file} datasets``, ``{shot-file} columns``, ``{shot-file} attributes``: what stands in a shot's file
 - ``{hooks}``, ``{role} Camera``, ``{errors}``, ``{error-tree}``, ``{plan-rules}``
 """
 
@@ -22,7 +23,7 @@ from docutils.statemachine import StringList
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
-from labseq_reference import commands, python, tables
+from labseq_reference import commands, python, shot_file, tables
 
 
 class _Generated(SphinxDirective):
@@ -71,6 +72,13 @@ class _Role(_Generated):
         return python.role(*self.arguments)
 
 
+class _ShotFile(_Generated):
+    required_arguments = 1
+
+    def lines(self) -> list[str]:
+        return shot_file.part(*self.arguments)
+
+
 def _plain(make: Callable[[], list[str]]) -> type[_Generated]:
     """A directive without arguments."""
 
@@ -88,6 +96,7 @@ def setup(app: Sphinx) -> dict[str, Any]:
     app.add_directive("quantities", _plain(tables.quantities_table))
     app.add_directive("command", _Command)
     app.add_directive("role", _Role)
+    app.add_directive("shot-file", _ShotFile)
     app.add_directive("hooks", _plain(python.hooks))
     app.add_directive("errors", _plain(python.error_list))
     app.add_directive("error-tree", _plain(python.error_tree))

@@ -21,12 +21,12 @@ from labseq.errors import ConfigError, LabseqError, Problem, RecordingError
 from labseq.model import CALIBRATION_KINDS, CalibrationEntry, grid_facts, same_grid
 from labseq.recording import Run, open_run
 from labseq.roles import RunObserver
-from labseq.session.assembly import set_up_bench
 from labseq.session.calibrate.method import Evidence, Finding, Method
 from labseq.session.calibrating import store_of, why_left_out
 from labseq.session.choosing import Bench, DryRun
 from labseq.session.plan_inputs import recorded_machine
 from labseq.session.session import Session
+from labseq.session.setting_up import set_up_bench
 
 PICTURE_DPI: Final = 110
 VALUE_FILES: Final = (".npy", ".csv")

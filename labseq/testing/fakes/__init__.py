@@ -17,6 +17,7 @@ from labseq.testing.fakes.devices import (
     RecordingStaticTweezers,
 )
 from labseq.testing.fakes.lab import FakeLab, ListSink, RecordingObserver, fake_lab
+from labseq.testing.fakes.leader import RecordingLeader
 from labseq.testing.planner import OneByOnePlanner
 
 __all__ = [
@@ -31,6 +32,7 @@ __all__ = [
     "OneByOnePlanner",
     "RecordingCamera",
     "RecordingDevice",
+    "RecordingLeader",
     "RecordingLines",
     "RecordingMobileTweezers",
     "RecordingObserver",

@@ -15,7 +15,7 @@ from labseq.recording import Run, open_run
 from labseq.recording.statistics import statistics_of
 from labseq.session.run_figures import figure_4, figure_5
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 PROFILE = str(ROOT / "hardware_profiles" / "virtual.yaml")
 
 

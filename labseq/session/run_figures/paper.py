@@ -10,13 +10,13 @@ import numpy as np
 
 from labseq.config.wording import clean
 from labseq.drawing import CyclesDrawing, ParallelismDrawing, Series
-from labseq.errors import ConfigError, Problem
 from labseq.model.estimate import Estimate
 from labseq.recording import Run
 from labseq.recording.points import ScanPoint, scan_points
 from labseq.recording.rates import Rate
 from labseq.recording.statistics import Statistics, statistics_of
 from labseq.session.ceiling import Losses, ceiling, survival
+from labseq.session.run_figures.words import note_of, unfit
 from labseq.units import format_quantity
 
 PAPER: Final = "Tian et al."
@@ -48,7 +48,7 @@ def figure_5(run: Run, other: Run | None = None) -> CyclesDrawing:
     ]
     return CyclesDrawing(
         title="figure 5: defect-free probability after n cycles",
-        note=_note(run),
+        note=note_of(run),
         series=tuple(series),
         defects=tuple(np.array(statistics.cycles[-1].defects, np.int64) for statistics in found),
         quoted=_quoted(run, PAPERS_DEFECT_FREE),
@@ -58,14 +58,14 @@ def figure_5(run: Run, other: Run | None = None) -> CyclesDrawing:
 
 def _cycles_of(run: Run) -> Statistics:
     if run.record.get("scan"):
-        raise _unfit(run, "it scans", "a run without a scan, of a sequence like figure5_multicycle.yaml")
+        raise unfit(run, "it scans", "a run without a scan, of a sequence like figure5_multicycle.yaml")
     statistics = statistics_of(run.shots, run.target)
     if not statistics.cycles:
-        raise _unfit(run, "no shot of it rearranges", "shots with rearrangement cycles")
+        raise unfit(run, "no shot of it rearranges", "shots with rearrangement cycles")
     if statistics.cycles[-1].n_shots < statistics.cycles[0].n_shots:
         n_last, n_first = statistics.cycles[-1].n_shots, statistics.cycles[0].n_shots
         what = f"{n_first} of its shots make the first cycle, and {n_last} the last"
-        raise _unfit(run, what, "every cycle made in every shot: 'stop_when: never' in the rearrangement")
+        raise unfit(run, what, "every cycle made in every shot: 'stop_when: never' in the rearrangement")
     return statistics
 
 
@@ -118,7 +118,7 @@ def figure_4(run: Run, other: Run | None = None) -> ParallelismDrawing:
     shown = parted[0][1] or parted[0][0]
     return ParallelismDrawing(
         title="figure 4: filling after one cycle",
-        note=_note(run),
+        note=note_of(run),
         fixed=tuple(fixed),
         optimised=tuple(own),
         survival=_line(
@@ -133,7 +133,7 @@ def figure_4(run: Run, other: Run | None = None) -> ParallelismDrawing:
 def _points_of(run: Run) -> list[_Point]:
     points = scan_points(run)
     if not points or DOP not in points[0].parameters:
-        raise _unfit(run, f"it does not scan {DOP}", "a run of a sequence like figure4_dop_scan.yaml")
+        raise unfit(run, f"it does not scan {DOP}", "a run of a sequence like figure4_dop_scan.yaml")
     return [_point_of(run, point) for point in points]
 
 
@@ -141,11 +141,11 @@ def _point_of(run: Run, point: ScanPoint) -> _Point:
     statistics = statistics_of(point.shots, run.target)
     n_read = len(point.shots) - len(statistics.unreadable)
     if len(statistics.cycles) != 1 or statistics.cycles[0].n_shots < n_read:
-        raise _unfit(run, "not all of its shots make one cycle", "'cycles: 1, stop_when: never'")
+        raise unfit(run, "not all of its shots make one cycle", "'cycles: 1, stop_when: never'")
     others = [address for address in point.parameters if address != DOP and not address.endswith("window")]
     if others:
         what = f"it also scans {', '.join(map(clean, others))}"
-        raise _unfit(run, what, "a scan of the degree of parallelism and the window alone")
+        raise unfit(run, what, "a scan of the degree of parallelism and the window alone")
     return _Point(int(point.parameters[DOP]), _window_s(run, point), statistics.cycles[0].filling)
 
 
@@ -157,7 +157,7 @@ def _window_s(run: Run, point: ScanPoint) -> float:
     window: Any = found[0] if found else None
     first: Any = window[0] if isinstance(window, list) and window else window  # pyright: ignore[reportUnknownVariableType]
     if not isinstance(first, float | int):
-        raise _unfit(run, "its window is not recorded", "a window in 'rearrange'")
+        raise unfit(run, "its window is not recorded", "a window in 'rearrange'")
     return float(first)
 
 
@@ -170,7 +170,7 @@ def _parted(run: Run, points: Sequence[_Point]) -> tuple[list[_Point], list[_Poi
     for point in points:
         by_dop.setdefault(point.dop, []).append(point)
     if max(map(len, by_dop.values())) > 2:
-        raise _unfit(run, "it has more than two windows for a degree of parallelism", "at most two")
+        raise unfit(run, "it has more than two windows for a degree of parallelism", "at most two")
     longest_s = max(point.window_s for point in points)
     ordered = [sorted(by_dop[dop], key=lambda point: point.window_s) for dop in sorted(by_dop)]
     fixed = [of[-1] for of in ordered if of[-1].window_s == longest_s]
@@ -217,15 +217,3 @@ def _name(run: Run, runs: Sequence[Run]) -> str:
     """What a run is called beside others: by its folder if its name does not tell them apart."""
     alike = sum(one.name == run.name for one in runs) > 1
     return clean(run.path.name if alike else run.name)
-
-
-def _note(run: Run) -> str:
-    ended = "" if run.status == "complete" else f" ({run.status}, {len(run.shots)} of {run.n_shots} shots)"
-    atoms = f"{clean(run.target.name)}, {run.target.n_atoms} atoms"
-    kind = "simulated" if run.simulated else "measured"
-    return f"{clean(run.path.parent.name)}/{clean(run.path.name)}{ended}: {atoms}, seed {run.seed}, {kind}"
-
-
-def _unfit(run: Run, what: str, expected: str) -> ConfigError:
-    text = f"the figure cannot be drawn from this run: {what}"
-    return ConfigError(Problem(text, clean(str(run.path)), expected=expected))

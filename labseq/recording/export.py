@@ -1,0 +1,149 @@
+"""A run in one file that other programs read."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from labseq.errors import ConfigError, Problem, one_of
+from labseq.files import whole_file
+from labseq.recording.columns import Column, columns_of
+from labseq.recording.reader import Run
+from labseq.recording.tabular import check_installed, dataframe_of, dataset_of, facts_of
+
+ENDINGS: Final = {"csv": ".csv", "parquet": ".parquet", "netcdf": ".nc", "archive": ".h5"}
+"""Kind of export -> how its file's name ends."""
+
+
+def files_of(kind: str, path: Path) -> tuple[Path, ...]:
+    """The files that an export writes: the table of units stands beside a CSV file.
+
+    Example:
+        >>> [file.name for file in files_of("csv", Path("run.csv"))]
+        ['run.csv', 'run.units.csv']
+    """
+    return (path, path.with_suffix(".units.csv")) if kind == "csv" else (path,)
+
+
+def check_export(kind: str, path: Path, *, frames: bool = False, replace: bool = False) -> None:
+    """Find out whether a run can be exported, before anything is read.
+
+    Args:
+        kind: One of :data:`ENDINGS`.
+        path: The file.
+        frames: Whether frames are asked for; only the archive has them.
+        replace: Whether files that are there may be replaced.
+
+    Raises:
+        ConfigError: It cannot; tells what would have been right.
+    """
+    if kind not in ENDINGS:
+        raise ConfigError(
+            Problem(f"a run cannot be exported as '{kind}'", "--to", expected=one_of([*ENDINGS]))
+        )
+    if frames and kind != "archive":
+        raise ConfigError(Problem(f"a {kind} file holds no frames", "--frames", hint="use --to archive"))
+    if path.suffix.lower() != ENDINGS[kind]:
+        wanted = f"a file that ends in {ENDINGS[kind]}"
+        raise ConfigError(Problem(f"this is no name of a {kind} file", str(path), expected=wanted))
+    try:
+        has_folder, there = path.parent.is_dir(), [one for one in files_of(kind, path) if one.exists()]
+    except OSError as error:  # a name that is too long
+        raise ConfigError(Problem(f"this is no name of a file: {error.strerror}", str(path))) from error
+    if not has_folder:
+        raise ConfigError(Problem("there is no such folder", str(path.parent), expected="one that exists"))
+    odd = [one for one in there if not one.is_file()]
+    if odd:
+        raise ConfigError(Problem("this is not an ordinary file", str(odd[0]), hint="choose another name"))
+    if there and not replace:
+        hint = "choose another name, or replace it with --force"
+        raise ConfigError(Problem("this file is there already", str(there[0]), hint=hint))
+    packages = {"parquet": ("pandas", "pyarrow"), "netcdf": ("xarray", "h5netcdf")}
+    check_installed(*packages.get(kind, ()))
+
+
+def export_run(run: Run, kind: str, path: Path, *, frames: bool = False) -> list[str]:
+    """Write a run to a file, whole or not at all; :func:`check_export` comes first.
+
+    Args:
+        run: The run; of one that goes on, the shots that it had when it was opened.
+        kind: One of :data:`ENDINGS`.
+        path: The file; an older one is replaced.
+        frames: Whether an archive holds the frames.
+
+    Returns:
+        What had to be left out of an archive, because files are damaged: one line for each shot.
+
+    Raises:
+        ConfigError: The file cannot be written.
+        RecordingError: The run is damaged.
+    """
+    from labseq.recording.archive import write_archive  # h5py takes 0.1 s to import
+
+    left_out: list[str] = []
+    writers: dict[str, Callable[[], None]] = {
+        "csv": lambda: _write_csv(run, path),
+        "parquet": lambda: _write_parquet(run, path),
+        "netcdf": lambda: _write_netcdf(run, path),
+        "archive": lambda: left_out.extend(write_archive(run, path, frames=frames)),
+    }
+    try:
+        writers[kind]()
+    except (OSError, RuntimeError) as error:  # HDF5 tells of a full disk by either
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else error
+        raise ConfigError(Problem(f"it cannot be written: {reason}", str(path))) from error
+    return left_out
+
+
+def _write_csv(run: Run, path: Path) -> None:
+    columns = columns_of(run)
+    rows = zip(*(map(_cell, column.values.tolist()) for column in columns), strict=True)
+    about = [(column.name, column.units, column.description) for column in columns]
+    table, units = files_of("csv", path)
+    _write_rows(units, [("column", "units", "description"), *about])
+    _write_rows(table, [[column.name for column in columns], *rows])
+
+
+def _write_rows(path: Path, rows: Sequence[Sequence[str]]) -> None:
+    text = io.StringIO(newline="")
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    with whole_file(path) as file:
+        file.write(text.getvalue().encode("utf-8", "backslashreplace"))
+
+
+def _cell(value: Any) -> str:
+    """A value as text that every program reads; nothing for nan."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    return "" if value != value else str(value)
+
+
+def _write_parquet(run: Run, path: Path) -> None:
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    table: Any = pa.Table.from_pandas(dataframe_of(run))
+    about = {column.name: column for column in columns_of(run)}
+    fields = [field.with_metadata(_metadata(about[field.name])) for field in table.schema]
+    facts = {b"labseq": json.dumps(facts_of(run)).encode()}
+    schema = pa.schema(fields, {**(table.schema.metadata or {}), **facts})
+    with whole_file(path) as file:
+        parquet.write_table(table.cast(schema), file)
+
+
+def _metadata(column: Column) -> dict[str, str]:
+    return {"units": column.units, "description": column.description}
+
+
+def _write_netcdf(run: Run, path: Path) -> None:
+    dataset = dataset_of(run)
+    names = [str(name) for name in (*dataset.variables, *dataset.dims) if "/" in str(name)]
+    dataset = dataset.rename({name: name.replace("/", "_") for name in dict.fromkeys(names)})
+    packed = {"zlib": True, "shuffle": True} if dataset["occupancy"].size else {}
+    with whole_file(path) as file:
+        encoding = {"occupancy": {**packed, "_FillValue": None}}
+        dataset.to_netcdf(Path(file.name), engine="h5netcdf", format="NETCDF4", encoding=encoding)

@@ -1,0 +1,117 @@
+"""What analyses made of a run's shots: in its folder, a file of lines for each analysis.
+
+A line with "shot" is the result of a shot; of several of the same shot the last one counts. Any
+other line says what made those that follow it: plugin, version, settings; where it has "anew", the lines
+before it do not count any more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, Final, cast
+
+from labseq.errors import RecordingError
+from labseq.recording import folders
+from labseq.recording.durable import LineLog, explained, read_lines
+
+SHOT: Final = "shot"
+ERROR: Final = "error"
+ANEW: Final = "anew"
+_SUFFIX: Final = ".jsonl"
+
+
+def results_file(run_dir: Path, name: str) -> Path:
+    """The file of an analysis."""
+    return run_dir / folders.RESULTS_FOLDER / f"{folders.slug(name)}{_SUFFIX}"
+
+
+class ResultsLog:
+    """The file of an analysis, for writing: every line is on the disk before the next shot is looked at.
+
+    Args:
+        path: The file; its folder is made if there is none.
+        about: What makes the results; with "anew" true they are begun again.
+
+    Raises:
+        RecordingError: The file cannot be written.
+    """
+
+    def __init__(self, path: Path, about: Mapping[str, Any]) -> None:
+        self.path = path
+        with explained(path):
+            path.parent.mkdir(exist_ok=True)
+        self._log = LineLog(path)
+        self._log.append(about, sync=True)
+
+    @staticmethod
+    def checked(result: object) -> Mapping[str, Any]:
+        """A result that can be written.
+
+        Raises:
+            TypeError: It is none.
+        """
+        if not isinstance(result, Mapping):
+            raise TypeError(f"the result is {type(result).__name__}; expected a mapping of names to values")
+        values = cast("Mapping[Any, Any]", result)
+        for name in values:
+            if not isinstance(name, str) or name in (SHOT, ERROR):
+                raise TypeError(f"the result has the name {name!r}; expected text but '{SHOT}' and '{ERROR}'")
+        return values
+
+    def write(self, shot: int, result: Mapping[str, Any]) -> None:
+        """Keep the result of a shot.
+
+        Raises:
+            RecordingError: The disk is full.
+        """
+        self._log.append({SHOT: shot, **result}, sync=True)
+
+    def fail(self, shot: int, error: BaseException) -> None:
+        """Keep why there is no result of a shot.
+
+        Raises:
+            RecordingError: The disk is full.
+        """
+        self._log.append({SHOT: shot, ERROR: f"{type(error).__name__}: {error}"}, sync=True)
+
+
+def read_results(path: Path) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """Read the file of an analysis, whatever state it is in.
+
+    Returns:
+        The row of each shot, in the order of the shots; and what made the last of them, {} if nobody said.
+
+    Raises:
+        RecordingError: The file exists but cannot be read.
+    """
+    rows: dict[int, dict[str, Any]] = {}
+    about: dict[str, Any] = {}
+    for row in read_lines(path)[0]:
+        if type(row.get(SHOT)) is int:
+            rows[row[SHOT]] = row
+        else:
+            about = row
+            if row.get(ANEW):
+                rows.clear()
+    return [rows[shot] for shot in sorted(rows)], about
+
+
+def done(rows: Iterable[Mapping[str, Any]]) -> set[int]:
+    """The shots that have a result."""
+    return {row[SHOT] for row in rows if ERROR not in row}
+
+
+def rows_of(run_dir: Path, name: str) -> list[dict[str, Any]]:
+    """The row of each shot that an analysis has looked at.
+
+    Raises:
+        RecordingError: There are no results of that name, or they cannot be read.
+    """
+    path = results_file(run_dir, name)
+    if not path.is_file():
+        names = sorted(file.stem for file in path.parent.glob(f"*{_SUFFIX}"))
+        there = f"there are those of {', '.join(names)}" if names else "there are none at all"
+        hint = f"'labseq analyse {run_dir} --use {name}' makes them"
+        raise RecordingError(path, f"there are no results of the analysis '{name}', {there}; {hint}")
+    return read_results(path)[0]

@@ -1,0 +1,192 @@
+"""A shot on disk: what the index tells, and what its file holds."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq.errors import RecordingError
+from labseq.model import CycleRecord, ImageRecord, Plan, ShotRecord, StageTiming, TargetPattern
+from labseq.model.records import ShotStatus
+from labseq.recording.summaries import ShotSummary, summarise, summary_in
+
+if TYPE_CHECKING:
+    from labseq.recording.shot_reader import ShotContent
+
+
+def load_content(path: Path) -> ShotContent:
+    """Read a shot's file without its frames; see :func:`labseq.recording.shot_reader.read_content`."""
+    from labseq.recording.shot_reader import read_content  # h5py takes 0.1 s to import
+
+    return read_content(path)
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Shot:
+    """A shot on disk. What the index holds costs nothing; the rest reads the shot's file.
+
+    Every property from ``occupancies`` on raises ``RecordingError`` if the file is missing or damaged.
+
+    Attributes:
+        file: The shot's HDF5 file.
+        row: Its line in the index.
+    """
+
+    file: Path
+    row: dict[str, Any]
+    _load: Callable[[Path], ShotContent] = field()
+
+    def __repr__(self) -> str:
+        return f"<Shot {self.index}: {self.status}, {self.file}>"
+
+    @property
+    def index(self) -> int:
+        """Index in the run, from 0."""
+        return int(self.row["shot"])
+
+    @property
+    def attempt(self) -> int:
+        """Which attempt this is, from 0."""
+        return int(self.row["attempt"])
+
+    @property
+    def status(self) -> ShotStatus:
+        """One of "complete", "interrupted" and "failed"."""
+        return self.row["status"]
+
+    @property
+    def success(self) -> bool:
+        """Whether the last ``image`` step met the target."""
+        return bool(self.row["success"])
+
+    @property
+    def filling_fraction(self) -> float:
+        """Filling of the target on the last ``image`` step; nan without one."""
+        value = self.row["filling_fraction"]
+        return math.nan if value is None else float(value)
+
+    @property
+    def seen_defect_free_cycle(self) -> int:
+        """First cycle whose image met the target; 0 if none."""
+        return int(self.row["seen_defect_free_cycle"])
+
+    @property
+    def occupancies(self) -> NDArray[np.bool_]:
+        """As detected, bool (n_images, n_rows, n_cols)."""
+        return self._of_each_image("occupancy", np.bool_)
+
+    @property
+    def summary(self) -> ShotSummary:
+        """What its images and cycles came to; the file is read for runs before format 1.1 only."""
+        found = summary_in(self.row)
+        return summarise(self._content.record, self._content.target) if found is None else found
+
+    @property
+    def confidences(self) -> NDArray[np.float32]:
+        """The detector's confidence, float32 (n_images, n_rows, n_cols)."""
+        return self._of_each_image("confidence", np.float32)
+
+    @property
+    def target(self) -> TargetPattern:
+        """The target of the run."""
+        return self._content.target
+
+    @property
+    def images(self) -> tuple[ImageRecord, ...]:
+        """The images without their frames, in the order they were taken."""
+        return tuple(self._content.record.images)
+
+    @property
+    def plans(self) -> tuple[Plan, ...]:
+        """The plan of each cycle."""
+        return tuple(cycle.plan for cycle in self.cycles)
+
+    @property
+    def cycles(self) -> tuple[CycleRecord, ...]:
+        """The rearrangement cycles."""
+        return tuple(self._content.record.cycles)
+
+    @property
+    def timing(self) -> tuple[StageTiming, ...]:
+        """The stages, in the order they ended."""
+        return tuple(self._content.record.timing)
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """What differs from the files in this shot: address -> value; those of a scan in SI."""
+        return dict(self.row.get("parameters") or {})
+
+    @property
+    def calibrations(self) -> dict[str, str]:
+        """The calibrations in use: kind -> id."""
+        return dict(self._content.record.calibrations)
+
+    @property
+    def readings(self) -> dict[str, Any]:
+        """Values read from devices during the shot."""
+        return dict(self._content.record.readings)
+
+    @property
+    def story(self) -> dict[str, NDArray[Any]]:
+        """What the simulation told of the atoms: name -> structured array; empty if it told nothing."""
+        return dict(self._content.record.story)
+
+    @property
+    def provenance(self) -> dict[str, Any]:
+        """Seed, versions, texts and settings, as the shot's file has them."""
+        return dict(self._content.provenance)
+
+    @property
+    def devices(self) -> dict[str, Any]:
+        """What each device said of itself."""
+        return dict(self._content.devices)
+
+    @property
+    def frames(self) -> NDArray[np.uint16]:
+        """The frames that were kept, uint16 (n_frames, height, width); read anew each time.
+
+        Raises:
+            RecordingError: The frames differ in size; :meth:`record` gives them one by one.
+        """
+        from labseq.recording.shot_reader import read_frames
+
+        images = [frame.image for frame in read_frames(self.file).values()]
+        if len({image.shape for image in images}) > 1:
+            raise RecordingError(self.file, "holds frames of several sizes; use shot.record().images")
+        return np.stack(images) if images else np.empty((0, 0, 0), np.uint16)
+
+    def record(self) -> ShotRecord:
+        """The whole record as it was written, frames included."""
+        from labseq.recording.shot_reader import read_frames, with_frames
+
+        return with_frames(self._content.record, read_frames(self.file))
+
+    def verify(self) -> None:
+        """Compare the file with the checksum in the index.
+
+        Raises:
+            RecordingError: A byte has changed since it was written.
+        """
+        try:
+            data = self.file.read_bytes()
+        except OSError as error:
+            reason = f"cannot be read: {error.strerror}; take it from a backup"
+            raise RecordingError(self.file, reason) from error
+        if hashlib.sha256(data).hexdigest() != self.row.get("sha256"):
+            raise RecordingError(self.file, "has changed since it was written; take it from a backup")
+
+    @property
+    def _content(self) -> ShotContent:
+        return self._load(self.file)
+
+    def _of_each_image(self, name: str, dtype: Any) -> NDArray[Any]:
+        images = self._content.record.images
+        shape = (len(images), *self._content.target.shape)
+        return np.array([getattr(image, name) for image in images], dtype).reshape(shape)

@@ -1,0 +1,170 @@
+"""Another control system leads: the step that waits for its word, and what it is told of the outcome."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol
+
+from labseq.errors import ConfigError, LabseqError, one_of
+from labseq.model import ShotRecord, TimelineEntry
+from labseq.roles import Device, Leading, Shot, StepContext
+from labseq.sequencer.guard import LATE_S, Guard
+from labseq.sequencer.lab import Lab
+from labseq.sequencer.steps import WaitStep
+
+Emit = Callable[[str, Mapping[str, Any]], None]
+
+
+class _Settings(Protocol):
+    @property
+    def duration(self) -> float | None: ...
+    @property
+    def signal(self) -> str | None: ...
+    @property
+    def timeout(self) -> float | None: ...
+    @property
+    def device(self) -> str | None: ...
+
+
+class FollowStep:
+    """Waits until another control system says to go on."""
+
+    needs_image = False
+    takes_image = False
+
+    def __init__(self, signal: str, timeout_s: float, device: str = "") -> None:
+        self.signal = signal
+        self.timeout_s = timeout_s
+        self.device = device
+
+    def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:  # noqa: ARG002 - Protocol
+        """One bar, at most the timeout; lines are idle, because nobody knows how long it takes."""
+        return [TimelineEntry(f"wait for {self.signal}", self.timeout_s, 0.0)]
+
+    def run(self, shot: Shot) -> None:
+        """Wait for the signal."""
+        shot.follow(self.signal, self.timeout_s, self.device)
+
+
+def wait_step(settings: _Settings) -> WaitStep | FollowStep:
+    """The step ``wait``: for a time, or for a signal."""
+    if settings.signal is None or settings.timeout is None:
+        return WaitStep(settings)
+    return FollowStep(settings.signal, settings.timeout, settings.device or "")
+
+
+def leaders(devices: Mapping[str, Device]) -> Iterator[tuple[str, Leading]]:
+    """The devices through which other control systems lead, with their names."""
+    for name, device in devices.items():
+        if isinstance(device, Leading):
+            yield name, device
+
+
+def find_leader(devices: Mapping[str, Device], name: str = "") -> tuple[str, Leading]:
+    """The device whose leader a step waits for.
+
+    Args:
+        devices: Those of the profile.
+        name: Of the device; "" for the only one that leads.
+
+    Raises:
+        ConfigError: It cannot lead, or nobody can, or it is not clear who is meant.
+    """
+    able = dict(leaders(devices))
+    if name in able:
+        return name, able[name]
+    if name:
+        raise ConfigError(f"no other control system leads through '{name}'")
+    if not able:
+        raise ConfigError("the profile has no device through which another control system leads")
+    if len(able) > 1:
+        raise ConfigError(f"several devices lead; set `device` to {one_of(list(able))}")
+    return next(iter(able.items()))
+
+
+@dataclass(frozen=True, slots=True)
+class Leaders:
+    """Those who lead a shot: whoever said `go` is told what came of it.
+
+    A device knows itself whether it owes an answer, and gives it once; so all are told at each end of a shot.
+
+    Attributes:
+        lab: The devices.
+        guard: Runs every call into them.
+        record: Of the shot.
+        emit: Told every event: name and values.
+    """
+
+    lab: Lab
+    guard: Guard
+    record: ShotRecord
+    emit: Emit
+
+    def follow(self, signal: str, timeout_s: float, device: str) -> None:
+        """Wait for a signal; see ``labseq.roles.Shot.follow``."""
+        name, leader = find_leader(self.lab.devices, device)
+        self._tell(name, leader, "ready", self.guard.call)  # of an earlier signal in this shot
+        awaited = {"shot": self.record.shot_index, "device": name, "signal": signal, "timeout_s": timeout_s}
+        self.emit("leader_awaited", awaited)
+        try:
+            text = self.guard.call(name, timeout_s + LATE_S, leader.wait_for, signal, timeout_s)
+        finally:
+            self._log_news(name, leader)
+        self._note(f"{name}.{signal}", text)
+        self._log("leader_said", name, f"{signal} {text}".strip())
+
+    def ready(self) -> None:
+        """The last step is over.
+
+        Raises:
+            DeviceError: A device fails.
+            StopRequested: The run was asked to stop; they are to be told that it failed.
+        """
+        for name, leader in leaders(self.lab.devices):
+            self._tell(name, leader, "ready", self.guard.call)
+
+    def failed(self, error: BaseException) -> None:
+        """The shot failed, or was interrupted; no failure to tell it stands in the way of anything."""
+        reason = str(error) or type(error).__name__
+        for name, leader in leaders(self.lab.devices):
+            try:
+                self._tell(name, leader, "failed", self.guard.call_to_the_end, reason)
+            except LabseqError as failure:
+                text = f"the system that leads through '{name}' could not be told of the failure: {failure}"
+                self.emit("warning", {"text": text})
+
+    def _tell(
+        self,
+        name: str,
+        leader: Leading,
+        state: Literal["ready", "failed"],
+        call: Callable[..., Any],
+        reason: str = "",
+    ) -> None:
+        about: dict[str, bool | int | float | str] = {"shot": self.record.shot_index}
+        if state == "ready" and not math.isnan(self.record.filling_fraction):
+            about |= {"success": self.record.success, "filling": self.record.filling_fraction}
+        if reason:
+            about["reason"] = reason
+        told = call(name, self.lab.timeouts.call_s, leader.tell, state, about)
+        if told:
+            self._note(f"{name}.told", told)
+            self._log("leader_told", name, told)
+        self._log_news(name, leader)
+
+    def _log_news(self, name: str, leader: Leading) -> None:
+        try:
+            news = self.guard.call_to_the_end(name, self.lab.timeouts.call_s, leader.news)
+        except LabseqError as failure:
+            news = [str(failure)]
+        for text in news:
+            self._log("leader_news", name, text)
+
+    def _note(self, name: str, text: str) -> None:
+        """Add to the shot's readings; there may be several waits in a shot."""
+        self.record.readings[name] = [*self.record.readings.get(name, ()), text]
+
+    def _log(self, event: str, device: str, text: str) -> None:
+        self.emit(event, {"shot": self.record.shot_index, "device": device, "text": text})

@@ -1,0 +1,209 @@
+"""Analyses of a run's shots: what is to be worked out, and working it out."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Generator, Iterable, Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Final, cast
+
+import labseq
+from labseq.config import validate_values
+from labseq.errors import ConfigError, Problem, RecordingError
+from labseq.locks import Lock, knows_no_locks
+from labseq.recording import Run
+from labseq.recording.results import ANEW, ResultsLog, done, read_results, results_file
+from labseq.roles import Analysis, RecordedShot
+from labseq.session.choosing import Chosen
+from labseq.session.constructing import construct_one
+from labseq.session.recorded import context_of, plugins_of, resolved_of
+
+USE: Final = "use"
+FINISH_WITHIN: Final = "finish_within"
+FAILED: Final = "failed: "
+"""What a line of a process's log begins with that the run is to tell."""
+
+
+@dataclass(frozen=True, slots=True)
+class Prepared:
+    """An analysis that is ready for the shots of a run.
+
+    Attributes:
+        name: Its name.
+        analysis: What analyses.
+        about: What the file of the results says of it.
+    """
+
+    name: str
+    analysis: Analysis
+    about: Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Analysed:
+    """What came of an analysis.
+
+    Attributes:
+        name: Its name.
+        n_done: Shots that were analysed now.
+        n_before: Shots of which there was a result already.
+        failures: Index of a shot -> why there is no result of it.
+        path: The file of the results.
+    """
+
+    name: str
+    n_done: int
+    n_before: int
+    failures: Mapping[int, str]
+    path: Path
+
+
+def analyses_of(run: Run) -> list[dict[str, Any]]:
+    """The analyses that a run's sequence asks for, with their settings.
+
+    Raises:
+        RecordingError: The run does not say what it was taken with.
+    """
+    found: Any = resolved_of(run).get("analysis") or []
+    return [dict(one) for one in cast("list[dict[str, Any]]", found)]
+
+
+def prepare(run: Run, settings: Mapping[str, Any]) -> Prepared:
+    """Make an analysis for the shots of a run.
+
+    Args:
+        run: The run.
+        settings: "use" and its settings.
+
+    Raises:
+        UnknownPluginError: No plugin offers it.
+        PluginLoadError: Its plugin failed to load, or is at fault.
+        ConfigError: A setting is wrong.
+        RecordingError: The run does not say enough of itself.
+    """
+    name = str(settings[USE])
+    host = plugins_of(run)
+    entry = host.get("analysis", name)
+    own = {key: value for key, value in settings.items() if key not in (USE, FINISH_WITHIN)}
+    chosen = Chosen(entry, validate_values(entry.settings_model, own, f"analysis '{name}'"))
+    version = next((info.version for info in host.infos if info.name == entry.origin), "")
+    about = {
+        "analysis": name,
+        "settings": {key: value for key, value in chosen.dump().items() if key != USE},
+        "plugin": entry.origin,
+        "version": version,
+        "labseq": labseq.__version__,
+        "t_utc": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+    return Prepared(name, construct_one(chosen, context_of(run, name)), about)
+
+
+@contextlib.contextmanager
+def results_of(
+    run_dir: Path, prepared: Prepared, *, anew: bool = False
+) -> Generator[tuple[ResultsLog, set[int]]]:
+    """The results of an analysis, for writing by this process alone.
+
+    Results of other settings never stand beside new ones: all shots are analysed again then.
+
+    Args:
+        run_dir: The run's folder.
+        prepared: The analysis.
+        anew: Whether to begin again in any case.
+
+    Yields:
+        Where results go, and the shots that have one already.
+
+    Raises:
+        ConfigError: Another process writes them.
+        RecordingError: They cannot be written.
+    """
+    path = results_file(run_dir, prepared.name)
+    with _alone(path, prepared.name):
+        rows, about = read_results(path)
+        anew = anew or about.get("settings") != prepared.about["settings"]
+        yield ResultsLog(path, {**prepared.about, ANEW: anew}), set() if anew else done(rows)
+
+
+def analyse(
+    prepared: Prepared,
+    shots: Iterable[RecordedShot],
+    log: ResultsLog,
+    failed: Callable[[int, BaseException], None],
+) -> int:
+    """Analyse shots; one that raises is noted and told, and the next one comes.
+
+    Args:
+        prepared: The analysis.
+        shots: The shots.
+        log: Where the results go.
+        failed: Told the index of a shot, and what was raised.
+
+    Returns:
+        How many have a result.
+
+    Raises:
+        RecordingError: The disk is full.
+    """
+    n_done = 0
+    for shot in shots:
+        try:
+            result = log.checked(prepared.analysis.shot(shot))
+        except (Exception, SystemExit) as error:  # noqa: BLE001 - an analysis may raise anything
+            log.fail(shot.index, error)
+            failed(shot.index, error)
+        else:
+            log.write(shot.index, result)
+            n_done += 1
+    return n_done
+
+
+def make_up(run: Run, settings: Mapping[str, Any], *, anew: bool = False) -> Analysed:
+    """Analyse the shots of a run that have no result yet.
+
+    Args:
+        run: The run.
+        settings: "use" and its settings.
+        anew: Whether to analyse all shots again.
+
+    Raises:
+        ConfigError: A setting is wrong, or another process writes the same results.
+        LabseqError: See :func:`prepare`; or the disk is full.
+    """
+    prepared = prepare(run, settings)
+    failures: dict[int, str] = {}
+
+    def failed(shot: int, error: BaseException) -> None:
+        failures[shot] = f"{type(error).__name__}: {error}"
+
+    with results_of(run.path, prepared, anew=anew) as (log, before):
+        n_done = analyse(prepared, (s for s in run.shots if s.index not in before), log, failed)
+    return Analysed(prepared.name, n_done, len(before), failures, log.path)
+
+
+@contextlib.contextmanager
+def _alone(path: Path, name: str) -> Generator[None]:
+    """Keep other processes from writing the same results at the same time.
+
+    Raises:
+        ConfigError: One does already.
+        RecordingError: The folder cannot be written to.
+    """
+    lock = Lock(path.with_name(f".{path.stem}.lock"), f"the analysis '{name}'")
+    try:
+        holder = lock.take()
+    except OSError as error:
+        if not knows_no_locks(error):
+            raise RecordingError(
+                path.parent, f"cannot be written: {error.strerror}; check the disk"
+            ) from error
+        holder = None
+    if holder is not None:
+        what = f"the results of '{name}' are being written by {holder}"
+        raise ConfigError(Problem(what, str(path), hint="wait until it has finished"))
+    try:
+        yield
+    finally:
+        lock.release()

@@ -1,0 +1,100 @@
+"""The process of one analysis: ``python -m labseq.session.analysis_process RUN_DIR NAME FINISH_WITHIN``.
+
+It reads the run's index, in which a shot stands as soon as it is whole on the disk: the index is the
+queue. So the run never waits for an analysis, one that falls behind takes no memory, and one that
+is begun again goes on where it was. The end of standard input is the end of the run.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Generator
+from contextlib import suppress
+from pathlib import Path
+from typing import Final
+
+from labseq.errors import LabseqError
+from labseq.recording import Shot, open_run
+from labseq.recording.following import Follower
+from labseq.session.analysing import FAILED, USE, analyse, analyses_of, prepare, results_of
+
+LOOK_S: Final = 0.1
+"""How often it looks for new shots."""
+
+
+class _End:
+    """The end of the run, and of the time after it."""
+
+    def __init__(self, finish_within_s: float) -> None:
+        self._within_s = finish_within_s
+        self._deadline_s = float("inf")
+        self._came = threading.Event()
+        threading.Thread(target=self._listen, daemon=True).start()
+
+    @property
+    def came(self) -> bool:
+        """Whether the run is over."""
+        return self._came.is_set()
+
+    @property
+    def time_is_up(self) -> bool:
+        """Whether no further shot is to be begun."""
+        return time.monotonic() > self._deadline_s
+
+    def wait(self) -> None:
+        """Wait a moment for new shots, or until the run is over."""
+        self._came.wait(LOOK_S)
+
+    def _listen(self) -> None:
+        with suppress(OSError):
+            sys.stdin.buffer.read()
+        self._deadline_s = time.monotonic() + self._within_s
+        self._came.set()
+
+
+def main(run_dir: Path, name: str, finish_within_s: float) -> None:
+    """Analyse the shots of a run as they come, until it is over.
+
+    Args:
+        run_dir: The run's folder.
+        name: One of the analyses of its sequence.
+        finish_within_s: How long to go on after its end.
+    """
+    end = _End(finish_within_s)
+    if hasattr(os, "nice"):
+        os.nice(10)  # the run comes first
+    run = open_run(run_dir)
+    prepared = prepare(run, next(one for one in analyses_of(run) if one[USE] == name))
+    with results_of(run_dir, prepared) as (log, before):
+        analyse(prepared, _as_they_come(run_dir, before, end), log, _tell)
+
+
+def _as_they_come(run_dir: Path, before: set[int], end: _End) -> Generator[Shot]:
+    """The shots that have no result yet, until the run is over and there are no more."""
+    follower = Follower(run_dir)
+    while True:
+        over = end.came  # before the index is read: what was written by then is in it
+        for shot in follower.new():
+            if end.time_is_up:
+                return
+            if shot.index not in before:
+                yield shot
+        if over:
+            return
+        end.wait()
+
+
+def _tell(shot: int, error: BaseException) -> None:
+    traceback.print_exception(error)
+    print(f"{FAILED}shot {shot + 1}: {type(error).__name__}: {error}", file=sys.stderr, flush=True)  # noqa: T201 - its log
+
+
+if __name__ == "__main__":
+    try:
+        main(Path(sys.argv[1]), sys.argv[2], float(sys.argv[3]))
+    except LabseqError as failure:
+        sys.exit(f"{FAILED}{failure}")

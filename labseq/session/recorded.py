@@ -1,0 +1,111 @@
+"""What a run was taken with, from its own folder: whatever files and calibrations say today."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, cast
+
+from labseq.calibrations import read_entry
+from labseq.config import Kept
+from labseq.config.reading import beside
+from labseq.errors import RecordingError
+from labseq.model import CalibrationEntry, RandomStream
+from labseq.plugins import PluginHost
+from labseq.recording import Run
+from labseq.recording.folders import RUN_FILE
+from labseq.recording.run_file import sha256_of_text
+from labseq.roles import Context
+from labseq.session.plan_inputs import Machine, recorded_machine
+from labseq.session.setting_up import load_plugins
+
+
+def resolved_of(run: Run) -> dict[str, Any]:
+    """Every setting of a run, SI; of a scan, at its first point.
+
+    Raises:
+        RecordingError: They are not there.
+    """
+    found: Any = run.record.get("resolved")
+    if not (isinstance(found, dict) and isinstance(found.get("profile"), dict)):
+        raise RecordingError(run.path / RUN_FILE, "does not say what the run was taken with")
+    return cast("dict[str, Any]", found)
+
+
+def kept_text(path: Path, sha256: str) -> Kept:
+    """The text of a file in a run's folder.
+
+    Args:
+        path: The file.
+        sha256: What it was when the run was begun.
+
+    Raises:
+        RecordingError: It is missing, or something else.
+    """
+    try:
+        text = path.read_bytes().decode("utf-8", "surrogateescape")
+    except OSError as error:
+        raise RecordingError(path, f"cannot be read: {error.strerror}; take it from a backup") from error
+    if sha256_of_text(text) != sha256:
+        raise RecordingError(path, f"is not what {RUN_FILE} says it was; take it from a backup")
+    return Kept(text, str(path))
+
+
+def plugins_of(run: Run) -> PluginHost:
+    """The plugins that a run can name: those installed now, and those of its own folders.
+
+    Raises:
+        ConfigError: A folder does not exist any more.
+        RecordingError: The run does not say where they are.
+    """
+    resolved = resolved_of(run)
+    named = (("profile_path", resolved["profile"]), ("sequence_path", resolved))
+    return load_plugins(
+        [
+            beside(Path(run.record[path]).parent, folder)
+            for path, settings in named
+            for folder in settings.get("plugin_folders", ())
+        ]
+    )
+
+
+def calibrations_of(run: Run) -> dict[str, CalibrationEntry]:
+    """The calibrations of a run, from the copies in its folder: kind -> entry.
+
+    Raises:
+        ConfigError: A copy is missing or damaged.
+        RecordingError: A copy is of another calibration than the run's.
+    """
+    entries: dict[str, CalibrationEntry] = {}
+    for kind, own in cast("Mapping[str, str]", run.record.get("calibrations") or {}).items():
+        path = run.path / f"calibration_{kind}.json"
+        entries[kind] = read_entry(path)
+        if entries[kind].id != own:
+            text = f"is calibration {entries[kind].id}, but the run was taken with {own}"
+            raise RecordingError(path, f"{text}; take that from a backup")
+    return entries
+
+
+def machine_of(run: Run) -> Machine:
+    """The grid of a run, with the tones of its calibrations, and its motion; of a scan, at its first point.
+
+    Raises:
+        ConfigError: What the run says of them makes no sense.
+        RecordingError: It says nothing.
+    """
+    return recorded_machine(resolved_of(run)["profile"], str(run.path / RUN_FILE))
+
+
+def context_of(run: Run, name: str) -> Context:
+    """What a plugin is given that looks at a run afterwards.
+
+    Args:
+        run: The run.
+        name: The plugin's role or name.
+
+    Raises:
+        ConfigError: What the run says of itself makes no sense, or a calibration is missing.
+        RecordingError: It does not say enough.
+    """
+    machine, stream = machine_of(run), RandomStream(run.seed, name)
+    return Context(name, machine.grid, machine.motion, random=stream, calibrations=calibrations_of(run))

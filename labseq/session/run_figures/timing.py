@@ -1,0 +1,187 @@
+"""How long the stages of a run's shots took, against their budgets."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from datetime import datetime
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq.errors import RecordingError
+from labseq.model import StageTiming
+from labseq.recording import Run, Shot
+
+ORDER: Final = ("load", "expose", "detect", "plan", "check", "prepare", "play", "move", "write")
+"""The stages of a shot as they come; others stand between the last two."""
+WRITE: Final = "write"
+"""Writing a shot to the disk: from its end to the line of the event log that says that it is written."""
+STEP: Final = "step "
+"""What the names of whole steps begin with."""
+
+Quantiles = tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class StageStatistics:
+    """A stage over many shots.
+
+    Attributes:
+        stage: Its name: "expose", "plan", ..., "write", or "step 2 rearrange" for a whole step.
+        n: How often it came.
+        n_per_shot: The same in a shot, a mean.
+        budget_s: What it may take, a median: the budget of "play" is the length of each program; NaN without.
+        session_s: Median and 99th percentile on the session's clock: modelled in a simulated run.
+        host_s: The same on this computer's clock.
+        share: Its part of the time of a shot, on the session's clock; that of writing comes on top.
+        n_over: How often it went over its budget.
+    """
+
+    stage: str
+    n: int
+    n_per_shot: float
+    budget_s: float
+    session_s: Quantiles
+    host_s: Quantiles
+    share: float
+    n_over: int
+
+
+@dataclass(frozen=True, slots=True)
+class RunTiming:
+    """The stages of a run's shots.
+
+    Attributes:
+        n_read: Shots whose files were read.
+        shot_s: Median and 99th percentile of the steps of a shot together, on the session's clock.
+        stages: The stages, in the order of a shot; whole steps last.
+    """
+
+    n_read: int
+    shot_s: Quantiles
+    stages: tuple[StageStatistics, ...]
+
+
+@dataclass(slots=True)
+class _Durations:
+    session_s: list[float] = field(default_factory=list[float])
+    host_s: list[float] = field(default_factory=list[float])
+    budget_s: list[float] = field(default_factory=list[float])
+    n_over: int = 0
+
+    def add(self, timing: StageTiming) -> None:
+        self.session_s.append(timing.duration_s)
+        self.host_s.append(timing.host_s)
+        self.budget_s.append(timing.budget_s)
+        self.n_over += timing.over_budget
+
+
+@dataclass(slots=True)
+class Stopwatch:
+    """Adds up the stages of shots."""
+
+    _found: dict[str, _Durations] = field(default_factory=dict[str, _Durations])
+    _shot_s: list[float] = field(default_factory=list[float])
+
+    def add(self, shot: Shot) -> None:
+        """Add the stages of a shot.
+
+        Args:
+            shot: Its file is read.
+
+        Raises:
+            RecordingError: The file cannot be read.
+        """
+        timing = shot.timing
+        for one in timing:
+            self._found.setdefault(one.stage, _Durations()).add(one)
+        self._shot_s.append(math.fsum(one.duration_s for one in timing if one.stage.startswith(STEP)))
+
+    def sum_up(self, run: Run) -> RunTiming:
+        """What the stages came to.
+
+        Args:
+            run: The run; its index and event log tell how long writing took, of all its shots.
+        """
+        n_read, total_s = len(self._shot_s), math.fsum(self._shot_s)
+        names = sorted(self._found, key=_place)
+        stages = [_sum_up(name, self._found[name], n_read, total_s) for name in names]
+        written = _writing(run, total_s / n_read if n_read else math.nan)
+        before = sum(not name.startswith(STEP) for name in names)
+        return RunTiming(n_read, quantiles(self._shot_s), (*stages[:before], *written, *stages[before:]))
+
+
+def timing_of(run: Run, shots: Iterable[Shot]) -> RunTiming:
+    """Sum up the stages of some shots; those whose files cannot be read are left out.
+
+    Args:
+        run: Their run.
+        shots: The shots.
+    """
+    watch = Stopwatch()
+    for shot in shots:
+        with suppress(RecordingError):
+            watch.add(shot)
+    return watch.sum_up(run)
+
+
+def _place(name: str) -> tuple[bool, int, str]:
+    """Known stages in their order, then others, then whole steps."""
+    return name.startswith(STEP), ORDER.index(name) if name in ORDER else len(ORDER), name
+
+
+def _sum_up(name: str, of: _Durations, n_shots: int, total_s: float) -> StageStatistics:
+    budgets_s = [s for s in of.budget_s if not math.isnan(s)]
+    return StageStatistics(
+        stage=name,
+        n=len(of.session_s),
+        n_per_shot=len(of.session_s) / n_shots,
+        budget_s=float(np.median(budgets_s)) if budgets_s else math.nan,
+        session_s=quantiles(of.session_s),
+        host_s=quantiles(of.host_s),
+        share=math.fsum(of.session_s) / total_s if total_s else math.nan,
+        n_over=of.n_over,
+    )
+
+
+def _writing(run: Run, shot_s: float) -> list[StageStatistics]:
+    times_s = writing_s(run)
+    if not times_s:
+        return []
+    host_s = quantiles(times_s)
+    session_s = (math.nan, math.nan) if run.simulated else host_s  # a model knows of no disk
+    share = float(np.mean(times_s)) / shot_s if shot_s and not run.simulated else math.nan
+    return [StageStatistics(WRITE, len(times_s), 1.0, math.nan, session_s, host_s, share, 0)]
+
+
+def writing_s(run: Run) -> list[float]:
+    """How long it took to write each attempt at a shot, in seconds, by the clock on the wall.
+
+    Those that the clock was set back in are left out, and those that the event log does not tell of.
+    """
+    ends = {(shot.index, shot.attempt): shot.row.get("t_end_utc") for shot in (*run.shots, *run.attempts)}
+    found: list[float] = []
+    for event in run.events:
+        if event.get("event") in {"shot_finished", "shot_repeated"}:
+            with suppress(KeyError, TypeError, ValueError):  # a damaged line
+                shot: Mapping[str, Any] = event["values"]["shot"]
+                end = datetime.fromisoformat(str(ends[shot["shot_index"], shot["attempt"]]))
+                found.append((datetime.fromisoformat(event["t_utc"]) - end).total_seconds())
+    return [s for s in found if s >= 0]
+
+
+def quantiles(values: Sequence[float] | NDArray[np.float64]) -> Quantiles:
+    """Median and 99th percentile, between the nearest values; NaN of nothing.
+
+    Example:
+        >>> quantiles([1.0, 2.0, 3.0])[0]
+        2.0
+    """
+    if not len(values):
+        return math.nan, math.nan
+    p50, p99 = np.quantile(values, (0.5, 0.99))
+    return float(p50), float(p99)

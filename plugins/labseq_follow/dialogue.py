@@ -1,0 +1,206 @@
+"""What a leader says and what it is told: the protocol, without any line to speak it on."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+from labseq.config.wording import clean, visible
+
+GO: Final = "go"
+VERSION: Final = 1
+MAX_LINE: Final = 200
+"""Longest line in bytes; more is noise."""
+MAX_NEWS: Final = 100
+"""Most news that are kept; a line full of noise must not fill the memory."""
+NOT_ANSWERED: Final = "error"
+"""Lines that begin so are never answered: two that do not understand each other would never end."""
+
+About = Mapping[str, bool | int | float | str]
+
+
+@dataclass(slots=True)
+class _Go:
+    """A `go` whose shot is not over.
+
+    Attributes:
+        text: What stood behind it.
+        due_s: When it must be answered.
+        taken: Whether a step has waited for it.
+        answered: "late" or "gone" if there is nothing more to say; "" if an answer is owed.
+    """
+
+    text: str
+    due_s: float
+    taken: bool = False
+    answered: str = ""
+
+
+class Dialogue:
+    """Makes sure that each `go` gets exactly one answer. It does no I/O and is not safe for threads.
+
+    All that it returns is to be sent to the leader, line by line; all times are on one clock.
+
+    Args:
+        deadline_s: Longest time from `go` to its answer.
+
+    Attributes:
+        is_waiting: Whether a step waits for `go`.
+        is_connected: Whether there is a leader.
+    """
+
+    def __init__(self, deadline_s: float) -> None:
+        self.is_waiting = False
+        self.is_connected = False
+        self._deadline_s = deadline_s
+        self._go: _Go | None = None
+        self._news: deque[str] = deque(maxlen=MAX_NEWS)
+
+    @property
+    def state(self) -> str:
+        """From `go` to the end of its shot "busy", while a step waits "waiting", else "idle"."""
+        if self._go is not None:
+            return "busy"
+        return "waiting" if self.is_waiting else "idle"
+
+    def connected(self, who: str) -> list[str]:
+        """A leader is there."""
+        self.is_connected = True
+        self.note(f"{who} leads")
+        return [self._hello()]
+
+    def lost(self, reason: str) -> None:
+        """The leader is gone: a `go` that nobody took is forgotten, the shot of another goes on."""
+        self.is_connected = False
+        self.note(f"the leader is gone: {reason}")
+        if self._go is not None and not self._go.taken:
+            self._go = None
+        elif self._go is not None and not self._go.answered:
+            self._go.answered = "gone"
+            self.note("its shot goes on; nobody will be told how it ends")
+
+    def heard(self, line: str, now_s: float) -> list[str]:
+        """A line came."""
+        word, _, text = line.strip().partition(" ")
+        if word == GO:
+            return self._heard_go(text.strip(), now_s)
+        if word == "state?" and not text:
+            return [f"state {self.state}"]
+        if word == "hello":
+            return [self._hello()]
+        if word:
+            self.note(f"the leader said '{clean(line.strip())}'")
+        if not word or word == NOT_ANSWERED:
+            return []
+        return [f"error what is '{_one_line(line)[:40]}'? expected go, state? or hello"]
+
+    def take(self, now_s: float) -> tuple[str, list[str]] | None:
+        """What stood behind a `go` that nobody took, for a step that waits; None if there is none."""
+        if self._go is None or self._go.taken or now_s >= self._go.due_s:
+            return None
+        self._go.taken = True
+        return self._go.text, ["busy"]
+
+    def tell(self, state: str, about: About, now_s: float) -> tuple[str, list[str]]:
+        """The shot of a `go` is over: what the leader was told of it, see ``labseq.Leading.tell``."""
+        if self._go is None or not self._go.taken:
+            return "", []
+        said = self.overdue(now_s)
+        go, self._go = self._go, None
+        if go.answered:
+            return go.answered, said
+        return state, [_answer(state, about)]
+
+    def overdue(self, now_s: float) -> list[str]:
+        """Answer a `go` whose deadline has passed."""
+        go = self._go
+        if go is None or go.answered or now_s < go.due_s:
+            return []
+        if go.taken:
+            go.answered = "late"
+            self.note("the shot is not over at the deadline; the leader was told that it failed")
+        else:
+            self._go = None
+            self.note("no step waited for `go` before its deadline; the leader was told of a failure")
+        return [_answer("failed", {"reason": "deadline"})]
+
+    def end(self) -> list[str]:
+        """Nothing more will be said: whoever is owed an answer gets it."""
+        go, self._go = self._go, None
+        return [] if go is None or go.answered else [_answer("failed", {"reason": "labseq ends"})]
+
+    def note(self, text: str) -> None:
+        """Keep something for the log."""
+        self._news.append(text)
+
+    def news(self) -> list[str]:
+        """What was noted since the last call."""
+        news = [*self._news]
+        self._news.clear()
+        return news
+
+    def _heard_go(self, text: str, now_s: float) -> list[str]:
+        if self._go is not None:
+            self.note("`go` came while labseq was busy, and was refused")
+            return [_answer("failed", {"reason": "busy"})]
+        self._go = _Go(visible(text), now_s + self._deadline_s)
+        return []
+
+    def _hello(self) -> str:
+        return f"hello labseq {VERSION} deadline={self._deadline_s:g}"
+
+
+class Splitter:
+    """Makes lines of what comes in pieces."""
+
+    def __init__(self) -> None:
+        self._begun = bytearray()
+        self._is_noise = False
+
+    def feed(self, came: bytes) -> list[str | None]:
+        """The lines that are complete; None for each that was too long."""
+        lines: list[str | None] = []
+        *ended, begun = came.split(b"\n")
+        for piece in ended:
+            self._add(piece)
+            lines.append(None if self._is_noise else self._begun.decode("utf-8", "backslashreplace"))
+            self._begun.clear()
+            self._is_noise = False
+        self._add(begun)
+        return lines
+
+    def rest(self) -> str:
+        """What came of a line that has not ended; it is forgotten."""
+        rest = self._begun.decode("utf-8", "backslashreplace")
+        self._begun.clear()
+        self._is_noise = False
+        return rest
+
+    def _add(self, piece: bytes) -> None:
+        self._is_noise = self._is_noise or len(self._begun) + len(piece) > MAX_LINE
+        if self._is_noise:
+            self._begun.clear()
+        else:
+            self._begun += piece
+
+
+def encoded(line: str) -> bytes:
+    """A line as it is sent: ASCII."""
+    return line.encode("ascii", "backslashreplace")[:MAX_LINE] + b"\n"
+
+
+def _answer(state: str, about: About) -> str:
+    """For example "ready shot=12 success=1 filling=0.987"; a reason goes to the end of the line."""
+    parts = [state]
+    for key, value in sorted(about.items(), key=lambda item: item[0] == "reason"):
+        if isinstance(value, bool | int):
+            parts.append(f"{key}={int(value)}")
+        else:
+            parts.append(f"{key}={value:.4g}" if isinstance(value, float) else f"{key}={_one_line(value)}")
+    return " ".join(parts)
+
+
+def _one_line(text: str) -> str:
+    return " ".join(visible(text).split())

@@ -1,0 +1,74 @@
+"""Settings of the devices that a leader speaks through."""
+
+from __future__ import annotations
+
+import ipaddress
+from typing import Annotated, Final, Literal, Self, TypeAlias
+
+from pydantic import Field, model_validator
+
+from labseq import Duration, Settings
+from labseq.config.fields import misfit
+from labseq.config.wording import clean
+
+SIMULATED: Final = "simulated"
+
+PositiveDuration: TypeAlias = Annotated[Duration, Field(gt=0)]
+
+
+class LeaderSettings(Settings):
+    """What does not depend on the line."""
+
+    deadline: PositiveDuration = Field(
+        default=10.0, description="longest time from `go` to `ready` or `failed`; the leader is told it"
+    )
+    leader: Literal["real", "simulated"] = Field(
+        default="real", description="simulated: one that says `go` by itself, as in a dry run"
+    )
+    goes_after: Duration = Field(
+        default=0.5, description="time after which the simulated leader says `go`; atoms load meanwhile"
+    )
+    loads: bool = Field(
+        default=False,
+        description="with a real leader of a simulated lab: atoms load at `go`, unless there are some",
+    )
+
+
+class TcpLeaderSettings(LeaderSettings):
+    """A leader that connects over TCP."""
+
+    host: Annotated[str, Field(min_length=1)] = Field(
+        default="127.0.0.1", description="address of this computer on which labseq listens"
+    )
+    port: int = Field(
+        default=5750, ge=0, le=65535, description="port on which labseq listens; 0 takes any that is free"
+    )
+    allow_remote: bool = Field(
+        default=False, description="whether other computers may lead: whoever reaches the port may then"
+    )
+
+    @model_validator(mode="after")
+    def _is_local(self) -> Self:
+        if not self.allow_remote and not _is_loopback(self.host):
+            what = f"host is '{clean(self.host)}', which other computers reach"
+            hint = "or set 'allow_remote: true' in a network where everybody may lead"
+            raise misfit(what, "an address of this computer alone, such as 127.0.0.1", hint, at=("host",))
+        return self
+
+
+class SerialLeaderSettings(LeaderSettings):
+    """A leader on a serial line: 8 data bits, no parity, 1 stop bit."""
+
+    port: Annotated[str, Field(min_length=1)] = Field(
+        description="the port: `/dev/ttyUSB0`, `COM3`, or a URL of pyserial"
+    )
+    baud_rate: int = Field(default=115200, ge=1, description="bits per second")
+
+
+def _is_loopback(host: str) -> bool:
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False

@@ -1,0 +1,191 @@
+"""``labseq queue``, ``resume`` and ``stop``: what is printed, and the exit code."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import labseq
+from labseq.cli import main
+from labseq.errors import StopRequested
+from labseq.session.stopping import ask_to_stop
+from labseq.testing.fakes import RecordingObserver
+
+SEQUENCE = """
+labseq: 1
+name: look µ
+profile: ./p.yaml
+shots: 3
+seed: 1
+target: {pattern: compact, rows: 2, cols: 2}
+shot:
+  - load: {duration: 1 ms}
+  - image: {}
+"""
+PROFILE = """
+labseq: 1
+name: bench
+grid: {rows: 4, cols: 4, spacing: 4.49 um}
+camera: {use: virtual}
+static_tweezers: {use: virtual}
+mobile_tweezers: {use: virtual}
+detector: {use: threshold}
+simulation: {use: virtual}
+"""
+
+
+@pytest.fixture(autouse=True)
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("LABSEQ_DATA", raising=False)
+    monkeypatch.setenv("GIT_DIR", "/dev/null")  # nobody's edits while the tests run are a change here
+    Path("s.yaml").write_text(SEQUENCE, encoding="utf-8")
+    Path("p.yaml").write_text(PROFILE, encoding="utf-8")
+
+
+def call(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[Any, str, str]:
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as leaving:
+        main(arguments)
+    out, err = capsys.readouterr()
+    return leaving.value.code, out, err
+
+
+def test_runs_are_queued_listed_moved_removed_and_run(capsys: pytest.CaptureFixture[str]) -> None:
+    assert call(capsys, "queue", "list") == (0, "the queue is empty\n", "")
+    added = call(capsys, "queue", "add", "s.yaml", "--shots", "2", "--set", "attempts=5")
+    assert added == (0, "1: s.yaml, 2 shots, as it is written now\n", "")
+    call(capsys, "queue", "add", "s.yaml")
+    call(capsys, "queue", "add", "s.yaml", "--seed", "7")
+    assert call(capsys, "queue", "move", "3", "--before", "1")[0] == 0
+    assert call(capsys, "queue", "remove", "2")[0] == 0
+    code, out, err = call(capsys, "queue", "list")
+    assert (code, err) == (0, "")
+    header, first, second = out.splitlines()
+    assert header.split() == ["id", "state", "sequence", "added", "options"]
+    assert (first.split()[:3], first.split()[-1]) == (["3", "waiting", "s.yaml"], "seed=7")
+    assert second.endswith("shots=2, attempts=5")
+    code, out, err = call(capsys, "queue", "run")
+    assert (code, err) == (0, "")
+    assert [line[:8] for line in out.splitlines() if line.startswith("queue:")] == ["queue: 3", "queue: 1"]
+    runs = sorted(Path("data").glob("*/*/run.json"))
+    assert [len(labseq.open_run(run).shots) for run in runs] == [3, 2]
+    assert call(capsys, "queue", "list") == (0, "the queue is empty\n", "")
+
+
+def test_the_list_says_what_one_should_know(capsys: pytest.CaptureFixture[str]) -> None:
+    call(capsys, "queue", "add", "s.yaml")
+    Path("s.yaml").write_text(SEQUENCE + "\n", encoding="utf-8")
+    Path("p.yaml").unlink()
+    code, _, err = call(capsys, "queue", "run")
+    assert code == 2
+    assert err.startswith(f"{Path.cwd() / 's.yaml'} (as queued):4:10: there is no hardware profile at ")
+    code, out, _ = call(capsys, "queue", "list")
+    *_, changed, why = out.splitlines()
+    assert changed == "1: s.yaml has been changed or removed since; what it said then is run"
+    assert why.startswith("1: ")
+    assert "there is no hardware profile" in why
+    values = json.loads(call(capsys, "queue", "list", "--json")[1])["entries"][0]
+    assert (values["state"], values["changed"], values["run_dir"]) == ("waiting", True, None)
+    assert values["options"]["dry_run"] == "off"
+
+
+def test_what_is_wrong_with_a_sequence_is_told_with_its_line(capsys: pytest.CaptureFixture[str]) -> None:
+    Path("s.yaml").write_text(SEQUENCE.replace("compact", "kompact"), encoding="utf-8")
+    code, out, err = call(capsys, "queue", "add", "s.yaml")
+    assert (code, out) == (2, "")
+    assert "s.yaml:7:19: unknown pattern 'kompact'" in err
+    assert "^^^^^^^" in err
+
+
+def test_a_queue_that_keeps_going_ends_with_the_first_failure(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    call(capsys, "queue", "add", "s.yaml", "--set", "profile.camera.faults={transient: 1.0}")
+    call(capsys, "queue", "add", "s.yaml")
+    code, out, err = call(capsys, "queue", "run", "--keep-going")
+    assert code == 3
+    assert err.count("error: ") == 1
+    assert out.count("queue: ") == 2
+    code, out, _ = call(capsys, "queue", "list")
+    (run,) = [path.parent for path in Path("data").glob("*/*/run.json") if not labseq.open_run(path).shots]
+    assert f"1: labseq resume {run.absolute()}" in out.splitlines()
+    assert out.splitlines()[1].split()[:2] == ["1", "failed"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("queue", "remove", "5"), "error: the queue has no entry 5; expected nothing: the queue is empty\n"),
+        (("queue", "move", "5", "--before", "6"), "error: the queue has no entry 5; expected nothing"),
+        (("stop",), "error: no run is in progress\n"),
+        (("stop", "--profile", "./p.yaml"), "error: no run is in progress on the profile ./p.yaml\n"),
+        (("stop", "--queue"), "error: the queue is not at work; 'labseq stop' without --queue ends a run\n"),
+        (("stop", "nowhere"), "nowhere: no such file or folder"),
+        (("resume", "nowhere"), "nowhere: no such file or folder"),
+    ],
+)
+def test_what_is_not_there_is_said(
+    arguments: tuple[str, ...], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, out, err = call(capsys, *arguments)
+    assert (code, out) == (2, "")
+    assert message in err
+
+
+class Stopping(RecordingObserver):
+    """Asks for the end of the run in its second shot."""
+
+    def event(self, name: str, values: Any) -> None:
+        super().event(name, values)
+        if name == "shot_started" and values["shot"] == 1:
+            ask_to_stop(Path(self.of("run_starting")[0]["run_dir"]))
+
+
+@pytest.fixture
+def stopped() -> Path:
+    """A run of three shots of which two are done."""
+    with labseq.Session.open("s.yaml", observer=Stopping()) as session:
+        with pytest.raises(StopRequested):
+            session.run()
+        assert session.run_dir is not None
+        return session.run_dir
+
+
+def test_a_run_is_resumed(stopped: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, out, err = call(capsys, "resume", str(stopped))
+    assert (code, err) == (0, "")
+    assert "3 shots, 2 of them taken before, seed 1" in out
+    assert "shot 3/3" in out
+    assert "shot 1/3" not in out
+    assert labseq.open_run(stopped).status == "complete"
+    code, _, err = call(capsys, "resume", str(stopped))
+    assert (code, err) == (2, f"{stopped}: the run cannot be resumed: it is complete: no shot is missing\n")
+
+
+def test_what_has_changed_is_told_line_by_line(stopped: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    record = json.loads((stopped / "run.json").read_text(encoding="utf-8"))
+    record["resolved"]["attempts"] = 7
+    (stopped / "run.json").write_text(json.dumps(record), encoding="utf-8")
+    code, _, err = call(capsys, "resume", str(stopped))
+    assert code == 2
+    assert err.splitlines()[0] == f"{stopped}: attempts was 7, is 3"
+    assert "--accept-changes" in err.splitlines()[1]
+    assert call(capsys, "resume", str(stopped), "--accept-changes")[0] == 0
+
+
+def test_a_run_in_progress_is_asked(stopped: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from labseq.recording import mark_active, marker_roots
+    from labseq.recording.durable import write_file
+    from labseq.recording.run_file import encode_state
+
+    write_file(stopped / "STATE", encode_state("running"))
+    mark_active(marker_roots(Path("data")), "lab", stopped)
+    code, out, err = call(capsys, "stop")
+    assert (code, err) == (0, "")
+    assert out.splitlines()[0].startswith(f"{stopped} (process ")
+    assert out.splitlines()[1] == f"go on later with: labseq resume {stopped}"
+    assert (stopped / "STOP").exists()

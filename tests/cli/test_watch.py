@@ -1,0 +1,141 @@
+"""A run in another process, watched by its files."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from labseq.cli.following import Follower, Tail, record_of
+from labseq.cli.tally import Tally
+from labseq.cli.watch import POLL_S, watch_run
+from labseq.errors import ConfigError
+from labseq.recording import RunWriter, open_run
+
+
+class Bench:
+    """A run that is written while it is watched."""
+
+    def __init__(self, root: Path, fake: Any, n_shots: int = 3) -> None:
+        self.fake = fake
+        self.writer = RunWriter.create(root, fake.run(n_shots=n_shots))
+        self.writer.event("run_starting", run_dir=str(self.writer.run_dir))
+        self.out = io.StringIO()
+
+    def take(self, index: int, **changes: Any) -> None:
+        shot = self.fake.shot(index, **changes)
+        shot.images.append(self.fake.image(self.fake.target().fill))
+        self.writer.event("shot_started", shot=index, attempt=shot.attempt)
+        self.writer.write_shot(shot)
+        names = ("shot_index", "attempt", "status", "error", "success", "filling_fraction")
+        told = {name: getattr(shot, name) for name in names}
+        self.writer.event("shot_finished" if shot.status == "complete" else "shot_repeated", shot=told)
+
+    def watch(self, *meanwhile: Callable[[], None]) -> list[str]:
+        """Watch the run; between the looks at it, do these things."""
+        left = list(meanwhile)
+
+        def wait(duration_s: float) -> None:
+            assert duration_s == POLL_S
+            left.pop(0)()
+
+        watch_run(self.writer.run_dir, self.out, wait)
+        assert not left
+        return self.out.getvalue().splitlines()
+
+
+@pytest.fixture
+def bench(tmp_path: Path, fake: Any) -> Bench:
+    return Bench(tmp_path, fake)
+
+
+def test_a_run_is_watched_to_its_end(bench: Bench) -> None:
+    bench.take(0)
+    lines = bench.watch(
+        lambda: bench.take(1, status="failed", error="TransientError: no light"),
+        lambda: bench.take(1, attempt=1),
+        lambda: None,
+        lambda: bench.writer.finish("stopped"),
+    )
+    assert lines[0].endswith("3 shots, seed 1, profile virtual, simulated")
+    assert lines[1:4] == [
+        "shot 1/3  defect-free in cycle 2  filling 100.0 %  1.9 s",
+        "shot 2: attempt 1 failed, once more: TransientError: no light",
+        "shot 2/3  defect-free in cycle 2  filling 100.0 %  1.9 s",
+    ]
+    assert "shots             2 of 3, 1 attempt kept that did not complete" in lines
+
+
+def test_a_finished_run_is_shown_at_once(bench: Bench) -> None:
+    bench.take(0)
+    bench.writer.finish("complete")
+    assert "status            complete" in bench.watch()
+
+
+def test_ctrl_c_leaves_the_run_alone(bench: Bench) -> None:
+    def interrupt() -> None:
+        raise KeyboardInterrupt
+
+    lines = bench.watch(interrupt)
+    assert lines[-1] == f"no longer watched; {bench.writer.run_dir} goes on"
+    assert open_run(bench.writer.run_dir).status == "running"
+
+
+def test_the_view_learns_what_the_runs_own_view_does(bench: Bench) -> None:
+    bench.take(0)
+    follower = Follower(open_run(bench.writer.run_dir), lambda: 1e10)
+    tally = Tally(follower.now)
+    for name, values in follower.read():
+        tally.note(name, values)
+    assert (tally.n_done, tally.n_defect_free, tally.n_seen, tally.n_shots) == (1, 1, 1, 3)
+    assert follower.now() == 1e10
+    assert not follower.is_over()
+    assert [*follower.read()] == []
+
+
+def test_lines_of_another_version_and_damaged_ones_are_passed_over(bench: Bench) -> None:
+    path = bench.writer.run_dir / "events.jsonl"
+    bench.take(0)
+    odd: list[Any] = [
+        {},
+        {"event": "warning"},
+        {"t_utc": "2026-11-20T10:00:00+00:00", "event": "shot_finished", "values": {}},
+    ]
+    bench.writer.finish("complete")
+    path.write_text(
+        "x\n" + "".join(f"{json.dumps(line)}\n" for line in odd) + path.read_text("utf-8"), "utf-8"
+    )
+    assert any(line.startswith("shot 1/3") for line in bench.watch())
+
+
+def test_a_shot_whose_file_is_gone_is_still_told(bench: Bench) -> None:
+    bench.take(0)
+    bench.writer.finish("complete")
+    next(bench.writer.run_dir.glob("shots/*.h5")).unlink()
+    assert any(line.startswith("shot 1/3") for line in bench.watch())
+
+
+def test_only_whole_lines_are_read_and_each_once(tmp_path: Path) -> None:
+    tail = Tail(tmp_path / "log")
+    assert tail.read() == []
+    (tmp_path / "log").write_text('{"a": 1}\n{"a"')
+    assert tail.read() == [{"a": 1}]
+    with (tmp_path / "log").open("a") as file:
+        file.write(": 2}\n[]\n")
+    assert tail.read() == [{"a": 2}]
+    assert tail.read() == []
+
+
+def test_a_record_knows_the_scan(bench: Bench) -> None:
+    run = open_run(bench.writer.run_dir)
+    run.record["scan"] = {"addresses": ["a"]}
+    assert record_of(run).scan == {"addresses": ["a"]}
+
+
+def test_what_is_no_run_is_told(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="no such file or folder"):
+        watch_run(tmp_path / "x")

@@ -1,0 +1,290 @@
+"""Another control system leads, over TCP and on a serial line."""
+
+from __future__ import annotations
+
+import sys
+import threading
+from collections.abc import Generator, Mapping
+from contextlib import contextmanager
+from functools import partial
+from typing import Any, ClassVar
+
+import pytest
+from hypothesis import given, strategies as st
+from labseq_follow.dialogue import Dialogue, Splitter
+from labseq_follow.leader import serial_leader, tcp_leader
+from labseq_follow.settings import SerialLeaderSettings, TcpLeaderSettings
+
+from labseq import ConfigError, Context, Device, DeviceError, DeviceTimeoutError, StopRequested
+from labseq.config import Document
+from labseq.roles import KnownCommands, Leading
+from labseq.sequencer import RealClock, StopFlag
+from labseq.testing import DeviceContract
+from labseq.testing.contracts.hardware import Factory, Wait
+from labseq.testing.fakes import FakeClock, RecordingSimulation
+
+from .labseq_follow_rig import PtyPeer, led, listening
+
+on_a_pty = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no ptys")
+
+
+class LeaderContract(DeviceContract):
+    values: ClassVar[list[str]] = ["state", "is_connected"]  # pyright: ignore[reportIncompatibleVariableOverride]
+
+    def waits(self) -> Mapping[str, Wait[Device]]:
+        def wait(device: Any) -> None:
+            device.wait_for("go", 0.05)
+
+        return {"wait_for('go')": Wait(0.05, lambda _: None, wait)}
+
+
+class TestTcp(LeaderContract):
+    @pytest.fixture
+    def factory(self) -> Factory[Device]:
+        return partial(tcp_leader, TcpLeaderSettings(port=0))
+
+
+@on_a_pty
+class TestSerial(LeaderContract):
+    @pytest.fixture
+    def factory(self) -> Generator[Factory[Device]]:
+        peer = PtyPeer()
+        yield partial(serial_leader, SerialLeaderSettings(port=peer.port))
+        peer.leave()
+
+
+class TestSimulated(LeaderContract):
+    @pytest.fixture
+    def factory(self) -> Factory[Device]:
+        return partial(tcp_leader, TcpLeaderSettings(leader="simulated"))
+
+
+def test_both_lead_and_know_that_they_have_no_commands() -> None:
+    for leader in (
+        tcp_leader(TcpLeaderSettings(), Context("leader")),
+        serial_leader(SerialLeaderSettings(port="COM7"), Context("leader")),
+    ):
+        assert isinstance(leader, Leading)
+        assert isinstance(leader, KnownCommands)
+        with pytest.raises(DeviceError, match="unknown command 'go'; it has none"):
+            leader.check_command("go")
+
+
+def test_go_is_answered_by_busy_and_then_by_what_came_of_it() -> None:
+    with led() as (device, peer):
+        peer.say("go run 17")
+        assert device.wait_for("go", 20.0) == "run 17"
+        assert peer.hear() == "busy"
+        assert device.tell("ready", {"shot": 12, "success": True, "filling": 0.98666}) == "ready"
+        assert peer.hear() == "ready shot=12 success=1 filling=0.9867"
+        peer.say("go")
+        assert device.wait_for("go", 20.0) == ""
+        assert peer.hear() == "busy"
+        assert device.tell("failed", {"reason": "camera: no frame\nwithin 1 s", "shot": 13}) == "failed"
+        assert peer.hear() == r"failed shot=13 reason=camera: no frame\nwithin 1 s"
+
+
+def test_nothing_is_said_to_a_leader_that_is_owed_nothing() -> None:
+    with led() as (device, peer):
+        assert device.tell("ready", {"shot": 0}) == ""
+        peer.say("go")
+        assert peer.ask("state?") == "state busy"
+        assert device.tell("ready", {"shot": 0}) == "", "no step has waited for it"
+        device.wait_for("go", 20.0)
+        assert [peer.hear(), device.tell("ready", {}), peer.hear()] == ["busy", "ready", "ready"]
+        assert device.tell("failed", {"reason": "too late"}) == ""
+        assert peer.ask("state?") == "state idle"
+
+
+def test_it_tells_its_state_at_any_time() -> None:
+    with led() as (device, peer):
+        assert peer.ask("state?") == "state idle"
+        waiting = threading.Thread(target=device.wait_for, args=("go", 20.0))
+        waiting.start()
+        while peer.ask("state?") != "state waiting":
+            pass
+        peer.say("go")
+        assert peer.hear() == "busy"
+        waiting.join()
+        assert peer.ask("state?") == "state busy"
+        assert (device.read("state"), device.read("is_connected")) == ("busy", True)
+        assert peer.ask("hello") == "hello labseq 1 deadline=10"
+
+
+def test_a_second_go_is_refused_and_does_not_disturb_the_first() -> None:
+    with led() as (device, peer):
+        peer.say("go")
+        device.wait_for("go", 20.0)
+        assert peer.hear() == "busy"
+        assert peer.ask("go") == "failed reason=busy"
+        device.tell("ready", {"shot": 0})
+        assert peer.hear() == "ready shot=0"
+        assert "`go` came while labseq was busy, and was refused" in device.news()
+
+
+def test_at_the_deadline_it_answers_by_itself_and_a_late_ready_is_not_sent() -> None:
+    now_s = 0.0
+    with led() as (device, peer):
+        vars(device)["_now"] = lambda: now_s
+        peer.say("go")
+        device.wait_for("go", 20.0)
+        now_s = 11.0
+        assert [peer.hear(), peer.hear()] == ["busy", "failed reason=deadline"]
+        assert peer.ask("go") == "failed reason=busy", "the moves may still go on"
+        assert device.tell("ready", {"shot": 3}) == "late"
+        assert peer.ask("state?") == "state idle"
+        assert any("not over at the deadline" in text for text in device.news())
+
+
+def test_a_go_that_no_step_waits_for_is_answered_at_the_deadline() -> None:
+    with led(deadline=0.05) as (device, peer):
+        assert peer.ask("go") == "failed reason=deadline"
+        assert peer.ask("state?") == "state idle"
+        assert any("no step waited" in text for text in device.news())
+
+
+def test_a_wait_that_lasts_too_long_says_whether_anybody_is_there() -> None:
+    nobody = r"no 'go' within 10 ms on 127.0.0.1:\d+; nobody has connected"
+    with listening() as device, pytest.raises(DeviceTimeoutError, match=nobody):
+        device.wait_for("go", 0.01)
+    with led() as (device, _):
+        with pytest.raises(DeviceTimeoutError, match="the leader is connected"):
+            device.wait_for("go", 0.01)
+        with pytest.raises(DeviceError, match="unknown signal 'start'; expected 'go'"):
+            device.wait_for("start", 0.01)
+
+
+def test_a_stop_request_ends_the_wait() -> None:
+    stop, ends = StopFlag(), list[BaseException]()
+
+    def wait() -> None:
+        try:
+            device.wait_for("go", 600.0)
+        except StopRequested as error:
+            ends.append(error)
+
+    with led(Context("leader", clock=RealClock(stop))) as (device, peer):
+        waiting = threading.Thread(target=wait)
+        waiting.start()
+        while peer.ask("state?") != "state waiting":
+            pass
+        stop.request()
+        waiting.join()
+        assert len(ends) == 1
+        assert peer.ask("state?") == "state idle"
+
+
+@contextmanager
+def on_a_line() -> Generator[tuple[Any, PtyPeer]]:
+    peer = PtyPeer()
+    device = serial_leader(SerialLeaderSettings(port=peer.port), Context("leader"))
+    device.open()
+    try:
+        assert peer.hear() == "hello labseq 1 deadline=10"
+        yield device, peer
+    finally:
+        device.close()
+        peer.leave()
+
+
+@on_a_pty
+def test_a_serial_line_speaks_the_same() -> None:
+    with on_a_line() as (device, peer):
+        peer.say("go 5")
+        assert device.wait_for("go", 20.0) == "5"
+        assert peer.hear() == "busy"
+        assert device.tell("ready", {"shot": 0, "success": False, "filling": 0.5}) == "ready"
+        assert peer.hear() == "ready shot=0 success=0 filling=0.5"
+        assert peer.ask("state?") == "state idle"
+        assert device.describe()["address"] == peer.port
+
+
+@on_a_pty
+def test_a_serial_port_is_opened_alone() -> None:
+    with on_a_line() as (_, peer):
+        second = serial_leader(SerialLeaderSettings(port=peer.port), Context("second"))
+        with pytest.raises(DeviceError, match=f"cannot open {peer.port}: another program has it open"):
+            second.open()
+
+
+def test_a_port_that_is_taken_is_told() -> None:
+    with listening() as first:
+        port = int(first.describe()["address"].rpartition(":")[2])
+        second = tcp_leader(TcpLeaderSettings(port=port), Context("leader"))
+        with pytest.raises(DeviceError, match=f"cannot listen on 127.0.0.1 port {port}: .*another 'port'"):
+            second.open()
+        second.close()
+
+
+def test_only_this_computer_may_lead_unless_it_is_allowed() -> None:
+    document = Document.parse("leader: {host: 0.0.0.0}", "p.yaml")
+    with pytest.raises(ConfigError) as caught:
+        document.validate(TcpLeaderSettings, ("leader",))
+    text = "p.yaml:1:16: host is '0.0.0.0', which other computers reach; expected an address of this computer"
+    assert str(caught.value).startswith(text)
+    assert TcpLeaderSettings(host="0.0.0.0", allow_remote=True).host == "0.0.0.0"
+    for host in ("127.0.0.1", "127.1.2.3", "::1", "localhost"):
+        assert TcpLeaderSettings(host=host).host == host
+
+
+def test_a_simulated_leader_loads_and_says_go_by_itself_on_the_sessions_clock() -> None:
+    clock = FakeClock()
+    world = RecordingSimulation()
+    device = tcp_leader(
+        TcpLeaderSettings(leader="simulated", goes_after=0.4, deadline=2.0),
+        Context("leader", clock=clock, simulation=world),
+    )
+    device.open()
+    assert device.wait_for("go", 10.0) == "1"
+    assert clock.now() == 0.4
+    assert [str(call) for call in world.calls.of("simulation.load")] == ["simulation.load(0.0, 0.4)"]
+    assert device.tell("ready", {"shot": 0}) == "ready"
+    assert device.wait_for("go", 10.0) == "2"
+    clock.sleep(3.0)
+    assert device.tell("ready", {"shot": 1}) == "late"
+    with pytest.raises(DeviceTimeoutError, match="the simulated leader says 'go' after 400 ms"):
+        device.wait_for("go", 0.1)
+
+
+def test_loading_needs_a_simulated_lab() -> None:
+    with pytest.raises(ConfigError, match="'loads' is for a simulated lab"):
+        tcp_leader(TcpLeaderSettings(loads=True), Context("leader"))
+
+
+EVENTS = st.lists(st.sampled_from(["go", "take", "tell", "pass", "leave", "noise"]), max_size=40)
+
+
+@given(EVENTS)
+def test_each_go_gets_exactly_one_answer(events: list[str]) -> None:
+    dialogue, now_s, n_gos, n_lost, said = Dialogue(1.0), 0.0, 0, 0, list[str]()
+    dialogue.connected("a leader")
+    for event in events:
+        now_s += 1.5 if event == "pass" else 0.1
+        said += dialogue.overdue(now_s)
+        n_answers = sum(line.startswith(("ready", "failed")) for line in said)
+        if event == "go":
+            n_gos += 1
+            said += dialogue.heard("go", now_s)
+        elif event == "noise":
+            said += dialogue.heard("gog", now_s)
+        elif event == "take" and (taken := dialogue.take(now_s)) is not None:
+            said += taken[1]
+        elif event == "tell":
+            said += dialogue.tell("ready", {"shot": 0}, now_s)[1]
+        elif event == "leave":
+            n_lost += n_gos - n_lost - n_answers  # whoever leaves gives up its answer, and gets no other
+            dialogue.lost("it left")
+            dialogue.connected("another leader")
+    said += dialogue.end()
+    assert sum(line.startswith(("ready", "failed")) for line in said) == n_gos - n_lost
+
+
+@given(st.lists(st.binary(max_size=12), max_size=8), st.integers(1, 7))
+def test_lines_come_out_as_they_went_in_however_they_are_cut(lines: list[bytes], size: int) -> None:
+    kept = [line.replace(b"\n", b"") for line in lines]
+    data = b"".join(line + b"\n" for line in kept) + b"half"
+    splitter = Splitter()
+    pieces = [data[i : i + size] for i in range(0, len(data), size)]
+    found = [line for piece in pieces for line in splitter.feed(piece)]
+    assert found == [line.decode("utf-8", "backslashreplace") for line in kept]
+    assert splitter.rest() == "half"

@@ -1,0 +1,183 @@
+"""What a leader does wrong, and what becomes of it: no crash, one answer, a line in the log."""
+
+from __future__ import annotations
+
+import signal
+import socket
+import subprocess
+import sys
+from contextlib import suppress
+from typing import Any
+
+import pytest
+from labseq_follow.leader import LeaderDevice, serial_leader
+from labseq_follow.settings import SerialLeaderSettings
+
+from labseq import Context, DeviceError
+
+from .labseq_follow_rig import PtyPeer, TcpPeer, led, listening
+
+on_a_pty = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no ptys")
+
+
+def told(device: LeaderDevice) -> str:
+    return "\n".join(device.news())
+
+
+@pytest.mark.parametrize(
+    ("noise", "answer"),
+    [
+        (b"Go!\n", "error what is 'Go!'? expected go, state? or hello"),
+        (b"\xff\x00\x80\n", r"error what is '\xff\x00\x80'? expected go, state? or hello"),
+        (b"x" * 10_000 + b"\n", "error the line is too long"),
+        (b"gogo\n", "error what is 'gogo'? expected go, state? or hello"),
+    ],
+    ids=["words", "bytes", "very long", "two in one"],
+)
+def test_what_it_does_not_understand_is_answered_and_logged(noise: bytes, answer: str) -> None:
+    with led() as (device, peer):
+        peer.send(noise)
+        assert peer.hear() == answer
+        peer.say("go")
+        device.wait_for("go", 20.0)
+        assert peer.hear() == "busy"
+        assert "leads" in told(device)
+
+
+def test_errors_and_empty_lines_are_not_answered() -> None:
+    with led() as (device, peer):
+        peer.send(b"error what is 'hello'?\n\r\n\n")
+        assert peer.ask("state?") == "state idle"
+        assert "the leader said 'error what is" in told(device)
+
+
+def test_a_line_may_come_in_pieces_and_end_as_on_windows() -> None:
+    with led() as (device, peer):
+        for piece in (b"g", b"o 1", b"7\r", b"\n"):
+            peer.send(piece)
+        assert device.wait_for("go", 20.0) == "17"
+
+
+def test_half_a_line_and_then_nothing_is_no_go() -> None:
+    with led() as (device, peer):
+        peer.send(b"go 1")
+        peer.leave()
+        again = reconnect(device)
+        assert again.ask("state?") == "state idle"
+        again.leave()
+        assert "did not end, and was dropped" in told(device)
+
+
+def reconnect(device: LeaderDevice) -> TcpPeer:
+    """Connect after the last leader left; until labseq has seen that, it turns others away."""
+    while True:
+        peer = TcpPeer(device.describe()["address"])
+        if peer.hear().startswith("hello"):
+            return peer
+        peer.leave()
+
+
+def test_a_second_leader_is_turned_away_with_a_line_that_says_so() -> None:
+    with led() as (device, peer):
+        second = TcpPeer(device.describe()["address"])
+        second.send(b"go\n")
+        assert second.hear() == "error another leader is connected; one at a time"
+        assert second.hear() == ""
+        second.leave()
+        assert peer.ask("state?") == "state idle"
+        assert "was turned away" in told(device)
+
+
+def test_after_a_disconnect_the_shot_goes_on_and_nobody_else_is_told_of_it() -> None:
+    with led() as (device, peer):
+        peer.say("go")
+        device.wait_for("go", 20.0)
+        assert peer.hear() == "busy"
+        peer.leave()
+        again = reconnect(device)
+        assert again.ask("go") == "failed reason=busy"
+        assert device.tell("ready", {"shot": 0}) == "gone"
+        assert again.ask("state?") == "state idle"
+        again.say("go")
+        device.wait_for("go", 20.0)
+        assert again.hear() == "busy"
+        again.leave()
+        assert "nobody will be told how it ends" in told(device)
+
+
+def test_a_go_whose_leader_left_before_a_step_waited_is_forgotten() -> None:
+    with led() as (device, peer):
+        assert [peer.ask("hello")[:5], peer.say("go"), peer.ask("state?")] == ["hello", None, "state busy"]
+        peer.leave()
+        again = reconnect(device)
+        assert again.ask("state?") == "state idle"
+        again.leave()
+
+
+def test_at_its_end_labseq_answers_and_closes_the_connection() -> None:
+    with listening() as device:
+        peer = TcpPeer(device.describe()["address"])
+        assert [peer.hear()[:5], peer.say("go"), peer.ask("state?")] == ["hello", None, "state busy"]
+        device.close()
+        assert [peer.hear(), peer.hear()] == ["failed reason=labseq ends", ""]
+        peer.leave()
+
+
+def test_one_that_reads_nothing_counts_as_gone() -> None:
+    with led() as (device, peer):
+        link: Any = device._link
+        link._leader.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)
+        with pytest.raises(OSError, match=r"timed out|reset|Broken pipe|closed"):
+            link.send(b"x" * 100_000_000)
+        peer.leave()
+        again = reconnect(device)
+        assert again.ask("state?") == "state idle"
+        again.leave()
+
+
+def test_a_fault_of_its_own_is_told_to_the_step_that_waits(monkeypatch: pytest.MonkeyPatch) -> None:
+    with listening() as device:
+        monkeypatch.setattr(device._link, "serve", lambda _: 1 / 0)
+        with pytest.raises(DeviceError, match=r"it does not listen any more: ZeroDivisionError"):
+            device.wait_for("go", 20.0)
+
+
+KILLED = """
+from labseq import Context
+from labseq_follow.leader import tcp_leader
+from labseq_follow.settings import TcpLeaderSettings
+device = tcp_leader(TcpLeaderSettings(port=0), Context("leader"))
+device.open()
+print(device.describe()["address"], flush=True)
+device.wait_for("go", 600.0)
+device.wait_for("go", 600.0)
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGKILL")
+def test_if_labseq_is_killed_the_connection_closes() -> None:
+    with subprocess.Popen([sys.executable, "-c", KILLED], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        peer = TcpPeer(process.stdout.readline().strip())
+        assert [peer.hear()[:5], peer.ask("go")] == ["hello", "busy"]
+        process.send_signal(signal.SIGKILL)
+        with suppress(ConnectionError):  # or it was reset
+            assert peer.hear() == ""
+        peer.leave()
+
+
+@on_a_pty
+def test_a_serial_line_that_breaks_is_told_and_the_shot_goes_on() -> None:
+    peer = PtyPeer()
+    device = serial_leader(SerialLeaderSettings(port=peer.port), Context("leader"))
+    device.open()
+    assert peer.hear()[:5] == "hello"
+    peer.say("go")
+    device.wait_for("go", 20.0)
+    peer.leave()
+    while device.read("is_connected"):
+        pass
+    assert device.tell("ready", {"shot": 0}) == "gone"
+    assert "unplugged?" in told(device)
+    device.safe_state()
+    device.close()

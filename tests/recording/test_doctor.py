@@ -1,0 +1,206 @@
+"""Planted damages are found, mended without guessing, or moved aside; nothing is ever deleted."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import pytest
+from hypothesis import HealthCheck, given, settings, strategies as st
+
+from labseq.recording import RunWriter, open_run
+from labseq.recording.doctor import examine
+
+from .damages import (
+    LOST,
+    MENDED,
+    N_SHOTS,
+    MakeRun,
+    MakeShot,
+    alien_hdf5,
+    contents,
+    copied,
+    damaged_line,
+    damaged_state,
+    dead_run,
+    doubled_line,
+    empty_file,
+    flipped_bit,
+    holder_left,
+    line_of_no_shot,
+    lines_of,
+    lost_file,
+    lost_line,
+    misnamed_shot,
+    shot_of_another_run,
+    stop_left,
+    told,
+    write_whole_run,
+)
+
+
+@pytest.fixture(scope="module")
+def template(tmp_path_factory: pytest.TempPathFactory, make_run: MakeRun, make_shot: MakeShot) -> Path:
+    return write_whole_run(tmp_path_factory.mktemp("made"), make_run, make_shot)
+
+
+@pytest.fixture
+def run_dir(template: Path, tmp_path: Path) -> Path:
+    return copied(template, tmp_path / "data")
+
+
+@pytest.mark.parametrize("plant", [*MENDED, *LOST], ids=lambda plant: plant.__name__)
+def test_a_damage_is_found_and_nothing_is_deleted(run_dir: Path, plant: Callable[[Path], None]) -> None:
+    root = run_dir.parents[1]
+    rows = open_run(run_dir).to_dataframe()
+    plant(run_dir)
+    before, lines = contents(root), lines_of(root)
+    only_told = examine(root, dry_run=True)
+    assert only_told.findings
+    assert all(one.left for one in only_told.findings)
+    assert (contents(root), lines_of(root)) == (before, lines)
+    assert not list(root.rglob("quarantine"))
+    report = examine(root)
+    assert told(report) == told(only_told)
+    assert not any(one.left for one in report.findings), report.findings
+    assert {*before} <= {*contents(root)} | {b"", b"\0\0"}
+    assert {*lines} <= {*lines_of(root)}
+    assert examine(root).findings == []  # all is well now
+    run = open_run(run_dir)
+    whole = list(range(N_SHOTS)) if plant in MENDED else [0, 2, 3]
+    assert [shot.index for shot in run.shots] == whole
+    table = run.to_dataframe()
+    assert table.equals(rows.loc[whole, [*table.columns]])
+    assert [shot.index for shot in run.attempts] == [2]
+    for shot in (*run.shots, *run.attempts):
+        shot.verify()
+    assert report.n_runs == 1
+    assert report.n_shots == len(whole) + 1
+
+
+@pytest.mark.parametrize(
+    ("plant", "what", "where"),
+    [
+        (
+            flipped_bit,
+            "the checksum does not hold: a byte has changed since it was written",
+            "shot_000001.h5",
+        ),
+        (empty_file, "the shot's file is empty", "shot_000001.h5"),
+        (lost_file, "the shot's file is missing", "shot_000001.h5"),
+        (lost_line, "no line in the index", "shot_000001.h5"),
+        (doubled_line, "a second line for shot_000001.h5", "index.jsonl"),
+        (damaged_line, "line 2 is damaged", "index.jsonl"),
+        (line_of_no_shot, "a line of the index is no shot's", "index.jsonl"),
+        (dead_run, "the run has no end, and its process is gone", "STATE"),
+        (damaged_state, "STATE is damaged", "STATE"),
+        (alien_hdf5, "no line in the index, and is not a shot's file of labseq", "shot_000007.h5"),
+        (shot_of_another_run, "a shot of another run, 2020-01-01/0001_other", "shot_000001.h5"),
+        (misnamed_shot, "a shot under a name that is not its own", "shot_000011.h5"),
+        (stop_left, "a request to stop that nobody followed", "STOP"),
+        (holder_left, "a lock whose holder is gone", ".lock.holder"),
+    ],
+    ids=lambda one: getattr(one, "__name__", ""),
+)
+def test_a_damage_is_named(run_dir: Path, plant: Callable[[Path], None], what: str, where: str) -> None:
+    plant(run_dir)
+    assert (what, where) in told(examine(run_dir, dry_run=True))
+
+
+def test_a_whole_run_is_left_as_it_is(run_dir: Path) -> None:
+    (run_dir / "notes.txt").write_text("my own")
+    (run_dir / "shots" / "my notes.h5").write_bytes(b"\0")
+    before = {path: path.stat().st_mtime_ns for path in run_dir.rglob("*")}
+    report = examine(run_dir.parents[1])
+    assert (report.findings, report.n_runs, report.n_shots) == ([], 1, N_SHOTS + 1)
+    assert {path: path.stat().st_mtime_ns for path in run_dir.rglob("*")} == before
+
+
+def test_a_file_that_is_put_back_counts_again(run_dir: Path) -> None:
+    lost_file(run_dir)
+    examine(run_dir)
+    assert len(open_run(run_dir).shots) == N_SHOTS - 1
+    (run_dir.parents[1] / "elsewhere.h5").rename(run_dir / "shots" / "shot_000001.h5")
+    examine(run_dir)
+    assert len(open_run(run_dir).shots) == N_SHOTS
+
+
+def test_what_is_quarantined_says_where_it_came_from(run_dir: Path) -> None:
+    flipped_bit(run_dir)
+    examine(run_dir)
+    place = run_dir / "quarantine"
+    assert sorted(path.name for path in place.iterdir()) == ["doctor.jsonl", "index.jsonl", "shot_000001.h5"]
+    first = json.loads((place / "doctor.jsonl").read_text("utf-8").splitlines()[0])
+    assert first["from"] == str(run_dir / "shots" / "shot_000001.h5")
+    assert first["what"].startswith("the checksum does not hold")
+
+
+def test_two_files_of_a_name_are_both_kept(run_dir: Path) -> None:
+    for content in (b"first", b"second"):
+        (run_dir / "shots" / "shot_000009.h5.part").write_bytes(content)
+        examine(run_dir)
+    kept = [(run_dir / "quarantine" / f"shot_000009.h5.part{end}").read_bytes() for end in ("", ".2")]
+    assert kept == [b"first", b"second"]
+
+
+def test_a_dead_run_is_marked_as_interrupted(run_dir: Path) -> None:
+    dead_run(run_dir)
+    examine(run_dir)
+    state = json.loads((run_dir / "STATE").read_text())
+    assert (state["state"], state["pid"]) == ("failed", 2**22 + 1)
+    assert open_run(run_dir).error == "interrupted: the process that ran it is gone"
+
+
+def test_an_earlier_take_of_a_shot_does_not_replace_the_later(
+    run_dir: Path, make_run: MakeRun, make_shot: MakeShot
+) -> None:
+    lost_line(run_dir)
+    writer = RunWriter.reopen(run_dir, make_run(), n_written=3)
+    later = writer.write_shot(make_shot(1, success=False))
+    writer.finish("complete")
+    assert later.name == "shot_000001.take_2.h5"
+    with h5py.File(later, "r+") as file:
+        run_id = json.loads((run_dir / "run.json").read_text("utf-8"))["run_id"]
+        file["entry"].attrs["run_id"] = run_id
+    rows = [json.loads(line) for line in (run_dir / "index.jsonl").read_bytes().splitlines()]
+    rows[-1]["sha256"] = hashlib.sha256(later.read_bytes()).hexdigest()
+    (run_dir / "index.jsonl").write_text("".join(f"{json.dumps(row)}\n" for row in rows), "utf-8")
+    assert told(examine(run_dir)) == [("no line in the index", "shot_000001.h5")]
+    assert not open_run(run_dir).shots[1].success
+
+
+damages = st.lists(st.sampled_from([*MENDED, *LOST]), max_size=4, unique=True)
+cuts = st.tuples(
+    st.sampled_from(["index.jsonl", "events.jsonl", "STATE", "shots/shot_000003.h5"]), st.floats(0, 1)
+)
+
+
+@settings(max_examples=15, suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture])
+@given(damages, st.lists(cuts, max_size=2))
+def test_any_damages_together_are_mended_in_one_round(
+    template: Path, tmp_path_factory: pytest.TempPathFactory, plants: list[Any], cut: list[tuple[str, float]]
+) -> None:
+    run_dir = copied(template, tmp_path_factory.mktemp("data"))
+    for plant in plants:
+        try:
+            plant(run_dir)
+        except (OSError, KeyError, IndexError, ValueError):  # an earlier damage is in its way
+            continue
+    for name, part in cut:
+        if (path := run_dir / name).exists():
+            path.write_bytes(path.read_bytes()[: int(part * path.stat().st_size)])
+    report = examine(run_dir.parents[1])
+    assert not any(one.left for one in report.findings), report.findings
+    assert examine(run_dir.parents[1]).findings == []
+    run = open_run(run_dir)
+    assert run.n_damaged_lines == 0
+    for shot in (*run.shots, *run.attempts):
+        shot.verify()
+        assert shot.record().shot_index == shot.index
+    assert {0, 2} <= {shot.index for shot in run.shots}
+    shutil.rmtree(run_dir.parents[1])

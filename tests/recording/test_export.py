@@ -1,0 +1,265 @@
+"""What is exported says the same as the shots' files, read by other programs' packages alone."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+
+from labseq.errors import ConfigError
+from labseq.model import RunRecord, ShotRecord
+from labseq.recording import Run, RunWriter, open_run
+from labseq.recording.export import ENDINGS, check_export, export_run
+
+from .scanned import ADDRESSES, POINTS, write_scan
+
+MakeRun = Callable[..., RunRecord]
+MakeShot = Callable[..., ShotRecord]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory, make_run: MakeRun, make_shot: MakeShot) -> Run:
+    folder = write_scan(tmp_path_factory.mktemp("scan"), make_run, make_shot, points=POINTS, n_repeats=1)
+    (folder / "calibration_sites.json").write_text('{"kind": "sites", "µ": 1}\n', "utf-8")
+    (folder / "odd.bin").write_bytes(b"\xff\0")
+    (folder / "analysis").mkdir()
+    (folder / "analysis" / "fits.jsonl").write_text('{"shot": 0}\n')
+    return open_run(folder)
+
+
+def exported(run: Run, kind: str, folder: Path, **options: Any) -> Path:
+    path = folder / f"run{ENDINGS[kind]}"
+    check_export(kind, path, **options)
+    assert export_run(run, kind, path, **options) == []
+    return path
+
+
+def test_csv_is_a_table_with_a_line_of_names_and_a_table_of_units(run: Run, tmp_path: Path) -> None:
+    path = exported(run, "csv", tmp_path)
+    with path.open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    with path.with_name("run.units.csv").open(encoding="utf-8", newline="") as file:
+        about = {row["column"]: row for row in csv.DictReader(file)}
+    assert len(rows) == len(run.shots) == 12
+    assert list(rows[0]) == list(about)
+    assert about["shot.2.rearrange.window"]["units"] == "s"
+    for shot, row in zip(run.shots, rows, strict=True):
+        with h5py.File(run.path / row["file"]) as file:
+            entry: Any = file["entry"]
+            assert int(row["shot"]) == entry.attrs["shot_index"] == shot.index
+            assert float(row["filling_fraction"]) == entry.attrs["filling_fraction"]
+            assert row["success"] == ("true" if entry.attrs["success"] else "false")
+            assert float(row[ADDRESSES[1]]) == json.loads(entry["parameters"][()])[ADDRESSES[1]]
+
+
+def test_csv_has_nothing_where_nothing_is_known(
+    tmp_path: Path, make_run: MakeRun, make_shot: MakeShot
+) -> None:
+    writer = RunWriter.create(tmp_path, make_run())
+    writer.write_shot(make_shot(filling_fraction=math.nan, readings={"a,b\n": 'say "µ"'}))
+    with exported(open_run(writer.run_dir), "csv", tmp_path).open(encoding="utf-8", newline="") as file:
+        (row,) = csv.DictReader(file)
+    assert row["filling_fraction"] == ""
+    assert row["reading.a,b\n"] == 'say "µ"'
+
+
+def test_parquet_reads_back_with_its_units(run: Run, tmp_path: Path) -> None:
+    pandas, parquet = pytest.importorskip("pandas"), pytest.importorskip("pyarrow.parquet")
+    path = exported(run, "parquet", tmp_path)
+    assert pandas.read_parquet(path).equals(run.to_dataframe())
+    schema = parquet.read_schema(path)
+    assert schema.field("shot.2.rearrange.window").metadata[b"units"] == b"s"
+    assert all(field.metadata[b"description"] for field in schema)
+    assert json.loads(schema.metadata[b"labseq"])["name"] == run.name
+
+
+def test_netcdf_reads_back_as_it_was(run: Run, tmp_path: Path) -> None:
+    xarray = pytest.importorskip("xarray")
+    with xarray.open_dataset(exported(run, "netcdf", tmp_path), engine="h5netcdf") as data:
+        expected = run.to_xarray()
+        assert dict(data.sizes) == dict(expected.sizes)
+        np.testing.assert_array_equal(data["occupancy"].values, expected["occupancy"].values)
+        np.testing.assert_array_equal(data["filling_fraction"].values, expected["filling_fraction"].values)
+        assert data["status"].values.tolist() == expected["status"].values.tolist()
+        assert data[ADDRESSES[1]].attrs["units"] == "s"
+        assert data.attrs["name"] == run.name
+
+
+def test_names_that_netcdf_does_not_take_are_changed(
+    tmp_path: Path, make_run: MakeRun, make_shot: MakeShot
+) -> None:
+    xarray = pytest.importorskip("xarray")
+    writer = RunWriter.create(tmp_path, make_run())
+    writer.write_shot(make_shot(readings={"laser/780": 1.5}))
+    with xarray.open_dataset(exported(open_run(writer.run_dir), "netcdf", tmp_path)) as data:
+        assert data["reading.laser_780"].values.tolist() == [1.5]
+
+
+@pytest.mark.parametrize("kind", ["netcdf", "parquet", "csv", "archive"])
+def test_a_run_without_shots_is_exported(kind: str, tmp_path: Path, make_run: MakeRun) -> None:
+    run = open_run(RunWriter.create(tmp_path, make_run()).run_dir)
+    assert exported(run, kind, tmp_path).stat().st_size
+
+
+def everything(group: Any) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    group.visititems(lambda name, node: found.update({name: node} if isinstance(node, h5py.Dataset) else {}))
+    return found
+
+
+def values_in(dataset: Any) -> str:
+    """All values, nan like nan."""
+    return repr((dataset.dtype, np.asarray(dataset).tolist()))
+
+
+@pytest.mark.parametrize("frames", [False, True])
+def test_an_archive_holds_what_the_files_hold(run: Run, tmp_path: Path, frames: bool) -> None:
+    with h5py.File(exported(run, "archive", tmp_path, frames=frames)) as archive:
+        assert list(archive["shots"]) == [f"shot_{index:06d}" for index in range(12)]  # pyright: ignore[reportArgumentType]
+        for shot in run.shots:
+            copy: Any = archive["shots"][shot.file.stem]  # pyright: ignore[reportIndexIssue]
+            with h5py.File(shot.file) as file:
+                entry: Any = file["entry"]
+                expected, found = everything(entry), everything(copy)
+                left_out = set[str]() if frames else {"camera/camera/images"}
+                assert {*found} == {*expected} - left_out
+                for name, dataset in found.items():
+                    assert values_in(dataset) == values_in(expected[name]), name
+                    assert {*dataset.attrs} == {*expected[name].attrs}, name
+                assert copy.attrs["shot_index"] == entry.attrs["shot_index"]
+                if frames:
+                    np.testing.assert_array_equal(copy["images_view/images"], entry["images_view/images"])
+                else:
+                    assert "images_view" not in copy
+                    assert copy.attrs["default"] == "detection"
+
+
+def test_an_archive_needs_nothing_else(run: Run, tmp_path: Path) -> None:
+    """It stands alone: no links to other files, no virtual datasets, no filters but those of every HDF5."""
+    path = exported(run, "archive", tmp_path, frames=True)
+    with h5py.File(path) as archive:
+        for name, dataset in everything(archive).items():
+            assert not dataset.is_virtual, name
+            assert not dataset.external, name
+            assert dataset.compression in (None, "gzip"), name
+            assert dataset.attrs["description"], name
+            assert "units" in dataset.attrs, name
+
+        def check(name: str) -> None:
+            assert not isinstance(archive.get(name, getlink=True), h5py.ExternalLink)
+
+        archive.visit(check)
+    assert path.read_bytes()[8] == 0  # superblock version 0: any HDF5 from 1.8 on
+
+
+def test_an_archive_holds_the_files_of_the_run(run: Run, tmp_path: Path) -> None:
+    with h5py.File(exported(run, "archive", tmp_path)) as archive:
+        files: Any = archive["run"]
+        assert json.loads(files["run.json"][()])["name"] == run.name
+        assert files["sequence.yaml"][()] == (run.path / "sequence.yaml").read_bytes()
+        assert files["calibration_sites.json"][()].decode() == '{"kind": "sites", "µ": 1}\n'
+        assert files["odd.bin"][()].tobytes() == b"\xff\0"
+        assert files["analysis/fits.jsonl"][()] == b'{"shot": 0}\n'
+        assert archive.attrs["format"] == "labseq-archive"
+
+
+def test_an_archive_opens_with_a_plot_and_a_table(run: Run, tmp_path: Path) -> None:
+    with h5py.File(exported(run, "archive", tmp_path)) as archive:
+        table: Any = archive[str(archive.attrs["default"])]
+        assert table.attrs["NX_class"] == "NXdata"
+        assert table[table.attrs["signal"]].shape == table[table.attrs["axes"][0]].shape == (12,)
+        np.testing.assert_array_equal(table["filling_fraction"], [s.filling_fraction for s in run.shots])
+        assert table["shot.2.rearrange.window"].attrs["units"] == "s"
+
+
+def test_what_is_the_same_in_all_shots_stands_in_an_archive_once(run: Run, tmp_path: Path) -> None:
+    path = exported(run, "archive", tmp_path)
+    assert path.stat().st_size < 0.7 * sum(shot.file.stat().st_size for shot in run.shots)
+    with h5py.File(path) as archive:
+        first, last = (archive[f"shots/shot_{i:06d}/provenance"] for i in (0, 11))
+        assert first == last
+
+
+def test_an_archive_of_compressed_frames_is_plain(
+    tmp_path: Path, make_run: MakeRun, make_shot: MakeShot
+) -> None:
+    pytest.importorskip("hdf5plugin")
+    writer = RunWriter.create(tmp_path, make_run(), compress=True)
+    writer.write_shot(make_shot())
+    path = exported(open_run(writer.run_dir), "archive", tmp_path, frames=True)
+    code = "import sys, h5py; print(h5py.File(sys.argv[1])['shots/shot_000000/images_view/images'][()].sum())"
+    done = subprocess.run([sys.executable, "-c", code, path], capture_output=True, text=True, check=True)
+    frames = [image.frame for image in make_shot().images]
+    assert int(done.stdout) == sum(int(frame.image.sum()) for frame in frames if frame is not None)
+
+
+def test_damaged_shots_are_left_out_of_an_archive_and_told(
+    tmp_path: Path, make_run: MakeRun, make_shot: MakeShot
+) -> None:
+    writer = RunWriter.create(tmp_path, make_run())
+    paths = [writer.write_shot(make_shot(index)) for index in range(3)]
+    writer.write_shot(make_shot(3, status="failed"))
+    paths[0].unlink()
+    paths[1].write_bytes(paths[1].read_bytes()[:-1])
+    left_out = export_run(open_run(writer.run_dir), "archive", tmp_path / "a.h5")
+    assert [line.partition(": ")[0] for line in left_out] == [str(path) for path in paths[:2]]
+    with h5py.File(tmp_path / "a.h5") as archive:
+        assert list(archive["shots"]) == ["shot_000002", "shot_000003.attempt_0"]  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "options", "message"),
+    [
+        ("xls", "a.xls", {}, "--to: a run cannot be exported as 'xls'; expected .*archive"),
+        ("csv", "a.txt", {}, r"a\.txt: this is no name of a csv file; expected a file that ends in \.csv"),
+        ("csv", "no/a.csv", {}, "no: there is no such folder"),
+        (
+            "csv",
+            "there.csv",
+            {},
+            "this file is there already; choose another name, or replace it with --force",
+        ),
+        ("csv", "units.csv", {}, r"units\.units\.csv: this file is there already"),
+        ("netcdf", "a.nc", {"frames": True}, "--frames: a netcdf file holds no frames; use --to archive"),
+        ("archive", "folder.h5", {"replace": True}, "this is not an ordinary file"),
+        ("archive", f"{'a' * 300}.h5", {}, "this is no name of a file"),
+    ],
+)
+def test_what_cannot_be_exported_is_told_before(
+    tmp_path: Path, kind: str, name: str, options: dict[str, Any], message: str
+) -> None:
+    (tmp_path / "there.csv").write_text("old")
+    (tmp_path / "units.units.csv").write_text("old")
+    (tmp_path / "folder.h5").mkdir()
+    with pytest.raises(ConfigError, match=message):
+        check_export(kind, tmp_path / name, **options)
+
+
+@pytest.mark.parametrize("kind", [*ENDINGS])
+def test_an_older_file_is_replaced_whole_or_not_at_all(
+    kind: str, run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / f"a{ENDINGS[kind]}"
+    path.write_bytes(b"old")
+    check_export(kind, path, replace=True)
+    with monkeypatch.context() as patch:
+        patch.setattr("labseq.files.os.fsync", full)
+        with pytest.raises(ConfigError, match=r"it cannot be written: No space left on device"):
+            export_run(run, kind, path)
+    assert path.read_bytes() == b"old"
+    assert not list(tmp_path.glob("*.part"))
+    export_run(run, kind, path)
+    assert path.stat().st_size > 3
+
+
+def full(_: int) -> None:
+    raise OSError(28, "No space left on device")

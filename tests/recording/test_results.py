@@ -1,0 +1,70 @@
+"""Results of analyses: one file of lines for each, readable in whatever state it is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from labseq.errors import RecordingError
+from labseq.recording import RunWriter, open_run
+from labseq.recording.results import ResultsLog, done, read_results, results_file
+
+ABOUT = {"analysis": "mine", "settings": {"width": 1.0}, "anew": False}
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return results_file(tmp_path, "mine")
+
+
+def test_rows_come_back_in_the_order_of_the_shots(path):
+    log = ResultsLog(path, ABOUT)
+    for shot in (2, 0, 1):
+        log.write(shot, {"mean": np.float64(shot / 2), "sites": np.eye(2, dtype=np.int64)})
+    rows, about = read_results(path)
+    assert [row["shot"] for row in rows] == [0, 1, 2]
+    assert rows[1] == {"shot": 1, "mean": 0.5, "sites": [[1, 0], [0, 1]]}
+    assert about == ABOUT
+
+
+def test_of_several_rows_of_a_shot_the_last_counts(path):
+    log = ResultsLog(path, ABOUT)
+    log.fail(0, ValueError("too dark"))
+    assert read_results(path)[0] == [{"shot": 0, "error": "ValueError: too dark"}]
+    assert done(read_results(path)[0]) == set()
+    log.write(0, {"mean": 1})
+    assert read_results(path)[0] == [{"shot": 0, "mean": 1}]
+    assert done(read_results(path)[0]) == {0}
+
+
+def test_what_was_before_results_that_are_begun_again_does_not_count(path):
+    ResultsLog(path, ABOUT).write(0, {"mean": 1})
+    ResultsLog(path, ABOUT).write(1, {"mean": 2})
+    ResultsLog(path, {**ABOUT, "anew": True}).write(5, {"mean": 3})
+    assert read_results(path)[0] == [{"shot": 5, "mean": 3}]
+
+
+def test_a_torn_last_line_is_no_result_and_takes_none_with_it(path):
+    ResultsLog(path, ABOUT).write(0, {"mean": 1})
+    with path.open("ab") as file:
+        file.write(b'{"shot": 1, "me')
+    assert [row["shot"] for row in read_results(path)[0]] == [0]
+    ResultsLog(path, ABOUT).write(2, {"mean": 2})
+    assert [row["shot"] for row in read_results(path)[0]] == [0, 2]
+
+
+@pytest.mark.parametrize("result", [None, 5, [1], {"shot": 1}, {"error": 1}, {3: 1}])
+def test_what_is_no_result_is_refused(result):
+    with pytest.raises(TypeError, match="the result"):
+        ResultsLog.checked(result)
+
+
+def test_a_run_finds_its_results(tmp_path, make_run):
+    writer = RunWriter.create(tmp_path, make_run())
+    ResultsLog(results_file(writer.run_dir, "my µ/analysis"), ABOUT).write(0, {"mean": 1})
+    assert open_run(writer.run_dir).analysis("my µ/analysis") == [{"shot": 0, "mean": 1}]
+    expected = r"of the analysis 'other', there are those of my_µ_analysis; 'labseq analyse .* --use other'"
+    with pytest.raises(RecordingError, match=expected):
+        open_run(writer.run_dir).analysis("other")

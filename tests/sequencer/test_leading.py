@@ -1,0 +1,262 @@
+"""Another control system leads: it is told once what became of each of its signals, whatever happens."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from labseq.errors import (
+    ConfigError,
+    DeviceError,
+    DeviceTimeoutError,
+    RecordingError,
+    StopRequested,
+    TransientError,
+)
+from labseq.model import LineSpec, ShotRecord
+from labseq.roles import Context, Leading, StepContext
+from labseq.sequencer.leading import FollowStep, find_leader, wait_step
+from labseq.sequencer.steps import WaitStep
+from labseq.testing import StepContract
+from labseq.testing.contracts.step import Factory
+from labseq.testing.fakes import FakeLab, ListSink, RecordingDevice, RecordingLeader
+from tests.sequencer.rig import IMAGE, Rig, given
+
+FOLLOW = ("wait", FollowStep("go", 10.0))
+
+
+class TestFollow(StepContract):
+    @pytest.fixture
+    def factory(self) -> Factory:
+        return lambda: FollowStep("go", 10.0)
+
+    def lab(self) -> FakeLab:
+        lab = super().lab()
+        leader = RecordingLeader(Context("leader", clock=lab.clock), lab.calls)
+        object.__setattr__(lab, "devices", {"leader": leader})
+        return lab
+
+
+def rig(*steps: tuple[str, Any], goes_after_s: float = 0.5, attempts: int = 3, **lab: Any) -> Rig:
+    made = Rig(steps or (FOLLOW, IMAGE), attempts=attempts, **lab)
+    leader = RecordingLeader(Context("leader", clock=made.lab.clock), made.lab.calls)
+    leader.goes_after_s = goes_after_s
+    object.__setattr__(made.lab, "devices", {**made.lab.devices, "leader": leader})
+    return made
+
+
+def leader_of(made: Rig) -> RecordingLeader:
+    leader = made.lab.devices["leader"]
+    assert isinstance(leader, RecordingLeader)
+    return leader
+
+
+def states(made: Rig) -> list[str]:
+    return [state for state, _ in leader_of(made).answers]
+
+
+def reason(made: Rig) -> str:
+    ((state, about),) = leader_of(made).answers
+    assert state == "failed"
+    return about["reason"]
+
+
+def test_the_fake_can_lead_and_an_instrument_cannot() -> None:
+    assert isinstance(RecordingLeader(), Leading)
+    assert not isinstance(RecordingDevice(), Leading)
+
+
+def test_a_wait_is_for_a_time_or_for_a_signal() -> None:
+    settings = {"duration": None, "signal": None, "timeout": None, "device": None}
+    pause = wait_step(given(**settings | {"duration": 0.1}))
+    assert isinstance(pause, WaitStep)
+    assert pause.duration_s == 0.1
+    follow = wait_step(given(**settings | {"signal": "go", "timeout": 2.0, "device": "artiq"}))
+    assert isinstance(follow, FollowStep)
+    assert (follow.signal, follow.timeout_s, follow.device) == ("go", 2.0, "artiq")
+
+
+def test_it_lasts_as_long_as_the_leader_needs_and_at_most_its_timeout() -> None:
+    made = rig()
+    lab = made.lab
+    (bar,) = FOLLOW[1].plan_timeline(StepContext(lab.grid, lab.motion, lab.target))
+    assert (bar.label, bar.duration_s, bar.least_s, bar.kind) == ("wait for go", 10.0, 0.0, "")
+    made.run()
+    assert made.lab.clock.now() >= 0.5
+    assert made.lab.calls.names("leader")[:4] == [
+        "leader.open",
+        "leader.tell",
+        "leader.wait_for",
+        "leader.tell",
+    ]
+
+
+def test_the_leader_is_told_what_came_of_each_shot() -> None:
+    made = rig(occupancies=[np.ones((2, 2), bool), np.eye(2, dtype=bool)])
+    made.run(2)
+    assert leader_of(made).answers == [
+        ("ready", {"shot": 0, "success": True, "filling": 1.0}),
+        ("ready", {"shot": 1, "success": False, "filling": 0.5}),
+    ]
+    assert [shot.readings["leader.go"] for shot in made.sink.shots] == [["1"], ["2"]]
+    assert [shot.readings["leader.told"] for shot in made.sink.shots] == [["ready"], ["ready"]]
+
+
+def test_a_shot_that_nobody_judges_has_no_filling() -> None:
+    made = rig(FOLLOW)
+    made.run()
+    assert leader_of(made).answers == [("ready", {"shot": 0})]
+
+
+def test_it_is_ready_before_the_shot_is_written() -> None:
+    class FullDisk(ListSink):
+        def write_shot(self, shot: ShotRecord) -> None:
+            raise RecordingError("shots", "the disk is full")
+
+    made = rig(sink=FullDisk())
+    with pytest.raises(RecordingError):
+        made.run()
+    assert states(made) == ["ready"], "once, although the shot failed later"
+
+
+def test_a_second_wait_in_the_shot_says_first_that_the_first_part_is_ready() -> None:
+    made = rig(FOLLOW, IMAGE, FOLLOW, IMAGE)
+    made.run()
+    assert states(made) == ["ready", "ready"]
+    assert made.record().readings["leader.go"] == ["1", "2"]
+    assert made.record().readings["leader.told"] == ["ready", "ready"]
+    names = made.lab.calls.names("leader", "camera")
+    after_the_image = names[names.index("camera.read") + 1 :]
+    assert after_the_image[:3] == ["leader.tell", "leader.wait_for", "camera.arm"]
+
+
+def test_each_attempt_waits_for_atoms_of_its_own() -> None:
+    made = rig(fail_on={"camera.read": [TransientError("a frame was lost", "camera"), None]})
+    made.run()
+    assert states(made) == ["failed", "ready"]
+    assert "a frame was lost" in leader_of(made).answers[0][1]["reason"]
+    assert [shot.readings["leader.told"] for shot in made.sink.shots] == [["failed"], ["ready"]]
+
+
+def test_it_is_told_of_a_passing_failure_after_the_devices_are_silent_again() -> None:
+    made = rig(fail_on={"camera.read": [TransientError("a frame was lost", "camera"), None]})
+    made.run()
+    names = made.lab.calls.names("leader", "camera", "mobile_tweezers")
+    told = [n for n, name in enumerate(names) if name == "leader.tell"][1]
+    assert names[told - 2 : told] == ["mobile_tweezers.safe_state", "camera.safe_state"]
+
+
+def test_a_failure_is_told_after_all_devices_are_safe_and_before_they_are_closed() -> None:
+    made = rig(fail_on={"camera.read": OSError("cable")})
+    with pytest.raises(DeviceError):
+        made.run()
+    assert "cable" in reason(made)
+    names = made.lab.calls.names()
+    told = len(names) - 1 - names[::-1].index("leader.tell")
+    assert names.index("static_tweezers.safe_state") < told < names.index("leader.close")
+    assert made.record().readings["leader.told"] == ["failed"]
+
+
+def test_a_last_attempt_that_fails_is_told_once() -> None:
+    made = rig(fail_on={"camera.read": TransientError("a frame was lost", "camera")}, attempts=2)
+    with pytest.raises(TransientError):
+        made.run()
+    assert states(made) == ["failed", "failed"]
+
+
+def test_a_stop_after_go_is_told_as_a_failure() -> None:
+    class Stopping(WaitStep):
+        def run(self, shot: Any) -> None:
+            made.lab.stop.request()
+            super().run(shot)
+
+    made = rig(FOLLOW, ("stop", Stopping(given(duration=1.0))), IMAGE)
+    with pytest.raises(StopRequested):
+        made.run()
+    assert reason(made) == "stopped by Ctrl-C"
+
+
+def test_a_stop_after_the_last_step_is_told_as_a_failure_too() -> None:
+    class Stopping(WaitStep):
+        def run(self, shot: Any) -> None:
+            made.lab.stop.request()
+
+    made = rig(FOLLOW, IMAGE, ("stop", Stopping(given(duration=1.0))))
+    with pytest.raises(StopRequested):
+        made.run()
+    assert reason(made) == "stopped by Ctrl-C"
+    assert made.record().status == "interrupted"
+
+
+def test_a_stop_while_it_waits_is_nobodys_failure() -> None:
+    made = rig()
+    leader = leader_of(made)
+
+    def never(signal: str, timeout_s: float) -> str:
+        made.lab.stop.request()
+        made.lab.clock.check()
+        return ""
+
+    vars(leader)["wait_for"] = never
+    with pytest.raises(StopRequested):
+        made.run()
+    assert leader.answers == []
+
+
+def test_a_go_that_never_comes_ends_the_run_safely() -> None:
+    made = rig(goes_after_s=3600.0)
+    with pytest.raises(DeviceTimeoutError, match="no 'go' within"):
+        made.run()
+    assert set(made.made_safe()) == {"mobile_tweezers", "shutter", "leader", "camera", "static_tweezers"}
+    assert states(made) == []
+    assert made.unsafe == {}
+
+
+def test_one_that_cannot_be_told_is_a_warning_and_hides_nothing() -> None:
+    made = rig(fail_on={"camera.read": OSError("cable")})
+    leader, tell = leader_of(made), leader_of(made).tell
+
+    def unplugged(state: Any, about: Any) -> str:
+        if state == "failed":
+            raise OSError("unplugged")
+        return tell(state, about)
+
+    vars(leader)["tell"] = unplugged
+    with pytest.raises(DeviceError, match="cable"):
+        made.run()
+    (warning,) = made.observer.of("warning")
+    assert "could not be told" in warning["text"]
+    assert "unplugged" in warning["text"]
+    assert made.sink.shots, "it was written all the same"
+
+
+def test_what_it_said_and_was_told_is_in_the_log() -> None:
+    made = rig()
+    leader_of(made).noted = ["127.0.0.1:40001 leads"]
+    made.run()
+    assert made.observer.of("leader_news") == [
+        {"shot": 0, "device": "leader", "text": "127.0.0.1:40001 leads"}
+    ]
+    assert made.observer.of("leader_awaited") == [
+        {"shot": 0, "device": "leader", "signal": "go", "timeout_s": 10.0}
+    ]
+    assert [said["text"] for said in made.observer.of("leader_said")] == ["go 1"]
+    assert [told["text"] for told in made.observer.of("leader_told")] == ["ready"]
+
+
+def test_lines_stay_idle_while_it_waits() -> None:
+    made = rig(line_specs=[LineSpec("mot", 3, frozenset({"wait", "image"}))])
+    made.run()
+    programs: Any = made.lab.lines
+    assert [program.kind for program in programs.programs] == ["image"]
+
+
+def test_without_a_leader_or_with_a_wrong_one_it_says_so() -> None:
+    devices = {"shutter": RecordingDevice(), "a": RecordingLeader(), "b": RecordingLeader()}
+    assert find_leader(devices, "b") == ("b", devices["b"])
+    with pytest.raises(ConfigError, match="no device through which another control system leads"):
+        find_leader({"shutter": devices["shutter"]})
+    with pytest.raises(ConfigError, match="no other control system leads through 'shutter'"):
+        find_leader(devices, "shutter")
+    with pytest.raises(ConfigError, match="set `device` to one of 'a', 'b'"):
+        find_leader(devices)

@@ -1,0 +1,121 @@
+"""Filling and defect-free fraction against what was scanned."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from itertools import product
+from typing import Any
+
+import numpy as np
+import pytest
+
+from labseq.drawing.charts import CurvesChart, MapChart
+from labseq.errors import ConfigError
+from labseq.model import ShotRecord
+from labseq.recording import Run
+from labseq.session.run_figures import overview, picture_of
+
+Shot = Callable[..., ShotRecord]
+Write = Callable[..., Run]
+
+
+def scan(*columns: tuple[str, Sequence[str]], repeats: int = 1) -> dict[str, Any]:
+    """A scan whose points are rows of these columns."""
+    written = [list(row) for row in zip(*(words for _, words in columns), strict=True)]
+    return {
+        "addresses": [address for address, _ in columns],
+        "points": written,
+        "written": written,
+        "point_of_shot": [point for point in range(len(written)) for _ in range(repeats)],
+    }
+
+
+def taken(write: Write, shot: Shot, of: dict[str, Any], n_shots: int | None = None) -> Run:
+    n = len(of["point_of_shot"]) if n_shots is None else n_shots
+    return write([shot(i, n_defects=i % 3) for i in range(n)], scan=of)
+
+
+def charts(run: Run) -> list[list[Any]]:
+    return [list(row) for row in picture_of(run, "scan").rows]
+
+
+def test_a_quantity_is_an_axis_in_its_unit(write: Write, shot: Shot) -> None:
+    ((filling, success),) = charts(
+        taken(write, shot, scan(("a.window", ["90 ms", "30 ms", "60 ms"]), repeats=2))
+    )
+    assert isinstance(filling, CurvesChart)
+    assert filling.x_label == "a.window (ms)"
+    assert filling.series[0].x.tolist() == [30, 60, 90]
+    assert filling.series[0].y == pytest.approx([(4 / 6 + 1) / 2, (5 / 6 + 4 / 6) / 2, (1 + 5 / 6) / 2])
+    assert success.series[0].y.tolist() == [0.5, 0, 0.5]
+    assert not filling.logarithmic
+
+
+@pytest.mark.parametrize(
+    ("words", "logarithmic"),
+    [
+        (["1", "10", "100"], True),
+        (["1", "2", "5", "10", "20"], True),
+        (["1", "50", "100"], False),
+        (["-1", "0", "30"], False),
+    ],
+)
+def test_values_at_equal_ratios_are_on_a_logarithmic_axis(
+    write: Write, shot: Shot, words: list[str], logarithmic: bool
+) -> None:
+    ((chart, _),) = charts(taken(write, shot, scan(("a", words))))
+    assert chart.logarithmic is logarithmic
+
+
+@pytest.mark.parametrize("words", [["psca", "other"], ["10 ms", "1 s"], ["1", "true"]])
+def test_what_is_no_number_is_written_below_the_axis(write: Write, shot: Shot, words: list[str]) -> None:
+    ((chart, _),) = charts(taken(write, shot, scan(("planner", words))))
+    assert chart.ticks == tuple(words)
+    assert chart.series[0].x.tolist() == [0, 1]
+
+
+def test_two_values_make_a_map(write: Write, shot: Shot) -> None:
+    rows = list(product(["1", "2", "3"], ["10 ms", "20 ms"]))
+    of = scan(("dop", [a for a, _ in rows]), ("window", [b for _, b in rows]))
+    (filling, success), *_ = charts(taken(write, shot, of))
+    assert isinstance(filling, MapChart)
+    assert (filling.y_label, filling.x_label, filling.values.shape) == ("dop", "window", (3, 2))
+    assert filling.values.ravel() == pytest.approx([1, 5 / 6, 4 / 6] * 2)
+    assert success.label == "defect-free (%)"
+
+
+def test_more_values_make_a_row_of_maps_with_one_scale(write: Write, shot: Shot) -> None:
+    rows = list(product("ab", "123", "xy"))
+    of = scan(*((name, [row[i] for row in rows]) for i, name in enumerate(("first", "second", "third"))))
+    run = taken(write, shot, of)
+    maps, _ = charts(run)
+    assert [chart.title for chart in maps] == ["first a", "first b"]
+    assert len({chart.limits for chart in maps}) == 1
+    assert [isinstance(chart, MapChart) for chart in overview(run).rows[2]] == [True, True]
+
+
+def test_values_that_go_together_are_one_axis(write: Write, shot: Shot) -> None:
+    of = scan(("dop", ["1", "2", "3"]), ("window", ["30 ms", "20 ms", "20 ms"]), ("fixed", ["7", "7", "7"]))
+    ((chart, _),) = charts(taken(write, shot, of))
+    assert chart.x_label == "dop with window"
+
+
+def test_points_of_an_optimiser_are_drawn_in_their_order(write: Write, shot: Shot) -> None:
+    a, b = ["0.1", "0.4", "0.2", "0.35", "0.3", "0.15"], ["1", "5", "2", "3", "4", "6"]
+    ((chart, _),) = charts(taken(write, shot, scan(("a", a), ("b", b))))
+    assert chart.x_label == "point of the scan"
+    assert chart.series[0].x.tolist() == [1, 2, 3, 4, 5, 6]
+
+
+def test_a_scan_in_progress_has_blank_cells(write: Write, shot: Shot) -> None:
+    rows = list(product("12", "xy"))
+    of = scan(("a", [a for a, _ in rows]), ("b", [b for _, b in rows]))
+    (filling, _), *_ = charts(taken(write, shot, of, n_shots=3))
+    assert np.isnan(filling.values).tolist() == [[False, False], [False, True]]
+
+
+def test_a_run_without_a_scan_says_so(write: Write, shot: Shot) -> None:
+    with pytest.raises(
+        ConfigError, match="nothing to show of the scan; expected a run of a sequence with 'scan:'"
+    ):
+        picture_of(write([shot(0)]), "scan")

@@ -1,0 +1,105 @@
+"""The pictures of one shot."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from labseq.drawing.shot import save_shot
+from labseq.errors import ConfigError
+from labseq.model import ShotRecord
+from labseq.recording import Run
+from labseq.session.run_figures import shot_picture
+
+Shot = Callable[..., ShotRecord]
+Write = Callable[..., Run]
+
+
+def test_every_image_has_a_panel_with_the_moves_that_followed(compact: Run) -> None:
+    drawing = shot_picture(compact, 1)
+    shot = compact.shots[0]
+    assert len(drawing.panels) == len(shot.occupancies)
+    assert [len(panel.moves) for panel in drawing.panels] == [
+        *(cycle.plan.batch_offsets[cycle.n_batches_played] for cycle in shot.cycles),
+        0,
+        0,
+    ]
+    assert drawing.panels[0].title.endswith("batches")
+    assert drawing.panels[1].title.startswith("after cycle 1: ")
+    assert drawing.sites_px is not None
+    assert drawing.sites_px.shape == (20, 20, 2)
+
+
+def test_frames_lie_under_the_sites(compact: Run, tmp_path: Path) -> None:
+    save_shot(tmp_path / "shot.png", shot_picture(compact, 2, cycle=1))
+    assert (tmp_path / "shot.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_cycle_is_the_image_before_and_the_one_after_it(write: Write, shot: Shot) -> None:
+    panels = shot_picture(write([shot(0, n_cycles=2)]), 1, cycle=2).panels
+    assert [panel.title.partition(":")[0] for panel in panels] == ["after cycle 1", "after cycle 2"]
+
+
+def test_without_frames_the_sites_are_drawn_alone(write: Write, shot: Shot, tmp_path: Path) -> None:
+    drawing = shot_picture(write([shot(0)]), 1)
+    assert drawing.note.endswith("no frames: not kept")
+    save_shot(tmp_path / "shot.svg", drawing)
+
+
+def test_frames_of_another_size_than_the_sites_are_left_out(write: Write, shot: Shot) -> None:
+    drawing = shot_picture(write([shot(0, kept=True)]), 1)
+    assert drawing.sites_px is None
+    assert drawing.note.endswith("no frames: not of the sites' size")
+
+
+def test_an_interrupted_shot_is_shown_as_far_as_it_came(write: Write, shot: Shot) -> None:
+    whole = shot(0)
+    broken = shot(0, images=whole.images[:1], status="interrupted", error="StopRequested: enough")
+    drawing = shot_picture(write([broken], status="stopped"), 1)
+    assert drawing.title == "shot 1, interrupted: StopRequested: enough"
+    (panel,) = drawing.panels
+    assert panel.title.endswith("then 1 move in 1 batch")
+
+
+def test_what_counts_is_shown_before_attempts_that_do_not(write: Write, shot: Shot) -> None:
+    run = write([shot(0, status="failed", error="no light"), shot(0, attempt=1)])
+    assert shot_picture(run, 1).title == "shot 1"
+
+
+@pytest.mark.parametrize(
+    ("number", "cycle", "told"),
+    [
+        (3, None, "--shot: the run has no shot 3; expected one from 1 to 2"),
+        (0, None, "--shot: the run has no shot 0"),
+        (1, 2, "has no cycle 2; expected one from 1 to 1"),
+        (2, 1, "has no cycle 1; expected a shot that rearranges"),
+    ],
+)
+def test_what_is_not_there_is_told(
+    write: Write, shot: Shot, number: int, cycle: int | None, told: str
+) -> None:
+    run = write([shot(0), shot(1, n_cycles=0)])
+    with pytest.raises(ConfigError, match=told):
+        shot_picture(run, number, cycle)
+
+
+def test_a_shot_without_images_has_no_picture(write: Write, shot: Shot) -> None:
+    with pytest.raises(ConfigError, match="shot 1 has no images"):
+        shot_picture(write([shot(0, images=[], cycles=[])]), 1)
+
+
+def test_an_array_that_cannot_be_made_out_is_told(
+    write: Write, shot: Shot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("labseq.session.run_figures.shot.MAX_SITES", 4)
+    with pytest.raises(ConfigError, match="4 x 5 sites are too many"):
+        shot_picture(write([shot(0)]), 1)
+
+
+def test_rows_that_shift_to_the_left_are_drawn_so(write: Write, shot: Shot) -> None:
+    run = write([shot(0)], resolved={"profile": {"grid": {"shear": -1}}})
+    assert shot_picture(run, 1).grid.shear == -1
+    assert np.isclose(shot_picture(run, 1).grid.spacing_m, 4e-6)

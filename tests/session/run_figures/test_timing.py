@@ -1,0 +1,79 @@
+"""The stages of a shot over many shots."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from itertools import pairwise
+
+import pytest
+from hypothesis import given, strategies as st
+
+from labseq.model import ShotRecord
+from labseq.recording import Run, open_run
+from labseq.session.run_figures import spread, timing_of
+from labseq.session.run_figures.timing import quantiles, writing_s
+
+Shot = Callable[..., ShotRecord]
+Write = Callable[..., Run]
+
+
+def test_stages_come_in_the_order_of_a_shot_and_whole_steps_last(compact: Run) -> None:
+    names = [stage.stage for stage in timing_of(compact, compact.shots).stages]
+    assert names[:8] == ["expose", "detect", "plan", "check", "prepare", "play", "move", "write"]
+    assert names[8:] == ["step 0 load", "step 1 image", "step 2 rearrange", "step 3 image"]
+
+
+def test_each_stage_is_told_against_its_budget(write: Write, shot: Shot) -> None:
+    run = write([shot(i, n_cycles=2) for i in range(4)])
+    timing = timing_of(run, run.shots)
+    stages = {stage.stage: stage for stage in timing.stages}
+    move = stages["move"]
+    assert (move.n, move.n_per_shot, move.n_over, move.budget_s) == (8, 2.0, 4, 0.03)
+    assert move.session_s[0] == pytest.approx(0.03)
+    assert move.host_s == pytest.approx((0.003, 0.003))
+    assert move.share == pytest.approx(0.06)
+    assert math.isnan(stages["plan"].budget_s)
+    assert timing.shot_s == pytest.approx((1.0, 1.0))
+
+
+def test_writing_is_told_by_the_event_log(write: Write, shot: Shot) -> None:
+    run = write([shot(0), shot(1)])
+    lines = [json.loads(line) for line in (run.path / "events.jsonl").read_text("utf-8").splitlines()]
+    for line, written in zip(
+        lines, ("2026-11-20T10:00:01.020+00:00", "2026-11-20T09:59:00+00:00"), strict=False
+    ):
+        line["t_utc"] = written  # the second one after the clock was set back
+    text = "".join(f"{json.dumps(line)}\n" for line in [*lines, {"event": "shot_finished"}])
+    (run.path / "events.jsonl").write_text(text, "utf-8")
+    assert writing_s(open_run(run.path)) == pytest.approx([0.02])
+
+
+def test_a_model_knows_nothing_of_writing(write: Write, shot: Shot) -> None:
+    for simulated in (True, False):
+        run = write([shot(0)], simulated=simulated)
+        (stage,) = (one for one in timing_of(run, run.shots).stages if one.stage == "write")
+        assert math.isnan(stage.session_s[0]) is simulated
+        assert stage.host_s[0] > 0
+
+
+def test_no_shots_have_no_stages(write: Write) -> None:
+    run = write([])
+    timing = timing_of(run, run.shots)
+    assert (timing.n_read, timing.stages) == (0, ())
+    assert math.isnan(timing.shot_s[0])
+
+
+@given(st.lists(st.floats(0, 1), min_size=1))
+def test_quantiles_lie_within_the_values(values: list[float]) -> None:
+    p50, p99 = quantiles(values)
+    assert min(values) <= p50 <= p99 <= max(values)
+
+
+@given(st.integers(0, 50), st.integers(1, 20))
+def test_chosen_shots_are_spread_over_the_run(n: int, most: int) -> None:
+    chosen = spread(range(n), most)
+    assert len(chosen) == min(n, most)
+    steps = [b - a for a, b in pairwise(chosen)]
+    assert not steps or max(steps) - min(steps) <= 1

@@ -1,0 +1,92 @@
+"""What has changed since a run was begun."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import labseq
+from labseq.errors import ConfigError
+from labseq.session.changes import changes_between
+from labseq.session.run_record import run_record
+from labseq.testing.fakes import RecordingObserver
+
+from .small_runs import SEQUENCE, changed, no_git, resumed, stopped, stopped_home
+
+__all__ = ["no_git", "stopped", "stopped_home"]
+
+
+CHANGES: dict[str, tuple[Any, str]] = {
+    "version": (lambda r: r["provenance"].update(labseq="0.0.1"), r"labseq was 0\.0\.1, is 0\.1\.0"),
+    "commit": (
+        lambda r: r["provenance"].update(git={"code": {"commit": "a" * 40, "dirty": False}}),
+        r"labseq's commit was \"a+\", is null",
+    ),
+    "plugin": (
+        lambda r: r["plugins"][0].update(version="7"),
+        r"plugin .*: version was 7, is ",
+    ),
+    "no plugin": (lambda r: r["plugins"].pop(), r"plugin labseq_.*: version was nothing, is "),
+    "setting": (
+        lambda r: r["resolved"]["planner"].update(degree_of_parallelism=3),
+        r"planner\.degree_of_parallelism was 3, is 7",
+    ),
+    "step": (
+        lambda r: r["resolved"]["shot"][2]["rearrange"].update(cycles=9),
+        r"shot\.2\.rearrange\.cycles was 9, is 2",
+    ),
+    "new setting": (lambda r: r["resolved"]["planner"].pop("variant"), r"variant was nothing, is \"fewest\""),
+}
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_what_has_changed_is_refused_and_told_or_accepted_and_recorded(stopped: Path, name: str) -> None:
+    change, message = CHANGES[name]
+    changed(stopped, change)
+    with pytest.raises(ConfigError, match=message) as caught:
+        labseq.Session.resume(stopped)
+    assert "--accept-changes" in str(caught.value)
+    assert labseq.open_run(stopped).status == "stopped"
+    run = resumed(stopped, accept_changes=True)
+    (once,) = run.record["resumed"]
+    assert once["changes"][0].keys() == {"what", "was", "now"}
+    assert len(run.shots) == 6
+
+
+def test_code_without_a_commit_is_compared_as_far_as_it_is_known(stopped: Path) -> None:
+
+    with labseq.Session.resume(stopped) as session:
+        today = run_record(session.assembly, 5, session.options.changes(), {}, Path.cwd())
+    then = session.earlier.run.record if session.earlier is not None else {}
+
+    def told(was: Any, now: Any) -> list[str]:
+        then["provenance"]["git"]["code"] = was
+        provenance = {**today.provenance, "git": {"code": now}}
+
+        return [str(c) for c in changes_between(then, dataclasses.replace(today, provenance=provenance))]
+
+    clean = {"commit": "a", "dirty": False, "code_sha256": ""}
+    docs = {"commit": "a", "dirty": True, "code_sha256": ""}
+    patched = {"commit": "a", "dirty": True, "code_sha256": "b" * 64}
+    old = {"commit": "a", "dirty": True}
+    what = "labseq's code without a commit"
+    assert told(None, None) == told(clean, clean) == told(clean, docs) == told(patched, patched) == []
+    assert told(None, clean) == ['labseq\'s commit was null, is "a"']
+    assert told(clean, {"commit": "b"}) == ["labseq's commit was a, is b"]
+    assert told(clean, patched) == [f"{what} was as committed, is changed in a way known as bbbbbbbbbbbb"]
+    nobody = "something that nobody can compare"
+    assert told(old, clean) == [f"{what} was {nobody}, is as committed"]
+    assert told(old, old) == [f"{what} was {nobody}, is {nobody}"]
+
+
+def test_the_runs_own_texts_count(stopped: Path, tmp_path: Path) -> None:
+    sequence, profile = tmp_path / "no_scan.yaml", tmp_path / "p.yaml"
+    sequence.write_text(SEQUENCE.replace("SCAN", "shots: 3").replace("psca", "lsap"), encoding="utf-8")
+    profile.unlink()
+    seen = RecordingObserver()
+    assert len(resumed(stopped, seen).shots) == 6
+    (warning,) = [values["text"] for values in seen.of("warning")]
+    assert warning == f"{sequence} has been changed since; the run goes on with what it said then"

@@ -1,0 +1,181 @@
+"""One at a time on the same real devices."""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Generator
+from pathlib import Path
+
+import pytest
+
+import labseq
+from labseq.errors import DeviceError
+from labseq.recording import lock_files, marker_roots
+from labseq.session import check_devices, make_profile_safe, set_up_bench
+from labseq.session.holding import devices_held
+from labseq.testing.fakes import RecordingObserver
+
+PROFILE = """labseq: 1
+name: bench
+grid: {rows: 4, cols: 4, spacing: 4.49 um}
+camera: {use: virtual}
+static_tweezers: {use: virtual}
+mobile_tweezers: {use: virtual}
+detector: {use: threshold}
+simulation: {use: virtual}
+plugin_folders: [plugins]
+devices: {shutter: {use: SHUTTER}}
+"""
+PLUGIN = """
+import labseq
+
+LABSEQ_API = 1
+
+
+class Mine:
+    def __init__(self, settings, context): pass
+    def open(self): pass
+    def close(self): pass
+    def safe_state(self): pass
+    def describe(self): return {}
+    def command(self, name, **arguments): pass
+    def read(self, name): pass
+
+
+@labseq.hookimpl
+def labseq_register(registry):
+    registry.device("mine", Mine)
+"""
+SEQUENCE = """
+labseq: 1
+name: look
+profile: ./p.yaml
+shots: 2
+target: {pattern: compact, rows: 2, cols: 2}
+shot:
+  - load: {duration: 1 ms}
+  - image: {}
+"""
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("plugins").mkdir()
+    Path("plugins/mine.py").write_text(PLUGIN, encoding="utf-8")
+    Path("s.yaml").write_text(SEQUENCE, encoding="utf-8")
+    write("mine")
+
+
+def write(shutter: str) -> None:
+    Path("p.yaml").write_text(PROFILE.replace("SHUTTER", shutter), encoding="utf-8")
+
+
+@pytest.fixture
+def held() -> Generator[None]:
+    with devices_held(set_up_bench("./p.yaml"), marker_roots(Path("data")), "the run x", pytest.fail):
+        yield
+
+
+def run(observer: RecordingObserver | None = None) -> labseq.Run:
+    with labseq.Session.open("s.yaml", observer=observer) as session:
+        return session.run()
+
+
+def test_a_second_run_is_refused_and_told_of_the_first(held: None) -> None:
+    with pytest.raises(
+        DeviceError, match=r"bench: its devices are in use by the run x \(process \d+ on .*\)"
+    ) as e:
+        run()
+    assert "labseq stop" in str(e.value)
+    assert not Path("data").exists()
+
+
+def test_the_devices_are_free_after_a_run_and_after_one_that_failed() -> None:
+    run()
+    with devices_held(set_up_bench("./p.yaml"), marker_roots(Path("data")), "me", pytest.fail):
+        pass
+    Path("plugins/mine.py").write_text(
+        PLUGIN.replace("open(self): pass", "open(self): 1 / 0"), encoding="utf-8"
+    )
+    with pytest.raises(DeviceError):
+        run()
+    with devices_held(set_up_bench("./p.yaml"), marker_roots(Path("data")), "me", pytest.fail):
+        pass
+
+
+def test_a_run_holds_its_devices_and_says_which_run_it_is() -> None:
+    class Looking(RecordingObserver):
+        told = ""
+
+        def event(self, name: str, values: object) -> None:
+            if name == "run_started":
+                with pytest.raises(DeviceError) as caught:
+                    check_devices("./p.yaml")
+                self.told = str(caught.value)
+
+    looking = Looking()
+    done = run(looking)
+    assert f"in use by the run {done.path} (process {os.getpid()} on " in looking.told
+
+
+def test_data_elsewhere_make_no_difference(held: None, tmp_path: Path) -> None:
+    with (
+        pytest.raises(DeviceError, match="in use by the run x"),
+        labseq.Session.open("s.yaml", output=tmp_path / "elsewhere") as session,
+    ):
+        session.run()
+
+
+def test_devices_are_not_tested_while_somebody_uses_them(held: None) -> None:
+    with pytest.raises(DeviceError, match="bench: its devices are in use by the run x"):
+        check_devices("./p.yaml")
+    assert check_devices("./p.yaml", dry_run="fast").devices  # it touches none
+
+
+def test_devices_are_made_safe_whoever_uses_them(held: None) -> None:
+    seen = RecordingObserver()
+    assert not make_profile_safe("./p.yaml", observer=seen).failures
+    assert [v["text"][:39] for v in seen.of("warning")] == ["its devices are in use by the run x (pr"]
+
+
+def test_nobody_is_kept_from_simulated_devices(held: None) -> None:
+    write("virtual")
+    assert run().status == "complete"
+    assert check_devices("./p.yaml").devices
+
+
+def test_nobody_is_kept_from_a_dry_run(held: None) -> None:
+    with labseq.Session.open("s.yaml", dry_run="full") as session:
+        assert session.run().status == "complete"
+
+
+def test_a_command_that_records_nothing_makes_no_data_folder() -> None:
+    check_devices("./p.yaml")
+    make_profile_safe("./p.yaml")
+    assert not Path("data").exists()
+
+
+def test_a_folder_without_locks_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    fcntl = pytest.importorskip("fcntl")
+
+    def refuse(*_: object) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    Path("data").mkdir()
+    seen = RecordingObserver()
+    assert run(seen).status == "complete"
+    texts = [values["text"] for values in seen.of("warning")]
+    folder = lock_files(marker_roots(Path("data")), "x")[0].parent
+    assert texts[0].startswith(f"the folder {folder} knows no locks: nothing keeps a run on another")
+    assert texts[-1] == "no lock could be had: nothing keeps another run from the same devices"
+
+
+def test_a_state_folder_that_cannot_be_used_does_no_harm(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("LABSEQ_STATE", os.devnull)
+    Path("data").mkdir()
+    seen = RecordingObserver()
+    run(seen)
+    assert not seen.of("warning")

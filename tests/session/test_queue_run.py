@@ -1,0 +1,222 @@
+"""What is queued is run in order."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from labseq.errors import ConfigError, DeviceError, RecordingError, StopRequested
+from labseq.recording import open_run
+from labseq.recording.process import Owner
+from labseq.session import Session
+from labseq.session.queue import Queue
+from labseq.session.queue_run import Opening, QueueRun
+from labseq.session.stopping import ask_to_stop
+
+from .queued import PROFILE, SEQUENCE, Taking, add, queue, states
+
+__all__ = ["queue"]
+
+
+def test_entries_are_run_in_order_and_leave_the_queue(queue: Queue) -> None:
+    first, second = add(queue), add(queue, shots=1)
+    assert states(queue) == {1: "waiting", 2: "waiting"}
+    taking = Taking()
+    assert taking.run(queue).first_error is None
+    assert taking.begun == [first.id, second.id]
+    assert [len(open_run(run).shots) for run in taking.runs] == [3, 1]
+    assert queue.entries() == []
+    assert add(queue).id == 3  # no number comes again
+
+
+def test_what_is_queued_is_what_will_be_run(queue: Queue) -> None:
+    entry = add(queue)
+    assert not entry.has_changed
+    Path("s.yaml").write_text(SEQUENCE.replace("shots: 3", "shots: 9"), encoding="utf-8")
+    assert queue.entries()[0].has_changed
+    Path("s.yaml").unlink()
+    assert queue.entries()[0].has_changed
+    taking = Taking()
+    taking.run(queue)
+    run = open_run(taking.runs[0])
+    assert (run.n_shots, run.record["sequence_text"]) == (3, SEQUENCE)
+    assert run.record["sequence_path"] == str(Path("s.yaml").absolute())
+
+
+def test_options_are_kept(queue: Queue, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    add(
+        queue,
+        shots=2,
+        seed=5,
+        overrides=("shot.0.load.duration=2 ms",),
+        profile="./p.yaml",
+        output=Path("out"),
+    )
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    taking = Taking()
+    taking.run(queue)
+    run = open_run(taking.runs[0])
+    assert run.path.is_relative_to(tmp_path / "out")
+    assert (run.seed, run.n_shots) == (5, 2)
+    assert run.record["resolved"]["shot"][0]["load"]["duration"] == 0.002
+
+
+def test_a_failure_ends_the_queue_and_is_kept(queue: Queue) -> None:
+    add(queue)
+    add(queue)
+
+    def fail(run_dir: Path) -> None:
+        shutil.rmtree(run_dir / "shots")
+
+    taking = Taking(fail)
+    with pytest.raises(RecordingError):
+        taking.run(queue)
+    assert states(queue) == {1: "failed", 2: "waiting"}
+    failed = queue.entries()[0]
+    assert failed.run_dir == taking.runs[0]
+    assert "the folder is gone" in failed.error
+    again = Taking()
+    again.run(queue)
+    assert again.begun == [2]  # what failed is not tried again by itself
+    assert states(queue) == {1: "failed"}
+
+
+def test_the_queue_may_keep_going(queue: Queue) -> None:
+    add(queue)
+    add(queue)
+    taking = Taking(lambda run_dir: shutil.rmtree(run_dir / "shots"))
+    runs = taking.run(queue, keep_going=True)
+    assert taking.begun == [1, 2]
+    assert isinstance(runs.first_error, RecordingError)
+    assert taking.failures == [runs.first_error]
+    assert states(queue) == {1: "failed"}
+
+
+def test_what_could_not_begin_goes_on_waiting(queue: Queue) -> None:
+    add(queue)
+    Path("p.yaml").write_text(PROFILE.replace("virtual}", "cannon}", 1), encoding="utf-8")
+    with pytest.raises(ConfigError, match="cannon"):
+        Taking().run(queue)
+    (entry,) = queue.entries()
+    assert (entry.state, entry.run_dir) == ("waiting", None)
+    assert "cannon" in entry.error
+    Path("p.yaml").write_text(PROFILE, encoding="utf-8")
+    Taking().run(queue)
+    assert queue.entries() == []
+
+
+def test_a_run_that_is_stopped_after_its_shot_does_not_end_the_queue(queue: Queue) -> None:
+    add(queue)
+    add(queue)
+    taking = Taking(ask_to_stop)
+    taking.run(queue)
+    assert taking.begun == [1, 2]
+    assert [open_run(run).status for run in taking.runs] == ["stopped", "complete"]
+    assert states(queue) == {1: "stopped"}
+    with Session.resume(taking.runs[0]) as session:
+        session.run()
+    assert states(queue) == {1: "complete"}
+    Taking().run(queue)
+    assert queue.entries() == []
+
+
+def test_the_queue_may_be_stopped_too(queue: Queue) -> None:
+    add(queue)
+    add(queue)
+    assert not queue.ask_to_stop()  # nobody is at work
+
+    def stop(run_dir: Path) -> None:
+        assert queue.ask_to_stop()
+
+    taking = Taking(stop)
+    taking.run(queue)
+    assert taking.begun == [1]
+    assert open_run(taking.runs[0]).status == "complete"
+    assert states(queue) == {2: "waiting"}
+    Taking().run(queue)
+    assert queue.entries() == []
+
+
+def test_a_queue_is_run_by_one(queue: Queue) -> None:
+    add(queue)
+
+    def again(_: Path) -> None:
+        with pytest.raises(ConfigError, match=r"at work already: labseq queue run \(process \d+ on "):
+            Taking().run(queue)
+
+    Taking(again).run(queue)
+    assert queue.holder() is None
+
+
+@pytest.mark.parametrize(("number", "status"), [(2, "stopped"), (15, "running")])
+def test_ctrl_c_is_meant_and_a_computer_that_shuts_down_is_not(
+    queue: Queue, number: int, status: str
+) -> None:
+    add(queue)
+    add(queue)
+
+    class Signalling:
+        def event(self, name: str, values: Mapping[str, Any]) -> None:
+            if name == "shot_finished":
+                session.stop_flag.request(number)
+
+    def take(opening: Opening) -> None:
+        nonlocal session
+        with opening(Signalling()) as session:
+            session.run()
+
+    session: Any = None
+    with pytest.raises(StopRequested):
+        QueueRun(queue, take, lambda _: None, lambda _: None).run()
+    first, second = queue.entries()
+    assert (first.status, second.status) == (status, "waiting")
+    assert first.run_dir == session.run_dir
+    if status == "running":  # by a process that will be gone
+        queue.write(replace(first, owner=replace(Owner.current(), started="another time")))
+    taking = Taking()
+    taking.run(queue)
+    assert taking.begun == ([2] if status == "stopped" else [1, 2])
+
+
+def test_an_interrupted_entry_comes_first_and_goes_on(queue: Queue) -> None:
+    add(queue)
+    add(queue)
+    Taking(ask_to_stop, lambda _: None).run(queue)
+    (entry,) = queue.entries()
+    add(queue)
+    queue.move(3, 1)
+    gone = replace(Owner.current(), started="another time")
+    queue.write(replace(entry, status="running", owner=gone))
+    assert states(queue) == {3: "waiting", 1: "interrupted"}
+    taking = Taking()
+    taking.run(queue)
+    assert taking.begun == [1, 3]
+    assert len(open_run(taking.runs[0]).record["resumed"]) == 1
+    assert queue.entries() == []
+
+
+def test_an_entry_of_a_living_process_is_left_alone(queue: Queue) -> None:
+    entry = add(queue)
+    queue.write(replace(entry, status="running", owner=Owner.current()))
+    assert states(queue) == {1: "running"}
+    Taking().run(queue)
+    assert states(queue) == {1: "running"}
+    with pytest.raises(ConfigError, match="entry 1 is running; 'labseq stop' ends it first"):
+        queue.remove([1])
+
+
+def test_devices_in_use_leave_the_entry_waiting(queue: Queue) -> None:
+    add(queue)
+
+    def refuse(opening: Opening) -> None:
+        raise DeviceError("bench", "its devices are in use")
+
+    with pytest.raises(DeviceError):
+        QueueRun(queue, refuse, lambda _: None, lambda _: None).run()
+    assert states(queue) == {1: "waiting"}
