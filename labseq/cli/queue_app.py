@@ -16,6 +16,7 @@ from labseq.cli.shared_options import (
     Seed,
     SequenceFile,
     Shots,
+    run_options,
 )
 
 queue = typer.Typer(
@@ -48,15 +49,14 @@ def add(
 ) -> None:
     """Check a sequence as labseq check does, and add it at the end; it will run as it is written now."""
     from labseq.cli.queue import add_entry
-    from labseq.session import Options
 
-    options = Options(
+    options = run_options(
         profile=profile,
+        dry_run=dry_run,
         shots=shots,
         seed=seed,
-        overrides=tuple(overrides or ()),
+        overrides=overrides,
         output=output,
-        dry_run="off" if dry_run is None else dry_run.value,
         realtime=realtime,
     )
     add_entry(sequence, options)

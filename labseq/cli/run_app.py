@@ -17,6 +17,7 @@ from labseq.cli.shared_options import (
     Seed,
     SequenceFile,
     Shots,
+    run_options,
 )
 
 RUN_EXAMPLES = """\b
@@ -46,15 +47,14 @@ def run(
 ) -> None:
     """Run a sequence and record every shot."""
     from labseq.cli.run import run_sequence
-    from labseq.session import Options
 
-    options = Options(
+    options = run_options(
         profile=profile,
+        dry_run=dry_run,
         shots=shots,
         seed=seed,
-        overrides=tuple(overrides or ()),
+        overrides=overrides,
         output=output,
-        dry_run="off" if dry_run is None else dry_run.value,
         realtime=realtime,
     )
     run_sequence(sequence, options, as_json=as_json)

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+if TYPE_CHECKING:
+    from labseq.session import Options
 
 
 class DryRunKind(StrEnum):
@@ -64,3 +67,27 @@ RunFolder = Annotated[
     Path | None,
     typer.Argument(metavar="RUN", help="A run's folder; the newest run by default.", show_default=False),
 ]
+
+
+def run_options(
+    *,
+    profile: str | None,
+    dry_run: DryRunKind | None,
+    shots: int | None,
+    seed: int | None,
+    overrides: list[str] | None,
+    output: Path | None,
+    realtime: bool,
+) -> Options:
+    """What was chosen for a run, now or later."""
+    from labseq.session import Options
+
+    return Options(
+        profile=profile,
+        shots=shots,
+        seed=seed,
+        overrides=tuple(overrides or ()),
+        output=output,
+        dry_run="off" if dry_run is None else dry_run.value,
+        realtime=realtime,
+    )

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Self
+from typing import Annotated, Literal, Protocol, Self, cast
 
 from pydantic import Field, NonNegativeInt, PositiveInt, model_validator
 
 from labseq.config.settings import Duration, Settings, Temperature
 from labseq.drivers import Cooling
+from labseq.errors import ConfigError
 from labseq.model import SensorMode
+from labseq.roles import Context, KnownSensor, Simulation
 from labseq.units import ZERO_CELSIUS_K, format_quantity
+
+
+class SensedWorld(Simulation, KnownSensor, Protocol):
+    """A simulated world that tells of its sensor."""
 
 
 class RegionSettings(Settings):
@@ -48,6 +54,20 @@ class CameraSettings(Settings):
             return f"{ends}, beyond the sensor of {rows} x {cols} pixels; choose a smaller or another one"
         return _unbinnable(height, width, self.binning)
 
+    def simulated_world(self, context: Context) -> SensedWorld:
+        """The simulated world that the simulated counterpart of a camera shows.
+
+        Raises:
+            ConfigError: There is none, it does not know its sensor, or the region is beyond that.
+        """
+        world = context.simulation
+        if world is None or not isinstance(world, KnownSensor):
+            text = "a simulated camera needs a simulated world that tells of its sensor"
+            raise ConfigError(f"{text}; add `simulation: {{use: virtual}}` to the profile")
+        if misfit := self.misfit_on(world.sensor_shape):
+            raise ConfigError(misfit)
+        return cast("SensedWorld", world)
+
     @model_validator(mode="after")
     def _region_can_be_binned(self) -> Self:
         if self.region is not None and (
@@ -55,6 +75,27 @@ class CameraSettings(Settings):
         ):
             raise ValueError(text)
         return self
+
+
+class IndustrialCameraSettings(CameraSettings):
+    """What cameras on GigE Vision and USB3 Vision can be told besides."""
+
+    readout: Duration = Field(
+        default=5e-3,
+        description="time from the end of an exposure until its frame can be read, for budgets; the "
+        "simulated camera takes so long",
+    )
+    trigger_line: str = Field(
+        default="Line1", min_length=1, description="input of the external trigger, as the camera calls it"
+    )
+    trigger_edge: Literal["rising", "falling"] = Field(
+        default="rising", description="edge of the external trigger that starts an exposure"
+    )
+    packet_delay: Duration | None = Field(
+        default=None,
+        description="pause between two network packets (GigE), for cameras that share a cable; none: as the "
+        "camera is set",
+    )
 
 
 class CoolingSettings(Settings):

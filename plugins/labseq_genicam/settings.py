@@ -6,7 +6,8 @@ from typing import Annotated, Final, Literal, TypeAlias
 
 from pydantic import Field, NonNegativeInt, field_validator
 
-from labseq import CameraSettings, Duration, Fraction, Frequency, Settings
+from labseq import Duration, Fraction, Frequency, Settings
+from labseq.config.cameras import IndustrialCameraSettings
 
 PixelFormat: TypeAlias = Literal["Mono8", "Mono10", "Mono12", "Mono14", "Mono16"]
 
@@ -34,7 +35,7 @@ class FaultSettings(Settings):
     ignores_triggers: bool = Field(default=False, description="its software trigger leads nowhere")
 
 
-class GenicamSettings(CameraSettings):
+class GenicamSettings(IndustrialCameraSettings):
     """A GigE Vision or USB3 Vision camera."""
 
     camera: str | None = Field(
@@ -54,31 +55,15 @@ class GenicamSettings(CameraSettings):
         le=1e6,
         description="analogue gain in the camera's unit, mostly dB; none: as the camera is set",
     )
-    readout: Duration = Field(
-        default=5e-3,
-        description="time from the end of an exposure until its frame can be read, for budgets; the "
-        "simulated camera takes so long",
-    )
     frame_rate: Annotated[Frequency, Field(gt=0)] | None = Field(
         default=None,
         description="exposures per second with the internal trigger, as `100 Hz`; none: each begins at the "
         "end of the read-out before",
     )
-    trigger_line: str = Field(
-        default="Line1", min_length=1, description="input of the external trigger, as the camera calls it"
-    )
-    trigger_edge: Literal["rising", "falling"] = Field(
-        default="rising", description="edge of the external trigger that starts an exposure"
-    )
     packet_size: Annotated[int, Field(ge=576, le=65535)] | None = Field(
         default=None,
         description="bytes of a network packet (GigE); none: as the camera is set, or less if that does not "
         "come through",
-    )
-    packet_delay: Duration | None = Field(
-        default=None,
-        description="pause between two network packets (GigE), for cameras that share a cable; none: as the "
-        "camera is set",
     )
     packet_timeout: Annotated[Duration, Field(gt=0)] = Field(
         default=20e-3, description="after which time a missing network packet is asked for again (GigE)"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from labseq import DeviceError, LimitError
+from labseq.drivers.increments import nearest
 from labseq.errors import one_of
 from labseq.units import ZERO_CELSIUS_K
 from labseq_genicam.aravis import Camera
@@ -72,17 +73,6 @@ def temperature_k(camera: Camera) -> float | None:
     if not camera.is_available("DeviceTemperature"):
         return None
     return round(camera.get_float("DeviceTemperature") + ZERO_CELSIUS_K, 2)
-
-
-def nearest(value: int, low: int, high: int, step: int) -> int:
-    """The number nearest to a value, from low to high in steps.
-
-    Example:
-        >>> nearest(37, 0, 100, 4), nearest(39, 2, 100, 4), nearest(200, 0, 99, 4)
-        (36, 38, 96)
-    """
-    n_steps = (min(max(value, low), high) - low + step // 2) // step
-    return low + step * min(n_steps, (high - low) // step)
 
 
 def _set_pixel_format(name: str, camera: Camera, wanted: PixelFormat | None) -> str:

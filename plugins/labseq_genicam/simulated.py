@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq import ConfigError, Context, DeviceError, Frame, KnownSensor, Series, SimulatedSensor, Wired
+from labseq import Context, DeviceError, Frame, Series, SimulatedSensor, Wired
 from labseq.lines import trigger_line
 from labseq_genicam.acquisition import Acquisition, Start
 from labseq_genicam.counterpart.fake import FakeCamera
@@ -33,12 +33,7 @@ class SimulatedCamera:
     """
 
     def __init__(self, settings: GenicamSettings, context: Context) -> None:
-        world = context.simulation
-        if world is None or not isinstance(world, KnownSensor):
-            text = "a simulated camera needs a simulated world that tells of its sensor"
-            raise ConfigError(f"{text}; add `simulation: {{use: virtual}}` to the profile")
-        if misfit := settings.misfit_on(world.sensor_shape):
-            raise ConfigError(misfit)
+        world = settings.simulated_world(context)
         self._name = context.name or "camera"
         self._world = world
         self._clock = context.clock

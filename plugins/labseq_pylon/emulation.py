@@ -22,7 +22,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq import ConfigError, Context, DeviceError, Frame, KnownSensor, Series, SimulatedSensor, Trigger
+from labseq import Context, DeviceError, Frame, KnownSensor, Series, SimulatedSensor, Trigger
 from labseq_pylon.finding import EMULATION
 from labseq_pylon.library import Sdk
 from labseq_pylon.nodes import Nodes
@@ -44,12 +44,7 @@ class EmulatedCamera:
     """
 
     def __init__(self, settings: PylonSettings, context: Context) -> None:
-        world = context.simulation
-        if world is None or not isinstance(world, KnownSensor):
-            text = "a simulated camera needs a simulated world that tells of its sensor"
-            raise ConfigError(f"{text}; add `simulation: {{use: virtual}}` to the profile")
-        if misfit := settings.misfit_on(world.sensor_shape):
-            raise ConfigError(misfit)
+        world = settings.simulated_world(context)
         self._world: KnownSensor = world
         self._sensor = SimulatedSensor(world, context.clock)
         self._clock = context.clock

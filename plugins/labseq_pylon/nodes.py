@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any, Final, TypeAlias
 
 from labseq import DeviceError, LimitError
+from labseq.drivers.increments import nearest
 from labseq.errors import one_of
 from labseq_pylon.library import Sdk
 
@@ -142,14 +143,3 @@ class Nodes:
 
     def _can_write(self, node: Any | None) -> bool:
         return node is not None and bool(self._sdk.genicam.IsWritable(node))
-
-
-def nearest(value: int, low: int, high: int, step: int) -> int:
-    """The number nearest to a value, from low to high in steps.
-
-    Example:
-        >>> nearest(37, 0, 100, 4), nearest(39, 2, 100, 4), nearest(200, 0, 99, 4)
-        (36, 38, 96)
-    """
-    n_steps = (min(max(value, low), high) - low + step // 2) // step
-    return low + step * min(n_steps, (high - low) // step)

@@ -6,7 +6,7 @@ from typing import Annotated, Final, Literal, Self, TypeAlias
 
 from pydantic import Field, field_validator, model_validator
 
-from labseq import CameraSettings, Duration
+from labseq.config.cameras import IndustrialCameraSettings
 
 PixelFormat: TypeAlias = Literal["Mono8", "Mono10", "Mono12", "Mono16"]
 
@@ -17,7 +17,7 @@ SIMULATED: Final = "simulated"
 """The camera that needs no camera."""
 
 
-class PylonSettings(CameraSettings):
+class PylonSettings(IndustrialCameraSettings):
     """A Basler camera."""
 
     camera: str | None = Field(
@@ -40,24 +40,8 @@ class PylonSettings(CameraSettings):
         ge=0,
         description="analogue gain in steps of the camera, for older cameras that have no gain in dB",
     )
-    readout: Duration = Field(
-        default=5e-3,
-        description="time from the end of an exposure until its frame can be read, for budgets; the "
-        "simulated camera takes so long",
-    )
-    trigger_line: str = Field(
-        default="Line1", min_length=1, description="input of the external trigger, as the camera calls it"
-    )
-    trigger_edge: Literal["rising", "falling"] = Field(
-        default="rising", description="edge of the external trigger that starts an exposure"
-    )
     packet_size: Annotated[int, Field(ge=220, le=16404)] | None = Field(
         default=None, description="bytes of a network packet (GigE); none: as the camera is set"
-    )
-    packet_delay: Duration | None = Field(
-        default=None,
-        description="pause between two network packets (GigE), for cameras that share a cable; none: as the "
-        "camera is set",
     )
 
     @field_validator("camera", mode="before")

@@ -15,7 +15,6 @@ from labseq_genicam.camera import GenicamCamera
 from labseq_genicam.counterpart.images import Request
 from labseq_genicam.counting import LAST_ID, FrameCounter
 from labseq_genicam.settings import FORMATS, GenicamSettings
-from labseq_genicam.setup import nearest
 from numpy.typing import NDArray
 
 from labseq import ConfigError, Context
@@ -255,23 +254,6 @@ def test_numbers_tell_how_many_frames_never_came(first: int, steps: list[int], i
         if is_ethernet:
             frame_id = (frame_id - 1) % LAST_ID + 1
         assert counter.number(frame_id) == number
-
-
-@given(
-    value=st.integers(-50, 200),
-    low=st.integers(0, 20),
-    n_steps=st.integers(0, 20),
-    step=st.integers(1, 16),
-    rest=st.integers(0, 15),
-)
-def test_no_good_number_is_nearer_than_the_nearest(
-    value: int, low: int, n_steps: int, step: int, rest: int
-) -> None:
-    high = low + n_steps * step + rest % step
-    good = range(low, high + 1, step)
-    found = nearest(value, low, high, step)
-    assert found in good
-    assert abs(found - value) == min(abs(one - value) for one in good)
 
 
 def test_a_serial_number_may_be_written_as_a_number() -> None:

@@ -15,7 +15,6 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from labseq_pylon.camera import PylonCamera
 from labseq_pylon.library import load_pypylon
-from labseq_pylon.nodes import nearest
 from labseq_pylon.settings import BITS, PylonSettings
 
 from labseq import ConfigError, Context
@@ -184,23 +183,6 @@ def test_a_simulated_camera_needs_a_simulated_world() -> None:
 def test_a_region_beyond_the_simulated_sensor_is_refused_before_anything_is_opened() -> None:
     with pytest.raises(ConfigError, match="beyond the sensor of 96 x 128 pixels"):
         Rig(region={"y": 60, "x": 0, "height": 48, "width": 64})
-
-
-@given(
-    value=st.integers(-50, 200),
-    low=st.integers(0, 20),
-    n_steps=st.integers(0, 20),
-    step=st.integers(1, 16),
-    rest=st.integers(0, 15),
-)
-def test_no_good_number_is_nearer_than_the_nearest(
-    value: int, low: int, n_steps: int, step: int, rest: int
-) -> None:
-    high = low + n_steps * step + rest % step
-    good = range(low, high + 1, step)
-    found = nearest(value, low, high, step)
-    assert found in good
-    assert abs(found - value) == min(abs(one - value) for one in good)
 
 
 def test_a_serial_number_may_be_written_as_a_number() -> None:
