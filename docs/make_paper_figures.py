@@ -26,6 +26,7 @@ from labseq import Session, ShotRecord
 from labseq.drawing import CyclesDrawing, ParallelismDrawing, Series, save_cycles, save_parallelism
 from labseq.recording.rates import Rate
 from labseq.sequencer import Sequencer
+from labseq.sequencer.policies import RunPolicy
 from labseq.session.ceiling import survival
 from labseq.session.run_figures import (
     PAPERS_DEFECT_FREE,
@@ -86,7 +87,14 @@ def take(sequence: str, n_shots: int, overrides: Sequence[str], seed: int) -> Ta
     tally = Tally(target=lab.target)
     first = session.course.first
     sequencer = Sequencer(
-        lab, first.steps, session.stop_flag, tally, Nobody(), seed=seed, attempts=1, parameters={}
+        lab,
+        first.steps,
+        session.stop_flag,
+        tally,
+        Nobody(),
+        seed=seed,
+        policy=RunPolicy(attempts=1),
+        parameters={},
     )
     try:
         sequencer.open()

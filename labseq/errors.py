@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 
 class LabseqError(Exception):
@@ -138,6 +138,14 @@ class DeviceTimeoutError(DeviceError, TimeoutError):
         super().__init__(device, message)
 
 
+class DeviceHungError(DeviceTimeoutError):
+    """A call into a device, its driver or a step did not come back; its thread may still act."""
+
+
+class InterlockError(DeviceError):
+    """A value that a device watches is past its limit, or cannot be told; no policy goes on after it."""
+
+
 class LimitError(LabseqError, ValueError):
     """A value lies outside what a device or the profile allows.
 
@@ -218,6 +226,44 @@ class TransientError(LabseqError):
     def __init__(self, message: str, device: str = "") -> None:
         self.device = device
         super().__init__(f"{device}: {message}" if device else message)
+
+
+class StepTimeoutError(TransientError):
+    """A step took longer than the ``timeout`` of its policy.
+
+    Attributes:
+        timeout_s: What it may take, in seconds.
+    """
+
+    def __init__(self, message: str, timeout_s: float) -> None:
+        self.timeout_s = timeout_s
+        super().__init__(message)
+
+
+class OverBudgetError(TransientError):
+    """A stage took longer than its budget, and the policy of its step does not let that pass.
+
+    Attributes:
+        then: What the policy wants: "repeat_shot", "skip_point" or "stop".
+    """
+
+    def __init__(self, message: str, then: Literal["repeat_shot", "skip_point", "stop"]) -> None:
+        self.then: Literal["repeat_shot", "skip_point", "stop"] = then
+        super().__init__(message)
+
+
+class CheckFailedError(LabseqError):
+    """A value of the last shots is past what a check of the sequence allows.
+
+    Attributes:
+        value: Its name, for example "filling_fraction".
+    """
+
+    exit_code: ClassVar[int] = 3
+
+    def __init__(self, message: str, value: str) -> None:
+        self.value = value
+        super().__init__(message)
 
 
 class StopRequested(LabseqError):  # noqa: N818 - a request, not an error

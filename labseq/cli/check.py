@@ -16,6 +16,7 @@ from labseq.cli.excerpt import excerpt
 from labseq.cli.failures import lines_of
 from labseq.cli.log_lines import LogLines
 from labseq.cli.output import columns, divert_stdout, encodes, say
+from labseq.cli.policy_words import policy_texts
 from labseq.cli.show import as_line
 from labseq.cli.timeline import BAR_WIDTH, lines_table, timeline_table
 from labseq.cli.words import age_text, clock_time, plural, settings_text
@@ -219,7 +220,8 @@ def _limits(assembly: Assembly) -> list[tuple[str, str]]:
     return [
         *(("window", text) for text in _windows(assembly.resolved)),
         ("mobile tweezers", at_once),
-        ("attempts", f"{spec.attempts} at a shot that fails with a transient error"),
+        ("attempts", f"{spec.attempts} at a shot that is repeated"),
+        *(("policy", text) for text in policy_texts(assembly)),
         ("timeouts", ", ".join(f"{what} {format_quantity(value, 'time')}" for what, value in waits)),
     ]
 

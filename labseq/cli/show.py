@@ -251,7 +251,7 @@ def summary_lines(run: Run) -> list[str]:
     rows = [
         ("run", str(run.path)),
         ("status", f"{run.status}: {run.error}" if run.status == "failed" else run.status),
-        ("shots", f"{len(run.shots)} of {run.n_shots}" + (_repeated(run) if run.attempts else "")),
+        ("shots", f"{len(run.shots)} of {run.n_shots}" + _skipped(run) + _repeated(run)),
         *statistics_rows(statistics),
         ("duration", _duration(run)),
     ]
@@ -261,7 +261,11 @@ def summary_lines(run: Run) -> list[str]:
 
 
 def _repeated(run: Run) -> str:
-    return f", {plural(len(run.attempts), 'attempt')} kept that did not complete"
+    return f", {plural(len(run.attempts), 'attempt')} kept that did not complete" if run.attempts else ""
+
+
+def _skipped(run: Run) -> str:
+    return f", {len(run.skipped)} skipped" if run.skipped else ""
 
 
 def _duration(run: Run) -> str:

@@ -12,7 +12,7 @@ from typing import Any, Final
 from labseq.cli.scan_plot import ScanTally
 from labseq.model import ImageRecord, RunRecord, ShotRecord, StageTiming
 
-STAGES: Final = ("expose", "detect", "plan", "check", "prepare", "play", "move")
+STAGES: Final = ("expose", "read_out", "detect", "plan", "check", "prepare", "play", "move", "write")
 """The stages that are shown; a shot has others."""
 
 _KEPT: Final = 200

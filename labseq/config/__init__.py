@@ -8,13 +8,10 @@ from labseq.config.document import Document, Kept
 from labseq.config.fields import ROLES, Choice, plugin_paths
 from labseq.config.find import find_profile, packaged_profiles_dir
 from labseq.config.lines import LINES_KEYS
+from labseq.config.motion import MOTION_KEYS, MotionSettings
 from labseq.config.nodes import Loc
-from labseq.config.profile import (
-    MOTION_KEYS,
-    MotionSettings,
-    ProfileSpec,
-    load_profile,
-)
+from labseq.config.policies import CheckSettings, StepPolicySettings
+from labseq.config.profile import ProfileSpec, load_profile
 from labseq.config.scan import Axis, Scan
 from labseq.config.scan_reading import bind_scan, read_scan
 from labseq.config.sequence import SequenceSpec, StepSpec, load_sequence
@@ -42,6 +39,7 @@ __all__ = [
     "CalibrationChoices",
     "CalibrationSettings",
     "CheckOverlaySettings",
+    "CheckSettings",
     "CheckSitesSettings",
     "Choice",
     "Collected",
@@ -60,6 +58,7 @@ __all__ = [
     "Scan",
     "SequenceSpec",
     "Settings",
+    "StepPolicySettings",
     "StepSpec",
     "TimeoutSettings",
     "WaitSettings",

@@ -36,6 +36,7 @@ ROLES: Final = ("camera", "static_tweezers", "mobile_tweezers", "detector", "lin
 """The roles of a profile that are one plugin each."""
 MAY_ADD: Final = (
     "timeouts",
+    "budgets",
     "grid.row_frequency",
     "grid.column_frequency",
     "mobile_tweezers.rf",

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, model_validator
 
 from labseq.config.fields import Name, misfit
-from labseq.config.profile import Sites
+from labseq.config.motion import Sites
 from labseq.config.reading import decode
 from labseq.config.settings import Settings
 from labseq.config.values import validate_values

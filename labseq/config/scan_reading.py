@@ -149,7 +149,12 @@ def _check_place(axis: Axis, document: Document) -> None:
     loc = axis.loc
     if loc[0] == "planner":
         return
-    if loc[0] == "shot" and len(loc) > 2 and loc[2] != "name" and document.root.at(loc[:3]) is not None:
+    if (
+        loc[0] == "shot"
+        and len(loc) > 2
+        and loc[2] not in ("name", "policy")
+        and document.root.at(loc[:3]) is not None
+    ):
         return
     raise _unfit(axis.address, axis.key, document.name)
 

@@ -23,11 +23,13 @@ from labseq.config.fields import (
     PatternChoice,
     Text,
     check_kind,
+    empty_is,
     misfit,
     placed_by_field,
 )
 from labseq.config.mending import StandIns, load_checked
 from labseq.config.nodes import Loc
+from labseq.config.policies import PolicySettings
 from labseq.config.scan import Scan, ScanOrder
 from labseq.config.scan_reading import read_scan
 from labseq.config.settings import Settings
@@ -35,6 +37,8 @@ from labseq.config.wording import clean, shown
 
 DEFAULT_PLANNER: Final = "psca"
 
+_BESIDE: Final = ("name", "policy")
+"""Keys of a step that are no kind of step."""
 _STEP_NAME: Final = re.compile(r"[^\W\d][\w-]*")
 
 
@@ -52,6 +56,11 @@ class StepSpec:
     name: str
     loc: Loc
 
+    @property
+    def policy_loc(self) -> Loc:
+        """Where the mapping of its policy is, if it has one."""
+        return (*self.loc[:-1], "policy")
+
 
 def _step(value: Any) -> StepSpec:
     """Read one item of ``shot``; its index is added later."""
@@ -60,7 +69,7 @@ def _step(value: Any) -> StepSpec:
     if not isinstance(value, dict):
         raise misfit(f"a step is {shown(value)}", "a mapping such as 'image: {exposure: 45 ms}'")
     item = cast("dict[str, Any]", value)
-    kinds = [key for key in item if key != "name"]
+    kinds = [key for key in item if key not in _BESIDE]
     if not kinds:
         raise misfit("a step says nothing to do", "a mapping such as 'image: {exposure: 45 ms}'")
     if len(kinds) > 1:
@@ -113,6 +122,9 @@ class SequenceSpec(Settings):
     attempts: int = Field(
         default=3, ge=1, le=100, description="how often a shot is tried before the run stops"
     )
+    policy: Annotated[PolicySettings, empty_is({})] = Field(
+        default=PolicySettings(), description="what follows failures, exceeded budgets and values gone astray"
+    )
     plugin_folders: Folders = Field(default=[], description="folders with plugins, relative to this file")
     scan: dict[str, Any] | list[dict[str, Any]] | None = Field(
         default=None, description="addresses whose values change from shot to shot"
@@ -164,7 +176,7 @@ def load_sequence(
     check_kind(document, "sequence")
     if document.data.get("planner") is None:
         document = document.override("planner", f"{{use: {DEFAULT_PLANNER}}}", "the default planner")
-    document = document.override_all(overrides, found=found)
+    document = document.override_all(overrides, may_add=("policy",), found=found)
     problems = Collected() if found is None else found
     document = _at_first_point(document, [Override(*one) for one in overrides], profile_set, problems)
     if found is None:

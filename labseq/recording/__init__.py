@@ -10,6 +10,7 @@ from labseq.recording.active import (
 )
 from labseq.recording.folders import data_root
 from labseq.recording.reader import Run, open_run
+from labseq.recording.row_values import value_in
 from labseq.recording.shot import Shot
 from labseq.recording.writer import RunWriter
 
@@ -25,4 +26,5 @@ __all__ = [
     "marker_roots",
     "open_run",
     "runs_in_progress",
+    "value_in",
 ]

@@ -90,6 +90,16 @@ def columns_of(run: Run, shots: Sequence[Shot] | None = None) -> list[Column]:
     return columns
 
 
+def values_of(shot: Shot) -> dict[str, Any]:
+    """What the index tells of a shot, by the names of the columns; those that are taken twice only once."""
+    return {
+        **{f"reading.{name}": value for name, value in _readings(shot).items()},
+        **{f"stage.{name}": value for name, value in _stages(shot.row).items()},
+        **_mapping(shot.row.get("parameters")),
+        **_told(shot),
+    }
+
+
 def _as(description: str) -> _Described:
     """Describes all names alike, each with the unit that it ends in."""
     return lambda name: (unit_of(name), description)

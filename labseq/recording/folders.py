@@ -18,6 +18,8 @@ RUN_FILE: Final = "run.json"
 STATE_FILE: Final = "STATE"
 INDEX_FILE: Final = "index.jsonl"
 EVENTS_FILE: Final = "events.jsonl"
+SKIPPED_FILE: Final = "skipped.jsonl"
+"""Shots that will not be taken, and why; only where there are any."""
 SEQUENCE_FILE: Final = "sequence.yaml"
 PROFILE_FILE: Final = "profile.yaml"
 SHOTS_FOLDER: Final = "shots"
@@ -29,6 +31,7 @@ LOCK_FILE: Final = ".lock"
 """Locked by whoever goes on with a run."""
 OWN_NAMES: Final = frozenset(
     {RUN_FILE, STATE_FILE, INDEX_FILE, EVENTS_FILE, SEQUENCE_FILE, PROFILE_FILE, STOP_FILE}
+    | {SKIPPED_FILE}
     | {SHOTS_FOLDER, RESULTS_FOLDER}
 )
 

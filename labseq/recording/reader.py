@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from labseq.errors import RecordingError
 from labseq.model import TargetPattern
@@ -55,7 +55,18 @@ def open_run(path: str | Path) -> Run:
         shots=tuple(Shot(folder / row["file"], row, load) for _, row in sorted(counted.items())),
         attempts=tuple(Shot(folder / row["file"], row, load) for row in usable if not row["counts"]),
         n_damaged_lines=len(damaged) + len(rows) - len(usable),
+        skipped=_skipped(folder),
     )
+
+
+def _skipped(folder: Path) -> dict[int, str]:
+    found = dict[int, str]()
+    for line in read_lines(folder / folders.SKIPPED_FILE)[0]:
+        shots = line.get("shots")
+        if isinstance(shots, list):
+            indices = [shot for shot in cast("list[Any]", shots) if isinstance(shot, int)]
+            found |= dict.fromkeys(indices, str(line.get("why") or ""))
+    return found
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -70,6 +81,7 @@ class Run:
         shots: The shots that count, in order.
         attempts: Attempts at shots that failed or were interrupted, in the order they were made.
         n_damaged_lines: Lines of the index that cannot be read; 0 unless the file was damaged.
+        skipped: Shots that a policy left out: index -> why.
     """
 
     path: Path
@@ -79,6 +91,7 @@ class Run:
     shots: Sequence[Shot]
     attempts: Sequence[Shot]
     n_damaged_lines: int = 0
+    skipped: Mapping[int, str] = field(default_factory=dict[int, str])
 
     def __repr__(self) -> str:
         return f"<Run {self.path}: {len(self.shots)} of {self.n_shots} shots, {self.status}>"
@@ -142,6 +155,7 @@ class Run:
         return {
             "run_dir": str(self.path),
             "shots": len(self.shots),
+            "skipped": len(self.skipped),
             "defect_free": to_plain(self.defect_free),
             "filling_fraction": to_plain(self.filling_fraction),
             "status": self.status,

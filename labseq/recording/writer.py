@@ -6,7 +6,7 @@ import hashlib
 import itertools
 import shutil
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -34,11 +34,13 @@ class RunWriter:
     Attributes:
         run_dir: The run's folder.
         n_written: Shots written that count; failed attempts do not.
+        last_row: The line in the index of the attempt that was written last; empty before the first.
     """
 
     def __init__(self, run_dir: Path, run: RunRecord, *, compress: bool = False) -> None:
         self.run_dir = run_dir
         self.n_written = 0
+        self.last_row: Mapping[str, Any] = {}
         self._run = run
         self._compress = compress
         self._encoder = self._make_encoder()
@@ -162,8 +164,23 @@ class RunWriter:
         sha256 = hashlib.sha256(data).hexdigest()
         row = index_row(shot, self._run.target, file=file, sha256=sha256, n_bytes=data.nbytes)
         self._index.append(row, sync=True)
+        self.last_row = row
         self.n_written += counts
         return path
+
+    def skip(self, shots: Sequence[int], why: str) -> None:
+        """Put down that shots will not be taken, also if the run is resumed.
+
+        Args:
+            shots: Their indices.
+            why: What their point is skipped for.
+
+        Raises:
+            RecordingError: The disk is full.
+        """
+        t_utc = datetime.now(UTC).isoformat(timespec="microseconds")
+        log = LineLog(self.run_dir / folders.SKIPPED_FILE)
+        log.append({"shots": list(shots), "why": why, "t_utc": t_utc}, sync=True)
 
     def _free_name(self, shot: ShotRecord, *, counts: bool) -> str:
         """The name of a shot's file; none that the run had before it was resumed."""

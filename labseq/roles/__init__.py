@@ -27,9 +27,10 @@ from labseq.roles.hardware import (
     SelfTesting,
     Settling,
     StaticTweezers,
+    Timed,
     Trigger,
 )
-from labseq.roles.shot import Context, RunObserver, Shot, Step, StepContext
+from labseq.roles.shot import Context, Repeatable, RunObserver, Shot, Step, StepContext
 from labseq.roles.simulation import (
     WHOLE_SENSOR,
     KnownLoading,
@@ -69,6 +70,7 @@ __all__ = [
     "Planner",
     "Polled",
     "RecordedShot",
+    "Repeatable",
     "RfSource",
     "RunObserver",
     "SelfTesting",
@@ -81,6 +83,7 @@ __all__ = [
     "Step",
     "StepContext",
     "Storyteller",
+    "Timed",
     "ToneSource",
     "Trigger",
     "TruthTeller",

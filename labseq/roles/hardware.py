@@ -8,13 +8,7 @@ from typing import Any, Literal, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.model import (
-    CameraFacts,
-    Frame,
-    LineProgram,
-    LinesFacts,
-    ToneProgram,
-)
+from labseq.model import CameraFacts, Frame, LineProgram, LinesFacts, ToneProgram
 
 Trigger = Literal["software", "internal", "external"]
 
@@ -233,6 +227,15 @@ class MobileTweezers(Hardware, Protocol):
         Raises:
             DeviceTimeoutError: It did not end within ``timeout_s``.
         """
+        ...
+
+
+@runtime_checkable
+class Timed(Protocol):
+    """Mobile tweezers that tell how long the parts of their last ``prepare()`` took."""
+
+    def timings(self) -> Mapping[str, float]:
+        """Name of a part ("render", "upload") -> seconds on this computer's clock; no I/O."""
         ...
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
-from typing import Any, ParamSpec, Protocol, TypeVar
+from typing import Any, ParamSpec, Protocol, TypeVar, runtime_checkable
 
 from labseq.model import (
     CalibrationEntry,
@@ -221,6 +221,20 @@ class Shot(Protocol):
         """Context manager that times a stage against its budget."""
         ...
 
+    def stage_done(
+        self, name: str, duration_s: float, host_s: float, budget_s: float = ..., cycle: int = 0
+    ) -> None:
+        """Keep the time of a stage that has just ended, where no ``with`` can stand around it.
+
+        Args:
+            name: Of the stage.
+            duration_s: Its duration on the session's clock, in seconds.
+            host_s: The same on this computer's clock.
+            budget_s: What it may take; by default what the profile's ``budgets`` say.
+            cycle: Rearrangement cycle, counted from 1; 0 outside of one.
+        """
+        ...
+
     def take_image(self, exposure_s: float, cycle: int = 0) -> Occupancy:
         """Expose, read, detect and record an image."""
         ...
@@ -275,6 +289,17 @@ class Step(Protocol):
     def run(self, shot: Shot) -> None:
         """Do it."""
         ...
+
+
+@runtime_checkable
+class Repeatable(Protocol):
+    """A step that may be tried again in the same shot when it fails: it leaves the atoms where they are.
+
+    Attributes:
+        repeatable: Whether it may; others can only be repeated with the whole shot.
+    """
+
+    repeatable: bool
 
 
 class RunObserver(Protocol):

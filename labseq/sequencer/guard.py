@@ -10,7 +10,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, Final, ParamSpec, TypeVar
 
-from labseq.errors import DeviceError, DeviceTimeoutError, LabseqError, PlanError, StopRequested
+from labseq.errors import DeviceError, DeviceHungError, LabseqError, PlanError, StopRequested
 from labseq.sequencer.clock import LOOK_S, StopFlag
 
 P = ParamSpec("P")
@@ -75,24 +75,34 @@ class Guard:
     def __init__(self, stop: StopFlag) -> None:
         self._stop = stop
         self._workers: dict[str, _Worker] = {}
+        self._step_hangs = False
 
     def call(
         self, owner: str, timeout_s: float, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs
     ) -> T:
         """Call a function; see ``labseq.roles.Shot.call``.
 
-        After a stop request nothing is called any more, not even while it is held:
-        a step that was given up must not switch anything on behind the safe state.
+        After a stop request, or behind a step that hangs, nothing is called any more, not even while
+        the request is held: a step that was given up must not switch anything on behind the safe state.
         """
-        if self._stop.is_set:
+        if self._stop.is_set or self._step_hangs:
             raise StopRequested(self._stop.signal_number)
         job = self._submit(owner, partial(function, *args, **kwargs))
         return self._wait(owner, job, timeout_s, GRACE_S)
 
-    def run_step(self, run: partial[None]) -> None:
-        """Run a step, however long it takes; after a stop request one that hangs is given up."""
+    def run_step(self, run: partial[None], timeout_s: float = math.inf) -> None:
+        """Run a step; after a stop request one that hangs is given up.
+
+        Args:
+            run: Runs it.
+            timeout_s: How long it may take before it counts as hung.
+        """
         self._stop.check()
-        self._wait("step", self._submit("step", run), math.inf, STEP_GRACE_S)
+        try:
+            self._wait("step", self._submit("step", run), timeout_s, STEP_GRACE_S)
+        except DeviceHungError:
+            self._step_hangs = True
+            raise
 
     def call_to_the_end(
         self, owner: str, timeout_s: float, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs
@@ -133,7 +143,7 @@ class Guard:
 
 def _timeout(owner: str, name: str, timeout_s: float) -> LabseqError:
     text = f"{name}did not answer within {timeout_s:.3g} s and is given up"
-    return PlanError(text) if owner == "planner" else DeviceTimeoutError(owner, text, timeout_s)
+    return PlanError(text) if owner == "planner" else DeviceHungError(owner, text, timeout_s)
 
 
 def _translated(owner: str, name: str, error: BaseException) -> BaseException:

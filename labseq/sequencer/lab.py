@@ -51,7 +51,7 @@ class Timeouts:
 
 @dataclass(frozen=True, slots=True)
 class Lab:
-    """Everything that a shot is made with."""
+    """Everything that a shot is made with; ``budgets``: what stages may take that know it not themselves."""
 
     grid: SiteGrid
     motion: MotionSpec
@@ -74,6 +74,7 @@ class Lab:
     blinding: Mapping[str, Blinding] = field(default_factory=dict[str, Blinding], kw_only=True)
     lines: Lines | None = field(default=None, kw_only=True)
     line_specs: tuple[LineSpec, ...] = field(default=(), kw_only=True)
+    budgets: Mapping[str, float] = field(default_factory=dict[str, float], kw_only=True)
 
     @property
     def step_context(self) -> StepContext:

@@ -8,7 +8,7 @@ from numbers import Real
 
 from labseq.errors import DeviceError
 from labseq.model import ToneProgram
-from labseq.roles import Shot
+from labseq.roles import Shot, Timed
 
 
 def play(shot: Shot, build: Callable[[], ToneProgram], start_s: float, cycle: int = 0) -> None:
@@ -29,7 +29,12 @@ def play(shot: Shot, build: Callable[[], ToneProgram], start_s: float, cycle: in
     overhead_s = shot.motion.overhead_per_cycle_s
     mobile, limit_s = shot.mobile_tweezers, shot.call_timeout_s
     with shot.stage("prepare", overhead_s, cycle):
-        duration_s = _duration(shot.call("mobile_tweezers", limit_s, mobile.prepare, build()))
+        with shot.stage("tones", cycle=cycle):
+            program = build()
+        duration_s = _duration(shot.call("mobile_tweezers", limit_s, mobile.prepare, program))
+        if isinstance(mobile, Timed):
+            for part, host_s in shot.call("mobile_tweezers", limit_s, mobile.timings).items():
+                shot.stage_done(part, 0.0 if shot.clock.virtual else host_s, host_s, cycle=cycle)
         if shot.clock.virtual:
             shot.clock.sleep(max(0.0, overhead_s - (shot.clock.now() - start_s)))
     shot.check_interlocks()

@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+import itertools
+import math
+import time
 from collections.abc import Collection, Mapping, Sequence
 from datetime import UTC, datetime
 from functools import partial
 from typing import Any, Protocol
 
-from labseq.errors import LabseqError, StopRequested, TransientError
+from labseq.errors import LabseqError, StopRequested
 from labseq.model import ShotRecord
 from labseq.model.records import ShotStatus
-from labseq.roles import RunObserver, Settling, Step
+from labseq.roles import RunObserver, Step
 from labseq.sequencer.calling import budget_s, run_step
 from labseq.sequencer.clock import StopFlag
-from labseq.sequencer.guard import LATE_S, Guard
+from labseq.sequencer.guard import Guard
 from labseq.sequencer.lab import Lab, Outcome, close_all, make_safe
 from labseq.sequencer.leading import Leaders
+from labseq.sequencer.opening import close_devices, open_devices
+from labseq.sequencer.policies import RunPolicy, StepPolicy, Then, may_be_retried
 from labseq.sequencer.shot import RunningShot
+from labseq.sequencer.stages import Stages
 from labseq.sequencer.states import State, StateTable
 
 
@@ -38,7 +44,7 @@ class Sequencer:
         sink: Where shots are written.
         observer: Told everything that happens.
         seed: The run's seed.
-        attempts: How often a shot is tried when it fails with ``TransientError``.
+        policy: What follows failures and exceeded budgets.
         parameters: What differs from the files, kept with each shot: address -> value.
 
     Raises:
@@ -54,7 +60,7 @@ class Sequencer:
         observer: RunObserver,
         *,
         seed: int,
-        attempts: int = 3,
+        policy: RunPolicy = RunPolicy(),  # noqa: B008 - frozen
         parameters: Mapping[str, Any] | None = None,
     ) -> None:
         self.lab = lab
@@ -64,7 +70,7 @@ class Sequencer:
         self._sink = sink
         self._observer = observer
         self._seed = seed
-        self._attempts = attempts
+        self._policy = policy
         self._parameters = dict(parameters or {})
         self._states = StateTable(lambda state: self._emit("state", {"state": state.value}))
         self._unsafe: dict[str, LabseqError] = {}
@@ -78,7 +84,7 @@ class Sequencer:
     def open(self) -> None:
         """Open the simulation, then each device, and turn the static tweezers on."""
         self._states.to(State.OPENING)
-        self._open({"simulation", *dict(self.lab.hardware())})
+        open_devices(self.lab, self.guard, self._stop, self._emit, {"simulation", *dict(self.lab.hardware())})
         self._states.to(State.IDLE)
 
     def change(
@@ -102,47 +108,12 @@ class Sequencer:
         """
         if reopened:
             self._states.to(State.REOPENING)
-            self._close(reopened)
+            close_devices(self.lab, self.guard, reopened)
         self.lab, self._steps, self._parameters = lab, steps, dict(parameters)
         if reopened:
-            self._open(reopened)
+            open_devices(lab, self.guard, self._stop, self._emit, reopened)
             self._states.to(State.IDLE)
         self._budgets = self._lay_out()
-
-    def _open(self, names: Collection[str]) -> None:
-        """Open the simulation and the devices of these names; then wait for those that need time.
-
-        Static tweezers among them are turned on.
-        """
-        lab, timeout_s = self.lab, self.lab.timeouts.call_s
-        simulation = () if lab.simulation is None else (("simulation", lab.simulation),)
-        for name, part in (*simulation, *lab.hardware()):
-            if name in names:
-                self._stop.check()
-                # Nothing is made safe beside an open() that is only slow: what that does last would undo it.
-                self.guard.call_to_the_end(name, timeout_s, part.open)
-        if "static_tweezers" in names:
-            self.guard.call("static_tweezers", timeout_s, lab.static_tweezers.load, None)
-            self.guard.call("static_tweezers", timeout_s, lab.static_tweezers.start)
-        for name, device in lab.hardware():
-            if (
-                name in names
-                and isinstance(device, Settling)
-                and (longest_s := device.settling_timeout_s) > 0
-            ):
-                self._emit("settling", {"device": name, "timeout_s": longest_s})
-                self.guard.call(name, longest_s + LATE_S, device.settle)
-
-    def _close(self, names: Collection[str]) -> None:
-        """Make the devices of these names safe, all of them first, then close them."""
-        lab, timeout_s = self.lab, self.lab.timeouts.safe_state_s
-        devices = [(name, device) for name, device in lab.safe_order() if name in names]
-        for name, device in devices:
-            self.guard.call_to_the_end(name, timeout_s, device.safe_state)
-        for name, device in devices:
-            self.guard.call_to_the_end(name, timeout_s, device.close)
-        if lab.simulation is not None and "simulation" in names:
-            self.guard.call_to_the_end("simulation", timeout_s, lab.simulation.close)
 
     def _lay_out(self) -> list[float]:
         """What each step may take, in seconds."""
@@ -152,18 +123,26 @@ class Sequencer:
             for number, (name, step) in enumerate(self._steps)
         ]
 
-    def run(self, shot_indices: Sequence[int]) -> None:
-        """Take the shots, repeating each that fails with ``TransientError``.
+    def run(self, shot_indices: Sequence[int]) -> dict[int, str]:
+        """Take the shots, and repeat those that fail, as the policy says.
+
+        Returns:
+            Shots that were given up, and why; the points of the scan that they are at shall be skipped.
 
         Raises:
             LabseqError: Whatever ended the run before its last shot. The caller
                 must call :meth:`shut_down` on this way out too.
         """
+        given_up = dict[int, str]()
         for index in shot_indices:
-            for attempt in range(self._attempts):
+            for attempt in itertools.count():
                 self._stop.check()
-                if self._take(index, attempt, last=attempt + 1 == self._attempts):
+                then, why = self._take(index, attempt)
+                if then == "skip_point":
+                    given_up[index] = why
+                if then != "repeat_shot":
                     break
+        return given_up
 
     def shut_down(self) -> Mapping[str, LabseqError]:
         """Safe state of every device, then close; from any state, any number of times.
@@ -190,17 +169,20 @@ class Sequencer:
         self._tell("safe_state", outcome)  # only now: neither a screen nor a disk shall delay the devices
         self._states.to(State.SAFE)
 
-    def _take(self, index: int, attempt: int, *, last: bool) -> bool:
-        """Take one attempt at a shot and write it; whether the shot is done."""
+    def _take(self, index: int, attempt: int) -> tuple[Then | None, str]:
+        """Take one attempt at a shot and write it; what follows, if it failed, and why it did."""
         self._states.to(State.SHOT)
         record = ShotRecord(index, attempt, self._seed, _utc_now(), parameters=self._parameters)
         record.calibrations = {kind: entry.id for kind, entry in self.lab.calibrations.items()}
-        failure: TransientError | None = None
+        shot = RunningShot(self.lab, self.guard, record, self._emit)
+        failure: LabseqError | None = None
+        then: Then | None = None
         try:
             try:
-                self._perform(record)
-            except TransientError as error:
-                if last:
+                self._perform(shot)
+            except LabseqError as error:
+                then = self._policy.after(error, shot.step if shot.in_step else None, attempt)
+                if then == "stop":
                     raise
                 failure = error
                 self._recover()
@@ -211,35 +193,66 @@ class Sequencer:
             raise
         self._close_record(record, "complete" if failure is None else "failed", failure)
         self._states.to(State.WRITING)
+        start_s = time.perf_counter()
         self._sink.write_shot(record)
-        self._emit("shot_finished" if failure is None else "shot_repeated", {"shot": record})
+        host_s = time.perf_counter() - start_s
+        self._emit("shot_repeated" if then == "repeat_shot" else "shot_finished", {"shot": record})
         self._states.to(State.IDLE)
-        return failure is None
+        self._mind_writing(shot.stages, host_s)
+        return then, record.error
 
-    def _perform(self, record: ShotRecord) -> None:
+    def _mind_writing(self, stages: Stages, host_s: float) -> None:
+        """Tell how long writing took; a model knows of no disk, so in a simulated run it takes no time.
+
+        Raises:
+            OverBudgetError: It took longer than its budget, and the run's policy wants to stop then.
+        """
+        then = self._policy.otherwise.over_budget
+        stages.policy = StepPolicy(over_budget=then if then in ("record", "stop") else "warn")
+        stages.done("write", 0.0 if self.lab.clock.virtual else host_s, host_s, math.nan, 0)
+
+    def _perform(self, shot: RunningShot) -> None:
+        record = shot.record
         for stream in self.lab.random_streams:
             stream.begin_shot(record.shot_index, record.attempt)
         if self.lab.simulation is not None:
             self.guard.call("simulation", self.lab.timeouts.call_s, self.lab.simulation.begin_shot)
         self._emit("shot_started", {"shot": record.shot_index, "attempt": record.attempt})
-        shot = RunningShot(self.lab, self.guard, record, self._emit)
         shot.poll()
         shot.check_interlocks()
         for number, (name, step) in enumerate(self._steps):
             self._stop.check()
-            shot.begin_step(number)
-            with shot.stage(f"step {number} {name}", self._budgets[number]):
-                self.guard.run_step(partial(run_step, step, number, name, shot))
+            with shot.of_step(number, name, self._policy.of_step(number), self._budgets[number]):
+                self._run_step(shot, number, name, step)
         shot.leaders.ready()  # before the shot is written: atoms do not wait for a disk
         shot.note_truth()
+
+    def _run_step(self, shot: RunningShot, number: int, name: str, step: Step) -> None:
+        """Run a step, and again if it fails and its policy lets it be tried again."""
+        policy = self._policy.of_step(number)
+        for left in range(policy.retries, -1, -1):
+            shot.stages.begin_try()
+            try:
+                longest_s = policy.timeout_s + self.lab.timeouts.call_s
+                self.guard.run_step(partial(run_step, step, number, name, shot), longest_s)
+                shot.stages.check_timeout()
+            except LabseqError as error:
+                if not (left and may_be_retried(error)):
+                    raise
+                self._recover()
+                self._states.to(State.SHOT)
+                self._emit("step_repeated", {"shot": shot.index, "step": number, "error": str(error)})
+            else:
+                return
 
     def _recover(self) -> None:
         """Silence what may still be busy."""
         self._states.to(State.RECOVERING)
         lab, timeout_s = self.lab, self.lab.timeouts.safe_state_s
+        busy = [("mobile_tweezers", lab.mobile_tweezers), ("camera", lab.camera)]
         with self._stop.held():
-            self.guard.call_to_the_end("mobile_tweezers", timeout_s, lab.mobile_tweezers.safe_state)
-            self.guard.call_to_the_end("camera", timeout_s, lab.camera.safe_state)
+            for name, device in busy if lab.lines is None else (*busy, ("lines", lab.lines)):
+                self.guard.call_to_the_end(name, timeout_s, device.safe_state)
 
     def _abort(self, record: ShotRecord, status: ShotStatus, error: BaseException) -> None:
         """Safety first; only then is who leads told, and what the shot has written down."""

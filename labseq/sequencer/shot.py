@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Generator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 
-from labseq.errors import ConfigError, DeviceError
+from labseq.errors import ConfigError, DeviceError, InterlockError
 from labseq.lines import line_program, margin_s, trigger_line
-from labseq.model import CycleRecord, Frame, ImageRecord, Occupancy, ShotRecord, StageTiming
+from labseq.model import CycleRecord, Frame, ImageRecord, Occupancy, ShotRecord
 from labseq.roles import Device, Interlocked, LossTeller, Polled, Storyteller, TruthTeller
 from labseq.sequencer.guard import LATE_S, Guard
 from labseq.sequencer.interlock import check_blinding
 from labseq.sequencer.lab import Lab
 from labseq.sequencer.leading import Emit, Leaders
+from labseq.sequencer.policies import StepPolicy
+from labseq.sequencer.stages import Stages
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -52,20 +55,35 @@ class RunningShot:
         self.degree_of_parallelism = lab.degree_of_parallelism
         self.call_timeout_s = lab.timeouts.call_s
         self.plan_timeout_s = lab.timeouts.plan_s
-        self.step = 0
-        self.start_s = lab.clock.now()
+        self.in_step = False
+        self.stages = Stages(lab, record, emit)
+        self.start_s = self.stages.start_s
         self.leaders = Leaders(lab, guard, record, emit)
         self._guard = guard
         self._emit = emit
+
+    @property
+    def step(self) -> int:
+        """Index of the running step."""
+        return self.stages.step
 
     @property
     def elapsed_s(self) -> float:
         """Time since the start of the shot, on the session's clock."""
         return self.clock.now() - self.start_s
 
-    def begin_step(self, index: int) -> None:
-        """Name the step that the following stages and images belong to."""
-        self.step = index
+    @contextmanager
+    def of_step(self, number: int, name: str, policy: StepPolicy, budget_s: float) -> Generator[None]:
+        """Around a step: the stages, images and failures within belong to it.
+
+        Raises:
+            OverBudgetError: It took longer than its budget, and its policy does not let that pass.
+        """
+        self.in_step = True
+        self.stages.begin_step(number, name, policy)
+        with self.stage(f"step {number} {name}", budget_s):
+            yield
+        self.stages.policy, self.in_step = StepPolicy(), False
 
     def device(self, name: str) -> Device:
         """A named device of the profile."""
@@ -78,7 +96,12 @@ class RunningShot:
     def call(
         self, owner: str, timeout_s: float, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs
     ) -> T:
-        """Call a device or plugin; see ``labseq.roles.Shot``."""
+        """Call a device or plugin; see ``labseq.roles.Shot``.
+
+        Raises:
+            StepTimeoutError: The step has used up the time that its policy gives it.
+        """
+        self.stages.check_timeout()
         return self._guard.call(owner, timeout_s, function, *args, **kwargs)
 
     def poll(self) -> None:
@@ -92,7 +115,11 @@ class RunningShot:
         """Ask every device that watches something; see ``labseq.roles.Shot``."""
         for name, device in self.lab.hardware():
             if isinstance(device, Interlocked):
-                self.call(name, self.call_timeout_s, device.check_interlocks)
+                try:
+                    self.call(name, self.call_timeout_s, device.check_interlocks)
+                except DeviceError as error:
+                    text = str(error).removeprefix(f"{error.device}: ")
+                    raise InterlockError(error.device, text) from error
 
     def follow(self, signal: str, timeout_s: float, device: str = "") -> None:
         """Wait until another control system says to go on; see ``labseq.roles.Shot``."""
@@ -119,18 +146,15 @@ class RunningShot:
         left_s = max(0.0, program.duration_s - (self.clock.now() - fired_s)) + timeout_s
         self.call("lines", left_s + LATE_S, lines.wait, left_s)
 
-    @contextmanager
-    def stage(self, name: str, budget_s: float = float("nan"), cycle: int = 0) -> Generator[None]:
-        """Time a stage against its budget; it is recorded however it ends."""
-        start_s, host_start_s = self.elapsed_s, time.perf_counter()
-        try:
-            yield
-        finally:
-            host_s = time.perf_counter() - host_start_s
-            duration_s = self.elapsed_s - start_s
-            timing = StageTiming(name, self.step, cycle, start_s, duration_s, host_s, budget_s)
-            self.record.timing.append(timing)
-            self._emit("stage", {"timing": timing})
+    def stage(self, name: str, budget_s: float = math.nan, cycle: int = 0) -> AbstractContextManager[None]:
+        """Time a stage against its budget; see ``labseq.sequencer.stages``."""
+        return self.stages.around(name, budget_s, cycle)
+
+    def stage_done(
+        self, name: str, duration_s: float, host_s: float, budget_s: float = math.nan, cycle: int = 0
+    ) -> None:
+        """Keep the time of a stage that has just ended; see ``labseq.roles.Shot``."""
+        self.stages.done(name, duration_s, host_s, budget_s, cycle)
 
     def take_image(self, exposure_s: float, cycle: int = 0) -> Occupancy:
         """Expose, read, detect and record an image.
@@ -139,18 +163,9 @@ class RunningShot:
             DeviceError: Camera or detector delivered something of the wrong kind, or a light is on that
                 would blind the camera.
         """
-        camera, timeout_s = self.lab.camera, self.call_timeout_s
-        start_s = self.elapsed_s
-        specs, limit_s = self.lab.line_specs, timeout_s + exposure_s
-        budget_s = exposure_s + self.lab.step_context.camera.readout_s + margin_s(specs, "image")
+        timeout_s, start_s = self.call_timeout_s, self.elapsed_s
         check_blinding(self.lab, self._guard)
-        by_line = trigger_line(specs, "camera") is not None
-        with self.stage("expose", budget_s, cycle):
-            self.call("camera", timeout_s, camera.arm, 1, exposure_s, "external" if by_line else "software")
-            with self.lit("image", exposure_s):
-                if not by_line:
-                    self.call("camera", limit_s, camera.trigger)
-                frame = self.call("camera", limit_s + LATE_S, camera.read, limit_s)
+        frame = self._expose(exposure_s, cycle)
         if not isinstance(frame, Frame):  # pyright: ignore[reportUnnecessaryIsInstance]
             raise DeviceError("camera", f"read() returned {type(frame).__name__}; expected a Frame")
         with self.stage("detect", cycle=cycle):
@@ -163,6 +178,24 @@ class RunningShot:
             self.record.seen_defect_free_cycle = cycle
         self._emit("image", {"image": image, "filling_fraction": self.target.filling_fraction(occupancy)})
         return occupancy
+
+    def _expose(self, exposure_s: float, cycle: int) -> object:
+        """Take a frame; what lies behind the end of the exposure is the stage of its read-out."""
+        camera, specs, timeout_s = self.lab.camera, self.lab.line_specs, self.call_timeout_s
+        limit_s, readout_s = timeout_s + exposure_s, self.lab.step_context.camera.readout_s
+        by_line = trigger_line(specs, "camera") is not None
+        with self.stage("expose", exposure_s + readout_s + margin_s(specs, "image"), cycle):
+            self.call("camera", timeout_s, camera.arm, 1, exposure_s, "external" if by_line else "software")
+            with self.lit("image", exposure_s):
+                if not by_line:
+                    self.call("camera", limit_s, camera.trigger)
+                end_s, host_start_s = self.elapsed_s + exposure_s, time.perf_counter()
+                frame = self.call("camera", limit_s + LATE_S, camera.read, limit_s)
+                host_s = time.perf_counter() - host_start_s
+                late_s = max(0.0, self.elapsed_s - end_s)
+                waited_s = 0.0 if self.clock.virtual else exposure_s
+                self.stage_done("read_out", late_s, max(0.0, host_s - waited_s), readout_s, cycle)
+        return frame
 
     def judge(self) -> None:
         """Judge the shot on the image just taken; called by the ``image`` step alone."""

@@ -18,7 +18,7 @@ class State(Enum):
     SHOT = "shot"
     WRITING = "writing"
     RECOVERING = "recovering"
-    """After a transient failure: back to idle, then the shot is repeated."""
+    """After a failure that does not end the run: what may be busy is silenced."""
     REOPENING = "reopening"
     """Between shots: devices whose settings change are closed through their safe state and opened anew."""
     MAKING_SAFE = "making safe"
@@ -33,7 +33,7 @@ TRANSITIONS: Final = MappingProxyType(
         State.IDLE: frozenset({State.SHOT, State.REOPENING, State.MAKING_SAFE}),
         State.REOPENING: frozenset({State.IDLE, State.MAKING_SAFE}),
         State.SHOT: frozenset({State.WRITING, State.RECOVERING, State.MAKING_SAFE}),
-        State.RECOVERING: frozenset({State.WRITING, State.MAKING_SAFE}),
+        State.RECOVERING: frozenset({State.WRITING, State.SHOT, State.MAKING_SAFE}),
         State.WRITING: frozenset({State.IDLE, State.MAKING_SAFE}),
         State.MAKING_SAFE: frozenset({State.SAFE, State.MAKING_SAFE}),
         State.SAFE: frozenset({State.CLOSING}),

@@ -67,6 +67,7 @@ class ImageStep:
 
     needs_image = False
     takes_image = True
+    repeatable = True
 
     def __init__(self, settings: _Exposure) -> None:
         self.exposure_s = settings.exposure
@@ -87,6 +88,7 @@ class WaitStep:
 
     needs_image = False
     takes_image = False
+    repeatable = True
 
     def __init__(self, settings: _WaitTime) -> None:
         self.duration_s = settings.duration or 0.0
@@ -108,6 +110,7 @@ class DeviceStep:
 
     needs_image = False
     takes_image = False
+    repeatable = True
 
     def __init__(self, settings: _Command) -> None:
         self.device = settings.name

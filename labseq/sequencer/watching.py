@@ -58,6 +58,7 @@ class CheckSitesStep:
 
     needs_image = True
     takes_image = False
+    repeatable = True
 
     def __init__(self, settings: _SitesSettings) -> None:
         self.settings = settings

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,7 @@ from labseq.errors import ConfigError
 from labseq.model import TargetPattern
 from labseq.plugins import PluginHost
 from labseq.roles import Step
+from labseq.sequencer.policies import RunPolicy
 from labseq.session.calibrating import with_tones
 from labseq.session.choosing import (
     Bench,
@@ -36,6 +37,7 @@ from labseq.session.choosing import (
     validate,
 )
 from labseq.session.contents import make_analyses, make_steps, make_target
+from labseq.session.policies import make_policy, with_policies
 from labseq.session.scan import Point, Scanned
 from labseq.session.setting_up import Again, set_up_bench
 
@@ -55,6 +57,7 @@ class Assembly:
         resolved: Every setting after defaults and overrides, SI, JSON-ready; of a scan, at its first
             point, as everything else here.
         scanned: The points of the scan; None without one.
+        policy: What follows failures and exceeded budgets.
     """
 
     document: Document
@@ -66,6 +69,7 @@ class Assembly:
     dry_run: DryRun
     resolved: Mapping[str, Any]
     scanned: Scanned | None = None
+    policy: RunPolicy = field(default_factory=RunPolicy)
 
     @property
     def virtual_time(self) -> bool:
@@ -145,6 +149,7 @@ def assemble(
     with found:
         made["planner"] = resolve(bench.host, document, "planner", sequence.planner)
     steps, step_dumps = make_steps(bench, document, sequence, found)
+    policy = make_policy(document, sequence, steps, found)
     analyses = make_analyses(bench, document, sequence, found)
     scanned: Scanned | None = None
     try:
@@ -158,12 +163,21 @@ def assemble(
         **sequence.model_dump(mode="json", exclude={"shot", "target", "planner", "scan"}),
         "target": made["target_dump"],
         "planner": made["planner"].dump(),
-        "shot": step_dumps,
+        "shot": with_policies(document, sequence, step_dumps),
         "analysis": analyses,
         "profile": _profile_dump(bench),
     }
     return Assembly(
-        document, sequence, bench, made["target"], made["planner"], tuple(steps), dry_run, resolved, scanned
+        document,
+        sequence,
+        bench,
+        made["target"],
+        made["planner"],
+        tuple(steps),
+        dry_run,
+        resolved,
+        scanned,
+        policy,
     )
 
 

@@ -18,6 +18,7 @@ from labseq.model import Frame, Occupancy, Plan, ShotRecord, StageTiming, Target
 from labseq.motion import Renderer, RenderPath, check_plan, comb_sample_rate, tone_program
 from labseq.roles import Detector, Planner, Shot, Step, StepContext
 from labseq.sequencer import Lab, Sequencer
+from labseq.sequencer.policies import RunPolicy
 from labseq.session.bench_latency_report import BETWEEN, HAND_OVER, HOST_STAGES, LatencyReport, Stage
 from labseq.session.session import Session
 from labseq.session.signals import stop_on_signals
@@ -89,7 +90,9 @@ def measure_latency(
     with stop_on_signals(session.stop_flag):
         session.warm(lab)
         lab = replace(lab, detector=timed, planner=timed)
-        sequencer = Sequencer(lab, steps, session.stop_flag, watch, watch, seed=request.seed, attempts=1)
+        sequencer = Sequencer(
+            lab, steps, session.stop_flag, watch, watch, seed=request.seed, policy=RunPolicy(attempts=1)
+        )
         try:
             sequencer.open()
             sequencer.run(range(N_WARM + request.n_loadings))

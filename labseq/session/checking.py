@@ -22,6 +22,7 @@ from labseq.sequencer.calling import lay_out
 from labseq.sequencer.lab import Lab
 from labseq.sequencer.leading import FollowStep, find_leader
 from labseq.session.commands import check_commands
+from labseq.session.policy_warnings import timeout_warnings
 from labseq.session.session import Session
 from labseq.units import format_quantity
 
@@ -124,6 +125,7 @@ def check(session: Session) -> CheckReport:
     warnings += _judgement_warnings(session, [number for number, _ in windows])
     warnings += _parallelism_warnings(session)
     warnings += _deadline_warnings(session, lab, timeline)
+    warnings += timeout_warnings(assembly, timeline)
     for point in session.course.each_lab():
         session.build_lab(point)  # whether the constructors accept the settings
     return CheckReport(

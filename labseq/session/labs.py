@@ -72,6 +72,7 @@ def build_lab(point: Point, target: TargetPattern, clock: Clock, seed: int) -> L
         blinding=_blinding(profile),
         lines=made.get("lines"),
         line_specs=profile.line_specs,
+        budgets=profile.budgets.model_dump(),
     )
     refuse_wrong_wiring(bench.document, lab)
     return lab

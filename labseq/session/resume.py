@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final, Self
+from typing import Any, Final, Self
 
 from labseq.config.reading import decode, read_bytes
 from labseq.config.wording import visible
@@ -51,7 +51,7 @@ class Earlier:
 
     Attributes:
         run: As it was when it was opened.
-        done: Shots that are on disk.
+        done: Shots that are on disk, or were skipped.
         changes: What differs from then, and was accepted.
         warnings: What the user should know although it is no error.
     """
@@ -104,12 +104,17 @@ class Earlier:
         LineLog(folder / INDEX_FILE)  # ends a torn last line: if that is whole, its shot counts
         run = open_run(folder)
         gone = [shot.index for shot in run.shots if not shot.file.is_file()]
-        done = frozenset(shot.index for shot in run.shots).difference(gone)
+        done = frozenset(shot.index for shot in run.shots).difference(gone).union(run.skipped)
         if run.status == "complete" and len(done) >= run.n_shots:
             raise _refused(folder, "it is complete: no shot is missing")
         if gone:
             warnings.append(f"files of shots are gone, and these shots are taken again: {_numbers(gone)}")
         return cls(run, done, tuple(changes), warnings, lock)
+
+    @property
+    def rows(self) -> list[Mapping[str, Any]]:
+        """The lines of the index of the shots that are on disk, in order."""
+        return [shot.row for shot in self.run.shots if shot.index in self.done]
 
     @property
     def root(self) -> Path:
@@ -189,7 +194,7 @@ class Earlier:
             resumed += ({**entry, "changes": changes, "provenance": record.provenance},)
         then = str(self.run.record["t_start_utc"])
         record = replace(record, t_start_utc=then, resumed=resumed)
-        return RunWriter.reopen(self.run.path, record, n_written=len(self.done))
+        return RunWriter.reopen(self.run.path, record, n_written=len(self.rows))
 
 
 def _refused(folder: Path, why: str) -> ConfigError:

@@ -17,8 +17,8 @@ from typing import Any, Final
 import numpy as np
 
 from labseq.config import ROLES, Axis, Choice, Collected, Document, Loc, Scan, SequenceSpec
+from labseq.config.motion import MobileTweezersChoice
 from labseq.config.nodes import Node
-from labseq.config.profile import MobileTweezersChoice
 from labseq.errors import ConfigError
 from labseq.roles import Step
 from labseq.session.choosing import HARDWARE_KINDS, Bench, Chosen, DryRun, choose, resolve

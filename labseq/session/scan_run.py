@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
 from labseq.sequencer import Sequencer
 from labseq.sequencer.lab import Lab
 from labseq.session.assembly import Assembly
+from labseq.session.between import Between
 from labseq.session.labs import rebuild_lab
 from labseq.session.scan import Point
 
@@ -52,30 +53,41 @@ class Course:
                 seen.add(key)
                 yield point
 
-    def run(
-        self, sequencer: Sequencer, lab: Lab, changes: Mapping[str, Any], between: Callable[[], None]
-    ) -> None:
+    def run(self, sequencer: Sequencer, lab: Lab, changes: Mapping[str, Any], between: Between) -> None:
         """Take all shots.
 
         Args:
             sequencer: Open, at the point of the first shot.
             lab: What it is open with.
             changes: What differs from the files in every shot: address -> value.
-            between: Called before each shot; what it raises ends the run.
+            between: What is done between two shots; what it raises ends the run.
 
         Raises:
             LabseqError: Whatever ended the run before its last shot.
         """
         now, before = self.points[self.shots[0]], self.first
+        skipped = set[int]()
         for shot in self.shots:
-            between()
+            if shot in skipped:
+                continue
+            between.before()
             point = self.points[shot]
             if point != now:
                 after = self.assembly.at(point)
                 lab, reopened = rebuild_lab(lab, before, after, self._seed)
                 sequencer.change(lab, after.steps, {**changes, **after.parameters}, reopened)
                 now, before = point, after
-            sequencer.run([shot])
+            given_up = sequencer.run([shot])
+            if why := between.after([*given_up.values()]):
+                left = [*given_up, *self._later_at_its_point(shot)]
+                between.skip(left, why)
+                skipped.update(left)
+
+    def _later_at_its_point(self, shot: int) -> list[int]:
+        """Shots still to take at the point of a shot; without a scan each shot stands for itself."""
+        if self.assembly.scanned is None:
+            return []
+        return [later for later in self.shots if later > shot and self.points[later] == self.points[shot]]
 
     def record(self) -> dict[str, Any]:
         """The scan for the run's record, JSON-ready; empty without one.

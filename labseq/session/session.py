@@ -7,7 +7,6 @@ import itertools
 import secrets
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import ParamSpec, Self
@@ -28,19 +27,20 @@ from labseq.sequencer import Guard, Sequencer, StopFlag
 from labseq.sequencer.calling import lay_out
 from labseq.sequencer.lab import Lab, describe
 from labseq.session.assembly import Assembly, assemble
+from labseq.session.between import Between
 from labseq.session.choosing import DryRun
 from labseq.session.commands import check_commands
 from labseq.session.holding import devices_held
 from labseq.session.labs import build_lab, clock_for
 from labseq.session.observers import Observers
 from labseq.session.options import Options, path_of
+from labseq.session.policies import Checks
 from labseq.session.resume import Earlier, reopened
 from labseq.session.run_record import copies, ending, run_record
 from labseq.session.safe import secure_after_crash
 from labseq.session.scan import Point
 from labseq.session.scan_run import Course
 from labseq.session.signals import stop_on_signals
-from labseq.session.stopping import look_for_stop
 from labseq.session.warming import warm
 
 P = ParamSpec("P")
@@ -246,7 +246,6 @@ class Session:
         return open_run(writer.run_dir)
 
     def _take_shots(self, lab: Lab, roots: Sequence[Path], writer: RunWriter, record: RunRecord) -> None:
-        spec = self.assembly.sequence
         about = {"record": record, "run_dir": str(writer.run_dir), "n_before": writer.n_written}
         first, changes = self.course.first, self.options.changes()
         sequencer = self._sequencer = Sequencer(
@@ -256,7 +255,7 @@ class Session:
             writer,
             self._observers,
             seed=record.seed,
-            attempts=spec.attempts,
+            policy=self.assembly.policy,
             parameters={**changes, **first.parameters},
         )
         mark_active(roots, self._profile_key, writer.run_dir)
@@ -265,7 +264,9 @@ class Session:
         writer.set_devices(describe(lab, sequencer.guard))
         self._observers.analyse(writer.run_dir, self.assembly.resolved["analysis"])
         self._observers.event("run_started", about)
-        self.course.run(sequencer, lab, changes, partial(look_for_stop, writer.run_dir))
+        before = () if self.earlier is None else self.earlier.rows
+        checks = Checks(self.assembly.sequence.policy.checks, before, self._warn)
+        self.course.run(sequencer, lab, changes, Between(writer, checks, self._observers.event))
 
     def _begin(self, root: Path) -> tuple[RunRecord, RunWriter]:
         """The run's folder, a new one or that of the run that goes on."""

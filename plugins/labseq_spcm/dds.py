@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import Final
 
 import numpy as np
@@ -31,9 +32,11 @@ class Dds:
 
     Attributes:
         patience_s: How long the card can be left alone while it plays.
+        render_s: What compiling took in the last ``prepare``, on this computer's clock.
     """
 
     patience_s = POLL_S
+    render_s = 0.0
 
     def __init__(self, card: AwgCard, cores: Cores) -> None:
         self._card = card
@@ -66,7 +69,9 @@ class Dds:
             LimitError: The DDS cannot play it.
             DeviceTimeoutError: The card does not take the commands.
         """
+        start_s = time.perf_counter()
         self._commands = compile_commands(self._card.name, program, self._cores)
+        self.render_s = time.perf_counter() - start_s
         self._n_sent = 0
         self._reset()
         deadline_s = self._card.clock.now() + TRANSFER_TIMEOUT_S

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from typing import Final
 
 from labseq import DeviceError, DeviceTimeoutError, ToneProgram, TransientError
@@ -32,7 +33,10 @@ class Fifo:
 
     Attributes:
         patience_s: How long the card can now be left alone while it plays; 0: not at all.
+        render_s: What rendering has taken since the last ``prepare`` began, on this computer's clock.
     """
+
+    render_s = 0.0
 
     def __init__(self, card: AwgCard, settings: SpcmSettings, sample_rate_hz: float) -> None:
         self._card = card
@@ -60,7 +64,9 @@ class Fifo:
             DeviceTimeoutError: The card does not fetch the data.
         """
         card, spcm = self._card, self._card.spcm
+        start_s = time.perf_counter()
         self._renderer = InterleavedRenderer(program, self._rate_hz, self._row_channel)
+        self.render_s = time.perf_counter() - start_s
         n_samples = self._renderer.n_samples
         card.set(spcm.SPC_SEGMENTSIZE, n_samples, "number of samples")
         card.define_transfer(self._ring, CHUNK * FRAME_BYTES)
@@ -123,7 +129,9 @@ class Fifo:
             if card.read(spcm.SPC_DATA_AVAIL_USER_LEN) < CHUNK * FRAME_BYTES:
                 return n_fed
             first = self._n_handed % len(self._ring)
+            start_s = time.perf_counter()
             renderer.write(self._n_handed, self._ring[first : first + CHUNK])
+            self.render_s += time.perf_counter() - start_s
             card.write(spcm.SPC_DATA_AVAIL_CARD_LEN, CHUNK * FRAME_BYTES, "handing samples over")
             self._n_handed += CHUNK
         return RING_CHUNKS

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import math
+import time
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -38,9 +39,11 @@ class PlayMode(Protocol):
 
     Attributes:
         patience_s: How long the card can now be left alone while it plays; 0: not at all.
+        render_s: What rendering took in the last ``prepare``, on this computer's clock.
     """
 
     patience_s: float
+    render_s: float
 
     def prepare(self, program: ToneProgram) -> float:
         """Bring a program onto the card; returns the playing time in seconds."""
@@ -93,6 +96,7 @@ class SpcmMobileTweezers:
         self._card: AwgCard | None = None
         self._mode: PlayMode | None = None
         self._facts: dict[str, Any] = {}
+        self._timings: dict[str, float] = {}
         self._world = context.simulation
         self._identifier = settings.card
         self._duration_s: float | None = None
@@ -180,10 +184,17 @@ class SpcmMobileTweezers:
         card.stop()
         if self.simulated_card is not None and not isinstance(self._world, Listening):
             self.simulated_card.forget(self._clock.now())
+        start_s = time.perf_counter()
         playing_s = mode.prepare(program)
+        took_s = time.perf_counter() - start_s
+        self._timings = {"render": mode.render_s, "upload": took_s - mode.render_s}
         duration_s = max(playing_s, program.total_duration_s) + float(self._facts["trigger_delay_s"])
         self._duration_s = duration_s
         return duration_s
+
+    def timings(self) -> Mapping[str, float]:
+        """What rendering, and all else of the last ``prepare``, took on this computer's clock, in seconds."""
+        return self._timings
 
     def play(self) -> None:
         """Start the card, and give the trigger or arm it; returns at once.

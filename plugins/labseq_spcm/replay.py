@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 
 from labseq import LimitError, ToneProgram
 from labseq_spcm.card import AwgCard, Buffer
@@ -20,9 +21,11 @@ class Replay:
 
     Attributes:
         patience_s: How long the card can be left alone while it plays.
+        render_s: What rendering took in the last ``prepare``, on this computer's clock.
     """
 
     patience_s = math.inf
+    render_s = 0.0
 
     def __init__(self, card: AwgCard, settings: SpcmSettings, sample_rate_hz: float) -> None:
         self._card = card
@@ -43,6 +46,7 @@ class Replay:
         Raises:
             LimitError: It does not fit into the card's memory.
         """
+        start_s = time.perf_counter()
         rendered = InterleavedRenderer(program, self._rate_hz, self._row_channel)
         n_samples = rendered.n_samples
         if n_samples > self._most:
@@ -52,6 +56,7 @@ class Replay:
             raise LimitError(what, asked, f"{most}: the card's memory", hint)
         frames = self._buffer.reserve(n_samples)
         rendered.write(0, frames)
+        self.render_s = time.perf_counter() - start_s
         self._card.set(self._card.spcm.SPC_MEMSIZE, n_samples, "memory size")
         self._card.upload(frames)
         return n_samples / self._rate_hz

@@ -86,6 +86,7 @@ def test_json_is_alone_on_stdout(perform: Any) -> None:
     assert answer == {
         "run_dir": str(session.run_dir),
         "shots": 2,
+        "skipped": 0,
         "defect_free": 0.5,
         "filling_fraction": pytest.approx(449 / 450),
         "status": "complete",

@@ -55,6 +55,7 @@ def test_json(fake: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert answer == {
         "run_dir": str(folder),
         "shots": 1,
+        "skipped": 0,
         "defect_free": 1.0,
         "filling_fraction": 1.0,
         "status": "stopped",

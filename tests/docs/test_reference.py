@@ -31,7 +31,9 @@ from labseq.config import (
 )
 from labseq.config.composer import compose
 from labseq.config.fields import PatternChoice
-from labseq.config.profile import GridSettings, MobileTweezersChoice
+from labseq.config.motion import MobileTweezersChoice
+from labseq.config.policies import BudgetSettings, PolicySettings, StepPolicySettings
+from labseq.config.profile import GridSettings
 from labseq.registry import Entry, Registry
 
 Pages = Mapping[str, Element]
@@ -48,6 +50,7 @@ SEQUENCE = {
     "planner": "{use: psca}",
     "record_frames": "all",
     "attempts": "1",
+    "policy": "{}",
     "plugin_folders": "[]",
     "shot": "[{image: {}}]",
 }
@@ -64,6 +67,7 @@ PROFILE = {
     "calibrations": "off",
     "plugin_folders": "[]",
     "timeouts": "{}",
+    "budgets": "{}",
 }
 
 
@@ -82,6 +86,9 @@ SUBJECTS: dict[str, type[BaseModel] | None] = {
     "profile-mobile_tweezers": MobileTweezersChoice,
     "profile-calibrations": CalibrationSettings,
     "profile-timeouts": TimeoutSettings,
+    "profile-budgets": BudgetSettings,
+    "sequence-policy": PolicySettings,
+    "step_policy": StepPolicySettings,
     **{f"{entry.kind}-{entry.name}": entry.settings_model for entry in own_entries()},
 }
 """Class of a table in the reference -> the model whose keys it lists, at any depth."""
@@ -99,7 +106,8 @@ def settings_of(model: type[BaseModel] | None, prefix: str = "") -> Iterator[tup
         for inner in by_name:
             if isinstance(inner, type) and issubclass(inner, BaseModel):
                 yield from settings_of(inner, f"{key}.NAME.")
-        for inner in (field.annotation, *optional):
+        listed = get_args(field.annotation) if get_origin(field.annotation) is tuple else ()
+        for inner in (field.annotation, *optional, *listed):
             if isinstance(inner, type) and issubclass(inner, BaseModel) and not issubclass(inner, Choice):
                 yield from settings_of(inner, f"{key}.")
 

@@ -45,6 +45,7 @@ def test_a_run_tells_what_it_was(run_dir: Path) -> None:
     assert run.summary() == {
         "run_dir": str(run_dir),
         "shots": 3,
+        "skipped": 0,
         "defect_free": 0.5,
         "filling_fraction": 0.75,
         "status": "complete",

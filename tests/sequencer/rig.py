@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from labseq.sequencer import Sequencer
+from labseq.sequencer.policies import RunPolicy
 from labseq.sequencer.steps import ImageStep, LoadStep
 from labseq.testing.fakes import ListSink, RecordingObserver, fake_lab
 
@@ -24,18 +25,20 @@ FULL, EMPTY = np.ones((2, 2), bool), np.zeros((2, 2), bool)
 class Rig:
     """A sequencer on a fake lab."""
 
-    def __init__(self, steps=(LOAD, IMAGE), attempts=3, sink=None, **lab):
+    def __init__(self, steps=(LOAD, IMAGE), attempts=3, sink=None, policy=None, **lab):
         self.lab = fake_lab(**lab)
         self.sink = sink or ListSink()
         self.observer = RecordingObserver()
         self.sequencer = Sequencer(
-            self.lab, steps, self.lab.stop, self.sink, self.observer, seed=1, attempts=attempts
+            *(self.lab, steps, self.lab.stop, self.sink, self.observer),
+            seed=1,
+            policy=policy or RunPolicy(attempts=attempts),
         )
 
     def run(self, n_shots=1):
         try:
             self.sequencer.open()
-            self.sequencer.run(range(n_shots))
+            self.given_up = self.sequencer.run(range(n_shots))
         finally:
             self.unsafe = self.sequencer.shut_down()
 

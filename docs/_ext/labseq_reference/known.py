@@ -11,7 +11,7 @@ from typing import Final
 from pydantic import BaseModel
 
 from labseq import builtins
-from labseq.config import ProfileSpec, SequenceSpec
+from labseq.config import ProfileSpec, SequenceSpec, StepPolicySettings
 from labseq.config.schema import keys_of, models_at
 from labseq.errors import UnknownPluginError
 from labseq.plugins import ENTRY_POINT_GROUP, PluginHost
@@ -19,6 +19,8 @@ from labseq.registry import KINDS, Entry
 
 FILES: Final = {"sequence": SequenceSpec, "profile": ProfileSpec}
 """Kind of file -> its model."""
+PARTS: Final = {"step_policy": StepPolicySettings}
+"""What stands in files beside what plugins read -> its model."""
 
 _PROJECT: Final = Path(__file__).resolve().parents[3] / "pyproject.toml"
 
@@ -69,6 +71,8 @@ def settings_of(kind: str, *names: str) -> type[BaseModel] | None:
     Raises:
         UnknownNameError: There is no such thing.
     """
+    if kind in PARTS:
+        return PARTS[kind]
     if kind not in FILES:
         return entry_of(kind, *names).settings_model
     models: list[type[BaseModel]] = [FILES[kind]]

@@ -14,9 +14,13 @@ from numpy.typing import NDArray
 
 from labseq.errors import RecordingError
 from labseq.model import StageTiming
+from labseq.model.records import OVERSHOOT_S
 from labseq.recording import Run, Shot
 
-ORDER: Final = ("load", "expose", "detect", "plan", "check", "prepare", "play", "move", "write")
+ORDER: Final = (
+    *("load", "expose", "read_out", "detect", "plan", "check"),
+    *("tones", "render", "upload", "prepare", "play", "move", "write"),
+)
 """The stages of a shot as they come; others stand between the last two."""
 WRITE: Final = "write"
 """Writing a shot to the disk: from its end to the line of the event log that says that it is written."""
@@ -155,7 +159,16 @@ def _writing(run: Run, shot_s: float) -> list[StageStatistics]:
     host_s = quantiles(times_s)
     session_s = (math.nan, math.nan) if run.simulated else host_s  # a model knows of no disk
     share = float(np.mean(times_s)) / shot_s if shot_s and not run.simulated else math.nan
-    return [StageStatistics(WRITE, len(times_s), 1.0, math.nan, session_s, host_s, share, 0)]
+    budget_s = _writing_budget_s(run)
+    n_over = 0 if run.simulated else sum(one > budget_s + OVERSHOOT_S for one in times_s)
+    return [StageStatistics(WRITE, len(times_s), 1.0, budget_s, session_s, host_s, share, n_over)]
+
+
+def _writing_budget_s(run: Run) -> float:
+    try:
+        return float(run.record["resolved"]["profile"]["budgets"][WRITE])
+    except (LookupError, TypeError, ValueError):  # of a run before there were any
+        return math.nan
 
 
 def writing_s(run: Run) -> list[float]:

@@ -21,8 +21,9 @@ Write = Callable[..., Run]
 
 def test_stages_come_in_the_order_of_a_shot_and_whole_steps_last(compact: Run) -> None:
     names = [stage.stage for stage in timing_of(compact, compact.shots).stages]
-    assert names[:8] == ["expose", "detect", "plan", "check", "prepare", "play", "move", "write"]
-    assert names[8:] == ["step 0 load", "step 1 image", "step 2 rearrange", "step 3 image"]
+    seen = ["expose", "read_out", "detect", "plan", "check"]
+    assert names[:10] == [*seen, "tones", "prepare", "play", "move", "write"]
+    assert names[10:] == ["step 0 load", "step 1 image", "step 2 rearrange", "step 3 image"]
 
 
 def test_each_stage_is_told_against_its_budget(write: Write, shot: Shot) -> None:

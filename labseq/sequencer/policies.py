@@ -1,0 +1,102 @@
+"""What follows when a step fails, takes too long or goes over a budget."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, Literal
+
+from labseq.errors import (
+    ConfigError,
+    DeviceError,
+    DeviceHungError,
+    InterlockError,
+    LabseqError,
+    OverBudgetError,
+    PluginLoadError,
+    RecordingError,
+    StopRequested,
+    TransientError,
+    UnknownPluginError,
+)
+
+Then = Literal["repeat_shot", "skip_point", "stop"]
+"""What follows a failure."""
+OverBudget = Literal["record", "warn", "repeat_shot", "skip_point", "stop"]
+"""What follows a stage that took longer than its budget."""
+UsedUp = Literal["skip_point", "stop"]
+"""What follows when a shot has been repeated as often as it may be."""
+
+_ENDING: Final = (
+    StopRequested,
+    InterlockError,
+    DeviceHungError,
+    ConfigError,
+    RecordingError,
+    PluginLoadError,
+    UnknownPluginError,
+)
+"""Failures after which no policy goes on: the operator asks for the end, somebody should look, or nothing
+would be different the next time."""
+
+
+@dataclass(frozen=True, slots=True)
+class StepPolicy:
+    """What holds for a step.
+
+    Attributes:
+        timeout_s: How long it may take, on the session's clock; a try that takes longer has failed.
+        retries: How often it is tried again before it counts as failed.
+        on_failure: What follows then; None: a transient failure repeats the shot, others stop the run.
+        over_budget: What follows a stage of it that goes over its budget.
+    """
+
+    timeout_s: float = math.inf
+    retries: int = 0
+    on_failure: Then | None = None
+    over_budget: OverBudget = "record"
+
+
+@dataclass(frozen=True, slots=True)
+class RunPolicy:
+    """What holds for a run.
+
+    Attributes:
+        attempts: How often a shot is tried.
+        used_up: What follows when it has failed that often.
+        otherwise: What holds between the steps, and for the steps that are not in ``steps``.
+        steps: What holds for each step, in their order.
+    """
+
+    attempts: int = 3
+    used_up: UsedUp = "stop"
+    otherwise: StepPolicy = StepPolicy()
+    steps: Sequence[StepPolicy] = ()
+
+    def of_step(self, number: int | None) -> StepPolicy:
+        """What holds for a step; None: outside of all steps."""
+        inside = number is not None and number < len(self.steps)
+        return self.steps[number] if inside and number is not None else self.otherwise
+
+    def after(self, error: LabseqError, step: int | None, attempt: int) -> Then:
+        """What follows a failure.
+
+        Args:
+            error: What went wrong.
+            step: Index of the step in which it did; None outside of all steps.
+            attempt: Which attempt at the shot it was, from 0.
+        """
+        if isinstance(error, _ENDING):
+            return "stop"
+        then = error.then if isinstance(error, OverBudgetError) else self.of_step(step).on_failure
+        if then is None:
+            then = "repeat_shot" if isinstance(error, TransientError) else "stop"
+        return self.used_up if then == "repeat_shot" and attempt + 1 >= self.attempts else then
+
+
+def may_be_retried(error: LabseqError) -> bool:
+    """Whether a step that failed so may go better the next time, in the same shot."""
+    if isinstance(error, (*_ENDING, OverBudgetError)):
+        return False
+    return isinstance(error, DeviceError | TransientError)

@@ -1,0 +1,328 @@
+"""What follows when a step fails, takes too long or goes over a budget."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from typing import Any
+
+import pytest
+
+from labseq.errors import (
+    DeviceError,
+    DeviceHungError,
+    DeviceTimeoutError,
+    InterlockError,
+    LimitError,
+    OverBudgetError,
+    PlanError,
+    StepTimeoutError,
+    StopRequested,
+    TransientError,
+)
+from labseq.model import TimelineEntry
+from labseq.roles import Shot, StepContext
+from labseq.sequencer.lab import Timeouts
+from labseq.sequencer.policies import RunPolicy, StepPolicy, may_be_retried
+from labseq.sequencer.rearrange import RearrangeStep
+from labseq.testing.fakes import RecordingCamera, RecordingDevice
+from labseq.testing.fakes.devices import RecordingMobileTweezers
+
+from .rig import IMAGE, LOAD, SAFE_ORDER, Rig, given
+
+LOST = DeviceTimeoutError("camera", "the frame did not come", 1.0)
+SHORT = Timeouts(call_s=0.05)
+AGAIN = StepPolicy(on_failure="repeat_shot")
+
+
+def policy(step: StepPolicy, *, attempts: int = 3, used_up: Any = "stop") -> RunPolicy:
+    """For LOAD and IMAGE: this one for the image."""
+    return RunPolicy(attempts, used_up, steps=(StepPolicy(), step))
+
+
+class Slow:
+    """Takes its time, and says that it will not."""
+
+    needs_image = takes_image = False
+    repeatable = True
+
+    def __init__(self, *duration_s: float) -> None:
+        self.durations_s = list(duration_s)
+
+    def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:
+        return [TimelineEntry("slow", 0.1, 0.1)]
+
+    def run(self, shot: Shot) -> None:
+        shot.clock.sleep(self.durations_s.pop(0))
+        shot.call("camera", 1.0, shot.static_tweezers.describe)
+
+
+@pytest.mark.parametrize(
+    "error", [LOST, DeviceError("camera", "hot"), LimitError("x", 2, 1), PlanError("no")]
+)
+def test_a_shot_is_repeated_where_the_step_says_so(error: Exception) -> None:
+    made = Rig(policy=policy(AGAIN), fail_on={"camera.arm": [error]})
+    made.run()
+    assert [(shot.attempt, shot.status) for shot in made.sink.shots] == [(0, "failed"), (1, "complete")]
+    assert str(error) in made.sink.shots[0].error
+    assert made.given_up == {}
+
+
+def test_without_a_policy_only_transient_failures_are_repeated() -> None:
+    made = Rig(policy=RunPolicy(), fail_on={"camera.read": [TransientError("once"), LOST]})
+    with pytest.raises(DeviceTimeoutError):
+        made.run()
+    assert [shot.status for shot in made.sink.shots] == ["failed", "failed"]
+    assert made.made_safe()[2:] == SAFE_ORDER
+
+
+def test_a_transient_failure_stops_where_the_step_says_so() -> None:
+    made = Rig(policy=policy(StepPolicy(on_failure="stop")), fail_on={"camera.read": TransientError("once")})
+    with pytest.raises(TransientError):
+        made.run()
+    assert len(made.sink.shots) == 1
+
+
+def test_a_step_speaks_for_itself_alone() -> None:
+    made = Rig(policy=policy(AGAIN), fail_on={"static_tweezers.start": [None, DeviceError("x", "dark")]})
+    with pytest.raises(DeviceError, match="dark"):
+        made.run()
+
+
+def test_the_run_speaks_for_what_is_outside_of_steps() -> None:
+    lost = DeviceError("shutter", "no answer")
+    again = RunPolicy(otherwise=StepPolicy(on_failure="repeat_shot"))
+
+    class Polled(RecordingDevice):
+        polls = 0
+
+        def poll(self) -> dict[str, float]:
+            self.polls += 1
+            if self.polls == 1:
+                raise lost
+            return {"power_w": 1.0}
+
+    made = Rig(policy=again)
+    made.lab.devices["shutter"].__class__ = Polled  # fakes are made by their role, with its methods
+    made.run()
+    assert [shot.status for shot in made.sink.shots] == ["failed", "complete"]
+
+
+@pytest.mark.parametrize(("used_up", "n_shots"), [("stop", 2), ("skip_point", 4)])
+def test_attempts_are_used_up(used_up: str, n_shots: int) -> None:
+    made = Rig(
+        policy=policy(AGAIN, attempts=2, used_up=used_up),
+        fail_on={"camera.read": [LOST, LOST, None, None]},
+    )
+    if used_up == "stop":
+        with pytest.raises(DeviceTimeoutError):
+            made.run(3)
+    else:
+        made.run(3)
+        assert made.given_up == {0: f"DeviceTimeoutError: {LOST}"}
+    told = [(shot.shot_index, shot.attempt, shot.status) for shot in made.sink.shots]
+    assert told == [(0, 0, "failed"), (0, 1, "failed"), (1, 0, "complete"), (2, 0, "complete")][:n_shots]
+
+
+def test_a_shot_is_given_up_at_once() -> None:
+    made = Rig(policy=policy(StepPolicy(on_failure="skip_point")), fail_on={"camera.read": [LOST]})
+    made.run(2)
+    assert [*made.given_up] == [0]
+    assert [shot.status for shot in made.sink.shots] == ["failed", "complete"]
+    assert made.observer.names.count("shot_finished") == 2
+    assert "shot_repeated" not in made.observer.names
+
+
+def test_before_it_goes_on_what_may_be_busy_is_silenced() -> None:
+    made = Rig(policy=policy(AGAIN), fail_on={"camera.read": [LOST]})
+    made.run()
+    assert made.made_safe()[:2] == ["mobile_tweezers", "camera"]
+    assert {"state": "recovering"} in made.observer.of("state")
+
+
+def test_it_stops_if_that_fails() -> None:
+    made = Rig(
+        policy=policy(AGAIN),
+        fail_on={"camera.read": [LOST], "mobile_tweezers.safe_state": [DeviceError("mobile_tweezers", "on")]},
+    )
+    with pytest.raises(DeviceError, match="on"):
+        made.run()
+    assert made.made_safe()[1:] == SAFE_ORDER
+
+
+@pytest.mark.parametrize("then", ["repeat_shot", "skip_point"])
+def test_no_policy_goes_on_after_a_call_that_hangs(then: Any) -> None:
+    step = StepPolicy(on_failure=then, retries=2)
+    made = Rig(policy=policy(step), hang_on={"camera.arm"}, timeouts=SHORT)
+    with pytest.raises(DeviceHungError):
+        made.run()
+    made.lab.hangs["camera.arm"].release.set()
+    assert len(made.sink.shots) == 1
+
+
+@pytest.mark.parametrize("then", ["repeat_shot", "skip_point"])
+def test_no_policy_goes_on_past_an_interlock(then: Any) -> None:
+    class Watching(RecordingDevice):
+        def check_interlocks(self) -> None:
+            raise DeviceError("shutter", "power is 2 W, above its limit of 1 W")
+
+    made = Rig(policy=RunPolicy(otherwise=StepPolicy(on_failure=then)))
+    made.lab.devices["shutter"].__class__ = Watching
+    with pytest.raises(InterlockError, match=r"^shutter: power is 2 W, above its limit of 1 W$") as caught:
+        made.run()
+    assert caught.value.device == "shutter"
+    assert made.made_safe() == SAFE_ORDER
+
+
+def test_a_step_is_tried_again_in_the_same_shot() -> None:
+    made = Rig(policy=policy(StepPolicy(retries=2)), fail_on={"camera.read": [LOST, LOST]})
+    made.run()
+    (shot,) = made.sink.shots
+    assert (shot.status, shot.attempt, len(shot.images)) == ("complete", 0, 1)
+    assert made.lab.calls.names("static_tweezers").count("static_tweezers.load") == 1
+    assert [event["step"] for event in made.observer.of("step_repeated")] == [1, 1]
+    stages = [timing.stage for timing in shot.timing]
+    assert stages.count("expose") == 3
+
+
+def test_retries_are_used_up() -> None:
+    made = Rig(policy=policy(StepPolicy(retries=1)), fail_on={"camera.read": LOST})
+    with pytest.raises(DeviceTimeoutError):
+        made.run()
+    assert made.lab.calls.names("camera").count("camera.read") == 2
+
+
+def test_what_would_fail_again_is_not_tried_again() -> None:
+    assert may_be_retried(LOST)
+    assert may_be_retried(TransientError("once"))
+    for error in (LimitError("x", 2, 1), PlanError("no"), InterlockError("laser", "hot")):
+        assert not may_be_retried(error)
+
+
+def test_a_step_that_takes_too_long_has_failed() -> None:
+    step = Slow(0.3, 0.1)
+    made = Rig(steps=(("slow", step),), policy=RunPolicy(steps=(StepPolicy(timeout_s=0.2),)))
+    made.run()
+    assert [shot.status for shot in made.sink.shots] == ["failed", "complete"]
+    assert made.sink.shots[0].error == (
+        "StepTimeoutError: step 0 (slow) is not done after its timeout of 200 ms"
+    )
+
+
+def test_each_try_has_the_whole_timeout() -> None:
+    limited = StepPolicy(timeout_s=0.2, retries=1)
+    made = Rig(steps=(("slow", Slow(0.3, 0.15)),), policy=RunPolicy(steps=(limited,)))
+    made.run()
+    assert [shot.status for shot in made.sink.shots] == ["complete"]
+
+
+def test_a_step_that_never_ends_is_given_up_and_calls_nothing_any_more() -> None:
+    release, refused = threading.Event(), threading.Event()
+
+    class Endless(Slow):
+        def run(self, shot: Shot) -> None:
+            release.wait(30.0)
+            try:
+                shot.call("camera", 1.0, shot.static_tweezers.start)
+            except StopRequested:
+                refused.set()
+
+    limited = RunPolicy(steps=(StepPolicy(timeout_s=0.01, on_failure="repeat_shot"),))
+    made = Rig(steps=(("slow", Endless()),), policy=limited, timeouts=SHORT)
+    with pytest.raises(DeviceHungError, match="step"):
+        made.run()
+    n_calls = len(made.lab.calls)
+    release.set()
+    assert refused.wait(30.0)
+    assert len(made.lab.calls) == n_calls
+
+
+@pytest.mark.parametrize(
+    ("then", "statuses"),
+    [
+        ("record", ["complete"]),
+        ("warn", ["complete"]),
+        ("repeat_shot", ["failed", "complete"]),
+        ("skip_point", ["failed"]),
+    ],
+)
+def test_a_stage_over_its_budget_does_what_its_policy_says(then: Any, statuses: list[str]) -> None:
+    made = Rig(steps=(("slow", Slow(0.3, 0.1)),), policy=RunPolicy(steps=(StepPolicy(over_budget=then),)))
+    made.run()
+    assert [shot.status for shot in made.sink.shots] == statuses
+    warnings = [event["text"] for event in made.observer.of("warning")]
+    assert warnings == (["shot 1: 'step 0 slow' took 300 ms; its budget is 100 ms"] if then == "warn" else [])
+    (first, *_) = [timing for timing in made.sink.shots[0].timing if timing.stage == "step 0 slow"]
+    assert first.over_budget
+
+
+def test_a_stage_over_its_budget_stops_the_run() -> None:
+    made = Rig(steps=(("slow", Slow(0.3)),), policy=RunPolicy(steps=(StepPolicy(over_budget="stop"),)))
+    with pytest.raises(OverBudgetError, match="'step 0 slow' took 300 ms; its budget is 100 ms"):
+        made.run()
+    assert made.made_safe() == SAFE_ORDER
+
+
+def test_the_budget_of_a_stage_is_the_profiles() -> None:
+    made = Rig(policy=policy(StepPolicy(over_budget="warn")), budgets={"detect": 1e-3})
+    sleep = made.lab.clock.sleep
+    detect = made.lab.detector.detect
+
+    def slowly(frame: Any) -> Any:
+        sleep(0.01)
+        return detect(frame)
+
+    vars(made.lab.detector)["detect"] = slowly
+    made.run()
+    assert [event["text"] for event in made.observer.of("warning")] == [
+        "shot 1: 'detect' took 10 ms; its budget is 1 ms"
+    ]
+    budgets = {timing.stage: timing.budget_s for timing in made.record().timing}
+    assert budgets["detect"] == 1e-3
+
+
+def test_the_read_out_is_what_comes_after_the_exposure() -> None:
+    made = Rig((LOAD, IMAGE))
+    read = made.lab.camera.read
+
+    def late(timeout_s: float) -> Any:
+        frame = read(timeout_s)
+        made.lab.clock.sleep(0.007)
+        return frame
+
+    vars(made.lab.camera)["read"] = late
+    made.run()
+    stages = {timing.stage: timing for timing in made.record().timing}
+    assert isinstance(made.lab.camera, RecordingCamera)
+    assert stages["read_out"].duration_s == pytest.approx(0.007)
+    assert stages["expose"].duration_s == pytest.approx(0.052)
+
+
+def test_mobile_tweezers_may_tell_what_their_time_goes_into() -> None:
+    class Telling(RecordingMobileTweezers):
+        def timings(self) -> dict[str, float]:
+            return {"render": 1e-3, "upload": 2e-3}
+
+    ways = {"stop_when": "never", "window_mode": "early", "window_of": lambda _: 1.0}
+    step = RearrangeStep(given(cycles=1, exposure=0.02, **ways))
+    made = Rig((LOAD, IMAGE, ("rearrange", step)), occupancies=[[[1, 0]], [[0, 1]]], fill=[[0, 1]])
+    made.lab.mobile_tweezers.__class__ = Telling
+    made.run()
+    stages = {timing.stage: timing for timing in made.record().timing}
+    assert (stages["render"].host_s, stages["upload"].host_s) == (1e-3, 2e-3)
+    assert "tones" in stages
+
+
+def test_a_disk_that_is_slow_is_told_and_may_end_the_run() -> None:
+    made = Rig(policy=RunPolicy(otherwise=StepPolicy(over_budget="repeat_shot")), budgets={"write": -1.0})
+    made.run()  # a shot that is on the disk is not repeated for that
+    assert [shot.status for shot in made.sink.shots] == ["complete"]
+    made = Rig(policy=RunPolicy(otherwise=StepPolicy(over_budget="stop")), budgets={"write": -1.0})
+    with pytest.raises(OverBudgetError, match="'write'"):
+        made.run(2)
+    assert [shot.status for shot in made.sink.shots] == ["complete"]
+    assert made.made_safe() == SAFE_ORDER
+
+
+def test_a_timeout_carries_its_value() -> None:
+    assert StepTimeoutError("late", 0.2).timeout_s == 0.2

@@ -1,0 +1,245 @@
+"""Runs whose shots fail, and go on as their policies say."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import labseq
+from labseq.config import CheckSettings
+from labseq.errors import CheckFailedError, ConfigError, DeviceError
+from labseq.session.checking import check
+from labseq.session.policies import Checks
+from labseq.testing.fakes import RecordingObserver
+
+from .small_runs import Interrupting, no_git, resumed, table, write
+
+__all__ = ["no_git"]
+
+PLUGIN = '''
+"""A step that fails at some shots."""
+
+from labseq import DeviceError, Duration, Settings, hookimpl
+
+LABSEQ_API = 1
+
+
+class Failing(Settings):
+    """Where."""
+
+    at: list[int] = []
+    gain: int = 1
+
+
+class FailingStep:
+    """Fails."""
+
+    needs_image = takes_image = False
+    repeatable = True
+
+    def __init__(self, settings):
+        self.at = settings.at
+
+    def plan_timeline(self, context):
+        return []
+
+    def run(self, shot):
+        shot.note("laser.power_w", 0.1 * shot.index)
+        if shot.index in self.at:
+            raise DeviceError("laser", "went out of lock")
+
+
+@hookimpl
+def labseq_register(registry):
+    registry.step("failing", FailingStep, Failing)
+'''
+
+
+def sequence(home: Path, scan: str = "no scan", step: str = "{}", **keys: Any) -> Path:
+    """A small sequence with a step that may fail; keys are added at the top."""
+    path = write(home, scan)
+    (home / "mine").mkdir(exist_ok=True)
+    (home / "mine" / "failing.py").write_text(PLUGIN, encoding="utf-8")
+    text = path.read_text(encoding="utf-8").replace("\nshot:\n", f"\nshot:\n  - failing: {step}\n")
+    text += "plugin_folders: [mine]\n" + "".join(f"{k}: {json.dumps(v)}\n" for k, v in keys.items())
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def run(path: Path, observer: Any = None) -> labseq.Run:
+    output = path.parent / "data"
+    with labseq.Session.open(path, seed=5, output=output, observer=observer) as session:
+        return session.run()
+
+
+def test_a_shot_that_fails_again_and_again_is_skipped_and_the_run_complete(tmp_path: Path) -> None:
+    policy = {"on_failure": "repeat_shot", "used_up": "skip_point"}
+    seen = RecordingObserver()
+    done = run(sequence(tmp_path, step="{at: [2]}", attempts=2, policy=policy), seen)
+    assert done.status == "complete"
+    assert [shot.index for shot in done.shots] == [0, 1, 3, 4, 5]
+    assert [(shot.index, shot.attempt) for shot in done.attempts] == [(2, 0), (2, 1)]
+    assert done.skipped == {2: "DeviceError: laser: went out of lock"}
+    assert [event["text"] for event in seen.of("warning")] == [
+        "shot 3 is skipped: DeviceError: laser: went out of lock"
+    ]
+    assert done.summary()["skipped"] == 1
+    with pytest.raises(ConfigError, match="it is complete"):
+        labseq.Session.resume(done.path)
+
+
+def test_the_rest_of_a_point_is_skipped_with_it(tmp_path: Path) -> None:
+    step = "{at: [1]}\n    policy: {on_failure: skip_point}"
+    path = sequence(tmp_path, "planner", step)
+    done = run(path)
+    points = done.record["scan"]["point_of_shot"]
+    left_out = [shot for shot in range(6) if shot == 1 or (shot > 1 and points[shot] == points[1])]
+    assert sorted(done.skipped) == left_out
+    assert [shot.index for shot in done.shots] == [shot for shot in range(6) if shot not in left_out]
+
+
+@pytest.mark.parametrize("event", ["shot_started", "shots_skipped"])
+def test_a_resumed_run_skips_what_was_skipped(tmp_path: Path, event: str) -> None:
+    path = sequence(tmp_path, "planner", "{at: [1]}", policy={"on_failure": "skip_point"})
+    whole = run(path)
+    observer = Interrupting(event, 3 if event == "shot_started" else 1)
+    with labseq.Session.open(path, seed=5, output=tmp_path / "data", observer=observer) as session:
+        observer.session = session
+        with pytest.raises(labseq.StopRequested):
+            session.run()
+        assert session.run_dir is not None
+    again = resumed(session.run_dir)
+    assert (again.status, again.skipped) == ("complete", whole.skipped)
+    assert table(again) == table(whole)
+
+
+def test_a_check_between_shots_warns_or_stops(tmp_path: Path) -> None:
+    checks = [
+        {"value": "reading.laser.power_w", "at_most": 0.25, "shots": 2, "then": "stop"},
+        {"value": "filling_fraction", "at_least": 2},
+    ]
+    seen = RecordingObserver()
+    path = sequence(tmp_path, policy={"checks": checks})
+    told = "reading.laser.power_w is 0.35 on the mean of the last 2 shots; it should be at most 0.25"
+    with pytest.raises(CheckFailedError) as caught:
+        run(path, seen)
+    assert (str(caught.value), caught.value.value, caught.value.exit_code) == (
+        told, "reading.laser.power_w", 3
+    )  # fmt: skip
+    warnings = [event["text"] for event in seen.of("warning")]
+    assert len(warnings) == 4  # one a shot, before the run ends
+    assert "it should be at least 2" in warnings[0]
+    (folder,) = [path.parent for path in (tmp_path / "data").rglob("run.json")]
+    stopped = labseq.open_run(folder)
+    assert (stopped.status, stopped.error) == ("failed", f"CheckFailedError: {told}")
+    assert len(stopped.shots) == 5
+
+
+def test_a_check_may_skip_the_rest_of_a_point_also_after_a_resume(tmp_path: Path) -> None:
+    checks = [{"value": "reading.laser.power_w", "at_least": 0.15, "shots": 2, "then": "skip_point"}]
+    path = sequence(tmp_path, "planner", policy={"checks": checks})
+    whole = run(path)
+    assert whole.skipped
+    observer = Interrupting("shot_started", 2)
+    with labseq.Session.open(path, seed=5, output=tmp_path / "data", observer=observer) as session:
+        observer.session = session
+        with pytest.raises(labseq.StopRequested):
+            session.run()
+        assert session.run_dir is not None
+    again = resumed(session.run_dir)
+    assert again.skipped == whole.skipped
+    assert table(again) == table(whole)
+
+
+def test_values_that_shots_do_not_have_do_not_count() -> None:
+    one = CheckSettings(value="reading.x", at_least=1.0, shots=2, then="stop")
+    checks = Checks([one], [{"shot": 0, "readings": {"x": 0.1}}], warn=print)
+    with pytest.raises(CheckFailedError):
+        checks.after({"shot": 1, "readings": {}})
+    checks = Checks([one], [], warn=print)
+    assert checks.after({"shot": 0, "readings": {}}) == ""
+    assert checks.after({"shot": 1, "readings": {"x": "text"}}) == ""
+
+
+def test_policies_are_on_record_and_told_before(tmp_path: Path) -> None:
+    step = "{}\n    policy: {timeout: 2 s, retries: 1}"
+    path = sequence(tmp_path, step=step, policy={"over_budget": "warn"})
+    with labseq.Session.open(path) as session:
+        resolved = session.assembly.resolved
+        assert resolved["shot"][0]["policy"] == {"timeout": 2.0, "retries": 1}
+        assert "policy" not in resolved["shot"][1]
+        assert resolved["policy"]["over_budget"] == "warn"
+        assert resolved["profile"]["budgets"]["plan"] == 5e-3
+        assert session.assembly.policy.steps[0].over_budget == "warn"
+
+
+def test_a_timeout_shorter_than_the_step_is_told(tmp_path: Path) -> None:
+    path = write(tmp_path)
+    text = path.read_text(encoding="utf-8").replace(
+        "- load: {duration: 500 ms}", "- load: {duration: 500 ms}\n    policy: {timeout: 400 ms}"
+    )
+    path.write_text(text, encoding="utf-8")
+    with labseq.Session.open(path) as session:
+        told = [str(problem) for problem in check(session).warnings]
+    what = "the step takes up to 500 ms, longer than its timeout of 400 ms; expected more than 500 ms"
+    assert f"{path}:10:23: {what}" in told
+
+
+@pytest.mark.parametrize(
+    ("step", "keys", "message"),
+    [
+        ("{}\n    policy: {retry: 1}", {}, "10:14: 'retry' is not a setting of the policy of 'failing'"),
+        ("{}\n    policy: {timeout: 0 s}", {}, "10:23: timeout is '0 s'; expected more than 0"),
+        ("{}\n    policy: 5", {}, "10:13: policy is 5; expected a mapping of settings"),
+        ("{}", {"policy": {"used_up": "repeat"}}, "used_up is 'repeat'; expected"),
+        ("{}", {"policy": {"checks": [{"value": "x"}]}}, "the check has no limit; expected 'at_least'"),
+        (
+            "{}",
+            {"policy": {"checks": [{"value": "x", "at_least": 2, "at_most": 1}]}},
+            "at_least is 2, but at_most is 1",
+        ),
+        (
+            "{}",
+            {"policy": {"checks": [{"value": "x", "at_least": 2, "then": "skip_point"}]}},
+            "there is no scan whose points could be skipped; expected 'warn' or 'stop'",
+        ),
+    ],
+)
+def test_a_wrong_policy_is_told_with_its_place(
+    tmp_path: Path, step: str, keys: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ConfigError) as caught:
+        labseq.Session.open(sequence(tmp_path, step=step, **keys))
+    assert message in str(caught.value)
+
+
+def test_only_what_leaves_the_atoms_alone_is_tried_again(tmp_path: Path) -> None:
+    path = write(tmp_path)
+    text = path.read_text(encoding="utf-8").replace(
+        "- load: {duration: 500 ms}", "- load: {duration: 500 ms}\n    policy: {retries: 1}"
+    )
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"10:14: 'load' cannot be tried again in the same shot") as caught:
+        labseq.Session.open(path)
+    assert "on_failure: repeat_shot" in str(caught.value)
+
+
+def test_a_scan_cannot_change_a_policy(tmp_path: Path) -> None:
+    path = write(tmp_path)
+    text = path.read_text(encoding="utf-8").replace("shots: 6", "scan: {shot.0.policy.retries: [0, 1]}")
+    path.write_text(text.replace("500 ms}", "500 ms}\n    policy: {retries: 0}"), encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"a scan cannot change 'shot\.0\.policy\.retries'"):
+        labseq.Session.open(path)
+
+
+def test_options_change_policies(tmp_path: Path) -> None:
+    path = sequence(tmp_path, step="{at: [0]}", attempts=1)
+    changes = ["policy.used_up=skip_point", "policy.on_failure=repeat_shot"]
+    output = tmp_path / "data"
+    with labseq.Session.open(path, seed=5, overrides=changes, output=output) as session:
+        assert list(session.run().skipped) == [0]
+    with labseq.Session.open(path, seed=5, output=output) as session, pytest.raises(DeviceError):
+        session.run()

@@ -1,0 +1,95 @@
+"""A scan of 3 x 4 points, 5 times each: plotted, exported, compared with the files read by plain h5py."""
+
+from __future__ import annotations
+
+import csv
+import itertools
+import json
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import labseq
+from labseq.cli.app import app
+
+pytestmark = pytest.mark.system
+
+FOLDER = Path(__file__).parents[2]
+DOPS, WINDOWS_S = (1, 2, 4), (0.005, 0.01, 0.02, 0.06)
+SEQUENCE = """
+labseq: 1
+name: grid scan
+profile: ./profile.yaml
+seed: 3
+target: {pattern: compact, rows: 3, cols: 3}
+planner: {use: psca}
+scan:
+  planner.degree_of_parallelism: [1, 2, 4]
+  shot.2.rearrange.window: [5 ms, 10 ms, 20 ms, 60 ms]
+repeats: 5
+order: shuffled
+record_frames: none
+shot:
+  - load: {duration: 500 ms}
+  - image: {exposure: 45 ms}
+  - rearrange: {cycles: 1}
+  - image: {exposure: 45 ms}
+"""
+PROFILE = """
+labseq: 1
+name: small
+grid: {rows: 6, cols: 6, spacing: 4.49 um}
+camera: {use: virtual}
+static_tweezers: {use: virtual}
+mobile_tweezers: {use: virtual}
+detector: {use: threshold}
+simulation: {use: virtual}
+"""
+
+
+@pytest.fixture(scope="module")
+def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("grid")
+    (folder / "profile.yaml").write_text(PROFILE, encoding="utf-8")
+    (folder / "sequence.yaml").write_text(SEQUENCE, encoding="utf-8")
+    with labseq.Session.open(folder / "sequence.yaml", output=folder / "data") as session:
+        return session.run().path
+
+
+def call(*arguments: str) -> str:
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+def test_every_point_was_taken_as_often_as_asked(run_dir: Path) -> None:
+    taken = [tuple(shot.parameters.values()) for shot in labseq.open_run(run_dir).shots]
+    assert sorted(taken) == sorted([*itertools.product(DOPS, WINDOWS_S)] * 5)
+
+
+def test_the_exported_table_agrees_with_the_files(run_dir: Path, tmp_path: Path) -> None:
+    target = tmp_path / "table.csv"
+    call("export", str(run_dir), "--to", "csv", "--output", str(target))
+    with target.open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
+    assert len(rows) == 60
+    for row in rows:
+        with h5py.File(run_dir / row["file"], "r") as shot:
+            seen = shot["entry/detection/occupancy"][-1].astype(bool)
+            fill = shot["entry/target/fill"][:].astype(bool)
+            batches = shot["entry/rearrangement/cycles"][:]
+            changed = json.loads(shot["entry/parameters"][()])
+        assert float(row["filling_fraction"]) == pytest.approx(seen[fill].mean())
+        assert int(row["n_defects"]) == np.count_nonzero(~seen[fill])
+        assert int(row["n_batches"]) == batches["n_batches_played"].sum()
+        for address, value in changed.items():
+            assert float(row[address]) == value
+
+
+def test_it_is_plotted(run_dir: Path, tmp_path: Path) -> None:
+    picture = tmp_path / "scan.png"
+    call("plot", str(run_dir), "--output", str(picture))
+    assert picture.stat().st_size > 5_000
