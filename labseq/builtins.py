@@ -25,6 +25,7 @@ def labseq_register(registry: Registry) -> None:
         ImageSettings,
         LoadSettings,
         ProbeSettings,
+        RampSettings,
         RearrangeSettings,
         WaitSettings,
     )
@@ -35,6 +36,7 @@ def labseq_register(registry: Registry) -> None:
     from labseq.sequencer.equalise import EqualiseStep
     from labseq.sequencer.leading import wait_step
     from labseq.sequencer.probe import ProbeStep
+    from labseq.sequencer.ramp import RampStep
     from labseq.sequencer.rearrange import RearrangeStep
     from labseq.sequencer.steps import DeviceStep, ImageStep, LoadStep
     from labseq.sequencer.watching import CheckOverlayStep, CheckSitesStep
@@ -42,6 +44,7 @@ def labseq_register(registry: Registry) -> None:
     registry.step("load", LoadStep, LoadSettings)
     registry.step("image", ImageStep, ImageSettings)
     registry.step("rearrange", RearrangeStep, RearrangeSettings)
+    registry.step("ramp", RampStep, RampSettings)
     registry.step("probe", ProbeStep, ProbeSettings)
     registry.step("check_sites", CheckSitesStep, CheckSitesSettings)
     registry.step("check_overlay", CheckOverlayStep, CheckOverlaySettings)

@@ -24,6 +24,7 @@ from labseq.config.steps import (
     ImageSettings,
     LoadSettings,
     ProbeSettings,
+    RampSettings,
     RearrangeSettings,
     WaitSettings,
 )
@@ -54,6 +55,7 @@ __all__ = [
     "Override",
     "ProbeSettings",
     "ProfileSpec",
+    "RampSettings",
     "RearrangeSettings",
     "Scan",
     "SequenceSpec",

@@ -24,8 +24,8 @@ class ChannelSettings(Settings):
     channel: NonNegativeInt = Field(description="output of the timing box")
     on: tuple[Text, ...] = Field(
         default=(),
-        description="kinds of step during which it is on: `load`, `image`, `rearrange`, `wait`; `idle`: "
-        "between steps, and before and after a shot",
+        description="kinds of step during which it is on: `load`, `image`, `rearrange`, `ramp`, `wait`; "
+        "`idle`: between steps, and before and after a shot",
     )
     lead: Duration = Field(default=0.0, description="how long before such a step it is turned on")
     lag: Duration = Field(default=0.0, description="how long after such a step it is turned off")

@@ -7,7 +7,7 @@ from typing import Annotated, Literal, Self, TypeAlias
 from pydantic import Field, model_validator
 
 from labseq.config.fields import Text, empty_is, misfit
-from labseq.config.settings import Duration, Length, Settings
+from labseq.config.settings import Duration, Fraction, Length, Settings
 
 Exposure: TypeAlias = Annotated[Duration, Field(gt=0)]
 """Seconds, more than 0; "45 ms"."""
@@ -142,6 +142,16 @@ class EqualiseSettings(Settings):
     )
     max_averages: int = Field(default=100, ge=2, description="most measurements that a round averages")
     max_rounds: int = Field(default=25, ge=1, description="most rounds")
+
+
+class RampSettings(Settings):
+    """``ramp``: make the static tweezers shallower or deeper, without a jump."""
+
+    device: Literal["static_tweezers"] = Field(
+        default="static_tweezers", description="what is ramped: so far the static tweezers alone"
+    )
+    depth: Fraction = Field(description="depth at the end, as a fraction of the nominal one")
+    duration: Exposure = Field(default=5e-3, description="how long the ramp takes; it is linear")
 
 
 class WaitSettings(Settings):

@@ -138,7 +138,8 @@ def put_in_words(error: Mapping[str, Any], name: str, value: Any, raw: str) -> W
         return Words(what, "a finite number")
     if kind in ("literal_error", "enum"):
         choices = re.findall(r"'([^']*)'", context["expected"])
-        return Words(what, context["expected"], did_you_mean(str(value), choices))
+        hint = did_you_mean(str(value), choices) if len(choices) > 1 else ""
+        return Words(what, context["expected"], hint)
     if kind == "union_tag_invalid":
         tags = context["expected_tags"]
         hint = did_you_mean(str(context["tag"]), re.findall(r"'([^']*)'", tags))

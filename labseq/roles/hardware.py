@@ -195,7 +195,10 @@ class StaticTweezers(Hardware, Protocol):
         ...
 
     def start(self) -> None:
-        """Turn the array on at its nominal depth; no effect if it is on."""
+        """Bring the array to its nominal depth, from off or after a ramp; no effect if it is there.
+
+        Each shot begins with it.
+        """
         ...
 
     def ramp(self, depth: float, duration_s: float) -> None:

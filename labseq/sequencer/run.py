@@ -218,6 +218,8 @@ class Sequencer:
         if self.lab.simulation is not None:
             self.guard.call("simulation", self.lab.timeouts.call_s, self.lab.simulation.begin_shot)
         self._emit("shot_started", {"shot": record.shot_index, "attempt": record.attempt})
+        # the shot before may have ramped them
+        shot.call("static_tweezers", shot.call_timeout_s, shot.static_tweezers.start)
         shot.poll()
         shot.check_interlocks()
         for number, (name, step) in enumerate(self._steps):

@@ -38,7 +38,7 @@ class _Command(Protocol):
 
 
 class LoadStep:
-    """Turns the static tweezers on and lets atoms load for a time."""
+    """Lets atoms load for a time, into the static tweezers at the depth that they have."""
 
     needs_image = False
     takes_image = False
@@ -52,9 +52,7 @@ class LoadStep:
         return [TimelineEntry("load", duration_s, duration_s, kind="load")]
 
     def run(self, shot: Shot) -> None:
-        """Start the array, then wait while the atom source is on."""
-        tweezers = shot.static_tweezers
-        shot.call("static_tweezers", shot.call_timeout_s, tweezers.start)
+        """Wait while the atom source is on."""
         with shot.lit("load", self.duration_s):
             start_s = shot.clock.now()
             shot.clock.sleep(self.duration_s)

@@ -91,16 +91,16 @@ class SoapyStaticTweezers:
         self._load(amplitudes)
 
     def start(self) -> None:
-        """Ramp the array up to its nominal depth; no effect if it is on.
+        """Ramp the array to its nominal depth; no effect if it is there.
 
         Raises:
             TransientError: The radio ran out of samples while the array was on.
             DeviceError: Not open, or the stream is dead.
         """
         self._checked()
-        if self._depth == 0.0:
-            if not self._is_loaded:
-                self._load(self._amplitudes)
+        if not self._is_loaded:
+            self._load(self._amplitudes)
+        if self._depth != 1.0:
             self._ramp(1.0, self._settings.switch)
 
     def ramp(self, depth: float, duration_s: float) -> None:

@@ -47,10 +47,11 @@ class VirtualStaticTweezers(VirtualDriver):
         self._world.play("static_tweezers", TweezerAmplitudes(rows, cols), self._clock.now())
 
     def start(self) -> None:
-        """Turn the array on at its nominal depth; no effect if it is on."""
+        """Bring the array to its nominal depth; no effect if it is there."""
         self._check_open()
         if self._depth == 0.0:
             self.load(self._amplitudes)
+        if self._depth != 1.0:
             self._play(1.0, 0.0)
 
     def ramp(self, depth: float, duration_s: float) -> None:

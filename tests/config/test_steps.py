@@ -11,6 +11,7 @@ from labseq.config import (
     ImageSettings,
     LoadSettings,
     ProbeSettings,
+    RampSettings,
     RearrangeSettings,
     WaitSettings,
 )
@@ -20,6 +21,7 @@ STEPS: list[type[BaseModel]] = [
     ImageSettings,
     RearrangeSettings,
     ProbeSettings,
+    RampSettings,
     CheckSitesSettings,
     CheckOverlaySettings,
     WaitSettings,

@@ -31,6 +31,7 @@ from labseq.config.steps import (
     ImageSettings,
     LoadSettings,
     ProbeSettings,
+    RampSettings,
     RearrangeSettings,
     WaitSettings,
 )
@@ -38,6 +39,7 @@ from labseq.imaging import ThresholdDetector
 from labseq.model import SiteGrid
 from labseq.sequencer.equalise import EqualiseStep
 from labseq.sequencer.probe import ProbeStep
+from labseq.sequencer.ramp import RampStep
 from labseq.sequencer.rearrange import RearrangeStep
 from labseq.sequencer.steps import DeviceStep, ImageStep, LoadStep, WaitStep
 from labseq.sequencer.watching import CheckOverlayStep, CheckSitesStep
@@ -193,6 +195,12 @@ class TestEqualise(StepContract):
     @pytest.fixture
     def factory(self) -> Factory:
         return partial(EqualiseStep, EqualiseSettings())
+
+
+class TestRamp(StepContract):
+    @pytest.fixture
+    def factory(self) -> Factory:
+        return partial(RampStep, RampSettings(depth=0.5))
 
 
 class TestWait(StepContract):

@@ -98,8 +98,9 @@ def test_static_tweezers_hold_atoms_until_they_are_made_safe(lab: Lab) -> None:
     start_s = lab.clock.now()
     lab.static.ramp(0.5, 10e-3)
     assert lab.clock.now() - start_s == pytest.approx(10e-3)
-    lab.static.start()
     assert lab.static.describe()["depth"] == 0.5
+    lab.static.start()
+    assert lab.static.describe()["depth"] == 1.0
     assert lab.n_atoms == 6
     lab.static.safe_state()
     assert lab.n_atoms == 0

@@ -17,6 +17,12 @@ class StartsAgain(RecordingStaticTweezers):
         super().start()
 
 
+class StaysShallow(RecordingStaticTweezers):
+    def start(self) -> None:
+        if self.depth == 0.0:
+            super().start()
+
+
 class NeverTurnsOff(RecordingStaticTweezers):
     def ramp(self, depth: float, duration_s: float) -> None:
         if depth == 0.0:
@@ -57,6 +63,7 @@ class LoadsAnything(RecordingStaticTweezers):
     ("tweezers", "test"),
     [
         (StartsAgain, "test_starts_twice"),
+        (StaysShallow, "test_starts_after_a_ramp"),
         (NeverTurnsOff, "test_ramps"),
         (NeedsATimeToRamp, "test_ramps"),
         (NormalizesInPlace, "test_loads_amplitudes"),

@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.model import SiteGrid
-from labseq.roles import StaticTweezers
+from labseq.roles import Context, StaticTweezers
 from labseq.testing.contracts.hardware import Action, Factory, HardwareContract, n_calls
 from labseq.testing.contracts.promises import doing, promise
+from labseq.testing.fakes.deciders import RecordingSimulation
 
 
 class StaticTweezersContract(HardwareContract[StaticTweezers]):
@@ -78,13 +79,26 @@ class StaticTweezersContract(HardwareContract[StaticTweezers]):
 
     @promise("start() turns the array on, and does nothing if it is on")
     def test_starts_twice(self, factory: Factory[StaticTweezers]) -> None:
-        """Every ``load`` step starts it."""
+        """Every shot starts it."""
         with self.opened(factory) as (tweezers, context):
             tweezers.start()
             before = n_calls(context)
             with doing("start() while on"):
                 tweezers.start()
             assert n_calls(context) == before, "start() while on was played again"
+
+    @promise("start() brings the array back to its nominal depth after a ramp")
+    def test_starts_after_a_ramp(self, factory: Factory[StaticTweezers]) -> None:
+        """Each shot begins at full depth, whatever the last one did."""
+        with self.opened(factory) as (tweezers, context):
+            tweezers.start()
+            tweezers.ramp(0.5, self.ramp_s)
+            before = _n_played(context)
+            with doing("start() after a ramp to half the depth"):
+                tweezers.start()
+            told = tweezers.describe().get("depth", 1.0)
+            assert told == 1.0, f"the depth is {told} after start(); expected 1"
+            assert not before or _n_played(context) > before, "start() after a ramp played nothing"
 
     @promise("ramp() takes every depth from 0 to 1, and a duration of 0")
     def test_ramps(self, factory: Factory[StaticTweezers]) -> None:
@@ -107,6 +121,13 @@ class StaticTweezersContract(HardwareContract[StaticTweezers]):
                 tweezers.load(amplitudes)
             untouched = all(np.array_equal(a, b) for a, b in zip(before, amplitudes, strict=True))
             assert untouched, "load() changed the caller's arrays"
+
+
+def _n_played(context: Context) -> int:
+    """How often the array played something to the simulation; 0 for one that plays nothing to it."""
+    simulation = context.simulation
+    calls = simulation.calls if isinstance(simulation, RecordingSimulation) else ()
+    return sum(call.method == "play" for call in calls)
 
 
 def amplitudes_of(grid: SiteGrid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -96,9 +96,9 @@ class RecordingStaticTweezers(RecordingHardware):
                 require_within("an amplitude", float(amplitude), 0.0, 1.0)
 
     def start(self) -> None:
-        """Turn on."""
+        """Go to the nominal depth."""
         self.use("start")
-        if self.depth == 0.0:
+        if self.depth != 1.0:
             self._go(1.0, 0.0)
 
     def ramp(self, depth: float, duration_s: float) -> None:
