@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Generator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import numpy as np
 from labseq import Context, DeviceError, LimitError, TransientError
 from labseq_soapy.alone import end_the_one_alone, marker_of, place
 from labseq_soapy.array_tones import Amplitudes, ArrayTones
+from labseq_soapy.capture import built
 from labseq_soapy.library import SoapyError
 from labseq_soapy.link import Link
 from labseq_soapy.messages import Setup
@@ -53,6 +55,16 @@ class SoapyStaticTweezers:
         self._facts: Facts | None = None
         self._is_loaded = False
         self.simulated_radio: SimulatedRadio | None = None
+
+    def warm(self) -> None:
+        """Compile the simulated radio, if that is what there is.
+
+        Raises:
+            DeviceError: It cannot be compiled.
+        """
+        if self._settings.is_simulated:
+            with self._in_words():
+                built()
 
     def open(self) -> None:
         """Open the radio and let it play silence; no effect if it is open.
@@ -184,10 +196,8 @@ class SoapyStaticTweezers:
     def _connect(self) -> Link:
         setup, device, environment, folder = self._settings, self._settings.device, dict(os.environ), place()
         if setup.is_simulated:
-            try:
+            with self._in_words():
                 self.simulated_radio = radio = SimulatedRadio(setup, self._world)
-            except SoapyError as error:
-                raise DeviceError(self._name, str(error)) from error
             device, environment, folder = radio.device, radio.environment, radio.folder
         marker = marker_of(device)
         end_the_one_alone(self._name, marker, self._clock)
@@ -208,6 +218,14 @@ class SoapyStaticTweezers:
         )
         log = Path(folder) / f"{marker.stem}.log"
         return Link(self._name, self._clock, told, log, environment)
+
+    @contextmanager
+    def _in_words(self) -> Generator[None]:
+        """What a simulated radio lacks is the device's failure."""
+        try:
+            yield
+        except SoapyError as error:
+            raise DeviceError(self._name, str(error)) from error
 
     def _load(self, amplitudes: Amplitudes | None) -> None:
         loop = self._tones.samples(self._calibrated if amplitudes is None else amplitudes)

@@ -25,6 +25,8 @@ def load_spcm(name: str, *, simulated: bool = False) -> Any:
     """
     try:
         with contextlib.redirect_stdout(io.StringIO()):  # spcm prints, and stdout may be for JSON
+            if simulated:
+                importlib.import_module("labseq_spcm.simulator").prepare()
             spcm = importlib.import_module("spcm")
     except ModuleNotFoundError as error:
         text = f"the Python package 'spcm' cannot be imported ({error}); install it with `pip install spcm`"

@@ -99,6 +99,7 @@ class SpcmMobileTweezers:
         self._timings: dict[str, float] = {}
         self._world = context.simulation
         self._identifier = settings.card
+        self._is_simulated = settings.card.startswith(SIMULATED)
         self._duration_s: float | None = None
         self._due_s: float | None = None
         self.simulated_card: SimulatedCard | None = None
@@ -113,8 +114,8 @@ class SpcmMobileTweezers:
         if self._card is not None:
             return
         try:
+            spcm = load_spcm(self._name, simulated=self._is_simulated)
             self._insert_simulated_card()
-            spcm = load_spcm(self._name, simulated=self._identifier.startswith(SIMULATED))
             self._card = AwgCard(self._name, spcm, self._identifier, self._clock)
             self._facts = set_up(self._card, self._settings, self._amplitude_mv)
             self._clock.sleep(limits.RELAY_S)
@@ -158,7 +159,12 @@ class SpcmMobileTweezers:
             self.simulated_card = None
 
     def warm(self) -> None:
-        """Compile the kernels of the mode, or load them from the cache."""
+        """Import the vendor's package, and compile the kernels of the mode or load them from the cache.
+
+        Raises:
+            DeviceError: No package or driver library.
+        """
+        load_spcm(self._name, simulated=self._is_simulated)
         if self._settings.mode == "dds":
             importlib.import_module("labseq_spcm._kernels_dds")
         else:

@@ -59,6 +59,17 @@ class TtlLines:
         """Channels and limits."""
         return LinesFacts(CHANNELS, TICK_S, SHORTEST_S, MOST_EDGES, LATENCY_S)
 
+    def warm(self) -> None:
+        """Compile what runs the firmware of a simulated box, if that is what simulates it.
+
+        Raises:
+            DeviceError: It cannot be compiled.
+        """
+        if self._settings.is_simulated and self._settings.simulated_by == "simavr":
+            from labseq_ttl.counterpart.build import runner
+
+            runner(self._name)
+
     def open(self) -> None:
         """Connect to the box; the lines are idle. No effect if it is open.
 

@@ -75,8 +75,20 @@ class TestOpening:
         rig = made()
         monkeypatch.setenv("LABSEQ_CACHE", str(tmp_path))
         monkeypatch.setenv("CXX", "no-such-compiler")
-        with pytest.raises(DeviceError, match=r"no C\+\+ compiler here; .* g\+\+ libsoapysdr-dev"):
-            rig.tweezers.open()
+        for use in (rig.tweezers.warm, rig.tweezers.open):
+            with pytest.raises(DeviceError, match=r"no C\+\+ compiler here; .* g\+\+ libsoapysdr-dev"):
+                use()
+
+    def test_what_takes_long_is_done_before_the_radio_is_opened(
+        self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    ) -> None:
+        rig = made()
+        monkeypatch.setenv("LABSEQ_CACHE", str(tmp_path))
+        rig.tweezers.warm()
+        assert list(tmp_path.rglob("libcapture.so"))
+        monkeypatch.setenv("CXX", "no-such-compiler")
+        rig.tweezers.open()
+        rig.tweezers.close()
 
 
 class TestUnderflow:

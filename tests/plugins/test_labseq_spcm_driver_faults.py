@@ -133,16 +133,22 @@ class TestFaultsOfThePackage:
             lab.tweezers.wait(1.0)
             assert sum(603000 <= e.register < DDS_CMD for e in lab.simulated.log) > 3000
 
-    def test_nothing_is_printed_by_the_import(self) -> None:
-        code = "import labseq_spcm.library as l; l.load_spcm('tweezers', simulated=True)"
-        prepare = "from labseq_spcm.simulator import *; from labseq.testing.fakes import FakeClock;"
-        run = subprocess.run(
-            [sys.executable, "-c", f"{prepare} install(SimulatedCard(FakeClock())); {code}"],
-            capture_output=True,
-            text=True,
-            check=True,
-        )
-        assert not run.stdout
+    def test_the_package_is_imported_when_warming_and_prints_nothing(self) -> None:
+        code = """
+import sys
+from labseq import Context, MotionSpec
+from labseq_spcm.mobile_tweezers import SpcmMobileTweezers
+from labseq_spcm.settings import SpcmSettings
+motion = MotionSpec(max_row_tones=16, max_column_tones=4)
+tweezers = SpcmMobileTweezers(SpcmSettings(card="simulated", mode="dds"), Context(motion=motion))
+assert "spcm" not in sys.modules
+tweezers.warm()
+assert "spcm" in sys.modules
+tweezers.open()
+tweezers.close()
+"""
+        run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+        assert (run.returncode, run.stdout, run.stderr) == (0, "", "")
 
 
 class TestMannersOfTheCard:

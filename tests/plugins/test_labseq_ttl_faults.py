@@ -248,3 +248,18 @@ def test_a_compiler_without_the_library_is_told(monkeypatch: pytest.MonkeyPatch,
     with pytest.raises(DeviceError, match=r"none\.h: No such file .*`apt-get install .* libsimavr-dev"):
         runner("lines")
     assert not list(tmp_path.glob("ttl/*/runner"))
+
+
+def test_what_takes_long_is_done_before_the_box_is_opened(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    need_simavr()
+    monkeypatch.setenv("LABSEQ_CACHE", str(tmp_path))
+    make_rig().lines.warm()
+    assert not list(tmp_path.rglob("runner"))  # the model needs nothing
+    lines = make_rig(simulated_by="simavr").lines
+    lines.warm()
+    assert list(tmp_path.rglob("runner"))
+    monkeypatch.setenv("PATH", "")
+    lines.open()
+    lines.close()

@@ -1,5 +1,7 @@
 """Ramps of the static tweezers in a shot, and their depth at the start of the next."""
 
+from typing import Any
+
 import pytest
 
 from labseq.errors import DeviceTimeoutError, TransientError
@@ -33,7 +35,8 @@ def test_each_shot_begins_at_full_depth() -> None:
 
     class Seen(RampStep):
         def run(self, shot) -> None:
-            depths.append(shot.static_tweezers.depth)
+            tweezers: Any = shot.static_tweezers
+            depths.append(tweezers.depth)
             super().run(shot)
 
     rig = Rig((LOAD, ("ramp", Seen(given(depth=0.5, duration=5e-3)))))
@@ -51,7 +54,8 @@ def test_a_repeated_shot_begins_at_full_depth() -> None:
             return []
 
         def run(self, shot) -> None:
-            depths.append(shot.static_tweezers.depth)
+            tweezers: Any = shot.static_tweezers
+            depths.append(tweezers.depth)
             if len(depths) == 1:
                 raise TransientError("a frame was lost")
 

@@ -10,7 +10,7 @@ Imported only where a profile says ``card: simulated``; the README says what it 
 
 from labseq_spcm.simulator.card import SimulatedCard
 from labseq_spcm.simulator.facts import M4I6631, CardModel, trigger_delay_s
-from labseq_spcm.simulator.install import install, installed, uninstall, vendor_library_found
+from labseq_spcm.simulator.install import install, installed, prepare, uninstall, vendor_library_found
 from labseq_spcm.simulator.output import SampleSpan, Span, Tone, ToneSpan
 from labseq_spcm.simulator.records import LogEntry
 from labseq_spcm.simulator.rules import ErrorInfo
@@ -27,6 +27,7 @@ __all__ = [
     "ToneSpan",
     "install",
     "installed",
+    "prepare",
     "trigger_delay_s",
     "uninstall",
     "vendor_library_found",

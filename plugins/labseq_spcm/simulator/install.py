@@ -49,6 +49,12 @@ def install(card: SimulatedCard, name: str = "") -> str:
         return name
 
 
+def prepare() -> None:
+    """Import ``spcm`` so that it finds simulated cards, whether or not there is a vendor's library."""
+    with _LOCK:
+        _library()
+
+
 def uninstall(name: str) -> None:
     """Take a simulated card away: it cannot be opened any more. No effect if it is not there."""
     with _LOCK:
