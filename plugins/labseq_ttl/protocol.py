@@ -8,7 +8,7 @@ from typing import Final, TypeAlias
 NAME: Final = "labseq-ttl"
 """What the box calls itself."""
 
-VERSION: Final = 1
+VERSION: Final = 2
 """Version of the protocol."""
 
 STOP: Final = b"!"
@@ -32,11 +32,26 @@ SHORTEST_S: Final = 5e-6
 LONGEST: Final = 2**32 - 1
 """Ticks between two edges, at most."""
 
+MOST_MS: Final = 0xFFFFF
+"""Longest deadline of a leader, in ms."""
+
 LINE: Final = 96
 """Longest line in bytes, checksum included."""
 
 PER_LINE: Final = 5
 """Edges that fit on a line, however long their numbers are."""
+
+DEAF: Final = 0
+"""What the box does about a leader: it hears none."""
+
+IDLE: Final = 1
+"""It listens for one."""
+
+OWED: Final = 2
+"""One has said go, and is owed an answer."""
+
+LATE: Final = 3
+"""The deadline of the answer has passed: the leader was told of a failure."""
 
 Edge: TypeAlias = tuple[int, int]
 """Ticks since the edge before, and what is on from then on: bit n is channel n."""

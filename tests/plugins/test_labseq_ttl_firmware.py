@@ -214,7 +214,7 @@ def test_no_bytes_hang_it(running: Firmware, noise: list[bytes]) -> None:
     for part in noise:
         running.write(part.replace(b"!", b"?"))
     running.write(b"\n")
-    assert running.ask("z id").startswith("z ok labseq-ttl 01")
+    assert running.ask("z id").startswith("z ok labseq-ttl 02")
 
 
 hexes = st.integers(0, 2**34).map(lambda n: f"{n:x}") | st.sampled_from(["0", "7", "a", "18", "204", "g", ""])
@@ -229,6 +229,7 @@ sensible = st.one_of(
         lambda words: " ".join(map(str, words))
     ),
     st.sampled_from(["fire", "state", "off", "set 4", "id"]),
+    st.sampled_from(["lead 20 40 80 0", "lead 0 40 0 fffff", "answer 1", "answer 0", "deaf", "leader"]),
 )
 questions = st.one_of(sensible, st.tuples(names, arguments).map(" ".join).map(str.strip))
 
@@ -238,7 +239,7 @@ questions = st.one_of(sensible, st.tuples(names, arguments).map(" ".join).map(st
 def test_the_model_answers_as_the_firmware_does(running: Firmware, asked: list[str]) -> None:
     model = EmulatedBox()
     fresh = [f"put {slot:x} 0 0 0" for slot in range(SLOTS)]
-    ready = ["polarity 0", "serial 0", "timeout 0", "off", *fresh]
+    ready = ["polarity 0", "serial 0", "timeout 0", "off", "deaf", *fresh]
     for question in (*ready, *(q for q in asked if len(framed(f"a {q}")) < 96)):
         assert plain(running.ask(f"a {question}")) == plain(ask(model, f"a {question}")), question
 

@@ -28,6 +28,10 @@ class Counterpart(Protocol):
         """
         ...
 
+    def start(self) -> None:
+        """A rising edge at the start input."""
+        ...
+
     def close(self) -> None:
         """End it; legal in any state."""
         ...

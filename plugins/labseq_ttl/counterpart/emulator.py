@@ -10,10 +10,14 @@ from collections.abc import Callable, Mapping
 from typing import Final
 
 from labseq.drivers.serial_port import Port
+from labseq_ttl.counterpart.leader_input import LeaderInput
+from labseq_ttl.counterpart.words import RefusedError, numbers
 from labseq_ttl.protocol import (
+    DEAF,
     EDGES,
     LINE,
     LONGEST,
+    MOST_MS,
     NAME,
     OUTPUTS,
     SHORTEST,
@@ -30,10 +34,6 @@ IDLE_S: Final = 1e-3
 
 POWER_UP: Final = 1
 RESET_INPUT: Final = 2
-
-
-class RefusedError(Exception):
-    """The box refuses a command."""
 
 
 class EmulatedBox:
@@ -56,8 +56,12 @@ class EmulatedBox:
             "get": self._get,
             "arm": self._arm,
             "fire": self._fire,
-            "await": self._fire,
+            "await": self._await,
             "off": self._off,
+            "lead": self._begin_leading,
+            "deaf": self._end_leading,
+            "answer": self._answer_leader,
+            "leader": self._tell_leader,
         }
         self._out = bytearray()
         self._polarity = self._serial = 0
@@ -66,6 +70,11 @@ class EmulatedBox:
         self._reset_after: int | None = None
         self._edges: list[Edge] = []
         self._boot(POWER_UP)
+
+    @property
+    def signs(self) -> int:
+        """Outputs that are on for a leader, beside those of the lines."""
+        return self._leader.signs
 
     @property
     def port(self) -> Port:
@@ -111,6 +120,19 @@ class EmulatedBox:
         if after_ticks is None:
             self._boot(RESET_INPUT)
 
+    def start(self) -> None:
+        """A rising edge at the start input."""
+        if self._leader.rise():
+            self._tell(f"!go {self._boots:04x} {self._leader.n_gos:04x}")
+
+    def lower(self) -> None:
+        """The start input goes low."""
+        self._leader.level = 0
+
+    def pass_deadline(self) -> None:
+        """Let the deadline of a leader pass; no time passes here by itself."""
+        self._leader.pass_deadline()
+
     def unplug(self) -> None:
         """Pull the cable."""
         self._unplugged = True
@@ -129,6 +151,7 @@ class EmulatedBox:
         self._slots: list[list[Edge]] = [[] for _ in range(SLOTS)]
         self._armed: int | None = None
         self._runs = self.on = 0
+        self._leader = LeaderInput()
         self._tell(f"!boot {self._boots:04x} {cause:02x}")
 
     def _take(self, byte: int) -> None:
@@ -175,23 +198,23 @@ class EmulatedBox:
         return f"{doing} {self._boots:04x} {self._runs:04x} {self.on:04x} {self._polarity:04x}"
 
     def _set_polarity(self, words: list[str]) -> str:
-        (self._polarity,) = _numbers(words, OUTPUTS)
+        (self._polarity,) = numbers(words, OUTPUTS)
         return ""
 
     def _set_serial(self, words: list[str]) -> str:
-        (self._serial,) = _numbers(words, 0xFFFF)
+        (self._serial,) = numbers(words, 0xFFFF)
         return ""
 
     def _set_lines(self, words: list[str]) -> str:
-        (self.on,) = _numbers(words, OUTPUTS)
+        (self.on,) = numbers(words, OUTPUTS)
         return ""
 
     def _set_limit(self, words: list[str]) -> str:
-        _numbers(words, 0xFFFF)  # no time passes here
+        numbers(words, 0xFFFF)  # no time passes here
         return ""
 
     def _put(self, words: list[str]) -> str:
-        slot, first = _numbers(words[:2], SLOTS - 1, EDGES - 1)
+        slot, first = numbers(words[:2], SLOTS - 1, EDGES - 1)
         edges = self._slots[slot]
         if first > len(edges):
             raise RefusedError("gap")
@@ -200,7 +223,7 @@ class EmulatedBox:
         del edges[first:]
         rest = words[2:]
         while True:
-            ticks, mask = _numbers(rest[:2], LONGEST, OUTPUTS)
+            ticks, mask = numbers(rest[:2], LONGEST, OUTPUTS)
             if len(edges) == EDGES:
                 raise RefusedError("full")
             if ticks < SHORTEST if edges else ticks != 0:
@@ -211,14 +234,14 @@ class EmulatedBox:
                 return f"{len(edges):02x}"
 
     def _get(self, words: list[str]) -> str:
-        slot, i = _numbers(words, SLOTS - 1, EDGES - 1)
+        slot, i = numbers(words, SLOTS - 1, EDGES - 1)
         if i >= len(self._slots[slot]):
             raise RefusedError("gap")
         ticks, mask = self._slots[slot][i]
         return f"{ticks:08x} {mask:04x}"
 
     def _arm(self, words: list[str]) -> str:
-        slot, n_edges = _numbers(words, SLOTS - 1, EDGES)
+        slot, n_edges = numbers(words, SLOTS - 1, EDGES)
         if not n_edges or n_edges != len(self._slots[slot]):
             raise RefusedError("gap")
         self._armed = slot
@@ -242,22 +265,33 @@ class EmulatedBox:
         self._runs = (self._runs + 1) & 0xFFFF
         return ""
 
+    def _await(self, words: list[str]) -> str:
+        if not words and self._leader.state != DEAF:
+            raise RefusedError("led")
+        return self._fire(words)
+
+    def _begin_leading(self, words: list[str]) -> str:
+        busy, ready, failed, _ = numbers(words, OUTPUTS, OUTPUTS, OUTPUTS, MOST_MS)
+        self._leader.begin(busy, ready, failed)
+        return f"{self._leader.level:02x}"
+
+    def _end_leading(self, words: list[str]) -> str:
+        del words
+        self._leader.end()
+        return ""
+
+    def _answer_leader(self, words: list[str]) -> str:
+        (is_ready,) = numbers(words, 1)
+        if self._leader.state == DEAF:
+            raise RefusedError("deaf")
+        return self._leader.answer(is_ready=bool(is_ready))
+
+    def _tell_leader(self, words: list[str]) -> str:
+        del words
+        leader = self._leader
+        return f"{leader.state:02x} {leader.n_gos:04x} {leader.more_came:02x} {leader.level:02x}"
+
     def _off(self, words: list[str]) -> str:
         del words
         self._armed, self.on = None, 0
         return ""
-
-
-def _numbers(words: list[str], *most: int) -> list[int]:
-    """Hexadecimal numbers, each at most so large; of a mask every bit must be an output."""
-    if len(words) != len(most):
-        raise RefusedError("arguments")
-    numbers: list[int] = []
-    for word, limit in zip(words, most, strict=True):
-        if not 1 <= len(word) <= 8 or not set(word) <= set("0123456789abcdefABCDEF"):
-            raise RefusedError("arguments")
-        number = int(word, 16)
-        if number > limit or (limit == OUTPUTS and number & ~OUTPUTS):
-            raise RefusedError("arguments")
-        numbers.append(number)
-    return numbers

@@ -10,7 +10,8 @@
 //   standard input, line by line; its end ends the process:
 //     reset           press the reset button
 //     reset CYCLES    the same, so many cycles after the gate next rises
-//     start           a rising edge at the start input
+//     start           a rising edge at the start input, which is pulled up
+//     low             it goes low
 //     skip CYCLES     let time pass
 //     hang            overwrite the firmware where it is with an endless loop, until the next reset
 //
@@ -103,11 +104,18 @@ static avr_cycle_count_t deliver(struct avr_t *box, avr_cycle_count_t when, void
   return box->cycle + CYCLES_PER_BYTE;
 }
 
+// Driven from outside, and so stronger than the pull-up.
+static void set_start(uint8_t level) {
+  avr_ioport_external_t driven = {.name = 'B', .mask = 1, .value = level};
+  avr_ioctl(avr, AVR_IOCTL_IOPORT_SET_EXTERNAL('B'), &driven);
+  avr_raise_irq(start_pin, level);
+}
+
 static avr_cycle_count_t rise(struct avr_t *box, avr_cycle_count_t when, void *unused) {
   (void)when, (void)unused;
   printf("start %llu\n", (unsigned long long)box->cycle);
-  avr_raise_irq(start_pin, 0);
-  avr_raise_irq(start_pin, 1);
+  set_start(0);
+  set_start(1);
   return 0;
 }
 
@@ -121,6 +129,8 @@ static void tell_reset(void) {
   if (hung_at) memcpy(avr->flash + hung_at, healthy, 2);
   hung_at = 0;
   levels = 0;
+  avr_raise_irq(start_pin, 0);  // simavr forgets the level in a reset, but not that it has told it
+  set_start(1);
   printf("reset %llu\n", (unsigned long long)avr->cycle);
   stay_busy(BUSY_CYCLES);
 }
@@ -144,6 +154,8 @@ static void obey(const char *command) {
   } else if (!strncmp(command, "start", 5)) {
     avr_cycle_timer_register(avr, CYCLES_PER_BYTE, rise, NULL);
     stay_busy(BUSY_CYCLES);
+  } else if (!strncmp(command, "low", 3)) {
+    set_start(0);
   } else if (!strncmp(command, "hang", 4)) {
     hung_at = avr->pc;
     memcpy(healthy, avr->flash + hung_at, 2);
@@ -211,6 +223,7 @@ static int make_box(const char *firmware) {
   poll_less();
   serial_in = avr_io_getirq(avr, AVR_IOCTL_UART_GETIRQ('0'), UART_IRQ_INPUT);
   start_pin = avr_io_getirq(avr, AVR_IOCTL_IOPORT_GETIRQ('B'), 0);
+  set_start(1);
   avr_irq_register_notify(avr_io_getirq(avr, AVR_IOCTL_UART_GETIRQ('0'), UART_IRQ_OUTPUT), on_sent, NULL);
   for (char port = 'B'; port <= 'D'; port += 2) {
     avr_irq_t *irq = avr_io_getirq(avr, AVR_IOCTL_IOPORT_GETIRQ(port), IOPORT_IRQ_REG_PORT);

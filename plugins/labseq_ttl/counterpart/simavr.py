@@ -83,6 +83,10 @@ class SimavrBox:
         """A rising edge at the start input."""
         self.command("start")
 
+    def lower(self) -> None:
+        """The start input goes low."""
+        self.command("low")
+
     def played(self, polarity: int) -> list[Edge]:
         """What the outputs did; see :class:`~labseq_ttl.counterpart.Counterpart`."""
         first: int | None = None

@@ -1,4 +1,4 @@
-// What the parts of the firmware share: play.c makes edges, line.c speaks, labseq_ttl.c obeys.
+// What the parts of the firmware share: play.c makes edges, lead.c hears go, line.c speaks, labseq_ttl.c obeys.
 
 #ifndef BOX_H
 #define BOX_H
@@ -6,7 +6,7 @@
 #include <avr/io.h>
 #include <stdint.h>
 
-#define PROTOCOL 1
+#define PROTOCOL 2
 #define SLOTS 8
 #define EDGES 24
 
@@ -28,12 +28,27 @@ typedef struct {
 extern uint16_t polarity;      // outputs that are low when they are on
 extern uint16_t held;          // what is on
 extern volatile uint8_t stop;  // the host said so
-extern volatile uint16_t age;  // overflows of the timer since the last byte
+extern volatile uint16_t age;    // overflows of the timer since the last byte
+extern volatile uint16_t beats;  // overflows of the timer
+extern volatile uint8_t started;  // the start input rose while its interrupt was on
 void start_timer(void);
 void nap(void);           // sleep until an interrupt; interrupts are off before and after
-void show(uint16_t mask);  // turn lines on and off now
+void show(uint16_t mask);  // turn lines on and off now; signs stay
 // Play a program now, or at the next edge of the start input; 0 if it was stopped.
 uint8_t play(const edge_t *edge, uint8_t n, uint8_t external);
+
+// lead.c
+enum { DEAF, IDLE, OWED, LATE };  // LATE: the deadline of a go has passed, and it was answered
+extern uint8_t lead;      // one of these
+extern uint16_t signs;    // outputs that are on for the leader, beside those of the lines
+extern uint16_t n_gos;    // edges that were taken since the start
+extern uint8_t went;      // one that was not told yet
+void begin_leading(uint16_t busy_at, uint16_t ready_at, uint16_t failed_at, uint16_t overflows);
+void end_leading(void);
+void look_at_leader(void);  // take an edge, keep the deadline; interrupts are off
+uint8_t more_came(void);    // whether an edge came that could not be taken
+uint8_t level(void);        // of the start input
+void answer_leader(uint8_t is_ready);
 
 // line.c
 extern char line[LINE + 1];  // what was received: tag, space, command

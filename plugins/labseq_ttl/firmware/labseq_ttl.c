@@ -10,6 +10,7 @@
 #include <avr/wdt.h>
 
 #define MAGIC 0x4C53
+#define MOST_MS 0xFFFFF  // of a deadline: half of what the timer's overflows can count
 
 typedef struct {
   uint16_t magic, polarity, serial, crc;
@@ -138,6 +139,7 @@ static void arm(void) {
 
 static void run(uint8_t external) {
   if (!at_end()) return refuse("arguments");
+  if (external && lead != DEAF) return refuse("led");
   if (!armed) return refuse("unarmed");
   uint8_t slot = armed - 1;
   armed = 0;
@@ -154,6 +156,45 @@ static void fire(void) { run(0); }
 
 static void fire_at_start(void) { run(1); }
 
+static void begin_lead(void) {
+  uint32_t busy, ready, failed, ms;
+  if (!mask_given(&busy) || !mask_given(&ready) || !mask_given(&failed)) return refuse("arguments");
+  if (!number(&ms, MOST_MS) || !at_end()) return refuse("arguments");
+  begin_leading(busy, ready, failed, ms && ms < 33 ? 1 : ms * 125 / 4096);
+  reply("ok");
+  say_number(level(), 2);
+  end();
+}
+
+static void end_lead(void) {
+  end_leading();
+  accept();
+}
+
+static void tell_leader(void) {
+  uint32_t is_ready;
+  if (!number(&is_ready, 1) || !at_end()) return refuse("arguments");
+  if (lead == DEAF) return refuse("deaf");
+  cli();
+  look_at_leader();
+  uint8_t was = lead, more = more_came();
+  answer_leader(is_ready);
+  sei();
+  reply("ok");
+  say_number(was, 2);
+  say_number(more, 2);
+  end();
+}
+
+static void tell_lead(void) {
+  reply("ok");
+  say_number(lead, 2);
+  say_number(n_gos, 4);
+  say_number(more_came(), 2);
+  say_number(level(), 2);
+  end();
+}
+
 static void all_off(void) {
   forget();
   accept();
@@ -166,6 +207,7 @@ static const struct {
     {"id", identify},   {"state", tell_state}, {"polarity", set_polarity}, {"serial", set_serial},
     {"set", set_lines}, {"timeout", set_limit}, {"put", put},              {"get", get},
     {"arm", arm},       {"fire", fire},         {"await", fire_at_start},  {"off", all_off},
+    {"lead", begin_lead}, {"deaf", end_lead},   {"answer", tell_leader},   {"leader", tell_lead},
 };
 
 static void answer(void) {
@@ -205,10 +247,19 @@ static void look_at_age(void) {
   uint8_t old = limit && age >= limit;
   if (old) age = 0;
   sei();
-  if (!old || !(held || armed)) return;
+  if (!old || !(held || armed || lead != DEAF)) return;
   forget();
+  end_leading();
   begin("!alone");
   say_number(boots, 4);
+  end();
+}
+
+static void tell_go(void) {
+  went = 0;
+  begin("!go");
+  say_number(boots, 4);
+  say_number(n_gos, 4);
   end();
 }
 
@@ -217,8 +268,13 @@ int main(void) {
   for (;;) {
     wdt_reset();
     look_at_age();
+    cli();
+    look_at_leader();
+    sei();
     if (stop) {
       halt();
+    } else if (went) {
+      tell_go();
     } else if (line_waits()) {
       if (receive()) {
         answer();
@@ -226,7 +282,7 @@ int main(void) {
       }
     } else {
       cli();
-      if (!line_waits() && !stop) nap();
+      if (!line_waits() && !stop && !(started && lead == IDLE)) nap();
       sei();
     }
   }

@@ -6,25 +6,30 @@
 #include <avr/interrupt.h>
 #include <avr/sleep.h>
 #include <avr/wdt.h>
+#include <util/atomic.h>
 
 #define RECEIVE _BV(PD0)  // pulled up: an open line sends nothing
 #define START _BV(PB0)    // pulled up: an open input never rises
 
 #define FIRST 40  // ticks from the start to the first edge
-#define NEAR 32   // ticks before an edge from which nothing is listened to
+#define NEAR 48   // ticks before an edge from which nothing is listened to: all interrupts and the leader take 30
 
 uint16_t polarity, held;
 volatile uint8_t stop;
-volatile uint16_t age;
+volatile uint16_t age, beats;
+volatile uint8_t started;
 
-static volatile uint8_t started;
 static volatile uint16_t started_at;
 
-ISR(TIMER1_OVF_vect) { age++; }
+ISR(TIMER1_OVF_vect) {
+  age++;
+  beats++;
+}
 
 ISR(TIMER1_CAPT_vect) {
   started_at = ICR1;
   started = 1;
+  TIMSK1 &= ~_BV(ICIE1);  // the first edge alone
 }
 
 EMPTY_INTERRUPT(TIMER1_COMPB_vect)
@@ -39,10 +44,12 @@ void nap(void) {
 }
 
 void show(uint16_t mask) {
-  uint16_t levels = (mask ^ polarity) & OUTPUTS;
-  held = mask;
-  PORTB = (levels >> 8) | START;
-  PORTD = levels | RECEIVE;
+  ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
+    uint16_t levels = ((mask | signs) ^ polarity) & OUTPUTS;
+    held = mask;
+    PORTB = (levels >> 8) | START | (PORTB & GATE);
+    PORTD = levels | RECEIVE;
+  }
 }
 
 // Wait for a tick less than 2^15 away; 0 if the host said stop. Interrupts are off afterwards.
@@ -55,6 +62,7 @@ static uint8_t until(uint16_t tick) {
   while (!stop && (int16_t)(TCNT1 - tick) < 0) {
     nap();
     wdt_reset();
+    look_at_leader();
   }
   return !stop;
 }
@@ -63,8 +71,6 @@ static uint8_t until(uint16_t tick) {
 static uint8_t make_edges(const edge_t *edge, uint8_t n, uint16_t due) {
   for (uint8_t i = 0; i < n; i++, edge++) {
     uint32_t left = i ? edge->ticks : FIRST;
-    uint16_t levels = edge->mask ^ polarity;
-    uint8_t b = (levels >> 8) | START | GATE, d = levels | RECEIVE;
     while (left > 0x7FFF) {
       due += 0x4000;
       left -= 0x4000;
@@ -72,6 +78,8 @@ static uint8_t make_edges(const edge_t *edge, uint8_t n, uint16_t due) {
     }
     due += left;
     if ((uint16_t)left > NEAR && !until(due - NEAR)) return 0;
+    uint16_t levels = (edge->mask | signs) ^ polarity;
+    uint8_t b = (levels >> 8) | START | GATE, d = levels | RECEIVE;
     OCR1A = due;
     TIFR1 = _BV(OCF1A);
     asm volatile(
