@@ -9,7 +9,7 @@ from typing import Any, Literal, Protocol
 
 from labseq.errors import ConfigError, LabseqError, one_of
 from labseq.model import ShotRecord, TimelineEntry
-from labseq.roles import Device, Leading, Shot, StepContext
+from labseq.roles import Leading, Shot, StepContext
 from labseq.sequencer.guard import LATE_S, Guard
 from labseq.sequencer.lab import Lab
 from labseq.sequencer.steps import WaitStep
@@ -55,18 +55,18 @@ def wait_step(settings: _Settings) -> WaitStep | FollowStep:
     return FollowStep(settings.signal, settings.timeout, settings.device or "")
 
 
-def leaders(devices: Mapping[str, Device]) -> Iterator[tuple[str, Leading]]:
-    """The devices through which other control systems lead, with their names."""
+def leaders(devices: Mapping[str, object]) -> Iterator[tuple[str, Leading]]:
+    """The devices, or lines, through which other control systems lead, with their names."""
     for name, device in devices.items():
         if isinstance(device, Leading):
             yield name, device
 
 
-def find_leader(devices: Mapping[str, Device], name: str = "") -> tuple[str, Leading]:
+def find_leader(devices: Mapping[str, object], name: str = "") -> tuple[str, Leading]:
     """The device whose leader a step waits for.
 
     Args:
-        devices: Those of the profile.
+        devices: All hardware of the profile.
         name: Of the device; "" for the only one that leads.
 
     Raises:
@@ -104,7 +104,7 @@ class Leaders:
 
     def follow(self, signal: str, timeout_s: float, device: str) -> None:
         """Wait for a signal; see ``labseq.roles.Shot.follow``."""
-        name, leader = find_leader(self.lab.devices, device)
+        name, leader = find_leader(dict(self.lab.hardware()), device)
         self._tell(name, leader, "ready", self.guard.call)  # of an earlier signal in this shot
         awaited = {"shot": self.record.shot_index, "device": name, "signal": signal, "timeout_s": timeout_s}
         self.emit("leader_awaited", awaited)
@@ -122,13 +122,13 @@ class Leaders:
             DeviceError: A device fails.
             StopRequested: The run was asked to stop; they are to be told that it failed.
         """
-        for name, leader in leaders(self.lab.devices):
+        for name, leader in leaders(dict(self.lab.hardware())):
             self._tell(name, leader, "ready", self.guard.call)
 
     def failed(self, error: BaseException) -> None:
         """The shot failed, or was interrupted; no failure to tell it stands in the way of anything."""
         reason = str(error) or type(error).__name__
-        for name, leader in leaders(self.lab.devices):
+        for name, leader in leaders(dict(self.lab.hardware())):
             try:
                 self._tell(name, leader, "failed", self.guard.call_to_the_end, reason)
             except LabseqError as failure:

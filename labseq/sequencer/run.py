@@ -259,7 +259,8 @@ class Sequencer:
     def _abort(self, record: ShotRecord, status: ShotStatus, error: BaseException) -> None:
         """Safety first; only then is who leads told, and what the shot has written down."""
         self._secure()
-        self._leaders(record).failed(error)
+        with self._stop.held():  # a driver that waits for its device's word shall be able to tell
+            self._leaders(record).failed(error)
         self._close_record(record, status, error)
         try:
             self._sink.write_shot(record)

@@ -268,7 +268,7 @@ def _deadline_warnings(
     for number, step in enumerate(steps):
         if not isinstance(step, FollowStep):
             continue
-        name, leader = find_leader(lab.devices, step.device)
+        name, leader = find_leader(dict(lab.hardware()), step.device)
         until = next((n for n in range(number + 1, len(steps)) if isinstance(steps[n], FollowStep)), None)
         longest_s = sum(bar.duration_s for _, bars in timeline[number + 1 : until] for bar in bars)
         if longest_s > leader.deadline_s:

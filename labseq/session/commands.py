@@ -63,12 +63,12 @@ def _failure(guard: Guard, lab: Lab, step: DeviceStep) -> LabseqError | None:
 def _leaderless(assembly: Assembly, lab: Lab, loc: Loc, step: FollowStep) -> Problem | None:
     """Why nobody can lead whom a step could wait for."""
     try:
-        find_leader(lab.devices, step.device)
+        find_leader(dict(lab.hardware()), step.device)
     except ConfigError as error:
         hint = ""
         if assembly.dry_run == "fast":
             hint = "virtual twins do not lead: '--dry-run' without 'fast' has one that says `go` by itself"
-        elif not dict(leaders(lab.devices)):
+        elif not dict(leaders(dict(lab.hardware()))):
             hint = "add one to its `devices`: `leader: {use: tcp_leader}`"
         key = "device" if step.device else "for"
         return assembly.document.problem((*loc, key), str(error), hint=hint)

@@ -134,6 +134,10 @@ class Box:
         """Play it now, or at the next edge of the start input; never sent twice."""
         self.line.ask("await" if external else "fire", again=False)
 
+    def ask_numbers(self, question: str, n: int) -> list[int]:
+        """Ask for so many numbers."""
+        return self._numbers(self.line.ask(question), n)
+
     def _first_answer(self) -> list[str]:
         deadline_s = time.monotonic() + max(BOOT_S, self._patience_s)
         try_s = max(BOOT_TRY_S, self._patience_s / 2)

@@ -20,6 +20,7 @@ from labseq.lines import idle_program, off_program
 from labseq.units import format_quantity
 from labseq_ttl.box import Box, cause_in_words
 from labseq_ttl.connection import SIMULATED_PATIENCE_S, Connection
+from labseq_ttl.counterpart import warm_counterpart
 from labseq_ttl.programs import MOST_EDGES, as_played, edges_of, mask_of
 from labseq_ttl.protocol import CHANNELS, SHORTEST_S, TICK_S, VERSION
 from labseq_ttl.self_test import check_box
@@ -48,6 +49,7 @@ class TtlLines:
         self._specs = context.lines
         self._names = tuple(spec.name for spec in self._specs)
         self._polarity = mask_of([spec.active_low for spec in self._specs], self._specs)
+        self._polarity |= 0 if settings.go is None else settings.go.polarity
         self._connection: Connection | None = None
         self._slots = Slots()
         self._n_boots = self._n_runs = 0
@@ -65,10 +67,8 @@ class TtlLines:
         Raises:
             DeviceError: It cannot be compiled.
         """
-        if self._settings.is_simulated and self._settings.simulated_by == "simavr":
-            from labseq_ttl.counterpart.build import runner
-
-            runner(self._name)
+        if self._settings.is_simulated:
+            warm_counterpart(self._settings.simulated_by, self._name)
 
     def open(self) -> None:
         """Connect to the box; the lines are idle. No effect if it is open.
@@ -293,9 +293,8 @@ class TtlLines:
         self._forget()
         self._slots.clear()
         self._n_boots, self._n_runs, self._was_lost = n_boots, 0, True
-        why = cause_in_words(cause)
-        text = f"the box was reset (reason: {why}) and turned all lines off; look after its supply and cable"
-        raise DeviceError(self._name, text)
+        text = f"the box was reset (reason: {cause_in_words(cause)}) and turned all lines off"
+        raise DeviceError(self._name, f"{text}; look after its supply and cable")
 
     def _too_late(self, timeout_s: float) -> DeviceTimeoutError:
         text = f"the lines' program is not over after {format_quantity(timeout_s, 'time')}"

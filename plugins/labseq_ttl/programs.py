@@ -55,6 +55,8 @@ def as_played(edges: Sequence[Edge], program: LineProgram, specs: Sequence[LineS
         program: What they should have done.
         specs: The lines, in the program's order.
     """
+    ours = sum(1 << spec.channel for spec in specs)  # others may be a leader's
+    edges = [(tick, mask & ours) for tick, mask in edges]
     changes = [edge for i, edge in enumerate(edges) if i == 0 or edge[1] != edges[i - 1][1]]
     on = [[bool(mask >> spec.channel & 1) for spec in specs] for _, mask in changes]
     t_s = np.array([tick for tick, _ in changes], np.float64) * TICK_S

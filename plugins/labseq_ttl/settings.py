@@ -2,17 +2,76 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Final, Literal, Self
+from itertools import combinations
+from typing import Annotated, Final, Literal, Self, TypeAlias
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from labseq import Duration, Settings
 from labseq.config.fields import misfit
+from labseq_ttl.protocol import CHANNELS
 
 SIMULATED: Final = "simulated"
 """The port that needs no box."""
 
 MAX_LIGHTS_OUT_S: Final = 65.0
+MAX_DEADLINE_S: Final = 1000.0
+
+
+def _is_output(channel: int) -> int:
+    if channel not in CHANNELS:
+        raise ValueError(f"expected an output of the box: {', '.join(map(str, CHANNELS))}")
+    return channel
+
+
+Channel: TypeAlias = Annotated[int, AfterValidator(_is_output)]
+"""Number of an output of the box."""
+
+
+class GoSettings(Settings):
+    """A leader at the box: `go` is a rising edge at the start input (D8), outputs are the answer."""
+
+    deadline: Annotated[Duration, Field(ge=0.1, le=MAX_DEADLINE_S)] = Field(
+        default=10.0,
+        description="longest time from `go` to `ready` or `failed`; the box keeps it, also without labseq",
+    )
+    busy: Channel | None = Field(
+        default=None, description="output that is high from `go` to the end of the shot"
+    )
+    ready: Channel | None = Field(
+        default=None, description="output that goes high when the shot is over, until the next `go`"
+    )
+    failed: Channel | None = Field(
+        default=None, description="output that goes high when it failed or was late, until the next `go`"
+    )
+    active_low: bool = Field(default=False, description="these outputs are low while they say something")
+    goes_after: Duration = Field(
+        default=0.5,
+        description="with a simulated box: time after which a simulated leader raises `go`; atoms load "
+        "meanwhile",
+    )
+
+    @property
+    def outputs(self) -> dict[str, int]:
+        """Name -> channel of those that are wired."""
+        pins = {"busy": self.busy, "ready": self.ready, "failed": self.failed}
+        return {name: pin for name, pin in pins.items() if pin is not None}
+
+    @property
+    def polarity(self) -> int:
+        """Those that are low when they are on: bit n is channel n."""
+        return sum(1 << pin for pin in self.outputs.values()) if self.active_low else 0
+
+    @model_validator(mode="after")
+    def _are_apart(self) -> Self:
+        pins = self.outputs
+        if not {"ready", "failed"} <= set(pins):
+            missing = "ready" if "ready" not in pins else "failed"
+            raise misfit(f"'{missing}' has no output", "outputs for 'ready' and 'failed'")
+        for (first, a), (second, b) in combinations(pins.items(), 2):
+            if a == b:
+                raise misfit(f"'{first}' and '{second}' are both on output {a}", "one each", at=(second,))
+        return self
 
 
 class TtlSettings(Settings):
@@ -42,6 +101,11 @@ class TtlSettings(Settings):
         "simulated processor",
     )
 
+    go: GoSettings | None = Field(
+        default=None,
+        description="lets another control system lead through the box, see [the guide](../how-to/follow.md)",
+    )
+
     @property
     def is_simulated(self) -> bool:
         """Whether there is no box."""
@@ -51,4 +115,7 @@ class TtlSettings(Settings):
     def _somebody_starts_it(self) -> Self:
         if self.is_simulated and self.start == "external":
             raise misfit("nobody gives a simulated box its external start", "`start: serial`", at=("start",))
+        if self.go is not None and self.start == "external":
+            what = "the start input cannot be a leader's and start programs too"
+            raise misfit(what, "`start: serial` beside 'go'", at=("start",))
         return self

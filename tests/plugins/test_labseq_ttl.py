@@ -95,7 +95,7 @@ def test_the_self_test_changes_no_line(simulated_by: str) -> None:
 def test_it_says_what_it_is(simulated_by: str) -> None:
     with rig(simulated_by=simulated_by) as lab:
         told = json.loads(json.dumps(dict(lab.lines.describe()), allow_nan=False))
-    assert (told["firmware"], told["serial_number"], told["started_by"]) == ("protocol 1", 0, "power-up")
+    assert (told["firmware"], told["serial_number"], told["started_by"]) == ("protocol 2", 0, "power-up")
     assert told["lines"] == {"cooling": 2, "mot": 3, "imaging": 4, "camera": 5, "shutter": 6}
 
 

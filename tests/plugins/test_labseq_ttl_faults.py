@@ -164,8 +164,8 @@ class Other(EmulatedBox):
     ("says", "told"),
     [
         ("shutter 01 0000 0000 01", "'shutter 01 0000 0000 01' answers; expected 'labseq-ttl'"),
-        ("labseq-ttl 02 0000 0000 01", "speaks version 2 of the protocol; expected 1"),
-        ("labseq-ttl 01 what", "the box answers 'what'; expected 3 hexadecimal numbers"),
+        ("labseq-ttl 03 0000 0000 01", "speaks version 3 of the protocol; expected 2"),
+        ("labseq-ttl 02 what", "the box answers 'what'; expected 3 hexadecimal numbers"),
         ("labseq-ttl nn", "the box answers 'nn'; expected 1 hexadecimal numbers"),
         ("", "'' answers; expected 'labseq-ttl'"),
     ],

@@ -188,6 +188,26 @@ def test_a_stop_after_the_last_step_is_told_as_a_failure_too() -> None:
     assert made.record().status == "interrupted"
 
 
+def test_a_leader_that_is_told_by_a_driver_which_waits_is_told_of_a_stop() -> None:
+    class Stopping(WaitStep):
+        def run(self, shot: Any) -> None:
+            made.lab.stop.request()
+            super().run(shot)
+
+    made = rig(FOLLOW, ("stop", Stopping(given(duration=1.0))), IMAGE)
+    leader = leader_of(made)
+    tell = leader.tell
+
+    def waits(state: Any, about: Any) -> str:
+        made.lab.clock.check()  # as every driver does that waits for its device
+        return tell(state, about)
+
+    vars(leader)["tell"] = waits
+    with pytest.raises(StopRequested):
+        made.run()
+    assert states(made) == ["failed"]
+
+
 def test_a_stop_while_it_waits_is_nobodys_failure() -> None:
     made = rig()
     leader = leader_of(made)

@@ -37,6 +37,18 @@ class Counterpart(Protocol):
         ...
 
 
+def warm_counterpart(simulated_by: str, device: str) -> None:
+    """Compile what a simulated box needs, before it is turned on.
+
+    Raises:
+        DeviceError: It cannot be compiled.
+    """
+    if simulated_by == "simavr":
+        from labseq_ttl.counterpart.build import runner
+
+        runner(device)
+
+
 def start_counterpart(simulated_by: str, device: str, clock: Clock) -> Counterpart:
     """Make a simulated box and turn it on.
 

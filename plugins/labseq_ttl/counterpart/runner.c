@@ -11,6 +11,7 @@
 //     reset           press the reset button
 //     reset CYCLES    the same, so many cycles after the gate next rises
 //     start           a rising edge at the start input, which is pulled up
+//     start CYCLES    the same, so many cycles after the gate next rises
 //     low             it goes low
 //     skip CYCLES     let time pass
 //     hang            overwrite the firmware where it is with an endless loop, until the next reset
@@ -46,7 +47,8 @@ static avr_irq_t *serial_in, *start_pin;
 static int line_fd, kept_fd;
 static char name[64];
 static uint16_t levels;
-static avr_cycle_count_t busy_until, reset_after, reset_at;
+static avr_cycle_count_t busy_until, reset_after, reset_at, start_after;
+static avr_cycle_count_t rise(struct avr_t *box, avr_cycle_count_t when, void *unused);
 static uint8_t inbox[4096];
 static size_t n_in, at_in;
 static uint32_t hung_at;
@@ -77,6 +79,10 @@ static void on_levels(struct avr_irq_t *irq, uint32_t value, void *shift) {
     reset_at = avr->cycle + reset_after;
     avr_cycle_timer_register(avr, reset_after, wake, NULL);
     reset_after = 0;
+  }
+  if (start_after && levels & ~before & GATE) {
+    avr_cycle_timer_register(avr, start_after, rise, NULL);
+    start_after = 0;
   }
   if (!(levels & GATE)) stay_busy(BUSY_CYCLES);
 }
@@ -151,6 +157,8 @@ static void obey(const char *command) {
     reset_after = cycles;
   } else if (!strncmp(command, "reset", 5)) {
     reset();
+  } else if (sscanf(command, "start %llu", &cycles) == 1) {
+    start_after = cycles;
   } else if (!strncmp(command, "start", 5)) {
     avr_cycle_timer_register(avr, CYCLES_PER_BYTE, rise, NULL);
     stay_busy(BUSY_CYCLES);
