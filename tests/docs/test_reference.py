@@ -34,7 +34,7 @@ from labseq.config.fields import PatternChoice
 from labseq.config.motion import MobileTweezersChoice
 from labseq.config.policies import BudgetSettings, PolicySettings, StepPolicySettings
 from labseq.config.profile import GridSettings
-from labseq.registry import Entry, Registry
+from labseq.registry import KINDS, Entry, Registry
 
 Pages = Mapping[str, Element]
 Tables = Mapping[str, Element]
@@ -225,12 +225,17 @@ def test_every_hook_is_in_the_reference(pages: Pages) -> None:
 
 def test_every_role_and_method_is_in_the_reference(pages: Pages) -> None:
     every = [one for name, one in vars(roles).items() if name in dir(labseq) and isinstance(one, type)]
+    assert {*KINDS} - {"pattern"} <= {snake_case(role.__name__) for role in every}
     shown = {re.split(r"[(:]", term)[0] for term in terms_of(pages, "plugin-api")}
-    for role in (one for one in every if one.__module__ == roles.__name__):
+    for role in every:
         members = {name for name, one in vars(role).items() if isinstance(one, FunctionType | property)}
-        about = (role.__doc__ or "?").partition("\n")[0].replace("``", "")
+        about = (role.__doc__ or "?").partition("\n")[0].replace("`", "")
         assert about in text_of(pages, "plugin-api"), role
         assert {name for name in members if not name.startswith("_")} <= shown, role
+
+
+def snake_case(name: str) -> str:
+    return re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower()
 
 
 def test_every_contract_suite_is_in_the_reference(pages: Pages) -> None:
