@@ -115,12 +115,16 @@ class UnsafeWhileArmed(RecordingCamera):
 
 
 class SafeOnlyOnce(RecordingCamera):
-    count = 0
+    is_safe = False
+
+    def arm(self, n_frames: int, exposure_s: float, trigger: Trigger) -> None:
+        self.is_safe = False
+        super().arm(n_frames, exposure_s, trigger)
 
     def safe_state(self) -> None:
-        self.count += 1
-        if self.count == 2:
+        if self.is_safe:
             raise DeviceError(self.name, "it is safe already")
+        self.is_safe = True
         super().safe_state()
 
 

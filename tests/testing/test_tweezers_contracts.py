@@ -82,10 +82,19 @@ class LeavesOutThePauses(RecordingMobileTweezers):
 
 
 class RunsOutOfMemory(RecordingMobileTweezers):
+    n_held = 0
+
     def prepare(self, program: ToneProgram) -> float:
-        if len(self.programs) == 2:
+        if self.n_held == 2:
             raise MemoryError
-        return super().prepare(program)
+        self.n_held, n_held = 0, self.n_held  # what is refused frees the memory
+        duration_s = super().prepare(program)
+        self.n_held = n_held + 1
+        return duration_s
+
+    def safe_state(self) -> None:
+        self.n_held = 0
+        super().safe_state()
 
 
 class PlaysToTheEnd(RecordingMobileTweezers):

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Generator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Generator, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any, ClassVar, Final, Generic, TypeAlias, TypeVar
 
@@ -96,26 +96,53 @@ class HardwareContract(Generic[D]):
         return {}
 
     @contextmanager
-    def opened(self, factory: Factory[D]) -> Generator[tuple[D, Context]]:
-        """A new device, opened, with its context; closed at the end."""
+    def made(self, factory: Factory[D]) -> Generator[tuple[D, Context]]:
+        """A new device, not opened, with its context; closed at the end, whatever has become of it."""
         context = self.context()
-        if context.simulation is not None:
-            context.simulation.open()
-        _begin_shot(context)
         device = factory(context)
-        device.open()
         try:
             yield device, context
         finally:
-            with suppress(Exception):  # what close() promises has tests of its own
-                device.close()
+            _close(device)
+
+    @contextmanager
+    def opened(self, factory: Factory[D]) -> Generator[tuple[D, Context]]:
+        """A new device, opened, with its context; closed at the end."""
+        with self.made(factory) as (device, context):
+            if context.simulation is not None:
+                context.simulation.open()
+            _begin_shot(context)
+            device.open()
+            yield device, context
+
+    @contextmanager
+    def each_state(self, factory: Factory[D]) -> Generator[Iterator[tuple[str, D, Context]]]:
+        """A device in each of its states: (state, device, context).
+
+        It is one device from state to state, and a new one only where that cannot get there.
+        """
+        with ExitStack() as stack:
+
+            def states() -> Iterator[tuple[str, D, Context]]:
+                device, context = stack.enter_context(self.opened(factory))
+                for state, enter in {"after open()": _stay, **self.states()}.items():
+                    try:
+                        enter(device)
+                    except Exception:  # noqa: BLE001 - that the last state is left rightly has tests of its own
+                        stack.close()
+                        device, context = stack.enter_context(self.opened(factory))
+                        enter(device)
+                    yield state, device, context
+
+            yield states()
 
     @promise("the constructor does no I/O")
     def test_constructor_does_no_io(self, factory: Factory[D]) -> None:
         """Nothing is opened, connected or started before open()."""
         context = self.context()
         with watch_io() as seen:
-            factory(context)
+            device = factory(context)
+        _close(device)
         assert not seen, f"it did {', '.join(seen)}; open() is the place for that"
 
     @promise("open() and close() twice do no harm, and a closed device can be opened again")
@@ -129,15 +156,16 @@ class HardwareContract(Generic[D]):
     @promise("close() is legal before open()")
     def test_closes_before_open(self, factory: Factory[D]) -> None:
         """A run that fails while it opens its devices closes them all."""
-        factory(self.context()).close()
+        with self.made(factory) as (device, _):
+            device.close()
 
     @promise(ALWAYS_SAFE)
     def test_safe_state_in_every_state(self, factory: Factory[D]) -> None:
         """Before open(), after it, in each state of the role, after close()."""
-        _safe_twice(factory(self.context()), "before open()")
-        for state, enter in {"after open()": _stay, **self.states()}.items():
-            with self.opened(factory) as (device, _):
-                enter(device)
+        with self.made(factory) as (device, _):
+            _safe_twice(device, "before open()")
+        with self.each_state(factory) as states:
+            for state, device, _ in states:
                 _safe_twice(device, state)
         with self.opened(factory) as (device, _):
             device.close()
@@ -146,9 +174,8 @@ class HardwareContract(Generic[D]):
     @promise("the device works in the next shot after safe_state()")
     def test_works_after_safe_state(self, factory: Factory[D]) -> None:
         """A shot that failed with TransientError is repeated without another open()."""
-        for state, enter in {"after open()": _stay, **self.states()}.items():
-            with self.opened(factory) as (device, context):
-                enter(device)
+        with self.each_state(factory) as states:
+            for state, device, context in states:
                 with promised(ALWAYS_SAFE):
                     device.safe_state()
                 _begin_shot(context)
@@ -158,17 +185,21 @@ class HardwareContract(Generic[D]):
     @promise("safe_state() and close() work after a failure")
     def test_closes_after_failures(self, factory: Factory[D]) -> None:
         """A failure must leave a device that can be made safe and closed."""
-        for what, fail in self._failures().items():
+        for failures in self._failures():
             with self.opened(factory) as (device, context):
-                try:
-                    self._in_time(context, what, fail, device)
-                except HangsError:  # timeouts have a test of their own
-                    continue
-                except Exception:  # noqa: BLE001, S110 - and so have errors
-                    pass
-                for method in (device.safe_state, device.close):
-                    with doing(f"{method.__name__}() after {what}"):
-                        method()
+                what = "open()"
+                for what, fail in failures.items():
+                    try:
+                        self._in_time(context, what, fail, device)
+                    except HangsError:  # timeouts have a test of their own
+                        break
+                    except Exception:  # noqa: BLE001, S110 - and so have errors
+                        pass
+                    with doing(f"safe_state() after {what}"):
+                        device.safe_state()
+                else:
+                    with doing(f"close() after {what}"):
+                        device.close()
 
     @promise("describe() gives values that JSON can hold")
     def test_describes_itself(self, factory: Factory[D]) -> None:
@@ -182,17 +213,18 @@ class HardwareContract(Generic[D]):
     def test_refuses_calls_while_closed(self, factory: Factory[D]) -> None:
         """Every call of the role that needs the device."""
         for what, use in self.uses().items():
-            refusal(DeviceError, f"{what} before open()", use, factory(self.context()))
-        for what, use in self.uses().items():
-            with self.opened(factory) as (device, _):
-                device.close()
+            with self.made(factory) as (device, _):
+                refusal(DeviceError, f"{what} before open()", use, device)
+        with self.opened(factory) as (device, _):
+            device.close()
+            for what, use in self.uses().items():
                 refusal(DeviceError, f"{what} after close()", use, device)
 
     @promise("what exceeds a limit is refused with LimitError before anything moves")
     def test_refuses_what_exceeds_limits(self, factory: Factory[D]) -> None:
         """Neither does time pass nor does the simulation see anything, and the device goes on working."""
-        for what, ask in self.excesses().items():
-            with self.opened(factory) as (device, context):
+        with self.opened(factory) as (device, context):
+            for what, ask in self.excesses().items():
                 self.ready(device)
                 before_s, before = context.clock.now(), n_calls(context)
                 refusal(LimitError, what, ask, device)
@@ -215,30 +247,37 @@ class HardwareContract(Generic[D]):
     @promise("a DeviceError names the device as the profile does")
     def test_errors_name_the_device(self, factory: Factory[D]) -> None:
         """Else nobody knows which of the instruments failed."""
-        for what, fail in {**self.uses(), **self._failures()}.items():
-            context = self.context()
-            device = factory(context)
-            if what not in self.uses():
-                device.open()
-            named = context.name
-            try:
-                self._in_time(context, what, fail, device)
-            except DeviceError as error:
-                named = error.device
-            except Exception:  # noqa: BLE001, S110 - that it fails rightly has tests of its own
-                pass
-            with suppress(Exception):  # what close() promises has tests of its own
-                device.close()
-            text = f"{what} raised an error of '{named}'; the profile calls it '{context.name}'"
-            assert named == context.name, text
+        for what, use in self.uses().items():
+            with self.made(factory) as (device, context):
+                self._named(context, what, use, device)
+        for failures in self._failures():
+            with self.opened(factory) as (device, context):
+                for what, fail in failures.items():
+                    self._named(context, what, fail, device)
 
-    def _failures(self) -> Mapping[str, Action[D]]:
-        """Every way in which the suite makes an open device fail."""
+    def _named(self, context: Context, what: str, fail: Action[D], device: D) -> None:
+        """Check whom the error of a call names, if it is a DeviceError; then the device is made safe."""
+        named = context.name
+        try:
+            self._in_time(context, what, fail, device)
+        except DeviceError as error:
+            named = error.device
+        except Exception:  # noqa: BLE001, S110 - that it fails rightly has tests of its own
+            pass
+        text = f"{what} raised an error of '{named}'; the profile calls it '{context.name}'"
+        assert named == context.name, text
+        with suppress(Exception):  # and so has this
+            device.safe_state()
+
+    def _failures(self) -> Iterator[Mapping[str, Action[D]]]:
+        """Every way in which the suite makes an open device fail, in groups for one device each."""
 
         def waiting(wait: Wait[D]) -> Action[D]:
             return lambda device: (wait.enter(device), wait.wait(device))
 
-        return {**self.excesses(), **{what: waiting(wait) for what, wait in self.waits().items()}}
+        yield self.excesses()
+        for what, wait in self.waits().items():
+            yield {what: waiting(wait)}
 
     def _in_time(self, context: Context, what: str, call: Callable[..., object], *args: object) -> None:
         """A call that must come back; one that polls the clock for ever is ended by it."""
@@ -248,6 +287,12 @@ class HardwareContract(Generic[D]):
             if isinstance(context.clock, FakeClock):
                 context.clock.stop.request()
             raise
+
+
+def _close(device: Hardware) -> None:
+    """Whatever the test has found; what close() promises has tests of its own."""
+    with suppress(Exception):
+        device.close()
 
 
 def _stay(device: object) -> None:
