@@ -47,16 +47,8 @@ class TestSimulatedInstrument(Declared):
 @on_a_pty
 class TestInstrumentOnAPty(Declared):
     @pytest.fixture
-    def factory(self, counterpart: Counterpart) -> Iterator[Factory]:
-        made: list[SerialDevice] = []
-
-        def make(context: Context) -> SerialDevice:
-            made.append(SerialDevice(settings(port=counterpart.port), context))
-            return made[-1]
-
-        yield make
-        for device in made:  # one that stays open keeps the next from opening
-            device.close()
+    def factory(self, counterpart: Counterpart) -> Factory:
+        return partial(SerialDevice, settings(port=counterpart.port))
 
 
 @on_a_pty

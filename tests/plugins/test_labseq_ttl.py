@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Generator
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -43,16 +43,8 @@ class TestModel(LinesContract):
 
 class TestFirmware(LinesContract):
     @pytest.fixture
-    def factory(self) -> Generator[Callable[[Context], TtlLines]]:
-        made: list[TtlLines] = []
-
-        def make(context: Context) -> TtlLines:
-            made.append(TtlLines(TtlSettings(simulated_by="simavr"), context))
-            return made[-1]
-
-        yield make
-        for lines in made:  # not every promise closes what it opened
-            lines.close()
+    def factory(self) -> Callable[[Context], TtlLines]:
+        return partial(TtlLines, TtlSettings(simulated_by="simavr"))
 
 
 @SIMULATED

@@ -36,9 +36,9 @@ def contents(run):
 
 @pytest.mark.parametrize("options", [{}, {"profile": "lab", "dry_run": "full"}, {"dry_run": "fast"}])
 def test_the_same_seed_gives_the_same_data(tmp_path, options):
-    first = run(tmp_path, shots=2, seed=11, **options)
-    again = run(tmp_path, shots=2, seed=11, **options)
-    other = run(tmp_path, shots=2, seed=12, **options)
+    first = run(tmp_path, shots=1, seed=11, **options)
+    again = run(tmp_path, shots=1, seed=11, **options)
+    other = run(tmp_path, shots=1, seed=12, **options)
     assert contents(first) == contents(again)
     assert contents(first) != contents(other)
     assert first.path != again.path

@@ -1,6 +1,6 @@
 """Figures 4 and 5 of the paper, out of ordinary sequences on the fitted virtual lab.
 
-A few hundred shots here; ``poe soak`` takes 10,000 of figure 5, and ``docs/make_paper_figures.py`` all of
+A hundred shots or so here; ``poe soak`` takes 10,000 of figure 5, and ``docs/make_paper_figures.py`` all of
 both.
 """
 
@@ -17,7 +17,7 @@ from labseq.recording.statistics import Statistics, statistics_of
 from labseq.session.ceiling import Losses, after_moves, ceiling
 
 SEQUENCES = Path(__file__).parents[2] / "sequences"
-N_SHOTS = int(os.environ.get("LABSEQ_FIGURE_SHOTS", "250"))
+N_SHOTS = int(os.environ.get("LABSEQ_FIGURE_SHOTS", "120"))
 MISSED = 5e-5
 """Atoms that the detector misses, as docs/explanation/virtual-images.md has them."""
 
