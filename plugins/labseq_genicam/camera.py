@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, Final
@@ -122,16 +123,20 @@ class GenicamCamera(CameraDriver):
 
     def _wait(self, timeout_s: float) -> Taken | None:
         """Wait for a frame, and ask now and then whether the camera is still there."""
-        acquisition, left_s = self._opened(), timeout_s
-        while True:
-            slice_s = min(left_s, ASK_S)
-            taken = wait_for(acquisition.poll, slice_s, self._clock)
-            if taken is not None:
-                return taken
+        acquisition, asked_s = self._opened(), time.monotonic()
+
+        def poll(longest_s: float) -> Taken | None:
+            nonlocal asked_s
+            taken = acquisition.poll(longest_s)
+            if taken is None and time.monotonic() - asked_s >= ASK_S:
+                acquisition.ask()
+                asked_s = time.monotonic()
+            return taken
+
+        taken = wait_for(poll, timeout_s, self._clock)
+        if taken is None:
             acquisition.ask()
-            left_s -= slice_s
-            if left_s <= 0:
-                return None
+        return taken
 
     def _opened(self) -> Acquisition:
         if self._acquisition is None:

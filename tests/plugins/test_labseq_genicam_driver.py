@@ -178,6 +178,19 @@ def test_a_frame_is_due_when_a_real_camera_would_have_it() -> None:
     assert frame.t_start_s == 0.0
 
 
+def test_a_computer_that_is_slow_costs_no_time_on_a_virtual_clock(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("labseq_genicam.camera.ASK_S", 1e-3)
+    with rig(readout="5 ms") as lab:
+        acquisition, asked = lab.camera._opened(), list[None]()
+        poll = acquisition.poll
+        monkeypatch.setattr(acquisition, "ask", lambda: asked.append(None))
+        monkeypatch.setattr(acquisition, "poll", lambda s: poll(s) if len(asked) > 2 else None)
+        frames = lab.take(1, 0.01)
+        assert len(asked) == 3
+        assert lab.clock.now() == pytest.approx(0.015)
+        assert_shown(frames, lab)
+
+
 def test_it_says_what_it_is_and_what_it_took() -> None:
     with rig(gain=6.0, packet_size=9000, packet_delay="1 us", binning=2, serial="SIM1") as lab:
         lab.take(1, 0.02)
