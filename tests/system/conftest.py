@@ -6,10 +6,14 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import redirect_stderr, redirect_stdout
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import pytest
+
+from labseq.cli import main
 
 WATCHED = '''
 """The virtual devices, noting every call in a file as it is entered."""
@@ -129,10 +133,24 @@ class Bench:
             stdin=subprocess.DEVNULL,
         )
 
-    def run(self, *arguments: str, timeout: float = 120.0) -> subprocess.CompletedProcess[str]:
+    def run_apart(self, *arguments: str, timeout: float = 120.0) -> subprocess.CompletedProcess[str]:
+        """To its end, in a process of its own."""
         process = self.start(*arguments)
         out, err = process.communicate(timeout=timeout)
         return subprocess.CompletedProcess(process.args, process.returncode, out, err)
+
+    def run(self, *arguments: str) -> subprocess.CompletedProcess[str]:
+        """To its end, in this process, where nothing must be imported first."""
+        out, err = StringIO(), StringIO()
+        with pytest.MonkeyPatch.context() as patch, redirect_stdout(out), redirect_stderr(err):
+            for name, value in self.environment.items():
+                patch.setenv(name, value)
+            patch.chdir(self.folder)
+            with pytest.raises(SystemExit) as ended:
+                main(list(arguments))
+        code = ended.value.code
+        assert code is None or isinstance(code, int)
+        return subprocess.CompletedProcess(arguments, code or 0, out.getvalue(), err.getvalue())
 
     def calls(self) -> list[str]:
         return self.log.read_text().split() if self.log.exists() else []

@@ -86,8 +86,8 @@ def test_a_run_that_is_killed_and_resumed_is_the_whole_run(scanned, whole, trial
         process.communicate()
         command = ["resume", str(scanned.run_dir())]
     if labseq.open_run(scanned.run_dir()).status != "complete":
-        done = scanned.run(*command, "--json")
-        assert (done.returncode, json.loads(done.stdout)["status"]) == (0, "complete"), done.stderr
+        done = scanned.run(*command)
+        assert done.returncode == 0, done.stderr
     run = labseq.open_run(scanned.run_dir())
     assert (run.status, len(run.shots)) == ("complete", N_SHOTS)
     counted = [row["shot"] for row in scanned.index() if row["counts"]]
@@ -122,7 +122,7 @@ def test_a_queue_that_is_killed_goes_on_with_the_run_at_hand(scanned):
     scanned.await_calls(process, "camera.read", 5)
     process.kill()
     process.communicate()
-    listed = json.loads(scanned.run("queue", "list", "--json").stdout)["entries"]
+    listed = json.loads(scanned.run_apart("queue", "list", "--json").stdout)["entries"]
     assert [entry["state"] for entry in listed] == ["interrupted", "waiting"]
     done = scanned.run("queue", "run")
     assert done.returncode == 0, done.stderr
