@@ -14,6 +14,8 @@ A plugin's test inherits the suite of its role and provides one fixture::
 ``factory(context)`` constructs what is tested, as labseq itself does after it
 has read the settings. Each failure names the promise that was broken.
 
+``SUITES`` has the suite of each kind of plugin; ``docs/reference/testing.md`` lists all promises.
+
 Never imported at run time: needs pytest and hypothesis. Names are resolved when
 they are first used, because pytest loads this package wherever labseq is installed.
 """
@@ -26,25 +28,33 @@ from typing import TYPE_CHECKING, Any, Final
 if TYPE_CHECKING:
     from labseq.testing import fakes as fakes, strategies as strategies
     from labseq.testing.contracts import (
+        SUITES as SUITES,
+        AnalysisContract as AnalysisContract,
         BrokenPromise as BrokenPromise,
         CameraContract as CameraContract,
         DetectorContract as DetectorContract,
         DeviceContract as DeviceContract,
         LinesContract as LinesContract,
         MobileTweezersContract as MobileTweezersContract,
+        PatternContract as PatternContract,
         PlannerContract as PlannerContract,
+        SimulationContract as SimulationContract,
         StaticTweezersContract as StaticTweezersContract,
         StepContract as StepContract,
     )
 
 _CONTRACTS: Final = (
+    "SUITES",
+    "AnalysisContract",
     "BrokenPromise",
     "CameraContract",
     "DetectorContract",
     "DeviceContract",
     "LinesContract",
     "MobileTweezersContract",
+    "PatternContract",
     "PlannerContract",
+    "SimulationContract",
     "StaticTweezersContract",
     "StepContract",
 )

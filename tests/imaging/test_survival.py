@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,10 +13,19 @@ import pytest
 from hypothesis import assume, given, strategies as st
 from hypothesis.extra.numpy import arrays
 
+from labseq.config.analyses import SurvivalSettings
 from labseq.imaging.survival import SurvivalAnalysis, after_moves
 from labseq.model import CycleRecord, ImageRecord, Plan, PlanReport
+from labseq.roles import Context
+from labseq.testing import AnalysisContract
 
 SHAPE = (1, 5)
+
+
+class TestSurvival(AnalysisContract):
+    @pytest.fixture
+    def factory(self) -> Callable[[Context], SurvivalAnalysis]:
+        return partial(SurvivalAnalysis, SurvivalSettings())
 
 
 def image(row: str, step: int, cycle: int = 0) -> ImageRecord:

@@ -15,14 +15,17 @@ from labseq_virtual.settings import (
     DeviceSettings,
     MobileTweezersSettings,
     StaticTweezersSettings,
+    WorldSettings,
 )
 from labseq_virtual.static_tweezers import VirtualStaticTweezers
+from labseq_virtual.world import World
 
 from labseq import Context
 from labseq.testing import (
     CameraContract,
     DeviceContract,
     MobileTweezersContract,
+    SimulationContract,
     StaticTweezersContract,
 )
 
@@ -64,3 +67,10 @@ class TestVirtualDevice(DeviceContract):
     @pytest.fixture
     def factory(self) -> Callable[[Context], VirtualDevice]:
         return partial(VirtualDevice, DeviceSettings(commands=("open", "set"), values={"power": 1.0}))
+
+
+class TestVirtualWorld(SimulationContract):
+    @pytest.fixture
+    def factory(self) -> Callable[[Context], World]:
+        settings = {"image": {"frame": [80, 96], "centre_px": [39.5, 47.5]}}
+        return partial(World, WorldSettings.model_validate(settings))

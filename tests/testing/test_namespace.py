@@ -5,12 +5,16 @@ import labseq.testing
 
 def test_every_public_name_resolves() -> None:
     for name in (
+        "SUITES",
+        "AnalysisContract",
         "BrokenPromise",
         "CameraContract",
         "DetectorContract",
         "DeviceContract",
         "MobileTweezersContract",
+        "PatternContract",
         "PlannerContract",
+        "SimulationContract",
         "StaticTweezersContract",
         "StepContract",
         "fakes",

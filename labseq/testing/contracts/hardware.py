@@ -3,147 +3,47 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Generator, Iterator, Mapping
-from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass
-from typing import Any, ClassVar, Final, Generic, TypeAlias, TypeVar
-
-import pytest
+from collections.abc import Mapping
+from contextlib import suppress
+from typing import Any, Final
 
 from labseq.errors import DeviceError, DeviceTimeoutError, LimitError
-from labseq.model import SiteGrid
 from labseq.roles import Context, Hardware
-from labseq.testing.contracts.promises import (
-    HangsError,
-    doing,
-    in_time,
-    no_factory,
-    promise,
-    promised,
-    refusal,
+from labseq.testing.contracts.bench import (
+    Action,
+    D,
+    Factory,
+    HardwareBench,
+    Wait,
+    begin_shot,
+    close_quietly,
+    n_calls,
 )
-from labseq.testing.contracts.watch import watch_io
-from labseq.testing.fakes import Calls, FakeClock, RecordingSimulation
+from labseq.testing.contracts.process import quietly
+from labseq.testing.contracts.promises import HangsError, doing, promise, promised, refusal
 
-D = TypeVar("D", bound=Hardware)
-Factory: TypeAlias = Callable[[Context], D]
-Action: TypeAlias = Callable[[D], object]
+__all__ = ["Action", "Factory", "HardwareContract", "Wait", "n_calls"]
 
 ALWAYS_SAFE: Final = "safe_state() is legal in every state, and twice"
 
 
-@dataclass(frozen=True, slots=True)
-class Wait(Generic[D]):
-    """A wait for something that does not come within its timeout.
-
-    Attributes:
-        timeout_s: The timeout, in seconds.
-        enter: Brings an open device to where it can wait.
-        wait: The call, with that timeout.
-    """
-
-    timeout_s: float
-    enter: Action[D]
-    wait: Action[D]
-
-
-class HardwareContract(Generic[D]):
+class HardwareContract(HardwareBench[D]):
     """Promises of every camera, tweezer driver and instrument.
 
     Inherit the suite of the role, not this one, and provide the fixture ``factory``.
-
-    Attributes:
-        role: Name that the device has in the profile.
-        patience_s: Real time after which a call counts as hung, in seconds.
     """
 
-    role: ClassVar[str] = "device"
-    patience_s: ClassVar[float] = 10.0
-
-    @pytest.fixture
-    def factory(self) -> Factory[D]:
-        """Constructs the device, given a context; provided by the plugin's test."""
-        no_factory(self, "context -> device")
-
-    def context(self) -> Context:
-        """What the device is constructed with; override it for another grid or simulation.
-
-        Keep the clock virtual: then waiting for a timeout costs no time.
-        """
-        clock = FakeClock()
-        return Context(self.role, SiteGrid(), clock=clock, simulation=RecordingSimulation(Calls(clock)))
-
-    def work(self, device: D) -> None:
-        """What the role does in a shot, once; the device is open."""
-
-    def ready(self, device: D) -> None:
-        """What comes before any work; the device is open."""
-
-    def uses(self) -> Mapping[str, Action[D]]:
-        """Calls of the role that need an open device: description -> call."""
-        return {}
-
-    def states(self) -> Mapping[str, Action[D]]:
-        """States of an open device: description -> how to get there."""
-        return {}
-
-    def excesses(self) -> Mapping[str, Action[D]]:
-        """Calls that ask for more than any device can do: description -> call."""
-        return {}
-
-    def waits(self) -> Mapping[str, Wait[D]]:
-        """Waits in vain: description -> wait."""
-        return {}
-
-    @contextmanager
-    def made(self, factory: Factory[D]) -> Generator[tuple[D, Context]]:
-        """A new device, not opened, with its context; closed at the end, whatever has become of it."""
-        context = self.context()
-        device = factory(context)
-        try:
-            yield device, context
-        finally:
-            _close(device)
-
-    @contextmanager
-    def opened(self, factory: Factory[D]) -> Generator[tuple[D, Context]]:
-        """A new device, opened, with its context; closed at the end."""
-        with self.made(factory) as (device, context):
-            if context.simulation is not None:
-                context.simulation.open()
-            _begin_shot(context)
-            device.open()
-            yield device, context
-
-    @contextmanager
-    def each_state(self, factory: Factory[D]) -> Generator[Iterator[tuple[str, D, Context]]]:
-        """A device in each of its states: (state, device, context).
-
-        It is one device from state to state, and a new one only where that cannot get there.
-        """
-        with ExitStack() as stack:
-
-            def states() -> Iterator[tuple[str, D, Context]]:
-                device, context = stack.enter_context(self.opened(factory))
-                for state, enter in {"after open()": _stay, **self.states()}.items():
-                    try:
-                        enter(device)
-                    except Exception:  # noqa: BLE001 - that the last state is left rightly has tests of its own
-                        stack.close()
-                        device, context = stack.enter_context(self.opened(factory))
-                        enter(device)
-                    yield state, device, context
-
-            yield states()
-
-    @promise("the constructor does no I/O")
+    @promise("the constructor does no I/O, and changes nothing that all code shares")
     def test_constructor_does_no_io(self, factory: Factory[D]) -> None:
         """Nothing is opened, connected or started before open()."""
         context = self.context()
-        with watch_io() as seen:
-            device = factory(context)
-        _close(device)
-        assert not seen, f"it did {', '.join(seen)}; open() is the place for that"
+        device: D | None = None
+        try:
+            with quietly("open() is the place for that"):
+                device = factory(context)
+        finally:
+            if device is not None:
+                close_quietly(device)
 
     @promise("open() and close() twice do no harm, and a closed device can be opened again")
     def test_opens_and_closes_twice(self, factory: Factory[D]) -> None:
@@ -178,19 +78,19 @@ class HardwareContract(Generic[D]):
             for state, device, context in states:
                 with promised(ALWAYS_SAFE):
                     device.safe_state()
-                _begin_shot(context)
+                begin_shot(context)
                 with doing(f"work after safe_state() {state}"):
                     self.work(device)
 
     @promise("safe_state() and close() work after a failure")
     def test_closes_after_failures(self, factory: Factory[D]) -> None:
         """A failure must leave a device that can be made safe and closed."""
-        for failures in self._failures():
+        for failures in self.failures():
             with self.opened(factory) as (device, context):
                 what = "open()"
                 for what, fail in failures.items():
                     try:
-                        self._in_time(context, what, fail, device)
+                        self.call_in_time(context, what, fail, device)
                     except HangsError:  # timeouts have a test of their own
                         break
                     except Exception:  # noqa: BLE001, S110 - and so have errors
@@ -240,7 +140,7 @@ class HardwareContract(Generic[D]):
             with self.opened(factory) as (device, context):
                 wait.enter(device)
                 before_s = context.clock.now()
-                self._in_time(context, what, refusal, DeviceTimeoutError, what, wait.wait, device)
+                self.call_in_time(context, what, refusal, DeviceTimeoutError, what, wait.wait, device)
                 passed_s = context.clock.now() - before_s
                 assert passed_s <= 1.1 * wait.timeout_s + 1e-3, f"{what} took {passed_s:g} s"
 
@@ -250,7 +150,7 @@ class HardwareContract(Generic[D]):
         for what, use in self.uses().items():
             with self.made(factory) as (device, context):
                 self._named(context, what, use, device)
-        for failures in self._failures():
+        for failures in self.failures():
             with self.opened(factory) as (device, context):
                 for what, fail in failures.items():
                     self._named(context, what, fail, device)
@@ -259,7 +159,7 @@ class HardwareContract(Generic[D]):
         """Check whom the error of a call names, if it is a DeviceError; then the device is made safe."""
         named = context.name
         try:
-            self._in_time(context, what, fail, device)
+            self.call_in_time(context, what, fail, device)
         except DeviceError as error:
             named = error.device
         except Exception:  # noqa: BLE001, S110 - that it fails rightly has tests of its own
@@ -269,49 +169,8 @@ class HardwareContract(Generic[D]):
         with suppress(Exception):  # and so has this
             device.safe_state()
 
-    def _failures(self) -> Iterator[Mapping[str, Action[D]]]:
-        """Every way in which the suite makes an open device fail, in groups for one device each."""
-
-        def waiting(wait: Wait[D]) -> Action[D]:
-            return lambda device: (wait.enter(device), wait.wait(device))
-
-        yield self.excesses()
-        for what, wait in self.waits().items():
-            yield {what: waiting(wait)}
-
-    def _in_time(self, context: Context, what: str, call: Callable[..., object], *args: object) -> None:
-        """A call that must come back; one that polls the clock for ever is ended by it."""
-        try:
-            in_time(self.patience_s, what, call, *args)
-        except HangsError:
-            if isinstance(context.clock, FakeClock):
-                context.clock.stop.request()
-            raise
-
-
-def _close(device: Hardware) -> None:
-    """Whatever the test has found; what close() promises has tests of its own."""
-    with suppress(Exception):
-        device.close()
-
-
-def _stay(device: object) -> None:
-    """A device that was opened is in that state already."""
-    del device
-
-
-def _begin_shot(context: Context) -> None:
-    if context.simulation is not None:
-        context.simulation.begin_shot()
-
 
 def _safe_twice(device: Hardware, state: str) -> None:
     for count in ("once", "twice"):
         with doing(f"safe_state() {state}, {count}"):
             device.safe_state()
-
-
-def n_calls(context: Context) -> int:
-    """How often the simulation was called; 0 for one that does not note it."""
-    simulation = context.simulation
-    return len(simulation.calls) if isinstance(simulation, RecordingSimulation) else 0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import random
 from typing import Any, Final
 
 import numpy as np
@@ -65,14 +64,6 @@ def equal(plan: Plan, other: Plan) -> bool:
     return all(np.array_equal(getattr(plan, name), getattr(other, name)) for name in fields)
 
 
-def global_random_state() -> tuple[object, object]:
-    """State of the random numbers that all of Python share, and all of numpy."""
-    name, keys, *rest = np.random.get_state()  # noqa: NPY002 - the global one is what is watched
-    return random.getstate(), (name, np.asarray(keys).tobytes(), *rest)
-
-
-def fresh_global_random_state() -> tuple[object, object]:
-    """The same after a draw, so that it is not what a fixed seed leaves behind."""
-    random.random()
-    np.random.random()  # noqa: NPY002 - the global one is what is watched
-    return global_random_state()
+def same(target: TargetPattern) -> TargetPattern:
+    """A copy, for a planner that may write into what it is given."""
+    return TargetPattern(target.fill.copy(), target.clear.copy(), target.name)

@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from functools import wraps
-from typing import Final, NoReturn, ParamSpec, TypeVar
+from typing import Any, Final, NoReturn, ParamSpec, TypeVar
 
 import pytest
 
@@ -50,7 +50,8 @@ def promised(promise: str) -> Generator[None]:
 def promise(text: str) -> Callable[[Callable[P, None]], Callable[P, None]]:
     """Make a test of a contract say which promise it holds a plugin to.
 
-    The sentence is kept as the test's attribute ``promise``.
+    The sentence is kept as the test's attribute ``promise``. A test that cannot go on because
+    another promise is broken is skipped, if a test of that promise fails: so a fault is told once.
     """
 
     def decorate(test: Callable[P, None]) -> Callable[P, None]:
@@ -59,7 +60,9 @@ def promise(text: str) -> Callable[[Callable[P, None]], Callable[P, None]]:
             __tracebackhide__ = True
             try:
                 test(*args, **kwargs)
-            except BrokenPromise:
+            except BrokenPromise as error:
+                if error.promise != text and _is_told_elsewhere(error.promise, *args, *kwargs.values()):
+                    pytest.skip(f"cannot go on: {error}")
                 raise
             except _FAILURES as error:
                 raise BrokenPromise(text, told(error)) from error
@@ -68,6 +71,19 @@ def promise(text: str) -> Callable[[Callable[P, None]], Callable[P, None]]:
         return run
 
     return decorate
+
+
+def _is_told_elsewhere(promise: str, *args: Any) -> bool:
+    """Whether a test of that promise fails too; the suite comes first, and then what its tests are given."""
+    suite = args[0]
+    tests = (getattr(type(suite), name) for name in dir(suite) if name.startswith("test_"))
+    for test in tests:
+        if getattr(test, "promise", None) == promise:
+            try:
+                test.__wrapped__(*args)
+            except _FAILURES:
+                return True
+    return False
 
 
 @contextmanager

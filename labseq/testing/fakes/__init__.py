@@ -18,6 +18,7 @@ from labseq.testing.fakes.devices import (
 )
 from labseq.testing.fakes.lab import FakeLab, ListSink, RecordingObserver, fake_lab
 from labseq.testing.fakes.leader import RecordingLeader
+from labseq.testing.fakes.shots import FakeShot, fake_shot
 from labseq.testing.planner import OneByOnePlanner
 
 __all__ = [
@@ -26,6 +27,7 @@ __all__ = [
     "Failure",
     "FakeClock",
     "FakeLab",
+    "FakeShot",
     "FixedDetector",
     "Hang",
     "ListSink",
@@ -42,4 +44,5 @@ __all__ = [
     "ScriptedPlanner",
     "fake_calibration",
     "fake_lab",
+    "fake_shot",
 ]

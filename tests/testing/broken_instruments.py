@@ -1,12 +1,12 @@
-"""Each promise of an instrument is broken once, and the suite names it and no other."""
+"""Instruments that break one promise each."""
 
 from typing import Any, ClassVar
-
-import pytest
 
 from labseq.errors import DeviceError, LimitError
 from labseq.testing import DeviceContract
 from labseq.testing.fakes import RecordingDevice
+
+from .planted import Planted
 
 
 class Suite(DeviceContract):
@@ -57,20 +57,15 @@ class ObeysAnyPower(RecordingDevice):
     pass
 
 
-@pytest.mark.parametrize(
-    ("device", "test"),
-    [
+PLANTED = Planted(
+    Suite(),
+    Right,
+    (
         (CannotTellItsState, "test_does_what_it_declares"),
         (RaisesKeyError, "test_refuses_unknown_commands"),
         (IsTerse, "test_refuses_unknown_commands"),
         (IgnoresUnknownCommands, "test_refuses_unknown_commands"),
         (AnswersNone, "test_refuses_unknown_values"),
         (ObeysAnyPower, "test_refuses_what_exceeds_limits"),
-    ],
+    ),
 )
-def test_the_broken_promise_is_named_and_no_other(breaks_only, device: Any, test: str) -> None:
-    breaks_only(Suite(), device, test)
-
-
-def test_a_right_device_keeps_all_promises(keeps_all) -> None:
-    keeps_all(Suite(), Right)

@@ -1,15 +1,30 @@
-"""Each promise of a camera is broken once, and the suite names it and no other."""
+"""Cameras that break one promise each."""
 
+import os
+import random
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import pytest
 
 from labseq.model import CameraFacts, Frame
 from labseq.roles import Context, Trigger
 from labseq.testing import CameraContract
 from labseq.testing.fakes import RecordingCamera
+
+from .planted import Planted
+
+
+class SeedsRandom(RecordingCamera):
+    def __init__(self, context: Context) -> None:
+        super().__init__(context)
+        random.seed(4)
+
+
+class SetsAVariable(RecordingCamera):
+    def __init__(self, context: Context) -> None:
+        super().__init__(context)
+        os.environ["LABSEQ_TEST_CAMERA"] = os.urandom(4).hex()
 
 
 class GivesAnArray(RecordingCamera):
@@ -122,9 +137,12 @@ class SaysItExposesByItself(RecordingCamera):
         super().arm(n_frames, exposure_s, "software" if trigger == "internal" else trigger)
 
 
-@pytest.mark.parametrize(
-    ("camera", "test"),
-    [
+PLANTED = Planted(
+    CameraContract(),
+    RecordingCamera,
+    (
+        (SeedsRandom, "test_constructor_does_no_io"),
+        (SetsAVariable, "test_constructor_does_no_io"),
         (GivesAnArray, "test_gives_a_frame"),
         (GivesEmptyImages, "test_gives_a_frame"),
         (TellsAnotherExposure, "test_gives_a_frame"),
@@ -140,7 +158,5 @@ class SaysItExposesByItself(RecordingCamera):
         (SharesItsBuffer, "test_frames_do_not_change"),
         (TriggersUnarmed, "test_refuses_trigger_without_arm"),
         (StaysArmed, "test_refuses_trigger_without_arm"),
-    ],
+    ),
 )
-def test_the_broken_promise_is_named_and_no_other(breaks_only, camera: Any, test: str) -> None:
-    breaks_only(CameraContract(), camera, test)

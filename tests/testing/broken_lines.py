@@ -1,20 +1,14 @@
-"""The fake keeps every promise of a timing box; each is broken once, and the suite names it and no other."""
+"""Timing boxes that break one promise each."""
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-import pytest
 
 from labseq.model import LineProgram
 from labseq.testing import LinesContract
 from labseq.testing.fakes import RecordingLines
 
-
-class TestRecordingLines(LinesContract):
-    @pytest.fixture
-    def factory(self):
-        return RecordingLines
+from .planted import Planted
 
 
 class LeavesALineOn(RecordingLines):
@@ -71,9 +65,10 @@ class StartsDark(RecordingLines):
             super()._tell(replace(program, on=np.zeros_like(program.on)))
 
 
-@pytest.mark.parametrize(
-    ("lines", "test"),
-    [
+PLANTED = Planted(
+    LinesContract(),
+    RecordingLines,
+    (
         (LeavesALineOn, "test_does_what_was_compiled"),
         (RunsSlow, "test_does_what_was_compiled"),
         (FiresTheFirstProgramAgain, "test_does_what_was_compiled"),
@@ -82,7 +77,5 @@ class StartsDark(RecordingLines):
         (StaysArmed, "test_refuses_fire_without_arm"),
         (LeavesLightOn, "test_rests"),
         (StartsDark, "test_rests"),
-    ],
+    ),
 )
-def test_the_broken_promise_is_named_and_no_other(breaks_only, lines: Any, test: str) -> None:
-    breaks_only(LinesContract(), lines, test)

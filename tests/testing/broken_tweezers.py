@@ -1,14 +1,15 @@
-"""Each promise of static and mobile tweezers is broken once, and the suite names it and no other."""
+"""Static and mobile tweezers that break one promise each."""
 
 from typing import Any
 
 import numpy as np
-import pytest
 
 from labseq.errors import LimitError
 from labseq.model import ToneProgram
 from labseq.testing import MobileTweezersContract, StaticTweezersContract
 from labseq.testing.fakes import RecordingMobileTweezers, RecordingStaticTweezers
+
+from .planted import Planted
 
 
 class StartsAgain(RecordingStaticTweezers):
@@ -59,9 +60,10 @@ class LoadsAnything(RecordingStaticTweezers):
         super().load(None)
 
 
-@pytest.mark.parametrize(
-    ("tweezers", "test"),
-    [
+STATIC = Planted(
+    StaticTweezersContract(),
+    RecordingStaticTweezers,
+    (
         (StartsAgain, "test_starts_twice"),
         (StaysShallow, "test_starts_after_a_ramp"),
         (NeverTurnsOff, "test_ramps"),
@@ -70,10 +72,8 @@ class LoadsAnything(RecordingStaticTweezers):
         (ClipsTheDepth, "test_refuses_what_exceeds_limits"),
         (RampsBeforeItLooks, "test_refuses_what_exceeds_limits"),
         (LoadsAnything, "test_refuses_what_exceeds_limits"),
-    ],
+    ),
 )
-def test_of_static_tweezers_the_broken_promise_is_named(breaks_only, tweezers: Any, test: str) -> None:
-    breaks_only(StaticTweezersContract(), tweezers, test)
 
 
 class LeavesOutThePauses(RecordingMobileTweezers):
@@ -137,9 +137,10 @@ class WaitsToTheEnd(RecordingMobileTweezers):
         super().wait(3600.0)
 
 
-@pytest.mark.parametrize(
-    ("tweezers", "test"),
-    [
+MOBILE = Planted(
+    MobileTweezersContract(),
+    RecordingMobileTweezers,
+    (
         (LeavesOutThePauses, "test_tells_the_playing_time"),
         (RunsOutOfMemory, "test_plays_programs"),
         (PlaysToTheEnd, "test_play_returns_at_once"),
@@ -148,22 +149,5 @@ class WaitsToTheEnd(RecordingMobileTweezers):
         (FailsOnNothing, "test_takes_an_empty_program"),
         (LooksWhenItPlays, "test_refuses_what_exceeds_limits"),
         (WaitsToTheEnd, "test_keeps_timeouts"),
-    ],
+    ),
 )
-def test_of_mobile_tweezers_the_broken_promise_is_named(breaks_only, tweezers: Any, test: str) -> None:
-    breaks_only(MobileTweezersContract(), tweezers, test)
-
-
-def test_right_tweezers_keep_all_promises(keeps_all) -> None:
-    keeps_all(StaticTweezersContract(), RecordingStaticTweezers)
-    keeps_all(MobileTweezersContract(), RecordingMobileTweezers)
-
-
-def test_an_empty_program_may_be_refused(keeps_all) -> None:
-    class WantsTones(RecordingMobileTweezers):
-        def prepare(self, program: ToneProgram) -> float:
-            if program.n_segments == 0:
-                raise LimitError("the length of the program", 0, "more than 0")
-            return super().prepare(program)
-
-    keeps_all(MobileTweezersContract(), WantsTones)

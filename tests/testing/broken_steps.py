@@ -1,4 +1,4 @@
-"""Each promise of a step is broken once, and the suite names it and no other."""
+"""Steps that break one promise each."""
 
 import itertools
 import os
@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import pytest
-
 from labseq.errors import StopRequested
 from labseq.model import TimelineEntry
 from labseq.roles import Shot, StepContext
 from labseq.testing import StepContract
+
+from .planted import Planted
 
 
 class Right:
@@ -81,9 +81,10 @@ class HearsNothing(Right):
             return
 
 
-@pytest.mark.parametrize(
-    ("step", "test"),
-    [
+PLANTED = Planted(
+    StepContract(),
+    Right,
+    (
         (UsuallyTakesLonger, "test_lays_out_its_timeline"),
         (HasNoEnd, "test_lays_out_its_timeline"),
         (ReadsAFile, "test_timeline_is_pure"),
@@ -93,11 +94,5 @@ class HearsNothing(Right):
         (TakesAnotherImage, "test_keeps_its_timeline"),
         (HearsNothing, "test_hears_a_stop_request"),
         (PlansInWords, "test_lays_out_its_timeline"),
-    ],
+    ),
 )
-def test_the_broken_promise_is_named_and_no_other(breaks_only, step: Any, test: str) -> None:
-    breaks_only(StepContract(), step, test)
-
-
-def test_a_right_step_keeps_all_promises(keeps_all) -> None:
-    keeps_all(StepContract(), Right)
