@@ -11,6 +11,7 @@ from labseq.cli import plan_options, plot_options, show_options, waveform_option
 from labseq.cli.bench_app import bench
 from labseq.cli.calibration_app import CALIBRATE_EXAMPLES, calibrate, calibration
 from labseq.cli.data_app import DOCTOR_EXAMPLES, EXPORT_EXAMPLES, doctor, export
+from labseq.cli.demo_app import demo
 from labseq.cli.queue_app import queue
 from labseq.cli.replay_app import ANALYSE_EXAMPLES, REPLAY_EXAMPLES, analyse, replay
 from labseq.cli.run_app import RESUME_EXAMPLES, RUN_EXAMPLES, resume, run, stop
@@ -55,6 +56,7 @@ def common(
     """Take the options that come before the command; ``main`` looks at ``--debug`` itself."""
 
 
+app.command(short_help="Take a first look, without any file.")(demo)
 app.command(epilog=RUN_EXAMPLES, short_help="Run a sequence and record every shot.")(run)
 app.command(epilog=RESUME_EXAMPLES, short_help="Go on with a run that ended early.")(resume)
 app.command(short_help="End a run in progress after the shot at hand.")(stop)

@@ -51,7 +51,12 @@ Json = Annotated[
     bool, typer.Option("--json", help="Print the outcome as one line of JSON on stdout, all else on stderr.")
 ]
 SequenceFile = Annotated[
-    Path, typer.Argument(metavar="SEQUENCE", help="The sequence file.", show_default=False)
+    Path,
+    typer.Argument(
+        metavar="SEQUENCE",
+        help="The sequence file, or the name of one in ./sequences or of one that comes with labseq.",
+        show_default=False,
+    ),
 ]
 Shots = Annotated[
     int | None, typer.Option(metavar="N", help="Number of shots, instead of the sequence's own.")

@@ -6,7 +6,12 @@ from labseq.config.collect import Collected
 from labseq.config.devices import DEVICE_KEYS
 from labseq.config.document import Document, Kept
 from labseq.config.fields import ROLES, Choice, plugin_paths
-from labseq.config.find import find_profile, packaged_profiles_dir
+from labseq.config.find import (
+    find_profile,
+    find_sequence,
+    packaged_profiles_dir,
+    packaged_sequences_dir,
+)
 from labseq.config.lines import LINES_KEYS
 from labseq.config.motion import MOTION_KEYS, MotionSettings
 from labseq.config.nodes import Loc
@@ -66,9 +71,11 @@ __all__ = [
     "WaitSettings",
     "bind_scan",
     "find_profile",
+    "find_sequence",
     "load_profile",
     "load_sequence",
     "packaged_profiles_dir",
+    "packaged_sequences_dir",
     "plugin_paths",
     "profile_overrides",
     "read_scan",

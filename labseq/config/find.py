@@ -1,7 +1,8 @@
-"""Where hardware profiles are."""
+"""Where hardware profiles and sequences are, those that come with labseq among them."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
@@ -10,21 +11,32 @@ from labseq.config.document import Document
 from labseq.config.wording import clean, did_you_mean, listing, visible
 from labseq.errors import ConfigError, Problem
 
-_FOLDER: Final = "hardware_profiles"
+PROFILES: Final = "hardware_profiles"
+SEQUENCES: Final = "sequences"
 
 
-def packaged_profiles_dir() -> Path:
-    """The folder of the profiles that come with labseq.
+def packaged_dir(folder: str) -> Path:
+    """The folder of the profiles or the sequences that come with labseq.
 
     In a wheel it lies beside this file, in a checkout at the top.
     """
     here = Path(__file__).resolve().parent
-    packaged = here / _FOLDER
-    return packaged if packaged.is_dir() else here.parents[1] / _FOLDER
+    packaged = here / folder
+    return packaged if packaged.is_dir() else here.parents[1] / folder
+
+
+def packaged_profiles_dir() -> Path:
+    """The folder of the profiles that come with labseq."""
+    return packaged_dir(PROFILES)
+
+
+def packaged_sequences_dir() -> Path:
+    """The folder of the sequences that come with labseq."""
+    return packaged_dir(SEQUENCES)
 
 
 def is_path(name: str) -> bool:
-    """Whether the value of ``profile`` is a path, not a name.
+    """Whether what names a profile or a sequence is a path, not a name.
 
     Example:
         >>> is_path("virtual"), is_path("mine.yaml"), is_path("../mine")
@@ -49,7 +61,7 @@ def find_profile(name_or_path: str | Path, beside: Path, *, named_in: Document |
     """
     if isinstance(name_or_path, Path):
         return name_or_path
-    folders = list(dict.fromkeys((beside, Path(_FOLDER), packaged_profiles_dir())))
+    folders = list(dict.fromkeys((beside, Path(PROFILES), packaged_profiles_dir())))
     if is_path(name_or_path):
         path = reading.beside(beside, name_or_path)
         if reading.is_file(path):
@@ -58,11 +70,9 @@ def find_profile(name_or_path: str | Path, beside: Path, *, named_in: Document |
         what, expected = f"there is {kind} at {visible(str(path))}", ""
         hint = reading.alike_file(path)
     else:
-        for folder in folders:
-            for suffix in reading.YAML_SUFFIXES:
-                path = folder / f"{name_or_path}{suffix}"
-                if reading.is_file(path):
-                    return path
+        found = _named(name_or_path, folders)
+        if found is not None:
+            return found
         names = _names(folders[1:])
         places = ", ".join(visible(str(folder)) for folder in folders)
         what = f"there is no hardware profile '{clean(name_or_path)}' in {places}"
@@ -71,6 +81,44 @@ def find_profile(name_or_path: str | Path, beside: Path, *, named_in: Document |
     if named_in is not None:
         raise named_in.error(("profile",), what, expected, hint)
     raise ConfigError(Problem(what, expected=expected, hint=hint))
+
+
+def find_sequence(given: Path) -> Path:
+    """Find a sequence.
+
+    Args:
+        given: A path, relative to the working directory; or a name, without a path separator and without
+            the ending .yaml or .yml: it is looked for in the working directory, in ./sequences and
+            among the packaged sequences.
+
+    Raises:
+        ConfigError: There is no sequence of this name; with the places and the names there are.
+    """
+    name = str(given)
+    if is_path(name) or given.suffix:
+        packaged = packaged_sequences_dir() / given.name
+        if reading.is_file(packaged) and not reading.is_file(given) and not reading.something_else(given):
+            raise ConfigError(Problem("there is no such file", visible(name), hint=_hint_at(packaged)))
+        return given
+    folders = (Path(), Path(SEQUENCES), packaged_sequences_dir())
+    found = given if reading.is_file(given) else _named(name, folders)
+    if found is not None or reading.something_else(given):
+        return found or given
+    names = _names([*folders[1:]])
+    places = ", ".join(visible(str(folder)) for folder in folders)
+    what = f"there is no sequence '{clean(name)}' in {places}"
+    hint = did_you_mean(name, names) or reading.alike_file(given)
+    raise ConfigError(Problem(what, expected=listing(names) if names else "a file", hint=hint))
+
+
+def _hint_at(packaged: Path) -> str:
+    return f"say '{packaged.stem}' for the one that comes with labseq, or copy it by 'labseq demo --copy .'"
+
+
+def _named(name: str, folders: Sequence[Path]) -> Path | None:
+    """The first file of a name in the folders, whichever YAML ending it has."""
+    paths = (folder / f"{name}{suffix}" for folder in folders for suffix in reading.YAML_SUFFIXES)
+    return next((path for path in paths if reading.is_file(path)), None)
 
 
 def _names(folders: list[Path]) -> list[str]:

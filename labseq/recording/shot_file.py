@@ -248,6 +248,6 @@ def _bitshuffle() -> Mapping[str, Any]:
     try:
         import hdf5plugin
     except ImportError as error:
-        missing = "asks for compressed frames, and the package for it is missing"
-        raise RecordingError(Path("compress"), f"{missing}; install labseq[compress]") from error
+        missing = "compressed frames need hdf5plugin, which is not installed"
+        raise RecordingError(Path("compress"), f"{missing}; pip install 'labseq[compress]'") from error
     return hdf5plugin.Bitshuffle(cname="lz4")

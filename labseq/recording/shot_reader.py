@@ -178,5 +178,6 @@ def allow_filter(path: Path, dataset: Any) -> None:
         import hdf5plugin  # noqa: F401  # pyright: ignore[reportUnusedImport] - importing it registers the filter
     except ImportError as error:
         raise RecordingError(
-            path, "holds compressed frames; install labseq[compress] to read them"
+            path,
+            "holds compressed frames, and to read them hdf5plugin is needed; pip install 'labseq[compress]'",
         ) from error

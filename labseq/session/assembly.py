@@ -17,6 +17,7 @@ from labseq.config import (
     Scan,
     SequenceSpec,
     bind_scan,
+    find_sequence,
     load_sequence,
     plugin_paths,
     read_scan,
@@ -102,7 +103,7 @@ def assemble(
     """Read and validate everything that can be validated without opening a device.
 
     Args:
-        sequence_path: The sequence file.
+        sequence_path: The sequence file, or the name of one; see :func:`labseq.config.find_sequence`.
         profile: Name or path of the profile, instead of the sequence's own.
         overrides: ``"address=value"`` strings, as given to ``--set``; they win.
         given: Values of other options.
@@ -117,6 +118,7 @@ def assemble(
         PluginLoadError: A plugin that is named failed to load.
     """
     check_dry_run(dry_run)
+    sequence_path = sequence_path if kept is not None else find_sequence(sequence_path)
     for_sequence, for_profile = split_overrides(overrides)
     profile_set = [one._replace(address=f"profile.{one.address}") for one in for_profile]
     found = Collected()

@@ -125,12 +125,13 @@ class Queue:
             RecordingError: The queue cannot be written to.
         """
         with Session.open(sequence, **asdict(options)) as session:
-            report, text = check(session), session.assembly.document.text
+            document = session.assembly.document
+            report, text, path = check(session), document.text, document.path.absolute()
         profile = None if options.profile is None else str(find_profile(options.profile, Path()).absolute())
         output = None if options.output is None else options.output.absolute()
         options = replace(options, profile=profile, output=output, overrides=tuple(options.overrides))
         last = max((one.position for one in self.entries()), default=Fraction(0))
-        entry = Entry(self._new_id(), last + 1, now_utc(), sequence.absolute(), text, options)
+        entry = Entry(self._new_id(), last + 1, now_utc(), path, text, options)
         self.write(entry)
         return entry, report
 

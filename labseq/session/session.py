@@ -95,7 +95,7 @@ class Session:
         """Read and check sequence and profile; nothing is opened yet.
 
         Args:
-            sequence: The sequence file.
+            sequence: The sequence file, or the name of one in ./sequences or of one that comes with labseq.
             profile: See :class:`Options`, as for all others.
             shots: Number of shots.
             seed: Seed of the run.

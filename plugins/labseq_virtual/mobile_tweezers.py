@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Mapping
 from typing import Any, Final
 
@@ -40,6 +41,10 @@ class VirtualMobileTweezers(VirtualDriver):
         self._grid = context.grid
         self._prepared: ToneProgram | None = None
         self._playing_until_s: float | None = None
+
+    def warm(self) -> None:
+        """Compile the kernels of atoms that these tweezers carry, or load them."""
+        importlib.import_module("labseq_virtual._kernels_transport")
 
     def prepare(self, program: ToneProgram) -> float:
         """Check a program and keep it for the next ``play``.

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from labseq.config import Document, find, find_profile, packaged_profiles_dir
+from labseq.config import Document, find, find_profile, find_sequence, packaged_profiles_dir
 from labseq.errors import ConfigError
 
 
@@ -15,6 +15,7 @@ def shelves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (tmp_path / folder).mkdir()
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(find, "packaged_profiles_dir", lambda: tmp_path / "packaged")
+    monkeypatch.setattr(find, "packaged_sequences_dir", lambda: tmp_path / "packaged")
     return tmp_path
 
 
@@ -98,3 +99,54 @@ def test_packaged_profiles_of_a_wheel(tmp_path: Path, monkeypatch: pytest.Monkey
     assert packaged_profiles_dir() == tmp_path.resolve() / "hardware_profiles"
     inside.mkdir(parents=True)
     assert packaged_profiles_dir() == inside.resolve()
+
+
+def refused_sequence(name: str) -> str:
+    with pytest.raises(ConfigError) as caught:
+        find_sequence(Path(name))
+    return str(caught.value)
+
+
+def test_order_of_the_places_of_a_sequence(shelves: Path) -> None:
+    for place in (shelves / "packaged", Path("sequences"), Path()):
+        (place / "kagome.yaml").touch()
+        assert find_sequence(Path("kagome")) == place / "kagome.yaml"
+    Path("kagome").mkdir()
+    assert find_sequence(Path("kagome")) == Path("kagome.yaml")
+    Path("kagome").rmdir()
+    Path("kagome").touch()
+    assert find_sequence(Path("kagome")) == Path("kagome")
+
+
+@pytest.mark.parametrize(
+    "path", ["kagome.yaml", "gone.json", "sequences/gone.YML", "..", ".", "sequences", "a/b"]
+)
+def test_a_path_of_a_sequence_is_taken_as_it_is(path: str) -> None:
+    assert find_sequence(Path(path)) == Path(path)
+
+
+def test_a_packaged_sequence_is_not_far(shelves: Path) -> None:
+    (shelves / "packaged" / "kagome.yaml").touch()
+    told = refused_sequence("sequences/kagome.yaml")
+    assert told == (
+        f"{Path('sequences/kagome.yaml')}: there is no such file; say 'kagome' for the one that comes with "
+        "labseq, or copy it by 'labseq demo --copy .'"
+    )
+    Path("sequences/kagome.yaml").mkdir()  # then it is said that this is a folder
+    assert find_sequence(Path("sequences/kagome.yaml")) == Path("sequences/kagome.yaml")
+
+
+def test_unknown_name_of_a_sequence(shelves: Path) -> None:
+    (shelves / "packaged" / "kagome.yaml").touch()
+    places = f"., sequences, {shelves / 'packaged'}"
+    assert refused_sequence("kagme") == (
+        f"there is no sequence 'kagme' in {places}; expected kagome; did you mean 'kagome'?"
+    )
+    Path("my_scan.yaml").touch()
+    assert refused_sequence("my_scann").endswith("; did you mean 'my_scan.yaml'?")
+
+
+@pytest.mark.parametrize("name", ["a\0b", "x" * 5000, "yes no"])
+def test_odd_names_of_sequences(name: str) -> None:
+    assert refused_sequence(name).startswith("there is no sequence '")
+    assert refused_sequence(name).isprintable()

@@ -233,7 +233,7 @@ def test_compressed_frames_come_back(
     (found,) = open_run(writer.run_dir).shots
     assert_same(found.record(), shot)
     monkeypatch.setitem(sys.modules, "hdf5plugin", None)
-    with pytest.raises(RecordingError, match=r"install labseq\[compress\] to read them"):
+    with pytest.raises(RecordingError, match=r"hdf5plugin is needed; pip install 'labseq\[compress\]'"):
         _ = found.frames
 
 

@@ -231,7 +231,7 @@ def test_compression_without_its_package_is_explained(
     make_run: MakeRun, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "hdf5plugin", None)
-    with pytest.raises(RecordingError, match=r"install labseq\[compress\]"):
+    with pytest.raises(RecordingError, match=r"pip install 'labseq\[compress\]'"):
         ShotEncoder(make_run(), "day/run", compress=True)
 
 

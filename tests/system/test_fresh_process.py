@@ -1,0 +1,108 @@
+"""What is imported when, and on which systems: told by processes in which nothing is imported yet."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.system
+
+
+def told(code: str, *arguments: str, cwd: Path) -> str:
+    """What a fresh process prints."""
+    command = [sys.executable, "-c", code, *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=cwd)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_import_and_help_load_next_to_nothing(tmp_path: Path) -> None:
+    code = """
+import sys
+import labseq
+
+def loaded():
+    heavy = {"h5py", "matplotlib", "numba", "numpy", "pluggy", "pydantic", "rich", "scipy", "serial", "yaml"}
+    vendors = {"gi", "pylablib", "pypylon", "SoapySDR", "spcm"}
+    plugins = {name for name in sys.modules if name.startswith("labseq_")}
+    return sorted((heavy | vendors | plugins) & set(sys.modules))
+
+print(loaded())
+print(sorted(name for name in sys.modules if name.startswith("labseq.")))
+sys.argv = ["labseq", "--help"]
+from labseq.cli import main
+try:
+    main()
+except SystemExit as leaving:
+    print("left with", leaving.code)
+print(loaded())
+"""
+    first, own, *_, left, last = told(code, cwd=tmp_path).splitlines()
+    assert (first, own, left) == ("[]", "[]", "left with 0")
+    assert last == "[]"
+
+
+def test_no_kernel_is_loaded_in_a_shot_of_the_virtual_lab(tmp_path: Path) -> None:
+    """Else the first run compiles it in the call of a device, which then counts as hung."""
+    code = """
+import sys
+import labseq
+from labseq.sequencer import Sequencer
+
+def kernels():
+    return {name for name in sys.modules if "kernels" in name}
+
+before, opening = [], Sequencer.open
+Sequencer.open = lambda self: (before.append(kernels()), opening(self))[1]
+labseq.Session.open("compact_225", shots=1, seed=1, output=sys.argv[1]).run()
+print(sorted(kernels() - before[0]))
+"""
+    assert told(code, str(tmp_path), cwd=tmp_path) == "[]\n"
+
+
+def test_every_module_can_be_imported_where_there_is_no_posix(tmp_path: Path) -> None:
+    """As on Windows: what only POSIX has is gone before labseq and its plugins are imported.
+
+    What they need of others is imported before that, because others look at ``sys.platform``.
+    """
+    code = """
+import os
+os.environ["NUMBA_DISABLE_JIT"] = "1"  # kernels are to be imported, not compiled
+import asyncio, ctypes, importlib, logging.handlers, multiprocessing.shared_memory, multiprocessing.pool
+import multiprocessing.popen_spawn_posix, pkgutil, signal, socket, ssl, subprocess, sys, tempfile
+import filelock, h5py, matplotlib.figure, numba, numpy.random, pandas, PIL.Image, pluggy, pydantic, pytest
+import hypothesis, rich.live, rich.progress, scipy.ndimage, scipy.optimize, scipy.special, serial
+import tifffile, typer, xarray, yaml
+
+for name in "fcntl termios resource pty pwd grp tty syslog readline crypt".split():
+    sys.modules[name] = None
+for module, names in {
+    os: "fork forkpty getuid geteuid getgid getgroups killpg setsid uname nice getloadavg sched_getaffinity "
+        "sched_setaffinity mkfifo statvfs fchmod chown openpty O_NOFOLLOW O_DIRECTORY O_NONBLOCK sysconf",
+    signal: "SIGKILL SIGHUP SIGUSR1 SIGUSR2 SIGALRM SIGPIPE SIGQUIT SIGCHLD setitimer alarm pthread_kill "
+        "pthread_sigmask sigwait pause",
+    socket: "AF_UNIX",
+}.items():
+    for name in names.split():
+        if hasattr(module, name):
+            delattr(module, name)
+
+wrong, n = [], 0
+for top in ["labseq", *sys.argv[1:]]:
+    for found in pkgutil.walk_packages(importlib.import_module(top).__path__, top + "."):
+        if found.name.endswith("__main__"):
+            continue
+        n += 1
+        try:
+            importlib.import_module(found.name)
+        except BaseException as error:
+            wrong.append(f"{found.name}: {type(error).__name__}: {error}")
+print(n, wrong)
+"""
+    plugins = sorted(path.parent.name for path in Path(__file__).parents[2].glob("plugins/*/__init__.py"))
+    assert len(plugins) > 10
+    n, _, wrong = told(code, *plugins, cwd=tmp_path).strip().partition(" ")
+    assert (int(n) > 300, wrong) == (True, "[]")

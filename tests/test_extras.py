@@ -1,0 +1,60 @@
+"""Without an extra, whatever needs it says what is missing, and what to install."""
+
+from __future__ import annotations
+
+import re
+import sys
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from labseq_andor.library import load_pylablib
+from labseq_frames.picture import BadFramesError, load
+from labseq_pylon.library import load_pypylon
+
+from labseq.config.drawings import read_drawing
+from labseq.drawing import check_place
+from labseq.errors import LabseqError
+from labseq.recording.export import check_export
+from labseq.recording.shot_file import _bitshuffle
+
+ROOT = Path(__file__).parents[1]
+EXTRAS: dict[str, list[str]] = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"][
+    "optional-dependencies"
+]
+NEEDS: dict[tuple[str, str, str], Callable[[], object]] = {
+    # extra, distribution, module that is not there -> what needs it
+    ("analysis", "pandas", "pandas"): lambda: check_export("parquet", Path("a.parquet")),
+    ("analysis", "pyarrow", "pyarrow"): lambda: check_export("parquet", Path("a.parquet")),
+    ("analysis", "xarray", "xarray"): lambda: check_export("netcdf", Path("a.nc")),
+    ("analysis", "h5netcdf", "h5netcdf"): lambda: check_export("netcdf", Path("a.nc")),
+    ("andor", "pylablib", "pylablib.devices.Andor.AndorSDK2"): lambda: load_pylablib("camera"),
+    ("compress", "hdf5plugin", "hdf5plugin"): _bitshuffle,
+    ("frames", "tifffile", "tifffile"): lambda: load("tifffile", "tifffile", Path("a.tif")),
+    ("frames", "pillow", "PIL.Image"): lambda: load("PIL.Image", "Pillow", Path("a.png")),
+    ("plot", "matplotlib", "matplotlib"): lambda: check_place(Path("a.png")),
+    ("plot", "pillow", "PIL"): lambda: read_drawing(ROOT / "docs" / "_static" / "plan_kagome.png", "#"),
+    ("pylon", "pypylon", "pypylon.pylon"): lambda: load_pypylon("camera"),
+}
+
+
+@pytest.mark.parametrize("case", NEEDS, ids=lambda case: "-".join(case[:2]))
+def test_what_to_install(case: tuple[str, str, str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    extra, distribution, module = case
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises((LabseqError, BadFramesError)) as caught:
+        NEEDS[case]()
+    told = str(caught.value)
+    assert f"labseq[{extra}]" in told
+    assert "install" in told
+    assert distribution in told.lower()
+
+
+def test_every_package_of_every_extra_is_tried() -> None:
+    def name(requirement: str) -> str:
+        return re.split("[;>=<]", requirement)[0].strip().removesuffix("-lightweight")
+
+    listed = {(extra, name(package)) for extra, packages in EXTRAS.items() for package in packages}
+    assert {case[:2] for case in NEEDS} == listed
