@@ -9,7 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import ClassVar, Final, Literal
+
+MAX_WORDS: Final = 500
+"""Characters of a plugin's own error that are told."""
 
 
 class LabseqError(Exception):
@@ -77,14 +80,17 @@ class PluginLoadError(LabseqError):
     Attributes:
         plugin: Name of the plugin.
         reason: Why it failed to load.
+        source: Its file, or the distribution that it came with; "" if the reason names it, or it has none.
     """
 
     exit_code: ClassVar[int] = 2
 
-    def __init__(self, plugin: str, reason: str) -> None:
+    def __init__(self, plugin: str, reason: str, source: str = "") -> None:
         self.plugin = plugin
         self.reason = reason
-        super().__init__(f"plugin '{plugin}' failed to load: {reason}")
+        self.source = "" if source in reason else source
+        text = f"plugin '{plugin}' failed to load: {reason}"
+        super().__init__(f"{text}; it comes from {self.source}" if self.source else text)
 
 
 class UnknownPluginError(LabseqError, LookupError):
@@ -294,3 +300,19 @@ def one_of(names: Sequence[str]) -> str:
         return "nothing: none is installed"
     quoted = ", ".join(f"'{name}'" for name in names)
     return quoted if len(names) == 1 else f"one of {quoted}"
+
+
+def in_words(error: BaseException) -> str:
+    """Kind and text of an error that somebody else's code raised, in one line that is not too long.
+
+    Example:
+        >>> in_words(KeyError("typo"))
+        "KeyError: 'typo'"
+    """
+    try:
+        text = str(error)
+    except (Exception, SystemExit) as another:  # noqa: BLE001 - it may raise anything
+        text = f"(its text cannot be had: {type(another).__name__})"
+    text = " ".join(f"{type(error).__name__}: {text[: 2 * MAX_WORDS]}".split()).rstrip(":")
+    text = "".join(c if c.isprintable() else "?" for c in text)
+    return text if len(text) <= MAX_WORDS else f"{text[:MAX_WORDS]} ..."

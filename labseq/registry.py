@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+import re
+from collections.abc import Callable, Generator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Final
 
 from labseq.errors import PluginLoadError, UnknownPluginError
@@ -27,7 +30,43 @@ KINDS: Final = (
 VIRTUAL_TWIN: Final = "virtual"
 """Name under which a plugin offers the virtual twin of a hardware role."""
 
+LOAD_S: Final = 30.0
+"""How long a plugin may take to load, and a constructor to return, where no profile says else."""
+
+_NAME: Final = re.compile(r"[^\W\d][\w-]{0,63}")
+_NOT_NAMES: Final = {"true", "false", "null"}
+"""Words that YAML takes for something else."""
+_SETTINGS: Final = ("labseq.config.settings", "Settings")
+
 Factory = Callable[..., Any]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Owner:
+    """A plugin as the owner of what it offers: whom to blame, and how long to wait for its code.
+
+    Attributes:
+        name: Name of the plugin.
+        source: Its file, or the distribution that it came with, in words; "" for labseq's own.
+        home: The file or the folder that its code is in; None if that is not known.
+        patience_s: How long it may take to load, and a constructor to return.
+        notes: What else it did to the process when it was loaded, or in a constructor.
+    """
+
+    name: str
+    source: str = ""
+    home: Path | None = None
+    patience_s: float = LOAD_S
+    notes: list[str] = field(default_factory=list[str])
+
+    def fault(self, reason: str) -> PluginLoadError:
+        """The error that names this plugin."""
+        return PluginLoadError(self.name, reason, self.source)
+
+    def note(self, text: str) -> None:
+        """Keep what it did, once."""
+        if text not in self.notes:
+            self.notes.append(text)
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +86,7 @@ class Entry:
         simulated: Settings that turn a driver into its own simulated counterpart, for
             example ``{"card": "simulated"}``; None if it has none. A dry run gives them;
             a driver that has them keeps to the session's clock.
+        owner: The plugin that registered it.
     """
 
     kind: str
@@ -56,6 +96,7 @@ class Entry:
     origin: str
     virtual_time: bool = False
     simulated: Mapping[str, Any] | None = None
+    owner: Owner = field(default=Owner("labseq"), compare=False, repr=False)
 
 
 class Registry:
@@ -71,15 +112,26 @@ class Registry:
     def __init__(self) -> None:
         self.contested: dict[tuple[str, str], PluginLoadError] = {}
         self._entries: dict[tuple[str, str], Entry] = {}
-        self._origin = "labseq"
+        self._owner = Owner("labseq")
+        self._is_closed = False
 
-    def set_origin(self, origin: str) -> None:
-        """Name the plugin whose ``labseq_register`` is called next."""
-        self._origin = origin
+    @contextmanager
+    def opened_for(self, owner: Owner) -> Generator[Registry]:
+        """What a plugin is given to register with, for as long as the block lasts.
 
-    def drop_origin(self, origin: str) -> None:
-        """Forget everything that a plugin registered."""
-        self._entries = {key: e for key, e in self._entries.items() if e.origin != origin}
+        Nothing of the plugin stays if the block fails.
+        """
+        own = Registry()
+        own._owner, own._entries, own.contested = owner, self._entries, self.contested
+        try:
+            yield own
+        except BaseException:
+            own._is_closed = True
+            for entry in self.entries(owner.name):
+                del self._entries[entry.kind, entry.name]
+            raise
+        finally:
+            own._is_closed = True
 
     def _add(
         self,
@@ -91,22 +143,35 @@ class Registry:
         virtual_time: bool = False,
         simulated: Mapping[str, Any] | None = None,
     ) -> None:
+        fault = self._owner.fault
         if not isinstance(name, str) or not name:  # pyright: ignore[reportUnnecessaryIsInstance]
-            raise PluginLoadError(self._origin, f"a {kind} needs a name, not {name!r}")
+            raise fault(f"a {kind} needs a name, not {name!r}")
+        is_key = (kind, name) == ("step", "name")  # which stands beside a step in a sequence
+        if _NAME.fullmatch(name) is None or name.lower() in _NOT_NAMES or is_key:
+            text = f"a {kind} cannot be called {name[:80]!r}"
+            raise fault(f"{text}; expected a letter, then letters, digits, '_' and '-', and no word of YAML")
+        if self._is_closed:
+            text = f"it registers {kind} '{name}' after its labseq_register has returned"
+            raise fault(f"{text}; register everything there")
         if not callable(factory):
-            raise PluginLoadError(self._origin, f"the factory of {kind} '{name}' cannot be called")
+            raise fault(f"the factory of {kind} '{name}' cannot be called")
         taken = self._entries.get((kind, name))
         if taken is not None:
             text = f"{kind} '{name}' is offered by '{taken.origin}' already; rename one of them"
-            error = PluginLoadError(self._origin, text)
-            if taken.origin != self._origin:
+            error = fault(text)
+            if taken.origin != self._owner.name:
                 self.contested[kind, name] = error
             raise error
-        if settings_model is not None and not callable(getattr(settings_model, "model_validate_json", None)):
-            text = f"the settings model of {kind} '{name}' is {settings_model!r}"
-            raise PluginLoadError(self._origin, f"{text}; expected a subclass of labseq.Settings")
+        if settings_model is not None and not _is_settings(settings_model):
+            text = f"the settings model of {kind} '{name}' is {settings_model!r:.200}"
+            raise fault(f"{text}; expected a subclass of labseq.Settings")
+        if simulated is not None:
+            known = {} if settings_model is None else settings_model.model_fields
+            if not isinstance(simulated, Mapping) or not set(simulated) <= set(known):  # pyright: ignore[reportUnnecessaryIsInstance]
+                text = f"'simulated' of {kind} '{name}' is {simulated!r:.200}"
+                raise fault(f"{text}; expected settings of its model")
         self._entries[kind, name] = Entry(
-            kind, name, factory, settings_model, self._origin, virtual_time, simulated
+            kind, name, factory, settings_model, self._owner.name, virtual_time, simulated, self._owner
         )
 
     def planner(self, name: str, factory: Factory, settings_model: type[Any] | None = None) -> None:
@@ -189,3 +254,10 @@ class Registry:
         """All entries, or those of one plugin, by kind and name."""
         found = [e for e in self._entries.values() if origin in (None, e.origin)]
         return sorted(found, key=lambda e: (KINDS.index(e.kind), e.name))
+
+
+def _is_settings(model: object) -> bool:
+    """Whether this is a subclass of ``labseq.Settings``, told by its name: that stands on an upper floor."""
+    return isinstance(model, type) and any(
+        (base.__module__, base.__qualname__) == _SETTINGS for base in model.__mro__
+    )

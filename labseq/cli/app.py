@@ -198,11 +198,12 @@ def plugins(
             "--profile", "-p", metavar="NAME|FILE", help="Also look in this profile's plugin folders."
         ),
     ] = None,
+    as_json: Json = False,
 ) -> None:
-    """List the plugins: what each offers, where it comes from, and why it failed to load."""
+    """List the plugins: what each offers, where it comes from, why it failed to load, what else it did."""
     from labseq.cli.plugins import list_plugins
 
-    list_plugins(profile)
+    list_plugins(profile, as_json=as_json)
 
 
 @app.command(short_help="Bring every device of a profile to its safe state.")

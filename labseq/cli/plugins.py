@@ -3,38 +3,60 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
-from labseq.cli.output import columns, say
+from labseq.cli.output import columns, divert_stdout, say
+from labseq.cli.show import as_line
 from labseq.config import load_profile, plugin_paths
-from labseq.plugins import PluginHost
+from labseq.plugins import PluginHost, PluginInfo
+from labseq.registry import LOAD_S
 from labseq.session import load_plugins
 
 
-def list_plugins(profile: str | None) -> None:
+def list_plugins(profile: str | None, *, as_json: bool = False) -> None:
     """Print a table of the plugins.
 
     Args:
         profile: Name or path of a profile whose plugin folders are searched too.
+        as_json: Whether to print one line of JSON instead.
 
     Raises:
         ConfigError: The profile is wrong, or one of its folders does not exist.
     """
-    say(*table(load_plugins(_folders(profile))))
+    answer = divert_stdout() if as_json else None
+    folders, patience_s = _folders(profile)
+    host = load_plugins(folders, patience_s=patience_s)
+    if answer is None:
+        say(*table(host))
+    else:
+        answer(as_line({"plugins": [_values(host, info) for info in host.infos]}))
 
 
 def table(host: PluginHost) -> list[str]:
-    """A row per plugin, and below it the reason if it failed to load."""
+    """A row per plugin, and below them why one failed to load, and what one did besides."""
     rows = [("plugin", "state", "version", "origin", "offers")]
+    told: list[str] = []
     for info in host.infos:
-        offers = ", ".join(f"{entry.kind}:{entry.name}" for entry in host.registry.entries(info.name))
-        rows.append((info.name, info.state, info.version or "-", info.origin, offers or "-"))
-    reasons = [f"{info.name}: {info.reason}" for info in host.infos if info.reason]
-    return [*columns(rows), *([""] if reasons else []), *reasons]
+        rows.append(
+            (info.name, info.state, info.version or "-", info.origin, ", ".join(_offers(host, info)) or "-")
+        )
+        told += [f"{info.name}: {info.reason}"] if info.reason else []
+        told += [f"{info.name}: warning: {note}" for note in info.notes]
+    return [*columns(rows), *([""] if told else []), *told]
 
 
-def _folders(profile: str | None) -> list[Path]:
-    """The profile's plugin folders; the plugins that it names need not exist for that."""
+def _offers(host: PluginHost, info: PluginInfo) -> list[str]:
+    return [f"{entry.kind}:{entry.name}" for entry in host.registry.entries(info.name)]
+
+
+def _values(host: PluginHost, info: PluginInfo) -> dict[str, Any]:
+    names = ("name", "state", "version", "origin", "source", "reason", "notes")
+    return {**{name: getattr(info, name) for name in names}, "offers": _offers(host, info)}
+
+
+def _folders(profile: str | None) -> tuple[list[Path], float]:
+    """The profile's plugin folders and patience; the plugins that it names need not exist for that."""
     if profile is None:
-        return []
+        return [], LOAD_S
     document, spec = load_profile(profile, beside=Path())
-    return plugin_paths(document, spec.plugin_folders)
+    return plugin_paths(document, spec.plugin_folders), spec.timeouts.load

@@ -17,3 +17,6 @@ class TimeoutSettings(Settings):
     call: Timeout = Field(default=10.0, description="longest device call, beyond what it does by itself")
     safe_state: Timeout = Field(default=5.0, description="longest way of a device to its safe state")
     plan: Timeout = Field(default=5.0, description="longest planning of a cycle")
+    load: Timeout = Field(
+        default=30.0, description="longest loading of a plugin, and longest way of a constructor"
+    )

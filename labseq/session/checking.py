@@ -128,6 +128,7 @@ def check(session: Session) -> CheckReport:
     warnings += timeout_warnings(assembly, timeline)
     for point in session.course.each_lab():
         session.build_lab(point)  # whether the constructors accept the settings
+    warnings += [Problem(text) for text in assembly.bench.host.notes]
     return CheckReport(
         timeline,
         assembly.sequence.shots,

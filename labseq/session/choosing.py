@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Final, Literal, get_args
 
@@ -19,7 +18,7 @@ from labseq.errors import (
     one_of,
 )
 from labseq.model import CalibrationEntry, SiteGrid
-from labseq.plugins import PluginHost
+from labseq.plugins import PluginHost, contained
 from labseq.registry import VIRTUAL_TWIN, Entry
 
 DryRun = Literal["off", "full", "fast"]
@@ -162,10 +161,14 @@ def validate(
     also_known = sorted(drop - {"use", "pattern"})
     called = f"{entry.kind.replace('_', ' ')} '{entry.name}'"
     try:
-        with blamed(entry, f"the settings model of {called}"):
-            return document.validate(
+        return contained(
+            entry.owner,
+            f"the settings model of {called}",
+            lambda: document.validate(
                 entry.settings_model, loc, drop=drop, also_known=also_known, called=called
-            )
+            ),
+            watch=False,
+        )
     except PluginLoadError as error:
         raise document.error(loc, str(error)) from error
 
@@ -214,27 +217,6 @@ def _absence(host: PluginHost, kind: str, name: str) -> str:
     return ""
 
 
-@contextmanager
-def blamed(entry: Entry, what: str) -> Generator[None]:
-    """Name the plugin in whatever its code raises; labseq's own errors pass as they are.
-
-    Args:
-        entry: Whose code runs in the block.
-        what: What runs, for the message.
-
-    Raises:
-        PluginLoadError: The block raised; a ``SystemExit`` counts, or a plugin could end
-            labseq as if all were well.
-    """
-    try:
-        yield
-    except LabseqError:
-        raise
-    except (Exception, SystemExit) as error:
-        text = f"{what} raised {type(error).__name__}: {error}"
-        raise PluginLoadError(entry.origin, text) from error
-
-
 def check_dry_run(dry_run: object) -> None:
     """Refuse what is no kind of dry run: a wrong word must not open hardware, or fail to.
 
@@ -253,8 +235,10 @@ def dump(entry: Entry, settings: Settings | None) -> dict[str, Any]:
     Raises:
         PluginLoadError: The plugin's own serializers fail.
     """
-    with blamed(entry, f"the settings of {entry.kind} '{entry.name}'"):
-        return {} if settings is None else settings.model_dump(mode="json", by_alias=True)
+    if settings is None:
+        return {}
+    what = f"the settings of {entry.kind} '{entry.name}'"
+    return contained(entry.owner, what, lambda: settings.model_dump(mode="json", by_alias=True), watch=False)
 
 
 def _defaults(entry: Entry) -> Settings | None:

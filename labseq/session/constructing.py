@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Final
 
-from labseq.errors import ConfigError, LabseqError, LimitError, PluginLoadError
+from labseq.errors import ConfigError, LabseqError, LimitError
 from labseq.model import CalibrationEntry, LineSpec, MotionSpec, RandomStream, SiteGrid, TargetPattern
+from labseq.plugins import contained
 from labseq.registry import Entry
 from labseq.roles import (
     Analysis,
@@ -22,7 +23,7 @@ from labseq.roles import (
     StaticTweezers,
     Step,
 )
-from labseq.session.choosing import Chosen, blamed
+from labseq.session.choosing import Chosen
 
 _ROLES: Final[Mapping[str, type]] = {
     "camera": Camera,
@@ -120,12 +121,29 @@ def construct_one(chosen: Chosen, context: Context) -> Any:
     """
     entry = chosen.entry
     try:
-        with blamed(entry, f"the constructor of {entry.kind} '{entry.name}'"):
-            made = entry.factory(chosen.settings, context)
-            check_role(entry, made)
+        return construct_role(entry, chosen.settings, context)
     except (ConfigError, LimitError) as error:
         raise chosen.placed(error) from error
-    return made
+
+
+def construct_role(entry: Entry, *arguments: Any) -> Any:
+    """Call a factory, and see whether what it made plays its role.
+
+    Args:
+        entry: Whose factory.
+        *arguments: What it is called with.
+
+    Raises:
+        LabseqError: The factory raised this one.
+        PluginLoadError: It raised something else, did not return in time, or made no object of that role.
+    """
+
+    def make() -> Any:
+        made = entry.factory(*arguments)
+        check_role(entry, made)
+        return made
+
+    return contained(entry.owner, f"the constructor of {entry.kind} '{entry.name}'", make)
 
 
 def construct_target(chosen: Chosen, grid: SiteGrid) -> TargetPattern:
@@ -136,11 +154,10 @@ def construct_target(chosen: Chosen, grid: SiteGrid) -> TargetPattern:
         PluginLoadError: The pattern's plugin is at fault; names it.
     """
     entry = chosen.entry
-    with blamed(entry, f"pattern '{entry.name}'"):
-        target = entry.factory(chosen.settings, grid)
+    target = contained(entry.owner, f"pattern '{entry.name}'", lambda: entry.factory(chosen.settings, grid))
     if not isinstance(target, TargetPattern) or target.shape != grid.shape:
-        text = f"pattern '{entry.name}' made no TargetPattern of shape {grid.shape}"
-        raise PluginLoadError(entry.origin, text)
+        came = "" if isinstance(target, TargetPattern) else f", but {_called(target)}"
+        raise entry.owner.fault(f"pattern '{entry.name}' made no TargetPattern of shape {grid.shape}{came}")
     return target
 
 
@@ -151,8 +168,19 @@ def check_role(entry: Entry, made: object) -> None:
         PluginLoadError: With what is missing.
     """
     role = _ROLES[entry.kind]
+    called, see = f"{entry.kind} '{entry.name}'", f"see labseq.{role.__name__}"
+    if made is None or isinstance(made, type):
+        raise entry.owner.fault(f"the factory of {called} made {_called(made)}; expected an object; {see}")
     names = [name for name in [*role.__annotations__, *dir(role)] if not name.startswith("_")]
     missing = [name for name in names if not hasattr(made, name)]
     if missing:
-        text = f"{entry.kind} '{entry.name}' has no {', '.join(missing)}; see labseq.{role.__name__}"
-        raise PluginLoadError(entry.origin, text)
+        raise entry.owner.fault(f"{called} has no {', '.join(missing)}; {see}")
+    methods = [name for name in names if callable(getattr(role, name, None))]
+    if wrong := [name for name in methods if not callable(getattr(made, name))]:
+        raise entry.owner.fault(f"{', '.join(wrong)} of {called} cannot be called; {see}")
+
+
+def _called(made: object) -> str:
+    if made is None:
+        return "None"
+    return f"the class {made.__name__} itself" if isinstance(made, type) else f"a {type(made).__name__}"

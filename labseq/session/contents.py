@@ -11,8 +11,8 @@ from labseq.config.settings import Settings
 from labseq.errors import ConfigError, LabseqError, PluginLoadError, one_of
 from labseq.model import TargetPattern
 from labseq.roles import Context, Step
-from labseq.session.choosing import Bench, blamed, dump, named, resolve, validate
-from labseq.session.constructing import check_role, construct_one, construct_target
+from labseq.session.choosing import Bench, dump, named, resolve, validate
+from labseq.session.constructing import construct_one, construct_role, construct_target
 
 DEVICE_KEYS: Final = {"device": "name", "equalise": "device", "wait": "device"}
 """Steps that need a device of the profile -> the setting that names it; a wait need not name one."""
@@ -78,10 +78,7 @@ def make_step(bench: Bench, document: Document, spec: StepSpec) -> tuple[Step, d
     if spec.kind in DEVICE_KEYS:
         _check_device_name(bench, document, settings, spec)
     try:
-        with blamed(entry, f"the constructor of step '{spec.kind}'"):
-            step = entry.factory(settings)
-            check_role(entry, step)
-        return step, dump(entry, settings)
+        return construct_role(entry, settings), dump(entry, settings)
     except (ConfigError, PluginLoadError) as error:
         raise document.error(spec.loc, str(error)) from error
 

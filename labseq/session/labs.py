@@ -7,11 +7,12 @@ from typing import Any, Final
 
 from labseq.config import MotionSettings, ProfileSpec
 from labseq.model import MotionSpec, RandomStream, TargetPattern
+from labseq.plugins import contained
 from labseq.roles import Clock
 from labseq.sequencer import PacedClock, RealClock, StopFlag, VirtualClock
 from labseq.sequencer.interlock import Blinding
 from labseq.sequencer.lab import Lab, Timeouts
-from labseq.session.choosing import Bench, Chosen, blamed
+from labseq.session.choosing import Bench, Chosen
 from labseq.session.constructing import construct
 from labseq.session.scan import Point
 from labseq.session.wiring import refuse_wrong_wiring
@@ -157,8 +158,12 @@ def _blinding(profile: ProfileSpec) -> dict[str, Blinding]:
 
 def parallelism_of(planner: Chosen, made: Any, motion: MotionSpec) -> int:
     """Most mobile tweezers that a batch of a planner may use, as it says, else what the motion bears."""
-    with blamed(planner.entry, "its degree_of_parallelism"):
-        dop = getattr(made, "degree_of_parallelism", motion.max_tweezers)
+    dop = contained(
+        planner.entry.owner,
+        "its degree_of_parallelism",
+        lambda: getattr(made, "degree_of_parallelism", motion.max_tweezers),
+        watch=False,
+    )
     return dop if isinstance(dop, int) else motion.max_tweezers
 
 

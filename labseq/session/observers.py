@@ -47,6 +47,11 @@ class Observers:
         if name == "shot_finished" and self._analysts is not None:
             self._analysts.look()
 
+    def tell_of_plugins(self) -> None:
+        """Tell what the plugins in use have done to the process, from loading to constructing."""
+        for text in self._host.notes:
+            self.event("warning", {"text": text})
+
     def analyse(self, run_dir: Path, analyses: Sequence[Mapping[str, Any]]) -> None:
         """Start what analyses the run's shots, each in a process of its own."""
         self._analysts = Analysts(run_dir, analyses, lambda text: self.event("warning", {"text": text}))

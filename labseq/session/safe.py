@@ -224,4 +224,4 @@ def _read(profile: str, overrides: Sequence[str], found: Collected) -> Bench:
     for folder in spec.plugin_folders:
         with suppress(ConfigError):  # told already
             folders += plugin_paths(document, [folder])
-    return choose_all(document, spec, load_plugins(folders, found), "off", found)
+    return choose_all(document, spec, load_plugins(folders, found, spec.timeouts.load), "off", found)

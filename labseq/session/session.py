@@ -13,15 +13,7 @@ from typing import ParamSpec, Self
 
 from labseq.errors import ConfigError, DeviceError, LabseqError
 from labseq.model import RunRecord, TimelineEntry
-from labseq.recording import (
-    Run,
-    RunWriter,
-    clear_active,
-    data_root,
-    mark_active,
-    marker_roots,
-    open_run,
-)
+from labseq.recording import Run, RunWriter, clear_active, data_root, mark_active, marker_roots, open_run
 from labseq.roles import RunObserver
 from labseq.sequencer import Guard, Sequencer, StopFlag
 from labseq.sequencer.calling import lay_out
@@ -207,6 +199,7 @@ class Session:
             lab = next(labs)
             for one in itertools.chain([lab], labs):
                 self.warm(one)
+            self._observers.tell_of_plugins()
             gc.unfreeze()  # what an earlier run in this process has left
             gc.collect()
             gc.freeze()  # what is loaded by now stays: going through it all would take 0.1 s of a shot

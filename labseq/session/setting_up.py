@@ -21,7 +21,7 @@ from labseq.config import (
 )
 from labseq.errors import ConfigError
 from labseq.plugins import PluginHost
-from labseq.registry import VIRTUAL_TWIN
+from labseq.registry import LOAD_S, VIRTUAL_TWIN
 from labseq.session.calibrating import Calibrated, calibrated
 from labseq.session.choosing import Bench, Chosen, DryRun, choose
 from labseq.session.wiring import check_kinds
@@ -77,7 +77,8 @@ def set_up_bench(
         found=found,
         kept=None if again is None else again.profile,
     )
-    host = load_plugins([*plugin_paths(document, spec.plugin_folders), *plugin_folders])
+    folders = [*plugin_paths(document, spec.plugin_folders), *plugin_folders]
+    host = load_plugins(folders, patience_s=spec.timeouts.load)
     problems = Collected() if found is None else found
     pins = None if again is None else again.calibrations
     bench = choose_all(document, spec, host, dry_run, problems, pins)
@@ -136,17 +137,20 @@ def _is_stand_in(document: Document, choice: Choice) -> bool:
     return choice.use == VIRTUAL_TWIN and here == around
 
 
-def load_plugins(folders: Sequence[Path] = (), found: Collected | None = None) -> PluginHost:
+def load_plugins(
+    folders: Sequence[Path] = (), found: Collected | None = None, patience_s: float = LOAD_S
+) -> PluginHost:
     """Load labseq's own, the installed and the folders' plugins.
 
     Args:
         folders: Folders with plugins, beside those of LABSEQ_PLUGIN_PATH.
         found: Where the problem of a folder that cannot be read goes; without it it is raised.
+        patience_s: How long a plugin may take to load, and a constructor to return.
 
     Raises:
         ConfigError: A folder does not exist, or cannot be read.
     """
-    host = PluginHost()
+    host = PluginHost(patience_s)
     host.load_builtin(builtins)
     host.load_entry_points()
     try:

@@ -1,0 +1,219 @@
+"""The plugins of one session: found, loaded, blocked and reported."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Final, Literal
+
+import pluggy
+
+from labseq import hookspecs
+from labseq.errors import ConfigError, PluginLoadError, Problem, UnknownPluginError, in_words
+from labseq.plugins.contained import contained
+from labseq.plugins.hooks import check_api, hooks_of
+from labseq.plugins.importing import forget, home_of, home_of_module, import_file
+from labseq.registry import LOAD_S, Entry, Owner, Registry
+
+ENTRY_POINT_GROUP: Final = "labseq"
+PATH_VARIABLE: Final = "LABSEQ_PLUGIN_PATH"
+
+
+@dataclass(frozen=True, slots=True)
+class PluginInfo:
+    """What is known of a plugin.
+
+    Attributes:
+        name: Import name, for a folder plugin without the ``labseq_local.`` prefix.
+        origin: "built in", "installed" or the file it came from.
+        version: Version of its distribution, or "".
+        state: "loaded" or "failed".
+        reason: Why it failed, or "".
+        source: Its file or its distribution, in words; "" for labseq's own.
+        notes: What else it did to the process when it was loaded, or in a constructor: a sentence each.
+    """
+
+    name: str
+    origin: str
+    version: str = ""
+    state: Literal["loaded", "failed"] = "loaded"
+    reason: str = ""
+    source: str = ""
+    notes: list[str] = field(default_factory=list[str])
+
+
+class PluginHost:
+    """The plugins of one session, with a plugin manager of their own.
+
+    Args:
+        patience_s: How long a plugin may take to load, and a constructor to return.
+
+    Attributes:
+        registry: What the loaded plugins offer.
+    """
+
+    def __init__(self, patience_s: float = LOAD_S) -> None:
+        self.registry = Registry()
+        self._patience_s = patience_s
+        self._used: set[str] = set()
+        self._pluggy = pluggy.PluginManager("labseq")
+        self._pluggy.add_hookspecs(hookspecs)
+        self._infos: dict[str, PluginInfo] = {}
+
+    @property
+    def infos(self) -> list[PluginInfo]:
+        """All plugins that were found, in the order of loading."""
+        return list(self._infos.values())
+
+    @property
+    def notes(self) -> list[str]:
+        """What the plugins that were asked for did to the process, a sentence each."""
+        used = [info for info in self._infos.values() if info.name in self._used]
+        return [f"plugin '{info.name}' ({info.source}): {note}" for info in used for note in info.notes]
+
+    def load_builtin(self, module: ModuleType) -> None:
+        """Register a module of labseq itself; its failure is a fault in labseq and raises."""
+        info = PluginInfo(module.__name__, "built in", _version("labseq"))
+        self._register(info, None, lambda: module)
+        self._infos[info.name] = info
+
+    def load_entry_points(self) -> None:
+        """Load every installed plugin; each failure is kept for the report."""
+        for point in importlib.metadata.entry_points(group=ENTRY_POINT_GROUP):
+            version = (point.dist.version if point.dist is not None else "") or ""
+            distribution = (point.dist.name if point.dist is not None else "") or "unknown"
+            source = f"the distribution {distribution} {version}".rstrip()
+            info = PluginInfo(point.name, "installed", version, source=source)
+            self._load(info, partial(home_of_module, point.value.partition(":")[0]), point.load)
+
+    def load_folders(self, folders: Sequence[Path]) -> None:
+        """Load single files and packages from folders, and from LABSEQ_PLUGIN_PATH.
+
+        Raises:
+            ConfigError: A folder does not exist, or cannot be read.
+        """
+        from_environment = [Path(p) for p in os.environ.get(PATH_VARIABLE, "").split(os.pathsep) if p]
+        for folder in [*folders, *from_environment]:
+            origin = "" if folder in folders else f" (from {PATH_VARIABLE})"
+            try:
+                paths = sorted(folder.iterdir())
+            except OSError as error:
+                what = f"plugin folder {folder}{origin} cannot be read: {error.strerror}"
+                if isinstance(error, FileNotFoundError):
+                    what = f"plugin folder {folder}{origin} does not exist"
+                raise ConfigError(Problem(what, expected="a folder with plugins")) from error
+            for path in paths:
+                self._load_path(path)
+
+    def _load_path(self, path: Path) -> None:
+        name = path.stem
+        if name.startswith((".", "_")):
+            return
+        if path.is_dir():
+            path = path / "__init__.py"
+        if path.suffix != ".py" or not path.is_file() or self._is_loaded(path):
+            return
+        info = PluginInfo(name, str(path), source=str(path))
+        if not name.isidentifier():
+            reason = "its name is no Python name: letters, digits and '_' only; rename it"
+            self._infos[name] = replace(info, state="failed", reason=reason)
+        elif not self._load(info, partial(home_of, path), partial(import_file, name, path)):
+            forget(name)
+
+    def _load(
+        self, info: PluginInfo, home: Callable[[], Path | None], importing: Callable[[], ModuleType]
+    ) -> bool:
+        """Load a plugin; whether it failed, and why, is in the report."""
+        if info.name in self._infos:
+            taken = self._infos[info.name]
+            where = f"the plugin in {taken.origin}"
+            if taken.origin == "installed":
+                where = f"an installed plugin (of {taken.source})"
+            reason = f"{where} is called '{info.name}' already; rename one of them"
+            failed = replace(info, name=f"{info.name} ({info.source})", state="failed", reason=reason)
+            self._infos[failed.name] = failed
+            return True  # the modules of that name are the other's
+        try:
+            self._register(info, home, importing)
+        except PluginLoadError as error:
+            info = replace(info, state="failed", reason=error.reason)
+        except Exception as error:  # noqa: BLE001 - pluggy may say more than we asked
+            info = replace(info, state="failed", reason=in_words(error))
+        self._infos[info.name] = info
+        return info.state == "loaded"
+
+    def _is_loaded(self, path: Path) -> bool:
+        files = (getattr(plugin, "__file__", None) for plugin in self._pluggy.get_plugins())
+        return any(file is not None and Path(file).resolve() == path.resolve() for file in files)
+
+    def _register(
+        self, info: PluginInfo, home: Callable[[], Path | None] | None, importing: Callable[[], ModuleType]
+    ) -> None:
+        where = None if home is None else home()
+        owner = Owner(info.name, info.source, where, self._patience_s, info.notes)
+        with self.registry.opened_for(owner) as registry:
+            module = contained(owner, "", partial(_prepare, importing, owner, registry))
+            self._pluggy.register(module, info.name)
+            try:
+                self._pluggy.check_pending()
+            except BaseException:
+                self._pluggy.unregister(module)
+                raise
+
+    def get(self, kind: str, name: str) -> Entry:
+        """Find what a sequence or profile names.
+
+        Raises:
+            PluginLoadError: The plugin of that name was found but did not load, or two plugins
+                offer the name.
+            UnknownPluginError: Nothing offers it.
+        """
+        if (kind, name) in self.registry.contested:
+            raise self.registry.contested[kind, name]
+        if self.registry.find(kind, name) is None:
+            broken = [info for info in self._infos.values() if info.state == "failed"]
+            for info in broken:
+                if info.name.removeprefix("labseq_").split(" ")[0] == name.removeprefix("labseq_"):
+                    raise PluginLoadError(info.name, info.reason, info.source)
+            if broken and kind not in ("step", "pattern"):
+                self._raise_with_broken(kind, name, broken)
+        entry = self.registry.get(kind, name)
+        self._used.add(entry.origin)
+        return entry
+
+    def _raise_with_broken(self, kind: str, name: str, broken: Sequence[PluginInfo]) -> None:
+        try:
+            self.registry.get(kind, name)
+        except UnknownPluginError as error:
+            reasons = "; ".join(f"plugin '{info.name}' did not load ({info.reason})" for info in broken)
+            hint = f"{error.hint}; {reasons}" if error.hint else reasons
+            raise UnknownPluginError(kind, name, error.known, hint) from None
+
+    def listeners(self, hook: str, **values: Any) -> list[tuple[str, Callable[[], object]]]:
+        """Name of each plugin that implements an observer hook, and the call that tells it."""
+        return [
+            (found.plugin_name, partial(found.function, **{name: values[name] for name in found.argnames}))
+            for found in getattr(self._pluggy.hook, hook).get_hookimpls()
+        ]
+
+
+def _prepare(importing: Callable[[], ModuleType], owner: Owner, registry: Registry) -> ModuleType:
+    """Everything of a plugin's that runs when it is loaded."""
+    module = importing()
+    check_api(module, owner)
+    hooks = hooks_of(module, owner)
+    if "labseq_register" in hooks:
+        hooks["labseq_register"](registry=registry)
+    return module
+
+
+def _version(distribution: str) -> str:
+    try:
+        return importlib.metadata.version(distribution)
+    except importlib.metadata.PackageNotFoundError:
+        return ""
