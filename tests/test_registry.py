@@ -73,22 +73,7 @@ def test_the_same_name_may_serve_several_kinds():
     assert registry.get("device", "virtual").simulated == {"port": "simulated"}
 
 
-ODD_NAMES = [
-    "",
-    5,
-    None,
-    "two words",
-    "a.b",
-    "a/b",
-    "../a",
-    "1st",
-    "-a",
-    "a\n",
-    "\x1b[31m",
-    "true",
-    "NULL",
-    "a" * 65,
-]
+ODD_NAMES = ["", 5, None, "two words", "a.b", "a/b", "../a", "1st", "-a", "a\n", "\x1b[31m", "true", "NULL"]
 
 
 @pytest.mark.parametrize("name", [*ODD_NAMES, "a" * 65], ids=repr)

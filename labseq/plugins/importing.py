@@ -40,6 +40,7 @@ def forget(name: str) -> None:
 
 def home_of(path: Path) -> Path:
     """What a folder's plugin consists of: its file, or the folder of its package."""
+    path = path.absolute()
     return path.parent if path.name == "__init__.py" else path
 
 
@@ -56,8 +57,16 @@ def place_of(error: BaseException, home: Path | None) -> str:
     """File and line that an error came from, the plugin's own if it has a part in it; "" if unknown."""
     if isinstance(error, SyntaxError) and error.filename:
         return f"{error.filename}:{error.lineno or 1}"
-    frames = traceback.extract_tb(error.__traceback__)
+    frames = [frame for one in _chain(error) for frame in traceback.extract_tb(one.__traceback__)]
     own = [f for f in frames if home is not None and home in (Path(f.filename), *Path(f.filename).parents)]
     foreign = [f for f in frames if Path(f.filename).parent != Path(__file__).parent]
     frame = (own or foreign or [None])[-1]
     return "" if frame is None else f"{frame.filename}:{frame.lineno}"
+
+
+def _chain(error: BaseException) -> list[BaseException]:
+    """The error that came first, then those that it led to: the last ones are the one that is told."""
+    chain = [error]
+    while (cause := chain[0].__cause__ or chain[0].__context__) is not None and cause not in chain:
+        chain.insert(0, cause)
+    return chain

@@ -199,7 +199,6 @@ class Session:
             lab = next(labs)
             for one in itertools.chain([lab], labs):
                 self.warm(one)
-            self._observers.tell_of_plugins()
             gc.unfreeze()  # what an earlier run in this process has left
             gc.collect()
             gc.freeze()  # what is loaded by now stays: going through it all would take 0.1 s of a shot
@@ -220,6 +219,7 @@ class Session:
 
     def _run(self, lab: Lab, roots: Sequence[Path]) -> Run:
         record, writer = self._begin(roots[0])
+        self._observers.tell_of_plugins()
         error: BaseException | None = None
         try:
             self._take_shots(lab, roots, writer, record)

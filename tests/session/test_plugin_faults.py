@@ -165,3 +165,70 @@ def test_a_dry_run_does_not_choose_between_two_plugins_of_one_name() -> None:
         Path(f"plugins/{name}.py").write_text(f"{register}    registry.camera('ixon', print)\n", "utf-8")
     with pytest.raises((ConfigError, PluginLoadError), match="is offered by 'one' already"):
         warnings_of_a_dry_run("ixon")
+
+
+def test_what_a_constructor_changes_is_told() -> None:
+    write(PLUGIN.replace("pass  # constructor", "import random; random.seed(1)"))
+    session = labseq.Session.open("s.yaml")
+    (warning,) = check(session).warnings
+    assert str(warning) == (
+        f"plugin 'mine' ({Path('plugins/mine.py')}): in the constructor of step 'mine' it seeded or used "
+        "Python's global random numbers; this was put back: draw from context.random"
+    )
+
+
+def test_a_run_tells_of_the_plugins_that_it_uses() -> None:
+    Path("plugins/unused.py").write_text(
+        PLUGIN.replace('"mine"', '"unused"') + "\nprint('unused')\n", "utf-8"
+    )
+    write(PLUGIN + "\nprint('used')\n")
+    seen = RecordingObserver()
+    labseq.Session.open("s.yaml", observer=seen, output=Path("data")).run()
+    (text,) = [values["text"] for name, values in seen.events if name == "warning"]
+    assert "while it was loaded it printed ('used'); this went to stderr" in text
+    (log,) = Path("data").glob("*/*/events.jsonl")
+    assert "it printed ('used')" in log.read_text("utf-8")
+    assert "unused" not in log.read_text("utf-8")
+
+
+def test_patience_is_the_profiles() -> None:
+    write(PLUGIN, PROFILE + "timeouts: {load: 12 s}\n")
+    host = labseq.Session.open("s.yaml").assembly.bench.host
+    assert host.get("step", "mine").owner.patience_s == 12.0
+
+
+WRITES = """
+class Writes:
+    degree_of_parallelism = 1
+
+    def __init__(self, settings, context):
+        pass
+
+    def plan(self, occupancy, target):
+        print("planning")
+        target.fill[0, 0] = True
+        return labseq.Plan.from_batches([])
+
+
+@labseq.hookimpl
+def labseq_register(registry):
+    registry.planner("writes", Writes)
+"""
+
+
+def test_a_planner_that_writes_to_its_target() -> None:
+    Path("plugins/writes.py").write_text(f"import labseq\nLABSEQ_API = 1\n{WRITES}", "utf-8")
+    Path("p.yaml").write_text(
+        PROFILE.split("simulation", maxsplit=1)[0] + "simulation: {use: virtual}\n", "utf-8"
+    )
+    steps = "  - load: {}\n  - image: {}\n  - rearrange: {cycles: 1, window: 60 ms, stop_when: never}\n"
+    sequence = SEQUENCE.replace("  - mine: {size: 5}\n", steps) + "planner: {use: writes}\n"
+    Path("s.yaml").write_text(
+        sequence.replace("pattern: mine", "pattern: compact, rows: 1, cols: 1"), "utf-8"
+    )
+    warnings = "\n".join(str(one) for one in check(labseq.Session.open("s.yaml")).warnings)
+    assert "plan() raised ValueError: assignment destination is read-only" in warnings
+    with pytest.raises(
+        labseq.PlanError, match=r"planner 'writes': plan\(\) raised ValueError: assignment dest"
+    ):
+        labseq.Session.open("s.yaml", output=Path("data"), overrides=["seed=1"]).run()

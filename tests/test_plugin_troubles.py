@@ -1,0 +1,454 @@
+"""Third-party plugins that misbehave when they are loaded or constructed: named, contained, reported.
+
+Each trouble is a small plugin of its own. What a plugin does wrong in a run is in tests/session.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import pytest
+
+import labseq
+from labseq.cli import main
+from labseq.cli.plugins import table
+from labseq.config import Document
+from labseq.errors import LabseqError, PluginLoadError
+from labseq.plugins import LOCAL_PACKAGE, PluginHost, PluginInfo
+from labseq.registry import Entry
+from labseq.roles import Context
+from labseq.session.choosing import Chosen, validate
+from labseq.session.constructing import construct_one, construct_target
+
+GOOD = '''
+from labseq import Settings, hookimpl
+LABSEQ_API = 1
+# at the top
+
+class Mine:
+    """A planner."""
+    degree_of_parallelism = 1
+
+    def __init__(self, settings, context):
+        pass  # constructor
+
+    def plan(self, occupancy, target):
+        return None
+
+@hookimpl
+def labseq_register(registry):
+    registry.planner("mine", Mine)  # registration
+'''
+PATIENCE_S = 60.0
+SHORT_S = 0.05
+
+
+@pytest.fixture
+def gate() -> Iterator[threading.Event]:
+    """What a plugin that hangs waits for: opened when the test is over, so that its thread ends."""
+    event = threading.Event()
+    sys.modules["gate"] = SimpleNamespace(event=event)  # pyright: ignore[reportArgumentType]
+    yield event
+    event.set()
+    for thread in threading.enumerate():
+        if thread.name.startswith("labseq plugin"):
+            thread.join(10.0)
+    del sys.modules["gate"]
+
+
+@pytest.fixture(autouse=True)
+def clean_local_modules() -> Iterator[None]:
+    yield
+    for name in [n for n in sys.modules if n.startswith(LOCAL_PACKAGE)]:
+        del sys.modules[name]
+
+
+def loaded(folder: Path, code: str, patience_s: float = PATIENCE_S) -> tuple[PluginHost, PluginInfo]:
+    (folder / "mine.py").write_text(code, encoding="utf-8")
+    host = PluginHost(patience_s)
+    host.load_folders([folder])
+    return host, host.infos[-1]
+
+
+def impatient(host: PluginHost) -> Entry:
+    entry = host.get("planner", "mine")
+    return replace(entry, owner=replace(entry.owner, patience_s=0.5))
+
+
+def construct(host: PluginHost) -> Any:
+    return construct_one(Chosen(host.get("planner", "mine"), None), Context("planner"))
+
+
+REGISTER = 'registry.planner("mine", Mine)  # registration'
+HOOK = "@hookimpl\ndef labseq_register(registry):"
+AT_LOADING: dict[str, tuple[str, str, str]] = {
+    # name -> what in the good plugin is replaced, by what, and the reason that is given
+    "sdk is missing": ("# at the top", "import no_such_sdk", "ModuleNotFoundError: No module named 'no_such"),
+    "own module is missing": ("# at the top", "from . import part", "ImportError: cannot import name 'part'"),
+    "leaves Python": ("# at the top", "raise SystemExit(0)", "SystemExit: 0 ("),
+    "leaves by quit": ("# at the top", "quit()", "SystemExit"),
+    "imitates Ctrl-C": ("# at the top", "raise KeyboardInterrupt", "KeyboardInterrupt ("),
+    "recursion": ("# at the top", "def f(): f()\nf()", "RecursionError: maximum recursion depth"),
+    "endless text": ("# at the top", "raise ValueError('x' * 10**7)", "xxx ... ("),
+    "error without text": (
+        "# at the top",
+        "class Odd(Exception):\n    def __str__(self): raise KeyError\nraise Odd",
+        "Odd: (its text cannot be had: KeyError)",
+    ),
+    "generator is closed": ("# at the top", "raise GeneratorExit", "GeneratorExit ("),
+    "error of labseq's": (
+        "# at the top",
+        "import labseq\nraise labseq.DeviceError('camera', 'no cable')",
+        "DeviceError: camera: no cable (",
+    ),
+    "sets a signal handler": (
+        "# at the top",
+        "import signal\nsignal.signal(signal.SIGINT, signal.SIG_IGN)",
+        "ValueError: signal only works in main thread",
+    ),
+    "older interface": (
+        "LABSEQ_API = 1",
+        "LABSEQ_API = 0",
+        "LABSEQ_API 0; this labseq has LABSEQ_API = 1; t",
+    ),
+    "newer interface": (
+        "LABSEQ_API = 1",
+        "LABSEQ_API = 2",
+        "LABSEQ_API 2; this labseq has LABSEQ_API = 1; up",
+    ),
+    "no interface": (
+        "LABSEQ_API = 1",
+        "",
+        "does not state LABSEQ_API; this labseq has LABSEQ_API = 1",
+    ),
+    "interface as text": ("LABSEQ_API = 1", "LABSEQ_API = '1.0'", "'1.0', which is no whole number"),
+    "interface is true": ("LABSEQ_API = 1", "LABSEQ_API = True", "True, which is no whole number"),
+    "interface is an array": ("LABSEQ_API = 1", "LABSEQ_API = [1]", "[1], which is no whole number"),
+    "hook is misspelled": (
+        "def labseq_register",
+        "def labseq_regster",
+        "unknown hook 'labseq_regster'",
+    ),
+    "hook is not marked": (
+        "# at the top",
+        "def labseq_shot_finished(shot): pass",
+        "its labseq_shot_finished would not be called; write '@hookimpl' above it",
+    ),
+    "wrong argument": ("(registry):", "(register):", "an argument 'register'; expected 'registry'"),
+    "no argument": ("(registry):", "():", "has no argument; expected 'registry'"),
+    "one more argument": ("(registry):", "(registry, config):", "an argument 'config'"),
+    "hook is async": (
+        "def labseq_register",
+        "async def labseq_register",
+        "is an 'async' function",
+    ),
+    "hook is a generator": (REGISTER, "yield", "is a generator and would never run"),
+    "hook is a wrapper": ("@hookimpl", "@hookimpl(wrapper=True)", "its labseq_register is a wrapper"),
+    "registration fails": (REGISTER, "1 / 0", "ZeroDivisionError: division by zero"),
+    "registers and fails": (REGISTER, f"{REGISTER}\n    raise SystemExit(0)", "SystemExit: 0"),
+    "unknown kind": (
+        "registry.planner",
+        "registry.planer",
+        "has no attribute 'planer'",
+    ),
+    "unknown option": ("Mine)  #", "Mine, fast=True)  #", "unexpected keyword argument 'fast'"),
+    "odd name": (
+        '"mine", Mine',
+        '"my planner", Mine',
+        "a planner cannot be called 'my planner'; exp",
+    ),
+    "name of a path": ('"mine", Mine', '"../../etc", Mine', "a planner cannot be called '../../etc'"),
+    "name of another kind": ('"mine", Mine', "3, Mine", "a planner needs a name, not 3"),
+    "nothing to call": ('"mine", Mine', '"mine", "Mine"', "the factory of planner 'mine' cannot be called"),
+    "registers twice": (REGISTER, f"{REGISTER}\n    {REGISTER}", "is offered by 'mine' already"),
+    "settings are no settings": (
+        "Mine)  #",
+        "Mine, dict)  #",
+        "is <class 'dict'>; expected a subclass",
+    ),
+    "settings of plain pydantic": (
+        "Mine)  #",
+        "Mine, __import__('pydantic').BaseModel)  #",
+        "expected a subclass of labseq.Settings",
+    ),
+    "settings that cannot be made": (
+        "# at the top",
+        "class Bad(Settings):\n    size: 'NoSuchType' = None\n    model_config = {'frozen': 3}\nBad(size=1)",
+        "PydanticUserError",
+    ),
+    "LABSEQ_API raises": (
+        "LABSEQ_API = 1",
+        "def __getattr__(name): raise OSError(name)",
+        "OSError: LABSEQ_API",
+    ),
+    "null bytes": ("# at the top", "\0", "null bytes"),
+}
+
+
+@pytest.mark.parametrize("trouble", AT_LOADING)
+def test_trouble_at_loading(trouble: str, tmp_path: Path) -> None:
+    old, new, reason = AT_LOADING[trouble]
+    assert old in GOOD
+    host, info = loaded(tmp_path, GOOD.replace(old, new))
+    assert info.state == "failed"
+    assert reason in info.reason
+    assert len(info.reason) < 1000
+    assert info.reason.isprintable()
+    assert host.registry.entries() == []
+    assert f"mine: {info.reason}" in table(host)
+    with pytest.raises(PluginLoadError) as caught:
+        host.get("planner", "mine")
+    assert str(caught.value).startswith("plugin 'mine' failed to load: ")
+    assert str(tmp_path / "mine.py") in str(caught.value)  # where it comes from
+
+
+def test_the_good_plugin_is_good(tmp_path: Path) -> None:
+    host, info = loaded(tmp_path, GOOD)
+    assert (info.state, info.reason, info.notes) == ("loaded", "", [])
+    assert construct(host).degree_of_parallelism == 1
+    assert host.notes == []
+
+
+def test_a_giant_docstring_costs_nothing(tmp_path: Path) -> None:
+    host, info = loaded(tmp_path, GOOD.replace("A planner.", "word " * 10**6))
+    assert info.state == "loaded"
+    assert sum(map(len, table(host))) < 1000
+
+
+def test_a_file_that_is_no_text(tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_bytes(b"\xff\xfe\x00")
+    host = PluginHost()
+    host.load_folders([tmp_path])
+    assert "SyntaxError" in host.infos[0].reason
+
+
+class TestHanging:
+    def test_at_import(self, tmp_path: Path, gate: threading.Event) -> None:
+        code = GOOD.replace("# at the top", "import random; random.seed(1)\nimport gate; gate.event.wait()")
+        stdout, state = sys.stdout, __import__("random").getstate()
+        _, info = loaded(tmp_path, code, SHORT_S)
+        assert info.reason == (
+            "it did not finish loading within 0.05 s and was given up; if it is only slow, raise "
+            "'timeouts: {load: ...}' in the profile"
+        )
+        assert sys.stdout is stdout
+        assert __import__("random").getstate() == state
+        assert "seeded or used Python's global random numbers" in info.notes[0]
+        assert f"{LOCAL_PACKAGE}.mine" not in sys.modules
+
+    def test_what_wakes_up_later_registers_nothing(self, tmp_path: Path, gate: threading.Event) -> None:
+        code = GOOD.replace("# registration", "").replace(HOOK, f"{HOOK}\n    import gate; gate.event.wait()")
+        host, _ = loaded(tmp_path, code, SHORT_S)
+        (thread,) = [t for t in threading.enumerate() if t.name == "labseq plugin mine"]
+        gate.set()
+        thread.join(10.0)
+        assert host.registry.entries() == []
+
+    def test_in_the_constructor(self, tmp_path: Path, gate: threading.Event) -> None:
+        code = GOOD.replace("pass  # constructor", "import gate; gate.event.wait()")
+        host, info = loaded(tmp_path, code)
+        assert info.state == "loaded"
+        told = r"the constructor of planner 'mine' did not return within 0\.5 s and was given up; if it is"
+        with pytest.raises(PluginLoadError, match=told):
+            construct_one(Chosen(impatient(host), None), Context("planner"))
+
+
+IN_THE_CONSTRUCTOR: dict[str, tuple[str, str, str]] = {
+    "raises": (
+        "pass  # constructor",
+        "raise OSError('no port')",
+        "constructor of planner 'mine' raised OSErr",
+    ),
+    "leaves Python": ("pass  # constructor", "raise SystemExit(0)", "raised SystemExit: 0 ("),
+    "imitates Ctrl-C": ("pass  # constructor", "raise KeyboardInterrupt", "raised KeyboardInterrupt ("),
+    "recursion": ("pass  # constructor", "self.__init__(settings, context)", "raised RecursionError"),
+    "too few arguments": (
+        "(self, settings, context)",
+        "(self, settings)",
+        "takes 2 positional argum",
+    ),
+    "makes nothing": (
+        REGISTER,
+        'registry.planner("mine", lambda s, c: None)',
+        "made None; expected",
+    ),
+    "makes a class": (
+        REGISTER,
+        'registry.planner("mine", lambda s, c: Mine)',
+        "made the class Mine it",
+    ),
+    "makes something else": (
+        REGISTER,
+        'registry.planner("mine", lambda s, c: 5)',
+        "planner 'mine' has no plan",
+    ),
+    "has no method": ("def plan(", "def plann(", "planner 'mine' has no plan; see labseq.Planner"),
+    "method is no method": (
+        "    def plan(",
+        "    plan = 3\n    def _(",
+        "plan of planner 'mine' cannot be c",
+    ),
+    "method cannot be had": (
+        "    def plan(",
+        "    @property\n    def plan(self): raise KeyError('x')\n    def _(",
+        "the constructor of planner 'mine' raised KeyError: 'x'",
+    ),
+    "registers later": (
+        REGISTER,
+        "global kept; kept = registry; registry.planner('mine', lambda s, c: kept.planner('more', Mine))",
+        "it registers planner 'more' after its labseq_register has returned; register everything there",
+    ),
+}
+
+
+@pytest.mark.parametrize("trouble", IN_THE_CONSTRUCTOR)
+def test_trouble_in_the_constructor(trouble: str, tmp_path: Path) -> None:
+    old, new, reason = IN_THE_CONSTRUCTOR[trouble]
+    assert old in GOOD
+    host, info = loaded(tmp_path, GOOD.replace(old, new))
+    assert info.state == "loaded", info.reason
+    with pytest.raises(PluginLoadError) as caught:
+        construct(host)
+    assert reason in str(caught.value)
+    assert str(tmp_path / "mine.py") in str(caught.value)
+    assert [entry.name for entry in host.registry.entries()] == ["mine"]
+
+
+def test_trouble_in_a_pattern(tmp_path: Path) -> None:
+    code = GOOD.replace(REGISTER, 'registry.pattern("mine", lambda settings, grid: [1, 2])')
+    host, _ = loaded(tmp_path, code)
+    grid = labseq.SiteGrid(3, 3, 5e-6)
+    with pytest.raises(PluginLoadError, match=r"made no TargetPattern of shape \(3, 3\), but a list"):
+        construct_target(Chosen(host.get("pattern", "mine"), None), grid)
+
+
+SETTINGS = """
+import pydantic
+
+class Odd(Settings):
+    size: int = 1
+
+    @pydantic.model_validator(mode="before")
+    @classmethod
+    def check(cls, values):
+        TROUBLE
+"""
+
+
+@pytest.mark.parametrize(
+    ("code", "told"),
+    [
+        ("raise SystemExit(0)", "the settings model of planner 'mine' raised SystemExit: 0 ("),
+        ("raise KeyboardInterrupt", "the settings model of planner 'mine' raised KeyboardInterrupt ("),
+        ("import gate; gate.event.wait()", "the settings model of planner 'mine' did not return within "),
+    ],
+)
+def test_trouble_in_the_settings(code: str, told: str, tmp_path: Path, gate: threading.Event) -> None:
+    code = GOOD.replace("# at the top", SETTINGS.replace("TROUBLE", code)).replace(
+        "Mine)  #", "Mine, Odd)  #"
+    )
+    host, info = loaded(tmp_path, code)
+    assert info.state == "loaded", info.reason
+    document = Document.parse("planner: {use: mine, size: 3}\n", "s.yaml")
+    with pytest.raises(LabseqError) as caught:
+        validate(document, impatient(host), ("planner",), frozenset({"use"}))
+    assert told in str(caught.value)
+    assert str(caught.value).startswith("s.yaml:1:")
+
+
+class Point:
+    """An entry point of a distribution that is not installed."""
+
+    def __init__(self, name: str, distribution: str, load: Callable[[], object]) -> None:
+        self.name = self.value = name
+        self.dist = SimpleNamespace(name=distribution, version="1.2")
+        self.load = load
+
+
+def module(name: str, code: str = GOOD) -> ModuleType:
+    made = ModuleType(name)
+    exec(code, made.__dict__)
+    return made
+
+
+def test_two_distributions_with_a_plugin_of_one_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    points = [
+        Point("ixon", "labseq-ixon", lambda: module("a")),
+        Point("ixon", "lab-of-bob", lambda: module("b")),
+    ]
+    monkeypatch.setattr(importlib.metadata, "entry_points", lambda group: points)
+    host = PluginHost()
+    host.load_entry_points()
+    first, second = host.infos
+    assert (first.state, first.source) == ("loaded", "the distribution labseq-ixon 1.2")
+    assert (second.name, second.state) == ("ixon (the distribution lab-of-bob 1.2)", "failed")
+    assert second.reason == (
+        "an installed plugin (of the distribution labseq-ixon 1.2) is called 'ixon' already; rename one of "
+        "them"
+    )
+    assert host.get("planner", "mine").origin == "ixon"
+
+
+def test_an_installed_plugin_is_told_by_its_distribution(monkeypatch: pytest.MonkeyPatch) -> None:
+    code = GOOD.replace("pass  # constructor", "raise OSError('no port')")
+    points = [
+        Point("ixon", "labseq-ixon", lambda: module("ixon", code)),
+        Point("odd", "labseq-odd", lambda: 5),
+        Point("old", "labseq-old", lambda: module("old", "LABSEQ_API = 0")),
+    ]
+    monkeypatch.setattr(importlib.metadata, "entry_points", lambda group: points)
+    host = PluginHost()
+    host.load_entry_points()
+    assert [info.state for info in host.infos] == ["loaded", "failed", "failed"]
+    with pytest.raises(
+        PluginLoadError, match=r"plugin 'old' .*; it comes from the distribution labseq-old 1\.2$"
+    ):
+        host.get("planner", "old")
+    with pytest.raises(PluginLoadError, match="the constructor of planner 'mine' raised OSError: no port"):
+        construct(host)
+
+
+NOISY = (
+    "import os, sys\nprint('hello')\nos.write(1, b'from C')\nsys.stdout.write('again')\nsys.stdout.flush()"
+)
+
+
+def test_what_plugins_print_spoils_no_json(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "mine.py").write_text(GOOD.replace("# at the top", NOISY))
+    (tmp_path / "other.py").write_text("1 / 0")
+    monkeypatch.setenv("LABSEQ_PLUGIN_PATH", str(tmp_path))
+    with pytest.raises(SystemExit) as leaving:
+        main(["plugins", "--json"])
+    out, err = capfd.readouterr()
+    assert leaving.value.code == 0
+    found = {one["name"]: one for one in json.loads(out)["plugins"]}
+    assert "hello" in err
+    assert found["mine"]["offers"] == ["planner:mine"]
+    assert "it printed ('hello again'); this went to stderr" in found["mine"]["notes"][0]
+    assert (found["other"]["state"], found["other"]["offers"]) == ("failed", [])
+    assert {one["state"] for name, one in found.items() if name != "other"} == {"loaded"}
+    assert [name for name, one in found.items() if one["notes"]] == ["mine"]  # labseq's own leave no trace
+
+
+def test_the_table_tells_what_a_plugin_did_besides(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "mine.py").write_text(GOOD.replace("# at the top", "import os; os.environ['MINE'] = '1'"))
+    monkeypatch.setenv("LABSEQ_PLUGIN_PATH", str(tmp_path))
+    with pytest.raises(SystemExit):
+        main(["plugins"])
+    last = capsys.readouterr().out.splitlines()[-1]
+    assert last == (
+        "mine: warning: while it was loaded it changed the environment variable 'MINE'; this was put back: "
+        "set it in open()"
+    )
