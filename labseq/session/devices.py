@@ -110,7 +110,7 @@ def check_devices(profile: str, overrides: Sequence[str] = (), dry_run: DryRun =
     devices += [CheckedDevice(name, constructed=False, failure=error) for name, error in refused.items()]
     plugins = {name: chosen.entry.name for name, chosen in bench.chosen.items()}
     stopped = StopRequested(stop.signal_number) if stop.is_set else None
-    return DevicesReport(devices, plugins, warnings, stopped)
+    return DevicesReport(devices, plugins, [*warnings, *bench.host.notes], stopped)
 
 
 def try_devices(

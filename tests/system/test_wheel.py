@@ -42,10 +42,12 @@ def call(*words: str | Path, cwd: Path) -> str:
 
 
 def found(python: str) -> str:
-    """The interpreter of a version, or "": nothing is fetched."""
+    """The interpreter of a version: uv's, one on the PATH, or pyenv's; "" if there is none here."""
     words = [UV, "python", "find", "--no-python-downloads", "--no-project", python]
     done = subprocess.run(words, capture_output=True, text=True, check=False)
-    return done.stdout.strip() if done.returncode == 0 else ""
+    if done.returncode == 0:
+        return done.stdout.strip()
+    return next(map(str, Path.home().glob(f".pyenv/versions/{python}.*/bin/python{python}")), "")
 
 
 def install(folder: Path, python: str, what: str) -> Path:
