@@ -9,6 +9,7 @@ from labseq.config.fields import ROLES, Choice, plugin_paths
 from labseq.config.find import (
     find_profile,
     find_sequence,
+    keeping_dir,
     packaged_profiles_dir,
     packaged_sequences_dir,
 )
@@ -72,6 +73,7 @@ __all__ = [
     "bind_scan",
     "find_profile",
     "find_sequence",
+    "keeping_dir",
     "load_profile",
     "load_sequence",
     "packaged_profiles_dir",

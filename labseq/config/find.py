@@ -35,6 +35,17 @@ def packaged_sequences_dir() -> Path:
     return packaged_dir(SEQUENCES)
 
 
+def keeping_dir(profile: Path) -> Path:
+    """The folder in which what belongs to a profile is kept: its own.
+
+    Of an installed profile it is ./hardware_profiles, where a copy of it would stand: what is installed
+    is everybody's, may be read-only, and goes with the next version.
+    """
+    folder = profile.resolve().parent
+    is_installed = folder == Path(__file__).resolve().parent / PROFILES
+    return Path(PROFILES).absolute() if is_installed else profile.parent
+
+
 def is_path(name: str) -> bool:
     """Whether what names a profile or a sequence is a path, not a name.
 

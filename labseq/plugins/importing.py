@@ -25,6 +25,7 @@ def import_file(name: str, path: Path) -> ModuleType:
     spec = importlib.util.spec_from_file_location(full_name, path, submodule_search_locations=inside)
     if spec is None or spec.loader is None:
         raise PluginLoadError(name, f"{path} is not a Python module")
+    forget(name)  # of another folder, or as it was before somebody changed it
     module = importlib.util.module_from_spec(spec)
     sys.modules[full_name] = module  # before execution, as dataclasses and relative imports need it
     spec.loader.exec_module(module)
@@ -32,7 +33,7 @@ def import_file(name: str, path: Path) -> ModuleType:
 
 
 def forget(name: str) -> None:
-    """Let nobody find the modules of a folder's plugin that failed."""
+    """Let nobody find the modules of a folder's plugin: they are imported anew."""
     full_name = f"{LOCAL_PACKAGE}.{name}"
     for module in [m for m in sys.modules if m == full_name or m.startswith(f"{full_name}.")]:
         del sys.modules[module]

@@ -9,7 +9,7 @@ from shlex import quote
 from typing import Any, Final, Literal
 
 from labseq.calibrations import Store, Stored, check_grid
-from labseq.config import Collected, Document, ProfileSpec, load_profile
+from labseq.config import Collected, Document, ProfileSpec, keeping_dir, load_profile
 from labseq.config.calibrations import OFF
 from labseq.errors import ConfigError, LimitError
 from labseq.model import CALIBRATION_KINDS, CalibrationEntry, CalibrationKind, SiteGrid
@@ -53,7 +53,7 @@ def store_of(
         profile: What it says.
         dry_run: "off", "full" or "fast"; a profile of virtual devices alone is the same lab in a dry run.
     """
-    folder = profile.calibrations.folder or document.path.parent / FOLDER / document.path.stem
+    folder = profile.calibrations.folder or keeping_dir(document.path) / FOLDER / document.path.stem
     choices = [profile.camera, profile.static_tweezers, profile.mobile_tweezers, *profile.devices.values()]
     is_other = dry_run != "off" and any(not choice.use.startswith(VIRTUAL_TWIN) for choice in choices)
     return Store(Path(folder) / DRY_RUN_FOLDER if is_other else Path(folder))

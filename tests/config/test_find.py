@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from labseq.config import Document, find, find_profile, find_sequence, packaged_profiles_dir
+from labseq.config import Document, find, find_profile, find_sequence, keeping_dir, packaged_profiles_dir
 from labseq.errors import ConfigError
 
 
@@ -99,6 +99,17 @@ def test_packaged_profiles_of_a_wheel(tmp_path: Path, monkeypatch: pytest.Monkey
     assert packaged_profiles_dir() == tmp_path.resolve() / "hardware_profiles"
     inside.mkdir(parents=True)
     assert packaged_profiles_dir() == inside.resolve()
+
+
+def test_what_belongs_to_a_profile_is_not_kept_inside_of_a_wheel(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert keeping_dir(packaged_profiles_dir() / "virtual.yaml") == packaged_profiles_dir()  # of a checkout
+    assert keeping_dir(Path("mine/lab.yaml")) == Path("mine")
+    inside = tmp_path / "labseq" / "config" / "hardware_profiles"
+    inside.mkdir(parents=True)
+    monkeypatch.setattr(find, "__file__", str(inside.parent / "find.py"))
+    assert keeping_dir(inside / "practice.yaml") == tmp_path / "hardware_profiles"
 
 
 def refused_sequence(name: str) -> str:
