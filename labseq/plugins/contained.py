@@ -66,8 +66,9 @@ class _Job:
 
     def run(self) -> None:
         try:
-            if self._surroundings is not None:
-                self._surroundings.enter()
+            with self._leaving:
+                if self._surroundings is not None:
+                    self._surroundings.enter()
             self.result = self._work()
         except BaseException as error:  # noqa: BLE001 - a plugin may raise anything
             self.error = error
