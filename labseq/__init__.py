@@ -19,6 +19,7 @@ _HOMES: Final = {
         "Fraction",
         "Frequency",
         "Length",
+        "Power",
         "Settings",
         "Speed",
         "Temperature",

@@ -19,6 +19,7 @@ from labseq.config.settings import (
     Fraction as Fraction,
     Frequency as Frequency,
     Length as Length,
+    Power as Power,
     Settings as Settings,
     Speed as Speed,
     Temperature as Temperature,

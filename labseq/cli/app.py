@@ -10,8 +10,10 @@ from labseq import __version__
 from labseq.cli import plan_options, plot_options, show_options, waveform_options
 from labseq.cli.bench_app import bench
 from labseq.cli.calibration_app import CALIBRATE_EXAMPLES, calibrate, calibration
+from labseq.cli.completing import profile_names
 from labseq.cli.data_app import DOCTOR_EXAMPLES, EXPORT_EXAMPLES, doctor, export
 from labseq.cli.demo_app import demo
+from labseq.cli.new_app import NEW_EXAMPLES, SCHEMA_EXAMPLES, new, schema
 from labseq.cli.queue_app import queue
 from labseq.cli.replay_app import ANALYSE_EXAMPLES, REPLAY_EXAMPLES, analyse, replay
 from labseq.cli.run_app import RESUME_EXAMPLES, RUN_EXAMPLES, resume, run, stop
@@ -190,12 +192,20 @@ app.command(epilog=EXPORT_EXAMPLES, short_help="Export a run as CSV, Parquet, ne
 app.command(epilog=DOCTOR_EXAMPLES, short_help="Find and repair damage in recorded data.")(doctor)
 
 
+app.command(epilog=NEW_EXAMPLES, short_help="Make a plugin, sequence or profile that runs at once.")(new)
+app.command(epilog=SCHEMA_EXAMPLES, short_help="Write the JSON schema of files, for editors.")(schema)
+
+
 @app.command(short_help="List the plugins and what they offer.")
 def plugins(
     profile: Annotated[
         str | None,
         typer.Option(
-            "--profile", "-p", metavar="NAME|FILE", help="Also look in this profile's plugin folders."
+            "--profile",
+            "-p",
+            metavar="NAME|FILE",
+            help="Also look in this profile's plugin folders.",
+            autocompletion=profile_names,
         ),
     ] = None,
     as_json: Json = False,
@@ -210,7 +220,12 @@ def plugins(
 def safe(
     profile: Annotated[
         str,
-        typer.Argument(metavar="PROFILE", help="Name or file of the hardware profile.", show_default=False),
+        typer.Argument(
+            metavar="PROFILE",
+            help="Name or file of the hardware profile.",
+            show_default=False,
+            autocompletion=profile_names,
+        ),
     ],
     overrides: Overrides = None,
 ) -> None:
@@ -224,7 +239,12 @@ def safe(
 def devices(
     profile: Annotated[
         str,
-        typer.Argument(metavar="PROFILE", help="Name or file of the hardware profile.", show_default=False),
+        typer.Argument(
+            metavar="PROFILE",
+            help="Name or file of the hardware profile.",
+            show_default=False,
+            autocompletion=profile_names,
+        ),
     ],
     dry_run: DryRun = None,
     overrides: Overrides = None,

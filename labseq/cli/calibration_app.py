@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from labseq.cli.completing import profile_names
 from labseq.cli.shared_options import DryRun as RunDry, DryRunKind, Json, Overrides
 
 calibration = typer.Typer(
@@ -32,7 +33,12 @@ Examples:
   labseq calibrate sites --profile lab --from sites.csv
 """
 
-Profile = Annotated[str, typer.Option("--profile", "-p", metavar="NAME|FILE", help="Hardware profile.")]
+Profile = Annotated[
+    str,
+    typer.Option(
+        "--profile", "-p", metavar="NAME|FILE", help="Hardware profile.", autocompletion=profile_names
+    ),
+]
 DryRun = Annotated[
     DryRunKind | None,
     typer.Option(

@@ -7,7 +7,7 @@ from typing import Annotated, Final
 
 import typer
 
-from labseq.cli.shared_options import Json
+from labseq.cli.shared_options import Json, RunFolder
 
 EXPORT_EXAMPLES: Final = """\b
 Examples:
@@ -24,10 +24,7 @@ Examples:
 
 
 def export(
-    run: Annotated[
-        Path | None,
-        typer.Argument(metavar="RUN", help="A run's folder; the newest run by default.", show_default=False),
-    ] = None,
+    run: RunFolder = None,
     to: Annotated[
         str,
         typer.Option(

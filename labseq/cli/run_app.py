@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from labseq.cli.completing import profile_names, run_folders
 from labseq.cli.shared_options import (
     DryRun,
     Json,
@@ -63,7 +64,12 @@ def run(
 def resume(
     run: Annotated[
         Path,
-        typer.Argument(metavar="RUN", help="The run's folder, or any file in it.", show_default=False),
+        typer.Argument(
+            metavar="RUN",
+            help="The run's folder, or any file in it.",
+            show_default=False,
+            autocompletion=run_folders,
+        ),
     ],
     accept_changes: Annotated[
         bool,
@@ -85,12 +91,21 @@ def stop(
     run: Annotated[
         Path | None,
         typer.Argument(
-            metavar="RUN", help="The run's folder; the one in progress by default.", show_default=False
+            metavar="RUN",
+            help="The run's folder; the one in progress by default.",
+            show_default=False,
+            autocompletion=run_folders,
         ),
     ] = None,
     profile: Annotated[
         str | None,
-        typer.Option("--profile", "-p", metavar="NAME|FILE", help="The run on this profile's devices."),
+        typer.Option(
+            "--profile",
+            "-p",
+            metavar="NAME|FILE",
+            help="The run on this profile's devices.",
+            autocompletion=profile_names,
+        ),
     ] = None,
     queue: Annotated[
         bool, typer.Option("--queue", help="Let labseq queue run take no further entry, too.")

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from labseq.cli.completing import profile_names, run_folders
+
 if TYPE_CHECKING:
     from labseq.session import Options
 
@@ -26,6 +28,7 @@ Profile = Annotated[
         "-p",
         metavar="NAME|FILE",
         help="Hardware profile, instead of the one that the sequence names.",
+        autocompletion=profile_names,
     ),
 ]
 Overrides = Annotated[
@@ -70,7 +73,12 @@ Output = Annotated[
 Realtime = Annotated[bool, typer.Option("--realtime", help="Let a simulated run take as long as a real one.")]
 RunFolder = Annotated[
     Path | None,
-    typer.Argument(metavar="RUN", help="A run's folder; the newest run by default.", show_default=False),
+    typer.Argument(
+        metavar="RUN",
+        help="A run's folder; the newest run by default.",
+        show_default=False,
+        autocompletion=run_folders,
+    ),
 ]
 
 

@@ -6,13 +6,7 @@ from labseq.config.collect import Collected
 from labseq.config.devices import DEVICE_KEYS
 from labseq.config.document import Document, Kept
 from labseq.config.fields import ROLES, Choice, plugin_paths
-from labseq.config.find import (
-    find_profile,
-    find_sequence,
-    keeping_dir,
-    packaged_profiles_dir,
-    packaged_sequences_dir,
-)
+from labseq.config.find import find_profile, find_sequence
 from labseq.config.lines import LINES_KEYS
 from labseq.config.motion import MOTION_KEYS, MotionSettings
 from labseq.config.nodes import Loc
@@ -36,6 +30,7 @@ from labseq.config.steps import (
 )
 from labseq.config.timeouts import TimeoutSettings
 from labseq.config.values import validate_values
+from labseq.places import keeping_dir, packaged_profiles_dir, packaged_sequences_dir
 
 __all__ = [
     "DEVICE_KEYS",

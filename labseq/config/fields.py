@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import unicodedata
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Final, Literal, Self, TypeAlias, TypeVar
 
@@ -134,9 +135,24 @@ def _is_name(name: str) -> str:
     return name
 
 
+@dataclass(frozen=True, slots=True)
+class EmptyIs:
+    """Puts a default in the place of an empty value.
+
+    Attributes:
+        default: The default.
+    """
+
+    default: Any
+
+    def __call__(self, value: Any) -> Any:
+        """The default for None; any other value as it is."""
+        return self.default if value is None else value
+
+
 def empty_is(default: Any) -> BeforeValidator:
     """Let a key that is there without a value count as ``default``."""
-    return BeforeValidator(lambda value: default if value is None else value)
+    return BeforeValidator(EmptyIs(default))
 
 
 FormatVersion: TypeAlias = Annotated[Literal[1], BeforeValidator(_is_version)]

@@ -4,46 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Final
 
 from labseq.config import reading
 from labseq.config.document import Document
 from labseq.config.wording import clean, did_you_mean, listing, visible
 from labseq.errors import ConfigError, Problem
-
-PROFILES: Final = "hardware_profiles"
-SEQUENCES: Final = "sequences"
-
-
-def packaged_dir(folder: str) -> Path:
-    """The folder of the profiles or the sequences that come with labseq.
-
-    In a wheel it lies beside this file, in a checkout at the top.
-    """
-    here = Path(__file__).resolve().parent
-    packaged = here / folder
-    return packaged if packaged.is_dir() else here.parents[1] / folder
-
-
-def packaged_profiles_dir() -> Path:
-    """The folder of the profiles that come with labseq."""
-    return packaged_dir(PROFILES)
-
-
-def packaged_sequences_dir() -> Path:
-    """The folder of the sequences that come with labseq."""
-    return packaged_dir(SEQUENCES)
-
-
-def keeping_dir(profile: Path) -> Path:
-    """The folder in which what belongs to a profile is kept: its own.
-
-    Of an installed profile it is ./hardware_profiles, where a copy of it would stand: what is installed
-    is everybody's, may be read-only, and goes with the next version.
-    """
-    folder = profile.resolve().parent
-    is_installed = folder == Path(__file__).resolve().parent / PROFILES
-    return Path(PROFILES).absolute() if is_installed else profile.parent
+from labseq.places import (
+    PROFILES,
+    SEQUENCES,
+    packaged_profiles_dir,
+    packaged_sequences_dir,
+)
 
 
 def is_path(name: str) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Final, TypeAlias, cast
 
@@ -38,15 +39,27 @@ class NoSettings(Settings):
     """The settings of what takes none."""
 
 
-def _quantity(dimension: str) -> BeforeValidator:
-    def read(value: Any) -> Any:
+@dataclass(frozen=True, slots=True)
+class Quantity:
+    """Reads a number, or text with a unit, into SI.
+
+    Attributes:
+        dimension: A key of :data:`labseq.units.UNITS`.
+    """
+
+    dimension: str
+
+    def __call__(self, value: Any) -> Any:
+        """Read text; numbers are SI already."""
         if isinstance(value, str):
-            return parse_quantity(value, dimension)
+            return parse_quantity(value, self.dimension)
         if value is None or isinstance(value, bool | list | tuple | dict):
-            raise ValueError(f"expected {expected(dimension)}")
+            raise ValueError(f"expected {expected(self.dimension)}")
         return value
 
-    return BeforeValidator(read)
+
+def _quantity(dimension: str) -> BeforeValidator:
+    return BeforeValidator(Quantity(dimension))
 
 
 def _not_too_long(duration_s: float) -> float:

@@ -1,5 +1,6 @@
 """Runs on disk: a folder per run, one HDF5 file per shot, and the way back."""
 
+from labseq.places import data_root
 from labseq.recording.active import (
     clear_active,
     died,
@@ -8,7 +9,6 @@ from labseq.recording.active import (
     marker_roots,
     runs_in_progress,
 )
-from labseq.recording.folders import data_root
 from labseq.recording.reader import Run, open_run
 from labseq.recording.row_values import value_in
 from labseq.recording.shot import Shot

@@ -39,11 +39,6 @@ _COUNTER = re.compile(r"\.?(\d{4,})[_.]")
 _MAX_SLUG: Final = 60
 
 
-def data_root() -> Path:
-    """Where runs are kept if nothing else is said: LABSEQ_DATA, else ``./data``."""
-    return Path(os.environ.get("LABSEQ_DATA") or "data").expanduser()
-
-
 def state_root() -> Path | None:
     """Folder of what labseq remembers for this user between runs, wherever their data lie.
 

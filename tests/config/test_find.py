@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from labseq import places
 from labseq.config import Document, find, find_profile, find_sequence, keeping_dir, packaged_profiles_dir
 from labseq.errors import ConfigError
 
@@ -86,21 +87,6 @@ def test_folder_is_no_profile() -> None:
     assert refusal("lab").startswith("there is no hardware profile 'lab'")
 
 
-def test_packaged_profiles() -> None:
-    folder = packaged_profiles_dir()
-    assert folder.name == "hardware_profiles"
-    assert folder.is_dir()
-
-
-def test_packaged_profiles_of_a_wheel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "hardware_profiles").rename(tmp_path / "elsewhere")
-    inside = tmp_path / "labseq" / "config" / "hardware_profiles"
-    monkeypatch.setattr(find, "__file__", str(inside.parent / "find.py"))
-    assert packaged_profiles_dir() == tmp_path.resolve() / "hardware_profiles"
-    inside.mkdir(parents=True)
-    assert packaged_profiles_dir() == inside.resolve()
-
-
 def test_what_belongs_to_a_profile_is_not_kept_inside_of_a_wheel(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -108,7 +94,7 @@ def test_what_belongs_to_a_profile_is_not_kept_inside_of_a_wheel(
     assert keeping_dir(Path("mine/lab.yaml")) == Path("mine")
     inside = tmp_path / "labseq" / "config" / "hardware_profiles"
     inside.mkdir(parents=True)
-    monkeypatch.setattr(find, "__file__", str(inside.parent / "find.py"))
+    monkeypatch.setattr(places, "__file__", str(inside.parents[1] / "places.py"))
     assert keeping_dir(inside / "practice.yaml") == tmp_path / "hardware_profiles"
 
 

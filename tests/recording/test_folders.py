@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given, strategies as st
 
 from labseq.errors import RecordingError
-from labseq.recording import data_root
 from labseq.recording.folders import find_run, make_run_folder, slug, state_root
 
 NOON = datetime(2026, 11, 20, 12, tzinfo=UTC)
@@ -25,15 +24,6 @@ input()
 for i in range(10):
     print(make_run_folder(Path(sys.argv[1]), sys.argv[2], noon))
 """
-
-
-def test_the_data_root_comes_from_the_environment(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.delenv("LABSEQ_DATA", raising=False)
-    assert data_root() == Path("data")
-    monkeypatch.setenv("LABSEQ_DATA", "")
-    assert data_root() == Path("data")
-    monkeypatch.setenv("LABSEQ_DATA", str(tmp_path))
-    assert data_root() == tmp_path
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,111 @@
+"""``labseq new`` and ``labseq schema``: what they say and what they leave behind."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from labseq.cli import main
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def code_of(*arguments: str) -> Any:
+    with pytest.raises(SystemExit) as leaving:
+        main(arguments)
+    return leaving.value.code
+
+
+def test_a_planner_from_an_empty_folder(capsys: pytest.CaptureFixture[str]) -> None:
+    assert code_of("new", "planner", "spiral") == 0
+    out = capsys.readouterr().out.replace("\\", "/")
+    assert out == (
+        "made the planner spiral:\n"
+        "  plugins/spiral/README.md\n"
+        "  plugins/spiral/__init__.py\n"
+        "  plugins/spiral/planner.py\n"
+        "  plugins/spiral/test_spiral.py\n"
+        "\n"
+        "go on with\n"
+        "  pytest plugins/spiral\n"
+        "  labseq new sequence first\n"
+        "  labseq run first.yaml --set planner.use=spiral\n"
+    )
+    assert code_of("new", "sequence", "first") == 0
+    assert code_of("run", "first.yaml", "--set", "planner.use=spiral", "--shots", "1", "--seed", "1") == 0
+    capsys.readouterr()
+    assert code_of("new", "detector", "mean_counts") == 0
+    assert "labseq new sequence" not in capsys.readouterr().out  # there is one
+
+
+def test_a_package(capsys: pytest.CaptureFixture[str]) -> None:
+    assert code_of("new", "camera", "mycam", "--package") == 0
+    out = capsys.readouterr().out
+    assert "  pip install -e labseq-mycam\n  pytest labseq-mycam\n" in out
+    assert Path("labseq-mycam/src/labseq_mycam/camera.py").is_file()
+    assert Path("labseq-mycam/tests/test_mycam.py").is_file()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (
+            ["planer", "x"],
+            "there is no kind 'planer'; expected one of planner, camera, .*did you mean 'planner'",
+        ),
+        (["planner", "my-planner"], "a planner cannot be called 'my-planner'.*for example 'my_planner'"),
+        (["sequence", "a", "--package"], "--package does not go with a sequence; leave it out"),
+        (["static_tweezers", "a", "--profile", "lab"], "--profile does not go with a static tweezers"),
+        (["planner", "a", "--folder", "nowhere"], "nowhere: there is no such folder"),
+        (["planner"], "NAME"),
+    ],
+)
+def test_mistakes(arguments: list[str], said: str, here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert code_of("new", *arguments) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert re.search(said, err), err
+    assert [*here.iterdir()] == []
+
+
+def test_schema_to_stdout_and_to_a_file(capsys: pytest.CaptureFixture[str]) -> None:
+    assert code_of("schema", "sequence") == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert code_of("schema", "sequence", "-o", "s.json") == 0
+    assert capsys.readouterr().out == "wrote s.json\n"
+    assert json.loads(Path("s.json").read_text(encoding="utf-8")) == printed
+    assert printed["$schema"].startswith("http://json-schema.org/draft-07/")
+
+
+def test_schema_knows_the_plugins_of_a_folder(capsys: pytest.CaptureFixture[str]) -> None:
+    code_of("new", "planner", "spiral")
+    Path("empty").mkdir()
+    capsys.readouterr()
+    for arguments, is_there in (
+        ([], True),
+        (["--plugins", "empty"], False),
+        (["--plugins", "plugins"], True),
+    ):
+        assert code_of("schema", "sequence", *arguments) == 0
+        assert ("planner.spiral" in json.loads(capsys.readouterr().out)["definitions"]) is is_there
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["sequenze"], "there is no schema of a 'sequenze'; expected one of sequence, profile; did you mean"),
+        (["profile", "--plugins", "nowhere"], "plugin folder nowhere does not exist"),
+        (["profile", "-o", "nowhere/p.json"], "it cannot be written"),
+    ],
+)
+def test_mistakes_with_schemas(arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert code_of("schema", *arguments) == 2
+    assert said in capsys.readouterr().err

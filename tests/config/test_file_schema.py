@@ -1,0 +1,196 @@
+"""The JSON schemas take every file that is right, and refuse those that are built wrongly."""
+
+from __future__ import annotations
+
+import runpy
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import jsonschema
+import pytest
+from pydantic import Field, PlainValidator
+
+import labseq
+from labseq.config.composer import compose
+from labseq.config.file_schema import FileKind, file_schema
+from labseq.config.json_schema import model_schema, quantity_schema
+from labseq.errors import ConfigError
+from labseq.registry import Registry
+from labseq.session import load_plugins
+from labseq.units import UNITS
+
+ROOT = Path(__file__).parents[2]
+FILES = [
+    *(("sequence", path) for path in sorted((ROOT / "sequences").glob("*.yaml"))),
+    *(("profile", path) for path in sorted((ROOT / "hardware_profiles").glob("*.yaml"))),
+]
+ABOUT_VALUES = {
+    "sequences": {
+        "shots as a float",
+        "name with a separator",
+        "name with a control character",
+        "name of dots",
+    },
+    "steps": {
+        "step name twice",
+        "zero exposure",
+        "infinite time",
+        "time that is no number",
+        "time beyond numbers",
+        "too few windows",
+        "limit of nothing",
+        "argument infinite",
+        "required setting missing in an empty step",
+        "wait for a time and for a signal",
+        "wait for a signal without end",
+        "timeout of a wait for a time",
+    },
+    "profiles": {
+        "spacing of zero",
+        "comb below zero",
+        "comb of one frequency",
+        "device called like a role",
+        "device with a space",
+        "timeout of zero",
+    },
+}
+"""What is wrong about the values of a file that is built rightly, and for `labseq check` to say."""
+
+
+def catalogue() -> list[Any]:
+    """The bad files of the tests of the configuration: kind, content, and whether only values are wrong."""
+    found: list[Any] = []
+    for name, about_values in ABOUT_VALUES.items():
+        module = runpy.run_path(str(Path(__file__).with_name(f"test_bad_{name}.py")))
+        cases = {case[0]: case for case in module["CASES"]}
+        assert about_values <= set(cases)
+        kind = "profile" if name == "profiles" else "sequence"
+        for case, (_, old, new, _) in cases.items():
+            try:
+                node = compose(module["GOOD"].replace(old, new, 1), case)
+            except ConfigError:  # no YAML
+                continue
+            data = None if node is None else node.plain()
+            found.append(pytest.param(kind, data, case in about_values, id=f"{name}: {case}"))
+    return found
+
+
+Valid = Callable[[str, Any], bool]
+
+
+@pytest.fixture(scope="module")
+def registry() -> Registry:
+    return load_plugins().registry
+
+
+@pytest.fixture(scope="module")
+def is_valid(registry: Registry) -> Valid:
+    kinds: list[FileKind] = ["sequence", "profile"]
+    schemas: dict[str, Any] = {kind: file_schema(kind, registry) for kind in kinds}
+    for schema in schemas.values():
+        jsonschema.Draft7Validator.check_schema(schema)
+    validators = {kind: jsonschema.Draft7Validator(schema) for kind, schema in schemas.items()}
+    return lambda kind, data: validators[kind].is_valid(data)
+
+
+@pytest.mark.parametrize(("kind", "path"), FILES, ids=lambda value: getattr(value, "name", value))
+def test_every_shipped_file_is_accepted(kind: str, path: Path, is_valid: Valid) -> None:
+    node = compose(path.read_text(encoding="utf-8"), path.name)
+    assert node is not None
+    assert is_valid(kind, node.plain())
+
+
+@pytest.mark.parametrize(("kind", "data", "is_about_values"), catalogue())
+def test_a_file_that_is_built_wrongly_is_refused(
+    kind: str, data: object, is_about_values: bool, is_valid: Valid
+) -> None:
+    assert is_valid(kind, data) is is_about_values
+
+
+GOOD = """
+labseq: 1
+name: x
+shots: 1
+target: {pattern: compact, rows: 5, cols: 5}
+planner: {use: psca}
+shot: [{load: {}}, {image: {}}]
+"""
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "good"),
+    [
+        ("planner: {use: psca}\n", "", True),
+        ("{use: psca}", "{use: psca, degree_of_parallelism: 7, max_tones: {row: 3}}", True),
+        ("{use: psca}", "{use: psca, degree_of_paralelism: 7}", False),
+        ("{use: psca}", "{use: psca, max_tones: {rows: 3}}", False),
+        ("{use: psca}", "{use: pscaa}", False),
+        ("{use: psca}", "{use: lsap, variant: paper}", False),
+        ("rows: 5", "rows: 5, order: 3", False),
+        ("compact, rows: 5", "compact", False),
+        ("compact, rows: 5, cols: 5", "sierpinski, order: 3", True),
+        ("{load: {}}", "{load: }", True),
+        ("{load: {}}", "{load: {duration: 500 ms}, name: fill}", True),
+        ("{load: {}}", "{load: {duration: 500 MHz}}", False),
+        ("{load: {}}", "{load: {duration: -500 ms}}", False),
+        ("{load: {}}", "{load: {}, image: {}}", False),
+        ("{load: {}}", "{name: fill}", False),
+        ("{load: {}}", "{device: }", False),
+        ("shots: 1", "scan: {planner.degree_of_parallelism: [3, 5]}", True),
+        ("shots: 1", "scan: [{a.b: {range: [0, 4, 2]}}, {c.d: {linspace: [1, 2, 3]}}]", True),
+        ("shots: 1", "scan: {a.b: {rage: [0, 4, 2]}}", False),
+        ("shots: 1\n", "", False),
+        ("shots: 1", "shots: 1\nanalysis: [{use: survival, atoms: moved, finish_within: 5 s}]", True),
+        ("shots: 1", "shots: 1\nanalysis: [{use: survival, atoms: some}]", False),
+        ("shots: 1", "shots: 1\nplugin_folders:", True),
+    ],
+)
+def test_sequences_with_plugins(old: str, new: str, good: bool, is_valid: Valid) -> None:
+    assert old in GOOD
+    node = compose(GOOD.replace(old, new, 1), "x")
+    assert node is not None
+    assert is_valid("sequence", node.plain()) is good
+
+
+def test_keys_are_explained(registry: Registry) -> None:
+    schema = file_schema("sequence", registry)
+    assert schema["properties"]["shots"]["description"] == "how many shots a run takes"
+    exposure = schema["definitions"]["step.image"]["properties"]["exposure"]
+    assert (exposure["description"], exposure["default"]) == ("exposure time of the camera", "45 ms")
+    planner = schema["properties"]["planner"]["anyOf"][0]["properties"]["use"]
+    assert len(planner["enum"]) == len(planner["enumDescriptions"])
+    assert {"psca", "lsap", "tetris"} <= {*planner["enum"]}
+
+
+@pytest.mark.parametrize("dimension", UNITS)
+def test_a_quantity_is_a_number_or_text_with_a_unit(dimension: str) -> None:
+    schema = jsonschema.Draft7Validator(quantity_schema(dimension))
+    assert schema.is_valid(3.5)
+    for unit in UNITS[dimension]:
+        assert schema.is_valid(f"3.5 {unit}")
+        assert schema.is_valid(f"-1e3{unit}")
+    assert not schema.is_valid("3.5 furlong")
+    assert not schema.is_valid("")
+    assert not any(schema.is_valid(value) for value in (None, True, [3.5]))
+
+
+class Odd(labseq.Settings):
+    """What no schema can tell of."""
+
+    of_the_plugin: Annotated[complex, PlainValidator(complex)] = Field(
+        default=1j, description="a number of its own"
+    )
+    inner: Odd | None = Field(default=None, description="itself")
+    pair: tuple[labseq.Duration, Literal["a", "b"]] = Field(default=(0.1, "a"), description="two")
+
+
+def test_a_model_that_is_hard_to_describe_still_tells_its_keys() -> None:
+    definitions: dict[str, Any] = {}
+    schema = model_schema(Odd, "odd.", definitions)
+    assert [*schema["properties"]] == ["of_the_plugin", "inner", "pair"]
+    whole = jsonschema.Draft7Validator({**schema, "definitions": definitions})
+    whole.check_schema(whole.schema)
+    assert whole.is_valid({"of_the_plugin": "2+3j", "inner": {"pair": ["20 ms", "b"]}})
+    assert not whole.is_valid({"inner": {"pair": ["20 ms", "c"]}})
+    assert not whole.is_valid({"inner": {"pairs": []}})

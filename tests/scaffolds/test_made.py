@@ -1,0 +1,131 @@
+"""What is made works at once: its own tests pass, it is clean, and a run with it goes through."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+import tomllib
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import pytest
+
+import labseq
+from labseq.config.document import Document
+from labseq.registry import KINDS
+from labseq.session import check, load_plugins
+
+
+def run(*command: str, cwd: Path, **environment: str) -> str:
+    done = subprocess.run(
+        [sys.executable, "-m", *command],
+        cwd=cwd,
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, **environment},
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def options_of(command: str) -> list[str]:
+    """What the shown command sets."""
+    words = shlex.split(command)
+    assert words[:3] == ["labseq", "run", "first.yaml"]
+    assert set(words[3::2]) == {"--set"}
+    return words[4::2]
+
+
+def test_their_own_tests_pass(made: Any) -> None:
+    source = made.package.path / "src"
+    folders = ["plugins", str(made.package.path / "tests")]
+    out = run(
+        "pytest", "-q", "-n0", "-p", "no:cacheprovider", *folders, cwd=made.path, PYTHONPATH=str(source)
+    )
+    passed = re.search(r"(\d+) passed", out)
+    assert passed is not None
+    assert int(passed[1]) > 100  # promises of seven roles and more: none was left out
+
+
+def test_they_are_clean(made: Any) -> None:
+    for folder, cwd in (("plugins", made.path), (".", made.package.path)):
+        run("ruff", "check", "--isolated", "--extend-select=I,B,UP,RUF,N,SIM", folder, cwd=cwd)
+        run("ruff", "format", "--isolated", "--check", folder, cwd=cwd)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_run_goes_through_with_each(kind: str, made: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(made.path)
+    overrides = options_of(made.plugins[kind].commands[-1])
+    with labseq.Session.open("first.yaml", shots=1, seed=1, overrides=overrides) as session:
+        result = session.run()
+    assert len(result.shots) == 1
+    assert result.status == "complete"
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_readme_says_how(kind: str, made: Any) -> None:
+    plugin = made.plugins[kind]
+    text = (plugin.path / "README.md").read_text(encoding="utf-8")
+    assert all(command in text for command in plugin.commands)
+    assert all(f"`{path.name}`" in text for path in plugin.path.glob("*.py"))
+
+
+def test_nothing_is_left_to_fill_in(made: Any) -> None:
+    files = [
+        path for path in made.path.rglob("*") if path.is_file() and path.suffix in (".py", ".md", ".toml")
+    ]
+    assert files
+    assert not [path for path in files if "${" in path.read_text(encoding="utf-8")]
+
+
+def test_the_sequence_is_checked_without_a_warning(made: Any) -> None:
+    with labseq.Session.open(made.path / "first.yaml") as session:
+        report = check(session)
+    assert report.warnings == ()
+
+
+def test_a_sequence_runs_on_the_profile(made: Any, tmp_path: Path) -> None:
+    overrides = ["profile=mine"]
+    path = made.path / "first.yaml"
+    with labseq.Session.open(path, shots=2, seed=1, overrides=overrides, output=tmp_path) as session:
+        assert session.run().filling_fraction > 0.9
+
+
+@pytest.mark.parametrize(("kind", "name"), [("sequence", "first"), ("profile", "mine")])
+def test_the_editor_finds_a_schema_that_accepts_the_file(kind: str, name: str, made: Any) -> None:
+    document = Document.read(made.path / f"{name}.yaml")
+    first = document.text.splitlines()[0]
+    place = first.removeprefix("# yaml-language-server: $schema=")
+    assert place == f".labseq/{kind}.schema.json"
+    schema = json.loads((made.path / place).read_text(encoding="utf-8"))
+    validator = jsonschema.Draft7Validator(schema)
+    assert validator.is_valid(document.root.plain())
+    assert {"sequence": "planner.ownpla", "profile": "camera.owncam"}[kind] in schema["definitions"]
+
+
+def test_a_package_is_found_as_an_installed_plugin(
+    made: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    project = tomllib.loads((made.package.path / "pyproject.toml").read_text(encoding="utf-8"))
+    assert project["project"]["name"] == made.package.path.name == "labseq-packed"
+    assert (made.package.path / project["tool"]["hatch"]["build"]["targets"]["wheel"]["packages"][0]).is_dir()
+    points = project["project"]["entry-points"]["labseq"]
+    installed = tmp_path / "labseq_packed-0.1.0.dist-info"  # as an installer would leave it behind
+    installed.mkdir()
+    (installed / "METADATA").write_text("Metadata-Version: 2.1\nName: labseq-packed\nVersion: 0.1.0\n")
+    (installed / "entry_points.txt").write_text(
+        "[labseq]\n" + "".join(f"{name} = {module}\n" for name, module in points.items())
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.syspath_prepend(str(made.package.path / "src"))
+    assert "labseq_packed" in entry_points(group="labseq").names
+    host = load_plugins()
+    assert host.get("planner", "packed").origin == "labseq_packed"
