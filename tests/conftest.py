@@ -6,6 +6,8 @@ import os
 import shutil
 import sys
 import tempfile
+import tomllib
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -51,3 +53,21 @@ def own_state(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.Monk
     """A state folder for each test and its subprocesses, so that none sees another's runs."""
     folder = tmp_path_factory.getbasetemp() / "state" / str(next(_NUMBERS))
     monkeypatch.setenv("LABSEQ_STATE", str(folder))
+
+
+@pytest.fixture
+def pretend_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[Path], None]:
+    """Makes Python find a package, until the test ends, as ``pip install -e`` would have."""
+
+    def install(package: Path) -> None:
+        project = tomllib.loads((package / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+        name, version, points = project["name"], project["version"], project["entry-points"]["labseq"]
+        info = tmp_path / "site-packages" / f"{name.replace('-', '_')}-{version}.dist-info"
+        info.mkdir(parents=True)
+        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
+        lines = (f"{point} = {module}\n" for point, module in points.items())
+        (info / "entry_points.txt").write_text("[labseq]\n" + "".join(lines))
+        monkeypatch.syspath_prepend(str(info.parent))
+        monkeypatch.syspath_prepend(str(package / "src"))
+
+    return install

@@ -59,6 +59,18 @@ def test_a_package_in_a_folder_is_a_plugin(host, tmp_path):
     assert host.get("planner", "mine")
 
 
+def test_a_package_is_loaded_as_it_is_now(tmp_path):
+    for folder, value in (("one", 1), ("two", 2)):  # of one name, in one process, as in a notebook
+        package = tmp_path / folder / "mine"
+        package.mkdir(parents=True)
+        text = GOOD.replace("class Mine:", "from .part import VALUE\nclass Mine:\n    value = VALUE")
+        (package / "__init__.py").write_text(text)
+        (package / "part.py").write_text(f"VALUE = {value}\n")
+        host = PluginHost()
+        host.load_folders([tmp_path / folder])
+        assert vars(host.get("planner", "mine").factory)["value"] == value
+
+
 def test_hidden_files_and_other_files_are_left_alone(host, tmp_path):
     for name in ("_private.py", ".hidden.py", "notes.txt", "data.json"):
         (tmp_path / name).write_text("raise SystemExit(1)")

@@ -135,7 +135,7 @@ def _is_name(name: str) -> str:
     return name
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)  # a default may be a dict, which has no hash
 class EmptyIs:
     """Puts a default in the place of an empty value.
 

@@ -9,7 +9,7 @@ import shlex
 import subprocess
 import sys
 import tomllib
-from importlib.metadata import entry_points
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -112,20 +112,10 @@ def test_the_editor_finds_a_schema_that_accepts_the_file(kind: str, name: str, m
 
 
 def test_a_package_is_found_as_an_installed_plugin(
-    made: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    made: Any, pretend_installed: Callable[[Path], None]
 ) -> None:
     project = tomllib.loads((made.package.path / "pyproject.toml").read_text(encoding="utf-8"))
     assert project["project"]["name"] == made.package.path.name == "labseq-packed"
     assert (made.package.path / project["tool"]["hatch"]["build"]["targets"]["wheel"]["packages"][0]).is_dir()
-    points = project["project"]["entry-points"]["labseq"]
-    installed = tmp_path / "labseq_packed-0.1.0.dist-info"  # as an installer would leave it behind
-    installed.mkdir()
-    (installed / "METADATA").write_text("Metadata-Version: 2.1\nName: labseq-packed\nVersion: 0.1.0\n")
-    (installed / "entry_points.txt").write_text(
-        "[labseq]\n" + "".join(f"{name} = {module}\n" for name, module in points.items())
-    )
-    monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.syspath_prepend(str(made.package.path / "src"))
-    assert "labseq_packed" in entry_points(group="labseq").names
-    host = load_plugins()
-    assert host.get("planner", "packed").origin == "labseq_packed"
+    pretend_installed(made.package.path)
+    assert load_plugins().get("planner", "packed").origin == "labseq_packed"

@@ -1,0 +1,95 @@
+"""Cameras of the maker Acme."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from pydantic import Field
+
+from labseq import (
+    CameraDriver,
+    CameraFacts,
+    Context,
+    DeviceError,
+    Duration,
+    Series,
+    Settings,
+    Taken,
+    wait_for,
+)
+
+
+class MycamSettings(Settings):
+    """What a profile can set beside `use: mycam`."""
+
+    serial: str = Field(description="serial number, as it stands on the camera")
+    readout: Duration = Field(default=5e-3, description="time to read a frame out")
+
+
+class MycamCamera(CameraDriver):
+    """One camera of Acme, by its software trigger.
+
+    Args:
+        settings: Which camera.
+        context: Its name in the profile, and the session's clock.
+    """
+
+    def __init__(self, settings: MycamSettings, context: Context) -> None:
+        super().__init__(context)
+        self._settings = settings
+        self._camera: Any = None
+        self._exposure_s = self._due_s = 0.0
+
+    @property
+    def facts(self) -> CameraFacts:
+        """What the data sheet says."""
+        return CameraFacts(
+            self._settings.readout,
+            max_exposure_s=60.0,
+            frame_shape=(512, 512),
+            triggers=("software",),
+        )
+
+    def describe(self) -> Mapping[str, Any]:
+        """What stands in the record of each run."""
+        firmware = None if self._camera is None else self._camera.firmware
+        return {"model": "Acme", "serial_number": self._settings.serial, "firmware": firmware}
+
+    def _connect(self) -> None:
+        from . import acme  # here, so that labseq can list the plugin where the library is missing
+
+        try:
+            self._camera = acme.Camera(self._settings.serial)
+        except acme.AcmeError as error:
+            raise DeviceError(self._name, f"{error}; check `serial` and the cable") from error
+
+    def _disconnect(self) -> None:
+        if self._camera is not None:
+            self._camera.close()
+            self._camera = None
+
+    def _start(self, series: Series) -> None:
+        self._exposure_s = series.exposure_s
+        self._camera.set_exposure_ms(1e3 * series.exposure_s)
+        self._camera.start()
+
+    def _fire(self) -> None:
+        self._camera.fire()
+        self._due_s = self._clock.now() + self._exposure_s + self._settings.readout
+
+    def _take(self, timeout_s: float) -> Taken | None:
+        not_yet_s = min(timeout_s, max(0.0, self._due_s - self._clock.now()))
+        self._clock.sleep(not_yet_s)
+        frame = wait_for(
+            lambda patience_s: self._camera.get_frame(1e3 * patience_s),
+            timeout_s - not_yet_s,
+            self._clock,
+        )
+        if frame is None:
+            return None
+        number, pixels = frame
+        return Taken(number - 1, pixels)
+
+    def _stop(self) -> None:
+        self._camera.stop()
