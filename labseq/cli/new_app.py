@@ -71,8 +71,8 @@ def schema(
     kind: Annotated[
         str,
         typer.Argument(
-            metavar="sequence|profile",
-            help="Which kind of file.",
+            metavar="KIND",
+            help="Kind of file: sequence or profile.",
             show_default=False,
             autocompletion=file_kinds,
         ),

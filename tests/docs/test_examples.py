@@ -97,6 +97,7 @@ def help_examples(group: Any, names: str = "labseq") -> list[Block]:
     return [*found, Block(f"{names} --help", "console", group.epilog)] if group.epilog else found
 
 
+OF_ALL = ("--help", "--version", "--install-completion", "--show-completion")
 SHOWN = [*of("console", "sh", "bash", "inline"), *help_examples(typer.main.get_command(app))]
 LINES = [(block, line) for block in SHOWN for line in lines_of(block)]
 
@@ -138,9 +139,11 @@ def test_every_command_line_can_be_parsed(block: Block, line: str) -> None:
     words = [word for word in arrange(shlex.split(line, comments=True)[1:]) if word != "--debug"]
     command: Any = typer.main.get_command(app)
     while hasattr(command, "commands"):
-        if not words or words[0] in ("COMMAND", "--help", "--version"):
+        if not words or words[0] in ("COMMAND", *OF_ALL):
             return
         command = command.commands[words.pop(0)]
+    if "--help" in words:
+        return
     if words or block.language != "inline":  # prose may name a command without its arguments
         command.make_context(line, words)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,7 @@ from labseq import (
     RandomStream,
     SiteGrid,
     ToneProgram,
+    Warmable,
 )
 from labseq.model import AxisTones
 from labseq.testing.fakes import FakeClock
@@ -282,3 +284,13 @@ def test_the_mobile_tweezers_tell_a_site_that_is_out_of_reach(lab: Lab) -> None:
         DeviceError, match=r"column 0 is out of reach: its tone of .* is not in the band of 99 to"
     ):
         mobile.self_test()
+
+
+def test_no_kernel_is_left_to_be_compiled_by_the_first_image(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kernels = "labseq_virtual._kernels_transport"  # which takes longer than a camera may
+    monkeypatch.delitem(sys.modules, kernels, raising=False)
+    assert isinstance(lab.mobile, Warmable)
+    lab.mobile.warm()
+    assert kernels in sys.modules

@@ -5,7 +5,9 @@ from __future__ import annotations
 import csv
 import itertools
 import json
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any, cast
 
 import h5py
 import numpy as np
@@ -77,7 +79,8 @@ def test_the_exported_table_agrees_with_the_files(run_dir: Path, tmp_path: Path)
         rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
     assert len(rows) == 60
     for row in rows:
-        with h5py.File(run_dir / row["file"], "r") as shot:
+        with h5py.File(run_dir / row["file"], "r") as file:
+            shot = cast("Mapping[str, Any]", file)
             seen = shot["entry/detection/occupancy"][-1].astype(bool)
             fill = shot["entry/target/fill"][:].astype(bool)
             batches = shot["entry/rearrangement/cycles"][:]
