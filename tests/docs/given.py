@@ -1,0 +1,182 @@
+"""What a page takes for granted: a copy of the repository's files, runs that were taken, a lab."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from labseq_virtual.settings import WorldSettings
+from labseq_virtual.world import World
+
+import labseq as api
+
+from .blocks import ROOT, Block, blocks_of
+from .running import RUN, labseq
+
+LOOK: Final = ROOT / "plugins" / "labseq_frames" / "README.md"
+"""The page with the files ``look.yaml`` and ``replay.yaml``."""
+OWN_RUNS: Final = ("docs/explanation/played-waveforms.md", "docs/tutorials")
+"""Pages that speak of the runs that they have taken themselves."""
+REAL_LAB: Final = ("docs/how-to/rehearse.md",)
+"""Pages that mean the profile ``lab`` as it is; on all others it is the virtual lab, so that it can be run."""
+
+SHOTS: Final = {
+    "compact-225": ("sequences/compact_225.yaml", 9),
+    "scan-dop": ("sequences/scan_dop.yaml", 8),
+    "look": ("look.yaml", 5),
+    "figure5-multicycle": ("sequences/figure5_multicycle.yaml", 2),
+}
+"""Name of a run on a page -> its sequence and number of shots."""
+
+
+class Store:
+    """Runs that pages speak of, each taken once and copied to the place at which a page looks for it."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.taken = cache(self._taken)
+
+    def give(self, text: str, to: Path) -> None:
+        """Put a run at each folder of a run that stands in a text."""
+        for place, name in set(RUN.findall(text)):
+            there = to / "data" / f"{place}_{name}"
+            if not there.exists() and name in (*SHOTS, "calibrate-sites"):
+                shutil.copytree(self.taken(name), there)
+
+    def _taken(self, name: str) -> Path:
+        data = self.folder / name
+        if name == "calibrate-sites":
+            copy_repository(data)
+            profile = str(data / "hardware_profiles" / "virtual.yaml")
+            code, _, errors = labseq(
+                ["calibrate", "sites", "-p", profile, "--shots", "10", "--seed", "1", "--output", str(data)]
+            )
+            assert code == 0, errors
+            (run,) = data.glob("*/*_calibrate-sites")
+            return run
+        file, shots = SHOTS[name]
+        sequence = self.folder / file if file == "look.yaml" else ROOT / file
+        every = ["record_frames=all"]
+        save_files(LOOK, self.folder)
+        with api.Session.open(sequence, shots=shots, seed=1, output=data, overrides=every) as session:
+            return session.run().path
+
+
+def save_files(page: Path, to: Path) -> None:
+    """What another page tells to put into files."""
+    for block in blocks_of(page):
+        if "file" in block.comments:
+            (to / block.comments["file"]).write_text(block.text, "utf-8")
+
+
+@dataclass
+class Given:
+    """What a page takes for granted beside files.
+
+    Attributes:
+        replaced: What stands on the page -> what it is here, for example ids of calibrations.
+        names: Python names that its code uses and does not make.
+    """
+
+    replaced: dict[str, str] = field(default_factory=dict)
+    names: dict[str, Any] = field(default_factory=dict)
+
+
+def copy_repository(to: Path) -> None:
+    """What readers have: sequences and profiles."""
+    shutil.copytree(ROOT / "sequences", to / "sequences")
+    shutil.copytree(ROOT / "hardware_profiles", to / "hardware_profiles", ignore=shutil.ignore_patterns("calibrations"))
+
+
+def virtual_lab(to: Path) -> None:
+    """A profile ``lab`` whose devices are virtual."""
+    text = (to / "hardware_profiles" / "virtual.yaml").read_text("utf-8")
+    lab = to / "hardware_profiles" / "lab.yaml"
+    lab.write_text(text.replace("\nname: virtual\n", "\nname: lab\n"), "utf-8")
+
+
+def prepare(page: str, blocks: list[Block], to: Path, store: Store) -> Given:
+    """All that a page takes for granted, in a folder."""
+    copy_repository(to)
+    if page not in REAL_LAB:
+        virtual_lab(to)
+    for block in blocks if not page.startswith(OWN_RUNS) else []:
+        store.give(block.text, to)
+    return GIVEN[page](to) if page in GIVEN else Given()
+
+
+def _andor(to: Path) -> Given:
+    world = World(WorldSettings(), api.Context("simulation"))
+    return Given(names={"context": api.Context("camera", simulation=world)})
+
+
+def _calibrations(to: Path) -> Given:
+    """Two calibrations of the sites of ``lab``, and a table of sites."""
+    rows = [f"{i},{j},{20 + 20 * i},{20 + 20 * j}" for i in range(20) for j in range(20)]
+    (to / "sites.csv").write_text("\n".join(["row,col,y,x", *rows]))
+    ids: list[str] = []
+    for seed in (1, 2):
+        lab = str(to / "hardware_profiles" / "lab.yaml")
+        code, said, errors = labseq(
+            ["calibrate", "sites", "-p", lab, "--shots", "8", "--seed", str(seed), "--output", str(to / "lab"), "--json"]
+        )
+        assert code == 0, errors
+        ids.append(json.loads(said)["id"])
+    return Given({"f102b3": ids[0], "a18d16": ids[1]})
+
+
+def _loading(to: Path) -> Given:
+    np.save(to / "loading.npy", np.random.default_rng(1).random((20, 20)) < 0.75)
+    return Given()
+
+
+def _look(to: Path) -> Given:
+    """Its sequence, and its profile on the run that the page names."""
+    save_files(LOOK, to)
+    replay = (to / "replay.yaml").read_text("utf-8")
+    (to / "replay.yaml").write_text(replay.replace("0001_look", "0001_compact-225"), "utf-8")
+    return Given()
+
+
+def _serial(to: Path) -> Given:
+    shutil.copy(to / "sequences" / "compact_225.yaml", to / "sequence.yaml")
+    return Given()
+
+
+def _stopped(to: Path) -> Given:
+    """The runs of the page, but without the end."""
+    for run in to.glob("data/*/*_scan-dop"):
+        index = (run / "index.jsonl").read_text("utf-8").splitlines(keepends=True)
+        (run / "index.jsonl").write_text("".join(index[:-1]), "utf-8")
+        (run / "STATE").write_text("stopped\n")
+        max((run / "shots").iterdir()).unlink()
+    return Given()
+
+
+def _survival(to: Path) -> Given:
+    """The run of the page, with results of the analysis ``survival``."""
+    (run,) = to.glob("data/*/*_compact-225")
+    code, _, errors = labseq(["analyse", str(run), "--use", "survival"])
+    assert code == 0, errors
+    return Given()
+
+
+GIVEN: Final[dict[str, Callable[[Path], Given]]] = {
+    "docs/how-to/analyse-shots.md": _survival,
+    "docs/how-to/calibrate.md": _calibrations,
+    "docs/how-to/look-at-a-waveform.md": _loading,
+    "docs/how-to/replay-frames.md": _look,
+    "docs/how-to/resume-a-run.md": _stopped,
+    "docs/how-to/serial-devices.md": _serial,
+    "plugins/labseq_andor/README.md": _andor,
+    "plugins/labseq_scans/README.md": lambda to: Given({"n_loadings=500": "n_loadings=2"}),
+    "plugins/labseq_single/README.md": lambda to: Given({"(500, 20, 20)": "(2, 20, 20)"}),
+}
+"""Page -> prepares its folder."""

@@ -1,0 +1,34 @@
+"""Every block of code of the documentation is run, in the order of its page."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from .blocks import PAGES, ROOT, blocks_of
+from .given import Store, prepare
+from .running import Reader
+
+
+@pytest.fixture(scope="session")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
+    return Store(tmp_path_factory.mktemp("runs"))
+
+
+def with_blocks() -> list[str]:
+    """Pages with something to run."""
+    names = [page.relative_to(ROOT).as_posix() for page in PAGES if page.exists()]
+    return [name for name in names if any(b.is_run and b.language != "yaml" for b in blocks_of(ROOT / name))]
+
+
+@pytest.mark.parametrize("page", with_blocks())
+def test_a_page_can_be_followed(
+    page: str, store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    blocks = blocks_of(ROOT / page)
+    given = prepare(page, blocks, tmp_path, store)
+    reader = Reader(given.replaced, given.names)
+    monkeypatch.chdir(tmp_path)
+    for block in blocks:
+        reader.read(block)
