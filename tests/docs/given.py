@@ -56,7 +56,7 @@ class Store:
             copy_repository(data)
             profile = str(data / "hardware_profiles" / "virtual.yaml")
             code, _, errors = labseq(
-                ["calibrate", "sites", "-p", profile, "--shots", "10", "--seed", "1", "--output", str(data)]
+                ["calibrate", "sites", "-p", profile, "--shots", "40", "--seed", "1", "--output", str(data)]
             )
             assert code == 0, errors
             (run,) = data.glob("*/*_calibrate-sites")
