@@ -20,13 +20,13 @@ from .blocks import Block, commands_of
 FILTERS: Final = ("jq", "tee", "head")
 """Programs behind a pipe that are the reader's own: what labseq gives them is not asked for."""
 FEW: Final = {
-    "run": "--shots 2",
+    "run": "--shots 2 --seed 1",
     "queue add": "--shots 2",
     "bench planners": "--loadings 2 --workers 1",
     "bench latency": "--loadings 2",
     "bench waveform": "--repeats 1",
     "calibrate tweezers": "",
-    "calibrate": "--shots 30",
+    "calibrate": "--shots 30 --seed 1",
 }
 """Commands that take long -> what makes them short where the page says nothing else."""
 RUN: Final = re.compile(r"data/(\d{4}-\d\d-\d\d/\d{4})_([a-z0-9-]+)")
