@@ -30,7 +30,7 @@ PAGES: Final = sorted(
         *(page for name in PLUGINS for page in (ROOT / "plugins" / name).rglob("*.md")),
     ]
 )
-_COMMENT: Final = re.compile(r"<!-- (file|output|run with|exit code|not run)\b(.*) -->")
+COMMENT: Final = re.compile(r"<!-- (file|output|run with|exit code|not run)\b(.*) -->")
 _NOT_RUN: Final = re.compile(r"(?: \((.+?)\))?: (.+)")
 
 
@@ -85,7 +85,7 @@ def blocks_of(page: Path) -> list[Block]:
         start = token.map[0]
         comments: dict[str, str] = {}
         for line in reversed(lines[:start]):
-            comment = _COMMENT.fullmatch(line.strip())
+            comment = COMMENT.fullmatch(line.strip())
             if comment is None:
                 break
             comments[comment[1]] = comment[2] if comment[1] == "not run" else comment[2].lstrip(":, ")

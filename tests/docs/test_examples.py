@@ -1,17 +1,16 @@
-"""What the documentation shows can be used as it stands: files, command lines, Python."""
+"""What the documentation shows can be used as it stands: files, command lines, Python; and what is not run is known."""
 
 from __future__ import annotations
 
 import re
 import shlex
 import shutil
-from dataclasses import dataclass
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
 import pytest
 import typer
+from markdown_it import MarkdownIt
 
 import labseq
 from labseq.cli.app import app
@@ -20,7 +19,9 @@ from labseq.cli.failures import told
 from labseq.config import ProfileSpec, SequenceSpec
 from labseq.config.composer import compose
 
-ROOT = Path(__file__).parents[2]
+from .blocks import BLOCKS, COMMENT, PAGES, ROOT, Block, commands_of, inline_of
+from .running import split
+
 SEQUENCE = {
     "labseq": "1",
     "name": "x",
@@ -40,43 +41,39 @@ PROFILE = {
     "simulation": "{use: virtual}",
 }
 """What an example leaves out."""
-
-
-@dataclass(frozen=True)
-class Block:
-    """A block of code on a page.
-
-    Attributes:
-        place: Page and number of the block on it.
-        language: Of the block, or "inline".
-        text: What stands in it.
-    """
-
-    place: str
-    language: str
-    text: str
-
-    def __str__(self) -> str:
-        return self.place
-
-
-def blocks_of(page: Path) -> list[Block]:
-    text, name = page.read_text(), page.relative_to(ROOT).as_posix()
-    found = [(m[2], m[3]) for m in re.finditer(r"^(```+)(\w+)\n(.*?)^\1$", text, re.DOTALL | re.MULTILINE)]
-    prose = re.sub(r"^(```+).*?^\1$", "", text, flags=re.DOTALL | re.MULTILINE)
-    found += [("inline", code.replace("\n", " ")) for code in re.findall(r"`(labseq[\s][^`]+)`", prose)]
-    return [Block(f"{name}:{i}", language, code) for i, (language, code) in enumerate(found)]
-
-
-INSTALLED = [point.value for point in entry_points(group="labseq")]
-PAGES = sorted(
-    [
-        ROOT / "README.md",
-        *(ROOT / "docs").rglob("*.md"),
-        *(page for name in INSTALLED for page in (ROOT / "plugins" / name).glob("*.md")),
+MEASURED = "a measurement that takes long; the tests run the same file with few frames"
+NOT_RUN = {
+    "README.md": ["installs labseq; runs all tests"],
+    "docs/explanation/detection.md": [MEASURED],
+    "docs/explanation/finding-sites.md": [MEASURED],
+    "docs/explanation/run-statistics.md": ["a formula"],
+    "docs/explanation/virtual-images.md": ["needs the published frames of a real camera"],
+    "docs/how-to/cameras-andor.md": ["installs packages", MEASURED],
+    "docs/how-to/cameras-genicam.md": ["changes the computer's settings", MEASURED],
+    "docs/how-to/cameras-pylon.md": ["installs packages", MEASURED],
+    "docs/how-to/export.md": ["installs packages"],
+    "docs/how-to/follow.md": [
+        "a drawing",
+        "waits for the leader below; tests/plugins/test_labseq_follow_session.py runs both",
+        "tests/plugins/test_labseq_follow_session.py runs it beside labseq",
+    ],
+    "docs/how-to/resume-a-run.md": ["tests/session/test_changes.py makes such changes"],
+    "docs/how-to/static-tweezers-soapy.md": ["installs packages, and looks for a radio"],
+    "docs/how-to/stop-and-safe.md": [
+        "no run is in progress; tests/session/test_stopping.py stops one",
+        "takes two processes; tests/session/test_holding.py has them",
+    ],
+    "docs/how-to/timing-box.md": ["writes to a real board", "needs a real board"],
+    "docs/how-to/update.md": ["fetches another version"],
+    "docs/reference/errors.md": ["tests/docs/test_examples.py makes this mistake"],
+    "docs/reference/patterns.md": ["a drawing"],
+    "docs/tutorials/first-run.md": ["installs labseq"],
+    "plugins/labseq_ttl/firmware/PROTOCOL.md": [
+        "tests/plugins/test_labseq_ttl_firmware.py says these lines to the firmware"
     ]
-)
-BLOCKS = [block for page in PAGES for block in blocks_of(page)]
+    * 2,
+}
+"""Page -> why blocks on it, or parts of them, are not run: whoever adds one says so here, too."""
 
 
 def of(*languages: str) -> list[Block]:
@@ -85,21 +82,48 @@ def of(*languages: str) -> list[Block]:
 
 def lines_of(block: Block) -> list[str]:
     """The command lines of labseq in a block."""
-    whole = block.text.replace("\\\n", " ").splitlines()
-    parts = [part.strip().removeprefix("uv run ") for line in whole for part in re.split(r"&&|\|", line)]
+    parts = [shlex.join(part) for line in commands_of(block) for part in split(shlex.split(line, comments=True), "|")]
     return [part for part in parts if part.startswith("labseq ")]
 
 
 def help_examples(group: Any, names: str = "labseq") -> list[Block]:
-    """The examples below the help of each command."""
+    """The examples below the help of each command, and thus in the reference."""
     inner = getattr(group, "commands", {}).items()
     found = [block for name, command in inner for block in help_examples(command, f"{names} {name}")]
-    return [*found, Block(f"{names} --help", "console", group.epilog)] if group.epilog else found
+    return [*found, Block(f"{names} --help", 0, "help", group.epilog, {})] if group.epilog else found
 
 
 OF_ALL = ("--help", "--version", "--install-completion", "--show-completion")
-SHOWN = [*of("console", "sh", "bash", "inline"), *help_examples(typer.main.get_command(app))]
+SHOWN = [
+    *of("console"),
+    *(block for page in PAGES for block in inline_of(page)),
+    *help_examples(typer.main.get_command(app)),
+]
 LINES = [(block, line) for block in SHOWN for line in lines_of(block)]
+
+
+def test_what_is_not_run_is_listed_with_its_reason() -> None:
+    found: dict[str, list[str]] = {}
+    for block in BLOCKS:
+        if block.reason:
+            found.setdefault(block.page, []).append(block.reason)
+    assert found == NOT_RUN
+
+
+def test_tests_that_run_a_block_elsewhere_are_there() -> None:
+    named = {path for reasons in NOT_RUN.values() for text in reasons for path in re.findall(r"tests/\S+\.py", text)}
+    assert [path for path in sorted(named) if not (ROOT / path).is_file()] == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_every_block_is_in_a_fence_and_every_comment_belongs_to_one(page: Path) -> None:
+    text = page.read_text("utf-8")
+    tokens = MarkdownIt().parse(text)
+    assert [token.map for token in tokens if token.type == "code_block"] == [], "indented code: use a fence"
+    assert not re.search(r"^ *~~~", text, re.MULTILINE), "fences are made of backticks"
+    n_comments = sum(COMMENT.fullmatch(line.strip()) is not None for line in text.splitlines())
+    name = page.relative_to(ROOT).as_posix()
+    assert n_comments == sum(len(block.comments) for block in BLOCKS if block.page == name)
 
 
 @pytest.mark.parametrize("block", of("yaml"), ids=str)
@@ -126,17 +150,17 @@ def write(path: Path, rest: dict[str, str], text: str, keys: set[str]) -> None:
 
 def write_plugins(block: Block, folder: Path) -> None:
     """The plugins of the example's page, where the example looks for them."""
-    page = block.place.partition(":")[0]
     for name in re.findall(r"^plugin_folders: \[(\w+)\]$", block.text, re.MULTILINE):
-        (folder / name).mkdir()
-        for i, other in enumerate(b for b in of("python") if b.place.startswith(f"{page}:")):
-            if "labseq_register" in other.text:
-                (folder / name / f"example_{i}.py").write_text(other.text)
+        for other in (b for b in of("python") if b.page == block.page):
+            file = other.comments.get("file", "")
+            if file.startswith(f"{name}/"):
+                (folder / name).mkdir(exist_ok=True)
+                (folder / file).write_text(other.text)
 
 
 @pytest.mark.parametrize(("block", "line"), LINES, ids=[f"{block}: {line}" for block, line in LINES])
 def test_every_command_line_can_be_parsed(block: Block, line: str) -> None:
-    words = [word for word in arrange(shlex.split(line, comments=True)[1:]) if word != "--debug"]
+    words = [word for word in arrange(shlex.split(line)[1:]) if word != "--debug"]
     command: Any = typer.main.get_command(app)
     while hasattr(command, "commands"):
         if not words or words[0] in ("COMMAND", *OF_ALL):
@@ -148,16 +172,11 @@ def test_every_command_line_can_be_parsed(block: Block, line: str) -> None:
         command.make_context(line, words)
 
 
-@pytest.mark.parametrize("block", of("python"), ids=str)
-def test_every_python_example_compiles(block: Block) -> None:
-    compile(block.text, str(block), "exec")
-
-
 def test_the_error_in_the_reference_is_what_labseq_says(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    example = next(block for block in of("yaml") if block.place.startswith("docs/reference/sequence.md"))
-    shown = next(block for block in of("text") if block.place.startswith("docs/reference/errors.md"))
+    example = next(block for block in of("yaml") if block.page == "docs/reference/sequence.md")
+    shown = next(block for block in of("text") if block.page == "docs/reference/errors.md")
     monkeypatch.chdir(tmp_path)
     Path("compact.yaml").write_text(example.text.replace("window", "winow"))
     with pytest.raises(labseq.ConfigError) as caught:
