@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -92,7 +91,9 @@ class Given:
 def copy_repository(to: Path) -> None:
     """What readers have: sequences and profiles."""
     shutil.copytree(ROOT / "sequences", to / "sequences")
-    shutil.copytree(ROOT / "hardware_profiles", to / "hardware_profiles", ignore=shutil.ignore_patterns("calibrations"))
+    shutil.copytree(
+        ROOT / "hardware_profiles", to / "hardware_profiles", ignore=shutil.ignore_patterns("calibrations")
+    )
 
 
 def virtual_lab(to: Path) -> None:
@@ -125,7 +126,19 @@ def _calibrations(to: Path) -> Given:
     for seed in (1, 2):
         lab = str(to / "hardware_profiles" / "lab.yaml")
         code, said, errors = labseq(
-            ["calibrate", "sites", "-p", lab, "--shots", "8", "--seed", str(seed), "--output", str(to / "lab"), "--json"]
+            [
+                "calibrate",
+                "sites",
+                "-p",
+                lab,
+                "--shots",
+                "8",
+                "--seed",
+                str(seed),
+                "--output",
+                str(to / "lab"),
+                "--json",
+            ]
         )
         assert code == 0, errors
         ids.append(json.loads(said)["id"])

@@ -113,7 +113,9 @@ class Reader:
             if program in FILTERS:
                 break
             if program != "labseq":
-                raise PageError(block, f"'{program}' is not labseq's; mark the block as not run, with a reason")
+                raise PageError(
+                    block, f"'{program}' is not labseq's; mark the block as not run, with a reason"
+                )
             code, piped, errors = labseq(arguments + extra(block, arguments), piped)
             self.said += piped + errors
         return code

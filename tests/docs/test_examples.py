@@ -43,6 +43,7 @@ PROFILE = {
 """What an example leaves out."""
 MEASURED = "a measurement that takes long; the tests run the same file with few frames"
 NOT_RUN = {
+    "CONTRIBUTING.md": ["installs labseq", "these are the checks"],
     "README.md": ["installs labseq; runs all tests"],
     "docs/explanation/detection.md": [MEASURED],
     "docs/explanation/finding-sites.md": [MEASURED],
@@ -82,7 +83,11 @@ def of(*languages: str) -> list[Block]:
 
 def lines_of(block: Block) -> list[str]:
     """The command lines of labseq in a block."""
-    parts = [shlex.join(part) for line in commands_of(block) for part in split(shlex.split(line, comments=True), "|")]
+    parts = [
+        shlex.join(part)
+        for line in commands_of(block)
+        for part in split(shlex.split(line, comments=True), "|")
+    ]
     return [part for part in parts if part.startswith("labseq ")]
 
 
@@ -111,7 +116,12 @@ def test_what_is_not_run_is_listed_with_its_reason() -> None:
 
 
 def test_tests_that_run_a_block_elsewhere_are_there() -> None:
-    named = {path for reasons in NOT_RUN.values() for text in reasons for path in re.findall(r"tests/\S+\.py", text)}
+    named = {
+        path
+        for reasons in NOT_RUN.values()
+        for text in reasons
+        for path in re.findall(r"tests/\S+\.py", text)
+    }
     assert [path for path in sorted(named) if not (ROOT / path).is_file()] == []
 
 

@@ -238,6 +238,51 @@ def snake_case(name: str) -> str:
     return re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower()
 
 
+def test_every_method_of_the_registry_is_in_the_reference(pages: Pages) -> None:
+    methods = {name for name, one in vars(Registry).items() if isinstance(one, FunctionType)}
+    offers = {name for name in methods & {*KINDS}}
+    shown = {term.partition("(")[0] for term in terms_of(pages, "plugin-api")}
+    assert offers == {*KINDS}
+    assert {f"registry.{name}" for name in offers} <= shown
+
+
+def test_every_public_name_is_in_the_reference(pages: Pages) -> None:
+    (table,) = (
+        one for one in pages["reference/python"].iter("table") if "namespace" in one.get("classes", "")
+    )
+    rows = [[text(cell) for cell in row.iter("entry")] for row in table.iter("row")][1:]
+    stub = (ROOT / "labseq" / "__init__.pyi").read_text("utf-8")
+    assert [name for name, _ in rows] == sorted(re.findall(r"^    (\w+) as \1,$", stub, re.MULTILINE))
+    assert [name for name, summary in rows if len(summary.split()) < 3] == []
+
+
+def test_every_model_of_a_file_has_a_table(tables: Tables) -> None:
+    shown = {row for subject in tables for row in keys_in(tables[subject])}
+    for file in FILES.values():
+        for model in models_below(file):
+            for key in model.model_fields:
+                assert any(row.split(".")[-1] == key for row in shown), f"{model.__name__}.{key}"
+
+
+def keys_in(table: Element) -> list[str]:
+    return [text(row.find("entry")) for row in table.iter("row")]
+
+
+def models_below(model: type[BaseModel]) -> Iterator[type[BaseModel]]:
+    """The models of all keys of a file, at any depth."""
+    for field in model.model_fields.values():
+        for inner in models_in(field.annotation):
+            yield inner
+            yield from models_below(inner)
+
+
+def models_in(annotation: Any) -> Iterator[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    for part in get_args(annotation):
+        yield from models_in(part)
+
+
 def test_every_contract_suite_is_in_the_reference(pages: Pages) -> None:
     for suite in (name for name in dir(testing) if name.endswith("Contract")):
         assert suite in text_of(pages, "plugin-api")
@@ -254,7 +299,8 @@ def test_every_error_and_exit_code_is_in_the_reference(pages: Pages) -> None:
 
 
 def test_every_environment_variable_is_in_the_reference(pages: Pages) -> None:
-    sources = "".join(path.read_text() for path in (ROOT / "labseq").rglob("*.py"))
+    files = [path for folder in ("labseq", "plugins") for path in (ROOT / folder).rglob("*.py")]
+    sources = "".join(path.read_text("utf-8") for path in files)
     for name in {*re.findall(r'"(LABSEQ_[A-Z_]+)"', sources)} - {"LABSEQ_API"}:
         assert name in terms_of(pages, "cli")
 

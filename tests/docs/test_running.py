@@ -17,7 +17,9 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def block(language: str, text: str, **comments: str) -> Block:
-    return Block("page.md", 3, language, text, {name.replace("_", " "): said for name, said in comments.items()})
+    return Block(
+        "page.md", 3, language, text, {name.replace("_", " "): said for name, said in comments.items()}
+    )
 
 
 def read(*blocks: Block) -> Reader:
@@ -89,7 +91,9 @@ def test_a_file_is_written_where_the_page_says(folder: Path) -> None:
 
 
 def test_what_a_command_prints_goes_through_a_pipe() -> None:
-    code, plan, _ = labseq(["plan", "random:10x10@0.75", "--seed", "4", "--target", "kagome:7x7", "--json", "-"])
+    code, plan, _ = labseq(
+        ["plan", "random:10x10@0.75", "--seed", "4", "--target", "kagome:7x7", "--json", "-"]
+    )
     assert code == 0
     code, _, said = labseq(["waveform", "-", "--json", "-"], plan)
     assert code == 0, said

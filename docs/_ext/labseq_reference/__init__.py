@@ -9,6 +9,7 @@ Each makes Markdown, which the page's own parser then reads:
 - ``{quantities}``: the quantities and their units
 - ``{command} run``, ``{command} bench planners``: one command; without a name, the options of all
 - ``{shot-file} datasets``, ``{shot-file} columns``, ``{shot-file} attributes``: what stands in a shot's file
+- ``{registry}``, ``{scripts}``, ``{names}``: how plugins offer things, what scripts call, all public names
 - ``{hooks}``, ``{role} Camera``, ``{errors}``, ``{error-tree}``, ``{plan-rules}``
 """
 
@@ -23,7 +24,7 @@ from docutils.statemachine import StringList
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
-from labseq_reference import commands, python, shot_file, tables
+from labseq_reference import commands, namespace, python, shot_file, tables
 
 
 class _Generated(SphinxDirective):
@@ -98,6 +99,9 @@ def setup(app: Sphinx) -> dict[str, Any]:
     app.add_directive("role", _Role)
     app.add_directive("shot-file", _ShotFile)
     app.add_directive("hooks", _plain(python.hooks))
+    app.add_directive("registry", _plain(namespace.registry))
+    app.add_directive("scripts", _plain(namespace.scripts))
+    app.add_directive("names", _plain(namespace.names))
     app.add_directive("errors", _plain(python.error_list))
     app.add_directive("error-tree", _plain(python.error_tree))
     app.add_directive("plan-rules", _plain(python.plan_rules))

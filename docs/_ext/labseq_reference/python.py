@@ -17,7 +17,7 @@ from labseq_reference.tables import table
 
 def hooks() -> list[str]:
     """A definition per hook."""
-    return [line for hook in public(hookspecs, inspect.isfunction) for line in _definition(hook)]
+    return [line for hook in public(hookspecs, inspect.isfunction) for line in definition(hook)]
 
 
 def role(name: str) -> list[str]:
@@ -37,7 +37,7 @@ def role(name: str) -> list[str]:
     for member in vars(found).values():
         function = member.fget if isinstance(member, property) else member
         if inspect.isfunction(function) and not function.__name__.startswith("_"):
-            lines += ["", *_definition(function, is_value=isinstance(member, property))]
+            lines += ["", *definition(function, is_value=isinstance(member, property))]
     return lines
 
 
@@ -91,8 +91,15 @@ def _branch(error: type[LabseqError], indent: str) -> Iterator[str]:
         yield from _branch(kind, f"{indent}    ")
 
 
-def _definition(function: Callable[..., Any], *, is_value: bool = False) -> list[str]:
-    text = _signature(function)
+def definition(function: Callable[..., Any], *, is_value: bool = False, name: str = "") -> list[str]:
+    """How a function is called, and its docstring.
+
+    Args:
+        function: A function or method.
+        is_value: Whether it is a property.
+        name: What it is called by, where that is not its own name.
+    """
+    text = _signature(function).replace(function.__name__, name or function.__name__, 1)
     if is_value:
         text = f"{function.__name__}: {text.partition(' -> ')[2]}"
     return [f"`{text}`", *_indented(prose.markdown(function)), ""]
