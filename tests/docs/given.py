@@ -24,7 +24,7 @@ LOOK: Final = ROOT / "plugins" / "labseq_frames" / "README.md"
 OWN_RUNS: Final = ("docs/explanation/played-waveforms.md", "docs/tutorials")
 """Pages that speak of the runs that they have taken themselves."""
 REAL_LAB: Final = ("docs/how-to/rehearse.md",)
-"""Pages that mean the profile ``lab`` as it is; on all others it is the virtual lab, so that it can be run."""
+"""Pages that mean the profile ``lab`` as it is; on all others it is the virtual lab, to be run."""
 
 SHOTS: Final = {
     "compact-225": ("sequences/compact_225.yaml", 9),
@@ -55,7 +55,7 @@ class Store:
             copy_repository(data)
             profile = str(data / "hardware_profiles" / "virtual.yaml")
             code, _, errors = labseq(
-                ["calibrate", "sites", "-p", profile, "--shots", "40", "--seed", "1", "--output", str(data)]
+                ["calibrate", "sites", "-p", profile, "--shots", "30", "--seed", "1", "--output", str(data)]
             )
             assert code == 0, errors
             (run,) = data.glob("*/*_calibrate-sites")

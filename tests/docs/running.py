@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import io
 import os
 import re
 import shlex
 import sys
 import tempfile
 from collections.abc import Callable, Generator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, Final
 
@@ -78,7 +77,7 @@ class Reader:
         return RUN.sub(self._own_run, text)
 
     def _own_run(self, shown: re.Match[str]) -> str:
-        """The folder of a run that stands on the page; that of the page's own run of this name if there is no such."""
+        """The folder of a run on the page, or of the page's own run of this name."""
         own = sorted(Path("data").glob(f"*/*_{shown[2]}"), key=lambda path: path.stat().st_mtime_ns)
         return shown[0] if Path(shown[0]).exists() or not own else own[-1].as_posix()
 
@@ -174,26 +173,25 @@ def printed(work: Callable[[], None]) -> str:
 @contextmanager
 def streams(piped: str) -> Generator[tuple[Callable[[], str], Callable[[], str]]]:
     """Files of our own as stdin, stdout and stderr, also for child processes; they tell what was written."""
-    names = ("stdin", "stdout", "stderr")
+    names, texts = ("stdin", "stdout", "stderr"), ["", "", ""]
     kept = [(getattr(sys, name), os.dup(number)) for number, name in enumerate(names)]
-    files = [tempfile.TemporaryFile() for _ in names]
-    files[0].write(piped.encode())
-    files[0].seek(0)
-    texts: list[str] = ["", "", ""]
-    try:
-        for number, (name, file) in enumerate(zip(names, files, strict=True)):
-            os.dup2(file.fileno(), number)
-            mode = "rb" if number == 0 else "wb"
-            setattr(sys, name, io.TextIOWrapper(open(number, mode, closefd=False), "utf-8"))
-        yield lambda: texts[1], lambda: texts[2]
-    finally:
-        for name in names[1:]:
-            getattr(sys, name).flush()
-        for number, (old, copy) in enumerate(kept):
-            setattr(sys, names[number], old)
-            os.dup2(copy, number)
-            os.close(copy)
-        for number, file in enumerate(files):
-            file.seek(0)
-            texts[number] = file.read().decode("utf-8", "replace")
-            file.close()
+    with ExitStack() as stack:
+        files = [stack.enter_context(tempfile.TemporaryFile()) for _ in names]
+        files[0].write(piped.encode())
+        files[0].seek(0)
+        try:
+            for number, (name, file) in enumerate(zip(names, files, strict=True)):
+                os.dup2(file.fileno(), number)
+                mode = "r" if number == 0 else "w"
+                setattr(sys, name, stack.enter_context(open(number, mode, encoding="utf-8", closefd=False)))
+            yield lambda: texts[1], lambda: texts[2]
+        finally:
+            for number, (old, copy) in enumerate(kept):
+                if number:
+                    getattr(sys, names[number]).flush()
+                setattr(sys, names[number], old)
+                os.dup2(copy, number)
+                os.close(copy)
+            for number, file in enumerate(files):
+                file.seek(0)
+                texts[number] = file.read().decode("utf-8", "replace")

@@ -1,4 +1,4 @@
-"""What the documentation shows can be used as it stands: files, command lines, Python; and what is not run is known."""
+"""What the documentation shows can be used as it stands; what is not run is known."""
 
 from __future__ import annotations
 

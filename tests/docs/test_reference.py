@@ -239,8 +239,7 @@ def snake_case(name: str) -> str:
 
 
 def test_every_method_of_the_registry_is_in_the_reference(pages: Pages) -> None:
-    methods = {name for name, one in vars(Registry).items() if isinstance(one, FunctionType)}
-    offers = {name for name in methods & {*KINDS}}
+    offers = {name for name, one in vars(Registry).items() if isinstance(one, FunctionType)} & {*KINDS}
     shown = {term.partition("(")[0] for term in terms_of(pages, "plugin-api")}
     assert offers == {*KINDS}
     assert {f"registry.{name}" for name in offers} <= shown

