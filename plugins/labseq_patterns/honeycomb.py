@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from labseq import SiteGrid, TargetPattern
-from labseq.geometry import block, pattern
 from labseq_patterns.settings import BlockSettings
-from labseq_patterns.triangular import as_sheared, need_triangular
+from labseq_patterns.triangular import diluted
 
 
 def honeycomb(settings: BlockSettings, grid: SiteGrid) -> TargetPattern:
@@ -29,8 +28,4 @@ def honeycomb(settings: BlockSettings, grid: SiteGrid) -> TargetPattern:
         >>> honeycomb(BlockSettings(rows=3, cols=3), SiteGrid(3, 3)).fill.astype(int).tolist()
         [[0, 1, 1], [1, 0, 1], [1, 1, 0]]
     """
-    need_triangular(grid, "honeycomb")
-    row, col = block(settings.rows, settings.cols, grid.shape)
-    mask = as_sheared((row - col) % 3 != 0, grid)
-    name = f"honeycomb {settings.rows} x {settings.cols}"
-    return pattern(mask, grid, origin=settings.origin, clear=settings.clear, name=name)
+    return diluted("honeycomb", settings, grid, lambda row, col: (row - col) % 3 != 0)

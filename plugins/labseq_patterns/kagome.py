@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from labseq import SiteGrid, TargetPattern
-from labseq.geometry import block, pattern
 from labseq_patterns.settings import BlockSettings
-from labseq_patterns.triangular import as_sheared, need_triangular
+from labseq_patterns.triangular import Ints, Mask, diluted
 
 
 def kagome(settings: BlockSettings, grid: SiteGrid) -> TargetPattern:
@@ -27,11 +26,7 @@ def kagome(settings: BlockSettings, grid: SiteGrid) -> TargetPattern:
         >>> kagome(BlockSettings(rows=3, cols=3), SiteGrid(3, 3)).fill.astype(int).tolist()
         [[1, 1, 1], [1, 0, 1], [1, 1, 1]]
     """
-    need_triangular(grid, "kagome")
-    row, col = block(settings.rows, settings.cols, grid.shape)
-    mask = as_sheared((row % 2 == 0) | (col % 2 == 0), grid)
-    name = f"kagome {settings.rows} x {settings.cols}"
-    return pattern(mask, grid, origin=settings.origin, clear=settings.clear, name=name)
+    return diluted("kagome", settings, grid, lambda row, col: (row % 2 == 0) | (col % 2 == 0))
 
 
 def link_kagome(settings: BlockSettings, grid: SiteGrid) -> TargetPattern:
@@ -59,13 +54,13 @@ def link_kagome(settings: BlockSettings, grid: SiteGrid) -> TargetPattern:
         >>> target.fill.astype(int).tolist()
         [[0, 1, 0, 1], [1, 1, 0, 0], [0, 0, 0, 0]]
     """
-    need_triangular(grid, "link_kagome")
-    row, col = block(settings.rows, settings.cols, grid.shape)
+    return diluted("link_kagome", settings, grid, _is_on_a_link)
+
+
+def _is_on_a_link(row: Ints, col: Ints) -> Mask:
+    """Both ends of a link are kagome sites: not both of their coordinates, halved, are odd."""
     odd_row, odd_col = row % 2 == 1, col % 2 == 1
-    # Both ends of a link are kagome sites: not both of their coordinates, halved, are odd.
     along_row = (row % 4 == 0) & odd_col
     along_column = odd_row & (col % 4 == 0)
     along_diagonal = odd_row & odd_col & ((row + col) % 4 == 2)
-    mask = as_sheared(along_row | along_column | along_diagonal, grid)
-    name = f"link-kagome {settings.rows} x {settings.cols}"
-    return pattern(mask, grid, origin=settings.origin, clear=settings.clear, name=name)
+    return along_row | along_column | along_diagonal

@@ -2,11 +2,41 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import TypeAlias
+
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq import ConfigError, SiteGrid
+from labseq import ConfigError, SiteGrid, TargetPattern
 from labseq.errors import Problem
+from labseq.geometry import block, pattern
+from labseq_patterns.settings import BlockSettings
+
+Ints: TypeAlias = NDArray[np.int64]
+Mask: TypeAlias = NDArray[np.bool_]
+
+
+def diluted(
+    name: str, settings: BlockSettings, grid: SiteGrid, keep: Callable[[Ints, Ints], Mask]
+) -> TargetPattern:
+    """A block of a triangular lattice, of which only some sites hold atoms.
+
+    Args:
+        name: Name of the pattern.
+        settings: Size and place.
+        grid: A triangular grid.
+        keep: Says of the sites' rows and columns, counted from the block's top left site, which of
+            them hold an atom.
+
+    Raises:
+        ConfigError: The grid is square.
+        LimitError: The block is larger than the grid or sticks out of it.
+    """
+    need_triangular(grid, name)
+    mask = as_sheared(keep(*block(settings.rows, settings.cols, grid.shape)), grid)
+    title = f"{name.replace('_', '-')} {settings.rows} x {settings.cols}"
+    return pattern(mask, grid, origin=settings.origin, clear=settings.clear, name=title)
 
 
 def need_triangular(grid: SiteGrid, name: str) -> None:
@@ -25,7 +55,7 @@ def need_triangular(grid: SiteGrid, name: str) -> None:
         )
 
 
-def as_sheared(mask: NDArray[np.bool_], grid: SiteGrid) -> NDArray[np.bool_]:
+def as_sheared(mask: Mask, grid: SiteGrid) -> Mask:
     """A mask made for ``shear: +1``, mirrored left to right on a grid with ``shear: -1``.
 
     So the array of atoms is the mirror image too.

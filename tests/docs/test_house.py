@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import re
 import subprocess
 import tomllib
@@ -109,6 +110,27 @@ def test_the_top_level_is_as_the_page_says() -> None:
 def test_files_stay_small() -> None:
     files = [path for folder in ("labseq", "plugins") for path in (ROOT / folder).rglob("*.py")]
     assert [str(path) for path in files if len(path.read_text("utf-8").splitlines()) > 300] == []
+
+
+def code_lines(function: ast.FunctionDef) -> int:
+    """Lines of a function without its signature and docstring."""
+    first = function.body[0]
+    has_docstring = ast.get_docstring(function) is not None
+    start = first.end_lineno if has_docstring else first.lineno - 1
+    assert start is not None
+    assert function.end_lineno is not None
+    return function.end_lineno - start
+
+
+def test_functions_stay_small() -> None:
+    found = {
+        f"{path.name} {one.name}": code_lines(one)
+        for folder in ("labseq", "plugins")
+        for path in (ROOT / folder).rglob("*.py")
+        for one in ast.walk(ast.parse(path.read_text("utf-8")))
+        if isinstance(one, ast.FunctionDef)
+    }
+    assert {name: n for name, n in found.items() if n > 55} == {}
 
 
 def test_a_release_is_cited_as_it_is() -> None:
