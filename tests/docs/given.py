@@ -11,10 +11,14 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from labseq_genicam.aravis.library import library
+from labseq_soapy.capture import built
+from labseq_ttl.counterpart.build import runner
 from labseq_virtual.settings import WorldSettings
 from labseq_virtual.world import World
 
 import labseq as api
+from tests.plugins.needs import need_library
 
 from .blocks import ROOT, Block, blocks_of
 from .running import RUN, labseq
@@ -26,6 +30,11 @@ OWN_RUNS: Final = ("docs/explanation/played-waveforms.md", "docs/tutorials")
 REAL_LAB: Final = ("docs/how-to/rehearse.md",)
 """Pages that mean the profile ``lab`` as it is; on all others it is the virtual lab, to be run."""
 
+NEEDED: Final[dict[str, tuple[Callable[[], object], ...]]] = {
+    "docs/how-to/cameras-genicam.md": (library, built, lambda: runner("lines")),
+    "docs/how-to/rehearse.md": (built,),
+}
+"""Page -> what loads the libraries of the system that its simulated counterparts need."""
 SHOTS: Final = {
     "compact-225": ("sequences/compact_225.yaml", 9),
     "scan-dop": ("sequences/scan_dop.yaml", 8),
@@ -105,6 +114,8 @@ def virtual_lab(to: Path) -> None:
 
 def prepare(page: str, blocks: list[Block], to: Path, store: Store) -> Given:
     """All that a page takes for granted, in a folder."""
+    for load in NEEDED.get(page, ()):
+        need_library(load)
     copy_repository(to)
     if page not in REAL_LAB:
         virtual_lab(to)

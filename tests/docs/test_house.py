@@ -97,6 +97,15 @@ def test_only_the_rooms_that_say_so_import_a_library() -> None:
         assert found - {"testing"} == rooms, library
 
 
+def test_every_profile_and_sequence_is_spoken_of() -> None:
+    pages = "".join(path.read_text("utf-8") for path in (ROOT / "docs").rglob("*.md"))
+    profiles = {path.stem for path in (ROOT / "hardware_profiles").glob("*.yaml")}
+    listed = (ROOT / "docs" / "reference" / "profile.md").read_text("utf-8")
+    assert set(re.findall(r"^\| `(\w+)` \|", listed, re.MULTILINE)) == profiles
+    patterns = {path.name for path in (ROOT / "sequences").glob("*.yaml")}
+    assert {name for name in patterns if f"sequences/{name}" not in pages} == set()
+
+
 def test_the_top_level_is_as_the_page_says() -> None:
     done = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=False)
     if done.returncode != 0:
