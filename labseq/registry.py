@@ -23,6 +23,7 @@ KINDS: Final = (
     "step",
     "pattern",
     "simulation",
+    "scanner",
     "analysis",
 )
 """Kinds of plugin that the registry knows."""
@@ -77,7 +78,7 @@ class Entry:
         kind: One of :data:`KINDS`.
         name: The name that a sequence or profile uses.
         factory: ``factory(settings, context)``; steps: ``factory(settings)``;
-            patterns: ``factory(settings, grid)``.
+            patterns: ``factory(settings, grid)``; scanners: ``factory(settings, space)``.
         settings_model: pydantic model of its settings, a subclass of
             ``labseq.Settings``; None if it takes none.
         origin: Name of the plugin that registered it.
@@ -193,6 +194,10 @@ class Registry:
     def simulation(self, name: str, factory: Factory, settings_model: type[Any] | None = None) -> None:
         """Offer a simulated world: ``factory(settings, context) -> Simulation``."""
         self._add("simulation", name, factory, settings_model, virtual_time=True)
+
+    def scanner(self, name: str, factory: Factory, settings_model: type[Any] | None = None) -> None:
+        """Offer what chooses the points of adaptive scans: ``factory(settings, space) -> Scanner``."""
+        self._add("scanner", name, factory, settings_model)
 
     def analysis(self, name: str, factory: Factory, settings_model: type[Any] | None = None) -> None:
         """Offer an analysis of shots: ``factory(settings, context) -> Analysis``."""

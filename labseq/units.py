@@ -118,6 +118,23 @@ def si_unit_of(text: str) -> str:
     return next((name for name, factor in known.items() if factor == 1.0), "")
 
 
+def factor_of(unit: str) -> float:
+    """Factor of a unit, of whatever dimension, to SI; 1 for "" and for what is no unit."""
+    return next((units[unit] for units in UNITS.values() if unit and unit in units), 1.0)
+
+
+def written(value: float, unit: str) -> str:
+    """A value in SI as it is written in a unit of any dimension, without the dust of rounding.
+
+    Example:
+        >>> written(0.0002, "us"), written(7, "")
+        ('200 us', '7')
+    """
+    if not unit:
+        return str(value) if isinstance(value, int) else f"{value:.12g}"
+    return f"{value / factor_of(unit):.12g} {unit}"
+
+
 def scaled(number: float, factor: float) -> float:
     """Multiply so that powers of ten come out exact: 4.49 um is 4.49e-06, not 4.4899...e-06.
 

@@ -24,6 +24,7 @@ from labseq.config import Axis
 from labseq.config.wording import clean
 from labseq.errors import ConfigError, Problem
 from labseq.session import Assembly, CheckReport, Session, check
+from labseq.session.adaptive import Search
 from labseq.session.checking import Rehearsal
 from labseq.session.choosing import DryRun
 from labseq.units import format_quantity
@@ -79,7 +80,7 @@ def _print(assembly: Assembly, checked: CheckReport) -> None:
         columns(_what(assembly)),
         timeline_table(checked.timeline, block, width),
         lines_table(checked.lines, checked.longest_shot_s, block, width),
-        columns([*_sums(checked), *_rehearsed(checked)]),
+        columns([*_sums(checked, assembly), *_rehearsed(checked)]),
         columns(_limits(assembly)),
     )
     say("\n\n".join("\n".join(lines) for lines in parts if lines))
@@ -153,6 +154,8 @@ def _scanned(assembly: Assembly) -> list[str]:
     if assembly.scanned is None:
         return []
     scan = assembly.scanned.scan
+    if assembly.search is not None:
+        return _chosen(assembly.search)
     lines: list[str] = []
     for group in scan.groups:
         axes = (f"{axis.address} {_ends(axis)}" for axis in group)
@@ -162,6 +165,19 @@ def _scanned(assembly: Assembly) -> list[str]:
         *lines,
         f"{plural(scan.n_points, 'point')}{repeats}, {scan.order}; all else here is of the first one",
     ]
+
+
+def _chosen(search: Search) -> list[str]:
+    """A line for each range of an adaptive scan, and what is chosen from them."""
+    scan, adaptive = search.scanned.scan, search.adaptive
+    lines: list[str] = []
+    for axis, ends in zip(scan.axes, adaptive.ends, strict=True):
+        steps = f" in {plural(ends.n_steps, 'step')}" if ends.n_steps else ""
+        lines.append(f"{axis.address} from {_ends(axis)}{steps}")
+    repeats = f", {plural(scan.repeats, 'shot')} of each" if scan.repeats > 1 else ""
+    what = f"points chosen during the run by {search.chosen.entry.name}, at most {adaptive.n_points}{repeats}"
+    aim = f"{'most' if adaptive.maximise else 'least'} {clean(adaptive.figure)}"
+    return [*lines, f"{what}, for the {aim}; all else here is as in the files"]
 
 
 def _ends(axis: Axis) -> str:
@@ -175,11 +191,12 @@ def _simulation(assembly: Assembly) -> str:
     return ", simulated" if assembly.virtual_time else ""
 
 
-def _sums(checked: CheckReport) -> list[tuple[str, str]]:
+def _sums(checked: CheckReport, assembly: Assembly) -> list[tuple[str, str]]:
     shot = [format_quantity(t, "time") for t in (checked.shortest_shot_s, checked.longest_shot_s)]
     n = checked.n_shots
     run = [clock_time(t) for t in checked.run_s]
     points = "" if checked.n_points is None else f"{plural(checked.n_points, 'point')}, "
+    points = f"at most {points}" if assembly.search is not None else points
     size = "of unknown size" if checked.shot_bytes is None else f"{size_text(checked.shot_bytes)} each"
     disk = "unknown" if checked.shot_bytes is None else f"{size_text(n * checked.shot_bytes)} at most"
     return [

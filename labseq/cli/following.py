@@ -176,4 +176,5 @@ def _shot_record(told: Mapping[str, Any], shot: Shot | None) -> ShotRecord:
         success=bool(told["success"]),
         filling_fraction=math.nan if filling is None else float(filling),
         n_missing_atoms=int(row.get("n_missing_atoms") or 0),
+        parameters=row.get("parameters") or {},
     )

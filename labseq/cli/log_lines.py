@@ -9,7 +9,7 @@ from labseq.cli.output import say
 from labseq.cli.telling import LASTING, tell
 from labseq.model import RunRecord
 
-_TOLD: Final = LASTING | {"shot_finished"}
+_TOLD: Final = LASTING | {"shot_finished", "scan_point", "scan_ended"}
 
 
 class LogLines:

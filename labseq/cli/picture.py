@@ -131,6 +131,8 @@ def _rates(tally: Tally, glyphs: Glyphs) -> list[Text]:
         Text.assemble(("seen defect-free  ", "bold"), count_of(tally.n_seen, tally.n_done)),
         Text.assemble(("filling           ", "bold"), filling),
     ]
+    if tally.best:
+        lines.append(Text.assemble(("best so far       ", "bold"), tally.best))
     if tally.n_repeated:
         lines.append(
             Text.assemble(("repeated          ", "bold"), (plural(tally.n_repeated, "attempt"), "yellow"))

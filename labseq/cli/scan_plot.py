@@ -12,6 +12,7 @@ from rich.text import Text
 
 from labseq.cli.glyphs import Glyphs
 from labseq.model import ShotRecord
+from labseq.recording.chosen_points import SCANNER, ChosenPoints
 
 LEAST_WIDTH: Final = 16
 LEAST_HEIGHT: Final = 4
@@ -55,14 +56,28 @@ class ScanTally:
 
     scan: Mapping[str, Any]
     _points: dict[int, PointTally] = field(default_factory=dict[int, PointTally])
+    _chosen: ChosenPoints | None = None
+
+    def __post_init__(self) -> None:
+        if SCANNER in self.scan:
+            self._chosen = ChosenPoints(self.scan)
 
     def add(self, shot: ShotRecord) -> None:
         """Count a shot; one that was not judged, or of a point that is not known, does not count."""
-        of_shot: Sequence[int] = self.scan.get("point_of_shot", ())
-        if math.isnan(shot.filling_fraction) or not 0 <= shot.shot_index < len(of_shot):
+        number = self._number(shot)
+        if number is None or math.isnan(shot.filling_fraction):
             return
-        point = self._points.setdefault(of_shot[shot.shot_index], PointTally())
+        point = self._points.setdefault(number, PointTally())
         point += PointTally(1, int(shot.success), shot.filling_fraction)
+
+    def _number(self, shot: ShotRecord) -> int | None:
+        if self._chosen is not None:
+            try:
+                return self._chosen.number(shot.parameters)
+            except KeyError:  # `labseq watch` on a damaged index
+                return None
+        of_shot: Sequence[int] = self.scan.get("point_of_shot", ())
+        return of_shot[shot.shot_index] if 0 <= shot.shot_index < len(of_shot) else None
 
     @property
     def name(self) -> str:
@@ -72,7 +87,9 @@ class ScanTally:
 
     def points(self) -> list[tuple[str, PointTally]]:
         """Each point as it is written, with its shots; by value where one number is scanned."""
-        written, values = self.scan.get("written", ()), self.scan.get("points", ())
+        told = self._chosen
+        written: Sequence[Sequence[str]] = self.scan.get("written", ()) if told is None else told.written
+        values: Sequence[Sequence[Any]] = self.scan.get("points", ()) if told is None else told.points
         order = list(range(len(written)))
         if all(len(value) == 1 and isinstance(value[0], float | int) for value in values):
             order.sort(key=lambda i: values[i][0])

@@ -41,7 +41,7 @@ OF_SHOT: Final = (
 
 def shots_table(run: Run) -> list[str]:
     """A row per shot, attempts that did not complete included, with what was scanned."""
-    scan: Mapping[str, Any] = run.record.get("scan") or {}
+    scan: Mapping[str, Any] = run.scan
     addresses: list[str] = [str(address) for address in scan.get("addresses", ())]
     n_atoms = run.target.n_atoms
     header = (

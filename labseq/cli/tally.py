@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from labseq.cli.scan_plot import ScanTally
+from labseq.cli.telling import tell_best
 from labseq.model import ImageRecord, RunRecord, ShotRecord, StageTiming
 
 STAGES: Final = ("expose", "read_out", "detect", "plan", "check", "prepare", "play", "move", "write")
@@ -72,6 +73,7 @@ class Tally:
         shot: The shot that runs, or the last one.
         stages: Stage -> its durations.
         scan: The points of the scan; None without one.
+        best: The best point of an adaptive scan so far, in words, or "".
         status: How the run ended, or "".
     """
 
@@ -93,6 +95,7 @@ class Tally:
         self.shot = 0
         self.stages = {name: StageTally() for name in STAGES}
         self.scan: ScanTally | None = None
+        self.best = ""
         self.status = ""
 
     @property
@@ -123,6 +126,8 @@ class Tally:
                 self.status = ""
                 if self.scan is None and values["record"].scan:  # a run that is resumed goes on with its own
                     self.scan = ScanTally(values["record"].scan)
+            case "scan_point":
+                self.best = tell_best(values)
             case "run_finished":
                 self.status = values["status"]
             case _:

@@ -55,10 +55,36 @@ def tell(name: str, values: Mapping[str, Any], run: RunRecord | None) -> str:
             longest = format_quantity(values["timeout_s"], "time")
             who, signal = values["device"], values["signal"]
             return f"shot {values['shot'] + 1}: waiting for '{signal}' from {who}, at most {longest}"
+        case "scan_point":
+            return tell_point(values)
+        case "scan_ended":
+            return f"{values['scanner']} wants no more points"
         case "device_command":
             return f"shot {values['shot'] + 1}: {values['device']}: {values['command']}"
         case _:
             return ""
+
+
+def tell_point(values: Mapping[str, Any]) -> str:
+    """A line about a point of an adaptive scan, and the best one so far."""
+    best = values["best"]
+    at = ", ".join(f"{address} {text}" for address, text in values["written"].items())
+    own = f"point {values['point'] + 1} ({at}): {values['figure']} {_figure(values['value'])}"
+    if best is None:
+        return own
+    return f"{own}; best so far " + ("this" if best["point"] == values["point"] else tell_best(values))
+
+
+def tell_best(values: Mapping[str, Any]) -> str:
+    """The best point of an adaptive scan so far, without its addresses; "" if there is none."""
+    best = values["best"]
+    if best is None:
+        return ""
+    return f"{_figure(best['value'])}, point {best['point'] + 1} ({', '.join(best['written'].values())})"
+
+
+def _figure(value: float | None) -> str:
+    return "unknown" if value is None else f"{value:.5g}"
 
 
 def tell_run(run: RunRecord, run_dir: str, n_before: int = 0) -> str:

@@ -227,7 +227,7 @@ def load_profile(
     check_kind(document, "hardware profile")
     placed = [_of_profile(Override(*override)) for override in overrides]
     document = document.override_all(placed, may_add=MAY_ADD, found=found)
-    document = document if scan is None else bind_scan(scan, document).put(document, 0, profile=True)
+    document = document if scan is None else bind_scan(scan, document).begun(document, profile=True)
     return load_checked(document, ProfileSpec, "a hardware profile", _STAND_INS, found)
 
 

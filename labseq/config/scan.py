@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Final, Literal
+from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,9 @@ from labseq.config.document import Document
 from labseq.config.nodes import Loc, Mark, Node
 from labseq.config.wording import clean
 from labseq.errors import ConfigError, Problem
+
+if TYPE_CHECKING:
+    from labseq.config.adaptive import Adaptive
 
 ScanOrder = Literal["sequential", "shuffled"]
 
@@ -59,6 +62,8 @@ class Scan:
         repeats: Shots of each point.
         order: "sequential" or "shuffled".
         notes: What the user should know, for example that ``--set`` replaced an axis.
+        adaptive: What chooses the points, if they are not known beforehand: then the groups are of one
+            axis each, whose two values are the ends of its range.
     """
 
     name: str
@@ -66,6 +71,7 @@ class Scan:
     repeats: int
     order: ScanOrder
     notes: tuple[str, ...] = ()
+    adaptive: Adaptive | None = None
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -74,8 +80,8 @@ class Scan:
 
     @property
     def n_points(self) -> int:
-        """Number of points."""
-        return math.prod(self.shape)
+        """Number of points; of an adaptive scan, the most that there may be."""
+        return math.prod(self.shape) if self.adaptive is None else self.adaptive.n_points
 
     @property
     def axes(self) -> tuple[Axis, ...]:
@@ -104,6 +110,24 @@ class Scan:
             return np.repeat(points, self.repeats)
         rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_ORDER_KEY,)))
         return np.concatenate([rng.permutation(points) for _ in range(self.repeats)])
+
+    def at(self, values: Sequence[float]) -> Scan:
+        """A point of an adaptive scan, as a scan of that point alone.
+
+        Args:
+            values: A value for each axis, SI.
+        """
+        assert self.adaptive is not None
+        pairs = zip(self.axes, self.adaptive.ends, values, strict=True)
+        groups = tuple((replace(axis, values=(ends.node(value),)),) for axis, ends, value in pairs)
+        return replace(self, groups=groups)
+
+    def begun(self, document: Document, *, profile: bool) -> Document:
+        """A copy of the sequence or of the profile with the values that a run begins with.
+
+        Those of the first point; of an adaptive scan, which has none yet, those of the file.
+        """
+        return document if self.adaptive is not None else self.put(document, 0, profile=profile)
 
     def put(self, document: Document, point: int, *, profile: bool) -> Document:
         """A copy of the sequence or of the profile with the values of a point."""

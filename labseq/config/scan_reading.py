@@ -11,18 +11,19 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Final
 
-from labseq.config.addresses import Override, find
+from labseq.config.adaptive_reading import is_adaptive, read_adaptive
+from labseq.config.addresses import Override
 from labseq.config.collect import Collected
 from labseq.config.document import Document
-from labseq.config.fields import MAY_ADD, ROLES
-from labseq.config.nodes import Loc, Mark, Node
-from labseq.config.scan import PROFILE, Axis, Group, Scan, ScanOrder
+from labseq.config.fields import ROLES
+from labseq.config.nodes import Mark, Node
+from labseq.config.scan import Axis, Group, Scan, ScanOrder
+from labseq.config.scan_places import find_axis, is_free, placed_axis, refuse_twice, unfit
 from labseq.config.scan_values import MAX_POINTS, values_of
 from labseq.config.wording import clean, shown
-from labseq.errors import ConfigError, Problem
+from labseq.errors import ConfigError
 
 _MEANT: Final = "a mapping of addresses and their values, or a list of such mappings"
-_SCANNABLE: Final = "an address in 'planner', 'shot.N.<step>' or 'profile.<role or device>'"
 
 
 def read_scan(document: Document, fixed: Sequence[Override] = ()) -> Scan | None:
@@ -42,19 +43,21 @@ def read_scan(document: Document, fixed: Sequence[Override] = ()) -> Scan | None
     found = Collected()
     node = document.root.child("scan")
     repeats, order = _options(document, has_scan=node is not None and node.value is not None, found=found)
+    if node is not None and is_adaptive(node):
+        return read_adaptive(document, repeats, fixed, found)
     groups: list[Group] = []
     notes: list[str] = []
     if node is not None and node.value is not None:
         for items in _mappings(node, document.name, found):
             group = tuple(
-                axis for axis in _axes(items, document, found) if _is_free(axis, fixed, document, notes)
+                axis for axis in _axes(items, document, found) if is_free(axis, fixed, document, notes)
             )
             with found:
                 _check_together(group, document.name)
             groups += [group] if group else []
     if not found.problems:
         with found:
-            _refuse_twice([axis for group in groups for axis in group], document.name)
+            refuse_twice([axis for group in groups for axis in group], document.name)
     found.raise_any()
     if node is None or node.value is None:
         return None
@@ -82,15 +85,15 @@ def bind_scan(scan: Scan, document: Document) -> Scan:
         if not axis.of_profile:
             return axis
         with found:
-            loc = _find(document, axis, scan.name)
+            loc = find_axis(document, axis, scan.name)
             if not (loc[0] in ROLES or (loc[0] == "devices" and len(loc) > 1)):
-                raise _unfit(axis.address, axis.key, scan.name)
+                raise unfit(axis.address, axis.key, scan.name)
             return replace(axis, loc=loc)
         return axis
 
     groups = tuple(tuple(bound(axis) for axis in group) for group in scan.groups)
     found.raise_any()
-    _refuse_twice([axis for group in groups for axis in group if axis.of_profile], scan.name)
+    refuse_twice([axis for group in groups for axis in group if axis.of_profile], scan.name)
     return replace(scan, groups=groups)
 
 
@@ -134,65 +137,9 @@ def _axes(written: Mapping[str, tuple[Mark, Node]], document: Document, found: C
     axes: list[Axis] = []
     for address, (key, node) in written.items():
         with found:
-            placed = _placed(key, document.name)
             values = values_of(node, address, document.name)
-            axis = Axis(address, (), tuple(_placed_node(value, document.name) for value in values), placed)
-            if not axis.of_profile:
-                axis = replace(axis, loc=_find(document, axis, document.name))
-                _check_place(axis, document)
-            axes.append(axis)
+            axes.append(placed_axis(address, key, values, document))
     return axes
-
-
-def _check_place(axis: Axis, document: Document) -> None:
-    """Refuse what a run has only one of."""
-    loc = axis.loc
-    if loc[0] == "planner":
-        return
-    if (
-        loc[0] == "shot"
-        and len(loc) > 2
-        and loc[2] not in ("name", "policy")
-        and document.root.at(loc[:3]) is not None
-    ):
-        return
-    raise _unfit(axis.address, axis.key, document.name)
-
-
-def _unfit(address: str, key: Mark, name: str) -> ConfigError:
-    return ConfigError(key.problem(name, f"a scan cannot change '{clean(address)}'", _SCANNABLE))
-
-
-def _find(document: Document, axis: Axis, name: str) -> Loc:
-    """Where an address leads; errors are placed at the scan's key."""
-    try:
-        return find(document.root, axis.address.removeprefix(PROFILE), document.name, "", MAY_ADD)
-    except ConfigError as error:
-        problems = [axis.key.problem(name, p.what, p.expected, p.hint) for p in error.problems]
-        raise ConfigError(problems) from None
-
-
-def _is_free(axis: Axis, fixed: Sequence[Override], document: Document, notes: list[str]) -> bool:
-    """Whether no option sets the value that the axis would change."""
-    for override in fixed:
-        other = _loc_of(override.address, document)
-        own: Loc = tuple(axis.address.split(".")) if axis.of_profile else axis.loc
-        if other and other == own[: len(other)]:
-            notes.append(f"{override.source} replaces the scan of '{clean(axis.address)}'")
-            return False
-        if own and own == other[: len(own)]:
-            what = f"the scan changes the whole of '{clean(axis.address)}'"
-            raise ConfigError(Problem(what, override.source, expected=f"--set {clean(axis.address)}=..."))
-    return True
-
-
-def _loc_of(address: str, document: Document) -> Loc:
-    if address.startswith(PROFILE):
-        return tuple(address.split("."))
-    try:
-        return find(document.root, address, document.name, "")
-    except ConfigError:  # told already, where it was applied
-        return ()
 
 
 def _check_together(group: Sequence[Axis], name: str) -> None:
@@ -214,29 +161,3 @@ def _check_together(group: Sequence[Axis], name: str) -> None:
                 node.mark.problem(name, what, "each value once", "write 'repeats' for more shots")
             )
         seen.add(position)
-
-
-def _refuse_twice(axes: Sequence[Axis], name: str) -> None:
-    """Refuse two addresses of which one holds the other."""
-    for i, axis in enumerate(axes):
-        for other in axes[:i]:
-            n = min(len(axis.loc), len(other.loc))
-            if n and axis.of_profile == other.of_profile and axis.loc[:n] == other.loc[:n]:
-                own, others = clean(axis.address), clean(other.address)
-                what = f"'{own}' is scanned, and so is '{others}', which holds the same value"
-                raise ConfigError(axis.key.problem(name, what, "each value in one place of the scan"))
-
-
-def _placed(mark: Mark, name: str) -> Mark:
-    """A mark that keeps its file when its value goes into another one."""
-    return mark if mark.origin else mark._replace(origin=name)
-
-
-def _placed_node(node: Node, name: str) -> Node:
-    value = node.value
-    if isinstance(value, list):
-        value = [_placed_node(child, name) for child in value]
-    elif isinstance(value, dict):
-        value = {key: _placed_node(child, name) for key, child in value.items()}
-    keys = {key: _placed(mark, name) for key, mark in node.keys.items()}
-    return replace(node, value=value, mark=_placed(node.mark, name), keys=keys)

@@ -25,7 +25,7 @@ _NUMBER: Final = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(\S.
 _FITS: Final = 1e-9  # of a step: what rounding may take from the last value of a range
 
 
-class _Number(NamedTuple):
+class Number(NamedTuple):
     """A number as written: 50, "um/ms" and the dimension that the unit belongs to ("" without unit)."""
 
     amount: float
@@ -64,7 +64,7 @@ def values_of(node: Node, address: str, name: str) -> list[Node]:
 
 def _linspace(given: Node, name: str) -> list[Node]:
     assert isinstance(given.value, list)
-    first, last = _alike(given.value[:2], name)
+    first, last = alike(given.value[:2], name)
     count = given.value[2]
     if type(count.value) is not int or not 2 <= count.value <= MAX_POINTS:
         what = f"the number of values is {shown(count.plain(), count.raw)}"
@@ -75,7 +75,7 @@ def _linspace(given: Node, name: str) -> list[Node]:
 
 def _range(given: Node, name: str) -> list[Node]:
     assert isinstance(given.value, list)
-    start, stop, step = _alike(given.value, name)
+    start, stop, step = alike(given.value, name)
     way = stop.amount - start.amount
     n_steps = way / step.amount if step.amount else math.nan
     if not n_steps >= 0:
@@ -89,8 +89,16 @@ def _range(given: Node, name: str) -> list[Node]:
     return _nodes(amounts, start, given.mark, whole=start.is_whole and step.is_whole)
 
 
-def _alike(nodes: list[Node], name: str) -> list[_Number]:
-    """Numbers of one dimension, all in the unit of the first."""
+def alike(nodes: list[Node], name: str) -> list[Number]:
+    """Numbers of one dimension, all in the unit of the first.
+
+    Args:
+        nodes: The numbers, with or without units.
+        name: The sequence's name in messages.
+
+    Raises:
+        ConfigError: One is no number, or is of another dimension than the first.
+    """
     numbers = [_number(node, name) for node in nodes]
     first = numbers[0]
     alike = [first]
@@ -104,19 +112,19 @@ def _alike(nodes: list[Node], name: str) -> list[_Number]:
     return alike
 
 
-def _number(node: Node, name: str) -> _Number:
+def _number(node: Node, name: str) -> Number:
     if type(node.value) in (int, float) and math.isfinite(amount := float(node.value)):  # pyright: ignore[reportArgumentType]
-        return _Number(amount, "", "", isinstance(node.value, int))
+        return Number(amount, "", "", isinstance(node.value, int))
     match = _NUMBER.match(node.value.strip()) if isinstance(node.value, str) else None
     unit = (match[2] or "") if match else ""
     dimension = next((known for known, units in UNITS.items() if unit and unit in units), "")
     if match is None or not dimension or not math.isfinite(float(match[1])):
         what = f"{shown(node.plain(), node.raw)} stands among the limits of a scan"
         raise _error(node.mark, name, what, "a number, or a number with a unit such as '50 um/ms'")
-    return _Number(float(match[1]), unit, dimension, is_whole=False)
+    return Number(float(match[1]), unit, dimension, is_whole=False)
 
 
-def _in_unit(number: _Number, of: _Number) -> _Number:
+def _in_unit(number: Number, of: Number) -> Number:
     if number.unit == of.unit:
         return number
     units = UNITS[of.dimension]
@@ -124,7 +132,7 @@ def _in_unit(number: _Number, of: _Number) -> _Number:
     return number._replace(amount=amount, unit=of.unit)
 
 
-def _nodes(amounts: list[float], like: _Number, mark: Mark, *, whole: bool) -> list[Node]:
+def _nodes(amounts: list[float], like: Number, mark: Mark, *, whole: bool) -> list[Node]:
     """The values as somebody would have written them: with the unit, without the dust of rounding."""
     nodes: list[Node] = []
     for amount in amounts:

@@ -202,7 +202,7 @@ def _at_first_point(
         expected = f"at most {n_shots}" if is_option else ""
         hint = "write 'repeats' for more" if is_option else "leave 'shots' out, it follows from the scan"
         found.add(document.error(("shots",), what + " (points x repeats)", expected, hint))
-    return scan.put(document, 0, profile=False)
+    return scan.begun(document, profile=False)
 
 
 def _without_scan(document: Document) -> Document:

@@ -22,6 +22,7 @@ from labseq.model.records import (
     ShotRecord,
     StageTiming,
 )
+from labseq.model.scanning import ScanRange, ScanSpace, VisitedPoint
 from labseq.model.signals import (
     AxisTones,
     DepthRamp,
@@ -61,6 +62,8 @@ __all__ = [
     "RfSpec",
     "RfTones",
     "RunRecord",
+    "ScanRange",
+    "ScanSpace",
     "SegmentKind",
     "SensorMode",
     "ShotRecord",
@@ -72,6 +75,7 @@ __all__ = [
     "TonesAt",
     "TonesNow",
     "TweezerAmplitudes",
+    "VisitedPoint",
     "Waveform",
     "as_occupancy",
     "grid_facts",

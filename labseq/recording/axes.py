@@ -53,7 +53,7 @@ def axes_of(run: Run) -> Axes:
     Raises:
         RecordingError: What run.json says of the scan is damaged.
     """
-    scan: Mapping[str, Any] = run.record.get("scan") or {}
+    scan: Mapping[str, Any] = run.scan
     indices = np.array([shot.index for shot in run.shots], np.int64)
     if not scan:
         n = len(indices)

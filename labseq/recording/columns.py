@@ -39,10 +39,13 @@ _FIXED: Final[Mapping[str, tuple[str, str]]] = {
 }
 """Columns that every run has: unit and description."""
 
+_TEXTS: Final = frozenset({"status", "t_start_utc", "t_end_utc", "file"})
+
+FIGURES: Final = tuple(name for name in _FIXED if name not in {*_TEXTS, "shot", "attempt"})
+"""Columns that every run has, and that are numbers that came of a shot."""
+
 _Described: TypeAlias = Callable[[str], tuple[str, str]]
 """Name -> unit and description."""
-
-_TEXTS: Final = frozenset({"status", "t_start_utc", "t_end_utc", "file"})
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,13 +93,15 @@ def columns_of(run: Run, shots: Sequence[Shot] | None = None) -> list[Column]:
     return columns
 
 
-def values_of(shot: Shot) -> dict[str, Any]:
-    """What the index tells of a shot, by the names of the columns; those that are taken twice only once."""
+def figures_of(shot: Shot) -> dict[str, float]:
+    """The numbers that the index tells of a shot, by the names of their columns; no nan among them."""
+    found = {name: value for name, value in _told(shot).items() if name in FIGURES}
+    found |= {f"stage.{name}": value for name, value in _stages(shot.row).items()}
+    found |= {f"reading.{name}": value for name, value in _readings(shot).items()}
     return {
-        **{f"reading.{name}": value for name, value in _readings(shot).items()},
-        **{f"stage.{name}": value for name, value in _stages(shot.row).items()},
-        **_mapping(shot.row.get("parameters")),
-        **_told(shot),
+        name: float(value)
+        for name, value in found.items()
+        if isinstance(value, bool | int | float) and math.isfinite(value)
     }
 
 
@@ -169,7 +174,7 @@ def _mapping(value: object) -> dict[str, Any]:
 
 def _parameters(run: Run) -> _Described:
     """Tells unit and description of a parameter."""
-    scan = _mapping(run.record.get("scan"))
+    scan = run.scan
     units: dict[str, str] = {}
     for values in scan.get("written") or ():
         for address, written in zip(scan.get("addresses") or (), values, strict=False):

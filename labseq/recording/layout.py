@@ -29,7 +29,7 @@ FORMAT_VERSION: Final = "1.4"
 """major.minor; a newer minor version only adds things, a newer major version cannot be read."""
 
 RUN_FORMAT: Final = "labseq-run"
-RUN_FORMAT_VERSION: Final = "1.2"
+RUN_FORMAT_VERSION: Final = "1.3"
 
 LIBRARY_VERSIONS: Final = ("earliest", "v110")
 """File features that HDF5 may use: the widest reader support."""

@@ -33,7 +33,7 @@ def scan_points(run: Run) -> list[ScanPoint]:
     Raises:
         RecordingError: What run.json says of the scan is damaged.
     """
-    scan: Mapping[str, Any] = run.record.get("scan") or {}
+    scan: Mapping[str, Any] = run.scan
     if not scan:
         return []
     shots: dict[int, list[Shot]] = {}

@@ -14,6 +14,7 @@ from labseq.model import TargetPattern
 from labseq.model.estimate import mean
 from labseq.model.records import RunStatus
 from labseq.recording import folders
+from labseq.recording.chosen_points import SCANNER, completed
 from labseq.recording.durable import read_lines
 from labseq.recording.plain import to_plain
 from labseq.recording.results import rows_of
@@ -120,6 +121,24 @@ class Run:
     def target(self) -> TargetPattern:
         """Target of the run."""
         return target_of(self.path / folders.RUN_FILE, self.record)
+
+    @property
+    def scan(self) -> Mapping[str, Any]:
+        """The scan: addresses, points and the point of each shot; empty without one.
+
+        Those of an adaptive scan are the points that have been chosen so far; worked out at each call.
+
+        Raises:
+            RecordingError: What run.json or the index say of it is damaged.
+        """
+        scan: Mapping[str, Any] = self.record.get("scan") or {}
+        if SCANNER not in scan:
+            return scan
+        try:
+            return completed(scan, [shot.row for shot in (*self.shots, *self.attempts)])
+        except (KeyError, TypeError, ValueError) as error:
+            reason = f"has a damaged scan: {error!r}; take it from a backup"
+            raise RecordingError(self.path / folders.RUN_FILE, reason) from error
 
     @property
     def defect_free(self) -> float:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from labseq.recording.columns import values_of
+from labseq.recording.columns import figures_of
 from labseq.recording.shot import Shot, load_content
 
 
@@ -26,5 +26,4 @@ def value_in(row: Mapping[str, Any], name: str) -> float:
         >>> value_in({"shot": 0, "filling_fraction": 0.5, "stage_s": {"plan": 0.1}}, "stage.plan_s")
         0.1
     """
-    value = values_of(Shot(Path(), dict(row), load_content)).get(name)
-    return float(value) if isinstance(value, bool | int | float) else math.nan
+    return figures_of(Shot(Path(), dict(row), load_content)).get(name, math.nan)

@@ -11,7 +11,7 @@ Failures: a device raises ``DeviceError`` (or ``DeviceTimeoutError``),
 """
 
 from labseq.roles.clock import Clock, NeverStopped
-from labseq.roles.deciding import Analysis, Detector, Planner, RecordedShot, SignalTeller, Warmable
+from labseq.roles.deciding import Analysis, Detector, Planner, RecordedShot, Scanner, SignalTeller, Warmable
 from labseq.roles.hardware import (
     Camera,
     Device,
@@ -73,6 +73,7 @@ __all__ = [
     "Repeatable",
     "RfSource",
     "RunObserver",
+    "Scanner",
     "SelfTesting",
     "Settling",
     "Shot",

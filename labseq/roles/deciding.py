@@ -1,4 +1,4 @@
-"""The roles that decide, and those that look at what came of it: planner, detector, analysis."""
+"""The roles that decide, and those that look at what came of it: planner, detector, scanner, analysis."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from labseq.model import (
     Plan,
     StageTiming,
     TargetPattern,
+    VisitedPoint,
 )
 
 
@@ -44,6 +45,28 @@ class Detector(Protocol):
         Returns:
             The occupancy, bool (n_rows, n_cols), and the confidence per site,
             float32 (n_rows, n_cols), 0 at the threshold and 1 for certainty.
+        """
+        ...
+
+
+class Scanner(Protocol):
+    """Chooses the points of an adaptive scan, one after another.
+
+    Pure: what it chooses follows from its settings, the space (its seed included) and the points
+    visited so far, and from nothing else; it does no I/O. So a run that is resumed goes on as it
+    would have. It may keep what it has worked out, as long as nobody can tell.
+    """
+
+    def next_point(self, visited: Sequence[VisitedPoint]) -> Mapping[str, float] | None:
+        """Choose the next point.
+
+        Args:
+            visited: The points so far with their scores, in order; none at the first call. A point
+                may stand in it more than once.
+
+        Returns:
+            A value for each address, SI, within its range (:meth:`labseq.ScanRange.at` gives such
+            values); or None if there is nothing more to find out: the run ends then.
         """
         ...
 

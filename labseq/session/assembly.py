@@ -28,6 +28,7 @@ from labseq.model import TargetPattern
 from labseq.plugins import PluginHost
 from labseq.roles import Step
 from labseq.sequencer.policies import RunPolicy
+from labseq.session.adaptive import Search, make_search
 from labseq.session.calibrating import with_tones
 from labseq.session.choosing import (
     Bench,
@@ -59,6 +60,7 @@ class Assembly:
             point, as everything else here.
         scanned: The points of the scan; None without one.
         policy: What follows failures and exceeded budgets.
+        search: What chooses the points, if they are not known beforehand.
     """
 
     document: Document
@@ -71,6 +73,7 @@ class Assembly:
     resolved: Mapping[str, Any]
     scanned: Scanned | None = None
     policy: RunPolicy = field(default_factory=RunPolicy)
+    search: Search | None = None
 
     @property
     def virtual_time(self) -> bool:
@@ -82,6 +85,12 @@ class Assembly:
         """What the user should know although it is no error."""
         notes = () if self.scanned is None else self.scanned.scan.notes
         return (*self.bench.warnings, *notes)
+
+    @property
+    def begun(self) -> Point:
+        """The settings of the first point of a scan; those of the files where no point is known yet."""
+        alone = self.scanned is None or self.search is not None
+        return Point(self.planner, self.steps, self.bench, {}) if alone else self.at(0)
 
     def at(self, point: int) -> Point:
         """The settings of a point of the scan."""
@@ -154,10 +163,13 @@ def assemble(
     policy = make_policy(document, sequence, steps, found)
     analyses = make_analyses(bench, document, sequence, found)
     scanned: Scanned | None = None
+    search: Search | None = None
     try:
         if scan is not None and is_whole:
             scanned = Scanned(bind_scan(scan, bench.document), document, sequence, bench, dry_run)
             scanned.check(found)
+            if not found.problems:
+                search = make_search(scanned, made["planner"], steps, found)
         found.raise_any()
     except ConfigError as error:
         raise _explained(error, scan) from None
@@ -179,7 +191,8 @@ def assemble(
         dry_run,
         resolved,
         scanned,
-        policy,
+        policy=policy,
+        search=search,
     )
 
 

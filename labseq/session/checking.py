@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
@@ -132,7 +131,7 @@ def check(session: Session) -> CheckReport:
     return CheckReport(
         timeline,
         assembly.sequence.shots,
-        None if assembly.scanned is None else len({*session.course.points}),
+        None if assembly.scanned is None else session.course.n_points,
         _run_s(session, lab),
         tuple(warnings),
         rehearsal,
@@ -142,21 +141,20 @@ def check(session: Session) -> CheckReport:
 
 
 def _run_s(session: Session, lab: Lab) -> tuple[float, float]:
-    """Least and most duration of the run, each shot at its own point of the scan."""
-    guard, n_shots = Guard(StopFlag()), Counter(session.course.points)
-    least_s = most_s = 0.0
-    for index, n in n_shots.items():
-        point = session.assembly.at(index)
+    """Least and most duration of the run, each shot at its own point of the scan, or at any corner of it."""
+    guard = Guard(StopFlag())
+    least_s, most_s = list[float](), list[float]()
+    for point, n in session.course.counted():
         context = replace(lab.step_context, motion=point.bench.profile.motion)
         bars = [
             bar
             for i, (name, step) in enumerate(point.steps)
             for bar in guard.call("step", lab.timeouts.call_s, lay_out, step, i, name, context)
         ]
-        least_s += n * sum(bar.least_s for bar in bars)
-        most_s += n * sum(bar.duration_s for bar in bars)
+        least_s.append(n * sum(bar.least_s for bar in bars))
+        most_s.append(n * sum(bar.duration_s for bar in bars))
     guard.end()
-    return least_s, most_s
+    return (min(least_s), max(most_s)) if session.course.is_adaptive else (sum(least_s), sum(most_s))
 
 
 def _windows(steps: Sequence[tuple[str, Step]]) -> list[tuple[int, list[float]]]:

@@ -6,7 +6,15 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 from labseq.errors import ConfigError, LabseqError, LimitError
-from labseq.model import CalibrationEntry, LineSpec, MotionSpec, RandomStream, SiteGrid, TargetPattern
+from labseq.model import (
+    CalibrationEntry,
+    LineSpec,
+    MotionSpec,
+    RandomStream,
+    ScanSpace,
+    SiteGrid,
+    TargetPattern,
+)
 from labseq.plugins import contained
 from labseq.registry import Entry
 from labseq.roles import (
@@ -19,6 +27,7 @@ from labseq.roles import (
     Lines,
     MobileTweezers,
     Planner,
+    Scanner,
     Simulation,
     StaticTweezers,
     Step,
@@ -35,6 +44,7 @@ _ROLES: Final[Mapping[str, type]] = {
     "planner": Planner,
     "simulation": Simulation,
     "step": Step,
+    "scanner": Scanner,
     "analysis": Analysis,
 }
 
@@ -112,8 +122,8 @@ def construct_each(
     return made, tuple(streams), refused
 
 
-def construct_one(chosen: Chosen, context: Context) -> Any:
-    """Construct the object of one role.
+def construct_one(chosen: Chosen, context: Context | ScanSpace) -> Any:
+    """Construct the object of one role; that of a scanner is given what it may choose from.
 
     Raises:
         ConfigError: Its constructor refuses its settings; with their place.

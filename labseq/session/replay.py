@@ -15,6 +15,8 @@ from labseq.model import CalibrationEntry, MotionSpec, RandomStream, SiteGrid
 from labseq.recording import Run, Shot
 from labseq.recording.folders import PROFILE_FILE, SEQUENCE_FILE
 from labseq.roles import Detector, NeverStopped, Planner, Warmable
+from labseq.sequencer import StopFlag
+from labseq.session.adaptive_run import course_of, point_of
 from labseq.session.assembly import Assembly, assemble
 from labseq.session.choosing import Chosen, resolve
 from labseq.session.constructing import construct
@@ -25,7 +27,6 @@ from labseq.session.recorded import calibrations_of, kept_text, machine_of
 from labseq.session.replay_images import ReplayedImages
 from labseq.session.replay_plans import ReplayedPlan, replay_plans
 from labseq.session.scan import Point
-from labseq.session.scan_run import Course
 from labseq.session.setting_up import Again
 
 _RANGE: Final = re.compile(r"\s*(\d{1,9})\s*(?:-\s*(\d{1,9})\s*)?")
@@ -192,15 +193,15 @@ def replay(run: Run, request: ReplayRequest, *, announce: Callable[[str], None] 
 
     changes, wanted = request.changes(), shots_of(run, request.shots)
     assembly = assembly_of(run)
-    points = Course(assembly, run.seed).points
+    course = course_of(assembly, run.seed, StopFlag())
     replayer = _Replayer(run, assembly, machine_of(run).grid, calibrations_of(run), changes)
     plans: list[ReplayedPlan] = []
     images = ReplayedImages.none(replayer.grid.shape)
     unreadable: dict[int, str] = {}
     with announcing(announce):
-        chosen = replayer.at(assembly.at(points[0])).chosen
+        chosen = replayer.at(assembly.begun).chosen
         for shot in wanted:
-            crew = replayer.at(assembly.at(points[shot.index]))
+            crew = replayer.at(point_of(assembly, shot, course))
             for stream in crew.streams:
                 stream.begin_shot(shot.index, shot.attempt)
             try:

@@ -14,6 +14,7 @@ from labseq.errors import ConfigError, Problem, RecordingError
 from labseq.locks import Lock, knows_no_locks
 from labseq.model import RunRecord
 from labseq.recording import Run, RunWriter, open_run
+from labseq.recording.chosen_points import SCANNER
 from labseq.recording.durable import LineLog, explained
 from labseq.recording.folders import (
     INDEX_FILE,
@@ -24,12 +25,13 @@ from labseq.recording.folders import (
     find_run,
 )
 from labseq.recording.run_file import read_owner, read_run, read_state
+from labseq.sequencer import StopFlag
+from labseq.session.adaptive_run import course_of
 from labseq.session.assembly import Assembly, assemble
 from labseq.session.changes import Change, changes_between, differences
 from labseq.session.options import Options
 from labseq.session.recorded import kept_text
 from labseq.session.run_record import now_utc, run_record
-from labseq.session.scan_run import Course
 from labseq.session.setting_up import Again
 
 _DAY: Final = re.compile(r"\d{4}-\d\d-\d\d")
@@ -105,7 +107,8 @@ class Earlier:
         run = open_run(folder)
         gone = [shot.index for shot in run.shots if not shot.file.is_file()]
         done = frozenset(shot.index for shot in run.shots).difference(gone).union(run.skipped)
-        if run.status == "complete" and len(done) >= run.n_shots:
+        ended = SCANNER in (run.record.get("scan") or {}) and not gone  # by the scanner, before its last shot
+        if run.status == "complete" and (ended or len(done) >= run.n_shots):
             raise _refused(folder, "it is complete: no shot is missing")
         if gone:
             warnings.append(f"files of shots are gone, and these shots are taken again: {_numbers(gone)}")
@@ -165,7 +168,7 @@ class Earlier:
             ConfigError: Something differs and is not accepted; or the shots themselves would be others.
         """
         record, folder = self.run.record, self.run.path
-        course = Course(assembly, self.run.seed)
+        course = course_of(assembly, self.run.seed, StopFlag())
         today = run_record(assembly, self.run.seed, options.changes(), course.record(), Path.cwd())
         for what in ("n_shots", "scan", "target"):
             if found := differences(record, today, what):

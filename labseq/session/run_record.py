@@ -69,7 +69,9 @@ def ending(error: BaseException | None) -> tuple[RunStatus, str]:
 
 def plugins_of(assembly: Assembly) -> tuple[dict[str, str], ...]:
     """Name, origin and version of each plugin that a run uses."""
-    origins = {item.entry.origin for item in [*assembly.bench.chosen.values(), assembly.planner]}
+    used = [*assembly.bench.chosen.values(), assembly.planner]
+    used += [] if assembly.search is None else [assembly.search.chosen]
+    origins = {item.entry.origin for item in used}
     return tuple(
         {"name": info.name, "origin": info.origin, "version": info.version}
         for info in assembly.bench.host.infos

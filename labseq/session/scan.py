@@ -126,6 +126,18 @@ class Scanned:
         parameters = {axis.address: _resolved(axis, node, parts) for axis, node in self.scan.values(point)}
         return Point(planner, tuple(changed), self._bench_at(point, parts), parameters)
 
+    def of(self, scan: Scan) -> Scanned:
+        """The same with other points."""
+        return Scanned(scan, self.document, self.sequence, self.bench, self.dry_run)
+
+    def present(self, axis: Axis) -> Any:
+        """What the files have in the place of an axis, SI; None if that is nothing, or wrong."""
+        part, alone = _part_of(axis), self.of(replace(self.scan, groups=()))
+        try:
+            return _value_in(alone._make(part, 0), part, axis)
+        except ConfigError:
+            return None
+
     def _bench_at(self, point: int, parts: Mapping[Part, Made]) -> Bench:
         """The profile at a point; the same object wherever it is the same."""
         positions = self.scan.positions(point)
@@ -209,7 +221,13 @@ def _part_of(axis: Axis) -> Part:
 def _resolved(axis: Axis, node: Node, parts: Mapping[Part, Made]) -> Any:
     """A scanned value as the plugin understood it, in SI; a mapping as it is written."""
     part = _part_of(axis)
-    value: Any = parts[part].dump
+    value = _value_in(parts[part], part, axis)
+    return node.plain() if value is None or isinstance(node.value, dict) else value
+
+
+def _value_in(made: Made, part: Part, axis: Axis) -> Any:
+    """The value of an axis among the settings of its part; None if there is none."""
+    value: Any = made.dump
     for step in axis.loc[len(part[1]) :]:
         value = value.get(step) if isinstance(value, dict) else None
-    return node.plain() if value is None or isinstance(node.value, dict) else value
+    return value

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
+from labseq.recording import RunWriter
+from labseq.roles import RunObserver
 from labseq.sequencer import Sequencer
 from labseq.sequencer.lab import Lab
 from labseq.session.assembly import Assembly
@@ -24,7 +27,10 @@ class Course:
     Attributes:
         points: The point of each shot of the run.
         shots: Indices of the shots to take, in order.
+        is_adaptive: Whether the points are chosen while the run goes on.
     """
+
+    is_adaptive = False
 
     def __init__(self, assembly: Assembly, seed: int, done: Collection[int] = ()) -> None:
         self.assembly = assembly
@@ -34,6 +40,11 @@ class Course:
         if scanned is not None:
             self.points = [int(point) for point in scanned.scan.points_of_shots(seed)[:n_shots]]
         self.shots = [shot for shot in range(n_shots) if shot not in done]
+
+    @property
+    def n_points(self) -> int:
+        """Number of points that the run's shots are at."""
+        return len({*self.points})
 
     @property
     def first(self) -> Point:
@@ -52,6 +63,13 @@ class Course:
             if key not in seen:
                 seen.add(key)
                 yield point
+
+    def counted(self) -> list[tuple[Point, int]]:
+        """Each point of the run, with the number of its shots."""
+        return [(self.assembly.at(point), n) for point, n in Counter(self.points).items()]
+
+    def follow(self, writer: RunWriter, observer: RunObserver) -> None:
+        """Say where the results come from, and who is told; before :meth:`run`."""
 
     def run(self, sequencer: Sequencer, lab: Lab, changes: Mapping[str, Any], between: Between) -> None:
         """Take all shots.
@@ -74,20 +92,31 @@ class Course:
             point = self.points[shot]
             if point != now:
                 after = self.assembly.at(point)
-                lab, reopened = rebuild_lab(lab, before, after, self._seed)
-                sequencer.change(lab, after.steps, {**changes, **after.parameters}, reopened)
+                lab = self._go_on(sequencer, lab, before, after, changes)
                 now, before = point, after
             given_up = sequencer.run([shot])
-            if why := between.after([*given_up.values()]):
-                left = [*given_up, *self._later_at_its_point(shot)]
-                between.skip(left, why)
-                skipped.update(left)
+            skipped.update(self._skip(shot, given_up, between))
+
+    def _skip(self, shot: int, given_up: Mapping[int, str], between: Between) -> list[int]:
+        """Put down what is left out after a shot."""
+        why = between.after([*given_up.values()])
+        left = [*given_up, *self._later_at_its_point(shot)] if why else []
+        between.skip(left, why)
+        return left
 
     def _later_at_its_point(self, shot: int) -> list[int]:
         """Shots still to take at the point of a shot; without a scan each shot stands for itself."""
         if self.assembly.scanned is None:
             return []
         return [later for later in self.shots if later > shot and self.points[later] == self.points[shot]]
+
+    def _go_on(
+        self, sequencer: Sequencer, lab: Lab, before: Point, after: Point, changes: Mapping[str, Any]
+    ) -> Lab:
+        """Bring the lab from one point to the next."""
+        lab, reopened = rebuild_lab(lab, before, after, self._seed)
+        sequencer.change(lab, after.steps, {**changes, **after.parameters}, reopened)
+        return lab
 
     def record(self) -> dict[str, Any]:
         """The scan for the run's record, JSON-ready; empty without one.

@@ -18,6 +18,7 @@ from labseq.roles import RunObserver
 from labseq.sequencer import Guard, Sequencer, StopFlag
 from labseq.sequencer.calling import lay_out
 from labseq.sequencer.lab import Lab, describe
+from labseq.session.adaptive_run import course_of
 from labseq.session.assembly import Assembly, assemble
 from labseq.session.between import Between
 from labseq.session.choosing import DryRun
@@ -31,7 +32,6 @@ from labseq.session.resume import Earlier, reopened
 from labseq.session.run_record import copies, ending, run_record
 from labseq.session.safe import secure_after_crash
 from labseq.session.scan import Point
-from labseq.session.scan_run import Course
 from labseq.session.signals import stop_on_signals
 from labseq.session.warming import warm
 
@@ -59,13 +59,14 @@ class Session:
         self.earlier = earlier
         seed = assembly.sequence.seed if earlier is None else earlier.run.seed
         self.seed = secrets.randbits(63) if seed is None else seed
-        self.course = Course(assembly, self.seed, () if earlier is None else earlier.done)
         self.run_dir: Path | None = None
         self._folder = Path.cwd()  # now: vendors' libraries change it
         # What the hardware is known by; a dry run touches none, and says nothing about it.
         profile = assembly.bench.hardware_key
         self._profile_key = profile if options.dry_run == "off" else f"{profile} (dry run)"
         self.stop_flag = StopFlag()
+        before, done = (None, ()) if earlier is None else (earlier.run, earlier.done)
+        self.course = course_of(assembly, self.seed, self.stop_flag, before, done)
         self._observers = Observers(assembly.bench.host, observer)
         self._hold: Callable[[str], None] = lambda _: None
         self._sequencer: Sequencer | None = None
@@ -211,7 +212,7 @@ class Session:
             point: Of the scan; None for the first one.
         """
         clock = clock_for(self.stop_flag, virtual=self.assembly.virtual_time, paced=self.options.realtime)
-        return build_lab(point or self.assembly.at(0), self.assembly.target, clock, self.seed)
+        return build_lab(point or self.assembly.begun, self.assembly.target, clock, self.seed)
 
     def warm(self, lab: Lab, *, devices: bool = True) -> None:
         """Compile what a lab will need; see :func:`labseq.session.warming.warm`."""
@@ -259,6 +260,7 @@ class Session:
         self._observers.event("run_started", about)
         before = () if self.earlier is None else self.earlier.rows
         checks = Checks(self.assembly.sequence.policy.checks, before, self._warn)
+        self.course.follow(writer, self._observers)
         self.course.run(sequencer, lab, changes, Between(writer, checks, self._observers.event))
 
     def _begin(self, root: Path) -> tuple[RunRecord, RunWriter]:

@@ -43,6 +43,12 @@ SCANS = {
     "planner": "scan: {planner.degree_of_parallelism: [1, 4]}\nrepeats: 3\norder: shuffled",
     "steps": "scan: {shot.2.rearrange.window: [10 ms, 60 ms]}\nrepeats: 3\norder: shuffled",
     "profile": "scan: {profile.simulation.loading: [60 %, 80 %]}\nrepeats: 3\norder: shuffled",
+    "adaptive": """scan:
+  use: climb
+  over: {planner.degree_of_parallelism: {from: 1, to: 9}, shot.2.rearrange.window: {from: 1 ms, to: 60 ms}}
+  maximise: filling_fraction
+  points: 3
+repeats: 2""",
     "all": """scan:
   planner.degree_of_parallelism: [2, 4]
   profile.mobile_tweezers.speed: [100 um/ms, 130 um/ms]

@@ -20,17 +20,28 @@ profile: watched
 seed: 7
 target: {pattern: compact, rows: 6, cols: 6}
 planner: {use: psca}
-scan:
-  planner.degree_of_parallelism: [2, 6]
-  profile.mobile_tweezers.speed: [100 um/ms, 130 um/ms]
-repeats: 3
-order: shuffled
+SCAN
 shot:
   - load: {duration: 500 ms}
   - image: {exposure: 45 ms}
   - rearrange: {cycles: 2, window: 60 ms, exposure: 45 ms}
   - image: {exposure: 45 ms}
 """
+SCANS = [
+    """scan:
+  planner.degree_of_parallelism: [2, 6]
+  profile.mobile_tweezers.speed: [100 um/ms, 130 um/ms]
+repeats: 3
+order: shuffled""",
+    """scan:
+  use: climb
+  over:
+    planner.degree_of_parallelism: {from: 2, to: 9}
+    profile.mobile_tweezers.pick_up: {from: 20 us, to: 400 us}
+  maximise: filling_fraction
+  points: 6
+repeats: 2""",
+]
 N_SHOTS = 12
 N_READS = 3 * N_SHOTS
 """Images of a run at least."""
@@ -57,9 +68,11 @@ def table(run):
     ]
 
 
-@pytest.fixture
-def scanned(bench):
-    (bench.folder / "sequence.yaml").write_text(SEQUENCE, encoding="utf-8")
+@pytest.fixture(params=[0])
+def scanned(bench, request):
+    """A bench with a sequence; the parameter says with which scan."""
+    text = SEQUENCE.replace("SCAN", SCANS[request.param])
+    (bench.folder / "sequence.yaml").write_text(text, encoding="utf-8")
     bench.environment["GIT_DIR"] = os.devnull  # nobody's edits while the tests run are a change here
     return bench
 
@@ -73,7 +86,9 @@ def whole(scanned, monkeypatch):
         return table(session.run())
 
 
-@pytest.mark.parametrize("trial", range(N_KILLS))
+@pytest.mark.parametrize(
+    ("scanned", "trial"), [(trial % 2, trial) for trial in range(N_KILLS)], indirect=["scanned"]
+)
 def test_a_run_that_is_killed_and_resumed_is_the_whole_run(scanned, whole, trial):
     moments = random.Random(trial)
     command = ["run", "sequence.yaml"]

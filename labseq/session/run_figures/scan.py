@@ -76,7 +76,7 @@ def scanned(run: Run) -> Scanned | None:
     points = scan_points(run)
     if not points:
         return None
-    rows = [tuple(map(clean, row)) for row in run.record["scan"]["written"]]
+    rows = [tuple(map(clean, row)) for row in run.scan["written"]]
     columns = list(zip(*rows, strict=True))
     addresses = list(map(clean, points[0].written))
     varied = [i for i, column in enumerate(columns) if len({*column}) > 1] or [0]

@@ -13,6 +13,7 @@ from labseq.testing.contracts.mobile_tweezers import MobileTweezersContract
 from labseq.testing.contracts.pattern import PatternContract
 from labseq.testing.contracts.planner import PlannerContract
 from labseq.testing.contracts.promises import BrokenPromise
+from labseq.testing.contracts.scanner import ScannerContract
 from labseq.testing.contracts.simulation import SimulationContract
 from labseq.testing.contracts.static_tweezers import StaticTweezersContract
 from labseq.testing.contracts.step import StepContract
@@ -44,6 +45,7 @@ __all__ = [
     "MobileTweezersContract",
     "PatternContract",
     "PlannerContract",
+    "ScannerContract",
     "SimulationContract",
     "StaticTweezersContract",
     "StepContract",

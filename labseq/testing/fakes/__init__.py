@@ -8,6 +8,7 @@ from labseq.testing.fakes.deciders import (
     RecordingSimulation,
     ScriptedDetector,
     ScriptedPlanner,
+    ScriptedScanner,
 )
 from labseq.testing.fakes.devices import (
     RecordingCamera,
@@ -42,6 +43,7 @@ __all__ = [
     "RecordingStaticTweezers",
     "ScriptedDetector",
     "ScriptedPlanner",
+    "ScriptedScanner",
     "fake_calibration",
     "fake_lab",
     "fake_shot",

@@ -1,4 +1,4 @@
-"""Detectors and a planner that say what a test tells them to; a simulation that only listens."""
+"""Detectors, a planner and a scanner that say what a test tells them to; a simulation that only listens."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from labseq.model import (
     Plan,
     SensorMode,
     TargetPattern,
+    VisitedPoint,
     as_occupancy,
 )
 from labseq.roles import WHOLE_SENSOR, Signal
@@ -81,6 +82,32 @@ class ScriptedPlanner:
         plan = self._plans[min(len(self.occupancies), len(self._plans) - 1)]
         self.occupancies.append(occupancy.copy())
         return plan
+
+
+class ScriptedScanner:
+    """Gives the given points, one after another, then None.
+
+    It counts the points it is shown, not its calls; so it can be asked again.
+
+    Args:
+        points: Address -> value each, or anything else that a bad scanner may return; what is an
+            exception is raised.
+
+    Attributes:
+        shown: What it was shown, at each call.
+    """
+
+    def __init__(self, points: Sequence[Any]) -> None:
+        self._points = list(points)
+        self.shown: list[tuple[VisitedPoint, ...]] = []
+
+    def next_point(self, visited: Sequence[VisitedPoint]) -> Mapping[str, float] | None:
+        """Give the next point."""
+        self.shown.append(tuple(visited))
+        point = self._points[len(visited)] if len(visited) < len(self._points) else None
+        if isinstance(point, Exception):
+            raise point
+        return point
 
 
 class RecordingSimulation:

@@ -1,0 +1,115 @@
+"""What an adaptive scan may vary, and what came of the points that it has visited."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from numbers import Real
+from typing import Any, Final
+
+import numpy as np
+
+_DUST: Final = 1e-9  # of a range or step
+_KEY: Final = 0x0ADA  # apart from every shot's own random numbers
+
+
+@dataclass(frozen=True, slots=True)
+class ScanRange:
+    """The values that an address may take in an adaptive scan, SI.
+
+    Attributes:
+        address: For example "planner.degree_of_parallelism".
+        low: The least value.
+        high: The greatest value.
+        is_whole: Whether only whole numbers count.
+        n_steps: Number of equal steps that the values are apart by; 0 where any value will do.
+        start: The value that the files have; nan if they have none.
+    """
+
+    address: str
+    low: float
+    high: float
+    is_whole: bool = False
+    n_steps: int = 0
+    start: float = math.nan
+
+    def at(self, fraction: float) -> float:
+        """The allowed value that is nearest to a fraction of the way from ``low`` to ``high``.
+
+        Example:
+            >>> ScanRange("planner.degree_of_parallelism", 2, 15, is_whole=True).at(0.5)
+            8
+            >>> ScanRange("profile.mobile_tweezers.pick_up", 0.0, 4e-4, n_steps=4).at(0.3)
+            0.0001
+        """
+        fraction = min(max(fraction, 0.0), 1.0)
+        if self.n_steps:
+            fraction = round(fraction * self.n_steps) / self.n_steps
+        value = self.low + fraction * (self.high - self.low) if fraction < 1.0 else self.high
+        return round(value) if self.is_whole else value
+
+    def allowed(self, value: object) -> float | None:
+        """A number without the dust of rounding, if it is one of the range's values; else None.
+
+        Example:
+            >>> dop = ScanRange("planner.degree_of_parallelism", 2, 15, is_whole=True)
+            >>> dop.allowed(7.0), dop.allowed(7.5), dop.allowed(16), dop.allowed(math.nan)
+            (7, None, None, None)
+        """
+        if isinstance(value, bool) or not isinstance(value, Real):
+            return None
+        try:
+            number = float(value)
+        except OverflowError:
+            return None
+        if not self.low - self.high <= number - self.low <= 2 * (self.high - self.low):  # nan is not, either
+            return None
+        near = self.at(self.fraction(number))
+        dust = _DUST * (self.high - self.low) / (self.n_steps or 1)
+        return near if abs(near - number) <= dust else None
+
+    def fraction(self, value: float) -> float:
+        """The opposite of :meth:`at`: 0 at ``low``, 1 at ``high``."""
+        return (value - self.low) / (self.high - self.low)
+
+
+@dataclass(frozen=True, slots=True)
+class ScanSpace:
+    """What a scanner may choose from.
+
+    Attributes:
+        ranges: A range for each address.
+        n_points: The most points that will be asked for, those visited twice counted twice.
+        repeats: Shots of each point.
+        seed: The run's seed.
+    """
+
+    ranges: tuple[ScanRange, ...]
+    n_points: int
+    repeats: int = 1
+    seed: int = 0
+
+    def random(self, n_visited: int) -> np.random.Generator:
+        """Random numbers for the choice of a point; after as many points always the same ones.
+
+        Args:
+            n_visited: Number of points that have been visited so far.
+        """
+        return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(_KEY, n_visited)))
+
+
+@dataclass(frozen=True, slots=True)
+class VisitedPoint:
+    """A point of an adaptive scan, and what came of it.
+
+    Attributes:
+        values: Address -> value, SI.
+        score: The higher, the better: the mean of the figure that the scan is to maximise over the
+            point's shots, its negative if it is to be minimised; nan if no shot has it.
+        shots: What the run's index tells of each shot: name of the figure -> number.
+    """
+
+    values: Mapping[str, float]
+    score: float
+    shots: tuple[Mapping[str, Any], ...] = ()

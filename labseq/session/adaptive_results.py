@@ -1,0 +1,108 @@
+"""What came of the points of an adaptive scan, as the run's index tells it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any
+
+from labseq.config.wording import clean, did_you_mean, listing
+from labseq.model import VisitedPoint
+from labseq.recording import Shot
+from labseq.recording.columns import figures_of
+from labseq.recording.plain import dumps
+from labseq.session.adaptive import Search
+
+
+@dataclass(slots=True, eq=False)
+class Results:
+    """What came of the points of an adaptive scan.
+
+    Attributes:
+        search: What chooses the points.
+        shots: The shots that count: index -> shot.
+    """
+
+    search: Search
+    shots: dict[int, Shot]
+    _visited: list[VisitedPoint] = field(default_factory=list[VisitedPoint])
+    _given_up: dict[int, dict[str, float]] = field(default_factory=dict[int, dict[str, float]])
+    _warned: bool = False
+
+    def add(self, shot: Shot) -> None:
+        """Take in one more."""
+        self.shots[shot.index] = shot
+
+    def give_up(self, shot: int, parameters: Mapping[str, Any]) -> None:
+        """Remember the point of a shot that was given up: the scanner is told that nothing came of it."""
+        visit = shot // self.search.scanned.scan.repeats
+        self._given_up[visit] = self._values_in(parameters)
+
+    def values(self, visit: int) -> dict[str, float] | None:
+        """The values of a point of which a shot was tried; None if none was."""
+        shots = self._shots_of(visit)
+        return self._values_in(shots[0].row["parameters"]) if shots else self._given_up.get(visit)
+
+    def _values_in(self, parameters: Mapping[str, Any]) -> dict[str, float]:
+        return {one.address: parameters[one.address] for one in self.search.ranges}
+
+    def before(self, visit: int) -> list[VisitedPoint]:
+        """What came of the points before one: those of which a shot was tried."""
+        while len(self._visited) < visit:
+            self._visited.append(self._visit(len(self._visited)))
+        return [one for one in self._visited[:visit] if one.values]
+
+    def missing_figure(self, shot: int) -> str:
+        """What to say, once, of a shot that has not what the scan climbs on; "" if it has."""
+        figure, figures = self.search.adaptive.figure, figures_of(self.shots[shot])
+        if self._warned or figure in figures:
+            return ""
+        self._warned = True
+        hint = did_you_mean(figure, figures)
+        known = f"it has {listing(list(figures))}"
+        return f"shot {shot + 1} has no '{clean(figure)}' to climb on ({hint or known})"
+
+    def told(self, visit: int) -> dict[str, Any]:
+        """A point and the best one so far, JSON-ready, for the run's events."""
+        own = self._visit(visit)
+        sign = 1.0 if self.search.adaptive.maximise else -1.0
+
+        def plain(number: int, values: Mapping[str, Any], score: float) -> dict[str, Any]:
+            value = None if math.isnan(score) else sign * score
+            return {"point": number, "written": self.search.told(values), "value": value}
+
+        best = self._best([*self.before(visit), own])
+        return {
+            "figure": self.search.adaptive.figure,
+            **plain(visit, own.values, own.score),
+            "best": None if best is None else plain(*best),
+        }
+
+    def _best(self, visited: list[VisitedPoint]) -> tuple[int, Mapping[str, Any], float] | None:
+        """First visit, values and mean score of the best point; all visits of a point count together."""
+        scores: dict[str, list[float]] = {}
+        first: dict[str, int] = {}
+        for number, one in enumerate(visited):
+            key = dumps(dict(one.values))
+            first.setdefault(key, number)
+            if not math.isnan(one.score):
+                scores.setdefault(key, []).append(one.score)
+        if not scores:
+            return None
+        means = {key: math.fsum(of) / len(of) for key, of in scores.items()}
+        key = max(means, key=lambda key: (means[key], -first[key]))
+        return first[key], visited[first[key]].values, means[key]
+
+    def _shots_of(self, visit: int) -> list[Shot]:
+        repeats = self.search.scanned.scan.repeats
+        indices = range(visit * repeats, (visit + 1) * repeats)
+        return [self.shots[index] for index in indices if index in self.shots]
+
+    def _visit(self, visit: int) -> VisitedPoint:
+        figures = [MappingProxyType(figures_of(shot)) for shot in self._shots_of(visit)]
+        name, sign = self.search.adaptive.figure, 1.0 if self.search.adaptive.maximise else -1.0
+        known = [sign * one[name] for one in figures if name in one]
+        score = math.fsum(known) / len(known) if known else math.nan
+        return VisitedPoint(MappingProxyType(self.values(visit) or {}), score, tuple(figures))

@@ -1,0 +1,194 @@
+"""A run goes from point to point of an adaptive scan; each is chosen once the last one is on disk."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Collection, Iterator, Mapping
+from functools import cached_property
+from typing import Any
+
+from labseq.errors import DeviceError
+from labseq.recording import Run, RunWriter, Shot
+from labseq.recording.plain import dumps
+from labseq.recording.shot import load_content
+from labseq.roles import RunObserver
+from labseq.sequencer import Sequencer, StopFlag
+from labseq.sequencer.lab import Lab
+from labseq.session.adaptive import Search
+from labseq.session.adaptive_results import Results
+from labseq.session.asking import Asker
+from labseq.session.assembly import Assembly
+from labseq.session.between import Between
+from labseq.session.scan import Point
+from labseq.session.scan_run import Course
+
+
+def course_of(
+    assembly: Assembly, seed: int, stop: StopFlag, run: Run | None = None, done: Collection[int] = ()
+) -> Course:
+    """The way of a run through the points of its scan.
+
+    Args:
+        assembly: The run.
+        seed: Its seed.
+        stop: The request to stop.
+        run: The same run as it was before, if it goes on.
+        done: Shots that need not be taken.
+    """
+    if assembly.search is None:
+        return Course(assembly, seed, done)
+    return AdaptiveCourse(assembly, assembly.search, seed, stop, run, done)
+
+
+class AdaptiveCourse(Course):
+    """The course of an adaptive scan.
+
+    What the scanner chooses follows from the shots on disk alone, their lines in the index: so a run
+    that is resumed goes on as it would have, and a shot that is taken again is taken at its old point.
+
+    Args:
+        assembly: The run.
+        search: What chooses its points.
+        seed: The run's seed.
+        stop: The request to stop.
+        run: The run as it was before, if it goes on.
+        done: Shots that need not be taken.
+    """
+
+    is_adaptive = True
+
+    def __init__(
+        self,
+        assembly: Assembly,
+        search: Search,
+        seed: int,
+        stop: StopFlag,
+        run: Run | None = None,
+        done: Collection[int] = (),
+    ) -> None:
+        self.assembly = assembly
+        self._seed = seed
+        self._search = search
+        self._asker = Asker(search, seed, stop)
+        self._missing = [shot for shot in range(assembly.sequence.shots) if shot not in done]
+        self._results = Results(search, {} if run is None else {shot.index: shot for shot in run.shots})
+        if run is not None:
+            for attempt in run.attempts:
+                if attempt.index in run.skipped:
+                    self._results.give_up(attempt.index, attempt.row["parameters"])
+        self._at: tuple[int, Point | None] = -1, None
+        self._writer: RunWriter | None = None
+        self._observer: RunObserver | None = None
+
+    @cached_property
+    def shots(self) -> list[int]:  # pyright: ignore[reportIncompatibleVariableOverride] - known once asked
+        """Indices of the shots to take at most; none if the scanner wants no more."""
+        if not self._missing or self._point_of(self._missing[0]) is not None:
+            return self._missing
+        if not self._results.shots:
+            raise DeviceError(self._search.name, "next_point() gave no point at all; expected a first one")
+        return []
+
+    @property
+    def n_points(self) -> int:
+        """The most points that there may be."""
+        return self._search.adaptive.n_points
+
+    @property
+    def first(self) -> Point:
+        """The settings of the first shot to take."""
+        point = self._point_of(self.shots[0])
+        assert point is not None
+        return point
+
+    def each(self) -> Iterator[Point]:
+        """The settings of the first shot to take, and of the corners of what is chosen from."""
+        if self.shots:
+            yield self.first
+        yield from map(self.assembly.at, range(math.prod(self._search.scanned.scan.shape)))
+
+    def each_lab(self) -> Iterator[Point]:
+        """The first point, and two opposite corners."""
+        points = [*self.each()]
+        yield from (*points[:2], points[-1])
+
+    def counted(self) -> list[tuple[Point, int]]:
+        """Each corner, as if all shots were taken there."""
+        n_corners = math.prod(self._search.scanned.scan.shape)
+        return [(self.assembly.at(corner), self.assembly.sequence.shots) for corner in range(n_corners)]
+
+    def follow(self, writer: RunWriter, observer: RunObserver) -> None:
+        """Say where the results come from, and who is told what they mean."""
+        self._writer, self._observer = writer, observer
+
+    def run(self, sequencer: Sequencer, lab: Lab, changes: Mapping[str, Any], between: Between) -> None:
+        """Take shots until there are no more, or the scanner wants none."""
+        before, skipped = self.first, set[int]()
+        for shot in self.shots:
+            if shot in skipped:
+                continue
+            between.before()
+            point = self._point_of(shot)
+            if point is None:
+                self._tell("scan_ended", {"scanner": self._search.name, "n_shots": shot})
+                return
+            if point is not before:
+                lab = self._go_on(sequencer, lab, before, point, changes)
+                before = point
+            given_up = sequencer.run([shot])
+            self._note(shot)
+            skipped.update(self._skip(shot, given_up, between))
+
+    def _later_at_its_point(self, shot: int) -> list[int]:
+        repeats = self._search.scanned.scan.repeats
+        return [later for later in self.shots if later > shot and later // repeats == shot // repeats]
+
+    def record(self) -> dict[str, Any]:
+        """The scan for the run's record, JSON-ready; see :meth:`Search.record`."""
+        return self._search.record()
+
+    def _tell(self, name: str, values: Mapping[str, Any]) -> None:
+        if self._observer is not None:
+            self._observer.event(name, values)
+
+    def _point_of(self, shot: int) -> Point | None:
+        """The settings of a shot: those of the others of its point, else what the scanner chooses."""
+        visit = shot // self._search.scanned.scan.repeats
+        if self._at[0] != visit:
+            values = self._results.values(visit)
+            if values is None:
+                values = self._asker.ask(self._results.before(visit))
+            point = None
+            if values is not None:
+                point = self._search.at(values, self.assembly.planner, self.assembly.steps)
+            self._at = visit, point
+        return self._at[1]
+
+    def _note(self, shot: int) -> None:
+        """Take in what came of a shot; tell of its point once that is done."""
+        assert self._writer is not None
+        row = self._writer.last_row
+        if not row["counts"]:
+            self._results.give_up(shot, row["parameters"])
+            return
+        self._results.add(Shot(self._writer.run_dir / row["file"], json.loads(dumps(row)), load_content))
+        if warning := self._results.missing_figure(shot):
+            self._tell("warning", {"text": warning})
+        repeats = self._search.scanned.scan.repeats
+        if (shot + 1) % repeats == 0 or shot + 1 == self.assembly.sequence.shots:
+            self._tell("scan_point", self._results.told(shot // repeats))
+
+
+def point_of(assembly: Assembly, shot: Shot, course: Course) -> Point:
+    """The settings that a recorded shot was taken with.
+
+    Args:
+        assembly: The run, put together of its own files.
+        shot: The shot.
+        course: The course of the run.
+    """
+    if assembly.search is None:
+        return assembly.at(course.points[shot.index])
+    values = {one.address: shot.row["parameters"][one.address] for one in assembly.search.ranges}
+    return assembly.search.at(values, assembly.planner, assembly.steps)

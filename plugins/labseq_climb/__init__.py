@@ -1,0 +1,14 @@
+"""A scanner that climbs: the shortest one that is of use, to begin your own with."""
+
+from __future__ import annotations
+
+from labseq import Registry, hookimpl
+from labseq_climb.scanner import Climb, ClimbSettings
+
+LABSEQ_API = 1
+
+
+@hookimpl
+def labseq_register(registry: Registry) -> None:
+    """Offer the scanner ``climb``."""
+    registry.scanner("climb", Climb, ClimbSettings)

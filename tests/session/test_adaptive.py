@@ -1,0 +1,264 @@
+"""Adaptive scans: points chosen during the run, on record, resumed; and scanners that do wrong."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import labseq
+from labseq.errors import ConfigError, DeviceError, DeviceTimeoutError
+from labseq.recording.points import scan_points
+from labseq.session import check
+from labseq.testing.fakes import RecordingObserver
+
+from .scripted_scanner import N_LINES, OVER, opened, run
+from .small_runs import no_git
+
+__all__ = ["no_git"]
+
+DOP = "planner.degree_of_parallelism"
+ROOT = Path(__file__).parents[2]
+
+
+def test_each_point_is_chosen_by_what_came_of_those_before(tmp_path: Path) -> None:
+    seen = RecordingObserver()
+    done = run(tmp_path, f"use: scripted, dops: [3, 5, 3], {OVER}, points: 5", "repeats: 2\n", observer=seen)
+    assert done.status == "complete"
+    assert [shot.parameters[DOP] for shot in done.shots] == [3, 3, 5, 5, 3, 3]
+    told = [values for name, values in seen.events if name == "scan_point"]
+    filling = [np.mean([shot.filling_fraction for shot in done.shots[i : i + 2]]) for i in (0, 2, 4)]
+    assert [values["value"] for values in told] == pytest.approx(filling)
+    of_points = {"3": (filling[0] + filling[2]) / 2, "5": filling[1]}
+    best = max(of_points, key=lambda dop: of_points[dop])
+    assert told[-1]["best"]["written"] == {DOP: best}
+    assert told[-1]["best"]["value"] == pytest.approx(of_points[best])
+
+
+def test_a_point_visited_twice_is_one_point_of_the_scan(tmp_path: Path) -> None:
+    done = run(tmp_path, f"use: scripted, dops: [3, 5, 3], {OVER}, points: 3")
+    points = scan_points(done)
+    assert [(point.parameters[DOP], len(point.shots)) for point in points] == [(3, 2), (5, 1)]
+    assert [point.written[DOP] for point in points] == ["3", "5"]
+    assert done.scan["point_of_shot"] == [0, 1, 0]
+    assert json.loads((done.path / "run.json").read_text("utf-8"))["scan"] == {
+        "addresses": [DOP],
+        "units": [""],
+        "ranges": [
+            {"address": DOP, "low": 1, "high": 9, "is_whole": True, "n_steps": 0, "start": 2.0},
+        ],
+        "scanner": {"use": "scripted", "dops": [3, 5, 3], "then": "end"},
+        "figure": "filling_fraction",
+        "maximise": True,
+        "n_points": 3,
+        "repeats": 1,
+    }
+    pytest.importorskip("xarray")
+    assert done.to_xarray(occupancies=False)["filling_fraction"].dims == (DOP, "repeat")
+
+
+def test_quantities_are_told_in_their_unit_and_chosen_in_si(tmp_path: Path) -> None:
+    scan = """use: climb, over: {profile.mobile_tweezers.pick_up: {from: 20 us, to: 0.4 ms, steps: 19},
+        shot.sort.window: {from: 10 ms, to: 60 ms}}, minimise: duration_s, points: 4"""
+    done = run(tmp_path, scan)
+    parameters = [tuple(shot.parameters[a] for a in done.scan["addresses"]) for shot in done.shots]
+    assert parameters[0] == pytest.approx((60e-6, 60e-3))  # as in the files
+    for pick_up, window in parameters:
+        assert 20e-6 <= pick_up <= 400e-6
+        assert (pick_up - 20e-6) / 20e-6 == pytest.approx(round((pick_up - 20e-6) / 20e-6))
+        assert 0.01 <= window <= 0.06
+    assert done.scan["written"][0] == ["60 us", "60 ms"]
+    assert all(
+        shot.cycles[0].window_s == window for shot, (_, window) in zip(done.shots, parameters, strict=True)
+    )
+
+
+def test_a_scanner_may_end_the_run_and_then_it_is_complete(tmp_path: Path) -> None:
+    seen = RecordingObserver()
+    done = run(tmp_path, f"use: scripted, dops: [3, 5], {OVER}, points: 5", observer=seen)
+    assert (done.status, len(done.shots), done.n_shots) == ("complete", 2, 5)
+    assert ("scan_ended", {"scanner": "scanner 'scripted'", "n_shots": 2}) in seen.events
+    with pytest.raises(ConfigError, match="it is complete"):
+        labseq.Session.resume(done.path)
+
+
+@pytest.mark.parametrize(
+    ("then", "told"),
+    [
+        ("nan", f"next_point() gave nan for '{DOP}'; expected a whole number from 1 to 9"),
+        ("text", f"next_point() gave '7' for '{DOP}'; expected a whole number from 1 to 9"),
+        ("yes", f"next_point() gave True for '{DOP}'; expected"),
+        ("half", f"next_point() gave 2.5 for '{DOP}'; expected"),
+        ("far", f"next_point() gave 10 for '{DOP}'; expected"),
+        ("huge", f"for '{DOP}'; expected"),
+        ("other", f"next_point() gave values for 'planner.use'; expected a value for each of '{DOP}'"),
+        ("list", f"next_point() gave a list; expected a value for each of '{DOP}'"),
+        ("nobody", f"next_point() gave values for no address; expected a value for each of '{DOP}'"),
+        ("raise", "next_point() raised RuntimeError: no idea"),
+    ],
+)
+def test_a_wrong_answer_names_the_scanner_and_what_was_taken_stays(
+    tmp_path: Path, then: str, told: str
+) -> None:
+    with opened(tmp_path, f"use: scripted, dops: [3], then: {then}, {OVER}, points: 5") as session:
+        with pytest.raises(DeviceError) as caught:
+            session.run()
+        assert session.run_dir is not None
+        done = labseq.open_run(session.run_dir)
+    assert str(caught.value).startswith("scanner 'scripted': ")
+    assert told in str(caught.value)
+    assert len(str(caught.value)) < 300
+    assert caught.value.exit_code == 3
+    assert (done.status, len(done.shots)) == ("failed", 1)
+    done.shots[0].verify()
+
+
+def test_a_scanner_that_never_answers_is_given_up(tmp_path: Path) -> None:
+    overrides = ["profile.timeouts.call=0.3 s"]
+    with opened(
+        tmp_path, f"use: scripted, dops: [3], then: hang, {OVER}, points: 5", overrides=overrides
+    ) as session:
+        with pytest.raises(DeviceTimeoutError, match=r"scanner 'scripted': .*did not answer within 0.3 s"):
+            session.run()
+        assert session.run_dir is not None
+        assert len(labseq.open_run(session.run_dir).shots) == 1
+
+
+def test_no_point_at_all_is_an_error_before_anything_is_opened(tmp_path: Path) -> None:
+    seen = RecordingObserver()
+    with (
+        opened(tmp_path, f"use: scripted, {OVER}, points: 5", observer=seen) as session,
+        pytest.raises(DeviceError, match="gave no point at all"),
+    ):
+        session.run()
+    assert not (tmp_path / "data").exists() or not [*(tmp_path / "data").glob("*/*/run.json")]
+
+
+def test_a_shot_that_is_gone_is_taken_again_at_its_point(tmp_path: Path) -> None:
+    done = run(tmp_path, f"use: scripted, dops: [3, 5, 3, 9], {OVER}, points: 4")
+    before = [shot.occupancies.tobytes() for shot in done.shots]
+    for index in (0, 2):
+        done.shots[index].file.unlink()
+    with labseq.Session.resume(done.path) as session:
+        again = session.run()
+    assert [shot.parameters[DOP] for shot in again.shots] == [3, 5, 3, 9]
+    assert [shot.occupancies.tobytes() for shot in again.shots] == before
+
+
+def test_what_a_shot_has_not_is_told_once_and_is_no_score(tmp_path: Path) -> None:
+    seen = RecordingObserver()
+    over = OVER.replace("filling_fraction", "reading.laser.power_w")
+    run(tmp_path, f"use: scripted, dops: [3, 5], {over}, points: 2", observer=seen)
+    (warning,) = [values["text"] for name, values in seen.events if name == "warning"]
+    assert warning.startswith("shot 1 has no 'reading.laser.power_w' to climb on")
+    told = [values for name, values in seen.events if name == "scan_point"]
+    assert [(values["value"], values["best"]) for values in told] == [(None, None)] * 2
+
+
+def test_an_option_takes_the_place_of_a_range(tmp_path: Path) -> None:
+    scan = """use: climb, over: {planner.degree_of_parallelism: {from: 1, to: 9},
+        shot.sort.window: {from: 10 ms, to: 60 ms}}, maximise: filling_fraction, points: 3"""
+    with opened(tmp_path, scan, overrides=[f"{DOP}=4"]) as session:
+        assert session.assembly.warnings == (f"--set {DOP}=4 replaces the scan of '{DOP}'",)
+        done = session.run()
+    assert done.scan["addresses"] == ["shot.sort.window"]
+    with pytest.raises(ConfigError, match="nothing is left to choose"):
+        opened(tmp_path, f"use: climb, {OVER}, points: 3", overrides=[f"{DOP}=4"])
+
+
+def test_the_check_tells_the_most_points_and_the_time_of_the_slowest_corner(tmp_path: Path) -> None:
+    scan = "use: climb, over: {shot.0.load.duration: {from: 1 s, to: 3 s}}, maximise: success, points: 3"
+    report = check(opened(tmp_path, scan, "repeats: 2\n"))
+    assert (report.n_points, report.n_shots) == (3, 6)
+    alone = check(opened(tmp_path, scan, overrides=["scan=~", "shots=6", "shot.0.load.duration=3 s"]))
+    assert report.run_s[1] == pytest.approx(alone.run_s[1])
+
+
+def test_shots_may_stand_in_place_of_points_and_end_a_point_early(tmp_path: Path) -> None:
+    done = run(tmp_path, f"use: scripted, dops: [3, 5, 7], {OVER}", "shots: 5\nrepeats: 2\n", shots=3)
+    assert [shot.parameters[DOP] for shot in done.shots] == [3, 3, 5]
+
+
+BOTH = "from: 1, to: 9"
+
+
+@pytest.mark.parametrize(
+    ("scan", "told"),
+    [
+        ("use: climb", "1:7: 'over' is missing"),
+        (f"use: clim, {OVER}, points: 3", "1:13: unknown scanner 'clim'; expected one of"),
+        (f"use: climb, {OVER}", "1:7: 'points' is missing from 'scan' (the most points)"),
+        (f"use: climb, {OVER}, points: 3, stop: 0.1", "'stop' is not a setting of scanner 'climb'"),
+        (f"use: climb, {OVER}, points: 20000", "points is 20000"),
+        ("use: climb, over: {}, maximise: success, points: 3", "over"),
+        (f"use: climb, over: {{{DOP}: {{from: 1}}}}, maximise: success, points: 3", "'to' is missing"),
+        (f"use: climb, over: {{{DOP}: [1, 9]}}, maximise: success, points: 3", f"{DOP} is a list"),
+        (
+            f"use: climb, over: {{{DOP}: {{from: 9, to: 1}}}}, maximise: success, points: 3",
+            "goes from 9 to 1",
+        ),
+        (
+            f"use: climb, over: {{{DOP}: {{from: 1, to: 9 ms}}}}, maximise: success, points: 3",
+            "'9 ms' does not go with 1; expected a number without a unit",
+        ),
+        (
+            f"use: climb, over: {{{DOP}: {{from: 0, to: 9}}}}, maximise: success, points: 3",
+            "the scan puts it into 'planner.degree_of_parallelism'",
+        ),
+        (
+            f"use: climb, over: {{{DOP}: {{{BOTH}, steps: 3}}}}, maximise: success, points: 3",
+            "3 equal steps from 1 to 9 are no whole ones; expected a number of steps that 8 is a multiple of",
+        ),
+        (
+            f"use: climb, over: {{planner.dop: {{{BOTH}}}}}, maximise: success, points: 3",
+            "'dop' is not a setting of planner 'psca'",
+        ),
+        (
+            f"use: climb, over: {{grid.rows: {{{BOTH}}}}}, maximise: success, points: 3",
+            "there is no 'grid' in",
+        ),
+        (
+            f"use: climb, over: {{profile.grid.rows: {{{BOTH}}}}}, maximise: success, points: 3",
+            "a scan cannot change 'profile.grid.rows'",
+        ),
+        (
+            f"use: climb, over: {{target.rows: {{{BOTH}}}}}, maximise: success, points: 3",
+            "a scan cannot change 'target.rows'",
+        ),
+        (f"use: climb, over: {{{DOP}: {{{BOTH}}}}}, points: 3", "the scan has no aim"),
+        (
+            f"use: climb, over: {{{DOP}: {{{BOTH}}}}}, maximise: success, minimise: success, points: 3",
+            "'maximise' and 'minimise' stand together",
+        ),
+        (
+            f"use: climb, over: {{{DOP}: {{{BOTH}}}}}, maximise: filling, points: 3",
+            "there is no figure 'filling' to climb on; expected",
+        ),
+        (f"use: scripted, then: refuse, {OVER}, points: 3", "it does not want to"),
+        (f"use: climb, {OVER}, points: 3, step: 0", "step is 0"),
+    ],
+)
+def test_a_wrong_scan_is_refused_with_its_place(tmp_path: Path, scan: str, told: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        opened(tmp_path, scan)
+    lines = str(caught.value).replace(f"s.yaml:{N_LINES + 1}:", "s.yaml:1:")
+    lines += str([problem.notes for problem in caught.value.problems])
+    assert told in lines
+    assert all(problem.line == N_LINES + 1 for problem in caught.value.problems), lines
+
+
+def test_an_order_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="'order' is given, but the points are chosen one after another"):
+        opened(tmp_path, f"use: climb, {OVER}, points: 3", "order: shuffled\n")
+
+
+def test_a_figure_that_needs_an_image_is_refused_without_one(tmp_path: Path) -> None:
+    session = opened(tmp_path, f"use: climb, {OVER}, points: 3")
+    text = (tmp_path / "s.yaml").read_text("utf-8")
+    start = text.index("  - image"), text.index("scan:")
+    (tmp_path / "s.yaml").write_text(text[: start[0]] + text[start[1] :], "utf-8")
+    assert session.assembly.search is not None
+    with pytest.raises(ConfigError, match="no shot has a filling_fraction: it takes no image"):
+        labseq.Session.open(tmp_path / "s.yaml")
