@@ -95,6 +95,10 @@ def test_an_edge_while_it_is_busy_is_told_and_starts_nothing(running: Firmware) 
     pins.go()
     running.simavr.start()
     running.simavr.command("skip 160000")
+    running.put(0, [(0, 4), (3000, 0)])
+    running.ask("a arm 0 2")
+    running.ask("a fire")
+    assert (running.line() or "").startswith("!done")
     assert pins.state() == ["02", "0001", "01", "01"]
     assert running.ask("a answer 1") == "a ok 02 01"
     assert pins.state() == ["01", "0001", "00", "01"]

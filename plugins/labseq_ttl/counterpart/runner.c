@@ -180,14 +180,17 @@ static void listen_for(int timeout_ms) {
   fflush(stdout);
   if (poll(files, n_in ? 1 : 2, timeout_ms) <= 0) return;
   if (files[0].revents) {
-    char byte;
-    if (read(STDIN_FILENO, &byte, 1) != 1) exit(0);
-    if (byte != '\n' && n_command < sizeof command - 1) {
-      command[n_command++] = byte;
-    } else {
-      command[n_command] = 0;
-      n_command = 0;
-      obey(command);
+    char bytes[64];
+    ssize_t n = read(STDIN_FILENO, bytes, sizeof bytes);
+    if (n < 1) exit(0);
+    for (ssize_t i = 0; i < n; i++) {  // all of them: what comes on the line after a command finds it obeyed
+      if (bytes[i] != '\n' && n_command < sizeof command - 1) {
+        command[n_command++] = bytes[i];
+      } else {
+        command[n_command] = 0;
+        n_command = 0;
+        obey(command);
+      }
     }
   }
   if (!n_in && files[1].revents & POLLIN) {

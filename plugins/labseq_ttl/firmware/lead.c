@@ -10,6 +10,7 @@ uint16_t signs, n_gos;
 uint8_t lead, went;
 
 static uint16_t busy, ready, failed;
+static uint8_t more;            // an edge came that could not be taken
 static uint16_t patience, due;  // in overflows of the timer; no patience: no deadline
 
 static void sign(uint16_t mask) {
@@ -17,10 +18,8 @@ static void sign(uint16_t mask) {
   show(held);
 }
 
-static uint8_t edge_waits(void) { return TIFR1 & _BV(ICF1); }
-
 static void listen(void) {
-  started = 0;
+  started = more = 0;
   TIMSK1 |= _BV(ICIE1);
 }
 
@@ -44,7 +43,15 @@ void end_leading(void) {
   }
 }
 
+static void see_more(void) {
+  if (lead > IDLE && TIFR1 & _BV(ICF1)) {
+    TIFR1 = _BV(ICF1);
+    more = 1;
+  }
+}
+
 void look_at_leader(void) {
+  see_more();
   if (lead == IDLE && started) {
     lead = OWED;
     due = beats + patience;
@@ -57,15 +64,14 @@ void look_at_leader(void) {
   }
 }
 
-uint8_t more_came(void) { return lead > IDLE && edge_waits(); }
+uint8_t more_came(void) { return more; }
 
 uint8_t level(void) { return !!(PINB & _BV(PB0)); }
 
 void answer_leader(uint8_t is_ready) {
   ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
     sign(is_ready && lead != LATE ? ready : failed);
-    if (more_came()) TIFR1 = _BV(ICF1);  // an edge from now on is the next go
-    lead = IDLE;
+    lead = IDLE;  // an edge since the last look is the next go
     listen();
   }
 }
