@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Generator, Mapping
+from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Final
 
@@ -89,8 +90,7 @@ def make_plugin(kind: str, name: str, folder: Path, *, package: bool = False) ->
     with _told(path):
         made = _write_folder(path, {filled(file, words): filled(text, words) for file, text in texts.items()})
         written = refresh_schemas(folder, _plugins_of(folder).registry)
-    has_first = (folder / f"{FIRST}.yaml").exists()
-    return Made(path, (*made, *written), tuple(c for c in commands if not (has_first and "new seq" in c)))
+    return Made(path, (*made, *written), (*_missing_for_tests(), *_still_to_do(commands, folder)))
 
 
 def make_file(kind: FileKind, name: str, folder: Path, *, profile: str = "virtual") -> Made:
@@ -134,6 +134,18 @@ def _plugins_of(folder: Path) -> PluginHost:
         raise ConfigError(Problem("there is no such folder", visible(str(folder)), hint="make it first"))
     own = folder / PLUGINS
     return load_plugins([own] if own.is_dir() else [])
+
+
+def _missing_for_tests() -> list[str]:
+    """The command that installs what the tests of a plugin need, if it is not there."""
+    is_there = all(find_spec(module) is not None for module in ("pytest", "hypothesis"))
+    return [] if is_there else ['pip install "labseq[testing]"']
+
+
+def _still_to_do(commands: Sequence[str], folder: Path) -> list[str]:
+    """The commands without the one that makes the sequence of the examples, if there is one."""
+    done = {f"labseq new sequence {FIRST}"} if (folder / f"{FIRST}.yaml").exists() else set[str]()
+    return [command for command in commands if command not in done]
 
 
 def _placed(sections: Mapping[str, str], source: str, tests: str) -> dict[str, str]:

@@ -137,3 +137,11 @@ def test_a_new_plugin_is_in_the_schemas_that_are_there(tmp_path: Path) -> None:
 def test_class_names() -> None:
     assert class_prefix("spiral") == "Spiral"
     assert class_prefix("my_2nd_spiral") == "My2ndSpiral"
+
+
+def test_what_the_tests_need_is_told_where_it_is_missing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("labseq.scaffolds.making.find_spec", lambda _: None)
+    commands = make_plugin("planner", "spiral", tmp_path).commands
+    assert commands[:2] == ('pip install "labseq[testing]"', "pytest plugins/spiral")
