@@ -98,7 +98,7 @@ class _FileSchema:
         for entry in entries:
             defined = f"{kind}.{entry.name}"
             self._definitions[defined] = self._settings(entry, {key: {}, **own["properties"]})
-            is_meant = {"properties": {key: {"const": entry.name}}, "required": [key]}
+            is_meant = {"type": "object", "properties": {key: {"const": entry.name}}, "required": [key]}
             rules.append({"if": is_meant, "then": {"$ref": _reference(defined)}})
         return {"type": "object", "properties": {key: name}, "required": [key], "allOf": rules}
 

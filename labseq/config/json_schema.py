@@ -16,7 +16,7 @@ from pydantic_core import core_schema
 
 from labseq.config.fields import EmptyIs
 from labseq.config.settings import Quantity
-from labseq.units import EXAMPLES, UNITS, format_quantity, parse_quantity
+from labseq.units import EXAMPLES, UNITS, expected, format_quantity, parse_quantity
 
 JsonSchema: TypeAlias = dict[str, Any]
 
@@ -69,6 +69,7 @@ def quantity_schema(dimension: str) -> JsonSchema:
     return {
         "type": ["number", "string"],
         "pattern": rf"^\s*{_SIGN}{_NUMBER}\s*({alternatives})\s*$",
+        "patternErrorMessage": f"expected {expected(dimension)}",  # known to VS Code only
         "examples": [EXAMPLES[dimension]],
         _DIMENSION: dimension,
     }

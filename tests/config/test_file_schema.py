@@ -153,11 +153,21 @@ def test_sequences_with_plugins(old: str, new: str, good: bool, is_valid: Valid)
     assert is_valid("sequence", node.plain()) is good
 
 
+def test_a_bare_name_is_told_once(registry: Registry) -> None:
+    validator = jsonschema.Draft7Validator(file_schema("profile", registry)["properties"]["detector"])
+    assert [error.message for error in validator.iter_errors("threshold")] == [
+        "'threshold' is not of type 'object'"
+    ]
+
+
 def test_keys_are_explained(registry: Registry) -> None:
     schema = file_schema("sequence", registry)
     assert schema["properties"]["shots"]["description"] == "how many shots a run takes"
     exposure = schema["definitions"]["step.image"]["properties"]["exposure"]
     assert (exposure["description"], exposure["default"]) == ("exposure time of the camera", "45 ms")
+    assert exposure["patternErrorMessage"].startswith(
+        "expected a time such as '45 ms' (s, ms, us, ns, min, h)"
+    )
     planner = schema["properties"]["planner"]["anyOf"][0]["properties"]["use"]
     assert len(planner["enum"]) == len(planner["enumDescriptions"])
     assert {"psca", "lsap", "tetris"} <= {*planner["enum"]}
