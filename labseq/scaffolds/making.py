@@ -17,7 +17,7 @@ from labseq.config.wording import visible
 from labseq.errors import ConfigError, Problem
 from labseq.plugins import PluginHost
 from labseq.scaffolds.names import check_file_name, check_plugin_name
-from labseq.scaffolds.schemas import KINDS as FILE_KINDS, refresh_schemas, write_schema
+from labseq.scaffolds.schemas import KINDS as FILE_KINDS, refresh_schemas, schema_path, write_schema
 from labseq.scaffolds.templates import class_prefix, filled, plugin_sections, read_template
 from labseq.session import load_plugins
 
@@ -111,12 +111,18 @@ def make_file(kind: FileKind, name: str, folder: Path, *, profile: str = "virtua
     find_profile(profile, folder)
     path = folder / f"{name}.yaml"
     text = filled(read_template(f"{kind}.yaml"), {"name": name, "profile": profile})
+    further: list[Path] = []
+    plugins, schema = folder / PLUGINS, schema_path(kind, folder)
     with _told(path):
-        with path.open("x", encoding="utf-8", newline="\n") as file:
-            file.write(text)
-        further = [write_schema(kind, folder, host.registry)]
-        if not (folder / PLUGINS).is_dir():
-            further += _write_folder(folder / PLUGINS, {"README.md": read_template("plugins.md")})
+        if path.exists():
+            raise FileExistsError
+    with _told(plugins):
+        if not plugins.is_dir():
+            further += _write_folder(plugins, {"README.md": read_template("plugins.md")})
+    with _told(schema):
+        further.append(write_schema(kind, folder, host.registry))
+    with _told(path), path.open("x", encoding="utf-8", newline="\n") as file:  # last: with it all is there
+        file.write(text)
     commands = {
         "sequence": (f"labseq check {name}.yaml", f"labseq run {name}.yaml"),
         "profile": (f"labseq devices {name}", f"labseq new sequence {FIRST} --profile {name}"),

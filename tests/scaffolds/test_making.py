@@ -7,10 +7,13 @@ import sys
 from pathlib import Path
 
 import pytest
+from hypothesis import example, given, settings, strategies as st
 
 from labseq.errors import ConfigError
+from labseq.plugins import PluginHost
 from labseq.registry import KINDS
 from labseq.scaffolds import make_file, make_plugin
+from labseq.scaffolds.names import check_file_name, check_plugin_name
 from labseq.scaffolds.templates import class_prefix, plugin_sections
 
 
@@ -95,6 +98,33 @@ def test_a_file_in_the_way_is_told(tmp_path: Path) -> None:
     (tmp_path / "plugins").write_text("")
     with pytest.raises(ConfigError, match="it cannot be made"):
         make_plugin("planner", "spiral", tmp_path)
+
+
+@pytest.mark.parametrize("name", ["plugins", ".labseq"])
+def test_a_file_in_the_way_of_a_folder_is_told(name: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_text("")
+    with pytest.raises(ConfigError, match=rf"{name}.*: it (exists already|cannot be made)"):
+        make_file("sequence", "first", tmp_path)
+    assert not (tmp_path / "first.yaml").exists()
+    assert (tmp_path / name).read_text() == ""
+
+
+@given(name=st.text(max_size=50))
+@example(name="x\n")
+@settings(max_examples=50)
+def test_any_text_is_a_name_or_refused_in_words(name: str) -> None:
+    host = PluginHost()
+    for check in (
+        lambda: check_plugin_name("planner", name, name, host),
+        lambda: check_file_name("sequence", name, Path()),
+    ):
+        try:
+            check()
+        except ConfigError as error:
+            assert "cannot be called" in str(error)
+            assert str(error).isprintable()
+        else:
+            assert name.replace("-", "_").isidentifier()
 
 
 @pytest.mark.skipif(sys.platform == "win32" or os.geteuid() == 0, reason="nothing is forbidden here")
