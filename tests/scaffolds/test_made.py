@@ -60,6 +60,20 @@ def test_they_are_clean(made: Any) -> None:
         run("ruff", "format", "--isolated", "--check", folder, cwd=cwd)
 
 
+@pytest.mark.skipif("LABSEQ_TYPES" not in os.environ, reason="takes long: poe scaffolds")
+def test_their_types_are_right(made: Any) -> None:
+    settings = {
+        "typeCheckingMode": "strict",
+        "pythonVersion": "3.11",
+        "include": ["plugins", "labseq-packed"],
+        "executionEnvironments": [{"root": "labseq-packed", "extraPaths": ["labseq-packed/src"]}],
+        "reportMissingTypeStubs": False,
+        "reportUnknownMemberType": False,
+    }
+    (made.path / "pyrightconfig.json").write_text(json.dumps(settings))
+    run("pyright", "--pythonpath", sys.executable, cwd=made.path)
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_run_goes_through_with_each(kind: str, made: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(made.path)
