@@ -35,11 +35,13 @@ from labseq.config.motion import MobileTweezersChoice
 from labseq.config.policies import BudgetSettings, PolicySettings, StepPolicySettings
 from labseq.config.profile import GridSettings
 from labseq.registry import KINDS, Entry, Registry
+from labseq.testing.contracts import HardwareContract
 
 Pages = Mapping[str, Element]
 Tables = Mapping[str, Element]
 
 ROOT = Path(__file__).parents[2]
+STRATEGIES = "labseq.testing.strategies"
 SEQUENCE = {
     "labseq": "1",
     "name": "x",
@@ -282,9 +284,21 @@ def models_in(annotation: Any) -> Iterator[type[BaseModel]]:
         yield from models_in(part)
 
 
-def test_every_contract_suite_is_in_the_reference(pages: Pages) -> None:
-    for suite in (name for name in dir(testing) if name.endswith("Contract")):
-        assert suite in text_of(pages, "plugin-api")
+def test_every_promise_strategy_and_fake_is_in_the_reference(pages: Pages) -> None:
+    shown = text_of(pages, "testing")
+    for suite in (*testing.SUITES.values(), HardwareContract):
+        assert suite.__name__ in shown
+        tests = [getattr(suite, name) for name in dir(suite) if name.startswith("test_")]
+        assert tests
+        for test in tests:
+            assert test.promise.replace("`", "") in shown, f"{suite.__name__}.{test.__name__}"
+            assert test.__name__ in shown
+    names = [name for name in vars(testing.strategies) if name.islower() and not name.startswith("_")]
+    own = [name for name in names if getattr(vars(testing.strategies)[name], "__module__", "") == STRATEGIES]
+    assert {"occupancies", "targets", "grids", "plans", "tone_programs"} <= {*own}
+    assert {*own} <= {re.split(r"[(:]", term)[0] for term in terms_of(pages, "testing")}
+    for name in testing.fakes.__all__:
+        assert name in shown
 
 
 def test_every_error_and_exit_code_is_in_the_reference(pages: Pages) -> None:

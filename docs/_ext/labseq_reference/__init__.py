@@ -10,6 +10,7 @@ Each makes Markdown, which the page's own parser then reads:
 - ``{command} run``, ``{command} bench planners``: one command; without a name, the options of all
 - ``{shot-file} datasets``, ``{shot-file} columns``, ``{shot-file} attributes``: what stands in a shot's file
 - ``{registry}``, ``{scripts}``, ``{names}``: how plugins offer things, what scripts call, all public names
+- ``{contract} camera``, ``{strategies}``, ``{fakes}``: what ``labseq.testing`` has for plugins
 - ``{hooks}``, ``{role} Camera``, ``{errors}``, ``{error-tree}``, ``{plan-rules}``
 """
 
@@ -24,7 +25,7 @@ from docutils.statemachine import StringList
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
-from labseq_reference import commands, namespace, python, shot_file, tables
+from labseq_reference import commands, namespace, python, shot_file, tables, testing
 
 
 class _Generated(SphinxDirective):
@@ -73,6 +74,13 @@ class _Role(_Generated):
         return python.role(*self.arguments)
 
 
+class _Contract(_Generated):
+    required_arguments = 1
+
+    def lines(self) -> list[str]:
+        return testing.contract(*self.arguments)
+
+
 class _ShotFile(_Generated):
     required_arguments = 1
 
@@ -98,6 +106,9 @@ def setup(app: Sphinx) -> dict[str, Any]:
     app.add_directive("command", _Command)
     app.add_directive("role", _Role)
     app.add_directive("shot-file", _ShotFile)
+    app.add_directive("contract", _Contract)
+    app.add_directive("strategies", _plain(testing.strategy_list))
+    app.add_directive("fakes", _plain(testing.fake_list))
     app.add_directive("hooks", _plain(python.hooks))
     app.add_directive("registry", _plain(namespace.registry))
     app.add_directive("scripts", _plain(namespace.scripts))

@@ -31,6 +31,10 @@ class HardwareContract(HardwareBench[D]):
     """Promises of every camera, tweezer driver and instrument.
 
     Inherit the suite of the role, not this one, and provide the fixture ``factory``.
+
+    Attributes:
+        role: Name that the device has in the profile.
+        patience_s: Real time after which a call counts as hung, in seconds.
     """
 
     @promise("the constructor does no I/O, and changes nothing that all code shares")
