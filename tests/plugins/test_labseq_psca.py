@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import labseq_psca
@@ -25,7 +23,6 @@ from labseq import (
     check_plan,
 )
 from labseq.roles import Warmable
-from labseq.testing import PlannerContract
 from labseq.testing.strategies import cases
 
 Bools = NDArray[np.bool_]
@@ -62,24 +59,6 @@ def in_the_middle(pattern: Any, shape: tuple[int, int] = (20, 20), *, clear: boo
 
 COMPACT = in_the_middle(np.ones((15, 15)))
 ROWS, COLS = np.indices((15, 15))
-
-
-class TestPscaContract(PlannerContract):
-    @pytest.fixture
-    def factory(self) -> Callable[[Context], PscaPlanner]:
-        return partial(PscaPlanner, PscaSettings())
-
-
-class TestPaperVariantContract(PlannerContract):
-    @pytest.fixture
-    def factory(self) -> Callable[[Context], PscaPlanner]:
-        return partial(PscaPlanner, PscaSettings(variant="paper"))
-
-
-class TestRepairContract(PlannerContract):
-    @pytest.fixture
-    def factory(self) -> Callable[[Context], PscaPlanner]:
-        return partial(PscaPlanner, PscaSettings(repair_below=1))
 
 
 @given(cases((7, 7)), st.integers(1, 8), st.integers(1, 2))

@@ -1,9 +1,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
 from itertools import pairwise
-from typing import Any, ClassVar
+from typing import Any
 
 import labseq_single
 import numpy as np
@@ -15,27 +14,22 @@ from labseq_single.planner import (
     LsapPlanner,
     LsapSquaredPlanner,
     SingleTweezerPlanner,
-    layers,
-    travel,
 )
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
 
 from labseq import (
     Context,
-    MotionSpec,
     Occupancy,
-    Plan,
     PlanError,
-    PlanReport,
     Registry,
     SiteGrid,
     TargetPattern,
     check_plan,
 )
 from labseq.roles import Warmable
-from labseq.testing import PlannerContract
 from labseq.testing.strategies import cases
+
+from .labseq_single_cases import distance, in_the_middle, journeys, loadings, plan_and_check
 
 Bools = NDArray[np.bool_]
 Factory = Callable[[Context], SingleTweezerPlanner]
@@ -50,77 +44,8 @@ PLANNERS: Sequence[type[SingleTweezerPlanner]] = (
 every_planner = pytest.mark.parametrize("planner", PLANNERS, ids=lambda planner: planner.name)
 
 
-def plan_and_check(
-    planner: type[SingleTweezerPlanner], atoms: Occupancy, target: TargetPattern, eject_slots: int = 1
-) -> tuple[Plan, PlanReport]:
-    motion = MotionSpec(eject_slots=eject_slots)
-    plan = planner(None, Context(motion=motion)).plan(atoms, target)
-    return plan, check_plan(plan, atoms, target, 1, motion=motion)
-
-
-def loadings(n: int, shape: Site = (20, 20), filling: float = 0.75) -> Bools:
-    return np.random.default_rng(1).random((n, *shape)) < filling
-
-
-def in_the_middle(pattern: Any, shape: Site = (20, 20), *, clear: bool = True) -> TargetPattern:
-    """A pattern in the middle of the grid; the other sites of its bounding box are to be empty."""
-    small = np.asarray(pattern, np.bool_)
-    top, left = (shape[0] - small.shape[0]) // 2, (shape[1] - small.shape[1]) // 2
-    box = (slice(top, top + small.shape[0]), slice(left, left + small.shape[1]))
-    fill, empty = np.zeros(shape, np.bool_), np.zeros(shape, np.bool_)
-    fill[box] = small
-    empty[box] = ~small & clear
-    return TargetPattern(fill, empty)
-
-
-def in_a_row(atoms: Sequence[int], fill: Sequence[int]) -> tuple[Bools, TargetPattern]:
-    """One row of atoms, and the target that wants some of its sites filled."""
-    wanted = np.array([fill], np.bool_)
-    return np.array([atoms], np.bool_), TargetPattern(wanted, np.zeros_like(wanted))
-
-
-def journeys(plan: Plan) -> list[list[Site]]:
-    """The corners of each atom's way, from pick-up to drop-off."""
-    ways: list[list[Site]] = []
-    for batch in plan.batches:
-        if not batch.linked:
-            ways.append([tuple(batch.from_sites[0].tolist())])
-        ways[-1].append(tuple(batch.to_sites[0].tolist()))
-    return ways
-
-
-def distance(plan: Plan) -> int:
-    return int(np.abs(plan.moves[:, 2:].astype(int) - plan.moves[:, :2]).sum())
-
-
 COMPACT = in_the_middle(np.ones((15, 15)))
 ROWS, COLS = np.indices((15, 15))
-
-
-class TestLsap(PlannerContract):
-    @pytest.fixture
-    def factory(self) -> Factory:
-        return partial(LsapPlanner, None)
-
-
-class TestLsapSquared(PlannerContract):
-    @pytest.fixture
-    def factory(self) -> Factory:
-        return partial(LsapSquaredPlanner, None)
-
-
-class TestCompression(PlannerContract):
-    @pytest.fixture
-    def factory(self) -> Factory:
-        return partial(CompressionPlanner, None)
-
-
-class TestHca(PlannerContract):
-    n_examples: ClassVar[int] = 100
-
-    @pytest.fixture
-    def factory(self) -> Factory:
-        return partial(HcaPlanner, None)
 
 
 @every_planner
@@ -276,59 +201,6 @@ def test_an_inner_atom_is_ejected_after_those_outside_of_it_went_on(
     assert report.meets_target
     assert plan.n_batches == 2
     assert np.count_nonzero(report.predicted) == 8
-
-
-@given(cases((6, 6)))
-@settings(max_examples=200, deadline=None)
-def test_lsap_moves_the_atoms_by_the_least_total_distance(case: tuple[TargetPattern, Occupancy]) -> None:
-    target, atoms = case
-    target = TargetPattern(target.fill, np.zeros_like(target.fill))
-    goals, sources = np.flatnonzero(target.fill), np.flatnonzero(atoms)
-    if len(goals) <= len(sources):
-        lengths = travel(goals, sources, atoms.shape[1])
-        least = lengths[linear_sum_assignment(lengths)].sum()
-        assert distance(plan_and_check(LsapPlanner, atoms, target)[0]) == least
-
-
-def test_the_squares_prefer_two_short_moves_to_a_long_one() -> None:
-    atoms, fill = np.zeros((2, 7), np.bool_), np.zeros((2, 7), np.bool_)
-    atoms[0, 0] = atoms[1, 3] = fill[1, 3] = fill[0, 6] = True
-    target = TargetPattern(fill, np.zeros_like(fill))
-    assert distance(plan_and_check(LsapPlanner, atoms, target)[0]) == 6
-    plan, _ = plan_and_check(LsapSquaredPlanner, atoms, target)
-    assert [(way[0], way[-1]) for way in journeys(plan)] == [((1, 3), (0, 6)), ((0, 0), (1, 3))]
-
-
-def test_a_queue_of_atoms_moves_from_its_front() -> None:
-    atoms, target = in_a_row([1, 1, 1, 0, 0], [0, 0, 1, 1, 1])
-    for planner in (LsapPlanner, LsapSquaredPlanner):
-        plan, report = plan_and_check(planner, atoms, target)
-        assert report.meets_target
-        assert distance(plan) == 6
-    assert [move[1] for move in plan_and_check(LsapSquaredPlanner, atoms, target)[0].moves.tolist()] == [
-        2,
-        1,
-        0,
-    ]
-
-
-def test_compression_fills_from_the_centre_with_the_nearest_atom_outside() -> None:
-    atoms, target = in_a_row([1, 1, 1, 0, 1, 1, 1], [0, 1, 1, 1, 1, 1, 0])
-    plan, _ = plan_and_check(CompressionPlanner, atoms, target)
-    assert plan.moves.tolist() == [[0, 2, 0, 3], [0, 1, 0, 2], [0, 0, 0, 1]]
-
-
-def test_an_atom_in_the_way_goes_into_the_depth_of_a_closed_region() -> None:
-    atoms, target = in_a_row([1, 1, 0, 0, 0, 1, 1, 1, 1], [0, 1, 1, 1, 1, 1, 1, 0, 0])
-    plan, report = plan_and_check(HcaPlanner, atoms, target)
-    assert report.meets_target
-    assert plan.moves[:2].tolist() == [[0, 1, 0, 4], [0, 0, 0, 3]]
-
-
-def test_layers_are_squares_around_the_centre() -> None:
-    order = layers(np.ones((4, 4), np.bool_))
-    assert order[:4].tolist() == [5, 6, 9, 10]
-    assert order[4:8].tolist() == [0, 3, 12, 15]
 
 
 @every_planner

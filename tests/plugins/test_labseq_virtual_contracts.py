@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import ClassVar
 
@@ -74,3 +75,34 @@ class TestVirtualWorld(SimulationContract):
     def factory(self) -> Callable[[Context], World]:
         settings = {"image": {"frame": [80, 96], "centre_px": [39.5, 47.5]}}
         return partial(World, WorldSettings.model_validate(settings))
+
+
+def in_the_world(context: Context) -> Context:
+    return replace(context, simulation=World(WorldSettings(), context))
+
+
+class TestVirtualCameraInItsWorld(CameraContract):
+    def context(self) -> Context:
+        return in_the_world(super().context())
+
+    @pytest.fixture
+    def factory(self) -> Callable[[Context], VirtualCamera]:
+        return partial(VirtualCamera, CameraSettings())
+
+
+class TestVirtualStaticTweezersInTheirWorld(StaticTweezersContract):
+    def context(self) -> Context:
+        return in_the_world(super().context())
+
+    @pytest.fixture
+    def factory(self) -> Callable[[Context], VirtualStaticTweezers]:
+        return partial(VirtualStaticTweezers, StaticTweezersSettings())
+
+
+class TestVirtualMobileTweezersInTheirWorld(MobileTweezersContract):
+    def context(self) -> Context:
+        return in_the_world(super().context())
+
+    @pytest.fixture
+    def factory(self) -> Callable[[Context], VirtualMobileTweezers]:
+        return partial(VirtualMobileTweezers, MobileTweezersSettings())

@@ -1,25 +1,11 @@
-"""What comes with labseq keeps the promises of its role; the virtual drivers act on their world."""
+"""The steps that come with labseq keep the promises of a step."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import pytest
-from labseq_psca.planner import PscaPlanner, PscaSettings
-from labseq_virtual.camera import VirtualCamera
-from labseq_virtual.device import VirtualDevice
-from labseq_virtual.mobile_tweezers import VirtualMobileTweezers
-from labseq_virtual.settings import (
-    CameraSettings,
-    DeviceSettings,
-    MobileTweezersSettings,
-    StaticTweezersSettings,
-    WorldSettings,
-)
-from labseq_virtual.static_tweezers import VirtualStaticTweezers
-from labseq_virtual.world import World
 
 from labseq import Context
 from labseq.config.detectors import ThresholdSettings
@@ -44,89 +30,11 @@ from labseq.sequencer.rearrange import RearrangeStep
 from labseq.sequencer.steps import DeviceStep, ImageStep, LoadStep, WaitStep
 from labseq.sequencer.watching import CheckOverlayStep, CheckSitesStep
 from labseq.testing import (
-    CameraContract,
-    DetectorContract,
-    DeviceContract,
-    MobileTweezersContract,
-    PlannerContract,
-    StaticTweezersContract,
     StepContract,
 )
 from labseq.testing.fakes import FakeLab, fake_lab
 
 Factory = Callable[..., Any]
-
-
-def in_the_world(context: Context) -> Context:
-    return replace(context, simulation=World(WorldSettings(), context))
-
-
-class TestPsca(PlannerContract):
-    @pytest.fixture
-    def factory(self) -> Factory:
-        return partial(PscaPlanner, PscaSettings())
-
-
-class TestPscaOneAtATime(PlannerContract):
-    n_examples: ClassVar[int] = 20
-
-    @pytest.fixture
-    def factory(self) -> Factory:
-        return partial(PscaPlanner, PscaSettings(degree_of_parallelism=1))
-
-
-class TestPscaWithFewTones(PlannerContract):
-    n_examples: ClassVar[int] = 20
-
-    def context(self, shape: tuple[int, int]) -> Context:
-        context = super().context(shape)
-        return replace(context, motion=replace(context.motion, max_row_tones=2, max_column_tones=3))
-
-    @pytest.fixture
-    def factory(self) -> Factory:
-        return partial(PscaPlanner, PscaSettings(degree_of_parallelism=15))
-
-
-class TestVirtualCamera(CameraContract):
-    def context(self) -> Context:
-        return in_the_world(super().context())
-
-    @pytest.fixture
-    def factory(self) -> Factory:
-        return partial(VirtualCamera, CameraSettings())
-
-
-class TestVirtualStaticTweezers(StaticTweezersContract):
-    def context(self) -> Context:
-        return in_the_world(super().context())
-
-    @pytest.fixture
-    def factory(self) -> Factory:
-        return partial(VirtualStaticTweezers, StaticTweezersSettings())
-
-
-class TestVirtualMobileTweezers(MobileTweezersContract):
-    def context(self) -> Context:
-        return in_the_world(super().context())
-
-    @pytest.fixture
-    def factory(self) -> Factory:
-        return partial(VirtualMobileTweezers, MobileTweezersSettings())
-
-
-class TestVirtualDevice(DeviceContract):
-    commands: ClassVar = {"open": {}, "set": {"power": 0.5}}
-    values: ClassVar = ("state", "power")
-
-    @pytest.fixture
-    def factory(self) -> Factory:
-        return partial(VirtualDevice, DeviceSettings(commands=("open", "set"), values={"power": 0.0}))
-
-
-class TestThresholdDetector(DetectorContract):
-    @pytest.fixture
-    def factory(self) -> Factory:
-        return partial(ThresholdDetector, ThresholdSettings())
 
 
 class TestLoad(StepContract):
