@@ -1,0 +1,64 @@
+"""Every picture is shown, and made by a script; those of commands by the commands that their page shows."""
+
+from __future__ import annotations
+
+import re
+import sys
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+from PIL import Image
+
+from .blocks import PAGES, ROOT, blocks_of, commands_of
+
+STATIC = ROOT / "docs" / "_static"
+BY_OTHERS = ("patterns/", "planners/", "paper/", "run.svg")
+"""Made by scripts with tests of their own."""
+
+
+def load(name: str) -> ModuleType:
+    spec = spec_from_file_location(name, ROOT / "docs" / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+SCRIPT = load("make_pictures")
+
+
+def test_every_picture_is_shown_and_made() -> None:
+    there = {
+        path.relative_to(STATIC).as_posix() for path in STATIC.rglob("*") if path.suffix in (".png", ".svg")
+    }
+    pages = "".join(page.read_text("utf-8") for page in PAGES)
+    shown = set(re.findall(r"_static/([\w/.-]+\.(?:png|svg))", pages))
+    assert there == shown
+    assert {name for name in there if not name.startswith(BY_OTHERS)} == {*SCRIPT.PICTURES}
+
+
+@pytest.mark.parametrize("name", SCRIPT.PICTURES)
+def test_a_picture_is_made_by_the_commands_of_its_page(name: str) -> None:
+    picture = SCRIPT.PICTURES[name]
+    page = ROOT / "docs" / picture.page
+    commands = [one for block in blocks_of(page) if block.language == "console" for one in commands_of(block)]
+    assert {*picture.commands} <= {*commands}
+    assert f"_static/{name}" in page.read_text("utf-8")
+
+
+def test_a_picture_can_be_made_again(tmp_path: Path) -> None:
+    SCRIPT.make("plan_kagome.png", tmp_path)
+    with Image.open(tmp_path / "plan_kagome.png") as made, Image.open(STATIC / "plan_kagome.png") as kept:
+        assert made.size == kept.size
+
+
+def test_the_picture_of_the_readme_can_be_made_again(tmp_path: Path) -> None:
+    load("make_run_picture").take(tmp_path / "run.svg", shots=2, after=1)
+    text = (tmp_path / "run.svg").read_text("utf-8")
+    assert "compact-225" in text
+    assert "1/2" in text
+    assert "compact-225" in (STATIC / "run.svg").read_text("utf-8")
