@@ -20,8 +20,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from PIL import Image
+
 DOCS: Final = Path(__file__).parent
 STATIC: Final = DOCS / "_static"
+WIDTH_PX: Final = 1400
+N_COLOURS: Final = 128
 
 
 @dataclass(frozen=True)
@@ -92,7 +96,15 @@ def make(name: str, static: Path = STATIC) -> None:
             subprocess.run(program, cwd=here, check=True, stdout=subprocess.DEVNULL)  # noqa: S603 - labseq
         (made,) = here.glob(picture.made)
         (static / name).parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy(made, static / name)
+        save_small(made, static / name)
+
+
+def save_small(made: Path, path: Path) -> None:
+    """Save a picture with few colours and no more pixels than a page shows."""
+    with Image.open(made) as picture:
+        small = picture.convert("RGB")
+    small.thumbnail((WIDTH_PX, 10 * WIDTH_PX))
+    small.quantize(N_COLOURS, dither=Image.Dither.NONE).save(path, optimize=True)
 
 
 def files_of(page: Path) -> dict[str, str]:
