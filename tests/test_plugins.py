@@ -1,6 +1,7 @@
 """The plugin host: loading, blocking, reporting."""
 
 import importlib.metadata
+import signal
 import sys
 from types import ModuleType
 
@@ -85,7 +86,15 @@ def test_a_file_whose_name_cannot_be_imported_is_reported(host, tmp_path):
     assert "rename it" in info.reason
 
 
-def test_ctrl_c_while_a_plugin_loads_goes_through(host, tmp_path):
+@pytest.fixture
+def ctrl_c():
+    """As in a terminal, also where the tests run in the background and Ctrl-C is ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def test_ctrl_c_while_a_plugin_loads_goes_through(host, tmp_path, ctrl_c):
     code = "import signal, threading\nsignal.raise_signal(signal.SIGINT)\nthreading.Event().wait()\n"
     stdout = sys.stdout
     with pytest.raises(KeyboardInterrupt):

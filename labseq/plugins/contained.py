@@ -39,9 +39,10 @@ def contained(owner: Owner, what: str, work: Callable[[], T], *, watch: bool = T
         LabseqError: It raised this one of labseq's own.
     """
     job = _Job(work, Surroundings() if watch else None)
-    threading.Thread(target=job.run, name=f"labseq plugin {owner.name}", daemon=True).start()
+    thread = threading.Thread(target=job.run, name=f"labseq plugin {owner.name}", daemon=True)
     deadline = time.monotonic() + owner.patience_s
-    try:
+    try:  # from here on: Ctrl-C may come while the thread starts
+        thread.start()
         while not job.done.wait(min(_LOOK_S, max(0.0, deadline - time.monotonic()))):
             if time.monotonic() >= deadline and not job.done.is_set():
                 raise owner.fault(_hung(what, owner.patience_s))

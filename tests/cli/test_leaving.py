@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 PLUGIN = """
+import sys
 import threading
 from labseq import hookimpl
 
@@ -18,7 +19,7 @@ threading.Thread(target={target}, name="labseq test poller", daemon={daemon}).st
 
 @hookimpl
 def labseq_register(registry):
-    print("still in the buffer", end="")
+    sys.__stdout__.write("still in the buffer")  # print() would go to stderr here
 """
 
 

@@ -148,13 +148,13 @@ CASES = [
         "timeout misspelt",
         "{call: 3 s}",
         "{cal: 3 s}",
-        "p.yaml:25:12: 'cal' is not a setting of 'timeouts'; expected one of call, safe_state, plan; did you mean 'call'?",
+        "p.yaml:25:12: 'cal' is not a setting of 'timeouts'; expected one of call, safe_state, plan, load; did you mean 'call'?",
     ),
     (
         "no space after a colon in braces",
         "{call: 3 s}",
         "{call:3 s}",
-        "p.yaml:25:12: 'call:3 s' is not a setting of 'timeouts'; expected one of call, safe_state, plan; put a space after the ':'",
+        "p.yaml:25:12: 'call:3 s' is not a setting of 'timeouts'; expected one of call, safe_state, plan, load; put a space after the ':'",
     ),
     ("timeout of zero", "{call: 3 s}", "{call: 0 s}", "p.yaml:25:18: call is '0 s'; expected more than 0"),
     (
