@@ -54,13 +54,12 @@ SHORT_S = 0.05
 @pytest.fixture
 def gate() -> Iterator[threading.Event]:
     """What a plugin that hangs waits for: opened when the test is over, so that its thread ends."""
-    event = threading.Event()
+    event, before = threading.Event(), {*threading.enumerate()}
     sys.modules["gate"] = SimpleNamespace(event=event)  # pyright: ignore[reportArgumentType]
     yield event
     event.set()
-    for thread in threading.enumerate():
-        if thread.name.startswith("labseq plugin"):
-            thread.join(10.0)
+    for thread in {*threading.enumerate()} - before:
+        thread.join(10.0)
     del sys.modules["gate"]
 
 
@@ -246,8 +245,9 @@ class TestHanging:
 
     def test_what_wakes_up_later_registers_nothing(self, tmp_path: Path, gate: threading.Event) -> None:
         code = GOOD.replace("# registration", "").replace(HOOK, f"{HOOK}\n    import gate; gate.event.wait()")
+        before = {*threading.enumerate()}
         host, _ = loaded(tmp_path, code, SHORT_S)
-        (thread,) = [t for t in threading.enumerate() if t.name == "labseq plugin mine"]
+        (thread,) = {*threading.enumerate()} - before
         gate.set()
         thread.join(10.0)
         assert host.registry.entries() == []

@@ -95,7 +95,7 @@ def ctrl_c():
 
 
 def test_ctrl_c_while_a_plugin_loads_goes_through(host, tmp_path, ctrl_c):
-    code = "import signal, threading\nsignal.raise_signal(signal.SIGINT)\nthreading.Event().wait()\n"
+    code = "import signal, threading\nsignal.raise_signal(signal.SIGINT)\nthreading.Event().wait(1.0)\n"
     stdout = sys.stdout
     with pytest.raises(KeyboardInterrupt):
         load(host, tmp_path, code)
