@@ -103,6 +103,37 @@ def parse_quantity(text: str, dimension: str) -> float:
     return scaled(float(match[1]), units[unit])
 
 
+def parse_any(text: str) -> tuple[float, str]:
+    """Read a quantity of whatever dimension into SI.
+
+    Returns:
+        The value, and its dimension; "fraction" for percents.
+
+    Raises:
+        ValueError: The text is no number with a unit.
+
+    Example:
+        >>> parse_any("45 ms")
+        (0.045, 'time')
+    """
+    match = _NUMBER.match(text)
+    unit = "" if match is None else match[2] or ""
+    dimension = "temperature" if unit == "degC" else dimension_of(unit)
+    if not dimension:
+        raise ValueError(f"'{text}' is no number with a unit")
+    return parse_quantity(text, dimension), dimension
+
+
+def dimension_of(unit: str) -> str:
+    """The dimension that a unit belongs to; "" for what is none.
+
+    Example:
+        >>> dimension_of("um/ms")
+        'speed'
+    """
+    return next((name for name, units in UNITS.items() if unit and unit in units), "")
+
+
 def si_unit_of(text: str) -> str:
     """The SI unit that a quantity is read into, whatever its dimension; "" for a fraction or no quantity.
 

@@ -12,6 +12,7 @@ from pydantic import BaseModel
 from labseq.config.addresses import Override, find
 from labseq.config.collect import Collected
 from labseq.config.composer import compose
+from labseq.config.expressions import Expressions, evaluate
 from labseq.config.nodes import Loc, Mark, Node
 from labseq.config.reading import decode, read_bytes
 from labseq.config.settings import NoSettings
@@ -51,6 +52,7 @@ class Document:
         text: The file's text, exactly, but for a byte order mark.
         root: The top mapping.
         data: The same as plain dicts, lists and scalars, overrides included.
+        expressions: What of it was worked out; None before :meth:`evaluated`.
     """
 
     path: Path
@@ -58,6 +60,7 @@ class Document:
     text: str
     root: Node
     data: dict[str, Any] = field(init=False)
+    expressions: Expressions | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "data", self.root.plain())
@@ -92,6 +95,32 @@ class Document:
             what = f"the file holds {shown(root.plain(), root.raw)} at its top"
             raise ConfigError(root.mark.problem(name, what, expected))
         return cls(Path(name), name, decoded, root)
+
+    @property
+    def written(self) -> Node:
+        """The top mapping with its expressions, whether or not they were worked out."""
+        return self.root if self.expressions is None else self.expressions.written
+
+    def evaluated(self) -> Document:
+        """A copy with the values of its expressions in their places.
+
+        Raises:
+            ConfigError: Everything that is wrong with them.
+        """
+        expressions = evaluate(self.written, self.name, self.text)
+        return replace(self, root=expressions.root, expressions=expressions)
+
+    def replaced(self, root: Node) -> Document:
+        """A copy with another tree; its expressions are worked out anew if those of this one were.
+
+        Args:
+            root: The tree, with its expressions.
+
+        Raises:
+            ConfigError: What is wrong with them.
+        """
+        document = replace(self, root=root, expressions=None)
+        return document if self.expressions is None else document.evaluated()
 
     def get(self, loc: Loc, default: Any = None) -> Any:
         """The plain value at a location, or the default."""
@@ -132,7 +161,7 @@ class Document:
         """
         loc = find(self.root, address, self.name, origin, may_add)
         node = compose(value, self.name, origin) or Node(None, Mark(0, 0, origin))
-        return Document(self.path, self.name, self.text, self.root.replaced(loc, node))
+        return self.replaced(self.written.replaced(loc, node))
 
     def override_all(
         self,

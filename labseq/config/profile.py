@@ -37,6 +37,7 @@ from labseq.config.scan import Scan
 from labseq.config.scan_reading import bind_scan
 from labseq.config.settings import Frequency, Length, Settings
 from labseq.config.timeouts import TimeoutSettings
+from labseq.config.variables import Variables
 from labseq.model import MotionSpec, SiteGrid
 from labseq.model.grid import centred_comb
 from labseq.model.lines import LineSpec
@@ -145,6 +146,7 @@ class ProfileSpec(Settings):
         default=CalibrationSettings(), description="which calibrations count: a mapping, a folder, or `off`"
     )
     plugin_folders: Folders = Field(default=[], description="folders with plugins, relative to this file")
+    variables: Variables = Field(default={}, description="numbers and quantities that expressions refer to")
     timeouts: Annotated[TimeoutSettings, empty_is({})] = Field(
         default=TimeoutSettings(), description="how long plugins may take"
     )
@@ -226,7 +228,7 @@ def load_profile(
     document = Document.read(find_profile(name_or_path, beside, named_in=named_in), kept)
     check_kind(document, "hardware profile")
     placed = [_of_profile(Override(*override)) for override in overrides]
-    document = document.override_all(placed, may_add=MAY_ADD, found=found)
+    document = document.override_all(placed, may_add=MAY_ADD, found=found).evaluated()
     document = document if scan is None else bind_scan(scan, document).begun(document, profile=True)
     return load_checked(document, ProfileSpec, "a hardware profile", _STAND_INS, found)
 

@@ -131,11 +131,11 @@ class Scan:
 
     def put(self, document: Document, point: int, *, profile: bool) -> Document:
         """A copy of the sequence or of the profile with the values of a point."""
-        root = document.root
+        root = document.written
         for axis, node in self.values(point):
             if axis.of_profile == profile:
                 root = root.replaced(axis.loc, node)
-        return replace(document, root=root)
+        return document.replaced(root)
 
     def explained(self, error: ConfigError) -> ConfigError:
         """An error that says of each wrong value which address the scan puts it into."""

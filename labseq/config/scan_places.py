@@ -11,10 +11,11 @@ from labseq.config.document import Document
 from labseq.config.fields import MAY_ADD
 from labseq.config.nodes import Loc, Mark, Node
 from labseq.config.scan import PROFILE, Axis
-from labseq.config.wording import clean
+from labseq.config.variables import VARIABLES
+from labseq.config.wording import clean, did_you_mean, listing
 from labseq.errors import ConfigError, Problem
 
-_SCANNABLE: Final = "an address in 'planner', 'shot.N.<step>' or 'profile.<role or device>'"
+_SCANNABLE: Final = "an address in 'planner', 'shot.N.<step>', 'variables' or 'profile.<role or device>'"
 
 
 def placed_axis(address: str, key: Mark, values: Sequence[Node], document: Document) -> Axis:
@@ -42,9 +43,30 @@ def _check_place(axis: Axis, document: Document) -> None:
     loc = axis.loc
     if loc[0] == "planner":
         return
+    if loc[0] == VARIABLES:
+        check_variable(axis, document, document.name)
+        return
     if loc[0] == "shot" and len(loc) > 2 and loc[2] not in ("name", "policy") and document.root.at(loc[:3]):
         return
     raise unfit(axis.address, axis.key, document.name)
+
+
+def check_variable(axis: Axis, document: Document, name: str) -> None:
+    """Refuse what is no variable of a file.
+
+    Args:
+        axis: The axis.
+        document: The file.
+        name: The sequence's name in messages.
+
+    Raises:
+        ConfigError: It is none.
+    """
+    if len(axis.loc) != 2 or document.root.at(axis.loc) is None:
+        known = list(document.data.get(VARIABLES) or {})
+        what = f"there is no variable '{clean(axis.address)}'"
+        hint = did_you_mean(str(axis.loc[-1]), known)
+        raise ConfigError(axis.key.problem(name, what, listing(known) if known else "'variables'", hint))
 
 
 def unfit(address: str, key: Mark, name: str) -> ConfigError:

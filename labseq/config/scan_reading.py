@@ -18,8 +18,9 @@ from labseq.config.document import Document
 from labseq.config.fields import ROLES
 from labseq.config.nodes import Mark, Node
 from labseq.config.scan import Axis, Group, Scan, ScanOrder
-from labseq.config.scan_places import find_axis, is_free, placed_axis, refuse_twice, unfit
+from labseq.config.scan_places import check_variable, find_axis, is_free, placed_axis, refuse_twice, unfit
 from labseq.config.scan_values import MAX_POINTS, values_of
+from labseq.config.variables import VARIABLES
 from labseq.config.wording import clean, shown
 from labseq.errors import ConfigError
 
@@ -86,7 +87,9 @@ def bind_scan(scan: Scan, document: Document) -> Scan:
             return axis
         with found:
             loc = find_axis(document, axis, scan.name)
-            if not (loc[0] in ROLES or (loc[0] == "devices" and len(loc) > 1)):
+            if loc[0] == VARIABLES:
+                check_variable(replace(axis, loc=loc), document, scan.name)
+            elif not (loc[0] in ROLES or (loc[0] == "devices" and len(loc) > 1)):
                 raise unfit(axis.address, axis.key, scan.name)
             return replace(axis, loc=loc)
         return axis

@@ -33,6 +33,7 @@ from labseq.config.policies import PolicySettings
 from labseq.config.scan import Scan, ScanOrder
 from labseq.config.scan_reading import read_scan
 from labseq.config.settings import Settings
+from labseq.config.variables import Variables
 from labseq.config.wording import clean, shown
 
 DEFAULT_PLANNER: Final = "psca"
@@ -131,6 +132,7 @@ class SequenceSpec(Settings):
     )
     repeats: int = Field(default=1, ge=1, le=1_000_000, description="shots of each point of the scan")
     order: ScanOrder = Field(default="sequential", description="order of the scan's shots")
+    variables: Variables = Field(default={}, description="numbers and quantities that expressions refer to")
     analysis: Analyses = Field(default=(), description="what is worked out from each shot, beside the run")
     shot: Steps = Field(description="the steps of a shot")
 
@@ -178,6 +180,7 @@ def load_sequence(
         document = document.override("planner", f"{{use: {DEFAULT_PLANNER}}}", "the default planner")
     document = document.override_all(overrides, may_add=("policy",), found=found)
     problems = Collected() if found is None else found
+    document = document.evaluated()
     document = _at_first_point(document, [Override(*one) for one in overrides], profile_set, problems)
     if found is None:
         problems.raise_any()

@@ -181,6 +181,8 @@ def assemble(
         "analysis": analyses,
         "profile": _profile_dump(bench),
     }
+    if texts := _expressions(document, bench.document):
+        resolved["expressions"] = texts
     return Assembly(
         document,
         sequence,
@@ -215,6 +217,15 @@ def _check_alone(document: Document, sequence: SequenceSpec, found: Collected) -
         if entry is not None:
             with found:
                 validate(document, entry, spec.loc)
+
+
+def _expressions(sequence: Document, profile: Document) -> dict[str, str]:
+    """The text of each expression, by its address; their values stand among the settings."""
+    texts: dict[str, str] = {}
+    for prefix, document in (("", sequence), ("profile.", profile)):
+        for loc, text in ({} if document.expressions is None else document.expressions.texts).items():
+            texts[prefix + ".".join(map(str, loc))] = text
+    return texts
 
 
 def _profile_dump(bench: Bench) -> dict[str, Any]:

@@ -19,10 +19,14 @@ import numpy as np
 from labseq.config import ROLES, Axis, Choice, Collected, Document, Loc, Scan, SequenceSpec
 from labseq.config.motion import MobileTweezersChoice
 from labseq.config.nodes import Node
+from labseq.config.scan import PROFILE
+from labseq.config.variables import VARIABLES
+from labseq.config.wording import clean
 from labseq.errors import ConfigError
 from labseq.roles import Step
 from labseq.session.choosing import HARDWARE_KINDS, Bench, Chosen, DryRun, choose, resolve
 from labseq.session.contents import make_step
+from labseq.units import parse_any
 
 MAX_PROBLEMS: Final = 20
 """Wrong values after which no more are looked for."""
@@ -91,6 +95,11 @@ class Scanned:
         Args:
             found: Where the problems go, those of the first :data:`MAX_PROBLEMS` wrong values.
         """
+        try:
+            self._check_following()
+        except ConfigError as error:
+            found.add(error)
+            return
         known, n_wrong = {*self.scan.explained(ConfigError(found.problems)).problems}, 0
         for part in self._parts():
             for point in self._points_of(part):
@@ -124,6 +133,10 @@ class Scanned:
                 number = int(loc[1])
                 changed[number] = (steps[number][0], made.step)
         parameters = {axis.address: _resolved(axis, node, parts) for axis, node in self.scan.values(point)}
+        for axis in self.scan.axes:
+            for loc in self._following(axis):
+                part = _part_of(axis.of_profile, loc)
+                parameters[_address(axis.of_profile, loc)] = _value_in(parts[part], part, loc)
         return Point(planner, tuple(changed), self._bench_at(point, parts), parameters)
 
     def of(self, scan: Scan) -> Scanned:
@@ -132,9 +145,12 @@ class Scanned:
 
     def present(self, axis: Axis) -> Any:
         """What the files have in the place of an axis, SI; None if that is nothing, or wrong."""
-        part, alone = _part_of(axis), self.of(replace(self.scan, groups=()))
+        base, alone = self.bench.document if axis.of_profile else self.document, replace(self.scan, groups=())
+        if axis.loc[0] == VARIABLES:
+            return _si(base.get(axis.loc))
+        part = _part_of(axis.of_profile, axis.loc)
         try:
-            return _value_in(alone._make(part, 0), part, axis)
+            return _value_in(self.of(alone)._make(part, 0), part, axis.loc)
         except ConfigError:
             return None
 
@@ -157,12 +173,40 @@ class Scanned:
         return self._benches[key]
 
     def _parts(self) -> list[Part]:
-        return list(dict.fromkeys(_part_of(axis) for axis in self.scan.axes))
+        return list(dict.fromkeys(part for axis in self.scan.axes for part in self._parts_of(axis)))
+
+    def _parts_of(self, axis: Axis) -> list[Part]:
+        """What a value goes into: its own part, and those with an expression that follows from it."""
+        own = [] if axis.loc[0] == VARIABLES else [_part_of(axis.of_profile, axis.loc)]
+        following = (_part_of(axis.of_profile, loc) for loc in self._following(axis))
+        return list(dict.fromkeys([*own, *following]))
+
+    def _following(self, axis: Axis) -> list[Loc]:
+        """The settings whose values follow from that of an axis."""
+        expressions = (self.bench.document if axis.of_profile else self.document).expressions
+        found = [] if expressions is None else expressions.following(axis.loc)
+        return [loc for loc in found if loc[0] != VARIABLES]
+
+    def _check_following(self) -> None:
+        """Refuse an axis from which nothing follows, or something of which a run has only one."""
+        for axis in self.scan.axes:
+            following, own, name = self._following(axis), clean(axis.address), self.scan.name
+            if axis.loc[0] == VARIABLES and not following:
+                hint = f"write '= {own.removeprefix(PROFILE)}' where it shall count"
+                what = f"nothing follows from '{own}'"
+                raise ConfigError(axis.key.problem(name, what, "an expression with it", hint))
+            for loc in following:
+                if not _is_part(axis.of_profile, loc):
+                    other = clean(_address(axis.of_profile, loc))
+                    what = f"'{other}' follows from '{own}', and a scan cannot change it"
+                    raise ConfigError(axis.key.problem(name, what, "one value of it for the whole run"))
 
     def _groups_of(self, part: Part) -> list[int]:
         """The groups whose values go into a part."""
         return [
-            g for g, group in enumerate(self.scan.groups) if any(_part_of(axis) == part for axis in group)
+            g
+            for g, group in enumerate(self.scan.groups)
+            if any(part in self._parts_of(axis) for axis in group)
         ]
 
     def _points_of(self, part: Part) -> Iterator[int]:
@@ -212,22 +256,43 @@ class Scanned:
         return Made(chosen, None, choice, dumped)
 
 
-def _part_of(axis: Axis) -> Part:
-    if not axis.of_profile:
-        return False, axis.loc[:1] if axis.loc[0] == "planner" else axis.loc[:3]
-    return True, axis.loc[:2] if axis.loc[0] == "devices" else axis.loc[:1]
+def _part_of(of_profile: bool, loc: Loc) -> Part:
+    if not of_profile:
+        return False, loc[:1] if loc[0] == "planner" else loc[:3]
+    return True, loc[:2] if loc[0] == "devices" else loc[:1]
+
+
+def _is_part(of_profile: bool, loc: Loc) -> bool:
+    """Whether a scan may change a setting."""
+    if of_profile:
+        return loc[0] in ROLES or (loc[0] == "devices" and len(loc) > 2)
+    return loc[0] == "planner" or (loc[0] == "shot" and len(loc) > 3)
+
+
+def _address(of_profile: bool, loc: Loc) -> str:
+    return ".".join([*((PROFILE.rstrip("."),) if of_profile else ()), *map(str, loc)])
 
 
 def _resolved(axis: Axis, node: Node, parts: Mapping[Part, Made]) -> Any:
     """A scanned value as the plugin understood it, in SI; a mapping as it is written."""
-    part = _part_of(axis)
-    value = _value_in(parts[part], part, axis)
+    if axis.loc[0] == VARIABLES:
+        return _si(node.plain())
+    part = _part_of(axis.of_profile, axis.loc)
+    value = _value_in(parts[part], part, axis.loc)
     return node.plain() if value is None or isinstance(node.value, dict) else value
 
 
-def _value_in(made: Made, part: Part, axis: Axis) -> Any:
-    """The value of an axis among the settings of its part; None if there is none."""
+def _value_in(made: Made, part: Part, loc: Loc) -> Any:
+    """A value among the settings of its part; None if there is none."""
     value: Any = made.dump
-    for step in axis.loc[len(part[1]) :]:
-        value = value.get(step) if isinstance(value, dict) else None
+    for step in loc[len(part[1]) :]:
+        if isinstance(value, list):
+            value = value[step] if isinstance(step, int) and step < len(value) else None  # pyright: ignore[reportUnknownVariableType]
+        else:
+            value = value.get(step) if isinstance(value, dict) else None
     return value
+
+
+def _si(value: Any) -> Any:
+    """A variable in SI."""
+    return parse_any(value)[0] if isinstance(value, str) else value

@@ -129,9 +129,11 @@ class Course:
             return {}
         scan = scanned.scan
         points = range(scan.n_points)
+        addresses = [axis.address for axis in scan.axes]
+        at = [self.assembly.at(point).parameters for point in points]
         return {
-            "addresses": [axis.address for axis in scan.axes],
-            "points": [list(self.assembly.at(point).parameters.values()) for point in points],
+            "addresses": addresses,
+            "points": [[parameters[address] for address in addresses] for parameters in at],
             "written": [[str(node.raw or node.plain()) for _, node in scan.values(p)] for p in points],
             "repeats": scan.repeats,
             "order": scan.order,

@@ -18,7 +18,7 @@ CASES = [
         "role misspelt",
         "static_tweezers:",
         "static_tweezer:",
-        "p.yaml:12:1: 'static_tweezer' is not a setting of a hardware profile; expected one of labseq, name, grid, camera, static_tweezers, mobile_tweezers, detector, devices, lines, simulation, calibrations, plugin_folders, timeouts, budgets; did you mean 'static_tweezers'?",
+        "p.yaml:12:1: 'static_tweezer' is not a setting of a hardware profile; expected one of labseq, name, grid, camera, static_tweezers, mobile_tweezers, detector, devices, lines, simulation, calibrations, plugin_folders, variables, timeouts, budgets; did you mean 'static_tweezers'?",
     ),
     (
         "role missing",

@@ -17,7 +17,7 @@ CASES = [
         "misspelt key",
         "shots: 20",
         "shoots: 20",
-        "s.yaml:5:1: 'shoots' is not a setting of a sequence; expected one of labseq, name, profile, shots, seed, target, planner, record_frames, attempts, policy, plugin_folders, scan, repeats, order, analysis, shot; did you mean 'shots'?",
+        "s.yaml:5:1: 'shoots' is not a setting of a sequence; expected one of labseq, name, profile, shots, seed, target, planner, record_frames, attempts, policy, plugin_folders, scan, repeats, order, variables, analysis, shot; did you mean 'shots'?",
     ),
     ("zero shots", "shots: 20", "shots: 0", "s.yaml:5:8: shots is 0; expected at least 1"),
     (

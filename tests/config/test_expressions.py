@@ -1,0 +1,280 @@
+"""Expressions in files: against a reference that only adds up, and everything that can be wrong with them."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given, strategies as st
+
+from labseq.config import Document, load_sequence
+from labseq.config.expressions_parsing import MAX_DEPTH, MAX_LENGTH
+from labseq.config.expressions_values import POWERS
+from labseq.errors import ConfigError
+from labseq.units import UNITS, parse_any
+
+VALUES = """variables: {hold: 20 ms, n: 3, way: 4.49 um, half: 50 %, turn: 90 deg, warm: 25 degC, zero: 0}
+shot:
+  - image: {exposure: 45 ms, name: x}
+  - {name: sort, rearrange: {window: [60 ms, 0.04]}}
+  - {name: a-b, image: {exposure: 1 s}}
+"""
+N_VALUES = VALUES.count("\n")
+
+
+def value(text: str, more: str = "") -> Any:
+    document = Document.parse(f"{VALUES}{more}it: {text}\n", "s.yaml").evaluated()
+    return document.data["it"]
+
+
+def refused(text: str, more: str = "") -> str:
+    with pytest.raises(ConfigError) as caught:
+        value(text, more)
+    return "\n".join(str(problem).replace(f"s.yaml:{N_VALUES + 1}:", "") for problem in caught.value.problems)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("= 2 * shot.0.image.exposure", "0.09 s"),
+        ("= variables.hold + 5 ms", "0.025 s"),
+        ("= variables.hold+5ms", "0.025 s"),
+        ('"= min(variables.hold, 5 ms)"', "0.005 s"),
+        ("'= max(variables.n, 5)'", 5),
+        ("= shot.sort.window.0 / 3", "0.02 s"),
+        ("= shot.sort.window.1", 0.04),
+        ("= 2 * variables.n", 6),
+        ("= 6 / variables.n", 2),
+        ("= 7 / 2", 3.5),
+        ("= 2 ** 3 ** 2", 512),
+        ("= -2 ** 2", -4),
+        ("= 2 ** -1", 0.5),
+        ("= --3 - -2", 5),
+        ("= (1 + 2) * 3", 9),
+        ("= variables.way / variables.hold", "0.0002245 m/s"),
+        ("= 130 um/ms * 2 ms", "0.00026 m"),
+        ("= 1 / variables.hold", "50.0 Hz"),
+        ("= 2 MHz * 3 us", 6.0),
+        ("= sqrt(4 um * 9 um)", "6e-06 m"),
+        ("= (2 ms) ** 2 / 1 ms", "0.004 s"),
+        ("= sin(variables.turn) + cos(0) + tan(0)", 2.0),
+        ("= variables.half * 3", 1.5),
+        ("= 75 % * 2", 1.5),
+        ("= variables.warm - 5 K", "293.15 K"),
+        ("= 20 degC", "293.15 K"),
+        ("= exp(log(3))", 3.0),
+        ("= floor(2.7) + ceil(2.1) + round(2.6)", 8),
+        ("= abs(-3 ms)", "0.003 s"),
+        ("= 2 * pi", 2 * math.pi),
+        ("= 5 m/shot.0.image.exposure", f"{float(f'{5 / 0.045:.15g}')!r} m/s"),
+        ("= 1e-3 s + .5 ms + 1. ms", "0.0025 s"),
+        ("= 0.1 + 0.2", 0.3),
+        ("== 2 + 3", "= 2 + 3"),
+        ("'=='", "="),
+    ],
+)
+def test_what_comes_out(text: str, expected: Any) -> None:
+    assert value(text) == expected
+    assert type(value(text)) is type(expected)
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("= 2 * (3 + 4", "16: the expression ends too early; expected an operator or ')'"),
+        ("=", "5: the expression ends too early; expected a number, a name or '('"),
+        ("= 2 *", "9: the expression ends too early"),
+        ("= 2 3", "9: '3' cannot stand here; expected an operator such as '+' or '*'"),
+        ("= 2 ms 3", "12: '3' cannot stand here"),
+        ("= 2 + 3)", "12: ')' cannot stand here"),
+        ("= variables.hold + 5", "22: a time and a number cannot be added; give the number its unit"),
+        ("= variables.hold - variables.way", "22: a time and a length cannot be subtracted"),
+        ('"= min(2 ms, 3)"', "8: a time and a number cannot be compared"),
+        ("= variables.hodl", "7: there is no 'variables.hodl' in this file; did you mean 'hold'?"),
+        ("= shot.0.image.gain", "7: there is no 'shot.0.image.gain' in this file; an expression knows what"),
+        ("= shot.7.image.gain", "7: 'shot' has no item '7'"),
+        ("= nothing", "7: there is no 'nothing' in this file"),
+        ("= shot.0.image", "7: 'shot.0.image' is a mapping"),
+        ("= shot.0.image.name", "7: 'shot.0.image.name' is 'x'; expected a number or a quantity"),
+        ("= 1 / variables.zero", "9: this divides by zero"),
+        ("= variables.zero ** -1", "22: this divides by zero"),
+        ("= 10 ** 400", "10: this is too large a number"),
+        ("= 1e308 * 1e308", "13: this is too large a number"),
+        ("= exp(1e9)", "7: this is too large a number"),
+        ("= 2 ** 1e6", "9: the exponent is 1e+06; expected a number from -1000 to 1000"),
+        ("= 2 ** 1 s", "9: the exponent is a time; expected"),
+        ("= (1 s) ** 0.5", "13: a time has whole powers only"),
+        ("= (-2) ** 0.5", "12: a negative number has no such power"),
+        ("= sqrt(-1)", "7: this function has no value there"),
+        ("= log(0)", "7: this function has no value there"),
+        ("= sqrt(2 s)", "7: sqrt() of a time has no unit"),
+        ("= exp(2 s)", "7: exp() of a time; expected a number"),
+        ("= sin(2 s)", "7: sin() of a time; expected a number or an angle"),
+        ("= sin(1, 2)", "sin() takes 1 value, not 2"),
+        ("= min(1)", "7: min() takes 2 values or more, not 1"),
+        ("= sni(1)", "7: there is no function 'sni'; expected one of"),
+        ("= __import__('os')", "7: there is no function '__import__'"),
+        ("= variables.n.real", "has no 'real' in it"),
+        ("= variables.n.__class__", "has no '__class__' in it"),
+        ("= 1 s * 1 s", "5: the result is in s^2, which is no unit of any setting"),
+        ("= (1 m) ** 13", "13: powers of units go up to 12"),
+        ("= it", "7: this goes round in a circle: it -> it"),
+        ("= 2 if 1 else 3", "9: 'i' cannot stand here"),
+        ("= [1, 2]", "7: '[' cannot stand here"),
+        ("= 1; 2", "8: ';' cannot stand here"),
+        (f"= {'(' * 40}1{')' * 40}", f"this is nested more than {MAX_DEPTH} deep"),
+        (f"= {'-' * 100}1", f"this is nested more than {MAX_DEPTH} deep"),
+        (f"= {'1 + ' * 200}1", f"the expression has 803 characters; expected at most {MAX_LENGTH}"),
+        ("= " + "9" * 400, "this is too large a number"),
+    ],
+)
+def test_what_is_wrong_is_told_with_its_place(text: str, told: str) -> None:
+    text = f"'{text}'" if ", " in text and not text.startswith('"') else text
+    said = refused(text)
+    if ", " not in text or text.startswith('"'):
+        assert said.startswith(told) or told in said.partition(": ")[2], said
+    else:
+        assert told.partition(": ")[2] in said or told in said, said
+    assert "\n" not in said
+
+
+def test_a_circle_and_what_hangs_on_it_is_told_once() -> None:
+    more = "a: = b + 1\nb: = c\nc: = 2 * a\n"
+    (told,) = refused("= a", more).splitlines()
+    assert told.endswith("this goes round in a circle: a -> b -> c -> a")
+
+
+def test_a_long_chain_ends() -> None:
+    chain = "".join(f"v{i}: = v{i + 1}\n" for i in range(40)) + "v40: 7\n"
+    assert value("= v0", chain) == 7
+    chain = "".join(f"v{i}: = v{i + 1}\n" for i in range(3000)) + "v3000: 7\n"
+    assert "more than 50 expressions refer to each other in a row" in refused("= v0", chain)
+
+
+def test_the_place_in_an_option_is_told_by_its_character() -> None:
+    document = Document.parse(VALUES, "s.yaml").override(
+        "variables.n", "= 2 + x", "--set variables.n== 2 + x"
+    )
+    with pytest.raises(
+        ConfigError, match=r"^--set .*: there is no 'x' in this file \(character 7 of '= 2 \+ x'\)"
+    ):
+        document.evaluated()
+
+
+def test_an_override_is_worked_out_anew() -> None:
+    document = Document.parse(VALUES + "it: = 2 * variables.hold\n", "s.yaml").evaluated()
+    assert document.override("variables.hold", "30 ms", "--set").data["it"] == "0.06 s"
+    assert document.override("it", "5", "--set").data["it"] == 5
+    assert document.data["it"] == "0.04 s"
+
+
+def test_a_field_says_what_it_makes_of_the_result(tmp_path: Path) -> None:
+    text = (
+        "labseq: 1\nname: s\nshots: 1\ntarget: {pattern: compact}\nshot:\n  - image: {}\nattempts: = 7 / 2\n"
+    )
+    (tmp_path / "s.yaml").write_text(text)
+    with pytest.raises(ConfigError, match=r"s.yaml:7:11: attempts is 3.5; expected a whole number"):
+        load_sequence(tmp_path / "s.yaml")
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("{hold: text}", "a variable is 'text'; expected a number, or a number with a unit"),
+        ("{hold: true}", "a variable is true"),
+        ("{hold: [1]}", "a variable is a list"),
+        ("{a b: 1}", "a variable is called 'a b'; expected letters, digits and '_', a letter first"),
+        ("[1]", "variables is a list"),
+    ],
+)
+def test_wrong_variables(tmp_path: Path, text: str, told: str) -> None:
+    rest = "labseq: 1\nname: s\nshots: 1\ntarget: {pattern: compact}\nshot:\n  - image: {}\n"
+    (tmp_path / "s.yaml").write_text(f"{rest}variables: {text}\n")
+    with pytest.raises(ConfigError) as caught:
+        load_sequence(tmp_path / "s.yaml")
+    assert told in str(caught.value)
+    assert caught.value.problems[0].line == 7
+
+
+# A naive reference: values as floats with a dict of powers, worked out while the text is put together.
+
+Worked = tuple[str, float, dict[str, int]] | None
+BASE = {"time": {"s": 1}, "length": {"m": 1}, "frequency": {"s": -1}, "voltage": {"V": 1}, "fraction": {}}
+
+
+def literal(amount: float, unit: str) -> Worked:
+    if not unit:
+        return f"{amount!r}", amount, {}
+    si, dimension = parse_any(f"{amount!r} {unit}")
+    return f"{amount!r} {unit}", si, BASE[dimension]
+
+
+def both(left: Worked, right: Worked, sign: str) -> Worked:
+    if left is None or right is None:
+        return None
+    (a, x, p), (b, y, q) = left, right
+    text = f"({a}) {sign} ({b})"
+    if sign in "+-":
+        return (text, x + y if sign == "+" else x - y, p) if p == q else None
+    if sign == "/" and y == 0:
+        return None
+    way = 1 if sign == "*" else -1
+    powers = {unit: p.get(unit, 0) + way * q.get(unit, 0) for unit in {*p, *q}}
+    return text, x * y if sign == "*" else x / y, {unit: n for unit, n in powers.items() if n}
+
+
+def minus(one: Worked) -> Worked:
+    return None if one is None else (f"-({one[0]})", -one[1], one[2])
+
+
+UNITS_TRIED = ["", "", "s", "ms", "us", "um", "kHz", "mV", "%"]
+LEAVES = st.builds(
+    literal, st.one_of(st.integers(0, 50), st.floats(0.01, 99.0)), st.sampled_from(UNITS_TRIED)
+)
+TREES: st.SearchStrategy[Worked] = st.recursive(
+    LEAVES,
+    lambda inner: st.one_of(st.builds(both, inner, inner, st.sampled_from("+-*/")), st.builds(minus, inner)),
+    max_leaves=8,
+)
+
+
+def si_of(result: Any) -> tuple[float, tuple[int, ...]]:
+    if isinstance(result, str):
+        amount, dimension = parse_any(result)
+        return amount, POWERS[dimension]
+    return result, POWERS["fraction"]
+
+
+@given(TREES)
+def test_expressions_come_out_as_the_reference_works_them_out(tree: Worked) -> None:
+    if tree is None:  # the reference could not work it out, and the text is gone with it
+        return
+    text, expected, powers = tree
+    wanted = tuple(powers.get(unit, 0) for unit in ("s", "m", "V", "W", "K", "rad"))
+    if len(text) + 2 > MAX_LENGTH or not math.isfinite(expected):
+        return
+    if wanted not in POWERS.values():
+        assert "no unit of any setting" in refused(f"'= {text}'") or "powers of units" in refused(
+            f"'= {text}'"
+        )
+        return
+    amount, found = si_of(value(f"'= {text}'"))
+    assert found == wanted
+    assert math.isclose(amount, expected, rel_tol=1e-9, abs_tol=1e-12)
+
+
+@given(st.sampled_from(["time", "length"]), st.sampled_from(["voltage", "fraction"]), st.sampled_from("+-"))
+def test_sums_of_different_dimensions_are_refused(one: str, other: str, sign: str) -> None:
+    a, b = (next(iter(UNITS[dimension])) for dimension in (one, other))
+    assert "cannot be" in refused(f"= 2 {a} {sign} 3 {b}")
+
+
+@given(st.text("0123456789.+-*/() eamsn%,=xX_", max_size=40))
+def test_any_text_is_worked_out_or_refused(text: str) -> None:
+    quoted = f'"= {text}"'
+    try:
+        assert isinstance(value(quoted), int | float | str)
+    except ConfigError as error:
+        assert error.problems[0].line == N_VALUES + 1
