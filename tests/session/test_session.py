@@ -26,7 +26,13 @@ def contents(run):
     ]
 
 
-@pytest.mark.parametrize("options", [{}, {"profile": "lab", "dry_run": "full"}, {"dry_run": "fast"}])
+PATIENT = ["profile.timeouts.call=120 s"]
+"""The first open() of a process imports a vendor's package, which takes long on a busy computer."""
+
+
+@pytest.mark.parametrize(
+    "options", [{}, {"profile": "lab", "dry_run": "full", "overrides": PATIENT}, {"dry_run": "fast"}]
+)
 def test_the_same_seed_gives_the_same_data(tmp_path, options):
     first = run(tmp_path, shots=1, seed=11, **options)
     again = run(tmp_path, shots=1, seed=11, **options)

@@ -6,12 +6,13 @@ from functools import partial
 
 import pytest
 
-from labseq.errors import LimitError
+from labseq.errors import DeviceError, LimitError
 from labseq.model import ToneProgram
 from labseq.registry import KINDS
+from labseq.roles import Context
 from labseq.testing import SUITES, BrokenPromise, MobileTweezersContract, PlannerContract
 from labseq.testing.contracts import HardwareContract
-from labseq.testing.fakes import OneByOnePlanner, RecordingMobileTweezers
+from labseq.testing.fakes import OneByOnePlanner, RecordingCamera, RecordingMobileTweezers
 
 from . import (
     broken_analyses,
@@ -79,6 +80,24 @@ def test_every_kind_of_plugin_has_a_suite_and_every_promise_a_fault() -> None:
         assert isinstance(ALL[kind].suite, suite)
         missing = {*promised_by(suite)} - {test for of, test in broken if of == kind} - shared
         assert not missing, f"no {kind} breaks the promise of {missing}"
+
+
+class CannotBeMadeSafe(RecordingCamera):
+    def safe_state(self) -> None:
+        raise DeviceError(self.name, "no answer")
+
+
+@pytest.mark.parametrize("plugin", [RecordingCamera, CannotBeMadeSafe])
+def test_all_that_a_suite_makes_is_closed(plugin: type[RecordingCamera]) -> None:
+    made: list[RecordingCamera] = []
+
+    def factory(context: Context) -> RecordingCamera:
+        made.append(plugin(context))
+        return made[-1]
+
+    failed_tests(broken_hardware.Suite(), factory)
+    assert len(made) > len(promised_by(broken_hardware.Suite()))
+    assert all(not camera.is_open and "camera.close" in camera.calls.names() for camera in made)
 
 
 def test_a_hang_is_told_with_the_patience() -> None:
