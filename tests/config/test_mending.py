@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from hypothesis import given, strategies as st
+from hypothesis import given, settings, strategies as st
 
 from labseq.config import Collected, Document, SequenceSpec, load_sequence
 from labseq.config.mending import StandIns, load_checked
@@ -26,6 +26,7 @@ VALUES = st.recursive(SCALARS, lambda inner: st.lists(inner) | st.dictionaries(s
 KEYS = st.sampled_from([*GOOD, "seed", "attempts", "record_frames", "unknown"])
 
 
+@settings(max_examples=40)
 @given(st.dictionaries(KEYS, VALUES))
 def test_whatever_is_wrong_the_rest_is_kept(changes: dict[str, Any]):
     base = Document.parse("labseq: 1\n", "s.yaml")

@@ -93,7 +93,7 @@ def test_a_missed_atom_that_costs_more_is_missed_less() -> None:
     assert dear.false_positive.mean() > cheap.false_positive.mean()
 
 
-@settings(max_examples=10)
+@settings(max_examples=5)
 @given(
     st.integers(0, 2**32 - 1),
     st.floats(0.3, 0.85),
@@ -157,6 +157,7 @@ def test_signals_that_cannot_be_fitted_are_refused() -> None:
             fitted(Emccd(np.random.default_rng(7)).draw(50, 0.6), cost)
 
 
+@settings(max_examples=40)
 @given(st.floats(-5, 5), st.floats(0.1, 3), st.floats(-1.5, 1.5))
 def test_a_peak_has_the_moments_that_it_tells(mean: float, width: float, skewness: float) -> None:
     peak, at = Peak(mean, width, skewness), mean + width * np.linspace(-15, 25, 40_001)

@@ -36,7 +36,7 @@ def told(found: Evidence, light: float) -> Floats:
     return np.asarray(weight * found.curve[:N] + constant)
 
 
-@settings(max_examples=12)
+@settings(max_examples=6)
 @given(
     light=st.floats(0.5, 8.0),
     gain=st.floats(30, 90),

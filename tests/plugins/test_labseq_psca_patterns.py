@@ -145,7 +145,7 @@ def patterns(draw: st.DrawFn) -> tuple[TargetPattern, SiteGrid]:
 
 
 @given(patterns(), st.randoms(use_true_random=False), st.integers(1, 9))
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=75, deadline=None)
 def test_any_size_and_place_ends_right(case: tuple[TargetPattern, SiteGrid], random: Any, dop: int) -> None:
     target, grid = case
     n_sites = target.fill.size

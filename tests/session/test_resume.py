@@ -53,7 +53,7 @@ def whole(home: Path, scan: str) -> list[Any]:
     return WHOLE[scan]
 
 
-@settings(max_examples=5, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=3, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     scan=st.sampled_from(sorted(SCANS)),
     stops=st.lists(
