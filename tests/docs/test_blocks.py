@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
+from functools import cache
 from pathlib import Path
 
 import pytest
+import typer
 
 from .blocks import PAGES, ROOT, blocks_of
 from .given import Store, prepare
@@ -14,6 +17,17 @@ from .running import Reader
 @pytest.fixture(scope="session")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
     return Store(tmp_path_factory.mktemp("runs"))
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What each command does once for its process is not done a hundred times in this one."""
+    monkeypatch.setattr("gc.collect", lambda: 0)
+    monkeypatch.setattr("typer.main.get_command", get_command)
+    monkeypatch.setenv("GIT_DIR", os.devnull)  # no digest of the code's changes for each run
+
+
+get_command = cache(typer.main.get_command)
 
 
 def with_blocks() -> list[str]:

@@ -99,10 +99,11 @@ def help_examples(group: Any, names: str = "labseq") -> list[Block]:
 
 
 OF_ALL = ("--help", "--version", "--install-completion", "--show-completion")
+COMMAND: Any = typer.main.get_command(app)
 SHOWN = [
     *of("console"),
     *(block for page in PAGES for block in inline_of(page)),
-    *help_examples(typer.main.get_command(app)),
+    *help_examples(COMMAND),
 ]
 LINES = [(block, line) for block in SHOWN for line in lines_of(block)]
 
@@ -171,7 +172,7 @@ def write_plugins(block: Block, folder: Path) -> None:
 @pytest.mark.parametrize(("block", "line"), LINES, ids=[f"{block}: {line}" for block, line in LINES])
 def test_every_command_line_can_be_parsed(block: Block, line: str) -> None:
     words = [word for word in arrange(shlex.split(line)[1:]) if word != "--debug"]
-    command: Any = typer.main.get_command(app)
+    command = COMMAND
     while hasattr(command, "commands"):
         if not words or words[0] in ("COMMAND", *OF_ALL):
             return
