@@ -1,0 +1,114 @@
+"""Adaptive scans as ``labseq run``, ``show``, ``watch`` and ``export`` tell of them."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from pathlib import Path
+
+import pytest
+
+import labseq
+from labseq.cli.following import Follower
+from labseq.cli.glyphs import UNICODE
+from labseq.cli.log_lines import LogLines
+from labseq.cli.picture import draw
+from labseq.cli.scan_plot import draw_scan
+from labseq.cli.show import Tables, show_run
+from labseq.cli.tally import Tally
+from labseq.cli.telling import tell
+from labseq.recording.export import export_run
+
+DOP = "planner.degree_of_parallelism"
+SEQUENCE = """labseq: 1
+name: climbs
+profile: ./p.yaml
+seed: 3
+record_frames: none
+target: {pattern: compact, rows: 3, cols: 3}
+planner: {use: psca, degree_of_parallelism: 2}
+scan:
+  use: climb
+  over:
+    planner.degree_of_parallelism: {from: 1, to: 9}
+    shot.2.rearrange.window: {from: 10 ms, to: 60 ms}
+  maximise: filling_fraction
+  points: 5
+repeats: 2
+shot:
+  - load: {duration: 500 ms}
+  - image: {exposure: 45 ms}
+  - rearrange: {cycles: 1, window: 60 ms}
+  - image: {exposure: 45 ms}
+"""
+PROFILE = """labseq: 1
+name: small
+grid: {rows: 6, cols: 6, spacing: 4.49 um}
+camera: {use: virtual}
+static_tweezers: {use: virtual}
+mobile_tweezers: {use: virtual}
+detector: {use: threshold}
+simulation: {use: virtual}
+"""
+
+
+@pytest.fixture(scope="module")
+def told(tmp_path_factory: pytest.TempPathFactory) -> tuple[labseq.Run, list[str]]:
+    """A run, and the lines that it printed."""
+    folder = tmp_path_factory.mktemp("climbs")
+    (folder / "p.yaml").write_text(PROFILE, "utf-8")
+    (folder / "s.yaml").write_text(SEQUENCE, "utf-8")
+    stream = io.StringIO()
+    with labseq.Session.open(folder / "s.yaml", output=folder, observer=LogLines(stream)) as session:
+        return session.run(), stream.getvalue().splitlines()
+
+
+def test_each_point_is_told_with_the_best_so_far(told: tuple[labseq.Run, list[str]]) -> None:
+    lines = [line for line in told[1] if line.startswith("point ")]
+    assert len(lines) == 5
+    assert lines[0].startswith(f"point 1 ({DOP} 2, shot.2.rearrange.window 60 ms): filling_fraction ")
+    assert lines[0].endswith("best so far this")
+    assert all("; best so far " in line for line in lines)
+
+
+def test_the_table_has_the_points_in_the_order_in_which_they_were_chosen(
+    told: tuple[labseq.Run, list[str]], capfd: pytest.CaptureFixture[str]
+) -> None:
+    show_run(told[0].path, as_json=False, tables=Tables(scan=True))
+    header, first, *rest = capfd.readouterr().out.splitlines()
+    assert header.split()[:3] == [DOP, "shot.2.rearrange.window", "shots"]
+    assert first.split()[:4] == ["2", "60", "ms", "2"]
+    assert len(rest) == 4
+    show_run(told[0].path, as_json=True)
+    points = json.loads(capfd.readouterr().out)["points"]
+    assert points[0]["parameters"] == {DOP: 2, "shot.2.rearrange.window": 0.06}
+    assert sum(point["shots"] for point in points) == 10
+
+
+def test_a_view_in_another_process_learns_the_points_and_the_best(told: tuple[labseq.Run, list[str]]) -> None:
+    follower = Follower(told[0])
+    tally, lines = Tally(follower.now), list[str]()
+    for name, values in follower.read():
+        tally.note(name, values)
+        lines.append(tell(name, values, tally.record))
+    assert [line for line in lines if line.startswith("point ")] == [
+        line for line in told[1] if line.startswith("point ")
+    ]
+    assert tally.scan is not None
+    points = tally.scan.points()
+    assert [point.n_shots for _, point in points] == [2] * 5
+    assert points[0][0] == "2, 60 ms"
+    assert draw_scan(tally.scan, 48, 8, UNICODE)
+    assert f"best so far       {tally.best}" in draw(tally, [], 110, 40, UNICODE).plain
+    assert ", point " in tally.best
+
+
+def test_a_run_that_is_exported_has_its_points(told: tuple[labseq.Run, list[str]], tmp_path: Path) -> None:
+    export_run(told[0], "csv", tmp_path / "t.csv")
+    with (tmp_path / "t.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert [int(row[DOP]) for row in rows] == [shot.parameters[DOP] for shot in told[0].shots]
+    with (tmp_path / "t.units.csv").open(encoding="utf-8") as file:
+        units = {row[0]: row[1] for row in csv.reader(file)}
+    assert units["shot.2.rearrange.window"] == "s"
