@@ -16,6 +16,28 @@ from labseq.recording.plain import dumps
 from labseq.session.adaptive import Search
 
 
+@dataclass(slots=True)
+class Standing:
+    """How a point stands.
+
+    Attributes:
+        first: Its first visit.
+        values: Address -> value, SI.
+        total: Sum of the scores of its visits.
+        n_scores: How many of them have one.
+    """
+
+    first: int
+    values: Mapping[str, Any]
+    total: float = 0.0
+    n_scores: int = 0
+
+    @property
+    def mean(self) -> float:
+        """Its mean score."""
+        return self.total / self.n_scores
+
+
 @dataclass(slots=True, eq=False)
 class Results:
     """What came of the points of an adaptive scan.
@@ -29,6 +51,8 @@ class Results:
     shots: dict[int, Shot]
     _visited: list[VisitedPoint] = field(default_factory=list[VisitedPoint])
     _given_up: dict[int, dict[str, float]] = field(default_factory=dict[int, dict[str, float]])
+    _standings: dict[str, Standing] = field(default_factory=dict[str, Standing])
+    _n_counted: int = 0
     _warned: bool = False
 
     def add(self, shot: Shot) -> None:
@@ -73,27 +97,24 @@ class Results:
             value = None if math.isnan(score) else sign * score
             return {"point": number, "written": self.search.told(values), "value": value}
 
-        best = self._best([*self.before(visit), own])
+        while self._n_counted <= visit:
+            self._count(self._n_counted)
+        known = [one for one in self._standings.values() if one.n_scores]
+        best = max(known, key=lambda one: (one.mean, -one.first), default=None)
         return {
             "figure": self.search.adaptive.figure,
             **plain(visit, own.values, own.score),
-            "best": None if best is None else plain(*best),
+            "best": None if best is None else plain(best.first, best.values, best.mean),
         }
 
-    def _best(self, visited: list[VisitedPoint]) -> tuple[int, Mapping[str, Any], float] | None:
-        """First visit, values and mean score of the best point; all visits of a point count together."""
-        scores: dict[str, list[float]] = {}
-        first: dict[str, int] = {}
-        for number, one in enumerate(visited):
-            key = dumps(dict(one.values))
-            first.setdefault(key, number)
-            if not math.isnan(one.score):
-                scores.setdefault(key, []).append(one.score)
-        if not scores:
-            return None
-        means = {key: math.fsum(of) / len(of) for key, of in scores.items()}
-        key = max(means, key=lambda key: (means[key], -first[key]))
-        return first[key], visited[first[key]].values, means[key]
+    def _count(self, visit: int) -> None:
+        """Add a visit to those of its point: all of them count together."""
+        one = self._visit(visit)
+        standing = self._standings.setdefault(dumps(dict(one.values)), Standing(visit, one.values))
+        if not math.isnan(one.score):
+            standing.total += one.score
+            standing.n_scores += 1
+        self._n_counted += 1
 
     def _shots_of(self, visit: int) -> list[Shot]:
         repeats = self.search.scanned.scan.repeats
