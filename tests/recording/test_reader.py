@@ -180,7 +180,7 @@ def test_a_run_of_a_newer_labseq_is_refused(run_dir: Path) -> None:
     open_run(run_dir)
     rewrite_json(run_dir / "run.json", format_version="2.0")
     with pytest.raises(
-        RecordingError, match=r"has format version 2\.0, this labseq reads 1\.2; update labseq"
+        RecordingError, match=r"has format version 2\.0, this labseq reads 1\.3; update labseq"
     ):
         open_run(run_dir)
 

@@ -14,6 +14,7 @@ def test_every_public_name_resolves() -> None:
         "MobileTweezersContract",
         "PatternContract",
         "PlannerContract",
+        "ScannerContract",
         "SimulationContract",
         "StaticTweezersContract",
         "StepContract",
