@@ -7,9 +7,10 @@ import time
 from collections.abc import Callable
 from typing import Any, Final, TypeVar
 
-from labseq.errors import LabseqError, PluginLoadError, in_words
+from labseq.errors import LabseqError, PluginLoadError
 from labseq.plugins.importing import place_of
 from labseq.plugins.surroundings import Surroundings
+from labseq.plugins.told import in_words
 from labseq.registry import Owner
 
 T = TypeVar("T")

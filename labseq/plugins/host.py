@@ -14,10 +14,11 @@ from typing import Any, Final, Literal
 import pluggy
 
 from labseq import hookspecs
-from labseq.errors import ConfigError, PluginLoadError, Problem, UnknownPluginError, in_words
+from labseq.errors import ConfigError, PluginLoadError, Problem, UnknownPluginError
 from labseq.plugins.contained import contained
 from labseq.plugins.hooks import check_api, hooks_of
 from labseq.plugins.importing import forget, home_of, home_of_module, import_file
+from labseq.plugins.told import in_words
 from labseq.registry import LOAD_S, Entry, Owner, Registry
 
 ENTRY_POINT_GROUP: Final = "labseq"

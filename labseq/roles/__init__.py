@@ -30,7 +30,7 @@ from labseq.roles.hardware import (
     Timed,
     Trigger,
 )
-from labseq.roles.shot import Context, Repeatable, RunObserver, Shot, Step, StepContext
+from labseq.roles.shot import Context, Shot
 from labseq.roles.simulation import (
     WHOLE_SENSOR,
     KnownLoading,
@@ -45,6 +45,7 @@ from labseq.roles.simulation import (
     TruthTeller,
     Wired,
 )
+from labseq.roles.step import Repeatable, RunObserver, Step, StepContext
 
 __all__ = [
     "WHOLE_SENSOR",

@@ -153,6 +153,18 @@ def assemble(
     except ConfigError as error:
         _check_alone(document, sequence, found)
         raise _explained(found.stop(error), scan) from None
+    return _put_together(document, sequence, bench, scan, found, dry_run)
+
+
+def _put_together(
+    document: Document,
+    sequence: SequenceSpec,
+    bench: Bench,
+    scan: Scan | None,
+    found: Collected,
+    dry_run: DryRun,
+) -> Assembly:
+    """Make what the sequence asks for, on its profile."""
     is_whole = not found.problems
     made: dict[str, Any] = {}
     with found:
@@ -173,29 +185,19 @@ def assemble(
         found.raise_any()
     except ConfigError as error:
         raise _explained(error, scan) from None
+    target, planner = made["target"], made["planner"]
     resolved = {
         **sequence.model_dump(mode="json", exclude={"shot", "target", "planner", "scan"}),
         "target": made["target_dump"],
-        "planner": made["planner"].dump(),
+        "planner": planner.dump(),
         "shot": with_policies(document, sequence, step_dumps),
         "analysis": analyses,
         "profile": _profile_dump(bench),
     }
     if texts := _expressions(document, bench.document):
         resolved["expressions"] = texts
-    return Assembly(
-        document,
-        sequence,
-        bench,
-        made["target"],
-        made["planner"],
-        tuple(steps),
-        dry_run,
-        resolved,
-        scanned,
-        policy=policy,
-        search=search,
-    )
+    parts = (document, sequence, bench, target, planner, tuple(steps), dry_run, resolved)
+    return Assembly(*parts, scanned, policy=policy, search=search)
 
 
 def _explained(error: ConfigError, scan: Scan | None) -> ConfigError:

@@ -58,6 +58,12 @@ NOT_RUN = {
         "waits for the leader below; tests/plugins/test_labseq_follow_session.py runs both",
         "tests/plugins/test_labseq_follow_session.py runs it beside labseq",
     ],
+    "docs/how-to/install.md": [
+        "tests/system/test_wheel.py builds one",
+        "tests/system/test_wheel.py installs it",
+        "tests/cli/test_demo.py copies them",
+    ],
+    "docs/how-to/plugin-trouble.md": ["an example; tests/test_plugin_troubles.py has them all"],
     "docs/how-to/resume-a-run.md": ["tests/session/test_changes.py makes such changes"],
     "docs/how-to/static-tweezers-soapy.md": ["installs packages, and looks for a radio"],
     "docs/how-to/stop-and-safe.md": [
@@ -68,11 +74,13 @@ NOT_RUN = {
     "docs/how-to/update.md": ["fetches another version"],
     "docs/reference/errors.md": ["tests/docs/test_examples.py makes this mistake"],
     "docs/reference/patterns.md": ["a drawing"],
+    "docs/tutorials/camera-driver.md": ["tests/docs/test_tutorials.py runs them"],
     "docs/tutorials/first-run.md": ["installs labseq"],
+    "docs/tutorials/planner.md": ["tests/docs/test_tutorials.py runs them"],
     "plugins/labseq_ttl/firmware/PROTOCOL.md": [
         "tests/plugins/test_labseq_ttl_firmware.py says these lines to the firmware"
     ]
-    * 2,
+    * 3,
 }
 """Page -> why blocks on it, or parts of them, are not run: whoever adds one says so here, too."""
 
