@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from typing import Final
 
 import numpy as np
@@ -17,7 +18,7 @@ from labseq_genicam.counterpart.images import Request
 from labseq_genicam.link import told
 from labseq_genicam.settings import GenicamSettings
 
-PATIENCE_S: Final = 2.0
+PATIENCE_S: Final = 5.0
 """How long the simulated camera may take to begin an exposure, and to send its frame, in real time."""
 
 
@@ -49,6 +50,8 @@ class SimulatedCamera:
             is_busy=settings.faults.busy,
             ignores_triggers=settings.faults.ignores_triggers,
         )
+        self._ignores_triggers = faults.ignores_triggers
+        self._made: deque[Frame | None] = deque()
         self._sensor = SimulatedSensor(world, context.clock)
         self._fake = FakeCamera(self._expose, sensor_shape=world.sensor_shape, faults=faults)
         self._acquisition: Acquisition | None = None
@@ -105,13 +108,19 @@ class SimulatedCamera:
     def fire(self) -> None:
         """Trigger an exposure, and return when it has begun on the session's clock.
 
+        Its image is made before: a camera that waits for one answers nothing, and on a busy computer it would
+        be taken for one that is gone.
+
         Raises:
             DeviceError: The camera is gone, or the world is further in time already.
         """
         assert self._acquisition is not None
         n = self._fake.n_begun
+        if not self._ignores_triggers:
+            self._made.append(self._sensor.expose(self._late_s, self._edge_s))
         self._acquisition.fire()
-        self._fake.wait_for_request(n, PATIENCE_S, answered=True)  # else its frame will be missed
+        if not self._fake.wait_for_request(n, PATIENCE_S, answered=True):
+            self._made.clear()  # its frame will be missed
         self.raise_pending()
 
     def wait(self, timeout_s: float) -> float | None:
@@ -141,6 +150,7 @@ class SimulatedCamera:
     def clear(self) -> None:
         """Forget the series."""
         self._sensor.clear()
+        self._made.clear()
         self._series = self._edge_s = self._due = None
         self._n_exposed = self._n_due = 0
 
@@ -166,7 +176,7 @@ class SimulatedCamera:
         """What the sensor sees; black where no exposure is armed. Called by the camera's own thread."""
         if self._series is not None:
             self._check(request)
-        frame = self._sensor.expose(self._late_s, self._edge_s)
+        frame = self._made.popleft() if self._made else self._sensor.expose(self._late_s, self._edge_s)
         if frame is None:
             return np.zeros((request.height, request.width), np.uint16)
         self._n_exposed += 1

@@ -21,7 +21,7 @@ MAX_GIGE_FRAMES: Final = 65535
 """GigE cameras number their frames from 1, with 16 bits."""
 NO_NUMBER: Final = 2**64 - 1
 READY_S: Final = 1.0
-"""How long a camera may take until it would see a trigger, in seconds."""
+"""How long a real camera may take until it would see a trigger, in seconds."""
 
 
 class Acquisition:
@@ -32,13 +32,15 @@ class Acquisition:
         camera: pylon's ``InstantCamera``, open.
         nodes: Its nodes.
         clock: The session's clock: looked at for stop requests.
+        ready_s: How long the camera may take until it would see a trigger, in seconds.
     """
 
-    def __init__(self, sdk: Sdk, camera: Any, nodes: Nodes, clock: Clock) -> None:
+    def __init__(self, sdk: Sdk, camera: Any, nodes: Nodes, clock: Clock, ready_s: float = READY_S) -> None:
         self._sdk = sdk
         self._camera = camera
         self._nodes = nodes
         self._clock = clock
+        self._ready_s = ready_s
         self._is_gige = camera.GetDeviceInfo().GetDeviceClass() == GIGE
         self._ticks_per_s = ticks_per_s(nodes)
         self._exposure_s = math.nan
@@ -107,10 +109,10 @@ class Acquisition:
 
         with self._sdk.doing("trigger"):
             can_tell = camera.CanWaitForFrameTriggerReady()
-            if can_tell and wait_for(ready, READY_S, self._clock) is None:
-                text = f"not ready for a trigger within {format_quantity(READY_S, 'time')}"
+            if can_tell and wait_for(ready, self._ready_s, self._clock) is None:
+                text = f"not ready for a trigger within {format_quantity(self._ready_s, 'time')}"
                 hint = "leave more time between exposures than the camera needs to read one out"
-                raise DeviceTimeoutError(self._sdk.name, f"{text}; {hint}", READY_S)
+                raise DeviceTimeoutError(self._sdk.name, f"{text}; {hint}", self._ready_s)
 
     def trigger(self) -> None:
         """Start an exposure."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import replace
 from typing import Any, Final
 
@@ -17,7 +17,7 @@ from labseq import (
     Trigger,
     wait_for,
 )
-from labseq_pylon.acquisition import Acquisition
+from labseq_pylon.acquisition import READY_S, Acquisition
 from labseq_pylon.emulation import EmulatedCamera, shown
 from labseq_pylon.finding import find_camera, open_camera
 from labseq_pylon.library import Sdk, load_pypylon
@@ -27,7 +27,8 @@ from labseq_pylon.settings import SIMULATED, PylonSettings
 from labseq_pylon.setup import identify, set_up, temperature_k
 
 PATIENCE_S: Final = 5.0
-"""How long the emulated camera may take for a frame that is due on the session's clock, in seconds."""
+"""How long the emulated camera may take for a frame that is due on the session's clock, and until it would
+see a trigger, in seconds: it has no more of a busy computer than others have."""
 
 
 class PylonCamera(CameraDriver):
@@ -64,7 +65,9 @@ class PylonCamera(CameraDriver):
         return CameraFacts(self._settings.readout, self._settings.max_exposure, shape, triggers=triggers)
 
     def warm(self) -> None:
-        """Work out what all simulated frames have in common."""
+        """Import pylon, which takes seconds; work out what all simulated frames have in common."""
+        with suppress(DeviceError):  # open() says what is missing
+            load_pypylon(self._name)
         if self._emulation is not None:
             self._emulation.warm()
 
@@ -87,7 +90,8 @@ class PylonCamera(CameraDriver):
         else:
             shape = sensor_shape(nodes)
         self._found = identify(sdk, camera, nodes) | set_up(sdk, nodes, settings, shape)
-        self._acquisition = Acquisition(sdk, camera, nodes, self._clock)
+        ready_s = READY_S if self._emulation is None else PATIENCE_S
+        self._acquisition = Acquisition(sdk, camera, nodes, self._clock, ready_s)
 
     def _disconnect(self) -> None:
         sdk, camera, self._camera = self._sdk, self._camera, None

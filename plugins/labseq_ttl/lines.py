@@ -17,8 +17,8 @@ from labseq import (
 )
 from labseq.errors import one_of
 from labseq.lines import idle_program, off_program
-from labseq.units import format_quantity
-from labseq_ttl.box import Box, cause_in_words
+from labseq_ttl import faults
+from labseq_ttl.box import Box
 from labseq_ttl.connection import SIMULATED_PATIENCE_S, Connection
 from labseq_ttl.counterpart import warm_counterpart
 from labseq_ttl.programs import MOST_EDGES, as_played, edges_of, mask_of
@@ -277,12 +277,10 @@ class TtlLines:
             self._was_reset(*numbers)
         elif what == "off":
             self._forget()
-            raise DeviceError(self._name, "the box was told to turn all lines off; expected nobody to do so")
+            raise faults.was_turned_off(self._name)
         elif what == "alone":
             self._forget()
-            waited = format_quantity(self._settings.lights_out, "time")
-            text = f"the box heard nothing for {waited} and turned all lines off"
-            raise DeviceError(self._name, f"{text}; is this computer too busy? raise 'lights_out'")
+            raise faults.was_alone(self._name, self._settings.lights_out)
 
     def _has_ended(self, n_runs: int) -> None:
         self._is_running, self._n_runs = False, n_runs
@@ -293,11 +291,8 @@ class TtlLines:
         self._forget()
         self._slots.clear()
         self._n_boots, self._n_runs, self._was_lost = n_boots, 0, True
-        text = f"the box was reset (reason: {cause_in_words(cause)}) and turned all lines off"
-        raise DeviceError(self._name, f"{text}; look after its supply and cable")
+        raise faults.was_reset(self._name, cause)
 
     def _too_late(self, timeout_s: float) -> DeviceTimeoutError:
-        text = f"the lines' program is not over after {format_quantity(timeout_s, 'time')}"
-        if self._settings.start == "external":
-            text += "; did the edge at the start input come?"
-        return DeviceTimeoutError(self._name, text, timeout_s)
+        is_external = self._settings.start == "external"
+        return faults.is_too_late(self._name, timeout_s, is_external=is_external)

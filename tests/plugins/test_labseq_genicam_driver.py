@@ -17,7 +17,7 @@ from labseq_genicam.counting import LAST_ID, FrameCounter
 from labseq_genicam.settings import FORMATS, GenicamSettings
 from numpy.typing import NDArray
 
-from labseq import ConfigError, Context
+from labseq import ConfigError, Context, Frame, SensorMode
 from labseq.errors import DeviceTimeoutError, StopRequested
 from labseq.roles import NeverStopped
 from labseq.testing import CameraContract
@@ -189,6 +189,20 @@ def test_a_computer_that_is_slow_costs_no_time_on_a_virtual_clock(monkeypatch: p
         assert len(asked) == 3
         assert lab.clock.now() == pytest.approx(0.015)
         assert_shown(frames, lab)
+
+
+def test_the_camera_answers_while_its_image_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
+    """However long that takes: a busy computer's camera is not gone."""
+    with rig() as lab:
+        expose, link = lab.world.expose, lab.camera._link
+        assert link is not None
+
+        def slow(t_start_s: float, exposure_s: float, mode: SensorMode) -> Frame:
+            link.ask()
+            return expose(t_start_s, exposure_s, mode)
+
+        monkeypatch.setattr(lab.world, "expose", slow)
+        assert_shown(lab.take(2), lab)
 
 
 def test_it_says_what_it_is_and_what_it_took() -> None:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
+from labseq_pylon import camera
 from labseq_pylon.camera import PylonCamera
 from labseq_pylon.library import load_pypylon
 from labseq_pylon.settings import BITS, PylonSettings
@@ -116,6 +117,34 @@ def test_a_frame_is_due_when_a_real_camera_would_have_it() -> None:
     assert frame.exposure_s == pytest.approx(0.045)
     assert frame.t_start_s == 0.0
     assert math.isnan(frame.device_time_s)  # the emulated camera has no clock
+
+
+def test_a_computer_that_is_slow_fails_no_trigger_and_costs_no_time_on_a_virtual_clock(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(camera, "READY_S", 0.0)  # a real camera's, which is not this one's
+    with rig(readout="5 ms") as lab:
+        wait, n_waits = lab.pylon.WaitForFrameTriggerReady, 0
+
+        def wait_slowly(milliseconds: int, handling: Any) -> bool:
+            nonlocal n_waits
+            n_waits += 1
+            return n_waits > 3 and wait(milliseconds, handling)
+
+        monkeypatch.setattr(lab.camera._opened(), "_camera", Slow(lab.pylon, wait_slowly))
+        lab.take(1, 0.01)
+    assert n_waits == 4
+    assert lab.clock.now() == pytest.approx(0.015)
+
+
+class Slow:
+    """pylon's camera, with a wait of its own."""
+
+    def __init__(self, camera: Any, wait: Callable[[int, Any], bool]) -> None:
+        self._camera, self.WaitForFrameTriggerReady = camera, wait
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._camera, name)
 
 
 def test_it_says_what_it_is_and_what_it_took() -> None:
