@@ -23,6 +23,7 @@ from . import (
     broken_lines,
     broken_patterns,
     broken_planners,
+    broken_scanners,
     broken_simulations,
     broken_steps,
     broken_tweezers,
@@ -40,6 +41,7 @@ ALL: dict[str, Planted] = {
     "step": broken_steps.PLANTED,
     "pattern": broken_patterns.PLANTED,
     "simulation": broken_simulations.PLANTED,
+    "scanner": broken_scanners.PLANTED,
     "analysis": broken_analyses.PLANTED,
     "hardware": broken_hardware.PLANTED,
 }
@@ -72,7 +74,7 @@ def test_a_right_planner_keeps_all_promises_of_the_whole_suite() -> None:
 
 
 def test_every_kind_of_plugin_has_a_suite_and_every_promise_a_fault() -> None:
-    assert {*KINDS} - {"scanner"} == {*SUITES}
+    assert {*KINDS} == {*SUITES}
     broken = {(kind, tests[0]) for kind, planted in ALL.items() for _, tests in planted.each()}
     shared = {*promised_by(HardwareContract())}
     assert shared == {test for kind, test in broken if kind == "hardware"}
@@ -113,3 +115,7 @@ def test_an_empty_program_may_be_refused() -> None:
             return super().prepare(program)
 
     assert failed_tests(MobileTweezersContract(), WantsTones) == {}
+
+
+def test_a_scanner_may_stop() -> None:
+    assert failed_tests(broken_scanners.Suite(), broken_scanners.Stops) == {}

@@ -29,6 +29,7 @@ SUITES: Final[Mapping[str, type[Any]]] = {
     "step": StepContract,
     "pattern": PatternContract,
     "simulation": SimulationContract,
+    "scanner": ScannerContract,
     "analysis": AnalysisContract,
 }
 """Kind of plugin, as the registry knows it -> its suite."""
