@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Annotated, Any, Final, Self, TypeAlias
 
-from pydantic import Field, model_validator
+from pydantic import Field, WithJsonSchema, model_validator
 
 from labseq.config.fields import Choice, Text, misfit
 from labseq.config.nodes import Loc, Mark, Node
@@ -19,14 +19,16 @@ MAX_RANGES: Final = 6
 
 _DIGITS: Final = 4  # of a range: finer than any setting of a machine is worth
 
+End: TypeAlias = Annotated[Any, WithJsonSchema({"type": ["number", "string"]})]
+"""A number or quantity; which one, the address decides."""
 Points: TypeAlias = Annotated[int, Field(ge=1, le=MAX_POINTS)]
 
 
 class EndsSettings(Settings):
     """The range of an address."""
 
-    low: Any = Field(alias="from", description="least value")
-    high: Any = Field(alias="to", description="greatest value")
+    low: End = Field(alias="from", description="least value")
+    high: End = Field(alias="to", description="greatest value")
     steps: Points | None = Field(
         default=None, description="number of equal steps between the values; without it any value will do"
     )

@@ -6,11 +6,20 @@ from inspect import cleandoc
 from types import FunctionType
 from typing import Final, Literal, cast
 
+from labseq.config.adaptive import AdaptiveChoice
 from labseq.config.analyses import AnalysisChoice
 from labseq.config.devices import DeviceChoice
 from labseq.config.fields import Choice, PatternChoice
-from labseq.config.json_schema import DEFINITIONS, DRAFT, JsonSchema, model_schema, or_empty
+from labseq.config.json_schema import (
+    DEFINITIONS,
+    DRAFT,
+    JsonSchema,
+    model_schema,
+    or_empty,
+    or_expression,
+)
 from labseq.config.lines import LinesChoice
+from labseq.config.policies import StepPolicySettings
 from labseq.config.profile import MobileTweezersChoice, ProfileSpec
 from labseq.config.sequence import SequenceSpec
 from labseq.config.settings import Settings
@@ -26,6 +35,8 @@ _ROLES: Final[dict[str, type[Choice]]] = {
     "lines": LinesChoice,
     "simulation": Choice,
 }
+_SCANNER: Final = "scanner"
+_AIMS: Final = ("maximise", "minimise")
 _MAY_BE_EMPTY: Final = frozenset({"lines", "simulation"})
 
 
@@ -55,11 +66,13 @@ class _FileSchema:
         self._fill(keys, "planner", or_empty(self._choice("planner", Choice)))
         self._fill(keys, "analysis", or_empty(analyses))
         self._fill(keys, "shot", {"type": "array", "minItems": 1, "items": self._step()})
-        self._fill(keys, "scan", or_empty(_scan()))
+        keys["scan"] = {"description": keys["scan"]["description"]}  # more of it below
         # There is a default planner, and a scan says how many shots there are.
         file["required"] = [key for key in file["required"] if key not in ("planner", "shots")]
         file["if"], file["else"] = {"required": ["scan"]}, {"required": ["shots"]}
-        return self._whole("labseq sequence", file)
+        whole = or_expression(file)
+        self._fill(whole["properties"], "scan", or_empty(self._scan()))  # where no expression may stand
+        return self._whole("labseq sequence", whole)
 
     def profile(self) -> JsonSchema:
         file = self._file(ProfileSpec)
@@ -71,14 +84,17 @@ class _FileSchema:
         self._fill(keys, "devices", or_empty(devices))
         calibrations = keys["calibrations"]  # just a folder, or `off`, may stand in its place
         keys["calibrations"] = {**calibrations, "anyOf": [*calibrations["anyOf"], {"type": "string"}]}
-        return self._whole("labseq hardware profile", file)
+        return self._whole("labseq hardware profile", or_expression(file))
 
     def _file(self, model: type[Settings]) -> JsonSchema:
         return model_schema(model, "", self._definitions)
 
     def _whole(self, title: str, file: JsonSchema) -> JsonSchema:
-        used = {name: self._definitions[name] for name in _reached(file, self._definitions)}
-        return {"$schema": DRAFT, "title": title, **file, DEFINITIONS: dict(sorted(used.items()))}
+        used = {name: self._definitions[name] for name in sorted(_reached(file, self._definitions))}
+        written = {
+            name: one if name.startswith(f"{_SCANNER}.") else or_expression(one) for name, one in used.items()
+        }
+        return {"$schema": DRAFT, "title": title, **file, DEFINITIONS: written}
 
     def _fill(self, keys: JsonSchema, key: str, schema: JsonSchema) -> None:
         """Say what stands behind a key; what it is for is told by the file's own model."""
@@ -100,7 +116,8 @@ class _FileSchema:
             self._definitions[defined] = self._settings(entry, {key: {}, **own["properties"]})
             is_meant = {"type": "object", "properties": {key: {"const": entry.name}}, "required": [key]}
             rules.append({"if": is_meant, "then": {"$ref": _reference(defined)}})
-        return {"type": "object", "properties": {key: name}, "required": [key], "allOf": rules}
+        needed: list[str] = own.get("required", [key])
+        return {"type": "object", "properties": {key: name}, "required": needed, "allOf": rules}
 
     def _settings(self, entry: Entry, around: JsonSchema) -> JsonSchema:
         """The settings of an entry, with the core's keys that may stand beside them."""
@@ -110,7 +127,7 @@ class _FileSchema:
         return {"additionalProperties": False, **merged, "description": _about(entry)}
 
     def _step(self) -> JsonSchema:
-        """One kind of step with its settings, and perhaps a name."""
+        """One kind of step with its settings, and perhaps a name and a policy."""
         kinds: JsonSchema = {}
         for entry in (one for one in self._registry.entries() if one.kind == "step"):
             self._definitions[f"step.{entry.name}"] = self._settings(entry, {})
@@ -119,14 +136,21 @@ class _FileSchema:
             about = {"description": _about(entry)}
             kinds[entry.name] = {**about, **({"allOf": [settings]} if is_needed else or_empty(settings))}
         name = {"type": "string", "minLength": 1, "description": "name of the step, for addresses"}
+        policy = model_schema(StepPolicySettings, "step.", self._definitions)
+        failing = "what follows its failures and exceeded budgets, in place of the run's policy"
         return {
             "type": "object",
-            "properties": {**kinds, "name": name},
+            "properties": {**kinds, "name": name, "policy": {"description": failing, **or_empty(policy)}},
             "additionalProperties": False,
-            "if": {"required": ["name"]},
-            "then": {"minProperties": 2, "maxProperties": 2},
-            "else": {"minProperties": 1, "maxProperties": 1},
+            **_one_beside("name", "policy"),
         }
+
+    def _scan(self) -> JsonSchema:
+        """Values of addresses, or a scanner with its settings and the ranges that it chooses from."""
+        scanner = self._choice(_SCANNER, AdaptiveChoice)
+        aims = [{"required": [aim], "properties": {aim: {"type": "string"}}} for aim in _AIMS]
+        is_adaptive: JsonSchema = {"type": "object", "required": [AdaptiveChoice.key]}
+        return {"if": is_adaptive, "then": {**scanner, "oneOf": aims}, "else": _grid_scan()}
 
 
 def _about(entry: Entry) -> str:
@@ -141,7 +165,19 @@ def _about(entry: Entry) -> str:
     return f"{entry.kind.replace('_', ' ')} of {entry.origin}"
 
 
-def _scan() -> JsonSchema:
+def _one_beside(*keys: str, n_given: int = 0) -> JsonSchema:
+    """That one key stands in a mapping, beside those of the given keys that are there."""
+    if not keys:
+        return {"minProperties": n_given + 1, "maxProperties": n_given + 1}
+    first, *others = keys
+    return {
+        "if": {"required": [first]},
+        "then": _one_beside(*others, n_given=n_given + 1),
+        "else": _one_beside(*others, n_given=n_given),
+    }
+
+
+def _grid_scan() -> JsonSchema:
     """Addresses and the values that each takes, or a list of such mappings."""
     three = {"type": "array", "minItems": 3, "maxItems": 3}
     forms: list[JsonSchema] = [{"type": "array", "minItems": 1}]

@@ -7,7 +7,7 @@ types, limits of plain numbers, units. ``labseq check`` says the rest.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Final, TypeAlias, cast
 
 from pydantic import BaseModel
@@ -16,6 +16,7 @@ from pydantic_core import core_schema
 
 from labseq.config.fields import EmptyIs
 from labseq.config.settings import Quantity
+from labseq.config.variables import si_of
 from labseq.units import EXAMPLES, UNITS, expected, format_quantity, parse_quantity
 
 JsonSchema: TypeAlias = dict[str, Any]
@@ -26,6 +27,9 @@ DEFINITIONS: Final = "definitions"
 _DIMENSION: Final = "x-dimension"  # of a quantity, until its default is written with a unit
 _SIGN: Final = "[+-]?"
 _NUMBER: Final = r"(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?"
+_EXPRESSION: Final = "^=(?!=)"
+_NUMBERS: Final = ("number", "integer")
+_VALUES: Final = ("default", "const", "enum", "examples")
 _MAPS: Final = frozenset({"properties", "patternProperties", "$defs"})
 _DROPPED: Final = frozenset({"title", "discriminator", "$defs", _DIMENSION})
 _LIMITS: Final = {"ge": "minimum", "gt": "exclusiveMinimum", "le": "maximum", "lt": "exclusiveMaximum"}
@@ -40,6 +44,8 @@ class _Generator(GenerateJsonSchema):
         function: object = schema["function"]["function"]
         if isinstance(function, Quantity):
             return quantity_schema(function.dimension)
+        if function is si_of:
+            return _variable_schema()
         inner = super().function_before_schema(schema)
         return or_empty(inner) if isinstance(function, EmptyIs) else inner
 
@@ -64,15 +70,68 @@ def quantity_schema(dimension: str) -> JsonSchema:
         >>> quantity_schema("time")["type"]
         ['number', 'string']
     """
-    units = [*UNITS[dimension], *(["degC"] if dimension == "temperature" else [])]
-    alternatives = "|".join(re.escape(unit) for unit in units)
     return {
         "type": ["number", "string"],
-        "pattern": rf"^\s*{_SIGN}{_NUMBER}\s*({alternatives})\s*$",
+        "pattern": _quantity_pattern(_units(dimension)),
         "patternErrorMessage": f"expected {expected(dimension)}",  # known to VS Code only
         "examples": [EXAMPLES[dimension]],
         _DIMENSION: dimension,
     }
+
+
+def _variable_schema() -> JsonSchema:
+    """A plain number, or a quantity of any kind."""
+    return {
+        "type": ["number", "string"],
+        "pattern": _quantity_pattern([unit for dimension in UNITS for unit in _units(dimension)]),
+        "patternErrorMessage": "expected a number, or a number with a unit such as '20 ms'",
+    }
+
+
+def _units(dimension: str) -> list[str]:
+    return [*UNITS[dimension], *(["degC"] if dimension == "temperature" else [])]
+
+
+def _quantity_pattern(units: Sequence[str]) -> str:
+    alternatives = "|".join(re.escape(unit) for unit in units)
+    return rf"^\s*{_SIGN}{_NUMBER}\s*({alternatives})\s*$"
+
+
+def or_expression(schema: Any) -> Any:
+    """The same schema, but that an expression may stand wherever a number or a quantity may.
+
+    Example:
+        >>> or_expression({"type": "integer", "minimum": 1})["type"]
+        ['integer', 'string']
+    """
+    if isinstance(schema, list):
+        return [or_expression(one) for one in cast("list[Any]", schema)]
+    if not isinstance(schema, dict):
+        return schema
+    node = cast("JsonSchema", schema)
+    if "const" in node:
+        return node
+    if "enum" in node:
+        is_number = node.get("type") in _NUMBERS
+        text = {"type": "string", "pattern": _EXPRESSION}
+        return {"anyOf": [node, text], **_about(node)} if is_number else node
+    changed: JsonSchema = {}
+    for key, value in node.items():
+        if key in _MAPS:
+            changed[key] = {name: or_expression(one) for name, one in value.items()}
+        else:
+            changed[key] = value if key in _VALUES else or_expression(value)
+    kind = node.get("type")
+    if kind in _NUMBERS:
+        changed |= {"type": [kind, "string"], "pattern": _EXPRESSION}
+        changed["patternErrorMessage"] = "expected a number, or an expression such as '= 2 * variables.x'"
+    elif kind == ["number", "string"] and "pattern" in node:
+        changed["pattern"] = f"{_EXPRESSION}|{node['pattern']}"
+    return changed
+
+
+def _about(node: JsonSchema) -> JsonSchema:
+    return {key: node[key] for key in ("description", "default") if key in node}
 
 
 def or_empty(schema: JsonSchema) -> JsonSchema:
@@ -113,7 +172,7 @@ def _tidy(schema: Any) -> Any:
             tidy[key] = {name: _tidy(one) for name, one in value.items()}
         elif key == "prefixItems":
             tidy["items"] = _tidy(value)
-        elif key in ("default", "const", "enum", "examples"):
+        elif key in _VALUES:
             tidy[key] = value
         elif key not in _DROPPED:
             tidy[_LIMITS.get(key, key)] = _tidy(value)

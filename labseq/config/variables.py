@@ -17,7 +17,8 @@ VARIABLES: Final = "variables"
 _NAME: Final = re.compile(r"[^\W\d]\w*")
 
 
-def _si(value: Any) -> Any:
+def si_of(value: Any) -> Any:
+    """The value of a variable, SI, from what is written."""
     if isinstance(value, int | float) and not isinstance(value, bool):
         return value
     try:
@@ -36,6 +37,6 @@ def _named(variables: dict[str, int | float]) -> dict[str, int | float]:
 
 
 Variables: TypeAlias = Annotated[
-    dict[str, Annotated[int | float, BeforeValidator(_si)]], AfterValidator(_named), empty_is({})
+    dict[str, Annotated[int | float, BeforeValidator(si_of)]], AfterValidator(_named), empty_is({})
 ]
 """Name -> value, SI."""

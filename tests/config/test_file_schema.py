@@ -45,6 +45,8 @@ ABOUT_VALUES = {
         "wait for a time and for a signal",
         "wait for a signal without end",
         "timeout of a wait for a time",
+        "depth of a ramp above 1",
+        "ramp that takes no time",
     },
     "profiles": {
         "spacing of zero",
@@ -140,6 +142,37 @@ shot: [{load: {}}, {image: {}}]
         ("shots: 1", "scan: {planner.degree_of_parallelism: [3, 5]}", True),
         ("shots: 1", "scan: [{a.b: {range: [0, 4, 2]}}, {c.d: {linspace: [1, 2, 3]}}]", True),
         ("shots: 1", "scan: {a.b: {rage: [0, 4, 2]}}", False),
+        ("shots: 1", "scan: {use: climb, over: {a.b: {from: 1, to: 9}}, maximise: n, points: 3}", True),
+        ("shots: 1", "scan: {use: climb, step: 0.5, over: {a.b: {from: 1 us, to: 9 us}}, minimise: n}", True),
+        ("shots: 1", "scan: {use: climb, over: {a.b: {from: 1, to: 9}}}", False),
+        ("shots: 1", "scan: {use: climb, over: {a.b: {from: 1, to: 9}}, maximise: n, minimise: m}", False),
+        ("shots: 1", "scan: {use: climb, over: {a.b: {from: 1}}, maximise: n}", False),
+        ("shots: 1", "scan: {use: climb, over: {a.b: [1, 9]}, maximise: n}", False),
+        ("shots: 1", "scan: {use: climb, over: {}, maximise: n}", False),
+        ("shots: 1", "scan: {use: climb, maximise: n}", False),
+        ("shots: 1", "scan: {use: climbs, over: {a.b: {from: 1, to: 9}}, maximise: n}", False),
+        ("shots: 1", "scan: {use: climb, stepp: 1, over: {a.b: {from: 1, to: 9}}, maximise: n}", False),
+        ("shots: 1", "scan: {use: climb, step: = 1/2, over: {a.b: {from: 1, to: 9}}, maximise: n}", False),
+        ("{image: {}}", "{image: {}, policy: {timeout: 1 s, retries: 2, on_failure: stop}}", True),
+        ("{image: {}}", "{name: x, image: {}, policy: {over_budget: warn}}", True),
+        ("{image: {}}", "{image: {}, policy: }", True),
+        ("{image: {}}", "{image: {}, policy: {retry: 2}}", False),
+        ("{image: {}}", "{image: {}, policy: {on_failure: ignore}}", False),
+        ("{image: {}}", "{policy: {retries: 2}}", False),
+        ("{image: {}}", "{name: x, policy: {retries: 2}}", False),
+        ("{image: {}}", "{image: {}, load: {}, name: x, policy: {retries: 2}}", False),
+        ("shots: 1", "shots: 1\npolicy: {used_up: skip_point, checks: [{value: n, at_least: 1}]}", True),
+        ("shots: 1", "shots: 1\npolicy: {checks: [{at_least: 1}]}", False),
+        ("shots: 1", "shots: 1\nvariables: {t: 20 ms, n: 3, f: 1.5 MHz, x: = 2 * variables.n}", True),
+        ("shots: 1", "shots: 1\nvariables: {t: long}", False),
+        ("shots: 1", "shots: 1\nvariables: [20 ms]", False),
+        ("shots: 1", "shots: = 2 * 3", True),
+        ("{load: {}}", "{load: {duration: = 2 * variables.t}}", True),
+        ("{load: {}}", "{load: = variables.t}", False),
+        ("{load: {}}", "{rearrange: {cycles: 2, window: [20 ms, = variables.t], stop_when: = 1}}", False),
+        ("{load: {}}", "{rearrange: {cycles: 2, window: [20 ms, = variables.t]}}", True),
+        ("rows: 5", "rows: = variables.n", True),
+        ("rows: 5", "rows: == variables.n", False),
         ("shots: 1\n", "", False),
         ("shots: 1", "shots: 1\nanalysis: [{use: survival, atoms: moved, finish_within: 5 s}]", True),
         ("shots: 1", "shots: 1\nanalysis: [{use: survival, atoms: some}]", False),
@@ -151,6 +184,26 @@ def test_sequences_with_plugins(old: str, new: str, good: bool, is_valid: Valid)
     node = compose(GOOD.replace(old, new, 1), "x")
     assert node is not None
     assert is_valid("sequence", node.plain()) is good
+
+
+@pytest.mark.parametrize(
+    ("more", "good"),
+    [
+        ("variables: {t: 20 ms}", True),
+        ("budgets: {plan: 5 ms, write: = variables.t}", True),
+        ("budgets: {planning: 5 ms}", False),
+        ("timeouts: {load: 3 s}", True),
+        ("timeouts: {load: = 2 * timeouts.plan, plan: 1 s}", True),
+        ("timeouts: {load: 3 um}", False),
+        ("policy: {on_failure: stop}", False),
+    ],
+)
+def test_profiles_with_more(more: str, good: bool, is_valid: Valid) -> None:
+    text = (ROOT / "hardware_profiles" / "virtual.yaml").read_text(encoding="utf-8")
+    profile, further = compose(text, "x"), compose(more, "y")
+    assert profile is not None
+    assert further is not None
+    assert is_valid("profile", {**profile.plain(), **further.plain()}) is good
 
 
 def test_a_bare_name_is_told_once(registry: Registry) -> None:
