@@ -157,7 +157,7 @@ def test_one_problem(text: str, expected: list[str]) -> None:
         ("  window: {}", f"3:11: window is a mapping; expected {TIME}"),
         ("  window: [1, 2 K]", f"3:15: window.1: '2 K' is a temperature, not a time; expected {TIME}"),
         ("  window: [1, -2]", "3:15: window.1 is -2; expected at least 0"),
-        ("  shape: noen", "3:10: shape is 'noen'; expected 'none'; did you mean 'none'?"),
+        ("  shape: noen", "3:10: shape is 'noen'; expected 'none'"),
         ("  shape: {count: 0}", "3:18: count is 0; expected at least 1"),
         ("  pet: {kind: cow}", "3:15: kind is 'cow'; expected 'cat', 'dog'"),
         ("  pet: {lives: 1}", "3:8: 'kind' is missing from 'pet'"),
