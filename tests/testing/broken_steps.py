@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from labseq.errors import StopRequested
+from labseq.errors import DeviceError, StopRequested
 from labseq.model import TimelineEntry
 from labseq.roles import Shot, StepContext
 from labseq.testing import StepContract
@@ -73,6 +73,32 @@ class TakesAnotherImage(Right):
         shot.take_image(0.045)
 
 
+class Again(Right):
+    """Right: may be tried again."""
+
+    repeatable: Any = True
+
+
+class RepeatsALot(Again):
+    repeatable = 3
+
+
+class LowersTheTweezers(Again):
+    def run(self, shot: Shot) -> None:
+        shot.static_tweezers.ramp(0.5, 0.0)
+        super().run(shot)
+
+
+class WorksOnce(Again):
+    has_run = False
+
+    def run(self, shot: Shot) -> None:
+        if self.has_run:
+            raise DeviceError("shutter", "is open already")
+        super().run(shot)
+        self.has_run = True
+
+
 class HearsNothing(Right):
     def run(self, shot: Shot) -> None:
         try:
@@ -92,6 +118,9 @@ PLANTED = Planted(
         (KnowsItsImagesLater, "test_declares_its_images"),
         (TakesLonger, "test_keeps_its_timeline"),
         (TakesAnotherImage, "test_keeps_its_timeline"),
+        (RepeatsALot, "test_runs_again"),
+        (LowersTheTweezers, "test_runs_again"),
+        (WorksOnce, "test_runs_again"),
         (HearsNothing, "test_hears_a_stop_request"),
         (PlansInWords, "test_lays_out_its_timeline"),
     ),

@@ -1,5 +1,7 @@
 """Static and mobile tweezers that break one promise each."""
 
+import os
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -137,6 +139,29 @@ class WaitsToTheEnd(RecordingMobileTweezers):
         super().wait(3600.0)
 
 
+class TellsItsTimings(RecordingMobileTweezers):
+    """Right: tells how long it took."""
+
+    def timings(self) -> Any:
+        return {"render": 0.0, "upload": 1e-9}
+
+
+class TellsMilliseconds(TellsItsTimings):
+    def timings(self) -> Any:
+        return {"render": 1e3}
+
+
+class TellsPairs(TellsItsTimings):
+    def timings(self) -> Any:
+        return [("render", 0.0)]
+
+
+class AsksTheCard(TellsItsTimings):
+    def timings(self) -> Any:
+        Path(os.devnull).read_bytes()
+        return super().timings()
+
+
 MOBILE = Planted(
     MobileTweezersContract(),
     RecordingMobileTweezers,
@@ -148,6 +173,9 @@ MOBILE = Planted(
         (StaysPrepared, "test_refuses_play_without_prepare"),
         (FailsOnNothing, "test_takes_an_empty_program"),
         (LooksWhenItPlays, "test_refuses_what_exceeds_limits"),
+        (TellsMilliseconds, "test_tells_its_timings"),
+        (TellsPairs, "test_tells_its_timings"),
+        (AsksTheCard, "test_tells_its_timings"),
         (WaitsToTheEnd, "test_keeps_timeouts"),
     ),
 )

@@ -117,5 +117,13 @@ def test_an_empty_program_may_be_refused() -> None:
     assert failed_tests(MobileTweezersContract(), WantsTones) == {}
 
 
-def test_a_scanner_may_stop() -> None:
-    assert failed_tests(broken_scanners.Suite(), broken_scanners.Stops) == {}
+@pytest.mark.parametrize(
+    ("kind", "plugin"),
+    [
+        ("scanner", broken_scanners.Stops),
+        ("step", broken_steps.Again),
+        ("mobile_tweezers", broken_tweezers.TellsItsTimings),
+    ],
+)
+def test_what_a_plugin_may_do_besides(kind: str, plugin: Factory) -> None:
+    assert failed_tests(ALL[kind].suite, plugin) == {}

@@ -5,16 +5,21 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import ClassVar
+from time import perf_counter
+from typing import Any, ClassVar, Final, cast
 
 import numpy as np
 
 from labseq.errors import DeviceError, LimitError
 from labseq.model import Plan, ToneProgram
 from labseq.motion import tone_program
-from labseq.roles import MobileTweezers
+from labseq.roles import MobileTweezers, Timed
 from labseq.testing.contracts.hardware import Action, Factory, HardwareContract, Wait
+from labseq.testing.contracts.process import quietly
 from labseq.testing.contracts.promises import doing, promise, refusal
+
+CLOCK_S: Final = 0.05
+"""Two clocks of a computer may differ by that."""
 
 
 class MobileTweezersContract(HardwareContract[MobileTweezers]):
@@ -126,6 +131,25 @@ class MobileTweezersContract(HardwareContract[MobileTweezers]):
             tweezers.prepare(self.program())
             tweezers.safe_state()
             refusal(DeviceError, "play() after safe_state()", tweezers.play)
+
+    @promise(
+        "timings(), if there is one, gives the seconds that parts of the last prepare() took, without I/O"
+    )
+    def test_tells_its_timings(self, factory: Factory[MobileTweezers]) -> None:
+        """They are recorded for every cycle, in the middle of a shot."""
+        with self.opened(factory) as (tweezers, _):
+            if not isinstance(tweezers, Timed):
+                return
+            start_s = perf_counter()
+            tweezers.prepare(self.program())
+            limit_s = perf_counter() - start_s + CLOCK_S
+            with quietly():
+                timings: Any = tweezers.timings()
+            assert isinstance(timings, Mapping), f"timings() gave a {type(timings).__name__}"
+            for part, taken_s in cast("Mapping[Any, Any]", timings).items():
+                assert isinstance(part, str), f"timings() names a part {part!r}; expected text"
+                told = f"timings() tells {taken_s!r} s for '{part}'; prepare() took {limit_s:.2g} s at most"
+                assert 0.0 <= taken_s <= limit_s, told
 
     @promise("an empty program is played, or refused with LimitError")
     def test_takes_an_empty_program(self, factory: Factory[MobileTweezers]) -> None:

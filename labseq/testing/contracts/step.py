@@ -4,23 +4,29 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
-from typing import Any, Final, TypeAlias
+from typing import Any, Final, TypeAlias, cast
 
 import numpy as np
 import pytest
 
 from labseq.errors import StopRequested
 from labseq.model import ShotRecord, TimelineEntry
-from labseq.roles import Step, StepContext
+from labseq.roles import Repeatable, Step, StepContext
 from labseq.sequencer.guard import Guard
 from labseq.sequencer.shot import RunningShot
 from labseq.testing.contracts.process import quietly
-from labseq.testing.contracts.promises import BrokenPromise, no_factory, promise, refusal
+from labseq.testing.contracts.promises import BrokenPromise, doing, no_factory, promise, refusal
 from labseq.testing.fakes import FakeLab, fake_lab
 
 Factory: TypeAlias = Callable[[], Step]
 
 TIMELINE: Final = "the timeline is known beforehand: labelled bars with 0 <= least_s <= duration_s"
+
+
+_MOVE_ATOMS: Final = frozenset(
+    {"mobile_tweezers.play", "static_tweezers.load", "static_tweezers.ramp", "simulation.load"}
+)
+"""Calls after which atoms may be elsewhere, lost, or more."""
 
 
 class StepContract:
@@ -79,6 +85,23 @@ class StepContract:
         planned_s, n_planned = sum(bar.duration_s for bar in bars), sum(bar.n_images for bar in bars)
         assert taken_s <= planned_s + 1e-6 or not planned_s, f"it took {taken_s} s; planned {planned_s} s"
         assert n_taken <= n_planned, f"it took {n_taken} images; planned {n_planned}"
+
+    @promise("a step that is `repeatable` leaves the atoms alone, and runs again in the same shot")
+    def test_runs_again(self, factory: Factory) -> None:
+        """So that a failed try can be followed by another one; steps that say nothing are not repeatable."""
+        step = factory()
+        if not isinstance(step, Repeatable):
+            return
+        assert isinstance(cast("Any", step.repeatable), bool), f"repeatable is {step.repeatable!r}"
+        if not step.repeatable:
+            return
+        with self.shot() as (shot, lab):
+            before = len(lab.calls.names())
+            for count in ("first", "second"):
+                with doing(f"the {count} run"):
+                    step.run(shot)
+            done = [name for name in lab.calls.names()[before:] if name in _MOVE_ATOMS]
+            assert not done, f"it is repeatable, and called {', '.join(dict.fromkeys(done))}"
 
     @promise("a stop request ends it with StopRequested")
     def test_hears_a_stop_request(self, factory: Factory) -> None:
