@@ -11,11 +11,14 @@ from pathlib import Path
 import pytest
 from labseq_andor.library import load_pylablib
 from labseq_frames.picture import BadFramesError, load
+from labseq_optuna.scanner import OptunaScanner, OptunaSettings
 from labseq_pylon.library import load_pypylon
 
+import labseq.testing
 from labseq.config.drawings import read_drawing
 from labseq.drawing import check_place
 from labseq.errors import LabseqError
+from labseq.model import ScanSpace
 from labseq.recording.export import check_export
 from labseq.recording.shot_file import _bitshuffle
 
@@ -33,9 +36,12 @@ NEEDS: dict[tuple[str, str, str], Callable[[], object]] = {
     ("compress", "hdf5plugin", "hdf5plugin"): _bitshuffle,
     ("frames", "tifffile", "tifffile"): lambda: load("tifffile", "tifffile", Path("a.tif")),
     ("frames", "pillow", "PIL.Image"): lambda: load("PIL.Image", "Pillow", Path("a.png")),
+    ("optuna", "optuna", "optuna"): lambda: OptunaScanner(OptunaSettings(), ScanSpace((), 1)),
     ("plot", "matplotlib", "matplotlib"): lambda: check_place(Path("a.png")),
     ("plot", "pillow", "PIL"): lambda: read_drawing(ROOT / "docs" / "_static" / "plan_kagome.png", "#"),
     ("pylon", "pypylon", "pypylon.pylon"): lambda: load_pypylon("camera"),
+    ("testing", "hypothesis", "hypothesis"): lambda: labseq.testing.CameraContract,
+    ("testing", "pytest", "pytest"): lambda: labseq.testing.CameraContract,
 }
 
 
@@ -44,7 +50,7 @@ def test_what_to_install(case: tuple[str, str, str], monkeypatch: pytest.MonkeyP
     extra, distribution, module = case
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises((LabseqError, BadFramesError)) as caught:
+    with pytest.raises((LabseqError, BadFramesError, ModuleNotFoundError)) as caught:
         NEEDS[case]()
     told = str(caught.value)
     assert f"labseq[{extra}]" in told

@@ -16,13 +16,14 @@ has read the settings. Each failure names the promise that was broken.
 
 ``SUITES`` has the suite of each kind of plugin; ``docs/reference/testing.md`` lists all promises.
 
-Never imported at run time: needs pytest and hypothesis. Names are resolved when
-they are first used, because pytest loads this package wherever labseq is installed.
+Never imported at run time: needs pytest and hypothesis (``pip install "labseq[testing]"``). Names are
+resolved when they are first used, because pytest loads this package wherever labseq is installed.
 """
 
 from __future__ import annotations
 
 import importlib
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
@@ -64,11 +65,15 @@ _MODULES: Final = ("fakes", "strategies")
 
 
 def __getattr__(name: str) -> Any:
+    if name not in (*_MODULES, *_CONTRACTS):
+        raise AttributeError(f"module 'labseq.testing' has no attribute '{name}'")
+    for package in ("pytest", "hypothesis"):
+        if find_spec(package) is None:
+            text = f'labseq.testing needs {package}; install it with: pip install "labseq[testing]"'
+            raise ModuleNotFoundError(text, name=package)
     if name in _MODULES:
         return importlib.import_module(f"labseq.testing.{name}")
-    if name in _CONTRACTS:
-        return getattr(importlib.import_module("labseq.testing.contracts"), name)
-    raise AttributeError(f"module 'labseq.testing' has no attribute '{name}'")
+    return getattr(importlib.import_module("labseq.testing.contracts"), name)
 
 
 def __dir__() -> list[str]:
