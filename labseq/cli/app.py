@@ -204,7 +204,7 @@ def plugins(
             "--profile",
             "-p",
             metavar="NAME|FILE",
-            help="Also look in this profile's plugin folders.",
+            help="Look in this profile's plugin folders, not in ./plugins.",
             autocompletion=profile_names,
         ),
     ] = None,

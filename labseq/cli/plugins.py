@@ -10,6 +10,7 @@ from labseq.cli.show import as_line
 from labseq.config import load_profile, plugin_paths
 from labseq.plugins import PluginHost, PluginInfo
 from labseq.registry import LOAD_S
+from labseq.scaffolds import PLUGINS
 from labseq.session import load_plugins
 
 
@@ -17,7 +18,8 @@ def list_plugins(profile: str | None, *, as_json: bool = False) -> None:
     """Print a table of the plugins.
 
     Args:
-        profile: Name or path of a profile whose plugin folders are searched too.
+        profile: Name or path of a profile whose plugin folders are searched too; without one, it is the
+            folder ``plugins``, if there is one.
         as_json: Whether to print one line of JSON instead.
 
     Raises:
@@ -57,6 +59,6 @@ def _values(host: PluginHost, info: PluginInfo) -> dict[str, Any]:
 def _folders(profile: str | None) -> tuple[list[Path], float]:
     """The profile's plugin folders and patience; the plugins that it names need not exist for that."""
     if profile is None:
-        return [], LOAD_S
+        return [path for path in (Path(PLUGINS),) if path.is_dir()], LOAD_S
     document, spec = load_profile(profile, beside=Path())
     return plugin_paths(document, spec.plugin_folders), spec.timeouts.load
