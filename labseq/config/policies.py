@@ -39,7 +39,7 @@ class CheckSettings(Settings):
 
     value: Text = Field(
         description="name of the value, as `labseq export` calls it: `filling_fraction`, `n_missing_atoms`, "
-        "`stage.plan`, `reading.laser.power_w`"
+        "`stage.plan_s`, `reading.laser.power_w`"
     )
     at_least: float | None = Field(default=None, description="smallest mean that is let pass, SI")
     at_most: float | None = Field(default=None, description="largest mean that is let pass, SI")

@@ -10,7 +10,7 @@ from labseq.recording.active import (
     runs_in_progress,
 )
 from labseq.recording.reader import Run, open_run
-from labseq.recording.row_values import value_in
+from labseq.recording.row_values import figures_in
 from labseq.recording.shot import Shot
 from labseq.recording.writer import RunWriter
 
@@ -21,10 +21,10 @@ __all__ = [
     "clear_active",
     "data_root",
     "died",
+    "figures_in",
     "lock_files",
     "mark_active",
     "marker_roots",
     "open_run",
     "runs_in_progress",
-    "value_in",
 ]

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 from labseq.errors import RecordingError
 from labseq.model import TargetPattern
@@ -18,7 +18,7 @@ from labseq.recording.chosen_points import SCANNER, completed
 from labseq.recording.durable import read_lines
 from labseq.recording.plain import to_plain
 from labseq.recording.results import rows_of
-from labseq.recording.run_file import is_index_row, read_run, read_state, target_of
+from labseq.recording.run_file import is_index_row, is_skip_row, read_run, read_state, target_of
 from labseq.recording.shot import Shot, load_content
 
 if TYPE_CHECKING:
@@ -56,17 +56,15 @@ def open_run(path: str | Path) -> Run:
         shots=tuple(Shot(folder / row["file"], row, load) for _, row in sorted(counted.items())),
         attempts=tuple(Shot(folder / row["file"], row, load) for row in usable if not row["counts"]),
         n_damaged_lines=len(damaged) + len(rows) - len(usable),
-        skipped=_skipped(folder),
+        skipped=_skipped(folder, record["n_shots"]),
     )
 
 
-def _skipped(folder: Path) -> dict[int, str]:
+def _skipped(folder: Path, n_shots: int) -> dict[int, str]:
     found = dict[int, str]()
     for line in read_lines(folder / folders.SKIPPED_FILE)[0]:
-        shots = line.get("shots")
-        if isinstance(shots, list):
-            indices = [shot for shot in cast("list[Any]", shots) if isinstance(shot, int)]
-            found |= dict.fromkeys(indices, str(line.get("why") or ""))
+        if is_skip_row(line, n_shots):
+            found |= dict.fromkeys(line["shots"], line["why"])
     return found
 
 

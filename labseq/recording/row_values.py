@@ -1,8 +1,7 @@
-"""A value of a shot by the name that its column has, from its line in the index."""
+"""The numbers of a shot by the names that their columns have, from its line in the index."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,19 +10,18 @@ from labseq.recording.columns import figures_of
 from labseq.recording.shot import Shot, load_content
 
 
-def value_in(row: Mapping[str, Any], name: str) -> float:
-    """A value of a shot.
+def figures_in(row: Mapping[str, Any]) -> dict[str, float]:
+    """The numbers that came of a shot.
 
     Args:
         row: The shot's line in the index.
-        name: As :meth:`labseq.Run.to_dataframe` calls its column: "filling_fraction", "stage.plan_s",
-            "reading.laser.power_w".
 
     Returns:
-        The value; nan if the shot has none of that name, or one that is no number.
+        Name -> value, as :meth:`labseq.Run.to_dataframe` calls its column: "filling_fraction",
+        "stage.plan_s", "reading.laser.power_w". No nan is among them.
 
     Example:
-        >>> value_in({"shot": 0, "filling_fraction": 0.5, "stage_s": {"plan": 0.1}}, "stage.plan_s")
-        0.1
+        >>> figures_in({"shot": 0, "filling_fraction": 0.5, "stage_s": {"plan": 0.1}})
+        {'filling_fraction': 0.5, 'stage.plan_s': 0.1}
     """
-    return figures_of(Shot(Path(), dict(row), load_content)).get(name, math.nan)
+    return figures_of(Shot(Path(), dict(row), load_content))

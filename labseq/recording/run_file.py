@@ -199,3 +199,11 @@ def index_row(
 def is_index_row(row: Mapping[str, Any]) -> bool:
     """Whether a line of the index holds what a run cannot be shown without; other values may be missing."""
     return all(name in row and isinstance(row[name], kind) for name, kind in _IN_INDEX.items())
+
+
+def is_skip_row(row: Mapping[str, Any], n_shots: int) -> bool:
+    """Whether a line of skipped.jsonl names shots of a run, and says why they were left out."""
+    shots, why = row.get("shots"), row.get("why")
+    if not isinstance(shots, list) or not isinstance(why, str):
+        return False
+    return all(type(shot) is int and 0 <= shot < n_shots for shot in cast("list[Any]", shots))

@@ -181,6 +181,8 @@ class RunWriter:
         t_utc = datetime.now(UTC).isoformat(timespec="microseconds")
         log = LineLog(self.run_dir / folders.SKIPPED_FILE)
         log.append({"shots": list(shots), "why": why, "t_utc": t_utc}, sync=True)
+        with explained(self.run_dir):
+            sync_folder(self.run_dir)  # it may be the first
 
     def _free_name(self, shot: ShotRecord, *, counts: bool) -> str:
         """The name of a shot's file; none that the run had before it was resumed."""

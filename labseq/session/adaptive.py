@@ -10,23 +10,19 @@ from typing import Any, Final
 from labseq.config import Collected
 from labseq.config.adaptive import SCANNER_KEYS, Adaptive, Ends
 from labseq.config.scan import Axis
-from labseq.config.wording import clean, did_you_mean, listing
+from labseq.config.wording import clean
 from labseq.errors import ConfigError
 from labseq.model import ScanRange, ScanSpace
 from labseq.recording.chosen_points import SCANNER
-from labseq.recording.columns import FIGURES
 from labseq.roles import Step
 from labseq.session.choosing import Chosen, resolve
 from labseq.session.constructing import construct_one
+from labseq.session.figure_names import check_figure
 from labseq.session.scan import Point, Scanned
 from labseq.units import written
 
-_JUDGED: Final = frozenset(
-    {"success", "filling_fraction", "n_defects", "n_surplus", "seen_defect_free_cycle"}
-)
-"""Figures that only a shot with an image has."""
-_UNFORESEEN: Final = ("reading.", "stage.")
-"""What the names of figures begin with that only a shot can tell."""
+CLIMBED: Final = "to climb on"
+"""What the figure of an adaptive scan is for."""
 
 Steps = Sequence[tuple[str, Step]]
 
@@ -114,7 +110,7 @@ def make_search(scanned: Scanned, planner: Chosen, steps: Steps, found: Collecte
         return None
     n_before, document = len(found.problems), scanned.document
     with found:
-        _check_figure(scanned, adaptive, steps)
+        check_figure(document, adaptive.aim, adaptive.figure, CLIMBED, steps)
     chosen: Chosen | None = None
     with found:
         chosen = resolve(scanned.bench.host, document, "scanner", adaptive.choice, SCANNER_KEYS)
@@ -131,17 +127,6 @@ def make_search(scanned: Scanned, planner: Chosen, steps: Steps, found: Collecte
     with found:
         construct_one(chosen, search.space(0))
     return search
-
-
-def _check_figure(scanned: Scanned, adaptive: Adaptive, steps: Steps) -> None:
-    figure, document = adaptive.figure, scanned.document
-    if figure not in FIGURES and not figure.startswith(_UNFORESEEN):
-        what = f"there is no figure '{clean(figure)}' to climb on"
-        known = [*FIGURES, "reading.<name>", "stage.<name>_s"]
-        raise document.error(adaptive.aim, what, listing(known), did_you_mean(figure, FIGURES))
-    if figure in _JUDGED and not any(step.takes_image for _, step in steps):
-        what = f"no shot has a {figure}: it takes no image"
-        raise document.error(adaptive.aim, what, "an 'image' step in the shot, or another figure")
 
 
 def _range(axis: Axis, ends: Ends, resolved: tuple[Any, Any], present: Any, name: str) -> ScanRange:

@@ -8,12 +8,12 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
 
-from labseq.config.wording import clean, did_you_mean, listing
 from labseq.model import VisitedPoint
 from labseq.recording import Shot
 from labseq.recording.columns import figures_of
 from labseq.recording.plain import dumps
-from labseq.session.adaptive import Search
+from labseq.session.adaptive import CLIMBED, Search
+from labseq.session.figure_names import missing_figure
 
 
 @dataclass(slots=True)
@@ -55,6 +55,11 @@ class Results:
     _n_counted: int = 0
     _warned: bool = False
 
+    @property
+    def is_empty(self) -> bool:
+        """Whether no shot has been tried."""
+        return not (self.shots or self._given_up)
+
     def add(self, shot: Shot) -> None:
         """Take in one more."""
         self.shots[shot.index] = shot
@@ -84,9 +89,7 @@ class Results:
         if self._warned or figure in figures:
             return ""
         self._warned = True
-        hint = did_you_mean(figure, figures)
-        known = f"it has {listing(list(figures))}"
-        return f"shot {shot + 1} has no '{clean(figure)}' to climb on ({hint or known})"
+        return missing_figure(shot, figure, CLIMBED, figures)
 
     def told(self, visit: int) -> dict[str, Any]:
         """A point and the best one so far, JSON-ready, for the run's events."""

@@ -86,7 +86,7 @@ class AdaptiveCourse(Course):
         """Indices of the shots to take at most; none if the scanner wants no more."""
         if not self._missing or self._point_of(self._missing[0]) is not None:
             return self._missing
-        if not self._results.shots:
+        if self._results.is_empty:
             raise DeviceError(self._search.name, "next_point() gave no point at all; expected a first one")
         return []
 
@@ -124,7 +124,7 @@ class AdaptiveCourse(Course):
 
     def run(self, sequencer: Sequencer, lab: Lab, changes: Mapping[str, Any], between: Between) -> None:
         """Take shots until there are no more, or the scanner wants none."""
-        before, skipped = self.first, set[int]()
+        before, skipped = self.first, set(self._skip_before(between))
         for shot in self.shots:
             if shot in skipped:
                 continue
@@ -139,6 +139,9 @@ class AdaptiveCourse(Course):
             given_up = sequencer.run([shot])
             self._note(shot)
             skipped.update(self._skip(shot, given_up, between))
+            if skipped.issuperset(self._later_at_its_point(shot)):
+                visit = shot // self._search.scanned.scan.repeats
+                self._tell("scan_point", self._results.told(visit))
 
     def _later_at_its_point(self, shot: int) -> list[int]:
         repeats = self._search.scanned.scan.repeats
@@ -166,7 +169,7 @@ class AdaptiveCourse(Course):
         return self._at[1]
 
     def _note(self, shot: int) -> None:
-        """Take in what came of a shot; tell of its point once that is done."""
+        """Take in what came of a shot."""
         assert self._writer is not None
         row = self._writer.last_row
         if not row["counts"]:
@@ -175,9 +178,6 @@ class AdaptiveCourse(Course):
         self._results.add(Shot(self._writer.run_dir / row["file"], json.loads(dumps(row)), load_content))
         if warning := self._results.missing_figure(shot):
             self._tell("warning", {"text": warning})
-        repeats = self._search.scanned.scan.repeats
-        if (shot + 1) % repeats == 0 or shot + 1 == self.assembly.sequence.shots:
-            self._tell("scan_point", self._results.told(shot // repeats))
 
 
 def point_of(assembly: Assembly, shot: Shot, course: Course) -> Point:

@@ -26,6 +26,14 @@ class Between:
         self._checks = checks
         self._emit = emit
 
+    @property
+    def left_open(self) -> tuple[int, str]:
+        """The last shot of the run as it was before, and why the others of its point are to be skipped.
+
+        That is "" if they are not. It may have been put down then, or not.
+        """
+        return self._checks.left_open
+
     def before(self) -> None:
         """Before a shot.
 

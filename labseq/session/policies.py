@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
 from labseq.config import CheckSettings, Collected, Document, SequenceSpec, StepPolicySettings, StepSpec
 from labseq.errors import CheckFailedError
-from labseq.recording import value_in
+from labseq.recording import figures_in
 from labseq.roles import Repeatable, Step
 from labseq.sequencer.policies import RunPolicy, StepPolicy
+from labseq.session.figure_names import check_figure, missing_figure
+
+_CHECKED: Final = "to check"
 
 
 def make_policy(
@@ -40,9 +44,12 @@ def make_policy(
             hint = "write 'on_failure: repeat_shot'"
             found.add(document.error((*spec.policy_loc, "retries"), what, "0", hint, key=True))
     for number, check in enumerate(own.checks):
+        place = "policy", "checks", number
+        with found:
+            check_figure(document, (*place, "value"), check.value, _CHECKED, steps if is_whole else None)
         if check.then == "skip_point" and sequence.scan is None:
             what = "there is no scan whose points could be skipped"
-            found.add(document.error(("policy", "checks", number, "then"), what, "'warn' or 'stop'"))
+            found.add(document.error((*place, "then"), what, "'warn' or 'stop'"))
     return RunPolicy(sequence.attempts, own.used_up, otherwise, tuple(policies))
 
 
@@ -90,6 +97,9 @@ class Checks:
         checks: What the sequence asks for.
         rows: The index's lines of the shots that were taken before, in order.
         warn: Told what is let pass with a warning.
+
+    Attributes:
+        left_open: The last of these shots, and why a check would skip the rest of its point, or "".
     """
 
     def __init__(
@@ -100,8 +110,12 @@ class Checks:
     ) -> None:
         self._checks = [(check, deque[float](maxlen=check.shots)) for check in checks]
         self._warn = warn
+        self._unseen = {check.value for check in checks}
+        self.left_open = -1, ""
         for row in rows:
-            self._look(row)  # what came of it was done then
+            skipping = [told for check, told in self._look(row) if check.then == "skip_point"]
+            self.left_open = row["shot"], skipping[0] if skipping else ""  # the rest was done then
+            self._unseen.clear()  # said then
 
     def after(self, row: Mapping[str, Any]) -> str:
         """Look at a shot that was taken.
@@ -116,6 +130,7 @@ class Checks:
             CheckFailedError: A value is beyond the limits of a check that stops the run.
         """
         skipped = ""
+        self._tell_unseen(row)
         for check, told in self._look(row):
             if check.then == "stop":
                 raise CheckFailedError(told, check.value)
@@ -125,11 +140,19 @@ class Checks:
                 self._warn(f"shot {row['shot'] + 1}: {told}")
         return skipped
 
+    def _tell_unseen(self, row: Mapping[str, Any]) -> None:
+        """Tell, after the first shot, of the values that it has not: their names may be misspelt."""
+        figures = figures_in(row) if self._unseen else {}
+        for value in sorted(self._unseen.difference(figures)):
+            self._warn(missing_figure(row["shot"], value, _CHECKED, figures))
+        self._unseen.clear()
+
     def _look(self, row: Mapping[str, Any]) -> list[tuple[CheckSettings, str]]:
         """The checks that a shot breaks, and what is wrong."""
         broken: list[tuple[CheckSettings, str]] = []
+        figures = figures_in(row) if self._checks else {}
         for check, values in self._checks:
-            values.append(value_in(row, check.value))
+            values.append(figures.get(check.value, math.nan))
             if told := _beyond(check, values):
                 broken.append((check, told))
                 values.clear()  # said once, and then again after as many shots

@@ -84,7 +84,7 @@ class Course:
             LabseqError: Whatever ended the run before its last shot.
         """
         now, before = self.points[self.shots[0]], self.first
-        skipped = set[int]()
+        skipped = set(self._skip_before(between))
         for shot in self.shots:
             if shot in skipped:
                 continue
@@ -96,6 +96,13 @@ class Course:
                 now, before = point, after
             given_up = sequencer.run([shot])
             skipped.update(self._skip(shot, given_up, between))
+
+    def _skip_before(self, between: Between) -> list[int]:
+        """Put down what should have been, had the run not died right after its last shot."""
+        shot, why = between.left_open
+        left = self._later_at_its_point(shot) if why else []
+        between.skip(left, why)
+        return left
 
     def _skip(self, shot: int, given_up: Mapping[int, str], between: Between) -> list[int]:
         """Put down what is left out after a shot."""

@@ -41,13 +41,13 @@ def copied(template: Path, root: Path) -> Path:
 
 def contents(root: Path) -> list[bytes]:
     """What is in all files, but for what the doctor itself writes."""
-    skipped = ("doctor.jsonl", "index.jsonl", "events.jsonl", "STATE", ".lock")
-    return sorted(p.read_bytes() for p in root.rglob("*") if p.is_file() and p.name not in skipped)
+    left_out = ("doctor.jsonl", "index.jsonl", "events.jsonl", "skipped.jsonl", "STATE", ".lock")
+    return sorted(p.read_bytes() for p in root.rglob("*") if p.is_file() and p.name not in left_out)
 
 
 def lines_of(root: Path) -> list[bytes]:
-    """All lines of all indices and event logs, those in quarantine among them."""
-    names = ("index.jsonl", "events.jsonl")
+    """All lines of all indices and logs, those in quarantine among them."""
+    names = ("index.jsonl", "events.jsonl", "skipped.jsonl")
     found = [line for p in root.rglob("*.jsonl") if p.name in names for line in p.read_bytes().split(b"\n")]
     return sorted(line for line in found if line)
 
@@ -135,6 +135,10 @@ def torn_events(run_dir: Path) -> None:
     path.write_bytes(b"{}x\n" + path.read_bytes() + b'{"eve')
 
 
+def foreign_skip(run_dir: Path) -> None:
+    (run_dir / "skipped.jsonl").write_bytes(b'{"shots": [4], "why": "no light"}\n{"shots": [true]}\n{"sho')
+
+
 def no_state(run_dir: Path) -> None:
     (run_dir / "STATE").unlink()
 
@@ -187,6 +191,6 @@ def edit_index(run_dir: Path, change: Callable[[list[bytes]], list[bytes]]) -> N
 MENDED = [
     torn_index, unended_line, doubled_line, two_lines_for_a_file, lost_line, lost_index, part_left,
     torn_events, no_state, damaged_state, dead_run, damaged_line, line_of_no_shot, stop_left, holder_left,
-    alien_file, alien_hdf5,
+    alien_file, alien_hdf5, foreign_skip,
 ]  # fmt: skip
 LOST = [flipped_bit, truncated_file, empty_file, lost_file, shot_of_another_run, misnamed_shot]

@@ -238,3 +238,11 @@ def test_importing_the_package_is_light() -> None:
 def test_what_is_no_path_is_no_run(path: Any) -> None:
     with pytest.raises(RecordingError, match="is no path; give a run's folder or a file in it"):
         open_run(path)
+
+
+def test_only_shots_of_the_run_are_skipped(tmp_path: Path, make_run: Any) -> None:
+    writer = RunWriter.create(tmp_path, make_run(n_shots=3))
+    writer.skip([2], "no light")
+    with (writer.run_dir / "skipped.jsonl").open("a", encoding="utf-8") as file:
+        file.write('{"shots": [0, 3], "why": ""}\n{"shots": [true], "why": ""}\n{"shots": 1}\n{"sho')
+    assert open_run(writer.run_dir).skipped == {2: "no light"}

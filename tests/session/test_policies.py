@@ -203,6 +203,11 @@ def test_a_timeout_shorter_than_the_step_is_told(tmp_path: Path) -> None:
         ),
         (
             "{}",
+            {"policy": {"checks": [{"value": "filing_fraction", "at_least": 0.5}]}},
+            "there is no figure 'filing_fraction' to check; expected ",
+        ),
+        (
+            "{}",
             {"policy": {"checks": [{"value": "x", "at_least": 2, "then": "skip_point"}]}},
             "there is no scan whose points could be skipped; expected 'warn' or 'stop'",
         ),
@@ -243,3 +248,58 @@ def test_options_change_policies(tmp_path: Path) -> None:
         assert list(session.run().skipped) == [0]
     with labseq.Session.open(path, seed=5, output=output) as session, pytest.raises(DeviceError):
         session.run()
+
+
+@pytest.mark.parametrize("scan", ["planner", "adaptive"])
+def test_a_run_that_died_before_it_put_down_what_to_skip_skips_it_all_the_same(
+    tmp_path: Path, scan: str
+) -> None:
+    checks = [{"value": "reading.laser.power_w", "at_least": 0.15, "shots": 2, "then": "skip_point"}]
+    path = sequence(tmp_path, scan, policy={"checks": checks})
+    path.write_text(
+        path.read_text(encoding="utf-8").replace("shot.2", "shot.3").replace("repeats: 2", "repeats: 3"),
+        encoding="utf-8",
+    )
+    whole = run(path)
+    assert whole.skipped
+    observer = Interrupting("shots_skipped", 1)
+    with labseq.Session.open(path, seed=5, output=tmp_path / "data", observer=observer) as session:
+        observer.session = session
+        with pytest.raises(labseq.StopRequested):
+            session.run()
+        assert session.run_dir is not None
+    (session.run_dir / "skipped.jsonl").unlink()  # as if it had died a moment before
+    again = resumed(session.run_dir)
+    assert again.skipped == whole.skipped
+    assert table(again) == table(whole)
+
+
+def test_an_adaptive_scan_tells_of_a_point_whose_last_shots_are_skipped(tmp_path: Path) -> None:
+    path = sequence(tmp_path, "adaptive", "{at: [1, 2]}", policy={"on_failure": "skip_point"})
+    path.write_text(path.read_text(encoding="utf-8").replace("shot.2", "shot.3"), encoding="utf-8")
+    seen = RecordingObserver()
+    run(path, seen)
+    told = seen.of("scan_point")
+    assert [(event["point"], event["value"] is None) for event in told] == [(0, False), (1, True), (2, False)]
+
+
+def test_a_value_that_no_shot_has_is_told_once(tmp_path: Path) -> None:
+    checks = [
+        {"value": "reading.laser.pwer_w", "at_least": 0.1},
+        {"value": "stage.plan", "at_most": 0.1},
+        {"value": "stage.plan_s", "at_most": 100},
+    ]
+    seen = RecordingObserver()
+    path = sequence(tmp_path, policy={"checks": checks})
+    observer = Interrupting("shot_started", 3)
+    with labseq.Session.open(path, seed=5, output=tmp_path / "data", observer=observer) as session:
+        observer.session = session
+        with pytest.raises(labseq.StopRequested):
+            session.run()
+    assert [event["text"] for event in observer.of("warning")] == [
+        "shot 1 has no 'reading.laser.pwer_w' to check (did you mean 'reading.laser.power_w'?)",
+        "shot 1 has no 'stage.plan' to check (did you mean 'stage.plan_s'?)",
+    ]
+    assert session.run_dir is not None
+    resumed(session.run_dir, seen)
+    assert seen.of("warning") == []

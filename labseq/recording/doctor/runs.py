@@ -16,7 +16,7 @@ from labseq.recording.doctor.shots import check_shots
 from labseq.recording.durable import parse_object, write_file
 from labseq.recording.plain import dumps
 from labseq.recording.process import Owner
-from labseq.recording.run_file import STATUSES, encode_state, read_run
+from labseq.recording.run_file import STATUSES, encode_state, is_skip_row, read_run
 
 
 def treat_run(run_dir: Path, report: Report, *, dry_run: bool) -> None:
@@ -84,7 +84,7 @@ class _Checked:
         if not (run_dir / folders.RUN_FILE).exists():
             self.ailments.append(_without_run_file(run_dir, shots))
             return
-        run_id = str(read_run(run_dir).get("run_id"))
+        record = read_run(run_dir)
         results = run_dir / folders.RESULTS_FOLDER
         self.ailments += [
             quarantined("half-written", folder / name, run_dir)
@@ -96,15 +96,26 @@ class _Checked:
             what = "a request to stop that nobody followed"
             self.ailments.append(quarantined(what, run_dir / folders.STOP_FILE, run_dir))
         self.ailments += _check_state(run_dir)
-        found = check_shots(run_dir, run_id)
+        found = check_shots(run_dir, str(record.get("run_id")))
         self.n_whole = found.n_whole
         self.ailments += found.ailments
         self.files.append(found.index)
+        self._look_at_skipped(run_dir / folders.SKIPPED_FILE, record["n_shots"])
         logs = [results / name for name in names_in(results) if name.endswith(".jsonl")]
         for path in (run_dir / folders.EVENTS_FILE, *logs):
             file, _, ailments = read_line_file(path)
             self.files.append(file)
             self.ailments += ailments
+
+    def _look_at_skipped(self, path: Path, n_shots: int) -> None:
+        file, lines, ailments = read_line_file(path)
+        self.files.append(file)
+        self.ailments += ailments
+        for line, row in lines:
+            if not is_skip_row(row, n_shots):
+                file.remove(line)
+                what = "a line names no shots of this run, or no reason"
+                self.ailments.append(Ailment(what, path, "moved to quarantine", file.save))
 
     def save(self) -> list[Finding]:
         """Write the files of lines that have changed; what cannot be written is told."""
