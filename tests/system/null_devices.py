@@ -41,7 +41,7 @@ class Null:
 class NullStep:
     needs_image = takes_image = False
 
-    def __init__(self):
+    def __init__(self, settings):
         pass
 
     def plan_timeline(self, context):
@@ -57,7 +57,7 @@ def labseq_register(registry):
     registry.static_tweezers("nothing", Null, virtual_time=True)
     registry.mobile_tweezers("nothing", Null, virtual_time=True)
     registry.detector("nothing", Null)
-    registry.step("null", NullStep)
+    registry.step("nothing", NullStep)
 '''
 PROFILE = """
 labseq: 1
