@@ -69,7 +69,9 @@ def test_copies_can_be_run_and_are_never_replaced(capsys: pytest.CaptureFixture[
     session = Session.open("lab/sequences/lion_head.yaml", profile="lab/hardware_profiles/virtual.yaml")
     assert session.assembly.target.fill.sum() == 177
     Path("lab/sequences/kagome.yaml").unlink()
-    with pytest.raises(ConfigError, match=r"climb_dop_ramp\.yaml: this is there already \(and 17 more files\)"):
+    with pytest.raises(
+        ConfigError, match=r"climb_dop_ramp\.yaml: this is there already \(and 17 more files\)"
+    ):
         demo.copy_files(Path("lab"))
     assert not Path("lab/sequences/kagome.yaml").exists()
 
