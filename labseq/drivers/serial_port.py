@@ -106,4 +106,7 @@ def _reason(error: BaseException) -> str:
         return "you may not; ask for membership of the group that it belongs to (often 'dialout')"
     if number == errno.ENOENT or "FileNotFoundError" in text:
         return f"there is no such port; expected {ports_in_words()}; is it plugged in, and switched on?"
+    first = error.__context__  # termios' own, which has its number among its arguments
+    if number == errno.EISDIR or (first is not None and errno.ENOTTY in first.args):
+        return f"it is no serial port; expected {ports_in_words()}"
     return re.sub(r"^(\[Errno \d+\] )?[Cc]ould not [^:]*: ", "", text)

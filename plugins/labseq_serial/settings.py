@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from typing import Final, Literal, Self
+from urllib.parse import urlsplit
 
 from pydantic import Field, model_validator
 
@@ -119,8 +120,7 @@ class SerialSettings(Settings):
             )
         if self.port is not None and self.usb is not None and self.port != SIMULATED:
             raise misfit("it has both 'port' and 'usb'", "one of them", at=("usb",), key=True)
-        scheme, is_url, rest = (self.port or "").partition("://")
-        if is_url and (scheme not in _SCHEMES or not rest):
+        if "://" in (self.port or "") and not _is_url(self.port or ""):
             known = " or ".join(f"{one}://host:port" for one in _SCHEMES)
             raise misfit(
                 f"'{clean(self.port or '')}' is no port", f"{known}, or a port of this computer", at=("port",)
@@ -203,3 +203,12 @@ def _can_be(text: str, encoding: str) -> bool:
     except UnicodeEncodeError:
         return False
     return True
+
+
+def _is_url(port: str) -> bool:
+    """Whether it is a URL that pyserial can open: it tells what is wrong with one in no words of use."""
+    try:
+        url = urlsplit(port)
+        return url.scheme in _SCHEMES and bool(url.hostname) and bool(url.port)
+    except ValueError:
+        return False

@@ -21,8 +21,11 @@ from labseq_soapy.radio import Facts
 
 OPEN_S: Final = 60.0
 """How long a radio may take to open: some load their firmware."""
-SILENT_S: Final = 10.0
-"""A streaming process that says nothing for so long hangs."""
+SILENT_S: Final = 6.0
+"""A streaming process that says nothing for so long, once the radio is open, hangs.
+
+It is less than labseq waits for any call, so that it is told what hangs.
+"""
 END_S: Final = 3.0
 """How long it may take to end beside its ramp."""
 
@@ -89,8 +92,9 @@ class Link:
 
     @property
     def hangs(self) -> bool:
-        """Whether the process is there, but silent."""
-        return not self._ended and time.monotonic() - self._heard_s > SILENT_S
+        """Whether the process is there, but silent; while the radio is opened it always is."""
+        is_open = self._facts is not None and not self._ended
+        return is_open and time.monotonic() - self._heard_s > SILENT_S
 
     def facts(self) -> Facts:
         """Wait until the radio is open and streams silence; what it says of itself.

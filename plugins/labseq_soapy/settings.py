@@ -2,15 +2,31 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self, TypeAlias
+import math
+from collections.abc import Mapping
+from typing import Annotated, Final, Literal, Self, TypeAlias
 
-from pydantic import Field, PositiveFloat, model_validator
+from pydantic import Field, model_validator
 
 from labseq import Duration, Frequency, Settings
+from labseq.config.fields import misfit
 from labseq.config.profile import FrequencyComb
+from labseq.config.wording import clean, closest
+from labseq.errors import one_of
 
 SIMULATED = "simulated"
 """The device that needs no radio."""
+LEAST: Final[Mapping[str, float]] = {
+    "speed": 1e-4,
+    "buffer": 1e-4,
+    "patience": 0.0,
+    "record": 0.0,
+    "channels": 1.0,
+    "coerce_rate": 0.0,
+}
+"""Arguments of the simulated radio that are numbers, and the least that they may be."""
+WORDS: Final[Mapping[str, tuple[str, ...]]] = {"fault": ("absent",), "folder": ()}
+"""Those that are not, and what they may be; none: anything."""
 
 Channel: TypeAlias = Annotated[int, Field(ge=0, le=15)]
 Rate: TypeAlias = Annotated[Frequency, Field(gt=0)]
@@ -56,7 +72,7 @@ class SoapySettings(Settings):
     clock_source: str = Field(
         default="", description="reference of the radio's clocks, for example `external`; none: its own"
     )
-    max_depth: PositiveFloat = Field(
+    max_depth: Annotated[float, Field(ge=1, allow_inf_nan=False)] = Field(
         default=1.0, description="greatest depth, as a fraction of the nominal depth"
     )
     fade: Annotated[Duration, Field(le=1.0)] = Field(
@@ -80,6 +96,39 @@ class SoapySettings(Settings):
     def is_simulated(self) -> bool:
         """Whether there is no radio; arguments of the simulated one may follow the name, after a comma."""
         return self.device.partition(",")[0] == SIMULATED
+
+    @property
+    def simulated_arguments(self) -> dict[str, str]:
+        """What stands behind the name of a simulated radio."""
+        pairs = (pair.partition("=") for pair in self.device.split(",")[1:])
+        return {key.strip(): value.strip() for key, _, value in pairs}
+
+    @model_validator(mode="after")
+    def _simulated_radio_knows_its_arguments(self) -> Self:
+        if self.is_simulated:
+            for key, value in self.simulated_arguments.items():
+                self._check_argument(key, value)
+        return self
+
+    def _check_argument(self, key: str, value: str) -> None:
+        known = (*LEAST, *WORDS)
+        if key not in known:
+            meant = closest(key, known)
+            hint = f"did you mean '{meant}'?" if meant else ""
+            raise misfit(
+                f"the simulated radio has no argument '{clean(key)}'", one_of(known), hint, at=("device",)
+            )
+        came = f"{key} of the simulated radio is '{clean(value)}'"
+        if (words := WORDS.get(key)) is not None:
+            if not value or (words and value not in words):
+                raise misfit(came, one_of(words) if words else "a folder", at=("device",))
+            return
+        try:
+            number = float(value)
+        except ValueError:
+            number = math.nan
+        if not LEAST[key] <= number < math.inf:
+            raise misfit(came, f"a number, at least {LEAST[key]:g}", at=("device",))
 
     @model_validator(mode="after")
     def _two_outputs(self) -> Self:

@@ -41,8 +41,7 @@ class SimulatedRadio:
     def __init__(self, settings: SoapySettings, world: Simulation | None) -> None:
         self._channels = settings.row_channel, settings.column_channel
         self._world = world if isinstance(world, Listening) else None
-        pairs = (pair.partition("=") for pair in settings.device.split(",")[1:])
-        given = {key.strip(): value.strip() for key, _, value in pairs}
+        given = settings.simulated_arguments
         self.environment = {**os.environ, "SOAPY_SDR_PLUGIN_PATH": str(built())}
         is_ours = "folder" not in given
         self.folder = Path(tempfile.mkdtemp(prefix="labseq-") if is_ours else given["folder"])

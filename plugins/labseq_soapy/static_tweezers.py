@@ -49,7 +49,7 @@ class SoapyStaticTweezers:
         self._tones = ArrayTones(self._name, settings, context.grid.shape)
         self._calibrated = _calibrated(context)
         self._amplitudes: Amplitudes | None = None
-        self._depth = 0.0
+        self._depth: float | None = 0.0  # None: a ramp was broken off
         self._dark = 0
         self._link: Link | None = None
         self._facts: Facts | None = None
@@ -147,10 +147,10 @@ class SoapyStaticTweezers:
         try:
             self._ramp(0.0, self._settings.switch)
         except DeviceError:
-            self._depth = 0.0
             if link.hangs:
                 self._disconnect()
                 raise
+            self._depth = 0.0
 
     def check_interlocks(self) -> None:
         """See whether the stream lives; asked at the start of each shot and before each pick-up.
@@ -199,7 +199,7 @@ class SoapyStaticTweezers:
             with self._in_words():
                 self.simulated_radio = radio = SimulatedRadio(setup, self._world)
             device, environment, folder = radio.device, radio.environment, radio.folder
-        marker = marker_of(device)
+        marker = marker_of(setup.device)  # a simulated radio's own folder is another each time
         end_the_one_alone(self._name, marker, self._clock)
         told = Setup(
             device=device,
@@ -231,13 +231,14 @@ class SoapyStaticTweezers:
         loop = self._tones.samples(self._calibrated if amplitudes is None else amplitudes)
         self._amplitudes, self._is_loaded = amplitudes, True
         self._opened().load(loop, self._settings.fade)
-        if self._depth > 0.0 and self._clock.virtual:
+        if self._depth != 0.0 and self._clock.virtual:
             self._clock.sleep(self._settings.fade)
         self._look()
 
     def _ramp(self, depth: float, duration_s: float) -> None:
-        link, self._depth = self._opened(), depth
+        link, self._depth = self._opened(), None
         link.ramp(depth, duration_s)
+        self._depth = depth
         if self._clock.virtual:
             self._clock.sleep(duration_s)
         self._look()

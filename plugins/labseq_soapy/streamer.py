@@ -148,7 +148,7 @@ class Streamer:
             case "end":
                 self._leave("")
             case "fail":
-                raise SoapyError(message["why"])
+                self._leave(message["why"])
             case _:  # a beat
                 pass
 

@@ -134,11 +134,13 @@ def test_a_second_user_is_told_that_the_port_is_taken(counterpart: Counterpart, 
     ("port", "text"),
     [
         ({"port": "/dev/ttyNOSUCH7"}, "cannot open /dev/ttyNOSUCH7: there is no such port; expected"),
+        ({"port": "/dev/null"}, "cannot open /dev/null: it is no serial port; expected"),
+        ({"port": "/tmp"}, "cannot open /tmp: it is no serial port; expected"),
         (
             {"port": None, "usb": {"vid": 0x0403, "serial": "NOSUCH"}},
             "no USB adapter has vid 0x0403, serial_number",
         ),
-        ({"port": "rfc2217://nonsense"}, "cannot open rfc2217://nonsense: "),
+        ({"port": "rfc2217://localhost:1"}, "cannot open rfc2217://localhost:1: "),
     ],
 )
 def test_a_port_that_is_not_there_is_named(port: dict[str, Any], text: str) -> None:

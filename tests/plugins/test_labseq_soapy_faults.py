@@ -12,12 +12,13 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from labseq_soapy import library
+from labseq_soapy import library, link
 from labseq_soapy.capture import Fault, Ring
 from labseq_soapy.library import SoapyError, stream_error
 from labseq_soapy.streamer import Streamer, repeated
 
 from labseq import DeviceError, TransientError
+from labseq.errors import StopRequested
 
 from .labseq_soapy_rig import another_labseq, depth, made, opened, recorded, until
 
@@ -116,6 +117,35 @@ class TestUnderflow:
             until(lambda: not rig.ring.is_playing)
             os.kill(pid, signal.SIGCONT)
             until(raised(TransientError, rig.tweezers.check_interlocks))
+
+
+class TestRampBrokenOff:
+    """By a stop request: whatever the depth is then, it is not the one that was asked for."""
+
+    def test_downwards_is_no_dark_array_for_the_safe_state(self) -> None:
+        with opened() as rig:
+            rig.tweezers.start()
+            _break_off(rig, 0.0)
+            with rig.clock.stop.held():
+                rig.tweezers.safe_state()
+            assert not rig.ring.latest(100).any()
+            assert rig.described("depth") == 0.0
+
+    def test_is_made_up_for_when_the_array_is_started(self) -> None:
+        with opened() as rig:
+            rig.tweezers.start()
+            before = np.abs(rig.ring.latest(100)).max()
+            _break_off(rig, 0.5)
+            _break_off(rig, 1.0)
+            with rig.clock.stop.held():
+                rig.tweezers.start()
+            assert np.abs(rig.ring.latest(100)).max() == pytest.approx(before)
+
+
+def test_a_radio_may_take_long_to_open_but_then_its_silence_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(link, "SILENT_S", 0.0)
+    with opened() as rig, pytest.raises(DeviceError, match=r"its streaming process .* hangs"):
+        rig.tweezers.check_interlocks()
 
 
 class TestDeadStream:
@@ -220,6 +250,16 @@ def test_a_command_that_comes_while_the_light_is_ramped_down_does_not_turn_it_on
     assert {"done": 3} not in said
 
 
+def test_a_loop_that_cannot_be_read_ends_the_stream_by_a_ramp() -> None:
+    with opened() as rig:
+        rig.tweezers.start()
+        assert rig.tweezers._link is not None
+        rig.tweezers._link._say({"do": "loop", "id": 99, "file": "none.npy", "fade_s": 0.0})
+        until(raised(DeviceError, rig.tweezers.check_interlocks))
+        with pytest.raises(DeviceError, match=r"a loop cannot be read: .*none\.npy.*; the array is dark"):
+            rig.tweezers.check_interlocks()
+
+
 def test_errors_of_streams_are_told_in_words() -> None:
     assert stream_error(-7) == "it ran out of samples (-7)"
     assert stream_error(-99) == "an unknown error (-99)"
@@ -247,6 +287,13 @@ def assert_ramped_down(folder: Path) -> None:
 
 def _process(rig: Any) -> int:
     return int(rig.tweezers._link.pid)
+
+
+def _break_off(rig: Any, depth: float) -> None:
+    """Begin a ramp of 10 s; the operator stops the run."""
+    rig.clock.stop.request()
+    with pytest.raises(StopRequested):
+        rig.tweezers.ramp(depth, 10.0)
 
 
 def _alone() -> list[Path]:

@@ -63,6 +63,23 @@ def test_a_simulated_radio_gives_the_same_atoms_as_the_virtual_tweezers(tmp_path
             "p.yaml:5:18: static_tweezers: row tones: the outermost tone is 3.6 MHz",
         ),
         ("{use: soapy, row_channel: 1}", 2, "row_channel and column_channel are both 1"),
+        ("{use: soapy, max_depth: 0.5}", 2, "p.yaml:5:42: max_depth is 0.5; expected at least 1"),
+        (
+            "{use: soapy, device: 'simulated,sped=1'}",
+            2,
+            "p.yaml:5:39: the simulated radio has no argument 'sped'; expected one of",
+        ),
+        (
+            "{use: soapy, device: 'simulated, speed=0'}",
+            2,
+            "p.yaml:5:39: speed of the simulated radio is '0'; expected a number, at least 0.0001",
+        ),
+        (
+            "{use: soapy, device: 'simulated,fault=fire'}",
+            2,
+            "fault of the simulated radio is 'fire'; expected",
+        ),
+        ("{use: soapy, device: 'simulated,record=many'}", 2, "record of the simulated radio is 'many'"),
         ("{use: soapy, device: 'driver=none'}", 3, "'driver=none' cannot be opened"),
     ],
 )
