@@ -6,6 +6,7 @@ import errno
 import importlib
 import re
 from typing import Any, Final, Protocol
+from urllib.parse import urlsplit
 
 from labseq.drivers.waiting import SLICE_S
 from labseq.errors import DeviceError
@@ -63,6 +64,9 @@ def open_port(port: str, device: str, baud_rate: int, **options: Any) -> Port:
         DeviceError: There is no such port, or somebody else has it open.
     """
     serial: Any = importlib.import_module("serial")
+    if port.startswith(("socket://", "rfc2217://")) and not is_network_port(port):
+        expected = "socket://host:port or rfc2217://host:port, with a port from 1 to 65535"
+        raise DeviceError(device, f"cannot open {port}: it is no network port; expected {expected}")
     if "://" in port:
         options.pop("write_timeout", None)
     else:
@@ -71,6 +75,15 @@ def open_port(port: str, device: str, baud_rate: int, **options: Any) -> Port:
         return serial.serial_for_url(port, baudrate=baud_rate, timeout=SLICE_S, **options)
     except (*BROKEN, ValueError, NotImplementedError) as error:
         raise DeviceError(device, f"cannot open {port}: {_reason(error)}") from error
+
+
+def is_network_port(url: str) -> bool:
+    """Whether a URL names a host and a port; of one that does not, pyserial's own words make no sense."""
+    try:
+        parts = urlsplit(url)
+        return bool(parts.hostname) and bool(parts.port)
+    except ValueError:
+        return False
 
 
 def is_write_timeout(error: BaseException) -> bool:

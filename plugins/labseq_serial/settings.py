@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from typing import Final, Literal, Self
-from urllib.parse import urlsplit
 
 from pydantic import Field, model_validator
 
 from labseq import Duration, Settings
 from labseq.config.fields import Text, misfit
 from labseq.config.wording import clean, closest
+from labseq.drivers.serial_port import is_network_port
 from labseq.errors import one_of
 from labseq_serial.arguments import Scalar, placed
 from labseq_serial.commands import Call, CommandSettings, IdentifySettings, PositiveDuration, call_of
@@ -120,7 +120,8 @@ class SerialSettings(Settings):
             )
         if self.port is not None and self.usb is not None and self.port != SIMULATED:
             raise misfit("it has both 'port' and 'usb'", "one of them", at=("usb",), key=True)
-        if "://" in (self.port or "") and not _is_url(self.port or ""):
+        scheme, is_url, _ = (self.port or "").partition("://")
+        if is_url and not (scheme in _SCHEMES and is_network_port(self.port or "")):
             known = " or ".join(f"{one}://host:port" for one in _SCHEMES)
             raise misfit(
                 f"'{clean(self.port or '')}' is no port", f"{known}, or a port of this computer", at=("port",)
@@ -203,12 +204,3 @@ def _can_be(text: str, encoding: str) -> bool:
     except UnicodeEncodeError:
         return False
     return True
-
-
-def _is_url(port: str) -> bool:
-    """Whether it is a URL that pyserial can open: it tells what is wrong with one in no words of use."""
-    try:
-        url = urlsplit(port)
-        return url.scheme in _SCHEMES and bool(url.hostname) and bool(url.port)
-    except ValueError:
-        return False

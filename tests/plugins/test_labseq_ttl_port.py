@@ -68,6 +68,8 @@ def test_the_port_has_one_user(plugged: SimavrBox) -> None:
 def test_a_port_that_is_not_there_is_named() -> None:
     with pytest.raises(DeviceError, match="cannot open /dev/ttyNONE: there is no such port"):
         make_rig(port="/dev/ttyNONE").lines.open()
+    with pytest.raises(DeviceError, match="cannot open socket://here: it is no network port; expected"):
+        make_rig(port="socket://here").lines.open()
 
 
 def test_a_box_with_another_serial_number_is_refused(plugged: SimavrBox) -> None:
