@@ -11,6 +11,7 @@ from typing import Any, Final
 
 from labseq.cli.failures import lines_of
 from labseq.cli.output import columns, say
+from labseq.cli.show_skipped import json_skipped, skipped_rows
 from labseq.cli.show_tables import (
     devices_table,
     json_devices,
@@ -95,6 +96,8 @@ def _told(run: Run, wanted: Tables) -> list[str]:
 
 def _points(run: Run) -> list[str]:
     lines = point_table(run, whole=True)
+    if not lines and run.skipped and run.record.get("scan"):
+        return [f"no point of the scan has a shot: {len(run.skipped)} of {run.n_shots} were skipped"]
     if not lines:
         what = "the run has no scan" if not run.record.get("scan") else "the scan has no shots yet"
         raise ConfigError(Problem(what, clean(str(run.path)), expected="a run of a sequence with 'scan:'"))
@@ -168,6 +171,8 @@ def json_summary(run: Run | None) -> dict[str, Any]:
     values = run.summary() | {"statistics": statistics_of(run.shots, run.target).as_dict()}
     if points := _json_points(run):
         values["points"] = points
+    if run.skipped:
+        values["skipped_shots"] = json_skipped(run)
     return values | ({"error": run.error} if run.error else {})
 
 
@@ -252,6 +257,7 @@ def summary_lines(run: Run) -> list[str]:
         ("run", str(run.path)),
         ("status", f"{run.status}: {run.error}" if run.status == "failed" else run.status),
         ("shots", f"{len(run.shots)} of {run.n_shots}" + _skipped(run) + _repeated(run)),
+        *skipped_rows(run),
         *statistics_rows(statistics),
         ("duration", _duration(run)),
     ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Generator
 from contextlib import contextmanager
 
@@ -16,10 +17,23 @@ def lay_out(step: Step, number: int, name: str, context: StepContext) -> list[Ti
         return list(step.plan_timeline(context))
 
 
-def budget_s(step: Step, number: int, name: str, context: StepContext) -> float:
-    """What a step may take at most, in seconds. For a guarded call."""
+def budget_s(step: Step, number: int, name: str, context: StepContext, detect_s: float) -> float:
+    """What a step may take at most, in seconds. For a guarded call.
+
+    Args:
+        step: The step.
+        number: Its index.
+        name: Its name.
+        context: What it lays out its timeline by.
+        detect_s: What finding the atoms on an image may take; a timeline leaves that out.
+
+    Returns:
+        Nan if it does not say how long it takes.
+    """
     with _named(number, name):
-        return sum(entry.duration_s for entry in step.plan_timeline(context))
+        bars = step.plan_timeline(context)
+        planned_s = sum(bar.duration_s for bar in bars)
+        return planned_s + detect_s * sum(bar.n_images for bar in bars) if planned_s else math.nan
 
 
 def run_step(step: Step, number: int, name: str, shot: Shot) -> None:

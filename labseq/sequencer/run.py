@@ -116,10 +116,11 @@ class Sequencer:
         self._budgets = self._lay_out()
 
     def _lay_out(self) -> list[float]:
-        """What each step may take, in seconds."""
+        """What each step may take, in seconds; nan for one that does not know."""
         context, timeout_s = self.lab.step_context, self.lab.timeouts.call_s
+        detect_s = self.lab.budgets.get("detect", 0.0)
         return [
-            self.guard.call("step", timeout_s, budget_s, step, number, name, context)
+            self.guard.call("step", timeout_s, budget_s, step, number, name, context, detect_s)
             for number, (name, step) in enumerate(self._steps)
         ]
 
@@ -231,7 +232,8 @@ class Sequencer:
 
     def _run_step(self, shot: RunningShot, number: int, name: str, step: Step) -> None:
         """Run a step, and again if it fails and its policy lets it be tried again."""
-        policy = self._policy.of_step(number)
+        policy, images = self._policy.of_step(number), shot.record.images
+        n_before = len(images)
         for left in range(policy.retries, -1, -1):
             shot.stages.begin_try()
             try:
@@ -241,6 +243,7 @@ class Sequencer:
             except LabseqError as error:
                 if not (left and may_be_retried(error)):
                     raise
+                del images[n_before:]  # the n-th image shall be the same one in every shot
                 self._recover()
                 self._states.to(State.SHOT)
                 self._emit("step_repeated", {"shot": shot.index, "step": number, "error": str(error)})

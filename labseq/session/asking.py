@@ -44,11 +44,12 @@ class Asker:
         """
         guard = Guard(self._stop)
         try:
-            return guard.call(self._search.name, self._timeout_s, self._next_point, tuple(visited))
+            return guard.call(self._search.name, self._timeout_s, self.next_point, tuple(visited))
         finally:
             guard.end()
 
-    def _next_point(self, visited: Sequence[VisitedPoint]) -> dict[str, float] | None:
+    def next_point(self, visited: Sequence[VisitedPoint]) -> dict[str, float] | None:
+        """The scanner's answer, checked; for a guarded call, which names this function."""
         try:
             answer: Any = self._scanner.next_point(visited)
             given = dict(cast("Mapping[Any, Any]", answer)) if isinstance(answer, Mapping) else None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Sequence
 from typing import Any
@@ -326,3 +327,48 @@ def test_a_disk_that_is_slow_is_told_and_may_end_the_run() -> None:
 
 def test_a_timeout_carries_its_value() -> None:
     assert StepTimeoutError("late", 0.2).timeout_s == 0.2
+
+
+def test_the_image_of_a_try_that_failed_is_not_kept() -> None:
+    made = Rig(policy=policy(StepPolicy(retries=1, timeout_s=0.2)))
+    sleep, detect = made.lab.clock.sleep, made.lab.detector.detect
+    late = [0.3, 0.0]
+
+    def slowly(frame: Any) -> Any:
+        sleep(late.pop(0))
+        return detect(frame)
+
+    vars(made.lab.detector)["detect"] = slowly
+    made.run()
+    (shot,) = made.sink.shots
+    assert (shot.status, len(shot.images), len(made.observer.of("step_repeated"))) == ("complete", 1, 1)
+    assert [timing.stage for timing in shot.timing].count("detect") == 2
+
+
+class Unknown(Slow):
+    """Does not know how long it takes."""
+
+    def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:
+        return [TimelineEntry("unknown", 0.0, 0.0)]
+
+
+def test_a_step_that_does_not_know_how_long_it_takes_has_no_budget() -> None:
+    strict = RunPolicy(steps=(StepPolicy(over_budget="stop"),))
+    made = Rig(steps=(("unknown", Unknown(0.3)),), policy=strict)
+    made.run()
+    (timing,) = [timing for timing in made.record().timing if timing.stage == "step 0 unknown"]
+    assert math.isnan(timing.budget_s)
+    assert not timing.over_budget
+
+
+def test_an_image_step_has_time_to_find_the_atoms() -> None:
+    made = Rig(policy=policy(StepPolicy(over_budget="stop")), budgets={"detect": 5e-3})
+    sleep, detect = made.lab.clock.sleep, made.lab.detector.detect
+
+    def slowly(frame: Any) -> Any:
+        sleep(0.005)
+        return detect(frame)
+
+    vars(made.lab.detector)["detect"] = slowly
+    made.run()
+    assert [shot.status for shot in made.sink.shots] == ["complete"]

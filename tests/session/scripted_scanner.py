@@ -49,6 +49,8 @@ class Scripted:
                 return None
             case "hang":
                 threading.Event().wait()
+            case "exit":
+                raise SystemExit(3)
             case "raise":
                 raise RuntimeError("no idea")
         return BAD[self.settings.then]

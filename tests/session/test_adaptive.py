@@ -14,7 +14,7 @@ from labseq.recording.points import scan_points
 from labseq.session import check
 from labseq.testing.fakes import RecordingObserver
 
-from .scripted_scanner import N_LINES, OVER, opened, run
+from .scripted_scanner import N_LINES, OVER, SEQUENCE, opened, run
 from .small_runs import no_git
 
 __all__ = ["no_git"]
@@ -97,6 +97,7 @@ def test_a_scanner_may_end_the_run_and_then_it_is_complete(tmp_path: Path) -> No
         ("list", f"next_point() gave a list; expected a value for each of '{DOP}'"),
         ("nobody", f"next_point() gave values for no address; expected a value for each of '{DOP}'"),
         ("raise", "next_point() raised RuntimeError: no idea"),
+        ("exit", "raised SystemExit: 3"),
     ],
 )
 def test_a_wrong_answer_names_the_scanner_and_what_was_taken_stays(
@@ -262,3 +263,18 @@ def test_a_figure_that_needs_an_image_is_refused_without_one(tmp_path: Path) -> 
     assert session.assembly.search is not None
     with pytest.raises(ConfigError, match="no shot has a filling_fraction: it takes no image"):
         labseq.Session.open(tmp_path / "s.yaml")
+
+
+def test_a_scan_whose_shots_were_all_skipped_is_complete_when_it_is_resumed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    late = SEQUENCE.replace("500 ms}", "500 ms}\n    policy: {timeout: 1 ms, on_failure: skip_point}")
+    monkeypatch.setattr("tests.session.scripted_scanner.SEQUENCE", late)
+    done = run(tmp_path, f"use: scripted, dops: [3, 5], {OVER}, points: 5")
+    assert (done.status, len(done.shots), [*done.skipped]) == ("complete", 0, [0, 1])
+    assert [point[0] for point in done.scan["points"]] == [3, 5]
+    state = json.loads((done.path / "STATE").read_text("utf-8"))  # as if it had died before its last word
+    (done.path / "STATE").write_text(json.dumps({**state, "state": "failed"}), "utf-8")
+    with labseq.Session.resume(done.path) as session:
+        again = session.run()
+    assert (again.status, again.skipped) == ("complete", done.skipped)
