@@ -22,7 +22,6 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """What each command does once for its process is not done a hundred times in this one."""
-    monkeypatch.setattr("gc.collect", lambda: 0)
     monkeypatch.setattr("typer.main.get_command", get_command)
     monkeypatch.setenv("GIT_DIR", os.devnull)  # no digest of the code's changes for each run
 
