@@ -118,7 +118,7 @@ def test_numbers_of_atoms_on_a_square_grid(name: str, settings: dict[str, Any], 
 
 @pytest.mark.parametrize("name", [*TRIANGULAR, "sierpinski", "ring"])
 @given(rows=st.integers(3, 16), cols=st.integers(3, 16))
-@hypothesis_settings(max_examples=15, deadline=None)
+@hypothesis_settings(max_examples=6, deadline=None)
 def test_the_other_shear_makes_the_mirror_image(name: str, rows: int, cols: int) -> None:
     there, here = (SiteGrid(16, 16, shear=shear) for shear in (1, -1))
     settings: dict[str, Any] = {"rows": rows, "cols": cols, "origin": (0, 0)}
@@ -189,7 +189,7 @@ def test_the_rest_of_the_block_is_cleared_or_left_to_the_reservoir(name: str) ->
 
 @pytest.mark.parametrize("name", [*TRIANGULAR, *ANYWHERE])
 @given(row=st.integers(0, 11), col=st.integers(0, 13))
-@hypothesis_settings(max_examples=15, deadline=None)
+@hypothesis_settings(max_examples=6, deadline=None)
 def test_an_origin_only_shifts_the_pattern(name: str, row: int, col: int) -> None:
     centred = make_target(name, rows=9, cols=7)
     moved = make_target(name, rows=9, cols=7, origin=(row, col))
