@@ -46,7 +46,7 @@ class Lab:
         self.store = Store(folder / "calibrations" / "hidden")
         self.observer = RecordingObserver()
 
-    def calibrate(self, kind: str, shots: int = 40, **changes: Any) -> Outcome:
+    def calibrate(self, kind: str, shots: int = 30, **changes: Any) -> Outcome:
         changes = {"output": self.folder / "data", "seed": 1, "shots": shots} | changes
         request = CalibrationRequest(str(self.profile), **changes)
         return calibrate(METHODS[kind], request, self.observer)
@@ -58,7 +58,7 @@ def lab(tmp_path: Path) -> Lab:
 
 
 def test_sites_are_found_from_scratch_and_thresholds_on_top_of_them(lab: Lab) -> None:
-    sites = lab.calibrate("sites")
+    sites = lab.calibrate("sites", shots=40)
     assert sites.refused == ""
     entry = sites.stored.entry
     assert np.abs(entry.values["positions_px"] - TRUE_PX).max() < 0.1
