@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from labseq.cli.files import write_text
 from labseq.cli.output import say
 from labseq.config.wording import clean, did_you_mean, listing
 from labseq.errors import ConfigError, Problem
-from labseq.scaffolds import FILE_KINDS, PLUGINS, schema_text
+from labseq.scaffolds import FILE_KINDS, PLUGINS, SCHEMA_FOLDER, schema_text
 from labseq.session import load_plugins
 
 
@@ -33,5 +34,8 @@ def write_schema(kind: str, output: Path | None, plugins: Sequence[Path] | None)
     if output is None:
         say(text.rstrip())
         return
+    if output.parent.name == SCHEMA_FOLDER:  # where new files look for it
+        with suppress(OSError):  # the writing tells of it
+            output.parent.mkdir(exist_ok=True)
     write_text(output, text)
     say(f"wrote {output}")

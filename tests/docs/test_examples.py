@@ -42,6 +42,7 @@ PROFILE = {
 }
 """What an example leaves out."""
 MEASURED = "a measurement that takes long; the tests run the same file with few frames"
+TUTORIALS = "tests/docs/test_tutorials.py"
 NOT_RUN = {
     "CONTRIBUTING.md": ["installs labseq", "these are the checks"],
     "README.md": ["installs labseq; runs all tests"],
@@ -52,6 +53,10 @@ NOT_RUN = {
     "docs/how-to/cameras-andor.md": ["installs packages", MEASURED],
     "docs/how-to/cameras-genicam.md": ["changes the computer's settings", MEASURED],
     "docs/how-to/cameras-pylon.md": ["installs packages", MEASURED],
+    "docs/how-to/editor.md": [
+        "tests/scaffolds/test_made.py looks for this line",
+        "changes the settings of the shell",
+    ],
     "docs/how-to/export.md": ["installs packages"],
     "docs/how-to/follow.md": [
         "a drawing",
@@ -59,11 +64,12 @@ NOT_RUN = {
         "tests/plugins/test_labseq_follow_session.py runs it beside labseq",
     ],
     "docs/how-to/install.md": [
-        "tests/system/test_wheel.py builds one",
+        "tests/system/test_wheel.py makes the wheel",
         "tests/system/test_wheel.py installs it",
-        "tests/cli/test_demo.py copies them",
+        "the files are there; tests/cli/test_demo.py copies them to an empty folder",
     ],
-    "docs/how-to/plugin-trouble.md": ["an example; tests/test_plugin_troubles.py has them all"],
+    "docs/how-to/new-plugin.md": ["a list of files"],
+    "docs/how-to/plugin-trouble.md": ["tests/test_plugin_troubles.py makes such plugins"],
     "docs/how-to/resume-a-run.md": ["tests/session/test_changes.py makes such changes"],
     "docs/how-to/static-tweezers-soapy.md": ["installs packages, and looks for a radio"],
     "docs/how-to/stop-and-safe.md": [
@@ -74,9 +80,19 @@ NOT_RUN = {
     "docs/how-to/update.md": ["fetches another version"],
     "docs/reference/errors.md": ["tests/docs/test_examples.py makes this mistake"],
     "docs/reference/patterns.md": ["a drawing"],
-    "docs/tutorials/camera-driver.md": ["tests/docs/test_tutorials.py runs them"],
-    "docs/tutorials/first-run.md": ["installs labseq"],
-    "docs/tutorials/planner.md": ["tests/docs/test_tutorials.py runs them"],
+    "docs/reference/testing.md": ["an example"],
+    "docs/tutorials/camera-driver.md": [
+        f"{TUTORIALS} runs it",
+        f"{TUTORIALS} runs it",
+        f"{TUTORIALS} writes it into the profile",
+        f"{TUTORIALS} does, with this driver",
+    ],
+    "docs/tutorials/planner.md": [
+        f"{TUTORIALS} runs it",
+        f"{TUTORIALS} deletes these lines",
+        f"{TUTORIALS} looks for these lines",
+        f"{TUTORIALS} installs it",
+    ],
     "plugins/labseq_ttl/firmware/PROTOCOL.md": [
         "tests/plugins/test_labseq_ttl_firmware.py says these lines to the firmware"
     ]
