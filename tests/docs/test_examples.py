@@ -64,12 +64,12 @@ NOT_RUN = {
         "tests/plugins/test_labseq_follow_session.py runs it beside labseq",
     ],
     "docs/how-to/install.md": [
-        "tests/system/test_wheel.py makes the wheel",
+        "tests/system/test_wheel.py builds one",
         "tests/system/test_wheel.py installs it",
-        "the files are there; tests/cli/test_demo.py copies them to an empty folder",
+        "tests/cli/test_demo.py copies them",
     ],
     "docs/how-to/new-plugin.md": ["a list of files"],
-    "docs/how-to/plugin-trouble.md": ["tests/test_plugin_troubles.py makes such plugins"],
+    "docs/how-to/plugin-trouble.md": ["an example; tests/test_plugin_troubles.py has them all"],
     "docs/how-to/resume-a-run.md": ["tests/session/test_changes.py makes such changes"],
     "docs/how-to/static-tweezers-soapy.md": ["installs packages, and looks for a radio"],
     "docs/how-to/stop-and-safe.md": [
@@ -82,13 +82,13 @@ NOT_RUN = {
     "docs/reference/patterns.md": ["a drawing"],
     "docs/reference/testing.md": ["an example"],
     "docs/tutorials/camera-driver.md": [
-        f"{TUTORIALS} runs it",
+        f"{TUTORIALS} runs them",
         f"{TUTORIALS} runs it",
         f"{TUTORIALS} writes it into the profile",
         f"{TUTORIALS} does, with this driver",
     ],
     "docs/tutorials/planner.md": [
-        f"{TUTORIALS} runs it",
+        f"{TUTORIALS} runs them",
         f"{TUTORIALS} deletes these lines",
         f"{TUTORIALS} looks for these lines",
         f"{TUTORIALS} installs it",
