@@ -85,6 +85,19 @@ def test_schema_to_stdout_and_to_a_file(capsys: pytest.CaptureFixture[str]) -> N
     assert printed["$schema"].startswith("http://json-schema.org/draft-07/")
 
 
+def test_a_schema_goes_where_new_files_look_for_it() -> None:
+    assert code_of("schema", "profile", "-o", ".labseq/profile.schema.json") == 0
+    assert Path(".labseq/profile.schema.json").is_file()
+    assert code_of("schema", "profile", "-o", "nowhere/profile.schema.json") == 2
+
+
+def test_plugins_of_the_folder_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
+    assert code_of("new", "planner", "spiral") == 0
+    capsys.readouterr()
+    assert code_of("plugins") == 0
+    assert "planner:spiral" in capsys.readouterr().out
+
+
 def test_schema_knows_the_plugins_of_a_folder(capsys: pytest.CaptureFixture[str]) -> None:
     code_of("new", "planner", "spiral")
     Path("empty").mkdir()
