@@ -121,7 +121,7 @@ def test_a_value_past_its_interlock_ends_the_run_before_anything_is_done(
         run(lab(tmp_path, counterpart.port), observer=observer)
     assert "TOGGLE" not in counterpart.log
     assert counterpart.log[-1] == "CLOSE"
-    assert observer.ends == [("failed", f"DeviceError: {text}")]
+    assert observer.ends == [("failed", f"InterlockError: {text}")]
 
 
 @on_a_pty
