@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import re
 import shutil
-import sys
 import tomllib
 from importlib import import_module
-from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import pytest
@@ -19,6 +16,8 @@ import labseq
 from labseq import builtins
 from labseq.drawing import target_text
 from labseq.registry import Registry
+
+from .scripts import load_script
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "reference" / "patterns.md").read_text(encoding="utf-8")
@@ -36,17 +35,7 @@ shot:
 """
 
 
-def load_gallery() -> ModuleType:
-    spec = spec_from_file_location("make_gallery", ROOT / "docs" / "make_gallery.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-GALLERY = load_gallery()
+GALLERY = load_script("make_gallery")
 EXAMPLES = list(GALLERY.examples())
 EACH = pytest.mark.parametrize("example", EXAMPLES, ids=lambda example: example.name)
 

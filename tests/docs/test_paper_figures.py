@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import csv
-import sys
-from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
-from types import ModuleType
 
 import pytest
+
+from .scripts import load_script
 
 ROOT = Path(__file__).parents[2]
 TABLES = ROOT / "docs" / "_static" / "paper"
@@ -22,16 +21,6 @@ def rows(name: str) -> list[dict[str, float]]:
 
 def fillings(*, fixed: bool) -> dict[int, float]:
     return {int(row["dop"]): row["filling"] for row in rows("figure4") if (row["window_ms"] == 200) == fixed}
-
-
-def load_script() -> ModuleType:
-    spec = spec_from_file_location("make_paper_figures", ROOT / "docs" / "make_paper_figures.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
 
 
 def test_degree_seven_is_on_a_plateau() -> None:
@@ -69,7 +58,7 @@ def test_the_page_has_the_numbers_of_the_tables() -> None:
 
 
 def test_the_script_takes_a_point_and_draws(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    script = load_script()
+    script = load_script("make_paper_figures")
     assert script.point(15, 60, 3, 1)["shots"] == 3
     for name in ("figure4", "figure5", "figure5_untuned"):
         (tmp_path / f"{name}.csv").write_bytes((TABLES / f"{name}.csv").read_bytes())

@@ -3,32 +3,20 @@
 from __future__ import annotations
 
 import re
-import sys
-from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 from PIL import Image, ImageChops, ImageStat
 
 from .blocks import PAGES, ROOT, blocks_of, commands_of
+from .scripts import load_script
 
 STATIC = ROOT / "docs" / "_static"
 BY_OTHERS = ("patterns/", "planners/", "paper/", "run.svg")
 """Made by scripts with tests of their own."""
 
 
-def load(name: str) -> ModuleType:
-    spec = spec_from_file_location(name, ROOT / "docs" / f"{name}.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-SCRIPT = load("make_pictures")
+SCRIPT = load_script("make_pictures")
 
 
 def test_every_picture_is_shown_and_made() -> None:
@@ -59,7 +47,7 @@ def test_a_picture_can_be_made_again(tmp_path: Path) -> None:
 
 
 def test_the_picture_of_the_readme_can_be_made_again(tmp_path: Path) -> None:
-    load("make_run_picture").take(tmp_path / "run.svg", shots=2, after=1)
+    load_script("make_run_picture").take(tmp_path / "run.svg", shots=2, after=1)
     text = (tmp_path / "run.svg").read_text("utf-8")
     assert "compact-225" in text
     assert "1/2" in text

@@ -3,30 +3,19 @@
 from __future__ import annotations
 
 import re
-import sys
-from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 
 from labseq.session.bench_figures import FIGURES
 
+from .scripts import load_script
+
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "explanation" / "planners.md").read_text(encoding="utf-8")
 
 
-def load_script() -> ModuleType:
-    spec = spec_from_file_location("make_planner_tables", ROOT / "docs" / "make_planner_tables.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-SCRIPT = load_script()
+SCRIPT = load_script("make_planner_tables")
 
 
 def test_every_figure_has_a_measured_part_and_a_picture() -> None:
