@@ -7,6 +7,7 @@ import itertools
 import shutil
 import threading
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -160,8 +161,10 @@ class RunWriter:
         file = self._free_name(shot, counts=counts)
         path = self.run_dir / file
         data = self._encoder.encode(shot)
-        write_file(path, data)
-        sha256 = hashlib.sha256(data).hexdigest()
+        with ThreadPoolExecutor(1) as beside:  # while the disk is waited for
+            checksum = beside.submit(lambda: hashlib.sha256(data).hexdigest())
+            write_file(path, data)
+            sha256 = checksum.result()
         row = index_row(shot, self._run.target, file=file, sha256=sha256, n_bytes=data.nbytes)
         self._index.append(row, sync=True)
         self.last_row = row
