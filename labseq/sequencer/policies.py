@@ -76,8 +76,9 @@ class RunPolicy:
 
     def of_step(self, number: int | None) -> StepPolicy:
         """What holds for a step; None: outside of all steps."""
-        inside = number is not None and number < len(self.steps)
-        return self.steps[number] if inside and number is not None else self.otherwise
+        if number is None or number >= len(self.steps):
+            return self.otherwise
+        return self.steps[number]
 
     def after(self, error: LabseqError, step: int | None, attempt: int) -> Then:
         """What follows a failure.

@@ -45,7 +45,6 @@ class Stages:
     def begin_step(self, number: int, name: str, policy: StepPolicy) -> None:
         """What follows belongs to this step."""
         self.step, self._name, self.policy, self._is_warned = number, name, policy, False
-        self.begin_try()
 
     def begin_try(self) -> None:
         """A try at the step begins: its timeout counts from here."""

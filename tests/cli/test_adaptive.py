@@ -19,6 +19,7 @@ from labseq.cli.show import Tables, show_run
 from labseq.cli.tally import Tally
 from labseq.cli.telling import tell
 from labseq.recording.export import export_run
+from tests.session.small_runs import PROFILE
 
 DOP = "planner.degree_of_parallelism"
 SEQUENCE = """labseq: 1
@@ -41,15 +42,6 @@ shot:
   - image: {exposure: 45 ms}
   - rearrange: {cycles: 1, window: 60 ms}
   - image: {exposure: 45 ms}
-"""
-PROFILE = """labseq: 1
-name: small
-grid: {rows: 6, cols: 6, spacing: 4.49 um}
-camera: {use: virtual}
-static_tweezers: {use: virtual}
-mobile_tweezers: {use: virtual}
-detector: {use: threshold}
-simulation: {use: virtual}
 """
 
 

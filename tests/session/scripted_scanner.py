@@ -7,6 +7,8 @@ from typing import Any
 
 import labseq
 
+from .small_runs import PROFILE
+
 PLUGIN = '''
 """Gives the points that its settings list, or something worse."""
 import threading
@@ -75,15 +77,6 @@ shot:
   - image: {}
 """
 N_LINES = SEQUENCE.count("\n")
-PROFILE = """labseq: 1
-name: small
-grid: {rows: 6, cols: 6, spacing: 4.49 um}
-camera: {use: virtual}
-static_tweezers: {use: virtual}
-mobile_tweezers: {use: virtual}
-detector: {use: threshold}
-simulation: {use: virtual}
-"""
 OVER = "over: {planner.degree_of_parallelism: {from: 1, to: 9}}, maximise: filling_fraction"
 
 

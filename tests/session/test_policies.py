@@ -15,7 +15,7 @@ from labseq.session.checking import check
 from labseq.session.policies import Checks
 from labseq.testing.fakes import RecordingObserver
 
-from .small_runs import Interrupting, no_git, resumed, table, write
+from .small_runs import Interrupting, interrupted, no_git, resumed, table, write
 
 __all__ = ["no_git"]
 
@@ -75,6 +75,13 @@ def run(path: Path, observer: Any = None) -> labseq.Run:
         return session.run()
 
 
+def stopped_at(path: Path, event: str, n: int) -> Path:
+    """The folder of a run that was stopped at the n-th event."""
+    run_dir = interrupted(path, event, n)
+    assert labseq.open_run(run_dir).status == "stopped"
+    return run_dir
+
+
 def test_a_shot_that_fails_again_and_again_is_skipped_and_the_run_complete(tmp_path: Path) -> None:
     policy = {"on_failure": "repeat_shot", "used_up": "skip_point"}
     seen = RecordingObserver()
@@ -105,13 +112,8 @@ def test_the_rest_of_a_point_is_skipped_with_it(tmp_path: Path) -> None:
 def test_a_resumed_run_skips_what_was_skipped(tmp_path: Path, event: str) -> None:
     path = sequence(tmp_path, "planner", "{at: [1]}", policy={"on_failure": "skip_point"})
     whole = run(path)
-    observer = Interrupting(event, 3 if event == "shot_started" else 1)
-    with labseq.Session.open(path, seed=5, output=tmp_path / "data", observer=observer) as session:
-        observer.session = session
-        with pytest.raises(labseq.StopRequested):
-            session.run()
-        assert session.run_dir is not None
-    again = resumed(session.run_dir)
+    run_dir = stopped_at(path, event, 3 if event == "shot_started" else 1)
+    again = resumed(run_dir)
     assert (again.status, again.skipped) == ("complete", whole.skipped)
     assert table(again) == table(whole)
 
@@ -143,13 +145,8 @@ def test_a_check_may_skip_the_rest_of_a_point_also_after_a_resume(tmp_path: Path
     path = sequence(tmp_path, "planner", policy={"checks": checks})
     whole = run(path)
     assert whole.skipped
-    observer = Interrupting("shot_started", 2)
-    with labseq.Session.open(path, seed=5, output=tmp_path / "data", observer=observer) as session:
-        observer.session = session
-        with pytest.raises(labseq.StopRequested):
-            session.run()
-        assert session.run_dir is not None
-    again = resumed(session.run_dir)
+    run_dir = stopped_at(path, "shot_started", 2)
+    again = resumed(run_dir)
     assert again.skipped == whole.skipped
     assert table(again) == table(whole)
 
@@ -262,14 +259,9 @@ def test_a_run_that_died_before_it_put_down_what_to_skip_skips_it_all_the_same(
     )
     whole = run(path)
     assert whole.skipped
-    observer = Interrupting("shots_skipped", 1)
-    with labseq.Session.open(path, seed=5, output=tmp_path / "data", observer=observer) as session:
-        observer.session = session
-        with pytest.raises(labseq.StopRequested):
-            session.run()
-        assert session.run_dir is not None
-    (session.run_dir / "skipped.jsonl").unlink()  # as if it had died a moment before
-    again = resumed(session.run_dir)
+    run_dir = stopped_at(path, "shots_skipped", 1)
+    (run_dir / "skipped.jsonl").unlink()  # as if it had died a moment before
+    again = resumed(run_dir)
     assert again.skipped == whole.skipped
     assert table(again) == table(whole)
 

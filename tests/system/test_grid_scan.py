@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 
 import labseq
 from labseq.cli.app import app
+from tests.session.small_runs import PROFILE
 
 pytestmark = pytest.mark.system
 
@@ -39,16 +40,6 @@ shot:
   - image: {exposure: 45 ms}
   - rearrange: {cycles: 1}
   - image: {exposure: 45 ms}
-"""
-PROFILE = """
-labseq: 1
-name: small
-grid: {rows: 6, cols: 6, spacing: 4.49 um}
-camera: {use: virtual}
-static_tweezers: {use: virtual}
-mobile_tweezers: {use: virtual}
-detector: {use: threshold}
-simulation: {use: virtual}
 """
 
 
