@@ -58,7 +58,7 @@ def planner_cells(row: Row) -> list[str]:
     scans = f" ({row.n_scans} scans)" if row.scans else ""
     scan_s = f" ({row.scan_s.scaled(1e3)} ms)" if row.scans else ""
     return [
-        f"`{row.entrant.label}`",
+        f"`{row.planner_entry.label}`",
         f"{batches}{scans}",
         str(row.n_atoms_moved),
         f"{row.distance_m.scaled(1e3)} mm",
@@ -120,13 +120,13 @@ def figures(names: Sequence[str], n_loadings: int) -> dict[str, list[str]]:
     """The figures; those of the same loadings are measured together."""
     reports: dict[object, Report] = {}
     for figure in (FIGURES[name] for name in names):
-        key = (figure.entrants, figure.conditions)
+        key = (figure.planner_entries, figure.conditions)
         if key not in reports:
             comparison, _ = read_request(BenchRequest(figure=figure.name, loadings=n_loadings))
             reports[key] = compare(comparison)
     return {
         f"figure {name}": figure_lines(
-            FIGURES[name], reports[FIGURES[name].entrants, FIGURES[name].conditions], n_loadings
+            FIGURES[name], reports[FIGURES[name].planner_entries, FIGURES[name].conditions], n_loadings
         )
         for name in names
     }

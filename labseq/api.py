@@ -16,7 +16,7 @@ from labseq.registry import Entry
 from labseq.roles import Context, Planner
 from labseq.session import load_plugins
 from labseq.session.calibrating import calibrated_grid
-from labseq.session.choosing import Chosen
+from labseq.session.choosing import ChosenPlugin
 from labseq.session.constructing import construct_one, construct_target
 
 Folders: TypeAlias = str | Path | Sequence[str | Path]
@@ -56,7 +56,7 @@ def make_planner(
     if not isinstance(motion, MotionSpec | None):  # pyright: ignore[reportUnnecessaryIsInstance]
         raise ConfigError(Problem(f"motion is {motion!r}", expected="a labseq.MotionSpec"))
     context = Context("planner", _grid(grid), motion or MotionSpec())
-    return construct_one(Chosen(entry, made), context)
+    return construct_one(ChosenPlugin(entry, made), context)
 
 
 def make_target(
@@ -86,7 +86,7 @@ def make_target(
     """
     entry = _find("pattern", pattern, plugin_folders)
     made = validate_values(entry.settings_model, settings, f"pattern '{pattern}'")
-    return construct_target(Chosen(entry, made), _grid(grid))
+    return construct_target(ChosenPlugin(entry, made), _grid(grid))
 
 
 def tone_program(

@@ -85,10 +85,10 @@ class Lock:
             lock.release()
             raise OSError(errno.ENOSYS, os.strerror(errno.ENOSYS))
         self._lock = lock
-        self.tell(self._holder.what)
+        self.describe(self._holder.what)
         return None
 
-    def tell(self, what: str) -> None:
+    def describe(self, what: str) -> None:
         """Say what is done meanwhile; what cannot be written is not said."""
         self._holder = replace(self._holder, what=what)
         with suppress(OSError), whole_file(self._about) as file:

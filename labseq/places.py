@@ -32,7 +32,7 @@ def packaged_sequences_dir() -> Path:
     return packaged_dir(SEQUENCES)
 
 
-def keeping_dir(profile: Path) -> Path:
+def profile_dir(profile: Path) -> Path:
     """The folder in which what belongs to a profile is kept: its own.
 
     Of an installed profile it is ./hardware_profiles, where a copy of it would stand: what is installed

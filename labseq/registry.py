@@ -50,14 +50,14 @@ class Owner:
         name: Name of the plugin.
         source: Its file, or the distribution that it came with, in words; "" for labseq's own.
         home: The file or the folder that its code is in; None if that is not known.
-        patience_s: How long it may take to load, and a constructor to return.
+        max_wait_s: How long it may take to load, and a constructor to return.
         notes: What else it did to the process when it was loaded, or in a constructor.
     """
 
     name: str
     source: str = ""
     home: Path | None = None
-    patience_s: float = LOAD_S
+    max_wait_s: float = LOAD_S
     notes: list[str] = field(default_factory=list[str])
 
     def fault(self, reason: str) -> PluginLoadError:

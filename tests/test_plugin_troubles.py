@@ -25,7 +25,7 @@ from labseq.errors import LabseqError, PluginLoadError
 from labseq.plugins import LOCAL_PACKAGE, PluginHost, PluginInfo
 from labseq.registry import Entry
 from labseq.roles import Context
-from labseq.session.choosing import Chosen, validate
+from labseq.session.choosing import ChosenPlugin, validate
 from labseq.session.constructing import construct_one, construct_target
 
 GOOD = '''
@@ -47,7 +47,7 @@ class Mine:
 def labseq_register(registry):
     registry.planner("mine", Mine)  # registration
 '''
-PATIENCE_S = 60.0
+MAX_WAIT_S = 60.0
 SHORT_S = 0.05
 
 
@@ -70,20 +70,20 @@ def clean_local_modules() -> Iterator[None]:
         del sys.modules[name]
 
 
-def loaded(folder: Path, code: str, patience_s: float = PATIENCE_S) -> tuple[PluginHost, PluginInfo]:
+def loaded(folder: Path, code: str, max_wait_s: float = MAX_WAIT_S) -> tuple[PluginHost, PluginInfo]:
     (folder / "mine.py").write_text(code, encoding="utf-8")
-    host = PluginHost(patience_s)
+    host = PluginHost(max_wait_s)
     host.load_folders([folder])
     return host, host.infos[-1]
 
 
 def impatient(host: PluginHost) -> Entry:
     entry = host.get("planner", "mine")
-    return replace(entry, owner=replace(entry.owner, patience_s=0.5))
+    return replace(entry, owner=replace(entry.owner, max_wait_s=0.5))
 
 
 def construct(host: PluginHost) -> Any:
-    return construct_one(Chosen(host.get("planner", "mine"), None), Context("planner"))
+    return construct_one(ChosenPlugin(host.get("planner", "mine"), None), Context("planner"))
 
 
 REGISTER = 'registry.planner("mine", Mine)  # registration'
@@ -258,7 +258,7 @@ class TestHanging:
         assert info.state == "loaded"
         told = r"the constructor of planner 'mine' did not return within 0\.5 s and was given up; if it is"
         with pytest.raises(PluginLoadError, match=told):
-            construct_one(Chosen(impatient(host), None), Context("planner"))
+            construct_one(ChosenPlugin(impatient(host), None), Context("planner"))
 
 
 IN_THE_CONSTRUCTOR: dict[str, tuple[str, str, str]] = {
@@ -327,7 +327,7 @@ def test_trouble_in_a_pattern(tmp_path: Path) -> None:
     host, _ = loaded(tmp_path, code)
     grid = labseq.SiteGrid(3, 3, 5e-6)
     with pytest.raises(PluginLoadError, match=r"made no TargetPattern of shape \(3, 3\), but a list"):
-        construct_target(Chosen(host.get("pattern", "mine"), None), grid)
+        construct_target(ChosenPlugin(host.get("pattern", "mine"), None), grid)
 
 
 SETTINGS = """

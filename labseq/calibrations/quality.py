@@ -16,7 +16,7 @@ _COUNT: Final = "n_sites_found"
 
 
 @dataclass(frozen=True, slots=True)
-class Deciding:
+class QualityFigure:
     """The figure by which calibrations of a kind are compared; the lower the better.
 
     Attributes:
@@ -30,16 +30,16 @@ class Deciding:
     words: str
 
 
-DECIDING: Final[Mapping[str, Deciding]] = {
+DECIDING: Final[Mapping[str, QualityFigure]] = {
     # A tenth of a pixel is what sites must be known to: beyond it the region of interest loses light.
-    "sites": Deciding("residual_px", 0.1, "residual"),
+    "sites": QualityFigure("residual_px", 0.1, "residual"),
     # Twice the paper's mean detection infidelity of 0.054 %.
-    "thresholds": Deciding("error", 1e-3, "expected error"),
+    "thresholds": QualityFigure("error", 1e-3, "expected error"),
     # The equalising's own goal.
-    "tweezers": Deciding("separable_spread", 5e-3, "separable spread"),
+    "tweezers": QualityFigure("separable_spread", 5e-3, "separable spread"),
     # A twentieth of the mobile tweezers' waist: what is lost by it cannot be seen.
-    "frequencies": Deciding("error_m", 50e-9, "error"),
-    "overlay": Deciding("error_m", 50e-9, "error"),
+    "frequencies": QualityFigure("error_m", 50e-9, "error"),
+    "overlay": QualityFigure("error_m", 50e-9, "error"),
 }
 """Kind -> what decides."""
 

@@ -34,7 +34,7 @@ from labseq.errors import ConfigError, Problem
 from labseq.files import whole_file
 from labseq.model import CalibrationEntry, CalibrationKind, SiteGrid
 
-PATIENCE_S: Final = 2.0
+MAX_WAIT_S: Final = 2.0
 """How long another process may take to note what is in use."""
 
 Picture: TypeAlias = bytes | Callable[[IO[bytes]], object]
@@ -219,7 +219,7 @@ class Store:
 
     def _note(self, activation: Activation) -> None:
         """Add to the history, unless it changes nothing."""
-        path, deadline = self.folder / ACTIVE_FILE, time.monotonic() + PATIENCE_S
+        path, deadline = self.folder / ACTIVE_FILE, time.monotonic() + MAX_WAIT_S
         with self._explained():
             self.folder.mkdir(parents=True, exist_ok=True)
             while True:

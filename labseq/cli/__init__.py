@@ -20,11 +20,11 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     from labseq.cli.arguments import arrange
     from labseq.cli.failures import report
     from labseq.cli.leaving import end_process
-    from labseq.cli.output import forgive_encoding, give_up_unwritten
+    from labseq.cli.output import replace_unencodable, discard_unwritten
     from labseq.cli.usage import USAGE_ERROR, refuse
 
     arranged = arrange(sys.argv[1:] if arguments is None else arguments)
-    forgive_encoding()
+    replace_unencodable()
     try:
         code = app(args=arranged, prog_name="labseq", standalone_mode=False) or 0
     except SystemExit as leaving:
@@ -33,7 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
         code = refuse(error, arranged)
     except BaseException as error:  # noqa: BLE001 - the one place where a failure becomes an exit code
         code = report(error, debug="--debug" in arranged[:1])
-    give_up_unwritten()
+    discard_unwritten()
     if arguments is None:
         end_process(code)
     sys.exit(code)

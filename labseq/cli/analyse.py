@@ -8,14 +8,14 @@ from pathlib import Path
 from typing import Any
 
 from labseq.cli.output import say
-from labseq.cli.replay import MOST_TOLD
+from labseq.cli.replay import MAX_REPORTED
 from labseq.cli.show import chosen_run
 from labseq.cli.words import plural
 from labseq.config import Document, split_overrides
 from labseq.config.wording import clean
 from labseq.errors import ConfigError, Problem
 from labseq.recording import Run
-from labseq.session.analysing import USE, Analysed, analyses_of, make_up
+from labseq.session.analysing import USE, AnalysisOutcome, analyses_of, analyse_missing
 
 
 def analyse_run(path: Path | None, use: str | None, overrides: Sequence[str], *, anew: bool) -> int:
@@ -36,8 +36,8 @@ def analyse_run(path: Path | None, use: str | None, overrides: Sequence[str], *,
     run = chosen_run(path)
     failed = False
     for settings in _wanted(run, use, overrides):
-        done = make_up(run, settings, anew=anew)
-        _tell(done)
+        done = analyse_missing(run, settings, anew=anew)
+        _report(done)
         failed = failed or bool(done.failures)
     return int(failed)
 
@@ -75,9 +75,9 @@ def _changes(overrides: Sequence[str]) -> dict[str, Any]:
     return Document.parse("{}", "the command line").override_all(for_sequence, may_add=parents).data
 
 
-def _tell(done: Analysed) -> None:
+def _report(done: AnalysisOutcome) -> None:
     before = f", {done.n_before} had a result already" if done.n_before else ""
     say(f"{done.name}: {plural(done.n_done, 'shot')} analysed{before}; see {done.path}")
     told = [f"{done.name}: shot {shot + 1} failed: {text}" for shot, text in done.failures.items()]
-    more = len(told) - MOST_TOLD
-    say(*told[:MOST_TOLD], *([f"and {more} more shots failed"] if more > 0 else []), stream=sys.stderr)
+    more = len(told) - MAX_REPORTED
+    say(*told[:MAX_REPORTED], *([f"and {more} more shots failed"] if more > 0 else []), stream=sys.stderr)

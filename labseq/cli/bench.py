@@ -8,8 +8,8 @@ from typing import Any
 
 from labseq.cli.bench_output import progress_of
 from labseq.cli.bench_table import notes, table
-from labseq.cli.files import STDOUT, check_different, prove_writable, write_text
-from labseq.cli.output import divert_stdout, say, tell_compiling
+from labseq.cli.files import STDOUT, check_different, check_writable, write_text
+from labseq.cli.output import stdout_to_stderr, say, report_compiling
 from labseq.cli.show import as_line
 from labseq.drawing import check_picture, save_comparison
 from labseq.errors import PlanError
@@ -47,16 +47,16 @@ def bench_planners(request: BenchRequest, output: BenchOutput) -> None:
         PlanError: A planner failed, or a plan breaks a rule, for some loadings.
         StopRequested: It was stopped; what was done until then has been told.
     """
-    answer = divert_stdout() if output.json == STDOUT else None
+    answer = stdout_to_stderr() if output.json == STDOUT else None
     comparison, figure = read_request(request)
     files = _files(output, figure)
     check_different(*files.values())
     for kind, path in files.items():
         if kind == "png":
             check_picture(path, (1, 1))
-        prove_writable(path)
+        check_writable(path)
     with progress_of("loadings") as progress:
-        report = compare(comparison, request.workers, announce=tell_compiling, progress=progress)
+        report = compare(comparison, request.workers, announce=report_compiling, progress=progress)
     say(*table(report), *notes(report, figure))
     if report.rows:
         _write_files(files, report, figure)
@@ -98,5 +98,5 @@ def _raise_failures(report: Report) -> None:
     failed = [row for row in report.rows if row.n_failed]
     if failed:
         n, of = sum(row.n_failed for row in failed), sum(row.n_loadings for row in failed)
-        names = ", ".join(dict.fromkeys(f"'{row.entrant.planner}'" for row in failed))
+        names = ", ".join(dict.fromkeys(f"'{row.planner_entry.planner}'" for row in failed))
         raise PlanError(f"{n} of {of} plans of {names} are wrong; they do not count in the table")

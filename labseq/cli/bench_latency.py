@@ -6,7 +6,7 @@ import sys
 
 from labseq.cli.bench_output import progress_of
 from labseq.cli.files import json_writer
-from labseq.cli.output import columns, say, tell_compiling
+from labseq.cli.output import columns, say, report_compiling
 from labseq.cli.words import percent, plural
 from labseq.session.bench_latency import LatencyRequest, measure_latency
 from labseq.session.bench_latency_report import GOAL_S, LatencyReport, Stage
@@ -27,7 +27,7 @@ def bench_latency(request: LatencyRequest, json: str | None = None) -> None:
     """
     write = json_writer(json)
     with progress_of("loadings") as progress:
-        report = measure_latency(request, announce=tell_compiling, progress=progress)
+        report = measure_latency(request, announce=report_compiling, progress=progress)
     say(*table(report), "", *light_table(report), "", *notes(report))
     say(*(f"warning: {text}" for text in report.warnings), stream=sys.stderr)
     write(report.as_dict())

@@ -23,13 +23,13 @@ def progress_of(what: str) -> Generator[Callable[[int, int], None]]:
     if not sys.stderr.isatty():
         told = 0
 
-        def tell(done: int, wanted: int) -> None:
+        def report_progress(done: int, wanted: int) -> None:
             nonlocal told
             if done * _STEPS // wanted > told:
                 told = done * _STEPS // wanted
                 say(f"{done} of {wanted} {what}", stream=sys.stderr)
 
-        yield tell
+        yield report_progress
         return
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn

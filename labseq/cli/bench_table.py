@@ -45,7 +45,7 @@ def notes(report: Report, figure: Figure | None) -> list[str]:
 def _cells(row: Row, report: Report) -> dict[str, str]:
     conditions = report.comparison.conditions
     rows, cols = row.condition.shape
-    cells: dict[str, str] = {"planner": row.entrant.label}
+    cells: dict[str, str] = {"planner": row.planner_entry.label}
     if len({condition.shape for condition in conditions}) > 1:
         cells["grid"] = f"{rows}x{cols}"
     if len({condition.target for condition in conditions}) > 1:
@@ -113,7 +113,7 @@ def _failure(report: Report, row: Row) -> list[str]:
         return []
     what = f"{row.n_failed} of {row.n_loadings} plans are wrong; the first, of loading {failure.loading}"
     return [
-        f"{row.entrant.label}: {what}: {failure.message}",
+        f"{row.planner_entry.label}: {what}: {failure.message}",
         f"  see it with: {_again(report, row, failure.loading)}",
     ]
 
@@ -126,9 +126,9 @@ def _again(report: Report, row: Row, loading: int) -> str:
     if condition.motion != BARE_MOTION:  # which takes a profile
         return f"numpy.random.default_rng({seed}).random(({rows}, {cols})) < {condition.loading:g}"
     words = ["labseq", "plan", f"random:{rows}x{cols}@{condition.loading:g}", "--seed", str(seed)]
-    words += ["--target", condition.target, "--planner", row.entrant.planner]
+    words += ["--target", condition.target, "--planner", row.planner_entry.planner]
     if "degree_of_parallelism" in row.settings and condition.degree_of_parallelism is not None:
         words += ["--dop", str(condition.degree_of_parallelism)]
-    for key, value in (*comparison.settings, *row.entrant.settings):
+    for key, value in (*comparison.settings, *row.planner_entry.settings):
         words += ["--set", f"{key}={value}"]
     return shlex.join(words)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from labseq.cli.files import json_writer
-from labseq.cli.output import columns, say, tell_compiling
+from labseq.cli.output import columns, say, report_compiling
 from labseq.session.bench_waveform import WaveformReport, bench_waveform
 from labseq.units import format_quantity
 
@@ -19,7 +19,7 @@ def bench_rendering(repeats: int, json: str | None = None) -> None:
         ConfigError: The file cannot be written.
     """
     write = json_writer(json)
-    report = bench_waveform(repeats, announce=tell_compiling)
+    report = bench_waveform(repeats, announce=report_compiling)
     say(*table(report), "", *ratios(report), "", _extent(report))
     write(report.as_dict())
 

@@ -9,9 +9,9 @@ from shlex import quote
 from typing import Any, Final
 
 from labseq.cli.calibration import difference_table, quantity
-from labseq.cli.output import columns, divert_stdout, say
+from labseq.cli.output import columns, stdout_to_stderr, say
 from labseq.cli.show import as_line
-from labseq.cli.telling import LASTING, tell
+from labseq.cli.telling import LASTING, event_text
 from labseq.config.wording import clean, did_you_mean, listing
 from labseq.errors import ConfigError, Problem
 from labseq.model import RunRecord
@@ -38,10 +38,10 @@ def calibrate_kind(kind: str, request: CalibrationRequest, *, as_json: bool) -> 
     if method is None:
         what, hint = f"'{clean(kind)}' cannot be calibrated", did_you_mean(kind, METHODS)
         raise ConfigError(Problem(what, expected=listing(METHODS), hint=hint))
-    answer = divert_stdout() if as_json else None
+    answer = stdout_to_stderr() if as_json else None
     outcome = calibrate(method, request, _Progress())
     if answer is None:
-        say(*told(outcome))
+        say(*summary_lines(outcome))
     else:
         answer(as_line(_values_of(outcome)))
     if outcome.refused:
@@ -53,12 +53,12 @@ def calibrate_kind(kind: str, request: CalibrationRequest, *, as_json: bool) -> 
         raise ConfigError(Problem(what, hint=hint))
 
 
-def told(outcome: Outcome) -> list[str]:
+def summary_lines(outcome: Outcome) -> list[str]:
     """What was found, how far it is from what was in use, and where it is kept."""
     entry, picture = outcome.stored.entry, outcome.stored.picture
     state = "in use from the next run on" if not outcome.refused else "not in use"
     figures = [(name, quantity(value, name)) for name, value in entry.quality.items()]
-    lines = [f"{entry.kind} {entry.id}: {state}", *outcome.told]
+    lines = [f"{entry.kind} {entry.id}: {state}", *outcome.summary_lines]
     lines += ["", *columns(figures)] if figures else []
     if outcome.before is not None:
         lines += ["", f"against {outcome.before.id}, which was in use:", *difference_table(outcome.changes)]
@@ -93,7 +93,7 @@ class _Progress:
         """Print what lasts, and how far it is."""
         if name == "run_starting":
             self._run = values["record"]
-        if name in LASTING and (text := tell(name, values, self._run)):
+        if name in LASTING and (text := event_text(name, values, self._run)):
             say(text, stream=sys.stderr)
         if name == "shot_finished" and self._run is not None:
             self._n_done += 1

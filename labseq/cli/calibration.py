@@ -192,7 +192,7 @@ def quantity(value: float | None, name: str) -> str:
     return f"{value:.4g} {unit}".rstrip()
 
 
-def told_quality(entry: CalibrationEntry) -> str:
+def quality_text(entry: CalibrationEntry) -> str:
     """The deciding figure of a calibration in words; "-" if it has none."""
     deciding, figure = DECIDING[entry.kind], figure_of(entry)
     return "-" if math.isnan(figure) else f"{deciding.words} {quantity(figure, deciding.figure)}"
@@ -205,7 +205,7 @@ def _row(one: Stored | Damaged, used: Mapping[str, str]) -> tuple[str, ...]:
     entry = one.entry
     origin = entry.origin.get("run") or entry.origin.get("command") or "-"
     taken, age = _time_text(entry.taken_utc), age_text(age_s(entry))
-    return (entry.kind, entry.id, taken, age, told_quality(entry), mark, clean(str(origin)))
+    return (entry.kind, entry.id, taken, age, quality_text(entry), mark, clean(str(origin)))
 
 
 def _values_of(one: Stored | Damaged, used: Mapping[str, str]) -> dict[str, Any]:

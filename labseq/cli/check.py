@@ -11,11 +11,11 @@ from typing import Any, Final, cast
 
 import numpy as np
 
-from labseq.cli.calibration import age_s, told_quality
+from labseq.cli.calibration import age_s, quality_text
 from labseq.cli.excerpt import excerpt
 from labseq.cli.failures import lines_of
 from labseq.cli.log_lines import LogLines
-from labseq.cli.output import columns, divert_stdout, encodes, say
+from labseq.cli.output import columns, stdout_to_stderr, encodes, say
 from labseq.cli.policy_words import policy_texts
 from labseq.cli.show import as_line
 from labseq.cli.timeline import BAR_WIDTH, lines_table, timeline_table
@@ -49,7 +49,7 @@ def check_sequence(
         UnknownPluginError: A plugin that is named does not exist.
         PluginLoadError: A plugin that is named failed to load.
     """
-    answer = divert_stdout() if as_json else None
+    answer = stdout_to_stderr() if as_json else None
     observer = LogLines(sys.stderr)
     try:
         session = Session.open(
@@ -137,7 +137,7 @@ def _what(assembly: Assembly) -> list[tuple[str, str]]:
 def _calibrated(assembly: Assembly) -> list[str]:
     """A line for each calibration in use."""
     return [
-        f"{entry.kind} {entry.id}, {age_text(age_s(entry))} old, {told_quality(entry)}"
+        f"{entry.kind} {entry.id}, {age_text(age_s(entry))} old, {quality_text(entry)}"
         for entry in assembly.bench.calibrations.values()
     ]
 

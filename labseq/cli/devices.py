@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from labseq.cli.check import refusal
-from labseq.cli.output import columns, divert_stdout, say, tell_compiling
+from labseq.cli.output import columns, stdout_to_stderr, say, report_compiling
 from labseq.config.wording import clean
 from labseq.errors import ConfigError, DeviceError
 from labseq.kernels.compile import announcing
@@ -36,9 +36,9 @@ def show_devices(profile: str, overrides: Sequence[str], dry_run: DryRun, *, as_
         DeviceError: Somebody else uses the same devices; none was touched.
         StopRequested: Ctrl-C or SIGTERM came meanwhile; told are the devices that were tried.
     """
-    answer = divert_stdout() if as_json else None
+    answer = stdout_to_stderr() if as_json else None
     try:
-        with announcing(tell_compiling):
+        with announcing(report_compiling):
             report = check_devices(profile, overrides, dry_run)
     except BaseException as error:
         if answer is not None:

@@ -17,7 +17,7 @@ EXIT_SIGNALLED: Final = 128
 """Added to the signal's number, as shells do: 130 for Ctrl-C, 143 for SIGTERM."""
 EXIT_INTERRUPTED: Final = EXIT_SIGNALLED + 2
 EXIT_INTERNAL: Final = 1
-MAX_TOLD: Final = 50
+MAX_REPORTED: Final = 50
 """Problems of a file that are told; a file with more of them is not what it was taken for."""
 
 
@@ -33,21 +33,21 @@ def report(error: BaseException, *, debug: bool = False) -> int:
     """
     if debug:
         traceback.print_exception(error)
-    lines = told(error) if isinstance(error, ConfigError) else lines_of(error)
+    lines = format_config_error(error) if isinstance(error, ConfigError) else lines_of(error)
     with suppress(OSError, RecordingError):  # the exit code says it, too
         say(*lines, stream=sys.stderr)
     return exit_code_of(error)
 
 
-def told(error: ConfigError) -> list[str]:
+def format_config_error(error: ConfigError) -> list[str]:
     """Every problem with the line that it is in, and what else there is to look at.
 
     Of very many problems only the first are told.
     """
     lines: list[str] = []
-    for problem, text in zip(error.problems[:MAX_TOLD], lines_of(error), strict=False):
+    for problem, text in zip(error.problems[:MAX_REPORTED], lines_of(error), strict=False):
         lines += [text, *excerpt(problem), *(f"      = {note}" for note in problem.notes)]
-    n_more = len(error.problems) - MAX_TOLD
+    n_more = len(error.problems) - MAX_REPORTED
     return [*lines, f"and {plural(n_more, 'more problem')}"] if n_more > 0 else lines
 
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
-from labseq.cli.output import divert_stdout
+from labseq.cli.output import stdout_to_stderr
 from labseq.cli.show import as_line
 from labseq.config.reading import is_file
 from labseq.config.wording import visible
@@ -32,10 +32,10 @@ def json_writer(name: str | None) -> Callable[[Any], None]:
     if name is None:
         return lambda _: None
     if name == STDOUT:
-        answer = divert_stdout()
+        answer = stdout_to_stderr()
         return lambda value: answer(as_line(value))
     path = Path(name)
-    prove_writable(path)
+    check_writable(path)
     return lambda value: write_text(path, f"{as_line(value)}\n")
 
 
@@ -62,7 +62,7 @@ def check_different(*names: str | Path | None) -> None:
         seen.add(real)
 
 
-def prove_writable(path: Path) -> None:
+def check_writable(path: Path) -> None:
     """Find out that a file cannot be written before hours are spent.
 
     Raises:

@@ -94,10 +94,10 @@ class Follower:
         for i, line in enumerate(lines):
             with suppress(KeyError, TypeError, ValueError, AttributeError):  # a damaged line
                 self._told_s = datetime.fromisoformat(line["t_utc"]).timestamp()
-                yield from self._tell(line["event"], line["values"], whole=i in to_open)
+                yield from self._forward(line["event"], line["values"], whole=i in to_open)
         self._told_s = math.nan
 
-    def _tell(self, name: str, values: dict[str, Any], *, whole: bool) -> Iterator[Event]:
+    def _forward(self, name: str, values: dict[str, Any], *, whole: bool) -> Iterator[Event]:
         if name == "run_starting":
             yield name, values | {"record": self._record}
         elif name in _OF_SHOTS:

@@ -9,10 +9,10 @@ import time
 from contextlib import suppress
 from typing import Any, Final, NoReturn
 
-from labseq.cli.output import give_up_unwritten, say
+from labseq.cli.output import discard_unwritten, say
 from labseq.errors import RecordingError
 
-PATIENCE_S: Final = 1.0
+MAX_WAIT_S: Final = 1.0
 """How long threads may take to end by themselves."""
 
 
@@ -33,12 +33,12 @@ def end_process(code: Any) -> NoReturn:
         threads = "a thread" if len(names) == 1 else f"{len(names)} threads"
         text = f"warning: {threads} of a plugin would not end: {', '.join(names)}; ended with the process"
         say(text, stream=sys.stderr)
-    give_up_unwritten()
+    discard_unwritten()
     os._exit(code if isinstance(code, int) else int(code is not None))
 
 
 def _wait() -> None:
-    deadline = time.monotonic() + PATIENCE_S
+    deadline = time.monotonic() + MAX_WAIT_S
     for thread in _left_over():
         thread.join(max(0.0, deadline - time.monotonic()))
 

@@ -20,7 +20,7 @@ from labseq.cli.glyphs import UNICODE, glyphs_for
 from labseq.cli.log_lines import LogLines
 from labseq.cli.picture import draw
 from labseq.cli.tally import Tally
-from labseq.cli.telling import LASTING, tell
+from labseq.cli.telling import LASTING, event_text
 from labseq.roles import RunObserver
 
 REDRAW_S: Final = 0.25
@@ -31,7 +31,7 @@ _BETWEEN_SHOTS: Final = frozenset(
 )
 
 
-class ClosingObserver(RunObserver, Protocol):
+class ClosableObserver(RunObserver, Protocol):
     """An observer that must be told when the run is over, in whatever way."""
 
     def refresh(self) -> None:
@@ -43,7 +43,7 @@ class ClosingObserver(RunObserver, Protocol):
         ...
 
 
-def observer_for(stream: TextIO, run_now: Callable[[], float] | None = None) -> ClosingObserver:
+def observer_for(stream: TextIO, run_now: Callable[[], float] | None = None) -> ClosableObserver:
     """The live view if the stream is a terminal that can show it, else plain lines.
 
     Args:
@@ -85,7 +85,7 @@ class LiveView:
     def event(self, name: str, values: Mapping[str, Any]) -> None:
         """Take an event into account and draw if it is time."""
         self._tally.note(name, values)
-        text = tell(name, values, self._tally.record)
+        text = event_text(name, values, self._tally.record)
         if text and name in LASTING:
             self._print(text)
         elif text:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any, Final, TextIO
 
 from labseq.cli.output import say
-from labseq.cli.telling import LASTING, tell
+from labseq.cli.telling import LASTING, event_text
 from labseq.model import RunRecord
 
 _TOLD: Final = LASTING | {"shot_finished", "scan_point", "scan_ended"}
@@ -27,7 +27,7 @@ class LogLines:
         """Print a line if the event is worth one."""
         if name == "run_starting":
             self._run = values["record"]
-        text = tell(name, values, self._run) if name in _TOLD else ""
+        text = event_text(name, values, self._run) if name in _TOLD else ""
         if text:
             say(text, stream=self._stream)
 

@@ -8,7 +8,7 @@ from labseq.cli.output import say
 from labseq.config.wording import clean, did_you_mean, listing
 from labseq.errors import ConfigError, Problem
 from labseq.registry import KINDS
-from labseq.scaffolds import FILE_KINDS, Made, make_file, make_plugin
+from labseq.scaffolds import FILE_KINDS, CreatedFiles, make_file, make_plugin
 
 
 def make_new(kind: str, name: str, folder: Path, *, package: bool, profile: str | None) -> None:
@@ -40,7 +40,7 @@ def make_new(kind: str, name: str, folder: Path, *, package: bool, profile: str 
     say(*lines_of(kind, name, made))
 
 
-def lines_of(kind: str, name: str, made: Made) -> list[str]:
+def lines_of(kind: str, name: str, made: CreatedFiles) -> list[str]:
     """What is printed.
 
     Example:

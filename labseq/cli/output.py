@@ -12,7 +12,7 @@ from typing import TextIO
 from labseq.errors import RecordingError
 
 
-def forgive_encoding() -> None:
+def replace_unencodable() -> None:
     """Let stdout and stderr replace characters that they cannot encode instead of failing.
 
     Closed ones lead nowhere from now on, so that no file of a run takes their place.
@@ -26,7 +26,7 @@ def forgive_encoding() -> None:
             stream.reconfigure(errors="replace")
 
 
-def divert_stdout() -> Callable[[str], None]:
+def stdout_to_stderr() -> Callable[[str], None]:
     """Send whatever anybody prints to stderr, for the rest of the process.
 
     That includes C libraries and child processes, so that nothing but the answer
@@ -52,7 +52,7 @@ def divert_stdout() -> Callable[[str], None]:
     return answer
 
 
-def tell_compiling(module: str) -> None:
+def report_compiling(module: str) -> None:
     """Say on stderr why it takes longer this time."""
     say(f"compiling {module}; later runs find it in the cache", stream=sys.stderr)
 
@@ -91,7 +91,7 @@ def writing_to(stream: TextIO) -> Generator[None]:
         raise RecordingError(stream.name, f"cannot be written: {error.strerror}") from error
 
 
-def give_up_unwritten() -> None:
+def discard_unwritten() -> None:
     """Drop what stdout and stderr could not take, else Python tries again as it ends, and complains."""
     for stream in (sys.stdout, sys.stderr):
         try:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from labseq.cli.files import STDOUT, check_different, json_writer
-from labseq.cli.output import say, tell_compiling
+from labseq.cli.output import say, report_compiling
 from labseq.cli.words import plural
 from labseq.kernels.compile import interpret
 from labseq.session import PlannedMoves, PlanRequest, plan_moves, read_source
@@ -53,7 +53,7 @@ def plan_once(request: PlanRequest, output: PlanOutput) -> None:
         check_picture(output.png, source.occupancy.shape)
     if source.occupancy.size <= INTERPRETED_SITES:
         interpret()
-    moves = plan_moves(request, source, announce=tell_compiling)
+    moves = plan_moves(request, source, announce=report_compiling)
     if output.png is not None:
         _draw(moves, output.png)
     if output.json != STDOUT:

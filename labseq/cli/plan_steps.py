@@ -38,7 +38,7 @@ class Steps:
             drawn = self.canvas.pair(("before", "after"), arrays[i : i + 2], (batch.from_sites, landed))
             yield [
                 Text.assemble((f"batch {i + 1} of {plan.n_batches}", "bold"), "  ", self._words(i, batch)),
-                *(Text(f"  {line}") for line in move_words(batch, shape, self.arrow)),
+                *(Text(f"  {line}") for line in moves_text(batch, shape, self.arrow)),
                 *drawn,
             ]
 
@@ -55,7 +55,7 @@ class Steps:
         return ", ".join(parts)
 
 
-def move_words(batch: Batch, shape: tuple[int, int], arrow: str = "->") -> list[str]:
+def moves_text(batch: Batch, shape: tuple[int, int], arrow: str = "->") -> list[str]:
     """Name the moves of a batch, a line of text per row or column.
 
     Args:
@@ -64,7 +64,7 @@ def move_words(batch: Batch, shape: tuple[int, int], arrow: str = "->") -> list[
         arrow: Stands between the ends of a move.
 
     Example:
-        >>> move_words(Batch([(2, 0), (2, 4)], [(2, 3), (2, 5)]), (5, 5))
+        >>> moves_text(Batch([(2, 0), (2, 4)], [(2, 3), (2, 5)]), (5, 5))
         ['row 2: columns 0->3, 4->ejected']
     """
     along_column = bool(np.any(batch.from_sites[:, 0] != batch.to_sites[:, 0]))

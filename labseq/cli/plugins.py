@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from labseq.cli.output import columns, divert_stdout, say
+from labseq.cli.output import columns, stdout_to_stderr, say
 from labseq.cli.show import as_line
 from labseq.config import load_profile, plugin_paths
 from labseq.plugins import PluginHost, PluginInfo
@@ -25,9 +25,9 @@ def list_plugins(profile: str | None, *, as_json: bool = False) -> None:
     Raises:
         ConfigError: The profile is wrong, or one of its folders does not exist.
     """
-    answer = divert_stdout() if as_json else None
-    folders, patience_s = _folders(profile)
-    host = load_plugins(folders, patience_s=patience_s)
+    answer = stdout_to_stderr() if as_json else None
+    folders, max_wait_s = _folders(profile)
+    host = load_plugins(folders, max_wait_s=max_wait_s)
     if answer is None:
         say(*table(host))
     else:

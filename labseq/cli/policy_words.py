@@ -16,7 +16,7 @@ def policy_texts(assembly: Assembly) -> list[str]:
     """What differs from doing without policies, a line for the run, each step and each check."""
     policy, spec = assembly.policy, assembly.sequence
     texts = [text for text in [_differing(policy.otherwise, StepPolicy())] if text]
-    if policy.used_up == "skip_point":
+    if policy.when_exhausted == "skip_point":
         texts.append("a shot whose attempts are used up skips its point")
     for number, (step, own) in enumerate(zip(spec.shot, policy.steps, strict=True)):
         if text := _differing(own, policy.otherwise):

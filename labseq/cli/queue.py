@@ -84,22 +84,22 @@ def run_entries(*, keep_going: bool, watch: bool) -> int:
     def take(opening: Opening) -> None:
         run_session(opening, as_json=False)
 
-    runs = QueueRun(Queue(data_root()), take, _tell, report, keep_going=keep_going)
+    runs = QueueRun(Queue(data_root()), take, _report, report, keep_going=keep_going)
     runs.run(watch=watch)
     return 0 if runs.first_error is None else exit_code_of(runs.first_error)
 
 
-def _tell(entry: Entry) -> None:
+def _report(entry: Entry) -> None:
     again = f", goes on with {entry.run_dir}" if entry.run_dir is not None else ""
     say(f"queue: {entry.id} {clean(str(entry.sequence))}{again}")
 
 
 def _row(entry: Entry) -> tuple[str, ...]:
     added = f"{datetime.fromisoformat(entry.added_utc).astimezone():%Y-%m-%d %H:%M}"
-    return str(entry.id), entry.state, clean(_short(entry.sequence)), added, clean(_told(entry.options))
+    return str(entry.id), entry.state, clean(_short(entry.sequence)), added, clean(_options_text(entry.options))
 
 
-def _told(options: Options) -> str:
+def _options_text(options: Options) -> str:
     changes = options.changes()
     return ", ".join(f"{address}={value}" for address, value in changes.items())
 

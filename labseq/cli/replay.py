@@ -12,17 +12,17 @@ from typing import Any, Final
 import numpy as np
 
 from labseq.cli.files import json_writer
-from labseq.cli.output import columns, divert_stdout, say, tell_compiling
+from labseq.cli.output import columns, stdout_to_stderr, say, report_compiling
 from labseq.cli.show import as_line, chosen_run
 from labseq.cli.words import count_of, percent, plural, settings_text
 from labseq.model.estimate import Estimate, mean
 from labseq.recording.plain import to_plain
 from labseq.session.replay import Replay, ReplayRequest, replay
 from labseq.session.replay_images import ReplayedImages
-from labseq.session.replay_plans import Means, ReplayedPlan
+from labseq.session.replay_plans import MeanCounts, ReplayedPlan
 from labseq.units import format_quantity
 
-MOST_TOLD: Final = 5
+MAX_REPORTED: Final = 5
 """Failures that are told one by one."""
 WIDEST: Final = 64
 """Widest array whose differing sites are drawn."""
@@ -45,8 +45,8 @@ def replay_run(path: Path | None, request: ReplayRequest, output: Path | None, *
     """
     run = chosen_run(path)
     write = json_writer(None if output is None else str(output))
-    answer = divert_stdout() if as_json else None
-    found = replay(run, request, announce=tell_compiling)
+    answer = stdout_to_stderr() if as_json else None
+    found = replay(run, request, announce=report_compiling)
     values = as_values(found)
     write(values)
     if answer is not None:
@@ -91,8 +91,8 @@ def _plan_lines(found: Replay) -> list[str]:
     rows: list[tuple[str, ...]] = []
     for label, plans in _groups(found.plans):
         made = [plan.replayed for plan in plans if plan.replayed is not None]
-        rows.append(_row(f"{label}, recorded", Means.over([plan.recorded for plan in plans])))
-        rows.append(_row(f"{label}, replayed", Means.over(made)))
+        rows.append(_row(f"{label}, recorded", MeanCounts.over([plan.recorded for plan in plans])))
+        rows.append(_row(f"{label}, replayed", MeanCounts.over(made)))
     n_same, n_failed = sum(plan.same for plan in found.plans), sum(bool(p.failure) for p in found.plans)
     lines = [_title("planner", found.used["planner"], found.changed["planner"])]
     lines += columns([header, *rows], right=range(1, len(header)))
@@ -114,7 +114,7 @@ def _groups(plans: Sequence[ReplayedPlan]) -> Iterator[tuple[str, list[ReplayedP
         yield "all", list(plans)
 
 
-def _row(label: str, means: Means) -> tuple[str, ...]:
+def _row(label: str, means: MeanCounts) -> tuple[str, ...]:
     return (
         label,
         str(means.n_plans),
@@ -185,8 +185,8 @@ def _failure_lines(found: Replay) -> list[str]:
     ]
     lines += [f"shot {s + 1}, image {i + 1}: {text}" for (s, i), text in found.images.failures.items()]
     lines += [f"shot {shot + 1} is left out: {text}" for shot, text in found.unreadable.items()]
-    more = len(lines) - MOST_TOLD
-    return [*lines[:MOST_TOLD], *([f"and {more} more; all of them with --output FILE"] if more > 0 else [])]
+    more = len(lines) - MAX_REPORTED
+    return [*lines[:MAX_REPORTED], *([f"and {more} more; all of them with --output FILE"] if more > 0 else [])]
 
 
 def as_values(found: Replay) -> dict[str, Any]:
@@ -220,15 +220,15 @@ def as_values(found: Replay) -> dict[str, Any]:
 def _plan_values(plans: Sequence[ReplayedPlan]) -> dict[str, Any]:
     made = [plan.replayed for plan in plans if plan.replayed is not None]
     return {
-        "recorded": _means_values(Means.over([plan.recorded for plan in plans])),
-        "replayed": _means_values(Means.over(made)),
+        "recorded": _means_values(MeanCounts.over([plan.recorded for plan in plans])),
+        "replayed": _means_values(MeanCounts.over(made)),
         "n_same": sum(plan.same for plan in plans),
         "n_invalid": sum(bool(plan.failure) for plan in plans),
         "plans": [asdict(plan) for plan in plans],
     }
 
 
-def _means_values(means: Means) -> dict[str, Any]:
+def _means_values(means: MeanCounts) -> dict[str, Any]:
     named = {name: getattr(means, name) for name in means.__slots__}
     return {
         name: {"mean": value.value, "error": value.error} if isinstance(value, Estimate) else value

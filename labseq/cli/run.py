@@ -10,7 +10,7 @@ from pathlib import Path
 
 from labseq.cli.failures import lines_of
 from labseq.cli.live import observer_for
-from labseq.cli.output import divert_stdout, say
+from labseq.cli.output import stdout_to_stderr, say
 from labseq.cli.show import as_line, existing, json_summary, summary_lines
 from labseq.errors import LabseqError, RecordingError, StopRequested
 from labseq.recording import Run, open_run
@@ -66,7 +66,7 @@ def run_session(opening: Callable[[RunObserver | None], Session], *, as_json: bo
     Raises:
         LabseqError: Whatever ended the run.
     """
-    answer = divert_stdout() if as_json else None
+    answer = stdout_to_stderr() if as_json else None
     observer = observer_for(sys.stdout)
     session: Session | None = None
     failure: BaseException | None = None
@@ -82,7 +82,7 @@ def run_session(opening: Callable[[RunObserver | None], Session], *, as_json: bo
             observer.close()
         run = _read_back(session)
         if run is not None:
-            _tell(run)
+            _report(run)
         if answer is not None:
             _answer(answer, outcome(session, run, failure), failure)
 
@@ -104,7 +104,7 @@ def outcome(session: Session | None, run: Run | None, failure: BaseException | N
     return as_line(values)
 
 
-def _tell(run: Run) -> None:
+def _report(run: Run) -> None:
     """Print the summary; a full disk behind stdout takes nothing from the run."""
     lines = summary_lines(run)
     try:

@@ -28,7 +28,7 @@ def secure_profile(profile: str, overrides: Sequence[str]) -> int:
     secured = make_profile_safe(profile, overrides, _Lines())
     if secured.problems is not None:
         report(secured.problems)
-    if any(secured.tried.values()):
+    if any(secured.attempted.values()):
         return DeviceError.exit_code
     return ConfigError.exit_code if secured.refused or secured.problems else 0
 

@@ -14,8 +14,8 @@ from labseq.cli.glyphs import Glyphs
 from labseq.model import ShotRecord
 from labseq.recording.chosen_points import SCANNER, ChosenPoints
 
-LEAST_WIDTH: Final = 16
-LEAST_HEIGHT: Final = 4
+MIN_WIDTH: Final = 16
+MIN_HEIGHT: Final = 4
 """Lines that a plot takes at least, its title and the line below it included."""
 BAR: Final = 5
 """Most characters that the bar of a point is wide."""
@@ -111,7 +111,7 @@ def draw_scan(tally: ScanTally, width: int, height: int, glyphs: Glyphs) -> list
     points = tally.points()
     shown = _merged([point for _, point in points], width - LABEL)
     taken = [point for point in shown if point.n_shots]
-    if not taken or width < LEAST_WIDTH or height < LEAST_HEIGHT:
+    if not taken or width < MIN_WIDTH or height < MIN_HEIGHT:
         return []
     is_rate = any(point.n_defect_free for point in taken)
     values = [_value(point, is_rate=is_rate) for point in shown]

@@ -75,12 +75,12 @@ def show_run(path: Path | None, *, as_json: bool, tables: Tables | None = None) 
     if as_json:
         say(as_line(values))
     elif wanted.any:
-        say(*_told(run, wanted))
+        say(*_output_lines(run, wanted))
     else:
         say(*shot_table(run), "", *summary_lines(run))
 
 
-def _told(run: Run, wanted: Tables) -> list[str]:
+def _output_lines(run: Run, wanted: Tables) -> list[str]:
     """The tables that are wanted, with an empty line between them."""
     found: list[list[str]] = []
     if wanted.shots:

@@ -12,7 +12,7 @@ from labseq.model.estimate import Estimate
 from labseq.recording.rates import Rate
 from labseq.recording.statistics import CycleStatistics, Statistics
 
-MOST_DEFECTS: Final = 6
+MAX_DEFECTS: Final = 6
 """From this number of defects on shots are counted together."""
 NOT_JUDGED: Final = "not judged: no image step after the last rearrangement"
 
@@ -116,7 +116,7 @@ def histogram_text(counts: Sequence[int]) -> str:
         >>> histogram_text((1,) * 12)
         'none in 1, 1 in 1, 2 in 1, 3 in 1, 4 in 1, 5 in 1, 6 or more in 6 shots'
     """
-    apart = len(counts) if len(counts) <= MOST_DEFECTS + 1 else MOST_DEFECTS
+    apart = len(counts) if len(counts) <= MAX_DEFECTS + 1 else MAX_DEFECTS
     parts = [f"{n or 'none'} in {count}" for n, count in enumerate(counts[:apart]) if count]
     if rest := sum(counts[apart:]):
         parts.append(f"{apart} or more in {rest}")

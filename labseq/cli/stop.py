@@ -11,7 +11,7 @@ from labseq.cli.show import existing
 from labseq.errors import ConfigError
 from labseq.recording import data_root
 from labseq.session.queue import Queue
-from labseq.session.stopping import ask_to_stop, find_running, is_running, running_here, told_owner
+from labseq.session.stopping import ask_to_stop, find_running, is_running, running_here, owner_text
 
 LOOK_S: Final = 0.1
 """How often ``--wait`` looks."""
@@ -38,7 +38,7 @@ def stop_run(run: Path | None, profile: str | None, *, queue: bool, wait: bool) 
             return
     folder = find_running(None if run is None else existing(run), profile)
     ask_to_stop(folder)
-    say(f"{folder} ({told_owner(folder)}) ends after the shot at hand")
+    say(f"{folder} ({owner_text(folder)}) ends after the shot at hand")
     say(f"go on later with: labseq resume {folder}")
     while wait and is_running(folder):
         time.sleep(LOOK_S)

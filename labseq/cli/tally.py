@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from labseq.cli.scan_plot import ScanTally
-from labseq.cli.telling import tell_best
+from labseq.cli.telling import best_text
 from labseq.model import ImageRecord, RunRecord, ShotRecord, StageTiming
 
 STAGES: Final = ("expose", "read_out", "detect", "plan", "check", "prepare", "play", "move", "write")
@@ -127,7 +127,7 @@ class Tally:
                 if self.scan is None and values["record"].scan:  # a run that is resumed goes on with its own
                     self.scan = ScanTally(values["record"].scan)
             case "scan_point":
-                self.best = tell_best(values)
+                self.best = best_text(values)
             case "run_finished":
                 self.status = values["status"]
             case _:

@@ -17,7 +17,7 @@ LASTING: Final = frozenset(
 """Events that must not scroll out of the live view unseen."""
 
 
-def tell(name: str, values: Mapping[str, Any], run: RunRecord | None) -> str:
+def event_text(name: str, values: Mapping[str, Any], run: RunRecord | None) -> str:
     """Put an event into words.
 
     Args:
@@ -30,9 +30,9 @@ def tell(name: str, values: Mapping[str, Any], run: RunRecord | None) -> str:
     """
     match name:
         case "run_starting":
-            return tell_run(values["record"], values["run_dir"], values.get("n_before", 0))
+            return run_text(values["record"], values["run_dir"], values.get("n_before", 0))
         case "shot_finished":
-            return tell_shot(values["shot"], run)
+            return shot_text(values["shot"], run)
         case "shot_repeated":
             shot: ShotRecord = values["shot"]
             return f"shot {shot.shot_index + 1}: attempt {shot.attempt + 1} failed, once more: {shot.error}"
@@ -56,7 +56,7 @@ def tell(name: str, values: Mapping[str, Any], run: RunRecord | None) -> str:
             who, signal = values["device"], values["signal"]
             return f"shot {values['shot'] + 1}: waiting for '{signal}' from {who}, at most {longest}"
         case "scan_point":
-            return tell_point(values)
+            return point_text(values)
         case "scan_ended":
             return f"{values['scanner']} wants no more points"
         case "device_command":
@@ -65,17 +65,17 @@ def tell(name: str, values: Mapping[str, Any], run: RunRecord | None) -> str:
             return ""
 
 
-def tell_point(values: Mapping[str, Any]) -> str:
+def point_text(values: Mapping[str, Any]) -> str:
     """A line about a point of an adaptive scan, and the best one so far."""
     best = values["best"]
     at = ", ".join(f"{address} {text}" for address, text in values["written"].items())
     own = f"point {values['point'] + 1} ({at}): {values['figure']} {_figure(values['value'])}"
     if best is None:
         return own
-    return f"{own}; best so far " + ("this" if best["point"] == values["point"] else tell_best(values))
+    return f"{own}; best so far " + ("this" if best["point"] == values["point"] else best_text(values))
 
 
-def tell_best(values: Mapping[str, Any]) -> str:
+def best_text(values: Mapping[str, Any]) -> str:
     """The best point of an adaptive scan so far, without its addresses; "" if there is none."""
     best = values["best"]
     if best is None:
@@ -87,7 +87,7 @@ def _figure(value: float | None) -> str:
     return "unknown" if value is None else f"{value:.5g}"
 
 
-def tell_run(run: RunRecord, run_dir: str, n_before: int = 0) -> str:
+def run_text(run: RunRecord, run_dir: str, n_before: int = 0) -> str:
     """A line about a run that starts, or goes on with so many shots taken before."""
     simulated = ", simulated" if run.simulated else ""
     profile = Path(run.profile_path).stem
@@ -95,7 +95,7 @@ def tell_run(run: RunRecord, run_dir: str, n_before: int = 0) -> str:
     return f"{run_dir}: {plural(run.n_shots, 'shot')}{before}, seed {run.seed}, profile {profile}{simulated}"
 
 
-def tell_shot(shot: ShotRecord, run: RunRecord | None) -> str:
+def shot_text(shot: ShotRecord, run: RunRecord | None) -> str:
     """A line about a shot that is over."""
     of = f"{shot.shot_index + 1}/{run.n_shots}" if run is not None else f"{shot.shot_index + 1}"
     if shot.status != "complete":

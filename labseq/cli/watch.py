@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final, TextIO
 
 from labseq.cli.following import Follower
-from labseq.cli.live import ClosingObserver, observer_for
+from labseq.cli.live import ClosableObserver, observer_for
 from labseq.cli.output import say
 from labseq.cli.show import chosen_run, summary_lines
 from labseq.recording import open_run
@@ -49,7 +49,7 @@ def watch_run(
         view.close()
 
 
-def follow(follower: Follower, view: ClosingObserver, wait: Callable[[float], None]) -> None:
+def follow(follower: Follower, view: ClosableObserver, wait: Callable[[float], None]) -> None:
     """Tell a view what comes, until the run is over.
 
     Args:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from labseq.cli.check import size_text
 from labseq.cli.files import check_different, json_writer
-from labseq.cli.output import columns, say, tell_compiling
+from labseq.cli.output import columns, say, report_compiling
 from labseq.cli.plan import warnings
 from labseq.cli.plan_report import what
 from labseq.cli.words import percent, plural
@@ -52,7 +52,7 @@ def show_waveform(request: WaveformRequest, output: WaveformOutput) -> None:
     check_different(request.plan.occupancy, output.json, output.png, output.npz)
     write = json_writer(output.json)
     _check_files(output)
-    waveform = plan_waveform(request, announce=tell_compiling)
+    waveform = plan_waveform(request, announce=report_compiling)
     both = waveform.statistics()
     if output.npz is not None:
         from labseq.session.waveform_file import save_samples

@@ -2,9 +2,9 @@
 
 from labseq.config.addresses import Override, profile_overrides, split_overrides
 from labseq.config.calibrations import CalibrationChoices, CalibrationSettings
-from labseq.config.collect import Collected
+from labseq.config.collect import ProblemCollector
 from labseq.config.devices import DEVICE_KEYS
-from labseq.config.document import Document, Kept
+from labseq.config.document import Document, StoredText
 from labseq.config.fields import ROLES, Choice, plugin_paths
 from labseq.config.find import find_profile, find_sequence
 from labseq.config.lines import LINES_KEYS
@@ -30,7 +30,7 @@ from labseq.config.steps import (
 )
 from labseq.config.timeouts import TimeoutSettings
 from labseq.config.values import validate_values
-from labseq.places import keeping_dir, packaged_profiles_dir, packaged_sequences_dir
+from labseq.places import profile_dir, packaged_profiles_dir, packaged_sequences_dir
 
 __all__ = [
     "DEVICE_KEYS",
@@ -44,12 +44,12 @@ __all__ = [
     "CheckSettings",
     "CheckSitesSettings",
     "Choice",
-    "Collected",
+    "ProblemCollector",
     "DeviceSettings",
     "Document",
     "EqualiseSettings",
     "ImageSettings",
-    "Kept",
+    "StoredText",
     "LoadSettings",
     "Loc",
     "MotionSettings",
@@ -68,7 +68,7 @@ __all__ = [
     "bind_scan",
     "find_profile",
     "find_sequence",
-    "keeping_dir",
+    "profile_dir",
     "load_profile",
     "load_sequence",
     "packaged_profiles_dir",

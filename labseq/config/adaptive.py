@@ -8,7 +8,7 @@ from typing import Annotated, Any, Final, Self, TypeAlias
 
 from pydantic import Field, WithJsonSchema, model_validator
 
-from labseq.config.fields import Choice, Text, misfit
+from labseq.config.fields import Choice, Text, setting_error
 from labseq.config.nodes import Loc, Mark, Node
 from labseq.config.scan_values import MAX_POINTS, Number
 from labseq.config.settings import Settings
@@ -47,9 +47,9 @@ class AdaptiveChoice(Choice):
     @model_validator(mode="after")
     def _has_one_aim(self) -> Self:
         if self.maximise is None and self.minimise is None:
-            raise misfit("the scan has no aim", "'maximise' or 'minimise' with the name of a figure")
+            raise setting_error("the scan has no aim", "'maximise' or 'minimise' with the name of a figure")
         if self.maximise is not None and self.minimise is not None:
-            raise misfit(
+            raise setting_error(
                 "'maximise' and 'minimise' stand together", "one of them", at=("minimise",), key=True
             )
         return self

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 from labseq.config.adaptive import Adaptive, AdaptiveChoice, Ends
 from labseq.config.addresses import Override
-from labseq.config.collect import Collected
+from labseq.config.collect import ProblemCollector
 from labseq.config.document import Document
 from labseq.config.nodes import Node
 from labseq.config.scan import Axis, Group, Scan
@@ -25,7 +25,7 @@ def is_adaptive(node: Node) -> bool:
     return isinstance(node.value, dict) and "use" in node.value
 
 
-def read_adaptive(document: Document, repeats: int, fixed: Sequence[Override], found: Collected) -> Scan:
+def read_adaptive(document: Document, repeats: int, fixed: Sequence[Override], found: ProblemCollector) -> Scan:
     """Read an adaptive scan.
 
     Args:

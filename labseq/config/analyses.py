@@ -6,7 +6,7 @@ from typing import Annotated, Final, Literal, TypeAlias
 
 from pydantic import AfterValidator, Field
 
-from labseq.config.fields import Choice, empty_is, misfit
+from labseq.config.fields import Choice, empty_is, setting_error
 from labseq.config.settings import Duration, Settings
 
 ANALYSIS_KEYS: Final = frozenset({"finish_within"})
@@ -27,7 +27,7 @@ def _listed(choices: tuple[AnalysisChoice, ...]) -> tuple[AnalysisChoice, ...]:
     for i, choice in enumerate(choices):
         if first.setdefault(choice.use, i) != i:
             what = f"the analysis '{choice.use}' stands here a second time"
-            raise misfit(what, "each analysis once", at=(i, "use"))
+            raise setting_error(what, "each analysis once", at=(i, "use"))
     return tuple(choice.placed("analysis", i) for i, choice in enumerate(choices))
 
 

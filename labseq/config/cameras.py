@@ -10,11 +10,11 @@ from labseq.config.settings import Duration, Settings, Temperature
 from labseq.drivers import Cooling
 from labseq.errors import ConfigError
 from labseq.model import SensorMode
-from labseq.roles import Context, KnownSensor, Simulation
+from labseq.roles import Context, ReportsSensor, Simulation
 from labseq.units import ZERO_CELSIUS_K, format_quantity
 
 
-class SensedWorld(Simulation, KnownSensor, Protocol):
+class SimulationWithSensor(Simulation, ReportsSensor, Protocol):
     """A simulated world that tells of its sensor."""
 
 
@@ -45,7 +45,7 @@ class CameraSettings(Settings):
         place = None if region is None else (region.y, region.x, region.height, region.width)
         return SensorMode(place, self.binning)
 
-    def misfit_on(self, sensor_shape: tuple[int, int]) -> str:
+    def sensor_conflict(self, sensor_shape: tuple[int, int]) -> str:
         """Why region and binning do not go with a sensor of (height, width) pixels; "" if they do."""
         y, x, height, width = self.mode.region or (0, 0, *sensor_shape)
         if y + height > sensor_shape[0] or x + width > sensor_shape[1]:
@@ -54,19 +54,19 @@ class CameraSettings(Settings):
             return f"{ends}, beyond the sensor of {rows} x {cols} pixels; choose a smaller or another one"
         return _unbinnable(height, width, self.binning)
 
-    def simulated_world(self, context: Context) -> SensedWorld:
+    def simulated_world(self, context: Context) -> SimulationWithSensor:
         """The simulated world that the simulated counterpart of a camera shows.
 
         Raises:
             ConfigError: There is none, it does not know its sensor, or the region is beyond that.
         """
         world = context.simulation
-        if world is None or not isinstance(world, KnownSensor):
+        if world is None or not isinstance(world, ReportsSensor):
             text = "a simulated camera needs a simulated world that tells of its sensor"
             raise ConfigError(f"{text}; add `simulation: {{use: virtual}}` to the profile")
-        if misfit := self.misfit_on(world.sensor_shape):
-            raise ConfigError(misfit)
-        return cast("SensedWorld", world)
+        if setting_error := self.sensor_conflict(world.sensor_shape):
+            raise ConfigError(setting_error)
+        return cast("SimulationWithSensor", world)
 
     @model_validator(mode="after")
     def _region_can_be_binned(self) -> Self:

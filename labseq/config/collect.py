@@ -7,7 +7,7 @@ from types import TracebackType
 from labseq.errors import ConfigError, Problem
 
 
-class Collected:
+class ProblemCollector:
     """Problems of several checks, so that the user sees them all at once.
 
     Example:
@@ -26,7 +26,7 @@ class Collected:
     def __init__(self) -> None:
         self.problems: list[Problem] = []
 
-    def __enter__(self) -> Collected:
+    def __enter__(self) -> ProblemCollector:
         return self
 
     def __exit__(

@@ -7,7 +7,7 @@ from typing import Annotated, Final
 
 from pydantic import Field
 
-from labseq.config.fields import ROLES, Choice, Text, misfit
+from labseq.config.fields import ROLES, Choice, Text, setting_error
 from labseq.config.settings import Settings
 from labseq.config.wording import clean
 
@@ -40,13 +40,13 @@ def device_name(name: str, what: str) -> None:
     """Refuse what cannot be a name in an address or a file."""
     if not _DEVICE_NAME.fullmatch(name):
         expected = "a word of letters, digits, '_' and '-' that begins with a letter"
-        raise misfit(f"{what} is called '{clean(name)}'", expected, at=(name,), key=True)
+        raise setting_error(f"{what} is called '{clean(name)}'", expected, at=(name,), key=True)
 
 
 def named(devices: dict[str, DeviceChoice]) -> dict[str, DeviceChoice]:
     """Refuse names that a device cannot have, and tell each choice its place."""
     for name in devices:
         if name in (*ROLES, "planner"):
-            raise misfit(f"a device is called '{name}', like a role", "another name", at=(name,), key=True)
+            raise setting_error(f"a device is called '{name}', like a role", "another name", at=(name,), key=True)
         device_name(name, "a device")
     return {name: choice.placed("devices", name) for name, choice in devices.items()}

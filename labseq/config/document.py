@@ -10,20 +10,20 @@ from typing import Any, NamedTuple, TypeVar, cast, overload
 from pydantic import BaseModel
 
 from labseq.config.addresses import Override, find
-from labseq.config.collect import Collected
+from labseq.config.collect import ProblemCollector
 from labseq.config.composer import compose
 from labseq.config.expressions import Expressions, evaluate
 from labseq.config.nodes import Loc, Mark, Node
 from labseq.config.reading import decode, read_bytes
 from labseq.config.settings import NoSettings
-from labseq.config.validation import Asked, validate
+from labseq.config.validation import ValidationContext, validate
 from labseq.config.wording import shown, visible
 from labseq.errors import ConfigError, Problem
 
 M = TypeVar("M", bound=BaseModel)
 
 
-class Kept(NamedTuple):
+class StoredText(NamedTuple):
     """The text of a file as it was at another time; paths in it stay relative to the file.
 
     Attributes:
@@ -66,7 +66,7 @@ class Document:
         object.__setattr__(self, "data", self.root.plain())
 
     @classmethod
-    def read(cls, path: Path, kept: Kept | None = None) -> Document:
+    def read(cls, path: Path, kept: StoredText | None = None) -> Document:
         """Read a file.
 
         Args:
@@ -168,7 +168,7 @@ class Document:
         overrides: Iterable[Override | tuple[str, str]],
         *,
         may_add: Collection[str] = (),
-        found: Collected | None = None,
+        found: ProblemCollector | None = None,
     ) -> Document:
         """A copy with several values replaced, in order; see :meth:`override`.
 
@@ -181,7 +181,7 @@ class Document:
             ConfigError: All the overrides that cannot be applied.
         """
         document = self
-        collected = Collected() if found is None else found
+        collected = ProblemCollector() if found is None else found
         for one in overrides:
             override = Override(*one)
             with collected:
@@ -199,7 +199,7 @@ class Document:
         loc: Loc = ...,
         *,
         drop: Collection[str] = ...,
-        also_known: Collection[str] = ...,
+        other_keys: Collection[str] = ...,
         called: str = ...,
     ) -> M: ...
     @overload
@@ -209,7 +209,7 @@ class Document:
         loc: Loc = ...,
         *,
         drop: Collection[str] = ...,
-        also_known: Collection[str] = ...,
+        other_keys: Collection[str] = ...,
         called: str = ...,
     ) -> None: ...
     def validate(
@@ -218,7 +218,7 @@ class Document:
         loc: Loc = (),
         *,
         drop: Collection[str] = (),
-        also_known: Collection[str] = (),
+        other_keys: Collection[str] = (),
         called: str = "",
     ) -> M | None:
         """Make settings of the mapping at a location; an empty or missing one counts as {}.
@@ -227,14 +227,14 @@ class Document:
             model: The settings model; None for what takes no settings.
             loc: Where the mapping is.
             drop: Keys that are somebody else's and left out.
-            also_known: Keys to name as known when one is misspelt.
+            other_keys: Keys to name as known when one is misspelt.
             called: What messages call the mapping: "camera 'andor'"; "" for its key.
 
         Raises:
             ConfigError: Everything that is wrong in the mapping, in file order.
         """
         name = next((step for step in reversed(loc) if isinstance(step, str)), "")
-        asked = Asked(name, called, drop, also_known, self.path.parent)
+        asked = ValidationContext(name, called, drop, other_keys, self.path.parent)
         result = validate(model or NoSettings, self.root.at(loc), asked)
         if not isinstance(result, list):
             return None if model is None else cast("M", result)

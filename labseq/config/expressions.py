@@ -23,7 +23,7 @@ from labseq.config.expressions_parsing import (
     Tree,
     parse,
 )
-from labseq.config.expressions_values import POWERS, Quantity, ReckoningError, applied, combined, negative
+from labseq.config.expressions_values import POWERS, Quantity, EvaluationError, applied, combined, negative
 from labseq.config.nodes import Loc, Mark, Node
 from labseq.config.wording import clean, did_you_mean, shown
 from labseq.errors import ConfigError, Problem
@@ -87,7 +87,7 @@ def is_expression(node: Node) -> bool:
     return isinstance(node.value, str) and node.value.startswith("=") and not node.value.startswith("==")
 
 
-class _SpoiltError(Exception):
+class _BadReferenceError(Exception):
     """What an expression refers to is wrong, and has been told."""
 
 
@@ -126,9 +126,9 @@ class _Evaluator:
         try:
             value = self._of(loc, node)
             return replace(node, **_scalar(value))
-        except _SpoiltError:
+        except _BadReferenceError:
             return node
-        except ReckoningError as error:
+        except EvaluationError as error:
             self._note(node, 0, str(error))
             return node
 
@@ -136,7 +136,7 @@ class _Evaluator:
         """The value of an expression.
 
         Raises:
-            _SpoiltError: It is wrong; that has been told.
+            _BadReferenceError: It is wrong; that has been told.
         """
         if loc not in self._values:
             self._values[loc] = None
@@ -146,13 +146,13 @@ class _Evaluator:
                 self._values[loc] = self._value(parse(str(node.value)))
             except ExpressionError as error:
                 self._note(node, error.at, error.what, error.expected, error.hint)
-            except _SpoiltError:
+            except _BadReferenceError:
                 pass
             finally:
                 self._stack.pop()
         value = self._values[loc]
         if value is None:
-            raise _SpoiltError
+            raise _BadReferenceError
         return value
 
     def _value(self, tree: Tree) -> Quantity:
@@ -168,7 +168,7 @@ class _Evaluator:
                     return combined(tree.sign, self._value(tree.left), self._value(tree.right))
                 case Applied():
                     return applied(tree.name, [self._value(one) for one in tree.values])
-        except ReckoningError as error:
+        except EvaluationError as error:
             raise ExpressionError(tree.at, str(error)) from None
         except OverflowError:
             raise ExpressionError(tree.at, "this is too large a number") from None
@@ -240,7 +240,7 @@ def _scalar(value: Quantity) -> dict[str, str | int | float]:
     """A result as somebody would have written it, without the dust of rounding.
 
     Raises:
-        ReckoningError: No setting has such a unit.
+        EvaluationError: No setting has such a unit.
     """
     tidy = value.amount
     short = float(f"{tidy:.15g}")
@@ -249,6 +249,6 @@ def _scalar(value: Quantity) -> dict[str, str | int | float]:
     if not value.unit:
         return {"value": tidy, "raw": repr(tidy)}
     if value.powers not in POWERS.values():
-        raise ReckoningError(f"the result is in {value.unit}, which is no unit of any setting")
+        raise EvaluationError(f"the result is in {value.unit}, which is no unit of any setting")
     text = f"{tidy!r} {value.unit}"
     return {"value": text, "raw": text}

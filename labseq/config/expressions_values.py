@@ -59,12 +59,12 @@ class Quantity(NamedTuple):
         pairs = zip(_BASES, self.powers, strict=True)
         return " ".join(base if power == 1 else f"{base}^{power}" for base, power in pairs if power)
 
-    def told(self) -> str:
+    def with_article(self) -> str:
         """With its article: "a time", "an angle", "a number"."""
         return f"{'an' if self.dimension[0] in 'aeio' else 'a'} {self.dimension}"
 
 
-class ReckoningError(ValueError):
+class EvaluationError(ValueError):
     """Something that cannot be worked out, in words."""
 
 
@@ -77,7 +77,7 @@ def combined(sign: str, x: Quantity, y: Quantity) -> Quantity:
     """Work out ``x sign y``.
 
     Raises:
-        ReckoningError: The dimensions do not go together, or there is no such number.
+        EvaluationError: The dimensions do not go together, or there is no such number.
     """
     match sign:
         case "+" | "-":
@@ -89,7 +89,7 @@ def combined(sign: str, x: Quantity, y: Quantity) -> Quantity:
             return _quantity(x.amount * y.amount, powers)
         case "/":
             if y.amount == 0:
-                raise ReckoningError("this divides by zero")
+                raise EvaluationError("this divides by zero")
             powers = tuple(a - b for a, b in zip(x.powers, y.powers, strict=True))
             is_whole = isinstance(x.amount, int) and isinstance(y.amount, int) and x.amount % y.amount == 0
             return _quantity(x.amount // y.amount if is_whole else x.amount / y.amount, powers)
@@ -101,12 +101,12 @@ def applied(name: str, values: list[Quantity]) -> Quantity:
     """The value of a function of :data:`FUNCTIONS`.
 
     Raises:
-        ReckoningError: It takes no such values.
+        EvaluationError: It takes no such values.
     """
     (least, most), act = FUNCTIONS[name]
     if not least <= len(values) <= most:
         wanted = "1 value" if most == 1 else f"{least} values or more"
-        raise ReckoningError(f"{name}() takes {wanted}, not {len(values)}")
+        raise EvaluationError(f"{name}() takes {wanted}, not {len(values)}")
     return act(name, values)
 
 
@@ -114,24 +114,24 @@ def _quantity(amount: Number, powers: Powers) -> Quantity:
     if isinstance(amount, int) and abs(amount) >= EXACT:
         amount = float(amount)
     if not math.isfinite(amount):
-        raise ReckoningError("this is too large a number")
+        raise EvaluationError("this is too large a number")
     if any(abs(power) > _MAX_POWER for power in powers):
-        raise ReckoningError(f"powers of units go up to {_MAX_POWER}")
+        raise EvaluationError(f"powers of units go up to {_MAX_POWER}")
     return Quantity(amount, powers)
 
 
 def _power(x: Quantity, y: Quantity) -> Quantity:
     if y.powers != NONE or abs(y.amount) > _MAX_EXPONENT:
-        came = y.told() if y.powers != NONE else f"{y.amount:g}"
-        raise ReckoningError(
+        came = y.with_article() if y.powers != NONE else f"{y.amount:g}"
+        raise EvaluationError(
             f"the exponent is {came}; expected a number from -{_MAX_EXPONENT} to {_MAX_EXPONENT}"
         )
     if x.powers != NONE and not isinstance(y.amount, int):
-        raise ReckoningError(f"{x.told()} has whole powers only; expected a whole number as exponent")
+        raise EvaluationError(f"{x.with_article()} has whole powers only; expected a whole number as exponent")
     if x.amount == 0 and y.amount < 0:
-        raise ReckoningError("this divides by zero")
+        raise EvaluationError("this divides by zero")
     if x.amount < 0 and y.amount != int(y.amount):
-        raise ReckoningError("a negative number has no such power")
+        raise EvaluationError("a negative number has no such power")
     amount: Number = float(x.amount) ** y.amount  # by floats first: they cannot grow without end
     if isinstance(x.amount, int) and isinstance(y.amount, int) and y.amount >= 0 and abs(amount) < EXACT:
         amount = x.amount**y.amount
@@ -140,9 +140,9 @@ def _power(x: Quantity, y: Quantity) -> Quantity:
 
 def _require_alike(x: Quantity, y: Quantity, done: str) -> None:
     if x.powers != y.powers:
-        what = f"{x.told()} and {y.told()} cannot be {done}"
+        what = f"{x.with_article()} and {y.with_article()} cannot be {done}"
         is_bare = NONE in (x.powers, y.powers)
-        raise ReckoningError(what + ("; give the number its unit" if is_bare else ""))
+        raise EvaluationError(what + ("; give the number its unit" if is_bare else ""))
 
 
 _Act = Callable[[str, list[Quantity]], Quantity]
@@ -154,8 +154,8 @@ def _plain(act: Callable[[float], Number], *, angles: bool = False) -> _Act:
     def apply(name: str, values: list[Quantity]) -> Quantity:
         (x,) = values
         if x.powers != NONE and not (angles and x.powers == _ANGLE):
-            raise ReckoningError(
-                f"{name}() of {x.told()}; expected a number{' or an angle' if angles else ''}"
+            raise EvaluationError(
+                f"{name}() of {x.with_article()}; expected a number{' or an angle' if angles else ''}"
             )
         return _quantity(act(x.amount), NONE)
 
@@ -165,7 +165,7 @@ def _plain(act: Callable[[float], Number], *, angles: bool = False) -> _Act:
 def _root(name: str, values: list[Quantity]) -> Quantity:
     (x,) = values
     if any(power % 2 for power in x.powers):
-        raise ReckoningError(f"{name}() of {x.told()} has no unit")
+        raise EvaluationError(f"{name}() of {x.with_article()} has no unit")
     return _quantity(math.sqrt(x.amount), tuple(power // 2 for power in x.powers))
 
 

@@ -50,7 +50,7 @@ Text: TypeAlias = Annotated[str, Field(min_length=1)]
 """Any text but the empty one."""
 
 
-def misfit(
+def setting_error(
     what: str, expected: str = "", hint: str = "", *, at: Loc = (), key: bool = False
 ) -> PydanticCustomError:
     """An error for a validator to raise that keeps its words, and its place within the value.
@@ -63,7 +63,7 @@ def misfit(
         key: Whether the key there is meant.
     """
     context: dict[str, Any] = {"what": what, "expected": expected, "hint": hint, "at": at, "key": key}
-    return PydanticCustomError("misfit", "{what}; expected {expected}", context)
+    return PydanticCustomError("setting_error", "{what}; expected {expected}", context)
 
 
 class Choice(Settings):
@@ -96,7 +96,7 @@ class Choice(Settings):
     def _is_no_bare_name(cls, value: Any) -> Any:
         if isinstance(value, str):
             name = clean(value)
-            raise misfit(f"just '{name}' stands here", "a mapping", f"write '{{{cls.key}: {name}}}'")
+            raise setting_error(f"just '{name}' stands here", "a mapping", f"write '{{{cls.key}: {name}}}'")
         return value
 
 
@@ -117,7 +117,7 @@ placed_by_field: Final = AfterValidator(_placed_by_field)
 
 def _is_version(value: Any) -> Any:
     if type(value) is not int or value != FORMAT:  # neither true nor 1.0 is a version
-        raise misfit(f"labseq is {shown(value)}", "1, the version of the file format")
+        raise setting_error(f"labseq is {shown(value)}", "1, the version of the file format")
     return FORMAT
 
 
@@ -127,16 +127,16 @@ def _is_name(name: str) -> str:
     odd = next((c for c in name if unicodedata.category(c)[0] not in "LMN" and c not in " -_."), None)
     expected = "letters, digits, spaces, '-', '_' and '.'"
     if odd is not None:
-        raise misfit(f"name is '{clean(name)}', with '{clean(odd)}' in it", expected)
+        raise setting_error(f"name is '{clean(name)}', with '{clean(odd)}' in it", expected)
     if not any(char.isalnum() for char in name):
-        raise misfit(f"name is '{clean(name)}'", "at least one letter or digit")
+        raise setting_error(f"name is '{clean(name)}'", "at least one letter or digit")
     if name != name.strip():
-        raise misfit(f"name is '{clean(name)}'", "no space at either end")
+        raise setting_error(f"name is '{clean(name)}'", "no space at either end")
     return name
 
 
 @dataclass(frozen=True, slots=True, eq=False)  # a default may be a dict, which has no hash
-class EmptyIs:
+class DefaultIfEmpty:
     """Puts a default in the place of an empty value.
 
     Attributes:
@@ -152,7 +152,7 @@ class EmptyIs:
 
 def empty_is(default: Any) -> BeforeValidator:
     """Let a key that is there without a value count as ``default``."""
-    return BeforeValidator(EmptyIs(default))
+    return BeforeValidator(DefaultIfEmpty(default))
 
 
 FormatVersion: TypeAlias = Annotated[Literal[1], BeforeValidator(_is_version)]

@@ -14,7 +14,7 @@ from pydantic import BaseModel
 from pydantic.json_schema import GenerateJsonSchema
 from pydantic_core import core_schema
 
-from labseq.config.fields import EmptyIs
+from labseq.config.fields import DefaultIfEmpty
 from labseq.config.settings import Quantity
 from labseq.config.variables import si_of
 from labseq.units import EXAMPLES, UNITS, expected, format_quantity, parse_quantity
@@ -47,7 +47,7 @@ class _Generator(GenerateJsonSchema):
         if function is si_of:
             return _variable_schema()
         inner = super().function_before_schema(schema)
-        return or_empty(inner) if isinstance(function, EmptyIs) else inner
+        return or_empty(inner) if isinstance(function, DefaultIfEmpty) else inner
 
     def function_plain_schema(self, schema: core_schema.PlainValidatorFunctionSchema) -> JsonSchema:
         """Whatever a validator takes that tells nothing of itself."""

@@ -8,11 +8,11 @@ from typing import Annotated, Final, Literal, Self
 from pydantic import AfterValidator, Field, NonNegativeInt, model_validator
 
 from labseq.config.devices import device_name
-from labseq.config.fields import Choice, Text, misfit
+from labseq.config.fields import Choice, Text, setting_error
 from labseq.config.settings import Duration, Settings
 from labseq.model.lines import LineSpec
 
-LINES_KEYS: Final = ("channels", "never_together")
+LINES_KEYS: Final = ("channels", "mutually_exclusive")
 """Keys of ``lines`` that belong to the core, not to the plugin."""
 
 MAX_PULSE_S: Final = 1.0
@@ -45,17 +45,17 @@ class ChannelSettings(Settings):
     @model_validator(mode="after")
     def _makes_sense(self) -> Self:
         if self.pulse and self.lag:
-            raise misfit(
+            raise setting_error(
                 "lag is set beside pulse", "one of the two: a pulse ends by itself", at=("lag",), key=True
             )
         if self.pulse and "idle" in self.on:
-            raise misfit(
+            raise setting_error(
                 "a pulse has 'idle' among its steps", "kinds of step, which have a beginning", at=("on",)
             )
         if self.triggers == "camera" and set(self.on) != {"image"}:
-            raise misfit("a line that triggers the camera is on at other times", "`on: [image]`", at=("on",))
+            raise setting_error("a line that triggers the camera is on at other times", "`on: [image]`", at=("on",))
         if self.triggers and self.lead:
-            raise misfit("lead is set for a trigger", "none: the step begins with it", at=("lead",), key=True)
+            raise setting_error("lead is set for a trigger", "none: the step begins with it", at=("lead",), key=True)
         return self
 
     def spec(self, name: str) -> LineSpec:
@@ -73,15 +73,15 @@ class ChannelSettings(Settings):
         )
 
 
-def _told_apart(channels: dict[str, ChannelSettings]) -> dict[str, ChannelSettings]:
+def _distinct(channels: dict[str, ChannelSettings]) -> dict[str, ChannelSettings]:
     for (first, a), (second, b) in combinations(channels.items(), 2):
         if a.channel == b.channel:
             what = f"'{first}' and '{second}' are both on channel {a.channel}"
-            raise misfit(what, "a channel for each line", at=(second, "channel"))
+            raise setting_error(what, "a channel for each line", at=(second, "channel"))
     triggers = [name for name, channel in channels.items() if channel.triggers == "camera"]
     if len(triggers) > 1:
         what = f"'{triggers[0]}' and '{triggers[1]}' both trigger the camera"
-        raise misfit(what, "one line for that", at=(triggers[1], "triggers"))
+        raise setting_error(what, "one line for that", at=(triggers[1], "triggers"))
     for name in channels:
         device_name(name, "a line")
     return channels
@@ -90,26 +90,26 @@ def _told_apart(channels: dict[str, ChannelSettings]) -> dict[str, ChannelSettin
 class LinesChoice(Choice):
     """The timing box, and what is wired to it."""
 
-    channels: Annotated[dict[str, ChannelSettings], AfterValidator(_told_apart)] = Field(
+    channels: Annotated[dict[str, ChannelSettings], AfterValidator(_distinct)] = Field(
         default={}, description="name of each line -> its channel, and when it is on"
     )
-    never_together: tuple[tuple[Text, Text], ...] = Field(
+    mutually_exclusive: tuple[tuple[Text, Text], ...] = Field(
         default=(), description="pairs of lines that must never be on at the same time"
     )
 
     @model_validator(mode="after")
     def _never_together(self) -> Self:
-        for number, pair in enumerate(self.never_together):
+        for number, pair in enumerate(self.mutually_exclusive):
             for place, name in enumerate(pair):
                 if name not in self.channels:
                     known = ", ".join(f"'{line}'" for line in self.channels) or "none is declared"
-                    raise misfit(f"there is no line '{name}'", known, at=("never_together", number, place))
+                    raise setting_error(f"there is no line '{name}'", known, at=("mutually_exclusive", number, place))
             first, second = (self.channels[name] for name in pair)
             if both := sorted(set(first.on) & set(second.on)):
                 what = (
                     f"'{pair[0]}' and '{pair[1]}' must never be on together, but both are during '{both[0]}'"
                 )
-                raise misfit(what, "one of them off then", at=("channels", pair[1], "on"))
+                raise setting_error(what, "one of them off then", at=("channels", pair[1], "on"))
         return self
 
     def specs(self) -> tuple[LineSpec, ...]:

@@ -8,10 +8,10 @@ from typing import Any, Final, TypeVar
 
 from pydantic import BaseModel
 
-from labseq.config.collect import Collected
+from labseq.config.collect import ProblemCollector
 from labseq.config.document import Document
 from labseq.config.nodes import Node
-from labseq.config.validation import Asked, validate
+from labseq.config.validation import ValidationContext, validate
 from labseq.config.values import node_of
 from labseq.errors import ConfigError
 
@@ -22,7 +22,7 @@ _NEEDED: Final = ("plugin_folders", "profile")
 
 
 @dataclass(frozen=True, slots=True)
-class StandIns:
+class FallbackValues:
     """What takes the place of wrong values; it must never give rise to errors of its own.
 
     Attributes:
@@ -35,7 +35,7 @@ class StandIns:
 
 
 def load_checked(
-    document: Document, model: type[M], called: str, stand_ins: StandIns, found: Collected | None
+    document: Document, model: type[M], called: str, fallbacks: FallbackValues, found: ProblemCollector | None
 ) -> tuple[Document, M]:
     """Validate a whole file; gather its problems, if asked to, and go on with stand-ins.
 
@@ -54,7 +54,7 @@ def load_checked(
     except ConfigError as error:
         if found is None:
             raise
-        mended = mend(document, model, stand_ins)
+        mended = replace_invalid(document, model, fallbacks)
         if any(mended.get((key,)) != document.get((key,)) for key in _NEEDED):
             raise
         spec = mended.validate(model, called=called)
@@ -62,7 +62,7 @@ def load_checked(
         return mended, spec
 
 
-def mend(document: Document, model: type[BaseModel], stand_ins: StandIns) -> Document:
+def replace_invalid(document: Document, model: type[BaseModel], fallbacks: FallbackValues) -> Document:
     """Replace or leave out every top-level value that the model refuses.
 
     Args:
@@ -75,13 +75,13 @@ def mend(document: Document, model: type[BaseModel], stand_ins: StandIns) -> Doc
     """
     root = document.root
     assert isinstance(root.value, dict)
-    right = {key: node_of(value, root.mark) for key, value in stand_ins.values.items()}
+    right = {key: node_of(value, root.mark) for key, value in fallbacks.values.items()}
 
     def accepts(key: str, node: Node) -> bool:
-        return not isinstance(validate(model, Node({**right, key: node}, root.mark), Asked("")), list)
+        return not isinstance(validate(model, Node({**right, key: node}, root.mark), ValidationContext("")), list)
 
     def mended_items(key: str, node: Node) -> Node:
-        other = node_of(stand_ins.items[key], node.mark)
+        other = node_of(fallbacks.items[key], node.mark)
         if isinstance(node.value, list):
             kept = [item if accepts(key, Node([item], node.mark)) else other for item in node.value]
             return Node(kept, node.mark)
@@ -96,7 +96,7 @@ def mend(document: Document, model: type[BaseModel], stand_ins: StandIns) -> Doc
     kept: dict[str, Node] = {}
     for key in model.model_fields.keys() & root.value.keys():
         node = root.value[key]
-        if not accepts(key, node) and key in stand_ins.items:
+        if not accepts(key, node) and key in fallbacks.items:
             node = mended_items(key, node)
         if accepts(key, node):
             kept[key] = node

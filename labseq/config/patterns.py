@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr, model_validator
 
 from labseq.config.drawings import read_drawing
-from labseq.config.fields import misfit
+from labseq.config.fields import setting_error
 from labseq.config.settings import FilePath, Settings
 from labseq.errors import ConfigError
 from labseq.geometry import DrawingError, read_bitmap
@@ -65,17 +65,17 @@ class BitmapSettings(Settings):
     @model_validator(mode="after")
     def _read(self) -> Self:
         if self.sites is not None and self.file is not None:
-            raise misfit("'file' stands beside 'sites'", "one of them", at=("file",), key=True)
+            raise setting_error("'file' stands beside 'sites'", "one of them", at=("file",), key=True)
         if self.file is not None:
             try:
                 self._mask = read_drawing(self.file, self.fill)
             except ConfigError as error:
-                raise misfit(str(error), at=("file",)) from None
+                raise setting_error(str(error), at=("file",)) from None
         elif self.sites is not None:
             try:
                 self._mask = read_bitmap(self.sites, self.fill)
             except DrawingError as error:
-                raise misfit(str(error), at=("sites",)) from None
+                raise setting_error(str(error), at=("sites",)) from None
         else:
-            raise misfit("a bitmap needs a drawing", "'sites' or 'file'")
+            raise setting_error("a bitmap needs a drawing", "'sites' or 'file'")
         return self

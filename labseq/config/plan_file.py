@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, model_validator
 
-from labseq.config.fields import Name, misfit
+from labseq.config.fields import Name, setting_error
 from labseq.config.motion import Sites
 from labseq.config.reading import decode
 from labseq.config.settings import Settings
@@ -67,7 +67,7 @@ class BatchFile(Settings):
     def _has_a_goal_for_each_atom(self) -> Self:
         if len(self.from_sites) != len(self.to_sites):
             what = f"'from' has {len(self.from_sites)} sites, 'to' has {len(self.to_sites)}"
-            raise misfit(what, "as many of both")
+            raise setting_error(what, "as many of both")
         return self
 
     def model(self) -> Batch:

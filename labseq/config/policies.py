@@ -6,7 +6,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from labseq.config.fields import Text, empty_is, misfit
+from labseq.config.fields import Text, empty_is, setting_error
 from labseq.config.settings import Duration, Settings
 
 
@@ -51,10 +51,10 @@ class CheckSettings(Settings):
     @model_validator(mode="after")
     def _has_limits(self) -> Self:
         if self.at_least is None and self.at_most is None:
-            raise misfit("the check has no limit", "'at_least', 'at_most' or both")
+            raise setting_error("the check has no limit", "'at_least', 'at_most' or both")
         if self.at_least is not None and self.at_most is not None and self.at_least > self.at_most:
             what = f"at_least is {self.at_least:g}, but at_most is {self.at_most:g}"
-            raise misfit(what, "limits with something between them", at=("at_least",))
+            raise setting_error(what, "limits with something between them", at=("at_least",))
         return self
 
 
@@ -65,7 +65,7 @@ class PolicySettings(Settings):
         default=None,
         description="what follows a failure; none: a transient one repeats the shot, any other stops the run",
     )
-    used_up: Literal["skip_point", "stop"] = Field(
+    when_exhausted: Literal["skip_point", "stop"] = Field(
         default="stop", description="what follows when a shot has failed `attempts` times"
     )
     over_budget: Literal["record", "warn", "repeat_shot", "skip_point", "stop"] = Field(

@@ -12,9 +12,9 @@ from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from labseq.config.addresses import Override
 from labseq.config.calibrations import CalibrationSettings
-from labseq.config.collect import Collected
+from labseq.config.collect import ProblemCollector
 from labseq.config.devices import DeviceChoice, named
-from labseq.config.document import Document, Kept
+from labseq.config.document import Document, StoredText
 from labseq.config.fields import (
     FORMAT,
     MAY_ADD,
@@ -25,12 +25,12 @@ from labseq.config.fields import (
     Name,
     check_kind,
     empty_is,
-    misfit,
+    setting_error,
     placed_by_field,
 )
 from labseq.config.find import find_profile
 from labseq.config.lines import LinesChoice
-from labseq.config.mending import StandIns, load_checked
+from labseq.config.mending import FallbackValues, load_checked
 from labseq.config.motion import MobileTweezersChoice, Sites
 from labseq.config.policies import BudgetSettings
 from labseq.config.scan import Scan
@@ -101,11 +101,11 @@ class GridSettings(Settings):
         for name, comb, n_sites in combs:
             if comb.table and len(comb.table) != n_sites:
                 what = f"there are {len(comb.table)} tones for {n_sites} sites"
-                raise misfit(what, f"{n_sites} frequencies", at=(name, "table"))
+                raise setting_error(what, f"{n_sites} frequencies", at=(name, "table"))
             lowest = float(comb.tones(n_sites).min())
             if lowest <= 0:
                 what = f"the lowest of the {n_sites} tones is at {format_quantity(lowest, 'frequency')}"
-                raise misfit(what, "all tones above 0 Hz", "choose a smaller step", at=(name,))
+                raise setting_error(what, "all tones above 0 Hz", "choose a smaller step", at=(name,))
         return self
 
     def model(self) -> SiteGrid:
@@ -177,7 +177,7 @@ class ProfileSpec(Settings):
 
 _VIRTUAL: Final = {"use": "virtual"}
 _NARROW: Final = {"step": 1.0}
-_STAND_INS: Final = StandIns(
+_STAND_INS: Final = FallbackValues(
     values={
         "labseq": FORMAT,
         "name": "x",
@@ -204,8 +204,8 @@ def load_profile(
     overrides: Sequence[Override | tuple[str, str]] = (),
     named_in: Document | None = None,
     scan: Scan | None = None,
-    found: Collected | None = None,
-    kept: Kept | None = None,
+    found: ProblemCollector | None = None,
+    kept: StoredText | None = None,
 ) -> tuple[Document, ProfileSpec]:
     """Find and read a hardware profile.
 

@@ -35,8 +35,8 @@ class RfSettings(Settings):
     column_band: Band = Field(
         default=_RF.column_band_hz, description="[lowest, highest] frequency of the column axis' AOD"
     )
-    least_spacing: Annotated[Frequency, Field(ge=0)] = Field(
-        default=_RF.least_spacing_hz, description="least distance of two tones of an axis"
+    min_spacing: Annotated[Frequency, Field(ge=0)] = Field(
+        default=_RF.min_spacing_hz, description="least distance of two tones of an axis"
     )
     row_amplitudes: Amplitudes = Field(
         default=_RF.row_amplitudes,
@@ -77,7 +77,7 @@ class RfSettings(Settings):
         return RfSpec(
             row_band_hz=self.row_band,
             column_band_hz=self.column_band,
-            least_spacing_hz=self.least_spacing,
+            min_spacing_hz=self.min_spacing,
             row_amplitudes=self.row_amplitudes,
             column_amplitudes=self.column_amplitudes,
             phases=self.phases,

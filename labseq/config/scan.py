@@ -146,13 +146,13 @@ class Scan:
             for mark in _marks(node)
         }
 
-        def told(problem: Problem) -> Problem:
+        def with_address(problem: Problem) -> Problem:
             address = places.get((problem.line, problem.column)) if problem.source == self.name else None
             note = f"the scan puts it into '{clean(address or '')}'"
             is_told = address is None or note in problem.notes
             return problem if is_told else replace(problem, notes=(*problem.notes, note))
 
-        return ConfigError([told(problem) for problem in error.problems])
+        return ConfigError([with_address(problem) for problem in error.problems])
 
 
 def _marks(node: Node) -> Iterator[Mark]:

@@ -48,7 +48,7 @@ def _check_place(axis: Axis, document: Document) -> None:
         return
     if loc[0] == "shot" and len(loc) > 2 and loc[2] not in ("name", "policy") and document.root.at(loc[:3]):
         return
-    raise unfit(axis.address, axis.key, document.name)
+    raise unscannable(axis.address, axis.key, document.name)
 
 
 def check_variable(axis: Axis, document: Document, name: str) -> None:
@@ -69,7 +69,7 @@ def check_variable(axis: Axis, document: Document, name: str) -> None:
         raise ConfigError(axis.key.problem(name, what, listing(known) if known else "'variables'", hint))
 
 
-def unfit(address: str, key: Mark, name: str) -> ConfigError:
+def unscannable(address: str, key: Mark, name: str) -> ConfigError:
     """Say that a scan cannot change what an address leads to."""
     return ConfigError(key.problem(name, f"a scan cannot change '{clean(address)}'", _SCANNABLE))
 

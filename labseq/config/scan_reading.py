@@ -13,12 +13,12 @@ from typing import Any, Final
 
 from labseq.config.adaptive_reading import is_adaptive, read_adaptive
 from labseq.config.addresses import Override
-from labseq.config.collect import Collected
+from labseq.config.collect import ProblemCollector
 from labseq.config.document import Document
 from labseq.config.fields import ROLES
 from labseq.config.nodes import Mark, Node
 from labseq.config.scan import Axis, Group, Scan, ScanOrder
-from labseq.config.scan_places import check_variable, find_axis, is_free, placed_axis, refuse_twice, unfit
+from labseq.config.scan_places import check_variable, find_axis, is_free, placed_axis, refuse_twice, unscannable
 from labseq.config.scan_values import MAX_POINTS, values_of
 from labseq.config.variables import VARIABLES
 from labseq.config.wording import clean, shown
@@ -41,7 +41,7 @@ def read_scan(document: Document, fixed: Sequence[Override] = ()) -> Scan | None
     Raises:
         ConfigError: Everything that is wrong with its form.
     """
-    found = Collected()
+    found = ProblemCollector()
     node = document.root.child("scan")
     repeats, order = _options(document, has_scan=node is not None and node.value is not None, found=found)
     if node is not None and is_adaptive(node):
@@ -80,7 +80,7 @@ def bind_scan(scan: Scan, document: Document) -> Scan:
     Raises:
         ConfigError: Addresses that lead nowhere in it, or to what a scan cannot change.
     """
-    found = Collected()
+    found = ProblemCollector()
 
     def bound(axis: Axis) -> Axis:
         if not axis.of_profile:
@@ -90,7 +90,7 @@ def bind_scan(scan: Scan, document: Document) -> Scan:
             if loc[0] == VARIABLES:
                 check_variable(replace(axis, loc=loc), document, scan.name)
             elif not (loc[0] in ROLES or (loc[0] == "devices" and len(loc) > 1)):
-                raise unfit(axis.address, axis.key, scan.name)
+                raise unscannable(axis.address, axis.key, scan.name)
             return replace(axis, loc=loc)
         return axis
 
@@ -100,7 +100,7 @@ def bind_scan(scan: Scan, document: Document) -> Scan:
     return replace(scan, groups=groups)
 
 
-def _options(document: Document, *, has_scan: bool, found: Collected) -> tuple[int, ScanOrder]:
+def _options(document: Document, *, has_scan: bool, found: ProblemCollector) -> tuple[int, ScanOrder]:
     """``repeats`` and ``order``, which belong to a scan; 1 and "sequential" where they are wrong."""
     values: dict[str, Any] = {}
     for key in ("repeats", "order"):
@@ -118,7 +118,7 @@ def _options(document: Document, *, has_scan: bool, found: Collected) -> tuple[i
     return repeats if is_number else 1, "shuffled" if shuffled else "sequential"
 
 
-def _mappings(node: Node, name: str, found: Collected) -> list[dict[str, tuple[Mark, Node]]]:
+def _mappings(node: Node, name: str, found: ProblemCollector) -> list[dict[str, tuple[Mark, Node]]]:
     """The groups as written: address -> its place and values."""
     items = node.value if isinstance(node.value, list) else [node]
     groups: list[dict[str, tuple[Mark, Node]]] = []
@@ -136,7 +136,7 @@ def _mappings(node: Node, name: str, found: Collected) -> list[dict[str, tuple[M
     return groups
 
 
-def _axes(written: Mapping[str, tuple[Mark, Node]], document: Document, found: Collected) -> list[Axis]:
+def _axes(written: Mapping[str, tuple[Mark, Node]], document: Document, found: ProblemCollector) -> list[Axis]:
     axes: list[Axis] = []
     for address, (key, node) in written.items():
         with found:

@@ -12,8 +12,8 @@ from pydantic import AfterValidator, Field, PlainValidator
 
 from labseq.config.addresses import Override
 from labseq.config.analyses import Analyses
-from labseq.config.collect import Collected
-from labseq.config.document import Document, Kept
+from labseq.config.collect import ProblemCollector
+from labseq.config.document import Document, StoredText
 from labseq.config.fields import (
     FORMAT,
     Choice,
@@ -24,10 +24,10 @@ from labseq.config.fields import (
     Text,
     check_kind,
     empty_is,
-    misfit,
+    setting_error,
     placed_by_field,
 )
-from labseq.config.mending import StandIns, load_checked
+from labseq.config.mending import FallbackValues, load_checked
 from labseq.config.nodes import Loc
 from labseq.config.policies import PolicySettings
 from labseq.config.scan import Scan, ScanOrder
@@ -66,26 +66,26 @@ class StepSpec:
 def _step(value: Any) -> StepSpec:
     """Read one item of ``shot``; its index is added later."""
     if isinstance(value, str) and _STEP_NAME.fullmatch(value):
-        raise misfit(f"a step is just '{value}'", "a mapping", f"write '- {value}: {{}}'")
+        raise setting_error(f"a step is just '{value}'", "a mapping", f"write '- {value}: {{}}'")
     if not isinstance(value, dict):
-        raise misfit(f"a step is {shown(value)}", "a mapping such as 'image: {exposure: 45 ms}'")
+        raise setting_error(f"a step is {shown(value)}", "a mapping such as 'image: {exposure: 45 ms}'")
     item = cast("dict[str, Any]", value)
     kinds = [key for key in item if key not in _BESIDE]
     if not kinds:
-        raise misfit("a step says nothing to do", "a mapping such as 'image: {exposure: 45 ms}'")
+        raise setting_error("a step says nothing to do", "a mapping such as 'image: {exposure: 45 ms}'")
     if len(kinds) > 1:
         what = f"'{clean(kinds[1])}' stands in the same step as '{clean(kinds[0])}'"
         hint = f"begin a new step with '- ', or indent settings of '{clean(kinds[0])}' further"
-        raise misfit(what, "one step in each item of the list", hint, at=(kinds[1],), key=True)
+        raise setting_error(what, "one step in each item of the list", hint, at=(kinds[1],), key=True)
     kind, settings = kinds[0], item[kinds[0]]
     if settings is not None and not isinstance(settings, dict):
         expected = "a mapping of settings such as {key: value}"
         hint = "put a space after the ':'" if ":" in kind else ""
-        raise misfit(f"{clean(kind)} is {shown(settings)}", expected, hint, at=(kind,))
+        raise setting_error(f"{clean(kind)} is {shown(settings)}", expected, hint, at=(kind,))
     name = item.get("name", "")
     if "name" in item and not (isinstance(name, str) and _STEP_NAME.fullmatch(name)):
         expected = "a word of letters, digits, '_' and '-' that begins with a letter"
-        raise misfit(f"the name of the step is {shown(name)}", expected, at=("name",))
+        raise setting_error(f"the name of the step is {shown(name)}", expected, at=("name",))
     return StepSpec(kind, cast("str", name), (kind,))
 
 
@@ -95,7 +95,7 @@ def _numbered(steps: tuple[StepSpec, ...]) -> tuple[StepSpec, ...]:
     for i, step in enumerate(steps):
         if step.name and first.setdefault(step.name, i) != i:
             what = f"the name '{step.name}' is taken by step {first[step.name]} (counted from 0)"
-            raise misfit(what, "another name", at=(i, "name"))
+            raise setting_error(what, "another name", at=(i, "name"))
     return tuple(replace(step, loc=("shot", i, step.kind)) for i, step in enumerate(steps))
 
 
@@ -137,7 +137,7 @@ class SequenceSpec(Settings):
     shot: Steps = Field(description="the steps of a shot")
 
 
-_STAND_INS: Final = StandIns(
+_STAND_INS: Final = FallbackValues(
     values={
         "labseq": FORMAT,
         "name": "x",
@@ -155,8 +155,8 @@ def load_sequence(
     overrides: Sequence[Override | tuple[str, str]] = (),
     *,
     profile_set: Sequence[Override] = (),
-    found: Collected | None = None,
-    kept: Kept | None = None,
+    found: ProblemCollector | None = None,
+    kept: StoredText | None = None,
 ) -> tuple[Document, SequenceSpec]:
     """Read a sequence file.
 
@@ -179,7 +179,7 @@ def load_sequence(
     if document.data.get("planner") is None:
         document = document.override("planner", f"{{use: {DEFAULT_PLANNER}}}", "the default planner")
     document = document.override_all(overrides, may_add=("policy",), found=found)
-    problems = Collected() if found is None else found
+    problems = ProblemCollector() if found is None else found
     document = document.evaluated()
     document = _at_first_point(document, [Override(*one) for one in overrides], profile_set, problems)
     if found is None:
@@ -188,7 +188,7 @@ def load_sequence(
 
 
 def _at_first_point(
-    document: Document, overrides: Sequence[Override], profile_set: Sequence[Override], found: Collected
+    document: Document, overrides: Sequence[Override], profile_set: Sequence[Override], found: ProblemCollector
 ) -> Document:
     """The first point's values in their places, and ``shots`` as the scan has them."""
     scan: Scan | None = None

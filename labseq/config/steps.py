@@ -6,7 +6,7 @@ from typing import Annotated, Literal, Self, TypeAlias
 
 from pydantic import Field, model_validator
 
-from labseq.config.fields import Text, empty_is, misfit
+from labseq.config.fields import Text, empty_is, setting_error
 from labseq.config.settings import Duration, Fraction, Length, Settings
 
 Exposure: TypeAlias = Annotated[Duration, Field(gt=0)]
@@ -51,7 +51,7 @@ class RearrangeSettings(Settings):
             entries = "1 entry" if len(self.window) == 1 else f"{len(self.window)} entries"
             default = "" if "cycles" in self.model_fields_set else ", its default"
             what = f"the list has {entries}, but cycles is {self.cycles}{default}"
-            raise misfit(what, f"{self.cycles}, one per cycle", at=("window",))
+            raise setting_error(what, f"{self.cycles}, one per cycle", at=("window",))
         return self
 
     def window_of(self, cycle: int) -> float:
@@ -173,17 +173,17 @@ class WaitSettings(Settings):
     def _is_for_one_thing(self) -> Self:
         if self.signal is None:
             if extra := next((key for key in ("timeout", "device") if key in self.model_fields_set), None):
-                raise misfit(
+                raise setting_error(
                     f"'{extra}' stands here without 'for'", "'for: go' beside it", at=(extra,), key=True
                 )
             if self.duration is None:
-                raise misfit(
+                raise setting_error(
                     "a wait says neither how long nor for what", "'duration', or 'for' and 'timeout'"
                 )
         elif self.duration is not None:
-            raise misfit("'duration' and 'for' stand together", "one of them", at=("duration",), key=True)
+            raise setting_error("'duration' and 'for' stand together", "one of them", at=("duration",), key=True)
         elif self.timeout is None:
-            raise misfit("a wait for 'go' has no 'timeout'", "how long it may take", at=("for",), key=True)
+            raise setting_error("a wait for 'go' has no 'timeout'", "how long it may take", at=("for",), key=True)
         return self
 
 

@@ -10,7 +10,7 @@ from yaml.error import Mark as YamlMark, MarkedYAMLError
 from yaml.events import Event, ScalarEvent
 
 from labseq.config.nodes import Mark
-from labseq.config.wording import Words, clean
+from labseq.config.wording import ErrorText, clean
 
 _QUOTE_IT: Final = "put text with special characters in quotes"
 
@@ -23,7 +23,7 @@ class _Rule:
     """Words for the errors whose problem and context match; ``{0}`` is the problem's first group."""
 
     problem: str
-    words: Words
+    words: ErrorText
     context: str = ""
     at_context: bool = False
 
@@ -31,22 +31,22 @@ class _Rule:
 _RULES: Final = (
     _Rule(
         r"found character (.+) that cannot start any token",
-        Words("a value cannot begin with {0}", "", _QUOTE_IT),
+        ErrorText("a value cannot begin with {0}", "", _QUOTE_IT),
     ),
     _Rule(
         "sequence entries are not allowed here",
-        Words("a list item ('- ') cannot begin here", "it on a line of its own"),
+        ErrorText("a list item ('- ') cannot begin here", "it on a line of its own"),
     ),
-    _Rule("mapping keys are not allowed here", Words("a '?' cannot stand here", "", _QUOTE_IT)),
+    _Rule("mapping keys are not allowed here", ErrorText("a '?' cannot stand here", "", _QUOTE_IT)),
     _Rule(
         "found unexpected (?:end of stream|document separator)",
-        Words("the quotation mark that opens here is never closed"),
+        ErrorText("the quotation mark that opens here is never closed"),
         context="quoted scalar",
         at_context=True,
     ),
     _Rule(
         "found unknown escape character (.+)",
-        Words(
+        ErrorText(
             "a backslash and {0} mean nothing in double quotes",
             "",
             r"use single quotes, or write '\\' for a backslash",
@@ -54,31 +54,31 @@ _RULES: Final = (
     ),
     _Rule(
         "expected escape sequence of (.+) hexadecimal numbers",
-        Words("this escape in double quotes needs {0} hexadecimal digits", "", "use single quotes"),
+        ErrorText("this escape in double quotes needs {0} hexadecimal digits", "", "use single quotes"),
     ),
     _Rule(
         "expected alphabetic or numeric character",
-        Words("'&' and '*' begin anchors and aliases, and a name must follow", "", _QUOTE_IT),
+        ErrorText("'&' and '*' begin anchors and aliases, and a name must follow", "", _QUOTE_IT),
         context="while scanning an",
         at_context=True,
     ),
-    _Rule("", Words("YAML tags ('!') are not allowed", "plain values", _QUOTE_IT), context="a tag"),
-    _Rule("tag handle", Words("YAML tags ('!') are not allowed", "plain values", _QUOTE_IT)),
+    _Rule("", ErrorText("YAML tags ('!') are not allowed", "plain values", _QUOTE_IT), context="a tag"),
+    _Rule("tag handle", ErrorText("YAML tags ('!') are not allowed", "plain values", _QUOTE_IT)),
     _Rule(
         "",
-        Words("'|' and '>' begin a block of text on the lines below", "nothing else on their line"),
+        ErrorText("'|' and '>' begin a block of text on the lines below", "nothing else on their line"),
         context="a block scalar",
     ),
     _Rule(
         "expected the node content, but found (.+)",
-        Words("a value is missing before {0}"),
+        ErrorText("a value is missing before {0}"),
     ),
     _Rule(
         "expected '<document start>', but found",
-        Words("this follows after the end of the file's mapping", "one mapping and nothing after it"),
+        ErrorText("this follows after the end of the file's mapping", "one mapping and nothing after it"),
     ),
-    _Rule("YAML d(?:irective|ocument)", Words("this is not a version of YAML that labseq reads", "YAML 1.2")),
-    _Rule("", Words("this is no YAML directive", "", _QUOTE_IT), context="a directive"),
+    _Rule("YAML d(?:irective|ocument)", ErrorText("this is not a version of YAML that labseq reads", "YAML 1.2")),
+    _Rule("", ErrorText("this is no YAML directive", "", _QUOTE_IT), context="a directive"),
 )
 _TOKENS: Final = {
     "'<stream end>'": "the end of the file",
@@ -92,7 +92,7 @@ _TOKENS: Final = {
 
 def explain(
     error: MarkedYAMLError, text: str, last: Event | None, opened: YamlMark | None
-) -> tuple[Mark, Words]:
+) -> tuple[Mark, ErrorText]:
     """Say where a syntax error is and what it is.
 
     Args:
@@ -111,7 +111,7 @@ def explain(
     if problem.startswith("mapping values"):
         return _mark(at), _stray_colon(text, at)
     if opened and problem.endswith("'<stream end>'"):
-        words = Words(
+        words = ErrorText(
             f"the '{text[opened.index]}' that opens here is never closed",
             f"',' or '{_CLOSER[text[opened.index]]}'",
         )
@@ -125,39 +125,39 @@ def explain(
     return _by_rule(problem, context, since, at)
 
 
-def _by_rule(problem: str, context: str, since: YamlMark, at: YamlMark) -> tuple[Mark, Words]:
+def _by_rule(problem: str, context: str, since: YamlMark, at: YamlMark) -> tuple[Mark, ErrorText]:
     for rule in _RULES:
         match = re.search(rule.problem, problem)
         if match and rule.context in context:
             found = match[1] if match.re.groups else ""
             what = rule.words.what.format(_TOKENS.get(found, clean(found)))
             mark = since if rule.at_context else at
-            return _mark(mark), Words(what, rule.words.expected, rule.words.hint)
-    return _mark(at), Words(f"this is not valid YAML: {clean(problem)}", "", _QUOTE_IT)
+            return _mark(mark), ErrorText(what, rule.words.expected, rule.words.hint)
+    return _mark(at), ErrorText(f"this is not valid YAML: {clean(problem)}", "", _QUOTE_IT)
 
 
-def _tab(text: str, at: YamlMark) -> Words:
+def _tab(text: str, at: YamlMark) -> ErrorText:
     if not text[at.index - at.column : at.index].strip():
-        return Words("a tab is used for indentation", "spaces")
-    return Words("a tab stands here", "a space")
+        return ErrorText("a tab is used for indentation", "spaces")
+    return ErrorText("a tab stands here", "a space")
 
 
-def _no_colon(text: str, at: YamlMark) -> Words:
+def _no_colon(text: str, at: YamlMark) -> ErrorText:
     line = re.split(r"[\r\n]", text[at.index :], maxsplit=1)[0]
     if ":" in line.partition(" #")[0]:
-        return Words("there is no space after the ':' of this line", "'key: value'")
-    return Words("this line has no ':'", "'key: value'")
+        return ErrorText("there is no space after the ':' of this line", "'key: value'")
+    return ErrorText("this line has no ':'", "'key: value'")
 
 
-def _stray_colon(text: str, at: YamlMark) -> Words:
+def _stray_colon(text: str, at: YamlMark) -> ErrorText:
     """A second colon on a line, or on a line that is indented so that it continues the text above."""
     before = text[at.index - at.column : at.index]
     spaces = len(before) - len(before.lstrip())
     above, line = _line_above(text, at)
     if ": " not in before and line and spaces > above:
         what = f"this line is indented further than line {line}, which has a value already"
-        return Words(what, f"{above} spaces as there")
-    return Words(
+        return ErrorText(what, f"{above} spaces as there")
+    return ErrorText(
         "a ':' cannot stand here", "one 'key: value' on a line", "put text that holds ': ' in quotes"
     )
 
@@ -172,19 +172,19 @@ def _line_above(text: str, at: YamlMark) -> tuple[int, int]:
     return 0, 0
 
 
-def _open_bracket(closer: str, since: YamlMark, at: YamlMark) -> tuple[Mark, Words]:
+def _open_bracket(closer: str, since: YamlMark, at: YamlMark) -> tuple[Mark, ErrorText]:
     """A list or mapping in brackets that goes wrong: on its first line, or only later."""
     pair = "[...]" if closer == "]" else "{...}"
     if at.line == since.line:
-        words = Words(
+        words = ErrorText(
             f"the {pair} that opens in column {since.column + 1} goes wrong here", f"',' or '{closer}'"
         )
         return _mark(at), words
     what = f"the '{pair[0]}' that opens here is not closed by line {at.line + 1}"
-    return _mark(since), Words(what, f"',' or '{closer}'")
+    return _mark(since), ErrorText(what, f"',' or '{closer}'")
 
 
-def _late_quote(last: Event | None, at: YamlMark) -> tuple[Mark, Words] | None:
+def _late_quote(last: Event | None, at: YamlMark) -> tuple[Mark, ErrorText] | None:
     """A quoted text that ends lines later than it should, at the next quotation mark."""
     if not isinstance(last, ScalarEvent) or last.style not in ("'", '"'):
         return None
@@ -192,26 +192,26 @@ def _late_quote(last: Event | None, at: YamlMark) -> tuple[Mark, Words] | None:
     if start.line == end.line or end.line != at.line:
         return None
     what = f"the quotation mark that opens here is closed only in line {end.line + 1}"
-    return _mark(start), Words(what, "a quotation mark at the end of the text")
+    return _mark(start), ErrorText(what, "a quotation mark at the end of the text")
 
 
-def _out_of_place(found: str, context: str, text: str, since: YamlMark, at: YamlMark) -> Words:
+def _out_of_place(found: str, context: str, text: str, since: YamlMark, at: YamlMark) -> ErrorText:
     """Something that fits neither the block that is open nor one around it."""
     is_item = found in ("-", "<block sequence start>")
     is_aligned = at.column == since.column
     if is_item and is_aligned:
-        return Words("a list item ('- ') stands among the keys of a mapping", "'key: value'")
+        return ErrorText("a list item ('- ') stands among the keys of a mapping", "'key: value'")
     if is_item:
-        return Words(_MISALIGNED, "that of the other items of the list")
+        return ErrorText(_MISALIGNED, "that of the other items of the list")
     if is_aligned and "collection" in context:
-        return Words("this line does not continue the list above", "'- '", "check the indentation")
+        return ErrorText("this line does not continue the list above", "'- '", "check the indentation")
     if is_aligned and found == ":":
-        return Words("a key is missing before this ':'", "'key: value'")
+        return ErrorText("a key is missing before this ':'", "'key: value'")
     if not is_aligned and found in ("<block mapping start>", "?"):
         above, line = _line_above(text, at)
         other = f" or {since.column} as in line {since.line + 1}" if since.column != above else ""
-        return Words(_MISALIGNED, f"{above} spaces as in line {line}{other}")
-    return Words("this does not belong here", "the end of the line", _QUOTE_IT)
+        return ErrorText(_MISALIGNED, f"{above} spaces as in line {line}{other}")
+    return ErrorText("this does not belong here", "the end of the line", _QUOTE_IT)
 
 
 def _mark(mark: YamlMark) -> Mark:

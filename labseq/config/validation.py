@@ -15,12 +15,12 @@ from labseq.config.schema import description_of, keys_of, models_at
 from labseq.config.settings import FOLDER
 from labseq.config.wording import (
     EXPECTED_TYPES,
-    Words,
+    ErrorText,
     clean,
     closest,
     comma_hint,
     listing,
-    put_in_words,
+    explain_validation_error,
     shown,
 )
 
@@ -36,7 +36,7 @@ class Finding:
     """Something wrong at a location below the mapping, or (``key``) with the key there."""
 
     loc: Loc
-    words: Words
+    words: ErrorText
     key: bool = False
 
 
@@ -63,30 +63,30 @@ class _Placed:
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class ValidationContext:
     """What a mapping is validated for.
 
     Attributes:
         name: Name of the mapping in messages; "" at the top of a file.
         called: What to call it in messages; "" for its name.
         drop: Keys that are left out.
-        also_known: Keys that belong to somebody else: named, but not validated.
+        other_keys: Keys that belong to somebody else: named, but not validated.
         folder: Folder that the paths in it are relative to.
     """
 
     name: str
     called: str = ""
     drop: Collection[str] = ()
-    also_known: Collection[str] = ()
+    other_keys: Collection[str] = ()
     folder: Path = Path()
 
 
-def validate(model: type[M], node: Node | None, asked: Asked) -> M | list[Finding]:
+def validate(model: type[M], node: Node | None, asked: ValidationContext) -> M | list[Finding]:
     """Make settings of a mapping, or say everything that is wrong with it."""
     data = {} if node is None or node.value is None else node.plain()
     if not isinstance(data, dict):
         raw = node.raw if node else ""
-        words = Words(f"{asked.name} is {shown(data, raw)}", "a mapping of settings such as {key: value}")
+        words = ErrorText(f"{asked.name} is {shown(data, raw)}", "a mapping of settings such as {key: value}")
         return [Finding((), words)]
     kept = {key: value for key, value in cast("dict[str, Any]", data).items() if key not in asked.drop}
     try:
@@ -95,7 +95,7 @@ def validate(model: type[M], node: Node | None, asked: Asked) -> M | list[Findin
         return _findings(error, model, node or Node({}, Mark(1, 1)), asked)
     except Exception as error:  # noqa: BLE001 - a plugin's own validator may raise anything
         reason = " ".join(f"{type(error).__name__}: {error}".split())
-        return [Finding((), Words(f"these settings make the plugin's check fail: {reason}"))]
+        return [Finding((), ErrorText(f"these settings make the plugin's check fail: {reason}"))]
 
 
 def _validated(model: type[M], text: str, context: Mapping[str, Any]) -> M:
@@ -118,7 +118,7 @@ def _is_long_enough(error: Mapping[str, Any]) -> bool:
     return error["type"] == "too_short" and len(error["input"]) >= error["ctx"]["min_length"]
 
 
-def _findings(error: ValidationError, model: type[BaseModel], top: Node, asked: Asked) -> list[Finding]:
+def _findings(error: ValidationError, model: type[BaseModel], top: Node, asked: ValidationContext) -> list[Finding]:
     found = cast("list[Mapping[str, Any]]", error.errors(include_url=False))
     errors = [_place(one, top) for one in found if not (_is_list_for_tuple(one) or _is_long_enough(one))]
     chosen = [one for one in errors if one.union is None]
@@ -180,42 +180,42 @@ def _best_branch(union: list[_Placed]) -> list[_Placed]:
     return max(branches.values(), key=fit)
 
 
-def _no_type_fits(union: list[_Placed], top: Node, asked: Asked) -> Finding:
+def _no_type_fits(union: list[_Placed], top: Node, asked: ValidationContext) -> Finding:
     loc = union[0].loc
     expected = dict.fromkeys(EXPECTED_TYPES[one.error["type"]] for one in union)
     node = top.at(loc) or top
     *others, last = expected
     either = f"{', '.join(others)} or {last}" if others else last
-    return Finding(loc, Words(f"{_name(loc, asked)} is {shown(node.plain(), node.raw)}", either))
+    return Finding(loc, ErrorText(f"{_name(loc, asked)} is {shown(node.plain(), node.raw)}", either))
 
 
-def _wrong_value(one: _Placed, top: Node, asked: Asked) -> Finding:
+def _wrong_value(one: _Placed, top: Node, asked: ValidationContext) -> Finding:
     context = one.error.get("ctx", {})
     at = (context["discriminator"].strip("'"),) if one.error["type"] == "union_tag_invalid" else ()
     loc = one.loc + tuple(context.get("at", at))
     node = top.at(one.loc) or top
     name = _name(one.loc, asked)
     if "[key]" in one.error["loc"]:
-        words = put_in_words(one.error, f"the key '{clean(str(one.loc[-1]))}'", one.loc[-1], "")
+        words = explain_validation_error(one.error, f"the key '{clean(str(one.loc[-1]))}'", one.loc[-1], "")
         return Finding(loc, words, key=True)
-    return Finding(loc, put_in_words(one.error, name, node.plain(), node.raw), bool(context.get("key")))
+    return Finding(loc, explain_validation_error(one.error, name, node.plain(), node.raw), bool(context.get("key")))
 
 
-def _unknown_key(one: _Placed, meant: str, model: type[BaseModel], top: Node, asked: Asked) -> Finding:
+def _unknown_key(one: _Placed, meant: str, model: type[BaseModel], top: Node, asked: ValidationContext) -> Finding:
     loc, key = one.loc, clean(str(one.loc[-1]))
     node = top.at(loc)
     comma = comma_hint(key, node.value) if node is not None else ""
     known = _known_keys(loc[:-1], model, asked)
     owner = _called(loc[:-1], asked)
     if not known:
-        words = Words(f"{owner} takes no settings, but '{key}' is given", "", comma or "remove it")
+        words = ErrorText(f"{owner} takes no settings, but '{key}' is given", "", comma or "remove it")
         return Finding(loc, words, key=True)
     hint = "put a space after the ':'" if ":" in key else f"did you mean '{meant}'?" if meant else ""
-    words = Words(f"'{key}' is not a setting of {owner}", listing(known), comma or hint)
+    words = ErrorText(f"'{key}' is not a setting of {owner}", listing(known), comma or hint)
     return Finding(loc, words, key=True)
 
 
-def _missing_key(one: _Placed, model: type[BaseModel], top: Node, asked: Asked) -> Finding:
+def _missing_key(one: _Placed, model: type[BaseModel], top: Node, asked: ValidationContext) -> Finding:
     loc, key = one.loc, str(one.loc[-1])
     parent = top.at(loc[:-1])
     about = description_of(models_at(model, loc[:-1]), key)
@@ -224,34 +224,34 @@ def _missing_key(one: _Placed, model: type[BaseModel], top: Node, asked: Asked) 
     known = _known_keys(loc[:-1], model, asked)
     others = [k for k in parent.value if k not in known] if parent and isinstance(parent.value, dict) else []
     alike = closest(key, others)
-    return Finding(loc, Words(what, "", f"did you write '{clean(alike)}' for it?" if alike else ""))
+    return Finding(loc, ErrorText(what, "", f"did you write '{clean(alike)}' for it?" if alike else ""))
 
 
-def _missing_item(one: _Placed, index: int, top: Node, asked: Asked) -> Finding:
+def _missing_item(one: _Placed, index: int, top: Node, asked: ValidationContext) -> Finding:
     loc = one.loc[:-1]
     node = top.at(loc)
     n = len(node.value) if node and isinstance(node.value, list) else 0
     what = f"{_name(loc, asked)} has {n} {'entry' if n == 1 else 'entries'}"
-    return Finding(loc, Words(what, f"at least {index + 1}"))
+    return Finding(loc, ErrorText(what, f"at least {index + 1}"))
 
 
-def _known_keys(loc: Loc, model: type[BaseModel], asked: Asked) -> list[str]:
+def _known_keys(loc: Loc, model: type[BaseModel], asked: ValidationContext) -> list[str]:
     known = [key for key in keys_of(models_at(model, loc)) if loc or key not in asked.drop]
-    return known if loc else [*known, *(key for key in asked.also_known if key not in known)]
+    return known if loc else [*known, *(key for key in asked.other_keys if key not in known)]
 
 
-def _meant_key(one: _Placed, model: type[BaseModel], asked: Asked) -> str:
+def _meant_key(one: _Placed, model: type[BaseModel], asked: ValidationContext) -> str:
     return closest(str(one.loc[-1]), _known_keys(one.loc[:-1], model, asked))
 
 
-def _called(loc: Loc, asked: Asked) -> str:
+def _called(loc: Loc, asked: ValidationContext) -> str:
     """What to call a mapping."""
     if loc:
         return f"'{_name(loc, asked)}'"
     return asked.called or (f"'{asked.name}'" if asked.name else "this file")
 
 
-def _name(loc: Loc, asked: Asked) -> str:
+def _name(loc: Loc, asked: ValidationContext) -> str:
     """Name of a value: its key, and the indices of the lists within."""
     last = next((i for i in reversed(range(len(loc))) if isinstance(loc[i], str)), 0)
     return ".".join(str(step) for step in loc[last:]) if loc else asked.name

@@ -12,7 +12,7 @@ from pydantic import BaseModel
 
 from labseq.config.nodes import Mark, Node
 from labseq.config.settings import NoSettings
-from labseq.config.validation import Asked, validate
+from labseq.config.validation import ValidationContext, validate
 from labseq.config.wording import clean
 from labseq.errors import ConfigError
 
@@ -35,7 +35,7 @@ def validate_values(model: type[M] | None, values: Mapping[str, Any], called: st
         ConfigError: Everything that is wrong with them.
     """
     root = node_of(dict(values), Mark(0, 0, called))
-    result = validate(model or NoSettings, root, Asked("", "it"))
+    result = validate(model or NoSettings, root, ValidationContext("", "it"))
     if isinstance(result, list):
         raise ConfigError(
             [root.mark.problem("", w.what, w.expected, w.hint) for w in (found.words for found in result)]

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Final, TypeAlias
 
 from pydantic import AfterValidator, BeforeValidator
 
-from labseq.config.fields import empty_is, misfit
+from labseq.config.fields import empty_is, setting_error
 from labseq.config.wording import clean, shown
 from labseq.units import parse_any
 
@@ -25,14 +25,14 @@ def si_of(value: Any) -> Any:
         return parse_any(value if isinstance(value, str) else "")[0]
     except ValueError:
         what = f"a variable is {shown(value)}"
-        raise misfit(what, "a number, or a number with a unit such as '20 ms'") from None
+        raise setting_error(what, "a number, or a number with a unit such as '20 ms'") from None
 
 
 def _named(variables: dict[str, int | float]) -> dict[str, int | float]:
     for name in variables:
         if not _NAME.fullmatch(name):
             what = f"a variable is called '{clean(name)}'"
-            raise misfit(what, "letters, digits and '_', a letter first", at=(name,), key=True)
+            raise setting_error(what, "letters, digits and '_', a letter first", at=(name,), key=True)
     return variables
 
 

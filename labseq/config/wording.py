@@ -43,7 +43,7 @@ _ONE: Final = {"entries": "entry", "characters": "character"}
 
 
 @dataclass(frozen=True, slots=True)
-class Words:
+class ErrorText:
     """What is wrong, what was expected, what to do."""
 
     what: str
@@ -110,7 +110,7 @@ def visible(text: str) -> str:
     return "".join(char if char.isprintable() else repr(char)[1:-1] for char in text)
 
 
-def put_in_words(error: Mapping[str, Any], name: str, value: Any, raw: str) -> Words:
+def explain_validation_error(error: Mapping[str, Any], name: str, value: Any, raw: str) -> ErrorText:
     """Put an error of pydantic into a physicist's words.
 
     Args:
@@ -121,45 +121,45 @@ def put_in_words(error: Mapping[str, Any], name: str, value: Any, raw: str) -> W
     """
     kind, context = str(error["type"]), error.get("ctx", {})
     what = f"{name} is {shown(value, raw)}" if name else f"this is {shown(value, raw)}"
-    if kind == "misfit":
-        return Words(context["what"], context["expected"], context["hint"])
+    if kind == "setting_error":
+        return ErrorText(context["what"], context["expected"], context["hint"])
     if kind in ("value_error", "assertion_error"):
         return _own_words(str(context.get("error", error["msg"])), name, what)
     if kind in EXPECTED_TYPES:
-        return Words(what, EXPECTED_TYPES[kind], _meant(kind, value))
+        return ErrorText(what, EXPECTED_TYPES[kind], _meant(kind, value))
     if kind in _LIMITS:
         words, key = _LIMITS[kind]
-        return Words(what, f"{words} {_limit(context[key], isinstance(value, str))}")
+        return ErrorText(what, f"{words} {_limit(context[key], isinstance(value, str))}")
     if kind in _LENGTHS:
         words, key, unit = _LENGTHS[kind]
         n = len(cast("Sized", value))
-        return Words(f"{name} has {n} {_ONE[unit] if n == 1 else unit}", f"{words} {context[key]}")
+        return ErrorText(f"{name} has {n} {_ONE[unit] if n == 1 else unit}", f"{words} {context[key]}")
     if kind == "finite_number":
-        return Words(what, "a finite number")
+        return ErrorText(what, "a finite number")
     if kind in ("literal_error", "enum"):
         choices = re.findall(r"'([^']*)'", context["expected"])
         hint = did_you_mean(str(value), choices) if len(choices) > 1 else ""
-        return Words(what, context["expected"], hint)
+        return ErrorText(what, context["expected"], hint)
     if kind == "union_tag_invalid":
         tags = context["expected_tags"]
         hint = did_you_mean(str(context["tag"]), re.findall(r"'([^']*)'", tags))
         setting = context["discriminator"].strip("'")
-        return Words(f"{setting} is {shown(context['tag'])}", tags, hint)
+        return ErrorText(f"{setting} is {shown(context['tag'])}", tags, hint)
     if kind == "union_tag_not_found":
-        return Words(f"{context['discriminator']} is missing from '{name}'")
+        return ErrorText(f"{context['discriminator']} is missing from '{name}'")
     message = str(error["msg"])
     expected = message.removeprefix("Input should be ")
-    return Words(what, expected) if expected != message else Words(f"{name}: {message}")
+    return ErrorText(what, expected) if expected != message else ErrorText(f"{name}: {message}")
 
 
-def _own_words(text: str, name: str, plain: str) -> Words:
+def _own_words(text: str, name: str, plain: str) -> ErrorText:
     """The text of a validator, on one line and parted at "; expected"."""
     text = " ".join(text.split())
     if text.startswith("expected "):
-        return Words(plain, text.removeprefix("expected "))
+        return ErrorText(plain, text.removeprefix("expected "))
     what, _, rest = text.partition("; expected ")
     expected, _, hint = rest.partition("; ")
-    return Words(f"{name}: {what}" if name else what, expected, hint)
+    return ErrorText(f"{name}: {what}" if name else what, expected, hint)
 
 
 def _limit(limit: Any, is_text: bool) -> str:

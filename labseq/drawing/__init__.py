@@ -3,7 +3,7 @@
 Importing this package imports no matplotlib; drawing a picture does.
 """
 
-from labseq.drawing.batches import BatchStory, line_words, occupancies, on_grid, tell_batches
+from labseq.drawing.batches import BatchSummary, lines_label, occupancies, on_grid, summarise_batches
 from labseq.drawing.figure4 import ParallelismDrawing, save_parallelism
 from labseq.drawing.figure5 import CyclesDrawing, save_cycles
 from labseq.drawing.panels import MAX_PANELS, Panel, make_panels
@@ -17,7 +17,7 @@ from labseq.drawing.waveform import WaveformDrawing, save_waveform
 __all__ = [
     "ENDINGS",
     "MAX_PANELS",
-    "BatchStory",
+    "BatchSummary",
     "ComparisonDrawing",
     "Curve",
     "CyclesDrawing",
@@ -32,7 +32,7 @@ __all__ = [
     "check_place",
     "draw_target",
     "encode_figure",
-    "line_words",
+    "lines_label",
     "make_panels",
     "occupancies",
     "on_grid",
@@ -43,5 +43,5 @@ __all__ = [
     "save_target",
     "save_waveform",
     "target_text",
-    "tell_batches",
+    "summarise_batches",
 ]

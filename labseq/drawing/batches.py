@@ -16,7 +16,7 @@ Axis = Literal["row", "column"]
 
 
 @dataclass(frozen=True, slots=True)
-class BatchStory:
+class BatchSummary:
     """A batch in a few numbers.
 
     Attributes:
@@ -34,7 +34,7 @@ class BatchStory:
     n_sites: int
 
 
-def tell_batches(plan: Plan, shape: tuple[int, int]) -> list[BatchStory]:
+def summarise_batches(plan: Plan, shape: tuple[int, int]) -> list[BatchSummary]:
     """Sum up each batch of a checked plan.
 
     Args:
@@ -42,17 +42,17 @@ def tell_batches(plan: Plan, shape: tuple[int, int]) -> list[BatchStory]:
         shape: (n_rows, n_cols) of the grid.
 
     Example:
-        >>> tell_batches(Plan.from_batches([([(2, 0), (2, 1)], [(2, 3), (2, 4)])]), (5, 4))
-        [BatchStory(axis='row', lines=(2,), n_atoms=2, n_ejected=1, n_sites=3)]
+        >>> summarise_batches(Plan.from_batches([([(2, 0), (2, 1)], [(2, 3), (2, 4)])]), (5, 4))
+        [BatchSummary(axis='row', lines=(2,), n_atoms=2, n_ejected=1, n_sites=3)]
     """
-    return [_tell(batch, shape) for batch in plan.batches]
+    return [_summarise(batch, shape) for batch in plan.batches]
 
 
-def _tell(batch: Batch, shape: tuple[int, int]) -> BatchStory:
+def _summarise(batch: Batch, shape: tuple[int, int]) -> BatchSummary:
     way = batch.to_sites - batch.from_sites
     axis: Axis = "column" if way[:, 0].any() else "row"
     lines = np.unique(batch.from_sites[:, 1 if axis == "column" else 0])
-    return BatchStory(
+    return BatchSummary(
         axis=axis,
         lines=tuple(lines.tolist()),
         n_atoms=len(batch),
@@ -96,11 +96,11 @@ def occupancies(plan: Plan, occupancy: Occupancy) -> list[Occupancy]:
     return before
 
 
-def line_words(axis: Axis, lines: Iterable[int]) -> str:
+def lines_label(axis: Axis, lines: Iterable[int]) -> str:
     """Name rows or columns, counted from 0.
 
     Example:
-        >>> line_words("row", [7]), line_words("column", [2, 3, 4, 9])
+        >>> lines_label("row", [7]), lines_label("column", [2, 3, 4, 9])
         ('row 7', 'columns 2-4, 9')
     """
     numbers = sorted(set(lines))

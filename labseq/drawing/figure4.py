@@ -32,7 +32,7 @@ COLOURS: Final = ((LIGHT, DARK), (ANOTHER, OTHER))
 """Of the series with one window and of that with a window for each point; this run's, and the other's."""
 ROOM: Final = 0.25
 """Room above and below the points, relative to their range."""
-LEAST_RANGE: Final = 0.5
+MIN_RANGE: Final = 0.5
 """Least range of filling that is shown, in per cent."""
 
 
@@ -82,7 +82,7 @@ def _draw(drawing: ParallelismDrawing) -> Figure:
     if drawing.quoted is not None:
         paint_quoted(axes, drawing.quoted)
     low, high = span((*drawing.fixed, *drawing.optimised, drawing.quoted))
-    room = ROOM * max(high - low, LEAST_RANGE)
+    room = ROOM * max(high - low, MIN_RANGE)
     axes.set_ylim(low - room, high + room)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set_xlabel("degree of parallelism")
@@ -99,7 +99,7 @@ def _draw_survival(axes: Axes, survival: Series) -> None:
     right = axes.twinx()
     right.plot(survival.x, 100 * survival.y, color=LIMIT, linewidth=1, label=plain(survival.label))
     low, high = span([survival])
-    room = ROOM * max(high - low, LEAST_RANGE)
+    room = ROOM * max(high - low, MIN_RANGE)
     right.set_ylim(low - room, high + room)
     right.set_ylabel("survival of the window (%)", color=LIMIT)
     right.tick_params(colors=LIMIT, width=0.7, labelsize=9)

@@ -33,7 +33,7 @@ WIDTHS: Final = (2.3, 1.0)
 """Of the probabilities and of the histogram; relative."""
 HEADROOM: Final = 1.35
 """Height of the panel, relative to the highest point: the key stands above the points."""
-LEAST_DEFECTS: Final = 4
+MIN_DEFECTS: Final = 4
 """Number of defects up to which the histogram goes at least."""
 
 
@@ -55,7 +55,7 @@ class CyclesDrawing:
     series: tuple[Series, ...]
     defects: tuple[NDArray[np.int64], ...]
     quoted: Series | None = None
-    ceiling: Series | None = None
+    max_defect_free: Series | None = None
 
 
 def save_cycles(path: Path, drawing: CyclesDrawing) -> None:
@@ -87,10 +87,10 @@ def _draw_rates(axes: Axes, drawing: CyclesDrawing) -> None:
         paint_series(axes, series, colour, marker, joined=True)
     if drawing.quoted is not None:
         paint_quoted(axes, drawing.quoted)
-    if drawing.ceiling is not None:
-        limit = drawing.ceiling
+    if drawing.max_defect_free is not None:
+        limit = drawing.max_defect_free
         axes.plot(limit.x, 100 * limit.y, color=LIMIT, linewidth=1, linestyle="--", label=plain(limit.label))
-    shown = [one for one in (*drawing.series, drawing.quoted, drawing.ceiling) if one is not None]
+    shown = [one for one in (*drawing.series, drawing.quoted, drawing.max_defect_free) if one is not None]
     axes.set_ylim(0.0, HEADROOM * span(shown)[1])
     axes.set_xlim(0.5, max(float(one.x[-1]) for one in shown) + 0.5)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
@@ -103,7 +103,7 @@ def _draw_rates(axes: Axes, drawing: CyclesDrawing) -> None:
 def _key(axes: Axes, drawing: CyclesDrawing) -> tuple[list[Any], list[str]]:
     """Handles and labels, points before lines."""
     handles, labels = axes.get_legend_handles_labels()
-    if drawing.ceiling is not None:  # matplotlib sorts lines before points with error bars
+    if drawing.max_defect_free is not None:  # matplotlib sorts lines before points with error bars
         handles, labels = [*handles[1:], handles[0]], [*labels[1:], labels[0]]
     return handles, labels
 
@@ -118,7 +118,7 @@ def _draw_defects(axes: Axes, drawing: CyclesDrawing) -> None:
         if inside is not None:
             axes.stairs(share, edges, fill=True, color=inside)
         axes.stairs(share, edges, color=rim, linewidth=0.9)
-    most = max(LEAST_DEFECTS, *(len(counts) - 1 for counts in drawing.defects))
+    most = max(MIN_DEFECTS, *(len(counts) - 1 for counts in drawing.defects))
     axes.set_xlim(-0.8, most + 0.8)
     axes.set_ylim(bottom=0.0)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))

@@ -22,7 +22,7 @@ DEFECT, RING, DOT, BAND = "#c8102e", "0.45", "0.82", "#dff0e0"
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
+class MarkerStyle:
     """A marker and how it is painted.
 
     Attributes:
@@ -52,18 +52,18 @@ class Look:
         }
 
 
-ATOM_LOOK: Final = Look("atom on a target site", "o", 0.62, ATOM, ATOM)
-DEFECT_LOOK: Final = Look("empty target site", "o", 0.62, "white", RING)
-SURPLUS_LOOK: Final = Look("surplus atom", "o", 0.5, SURPLUS, SURPLUS)
-RESERVOIR_LOOK: Final = Look("atom in the reservoir", "o", 0.5, RESERVOIR, RESERVOIR)
-EMPTY_LOOK: Final = Look("empty site", "o", 0.14, DOT, DOT)
-MISSING_LOOK: Final = Look("target site that stays empty", "o", 0.62, "white", DEFECT)
-EJECTED_LOOK: Final = Look("ejected", "X", 0.55, DEFECT, DEFECT)
+ATOM_LOOK: Final = MarkerStyle("atom on a target site", "o", 0.62, ATOM, ATOM)
+DEFECT_LOOK: Final = MarkerStyle("empty target site", "o", 0.62, "white", RING)
+SURPLUS_LOOK: Final = MarkerStyle("surplus atom", "o", 0.5, SURPLUS, SURPLUS)
+RESERVOIR_LOOK: Final = MarkerStyle("atom in the reservoir", "o", 0.5, RESERVOIR, RESERVOIR)
+EMPTY_LOOK: Final = MarkerStyle("empty site", "o", 0.14, DOT, DOT)
+MISSING_LOOK: Final = MarkerStyle("target site that stays empty", "o", 0.62, "white", DEFECT)
+EJECTED_LOOK: Final = MarkerStyle("ejected", "X", 0.55, DEFECT, DEFECT)
 
 
 def paint_sites(
     axes: Axes, sheet: Sheet, grid: SiteGrid, occupancy: Occupancy, target: TargetPattern, *, final: bool
-) -> list[Look]:
+) -> list[MarkerStyle]:
     """Paint every site as what it is.
 
     Args:
@@ -85,7 +85,7 @@ def paint_sites(
         (SURPLUS_LOOK, occupancy & unwanted),
         (ATOM_LOOK, occupancy & wanted),
     )
-    painted: list[Look] = []
+    painted: list[MarkerStyle] = []
     for look, here in layers:
         if here.any():
             x, y = place_sites(np.argwhere(here), grid).T

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from itertools import groupby, pairwise
 from typing import Any, Final
 
-from labseq.drawing.batches import Axis, BatchStory, line_words
+from labseq.drawing.batches import Axis, BatchSummary, lines_label
 
 MAX_PANELS: Final = 38
 """Most panels of batches; with the ones before and after that makes 40."""
@@ -50,7 +50,7 @@ class Panel:
         return f"{self.first + 1}-{self.last + 1}"
 
 
-def make_panels(stories: Sequence[BatchStory], max_panels: int = MAX_PANELS) -> list[Panel]:
+def make_panels(summaries: Sequence[BatchSummary], max_panels: int = MAX_PANELS) -> list[Panel]:
     """Share out batches among panels, in order.
 
     A batch has a panel of its own if there are enough. If not, successive batches
@@ -62,28 +62,28 @@ def make_panels(stories: Sequence[BatchStory], max_panels: int = MAX_PANELS) -> 
         max_panels: Most panels, at least 1.
 
     Example:
-        >>> rows = [BatchStory("row", (i // 2,), 3, 0, 5) for i in range(8)]
+        >>> rows = [BatchSummary("row", (i // 2,), 3, 0, 5) for i in range(8)]
         >>> [(panel.first, panel.last) for panel in make_panels(rows, 4)]
         [(0, 1), (2, 3), (4, 5), (6, 7)]
     """
-    groups = [[i] for i in range(len(stories))]
+    groups = [[i] for i in range(len(summaries))]
     if len(groups) > max_panels:
-        groups = _together(stories, lambda story: (story.axis, story.lines))
+        groups = _together(summaries, lambda summary: (summary.axis, summary.lines))
     if len(groups) > max_panels:
-        phases = _together(stories, lambda story: story.axis)
+        phases = _together(summaries, lambda summary: summary.axis)
         if len(phases) > max_panels:
-            phases = [list(range(len(stories)))]
+            phases = [list(range(len(summaries)))]
         groups = _evenly(phases, max_panels)
-    return [_panel(stories, group) for group in groups]
+    return [_panel(summaries, group) for group in groups]
 
 
 def _words(axis: Axis, lines: tuple[int, ...]) -> str:
-    words = line_words(axis, lines)
+    words = lines_label(axis, lines)
     return words if len(words) <= MAX_WORDS else f"{len(lines)} {axis}s"
 
 
-def _together(stories: Sequence[BatchStory], key: Callable[[BatchStory], Any]) -> list[list[int]]:
-    runs = groupby(range(len(stories)), lambda i: key(stories[i]))
+def _together(summaries: Sequence[BatchSummary], key: Callable[[BatchSummary], Any]) -> list[list[int]]:
+    runs = groupby(range(len(summaries)), lambda i: key(summaries[i]))
     return [list(run) for _, run in runs]
 
 
@@ -100,8 +100,8 @@ def _evenly(phases: list[list[int]], max_panels: int) -> list[list[int]]:
     return pieces
 
 
-def _panel(stories: Sequence[BatchStory], group: list[int]) -> Panel:
+def _panel(summaries: Sequence[BatchSummary], group: list[int]) -> Panel:
     lines: dict[Axis, set[int]] = {}
     for i in group:
-        lines.setdefault(stories[i].axis, set()).update(stories[i].lines)
+        lines.setdefault(summaries[i].axis, set()).update(summaries[i].lines)
     return Panel(group[0], group[-1], tuple((axis, tuple(sorted(found))) for axis, found in lines.items()))

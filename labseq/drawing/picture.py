@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from labseq.drawing.batches import occupancies, tell_batches
+from labseq.drawing.batches import occupancies, summarise_batches
 from labseq.drawing.paint import (
     EJECTED_LOOK,
-    Look,
+    MarkerStyle,
     frame,
     paint_lines,
     paint_moves,
@@ -91,7 +91,7 @@ def save_plan(path: Path, drawing: PlanDrawing) -> None:
 
 def _draw(drawing: PlanDrawing) -> Figure:
     plan, grid = drawing.plan, drawing.grid
-    panels = make_panels(tell_batches(plan, grid.shape))
+    panels = make_panels(summarise_batches(plan, grid.shape))
     sheet = lay_out(extent_of(plan, grid), len(panels) + 2)
     figure = make_figure(sheet.width_in, sheet.height_in)
     looks = _fill(figure, sheet, drawing, panels)
@@ -103,7 +103,7 @@ def _draw(drawing: PlanDrawing) -> Figure:
     return figure
 
 
-def _fill(figure: Figure, sheet: Sheet, drawing: PlanDrawing, panels: list[Panel]) -> list[Look]:
+def _fill(figure: Figure, sheet: Sheet, drawing: PlanDrawing, panels: list[Panel]) -> list[MarkerStyle]:
     """Paint all panels; return what the key has to explain."""
     plan, grid, target = drawing.plan, drawing.grid, drawing.target
     n_rows, n_cols = grid.shape
@@ -115,7 +115,7 @@ def _fill(figure: Figure, sheet: Sheet, drawing: PlanDrawing, panels: list[Panel
         *(panel.title for panel in panels),
         f"after: {target.n_atoms - drawing.report.n_defects} of {target.n_atoms} target sites filled",
     ]
-    looks: dict[Look, None] = {}
+    looks: dict[MarkerStyle, None] = {}
     for i, (atoms, title) in enumerate(zip(shown, titles, strict=True)):
         axes = figure.add_axes(sheet.place(i))
         final = i == len(shown) - 1
@@ -168,7 +168,7 @@ def _scale_bar(axes: Axes, sheet: Sheet, grid: SiteGrid) -> None:
     axes.text(left + length + 0.25, y, f"{length_um:g} µm", fontsize=7, ha="left", va="center")
 
 
-def _write_head(figure: Figure, sheet: Sheet, drawing: PlanDrawing, looks: list[Look]) -> None:
+def _write_head(figure: Figure, sheet: Sheet, drawing: PlanDrawing, looks: list[MarkerStyle]) -> None:
     """The title, and what the markers stand for."""
     from matplotlib.lines import Line2D
 

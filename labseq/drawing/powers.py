@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 SIZE_IN: Final = (8.4, 5.6)
-LEAST_RANGE: Final = 0.05
+MIN_RANGE: Final = 0.05
 """Least deviation from the mean that the colours go to."""
 TITLE_PT: Final = 10
 LABEL_PT: Final = 9
@@ -36,7 +36,7 @@ def draw_powers(before: Floats, after: Floats, rows: Floats, cols: Floats) -> Fi
     figure = make_figure(*SIZE_IN, layout="constrained")
     panels = figure.subplots(2, 2, height_ratios=(2.2, 1.0))
     maps = [power / np.nanmean(power) - 1 for power in (before, after)]
-    most = max(LEAST_RANGE, *(float(np.nanmax(np.abs(each))) for each in maps))
+    most = max(MIN_RANGE, *(float(np.nanmax(np.abs(each))) for each in maps))
     for axes, each, title in zip(panels[0], maps, ("before", "after"), strict=True):
         axes.imshow(100 * each, cmap="RdBu_r", vmin=-100 * most, vmax=100 * most)
         axes.set_title(f"{title}: {100 * float(np.nanstd(each)):.1f} % r.m.s.", fontsize=TITLE_PT)

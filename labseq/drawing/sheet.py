@@ -21,7 +21,7 @@ TITLE_IN: Final = 0.3
 """Room above each panel for its title, in inches."""
 HEAD_IN: Final = 0.9
 """Room at the top of the sheet for its title and key, in inches."""
-LEAST_WIDTH_IN: Final = 9.0
+MIN_WIDTH_IN: Final = 9.0
 """So wide are a sheet's title and key."""
 
 
@@ -140,4 +140,4 @@ def lay_out(extent: Extent, n_panels: int, panel_in: float = PANEL_IN) -> Sheet:
     n_cols = min(range(1, n_panels + 1), key=fault)
     across, down = size(n_cols)
     n_rows = math.ceil(n_panels / n_cols)
-    return Sheet(n_cols, n_rows, site_in, max(across, LEAST_WIDTH_IN), down, extent)
+    return Sheet(n_cols, n_rows, site_in, max(across, MIN_WIDTH_IN), down, extent)

@@ -18,7 +18,7 @@ from labseq.drawing.paint import (
     EMPTY_LOOK,
     RESERVOIR_LOOK,
     SURPLUS_LOOK,
-    Look,
+    MarkerStyle,
     frame,
     paint_moves,
     paint_numbers,
@@ -39,10 +39,10 @@ DPI: Final = 150
 LARGE_IN: Final = 6.5
 """Width of a panel where there are two at most, in inches."""
 ON_FRAME: Final = (
-    Look("atom on a target site", "o", 0.86, "none", "#56b4e9"),
-    Look("empty target site", "o", 0.86, "none", "#ff7f0e"),
-    Look("surplus atom", "s", 0.8, "none", "#f0e442"),
-    Look("atom in the reservoir", "o", 0.86, "none", "0.62"),
+    MarkerStyle("atom on a target site", "o", 0.86, "none", "#56b4e9"),
+    MarkerStyle("empty target site", "o", 0.86, "none", "#ff7f0e"),
+    MarkerStyle("surplus atom", "s", 0.8, "none", "#f0e442"),
+    MarkerStyle("atom in the reservoir", "o", 0.86, "none", "0.62"),
 )
 """Rings around sites, in the colours of Okabe and Ito, that stand out from grey for all eyes."""
 OUTLINE: Final = "#c8102e"
@@ -118,7 +118,7 @@ def _draw(drawing: ShotDrawing) -> Figure:
     n_rows, n_cols = grid.shape
     edge = place_sites(np.array([[0, 0], [0, n_cols], [n_rows, n_cols], [n_rows, 0]]) - 0.5, grid)
     limits = _limits(drawing)
-    looks: dict[Look, None] = {}
+    looks: dict[MarkerStyle, None] = {}
     for i, panel in enumerate(panels):
         axes = figure.add_axes(sheet.place(i))
         looks |= dict.fromkeys(_paint(axes, sheet, drawing, panel, limits))
@@ -133,7 +133,7 @@ def _draw(drawing: ShotDrawing) -> Figure:
 
 def _paint(
     axes: Axes, sheet: Sheet, drawing: ShotDrawing, panel: ShotPanel, limits: tuple[float, float]
-) -> list[Look]:
+) -> list[MarkerStyle]:
     """Paint the frame if there is one, the sites, the target's border and the moves."""
     from matplotlib.collections import LineCollection
 
@@ -173,14 +173,14 @@ def _lay_under(
 
 def _mark(
     axes: Axes, sheet: Sheet, grid: SiteGrid, occupancy: Occupancy, target: TargetPattern
-) -> list[Look]:
+) -> list[MarkerStyle]:
     here = (
         occupancy & target.fill,
         ~occupancy & target.fill,
         occupancy & target.clear,
         occupancy & ~target.fill & ~target.clear,
     )
-    marked: list[Look] = []
+    marked: list[MarkerStyle] = []
     for look, sites in zip(ON_FRAME, here, strict=True):
         if sites.any():
             x, y = place_sites(np.argwhere(sites), grid).T
@@ -205,7 +205,7 @@ def _colour(index: int, n_batches: int) -> Any:
     return colormaps[name](first + (last - first) * index / max(1, n_batches - 1))
 
 
-def _write_head(figure: Figure, sheet: Sheet, drawing: ShotDrawing, looks: list[Look]) -> None:
+def _write_head(figure: Figure, sheet: Sheet, drawing: ShotDrawing, looks: list[MarkerStyle]) -> None:
     """The title, and what the marks stand for."""
     from matplotlib.lines import Line2D
 

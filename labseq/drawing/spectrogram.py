@@ -30,7 +30,7 @@ FLOOR: Final = 1e-12
 
 
 @dataclass(frozen=True, slots=True)
-class Stretches:
+class WaveformPieces:
     """Pieces of a waveform, laid end to end: what a picture shows of it.
 
     Attributes:
@@ -42,7 +42,7 @@ class Stretches:
     at: NDArray[np.int64]
 
     @classmethod
-    def of(cls, pieces: list[tuple[int, int]]) -> Stretches:
+    def of(cls, pieces: list[tuple[int, int]]) -> WaveformPieces:
         """Lay pieces end to end.
 
         Args:
@@ -68,7 +68,7 @@ class Stretches:
 
 
 def spectrogram(
-    renderer: Renderer, channel: int, stretches: Stretches, n_columns: int, band_hz: tuple[float, float]
+    renderer: Renderer, channel: int, stretches: WaveformPieces, n_columns: int, band_hz: tuple[float, float]
 ) -> tuple[NDArray[np.float32], tuple[float, float]]:
     """Find out how strong each frequency is, column by column, without ever holding all samples.
 
@@ -107,7 +107,7 @@ def spectrogram(
     return level_db.T.astype(np.float32), edges_hz
 
 
-def envelope(renderer: Renderer, channel: int, stretches: Stretches, n_columns: int) -> NDArray[np.float64]:
+def envelope(renderer: Renderer, channel: int, stretches: WaveformPieces, n_columns: int) -> NDArray[np.float64]:
     """Find the largest sample of each column, looking at every sample.
 
     Args:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from labseq.drawing.paint import Look
+from labseq.drawing.paint import MarkerStyle
 from labseq.drawing.saving import make_figure, save_figure
 from labseq.drawing.sheet import MARGIN, place_sites
 from labseq.model import SiteGrid, TargetPattern
@@ -20,9 +20,9 @@ DPI: Final = 100
 SITE_IN: Final = 0.18
 """Distance between neighbours in a picture of :func:`save_target`, in inches."""
 
-FILL_LOOK: Final = Look("atom", "o", 0.76, "#1b5e8c", "#1b5e8c")
-CLEAR_LOOK: Final = Look("must be empty", "o", 0.34, "white", "0.78")
-OTHER_LOOK: Final = Look("reservoir", "o", 0.16, "0.6", "0.6")
+FILL_LOOK: Final = MarkerStyle("atom", "o", 0.76, "#1b5e8c", "#1b5e8c")
+CLEAR_LOOK: Final = MarkerStyle("must be empty", "o", 0.34, "white", "0.78")
+OTHER_LOOK: Final = MarkerStyle("reservoir", "o", 0.16, "0.6", "0.6")
 
 
 def draw_target(axes: Axes, target: TargetPattern, grid: SiteGrid, site_in: float = SITE_IN) -> None:

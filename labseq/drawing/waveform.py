@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.drawing.saving import make_figure, save_figure
-from labseq.drawing.spectrogram import Stretches, envelope, spectrogram
+from labseq.drawing.spectrogram import WaveformPieces, envelope, spectrogram
 from labseq.model import AxisTones, FrequencyCourse, RfSpec, SegmentKind, ToneProgram
 from labseq.motion import Renderer
 
@@ -89,7 +89,7 @@ class _Timeline:
 
     on: list[int]
     at_s: Floats
-    stretches: Stretches
+    stretches: WaveformPieces
 
 
 def save_waveform(path: Path, drawing: WaveformDrawing) -> None:
@@ -155,7 +155,7 @@ def _lay_out(drawing: WaveformDrawing) -> _Timeline:
     program, first = drawing.program, drawing.renderer.first_sample
     on = [i for i in drawing.segments if program.kind[i] != SegmentKind.IDLE]
     at_s = np.concatenate([[0.0], np.cumsum(program.duration_s[on])])
-    return _Timeline(on, at_s, Stretches.of([(int(first[i]), int(first[i + 1])) for i in on]))
+    return _Timeline(on, at_s, WaveformPieces.of([(int(first[i]), int(first[i + 1])) for i in on]))
 
 
 def _cuts(program: ToneProgram, timeline: _Timeline) -> list[float]:

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from typing import Any, Final
 
-from labseq.drivers.series import Series, Taken
+from labseq.drivers.series import Series, ExposureResult
 from labseq.errors import DeviceError, DeviceTimeoutError, LimitError, TransientError, one_of
 from labseq.model import CameraFacts, Frame
 from labseq.roles import Context, Trigger
@@ -63,7 +63,7 @@ class CameraDriver(ABC):
         """Start an exposure of a series with the software trigger."""
 
     @abstractmethod
-    def _take(self, timeout_s: float) -> Taken | None:
+    def _take(self, timeout_s: float) -> ExposureResult | None:
         """Wait for what comes next of the series; None if nothing comes in time.
 
         See :func:`labseq.drivers.wait_for`.
@@ -205,9 +205,9 @@ class CameraDriver(ABC):
         self._series: Series | None = None
         self._fired_s: list[float] = []
         self._n_read = 0
-        self._held: Taken | None = None
+        self._held: ExposureResult | None = None
 
-    def _t_start_s(self, taken: Taken, exposure_s: float) -> float:
+    def _t_start_s(self, taken: ExposureResult, exposure_s: float) -> float:
         if not math.isnan(taken.t_start_s):
             return taken.t_start_s
         if taken.number < len(self._fired_s):

@@ -98,7 +98,7 @@ def ports_here() -> list[Any]:
     return sorted(tools.comports())
 
 
-def ports_in_words() -> str:
+def ports_text() -> str:
     """The ports that there are, for a message."""
     found = [
         port.device
@@ -118,8 +118,8 @@ def _reason(error: BaseException) -> str:
     if number == errno.EACCES:
         return "you may not; ask for membership of the group that it belongs to (often 'dialout')"
     if number == errno.ENOENT or "FileNotFoundError" in text:
-        return f"there is no such port; expected {ports_in_words()}; is it plugged in, and switched on?"
+        return f"there is no such port; expected {ports_text()}; is it plugged in, and switched on?"
     first = error.__context__  # termios' own, which has its number among its arguments
     if number == errno.EISDIR or (first is not None and errno.ENOTTY in first.args):
-        return f"it is no serial port; expected {ports_in_words()}"
+        return f"it is no serial port; expected {ports_text()}"
     return re.sub(r"^(\[Errno \d+\] )?[Cc]ould not [^:]*: ", "", text)

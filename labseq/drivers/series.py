@@ -29,7 +29,7 @@ class Series:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Taken:
+class ExposureResult:
     """What came of one exposure.
 
     Attributes:

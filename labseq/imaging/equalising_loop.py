@@ -19,7 +19,7 @@ QUIET: Final = 1 / 3
 """Noise of the separable part, over the spread that is aimed at, at which averaging ends."""
 ROUGH: Final = 0.3
 """What a round is expected to leave of the spread."""
-LEAST_PROGRESS: Final = 0.9
+MIN_PROGRESS: Final = 0.9
 """By what factor the spread must fall in :data:`PATIENCE` rounds."""
 PATIENCE: Final = 4
 
@@ -135,7 +135,7 @@ def _noise(mean: Floats, variance: Floats) -> float:
 
 
 def _refuse_standstill(spreads: list[float], power: Floats, rows: Floats, cols: Floats) -> None:
-    if len(spreads) <= PATIENCE or spreads[-1] < LEAST_PROGRESS * spreads[-1 - PATIENCE]:
+    if len(spreads) <= PATIENCE or spreads[-1] < MIN_PROGRESS * spreads[-1 - PATIENCE]:
         return
     found = factors(power)
     name, off, amplitudes = max(

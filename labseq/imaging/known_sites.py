@@ -83,7 +83,7 @@ class KnownSites:
     positions_px: Floats
     frame: tuple[int, int]
     source: str
-    mend: str
+    remedy: str
 
     def __post_init__(self) -> None:
         positions = read_only(self.positions_px, np.float64, (-1, -1, 2), "positions_px")

@@ -18,10 +18,10 @@ from labseq.model import SiteGrid
 
 Floats = NDArray[np.float64]
 
-LEAST_FOUND: Final = 0.5
+MIN_FOUND: Final = 0.5
 """Least part of the sites that must be lit."""
 
-MOST_RESIDUAL: Final = 0.08
+MAX_RESIDUAL: Final = 0.08
 """Most r.m.s. distance of the spots from the smooth lattice, in spacings."""
 
 
@@ -144,7 +144,7 @@ def _indexed(spots: Spots, vectors: Vectors, grid: SiteGrid, camera: str) -> tup
     indexed = index_spots(spots, vectors, n_sites, max(grid.shape) + 2)
     bright = int(np.count_nonzero(spots.light > 0.3 * usual_light(spots.light, n_sites)))
     n_indexed = 0 if indexed is None else len(indexed.spots)
-    if indexed is None or n_indexed < LEAST_FOUND * min(bright, n_sites):
+    if indexed is None or n_indexed < MIN_FOUND * min(bright, n_sites):
         _fail(
             camera,
             f"of {bright} spots only {n_indexed} stand on a lattice; {n_sites} are expected; {_DARK}",
@@ -177,13 +177,13 @@ def _refined(
         fitted = fit_spots(flat, surface.at(sites), fitted.width_px, 0.3 * shortest, noise)
         off = np.hypot(*(fitted.places - surface.at(sites)).T)
         lit = (fitted.light > 0.25 * np.median(fitted.light)) & (off < 0.29 * shortest)
-        if lit.sum() < max(3, LEAST_FOUND * len(sites)):
+        if lit.sum() < max(3, MIN_FOUND * len(sites)):
             _fail(camera, f"{lit.sum()} spots found of {len(sites)} expected; {_DARK}")
         surface, _ = fit_surface(sites[lit], fitted.places[lit], 3, fitted.light[lit])
     positions = surface.at(sites)
     residuals = np.where(lit[:, None], fitted.places - positions, np.nan)
     residual = float(np.sqrt(np.nanmean((residuals**2).sum(axis=1))))
-    if residual > MOST_RESIDUAL * shortest:
+    if residual > MAX_RESIDUAL * shortest:
         _fail(
             camera,
             f"the spots lie {residual:.2f} pixels (r.m.s.) beside a lattice of {shortest:.1f} pixels; "

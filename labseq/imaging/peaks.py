@@ -14,15 +14,15 @@ from labseq.imaging.peak_shapes import Shapes, fit_shapes
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
-LEAST_FRAMES: Final = 30
-LEAST_IN_PEAK: Final = 5
+MIN_FRAMES: Final = 30
+MIN_IN_PEAK: Final = 5
 APART: Final = 3.0
 """Least distance of two peaks, in their joint widths; a single peak cut in two has 2."""
 
 FAINT: Final = 0.4
 """Least distance of a site's peaks, of the usual."""
 
-MOST_ONE_PEAK: Final = 0.2
+MAX_ONE_PEAK: Final = 0.2
 """Most sites with one peak, of all."""
 
 
@@ -90,8 +90,8 @@ def fit_thresholds(signals: Floats, miss_cost: float = 3.0, detector: str = "det
         DeviceError: More than 20 % of the sites show one peak only.
     """
     n_frames, *shape = signals.shape
-    if n_frames < LEAST_FRAMES:
-        raise LimitError("the number of frames for thresholds", n_frames, f"{LEAST_FRAMES} or more")
+    if n_frames < MIN_FRAMES:
+        raise LimitError("the number of frames for thresholds", n_frames, f"{MIN_FRAMES} or more")
     if not 0 < miss_cost < np.inf:
         raise LimitError("the cost of a missed atom", miss_cost, "more than 0 imagined ones")
     by_site = np.ascontiguousarray(signals.reshape(n_frames, -1).T, np.float64)
@@ -129,7 +129,7 @@ def _site_peaks(by_site: Floats) -> _SitePeaks:
     parts = [_described(by_site, part) for part in (by_site <= cut[:, None], by_site > cut[:, None])]
     (empty, width_empty, n_empty), (full, width_full, n_full) = parts
     apart = (full - empty) / np.maximum(np.hypot(width_empty, width_full), 1e-300)
-    few = np.minimum(n_empty, n_full) < max(LEAST_IN_PEAK, 0.02 * by_site.shape[1])
+    few = np.minimum(n_empty, n_full) < max(MIN_IN_PEAK, 0.02 * by_site.shape[1])
     two = np.isfinite(apart) & (apart > APART) & ~few
     if two.any():
         two &= full - empty > FAINT * np.median((full - empty)[two])
@@ -157,7 +157,7 @@ def _described(by_site: Floats, part: Bools) -> tuple[Floats, Floats, Floats]:
 
 def _check_enough(two: Bools, by_site: Floats, detector: str) -> None:
     n_one = int((~two).sum())
-    if n_one > MOST_ONE_PEAK * len(two):
+    if n_one > MAX_ONE_PEAK * len(two):
         spread = (
             "all signals are equal: black or saturated frames"
             if np.ptp(by_site) == 0

@@ -39,7 +39,7 @@ class SensorLike(Protocol):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Evidence:
+class LightLikelihood:
     """The log-likelihood of counts x under light lam, as ``weight(lam) * curve(x) + constant(lam)``.
 
     A term that depends on x alone is left out: it says nothing about the light.
@@ -59,7 +59,7 @@ class Evidence:
     curve: NDArray[np.float32]
 
 
-def evidence(sensor: SensorLike, darkest: float, brightest: float) -> Evidence:
+def evidence(sensor: SensorLike, darkest: float, brightest: float) -> LightLikelihood:
     """Work out what counts say about light between two limits.
 
     The number of photoelectrons is Poisson; with an EM register of high gain each
@@ -96,7 +96,7 @@ def evidence(sensor: SensorLike, darkest: float, brightest: float) -> Evidence:
     curve, weight = (curve - zero) / (one - zero), weight * (one - zero)
     counts = (np.arange(N_COUNTS) - sensor.offset) / sensor.counts_per_photoelectron
     table = np.interp(counts, signal, curve).astype(np.float32)
-    return Evidence(light, weight, constant, p @ curve, table)
+    return LightLikelihood(light, weight, constant, p @ curve, table)
 
 
 def _signals(em_register: bool, noise: float, n_most: int) -> Floats:

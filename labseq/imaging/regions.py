@@ -45,7 +45,7 @@ def region_corners(known: KnownSites, region: int) -> NDArray[np.int64]:
             f"the region of interest of site ({row}, {col}), by {known.source},",
             f"rows {y} to {y + last} and columns {x} to {x + last} of the frame",
             f"a frame of {height} x {width} pixels",
-            f"{known.mend}; or take a smaller `region`",
+            f"{known.remedy}; or take a smaller `region`",
         )
     return corners
 
@@ -62,6 +62,6 @@ def checked_image(frame: Frame, known: KnownSites, name: str) -> NDArray[np.uint
         raise DeviceError(
             name,
             f"the frame is {image.dtype} {image.shape}; by {known.source} the sites are on uint16 frames of "
-            f"({height}, {width}); {known.mend}",
+            f"({height}, {width}); {known.remedy}",
         )
     return image

@@ -13,7 +13,7 @@ from labseq.imaging.spots import spot_light
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-MOST_PASSES: Final = 12
+MAX_PASSES: Final = 12
 SETTLED: Final = 0.01
 REACH: Final = 2.7
 """Widths of a spot from its middle to the last pixel that is looked at."""
@@ -60,7 +60,7 @@ def fit_spots(flat: Floats, places: Floats, width_px: float, furthest_px: float,
     start, n, edge = places, len(places), np.array(flat.shape) - 1.0
     light, all_light, glow = np.zeros(n), np.zeros(n), np.zeros(flat.shape)
     growth = 0.0
-    for _ in range(MOST_PASSES):
+    for _ in range(MAX_PASSES):
         pixels, spots, widening = _spot_columns(flat.shape, places, width_px, light)
         seen = flat.ravel()[pixels]
         matrix: Any = hstack([spots, csr_array(widening[:, None]), _stray_columns(flat.shape, pixels)], "csr")

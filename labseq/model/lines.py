@@ -50,14 +50,14 @@ class LinesFacts:
         channels: Numbers of its outputs.
         resolution_s: Step of its clock: edges fall on multiples of it.
         shortest_s: Least time between two edges.
-        most_edges: Most edges of a program.
+        max_edges: Most edges of a program.
         latency_s: From the call of ``fire`` to the first edge.
     """
 
     channels: tuple[int, ...]
     resolution_s: float = 0.0
     shortest_s: float = 0.0
-    most_edges: int = 2**31
+    max_edges: int = 2**31
     latency_s: float = 0.0
 
 

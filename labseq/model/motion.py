@@ -24,7 +24,7 @@ class RfSpec:
     Attributes:
         row_band_hz: Lowest and highest frequency of the row axis' AOD.
         column_band_hz: The same for the columns.
-        least_spacing_hz: Least distance of two tones of an axis.
+        min_spacing_hz: Least distance of two tones of an axis.
         row_amplitudes: Amplitude of each row's tone as a fraction of full scale;
             empty: all equal, such that the most tones of the axis reach full scale together.
         column_amplitudes: The same for each column.
@@ -41,7 +41,7 @@ class RfSpec:
 
     row_band_hz: tuple[float, float] = (82e6, 118e6)
     column_band_hz: tuple[float, float] = (82e6, 118e6)
-    least_spacing_hz: float = 0.5e6
+    min_spacing_hz: float = 0.5e6
     row_amplitudes: tuple[float, ...] = ()
     column_amplitudes: tuple[float, ...] = ()
     phases: PhaseChoice = "random"
@@ -62,7 +62,7 @@ class RfSpec:
             raise ValueError("an amplitude is a fraction of full scale, above 0 and at most 1")
         if any(not value > 0 for value in (self.full_scale_v, self.max_peak_v, self.max_mean_power_w)):
             raise ValueError("voltages and powers must be above 0")
-        if any(not value >= 0 for value in (self.least_spacing_hz, self.snap_within_m, self.phase_seed)):
+        if any(not value >= 0 for value in (self.min_spacing_hz, self.snap_within_m, self.phase_seed)):
             raise ValueError("least spacing, snapping distance and seed cannot be negative")
         if not math.isfinite(self.amplifier_gain_db):
             raise ValueError(f"the amplifier's gain is {self.amplifier_gain_db} dB; expected a number")

@@ -145,7 +145,7 @@ class ShotRecord:
     readings: dict[str, Any] = field(default_factory=dict[str, Any])
     parameters: Mapping[str, Any] = field(default_factory=dict[str, Any])
     calibrations: Mapping[str, str] = field(default_factory=dict[str, str])
-    story: dict[str, NDArray[Any]] = field(default_factory=dict[str, NDArray[Any]])
+    atom_events: dict[str, NDArray[Any]] = field(default_factory=dict[str, NDArray[Any]])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -20,7 +20,7 @@ class TimelineEntry:
 
     label: str
     duration_s: float
-    least_s: float
+    min_duration_s: float
     n_images: int = 0
     exposure_s: float = 0.0
     kind: str = ""

@@ -111,7 +111,7 @@ def _limits(rf: RfSpec, axis: AxisIndex, direction: float) -> Floats:
         [
             low_hz * below,
             high_hz * above,
-            rf.least_spacing_hz * below,
+            rf.min_spacing_hz * below,
             direction,
             most * above,
             squares * above,

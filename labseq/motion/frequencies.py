@@ -12,7 +12,7 @@ from labseq.errors import DeviceError
 from labseq.model import MotionSpec, SiteGrid
 from labseq.motion.axes import drive
 from labseq.motion.overlay import OverlayFit, checked_counts, fit_overlay
-from labseq.motion.survival import LEAST_P, SurvivalShape, distance_m, unit_axes
+from labseq.motion.survival import MIN_P, SurvivalShape, distance_m, unit_axes
 
 Floats = NDArray[np.float64]
 
@@ -176,7 +176,7 @@ def _slopes(offset: Floats, shape: SurvivalShape, grid: SiteGrid) -> tuple[Float
     """Survival at some offsets from the centre, and its derivatives by the centre, (..., 2)."""
     axes = unit_axes(grid)
     distance = distance_m(offset, axes)
-    p = np.clip(shape.survival(distance), LEAST_P, 1 - LEAST_P)
+    p = np.clip(shape.survival(distance), MIN_P, 1 - MIN_P)
     outwards = (shape.survival(distance + SLOPE_STEP_M) - shape.survival(distance - SLOPE_STEP_M)) / (
         2 * SLOPE_STEP_M
     )

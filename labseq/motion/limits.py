@@ -65,7 +65,7 @@ def _refuse(
         raise LimitError(what, f"{value / 1e6:.6g} MHz", limit)
     if fault == SPACING:
         what = f"the distance of {name} tones {tone - 1} and {tone} {in_batch}"
-        least = format_quantity(rf.least_spacing_hz, "frequency")
+        least = format_quantity(rf.min_spacing_hz, "frequency")
         raise LimitError(what, f"{value / 1e6:.6g} MHz", f"{least} at least, in the order of the sites")
     if fault == AMPLITUDES and rf.full_scale_v > rf.max_peak_v:
         what, came = f"the peak voltage of {all_tones}", format_quantity(value * rf.full_scale_v, "voltage")

@@ -31,11 +31,11 @@ Floats = NDArray[np.float64]
 
 WORST_ERROR_M: Final = 50e-9
 """A centre that is known less well is no calibration."""
-LEAST_ATOMS: Final = 100
-LEAST_GAIN: Final = 30.0
+MIN_ATOMS: Final = 100
+MIN_GAIN: Final = 30.0
 """By how much the deviance must fall, over the dispersion, for a bump to be believed."""
 ROUNDS: Final = 6
-LEAST_CONTRAST: Final = 0.2
+MIN_CONTRAST: Final = 0.2
 UM: Final = 1e-6
 
 _KNOWN_BEFORE: Final = np.array([2.0, 2.0, 1.0, 0.5, 0.3, 0.3])
@@ -106,8 +106,8 @@ def fit_overlay(
     """
     offset, n, k = checked_counts(offset_m, n_before, n_survived)
     n, k = n.reshape(len(n), -1).sum(axis=1), k.reshape(len(k), -1).sum(axis=1)
-    if n.sum() < LEAST_ATOMS:
-        _refuse(f"only {int(n.sum())} atoms were probed; expected {LEAST_ATOMS} at least: take more shots")
+    if n.sum() < MIN_ATOMS:
+        _refuse(f"only {int(n.sum())} atoms were probed; expected {MIN_ATOMS} at least: take more shots")
     for axis, direction in enumerate(DIRECTIONS):
         if len(np.unique(offset[:, axis].round(9))) < 5:
             _refuse(
@@ -152,7 +152,7 @@ def _best_fit(offset: Floats, n: Floats, k: Floats, axes: Floats) -> OverlayFit:
     even, p = np.full(len(n), k.sum() / max(1.0, n.sum())), _survival(theta, offset, axes)
     gain = sum(sign * float((deviance_residuals(k, n, q) ** 2).sum()) for sign, q in ((1, even), (-1, p)))
     excess = dispersion(k, n, p, len(theta))
-    if gain < LEAST_GAIN * excess or theta[5] - theta[4] < LEAST_CONTRAST:
+    if gain < MIN_GAIN * excess or theta[5] - theta[4] < MIN_CONTRAST:
         _refuse(
             f"no bump: at no offset in range clearly more atoms survive than around it ({share} in all); "
             "scan further, and see whether the mobile tweezers are on"

@@ -14,7 +14,7 @@ from labseq.model import SiteGrid
 Floats = NDArray[np.float64]
 Counts = NDArray[np.int64]
 
-LEAST_P: Final = 1e-4
+MIN_P: Final = 1e-4
 """Probabilities this near to 0 or 1 are not told apart: a single false detection in so many atoms."""
 
 
@@ -103,7 +103,7 @@ def deviance_residuals(n_survived: Floats, n_before: Floats, p: Floats) -> Float
     """Signed roots of the binomial deviance; their sum of squares is least at the greatest likelihood."""
     from scipy.special import xlog1py
 
-    p = np.clip(p, LEAST_P, 1 - LEAST_P)
+    p = np.clip(p, MIN_P, 1 - MIN_P)
     share = np.divide(n_survived, n_before, out=p.copy(), where=n_before > 0)
     over = share - p
     deviance = 2 * n_before * (xlog1py(share, over / p) + xlog1py(1 - share, -over / (1 - p)))
@@ -121,7 +121,7 @@ def covariance(theta: Floats, n_before: Floats, model: Callable[[Floats], Floats
             those that the counts say nothing about from spoiling the inverse.
     """
     jacobian = slopes(theta, model, 1e-4 * prior)
-    p = np.clip(model(theta), LEAST_P, 1 - LEAST_P)
+    p = np.clip(model(theta), MIN_P, 1 - MIN_P)
     information = (jacobian.T * (n_before / (p * (1 - p)))) @ jacobian
     scaled = information * np.outer(prior, prior) + np.eye(len(theta))
     return np.linalg.inv(scaled) * np.outer(prior, prior)

@@ -8,9 +8,9 @@ from collections.abc import Callable
 from typing import Any, Final, TypeVar
 
 from labseq.errors import LabseqError, PluginLoadError
-from labseq.plugins.importing import place_of
-from labseq.plugins.surroundings import Surroundings
-from labseq.plugins.told import in_words
+from labseq.plugins.importing import error_location
+from labseq.plugins.surroundings import ProcessState
+from labseq.plugins.told import format_error
 from labseq.registry import Owner
 
 T = TypeVar("T")
@@ -39,14 +39,14 @@ def contained(owner: Owner, what: str, work: Callable[[], T], *, watch: bool = T
         PluginLoadError: It raised, or did not return in time.
         LabseqError: It raised this one of labseq's own.
     """
-    job = _Job(work, Surroundings() if watch else None)
+    job = _Job(work, ProcessState() if watch else None)
     thread = threading.Thread(target=job.run, name=f"labseq plugin {owner.name}", daemon=True)
-    deadline = time.monotonic() + owner.patience_s
+    deadline = time.monotonic() + owner.max_wait_s
     try:  # from here on: Ctrl-C may come while the thread starts
         thread.start()
         while not job.done.wait(min(_LOOK_S, max(0.0, deadline - time.monotonic()))):
             if time.monotonic() >= deadline and not job.done.is_set():
-                raise owner.fault(_hung(what, owner.patience_s))
+                raise owner.fault(_hung(what, owner.max_wait_s))
     finally:
         job.leave()
         for change in job.changes:
@@ -57,7 +57,7 @@ def contained(owner: Owner, what: str, work: Callable[[], T], *, watch: bool = T
 
 
 class _Job:
-    def __init__(self, work: Callable[[], Any], surroundings: Surroundings | None) -> None:
+    def __init__(self, work: Callable[[], Any], surroundings: ProcessState | None) -> None:
         self._work = work
         self._surroundings = surroundings
         self._leaving = threading.Lock()
@@ -86,17 +86,17 @@ class _Job:
                 self.changes = surroundings.leave(inside=inside)
 
 
-def _hung(what: str, patience_s: float) -> str:
+def _hung(what: str, max_wait_s: float) -> str:
     did = f"{what} did not return" if what else "it did not finish loading"
-    mend = "if it is only slow, raise 'timeouts: {load: ...}' in the profile"
-    return f"{did} within {patience_s:.3g} s and was given up; {mend}"
+    remedy = "if it is only slow, raise 'timeouts: {load: ...}' in the profile"
+    return f"{did} within {max_wait_s:.3g} s and was given up; {remedy}"
 
 
 def _named(owner: Owner, what: str, error: BaseException) -> LabseqError:
     is_own = isinstance(error, PluginLoadError) and error.plugin == owner.name
     if isinstance(error, LabseqError) and (what or is_own):
         return error
-    text = f"{type(error).__name__}: {error.msg}" if isinstance(error, SyntaxError) else in_words(error)
-    place = place_of(error, owner.home)
+    text = f"{type(error).__name__}: {error.msg}" if isinstance(error, SyntaxError) else format_error(error)
+    place = error_location(error, owner.home)
     text = f"{text} ({place})" if place else text
     return owner.fault(f"{what} raised {text}" if what else text)

@@ -35,15 +35,15 @@ def check_api(module: ModuleType, owner: Owner) -> None:
         return
     here = f"this labseq has LABSEQ_API = {LABSEQ_API}"
     if written_for is None:
-        mend = f"write 'LABSEQ_API = {LABSEQ_API}' at its top"
-        raise owner.fault(f"it does not state LABSEQ_API; {here}; {mend}")
+        remedy = f"write 'LABSEQ_API = {LABSEQ_API}' at its top"
+        raise owner.fault(f"it does not state LABSEQ_API; {here}; {remedy}")
     came = f"it was written for LABSEQ_API {written_for!r:.100}"
     if type(written_for) is not int:
         raise owner.fault(f"{came}, which is no whole number; {here}")
-    mend = "update labseq, or take an older version of the plugin"
+    remedy = "update labseq, or take an older version of the plugin"
     if written_for < LABSEQ_API:
-        mend = "take a newer version of the plugin, or adapt it (the changelog tells what has changed)"
-    raise owner.fault(f"{came}; {here}; {mend}")
+        remedy = "take a newer version of the plugin, or adapt it (the changelog tells what has changed)"
+    raise owner.fault(f"{came}; {here}; {remedy}")
 
 
 def hooks_of(module: ModuleType, owner: Owner) -> Hooks:

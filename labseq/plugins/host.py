@@ -17,8 +17,8 @@ from labseq import hookspecs
 from labseq.errors import ConfigError, PluginLoadError, Problem, UnknownPluginError
 from labseq.plugins.contained import contained
 from labseq.plugins.hooks import check_api, hooks_of
-from labseq.plugins.importing import forget, home_of, home_of_module, import_file
-from labseq.plugins.told import in_words
+from labseq.plugins.importing import forget, plugin_location, module_location, import_file
+from labseq.plugins.told import format_error
 from labseq.registry import LOAD_S, Entry, Owner, Registry
 
 ENTRY_POINT_GROUP: Final = "labseq"
@@ -52,15 +52,15 @@ class PluginHost:
     """The plugins of one session, with a plugin manager of their own.
 
     Args:
-        patience_s: How long a plugin may take to load, and a constructor to return.
+        max_wait_s: How long a plugin may take to load, and a constructor to return.
 
     Attributes:
         registry: What the loaded plugins offer.
     """
 
-    def __init__(self, patience_s: float = LOAD_S) -> None:
+    def __init__(self, max_wait_s: float = LOAD_S) -> None:
         self.registry = Registry()
-        self._patience_s = patience_s
+        self._patience_s = max_wait_s
         self._used: set[str] = set()
         self._pluggy = pluggy.PluginManager("labseq")
         self._pluggy.add_hookspecs(hookspecs)
@@ -90,7 +90,7 @@ class PluginHost:
             distribution = (point.dist.name if point.dist is not None else "") or "unknown"
             source = f"the distribution {distribution} {version}".rstrip()
             info = PluginInfo(point.name, "installed", version, source=source)
-            self._load(info, partial(home_of_module, point.value.partition(":")[0]), point.load)
+            self._load(info, partial(module_location, point.value.partition(":")[0]), point.load)
 
     def load_folders(self, folders: Sequence[Path]) -> None:
         """Load single files and packages from folders, and from LABSEQ_PLUGIN_PATH.
@@ -123,7 +123,7 @@ class PluginHost:
         if not name.isidentifier():
             reason = "its name is no Python name: letters, digits and '_' only; rename it"
             self._infos[name] = replace(info, state="failed", reason=reason)
-        elif not self._load(info, partial(home_of, path), partial(import_file, name, path)):
+        elif not self._load(info, partial(plugin_location, path), partial(import_file, name, path)):
             forget(name)
 
     def _load(
@@ -144,7 +144,7 @@ class PluginHost:
         except PluginLoadError as error:
             info = replace(info, state="failed", reason=error.reason)
         except Exception as error:  # noqa: BLE001 - pluggy may say more than we asked
-            info = replace(info, state="failed", reason=in_words(error))
+            info = replace(info, state="failed", reason=format_error(error))
         self._infos[info.name] = info
         return info.state == "loaded"
 

@@ -39,22 +39,22 @@ def forget(name: str) -> None:
         del sys.modules[module]
 
 
-def home_of(path: Path) -> Path:
+def plugin_location(path: Path) -> Path:
     """What a folder's plugin consists of: its file, or the folder of its package."""
     path = path.absolute()
     return path.parent if path.name == "__init__.py" else path
 
 
-def home_of_module(name: str) -> Path | None:
+def module_location(name: str) -> Path | None:
     """The folder of an installed package, or its file; None if it cannot be told. Nothing is imported."""
     try:
         spec = importlib.util.find_spec(name.partition(".")[0])
     except (ImportError, ValueError, AttributeError):
         return None
-    return None if spec is None or spec.origin is None else home_of(Path(spec.origin))
+    return None if spec is None or spec.origin is None else plugin_location(Path(spec.origin))
 
 
-def place_of(error: BaseException, home: Path | None) -> str:
+def error_location(error: BaseException, home: Path | None) -> str:
     """File and line that an error came from, the plugin's own if it has a part in it; "" if unknown."""
     if isinstance(error, SyntaxError) and error.filename:
         return f"{error.filename}:{error.lineno or 1}"

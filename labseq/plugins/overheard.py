@@ -5,11 +5,11 @@ from __future__ import annotations
 import sys
 from typing import Any, Final, TextIO
 
-MOST_HEARD: Final = 200
+MAX_HEARD: Final = 200
 """Characters that are remembered."""
 
 
-class Overheard:
+class RedirectedStdout:
     """Stands in for ``sys.stdout``: stdout may belong to a program that reads JSON from it.
 
     A plugin may keep it; afterwards it leads to where stdout led before.
@@ -42,7 +42,7 @@ class Overheard:
     def write(self, text: str) -> int:
         """Write to stderr, or once it is over to the real stdout."""
         if not self._is_over:
-            self._text = (self._text + text)[:MOST_HEARD]
+            self._text = (self._text + text)[:MAX_HEARD]
         stream = self._stream
         return len(text) if stream is None else stream.write(text)
 

@@ -18,14 +18,14 @@ from typing import Any, Final
 
 import numpy as np
 
-from labseq.plugins.overheard import Overheard
+from labseq.plugins.overheard import RedirectedStdout
 
-MOST_NAMED: Final = 3
+MAX_NAMED: Final = 3
 """Things of a kind that are named; of more only how many there are."""
 
 
 @dataclass(frozen=True, slots=True)
-class Shared:
+class SharedState:
     """Something that all code in the process shares.
 
     Attributes:
@@ -37,25 +37,25 @@ class Shared:
     """
 
     read: Callable[[], Any]
-    did: Callable[[Any, Any], str]
-    put_back: Callable[[Any], object]
-    instead: str
+    change_text: Callable[[Any, Any], str]
+    restore_state: Callable[[Any], object]
+    advice: str
     of_thread: bool = False
 
 
-class Surroundings:
+class ProcessState:
     """The process as it is when a plugin's code begins, and what came of it."""
 
     def __init__(self) -> None:
         self._before: list[Any] = []
         self._threads: set[int | None] = set()
-        self._stdout: Overheard | None = None
+        self._stdout: RedirectedStdout | None = None
 
     def enter(self) -> None:
         """Look at everything; what is printed goes to stderr from now on."""
         self._before = [shared.read() for shared in SHARED]
         self._threads = {thread.ident for thread in threading.enumerate()}
-        sys.stdout = self._stdout = Overheard(sys.stdout)
+        sys.stdout = self._stdout = RedirectedStdout(sys.stdout)
 
     def leave(self, *, inside: bool) -> list[str]:
         """Put back what can be put back.
@@ -71,11 +71,11 @@ class Surroundings:
             changes += self._stdout.restore()
         for shared, before in zip(SHARED, self._before, strict=False):
             after = shared.read() if inside or not shared.of_thread else before
-            did = shared.did(before, after) if before is not None and after is not None else ""
-            if did:
+            change_text = shared.change_text(before, after) if before is not None and after is not None else ""
+            if change_text:
                 with suppress(OSError, ValueError, locale.Error):
-                    shared.put_back(before)
-                changes.append(f"it {did}; this was put back: {shared.instead}")
+                    shared.restore_state(before)
+                changes.append(f"it {change_text}; this was put back: {shared.advice}")
         if inside:
             new = [t for t in threading.enumerate() if t.ident not in self._threads and t.is_alive()]
             if names := sorted(thread.name for thread in new):
@@ -85,8 +85,8 @@ class Surroundings:
 
 
 def _listed(names: list[str], kind: str) -> str:
-    told = ", ".join(f"'{name:.60}'" for name in names[:MOST_NAMED])
-    more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
+    told = ", ".join(f"'{name:.60}'" for name in names[:MAX_NAMED])
+    more = f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else ""
     return f"the {kind}{'s' if len(names) > 1 else ''} {told}{more}"
 
 
@@ -108,29 +108,29 @@ def _numpy_state(module: Any) -> Any:
     return kind, key.tobytes(), *rest
 
 
-def _put_back_numpy(state: Any) -> None:
+def _restore_numpy(state: Any) -> None:
     np.random.set_state((state[0], np.frombuffer(state[1], np.uint32), *state[2:]))  # noqa: NPY002 - not ours
 
 
-def _environment_did(before: dict[str, str], after: dict[str, str]) -> str:
+def _environment_change(before: dict[str, str], after: dict[str, str]) -> str:
     names = sorted(key for key in {*before, *after} if before.get(key) != after.get(key))
     return f"changed {_listed(names, 'environment variable')}" if names else ""
 
 
-def _put_back_environment(before: dict[str, str]) -> None:
+def _restore_environment(before: dict[str, str]) -> None:
     for key in {*os.environ} - {*before}:
         del os.environ[key]
     os.environ.update(before)
 
 
-def _path_did(before: list[str], after: list[str]) -> str:
+def _path_change(before: list[str], after: list[str]) -> str:
     if before == after:
         return ""
     names = [str(folder) for folder in after if folder not in before]
     return f"changed sys.path (it added {_listed(names, 'folder')})" if names else "changed sys.path"
 
 
-def _put_back_path(before: list[str]) -> None:
+def _restore_path(before: list[str]) -> None:
     sys.path[:] = before
 
 
@@ -140,7 +140,7 @@ def _is_broad(rule: Any) -> bool:
     return message is None and module is None and category.__module__ == "builtins"
 
 
-def _rules_did(before: list[Any], after: list[Any]) -> str:
+def _warning_rules_change(before: list[Any], after: list[Any]) -> str:
     added = [rule for rule in after if _is_broad(rule) and rule not in before]
     if added:
         return f"set everybody's warnings of {added[0][2].__name__} to '{added[0][0]}'"
@@ -148,7 +148,7 @@ def _rules_did(before: list[Any], after: list[Any]) -> str:
     return "changed everybody's rules for warnings" if moved else ""
 
 
-def _put_back_rules(before: list[Any]) -> None:
+def _restore_rules(before: list[Any]) -> None:
     narrow = [rule for rule in warnings.filters if rule not in before and not _is_broad(rule)]
     warnings.filters[:] = [*narrow, *before]  # pyright: ignore[reportIndexIssue]
     with warnings.catch_warnings():  # what was once decided by the other rules is decided anew
@@ -159,7 +159,7 @@ def _read_logging() -> tuple[int, list[logging.Handler], int]:
     return logging.root.level, list(logging.root.handlers), logging.root.manager.disable
 
 
-def _put_back_logging(before: tuple[int, list[logging.Handler], int]) -> None:
+def _restore_logging(before: tuple[int, list[logging.Handler], int]) -> None:
     logging.root.setLevel(before[0])
     logging.root.handlers[:] = before[1]
     logging.disable(before[2])
@@ -172,7 +172,7 @@ def _read_folder() -> Path | None:
         return None
 
 
-def _put_back_hooks(before: Any) -> None:
+def _restore_hooks(before: Any) -> None:
     sys.stderr, sys.excepthook, threading.excepthook = before
 
 
@@ -180,75 +180,75 @@ _NO_GLOBAL: Final = "draw from context.random"
 _CLOSE: Final = "change it only around the calls that need it"
 
 SHARED: Final = (
-    Shared(
+    SharedState(
         random.getstate,
         _changed("seeded or used Python's global random numbers"),
         random.setstate,
         _NO_GLOBAL,
     ),
-    Shared(
+    SharedState(
         _module("numpy.random", _numpy_state),
         _changed("seeded or used numpy's global random numbers"),
-        _put_back_numpy,
+        _restore_numpy,
         _NO_GLOBAL,
     ),
-    Shared(
+    SharedState(
         np.geterr,
         _changed("changed numpy's error state"),
         lambda state: np.seterr(**state),
         "use 'with numpy.errstate(...)'",
         of_thread=True,
     ),
-    Shared(
+    SharedState(
         np.get_printoptions,
         _changed("changed numpy's print options"),
         lambda options: np.set_printoptions(**options),
         "use 'with numpy.printoptions(...)'",
         of_thread=True,
     ),
-    Shared(
-        lambda: list(warnings.filters), _rules_did, _put_back_rules, "use 'with warnings.catch_warnings()'"
+    SharedState(
+        lambda: list(warnings.filters), _warning_rules_change, _restore_rules, "use 'with warnings.catch_warnings()'"
     ),
-    Shared(_read_folder, _changed_to("changed the working folder to"), os.chdir, "use absolute paths"),
-    Shared(
+    SharedState(_read_folder, _changed_to("changed the working folder to"), os.chdir, "use absolute paths"),
+    SharedState(
         lambda: locale.setlocale(locale.LC_ALL),
         _changed_to("changed the locale to"),
         lambda name: locale.setlocale(locale.LC_ALL, name),
         _CLOSE,
     ),
-    Shared(lambda: dict(os.environ), _environment_did, _put_back_environment, "set it in open()"),
-    Shared(
+    SharedState(lambda: dict(os.environ), _environment_change, _restore_environment, "set it in open()"),
+    SharedState(
         lambda: list(sys.path),
-        _path_did,
-        _put_back_path,
+        _path_change,
+        _restore_path,
         "import at the top of the module, or make the folder a package and import relatively",
     ),
-    Shared(
+    SharedState(
         _read_logging,
         _changed("changed the root of Python's logging"),
-        _put_back_logging,
+        _restore_logging,
         "use 'logging.getLogger(__name__)', without handlers",
     ),
-    Shared(
+    SharedState(
         lambda: (sys.stderr, sys.excepthook, threading.excepthook),
         _changed("replaced sys.stderr or an excepthook"),
-        _put_back_hooks,
+        _restore_hooks,
         _CLOSE,
     ),
-    Shared(sys.getrecursionlimit, _changed_to("set the recursion limit to"), sys.setrecursionlimit, _CLOSE),
-    Shared(
+    SharedState(sys.getrecursionlimit, _changed_to("set the recursion limit to"), sys.setrecursionlimit, _CLOSE),
+    SharedState(
         gc.isenabled,
         _changed("switched garbage collection on or off"),
         lambda on: gc.enable() if on else gc.disable(),
         _CLOSE,
     ),
-    Shared(
+    SharedState(
         _module("socket", lambda socket: (socket.getdefaulttimeout(),)),
         _changed("set a timeout for everybody's sockets"),
         lambda before: sys.modules["socket"].setdefaulttimeout(*before),
         "give each socket its own",
     ),
-    Shared(
+    SharedState(
         _module("multiprocessing", lambda module: (module.get_start_method(allow_none=True),)),
         _changed("set how multiprocessing starts processes"),
         lambda before: sys.modules["multiprocessing"].set_start_method(*before, force=True),

@@ -8,7 +8,7 @@ MAX_WORDS: Final = 500
 """Characters of a plugin's own error that are told."""
 
 
-def in_words(error: BaseException) -> str:
+def format_error(error: BaseException) -> str:
     """Kind and text of an error that somebody else's code raised, in one line that is not too long.
 
     Example:

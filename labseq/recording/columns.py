@@ -75,7 +75,7 @@ def columns_of(run: Run, shots: Sequence[Shot] | None = None) -> list[Column]:
         shots: Those that make the rows; by default those that count.
     """
     chosen = run.shots if shots is None else shots
-    told = [_told(shot) for shot in chosen]
+    told = [_shot_values(shot) for shot in chosen]
     rows = [shot.row for shot in chosen]
     columns = [
         Column(name, _array([of[name] for of in told], text=name in _TEXTS), *_FIXED[name]) for name in _FIXED
@@ -95,7 +95,7 @@ def columns_of(run: Run, shots: Sequence[Shot] | None = None) -> list[Column]:
 
 def figures_of(shot: Shot) -> dict[str, float]:
     """The numbers that the index tells of a shot, by the names of their columns; no nan among them."""
-    found = {name: value for name, value in _told(shot).items() if name in FIGURES}
+    found = {name: value for name, value in _shot_values(shot).items() if name in FIGURES}
     found |= {f"stage.{name}": value for name, value in _stages(shot.row).items()}
     found |= {f"reading.{name}": value for name, value in _readings(shot).items()}
     return {
@@ -123,7 +123,7 @@ def _free(name: str, taken: set[str]) -> str:
     return name
 
 
-def _told(shot: Shot) -> dict[str, Any]:
+def _shot_values(shot: Shot) -> dict[str, Any]:
     row = shot.row
     steps = [s for name, s in _mapping(row.get("stage_s")).items() if name.startswith("step ")]
     found = {name: row.get(name) for name in _FIXED}

@@ -15,7 +15,7 @@ _GRID: Final = "row, col"
 
 
 @dataclass(frozen=True, slots=True)
-class Described:
+class DatasetDescription:
     """A dataset of a shot's file.
 
     Attributes:
@@ -30,65 +30,65 @@ class Described:
     shape: str
     meaning: str
     units: str = ""
-    since: str = "1.0"
+    since_version: str = "1.0"
 
 
-DATASETS: Final[Mapping[str, Described]] = {
-    "target/fill": Described("uint8", _GRID, "1 where the target must hold an atom"),
-    "target/clear": Described("uint8", _GRID, "1 where the target must be empty"),
-    "camera/<name>/images": Described("uint16", "frame, y, x", "frames as the camera delivered them", "adu"),
-    "camera/<name>/t_s": Described(
+DATASETS: Final[Mapping[str, DatasetDescription]] = {
+    "target/fill": DatasetDescription("uint8", _GRID, "1 where the target must hold an atom"),
+    "target/clear": DatasetDescription("uint8", _GRID, "1 where the target must be empty"),
+    "camera/<name>/images": DatasetDescription("uint16", "frame, y, x", "frames as the camera delivered them", "adu"),
+    "camera/<name>/t_s": DatasetDescription(
         "float64", "frame", "start of the exposure, from the start of the shot", "s"
     ),
-    "camera/<name>/t_clock_s": Described(
+    "camera/<name>/t_clock_s": DatasetDescription(
         "float64", "frame", "start of the exposure on the session's clock", "s"
     ),
-    "camera/<name>/t_device_s": Described(
+    "camera/<name>/t_device_s": DatasetDescription(
         "float64",
         "frame",
         "the camera's own time stamp, from a zero of its own; nan if it gives none",
         "s",
         "1.3",
     ),
-    "camera/<name>/number": Described(
+    "camera/<name>/number": DatasetDescription(
         "int32", "frame", "place in the camera's series as the camera counted it, from 0", "", "1.3"
     ),
-    "camera/<name>/exposure_s": Described("float64", "frame", "exposure time that the camera reports", "s"),
-    "camera/<name>/image": Described(
+    "camera/<name>/exposure_s": DatasetDescription("float64", "frame", "exposure time that the camera reports", "s"),
+    "camera/<name>/image": DatasetDescription(
         "int32", "frame", "index of the image in detection that the frame belongs to"
     ),
-    "camera/<name>/step": Described("int32", "frame", "index of the step that took it, from 0"),
-    "camera/<name>/cycle": Described(
+    "camera/<name>/step": DatasetDescription("int32", "frame", "index of the step that took it, from 0"),
+    "camera/<name>/cycle": DatasetDescription(
         "int32", "frame", "rearrangement cycle that it ended, from 1; 0 for that of an image step"
     ),
-    "camera/<name>/event": Described(
+    "camera/<name>/event": DatasetDescription(
         "ascii, 16 bytes", "frame", "what it is: image, or cycle_3 for the one that ended cycle 3"
     ),
-    "detection/occupancy": Described("uint8", "image, row, col", "1 where the detector saw an atom"),
-    "detection/confidence": Described("float32", "image, row, col", "the detector's confidence in each site"),
-    "detection/t_s": Described("float64", "image", "start of the exposure, from the start of the shot", "s"),
-    "detection/images": Described("table", "image", "all images, whether their frames were kept or not"),
-    "rearrangement/moves": Described("table", "atom move", "the atom moves of all plans"),
-    "rearrangement/batches": Described(
+    "detection/occupancy": DatasetDescription("uint8", "image, row, col", "1 where the detector saw an atom"),
+    "detection/confidence": DatasetDescription("float32", "image, row, col", "the detector's confidence in each site"),
+    "detection/t_s": DatasetDescription("float64", "image", "start of the exposure, from the start of the shot", "s"),
+    "detection/images": DatasetDescription("table", "image", "all images, whether their frames were kept or not"),
+    "rearrangement/moves": DatasetDescription("table", "atom move", "the atom moves of all plans"),
+    "rearrangement/batches": DatasetDescription(
         "table", "batch", "the batches of all plans: moves made at the same time"
     ),
-    "rearrangement/cycles": Described("table", "cycle", "the rearrangement cycles: plan, check, move, image"),
-    "rearrangement/predicted": Described(
+    "rearrangement/cycles": DatasetDescription("table", "cycle", "the rearrangement cycles: plan, check, move, image"),
+    "rearrangement/predicted": DatasetDescription(
         "uint8", "cycle, row, col", "1 where the whole plan leaves an atom if none is lost"
     ),
-    "timing": Described("table", "stage", "how long each stage took, against its budget"),
-    "story/<name>": Described(
+    "timing": DatasetDescription("table", "stage", "how long each stage took, against its budget"),
+    "story/<name>": DatasetDescription(
         "table", "row", "what a simulation tells of the atoms; see its plugin", "", "1.1"
     ),
-    "parameters": Described(_JSON, "", "what differs from the files in this shot: address -> value, SI"),
-    "readings": Described(_JSON, "", "values read from devices during the shot, SI: name -> value"),
-    "devices/<name>": Described(_JSON, "", "what the device says of itself, SI"),
-    "provenance/sequence": Described("text", "", "the sequence file"),
-    "provenance/profile": Described("text", "", "the hardware profile"),
-    "provenance/resolved": Described(_JSON, "", "every setting after defaults and overrides, SI"),
-    "provenance/overrides": Described(_JSON, "", "what --set and other options changed: address -> value"),
-    "provenance/plugins": Described(_JSON, "", "name, version and origin of each plugin that was used"),
-    "provenance/<name>": Described(
+    "parameters": DatasetDescription(_JSON, "", "what differs from the files in this shot: address -> value, SI"),
+    "readings": DatasetDescription(_JSON, "", "values read from devices during the shot, SI: name -> value"),
+    "devices/<name>": DatasetDescription(_JSON, "", "what the device says of itself, SI"),
+    "provenance/sequence": DatasetDescription("text", "", "the sequence file"),
+    "provenance/profile": DatasetDescription("text", "", "the hardware profile"),
+    "provenance/resolved": DatasetDescription(_JSON, "", "every setting after defaults and overrides, SI"),
+    "provenance/overrides": DatasetDescription(_JSON, "", "what --set and other options changed: address -> value"),
+    "provenance/plugins": DatasetDescription(_JSON, "", "name, version and origin of each plugin that was used"),
+    "provenance/<name>": DatasetDescription(
         "JSON or plain text", "", "where the run comes from: versions, host, user"
     ),
 }
@@ -239,7 +239,7 @@ EVERYWHERE: Final[Mapping[str, str]] = {
 }
 """Attributes of every dataset."""
 
-UNTOLD: Final = "as the simulation that told it means it"
+UNDOCUMENTED: Final = "as the simulation that told it means it"
 """What a column of a story is whose simulation does not describe it."""
 
 
@@ -258,4 +258,4 @@ def column_meanings(path: str, table: np.dtype[Any]) -> list[str]:
     known = COLUMNS.get(path)
     if known is None:
         known = (table.metadata or {}).get("descriptions") or {}
-    return [str(known.get(name, UNTOLD)) for name in table.names or ()]
+    return [str(known.get(name, UNDOCUMENTED)) for name in table.names or ()]

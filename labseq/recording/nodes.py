@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 from h5py import h5a, h5s, h5t  # pyright: ignore[reportAttributeAccessIssue] - no stub knows h5a
 
-from labseq.recording.described import DATASETS, Described
+from labseq.recording.described import DATASETS, DatasetDescription
 from labseq.recording.plain import dumps, plain_text, to_plain
 
 _MAX_ATTRIBUTE: Final = 256
@@ -32,7 +32,7 @@ def set_attributes(node: Any, /, **values: Any) -> None:
             node.attrs[name] = value
 
 
-def describe(dataset: Any, what: Described) -> None:
+def describe(dataset: Any, what: DatasetDescription) -> None:
     """Say in its attributes what a dataset is, and in what unit."""
     set_attributes(dataset, units=what.units, description=what.meaning)
 
@@ -48,12 +48,12 @@ def _add_text(node: Any, name: str, text: Any, space: Any) -> None:
     h5a.create(node.id, name.encode(), _STRING_TYPE, space).write(text)  # attrs[...] takes twice the time
 
 
-def write_json(group: h5py.Group, name: str, value: object, what: Described) -> None:
+def write_json(group: h5py.Group, name: str, value: object, what: DatasetDescription) -> None:
     """Add a dataset that holds a value as JSON."""
     _write_text(group, name, dumps(value), _JSON, what)
 
 
-def _write_text(group: h5py.Group, name: str, text: str, content_type: str, what: Described) -> None:
+def _write_text(group: h5py.Group, name: str, text: str, content_type: str, what: DatasetDescription) -> None:
     dataset = group.create_dataset(name, data=text, dtype=_STRING)
     set_attributes(dataset, content_type=content_type)
     describe(dataset, what)

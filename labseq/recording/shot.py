@@ -134,9 +134,9 @@ class Shot:
         return dict(self._content.record.readings)
 
     @property
-    def story(self) -> dict[str, NDArray[Any]]:
+    def atom_events(self) -> dict[str, NDArray[Any]]:
         """What the simulation told of the atoms: name -> structured array; empty if it told nothing."""
-        return dict(self._content.record.story)
+        return dict(self._content.record.atom_events)
 
     @property
     def provenance(self) -> dict[str, Any]:

@@ -101,8 +101,8 @@ class ShotEncoder:
         _write_table(entry, "timing", tables.timing_table(shot.timing))
         if shot.calibrations:
             set_attributes(entry.create_group("calibrations"), **shot.calibrations)
-        if shot.story:
-            _write_story(entry.create_group("story"), shot.story)
+        if shot.atom_events:
+            _write_atom_events(entry.create_group("story"), shot.atom_events)
         write_json(entry, "parameters", shot.parameters, DATASETS["parameters"])
         write_json(entry, "readings", shot.readings, DATASETS["readings"])
 
@@ -216,9 +216,9 @@ def _write_detection(group: h5py.Group, images: Sequence[ImageRecord], shape: tu
     _write_table(group, "detection/images", np.array(rows, layout.IMAGES))
 
 
-def _write_story(group: h5py.Group, story: Mapping[str, NDArray[Any]]) -> None:
+def _write_atom_events(group: h5py.Group, atom_events: Mapping[str, NDArray[Any]]) -> None:
     names: list[str] = []
-    for name, table in story.items():
+    for name, table in atom_events.items():
         names.append(link_name(name, names))
         _write_table(group, "story/<name>", table, names[-1])
 

@@ -145,7 +145,7 @@ def _record(entry: Any) -> ShotRecord:
         readings=read_json(entry, "readings"),
         parameters=read_json(entry, "parameters"),
         calibrations=dict(entry["calibrations"].attrs) if "calibrations" in entry else {},
-        story={name: table[()] for name, table in entry["story"].items()} if "story" in entry else {},
+        atom_events={name: table[()] for name, table in entry["story"].items()} if "story" in entry else {},
     )
 
 

@@ -133,7 +133,7 @@ def _is_seen(shot: Shot) -> bool:
 
 
 @dataclass(frozen=True, slots=True)
-class _Made:
+class _ShotCycle:
     """One cycle of one shot."""
 
     is_met: bool
@@ -144,12 +144,12 @@ class _Made:
     period_s: float
 
 
-def _made(summary: ShotSummary) -> list[_Made]:
+def _made(summary: ShotSummary) -> list[_ShotCycle]:
     """The cycles of a shot, as far as each has an image that ended it."""
     images, cycles = summary.images, summary.cycles
     ends = [i for i, cycle in enumerate(images.cycle) if cycle > 0]
     return [
-        _Made(
+        _ShotCycle(
             is_met=not images.n_defects[i] and not images.n_surplus[i],
             n_defects=images.n_defects[i],
             n_atom_moves=cycles.n_atom_moves[k],
@@ -176,7 +176,7 @@ def _cycles(summaries: Sequence[ShotSummary], target: TargetPattern) -> tuple[Cy
     )
 
 
-def _cycle(cycle: int, made: Sequence[_Made], seen: Rate, n_atoms: int) -> CycleStatistics:
+def _cycle(cycle: int, made: Sequence[_ShotCycle], seen: Rate, n_atoms: int) -> CycleStatistics:
     defects = np.array([one.n_defects for one in made])
     return CycleStatistics(
         cycle=cycle,

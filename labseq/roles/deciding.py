@@ -152,7 +152,7 @@ class Analysis(Protocol):
 
 
 @runtime_checkable
-class Warmable(Protocol):
+class NeedsWarmUp(Protocol):
     """A planner, detector or driver with kernels to compile before the first shot."""
 
     def warm(self) -> None:
@@ -161,7 +161,7 @@ class Warmable(Protocol):
 
 
 @runtime_checkable
-class SignalTeller(Protocol):
+class ReportsSignals(Protocol):
     """A detector that tells what it compares with its thresholds, so that they can be calibrated."""
 
     @property

@@ -34,7 +34,7 @@ class Hardware(Protocol):
 
 
 @runtime_checkable
-class SelfTesting(Protocol):
+class HasSelfTest(Protocol):
     """A device that can tell whether it works, for ``labseq devices``."""
 
     def self_test(self) -> None:
@@ -47,7 +47,7 @@ class SelfTesting(Protocol):
 
 
 @runtime_checkable
-class Settling(Protocol):
+class NeedsSettling(Protocol):
     """A device that needs time after ``open()`` until it works as it shall: a camera that cools."""
 
     @property
@@ -65,7 +65,7 @@ class Settling(Protocol):
 
 
 @runtime_checkable
-class Polled(Protocol):
+class HasReadings(Protocol):
     """A device some of whose values are read at the start of each shot and kept with it."""
 
     def poll(self) -> Mapping[str, bool | int | float | str]:
@@ -87,7 +87,7 @@ class Interlocked(Protocol):
 
 
 @runtime_checkable
-class Leading(Protocol):
+class LeaderLink(Protocol):
     """A device through which another control system leads: it says `go`, and is told what came of it.
 
     For each `go` it gets exactly one answer, `ready` or `failed`, within the device's deadline, whatever
@@ -117,7 +117,7 @@ class Leading(Protocol):
         """
         ...
 
-    def tell(self, state: Literal["ready", "failed"], about: Mapping[str, bool | int | float | str]) -> str:
+    def report(self, state: Literal["ready", "failed"], about: Mapping[str, bool | int | float | str]) -> str:
         """Answer the signal that was waited for; without one, nothing is said.
 
         Args:
@@ -131,13 +131,13 @@ class Leading(Protocol):
         """
         ...
 
-    def news(self) -> Sequence[str]:
+    def new_events(self) -> Sequence[str]:
         """What happened since the last call, for the log: who came and went, what was not understood."""
         ...
 
 
 @runtime_checkable
-class KnownCommands(Protocol):
+class ChecksCommands(Protocol):
     """A device that knows its commands before it is opened, for ``labseq check`` and the start of a run."""
 
     def check_command(self, name: str, **arguments: Any) -> None:
@@ -175,7 +175,7 @@ class Camera(Hardware, Protocol):
 
 
 @runtime_checkable
-class KnownCamera(Protocol):
+class ReportsCameraFacts(Protocol):
     """A camera that tells its limits before it is opened, for ``labseq check`` and budgets."""
 
     @property
@@ -234,7 +234,7 @@ class MobileTweezers(Hardware, Protocol):
 
 
 @runtime_checkable
-class Timed(Protocol):
+class ReportsTimings(Protocol):
     """Mobile tweezers that tell how long the parts of their last ``prepare()`` took."""
 
     def timings(self) -> Mapping[str, float]:
@@ -288,7 +288,7 @@ class Lines(Hardware, Protocol):
 
 
 @runtime_checkable
-class KnownLines(Protocol):
+class ReportsLinesFacts(Protocol):
     """A timing box that tells its limits before it is opened, for ``labseq check``."""
 
     @property

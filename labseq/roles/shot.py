@@ -206,7 +206,7 @@ class Shot(Protocol):
         """How much longer a kind of step takes for the leads and lags of its lines, in seconds."""
         ...
 
-    def lit(self, kind: str, duration_s: float) -> AbstractContextManager[None]:
+    def lines_on(self, kind: str, duration_s: float) -> AbstractContextManager[None]:
         """Context manager around what a step does: its lines go on before it and off after it.
 
         Args:

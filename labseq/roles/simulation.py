@@ -71,7 +71,7 @@ class Simulation(Protocol):
 
 
 @runtime_checkable
-class KnownSensor(Protocol):
+class ReportsSensor(Protocol):
     """A simulation that tells of the sensor that its frames come from, before anything is opened."""
 
     @property
@@ -89,7 +89,7 @@ class KnownSensor(Protocol):
 
 
 @runtime_checkable
-class Wired(Protocol):
+class WiresTriggers(Protocol):
     """A simulation in which an edge of a line reaches the trigger input that it is wired to."""
 
     def wire(self, role: str, on_edge: Callable[[float], object]) -> None:
@@ -103,7 +103,7 @@ class Wired(Protocol):
 
 
 @runtime_checkable
-class KnownLoading(Protocol):
+class ReportsLoading(Protocol):
     """A simulation that tells how well it loads, for estimates before a run."""
 
     @property
@@ -113,7 +113,7 @@ class KnownLoading(Protocol):
 
 
 @runtime_checkable
-class TruthTeller(Protocol):
+class ReportsTruth(Protocol):
     """A simulation that knows, and tells for the record, where the atoms really are."""
 
     def truth(self) -> Occupancy:
@@ -122,7 +122,7 @@ class TruthTeller(Protocol):
 
 
 @runtime_checkable
-class LossTeller(Protocol):
+class ReportsLosses(Protocol):
     """A simulation that knows, and tells for the record, what atoms were lost by."""
 
     def losses(self) -> Mapping[str, int]:
@@ -131,10 +131,10 @@ class LossTeller(Protocol):
 
 
 @runtime_checkable
-class Storyteller(Protocol):
+class ReportsEvents(Protocol):
     """A simulation that tells, for the record, what happened to the atoms."""
 
-    def story(self, since_s: float) -> Mapping[str, NDArray[Any]]:
+    def atom_events(self, since_s: float) -> Mapping[str, NDArray[Any]]:
         """What happened since the shot began: name -> structured array, with a field for each column.
 
         A dtype with ``metadata={"descriptions": {column: text}}`` takes its texts into the shot's file.
@@ -173,14 +173,14 @@ class ToneSource(Protocol):
 
 
 @runtime_checkable
-class Listening(Protocol):
+class ReceivesOutput(Protocol):
     """A simulation that acts on what a device's outputs really play, rather than on what it is told."""
 
     def warm(self) -> None:
         """Compile the kernels for that; a driver that will be listened to calls it in its own ``warm``."""
         ...
 
-    def listen(self, role: str, source: RfSource | ToneSource) -> None:
+    def connect_outputs(self, role: str, source: RfSource | ToneSource) -> None:
         """From now on listen to these outputs of a role, in the place of earlier ones.
 
         Args:

@@ -28,11 +28,11 @@ FIRST: Final = "first"
 ENTRY_POINTS: Final = "labseq_"
 """What the names of plugins that are distributions of their own begin with."""
 
-__all__ = ["FILE_KINDS", "Made", "make_file", "make_plugin"]
+__all__ = ["FILE_KINDS", "CreatedFiles", "make_file", "make_plugin"]
 
 
 @dataclass(frozen=True, slots=True)
-class Made:
+class CreatedFiles:
     """What was made.
 
     Attributes:
@@ -46,7 +46,7 @@ class Made:
     commands: tuple[str, ...]
 
 
-def make_plugin(kind: str, name: str, folder: Path, *, package: bool = False) -> Made:
+def make_plugin(kind: str, name: str, folder: Path, *, package: bool = False) -> CreatedFiles:
     """Make a plugin that runs at once: the plugin, its settings, tests of its promises, a README.
 
     Args:
@@ -87,13 +87,13 @@ def make_plugin(kind: str, name: str, folder: Path, *, package: bool = False) ->
     if package:
         texts |= {"pyproject.toml": read_template("pyproject.txt"), f"{source}py.typed": ""}
     words["commands"] = "\n".join(commands)
-    with _told(path):
+    with _explained_errors(path):
         made = _write_folder(path, {filled(file, words): filled(text, words) for file, text in texts.items()})
         written = refresh_schemas(folder, _plugins_of(folder).registry)
-    return Made(path, (*made, *written), (*_missing_for_tests(), *_still_to_do(commands, folder)))
+    return CreatedFiles(path, (*made, *written), (*_missing_for_tests(), *_still_to_do(commands, folder)))
 
 
-def make_file(kind: FileKind, name: str, folder: Path, *, profile: str = "virtual") -> Made:
+def make_file(kind: FileKind, name: str, folder: Path, *, profile: str = "virtual") -> CreatedFiles:
     """Make a sequence or a profile that runs at once, and the schema that editors read with it.
 
     Args:
@@ -113,21 +113,21 @@ def make_file(kind: FileKind, name: str, folder: Path, *, profile: str = "virtua
     text = filled(read_template(f"{kind}.yaml"), {"name": name, "profile": profile})
     further: list[Path] = []
     plugins, schema = folder / PLUGINS, schema_path(kind, folder)
-    with _told(path):
+    with _explained_errors(path):
         if path.exists():
             raise FileExistsError
-    with _told(plugins):
+    with _explained_errors(plugins):
         if not plugins.is_dir():
             further += _write_folder(plugins, {"README.md": read_template("plugins.md")})
-    with _told(schema):
+    with _explained_errors(schema):
         further.append(write_schema(kind, folder, host.registry))
-    with _told(path), path.open("x", encoding="utf-8", newline="\n") as file:  # last: with it all is there
+    with _explained_errors(path), path.open("x", encoding="utf-8", newline="\n") as file:  # last: with it all is there
         file.write(text)
     commands = {
         "sequence": (f"labseq check {name}.yaml", f"labseq run {name}.yaml"),
         "profile": (f"labseq devices {name}", f"labseq new sequence {FIRST} --profile {name}"),
     }
-    return Made(path, (path, *further), commands[kind])
+    return CreatedFiles(path, (path, *further), commands[kind])
 
 
 def _plugins_of(folder: Path) -> PluginHost:
@@ -185,7 +185,7 @@ def _write_folder(path: Path, texts: Mapping[str, str]) -> list[Path]:
 
 
 @contextmanager
-def _told(path: Path) -> Generator[None]:
+def _explained_errors(path: Path) -> Generator[None]:
     """Say of what the system refuses why."""
     try:
         yield

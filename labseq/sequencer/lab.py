@@ -22,7 +22,7 @@ from labseq.roles import (
     Detector,
     Device,
     Hardware,
-    KnownCamera,
+    ReportsCameraFacts,
     Lines,
     MobileTweezers,
     Planner,
@@ -79,7 +79,7 @@ class Lab:
     @property
     def step_context(self) -> StepContext:
         """What steps need to lay out their timelines."""
-        facts = self.camera.facts if isinstance(self.camera, KnownCamera) else CameraFacts()
+        facts = self.camera.facts if isinstance(self.camera, ReportsCameraFacts) else CameraFacts()
         return StepContext(self.grid, self.motion, self.target, facts, self.line_specs)
 
     def hardware(self) -> Iterator[tuple[str, Hardware]]:

@@ -9,7 +9,7 @@ from typing import Any, Literal, Protocol
 
 from labseq.errors import ConfigError, LabseqError, one_of
 from labseq.model import ShotRecord, TimelineEntry
-from labseq.roles import Leading, Shot, StepContext
+from labseq.roles import LeaderLink, Shot, StepContext
 from labseq.sequencer.guard import LATE_S, Guard
 from labseq.sequencer.lab import Lab
 from labseq.sequencer.steps import WaitStep
@@ -55,14 +55,14 @@ def wait_step(settings: _Settings) -> WaitStep | FollowStep:
     return FollowStep(settings.signal, settings.timeout, settings.device or "")
 
 
-def leaders(devices: Mapping[str, object]) -> Iterator[tuple[str, Leading]]:
+def leaders(devices: Mapping[str, object]) -> Iterator[tuple[str, LeaderLink]]:
     """The devices, or lines, through which other control systems lead, with their names."""
     for name, device in devices.items():
-        if isinstance(device, Leading):
+        if isinstance(device, LeaderLink):
             yield name, device
 
 
-def find_leader(devices: Mapping[str, object], name: str = "") -> tuple[str, Leading]:
+def find_leader(devices: Mapping[str, object], name: str = "") -> tuple[str, LeaderLink]:
     """The device whose leader a step waits for.
 
     Args:
@@ -85,7 +85,7 @@ def find_leader(devices: Mapping[str, object], name: str = "") -> tuple[str, Lea
 
 
 @dataclass(frozen=True, slots=True)
-class Leaders:
+class LeaderHandshakes:
     """Those who lead a shot: whoever said `go` is told what came of it.
 
     A device knows itself whether it owes an answer, and gives it once; so all are told at each end of a shot.
@@ -105,7 +105,7 @@ class Leaders:
     def follow(self, signal: str, timeout_s: float, device: str) -> None:
         """Wait for a signal; see ``labseq.roles.Shot.follow``."""
         name, leader = find_leader(dict(self.lab.hardware()), device)
-        self._tell(name, leader, "ready", self.guard.call)  # of an earlier signal in this shot
+        self._report(name, leader, "ready", self.guard.call)  # of an earlier signal in this shot
         awaited = {"shot": self.record.shot_index, "device": name, "signal": signal, "timeout_s": timeout_s}
         self.emit("leader_awaited", awaited)
         try:
@@ -123,22 +123,22 @@ class Leaders:
             StopRequested: The run was asked to stop; they are to be told that it failed.
         """
         for name, leader in leaders(dict(self.lab.hardware())):
-            self._tell(name, leader, "ready", self.guard.call)
+            self._report(name, leader, "ready", self.guard.call)
 
     def failed(self, error: BaseException) -> None:
         """The shot failed, or was interrupted; no failure to tell it stands in the way of anything."""
         reason = str(error) or type(error).__name__
         for name, leader in leaders(dict(self.lab.hardware())):
             try:
-                self._tell(name, leader, "failed", self.guard.call_to_the_end, reason)
+                self._report(name, leader, "failed", self.guard.call_to_the_end, reason)
             except LabseqError as failure:
                 text = f"the system that leads through '{name}' could not be told of the failure: {failure}"
                 self.emit("warning", {"text": text})
 
-    def _tell(
+    def _report(
         self,
         name: str,
-        leader: Leading,
+        leader: LeaderLink,
         state: Literal["ready", "failed"],
         call: Callable[..., Any],
         reason: str = "",
@@ -148,18 +148,18 @@ class Leaders:
             about |= {"success": self.record.success, "filling": self.record.filling_fraction}
         if reason:
             about["reason"] = reason
-        told = call(name, self.lab.timeouts.call_s, leader.tell, state, about)
+        told = call(name, self.lab.timeouts.call_s, leader.report, state, about)
         if told:
             self._note(f"{name}.told", told)
             self._log("leader_told", name, told)
         self._log_news(name, leader)
 
-    def _log_news(self, name: str, leader: Leading) -> None:
+    def _log_news(self, name: str, leader: LeaderLink) -> None:
         try:
-            news = self.guard.call_to_the_end(name, self.lab.timeouts.call_s, leader.news)
+            new_events = self.guard.call_to_the_end(name, self.lab.timeouts.call_s, leader.new_events)
         except LabseqError as failure:
-            news = [str(failure)]
-        for text in news:
+            new_events = [str(failure)]
+        for text in new_events:
             self._log("leader_news", name, text)
 
     def _note(self, name: str, text: str) -> None:

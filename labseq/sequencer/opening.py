@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 
-from labseq.roles import Settling
+from labseq.roles import NeedsSettling
 from labseq.sequencer.clock import StopFlag
 from labseq.sequencer.guard import LATE_S, Guard
 from labseq.sequencer.lab import Lab
@@ -30,7 +30,7 @@ def open_devices(lab: Lab, guard: Guard, stop: StopFlag, emit: Emit, names: Coll
         guard.call("static_tweezers", timeout_s, lab.static_tweezers.load, None)
         guard.call("static_tweezers", timeout_s, lab.static_tweezers.start)
     for name, device in lab.hardware():
-        if name in names and isinstance(device, Settling) and (longest_s := device.settling_timeout_s) > 0:
+        if name in names and isinstance(device, NeedsSettling) and (longest_s := device.settling_timeout_s) > 0:
             emit("settling", {"device": name, "timeout_s": longest_s})
             guard.call(name, longest_s + LATE_S, device.settle)
 

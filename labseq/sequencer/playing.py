@@ -8,7 +8,7 @@ from numbers import Real
 
 from labseq.errors import DeviceError
 from labseq.model import ToneProgram
-from labseq.roles import Shot, Timed
+from labseq.roles import Shot, ReportsTimings
 
 
 def play(shot: Shot, build: Callable[[], ToneProgram], start_s: float, cycle: int = 0) -> None:
@@ -32,14 +32,14 @@ def play(shot: Shot, build: Callable[[], ToneProgram], start_s: float, cycle: in
         with shot.stage("tones", cycle=cycle):
             program = build()
         duration_s = _duration(shot.call("mobile_tweezers", limit_s, mobile.prepare, program))
-        if isinstance(mobile, Timed):
+        if isinstance(mobile, ReportsTimings):
             for part, host_s in shot.call("mobile_tweezers", limit_s, mobile.timings).items():
                 shot.stage_done(part, 0.0 if shot.clock.virtual else host_s, host_s, cycle=cycle)
         if shot.clock.virtual:
             shot.clock.sleep(max(0.0, overhead_s - (shot.clock.now() - start_s)))
     shot.check_interlocks()
     budget_s = duration_s + shot.margin_s("rearrange")
-    with shot.stage("play", budget_s, cycle), shot.lit("rearrange", duration_s):
+    with shot.stage("play", budget_s, cycle), shot.lines_on("rearrange", duration_s):
         shot.call("mobile_tweezers", limit_s, mobile.play)
         shot.call("mobile_tweezers", duration_s + 2 * limit_s, mobile.wait, duration_s + limit_s)
 

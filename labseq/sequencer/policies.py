@@ -25,7 +25,7 @@ Then = Literal["repeat_shot", "skip_point", "stop"]
 """What follows a failure."""
 OverBudget = Literal["record", "warn", "repeat_shot", "skip_point", "stop"]
 """What follows a stage that took longer than its budget."""
-UsedUp = Literal["skip_point", "stop"]
+WhenExhausted = Literal["skip_point", "stop"]
 """What follows when a shot has been repeated as often as it may be."""
 
 _ENDING: Final = (
@@ -64,13 +64,13 @@ class RunPolicy:
 
     Attributes:
         attempts: How often a shot is tried.
-        used_up: What follows when it has failed that often.
+        when_exhausted: What follows when it has failed that often.
         otherwise: What holds between the steps, and for the steps that are not in ``steps``.
         steps: What holds for each step, in their order.
     """
 
     attempts: int = 3
-    used_up: UsedUp = "stop"
+    when_exhausted: WhenExhausted = "stop"
     otherwise: StepPolicy = StepPolicy()
     steps: Sequence[StepPolicy] = ()
 
@@ -93,7 +93,7 @@ class RunPolicy:
         then = error.then if isinstance(error, OverBudgetError) else self.of_step(step).on_failure
         if then is None:
             then = "repeat_shot" if isinstance(error, TransientError) else "stop"
-        return self.used_up if then == "repeat_shot" and attempt + 1 >= self.attempts else then
+        return self.when_exhausted if then == "repeat_shot" and attempt + 1 >= self.attempts else then
 
 
 def may_be_retried(error: LabseqError) -> bool:

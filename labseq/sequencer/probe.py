@@ -17,7 +17,7 @@ from labseq.sequencer.playing import play
 Pattern = Literal["same", "cross"]
 
 
-class Holding(Protocol):
+class HoldSettings(Protocol):
     """How atoms are held, from the settings of a step."""
 
     @property
@@ -31,7 +31,7 @@ class Holding(Protocol):
         ...
 
 
-class _Settings(Holding, Protocol):
+class _Settings(HoldSettings, Protocol):
     @property
     def offset(self) -> tuple[float, float]: ...
     @property
@@ -77,7 +77,7 @@ class ProbeStep:
         return np.broadcast_to(np.asarray(offset_m, np.float64), (*grid.shape, 2))
 
 
-def hold(shot: Shot, sites: Occupancy, offsets_m: NDArray[np.float64], holding: Holding) -> None:
+def hold(shot: Shot, sites: Occupancy, offsets_m: NDArray[np.float64], hold_settings: HoldSettings) -> None:
     """Pick up, hold and drop the atoms of some sites, each beside its site by an offset.
 
     Args:
@@ -88,15 +88,15 @@ def hold(shot: Shot, sites: Occupancy, offsets_m: NDArray[np.float64], holding: 
     """
     if sites.any():
         start_s = shot.clock.now()
-        times_s = holding.hold, holding.drop_off
+        times_s = hold_settings.hold, hold_settings.drop_off
         play(shot, lambda: hold_program(shot.grid, shot.motion, sites, offsets_m, *times_s), start_s)
 
 
-def longest_s(context: StepContext, offsets_m: NDArray[np.float64], holding: Holding) -> float:
+def longest_s(context: StepContext, offsets_m: NDArray[np.float64], hold_settings: HoldSettings) -> float:
     """How long :func:`hold` takes if every site holds an atom.
 
     Raises:
         LimitError: The tone of a site leaves its band.
     """
-    time_s = hold_time_s(context.grid, context.motion, offsets_m, holding.hold, holding.drop_off)
+    time_s = hold_time_s(context.grid, context.motion, offsets_m, hold_settings.hold, hold_settings.drop_off)
     return context.motion.overhead_per_cycle_s + time_s

@@ -38,6 +38,6 @@ class RampStep:
     def run(self, shot: Shot) -> None:
         """Ramp, and wait for the end."""
         limit_s = self.duration_s + shot.call_timeout_s
-        with shot.lit("ramp", self.duration_s):
+        with shot.lines_on("ramp", self.duration_s):
             shot.call("static_tweezers", limit_s, shot.static_tweezers.ramp, self.depth, self.duration_s)
         shot.log("ramped", device="static_tweezers", depth=self.depth, duration_s=self.duration_s)

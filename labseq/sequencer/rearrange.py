@@ -48,9 +48,9 @@ class RearrangeStep:
         bars: list[TimelineEntry] = []
         for cycle in range(1, self.settings.cycles + 1):
             window_s = self.settings.window_of(cycle)
-            least_s, least_image_s = window_s if waited_out else 0.0, image_s if all_made else 0.0
-            moves = TimelineEntry(f"cycle {cycle}: move", window_s, least_s, kind="rearrange")
-            image = TimelineEntry(f"cycle {cycle}: image", image_s, least_image_s, 1, exposure_s, "image")
+            min_duration_s, min_image_s = window_s if waited_out else 0.0, image_s if all_made else 0.0
+            moves = TimelineEntry(f"cycle {cycle}: move", window_s, min_duration_s, kind="rearrange")
+            image = TimelineEntry(f"cycle {cycle}: image", image_s, min_image_s, 1, exposure_s, "image")
             bars += [moves, image]
         return bars
 

@@ -18,7 +18,7 @@ from labseq.sequencer.calling import budget_s, run_step
 from labseq.sequencer.clock import StopFlag
 from labseq.sequencer.guard import Guard
 from labseq.sequencer.lab import Lab, Outcome, close_all, make_safe
-from labseq.sequencer.leading import Leaders
+from labseq.sequencer.leading import LeaderHandshakes
 from labseq.sequencer.opening import close_devices, open_devices
 from labseq.sequencer.policies import RunPolicy, StepPolicy, Then, may_be_retried
 from labseq.sequencer.shot import RunningShot
@@ -157,7 +157,7 @@ class Sequencer:
             self._states.to(State.CLOSING)
             with self._stop.held():
                 outcome = close_all(self.lab, self.guard)
-            self._tell("closed", outcome)
+            self._report("closed", outcome)
             self.guard.end()
             self._states.to(State.CLOSED)
         return self._unsafe
@@ -167,7 +167,7 @@ class Sequencer:
         with self._stop.held():
             outcome = make_safe(self.lab, self.guard)
         self._unsafe = {name: error for name, error in outcome.items() if error is not None}
-        self._tell("safe_state", outcome)  # only now: neither a screen nor a disk shall delay the devices
+        self._report("safe_state", outcome)  # only now: neither a screen nor a disk shall delay the devices
         self._states.to(State.SAFE)
 
     def _take(self, index: int, attempt: int) -> tuple[Then | None, str]:
@@ -228,14 +228,14 @@ class Sequencer:
             with shot.of_step(number, name, self._policy.of_step(number), self._budgets[number]):
                 self._run_step(shot, number, name, step)
         shot.leaders.ready()  # before the shot is written: atoms do not wait for a disk
-        shot.note_truth()
+        shot.record_truth()
 
     def _run_step(self, shot: RunningShot, number: int, name: str, step: Step) -> None:
         """Run a step, and again if it fails and its policy lets it be tried again."""
         policy, images = self._policy.of_step(number), shot.record.images
         n_before = len(images)
         for left in range(policy.retries, -1, -1):
-            shot.stages.begin_try()
+            shot.stages.begin_attempt()
             try:
                 longest_s = policy.timeout_s + self.lab.timeouts.call_s
                 self.guard.run_step(partial(run_step, step, number, name, shot), longest_s)
@@ -271,15 +271,15 @@ class Sequencer:
             self._emit("warning", {"text": f"the interrupted shot could not be written: {failure}"})
         self._emit("shot_finished", {"shot": record})
 
-    def _leaders(self, record: ShotRecord) -> Leaders:
-        return Leaders(self.lab, self.guard, record, self._emit)
+    def _leaders(self, record: ShotRecord) -> LeaderHandshakes:
+        return LeaderHandshakes(self.lab, self.guard, record, self._emit)
 
     def _close_record(self, record: ShotRecord, status: ShotStatus, error: BaseException | None) -> None:
         record.status = status
         record.error = "" if error is None else f"{type(error).__name__}: {error}"
         record.t_end_utc = _utc_now()
 
-    def _tell(self, event: str, outcome: Outcome) -> None:
+    def _report(self, event: str, outcome: Outcome) -> None:
         for name, error in outcome.items():
             self._emit(event, {"device": name, "ok": error is None, "error": str(error or "")})
 

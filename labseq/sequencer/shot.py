@@ -13,11 +13,11 @@ import numpy as np
 from labseq.errors import ConfigError, DeviceError, InterlockError
 from labseq.lines import line_program, margin_s, trigger_line
 from labseq.model import CycleRecord, Frame, ImageRecord, Occupancy, ShotRecord
-from labseq.roles import Device, Interlocked, LossTeller, Polled, Storyteller, TruthTeller
+from labseq.roles import Device, Interlocked, ReportsLosses, HasReadings, ReportsEvents, ReportsTruth
 from labseq.sequencer.guard import LATE_S, Guard
 from labseq.sequencer.interlock import check_blinding
 from labseq.sequencer.lab import Lab
-from labseq.sequencer.leading import Emit, Leaders
+from labseq.sequencer.leading import Emit, LeaderHandshakes
 from labseq.sequencer.policies import StepPolicy
 from labseq.sequencer.stages import Stages
 
@@ -58,7 +58,7 @@ class RunningShot:
         self.in_step = False
         self.stages = Stages(lab, record, emit)
         self.start_s = self.stages.start_s
-        self.leaders = Leaders(lab, guard, record, emit)
+        self.leaders = LeaderHandshakes(lab, guard, record, emit)
         self._guard = guard
         self._emit = emit
 
@@ -107,7 +107,7 @@ class RunningShot:
     def poll(self) -> None:
         """Keep with the shot what devices are read for at its start."""
         for name, device in self.lab.hardware():
-            if isinstance(device, Polled):
+            if isinstance(device, HasReadings):
                 values = self.call(name, self.call_timeout_s, device.poll)
                 self.record.readings.update({f"{name}.{value}": read for value, read in values.items()})
 
@@ -130,7 +130,7 @@ class RunningShot:
         return margin_s(self.lab.line_specs, kind)
 
     @contextmanager
-    def lit(self, kind: str, duration_s: float) -> Generator[None]:
+    def lines_on(self, kind: str, duration_s: float) -> Generator[None]:
         """Fire the lines of a kind of step around it; see ``labseq.roles.Shot``."""
         lines, timeout_s = self.lab.lines, self.call_timeout_s
         if lines is None:
@@ -186,7 +186,7 @@ class RunningShot:
         by_line = trigger_line(specs, "camera") is not None
         with self.stage("expose", exposure_s + readout_s + margin_s(specs, "image"), cycle):
             self.call("camera", timeout_s, camera.arm, 1, exposure_s, "external" if by_line else "software")
-            with self.lit("image", exposure_s):
+            with self.lines_on("image", exposure_s):
                 if not by_line:
                     self.call("camera", limit_s, camera.trigger)
                 end_s, host_start_s = self.elapsed_s + exposure_s, time.perf_counter()
@@ -223,18 +223,18 @@ class RunningShot:
         """Add a line to the run's event log."""
         self._emit(event, {"shot": self.index, **values})
 
-    def note_truth(self) -> None:
+    def record_truth(self) -> None:
         """Keep the true occupancy, where the simulation tells it."""
-        if isinstance(self.simulation, TruthTeller):
+        if isinstance(self.simulation, ReportsTruth):
             truth = self.call("simulation", self.call_timeout_s, self.simulation.truth)
             self.record.readings["simulation.n_atoms_true"] = int(np.count_nonzero(truth))
             self.record.readings["simulation.n_defects_true"] = self.target.n_defects(truth)
-        if isinstance(self.simulation, LossTeller):
+        if isinstance(self.simulation, ReportsLosses):
             losses = self.call("simulation", self.call_timeout_s, self.simulation.losses)
             self.record.readings.update({f"simulation.lost.{cause}": n for cause, n in losses.items()})
-        if isinstance(self.simulation, Storyteller):
-            story = self.call("simulation", self.call_timeout_s, self.simulation.story, self.start_s)
-            self.record.story.update(story)
+        if isinstance(self.simulation, ReportsEvents):
+            atom_events = self.call("simulation", self.call_timeout_s, self.simulation.atom_events, self.start_s)
+            self.record.atom_events.update(atom_events)
 
     def _detected(self, answer: Any) -> tuple[Occupancy, Any]:
         shape = self.grid.shape

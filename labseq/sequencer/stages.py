@@ -46,7 +46,7 @@ class Stages:
         """What follows belongs to this step."""
         self.step, self._name, self.policy, self._is_warned = number, name, policy, False
 
-    def begin_try(self) -> None:
+    def begin_attempt(self) -> None:
         """A try at the step begins: its timeout counts from here."""
         self._try_start_s = self._clock.now()
 

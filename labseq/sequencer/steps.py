@@ -53,7 +53,7 @@ class LoadStep:
 
     def run(self, shot: Shot) -> None:
         """Wait while the atom source is on."""
-        with shot.lit("load", self.duration_s):
+        with shot.lines_on("load", self.duration_s):
             start_s = shot.clock.now()
             shot.clock.sleep(self.duration_s)
             if shot.simulation is not None:
@@ -99,7 +99,7 @@ class WaitStep:
 
     def run(self, shot: Shot) -> None:
         """Wait on the session's clock."""
-        with shot.lit("wait", self.duration_s):
+        with shot.lines_on("wait", self.duration_s):
             shot.clock.sleep(self.duration_s)
 
 

@@ -13,13 +13,13 @@ from labseq.errors import ConfigError, DeviceError
 from labseq.imaging.drift import measure_shift
 from labseq.model import TimelineEntry
 from labseq.motion import FastOffset, SurvivalShape, cross_offsets_m, fast_offset, group_counts
-from labseq.roles import Shot, SignalTeller, StepContext
-from labseq.sequencer.probe import Holding, hold, longest_s
+from labseq.roles import Shot, ReportsSignals, StepContext
+from labseq.sequencer.probe import HoldSettings, hold, longest_s
 from labseq.units import format_quantity
 
 Exceeded = Literal["warn", "stop"]
 
-LEAST_ATOMS: Final = 10
+MIN_ATOMS: Final = 10
 """With fewer, noise may pass for atoms that stand elsewhere."""
 SURE: Final = 1.0
 """A shift counts as too large if it exceeds the limit by this many of its errors."""
@@ -36,7 +36,7 @@ class _SitesSettings(Protocol):
     def exceeded(self) -> Exceeded: ...
 
 
-class _OverlaySettings(Holding, Protocol):
+class _OverlaySettings(HoldSettings, Protocol):
     @property
     def every(self) -> int: ...
     @property
@@ -79,14 +79,14 @@ class CheckSitesStep:
             return
         if shot.frame is None or shot.occupancy is None:
             raise ConfigError("check_sites needs an image before it in the shot")
-        if not isinstance(detector, SignalTeller):
+        if not isinstance(detector, ReportsSignals):
             raise ConfigError(
                 "check_sites needs a detector that tells where it looks for the atoms; "
                 "'threshold' and 'weighted' do"
             )
         image, sites_px = shot.frame.image, detector.sites_px[shot.occupancy]
         dy = dx = error = math.inf
-        if len(sites_px) >= LEAST_ATOMS:
+        if len(sites_px) >= MIN_ATOMS:
             with shot.stage("check sites"):
                 limit_s = shot.call_timeout_s
                 dy, dx, error = shot.call(
@@ -102,7 +102,7 @@ class CheckSitesStep:
         for name, value in (("shift_y_px", dy), ("shift_x_px", dx), ("shift_error_px", error)):
             shot.note(f"sites.{name}", value)
         if math.hypot(dy, dx) > settings.limit_px + SURE * error:
-            _tell(
+            _handle_exceeded(
                 shot,
                 settings.exceeded,
                 "camera",
@@ -178,10 +178,10 @@ class CheckOverlayStep:
         limit = format_quantity(settings.limit, "length")
         if not found.fits:
             text = "the survival of the probed atoms goes with no small offset of the mobile tweezers"
-            _tell(shot, settings.exceeded, "mobile_tweezers", f"{text}: run `labseq calibrate overlay`")
+            _handle_exceeded(shot, settings.exceeded, "mobile_tweezers", f"{text}: run `labseq calibrate overlay`")
         elif (offset_m > settings.limit + SURE * error_m).any():
             text = f"the mobile tweezers stand {parts} beside the sites; the limit is {limit}"
-            _tell(shot, settings.exceeded, "mobile_tweezers", f"{text}: run `labseq calibrate overlay`")
+            _handle_exceeded(shot, settings.exceeded, "mobile_tweezers", f"{text}: run `labseq calibrate overlay`")
         elif not (error_m <= settings.limit).all():
             n_atoms = "1 atom" if found.n_atoms == 1 else f"{found.n_atoms} atoms"
             _warn(shot, f"check_overlay cannot tell the overlay to {limit} with {n_atoms} on this shot")
@@ -190,7 +190,7 @@ class CheckOverlayStep:
         return cross_offsets_m(shape, (self.settings.offset, self.settings.offset))
 
 
-def _tell(shot: Shot, exceeded: Exceeded, device: str, text: str) -> None:
+def _handle_exceeded(shot: Shot, exceeded: Exceeded, device: str, text: str) -> None:
     if exceeded == "stop":
         raise DeviceError(device, text)
     _warn(shot, text)

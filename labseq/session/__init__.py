@@ -2,27 +2,27 @@
 
 from labseq.session.assembly import Assembly, assemble
 from labseq.session.checking import CheckReport, check
-from labseq.session.choosing import Bench
+from labseq.session.choosing import ResolvedProfile
 from labseq.session.devices import CheckedDevice, DevicesReport, check_devices
 from labseq.session.occupancies import Source, read_source
 from labseq.session.options import Options
 from labseq.session.plan_inputs import PlanRequest
 from labseq.session.planning import PlannedMoves, plan_moves
 from labseq.session.provenance import gather_provenance
-from labseq.session.safe import Secured, make_profile_safe
+from labseq.session.safe import SafeStateReport, make_profile_safe
 from labseq.session.session import Session
-from labseq.session.setting_up import load_plugins, set_up_bench
+from labseq.session.setting_up import load_plugins, resolve_profile
 
 __all__ = [
     "Assembly",
-    "Bench",
+    "ResolvedProfile",
     "CheckReport",
     "CheckedDevice",
     "DevicesReport",
     "Options",
     "PlanRequest",
     "PlannedMoves",
-    "Secured",
+    "SafeStateReport",
     "Session",
     "Source",
     "assemble",
@@ -33,5 +33,5 @@ __all__ = [
     "make_profile_safe",
     "plan_moves",
     "read_source",
-    "set_up_bench",
+    "resolve_profile",
 ]

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
-from labseq.config import Collected
+from labseq.config import ProblemCollector
 from labseq.config.adaptive import SCANNER_KEYS, Adaptive, Ends
 from labseq.config.scan import Axis
 from labseq.config.wording import clean
@@ -15,7 +15,7 @@ from labseq.errors import ConfigError
 from labseq.model import ScanRange, ScanSpace
 from labseq.recording.chosen_points import SCANNER
 from labseq.roles import Step
-from labseq.session.choosing import Chosen, resolve
+from labseq.session.choosing import ChosenPlugin, resolve
 from labseq.session.constructing import construct_one
 from labseq.session.figure_names import check_figure
 from labseq.session.scan import Point, Scanned
@@ -40,7 +40,7 @@ class Search:
 
     scanned: Scanned
     adaptive: Adaptive
-    chosen: Chosen
+    chosen: ChosenPlugin
     ranges: tuple[ScanRange, ...]
 
     @property
@@ -57,7 +57,7 @@ class Search:
         """What the scanner is constructed with."""
         return ScanSpace(self.ranges, self.adaptive.n_points, self.scanned.scan.repeats, seed)
 
-    def at(self, values: Mapping[str, float], planner: Chosen, steps: tuple[tuple[str, Step], ...]) -> Point:
+    def at(self, values: Mapping[str, float], planner: ChosenPlugin, steps: tuple[tuple[str, Step], ...]) -> Point:
         """The settings of a point.
 
         Args:
@@ -94,7 +94,7 @@ class Search:
         }
 
 
-def make_search(scanned: Scanned, planner: Chosen, steps: Steps, found: Collected) -> Search | None:
+def make_search(scanned: Scanned, planner: ChosenPlugin, steps: Steps, found: ProblemCollector) -> Search | None:
     """Check what chooses a scan's points; None if nothing does, or something is wrong.
 
     The scanner is constructed once, to see whether it can be.
@@ -111,7 +111,7 @@ def make_search(scanned: Scanned, planner: Chosen, steps: Steps, found: Collecte
     n_before, document = len(found.problems), scanned.document
     with found:
         check_figure(document, adaptive.aim, adaptive.figure, CLIMBED, steps)
-    chosen: Chosen | None = None
+    chosen: ChosenPlugin | None = None
     with found:
         chosen = resolve(scanned.bench.host, document, "scanner", adaptive.choice, SCANNER_KEYS)
     low = scanned.at(0, planner, tuple(steps)).parameters

@@ -17,7 +17,7 @@ from labseq.session.figure_names import missing_figure
 
 
 @dataclass(slots=True)
-class Standing:
+class PointScore:
     """How a point stands.
 
     Attributes:
@@ -51,7 +51,7 @@ class Results:
     shots: dict[int, Shot]
     _visited: list[VisitedPoint] = field(default_factory=list[VisitedPoint])
     _given_up: dict[int, dict[str, float]] = field(default_factory=dict[int, dict[str, float]])
-    _standings: dict[str, Standing] = field(default_factory=dict[str, Standing])
+    _point_scores: dict[str, PointScore] = field(default_factory=dict[str, PointScore])
     _n_counted: int = 0
     _warned: bool = False
 
@@ -102,7 +102,7 @@ class Results:
 
         while self._n_counted <= visit:
             self._count(self._n_counted)
-        known = [one for one in self._standings.values() if one.n_scores]
+        known = [one for one in self._point_scores.values() if one.n_scores]
         best = max(known, key=lambda one: (one.mean, -one.first), default=None)
         return {
             "figure": self.search.adaptive.figure,
@@ -113,7 +113,7 @@ class Results:
     def _count(self, visit: int) -> None:
         """Add a visit to those of its point: all of them count together."""
         one = self._visit(visit)
-        standing = self._standings.setdefault(dumps(dict(one.values)), Standing(visit, one.values))
+        standing = self._point_scores.setdefault(dumps(dict(one.values)), PointScore(visit, one.values))
         if not math.isnan(one.score):
             standing.total += one.score
             standing.n_scores += 1

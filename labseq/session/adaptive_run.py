@@ -17,16 +17,16 @@ from labseq.sequencer import Sequencer, StopFlag
 from labseq.sequencer.lab import Lab
 from labseq.session.adaptive import Search
 from labseq.session.adaptive_results import Results
-from labseq.session.asking import Asker
+from labseq.session.asking import ScannerCall
 from labseq.session.assembly import Assembly
-from labseq.session.between import Between
+from labseq.session.between import ShotHooks
 from labseq.session.scan import Point
-from labseq.session.scan_run import Course
+from labseq.session.scan_run import ScanRun
 
 
 def course_of(
     assembly: Assembly, seed: int, stop: StopFlag, run: Run | None = None, done: Collection[int] = ()
-) -> Course:
+) -> ScanRun:
     """The way of a run through the points of its scan.
 
     Args:
@@ -37,11 +37,11 @@ def course_of(
         done: Shots that need not be taken.
     """
     if assembly.search is None:
-        return Course(assembly, seed, done)
-    return AdaptiveCourse(assembly, assembly.search, seed, stop, run, done)
+        return ScanRun(assembly, seed, done)
+    return AdaptiveScanRun(assembly, assembly.search, seed, stop, run, done)
 
 
-class AdaptiveCourse(Course):
+class AdaptiveScanRun(ScanRun):
     """The course of an adaptive scan.
 
     What the scanner chooses follows from the shots on disk alone, their lines in the index: so a run
@@ -70,7 +70,7 @@ class AdaptiveCourse(Course):
         self.assembly = assembly
         self._seed = seed
         self._search = search
-        self._asker = Asker(search, seed, stop)
+        self._asker = ScannerCall(search, seed, stop)
         self._missing = [shot for shot in range(assembly.sequence.shots) if shot not in done]
         self._results = Results(search, {} if run is None else {shot.index: shot for shot in run.shots})
         if run is not None:
@@ -108,7 +108,7 @@ class AdaptiveCourse(Course):
             yield self.first
         yield from map(self.assembly.at, range(math.prod(self._search.scanned.scan.shape)))
 
-    def each_lab(self) -> Iterator[Point]:
+    def representative_labs(self) -> Iterator[Point]:
         """The first point, and two opposite corners."""
         points = [*self.each()]
         yield from (*points[:2], points[-1])
@@ -122,26 +122,26 @@ class AdaptiveCourse(Course):
         """Say where the results come from, and who is told what they mean."""
         self._writer, self._observer = writer, observer
 
-    def run(self, sequencer: Sequencer, lab: Lab, changes: Mapping[str, Any], between: Between) -> None:
+    def run(self, sequencer: Sequencer, lab: Lab, changes: Mapping[str, Any], shot_hooks: ShotHooks) -> None:
         """Take shots until there are no more, or the scanner wants none."""
-        before, skipped = self.first, set(self._skip_before(between))
+        before, skipped = self.first, set(self._skip_before(shot_hooks))
         for shot in self.shots:
             if shot in skipped:
                 continue
-            between.before()
+            shot_hooks.before()
             point = self._point_of(shot)
             if point is None:
-                self._tell("scan_ended", {"scanner": self._search.name, "n_shots": shot})
+                self._log_event("scan_ended", {"scanner": self._search.name, "n_shots": shot})
                 return
             if point is not before:
                 lab = self._go_on(sequencer, lab, before, point, changes)
                 before = point
             given_up = sequencer.run([shot])
             self._note(shot)
-            skipped.update(self._skip(shot, given_up, between))
+            skipped.update(self._skip(shot, given_up, shot_hooks))
             if skipped.issuperset(self._later_at_its_point(shot)):
                 visit = shot // self._search.scanned.scan.repeats
-                self._tell("scan_point", self._results.told(visit))
+                self._log_event("scan_point", self._results.told(visit))
 
     def _later_at_its_point(self, shot: int) -> list[int]:
         repeats = self._search.scanned.scan.repeats
@@ -151,7 +151,7 @@ class AdaptiveCourse(Course):
         """The scan for the run's record, JSON-ready; see :meth:`Search.record`."""
         return self._search.record()
 
-    def _tell(self, name: str, values: Mapping[str, Any]) -> None:
+    def _log_event(self, name: str, values: Mapping[str, Any]) -> None:
         if self._observer is not None:
             self._observer.event(name, values)
 
@@ -177,10 +177,10 @@ class AdaptiveCourse(Course):
             return
         self._results.add(Shot(self._writer.run_dir / row["file"], json.loads(dumps(row)), load_content))
         if warning := self._results.missing_figure(shot):
-            self._tell("warning", {"text": warning})
+            self._log_event("warning", {"text": warning})
 
 
-def point_of(assembly: Assembly, shot: Shot, course: Course) -> Point:
+def point_of(assembly: Assembly, shot: Shot, course: ScanRun) -> Point:
     """The settings that a recorded shot was taken with.
 
     Args:

@@ -16,7 +16,7 @@ from labseq.locks import Lock, knows_no_locks
 from labseq.recording import Run
 from labseq.recording.results import ANEW, ResultsLog, done, read_results, results_file
 from labseq.roles import Analysis, RecordedShot
-from labseq.session.choosing import Chosen
+from labseq.session.choosing import ChosenPlugin
 from labseq.session.constructing import construct_one
 from labseq.session.recorded import context_of, plugins_of, resolved_of
 
@@ -27,7 +27,7 @@ FAILED: Final = "failed: "
 
 
 @dataclass(frozen=True, slots=True)
-class Prepared:
+class PreparedAnalysis:
     """An analysis that is ready for the shots of a run.
 
     Attributes:
@@ -42,7 +42,7 @@ class Prepared:
 
 
 @dataclass(frozen=True, slots=True)
-class Analysed:
+class AnalysisOutcome:
     """What came of an analysis.
 
     Attributes:
@@ -70,7 +70,7 @@ def analyses_of(run: Run) -> list[dict[str, Any]]:
     return [dict(one) for one in cast("list[dict[str, Any]]", found)]
 
 
-def prepare(run: Run, settings: Mapping[str, Any]) -> Prepared:
+def prepare(run: Run, settings: Mapping[str, Any]) -> PreparedAnalysis:
     """Make an analysis for the shots of a run.
 
     Args:
@@ -87,7 +87,7 @@ def prepare(run: Run, settings: Mapping[str, Any]) -> Prepared:
     host = plugins_of(run)
     entry = host.get("analysis", name)
     own = {key: value for key, value in settings.items() if key not in (USE, FINISH_WITHIN)}
-    chosen = Chosen(entry, validate_values(entry.settings_model, own, f"analysis '{name}'"))
+    chosen = ChosenPlugin(entry, validate_values(entry.settings_model, own, f"analysis '{name}'"))
     version = next((info.version for info in host.infos if info.name == entry.origin), "")
     about = {
         "analysis": name,
@@ -97,12 +97,12 @@ def prepare(run: Run, settings: Mapping[str, Any]) -> Prepared:
         "labseq": labseq.__version__,
         "t_utc": datetime.now(UTC).isoformat(timespec="seconds"),
     }
-    return Prepared(name, construct_one(chosen, context_of(run, name)), about)
+    return PreparedAnalysis(name, construct_one(chosen, context_of(run, name)), about)
 
 
 @contextlib.contextmanager
 def results_of(
-    run_dir: Path, prepared: Prepared, *, anew: bool = False
+    run_dir: Path, prepared: PreparedAnalysis, *, anew: bool = False
 ) -> Generator[tuple[ResultsLog, set[int]]]:
     """The results of an analysis, for writing by this process alone.
 
@@ -128,7 +128,7 @@ def results_of(
 
 
 def analyse(
-    prepared: Prepared,
+    prepared: PreparedAnalysis,
     shots: Iterable[RecordedShot],
     log: ResultsLog,
     failed: Callable[[int, BaseException], None],
@@ -160,7 +160,7 @@ def analyse(
     return n_done
 
 
-def make_up(run: Run, settings: Mapping[str, Any], *, anew: bool = False) -> Analysed:
+def analyse_missing(run: Run, settings: Mapping[str, Any], *, anew: bool = False) -> AnalysisOutcome:
     """Analyse the shots of a run that have no result yet.
 
     Args:
@@ -180,7 +180,7 @@ def make_up(run: Run, settings: Mapping[str, Any], *, anew: bool = False) -> Ana
 
     with results_of(run.path, prepared, anew=anew) as (log, before):
         n_done = analyse(prepared, (s for s in run.shots if s.index not in before), log, failed)
-    return Analysed(prepared.name, n_done, len(before), failures, log.path)
+    return AnalysisOutcome(prepared.name, n_done, len(before), failures, log.path)
 
 
 @contextlib.contextmanager

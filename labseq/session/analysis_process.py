@@ -70,7 +70,7 @@ def main(run_dir: Path, name: str, finish_within_s: float) -> None:
     run = open_run(run_dir)
     prepared = prepare(run, next(one for one in analyses_of(run) if one[USE] == name))
     with results_of(run_dir, prepared) as (log, before):
-        analyse(prepared, _as_they_come(run_dir, before, end), log, _tell)
+        analyse(prepared, _as_they_come(run_dir, before, end), log, _report)
 
 
 def _as_they_come(run_dir: Path, before: set[int], end: _End) -> Generator[Shot]:
@@ -88,7 +88,7 @@ def _as_they_come(run_dir: Path, before: set[int], end: _End) -> Generator[Shot]
         end.wait()
 
 
-def _tell(shot: int, error: BaseException) -> None:
+def _report(shot: int, error: BaseException) -> None:
     traceback.print_exception(error)
     print(f"{FAILED}shot {shot + 1}: {type(error).__name__}: {error}", file=sys.stderr, flush=True)  # noqa: T201 - its log
 

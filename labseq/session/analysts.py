@@ -18,14 +18,14 @@ from labseq.units import format_quantity
 
 GRACE_S: Final = 2.0
 """How much longer than its time a process may take to end by itself."""
-MOST_READ: Final = 1 << 16
+MAX_READ: Final = 1 << 16
 """Bytes of a log that are looked at, from its end."""
 _MODULE: Final = "labseq.session.analysis_process"
 
 Tell = Callable[[str], None]
 
 
-class Analysts:
+class AnalysisProcesses:
     """A process for each analysis of a run; nothing that they do stops or slows the run.
 
     Args:
@@ -36,19 +36,19 @@ class Analysts:
 
     def __init__(self, run_dir: Path, analyses: Sequence[Mapping[str, Any]], tell: Tell) -> None:
         self._run_dir = run_dir
-        self._tell = tell
-        self._analysts: list[_Analyst] = []
+        self._report = tell
+        self._analysts: list[_AnalysisProcess] = []
         for analysis in analyses:
             name = str(analysis[USE])
             try:
-                self._analysts.append(_Analyst(run_dir, name, float(analysis[FINISH_WITHIN])))
+                self._analysts.append(_AnalysisProcess(run_dir, name, float(analysis[FINISH_WITHIN])))
             except OSError as error:
                 tell(f"the process of analysis '{name}' could not be started: {error.strerror}")
 
     def look(self) -> None:
         """Tell of each analysis, once, that it has failed; quick, for use between shots."""
         for one in self._analysts:
-            one.look(self._tell)
+            one.look(self._report)
 
     def finish(self) -> None:
         """The run is over: give each its time for the shots that are left, then tell what is missing."""
@@ -56,11 +56,11 @@ class Analysts:
             one.end_of_run()
         end_s = time.monotonic()
         for one in self._analysts:
-            one.wait(end_s, self._tell)
-            self._tell_missing(one.name)
+            one.wait(end_s, self._report)
+            self._report_missing(one.name)
         self._analysts = []
 
-    def _tell_missing(self, name: str) -> None:
+    def _report_missing(self, name: str) -> None:
         with suppress(LabseqError):
             rows = read_results(results_file(self._run_dir, name))[0]
             shots = {shot.index for shot in open_run(self._run_dir).shots}
@@ -68,10 +68,10 @@ class Analysts:
             if n_missing:
                 failed = f" ({n_failed} failed)" if n_failed else ""
                 text = f"analysis '{name}' has no result of {n_missing} of {len(shots)} shots{failed}"
-                self._tell(f"{text}; 'labseq analyse {self._run_dir}' makes up what is missing")
+                self._report(f"{text}; 'labseq analyse {self._run_dir}' makes up what is missing")
 
 
-class _Analyst:
+class _AnalysisProcess:
     """The process of one analysis."""
 
     def __init__(self, run_dir: Path, name: str, finish_within_s: float) -> None:
@@ -137,8 +137,8 @@ class _Analyst:
         if self._log.stat().st_size == self._seen:
             return []
         with self._log.open("rb") as log:
-            log.seek(max(self._seen, self._log.stat().st_size - MOST_READ))
-            text = log.read(MOST_READ)
+            log.seek(max(self._seen, self._log.stat().st_size - MAX_READ))
+            text = log.read(MAX_READ)
             self._seen = log.tell()
         return text.decode(errors="replace").splitlines()
 

@@ -15,7 +15,7 @@ from labseq.session.constructing import construct_one
 from labseq.units import written
 
 
-class Asker:
+class ScannerCall:
     """A scanner, with a deadline, and a check of each answer.
 
     Args:

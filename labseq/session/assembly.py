@@ -10,9 +10,9 @@ from typing import Any
 from labseq import builtins
 from labseq.config import (
     ROLES,
-    Collected,
+    ProblemCollector,
     Document,
-    Kept,
+    StoredText,
     Override,
     Scan,
     SequenceSpec,
@@ -31,8 +31,8 @@ from labseq.sequencer.policies import RunPolicy
 from labseq.session.adaptive import Search, make_search
 from labseq.session.calibrating import with_tones
 from labseq.session.choosing import (
-    Bench,
-    Chosen,
+    ResolvedProfile,
+    ChosenPlugin,
     DryRun,
     check_dry_run,
     resolve,
@@ -41,7 +41,7 @@ from labseq.session.choosing import (
 from labseq.session.contents import make_analyses, make_steps, make_target
 from labseq.session.policies import make_policy, with_policies
 from labseq.session.scan import Point, Scanned
-from labseq.session.setting_up import Again, set_up_bench
+from labseq.session.setting_up import RecordedSetup, resolve_profile
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,9 +65,9 @@ class Assembly:
 
     document: Document
     sequence: SequenceSpec
-    bench: Bench
+    bench: ResolvedProfile
     target: TargetPattern
-    planner: Chosen
+    planner: ChosenPlugin
     steps: tuple[tuple[str, Step], ...]
     dry_run: DryRun
     resolved: Mapping[str, Any]
@@ -106,8 +106,8 @@ def assemble(
     overrides: Sequence[str] = (),
     given: Sequence[Override] = (),
     dry_run: DryRun = "off",
-    kept: Kept | None = None,
-    again: Again | None = None,
+    kept: StoredText | None = None,
+    again: RecordedSetup | None = None,
 ) -> Assembly:
     """Read and validate everything that can be validated without opening a device.
 
@@ -130,7 +130,7 @@ def assemble(
     sequence_path = sequence_path if kept is not None else find_sequence(sequence_path)
     for_sequence, for_profile = split_overrides(overrides)
     profile_set = [one._replace(address=f"profile.{one.address}") for one in for_profile]
-    found = Collected()
+    found = ProblemCollector()
     try:
         document, sequence = load_sequence(
             sequence_path, [*given, *for_sequence], profile_set=profile_set, found=found, kept=kept
@@ -139,7 +139,7 @@ def assemble(
         raise found.stop(error) from None
     scan = None if found.problems else read_scan(document, [*given, *for_sequence, *profile_set])
     try:
-        bench = set_up_bench(
+        bench = resolve_profile(
             sequence.profile if profile is None else profile,
             sequence_path.parent if profile is None else Path(),
             for_profile,
@@ -159,9 +159,9 @@ def assemble(
 def _put_together(
     document: Document,
     sequence: SequenceSpec,
-    bench: Bench,
+    bench: ResolvedProfile,
     scan: Scan | None,
-    found: Collected,
+    found: ProblemCollector,
     dry_run: DryRun,
 ) -> Assembly:
     """Make what the sequence asks for, on its profile."""
@@ -204,7 +204,7 @@ def _explained(error: ConfigError, scan: Scan | None) -> ConfigError:
     return error if scan is None else scan.explained(error)
 
 
-def _check_alone(document: Document, sequence: SequenceSpec, found: Collected) -> None:
+def _check_alone(document: Document, sequence: SequenceSpec, found: ProblemCollector) -> None:
     """Check a sequence without its profile: the settings of what needs no plugin folder."""
     host = PluginHost()
     host.load_builtin(builtins)
@@ -230,7 +230,7 @@ def _expressions(sequence: Document, profile: Document) -> dict[str, str]:
     return texts
 
 
-def _profile_dump(bench: Bench) -> dict[str, Any]:
+def _profile_dump(bench: ResolvedProfile) -> dict[str, Any]:
     spec = bench.profile
     core = spec.model_dump(mode="json", exclude={*ROLES, "devices"})
     roles = {role: chosen.dump() for role, chosen in bench.chosen.items() if role in ROLES}

@@ -14,7 +14,7 @@ from typing import Final
 
 from labseq.errors import ConfigError, LabseqError, Problem, StopRequested
 from labseq.session.bench_courses import set_up, warm
-from labseq.session.bench_crew import work_through
+from labseq.session.bench_crew import run_jobs
 from labseq.session.bench_figures import Figure, find_figure
 from labseq.session.bench_report import Report, Tally
 from labseq.session.bench_spec import (
@@ -29,7 +29,7 @@ from labseq.session.bench_spec import (
 from labseq.session.bench_work import Done, Job
 
 DEFAULTS: Final = {"planners": "psca", "grid": "20x20", "target": "compact:15x15", "loading": "75 %"}
-MOST_AT_ONCE: Final = 50
+MAX_AT_ONCE: Final = 50
 """Most loadings of a job: what is lost of each process when a comparison is stopped."""
 ALONE_S: Final = 2.0
 """How long one process works before it starts others: about what their start takes."""
@@ -75,14 +75,14 @@ def read_request(request: BenchRequest) -> tuple[Comparison, Figure | None]:
         given = {name: getattr(request, name) or default for name, default in DEFAULTS.items()}
         shape, loading = parse_grid(given["grid"]), parse_loading(given["loading"])
         condition = Condition(shape, given["target"], loading, request.dop, (*BARE_MOTION, *motion))
-        entrants = parse_entrants(given["planners"])
+        planner_entries = parse_entrants(given["planners"])
         called = f"--planners {given['planners']}"
-        return Comparison(entrants, (condition,), request.loadings, request.seed, settings, called), None
+        return Comparison(planner_entries, (condition,), request.loadings, request.seed, settings, called), None
     figure = find_figure(request.figure)
     _check_figure_alone(request, figure, bool(settings))
     conditions = tuple(figure.with_motion(motion))
     called = f"figure {figure.name}"
-    return Comparison(figure.entrants, conditions, request.loadings, request.seed, (), called), figure
+    return Comparison(figure.planner_entries, conditions, request.loadings, request.seed, (), called), figure
 
 
 def compare(
@@ -137,14 +137,14 @@ def _results(comparison: Comparison, n_workers: int | None) -> Generator[Done]:
     todo = _jobs(comparison, n_workers or _n_cores())
     if n_workers is None:
         start_s, n_done = time.perf_counter(), 0
-        for done in work_through(comparison, todo, 1):
+        for done in run_jobs(comparison, todo, 1):
             yield done
             n_done += 1
             if time.perf_counter() - start_s > ALONE_S:
                 break
         todo = todo[n_done:]
     if todo:
-        yield from work_through(comparison, todo, min(n_workers or _n_cores(), len(todo)))
+        yield from run_jobs(comparison, todo, min(n_workers or _n_cores(), len(todo)))
 
 
 def _check_figure_alone(request: BenchRequest, figure: Figure, has_settings: bool) -> None:
@@ -164,7 +164,7 @@ def _jobs(comparison: Comparison, n_workers: int) -> list[Job]:
     time is about the same share of each.
     """
     n_loadings, n_conditions = comparison.n_loadings, len(comparison.conditions)
-    size = min(MOST_AT_ONCE, n_loadings, -(-n_loadings * n_conditions // (4 * n_workers)))
+    size = min(MAX_AT_ONCE, n_loadings, -(-n_loadings * n_conditions // (4 * n_workers)))
     return [
         Job(condition, start, min(start + size, n_loadings))
         for start in range(0, n_loadings, size)

@@ -7,14 +7,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
-from labseq.config import Choice, Collected, Document, MotionSettings, Override
+from labseq.config import Choice, ProblemCollector, Document, MotionSettings, Override
 from labseq.config.fields import PatternChoice
 from labseq.errors import ConfigError, LimitError, PlanError, Problem
 from labseq.model import MotionSpec, SiteGrid, TargetPattern
 from labseq.plugins import PluginHost
-from labseq.roles import NeverStopped, Planner, Warmable
-from labseq.session.bench_spec import Comparison, Condition, Entrant
-from labseq.session.choosing import Chosen, dump, resolve
+from labseq.roles import NeverStopped, Planner, NeedsWarmUp
+from labseq.session.bench_spec import Comparison, Condition, PlannerEntry
+from labseq.session.choosing import ChosenPlugin, dump, resolve
 from labseq.session.constructing import construct, construct_target
 from labseq.session.plan_inputs import parse_target
 from labseq.session.setting_up import load_plugins
@@ -41,7 +41,7 @@ class Runner:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Course:
+class PreparedCondition:
     """A condition, ready for planning.
 
     Attributes:
@@ -59,7 +59,7 @@ class Course:
     runners: tuple[Runner, ...]
 
 
-def set_up(comparison: Comparison) -> list[Course]:
+def set_up(comparison: Comparison) -> list[PreparedCondition]:
     """Read and validate a comparison, one course per condition.
 
     Raises:
@@ -70,7 +70,7 @@ def set_up(comparison: Comparison) -> list[Course]:
     return [_course(host, comparison, condition) for condition in comparison.conditions]
 
 
-def warm(courses: list[Course]) -> None:
+def warm(courses: list[PreparedCondition]) -> None:
     """Compile all kernels that will be needed, or load them from the cache.
 
     Raises:
@@ -78,26 +78,26 @@ def warm(courses: list[Course]) -> None:
     """
     importlib.import_module("labseq.kernels.plan_check")
     for runner in [runner for course in courses for runner in course.runners]:
-        if isinstance(runner.planner, Warmable):
+        if isinstance(runner.planner, NeedsWarmUp):
             try:
                 runner.planner.warm()
             except Exception as error:
                 raise PlanError(f"warm() raised {type(error).__name__}: {error}", runner.name) from error
 
 
-def _course(host: PluginHost, comparison: Comparison, condition: Condition) -> Course:
-    found = Collected()
+def _course(host: PluginHost, comparison: Comparison, condition: Condition) -> PreparedCondition:
+    found = ProblemCollector()
     grid, motion, target = SiteGrid(*condition.shape), _motion(condition), None
     with found:
         target = _target(host, condition, grid)
     runners: list[Runner] = []
-    for entrant in comparison.entrants:
+    for planner_entry in comparison.planner_entries:
         with found:
-            chosen = _planner(host, comparison, condition, entrant)
+            chosen = _planner(host, comparison, condition, planner_entry)
             runners.append(_runner(chosen, grid, motion, comparison.seed))
     found.raise_any()
     assert target is not None
-    return Course(grid, motion, target, condition.loading, tuple(runners))
+    return PreparedCondition(grid, motion, target, condition.loading, tuple(runners))
 
 
 def _motion(condition: Condition) -> MotionSpec:
@@ -130,20 +130,20 @@ def _target(host: PluginHost, condition: Condition, grid: SiteGrid) -> TargetPat
         raise ConfigError(Problem(str(error), option)) from error
 
 
-def _planner(host: PluginHost, comparison: Comparison, condition: Condition, entrant: Entrant) -> Chosen:
-    name, dop = entrant.planner, condition.degree_of_parallelism
+def _planner(host: PluginHost, comparison: Comparison, condition: Condition, planner_entry: PlannerEntry) -> ChosenPlugin:
+    name, dop = planner_entry.planner, condition.degree_of_parallelism
     overrides: list[Override] = []
     entry = host.registry.find("planner", name)
     if entry is not None and dop is not None and _DOP in getattr(entry.settings_model, "model_fields", {}):
         overrides.append(Override(f"planner.{_DOP}", str(dop), f"--dop {dop}"))
     for key, value in comparison.settings:
         overrides.append(Override(f"planner.{key}", value, f"--set planner.{key}={value}"))
-    for key, value in entrant.settings:
+    for key, value in planner_entry.settings:
         overrides.append(Override(f"planner.{key}", value, comparison.called))
     return _choose(host, Choice(use=name), overrides, comparison.called)
 
 
-def _choose(host: PluginHost, choice: Choice, overrides: list[Override], option: str) -> Chosen:
+def _choose(host: PluginHost, choice: Choice, overrides: list[Override], option: str) -> ChosenPlugin:
     """Resolve a plugin that was named in an option."""
     kind = "pattern" if choice.key == "pattern" else "planner"
     named = Override(f"{kind}.{choice.key}", choice.use, option)
@@ -154,7 +154,7 @@ def _document(overrides: list[Override], top: str) -> Document:
     return Document.parse("{}", "the command line").override_all(overrides, may_add=(top,))
 
 
-def _runner(chosen: Chosen, grid: SiteGrid, motion: MotionSpec, seed: int) -> Runner:
+def _runner(chosen: ChosenPlugin, grid: SiteGrid, motion: MotionSpec, seed: int) -> Runner:
     planner: Planner = construct({"planner": chosen}, grid, motion, NeverStopped(), seed)[0]["planner"]
     dop = getattr(planner, _DOP, None)
     dop = dop if isinstance(dop, int) else motion.max_tweezers

@@ -20,7 +20,7 @@ _LOOK_S: Final = 0.1
 _FAREWELL_S: Final = 1.0
 
 
-def work_through(comparison: Comparison, jobs: Iterable[Job], n_workers: int) -> Generator[Done]:
+def run_jobs(comparison: Comparison, jobs: Iterable[Job], n_workers: int) -> Generator[Done]:
     """Do all jobs, in this process if there is to be one worker only.
 
     Args:
@@ -38,15 +38,15 @@ def work_through(comparison: Comparison, jobs: Iterable[Job], n_workers: int) ->
     if n_workers == 1:
         yield from map(prepare(comparison), jobs)
         return
-    crew: dict[Connection, BaseProcess] = {}
+    workers: dict[Connection, BaseProcess] = {}
     try:
         with _interrupts_ignored():  # a process begins with the signals that its parent ignores
             for _ in range(n_workers):
                 connection, process = _start(comparison)
-                crew[connection] = process
-        yield from _hand_out(crew, iter(jobs))
+                workers[connection] = process
+        yield from _hand_out(workers, iter(jobs))
     finally:
-        _dismiss(crew)
+        _stop_workers(workers)
 
 
 def _start(comparison: Comparison) -> tuple[Connection, BaseProcess]:
@@ -58,9 +58,9 @@ def _start(comparison: Comparison) -> tuple[Connection, BaseProcess]:
     return ours, process
 
 
-def _hand_out(crew: dict[Connection, BaseProcess], jobs: Iterator[Job]) -> Generator[Done]:
+def _hand_out(workers: dict[Connection, BaseProcess], jobs: Iterator[Job]) -> Generator[Done]:
     """Keep every process busy with one job until there are no more."""
-    idle = list(crew)
+    idle = list(workers)
     busy: list[Connection] = []
     connection = idle[0]
     try:
@@ -75,7 +75,7 @@ def _hand_out(crew: dict[Connection, BaseProcess], jobs: Iterator[Job]) -> Gener
                 busy.remove(connection)
                 yield connection.recv()
     except (EOFError, OSError) as error:
-        raise _death(crew[connection]) from error
+        raise _death(workers[connection]) from error
 
 
 def _death(process: BaseProcess) -> LabseqError:
@@ -86,10 +86,10 @@ def _death(process: BaseProcess) -> LabseqError:
     )
 
 
-def _dismiss(crew: dict[Connection, BaseProcess]) -> None:
-    for process in crew.values():
+def _stop_workers(workers: dict[Connection, BaseProcess]) -> None:
+    for process in workers.values():
         process.terminate()
-    for connection, process in crew.items():
+    for connection, process in workers.items():
         connection.close()
         process.join(_FAREWELL_S)
         if process.is_alive():

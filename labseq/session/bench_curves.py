@@ -48,12 +48,12 @@ class Points:
 def points_of(report: Report, figure: Figure) -> list[Points]:
     """Each planner's points, as far as they are done, and the bound where batches are counted."""
     found: list[Points] = []
-    for entrant in report.comparison.entrants:
-        rows = report.rows_of(entrant)
-        label = f"{entrant.label} (scans)" if any(row.scans for row in rows) else entrant.label
+    for planner_entry in report.comparison.planner_entries:
+        rows = report.rows_of(planner_entry)
+        label = f"{planner_entry.label} (scans)" if any(row.scans for row in rows) else planner_entry.label
         found.append(_points(label, rows, figure, [_y(row, figure.y) for row in rows]))
     if figure.y == "n_batches":
-        rows = report.rows_of(report.comparison.entrants[0])
+        rows = report.rows_of(report.comparison.planner_entries[0])
         found.append(_points(BOUND, rows, figure, [row.bound for row in rows]))
     return found
 
@@ -72,7 +72,7 @@ def figure_drawing(report: Report, figure: Figure) -> ComparisonDrawing:
     if figure.paper_points:
         x, y = np.array(figure.paper_points, np.float64).T
         curves.append(Curve("the paper", x, y, np.zeros(len(x)), is_quoted=True))
-    first = report.comparison.entrants[0]
+    first = report.comparison.planner_entries[0]
     histograms = [
         Histogram(f"DOP {row.degree_of_parallelism}", row.counts)
         for row in report.rows_of(first)
@@ -104,7 +104,7 @@ def histogram_drawing(report: Report) -> ComparisonDrawing:
         y_label="",
         counted="batches",
         histograms=tuple(
-            Histogram(f"{row.entrant.label}: {row.n_batches}", row.counts) for row in report.rows
+            Histogram(f"{row.planner_entry.label}: {row.n_batches}", row.counts) for row in report.rows
         ),
     )
 

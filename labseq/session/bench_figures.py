@@ -14,7 +14,7 @@ from typing import Final, Literal
 
 from labseq.config.wording import clean, did_you_mean
 from labseq.errors import ConfigError, Problem, one_of
-from labseq.session.bench_spec import BARE_MOTION, Condition, Entrant, Words
+from labseq.session.bench_spec import BARE_MOTION, Condition, PlannerEntry, Words
 
 Quantity = Literal["n_target_atoms", "degree_of_parallelism", "n_batches", "motion_s"]
 
@@ -40,7 +40,7 @@ class Figure:
     title: str
     x: Quantity
     y: Quantity
-    entrants: tuple[Entrant, ...]
+    planner_entries: tuple[PlannerEntry, ...]
     conditions: tuple[Condition, ...]
     fitted: bool
     paper: str
@@ -52,8 +52,8 @@ class Figure:
         return [replace(condition, motion=(*condition.motion, *motion)) for condition in self.conditions]
 
 
-PSCA: Final = Entrant("psca")
-PSCA_OF_THE_PAPER: Final = Entrant("psca", (("variant", "paper"),))
+PSCA: Final = PlannerEntry("psca")
+PSCA_OF_THE_PAPER: Final = PlannerEntry("psca", (("variant", "paper"),))
 
 EBADI: Final[Words] = (("speed", "75 um/ms"), ("pick_up", "15 us"), ("drop_off", "15 us"))
 """Transport speed and capture time of S. Ebadi et al., Nature 595, 227 (2021)."""
@@ -79,7 +79,7 @@ def _interleaved(side: int) -> Condition:
 
 _COMPACT: Final = tuple(_compact(side) for side in (6, 9, 12, 15))
 _INTERLEAVED: Final = tuple(_interleaved(side) for side in (5, 7, 10, 13, 15, 18, 20))
-_MTA1: Final = (PSCA, PSCA_OF_THE_PAPER, Entrant("mta1"))
+_MTA1: Final = (PSCA, PSCA_OF_THE_PAPER, PlannerEntry("mta1"))
 
 FIGURES: Final[Mapping[str, Figure]] = MappingProxyType(
     {
@@ -90,7 +90,7 @@ FIGURES: Final[Mapping[str, Figure]] = MappingProxyType(
                 title="compact targets, 75 % loading, degree of parallelism 15",
                 x="n_target_atoms",
                 y="n_batches",
-                entrants=(PSCA, PSCA_OF_THE_PAPER, Entrant("lsap_squared")),
+                planner_entries=(PSCA, PSCA_OF_THE_PAPER, PlannerEntry("lsap_squared")),
                 conditions=_COMPACT,
                 fitted=True,
                 paper="PSCA 0.48(2), modified LSAP 1.16(1)",
@@ -100,7 +100,7 @@ FIGURES: Final[Mapping[str, Figure]] = MappingProxyType(
                 title="15 x 15 out of 20 x 20, 75 % loading",
                 x="degree_of_parallelism",
                 y="n_batches",
-                entrants=(PSCA, PSCA_OF_THE_PAPER),
+                planner_entries=(PSCA, PSCA_OF_THE_PAPER),
                 conditions=tuple(Condition((20, 20), "compact:15x15", 0.75, dop) for dop in range(2, 16)),
                 fitted=False,
                 paper="PSCA 160.0(2) batches at 2, 29.61(3) at 15",
@@ -112,7 +112,7 @@ FIGURES: Final[Mapping[str, Figure]] = MappingProxyType(
                 title="interleaved targets, 55 % loading, any degree of parallelism",
                 x="n_target_atoms",
                 y="n_batches",
-                entrants=_MTA1,
+                planner_entries=_MTA1,
                 conditions=_INTERLEAVED,
                 fitted=True,
                 paper="PSCA 0.388(2), MTA1 0.47(1)",
@@ -122,7 +122,7 @@ FIGURES: Final[Mapping[str, Figure]] = MappingProxyType(
                 title="interleaved targets, 55 % loading, any degree of parallelism",
                 x="n_target_atoms",
                 y="motion_s",
-                entrants=_MTA1,
+                planner_entries=_MTA1,
                 conditions=_INTERLEAVED,
                 fitted=True,
                 paper="at 400 atoms PSCA takes a quarter of MTA1's time",

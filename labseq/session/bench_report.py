@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from labseq.errors import LabseqError
 from labseq.model.estimate import Estimate, mean
-from labseq.session.bench_courses import Course
-from labseq.session.bench_spec import Comparison, Condition, Entrant
+from labseq.session.bench_courses import PreparedCondition
+from labseq.session.bench_spec import Comparison, Condition, PlannerEntry
 from labseq.session.bench_statistics import ratio_of_means
 from labseq.session.bench_work import LOADING, RESULT, Done, Failure
 
@@ -69,7 +69,7 @@ class Row:
         counts: int64 (most batches + 1,), number of plans with so many batches.
     """
 
-    entrant: Entrant
+    planner_entry: PlannerEntry
     condition: Condition
     settings: Mapping[str, Any]
     degree_of_parallelism: int
@@ -101,8 +101,8 @@ class Row:
         """Everything but the failure's words, JSON-ready, SI; None for what is not known."""
         rows, cols = self.condition.shape
         values: dict[str, Any] = {
-            "planner": self.entrant.planner,
-            "label": self.entrant.label,
+            "planner": self.planner_entry.planner,
+            "label": self.planner_entry.label,
             "settings": dict(self.settings),
             "degree_of_parallelism": self.degree_of_parallelism,
             "grid": {"rows": rows, "cols": cols},
@@ -143,9 +143,9 @@ class Report:
         """Loadings that were asked for, over all conditions."""
         return self.comparison.n_loadings * len(self.comparison.conditions)
 
-    def rows_of(self, entrant: Entrant) -> list[Row]:
+    def rows_of(self, planner_entry: PlannerEntry) -> list[Row]:
         """The rows of one planner, in the order of the conditions."""
-        return [row for row in self.rows if row.entrant == entrant]
+        return [row for row in self.rows if row.planner_entry == planner_entry]
 
     def as_dict(self) -> dict[str, Any]:
         """Everything, JSON-ready."""
@@ -170,8 +170,8 @@ class Report:
 class Tally:
     """Gathers what comes of the jobs of a comparison."""
 
-    def __init__(self, comparison: Comparison, courses: Sequence[Course]) -> None:
-        n_entrants, n_loadings = len(comparison.entrants), comparison.n_loadings
+    def __init__(self, comparison: Comparison, courses: Sequence[PreparedCondition]) -> None:
+        n_entrants, n_loadings = len(comparison.planner_entries), comparison.n_loadings
         self._comparison = comparison
         self._courses = courses
         self._results = [np.empty((n_entrants, n_loadings), RESULT) for _ in courses]
@@ -191,29 +191,29 @@ class Tally:
         self._loadings[i][span] = done.loadings
         self._is_done[i][span] = True
         for failure in done.failures:
-            key = (i, failure.entrant)
+            key = (i, failure.planner_entry)
             if key not in self._failures or failure.loading < self._failures[key].loading:
                 self._failures[key] = failure
 
     def rows(self) -> tuple[Row, ...]:
         """A row per condition and planner, of what is done."""
         return tuple(
-            self._row(i, entrant)
+            self._row(i, planner_entry)
             for i, done in enumerate(self._is_done)
             if done.any()
-            for entrant in range(len(self._comparison.entrants))
+            for planner_entry in range(len(self._comparison.planner_entries))
         )
 
-    def _row(self, i: int, entrant: int) -> Row:
+    def _row(self, i: int, planner_entry: int) -> Row:
         course, done = self._courses[i], self._is_done[i]
-        results, loadings = self._results[i][entrant, done], self._loadings[i][done]
+        results, loadings = self._results[i][planner_entry, done], self._loadings[i][done]
         right = ~results["failed"]
         good, n_atoms = results[right], course.target.n_atoms
         filled = good["n_defects"] == 0
         planning_s = good["planning_s"] if len(good) else np.array([math.nan])
-        runner = course.runners[entrant]
+        runner = course.runners[planner_entry]
         return Row(
-            entrant=self._comparison.entrants[entrant],
+            planner_entry=self._comparison.planner_entries[planner_entry],
             condition=self._comparison.conditions[i],
             settings=runner.settings,
             degree_of_parallelism=runner.degree_of_parallelism,
@@ -221,7 +221,7 @@ class Tally:
             n_loadings=len(results),
             n_short=int(np.count_nonzero(loadings["n_atoms"] < n_atoms)),
             n_failed=int(np.count_nonzero(~right)),
-            first_failure=self._failures.get((i, entrant)),
+            first_failure=self._failures.get((i, planner_entry)),
             n_batches=mean(good["n_batches"]),
             n_atoms_moved=mean(good["n_atoms_moved"]),
             distance_m=mean(good["distance_m"]),

@@ -25,7 +25,7 @@ _GRID: Final = re.compile(r"\s*(\d{1,6})\s*[xX]\s*(\d{1,6})\s*")
 
 
 @dataclass(frozen=True, slots=True)
-class Entrant:
+class PlannerEntry:
     """A planner as it enters a comparison.
 
     Attributes:
@@ -79,7 +79,7 @@ class Comparison:
         called: What messages name as the place of anything wrong: an option or a figure.
     """
 
-    entrants: tuple[Entrant, ...]
+    planner_entries: tuple[PlannerEntry, ...]
     conditions: tuple[Condition, ...]
     n_loadings: int
     seed: int
@@ -87,7 +87,7 @@ class Comparison:
     called: str = "--planners"
 
 
-def parse_entrants(text: str) -> tuple[Entrant, ...]:
+def parse_entrants(text: str) -> tuple[PlannerEntry, ...]:
     """Read a list of planners, each with the settings that only it has.
 
     Raises:
@@ -98,7 +98,7 @@ def parse_entrants(text: str) -> tuple[Entrant, ...]:
         ['psca', 'psca variant=paper', 'lsap']
     """
     option = clean(f"--planners {text}")
-    entrants: list[Entrant] = []
+    planner_entries: list[PlannerEntry] = []
     for part in _BETWEEN_ENTRANTS.split(text):
         name, _, rest = part.partition(":")
         settings = [setting.partition("=") for setting in _BETWEEN_SETTINGS.split(rest)] if rest else []
@@ -106,11 +106,11 @@ def parse_entrants(text: str) -> tuple[Entrant, ...]:
             expected = "names with commas between them, each perhaps with settings: psca,psca:variant=paper"
             raise ConfigError(Problem("this is no list of planners", option, expected=expected))
         words = tuple((key.strip(), value.strip()) for key, _, value in settings)
-        entrant = Entrant(name.strip(), words)
-        if entrant in entrants:
-            raise ConfigError(Problem(f"'{clean(entrant.label)}' is named twice", option, expected="once"))
-        entrants.append(entrant)
-    return tuple(entrants)
+        planner_entry = PlannerEntry(name.strip(), words)
+        if planner_entry in planner_entries:
+            raise ConfigError(Problem(f"'{clean(planner_entry.label)}' is named twice", option, expected="once"))
+        planner_entries.append(planner_entry)
+    return tuple(planner_entries)
 
 
 def parse_grid(text: str) -> tuple[int, int]:

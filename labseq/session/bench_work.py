@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from labseq.errors import PlanError
 from labseq.model import MotionSpec, Occupancy, Plan, SiteGrid, TargetPattern
 from labseq.motion import check_plan
-from labseq.session.bench_courses import Course, Runner, set_up, warm
+from labseq.session.bench_courses import PreparedCondition, Runner, set_up, warm
 from labseq.session.bench_spec import Comparison
 
 RESULT: Final = np.dtype(
@@ -87,7 +87,7 @@ class Failure:
         message: What went wrong.
     """
 
-    entrant: int
+    planner_entry: int
     condition: int
     loading: int
     message: str
@@ -162,7 +162,7 @@ def lines_to_cover(vacancies: NDArray[np.bool_]) -> NDArray[np.int32]:
     return np.count_nonzero(matched.reshape(n_loadings, n_rows) >= 0, axis=1).astype(np.int32)
 
 
-def work(courses: list[Course], seed: int, job: Job) -> Done:
+def work(courses: list[PreparedCondition], seed: int, job: Job) -> Done:
     """Let every planner plan the loadings of a job, and check and count its plans.
 
     Args:
@@ -186,8 +186,8 @@ def work(courses: list[Course], seed: int, job: Job) -> Done:
             try:
                 rows.append(_run(course, runner, scan, occupancy))
             except Exception as error:  # noqa: BLE001 - a planner may raise anything; it is counted
-                if not any(failure.entrant == i for failure in failures):
-                    failures.append(Failure(i, job.condition, index, _told(error)))
+                if not any(failure.planner_entry == i for failure in failures):
+                    failures.append(Failure(i, job.condition, index, _format_error(error)))
                 rows.append(_FAILED)
         results[i] = rows
     return Done(job, results, loadings, tuple(failures))
@@ -202,7 +202,7 @@ def prepare(comparison: Comparison) -> Callable[[Job], Done]:
     return lambda job: work(courses, comparison.seed, job)
 
 
-def _run(course: Course, runner: Runner, scan: Scan | None, occupancy: Occupancy) -> tuple[Any, ...]:
+def _run(course: PreparedCondition, runner: Runner, scan: Scan | None, occupancy: Occupancy) -> tuple[Any, ...]:
     own = occupancy.copy()  # so that a planner that writes into its input harms only itself
     scanned: Scanned | None = None
     start_s = perf_counter()
@@ -242,7 +242,7 @@ def _n_sites(plan: Plan) -> int:
     return int(np.abs(plan.moves[:, 2:] - plan.moves[:, :2]).sum())
 
 
-def _told(error: Exception) -> str:
+def _format_error(error: Exception) -> str:
     if isinstance(error, PlanError):
         return str(error)
     text = str(error)

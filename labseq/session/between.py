@@ -10,7 +10,7 @@ from labseq.session.policies import Checks
 from labseq.session.stopping import look_for_stop
 
 
-class Between:
+class ShotHooks:
     """Looks for a request to stop, and at what the last shots came to; puts down what is skipped.
 
     Args:

@@ -9,7 +9,7 @@ from shlex import quote
 from typing import Any, Final, Literal
 
 from labseq.calibrations import Store, Stored, check_grid
-from labseq.config import Collected, Document, ProfileSpec, keeping_dir, load_profile
+from labseq.config import ProblemCollector, Document, ProfileSpec, profile_dir, load_profile
 from labseq.config.calibrations import OFF
 from labseq.errors import ConfigError, LimitError
 from labseq.model import CALIBRATION_KINDS, CalibrationEntry, CalibrationKind, SiteGrid
@@ -29,7 +29,7 @@ PLACES: Final = frozenset({"threshold", "width", "sites", "frame", "centre_px", 
 
 
 @dataclass(frozen=True, slots=True)
-class Calibrated:
+class ActiveCalibrations:
     """A profile's calibrations in use.
 
     Attributes:
@@ -53,7 +53,7 @@ def store_of(
         profile: What it says.
         dry_run: "off", "full" or "fast"; a profile of virtual devices alone is the same lab in a dry run.
     """
-    folder = profile.calibrations.folder or keeping_dir(document.path) / FOLDER / document.path.stem
+    folder = profile.calibrations.folder or profile_dir(document.path) / FOLDER / document.path.stem
     choices = [profile.camera, profile.static_tweezers, profile.mobile_tweezers, *profile.devices.values()]
     is_other = dry_run != "off" and any(not choice.use.startswith(VIRTUAL_TWIN) for choice in choices)
     return Store(Path(folder) / DRY_RUN_FOLDER if is_other else Path(folder))
@@ -76,11 +76,11 @@ def open_store(profile: str, dry_run: Literal["off", "full", "fast"] = "off") ->
 def calibrated(
     document: Document,
     profile: ProfileSpec,
-    found: Collected,
+    found: ProblemCollector,
     dry_run: Literal["off", "full", "fast"] = "off",
     detector: Mapping[str, Any] | None = None,
     pins: Mapping[str, str] | None = None,
-) -> Calibrated:
+) -> ActiveCalibrations:
     """Read the calibrations that a profile goes by, and apply those of the tones.
 
     Args:
@@ -98,7 +98,7 @@ def calibrated(
             store.active()
         except ConfigError as error:  # told once, not for each kind
             found.add(error)
-            return Calibrated(entries, grid)
+            return ActiveCalibrations(entries, grid)
     for kind in CALIBRATION_KINDS:
         with found:
             if pins is None:
@@ -112,7 +112,7 @@ def calibrated(
     tones = grid
     with found:
         tones = _with_tones(document, grid, entries)
-    return Calibrated(entries, tones, tuple(warnings))
+    return ActiveCalibrations(entries, tones, tuple(warnings))
 
 
 def calibrated_grid(document: Document, profile: ProfileSpec) -> SiteGrid:
@@ -121,7 +121,7 @@ def calibrated_grid(document: Document, profile: ProfileSpec) -> SiteGrid:
     Raises:
         ConfigError: A calibration that it goes by cannot be used.
     """
-    found = Collected()
+    found = ProblemCollector()
     grid = calibrated(document, profile, found).grid
     found.raise_any()
     return grid

@@ -9,7 +9,7 @@ from typing import Any
 
 
 @dataclass(frozen=True, slots=True)
-class Losses:
+class AtomLosses:
     """What atoms are lost to although nobody moves them, and how often one is missed.
 
     Attributes:
@@ -25,7 +25,7 @@ class Losses:
     false_negative: float | None = None
 
     @classmethod
-    def of(cls, devices: Mapping[str, Any]) -> Losses | None:
+    def of(cls, devices: Mapping[str, Any]) -> AtomLosses | None:
         """What a run's simulation says of itself; None without one, or if it does not tell.
 
         Args:
@@ -42,7 +42,7 @@ class Losses:
         return cls(lifetime_s, loss, exposure_s, missed) if makes_sense else None
 
 
-def ceiling(n_atoms: int, period_s: float, exposure_s: float, losses: Losses) -> float:
+def max_defect_free(n_atoms: int, period_s: float, exposure_s: float, losses: AtomLosses) -> float:
     """The highest probability that an array is seen defect-free on the image that ends a cycle.
 
     Between the moment in which an atom is seen on one image and that on the next one,
@@ -61,7 +61,7 @@ def ceiling(n_atoms: int, period_s: float, exposure_s: float, losses: Losses) ->
         n_atoms: Atoms of the target, N.
         period_s: From the start of an exposure to the start of the next one, T.
         exposure_s: Exposure time.
-        losses: See :class:`Losses`.
+        losses: See :class:`AtomLosses`.
 
     Example:
         >>> paper = Losses(lifetime_s=33.0, imaging_loss=0.00314, imaging_loss_exposure_s=0.045)

@@ -78,7 +78,7 @@ def _code(was: Mapping[str, Any] | None, now: Mapping[str, Any] | None) -> list[
     if before == after != _UNKNOWN:
         return []
     what = "labseq's code without a commit"
-    return [Change(what, _told(before), _told(after))]
+    return [Change(what, _code_text(before), _code_text(after))]
 
 
 def _uncommitted(state: Mapping[str, Any]) -> str:
@@ -88,7 +88,7 @@ def _uncommitted(state: Mapping[str, Any]) -> str:
     return str(state.get("code_sha256", _UNKNOWN))
 
 
-def _told(uncommitted: str) -> str:
+def _code_text(uncommitted: str) -> str:
     if uncommitted == _UNKNOWN:
         return "something that nobody can compare"
     return f"changed in a way known as {uncommitted[:12]}" if uncommitted else "as committed"

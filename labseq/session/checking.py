@@ -15,7 +15,7 @@ from labseq.errors import LabseqError, Problem
 from labseq.lines import spans_on
 from labseq.model import TimelineEntry
 from labseq.motion import check_plan
-from labseq.roles import KnownLoading, Step
+from labseq.roles import ReportsLoading, Step
 from labseq.sequencer import Guard, StopFlag
 from labseq.sequencer.calling import lay_out
 from labseq.sequencer.lab import Lab
@@ -27,7 +27,7 @@ from labseq.units import format_quantity
 
 N_LOADINGS: Final = 200
 """Random loadings that the planner is tried on."""
-PATIENCE_S: Final = 5.0
+MAX_WAIT_S: Final = 5.0
 """Host time after which no further loading is tried."""
 PAPERS_LOADING: Final = 0.75
 """Loading probability where the profile has no simulation that tells it."""
@@ -89,7 +89,7 @@ class CheckReport:
     @property
     def shortest_shot_s(self) -> float:
         """Duration of a shot that leaves out what it may leave out."""
-        return sum(bar.least_s for bar in self.bars)
+        return sum(bar.min_duration_s for bar in self.bars)
 
     @property
     def n_images(self) -> int:
@@ -125,7 +125,7 @@ def check(session: Session) -> CheckReport:
     warnings += _parallelism_warnings(session)
     warnings += _deadline_warnings(session, lab, timeline)
     warnings += timeout_warnings(assembly, timeline)
-    for point in session.course.each_lab():
+    for point in session.course.representative_labs():
         session.build_lab(point)  # whether the constructors accept the settings
     warnings += [Problem(text) for text in assembly.bench.host.notes]
     return CheckReport(
@@ -143,7 +143,7 @@ def check(session: Session) -> CheckReport:
 def _run_s(session: Session, lab: Lab) -> tuple[float, float]:
     """Least and most duration of the run, each shot at its own point of the scan, or at any corner of it."""
     guard = Guard(StopFlag())
-    least_s, most_s = list[float](), list[float]()
+    min_duration_s, most_s = list[float](), list[float]()
     for point, n in session.course.counted():
         context = replace(lab.step_context, motion=point.bench.profile.motion)
         bars = [
@@ -151,10 +151,10 @@ def _run_s(session: Session, lab: Lab) -> tuple[float, float]:
             for i, (name, step) in enumerate(point.steps)
             for bar in guard.call("step", lab.timeouts.call_s, lay_out, step, i, name, context)
         ]
-        least_s.append(n * sum(bar.least_s for bar in bars))
+        min_duration_s.append(n * sum(bar.min_duration_s for bar in bars))
         most_s.append(n * sum(bar.duration_s for bar in bars))
     guard.end()
-    return (min(least_s), max(most_s)) if session.course.is_adaptive else (sum(least_s), sum(most_s))
+    return (min(min_duration_s), max(most_s)) if session.course.is_adaptive else (sum(min_duration_s), sum(most_s))
 
 
 def _windows(steps: Sequence[tuple[str, Step]]) -> list[tuple[int, list[float]]]:
@@ -171,11 +171,11 @@ def _windows(steps: Sequence[tuple[str, Step]]) -> list[tuple[int, list[float]]]
 def _rehearse(lab: Lab) -> tuple[Rehearsal | None, str]:
     """Plan for random loadings; what the planner does wrong is told, not raised."""
     loading = (
-        lab.simulation.loading_probability if isinstance(lab.simulation, KnownLoading) else PAPERS_LOADING
+        lab.simulation.loading_probability if isinstance(lab.simulation, ReportsLoading) else PAPERS_LOADING
     )
     rng, guard = np.random.default_rng(0), Guard(StopFlag())
     durations, firsts, n_filled = list[float](), list[float](), 0
-    deadline = time.monotonic() + PATIENCE_S
+    deadline = time.monotonic() + MAX_WAIT_S
     try:
         while len(durations) < N_LOADINGS and time.monotonic() < deadline:
             occupancy = rng.random(lab.grid.shape) < loading

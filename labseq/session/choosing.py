@@ -34,7 +34,7 @@ HARDWARE_KINDS: Final = frozenset({"camera", "static_tweezers", "mobile_tweezers
 
 
 @dataclass(frozen=True, slots=True)
-class Chosen:
+class ChosenPlugin:
     """A registry entry and the settings it will be constructed with.
 
     Attributes:
@@ -70,7 +70,7 @@ class Chosen:
 
 
 @dataclass(frozen=True, slots=True)
-class Bench:
+class ResolvedProfile:
     """A profile with its plugins chosen, before anything is opened.
 
     Attributes:
@@ -88,7 +88,7 @@ class Bench:
     profile: ProfileSpec
     host: PluginHost
     grid: SiteGrid
-    chosen: Mapping[str, Chosen]
+    chosen: Mapping[str, ChosenPlugin]
     warnings: tuple[str, ...]
     refused: Mapping[str, ConfigError] = field(default_factory=dict[str, ConfigError])
     calibrations: Mapping[str, CalibrationEntry] = field(default_factory=dict[str, CalibrationEntry])
@@ -106,7 +106,7 @@ class Bench:
 
 def resolve(
     host: PluginHost, document: Document, kind: str, choice: Choice, drop: frozenset[str] = frozenset()
-) -> Chosen:
+) -> ChosenPlugin:
     """Find what a file names and validate the settings given there.
 
     Args:
@@ -122,7 +122,7 @@ def resolve(
     """
     entry = named(host, document, kind, choice.use, (*choice.loc, choice.key))
     settings = validate(document, entry, choice.loc, drop | {choice.key})
-    return Chosen(entry, settings, document, choice.loc)
+    return ChosenPlugin(entry, settings, document, choice.loc)
 
 
 def named(
@@ -158,14 +158,14 @@ def validate(
     Raises:
         ConfigError: They are wrong, or the plugin's own validators fail; with their place.
     """
-    also_known = sorted(drop - {"use", "pattern"})
+    other_keys = sorted(drop - {"use", "pattern"})
     called = f"{entry.kind.replace('_', ' ')} '{entry.name}'"
     try:
         return contained(
             entry.owner,
             f"the settings model of {called}",
             lambda: document.validate(
-                entry.settings_model, loc, drop=drop, also_known=also_known, called=called
+                entry.settings_model, loc, drop=drop, other_keys=other_keys, called=called
             ),
             watch=False,
         )
@@ -179,7 +179,7 @@ def choose(
     kind: str,
     choice: Choice,
     dry_run: DryRun = "off",
-) -> tuple[Chosen, str]:
+) -> tuple[ChosenPlugin, str]:
     """Choose the entry that plays a role, in a dry run its simulated counterpart.
 
     Returns:
@@ -189,7 +189,7 @@ def choose(
     if dry_run == "off" or kind not in HARDWARE_KINDS or choice.use == VIRTUAL_TWIN:
         return resolve(host, document, kind, choice, drop), ""
     entry = host.registry.get(kind, VIRTUAL_TWIN)
-    twin = Chosen(entry, _defaults(entry), document, choice.loc)
+    twin = ChosenPlugin(entry, _defaults(entry), document, choice.loc)
     if dry_run == "fast":
         return twin, ""
     if absence := _absence(host, kind, choice.use):

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 
 from labseq.config import Loc
 from labseq.errors import ConfigError, LabseqError, Problem
-from labseq.roles import KnownCommands
+from labseq.roles import ChecksCommands
 from labseq.sequencer import Guard, StopFlag
 from labseq.sequencer.lab import Lab
 from labseq.sequencer.leading import FollowStep, find_leader, leaders
@@ -50,7 +50,7 @@ def check_commands(assembly: Assembly, points: Iterable[Point], build: Callable[
 
 def _failure(guard: Guard, lab: Lab, step: DeviceStep) -> LabseqError | None:
     device = lab.devices.get(step.device)
-    if not isinstance(device, KnownCommands):
+    if not isinstance(device, ChecksCommands):
         return None
     check, timeout_s = device.check_command, lab.timeouts.call_s
     try:

@@ -32,7 +32,7 @@ from labseq.roles import (
     StaticTweezers,
     Step,
 )
-from labseq.session.choosing import Chosen
+from labseq.session.choosing import ChosenPlugin
 
 _ROLES: Final[Mapping[str, type]] = {
     "camera": Camera,
@@ -50,7 +50,7 @@ _ROLES: Final[Mapping[str, type]] = {
 
 
 def construct(
-    chosen: Mapping[str, Chosen],
+    chosen: Mapping[str, ChosenPlugin],
     grid: SiteGrid,
     motion: MotionSpec,
     clock: Clock,
@@ -90,7 +90,7 @@ def construct(
 
 
 def construct_each(
-    chosen: Mapping[str, Chosen],
+    chosen: Mapping[str, ChosenPlugin],
     grid: SiteGrid,
     motion: MotionSpec,
     clock: Clock,
@@ -122,7 +122,7 @@ def construct_each(
     return made, tuple(streams), refused
 
 
-def construct_one(chosen: Chosen, context: Context | ScanSpace) -> Any:
+def construct_one(chosen: ChosenPlugin, context: Context | ScanSpace) -> Any:
     """Construct the object of one role; that of a scanner is given what it may choose from.
 
     Raises:
@@ -156,7 +156,7 @@ def construct_role(entry: Entry, *arguments: Any) -> Any:
     return contained(entry.owner, f"the constructor of {entry.kind} '{entry.name}'", make)
 
 
-def construct_target(chosen: Chosen, grid: SiteGrid) -> TargetPattern:
+def construct_target(chosen: ChosenPlugin, grid: SiteGrid) -> TargetPattern:
     """Make a target of its pattern.
 
     Raises:

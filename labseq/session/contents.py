@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any, Final
 
-from labseq.config import Collected, Document, SequenceSpec, StepSpec
+from labseq.config import ProblemCollector, Document, SequenceSpec, StepSpec
 from labseq.config.analyses import ANALYSIS_KEYS
 from labseq.config.settings import Settings
 from labseq.errors import ConfigError, LabseqError, PluginLoadError, one_of
 from labseq.model import TargetPattern
 from labseq.roles import Context, Step
-from labseq.session.choosing import Bench, dump, named, resolve, validate
+from labseq.session.choosing import ResolvedProfile, dump, named, resolve, validate
 from labseq.session.constructing import construct_one, construct_role, construct_target
 
 DEVICE_KEYS: Final = {"device": "name", "equalise": "device", "wait": "device"}
@@ -19,7 +19,7 @@ DEVICE_KEYS: Final = {"device": "name", "equalise": "device", "wait": "device"}
 
 
 def make_target(
-    bench: Bench, document: Document, sequence: SequenceSpec
+    bench: ResolvedProfile, document: Document, sequence: SequenceSpec
 ) -> tuple[TargetPattern, dict[str, Any]]:
     """The target of a sequence, and its settings for the record.
 
@@ -40,7 +40,7 @@ def make_target(
 
 
 def make_steps(
-    bench: Bench, document: Document, sequence: SequenceSpec, found: Collected
+    bench: ResolvedProfile, document: Document, sequence: SequenceSpec, found: ProblemCollector
 ) -> tuple[list[tuple[str, Step]], list[dict[str, Any]]]:
     """Name and step, in order, and the settings of each for the record.
 
@@ -67,7 +67,7 @@ def make_steps(
     return steps, dumps
 
 
-def make_step(bench: Bench, document: Document, spec: StepSpec) -> tuple[Step, dict[str, Any]]:
+def make_step(bench: ResolvedProfile, document: Document, spec: StepSpec) -> tuple[Step, dict[str, Any]]:
     """A step of a sequence, and its settings for the record.
 
     Raises:
@@ -84,7 +84,7 @@ def make_step(bench: Bench, document: Document, spec: StepSpec) -> tuple[Step, d
 
 
 def make_analyses(
-    bench: Bench, document: Document, sequence: SequenceSpec, found: Collected
+    bench: ResolvedProfile, document: Document, sequence: SequenceSpec, found: ProblemCollector
 ) -> list[dict[str, Any]]:
     """What is worked out from each shot: the settings of each analysis for the record.
 
@@ -106,7 +106,7 @@ def make_analyses(
     return dumps
 
 
-def _check_device_name(bench: Bench, document: Document, settings: Settings | None, spec: StepSpec) -> None:
+def _check_device_name(bench: ResolvedProfile, document: Document, settings: Settings | None, spec: StepSpec) -> None:
     key = DEVICE_KEYS[spec.kind]
     name = getattr(settings, key, None)
     if name is not None and name not in bench.profile.devices:
@@ -115,7 +115,7 @@ def _check_device_name(bench: Bench, document: Document, settings: Settings | No
         raise ConfigError(replace(problem, notes=(_place(bench.document, "devices"),)))
 
 
-def _grid_note(bench: Bench) -> str:
+def _grid_note(bench: ResolvedProfile) -> str:
     grid = bench.grid
     return f"the grid has {grid.n_rows} x {grid.n_cols} sites: {_place(bench.document, 'grid')}"
 

@@ -12,14 +12,14 @@ from typing import Any, Final
 from labseq.config import profile_overrides
 from labseq.errors import DeviceError, LabseqError, StopRequested
 from labseq.recording import data_root, marker_roots
-from labseq.roles import Hardware, Listening, SelfTesting, Simulation, Warmable
+from labseq.roles import Hardware, ReceivesOutput, HasSelfTest, Simulation, NeedsWarmUp
 from labseq.sequencer import Guard, RealClock, StopFlag, VirtualClock
 from labseq.sequencer.lab import Timeouts
 from labseq.session.choosing import DryRun, check_dry_run
-from labseq.session.holding import devices_held
+from labseq.session.holding import lock_devices
 from labseq.session.labs import timeouts_of
 from labseq.session.safe import attempt, construct_hardware
-from labseq.session.setting_up import set_up_bench
+from labseq.session.setting_up import resolve_profile
 from labseq.session.signals import stop_on_signals
 from labseq.session.warming import WARM_S
 
@@ -94,26 +94,26 @@ def check_devices(profile: str, overrides: Sequence[str] = (), dry_run: DryRun =
     """
     check_dry_run(dry_run)
     roots = marker_roots(data_root())
-    bench = set_up_bench(profile, overrides=profile_overrides(overrides), dry_run=dry_run)
+    bench = resolve_profile(profile, overrides=profile_overrides(overrides), dry_run=dry_run)
     stop = StopFlag()
     is_virtual = dry_run != "off" or bench.virtual_time
     clock = VirtualClock(stop) if is_virtual else RealClock(stop)
     warnings = [*bench.warnings]
     with ExitStack() as stack:
         if not is_virtual:
-            stack.enter_context(devices_held(bench, roots, "labseq devices", warnings.append))
+            stack.enter_context(lock_devices(bench, roots, "labseq devices", warnings.append))
         stack.enter_context(stop_on_signals(stop))
         made, refused = construct_hardware(bench, clock)
         simulation = made.pop("simulation", None)
         in_order = sorted(made.items(), key=lambda item: _OPENING.get(item[0], 2))
-        devices = try_devices(in_order, timeouts_of(bench.profile), stop, simulation)
+        devices = check_each_device(in_order, timeouts_of(bench.profile), stop, simulation)
     devices += [CheckedDevice(name, constructed=False, failure=error) for name, error in refused.items()]
     plugins = {name: chosen.entry.name for name, chosen in bench.chosen.items()}
     stopped = StopRequested(stop.signal_number) if stop.is_set else None
     return DevicesReport(devices, plugins, [*warnings, *bench.host.notes], stopped)
 
 
-def try_devices(
+def check_each_device(
     devices: Iterable[tuple[str, Hardware]],
     timeouts: Timeouts,
     stop: StopFlag,
@@ -158,7 +158,7 @@ def _examined(guard: Guard, name: str, device: Hardware | Simulation, timeouts: 
     """Open, identify and test a device, as far as it goes."""
     found = CheckedDevice(name)
     try:
-        if isinstance(device, Warmable) and not isinstance(device, Listening):
+        if isinstance(device, NeedsWarmUp) and not isinstance(device, ReceivesOutput):
             guard.call(name, WARM_S, device.warm)  # else a self test might have to compile within its timeout
         guard.call_to_the_end(name, timeouts.call_s, device.open)
         described: Any = guard.call(name, timeouts.call_s, device.describe)
@@ -166,7 +166,7 @@ def _examined(guard: Guard, name: str, device: Hardware | Simulation, timeouts: 
             text = f"describe() gave a {type(described).__name__}; expected a mapping"
             raise DeviceError(name, text)
         found = replace(found, described=described)
-        if isinstance(device, SelfTesting):
+        if isinstance(device, HasSelfTest):
             guard.call(name, timeouts.call_s, device.self_test)
             found = replace(found, tested=True)
         readings_s = [_reading_s(guard, name, device, timeouts.call_s) for _ in range(N_READINGS)]

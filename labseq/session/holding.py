@@ -9,12 +9,12 @@ from pathlib import Path
 from labseq.errors import DeviceError
 from labseq.locks import Holder, Lock, knows_no_locks
 from labseq.recording import lock_files
-from labseq.session.choosing import Bench
+from labseq.session.choosing import ResolvedProfile
 
 
 @contextmanager
-def devices_held(
-    bench: Bench, roots: Sequence[Path], what: str, warn: Callable[[str], object], *, in_spite: bool = False
+def lock_devices(
+    bench: ResolvedProfile, roots: Sequence[Path], what: str, warn: Callable[[str], object], *, in_spite: bool = False
 ) -> Generator[Callable[[str], None]]:
     """Keep everybody else from a profile's devices in the block.
 
@@ -59,11 +59,11 @@ def devices_held(
             if not locks:
                 warn("no lock could be had: nothing keeps another run from the same devices")
 
-        def tell(text: str) -> None:
+        def describe(text: str) -> None:
             for lock in locks:
-                lock.tell(text)
+                lock.describe(text)
 
-        yield tell
+        yield describe
 
 
 def _refusal(holder: Holder) -> str:

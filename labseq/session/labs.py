@@ -12,7 +12,7 @@ from labseq.roles import Clock
 from labseq.sequencer import PacedClock, RealClock, StopFlag, VirtualClock
 from labseq.sequencer.interlock import Blinding
 from labseq.sequencer.lab import Lab, Timeouts
-from labseq.session.choosing import Bench, Chosen
+from labseq.session.choosing import ResolvedProfile, ChosenPlugin
 from labseq.session.constructing import construct
 from labseq.session.scan import Point
 from labseq.session.wiring import refuse_wrong_wiring
@@ -125,7 +125,7 @@ def rebuild_lab(lab: Lab, before: Point, after: Point, seed: int) -> tuple[Lab, 
     ), reopened
 
 
-def _reopened(lab: Lab, before: Bench, after: Bench) -> frozenset[str]:
+def _reopened(lab: Lab, before: ResolvedProfile, after: ResolvedProfile) -> frozenset[str]:
     names = {name for name, _ in lab.hardware()} | ({"simulation"} if lab.simulation is not None else set())
     changed = {name for name in names if _differs(before, after, name)}
     moved = _changed_motion(before.profile.mobile_tweezers, after.profile.mobile_tweezers)
@@ -136,7 +136,7 @@ def _reopened(lab: Lab, before: Bench, after: Bench) -> frozenset[str]:
     return frozenset(changed)
 
 
-def _differs(before: Bench, after: Bench, name: str) -> bool:
+def _differs(before: ResolvedProfile, after: ResolvedProfile, name: str) -> bool:
     old, new = before.chosen[name], after.chosen[name]
     return (old.entry, old.settings) != (new.entry, new.settings)
 
@@ -156,7 +156,7 @@ def _blinding(profile: ProfileSpec) -> dict[str, Blinding]:
     return {name: Blinding(mark.value, mark.when) for name, mark in marks.items() if mark is not None}
 
 
-def parallelism_of(planner: Chosen, made: Any, motion: MotionSpec) -> int:
+def parallelism_of(planner: ChosenPlugin, made: Any, motion: MotionSpec) -> int:
     """Most mobile tweezers that a batch of a planner may use, as it says, else what the motion bears."""
     dop = contained(
         planner.entry.owner,

@@ -11,7 +11,7 @@ from labseq.model import CycleRecord, ShotRecord, StageTiming
 from labseq.plugins import PluginHost
 from labseq.roles import RunObserver
 from labseq.sequencer import Guard, StopFlag
-from labseq.session.analysts import Analysts
+from labseq.session.analysts import AnalysisProcesses
 
 _QUIET: Final = frozenset({"image", "cycle", "state", "compiling", "compiled", "run_finished"})
 """Events that the shot files tell better than the log would, and the one that the writer logs itself."""
@@ -20,7 +20,7 @@ _HOOKS: Final = {  # event -> hook of plugins, and what it is told of the event'
     "shot_finished": ("labseq_shot_finished", {"shot": "shot"}),
     "run_finished": ("labseq_run_finished", {"run": "record"}),
 }
-PATIENCE_S: Final = 5.0
+MAX_WAIT_S: Final = 5.0
 """How long a plugin's observer hook may take; one that takes longer is not called again in the run."""
 
 
@@ -36,7 +36,7 @@ class Observers:
         self._observer = observer
         self._guard = Guard(StopFlag())
         self._given_up: set[str] = set()
-        self._analysts: Analysts | None = None
+        self._analysts: AnalysisProcesses | None = None
         self.log: Callable[..., None] | None = None
 
     def event(self, name: str, values: Mapping[str, Any]) -> None:
@@ -47,14 +47,14 @@ class Observers:
         if name == "shot_finished" and self._analysts is not None:
             self._analysts.look()
 
-    def tell_of_plugins(self) -> None:
+    def report_plugin_changes(self) -> None:
         """Tell what the plugins in use have done to the process, from loading to constructing."""
         for text in self._host.notes:
             self.event("warning", {"text": text})
 
     def analyse(self, run_dir: Path, analyses: Sequence[Mapping[str, Any]]) -> None:
         """Start what analyses the run's shots, each in a process of its own."""
-        self._analysts = Analysts(run_dir, analyses, lambda text: self.event("warning", {"text": text}))
+        self._analysts = AnalysisProcesses(run_dir, analyses, lambda text: self.event("warning", {"text": text}))
 
     def finish_analyses(self) -> None:
         """Let the analyses finish; when the devices are safe."""
@@ -74,7 +74,7 @@ class Observers:
             if plugin in self._given_up:
                 continue
             try:
-                self._guard.call_to_the_end(plugin, PATIENCE_S, tell)
+                self._guard.call_to_the_end(plugin, MAX_WAIT_S, tell)
             except LabseqError as error:
                 if isinstance(error, DeviceTimeoutError):
                     self._given_up.add(plugin)

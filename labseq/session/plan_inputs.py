@@ -29,7 +29,7 @@ from labseq.errors import ConfigError, LimitError, Problem
 from labseq.model import MotionSpec, SiteGrid, TargetPattern
 from labseq.plugins import PluginHost
 from labseq.session.calibrating import calibrated_grid
-from labseq.session.choosing import Chosen, resolve
+from labseq.session.choosing import ChosenPlugin, resolve
 from labseq.session.constructing import construct_target
 from labseq.session.occupancies import Source
 from labseq.session.setting_up import load_plugins
@@ -85,7 +85,7 @@ class PlanInputs:
 
     machine: Machine
     target: TargetPattern
-    planner: Chosen
+    planner: ChosenPlugin
 
 
 def read_inputs(request: PlanRequest, source: Source) -> PlanInputs:
@@ -236,7 +236,7 @@ def _make_target(
         raise document.error(choice.loc, str(error)) from error
 
 
-def _planner(host: PluginHost, request: PlanRequest, settings: Sequence[Override]) -> Chosen:
+def _planner(host: PluginHost, request: PlanRequest, settings: Sequence[Override]) -> ChosenPlugin:
     option = f"--planner {request.planner}"
     if not _NAME.fullmatch(request.planner):
         raise ConfigError(Problem("this is no name of a planner", clean(option), expected="a name"))

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from labseq.config import CheckSettings, Collected, Document, SequenceSpec, StepPolicySettings, StepSpec
+from labseq.config import CheckSettings, ProblemCollector, Document, SequenceSpec, StepPolicySettings, StepSpec
 from labseq.errors import CheckFailedError
 from labseq.recording import figures_in
 from labseq.roles import Repeatable, Step
@@ -21,7 +21,7 @@ _CHECKED: Final = "to check"
 
 
 def make_policy(
-    document: Document, sequence: SequenceSpec, steps: Sequence[tuple[str, Step]], found: Collected
+    document: Document, sequence: SequenceSpec, steps: Sequence[tuple[str, Step]], found: ProblemCollector
 ) -> RunPolicy:
     """What holds for a run and its steps.
 
@@ -50,7 +50,7 @@ def make_policy(
         if check.then == "skip_point" and sequence.scan is None:
             what = "there is no scan whose points could be skipped"
             found.add(document.error((*place, "then"), what, "'warn' or 'stop'"))
-    return RunPolicy(sequence.attempts, own.used_up, otherwise, tuple(policies))
+    return RunPolicy(sequence.attempts, own.when_exhausted, otherwise, tuple(policies))
 
 
 def with_policies(
@@ -130,7 +130,7 @@ class Checks:
             CheckFailedError: A value is beyond the limits of a check that stops the run.
         """
         skipped = ""
-        self._tell_unseen(row)
+        self._warn_unchecked(row)
         for check, told in self._look(row):
             if check.then == "stop":
                 raise CheckFailedError(told, check.value)
@@ -140,7 +140,7 @@ class Checks:
                 self._warn(f"shot {row['shot'] + 1}: {told}")
         return skipped
 
-    def _tell_unseen(self, row: Mapping[str, Any]) -> None:
+    def _warn_unchecked(self, row: Mapping[str, Any]) -> None:
         """Tell, after the first shot, of the values that it has not: their names may be misspelt."""
         figures = figures_in(row) if self._unseen else {}
         for value in sorted(self._unseen.difference(figures)):

@@ -11,7 +11,7 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any, Final, Literal, cast, get_args
 
-from labseq.config import Kept, find_profile
+from labseq.config import StoredText, find_profile
 from labseq.config.reading import decode, read_bytes
 from labseq.config.wording import visible
 from labseq.errors import ConfigError, Problem, RecordingError
@@ -62,9 +62,9 @@ class Entry:
     owner: Owner | None = None
 
     @property
-    def kept(self) -> Kept:
+    def kept(self) -> StoredText:
         """The text, to be read in place of the file."""
-        return Kept(self.text, f"{self.sequence} (as queued)")
+        return StoredText(self.text, f"{self.sequence} (as queued)")
 
     @property
     def is_interrupted(self) -> bool:

@@ -98,7 +98,7 @@ class QueueRun:
     def _work(self, entry: Entry) -> None:
         self._tried.add(entry.id)
         self._begin(entry)
-        note = _Note(self._queue, replace(entry, status="running", owner=Owner.current(), error=""))
+        note = _EntryObserver(self._queue, replace(entry, status="running", owner=Owner.current(), error=""))
         note.write()
         try:
             self._take(lambda observer: _open(entry, note.beside(observer)))
@@ -120,7 +120,7 @@ class QueueRun:
             self._queue.drop(entry.id)
 
 
-class _Note:
+class _EntryObserver:
     """What is known of an entry that is being taken; implements ``RunObserver``."""
 
     def __init__(self, queue: Queue, entry: Entry) -> None:
@@ -128,7 +128,7 @@ class _Note:
         self._entry = entry
         self._observer: RunObserver | None = None
 
-    def beside(self, observer: RunObserver | None) -> _Note:
+    def beside(self, observer: RunObserver | None) -> _EntryObserver:
         """Pass everything on to an observer."""
         self._observer = observer
         return self

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from labseq.calibrations import read_entry
-from labseq.config import Kept
+from labseq.config import StoredText
 from labseq.config.reading import beside
 from labseq.errors import RecordingError
 from labseq.model import CalibrationEntry, RandomStream
@@ -32,7 +32,7 @@ def resolved_of(run: Run) -> dict[str, Any]:
     return cast("dict[str, Any]", found)
 
 
-def kept_text(path: Path, sha256: str) -> Kept:
+def stored_text(path: Path, sha256: str) -> StoredText:
     """The text of a file in a run's folder.
 
     Args:
@@ -48,7 +48,7 @@ def kept_text(path: Path, sha256: str) -> Kept:
         raise RecordingError(path, f"cannot be read: {error.strerror}; take it from a backup") from error
     if sha256_of_text(text) != sha256:
         raise RecordingError(path, f"is not what {RUN_FILE} says it was; take it from a backup")
-    return Kept(text, str(path))
+    return StoredText(text, str(path))
 
 
 def plugins_of(run: Run) -> PluginHost:

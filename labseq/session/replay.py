@@ -14,20 +14,20 @@ from labseq.errors import ConfigError, Problem, RecordingError
 from labseq.model import CalibrationEntry, MotionSpec, RandomStream, SiteGrid
 from labseq.recording import Run, Shot
 from labseq.recording.folders import PROFILE_FILE, SEQUENCE_FILE
-from labseq.roles import Detector, NeverStopped, Planner, Warmable
+from labseq.roles import Detector, NeverStopped, Planner, NeedsWarmUp
 from labseq.sequencer import StopFlag
 from labseq.session.adaptive_run import course_of, point_of
 from labseq.session.assembly import Assembly, assemble
-from labseq.session.choosing import Chosen, resolve
+from labseq.session.choosing import ChosenPlugin, resolve
 from labseq.session.constructing import construct
 from labseq.session.labs import parallelism_of
 from labseq.session.options import Options
 from labseq.session.planning import changed_settings
-from labseq.session.recorded import calibrations_of, kept_text, machine_of
+from labseq.session.recorded import calibrations_of, stored_text, machine_of
 from labseq.session.replay_images import ReplayedImages
 from labseq.session.replay_plans import ReplayedPlan, replay_plans
 from labseq.session.scan import Point
-from labseq.session.setting_up import Again
+from labseq.session.setting_up import RecordedSetup
 
 _RANGE: Final = re.compile(r"\s*(\d{1,9})\s*(?:-\s*(\d{1,9})\s*)?")
 
@@ -108,7 +108,7 @@ class Replay:
 
 
 @dataclass(slots=True)
-class _Crew:
+class _Pipeline:
     """What images go through at a point of the scan."""
 
     planner: Planner | None
@@ -116,7 +116,7 @@ class _Crew:
     degree_of_parallelism: int
     detector: Detector | None
     motion: MotionSpec
-    chosen: dict[str, Chosen]
+    chosen: dict[str, ChosenPlugin]
     streams: tuple[RandomStream, ...]
 
 
@@ -129,17 +129,17 @@ class _Replayer:
     grid: SiteGrid
     calibrations: dict[str, CalibrationEntry]
     changes: dict[str, list[Override]]
-    _crews: dict[tuple[int, int], _Crew] = field(default_factory=dict[tuple[int, int], _Crew])
+    _crews: dict[tuple[int, int], _Pipeline] = field(default_factory=dict[tuple[int, int], _Pipeline])
     _points: list[Point] = field(default_factory=list[Point])  # alive, so that no id is given twice
 
-    def at(self, point: Point) -> _Crew:
+    def at(self, point: Point) -> _Pipeline:
         key = id(point.planner), id(point.bench)
         if key not in self._crews:
             self._points.append(point)
             self._crews[key] = self._make(point)
         return self._crews[key]
 
-    def _make(self, point: Point) -> _Crew:
+    def _make(self, point: Point) -> _Pipeline:
         own = {"planner": point.planner, "detector": point.bench.chosen["detector"]}
         names = self.changes or own
         chosen = {kind: self._changed(kind, one) for kind, one in own.items() if kind in names}
@@ -148,10 +148,10 @@ class _Replayer:
             chosen, self.grid, motion, NeverStopped(), self.run.seed, calibrations=self.calibrations
         )
         for one in made.values():
-            if isinstance(one, Warmable):
+            if isinstance(one, NeedsWarmUp):
                 one.warm()
         planner = made.get("planner")
-        return _Crew(
+        return _Pipeline(
             planner=planner,
             planner_name=chosen["planner"].entry.name if planner is not None else "",
             degree_of_parallelism=parallelism_of(chosen["planner"], planner, motion)
@@ -163,7 +163,7 @@ class _Replayer:
             streams=streams,
         )
 
-    def _changed(self, kind: str, own: Chosen) -> Chosen:
+    def _changed(self, kind: str, own: ChosenPlugin) -> ChosenPlugin:
         """The run's own planner or detector, or what is tried in place of it."""
         options = self.changes.get(kind)
         if not options:
@@ -239,8 +239,8 @@ def assembly_of(run: Run) -> Assembly:
         overrides=options.overrides,
         given=options.own(),
         dry_run="fast",
-        kept=kept_text(run.path / SEQUENCE_FILE, record["sequence_sha256"]),
-        again=Again(kept_text(run.path / PROFILE_FILE, record["profile_sha256"]), {}),
+        kept=stored_text(run.path / SEQUENCE_FILE, record["sequence_sha256"]),
+        again=RecordedSetup(stored_text(run.path / PROFILE_FILE, record["profile_sha256"]), {}),
     )
 
 

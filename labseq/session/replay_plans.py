@@ -20,7 +20,7 @@ from labseq.session.planning import call_planner
 
 
 @dataclass(frozen=True, slots=True)
-class Counted:
+class PlanCounts:
     """A plan in numbers.
 
     Attributes:
@@ -40,7 +40,7 @@ class Counted:
     meets_target: bool
 
     @classmethod
-    def of(cls, plan: Plan, report: PlanReport, target: TargetPattern, planning_s: float) -> Counted:
+    def of(cls, plan: Plan, report: PlanReport, target: TargetPattern, planning_s: float) -> PlanCounts:
         """Count a plan that was checked."""
         filling = 1.0 - report.n_defects / target.n_atoms if target.n_atoms else 1.0
         return cls(
@@ -65,14 +65,14 @@ class ReplayedPlan:
     shot: int
     step: int
     cycle: int
-    recorded: Counted
-    replayed: Counted | None
+    recorded: PlanCounts
+    replayed: PlanCounts | None
     same: bool
     failure: str = ""
 
 
 @dataclass(frozen=True, slots=True)
-class Means:
+class MeanCounts:
     """Plans, summed up.
 
     Attributes:
@@ -94,7 +94,7 @@ class Means:
     filling: Estimate
 
     @classmethod
-    def over(cls, plans: Sequence[Counted]) -> Means:
+    def over(cls, plans: Sequence[PlanCounts]) -> MeanCounts:
         """Sum up plans; times that are not known are left out."""
         return cls(
             n_plans=len(plans),
@@ -128,14 +128,14 @@ def replay_plans(
         seen = image_before(cycle, shot.images)
         if seen is None:
             continue
-        recorded = Counted.of(cycle.plan, cycle.report, shot.target, _planning_s(shot.timing, cycle))
+        recorded = PlanCounts.of(cycle.plan, cycle.report, shot.target, _planning_s(shot.timing, cycle))
         replayed, same, failure = None, False, ""
         try:
             start_s = perf_counter()
             plan = call_planner(planner, name, seen.occupancy, shot.target)
             planning_s = perf_counter() - start_s
             report = check_plan(plan, seen.occupancy, shot.target, degree_of_parallelism, grid, motion, name)
-            replayed, same = Counted.of(plan, report, shot.target, planning_s), is_same(plan, cycle.plan)
+            replayed, same = PlanCounts.of(plan, report, shot.target, planning_s), is_same(plan, cycle.plan)
         except LabseqError as error:
             failure = str(error)
         found.append(ReplayedPlan(shot.index, cycle.step, cycle.cycle, recorded, replayed, same, failure))

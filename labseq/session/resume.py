@@ -30,9 +30,9 @@ from labseq.session.adaptive_run import course_of
 from labseq.session.assembly import Assembly, assemble
 from labseq.session.changes import Change, changes_between, differences
 from labseq.session.options import Options
-from labseq.session.recorded import kept_text
+from labseq.session.recorded import stored_text
 from labseq.session.run_record import now_utc, run_record
-from labseq.session.setting_up import Again
+from labseq.session.setting_up import RecordedSetup
 
 _DAY: Final = re.compile(r"\d{4}-\d\d-\d\d")
 _NEEDED: Final[Mapping[str, type]] = {
@@ -48,7 +48,7 @@ _NEEDED: Final[Mapping[str, type]] = {
 
 
 @dataclass(slots=True)
-class Earlier:
+class ResumableRun:
     """A run on disk that is to go on; nobody else can go on with it until it is released.
 
     Attributes:
@@ -139,8 +139,8 @@ class Earlier:
         record, options = self.run.record, Options.of(self.run.record["overrides"], realtime=realtime)
         sequence, profile = Path(record["sequence_path"]), Path(record["profile_path"])
         kept = {
-            "sequence": kept_text(self.run.path / SEQUENCE_FILE, record["sequence_sha256"]),
-            "profile": kept_text(self.run.path / PROFILE_FILE, record["profile_sha256"]),
+            "sequence": stored_text(self.run.path / SEQUENCE_FILE, record["sequence_sha256"]),
+            "profile": stored_text(self.run.path / PROFILE_FILE, record["profile_sha256"]),
         }
         assembly = assemble(
             sequence,
@@ -149,7 +149,7 @@ class Earlier:
             given=options.own(),
             dry_run=options.dry_run,
             kept=kept["sequence"],
-            again=Again(kept["profile"], record.get("calibrations", {})),
+            again=RecordedSetup(kept["profile"], record.get("calibrations", {})),
         )
         for path, own in ((sequence, kept["sequence"]), (profile, kept["profile"])):
             if _says_otherwise(path, own.text):
@@ -230,7 +230,7 @@ def _numbers(shots: list[int]) -> str:
     return told if len(shots) <= 5 else f"{told}, ... ({len(shots)} in all)"
 
 
-def reopened(path: Path, *, accept_changes: bool, realtime: bool) -> tuple[Assembly, Options, Earlier]:
+def reopened(path: Path, *, accept_changes: bool, realtime: bool) -> tuple[Assembly, Options, ResumableRun]:
     """Read a run back so that it can go on.
 
     Args:
@@ -242,7 +242,7 @@ def reopened(path: Path, *, accept_changes: bool, realtime: bool) -> tuple[Assem
         ConfigError: The run cannot be resumed, or something differs from then.
         RecordingError: It is no run, is damaged, of a newer labseq, or cannot be written to.
     """
-    earlier = Earlier.open(path)
+    earlier = ResumableRun.open(path)
     try:
         assembly, options = earlier.assemble(realtime=realtime)
         earlier.compare(assembly, options, accept=accept_changes)

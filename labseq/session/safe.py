@@ -8,24 +8,24 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
-from labseq.config import Collected, load_profile, plugin_paths, profile_overrides
+from labseq.config import ProblemCollector, load_profile, plugin_paths, profile_overrides
 from labseq.errors import ConfigError, LabseqError, RecordingError, StopRequested
 from labseq.recording import clear_active, data_root, died, marker_roots
 from labseq.roles import Clock, Hardware, RunObserver, Simulation
 from labseq.sequencer import Guard, RealClock, StopFlag, VirtualClock
 from labseq.sequencer.lab import Timeouts, in_safe_order
-from labseq.session.choosing import HARDWARE_KINDS, Bench
+from labseq.session.choosing import HARDWARE_KINDS, ResolvedProfile
 from labseq.session.constructing import construct_each
-from labseq.session.holding import devices_held
+from labseq.session.holding import lock_devices
 from labseq.session.labs import timeouts_of
-from labseq.session.setting_up import choose_all, load_plugins
+from labseq.session.setting_up import choose_plugins, load_plugins
 from labseq.session.signals import stop_on_signals
 
 _NEEDED_KINDS: Final = HARDWARE_KINDS | {"simulation"}
 
 
 @dataclass(frozen=True, slots=True)
-class Secured:
+class SafeStateReport:
     """What became of the devices of a profile.
 
     Attributes:
@@ -34,17 +34,17 @@ class Secured:
         problems: What else is wrong with the profile, or None.
     """
 
-    tried: Mapping[str, LabseqError | None]
+    attempted: Mapping[str, LabseqError | None]
     refused: Mapping[str, LabseqError]
     problems: ConfigError | None = None
 
     @property
     def failures(self) -> list[LabseqError]:
         """Why devices are not safe, those that were tried first; empty if all are."""
-        return [error for error in [*self.tried.values(), *self.refused.values()] if error is not None]
+        return [error for error in [*self.attempted.values(), *self.refused.values()] if error is not None]
 
 
-def secure(
+def make_each_safe(
     devices: Iterable[tuple[str, Hardware]],
     timeouts: Timeouts,
     simulation: Simulation | None = None,
@@ -90,7 +90,7 @@ def attempt(guard: Guard, name: str, timeout_s: float, method: Callable[[], None
     return None
 
 
-def construct_hardware(bench: Bench, clock: Clock) -> tuple[dict[str, Any], dict[str, LabseqError]]:
+def construct_hardware(bench: ResolvedProfile, clock: Clock) -> tuple[dict[str, Any], dict[str, LabseqError]]:
     """Construct the devices of a profile, and the simulation if there is one; nothing is opened.
 
     Args:
@@ -114,7 +114,7 @@ def construct_hardware(bench: Bench, clock: Clock) -> tuple[dict[str, Any], dict
     return made, {role: chosen[role].placed(error) for role, error in failures.items()}
 
 
-def secure_bench(bench: Bench, stop: StopFlag, observer: RunObserver | None = None) -> Secured:
+def make_profile_devices_safe(bench: ResolvedProfile, stop: StopFlag, observer: RunObserver | None = None) -> SafeStateReport:
     """Construct each device of a profile, open it, make it safe and close it.
 
     One that cannot be constructed never keeps the others from it; it is told at the end.
@@ -128,17 +128,17 @@ def secure_bench(bench: Bench, stop: StopFlag, observer: RunObserver | None = No
     made, failures = construct_hardware(bench, clock)
     simulation = made.pop("simulation", None)
     with stop.held():
-        tried = secure(in_safe_order(made), timeouts_of(bench.profile), simulation, observer)
+        attempted = make_each_safe(in_safe_order(made), timeouts_of(bench.profile), simulation, observer)
     refused: dict[str, LabseqError] = {role: e for role, e in bench.refused.items() if role != "detector"}
     refused |= failures
     if observer is not None:
         for role, error in refused.items():
             observer.event("safe_state", {"device": role, "ok": False, "error": str(error)})
-    return Secured(tried, refused)
+    return SafeStateReport(attempted, refused)
 
 
-def secure_after_crash(
-    bench: Bench, roots: Sequence[Path], key: str, stop: StopFlag, observer: RunObserver
+def make_safe_after_crash(
+    bench: ResolvedProfile, roots: Sequence[Path], key: str, stop: StopFlag, observer: RunObserver
 ) -> None:
     """If the last run on a profile died, its devices may still be on: make them safe.
 
@@ -160,7 +160,7 @@ def secure_after_crash(
         return
     text = f"the last run on this profile ({dead}) died; its devices are made safe first"
     observer.event("warning", {"text": text})
-    failures = secure_bench(bench, stop, observer).failures
+    failures = make_profile_devices_safe(bench, stop, observer).failures
     if failures:
         raise failures[0]
     try:
@@ -172,7 +172,7 @@ def secure_after_crash(
 
 def make_profile_safe(
     profile: str, overrides: Sequence[str] = (), observer: RunObserver | None = None
-) -> Secured:
+) -> SafeStateReport:
     """Bring every device of a profile to its safe state.
 
     It does so whoever else uses them, and says who does: a run in progress fails, or is seen to be at
@@ -188,7 +188,7 @@ def make_profile_safe(
         ConfigError: The profile cannot be read, or does not exist; no device was touched.
         StopRequested: Ctrl-C or SIGTERM came meanwhile.
     """
-    found, roots = Collected(), marker_roots(data_root())  # now: vendors' libraries change the folder
+    found, roots = ProblemCollector(), marker_roots(data_root())  # now: vendors' libraries change the folder
     bench = _read(profile, overrides, found)
     key, stop = bench.hardware_key, StopFlag()
 
@@ -198,9 +198,9 @@ def make_profile_safe(
 
     with ExitStack() as stack:
         if not bench.virtual_time:
-            stack.enter_context(devices_held(bench, roots, "labseq safe", warn, in_spite=True))
+            stack.enter_context(lock_devices(bench, roots, "labseq safe", warn, in_spite=True))
         stack.enter_context(stop_on_signals(stop))
-        secured = secure_bench(bench, stop, observer)
+        secured = make_profile_devices_safe(bench, stop, observer)
     told = [problem for error in bench.refused.values() for problem in error.problems]
     others = [problem for problem in found.problems if problem not in told]
     # A problem or an override may have left a device out, or put another in its place.
@@ -214,7 +214,7 @@ def make_profile_safe(
     return replace(secured, problems=ConfigError(others) if others else None)
 
 
-def _read(profile: str, overrides: Sequence[str], found: Collected) -> Bench:
+def _read(profile: str, overrides: Sequence[str], found: ProblemCollector) -> ResolvedProfile:
     """Read a profile and choose its devices, past everything that is wrong but can be gone past."""
     for_profile = profile_overrides(overrides)
     document, spec = load_profile(profile, beside=Path(), overrides=for_profile, found=found)
@@ -224,4 +224,4 @@ def _read(profile: str, overrides: Sequence[str], found: Collected) -> Bench:
     for folder in spec.plugin_folders:
         with suppress(ConfigError):  # told already
             folders += plugin_paths(document, [folder])
-    return choose_all(document, spec, load_plugins(folders, found, spec.timeouts.load), "off", found)
+    return choose_plugins(document, spec, load_plugins(folders, found, spec.timeouts.load), "off", found)

@@ -16,7 +16,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from labseq.config import ROLES, Axis, Choice, Collected, Document, Loc, Scan, SequenceSpec
+from labseq.config import ROLES, Axis, Choice, ProblemCollector, Document, Loc, Scan, SequenceSpec
 from labseq.config.motion import MobileTweezersChoice
 from labseq.config.nodes import Node
 from labseq.config.scan import PROFILE
@@ -24,7 +24,7 @@ from labseq.config.variables import VARIABLES
 from labseq.config.wording import clean
 from labseq.errors import ConfigError
 from labseq.roles import Step
-from labseq.session.choosing import HARDWARE_KINDS, Bench, Chosen, DryRun, choose, resolve
+from labseq.session.choosing import HARDWARE_KINDS, ResolvedProfile, ChosenPlugin, DryRun, choose, resolve
 from labseq.session.contents import make_step
 from labseq.units import parse_any
 
@@ -36,7 +36,7 @@ Part = tuple[bool, Loc]
 
 
 @dataclass(frozen=True, slots=True)
-class Made:
+class PartSettings:
     """A part with the settings of some of the points.
 
     Attributes:
@@ -46,7 +46,7 @@ class Made:
         dump: The settings after defaults, SI, JSON-ready.
     """
 
-    chosen: Chosen | None
+    chosen: ChosenPlugin | None
     step: Step | None
     choice: Choice | None
     dump: Mapping[str, Any]
@@ -63,9 +63,9 @@ class Point:
         parameters: Scanned address -> value, SI, JSON-ready.
     """
 
-    planner: Chosen
+    planner: ChosenPlugin
     steps: tuple[tuple[str, Step], ...]
-    bench: Bench
+    bench: ResolvedProfile
     parameters: Mapping[str, Any]
 
 
@@ -84,12 +84,12 @@ class Scanned:
     scan: Scan
     document: Document
     sequence: SequenceSpec
-    bench: Bench
+    bench: ResolvedProfile
     dry_run: DryRun
-    _made: dict[tuple[Part, tuple[int, ...]], Made] = field(default_factory=dict[Any, Made], repr=False)
-    _benches: dict[tuple[int, ...], Bench] = field(default_factory=dict[Any, Bench], repr=False)
+    _made: dict[tuple[Part, tuple[int, ...]], PartSettings] = field(default_factory=dict[Any, PartSettings], repr=False)
+    _benches: dict[tuple[int, ...], ResolvedProfile] = field(default_factory=dict[Any, ResolvedProfile], repr=False)
 
-    def check(self, found: Collected) -> None:
+    def check(self, found: ProblemCollector) -> None:
         """Validate every part with every combination of the values that go into it.
 
         Args:
@@ -114,7 +114,7 @@ class Scanned:
                 if n_wrong == MAX_PROBLEMS:
                     return
 
-    def at(self, point: int, planner: Chosen, steps: tuple[tuple[str, Step], ...]) -> Point:
+    def at(self, point: int, planner: ChosenPlugin, steps: tuple[tuple[str, Step], ...]) -> Point:
         """The settings of a point.
 
         Args:
@@ -154,7 +154,7 @@ class Scanned:
         except ConfigError:
             return None
 
-    def _bench_at(self, point: int, parts: Mapping[Part, Made]) -> Bench:
+    def _bench_at(self, point: int, parts: Mapping[Part, PartSettings]) -> ResolvedProfile:
         """The profile at a point; the same object wherever it is the same."""
         positions = self.scan.positions(point)
         touched = {g for (of_profile, loc) in parts if of_profile for g in self._groups_of((True, loc))}
@@ -218,14 +218,14 @@ class Scanned:
                 whole[g] = position
             yield int(np.ravel_multi_index(whole, shape))
 
-    def _part(self, part: Part, point: int) -> Made:
+    def _part(self, part: Part, point: int) -> PartSettings:
         positions = self.scan.positions(point)
         key = (part, tuple(positions[g] for g in self._groups_of(part)))
         if key not in self._made:
             self._made[key] = self._make(part, point)
         return self._made[key]
 
-    def _make(self, part: Part, point: int) -> Made:
+    def _make(self, part: Part, point: int) -> PartSettings:
         of_profile, loc = part
         base = self.bench.document if of_profile else self.document
         document = self.scan.put(base, point, profile=of_profile)
@@ -234,11 +234,11 @@ class Scanned:
         if loc == ("planner",):
             choice = document.validate(Choice, loc).placed("planner")
             chosen = resolve(self.bench.host, document, "planner", choice)
-            return Made(chosen, None, choice, chosen.dump())
+            return PartSettings(chosen, None, choice, chosen.dump())
         step, dumped = make_step(self.bench, document, self.sequence.shot[int(loc[1])])
-        return Made(None, step, None, dumped)
+        return PartSettings(None, step, None, dumped)
 
-    def _make_role(self, document: Document, loc: Loc) -> Made:
+    def _make_role(self, document: Document, loc: Loc) -> PartSettings:
         role = str(loc[-1])
         kind = role if loc[0] in ROLES else "device"
         model = MobileTweezersChoice if role == "mobile_tweezers" else Choice
@@ -253,7 +253,7 @@ class Scanned:
         dumped = chosen.dump()
         if isinstance(choice, MobileTweezersChoice):
             dumped |= choice.model_dump(mode="json", exclude={"use"})
-        return Made(chosen, None, choice, dumped)
+        return PartSettings(chosen, None, choice, dumped)
 
 
 def _part_of(of_profile: bool, loc: Loc) -> Part:
@@ -273,7 +273,7 @@ def _address(of_profile: bool, loc: Loc) -> str:
     return ".".join([*((PROFILE.rstrip("."),) if of_profile else ()), *map(str, loc)])
 
 
-def _resolved(axis: Axis, node: Node, parts: Mapping[Part, Made]) -> Any:
+def _resolved(axis: Axis, node: Node, parts: Mapping[Part, PartSettings]) -> Any:
     """A scanned value as the plugin understood it, in SI; a mapping as it is written."""
     if axis.loc[0] == VARIABLES:
         return _si(node.plain())
@@ -282,7 +282,7 @@ def _resolved(axis: Axis, node: Node, parts: Mapping[Part, Made]) -> Any:
     return node.plain() if value is None or isinstance(node.value, dict) else value
 
 
-def _value_in(made: Made, part: Part, loc: Loc) -> Any:
+def _value_in(made: PartSettings, part: Part, loc: Loc) -> Any:
     """A value among the settings of its part; None if there is none."""
     value: Any = made.dump
     for step in loc[len(part[1]) :]:

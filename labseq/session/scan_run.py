@@ -11,12 +11,12 @@ from labseq.roles import RunObserver
 from labseq.sequencer import Sequencer
 from labseq.sequencer.lab import Lab
 from labseq.session.assembly import Assembly
-from labseq.session.between import Between
+from labseq.session.between import ShotHooks
 from labseq.session.labs import rebuild_lab
 from labseq.session.scan import Point
 
 
-class Course:
+class ScanRun:
     """The point of each shot of a run, and which shots are to be taken.
 
     Args:
@@ -55,7 +55,7 @@ class Course:
         """The settings of each point that a shot to take is at."""
         return map(self.assembly.at, dict.fromkeys(self.points[shot] for shot in self.shots))
 
-    def each_lab(self) -> Iterator[Point]:
+    def representative_labs(self) -> Iterator[Point]:
         """One point for each planner and profile that there are, the first shot's first."""
         seen: set[tuple[int, int]] = set()
         for point in self.each():
@@ -71,7 +71,7 @@ class Course:
     def follow(self, writer: RunWriter, observer: RunObserver) -> None:
         """Say where the results come from, and who is told; before :meth:`run`."""
 
-    def run(self, sequencer: Sequencer, lab: Lab, changes: Mapping[str, Any], between: Between) -> None:
+    def run(self, sequencer: Sequencer, lab: Lab, changes: Mapping[str, Any], shot_hooks: ShotHooks) -> None:
         """Take all shots.
 
         Args:
@@ -84,31 +84,31 @@ class Course:
             LabseqError: Whatever ended the run before its last shot.
         """
         now, before = self.points[self.shots[0]], self.first
-        skipped = set(self._skip_before(between))
+        skipped = set(self._skip_before(shot_hooks))
         for shot in self.shots:
             if shot in skipped:
                 continue
-            between.before()
+            shot_hooks.before()
             point = self.points[shot]
             if point != now:
                 after = self.assembly.at(point)
                 lab = self._go_on(sequencer, lab, before, after, changes)
                 now, before = point, after
             given_up = sequencer.run([shot])
-            skipped.update(self._skip(shot, given_up, between))
+            skipped.update(self._skip(shot, given_up, shot_hooks))
 
-    def _skip_before(self, between: Between) -> list[int]:
+    def _skip_before(self, shot_hooks: ShotHooks) -> list[int]:
         """Put down what should have been, had the run not died right after its last shot."""
-        shot, why = between.left_open
+        shot, why = shot_hooks.left_open
         left = self._later_at_its_point(shot) if why else []
-        between.skip(left, why)
+        shot_hooks.skip(left, why)
         return left
 
-    def _skip(self, shot: int, given_up: Mapping[int, str], between: Between) -> list[int]:
+    def _skip(self, shot: int, given_up: Mapping[int, str], shot_hooks: ShotHooks) -> list[int]:
         """Put down what is left out after a shot."""
-        why = between.after([*given_up.values()])
+        why = shot_hooks.after([*given_up.values()])
         left = [*given_up, *self._later_at_its_point(shot)] if why else []
-        between.skip(left, why)
+        shot_hooks.skip(left, why)
         return left
 
     def _later_at_its_point(self, shot: int) -> list[int]:

@@ -20,17 +20,17 @@ from labseq.sequencer.calling import lay_out
 from labseq.sequencer.lab import Lab, describe
 from labseq.session.adaptive_run import course_of
 from labseq.session.assembly import Assembly, assemble
-from labseq.session.between import Between
+from labseq.session.between import ShotHooks
 from labseq.session.choosing import DryRun
 from labseq.session.commands import check_commands
-from labseq.session.holding import devices_held
+from labseq.session.holding import lock_devices
 from labseq.session.labs import build_lab, clock_for
 from labseq.session.observers import Observers
 from labseq.session.options import Options, path_of
 from labseq.session.policies import Checks
-from labseq.session.resume import Earlier, reopened
+from labseq.session.resume import ResumableRun, reopened
 from labseq.session.run_record import copies, ending, run_record
-from labseq.session.safe import secure_after_crash
+from labseq.session.safe import make_safe_after_crash
 from labseq.session.scan import Point
 from labseq.session.signals import stop_on_signals
 from labseq.session.warming import warm
@@ -52,7 +52,7 @@ class Session:
         assembly: Assembly,
         options: Options,
         observer: RunObserver | None = None,
-        earlier: Earlier | None = None,
+        earlier: ResumableRun | None = None,
     ) -> None:
         self.assembly = assembly
         self.options = options
@@ -189,14 +189,14 @@ class Session:
             stack.enter_context(stop_on_signals(self.stop_flag))
             if not self.assembly.virtual_time:
                 what = f"a run of {self.assembly.sequence.name}"
-                self._hold = stack.enter_context(devices_held(self.assembly.bench, roots, what, self._warn))
+                self._hold = stack.enter_context(lock_devices(self.assembly.bench, roots, what, self._warn))
             bench, key = self.assembly.bench, self._profile_key
-            secure_after_crash(bench, roots, key, self.stop_flag, self._observers)
+            make_safe_after_crash(bench, roots, key, self.stop_flag, self._observers)
             if not self.course.shots:  # its process died between the last shot and the last word
                 _, writer = self._begin(roots[0])
                 writer.finish("complete")
                 return open_run(writer.run_dir)
-            labs = (self.build_lab(point) for point in self.course.each_lab())
+            labs = (self.build_lab(point) for point in self.course.representative_labs())
             lab = next(labs)
             for one in itertools.chain([lab], labs):
                 self.warm(one)
@@ -220,7 +220,7 @@ class Session:
 
     def _run(self, lab: Lab, roots: Sequence[Path]) -> Run:
         record, writer = self._begin(roots[0])
-        self._observers.tell_of_plugins()
+        self._observers.report_plugin_changes()
         error: BaseException | None = None
         try:
             self._take_shots(lab, roots, writer, record)
@@ -261,7 +261,7 @@ class Session:
         before = () if self.earlier is None else self.earlier.rows
         checks = Checks(self.assembly.sequence.policy.checks, before, self._warn)
         self.course.follow(writer, self._observers)
-        self.course.run(sequencer, lab, changes, Between(writer, checks, self._observers.event))
+        self.course.run(sequencer, lab, changes, ShotHooks(writer, checks, self._observers.event))
 
     def _begin(self, root: Path) -> tuple[RunRecord, RunWriter]:
         """The run's folder, a new one or that of the run that goes on."""

@@ -10,9 +10,9 @@ from labseq import builtins
 from labseq.config import (
     ROLES,
     Choice,
-    Collected,
+    ProblemCollector,
     Document,
-    Kept,
+    StoredText,
     Override,
     ProfileSpec,
     Scan,
@@ -22,12 +22,12 @@ from labseq.config import (
 from labseq.errors import ConfigError
 from labseq.plugins import PluginHost
 from labseq.registry import LOAD_S, VIRTUAL_TWIN
-from labseq.session.calibrating import Calibrated, calibrated
-from labseq.session.choosing import Bench, Chosen, DryRun, choose
+from labseq.session.calibrating import ActiveCalibrations, calibrated
+from labseq.session.choosing import ResolvedProfile, ChosenPlugin, DryRun, choose
 from labseq.session.wiring import check_kinds
 
 
-class Again(NamedTuple):
+class RecordedSetup(NamedTuple):
     """What a run goes by that was begun before, whatever files and calibrations say today.
 
     Attributes:
@@ -35,11 +35,11 @@ class Again(NamedTuple):
         calibrations: The ids of the calibrations, by kind, and no others.
     """
 
-    profile: Kept
+    profile: StoredText
     calibrations: Mapping[str, str]
 
 
-def set_up_bench(
+def resolve_profile(
     profile: str | Path,
     beside: Path = Path(),
     overrides: Sequence[Override] = (),
@@ -48,9 +48,9 @@ def set_up_bench(
     named_in: Document | None = None,
     plugin_folders: Sequence[Path] = (),
     scan: Scan | None = None,
-    found: Collected | None = None,
-    again: Again | None = None,
-) -> Bench:
+    found: ProblemCollector | None = None,
+    again: RecordedSetup | None = None,
+) -> ResolvedProfile:
     """Read a profile, load the plugins and choose what plays each role.
 
     Args:
@@ -78,23 +78,23 @@ def set_up_bench(
         kept=None if again is None else again.profile,
     )
     folders = [*plugin_paths(document, spec.plugin_folders), *plugin_folders]
-    host = load_plugins(folders, patience_s=spec.timeouts.load)
-    problems = Collected() if found is None else found
+    host = load_plugins(folders, max_wait_s=spec.timeouts.load)
+    problems = ProblemCollector() if found is None else found
     pins = None if again is None else again.calibrations
-    bench = choose_all(document, spec, host, dry_run, problems, pins)
+    bench = choose_plugins(document, spec, host, dry_run, problems, pins)
     if found is None:
         problems.raise_any()
     return bench
 
 
-def choose_all(
+def choose_plugins(
     document: Document,
     spec: ProfileSpec,
     host: PluginHost,
     dry_run: DryRun,
-    found: Collected,
+    found: ProblemCollector,
     calibrations: Mapping[str, str] | None = None,
-) -> Bench:
+) -> ResolvedProfile:
     """Choose what plays each role of a profile.
 
     Args:
@@ -106,7 +106,7 @@ def choose_all(
         calibrations: The ids of those that count, by kind; None for what profile and store say.
     """
     mended = bool(found.problems)
-    chosen: dict[str, Chosen] = {}
+    chosen: dict[str, ChosenPlugin] = {}
     warnings: list[str] = []
     refused: dict[str, ConfigError] = {}
     for role, choice in {**spec.choices, **spec.devices}.items():
@@ -123,12 +123,12 @@ def choose_all(
     check_kinds(document, spec, host, found)
     detector = chosen["detector"].dump() if "detector" in chosen else {}
     made = (
-        Calibrated({}, spec.grid_model())
+        ActiveCalibrations({}, spec.grid_model())
         if mended
         else calibrated(document, spec, found, dry_run, detector, calibrations)
     )
     warnings += made.warnings
-    return Bench(document, spec, host, made.grid, chosen, tuple(warnings), refused, made.entries)
+    return ResolvedProfile(document, spec, host, made.grid, chosen, tuple(warnings), refused, made.entries)
 
 
 def _is_stand_in(document: Document, choice: Choice) -> bool:
@@ -138,19 +138,19 @@ def _is_stand_in(document: Document, choice: Choice) -> bool:
 
 
 def load_plugins(
-    folders: Sequence[Path] = (), found: Collected | None = None, patience_s: float = LOAD_S
+    folders: Sequence[Path] = (), found: ProblemCollector | None = None, max_wait_s: float = LOAD_S
 ) -> PluginHost:
     """Load labseq's own, the installed and the folders' plugins.
 
     Args:
         folders: Folders with plugins, beside those of LABSEQ_PLUGIN_PATH.
         found: Where the problem of a folder that cannot be read goes; without it it is raised.
-        patience_s: How long a plugin may take to load, and a constructor to return.
+        max_wait_s: How long a plugin may take to load, and a constructor to return.
 
     Raises:
         ConfigError: A folder does not exist, or cannot be read.
     """
-    host = PluginHost(patience_s)
+    host = PluginHost(max_wait_s)
     host.load_builtin(builtins)
     host.load_entry_points()
     try:

@@ -85,7 +85,7 @@ def find_running(run: Path | None = None, profile: str | None = None) -> Path:
     return running[0]
 
 
-def told_owner(run_dir: Path) -> str:
+def owner_text(run_dir: Path) -> str:
     """The process that a run belongs to, in words."""
     owner = read_owner(run_dir)
     return "nobody knows whose" if owner is None else f"process {owner.pid} on {owner.host}"

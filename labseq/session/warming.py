@@ -8,7 +8,7 @@ from typing import Final
 from labseq import motion
 from labseq.errors import PlanError
 from labseq.kernels.compile import announcing
-from labseq.roles import RunObserver, Warmable
+from labseq.roles import RunObserver, NeedsWarmUp
 from labseq.sequencer import Guard, StopFlag
 from labseq.sequencer.lab import Lab
 
@@ -48,7 +48,7 @@ def _warm_plugins(lab: Lab, stop_flag: StopFlag, devices: bool) -> None:
     guard = Guard(stop_flag)
     parts = (("planner", lab.planner), ("detector", lab.detector))
     for name, part in (*parts, *(lab.hardware() if devices else ())):
-        if isinstance(part, Warmable):
+        if isinstance(part, NeedsWarmUp):
             try:
                 guard.call(name, WARM_S, part.warm)
             except PlanError as error:

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 from typing import Final
 
-from labseq.config import Collected, Document, ProfileSpec
+from labseq.config import ProblemCollector, Document, ProfileSpec
 from labseq.config.wording import clean, did_you_mean
 from labseq.errors import ConfigError, Problem, one_of
 from labseq.lines import blinding_lines, trigger_line
 from labseq.model.lines import IDLE
 from labseq.plugins import PluginHost
-from labseq.roles import KnownLines
+from labseq.roles import ReportsLinesFacts
 from labseq.sequencer.lab import Lab
 
 _LINELESS: Final = frozenset({"device", "check_sites", "check_overlay", "equalise"})
 """Steps that take no time of their own."""
 
 
-def check_kinds(document: Document, spec: ProfileSpec, host: PluginHost, found: Collected) -> None:
+def check_kinds(document: Document, spec: ProfileSpec, host: PluginHost, found: ProblemCollector) -> None:
     """Find lines that belong to steps that nobody offers.
 
     Args:
@@ -48,7 +48,7 @@ def wiring_problems(document: Document, lab: Lab) -> list[Problem]:
     """
     problems: list[Problem] = []
     camera = lab.step_context.camera
-    if isinstance(lab.lines, KnownLines):
+    if isinstance(lab.lines, ReportsLinesFacts):
         channels = lab.lines.lines_facts.channels
         for spec in lab.line_specs:
             if spec.channel not in channels:

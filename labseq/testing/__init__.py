@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from labseq.testing.contracts import (
         SUITES as SUITES,
         AnalysisContract as AnalysisContract,
-        BrokenPromise as BrokenPromise,
+        ContractViolation as ContractViolation,
         CameraContract as CameraContract,
         DetectorContract as DetectorContract,
         DeviceContract as DeviceContract,
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 _CONTRACTS: Final = (
     "SUITES",
     "AnalysisContract",
-    "BrokenPromise",
+    "ContractViolation",
     "CameraContract",
     "DetectorContract",
     "DeviceContract",

@@ -37,7 +37,7 @@ def played(program: ToneProgram, start_s: float = START_S) -> tuple[list[RfSampl
     return [row], [column]
 
 
-class Recording:
+class PlayedRfSource:
     """An ``RfSource`` that has played everything already; each span is told once."""
 
     def __init__(self, spans: tuple[list[RfSamples], list[RfSamples]]) -> None:

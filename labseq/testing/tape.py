@@ -20,18 +20,18 @@ Tone = tuple[float, float, float, float]
 
 
 @dataclass
-class Tape:
+class ToneProgramBuilder:
     """A tone program in the making, in sites instead of hertz."""
 
     grid: SiteGrid = GRID
     segments: list[tuple[Sequence[Tone], Sequence[Tone]]] = field(default_factory=list[Any])
 
-    def add(self, rows: Sequence[Tone], cols: Sequence[Tone]) -> Tape:
+    def add(self, rows: Sequence[Tone], cols: Sequence[Tone]) -> ToneProgramBuilder:
         """Add a segment: tones of the rows and of the columns."""
         self.segments.append((rows, cols))
         return self
 
-    def move(self, rows: Sequence[tuple[float, float]], cols: Sequence[tuple[float, float]]) -> Tape:
+    def move(self, rows: Sequence[tuple[float, float]], cols: Sequence[tuple[float, float]]) -> ToneProgramBuilder:
         """Pick up with a ramp of the column tones, transport, drop off."""
         moving_rows = [(a, b, ON, ON) for a, b in rows]
         self.add([(a, a, ON, ON) for a, _ in rows], [(a, a, 0.0, ON) for a, _ in cols])

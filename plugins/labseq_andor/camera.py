@@ -13,11 +13,11 @@ from labseq import (
     ConfigError,
     Context,
     DeviceError,
-    KnownSensor,
+    ReportsSensor,
     LimitError,
     SensorMode,
     Series,
-    Taken,
+    ExposureResult,
     wait_for,
 )
 from labseq.units import format_quantity
@@ -25,7 +25,7 @@ from labseq_andor.codes import Code, Triggers
 from labseq_andor.cold import temperature_k, wait_until_cold
 from labseq_andor.counterpart import SimulatedCamera, SimulatedSdk
 from labseq_andor.heads import IXON_897, Head
-from labseq_andor.library import bind_sdk, bind_stand_in, load_pylablib
+from labseq_andor.library import bind_sdk, bind_simulator, load_pylablib
 from labseq_andor.reading import Reader
 from labseq_andor.sdk import Sdk, code_of
 from labseq_andor.settings import SIMULATED, AndorSettings
@@ -76,8 +76,8 @@ class AndorCamera(CameraDriver):
         self._sensor_shape = None if head is None else head.sensor_shape
         if settings.camera == SIMULATED:
             head = self._simulate(settings, context)
-        if self._sensor_shape is not None and (misfit := settings.misfit_on(self._sensor_shape)):
-            raise ConfigError(misfit)
+        if self._sensor_shape is not None and (setting_error := settings.sensor_conflict(self._sensor_shape)):
+            raise ConfigError(setting_error)
         self._readout_s = settings.readout_s(head, self._sensor_shape)
         self._max_exposure_s = settings.max_exposure
         self._triggers = tuple(TRIGGERS)
@@ -93,7 +93,7 @@ class AndorCamera(CameraDriver):
         if world is None:
             text = "the simulated camera needs a simulated world; add `simulation: {use: virtual}`"
             raise ConfigError(f"{text} to the profile")
-        shape = world.sensor_shape if isinstance(world, KnownSensor) else IXON_897.sensor_shape
+        shape = world.sensor_shape if isinstance(world, ReportsSensor) else IXON_897.sensor_shape
         head = settings.head_for(shape)
         self._sensor_shape = shape
         self.simulated = SimulatedCamera(world, context.clock, head, shape)
@@ -112,7 +112,7 @@ class AndorCamera(CameraDriver):
         """Import pylablib, which takes seconds; work out what all simulated frames have in common."""
         with suppress(DeviceError):  # open() says what is missing
             load_pylablib(self._name)
-        if self.simulated is not None and isinstance(self._world, KnownSensor):
+        if self.simulated is not None and isinstance(self._world, ReportsSensor):
             region = self._settings.mode.region
             is_whole = region == (0, 0, *self._world.sensor_shape)
             mode = SensorMode(None if is_whole else region, self._settings.binning, self.facts.em_gain)
@@ -147,7 +147,7 @@ class AndorCamera(CameraDriver):
         if self.simulated is None:
             bind_sdk(self._name, andor, self._settings.sdk)
         else:
-            self._stand_in = bind_stand_in(self._name, andor, self.simulated, *self.beside)
+            self._stand_in = bind_simulator(self._name, andor, self.simulated, *self.beside)
         self._sdk = sdk = Sdk(self._name, andor, self.simulated)
         indices = tuple(range(sdk.count()))
         if self._stand_in is not None and self.simulated is not None:
@@ -225,7 +225,7 @@ class AndorCamera(CameraDriver):
             text = "the camera does not take a trigger yet: it still reads the last frame; read that first"
             raise DeviceError(self._name, f"{text}, or set `frame_transfer: true`") from error
 
-    def _take(self, timeout_s: float) -> Taken | None:
+    def _take(self, timeout_s: float) -> ExposureResult | None:
         reader, simulated = self._reader, self.simulated
         if reader is None:
             return None

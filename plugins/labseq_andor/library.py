@@ -57,7 +57,7 @@ def bind_sdk(name: str, andor: Any, path: str) -> None:
         raise _missing(name, "atmcd64d.dll", error) from error
 
 
-def bind_stand_in(name: str, andor: Any, *cameras: SimulatedCamera) -> SimulatedSdk:
+def bind_simulator(name: str, andor: Any, *cameras: SimulatedCamera) -> SimulatedSdk:
     """Let pylablib call the stand-in, with cameras attached.
 
     Raises:

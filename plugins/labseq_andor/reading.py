@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from labseq import DeviceError, Taken
+from labseq import DeviceError, ExposureResult
 from labseq_andor.codes import Code, Features
 from labseq_andor.errors import GONE, NOT_TAKEN, explain_code
 from labseq_andor.sdk import Sdk, code_of
@@ -37,7 +37,7 @@ class Reader:
         self._has_time_stamps = bool(sdk.capabilities.ulFeatures & Features.METADATA)
         self.n_taken = 0
 
-    def look(self, wait_s: float) -> Taken | None:
+    def look(self, wait_s: float) -> ExposureResult | None:
         """Fetch the oldest frame; wait for one at most so long.
 
         Raises:
@@ -48,7 +48,7 @@ class Reader:
             fault = self._fault()
             if fault:
                 self.n_taken += 1
-                return Taken(self.n_taken - 1, None, fault)
+                return ExposureResult(self.n_taken - 1, None, fault)
             if wait_s <= 0 or not self._sdk.wait(wait_s):
                 return None
             number = self._oldest()
@@ -73,7 +73,7 @@ class Reader:
             raise DeviceError(self._name, explain_code("GetStatus", status))
         return f"{OVERRUN} (GetStatus gave {status})" if status in NOT_TAKEN else ""
 
-    def _fetch(self, number: int) -> Taken:
+    def _fetch(self, number: int) -> ExposureResult:
         height, width = self._shape
         with self._sdk.selected() as lib:
             pixels, _, _ = lib.GetImages16(number, number, height * width)
@@ -83,4 +83,4 @@ class Reader:
         if self._has_time_stamps:
             with suppress(DeviceError):  # a frame is worth more than its time stamp
                 time_s = self._sdk.time_stamp_s(number - 1)
-        return Taken(number - 1, image, exposure_s=self._exposure_s, device_time_s=time_s)
+        return ExposureResult(number - 1, image, exposure_s=self._exposure_s, device_time_s=time_s)

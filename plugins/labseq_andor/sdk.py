@@ -12,17 +12,17 @@ from labseq import DeviceError, LabseqError
 from labseq_andor.codes import Code
 from labseq_andor.errors import explain
 
-STOP_PATIENCE_S: Final = 0.2
+MAX_STOP_S: Final = 0.2
 """How long to wait for a call that hangs, before the camera is stopped all the same, in seconds."""
 
-CALL_PATIENCE_S: Final = 2.0
+MAX_CALL_S: Final = 2.0
 """How long to wait for another thread's call to come back, in seconds."""
 
 LINUX_SETTINGS: Final = "/usr/local/etc/andor"
 """Where Andor's installer for Linux puts what Initialize wants to know."""
 
 
-class Fallible(Protocol):
+class ReportsSimulatorErrors(Protocol):
     """A stand-in, which cannot raise through C what its simulated world raised."""
 
     failure: LabseqError | None
@@ -41,7 +41,7 @@ class Sdk:
         capabilities: The SDK's structure of what the camera can do.
     """
 
-    def __init__(self, name: str, andor: Any, stand_in: Fallible | None) -> None:
+    def __init__(self, name: str, andor: Any, stand_in: ReportsSimulatorErrors | None) -> None:
         self._name = name
         self._andor = andor
         self._stand_in = stand_in
@@ -76,7 +76,7 @@ class Sdk:
     def _open(self, index: int, fan: str) -> None:
         folder = "" if sys.platform == "win32" or self._stand_in is not None else LINUX_SETTINGS
         try:
-            with self._told():
+            with self._translated_errors():
                 # a number leaves the cooler as it is; without one pylablib would switch it on
                 self.camera = self._andor.AndorSDK2Camera(index, folder, temperature=0, fan_mode=fan)
         except (TypeError, ValueError, LookupError) as error:  # it takes much for granted
@@ -87,12 +87,12 @@ class Sdk:
 
     def count(self) -> int:
         """How many cameras are connected."""
-        with self._told():
+        with self._translated_errors():
             return int(self._andor.get_cameras_number())
 
     def version(self) -> str:
         """The SDK's version."""
-        with self._told():
+        with self._translated_errors():
             return str(self._andor.get_SDK_version())
 
     @contextmanager
@@ -102,10 +102,10 @@ class Sdk:
         Raises:
             DeviceError: A function failed, or another thread hangs in one.
         """
-        if not self._lock.acquire(timeout=CALL_PATIENCE_S):
+        if not self._lock.acquire(timeout=MAX_CALL_S):
             raise DeviceError(self._name, "a call to Andor's SDK does not come back; restart labseq")
         try:
-            with self._told():
+            with self._translated_errors():
                 self._select()
                 yield self._andor.lib
         finally:
@@ -118,11 +118,11 @@ class Sdk:
             The first failure; None if there was none.
         """
         first: DeviceError | None = None
-        is_mine = self._lock.acquire(timeout=STOP_PATIENCE_S)
+        is_mine = self._lock.acquire(timeout=MAX_STOP_S)
         try:
             for action in actions:
                 try:
-                    with self._told():
+                    with self._translated_errors():
                         self._select()
                         action(self._andor.lib)
                 except DeviceError as error:
@@ -142,7 +142,7 @@ class Sdk:
     def wait(self, timeout_s: float) -> bool:
         """Wait for the next frame, with everybody else let through; False if none came."""
         try:
-            with self._told():
+            with self._translated_errors():
                 handle = self.camera.handle
                 self._andor.lib.WaitForAcquisitionByHandleTimeOut(handle, round(timeout_s * 1e3))
         except DeviceError as error:
@@ -162,7 +162,7 @@ class Sdk:
     def disconnect(self) -> None:
         """Let the camera go; nothing can be done any more about what fails or hangs."""
         camera, self.camera = self.camera, None
-        if camera is not None and self._lock.acquire(timeout=STOP_PATIENCE_S):
+        if camera is not None and self._lock.acquire(timeout=MAX_STOP_S):
             try:
                 with suppress(self._andor.AndorError):
                     camera.close()
@@ -177,7 +177,7 @@ class Sdk:
             lib.SetCurrentCamera(handle)
 
     @contextmanager
-    def _told(self) -> Generator[None]:
+    def _translated_errors(self) -> Generator[None]:
         try:
             yield
         except self._andor.AndorError as error:

@@ -35,8 +35,8 @@ def set_up(sdk: Sdk, settings: AndorSettings, name: str) -> dict[str, Any]:
     with sdk.selected() as lib:
         width, height = sdk.camera.get_detector_size()
         *_, version, build = lib.GetHardwareVersion()
-    if misfit := settings.misfit_on((height, width)):
-        raise ConfigError(f"{name}: {misfit}")
+    if setting_error := settings.sensor_conflict((height, width)):
+        raise ConfigError(f"{name}: {setting_error}")
     facts: dict[str, Any] = {
         "model": model,
         "serial_number": str(info.serial_number),

@@ -19,7 +19,7 @@ class ClimbSettings(Settings):
     """How far it looks, in parts of the range of each address."""
 
     step: Part = Field(default=0.25, description="first step, as a part of each range")
-    least_step: Part = Field(default=0.05, description="no step is shorter; the scan ends when none is left")
+    min_step: Part = Field(default=0.05, description="no step is shorter; the scan ends when none is left")
 
 
 class Climb:
@@ -38,7 +38,7 @@ class Climb:
             scores[self._place(point.values)].append(-inf if isnan(point.score) else point.score)
         best = max(visited, key=lambda point: mean(scores[self._place(point.values)])).values
         step = self._settings.step
-        while step >= self._settings.least_step:
+        while step >= self._settings.min_step:
             for r in self._ranges:
                 for way in (step, -step):
                     point = {**best, r.address: r.at(r.fraction(best[r.address]) + way)}

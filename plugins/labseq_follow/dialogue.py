@@ -81,7 +81,7 @@ class Dialogue:
             self._go.answered = "gone"
             self.note("its shot goes on; nobody will be told how it ends")
 
-    def heard(self, line: str, now_s: float) -> list[str]:
+    def receive_line(self, line: str, now_s: float) -> list[str]:
         """A line came."""
         word, _, text = line.strip().partition(" ")
         if word == GO:
@@ -103,8 +103,8 @@ class Dialogue:
         self._go.taken = True
         return self._go.text, ["busy"]
 
-    def tell(self, state: str, about: About, now_s: float) -> tuple[str, list[str]]:
-        """The shot of a `go` is over: what the leader was told of it, see ``labseq.Leading.tell``."""
+    def report(self, state: str, about: About, now_s: float) -> tuple[str, list[str]]:
+        """The shot of a `go` is over: what the leader was told of it, see ``labseq.LeaderLink.report``."""
         if self._go is None or not self._go.taken:
             return "", []
         said = self.overdue(now_s)
@@ -135,11 +135,11 @@ class Dialogue:
         """Keep something for the log."""
         self._news.append(text)
 
-    def news(self) -> list[str]:
+    def new_events(self) -> list[str]:
         """What was noted since the last call."""
-        news = [*self._news]
+        new_events = [*self._news]
         self._news.clear()
-        return news
+        return new_events
 
     def _heard_go(self, text: str, now_s: float) -> list[str]:
         if self._go is not None:

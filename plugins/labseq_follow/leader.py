@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
-from labseq import ConfigError, Context, DeviceError, DeviceTimeoutError, TruthTeller, wait_for
+from labseq import ConfigError, Context, DeviceError, DeviceTimeoutError, ReportsTruth, wait_for
 from labseq.errors import one_of
 from labseq.units import format_quantity
 from labseq_follow.dialogue import GO, VERSION, About, Dialogue, Splitter, encoded
@@ -34,7 +34,7 @@ def serial_leader(settings: SerialLeaderSettings, context: Context) -> LeaderDev
 
 
 class LeaderDevice:
-    """Lets another control system lead; implements ``labseq.Leading``.
+    """Lets another control system lead; implements ``labseq.LeaderLink``.
 
     A thread of its own listens, and keeps the deadline while a shot goes on. It knows no commands; its
     values are ``state`` ("idle", "waiting", "busy") and ``is_connected``.
@@ -135,7 +135,7 @@ class LeaderDevice:
         return self._dialogue.state if name == "state" else self._dialogue.is_connected
 
     def wait_for(self, signal: str, timeout_s: float) -> str:
-        """Wait for `go`, and tell the leader that labseq is busy; see ``labseq.Leading``.
+        """Wait for `go`, and tell the leader that labseq is busy; see ``labseq.LeaderLink``.
 
         Raises:
             DeviceError: Not open, or another signal.
@@ -160,22 +160,22 @@ class LeaderDevice:
             self._load(LOADING_S)
         return text
 
-    def tell(self, state: str, about: About) -> str:
-        """Answer a `go`; see ``labseq.Leading``.
+    def report(self, state: str, about: About) -> str:
+        """Answer a `go`; see ``labseq.LeaderLink``.
 
         Raises:
             DeviceError: Not open.
         """
         self._check_open()
         with self._changed:
-            told, lines = self._dialogue.tell(state, about, self._now())
+            told, lines = self._dialogue.report(state, about, self._now())
             is_said = self._say(lines)
         return told if is_said or told != state else "gone"
 
-    def news(self) -> Sequence[str]:
+    def new_events(self) -> Sequence[str]:
         """What happened since the last call."""
         with self._changed:
-            return self._dialogue.news()
+            return self._dialogue.new_events()
 
     def describe(self) -> Mapping[str, Any]:
         """Address, version of the protocol, deadline."""
@@ -198,7 +198,7 @@ class LeaderDevice:
                     self._dialogue.note("a line of the leader was too long, and was dropped")
                     self._say(["error the line is too long"])
                 else:
-                    self._say(self._dialogue.heard(line, self._now()))
+                    self._say(self._dialogue.receive_line(line, self._now()))
             self._changed.notify_all()
 
     def lost(self, reason: str) -> None:
@@ -240,14 +240,14 @@ class LeaderDevice:
 
     def _go_by_itself(self, timeout_s: float) -> str:
         """What the simulated leader does: it loads atoms, and says `go`."""
-        after_s = self._settings.goes_after
+        after_s = self._settings.simulated_go_delay
         if after_s > timeout_s:
             self._clock.sleep(timeout_s)
             what = f"the simulated leader says '{GO}' after {format_quantity(after_s, 'time')}"
-            raise DeviceTimeoutError(self._name, f"{what}; see 'goes_after'", timeout_s)
+            raise DeviceTimeoutError(self._name, f"{what}; see 'simulated_go_delay'", timeout_s)
         self._load(after_s)
         self._n_gos += 1
-        self._dialogue.heard(f"{GO} {self._n_gos}", self._now())
+        self._dialogue.receive_line(f"{GO} {self._n_gos}", self._now())
         text = self._take(0.0)
         assert text is not None
         return text
@@ -257,7 +257,7 @@ class LeaderDevice:
         start_s = self._clock.now()
         self._clock.sleep(duration_s)
         world = self._world
-        if world is not None and not (isinstance(world, TruthTeller) and world.truth().any()):
+        if world is not None and not (isinstance(world, ReportsTruth) and world.truth().any()):
             world.load(start_s, duration_s)
 
     def _say(self, lines: Sequence[str]) -> bool:

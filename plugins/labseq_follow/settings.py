@@ -8,7 +8,7 @@ from typing import Annotated, Final, Literal, Self, TypeAlias
 from pydantic import Field, model_validator
 
 from labseq import Duration, Settings
-from labseq.config.fields import misfit
+from labseq.config.fields import setting_error
 from labseq.config.wording import clean
 
 SIMULATED: Final = "simulated"
@@ -25,7 +25,7 @@ class LeaderSettings(Settings):
     leader: Literal["real", "simulated"] = Field(
         default="real", description="simulated: one that says `go` by itself, as in a dry run"
     )
-    goes_after: Duration = Field(
+    simulated_go_delay: Duration = Field(
         default=0.5, description="time after which the simulated leader says `go`; atoms load meanwhile"
     )
     loads: bool = Field(
@@ -52,7 +52,7 @@ class TcpLeaderSettings(LeaderSettings):
         if not self.allow_remote and not _is_loopback(self.host):
             what = f"host is '{clean(self.host)}', which other computers reach"
             hint = "or set 'allow_remote: true' in a network where everybody may lead"
-            raise misfit(what, "an address of this computer alone, such as 127.0.0.1", hint, at=("host",))
+            raise setting_error(what, "an address of this computer alone, such as 127.0.0.1", hint, at=("host",))
         return self
 
 

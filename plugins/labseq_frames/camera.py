@@ -8,7 +8,7 @@ from collections.abc import Generator, Mapping
 from contextlib import suppress
 from typing import Any, Final
 
-from labseq import CameraDriver, CameraFacts, ConfigError, Context, DeviceError, Series, Taken
+from labseq import CameraDriver, CameraFacts, ConfigError, Context, DeviceError, Series, ExposureResult
 from labseq.errors import Problem
 from labseq_frames.picture import BadFramesError, Picture, told
 from labseq_frames.settings import FramesSettings
@@ -42,7 +42,7 @@ class FramesCamera(CameraDriver):
         self._playing: Series | None = None
         self._armed_s = 0.0
         self._n_taken = 0
-        self._coming: deque[tuple[float, Taken]] = deque()
+        self._coming: deque[tuple[float, ExposureResult]] = deque()
 
     @property
     def facts(self) -> CameraFacts:
@@ -91,7 +91,7 @@ class FramesCamera(CameraDriver):
     def _fire(self) -> None:
         self._expose(self._clock.now())
 
-    def _take(self, timeout_s: float) -> Taken | None:
+    def _take(self, timeout_s: float) -> ExposureResult | None:
         series = self._playing
         if series is not None and series.trigger == "internal" and not self._coming:
             self._expose(self._armed_s + self._n_taken * (series.exposure_s + self._settings.readout))
@@ -116,7 +116,7 @@ class FramesCamera(CameraDriver):
         recorded_s = picture.t_start_s if self._settings.time_stamps == "recorded" else None
         told_s = t_start_s if recorded_s is None else recorded_s
         due_s = t_start_s + self._playing.exposure_s + self._settings.readout
-        self._coming.append((due_s, Taken(self._n_taken, picture.image, "", exposure_s, told_s)))
+        self._coming.append((due_s, ExposureResult(self._n_taken, picture.image, "", exposure_s, told_s)))
         self._n_taken += 1
 
     def _look(self) -> Source:
@@ -142,7 +142,7 @@ class FramesCamera(CameraDriver):
             raise DeviceError(self._name, str(error)) from error
         if picture is None:
             text = f"all {self._n_played} frames of {self._settings.path} have been played"
-            hint = "take fewer shots, or set `when_over: repeat`"
+            hint = "take fewer shots, or set `at_end: repeat`"
             raise DeviceError(self._name, f"{text}; {hint}")
         self._n_played += 1
         return picture
@@ -156,7 +156,7 @@ class FramesCamera(CameraDriver):
         if self._pictures is None:
             self._pictures = self._started()
         picture = next(self._pictures, None)
-        if picture is None and self._settings.when_over == "repeat":
+        if picture is None and self._settings.at_end == "repeat":
             self._pictures = self._started()
             picture = next(self._pictures, None)
         if picture is not None and self._shape != _shape_of(picture):

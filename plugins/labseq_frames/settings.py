@@ -21,7 +21,7 @@ class FramesSettings(Settings):
         default="all",
         description="of a run: all frames of all shots in order, or only the first image of each shot",
     )
-    when_over: Literal["stop", "repeat"] = Field(
+    at_end: Literal["stop", "repeat"] = Field(
         default="stop",
         description="after the last frame: end the run with an error that says how many there were, or "
         "begin again with the first",

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import Final, Literal, TypeAlias
 
-from labseq import DeviceError, LimitError, Series, Taken
+from labseq import DeviceError, LimitError, Series, ExposureResult
 from labseq.units import format_quantity
 from labseq_genicam.aravis import Buffer, Camera, Stream, StreamOptions
 from labseq_genicam.counting import FrameCounter
@@ -97,7 +97,7 @@ class Acquisition:
             camera.trigger()
         self._n_triggered += 1
 
-    def poll(self, seconds: float) -> Taken | None:
+    def poll(self, seconds: float) -> ExposureResult | None:
         """Wait for the next frame of the series, for at most so long; None if none came.
 
         Raises:
@@ -113,7 +113,7 @@ class Acquisition:
             self.stop()
         time_s = 1e-9 * buffer.camera_time_ns if buffer.camera_time_ns else math.nan
         fault = FAULTS.get(buffer.status, f"its buffer is '{buffer.status}'")
-        return Taken(number, buffer.image, fault, self._exposure_s, device_time_s=time_s)
+        return ExposureResult(number, buffer.image, fault, self._exposure_s, device_time_s=time_s)
 
     def ask(self) -> None:
         """Ask the camera for a sign of life.

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, Final
 
-from labseq import CameraDriver, CameraFacts, Context, DeviceError, Series, Taken, wait_for
+from labseq import CameraDriver, CameraFacts, Context, DeviceError, Series, ExposureResult, wait_for
 from labseq_genicam.acquisition import Acquisition, Start
 from labseq_genicam.link import Link
 from labseq_genicam.settings import SIMULATED, GenicamSettings
@@ -102,12 +102,12 @@ class GenicamCamera(CameraDriver):
     def _fire(self) -> None:
         (self._simulated or self._opened()).fire()
 
-    def _take(self, timeout_s: float) -> Taken | None:
+    def _take(self, timeout_s: float) -> ExposureResult | None:
         simulated = self._simulated
         if simulated is None:
             return self._wait(timeout_s)
-        patience_s = simulated.wait(timeout_s)
-        taken = None if patience_s is None else self._wait(patience_s)
+        max_wait_s = simulated.wait(timeout_s)
+        taken = None if max_wait_s is None else self._wait(max_wait_s)
         simulated.raise_pending()
         return None if taken is None else replace(taken, t_start_s=simulated.start_s(taken.number))
 
@@ -121,11 +121,11 @@ class GenicamCamera(CameraDriver):
             self._simulated.clear()
         self._opened().stop()
 
-    def _wait(self, timeout_s: float) -> Taken | None:
+    def _wait(self, timeout_s: float) -> ExposureResult | None:
         """Wait for a frame, and ask now and then whether the camera is still there."""
         acquisition, asked_s = self._opened(), time.monotonic()
 
-        def poll(longest_s: float) -> Taken | None:
+        def poll(longest_s: float) -> ExposureResult | None:
             nonlocal asked_s
             taken = acquisition.poll(longest_s)
             if taken is None and time.monotonic() - asked_s >= ASK_S:

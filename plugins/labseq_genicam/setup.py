@@ -51,7 +51,7 @@ def set_up(link: Link, settings: GenicamSettings) -> dict[str, Any]:
     """
     with link.doing("set the camera up") as camera:
         camera.stop()
-        for feature, value in (("ExposureAuto", "Off"), ("GainAuto", "Off"), ("ExposureMode", "Timed")):
+        for feature, value in (("ExposureAuto", "Off"), ("GainAuto", "Off"), ("ExposureMode", "ReportsTimings")):
             if camera.is_available(feature):
                 camera.set_string(feature, value)
         pixel_format = _set_pixel_format(link.name, camera, settings.pixel_format)

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq import Context, DeviceError, Frame, Series, SimulatedSensor, Wired
+from labseq import Context, DeviceError, Frame, Series, SimulatedSensor, WiresTriggers
 from labseq.lines import trigger_line
 from labseq_genicam.acquisition import Acquisition, Start
 from labseq_genicam.counterpart.fake import FakeCamera
@@ -18,7 +18,7 @@ from labseq_genicam.counterpart.images import Request
 from labseq_genicam.link import told
 from labseq_genicam.settings import GenicamSettings
 
-PATIENCE_S: Final = 5.0
+MAX_WAIT_S: Final = 5.0
 """How long the simulated camera may take to begin an exposure, and to send its frame, in real time."""
 
 
@@ -102,7 +102,7 @@ class SimulatedCamera:
         self.clear()
         self._series, self._acquisition = series, acquisition
         self._sensor.arm(series, self._mode, self._readout_s, None if math.isnan(period_s) else period_s)
-        if series.trigger == "external" and isinstance(self._world, Wired):
+        if series.trigger == "external" and isinstance(self._world, WiresTriggers):
             self._world.wire("camera", self._on_edge)
 
     def fire(self) -> None:
@@ -119,7 +119,7 @@ class SimulatedCamera:
         if not self._ignores_triggers:
             self._made.append(self._sensor.expose(self._late_s, self._edge_s))
         self._acquisition.fire()
-        if not self._fake.wait_for_request(n, PATIENCE_S, answered=True):
+        if not self._fake.wait_for_request(n, MAX_WAIT_S, answered=True):
             self._made.clear()  # its frame will be missed
         self.raise_pending()
 
@@ -138,7 +138,7 @@ class SimulatedCamera:
             self.fire()
         if self._due is None:
             self._take(timeout_s)
-        return None if self._due is None else max(timeout_s, PATIENCE_S)
+        return None if self._due is None else max(timeout_s, MAX_WAIT_S)
 
     def start_s(self, number: int) -> float:
         """When the exposure of a frame that has come began, on the session's clock; nan if unknown."""

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from labseq import Clock, DeviceError, DeviceTimeoutError, LimitError, Taken, Trigger, wait_for
+from labseq import Clock, DeviceError, DeviceTimeoutError, LimitError, ExposureResult, Trigger, wait_for
 from labseq.units import format_quantity
 from labseq_pylon import nodes as n
 from labseq_pylon.library import Sdk
@@ -119,7 +119,7 @@ class Acquisition:
         with self._sdk.doing("trigger"):
             self._camera.ExecuteSoftwareTrigger()
 
-    def poll(self, seconds: float) -> Taken | None:
+    def poll(self, seconds: float) -> ExposureResult | None:
         """Wait for the next buffer, for at most so long; None if none came.
 
         Raises:
@@ -146,16 +146,16 @@ class Acquisition:
         if self._camera.IsCameraDeviceRemoved():
             raise DeviceError(self._sdk.name, "the camera is gone; look after its cable and power")
 
-    def _taken(self, result: Any) -> Taken:
+    def _taken(self, result: Any) -> ExposureResult:
         number = result.BlockID - int(self._is_gige)
         if result.BlockID == NO_NUMBER:
             number = result.ImageNumber - 1
         if not result.GrabSucceeded():
             code = f" (0x{result.ErrorCode:08X})" if result.ErrorCode else ""
-            return Taken(number, None, f"{result.ErrorDescription.rstrip('. ')}{code}")
+            return ExposureResult(number, None, f"{result.ErrorDescription.rstrip('. ')}{code}")
         image = np.asarray(result.Array).astype(np.uint16, copy=False)
         device_time_s = result.TimeStamp / self._ticks_per_s if result.TimeStamp else math.nan
-        return Taken(number, image, exposure_s=self._exposure_s, device_time_s=device_time_s)
+        return ExposureResult(number, image, exposure_s=self._exposure_s, device_time_s=device_time_s)
 
 
 def _milliseconds(seconds: float) -> int:

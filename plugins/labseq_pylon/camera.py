@@ -13,7 +13,7 @@ from labseq import (
     Context,
     DeviceError,
     Series,
-    Taken,
+    ExposureResult,
     Trigger,
     wait_for,
 )
@@ -26,7 +26,7 @@ from labseq_pylon.sensor import sensor_shape
 from labseq_pylon.settings import SIMULATED, PylonSettings
 from labseq_pylon.setup import identify, set_up, temperature_k
 
-PATIENCE_S: Final = 5.0
+MAX_WAIT_S: Final = 5.0
 """How long the emulated camera may take for a frame that is due on the session's clock, and until it would
 see a trigger, in seconds: it has no more of a busy computer than others have."""
 
@@ -90,7 +90,7 @@ class PylonCamera(CameraDriver):
         else:
             shape = sensor_shape(nodes)
         self._found = identify(sdk, camera, nodes) | set_up(sdk, nodes, settings, shape)
-        ready_s = READY_S if self._emulation is None else PATIENCE_S
+        ready_s = READY_S if self._emulation is None else MAX_WAIT_S
         self._acquisition = Acquisition(sdk, camera, nodes, self._clock, ready_s)
 
     def _disconnect(self) -> None:
@@ -120,14 +120,14 @@ class PylonCamera(CameraDriver):
         if self._emulation is None or self._emulation.expose():
             acquisition.trigger()
 
-    def _take(self, timeout_s: float) -> Taken | None:
+    def _take(self, timeout_s: float) -> ExposureResult | None:
         acquisition, emulation = self._opened(), self._emulation
         if emulation is None or emulation.waits_for_wire:
             return wait_for(acquisition.poll, timeout_s, self._clock)
         if emulation.runs_by_itself:
             self._fire()
         frame = emulation.wait(timeout_s)
-        taken = None if frame is None else wait_for(acquisition.poll, PATIENCE_S, self._clock)
+        taken = None if frame is None else wait_for(acquisition.poll, MAX_WAIT_S, self._clock)
         if frame is None or taken is None:
             return None
         emulation.drop(taken.number)

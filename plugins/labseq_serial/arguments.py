@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
 
 from labseq import Settings
-from labseq.config.fields import Text, misfit
+from labseq.config.fields import Text, setting_error
 from labseq.config.wording import clean
 from labseq_serial.templates import Sent
 from labseq_serial.units import Unit
@@ -66,7 +66,7 @@ class TypedSettings(Settings):
 
     def shown_limits(self) -> str:
         """The limits in words."""
-        return in_words(*self.limits, self.quantity)
+        return format_limits(*self.limits, self.quantity)
 
     @model_validator(mode="after")
     def _type_unit_and_limits_fit(self) -> Self:
@@ -75,11 +75,11 @@ class TypedSettings(Settings):
         for key in ("unit", "min", "max", "words"):
             if key in given and getattr(self, key) is not None and key not in allowed.get(self.type, ()):
                 kinds = " or ".join(kind for kind, keys in allowed.items() if key in keys)
-                raise misfit(
+                raise setting_error(
                     f"'{key}' does not go with type {self.type}", f"type {kinds}", at=(key,), key=True
                 )
         if self.words[0] == self.words[1]:
-            raise misfit(f"false and true are both '{self.words[0]}'", "two words", at=("words",))
+            raise setting_error(f"false and true are both '{self.words[0]}'", "two words", at=("words",))
         check_limits(self.unit, self.min, self.max)
         return self
 
@@ -149,13 +149,13 @@ class ArgumentSettings(TypedSettings):
     @model_validator(mode="after")
     def _numbers_have_limits(self) -> Self:
         if self.choices and self.type != "text":
-            raise misfit(f"'choices' do not go with type {self.type}", "type text", at=("choices",), key=True)
+            raise setting_error(f"'choices' do not go with type {self.type}", "type text", at=("choices",), key=True)
         for key in ("min", "max") if self.is_number else ():
             if getattr(self, key) is None:
-                raise misfit(f"'{key}' is missing", "both limits of a number that is sent")
+                raise setting_error(f"'{key}' is missing", "both limits of a number that is sent")
         low, high = self.limits
         if self.type == "int" and math.ceil(low) > math.floor(high):
-            raise misfit("there is no whole number within the limits", "some", at=("min",))
+            raise setting_error("there is no whole number within the limits", "some", at=("min",))
         return self
 
 
@@ -179,17 +179,17 @@ def check_limits(unit: str | None, low: Number | None, high: Number | None, *at:
     for key, limit in (("min", low), ("max", high)):
         if isinstance(limit, float | int) and not quantity.is_si:
             what = f"{key} is {limit:g}, without a unit"
-            raise misfit(what, f"'{limit:g} {unit}', or what is meant with its unit", at=(*at, key))
+            raise setting_error(what, f"'{limit:g} {unit}', or what is meant with its unit", at=(*at, key))
         try:
             read += [] if limit is None else [quantity.read(limit)]
         except ValueError as error:
             raise placed(error, *at, key) from None
     if len(read) == 2 and read[0] > read[1]:
         shown = [quantity.shown(limit) for limit in read]
-        raise misfit(f"min is {shown[0]}, more than max, {shown[1]}", "min below max", at=(*at, "min"))
+        raise setting_error(f"min is {shown[0]}, more than max, {shown[1]}", "min below max", at=(*at, "min"))
 
 
-def in_words(low: float, high: float, quantity: Unit) -> str:
+def format_limits(low: float, high: float, quantity: Unit) -> str:
     """Limits in words; infinite ones are none."""
     if math.isinf(low):
         return "anything" if math.isinf(high) else f"at most {quantity.shown(high)}"
@@ -202,4 +202,4 @@ def placed(error: ValueError, *at: str | int, key: bool = False) -> PydanticCust
     """What a reader of text said, with its place: "what; expected this; do that"."""
     what, _, rest = str(error).partition("; expected ")
     expected, _, hint = rest.partition("; ")
-    return misfit(what, expected, hint, at=at, key=key)
+    return setting_error(what, expected, hint, at=at, key=key)

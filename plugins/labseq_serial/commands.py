@@ -9,7 +9,7 @@ from typing import Annotated, Final, Self, TypeAlias
 from pydantic import Field, model_validator
 
 from labseq import Duration, Settings
-from labseq.config.fields import Text, misfit
+from labseq.config.fields import Text, setting_error
 from labseq.config.wording import clean, closest
 from labseq_serial.arguments import ArgumentSettings, Scalar, placed
 from labseq_serial.replies import compiled, example_of
@@ -125,7 +125,7 @@ class CommandSettings(Settings):
         for name in self.arguments:
             if not name.isidentifier() or name in RESERVED:
                 expected = f"a word of letters, digits and '_', none of {', '.join(sorted(RESERVED))}"
-                raise misfit(
+                raise setting_error(
                     f"an argument is called '{clean(name)}'", expected, at=("arguments", name), key=True
                 )
         try:
@@ -136,11 +136,11 @@ class CommandSettings(Settings):
             if name not in self.arguments:
                 meant = closest(name, self.arguments)
                 hint = f"did you mean '{meant}'?" if meant else f"declare '{name}' below 'arguments'"
-                raise misfit(f"'{{{name}}}' is not an argument", _listed(self.arguments), hint, at=("send",))
+                raise setting_error(f"'{{{name}}}' is not an argument", _listed(self.arguments), hint, at=("send",))
         for name in self.arguments:
             if name not in names:
                 what = f"the argument '{name}' has no place in '{clean(self.send)}'"
-                raise misfit(what, f"a placeholder {{{name}}} in 'send'", at=("arguments", name), key=True)
+                raise setting_error(what, f"a placeholder {{{name}}} in 'send'", at=("arguments", name), key=True)
         return self
 
     @model_validator(mode="after")
@@ -153,7 +153,7 @@ class CommandSettings(Settings):
                 raise placed(error, "send") from None
             if self.template.read(text, self.kinds) != rounded:
                 what = f"the arguments cannot be told apart in '{clean(text)}'"
-                raise misfit(what, "something between the placeholders", at=("send",))
+                raise setting_error(what, "something between the placeholders", at=("send",))
             for name, value in rounded.items():
                 self._check_rounded(name, value, text)
         return self
@@ -168,7 +168,7 @@ class CommandSettings(Settings):
         if not low - slack <= value <= high + slack:
             key = "min" if value < low else "max"
             what = f"as '{clean(text)}' it would be {argument.quantity.shown(value)}, beyond the limit"
-            raise misfit(what, "a limit with no more digits than are sent", at=("arguments", name, key))
+            raise setting_error(what, "a limit with no more digits than are sent", at=("arguments", name, key))
 
     @model_validator(mode="after")
     def _replies_fit(self) -> Self:
@@ -176,7 +176,7 @@ class CommandSettings(Settings):
             for key in ("error", "example"):
                 if getattr(self, key) is not None:
                     what = f"'{key}' is about a reply, but no 'reply' is waited for"
-                    raise misfit(what, "a 'reply'", at=(key,), key=True)
+                    raise setting_error(what, "a 'reply'", at=(key,), key=True)
             return self
         check_reply(self.reply, self.simulated_reply())
         check_pattern(self.error, "error")
@@ -204,10 +204,10 @@ def check_reply(pattern: str, example: str | None) -> None:
     compiled_pattern = check_pattern(pattern, "reply")
     if example is None:
         what = f"labseq cannot make up a reply like '{clean(pattern)}'"
-        raise misfit(what, "an example of one", "add 'example'", at=("reply",))
+        raise setting_error(what, "an example of one", "add 'example'", at=("reply",))
     if compiled_pattern is not None and compiled_pattern.fullmatch(example) is None:
         what = f"the reply '{clean(example)}' does not do"
-        raise misfit(what, f"one like '{clean(pattern)}'", at=("example",))
+        raise setting_error(what, f"one like '{clean(pattern)}'", at=("example",))
 
 
 def call_of(call: Call) -> tuple[str, Mapping[str, Scalar]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from labseq.drivers.serial_port import Port, open_port, ports_here, ports_in_words
+from labseq.drivers.serial_port import Port, open_port, ports_here, ports_text
 from labseq.errors import DeviceError
 from labseq_serial.settings import SerialSettings, UsbSettings
 
@@ -51,5 +51,5 @@ def _find(usb: UsbSettings, device: str) -> str:
         names = ", ".join(f"{port.device} ({port.serial_number})" for port in fits)
         text = f"{len(fits)} adapters have {described}: {names}; add 'serial' to tell them apart"
         raise DeviceError(device, text)
-    text = f"no USB adapter has {described}; expected {ports_in_words()}; is it plugged in?"
+    text = f"no USB adapter has {described}; expected {ports_text()}; is it plugged in?"
     raise DeviceError(device, text)

@@ -8,7 +8,7 @@ from typing import Final, Literal, Self
 from pydantic import Field, model_validator
 
 from labseq import Duration, Settings
-from labseq.config.fields import Text, misfit
+from labseq.config.fields import Text, setting_error
 from labseq.config.wording import clean, closest
 from labseq.drivers.serial_port import is_network_port
 from labseq.errors import one_of
@@ -37,7 +37,7 @@ class UsbSettings(Settings):
     @model_validator(mode="after")
     def _says_something(self) -> Self:
         if self.vid is None and self.pid is None and self.serial is None:
-            raise misfit("this fits every adapter", "vid, pid or serial")
+            raise setting_error("this fits every adapter", "vid, pid or serial")
         return self
 
 
@@ -115,15 +115,15 @@ class SerialSettings(Settings):
     @model_validator(mode="after")
     def _has_one_port(self) -> Self:
         if self.port is None and self.usb is None:
-            raise misfit(
+            raise setting_error(
                 "it has no port", "'port' or 'usb'", "`labseq devices` names the ports if one is wrong"
             )
         if self.port is not None and self.usb is not None and self.port != SIMULATED:
-            raise misfit("it has both 'port' and 'usb'", "one of them", at=("usb",), key=True)
+            raise setting_error("it has both 'port' and 'usb'", "one of them", at=("usb",), key=True)
         scheme, is_url, _ = (self.port or "").partition("://")
         if is_url and not (scheme in _SCHEMES and is_network_port(self.port or "")):
             known = " or ".join(f"{one}://host:port" for one in _SCHEMES)
-            raise misfit(
+            raise setting_error(
                 f"'{clean(self.port or '')}' is no port", f"{known}, or a port of this computer", at=("port",)
             )
         return self
@@ -133,14 +133,14 @@ class SerialSettings(Settings):
         for key in ("write_ends_with", "read_ends_with"):
             text: str = getattr(self, key)
             if "\\" in text:
-                raise misfit(
+                raise setting_error(
                     f"'{text}' holds a backslash",
                     "control characters",
                     'write "\\r" in double quotes',
                     at=(key,),
                 )
             if not _can_be(text, self.encoding):
-                raise misfit(f"'{clean(text)}' is not {self.encoding}", "another encoding", at=("encoding",))
+                raise setting_error(f"'{clean(text)}' is not {self.encoding}", "another encoding", at=("encoding",))
         for at, text in self.asked():
             if problem := self.why_unsendable(text):
                 raise placed(ValueError(problem), *at)
@@ -161,23 +161,23 @@ class SerialSettings(Settings):
         if command is None:
             meant = closest(name, self.commands)
             hint = f"did you mean '{meant}'?" if meant else "declare it below 'commands'"
-            raise misfit(f"there is no command '{clean(name)}'", known(self.commands), hint, at=place)
+            raise setting_error(f"there is no command '{clean(name)}'", known(self.commands), hint, at=place)
         for argument, given in arguments.items():
             inner = (*at, "arguments", argument)
             declared = command.arguments.get(argument)
             if declared is None:
                 what = f"'{name}' has no argument '{clean(argument)}'"
-                raise misfit(what, known(command.arguments), at=inner, key=True)
+                raise setting_error(what, known(command.arguments), at=inner, key=True)
             try:
                 value = declared.value_of(given)
             except ValueError as error:
                 raise placed(ValueError(f"{argument}: {error}"), *inner) from None
             if not declared.allows(value):
-                raise misfit(f"{argument} is {given}", declared.shown_limits(), at=inner)
+                raise setting_error(f"{argument} is {given}", declared.shown_limits(), at=inner)
         missing = [argument for argument in command.arguments if argument not in arguments]
         if missing:
             what, first = f"'{name}' needs {', '.join(missing)}", missing[0]
-            raise misfit(what, f"{{do: {name}, arguments: {{{first}: ...}}}}", at=place)
+            raise setting_error(what, f"{{do: {name}, arguments: {{{first}: ...}}}}", at=place)
 
     @model_validator(mode="after")
     def _commands_make_values(self) -> Self:
@@ -186,10 +186,10 @@ class SerialSettings(Settings):
                 at = ("commands", name, "makes", made)
                 value = self.values.get(made)
                 if value is None:
-                    raise misfit(f"there is no value '{clean(made)}'", known(self.values), at=at, key=True)
+                    raise setting_error(f"there is no value '{clean(made)}'", known(self.values), at=at, key=True)
                 kind, expected = _MADE.get(value.type, (None, "a value of another type"))
                 if type(state) is not kind:
-                    raise misfit(f"the value '{made}' is of type {value.type}", expected, at=at)
+                    raise setting_error(f"the value '{made}' is of type {value.type}", expected, at=at)
         return self
 
 

@@ -8,10 +8,10 @@ from typing import Annotated, Final, Self
 from pydantic import Field, model_validator
 
 from labseq import Duration, Settings
-from labseq.config.fields import Text, misfit
+from labseq.config.fields import Text, setting_error
 from labseq.config.wording import clean
 from labseq.errors import one_of
-from labseq_serial.arguments import Number, Scalar, TypedSettings, check_limits, in_words, placed
+from labseq_serial.arguments import Number, Scalar, TypedSettings, check_limits, format_limits, placed
 from labseq_serial.replies import VALUE, compiled, example_of
 from labseq_serial.units import Unit
 
@@ -50,7 +50,7 @@ class InterlockSettings(Settings):
             return " or ".join(
                 str(good).lower() if isinstance(good, bool) else str(good) for good in self.one_of
             )
-        return in_words(*self.limits(quantity), quantity)
+        return format_limits(*self.limits(quantity), quantity)
 
 
 class ValueSettings(TypedSettings):
@@ -152,7 +152,7 @@ class ValueSettings(TypedSettings):
                 raise placed(error, key) from None
             if key == "reply" and VALUE not in pattern.groupindex:
                 what = f"'{clean(self.reply)}' has no group '{VALUE}'"
-                raise misfit(what, f"the value in brackets: (?P<{VALUE}>...)", at=(key,))
+                raise setting_error(what, f"the value in brackets: (?P<{VALUE}>...)", at=(key,))
         return self
 
     @model_validator(mode="after")
@@ -161,18 +161,18 @@ class ValueSettings(TypedSettings):
         if lock is None:
             return self
         if lock.min is None and lock.max is None and not lock.one_of:
-            raise misfit("the interlock allows everything", "min, max or one_of", at=("interlock",), key=True)
+            raise setting_error("the interlock allows everything", "min, max or one_of", at=("interlock",), key=True)
         wrong = ("one_of",) if self.is_number else ("min", "max")
         for key in wrong:
             if getattr(lock, key) not in (None, ()):
                 expected = "min and max" if self.is_number else "one_of"
                 what = f"'{key}' does not go with a value of type {self.type}"
-                raise misfit(what, expected, at=("interlock", key), key=True)
+                raise setting_error(what, expected, at=("interlock", key), key=True)
         kind = bool if self.type == "bool" else str
         for i, good in enumerate(lock.one_of):
             if type(good) is not kind:
                 expected = "true or false" if kind is bool else "text, in quotes"
-                raise misfit(f"the value is of type {self.type}", expected, at=("interlock", "one_of", i))
+                raise setting_error(f"the value is of type {self.type}", expected, at=("interlock", "one_of", i))
         check_limits(self.unit, lock.min, lock.max, "interlock")
         return self
 
@@ -182,7 +182,7 @@ class ValueSettings(TypedSettings):
             reply = self.reply_with(self.typical)
             if reply is None:
                 what = f"labseq cannot make up a reply like '{clean(self.reply)}' with the value "
-                raise misfit(
+                raise setting_error(
                     what + self.shown(self.typical), "an example of one", "add 'example'", at=("reply",)
                 )
         else:

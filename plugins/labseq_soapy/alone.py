@@ -32,7 +32,7 @@ def marker_of(device: str) -> Path:
     return place() / f"soapy-{hashlib.sha256(device.encode()).hexdigest()[:16]}.alone"
 
 
-def end_the_one_alone(name: str, marker: Path, clock: Clock) -> None:
+def end_stale_process(name: str, marker: Path, clock: Clock) -> None:
     """End the process that an earlier labseq left behind with this radio, if there is one; it ramps down.
 
     Args:

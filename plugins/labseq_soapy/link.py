@@ -210,7 +210,7 @@ class Link:
         return ""
 
     def _beat(self) -> None:
-        while not self._closing.wait(self._setup.patience_s / 8):
+        while not self._closing.wait(self._setup.max_wait_s / 8):
             try:
                 self._say({"do": "beat"})
             except OSError:

@@ -39,7 +39,7 @@ class Setup:
         antenna: Name of the connector; "": as the radio chooses.
         clock_source: Reference of its clocks; "": as the radio chooses.
         ramp_s: Duration of its own ramp to nothing.
-        patience_s: How long labseq may be silent.
+        max_wait_s: How long labseq may be silent.
         hold: Whether to go on without labseq.
         marker: File that says that it goes on without labseq; who deletes it ends it.
     """
@@ -54,7 +54,7 @@ class Setup:
     antenna: str
     clock_source: str
     ramp_s: float
-    patience_s: float
+    max_wait_s: float
     hold: bool
     marker: str
 

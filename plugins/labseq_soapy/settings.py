@@ -9,7 +9,7 @@ from typing import Annotated, Final, Literal, Self, TypeAlias
 from pydantic import Field, model_validator
 
 from labseq import Duration, Frequency, Settings
-from labseq.config.fields import misfit
+from labseq.config.fields import setting_error
 from labseq.config.profile import FrequencyComb
 from labseq.config.wording import clean, closest
 from labseq.errors import one_of
@@ -115,20 +115,20 @@ class SoapySettings(Settings):
         if key not in known:
             meant = closest(key, known)
             hint = f"did you mean '{meant}'?" if meant else ""
-            raise misfit(
+            raise setting_error(
                 f"the simulated radio has no argument '{clean(key)}'", one_of(known), hint, at=("device",)
             )
         came = f"{key} of the simulated radio is '{clean(value)}'"
         if (words := WORDS.get(key)) is not None:
             if not value or (words and value not in words):
-                raise misfit(came, one_of(words) if words else "a folder", at=("device",))
+                raise setting_error(came, one_of(words) if words else "a folder", at=("device",))
             return
         try:
             number = float(value)
         except ValueError:
             number = math.nan
         if not LEAST[key] <= number < math.inf:
-            raise misfit(came, f"a number, at least {LEAST[key]:g}", at=("device",))
+            raise setting_error(came, f"a number, at least {LEAST[key]:g}", at=("device",))
 
     @model_validator(mode="after")
     def _two_outputs(self) -> Self:

@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq import Listening, Simulation
+from labseq import ReceivesOutput, Simulation
 from labseq_soapy.capture import CapturedOutputs, Ring, built
 from labseq_soapy.settings import SoapySettings
 
@@ -40,7 +40,7 @@ class SimulatedRadio:
 
     def __init__(self, settings: SoapySettings, world: Simulation | None) -> None:
         self._channels = settings.row_channel, settings.column_channel
-        self._world = world if isinstance(world, Listening) else None
+        self._world = world if isinstance(world, ReceivesOutput) else None
         given = settings.simulated_arguments
         self.environment = {**os.environ, "SOAPY_SDR_PLUGIN_PATH": str(built())}
         is_ours = "folder" not in given
@@ -57,11 +57,11 @@ class SimulatedRadio:
         """What it was sent; it must be open."""
         return Ring(self.folder)
 
-    def listen(self, tones_hz: tuple[NDArray[np.float64], NDArray[np.float64]]) -> None:
+    def connect_outputs(self, tones_hz: tuple[NDArray[np.float64], NDArray[np.float64]]) -> None:
         """Let the world, if it listens, hear the tones of rows and columns from now on."""
         if self._world is not None:
             self._outputs = CapturedOutputs(self.ring, tones_hz, self._channels)
-            self._world.listen("static_tweezers", self._outputs)
+            self._world.connect_outputs("static_tweezers", self._outputs)
 
     def look(self) -> None:
         """The driver has changed what is played."""

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from labseq import Context, DeviceError, LimitError, TransientError
-from labseq_soapy.alone import end_the_one_alone, marker_of, place
+from labseq_soapy.alone import end_stale_process, marker_of, place
 from labseq_soapy.array_tones import Amplitudes, ArrayTones
 from labseq_soapy.capture import built
 from labseq_soapy.library import SoapyError
@@ -80,7 +80,7 @@ class SoapyStaticTweezers:
             self._facts = self._link.facts()
             self._tones.tune(self._facts)
             if self.simulated_radio is not None:
-                self.simulated_radio.listen(self._tones.tones_hz)
+                self.simulated_radio.connect_outputs(self._tones.tones_hz)
         except BaseException:
             self._disconnect()
             raise
@@ -200,7 +200,7 @@ class SoapyStaticTweezers:
                 self.simulated_radio = radio = SimulatedRadio(setup, self._world)
             device, environment, folder = radio.device, radio.environment, radio.folder
         marker = marker_of(setup.device)  # a simulated radio's own folder is another each time
-        end_the_one_alone(self._name, marker, self._clock)
+        end_stale_process(self._name, marker, self._clock)
         told = Setup(
             device=device,
             stream=setup.stream,
@@ -212,7 +212,7 @@ class SoapyStaticTweezers:
             antenna=setup.antenna,
             clock_source=setup.clock_source,
             ramp_s=setup.switch,
-            patience_s=setup.patience,
+            max_wait_s=setup.patience,
             hold=setup.on_exit == "hold",
             marker=str(marker),
         )

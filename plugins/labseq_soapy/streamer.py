@@ -32,11 +32,11 @@ WRITE_S: Final = 0.1
 MARKER_S: Final = 0.1
 
 
-class Ear:
+class CommandReader:
     """Reads what labseq says, in a thread, and the loops that it names from their files."""
 
     def __init__(self, pipe: int) -> None:
-        self.heard: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
+        self.inbox: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
         self.last_s = time.monotonic()
         self.closed = False
         self._messages = received(pipe)
@@ -51,11 +51,11 @@ class Ear:
                     message["loop"] = repeated(np.load(message["file"]))
                 except (OSError, ValueError) as error:
                     message = {"do": "fail", "why": f"a loop cannot be read: {error}"}
-            self.heard.put(message)
+            self.inbox.put(message)
         self.closed = True
 
 
-class Mouth:
+class StatusWriter:
     """Tells labseq things, in a thread: a labseq that hangs must not hold up the stream."""
 
     def __init__(self, pipe: int) -> None:
@@ -63,7 +63,7 @@ class Mouth:
         self._said: queue.SimpleQueue[Mapping[str, Any] | threading.Event] = queue.SimpleQueue()
         threading.Thread(target=self._talk, daemon=True).start()
 
-    def say(self, message: Mapping[str, Any]) -> None:
+    def post(self, message: Mapping[str, Any]) -> None:
         """Say something, soon."""
         self._said.put(message)
 
@@ -95,9 +95,9 @@ class Streamer:
     """
 
     def __init__(
-        self, stream: Stream, setup: Setup, rate_hz: float, ear: Ear, say: Callable[[Any], None]
+        self, stream: Stream, setup: Setup, rate_hz: float, ear: CommandReader, post: Callable[[Any], None]
     ) -> None:
-        self._stream, self._setup, self._rate_hz, self._ear, self._say = stream, setup, rate_hz, ear, say
+        self._stream, self._setup, self._rate_hz, self._commands, self._say = stream, setup, rate_hz, ear, post
         self._output = Output()
         self._written = self._buffered = self._due = 0
         self._task: int | None = None
@@ -126,8 +126,8 @@ class Streamer:
             SoapyError: The stream is broken.
         """
         while not (self._leaving and self._task is None):
-            while not self._ear.heard.empty():
-                self._obey(self._ear.heard.get())
+            while not self._commands.inbox.empty():
+                self._execute(self._commands.inbox.get())
             self._write(self._output.block())
             self._look()
 
@@ -135,7 +135,7 @@ class Streamer:
         """Ramp down and end; a signal's handler."""
         self._terminated = True
 
-    def _obey(self, message: dict[str, Any]) -> None:
+    def _execute(self, message: dict[str, Any]) -> None:
         if self._leaving:  # too late
             return
         match message["do"]:
@@ -186,10 +186,10 @@ class Streamer:
             self._leave("it was asked to end by a signal")
         elif self._alone:
             self._look_at_marker(now_s)
-        elif self._ear.closed:
+        elif self._commands.closed:
             self._part("labseq is gone")
-        elif not self._setup.hold and now_s - self._ear.last_s > self._setup.patience_s:
-            self._part(f"labseq said nothing for {self._setup.patience_s:g} s")
+        elif not self._setup.hold and now_s - self._commands.last_s > self._setup.max_wait_s:
+            self._part(f"labseq said nothing for {self._setup.max_wait_s:g} s")
 
     def _part(self, why: str) -> None:
         self._alone = True
@@ -220,7 +220,7 @@ def repeated(loop: Samples) -> Samples:
     return np.tile(loop, (1, -(-BLOCK // n)))
 
 
-def stream_to(ear: Ear, mouth: Mouth) -> None:
+def stream_to(ear: CommandReader, mouth: StatusWriter) -> None:
     """Open the radio, stream, close it.
 
     Raises:
@@ -232,10 +232,10 @@ def stream_to(ear: Ear, mouth: Mouth) -> None:
         facts = set_up(radio, setup)
         stream = radio.stream(sorted(setup.channels), setup.stream)
         stream.activate()
-        streamer = Streamer(stream, setup, facts.rate_hz, ear, mouth.say)
+        streamer = Streamer(stream, setup, facts.rate_hz, ear, mouth.post)
         signal.signal(signal.SIGTERM, streamer.terminate)
         told = Facts(facts.radio, facts.rate_hz, facts.oscillator_hz, facts.gain_db, streamer.fill())
-        mouth.say({"facts": told.as_message()})
+        mouth.post({"facts": told.as_message()})
         try:
             streamer.run()
         finally:
@@ -255,12 +255,12 @@ def main() -> int:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for labseq, which then ramps down
     pipe = os.dup(1)
     os.dup2(2, 1)  # whatever a radio's module prints goes to the log
-    ear, mouth = Ear(0), Mouth(pipe)
+    ear, mouth = CommandReader(0), StatusWriter(pipe)
     gc.disable()  # nothing here makes cycles
     try:
         stream_to(ear, mouth)
     except SoapyError as error:
-        mouth.say({"failed": str(error)})
+        mouth.post({"failed": str(error)})
         mouth.finish()
         return 3
     mouth.finish()

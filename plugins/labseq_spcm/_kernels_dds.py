@@ -17,7 +17,7 @@ from labseq.kernels.compile import const, kernel
 from labseq_spcm._kernels_dds_steps import (
     COURSE_STEPS,
     END_HZ,
-    LEAST_TICKS,
+    MIN_TICKS,
     START_HZ,
     TICK_S,
     TONES,
@@ -242,7 +242,7 @@ def compile_program(
         for k in range(n_steps):
             tick = np.rint((joint_s + knots[k] * before_s) / TICK_S)
             n_ticks = np.rint((joint_s + knots[k + 1] * before_s) / TICK_S) - tick
-            if n_ticks < LEAST_TICKS:
+            if n_ticks < MIN_TICKS:
                 ends[0] = i
                 return TOO_SHORT
             step_s, late_s = n_ticks * TICK_S, tick * TICK_S - (joint_s + knots[k] * before_s)
@@ -267,7 +267,7 @@ def compile_program(
         n = drive_core(
             column_cores[at], column_now[HZ, at], 0.0, 0.0, 0.0, column_now, at, registers, values, n
         )
-    n = put(TIMER, 2 * LEAST_TICKS * TICK_S, registers, values, n)
+    n = put(TIMER, 2 * MIN_TICKS * TICK_S, registers, values, n)
     n = put(COMMAND, AT_TRIGGER, registers, values, n)
     ends[n_blocks] = n
     n = put(SOURCE, FROM_CARD, registers, values, n)

@@ -13,7 +13,7 @@ Reals = NDArray[np.float64]
 
 TICK_S: Final = 6.4e-9
 """Resolution of the DDS timer."""
-LEAST_TICKS: Final = 13
+MIN_TICKS: Final = 13
 """Shortest time between two blocks: 83.2 ns."""
 RAMP_STEPS: Final = 8
 """The depth is within 1 / (4 n^2) of linear: 0.4 % of the full depth."""
@@ -57,7 +57,7 @@ def widest_ramp(tones: Reals, first: int, last: int, widest: Reals) -> None:
 def cut(widest: Reals, course: int, duration_s: float, knots: Reals) -> int:
     """Where a segment is cut into steps, as fractions of its duration; returns how many steps."""
     start, end = widest[0], widest[1]
-    room = duration_s / ((LEAST_TICKS + 1) * TICK_S)
+    room = duration_s / ((MIN_TICKS + 1) * TICK_S)
     if abs(end - start) > 0.05 * max(start, end):
         n_steps = max(1, min(RAMP_STEPS, int(np.sqrt(room))))
         for k in range(n_steps + 1):

@@ -89,7 +89,7 @@ class AwgCard:
         self._forget()
 
     @contextmanager
-    def _told(self, what: str) -> Generator[None]:
+    def _translated_errors(self, what: str) -> Generator[None]:
         try:
             yield
         except self.spcm.SpcmTimeout as error:
@@ -117,7 +117,7 @@ class AwgCard:
         Raises:
             DeviceError: The card refuses.
         """
-        with self._told(f"reading register {register}"):
+        with self._translated_errors(f"reading register {register}"):
             return int(self._card.get_i(register))
 
     def read_real(self, register: int) -> float:
@@ -126,7 +126,7 @@ class AwgCard:
         Raises:
             DeviceError: The card refuses.
         """
-        with self._told(f"reading register {register}"):
+        with self._translated_errors(f"reading register {register}"):
             return float(self._card.get_d(register))
 
     def write(self, register: int, value: int, what: str) -> None:
@@ -135,7 +135,7 @@ class AwgCard:
         Raises:
             DeviceError: The card refuses.
         """
-        with self._told(f"{what} = {value}"):
+        with self._translated_errors(f"{what} = {value}"):
             self._card.set_i(register, value)
 
     def set(self, register: int, value: int, what: str, tolerance: int = 0) -> int:
@@ -172,7 +172,7 @@ class AwgCard:
             DeviceError: The card refuses one; those before it are written.
         """
         address = ctypes.c_void_p(entries.ctypes.data)
-        with self._told(what):
+        with self._translated_errors(what):
             self._card.set_ptr(self.spcm.SPC_REGISTER_LIST, address, entries.nbytes)
 
     def command(self, command: int, what: str) -> None:
@@ -181,7 +181,7 @@ class AwgCard:
         Raises:
             DeviceError: The card refuses.
         """
-        with self._told(what):
+        with self._translated_errors(what):
             self._card.set_i(self.spcm.SPC_M2CMD, command)
 
     @property

@@ -31,11 +31,11 @@ class Dds:
         cores: Which cores drive which axis.
 
     Attributes:
-        patience_s: How long the card can be left alone while it plays.
+        max_wait_s: How long the card can be left alone while it plays.
         render_s: What compiling took in the last ``prepare``, on this computer's clock.
     """
 
-    patience_s = POLL_S
+    max_wait_s = POLL_S
     render_s = 0.0
 
     def __init__(self, card: AwgCard, cores: Cores) -> None:

@@ -14,7 +14,7 @@ from labseq_spcm.settings import SpcmSettings
 RING_CHUNKS: Final = 4
 FRAME_BYTES: Final = 4
 """A sample of both outputs."""
-LEAST_FILL: Final = 1 << 20
+MIN_FILL: Final = 1 << 20
 """Least part of the on-board memory that is used as a FIFO, in bytes."""
 
 
@@ -32,7 +32,7 @@ class Fifo:
         sample_rate_hz: What the card's clock really makes.
 
     Attributes:
-        patience_s: How long the card can now be left alone while it plays; 0: not at all.
+        max_wait_s: How long the card can now be left alone while it plays; 0: not at all.
         render_s: What rendering has taken since the last ``prepare`` began, on this computer's clock.
     """
 
@@ -46,12 +46,12 @@ class Fifo:
         self._half_ring_s = RING_CHUNKS / 2 * CHUNK / sample_rate_hz
         self._renderer: InterleavedRenderer | None = None
         self._n_handed = self._n_samples = 0
-        self.patience_s = 0.0
+        self.max_wait_s = 0.0
         spcm = card.spcm
         card.set(spcm.SPC_CARDMODE, spcm.SPC_REP_FIFO_SINGLE, "card mode")
         card.set(spcm.SPC_LOOPS, 1, "loops")
         ahead = int(settings.fill * sample_rate_hz) * FRAME_BYTES - self._ring.nbytes
-        self._fill = 1 << round(math.log2(max(LEAST_FILL, ahead)))
+        self._fill = 1 << round(math.log2(max(MIN_FILL, ahead)))
         card.set(spcm.SPC_DATA_OUTBUFSIZE, self._fill, "size of the card's FIFO in bytes")
 
     def prepare(self, program: ToneProgram) -> float:
@@ -98,7 +98,7 @@ class Fifo:
         except DeviceError:  # the card may have stopped since it was asked for room
             self._check_supply()
             raise
-        self.patience_s = self._half_ring_s if is_full else 0.0
+        self.max_wait_s = self._half_ring_s if is_full else 0.0
         return self._check_supply()
 
     def _check_supply(self) -> bool:

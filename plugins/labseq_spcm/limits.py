@@ -88,10 +88,10 @@ def check_rate(name: str, sample_rate_hz: float, rf: RfSpec) -> None:
     Raises:
         LimitError: It is not above twice the highest frequency.
     """
-    most_hz = max(*rf.row_band_hz, *rf.column_band_hz)
-    if sample_rate_hz <= 2 * most_hz:
-        rate, highest = (format_quantity(hz, "frequency") for hz in (sample_rate_hz, most_hz))
-        least = format_quantity(2 * most_hz, "frequency")
+    max_hz = max(*rf.row_band_hz, *rf.column_band_hz)
+    if sample_rate_hz <= 2 * max_hz:
+        rate, highest = (format_quantity(hz, "frequency") for hz in (sample_rate_hz, max_hz))
+        least = format_quantity(2 * max_hz, "frequency")
         raise LimitError(
             f"{name}: sample_rate", rate, f"above {least}, twice the end of the AODs' band, {highest}"
         )

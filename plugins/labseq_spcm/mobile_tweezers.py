@@ -12,7 +12,7 @@ from labseq import (
     Context,
     DeviceError,
     DeviceTimeoutError,
-    Listening,
+    ReceivesOutput,
     ToneProgram,
     TransientError,
 )
@@ -38,11 +38,11 @@ class PlayMode(Protocol):
     """How a program gets to the outputs.
 
     Attributes:
-        patience_s: How long the card can now be left alone while it plays; 0: not at all.
+        max_wait_s: How long the card can now be left alone while it plays; 0: not at all.
         render_s: What rendering took in the last ``prepare``, on this computer's clock.
     """
 
-    patience_s: float
+    max_wait_s: float
     render_s: float
 
     def prepare(self, program: ToneProgram) -> float:
@@ -137,9 +137,9 @@ class SpcmMobileTweezers:
 
             self.simulated_card = SimulatedCard(self._clock)
             self._identifier = install(self.simulated_card)
-            if isinstance(self._world, Listening):
+            if isinstance(self._world, ReceivesOutput):
                 outputs = CardOutputs(self.simulated_card, self._settings.row_channel)
-                self._world.listen("mobile_tweezers", outputs)
+                self._world.connect_outputs("mobile_tweezers", outputs)
 
     def close(self) -> None:
         """Make the outputs harmless and let the card go; legal in any state."""
@@ -170,7 +170,7 @@ class SpcmMobileTweezers:
         else:
             importlib.import_module("labseq_spcm._kernels")
             warm_rendering()
-        if self._settings.card == SIMULATED and isinstance(self._world, Listening):
+        if self._settings.card == SIMULATED and isinstance(self._world, ReceivesOutput):
             self._world.warm()
 
     def prepare(self, program: ToneProgram) -> float:
@@ -188,7 +188,7 @@ class SpcmMobileTweezers:
         self._duration_s = None
         limits.refuse_excess(self._name, program, self._rf)
         card.stop()
-        if self.simulated_card is not None and not isinstance(self._world, Listening):
+        if self.simulated_card is not None and not isinstance(self._world, ReceivesOutput):
             self.simulated_card.forget(self._clock.now())
         start_s = time.perf_counter()
         playing_s = mode.prepare(program)
@@ -242,7 +242,7 @@ class SpcmMobileTweezers:
                 if now_s >= deadline_s:
                     raise self._late(timeout_s)
                 idle_s = max(POLL_S, due_s - now_s) if math.isfinite(due_s) else POLL_S
-                self._clock.sleep(min(deadline_s - now_s, mode.patience_s, idle_s))
+                self._clock.sleep(min(deadline_s - now_s, mode.max_wait_s, idle_s))
                 if self._due_s is None:
                     raise DeviceError(self._name, "stopped by safe_state() while it played")
         except (DeviceError, TransientError):

@@ -20,11 +20,11 @@ class Replay:
         sample_rate_hz: What the card's clock really makes.
 
     Attributes:
-        patience_s: How long the card can be left alone while it plays.
+        max_wait_s: How long the card can be left alone while it plays.
         render_s: What rendering took in the last ``prepare``, on this computer's clock.
     """
 
-    patience_s = math.inf
+    max_wait_s = math.inf
     render_s = 0.0
 
     def __init__(self, card: AwgCard, settings: SpcmSettings, sample_rate_hz: float) -> None:

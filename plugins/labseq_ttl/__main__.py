@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from labseq import LabseqError
 from labseq.roles.clock import NeverStopped
 from labseq_ttl.box import Box
-from labseq_ttl.connection import PATIENCE_S
+from labseq_ttl.connection import MAX_WAIT_S
 from labseq_ttl.port import open_box
 
 
@@ -22,7 +22,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if given.serial is not None and not 0 <= given.serial <= 0xFFFF:
         parser.error(f"--serial is {given.serial}; expected 0 to 65535")
     try:
-        box = Box(open_box(given.port, "timing box"), "timing box", NeverStopped(), PATIENCE_S)
+        box = Box(open_box(given.port, "timing box"), "timing box", NeverStopped(), MAX_WAIT_S)
         try:
             box.identify()
             if given.serial is not None:

@@ -61,16 +61,16 @@ class Box:
         port: The port.
         device: Name of the box, for messages.
         clock: The session's clock.
-        patience_s: How long an answer may take, in seconds.
+        max_wait_s: How long an answer may take, in seconds.
 
     Attributes:
         line: The conversation with it.
     """
 
-    def __init__(self, port: Port, device: str, clock: Clock, patience_s: float) -> None:
-        self.line = Conversation(port, device, clock, patience_s)
+    def __init__(self, port: Port, device: str, clock: Clock, max_wait_s: float) -> None:
+        self.line = Conversation(port, device, clock, max_wait_s)
         self._device = device
-        self._patience_s = patience_s
+        self._patience_s = max_wait_s
 
     def identify(self) -> Identity:
         """Wait until the box answers, and see that it is one.
@@ -88,7 +88,7 @@ class Box:
             text = f"the box's firmware speaks version {version} of the protocol; expected {VERSION}"
             raise DeviceError(self._device, f"{text}; flash it again, see docs/how-to/timing-box.md")
         serial_number, boots, cause = self._numbers(words[2:], 3)
-        return Identity(serial_number, boots, cause_in_words(cause))
+        return Identity(serial_number, boots, cause_text(cause))
 
     def state(self, tries: int = TRIES) -> BoxState:
         """What it is doing; no answer while a program runs."""
@@ -102,7 +102,7 @@ class Box:
         """Keep a serial number for good."""
         self.line.ask(f"serial {number:x}")
 
-    def set_lights_out(self, timeout_s: float) -> None:
+    def set_watchdog_timeout(self, timeout_s: float) -> None:
         """Turn all lines off if nothing is heard for so long; 0: never."""
         self.line.ask(f"timeout {round(timeout_s * 1e3):x}")
 
@@ -144,7 +144,7 @@ class Box:
         while True:
             self.line.send(b"\n")  # ends what others may have left unfinished
             try:
-                return self.line.ask("id", patience_s=try_s, tries=1)
+                return self.line.ask("id", max_wait_s=try_s, tries=1)
             except DeviceTimeoutError:
                 if time.monotonic() > deadline_s:
                     raise
@@ -160,11 +160,11 @@ class Box:
         return numbers
 
 
-def cause_in_words(bits: int) -> str:
+def cause_text(bits: int) -> str:
     """Why the box started.
 
     Example:
-        >>> cause_in_words(8), cause_in_words(0)
+        >>> cause_text(8), cause_text(0)
         ('watchdog', 'unknown')
     """
     return ", ".join(text for bit, text in CAUSES.items() if bits & bit) or "unknown"

@@ -6,15 +6,15 @@ from typing import Final
 
 from labseq import Clock, DeviceError
 from labseq_ttl.box import Box
-from labseq_ttl.counterpart import Counterpart, start_counterpart
+from labseq_ttl.counterpart import Counterpart, start_simulator
 from labseq_ttl.heartbeat import Heartbeat
 from labseq_ttl.port import open_box
 from labseq_ttl.settings import TtlSettings
 
-PATIENCE_S: Final = 1.0
+MAX_WAIT_S: Final = 1.0
 """How long an answer of a real box may take, in seconds."""
 
-SIMULATED_PATIENCE_S: Final = 15.0
+SIMULATED_MAX_WAIT_S: Final = 15.0
 """The same of a simulated one, on a computer that is busy."""
 
 
@@ -41,13 +41,13 @@ class Connection:
         self.counterpart: Counterpart | None = None
         self._heartbeat: Heartbeat | None = None
         if settings.is_simulated:
-            self.counterpart = start_counterpart(settings.simulated_by, device, clock)
-            patience_s = SIMULATED_PATIENCE_S
+            self.counterpart = start_simulator(settings.simulated_by, device, clock)
+            max_wait_s = SIMULATED_MAX_WAIT_S
         else:
-            patience_s = PATIENCE_S
+            max_wait_s = MAX_WAIT_S
         try:
             port = open_box(settings.port, device) if self.counterpart is None else self.counterpart.port
-            self.box = Box(port, device, clock, patience_s)
+            self.box = Box(port, device, clock, max_wait_s)
         except BaseException:
             if self.counterpart is not None:
                 self.counterpart.close()
@@ -72,14 +72,14 @@ class Connection:
         if not settings.is_simulated and wanted is not None and wanted != came:
             text = f"the box at {settings.port} has the serial number {came}; expected {wanted}"
             raise DeviceError(device, f"{text}; is this the right port?")
-        self.box.line.forget_news()
+        self.box.line.drop_messages()
         self.box.line.ask("off")
         state = self.box.state()
         self.n_runs = state.runs
         if state.polarity != polarity:
             self.box.set_polarity(polarity)
-        timeout_s = 0.0 if settings.is_simulated else settings.lights_out
-        self.box.set_lights_out(timeout_s)
+        timeout_s = 0.0 if settings.is_simulated else settings.watchdog_timeout
+        self.box.set_watchdog_timeout(timeout_s)
         if timeout_s:
             line = self.box.line
             self._heartbeat = Heartbeat(lambda: line.send(b"\n"), timeout_s)  # an empty line is not answered

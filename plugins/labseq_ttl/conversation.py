@@ -36,15 +36,15 @@ class Conversation:
         port: The port, open.
         device: Name of the box, for messages.
         clock: The session's clock.
-        patience_s: How long an answer may take, in seconds.
+        max_wait_s: How long an answer may take, in seconds.
     """
 
-    def __init__(self, port: Port, device: str, clock: Clock, patience_s: float) -> None:
+    def __init__(self, port: Port, device: str, clock: Clock, max_wait_s: float) -> None:
         self.lock = threading.RLock()
         self._port = port
         self._device = device
         self._clock = clock
-        self._patience_s = patience_s
+        self._patience_s = max_wait_s
         self._given_up = False
         self._n_asked = 0
         self._came = bytearray()
@@ -53,14 +53,14 @@ class Conversation:
         self._news: deque[list[str]] = deque(maxlen=64)
 
     def ask(
-        self, question: str, *, again: bool = True, patience_s: float | None = None, tries: int = TRIES
+        self, question: str, *, again: bool = True, max_wait_s: float | None = None, tries: int = TRIES
     ) -> list[str]:
         """Send a command and wait for the answer.
 
         Args:
             question: The command and its arguments.
             again: Whether it may be sent again if no answer comes.
-            patience_s: How long an answer may take, in seconds; None: as always.
+            max_wait_s: How long an answer may take, in seconds; None: as always.
             tries: How often it is sent.
 
         Returns:
@@ -71,14 +71,14 @@ class Conversation:
             DeviceError: The box refuses, or the line is broken.
             StopRequested: The operator asked the run to stop.
         """
-        patience_s = self._patience_s if patience_s is None else patience_s
+        max_wait_s = self._patience_s if max_wait_s is None else max_wait_s
         with self.lock:
             self._n_asked += 1
             tag = _TAGS[self._n_asked % len(_TAGS)]
             self._answers.clear()
             for _ in range(tries):
                 self.send(framed(f"{tag} {question}"))
-                answer = self._wait(lambda: self._answer(tag, again), patience_s)
+                answer = self._wait(lambda: self._answer(tag, again), max_wait_s)
                 if answer is None and not again:
                     break
                 if answer in (None, _REFUSED, _GARBLED):
@@ -89,9 +89,9 @@ class Conversation:
                 raise DeviceError(
                     self._device, f"the box refuses '{question}': {' '.join(rest)}; see its PROTOCOL.md"
                 )
-        raise DeviceTimeoutError(self._device, self._mute(question, patience_s), patience_s)
+        raise DeviceTimeoutError(self._device, self._mute(question, max_wait_s), max_wait_s)
 
-    def news(self, timeout_s: float = 0.0) -> list[str] | None:
+    def new_events(self, timeout_s: float = 0.0) -> list[str] | None:
         """Wait for what the box says unasked: its words; None if nothing came.
 
         Raises:
@@ -100,7 +100,7 @@ class Conversation:
         """
         return self._wait(lambda: self._news.popleft() if self._news else None, timeout_s)
 
-    def forget_news(self) -> None:
+    def drop_messages(self) -> None:
         """Drop what the box said unasked until now."""
         with self.lock:
             self._pump(wait=False)
@@ -176,8 +176,8 @@ class Conversation:
             else:
                 self._answers.append(said)
 
-    def _mute(self, question: str, patience_s: float) -> str:
-        waited = format_quantity(patience_s, "time")
+    def _mute(self, question: str, max_wait_s: float) -> str:
+        waited = format_quantity(max_wait_s, "time")
         noise = self._noise or bytes(self._came)
         if not noise:
             what = f"no answer to '{question}' within {waited}"

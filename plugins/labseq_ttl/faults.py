@@ -4,24 +4,24 @@ from __future__ import annotations
 
 from labseq import DeviceError, DeviceTimeoutError
 from labseq.units import format_quantity
-from labseq_ttl.box import cause_in_words
+from labseq_ttl.box import cause_text
 
 
-def was_reset(device: str, cause: int) -> DeviceError:
+def reset_error(device: str, cause: int) -> DeviceError:
     """The box started anew in the middle of its work."""
-    text = f"the box was reset (reason: {cause_in_words(cause)}) and turned all lines off"
+    text = f"the box was reset (reason: {cause_text(cause)}) and turned all lines off"
     return DeviceError(device, f"{text}; look after its supply and cable")
 
 
-def was_turned_off(device: str) -> DeviceError:
+def turned_off_error(device: str) -> DeviceError:
     """Somebody else told the box to turn its lines off."""
     return DeviceError(device, "the box was told to turn all lines off; expected nobody to do so")
 
 
-def was_alone(device: str, lights_out_s: float) -> DeviceError:
+def watchdog_error(device: str, lights_out_s: float) -> DeviceError:
     """The box heard nothing from this computer for too long."""
     text = f"the box heard nothing for {format_quantity(lights_out_s, 'time')} and turned all lines off"
-    return DeviceError(device, f"{text}; is this computer too busy? raise 'lights_out'")
+    return DeviceError(device, f"{text}; is this computer too busy? raise 'watchdog_timeout'")
 
 
 def is_too_late(device: str, timeout_s: float, *, is_external: bool) -> DeviceTimeoutError:

@@ -19,13 +19,13 @@ class Leader:
 
     Attributes:
         state: DEAF, IDLE, OWED or LATE of the protocol.
-        n_gos: Edges that the box took since its start.
+        n_go_signals: Edges that the box took since its start.
         more_came: Whether one came that it could not take.
         is_high: Level of the start input.
     """
 
     state: int
-    n_gos: int
+    n_go_signals: int
     more_came: bool
     is_high: bool
 
@@ -54,7 +54,7 @@ class LeaderPins:
         self._settings = settings
         self._deadline_s = deadline_s
 
-    def listen(self) -> bool:
+    def poll_input(self) -> bool:
         """Take rising edges from now on; whether the input is high."""
         pins = (self._settings.busy, self._settings.ready, self._settings.failed)
         masks = " ".join(f"{0 if pin is None else 1 << pin:x}" for pin in pins)
@@ -63,8 +63,8 @@ class LeaderPins:
 
     def look(self) -> Leader:
         """What has happened; a cheap question."""
-        state, n_gos, more, level = self._box.ask_numbers("leader", 4)
-        return Leader(state, n_gos, bool(more), bool(level))
+        state, n_go_signals, more, level = self._box.ask_numbers("leader", 4)
+        return Leader(state, n_go_signals, bool(more), bool(level))
 
     def answer(self, *, is_ready: bool) -> tuple[bool, bool]:
         """Raise `ready` or `failed`, and lower `busy`.

@@ -6,10 +6,10 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
-from labseq import ConfigError, Context, DeviceError, DeviceTimeoutError, TruthTeller
+from labseq import ConfigError, Context, DeviceError, DeviceTimeoutError, ReportsTruth
 from labseq.units import format_quantity
 from labseq_ttl.box import Box
-from labseq_ttl.connection import SIMULATED_PATIENCE_S
+from labseq_ttl.connection import SIMULATED_MAX_WAIT_S
 from labseq_ttl.leader import HIGH, MORE, LeaderPins
 from labseq_ttl.lines import TtlLines
 from labseq_ttl.settings import GoSettings, TtlSettings
@@ -36,7 +36,7 @@ def ttl_lines(settings: TtlSettings, context: Context) -> TtlLines:
 
 
 class LeadingLines(TtlLines):
-    """The same box; implements ``labseq.Leading`` too.
+    """The same box; implements ``labseq.LeaderLink`` too.
 
     The box itself takes the edge, raises `busy`, and keeps the deadline, also if labseq hangs or dies.
 
@@ -69,7 +69,7 @@ class LeadingLines(TtlLines):
             self._disconnect()
 
     def wait_for(self, signal: str, timeout_s: float) -> str:
-        """Wait for `go`; see ``labseq.Leading``.
+        """Wait for `go`; see ``labseq.LeaderLink``.
 
         Raises:
             DeviceError: Not open, another signal, or the box was reset.
@@ -86,12 +86,12 @@ class LeadingLines(TtlLines):
             left_s = until_s - self._clock.now()
             if left_s <= 0:
                 raise self._no_go(timeout_s, is_high=pins.look().is_high)
-            if (news := box.line.news(min(left_s, LOOK_S))) is not None:
-                self._hear(news)
+            if (new_events := box.line.new_events(min(left_s, LOOK_S))) is not None:
+                self._hear(new_events)
         return ""
 
-    def tell(self, state: str, about: Mapping[str, bool | int | float | str]) -> str:
-        """Raise `ready` or `failed`; see ``labseq.Leading``.
+    def report(self, state: str, about: Mapping[str, bool | int | float | str]) -> str:
+        """Raise `ready` or `failed`; see ``labseq.LeaderLink``.
 
         Raises:
             DeviceError: Not open, or the box does not answer: it raises `failed` by itself at the deadline.
@@ -109,11 +109,11 @@ class LeadingLines(TtlLines):
             self._news.append("the shot is not over at the deadline; the leader was told that it failed")
         return "late" if is_late else state
 
-    def news(self) -> Sequence[str]:
+    def new_events(self) -> Sequence[str]:
         """What happened since the last call."""
-        news = [*self._news]
+        new_events = [*self._news]
         self._news.clear()
-        return news
+        return new_events
 
     def describe(self) -> Mapping[str, Any]:
         """Those of the box, and the outputs of the leader."""
@@ -125,7 +125,7 @@ class LeadingLines(TtlLines):
         try:
             deadline_s = 0.0 if self._settings.is_simulated else self._go.deadline
             self._pins = LeaderPins(box, self._go, deadline_s)
-            if self._pins.listen():
+            if self._pins.poll_input():
                 self._news.append(HIGH)
         except BaseException:
             self._disconnect()
@@ -146,18 +146,18 @@ class LeadingLines(TtlLines):
 
     def _go_by_itself(self, timeout_s: float) -> float:
         """What a simulated leader does: it loads atoms, and raises `go`. How long it may take to be heard."""
-        after_s, counterpart = self._go.goes_after, self._opened().counterpart
+        after_s, counterpart = self._go.simulated_go_delay, self._opened().counterpart
         assert counterpart is not None
         if after_s > timeout_s:
             self._clock.sleep(timeout_s)
             what = f"the simulated leader says '{GO}' after {format_quantity(after_s, 'time')}"
-            raise DeviceTimeoutError(self._name, f"{what}; see 'goes_after'", timeout_s)
+            raise DeviceTimeoutError(self._name, f"{what}; see 'simulated_go_delay'", timeout_s)
         start_s, world = self._clock.now(), self._world
         self._clock.sleep(after_s)
-        if world is not None and not (isinstance(world, TruthTeller) and world.truth().any()):
+        if world is not None and not (isinstance(world, ReportsTruth) and world.truth().any()):
             world.load(start_s, after_s)
         counterpart.start()
-        if self._opened().box.line.news(SIMULATED_PATIENCE_S) is None:
+        if self._opened().box.line.new_events(SIMULATED_MAX_WAIT_S) is None:
             raise DeviceError(self._name, "the simulated box does not hear the simulated leader")
         return LOOK_S
 

@@ -19,9 +19,9 @@ from labseq.errors import one_of
 from labseq.lines import idle_program, off_program
 from labseq_ttl import faults
 from labseq_ttl.box import Box
-from labseq_ttl.connection import SIMULATED_PATIENCE_S, Connection
-from labseq_ttl.counterpart import warm_counterpart
-from labseq_ttl.programs import MOST_EDGES, as_played, edges_of, mask_of
+from labseq_ttl.connection import SIMULATED_MAX_WAIT_S, Connection
+from labseq_ttl.counterpart import warm_simulator
+from labseq_ttl.programs import MAX_EDGES, as_played, edges_of, mask_of
 from labseq_ttl.protocol import CHANNELS, SHORTEST_S, TICK_S, VERSION
 from labseq_ttl.self_test import check_box
 from labseq_ttl.settings import TtlSettings
@@ -59,7 +59,7 @@ class TtlLines:
     @property
     def lines_facts(self) -> LinesFacts:
         """Channels and limits."""
-        return LinesFacts(CHANNELS, TICK_S, SHORTEST_S, MOST_EDGES, LATENCY_S)
+        return LinesFacts(CHANNELS, TICK_S, SHORTEST_S, MAX_EDGES, LATENCY_S)
 
     def warm(self) -> None:
         """Compile what runs the firmware of a simulated box, if that is what simulates it.
@@ -68,7 +68,7 @@ class TtlLines:
             DeviceError: It cannot be compiled.
         """
         if self._settings.is_simulated:
-            warm_counterpart(self._settings.simulated_by, self._name)
+            warm_simulator(self._settings.simulated_by, self._name)
 
     def open(self) -> None:
         """Connect to the box; the lines are idle. No effect if it is open.
@@ -90,7 +90,7 @@ class TtlLines:
         except BaseException:
             self._disconnect()
             raise
-        self._tell(idle)
+        self._apply_lines(idle)
 
     def close(self) -> None:
         """Turn all lines off and disconnect; legal in any state."""
@@ -110,13 +110,13 @@ class TtlLines:
             return
         try:
             self._connection.box.line.stop()
-            self._connection.box.line.forget_news()
+            self._connection.box.line.drop_messages()
         except DeviceError:
             self._was_lost = True
         if self._was_lost:
             self._disconnect()
             self._connect()  # which turns all off
-        self._tell(off_program(self._specs))
+        self._apply_lines(off_program(self._specs))
 
     def compile(self, program: LineProgram) -> None:
         """Take a program for the next firing; one that the box knows already is not sent again.
@@ -171,7 +171,7 @@ class TtlLines:
         self._over_s = now_s + program.duration_s
         if connection.counterpart is not None:
             edges = connection.counterpart.played(self._polarity)
-            self._tell(as_played(edges, program, self._specs))
+            self._apply_lines(as_played(edges, program, self._specs))
 
     def wait(self, timeout_s: float) -> None:
         """Wait for the end of the program.
@@ -186,7 +186,7 @@ class TtlLines:
             self._clock.sleep(max(0.0, min(left_s, timeout_s)))
             if left_s > timeout_s + ROUNDING_S:
                 raise self._too_late(timeout_s)
-            timeout_s = SIMULATED_PATIENCE_S
+            timeout_s = SIMULATED_MAX_WAIT_S
         if self._is_running:
             self._wait_for_box(connection.box, timeout_s)
 
@@ -235,25 +235,25 @@ class TtlLines:
             raise DeviceError(self._name, "not open; call open() first")
         return self._connection
 
-    def _tell(self, program: LineProgram) -> None:
+    def _apply_lines(self, program: LineProgram) -> None:
         """Let the simulated world feel the lines of a simulated box."""
         simulated = self._connection is not None and self._connection.counterpart is not None
         if simulated and self._world is not None:
             self._world.play("lines", program, self._clock.now())
 
     def _refuse_while_running(self, what: str) -> None:
-        while (news := self._opened().box.line.news()) is not None:
-            self._hear(news)
+        while (new_events := self._opened().box.line.new_events()) is not None:
+            self._hear(new_events)
         if self._is_running or self._clock.now() < self._over_s - ROUNDING_S:
             raise DeviceError(self._name, f"{what} while a program runs; call wait() first")
 
     def _wait_for_box(self, box: Box, timeout_s: float) -> None:
-        news = box.line.news(timeout_s)
-        while news is not None:
-            self._hear(news)
+        new_events = box.line.new_events(timeout_s)
+        while new_events is not None:
+            self._hear(new_events)
             if not self._is_running:
                 return
-            news = box.line.news(timeout_s)
+            new_events = box.line.new_events(timeout_s)
         with suppress(DeviceTimeoutError):  # perhaps it has said so, and nobody understood it
             state = box.state(tries=1)
             if state.boots != self._n_boots:
@@ -263,13 +263,13 @@ class TtlLines:
                 return
         raise self._too_late(timeout_s)
 
-    def _hear(self, news: list[str]) -> None:
+    def _hear(self, new_events: list[str]) -> None:
         """What the box says unasked.
 
         Raises:
             DeviceError: It turned all lines off.
         """
-        what, *words = news
+        what, *words = new_events
         numbers = [int(word, 16) for word in words]
         if what == "done":
             self._has_ended(numbers[-1])
@@ -277,10 +277,10 @@ class TtlLines:
             self._was_reset(*numbers)
         elif what == "off":
             self._forget()
-            raise faults.was_turned_off(self._name)
+            raise faults.turned_off_error(self._name)
         elif what == "alone":
             self._forget()
-            raise faults.was_alone(self._name, self._settings.lights_out)
+            raise faults.watchdog_error(self._name, self._settings.watchdog_timeout)
 
     def _has_ended(self, n_runs: int) -> None:
         self._is_running, self._n_runs = False, n_runs
@@ -291,7 +291,7 @@ class TtlLines:
         self._forget()
         self._slots.clear()
         self._n_boots, self._n_runs, self._was_lost = n_boots, 0, True
-        raise faults.was_reset(self._name, cause)
+        raise faults.reset_error(self._name, cause)
 
     def _too_late(self, timeout_s: float) -> DeviceTimeoutError:
         is_external = self._settings.start == "external"

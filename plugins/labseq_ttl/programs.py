@@ -11,7 +11,7 @@ from labseq import LimitError, LineProgram, LineSpec
 from labseq.units import format_quantity
 from labseq_ttl.protocol import EDGES, LONGEST, SHORTEST, TICK_S, Edge
 
-MOST_EDGES: Final = EDGES - 1
+MAX_EDGES: Final = EDGES - 1
 """Edges of a program; one more marks its end."""
 
 
@@ -29,8 +29,8 @@ def edges_of(program: LineProgram, specs: Sequence[LineSpec], device: str) -> tu
         LimitError: More edges, or nearer to one another, than the box can make.
     """
     what = f"{device}: `{program.kind}`"
-    if len(program.t_s) > MOST_EDGES:
-        raise LimitError(f"{what}: number of edges", len(program.t_s), f"at most {MOST_EDGES}")
+    if len(program.t_s) > MAX_EDGES:
+        raise LimitError(f"{what}: number of edges", len(program.t_s), f"at most {MAX_EDGES}")
     ticks = np.rint(program.t_s / TICK_S)
     masks = [mask_of(row, specs) for row in program.on.tolist()]
     apart = np.diff(ticks)

@@ -32,7 +32,7 @@ SHORTEST_S: Final = 5e-6
 LONGEST: Final = 2**32 - 1
 """Ticks between two edges, at most."""
 
-MOST_MS: Final = 0xFFFFF
+MAX_MS: Final = 0xFFFFF
 """Longest deadline of a leader, in ms."""
 
 LINE: Final = 96

@@ -7,7 +7,7 @@ from typing import Final
 
 from labseq import DeviceError
 from labseq.units import format_quantity
-from labseq_ttl.connection import SIMULATED_PATIENCE_S, Connection
+from labseq_ttl.connection import SIMULATED_MAX_WAIT_S, Connection
 from labseq_ttl.protocol import EDGES, LONGEST, OUTPUTS, SHORTEST, TICK_S, Edge
 
 BLANK_TICKS: Final = 200_000
@@ -40,10 +40,10 @@ def check_box(connection: Connection, slot: int, device: str, polarity: int) -> 
     box.fire()
     if connection.counterpart is not None:
         connection.counterpart.played(polarity)
-    news = box.line.news(SIMULATED_PATIENCE_S)
+    new_events = box.line.new_events(SIMULATED_MAX_WAIT_S)
     took_s = time.monotonic() - started_s
-    if news is None or news[0] != "done":
-        said = "nothing" if news is None else " ".join(news)
+    if new_events is None or new_events[0] != "done":
+        said = "nothing" if new_events is None else " ".join(new_events)
         raise DeviceError(device, f"at the end of a program the box says '{said}'; expected 'done'")
     if connection.counterpart is None and took_s < EARLY * wanted_s:
         text = f"the box played {format_quantity(wanted_s, 'time')} in {format_quantity(took_s, 'time')}"

@@ -8,13 +8,13 @@ from typing import Annotated, Final, Literal, Self, TypeAlias
 from pydantic import AfterValidator, Field, model_validator
 
 from labseq import Duration, Settings
-from labseq.config.fields import misfit
+from labseq.config.fields import setting_error
 from labseq_ttl.protocol import CHANNELS
 
 SIMULATED: Final = "simulated"
 """The port that needs no box."""
 
-MAX_LIGHTS_OUT_S: Final = 65.0
+MAX_WATCHDOG_S: Final = 65.0
 MAX_DEADLINE_S: Final = 1000.0
 
 
@@ -45,7 +45,7 @@ class GoSettings(Settings):
         default=None, description="output that goes high when it failed or was late, until the next `go`"
     )
     active_low: bool = Field(default=False, description="these outputs are low while they say something")
-    goes_after: Duration = Field(
+    simulated_go_delay: Duration = Field(
         default=0.5,
         description="with a simulated box: time after which a simulated leader raises `go`; atoms load "
         "meanwhile",
@@ -67,10 +67,10 @@ class GoSettings(Settings):
         pins = self.outputs
         if not {"ready", "failed"} <= set(pins):
             missing = "ready" if "ready" not in pins else "failed"
-            raise misfit(f"'{missing}' has no output", "outputs for 'ready' and 'failed'")
+            raise setting_error(f"'{missing}' has no output", "outputs for 'ready' and 'failed'")
         for (first, a), (second, b) in combinations(pins.items(), 2):
             if a == b:
-                raise misfit(f"'{first}' and '{second}' are both on output {a}", "one each", at=(second,))
+                raise setting_error(f"'{first}' and '{second}' are both on output {a}", "one each", at=(second,))
         return self
 
 
@@ -90,7 +90,7 @@ class TtlSettings(Settings):
         description="what starts a program that was fired: the serial line, or the next rising edge at the "
         "box's start input",
     )
-    lights_out: Annotated[Duration, Field(le=MAX_LIGHTS_OUT_S)] = Field(
+    watchdog_timeout: Annotated[Duration, Field(le=MAX_WATCHDOG_S)] = Field(
         default=0.0,
         description="how long the box waits for a word of labseq before it turns all lines off, while no "
         "program runs; 0: for ever",
@@ -114,8 +114,8 @@ class TtlSettings(Settings):
     @model_validator(mode="after")
     def _somebody_starts_it(self) -> Self:
         if self.is_simulated and self.start == "external":
-            raise misfit("nobody gives a simulated box its external start", "`start: serial`", at=("start",))
+            raise setting_error("nobody gives a simulated box its external start", "`start: serial`", at=("start",))
         if self.go is not None and self.start == "external":
             what = "the start input cannot be a leader's and start programs too"
-            raise misfit(what, "`start: serial` beside 'go'", at=("start",))
+            raise setting_error(what, "`start: serial` beside 'go'", at=("start",))
         return self

@@ -74,7 +74,7 @@ def mix(row: Floats, col: Floats, state: States) -> int:
 
 @kernel(f"int64({TABLE}, {TABLE}, int8[:, ::1], {TABLE}, float64, float64[:, ::1], int64[::1])")
 def find_ways(
-    row: Floats, col: Floats, state: States, depth: Floats, least_depth: float, ways: Floats, work: Ints
+    row: Floats, col: Floats, state: States, depth: Floats, min_depth: float, ways: Floats, work: Ints
 ) -> int:
     """Find the crossings that move and are deep enough to throw atoms out; returns how many."""
     n = 0
@@ -83,7 +83,7 @@ def find_ways(
         for j in range(len(col)):
             right = col[j, END] - col[j, START]
             still = abs(down) <= AT_REST and abs(right) <= AT_REST
-            if still or state[i, j] == DARK or depth[i, j] <= least_depth:
+            if still or state[i, j] == DARK or depth[i, j] <= min_depth:
                 continue
             ways[n, 0], ways[n, 1], ways[n, 2], ways[n, 3] = row[i, START], col[j, START], down, right
             ways[n, 4] = down * down + right * right
@@ -126,7 +126,7 @@ def sweep(
     col: Floats,
     state: States,
     depth: Floats,
-    least_depth: float,
+    min_depth: float,
     tolerance: float,
     ways: Floats,
     work: Ints,
@@ -137,7 +137,7 @@ def sweep(
     own atom too.
     """
     n_lost = 0
-    n = find_ways(row, col, state, depth, least_depth, ways, work)
+    n = find_ways(row, col, state, depth, min_depth, ways, work)
     top, bottom = span(ways, n, 0, occupied.shape[0], tolerance) if n > 0 else (0, 0)
     left, right = span(ways, n, 1, occupied.shape[1], tolerance) if n > 0 else (0, 0)
     for r in range(top, bottom):

@@ -182,7 +182,7 @@ def run_risks(
 
 
 @kernel(f"int64({OFFSETS}, int64)")
-def most_tones(offsets: Offsets, n_segments: int) -> int:
+def max_tones(offsets: Offsets, n_segments: int) -> int:
     """The most tones of an axis in one of the first segments."""
     most = 0
     for k in range(n_segments):
@@ -272,7 +272,7 @@ def carry_atoms(
     Returns:
         How many atoms were lost by each cause (5,).
     """
-    shape = most_tones(row_offsets, n_segments), most_tones(col_offsets, n_segments)
+    shape = max_tones(row_offsets, n_segments), max_tones(col_offsets, n_segments)
     old_state, state = np.zeros(shape, np.int8), np.zeros(shape, np.int8)
     old_risk, risk, depth = np.zeros(shape), np.zeros(shape), np.zeros(shape)
     ways = np.zeros((shape[0] * shape[1], N_WAY))

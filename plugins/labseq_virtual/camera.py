@@ -12,12 +12,12 @@ from labseq import (
     CameraFacts,
     ConfigError,
     Context,
-    KnownSensor,
+    ReportsSensor,
     SensorMode,
     Series,
     SimulatedSensor,
-    Taken,
-    Wired,
+    ExposureResult,
+    WiresTriggers,
     settle,
 )
 from labseq.lines import trigger_line
@@ -55,9 +55,9 @@ class VirtualCamera(CameraDriver):
         )
         self._in_force = self._idle
         self._readout_s, self._frame_shape = settings.readout, None
-        if isinstance(self._world, KnownSensor):
-            if misfit := settings.misfit_on(self._world.sensor_shape):
-                raise ConfigError(misfit)
+        if isinstance(self._world, ReportsSensor):
+            if setting_error := settings.sensor_conflict(self._world.sensor_shape):
+                raise ConfigError(setting_error)
             self._readout_s *= self._world.readout_fraction(self._mode)
             self._frame_shape = self._mode.frame_shape(self._world.sensor_shape)
         cooling = settings.cooling
@@ -77,7 +77,7 @@ class VirtualCamera(CameraDriver):
 
     def warm(self) -> None:
         """Work out what all frames have in common, and compile their kernels or load them."""
-        if isinstance(self._world, KnownSensor):
+        if isinstance(self._world, ReportsSensor):
             self._world.prepare_sensor(self._mode)
 
     @property
@@ -122,7 +122,7 @@ class VirtualCamera(CameraDriver):
         self._is_internal = series.trigger == "internal"
         self._coming.clear()
         self._n_seen = 0
-        if series.trigger == "external" and isinstance(self._world, Wired):
+        if series.trigger == "external" and isinstance(self._world, WiresTriggers):
             self._world.wire("camera", self._expose)
 
     def _fire(self) -> None:
@@ -131,7 +131,7 @@ class VirtualCamera(CameraDriver):
         else:
             self._expose()
 
-    def _take(self, timeout_s: float) -> Taken | None:
+    def _take(self, timeout_s: float) -> ExposureResult | None:
         until_s = self._clock.now() + timeout_s
         while True:
             if self._is_internal and not self._coming:
@@ -143,9 +143,9 @@ class VirtualCamera(CameraDriver):
             if not is_lost:
                 break
         if self._happens(self._settings.faults.transient):
-            return Taken(number, None, "it did not come over the wire whole (rehearsed failure)")
+            return ExposureResult(number, None, "it did not come over the wire whole (rehearsed failure)")
         t_start_s = frame.t_start_s
-        return Taken(number, frame.image, t_start_s=t_start_s, device_time_s=t_start_s - self._opened_s)
+        return ExposureResult(number, frame.image, t_start_s=t_start_s, device_time_s=t_start_s - self._opened_s)
 
     def _stop(self) -> None:
         self._sensor.clear()

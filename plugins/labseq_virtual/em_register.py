@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq_virtual.law import Law
+from labseq_virtual.law import CountDistribution
 
 Complex = NDArray[np.complex128]
 
@@ -56,15 +56,15 @@ class Register:
         return 2 * (self.gain - 1) * self.gain ** (-(self.n_stages + 1) / self.n_stages) + 1 / self.gain
 
     @cached_property
-    def one(self) -> Law:
+    def one(self) -> CountDistribution:
         """Law of the output for one electron in, without the spurious ones."""
         n_values = power_of_two(45 * self.gain + 64)
-        return Law.of(np.fft.irfft(_transforms(self.n_stages, self.gain, n_values)[0], n_values))
+        return CountDistribution.of(np.fft.irfft(_transforms(self.n_stages, self.gain, n_values)[0], n_values))
 
     @cached_property
-    def _added(self) -> Law:
+    def _added(self) -> CountDistribution:
         """Law of what the spurious electrons add to the output."""
-        return Law.of(
+        return CountDistribution.of(
             self.output(0.0, power_of_two((self.spurious + 9 * self.spurious**0.5 + 45) * self.gain))
         )
 

@@ -10,16 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq_virtual.em_register import Register, power_of_two
-from labseq_virtual.law import Law
+from labseq_virtual.law import CountDistribution
 from labseq_virtual.view import View
 
 FULL_SCALE: Final = 65535
 """Counts at which the converter of 16 bit ends."""
 
-MOST_WORK: Final = 2**23
+MAX_WORK: Final = 2**23
 """Outputs of the register times counts that the read noise reaches, above which no table is made."""
 
-MOST_ELECTRONS: Final = 300
+MAX_ELECTRONS: Final = 300
 """Mean electrons of a dark pixel above which none is made; fewer never fill a well."""
 
 
@@ -110,13 +110,13 @@ class Emccd:
 
 
 @lru_cache(maxsize=64)
-def _dark_law(register: Register, output: Output, mean_electrons: float) -> Law | None:
+def _dark_law(register: Register, output: Output, mean_electrons: float) -> CountDistribution | None:
     """Law of the counts of a pixel without an atom's light; None where a table would be too long."""
     most = mean_electrons + register.spurious
     n_values = power_of_two((most + 9 * (2 * most) ** 0.5 + 45) * register.gain)
     spread = output.read_noise / output.electrons_per_adu
     reach = int(np.ceil(6.5 * spread)) + 1
-    if n_values * reach > MOST_WORK or mean_electrons > MOST_ELECTRONS:
+    if n_values * reach > MAX_WORK or mean_electrons > MAX_ELECTRONS:
         return None
     p = np.maximum(register.output(mean_electrons, n_values), 0.0)
     p = p[: np.flatnonzero(p > 1e-15)[-1] + 1]
@@ -127,7 +127,7 @@ def _dark_law(register: Register, output: Output, mean_electrons: float) -> Law 
         count = nearest + beside
         share = _rounded(count - value, spread) * p
         law += np.bincount(np.clip(count, 0, FULL_SCALE), share, len(law))
-    return Law.of(law)
+    return CountDistribution.of(law)
 
 
 def _rounded(distance: NDArray[np.float64], spread: float) -> NDArray[np.float64]:

@@ -50,7 +50,7 @@ class Envelope:
     values: NDArray[np.complex64]
 
 
-def sounding(span: RfSpan) -> list[tuple[float, float]]:
+def active_spans(span: RfSpan) -> list[tuple[float, float]]:
     """When a span is not silent: (start, end) in seconds, in time's order."""
     if isinstance(span, RfTones):
         return [(span.start_s, span.end_s)] if len(span.frequency_hz) else []

@@ -17,8 +17,8 @@ from labseq_virtual.settings import WorldSettings
 from labseq_virtual.view import View
 
 
-class ShowsSensor:
-    """The part of a world that tells of its sensor; implements ``labseq.KnownSensor``."""
+class SensorMixin:
+    """The part of a world that tells of its sensor; implements ``labseq.ReportsSensor``."""
 
     _exposure: Exposure
 

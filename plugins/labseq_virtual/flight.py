@@ -13,12 +13,12 @@ from labseq import MotionSpec
 from labseq.model import SiteGrid
 from labseq_virtual.axis_tones import full_amplitudes
 from labseq_virtual.envelope import Band
-from labseq_virtual.hearing import Episode
+from labseq_virtual.hearing import RfPulse
 from labseq_virtual.jumps import JUMPS, depth_jumps, phase_jumps
 from labseq_virtual.places import Places
 from labseq_virtual.settings import WorldSettings
 from labseq_virtual.thermal import draw_atoms
-from labseq_virtual.tones import HOPS, WINDOW, Tracks, follow_tones, refuse_blur
+from labseq_virtual.tones import HOPS, WINDOW, Tracks, track_tones, refuse_blur
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -32,7 +32,7 @@ STEP_S: Final = 0.1e-6
 """Step of the integration: a seventieth of a period in a tweezer of 2.1 mK."""
 BAND_HZ: Final = 50e6
 """Least width of the AODs' band."""
-LEAST_DEPTH: Final = 2e-3
+MIN_DEPTH: Final = 2e-3
 """Fraction of the full depth of an axis below which a tone is not heard."""
 SLEW_HZ: Final = 4e6
 """Most that a tone's frequency leaves its course in a transit time: 1100 um/ms at 1.6 MHz per site."""
@@ -84,7 +84,7 @@ CAUSES: Final = {
 """The cause that a fate counts as."""
 
 
-class Flight:
+class RfTransport:
     """Carries atoms by what the mobile tweezers' outputs played.
 
     Args:
@@ -116,7 +116,7 @@ class Flight:
         self._jumps: list[tuple[Any, ...]] = []
 
     def refuse_blur(self) -> None:
-        """Refuse tones that :func:`labseq_virtual.tones.follow_tones` cannot tell apart.
+        """Refuse tones that :func:`labseq_virtual.tones.track_tones` cannot tell apart.
 
         Raises:
             LimitError: They are too near, or too fast, for the time that the sound takes across the beam.
@@ -137,7 +137,7 @@ class Flight:
         return {"flights": flights.view(FLIGHTS), "jumps": jumps.view(JUMPS)}  # with their descriptions
 
     def carry(
-        self, occupied: Mask, episode: Episode, depth: Floats, rng: np.random.Generator, loss_factor: float
+        self, occupied: Mask, pulse: RfPulse, depth: Floats, rng: np.random.Generator, loss_factor: float
     ) -> Counter[str]:
         """Let an episode act on the atoms.
 
@@ -153,7 +153,7 @@ class Flight:
         """
         from labseq_virtual._kernels_atoms import DEPTH, HELD_S, LOST_S, N_DIARY, OFFSET, PAIRED, follow_atoms
 
-        tones = self._listen(episode)
+        tones = self._listen(pulse)
         if tones is None:
             return Counter()
         (rows, row_depth, cols, col_depth), t_s = tones
@@ -178,7 +178,7 @@ class Flight:
         flights["from_row"], flights["from_col"] = row, col
         flights["to_row"], flights["to_col"] = to_row, to_col
         flights["lost_s"], flights["lost_row"], flights["lost_col"] = diary[:, LOST_S:PAIRED].T
-        n_tones = max(0, _most_on(rows) + _most_on(cols) - 2)
+        n_tones = max(0, _max_on(rows) + _max_on(cols) - 2)
         loss = self._settings.transport_loss + n_tones * self._settings.transport_loss_per_tone
         drawn = held & (rng.random(len(row)) < loss * loss_factor)
         self._judge(flights, alive, diary[:, PAIRED] == 1, bound, drawn, float(t_s[-1]))
@@ -188,16 +188,16 @@ class Flight:
         self._flights.append(flights[held | ~kept])
         return Counter(CAUSES[fate] for fate in flights["fate"][~kept].tolist())
 
-    def _listen(self, episode: Episode) -> tuple[tuple[Floats, Floats, Floats, Floats], Floats] | None:
+    def _listen(self, pulse: RfPulse) -> tuple[tuple[Floats, Floats, Floats, Floats], Floats] | None:
         """Places (in sites) and depth factors of the row and column tones, and the times of the frames."""
         found: list[Tracks] = []
-        for axis, spans in enumerate((episode.rows, episode.columns)):
+        for axis, spans in enumerate((pulse.rows, pulse.columns)):
             if not spans:
                 return None
-            start_s, end_s = episode.start_s - self.margin_s, episode.end_s + 2 * self.margin_s
-            least_v = float(self._full_v[axis].min()) * math.sqrt(LEAST_DEPTH)
+            start_s, end_s = pulse.start_s - self.margin_s, pulse.end_s + 2 * self.margin_s
+            min_v = float(self._full_v[axis].min()) * math.sqrt(MIN_DEPTH)
             transit_s = self._light.transit_time
-            found.append(follow_tones(spans, start_s, end_s, self._bands[axis], transit_s, least_v, SLEW_HZ))
+            found.append(track_tones(spans, start_s, end_s, self._bands[axis], transit_s, min_v, SLEW_HZ))
         n_frames = min(len(tracks.t_s) for tracks in found)
         sites: list[Floats] = []
         depths: list[Floats] = []
@@ -285,7 +285,7 @@ def _lines(tracks: Floats, n_sites: int) -> Mask:
     return lines[:, 2 : n_sites + 2]
 
 
-def _most_on(tracks: Floats) -> int:
+def _max_on(tracks: Floats) -> int:
     return int((~np.isnan(tracks)).sum(axis=1).max(initial=0))
 
 

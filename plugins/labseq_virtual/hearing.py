@@ -9,14 +9,14 @@ from typing import Final
 
 from labseq.model import RfSpan
 from labseq.roles import RfSource
-from labseq_virtual.envelope import sounding
+from labseq_virtual.envelope import active_spans
 
 ROUNDING_S: Final = 1e-8
 """How near to a cut a sound must begin to be the same sound."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Episode:
+class RfPulse:
     """A time in which light is on, from silence to silence.
 
     Attributes:
@@ -34,7 +34,7 @@ class Episode:
     continued: bool
 
 
-class Ear:
+class PulseReceiver:
     """Hears what a driver's outputs play, and parts it at the silences.
 
     Args:
@@ -47,7 +47,7 @@ class Ear:
         self._silence_s = silence_s
         self._cut_s = -math.inf
 
-    def hear(self, until_s: float) -> Iterator[Episode]:
+    def receive_until(self, until_s: float) -> Iterator[RfPulse]:
         """What was played until a time, in episodes; the last one is cut off there if it must be.
 
         Args:
@@ -55,10 +55,10 @@ class Ear:
         """
         heard = self._source.played(until_s)
         cut_s, self._cut_s = self._cut_s, until_s
-        times = [times for spans in heard for span in spans for times in sounding(span)]
+        times = [times for spans in heard for span in spans for times in active_spans(span)]
         for start_s, end_s in _joined(times, self._silence_s):
             rows, columns = (_between(spans, start_s, end_s) for spans in heard)
-            yield Episode(start_s, end_s, rows, columns, start_s < cut_s + ROUNDING_S)
+            yield RfPulse(start_s, end_s, rows, columns, start_s < cut_s + ROUNDING_S)
 
 
 def _between(spans: Sequence[RfSpan], start_s: float, end_s: float) -> tuple[RfSpan, ...]:

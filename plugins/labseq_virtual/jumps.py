@@ -39,12 +39,12 @@ way round. A "depth" jump is that of a tweezer, as a fraction of the full depth.
 INNER: Final = 3 * HOPS // 4
 OUTER: Final = 2 * HOPS
 """Frames on each side of a place, from which to which a tone is looked at: the nearer ones see the jump."""
-LEAST_RAD: Final = 0.5
+MIN_RAD: Final = 0.5
 RESIDUAL_RAD: Final = 0.02
 """Greatest misfit of a smooth course; where it is worse, something else happens, such as a second start."""
 CHIRP_RAD: Final = 0.3
 """What a change of the chirp must amount to within the inner frames to tell its place."""
-LEAST_DEPTH: Final = 0.6
+MIN_DEPTH: Final = 0.6
 """Change of the depth in a transit time; a ramp of 60 us makes a sixth."""
 
 
@@ -74,15 +74,15 @@ def phase_jumps(tracks: Tracks, j: int) -> list[tuple[float, int, float]]:
     courses = np.concatenate([np.zeros((len(steps), 1)), np.cumsum(steps, axis=1)], axis=1)
     before, after = np.arange(OUTER - INNER + 1), np.arange(OUTER + INNER, n_span)
     at_s = np.arange(-OUTER, OUTER + 1, dtype=np.float64) * step_s
-    first, misfit = _fit(courses[:, before], at_s[before])
+    first, setting_error = _fit(courses[:, before], at_s[before])
     second, other_misfit = _fit(courses[:, after], at_s[after])
     shift, slope, bend = (second - first).T
     inner_s = INNER * step_s
     bent = np.abs(bend) * inner_s**2 > CHIRP_RAD
     place_s = np.where(bent, -slope / np.where(bent, 2 * bend, 1.0), 0.0)
     size = _wrapped(shift + slope * place_s + bend * place_s**2)
-    fine = (np.maximum(misfit, other_misfit) < RESIDUAL_RAD) & (np.abs(place_s) <= inner_s)
-    found = peaks(np.where(fine, np.abs(size), 0.0), LEAST_RAD, 2 * INNER)
+    fine = (np.maximum(setting_error, other_misfit) < RESIDUAL_RAD) & (np.abs(place_s) <= inner_s)
+    found = peaks(np.where(fine, np.abs(size), 0.0), MIN_RAD, 2 * INNER)
     return [(float(tracks.t_s[k + OUTER] + place_s[k]), k + OUTER, float(size[k])) for k in found]
 
 
@@ -96,7 +96,7 @@ def depth_jumps(depth: Floats) -> list[tuple[int, float]]:
         Frame and size of each.
     """
     change = depth[HOPS:] - depth[:-HOPS]
-    return [(k + HOPS // 2, float(change[k])) for k in peaks(np.abs(change), LEAST_DEPTH, HOPS)]
+    return [(k + HOPS // 2, float(change[k])) for k in peaks(np.abs(change), MIN_DEPTH, HOPS)]
 
 
 def peaks(values: Floats, least: float, apart: int) -> list[int]:

@@ -13,7 +13,7 @@ NEVER: Final = 1e-13
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Law:
+class CountDistribution:
     """A law of whole numbers: its distribution function in a table, inverted by 32 random bits.
 
     Probabilities are rounded to whole multiples of 2^-32.
@@ -29,7 +29,7 @@ class Law:
     starts: NDArray[np.int32]
 
     @classmethod
-    def of(cls, probability: NDArray[np.float64], first: int = 0) -> Law:
+    def of(cls, probability: NDArray[np.float64], first: int = 0) -> CountDistribution:
         """Tabulate a law.
 
         Args:

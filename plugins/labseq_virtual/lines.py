@@ -39,7 +39,7 @@ class VirtualLines(VirtualDriver):
         """Channels and limits."""
         settings = self._settings
         channels = tuple(range(settings.n_channels))
-        return LinesFacts(channels, settings.resolution, settings.shortest, settings.most_edges)
+        return LinesFacts(channels, settings.resolution, settings.shortest, settings.max_edges)
 
     def open(self) -> None:
         """Connect to the simulated world; the lines are idle."""
@@ -58,7 +58,7 @@ class VirtualLines(VirtualDriver):
         known = tuple(spec.name for spec in self._specs)
         if program.lines != known:
             raise DeviceError(self._name, f"a program has the lines {program.lines}; expected {known}")
-        n_edges, most = len(program.t_s), self._settings.most_edges
+        n_edges, most = len(program.t_s), self._settings.max_edges
         what = f"{self._name}: `{program.kind}`"
         if n_edges > most:
             raise LimitError(f"{what}: number of edges", n_edges, f"at most {most}")

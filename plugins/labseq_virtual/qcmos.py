@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq_virtual.emccd import FULL_SCALE
-from labseq_virtual.law import Law
+from labseq_virtual.law import CountDistribution
 from labseq_virtual.view import View
 
 Floats = NDArray[np.float32]
@@ -90,8 +90,8 @@ class Qcmos:
 
 
 @lru_cache(maxsize=16)
-def _poisson(mean: float) -> Law:
+def _poisson(mean: float) -> CountDistribution:
     from scipy.special import gammaln, xlogy
 
     k = np.arange(int(mean + 9 * mean**0.5) + 45)
-    return Law.of(np.exp(xlogy(k, mean) - mean - gammaln(k + 1)))
+    return CountDistribution.of(np.exp(xlogy(k, mean) - mean - gammaln(k + 1)))

@@ -278,7 +278,7 @@ class LinesSettings(Settings):
     n_channels: PositiveInt = Field(default=32, description="number of outputs, counted from 0 (ours)")
     resolution: Duration = Field(default=0.0, description="step of its clock; 0 for any time (ours)")
     shortest: Duration = Field(default=1e-6, description="least time between two edges (ours)")
-    most_edges: PositiveInt = Field(default=1000, description="most edges of a program (ours)")
+    max_edges: PositiveInt = Field(default=1000, description="most edges of a program (ours)")
 
 
 class SpotMeterSettings(Settings):

@@ -60,13 +60,13 @@ class StaticArray:
         self._level = 0.0
         self._source = None
 
-    def listen(self, source: ToneSource) -> None:
+    def connect_outputs(self, source: ToneSource) -> None:
         """From now on the light is what these outputs play."""
         rows, cols = self._grid.shape
         self.drive(TweezerAmplitudes(np.zeros(rows), np.zeros(cols)))
         self._source, self._level = source, 1.0
 
-    def hear(self, until_s: float, occupied: NDArray[np.bool_]) -> int:
+    def receive_until(self, until_s: float, occupied: NDArray[np.bool_]) -> int:
         """Follow what the outputs played; atoms in too shallow tweezers are gone from ``occupied``.
 
         Returns:

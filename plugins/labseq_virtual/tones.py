@@ -36,9 +36,9 @@ FRAMES: Final = 4096
 """Spectra worked out together: 40 MB at 10 us of transit, however long a program is."""
 
 
-LEAST_TURNS: Final = 2.0
+MIN_TURNS: Final = 2.0
 """Least number of beats of two tones within a transit time: with fewer, their peaks are one."""
-MOST_SITES: Final = 0.6
+MAX_SITES: Final = 0.6
 """Most sites that a tweezer moves in a transit time: a faster chirp is as broad as the gap to the next."""
 PEAK_SPEED: Final = {"constant": 1.0, "minimum_jerk": 15 / 8, "constant_jerk": 2.0}
 """Greatest speed over the mean, see :class:`labseq.model.FrequencyCourse`."""
@@ -62,7 +62,7 @@ class Tracks:
 
 
 def refuse_blur(grid: SiteGrid, motion: MotionSpec, transit_s: float) -> None:
-    """Refuse what :func:`follow_tones` could not tell apart, so that it is no loss of atoms.
+    """Refuse what :func:`track_tones` could not tell apart, so that it is no loss of atoms.
 
     Args:
         grid: The grid, with the tones of its sites.
@@ -76,23 +76,23 @@ def refuse_blur(grid: SiteGrid, motion: MotionSpec, transit_s: float) -> None:
     transit = format_quantity(transit_s, "time")
     steps_hz = [np.abs(np.diff(hz)) for hz in (grid.row_frequency_hz, grid.column_frequency_hz)]
     step_hz = float(np.concatenate(steps_hz).min(initial=np.inf))
-    if step_hz < (least_hz := max(APART_HZ, LEAST_TURNS / transit_s)):
-        step, least = (format_quantity(hz, "frequency") for hz in (step_hz, least_hz))
+    if step_hz < (min_hz := max(APART_HZ, MIN_TURNS / transit_s)):
+        step, least = (format_quantity(hz, "frequency") for hz in (step_hz, min_hz))
         what = f"the smallest step of the sites' tones at a transit_time of {transit}"
         raise LimitError(what, step, f"at least {least}: less cannot be told apart", hint)
     sites = PEAK_SPEED[motion.speed_profile] * motion.speed_m_s * transit_s / grid.spacing_m
-    if sites > MOST_SITES:
+    if sites > MAX_SITES:
         what = f"the way of a mobile tweezer in a transit_time of {transit}"
-        raise LimitError(what, f"{sites:.2g} sites", f"{MOST_SITES:g}: a faster chirp blurs the tones", hint)
+        raise LimitError(what, f"{sites:.2g} sites", f"{MAX_SITES:g}: a faster chirp blurs the tones", hint)
 
 
-def follow_tones(
+def track_tones(
     spans: Sequence[RfSpan],
     start_s: float,
     end_s: float,
     band: Band,
     transit_s: float,
-    least_v: float,
+    min_v: float,
     slew_hz: float,
 ) -> Tracks:
     """Recover the tones from what an output played, without knowing what was meant.
@@ -107,17 +107,17 @@ def follow_tones(
         end_s: Its end.
         band: The AOD's band.
         transit_s: Time that the sound takes across the beam, 1/e^2 of the intensity at both ends.
-        least_v: Least amplitude of a tone.
+        min_v: Least amplitude of a tone.
         slew_hz: Most that a tone's frequency changes in a transit time.
     """
     from labseq_virtual._kernels_tones import find_tones, link_tones, measure_tones
 
     signal = envelope(spans, start_s, end_s, band)
-    sound = _Sound(signal.values, transit_s * signal.rate_hz)
+    sound = _Spectra(signal.values, transit_s * signal.rate_hz)
     bin_hz = signal.rate_hz / sound.n_window
     reach, apart = (max(2, round(hz / bin_hz)) for hz in (REACH_HZ, APART_HZ))
     parts = range(0, sound.n_frames, FRAMES)
-    found = [find_tones(_power(sound.spectra(k)), least_v**2, apart, reach, MOST) for k in parts]
+    found = [find_tones(_power(sound.spectra(k)), min_v**2, apart, reach, MOST) for k in parts]
     centroid, count = (np.concatenate(part) for part in zip(*found, strict=True))
     tracks, n_tracks = link_tones(centroid, count, slew_hz / HOPS / bin_hz)
     tracks = np.ascontiguousarray(tracks[:, :n_tracks])
@@ -129,7 +129,7 @@ def follow_tones(
     return Tracks(t_s, signal.low_hz + tracks * bin_hz, amplitude, phase)
 
 
-class _Sound:
+class _Spectra:
     """What is in the beam from frame to frame.
 
     Args:

@@ -27,9 +27,9 @@ from labseq import (
     TweezerAmplitudes,
 )
 from labseq.roles import WHOLE_SENSOR, Signal
-from labseq_virtual.exposure import Exposure, ShowsSensor
-from labseq_virtual.flight import Flight
-from labseq_virtual.hearing import Ear
+from labseq_virtual.exposure import Exposure, SensorMixin
+from labseq_virtual.flight import RfTransport
+from labseq_virtual.hearing import PulseReceiver
 from labseq_virtual.lights import Lights
 from labseq_virtual.places import Places
 from labseq_virtual.settings import WorldSettings
@@ -40,11 +40,11 @@ ROUNDING_S: Final = 1e-6
 """How far into the past an event may lie because sums of times were rounded."""
 
 
-class World(ShowsSensor):
+class World(SensorMixin):
     """Atoms in static tweezers, what light does to them, and what a camera sees of it.
 
-    Implements ``labseq.Simulation``, ``labseq.KnownSensor``, ``labseq.TruthTeller``, ``labseq.LossTeller``,
-    ``labseq.Listening`` and ``labseq.Storyteller``. Events come in the order of time. A program of the mobile
+    Implements ``labseq.Simulation``, ``labseq.ReportsSensor``, ``labseq.ReportsTruth``, ``labseq.ReportsLosses``,
+    ``labseq.ReceivesOutput`` and ``labseq.ReportsEvents``. Events come in the order of time. A program of the mobile
     tweezers is carried out when it has ended, or as far as it came when another program takes
     its place: playing a program without segments cuts it short, and atoms in flight are lost. A
     ramp of the static tweezers that comes during a program or an exposure acts at its end.
@@ -67,9 +67,9 @@ class World(ShowsSensor):
         self._clock = context.clock
         self._places = Places(context.grid, settings.mobile_light)
         self._transport = Transport(context.grid, context.motion, settings, self._places)
-        self._flight = Flight(context.grid, context.motion, settings, self._places)
+        self._flight = RfTransport(context.grid, context.motion, settings, self._places)
         self._static = StaticArray(context.grid, settings)
-        self._ear: Ear | None = None
+        self._pulse_receiver: PulseReceiver | None = None
         self._seed = context.random.seed if settings.machine_seed is None else settings.machine_seed
         self._lights = Lights(settings.lights, context.lines)
         self._exposure = Exposure(context.grid, settings, self._seed)
@@ -98,7 +98,7 @@ class World(ShowsSensor):
         """Forget everything."""
         self._is_open = False
         self._static.switch_off()
-        self._ear = None
+        self._pulse_receiver = None
         self._lights.forget()
         self._forget()
 
@@ -106,8 +106,8 @@ class World(ShowsSensor):
         """Remove all atoms and draw the shot's factor on the transport loss."""
         self._check_open()
         self._forget()
-        if self._ear is not None:
-            deque(self._ear.hear(self._clock.now()), maxlen=0)  # light without atoms
+        if self._pulse_receiver is not None:
+            deque(self._pulse_receiver.receive_until(self._clock.now()), maxlen=0)  # light without atoms
         self._flight.begin_shot()
         spread = self._settings.transport_loss_spread
         self._loss_factor = math.exp(spread * self._random.shot.standard_normal() - spread**2 / 2)
@@ -154,7 +154,7 @@ class World(ShowsSensor):
         """Tell a device of the edges of the line that triggers its role, from now on."""
         self._lights.wire(role, on_edge)
 
-    def listen(self, role: str, source: RfSource | ToneSource) -> None:
+    def connect_outputs(self, role: str, source: RfSource | ToneSource) -> None:
         """From now on listen to the outputs of a driver of tweezers, after the last of earlier ones.
 
         Raises:
@@ -163,13 +163,13 @@ class World(ShowsSensor):
         """
         self._check_open()
         if role == "static_tweezers":
-            self._static.listen(cast("ToneSource", source))
+            self._static.connect_outputs(cast("ToneSource", source))
             return
         if role != "mobile_tweezers":
             raise DeviceError(self._name, f"'{role}' wants to be heard; only tweezers play RF")
         self._flight.refuse_blur()
         self._hear(self._clock.now())
-        self._ear = Ear(cast("RfSource", source), 2 * self._flight.margin_s)
+        self._pulse_receiver = PulseReceiver(cast("RfSource", source), 2 * self._flight.margin_s)
 
     def expose(self, t_start_s: float, exposure_s: float, mode: SensorMode = WHOLE_SENSOR) -> Frame:
         """Take a frame; the imaging light heats some atoms out, and they shine until they are lost.
@@ -203,14 +203,14 @@ class World(ShowsSensor):
         self._hear(self._clock.now())
         return self._static.depth
 
-    def story(self, since_s: float) -> Mapping[str, NDArray[Any]]:
+    def atom_events(self, since_s: float) -> Mapping[str, NDArray[Any]]:
         """What the mobile tweezers did to atoms in this shot, as far as the world heard them play.
 
         Returns:
             "flights" (:data:`labseq_virtual.flight.FLIGHTS`) and "jumps"
             (:data:`labseq_virtual.jumps.JUMPS`); nothing if it listens to nobody.
         """
-        if self._ear is None:
+        if self._pulse_receiver is None:
             return {}
         self._hear(self._clock.now())
         return self._flight.tables(since_s)
@@ -246,16 +246,16 @@ class World(ShowsSensor):
 
     def _hear(self, until_s: float) -> None:
         """Carry out what was heard from the outputs of mobile and static tweezers until a time."""
-        for episode in () if self._ear is None else self._ear.hear(until_s):
-            if episode.continued or episode.start_s < self._now_s - ROUNDING_S:
-                text = f"the mobile tweezers were on at {episode.start_s:.6f} s, together with something else"
+        for pulse in () if self._pulse_receiver is None else self._pulse_receiver.receive_until(until_s):
+            if pulse.continued or pulse.start_s < self._now_s - ROUNDING_S:
+                text = f"the mobile tweezers were on at {pulse.start_s:.6f} s, together with something else"
                 raise DeviceError(self._name, f"{text}; wait (mobile_tweezers.wait, camera.read) first")
-            self._let_pass(episode.start_s)
-            factor = self._loss_factor * self._heating(episode.start_s, episode.end_s)
+            self._let_pass(pulse.start_s)
+            factor = self._loss_factor * self._heating(pulse.start_s, pulse.end_s)
             depth, chance = self._static.depth, self._random.shot
-            self._lost += self._flight.carry(self._occupied, episode, depth, chance, factor)
-            self._let_pass(episode.end_s)
-        self._lost["light"] += self._static.hear(until_s, self._occupied)
+            self._lost += self._flight.carry(self._occupied, pulse, depth, chance, factor)
+            self._let_pass(pulse.end_s)
+        self._lost["light"] += self._static.receive_until(until_s, self._occupied)
 
     def _heating(self, start_s: float, end_s: float) -> float:
         """Factor on the transport loss, for the part of the time without cooling light."""

@@ -211,7 +211,7 @@ def test_the_rest_of_a_killed_process_is_told(store: Store, monkeypatch: pytest.
     stored = store.add(overlay())
     part = store.folder / "active.json.part"
     part.touch()
-    monkeypatch.setattr(store_module, "PATIENCE_S", 0.0)
+    monkeypatch.setattr(store_module, "MAX_WAIT_S", 0.0)
     with pytest.raises(ConfigError, match=r"active.json.part: another labseq is writing.*delete it"):
         store.use(stored, GRID)
     assert part.exists()

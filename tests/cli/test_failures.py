@@ -2,7 +2,7 @@ import errno
 
 import pytest
 
-from labseq.cli.failures import MAX_TOLD, exit_code_of, lines_of, report
+from labseq.cli.failures import MAX_REPORTED, exit_code_of, lines_of, report
 from labseq.errors import (
     ConfigError,
     DeviceTimeoutError,
@@ -76,6 +76,6 @@ def test_only_debug_shows_the_traceback(debug: bool, capsys: pytest.CaptureFixtu
 
 
 def test_of_very_many_problems_the_first_are_told(capsys: pytest.CaptureFixture[str]) -> None:
-    assert report(ConfigError([Problem(f"wrong {i}") for i in range(MAX_TOLD + 3)])) == 2
+    assert report(ConfigError([Problem(f"wrong {i}") for i in range(MAX_REPORTED + 3)])) == 2
     lines = capsys.readouterr().err.splitlines()
-    assert lines[-2:] == [f"error: wrong {MAX_TOLD - 1}", "and 3 more problems"]
+    assert lines[-2:] == [f"error: wrong {MAX_REPORTED - 1}", "and 3 more problems"]

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from labseq.cli.files import check_different, json_writer, prove_writable
+from labseq.cli.files import check_different, json_writer, check_writable
 from labseq.errors import ConfigError
 
 
@@ -34,14 +34,14 @@ def test_a_file_that_cannot_be_written_is_refused_at_once(tmp_path: Path, name: 
 def test_the_proof_leaves_an_older_file_as_it_is(tmp_path: Path) -> None:
     path = tmp_path / "a.json"
     path.write_text("old", "utf-8")
-    prove_writable(path)
+    check_writable(path)
     assert path.read_text("utf-8") == "old"
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no named pipes in folders")
 def test_the_proof_does_not_wait_for_the_reader_of_a_pipe(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
-    prove_writable(tmp_path / "pipe")
+    check_writable(tmp_path / "pipe")
 
 
 def test_a_file_that_is_named_twice_is_refused(tmp_path: Path) -> None:

@@ -29,7 +29,7 @@ class Screen(io.TextIOWrapper):
         return raw.getvalue().decode(self.encoding)
 
 
-class Bench:
+class ResolvedProfile:
     """A live view on a screen, with a clock that is set by hand."""
 
     def __init__(self, encoding: str = "utf-8", size: tuple[int, int] = (110, 26)) -> None:
@@ -56,7 +56,7 @@ class Bench:
 @pytest.mark.parametrize("encoding", ["utf-8", "cp1252", "ascii", "cp437"])
 @pytest.mark.parametrize("size", [(110, 26), (80, 24), (40, 8)])
 def test_a_run_is_shown_on_any_screen(fake: Any, encoding: str, size: tuple[int, int]) -> None:
-    bench = Bench(encoding, size)
+    bench = ResolvedProfile(encoding, size)
     bench.play(fake.script(fake.run()))
     text = bench.screen.text
     assert "data/2026-01-02/0001_compact-225" in text
@@ -67,7 +67,7 @@ def test_a_run_is_shown_on_any_screen(fake: Any, encoding: str, size: tuple[int,
 
 def test_stdout_is_given_back(fake: Any) -> None:
     before = sys.stdout, sys.stderr
-    bench = Bench()
+    bench = ResolvedProfile()
     events = iter(fake.script(fake.run()))
     for name, values in events:
         bench.view.event(name, values)
@@ -80,7 +80,7 @@ def test_stdout_is_given_back(fake: Any) -> None:
 
 
 def test_it_is_drawn_at_most_four_times_a_second(fake: Any) -> None:
-    bench = Bench()
+    bench = ResolvedProfile()
     run = fake.run()
     bench.play([("run_starting", {"record": run, "run_dir": "x"})])
     image = {"image": fake.image(run.target.fill, 1), "filling_fraction": 1.0}
@@ -90,7 +90,7 @@ def test_it_is_drawn_at_most_four_times_a_second(fake: Any) -> None:
 
 
 def test_with_real_hardware_it_is_drawn_between_shots_only(fake: Any) -> None:
-    bench = Bench()
+    bench = ResolvedProfile()
     run = fake.run(simulated=False)
     bench.play([("run_starting", {"record": run, "run_dir": "x"})])
     image = {"image": fake.image(run.target.fill, 1), "filling_fraction": 1.0}
@@ -100,7 +100,7 @@ def test_with_real_hardware_it_is_drawn_between_shots_only(fake: Any) -> None:
 
 
 def test_what_must_be_seen_stays_on_the_screen(fake: Any) -> None:
-    bench = Bench()
+    bench = ResolvedProfile()
     bench.play([("run_starting", {"record": fake.run(), "run_dir": "x"})])
     bench.play([("warning", {"text": "the [laser] is warm"})])
     bench.play([("safe_state", {"device": "camera", "ok": False, "error": "camera: mute"})])
@@ -112,7 +112,7 @@ def test_what_must_be_seen_stays_on_the_screen(fake: Any) -> None:
 
 
 def test_the_screen_is_given_back_even_if_drawing_fails(fake: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    bench = Bench()
+    bench = ResolvedProfile()
     bench.play([("run_starting", {"record": fake.run(), "run_dir": "x"})])
     before = sys.stdout
 
@@ -127,7 +127,7 @@ def test_the_screen_is_given_back_even_if_drawing_fails(fake: Any, monkeypatch: 
 
 
 def test_export_svg_needs_nothing_from_elsewhere(fake: Any, tmp_path: Path) -> None:
-    bench = Bench("ascii")
+    bench = ResolvedProfile("ascii")
     bench.play(fake.script(fake.run()))
     bench.view.export_svg(tmp_path / "run.svg")
     text = (tmp_path / "run.svg").read_text("utf-8")

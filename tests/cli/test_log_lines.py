@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from labseq.cli.log_lines import LogLines
-from labseq.cli.telling import tell
+from labseq.cli.telling import event_text
 
 
 def lines_of(events: Any) -> list[str]:
@@ -63,30 +63,30 @@ def test_what_goes_wrong_is_told(fake: Any) -> None:
     ],
 )
 def test_a_shot_in_words(fake: Any, changes: Any, words: str) -> None:
-    text = tell("shot_finished", {"shot": fake.shot(2, **changes)}, fake.run())
+    text = event_text("shot_finished", {"shot": fake.shot(2, **changes)}, fake.run())
     assert text == f"shot 3/20  {words}  1.9 s"
 
 
 def test_a_shot_that_was_interrupted_needs_no_reason(fake: Any) -> None:
     shot = fake.shot(0, status="interrupted", error="StopRequested: stopped by Ctrl-C")
-    assert tell("shot_finished", {"shot": shot}, fake.run()) == "shot 1/20  interrupted"
+    assert event_text("shot_finished", {"shot": shot}, fake.run()) == "shot 1/20  interrupted"
 
 
 def test_missing_atoms_are_told(fake: Any) -> None:
     shot = fake.shot(0, success=False, seen=0, filling=0.9)
     shot.n_missing_atoms = 3
-    assert "3 atoms too few loaded" in tell("shot_finished", {"shot": shot}, fake.run())
+    assert "3 atoms too few loaded" in event_text("shot_finished", {"shot": shot}, fake.run())
 
 
 def test_a_window_that_was_too_short(fake: Any) -> None:
     values = {"shot": 0, "cycle": 2, "n_batches": 40, "n_batches_played": 12}
-    assert tell("window_too_short", values, fake.run()) == "shot 1, cycle 2: 12 of 40 batches fit the window"
+    assert event_text("window_too_short", values, fake.run()) == "shot 1, cycle 2: 12 of 40 batches fit the window"
 
 
 def test_whom_a_run_waits_for(fake: Any) -> None:
     values = {"shot": 0, "device": "leader", "signal": "go", "timeout_s": 60.0}
     text = "shot 1: waiting for 'go' from leader, at most 60 s"
-    assert tell("leader_awaited", values, fake.run()) == text
+    assert event_text("leader_awaited", values, fake.run()) == text
 
 
 def test_compiling_is_announced_module_by_module() -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given, strategies as st
 
-from labseq.cli.output import columns, give_up_unwritten, say
+from labseq.cli.output import columns, discard_unwritten, say
 from labseq.errors import RecordingError
 
 FULL = Path("/dev/full")
@@ -99,4 +99,4 @@ def test_what_cannot_be_written_is_given_up(tmp_path: Path, monkeypatch: pytest.
         say("nobody reads this")
         say("nor this")
         stream.write("nor what a plugin left in the buffer")
-        give_up_unwritten()
+        discard_unwritten()

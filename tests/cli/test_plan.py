@@ -13,7 +13,7 @@ from rich.text import Text
 from labseq.cli import main
 from labseq.cli.plan import PlanOutput, plan_once, warnings
 from labseq.cli.plan_report import print_plan, title, totals
-from labseq.cli.plan_steps import move_words
+from labseq.cli.plan_steps import moves_text
 from labseq.errors import ConfigError
 from labseq.model import Batch
 from labseq.session import PlannedMoves, PlanRequest, plan_moves
@@ -104,12 +104,12 @@ def test_move_words_name_every_line() -> None:
         np.array([(0, 1), (0, 4), (3, 1), (3, 4)], np.int16),
         np.array([(0, 2), (0, 5), (3, 2), (3, 5)], np.int16),
     )
-    assert move_words(batch, (4, 5), "to") == [
+    assert moves_text(batch, (4, 5), "to") == [
         "row 0: columns 1to2, 4toejected",
         "row 3: columns 1to2, 4toejected",
     ]
     column = Batch(np.array([(2, 1)], np.int16), np.array([(-1, 1)], np.int16))
-    assert move_words(column, (4, 5)) == ["column 1: row 2->ejected"]
+    assert moves_text(column, (4, 5)) == ["column 1: row 2->ejected"]
 
 
 def test_the_title_of_a_picture(moves: PlannedMoves) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from labseq.cli.output import give_up_unwritten
+from labseq.cli.output import discard_unwritten
 from labseq.cli.run import run_sequence
 from labseq.errors import ConfigError, DeviceError, Problem, RecordingError, StopRequested
 from labseq.recording import RunWriter
@@ -196,7 +196,7 @@ def test_a_full_disk_behind_stdout_takes_nothing_from_the_run(perform: Any) -> N
         patch.setattr(sys, "stdout", full)
         patch.setattr("labseq.cli.log_lines.LogLines.event", lambda *_: None)  # a session gives it up
         session, _, err, caught = perform(as_json=False)
-        give_up_unwritten()
+        discard_unwritten()
     assert caught is None
     lines = err.splitlines()
     assert lines[0] == (
@@ -221,8 +221,8 @@ def test_an_answer_that_cannot_be_given_hides_no_failure(perform: Any, error: Ba
 
 LATE_PRINTS = """
 import atexit, ctypes, ctypes.util, sys
-from labseq.cli.output import divert_stdout, say
-answer = divert_stdout()
+from labseq.cli.output import stdout_to_stderr, say
+answer = stdout_to_stderr()
 atexit.register(print, "said at the end")
 library = ctypes.CDLL(None)
 library.puts(b"buffered by the C library until the process ends")

@@ -17,7 +17,7 @@ from labseq.errors import ConfigError
 from labseq.recording import RunWriter, open_run
 
 
-class Bench:
+class ResolvedProfile:
     """A run that is written while it is watched."""
 
     def __init__(self, root: Path, fake: Any, n_shots: int = 3) -> None:
@@ -49,11 +49,11 @@ class Bench:
 
 
 @pytest.fixture
-def bench(tmp_path: Path, fake: Any) -> Bench:
-    return Bench(tmp_path, fake)
+def bench(tmp_path: Path, fake: Any) -> ResolvedProfile:
+    return ResolvedProfile(tmp_path, fake)
 
 
-def test_a_run_is_watched_to_its_end(bench: Bench) -> None:
+def test_a_run_is_watched_to_its_end(bench: ResolvedProfile) -> None:
     bench.take(0)
     lines = bench.watch(
         lambda: bench.take(1, status="failed", error="TransientError: no light"),
@@ -70,13 +70,13 @@ def test_a_run_is_watched_to_its_end(bench: Bench) -> None:
     assert "shots             2 of 3, 1 attempt kept that did not complete" in lines
 
 
-def test_a_finished_run_is_shown_at_once(bench: Bench) -> None:
+def test_a_finished_run_is_shown_at_once(bench: ResolvedProfile) -> None:
     bench.take(0)
     bench.writer.finish("complete")
     assert "status            complete" in bench.watch()
 
 
-def test_ctrl_c_leaves_the_run_alone(bench: Bench) -> None:
+def test_ctrl_c_leaves_the_run_alone(bench: ResolvedProfile) -> None:
     def interrupt() -> None:
         raise KeyboardInterrupt
 
@@ -85,7 +85,7 @@ def test_ctrl_c_leaves_the_run_alone(bench: Bench) -> None:
     assert open_run(bench.writer.run_dir).status == "running"
 
 
-def test_the_view_learns_what_the_runs_own_view_does(bench: Bench) -> None:
+def test_the_view_learns_what_the_runs_own_view_does(bench: ResolvedProfile) -> None:
     bench.take(0)
     follower = Follower(open_run(bench.writer.run_dir), lambda: 1e10)
     tally = Tally(follower.now)
@@ -97,7 +97,7 @@ def test_the_view_learns_what_the_runs_own_view_does(bench: Bench) -> None:
     assert [*follower.read()] == []
 
 
-def test_lines_of_another_version_and_damaged_ones_are_passed_over(bench: Bench) -> None:
+def test_lines_of_another_version_and_damaged_ones_are_passed_over(bench: ResolvedProfile) -> None:
     path = bench.writer.run_dir / "events.jsonl"
     bench.take(0)
     odd: list[Any] = [
@@ -112,7 +112,7 @@ def test_lines_of_another_version_and_damaged_ones_are_passed_over(bench: Bench)
     assert any(line.startswith("shot 1/3") for line in bench.watch())
 
 
-def test_a_shot_whose_file_is_gone_is_still_told(bench: Bench) -> None:
+def test_a_shot_whose_file_is_gone_is_still_told(bench: ResolvedProfile) -> None:
     bench.take(0)
     bench.writer.finish("complete")
     next(bench.writer.run_dir.glob("shots/*.h5")).unlink()
@@ -130,7 +130,7 @@ def test_only_whole_lines_are_read_and_each_once(tmp_path: Path) -> None:
     assert tail.read() == []
 
 
-def test_a_record_knows_the_scan(bench: Bench) -> None:
+def test_a_record_knows_the_scan(bench: ResolvedProfile) -> None:
     run = open_run(bench.writer.run_dir)
     run.record["scan"] = {"addresses": ["a"]}
     assert record_of(run).scan == {"addresses": ["a"]}

@@ -11,7 +11,7 @@ import pytest
 from labseq.config import (
     CheckOverlaySettings,
     CheckSitesSettings,
-    Collected,
+    ProblemCollector,
     DeviceSettings,
     ImageSettings,
     LoadSettings,
@@ -329,7 +329,7 @@ CASES = [
 
 def check(path: Path) -> None:
     document, spec = load_sequence(path)
-    found = Collected()
+    found = ProblemCollector()
     for step in spec.shot:
         with found:
             document.validate(MODELS[step.kind], step.loc)

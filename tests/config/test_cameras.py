@@ -32,23 +32,23 @@ def test_a_region_begins_at_the_corner_unless_it_says_where() -> None:
 
 @given(corners, corners, sizes, sizes)
 def test_a_region_fits_if_its_last_pixel_is_on_the_sensor(y: int, x: int, height: int, width: int) -> None:
-    misfit = camera(region={"y": y, "x": x, "height": height, "width": width}).misfit_on((512, 400))
+    setting_error = camera(region={"y": y, "x": x, "height": height, "width": width}).sensor_conflict((512, 400))
     if y + height <= 512 and x + width <= 400:
-        assert misfit == ""
+        assert setting_error == ""
     else:
         ends = f"`region` ends at row {y + height} and column {x + width}"
-        assert misfit == f"{ends}, beyond the sensor of 512 x 400 pixels; choose a smaller or another one"
+        assert setting_error == f"{ends}, beyond the sensor of 512 x 400 pixels; choose a smaller or another one"
 
 
 @given(sizes, sizes, st.integers(1, 8))
 def test_what_cannot_be_binned_is_refused(height: int, width: int, binning: int) -> None:
     fits = height % binning == 0 and width % binning == 0
     told = "" if fits else f"{height} x {width} pixels cannot be binned by {binning}; choose a `region`"
-    assert camera(binning=binning).misfit_on((height, width)).startswith(told)
-    assert bool(camera(binning=binning).misfit_on((height, width))) != fits
+    assert camera(binning=binning).sensor_conflict((height, width)).startswith(told)
+    assert bool(camera(binning=binning).sensor_conflict((height, width))) != fits
     region = {"height": height, "width": width}
     if fits:
-        assert camera(region=region, binning=binning).misfit_on((600, 600)) == ""
+        assert camera(region=region, binning=binning).sensor_conflict((600, 600)) == ""
     else:
         with pytest.raises(ValidationError, match="cannot be binned"):
             camera(region=region, binning=binning)

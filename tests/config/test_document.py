@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from hypothesis import given, strategies as st
 
-from labseq.config import Document, Kept, load_profile, load_sequence
+from labseq.config import Document, StoredText, load_profile, load_sequence
 from labseq.errors import ConfigError
 
 TEXT = """\
@@ -147,10 +147,10 @@ def test_json_is_yaml(data: dict[str, Any]) -> None:
 
 def test_a_kept_text_stands_for_a_file_that_may_be_gone(tmp_path: Path) -> None:
     path = tmp_path / "gone.yaml"
-    document = Document.read(path, Kept("\ufeffshots: 3\n", "copy/sequence.yaml"))
+    document = Document.read(path, StoredText("\ufeffshots: 3\n", "copy/sequence.yaml"))
     assert (document.path, document.name, document.text) == (path, "copy/sequence.yaml", "shots: 3\n")
     assert str(document.problem(("shots",), "wrong")) == "copy/sequence.yaml:1:8: wrong"
-    kept = Kept("labseq: 1\nname: 5\n", "copy.yaml")
+    kept = StoredText("labseq: 1\nname: 5\n", "copy.yaml")
     with pytest.raises(ConfigError, match=r"(?m)^copy\.yaml:2:7: name is 5"):
         load_sequence(path, kept=kept)
     with pytest.raises(ConfigError, match=r"(?m)^copy\.yaml:2:7: name is 5"):

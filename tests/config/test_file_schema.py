@@ -161,7 +161,7 @@ shot: [{load: {}}, {image: {}}]
         ("{image: {}}", "{policy: {retries: 2}}", False),
         ("{image: {}}", "{name: x, policy: {retries: 2}}", False),
         ("{image: {}}", "{image: {}, load: {}, name: x, policy: {retries: 2}}", False),
-        ("shots: 1", "shots: 1\npolicy: {used_up: skip_point, checks: [{value: n, at_least: 1}]}", True),
+        ("shots: 1", "shots: 1\npolicy: {when_exhausted: skip_point, checks: [{value: n, at_least: 1}]}", True),
         ("shots: 1", "shots: 1\npolicy: {checks: [{at_least: 1}]}", False),
         ("shots: 1", "shots: 1\nvariables: {t: 20 ms, n: 3, f: 1.5 MHz, x: = 2 * variables.n}", True),
         ("shots: 1", "shots: 1\nvariables: {t: long}", False),

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from labseq import places
-from labseq.config import Document, find, find_profile, find_sequence, keeping_dir, packaged_profiles_dir
+from labseq.config import Document, find, find_profile, find_sequence, profile_dir, packaged_profiles_dir
 from labseq.errors import ConfigError
 
 
@@ -90,12 +90,12 @@ def test_folder_is_no_profile() -> None:
 def test_what_belongs_to_a_profile_is_not_kept_inside_of_a_wheel(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert keeping_dir(packaged_profiles_dir() / "virtual.yaml") == packaged_profiles_dir()  # of a checkout
-    assert keeping_dir(Path("mine/lab.yaml")) == Path("mine")
+    assert profile_dir(packaged_profiles_dir() / "virtual.yaml") == packaged_profiles_dir()  # of a checkout
+    assert profile_dir(Path("mine/lab.yaml")) == Path("mine")
     inside = tmp_path / "labseq" / "config" / "hardware_profiles"
     inside.mkdir(parents=True)
     monkeypatch.setattr(places, "__file__", str(inside.parents[1] / "places.py"))
-    assert keeping_dir(inside / "practice.yaml") == tmp_path / "hardware_profiles"
+    assert profile_dir(inside / "practice.yaml") == tmp_path / "hardware_profiles"
 
 
 def refused_sequence(name: str) -> str:

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from labseq.config import (
-    Collected,
+    ProblemCollector,
     DeviceSettings,
     ImageSettings,
     LoadSettings,
@@ -148,7 +148,7 @@ def test_sequences(path: Path, data: bytes) -> None:
 
     def load() -> None:
         document, spec = load_sequence(path)
-        found = Collected()
+        found = ProblemCollector()
         for step in spec.shot:
             with found:
                 document.validate(MODELS.get(step.kind), step.loc)

@@ -5,11 +5,11 @@ from typing import Any
 
 from hypothesis import given, settings, strategies as st
 
-from labseq.config import Collected, Document, SequenceSpec, load_sequence
-from labseq.config.mending import StandIns, load_checked
+from labseq.config import ProblemCollector, Document, SequenceSpec, load_sequence
+from labseq.config.mending import FallbackValues, load_checked
 from labseq.config.values import node_of
 
-STAND_INS = StandIns(
+STAND_INS = FallbackValues(
     values={
         "labseq": 1,
         "name": "x",
@@ -31,7 +31,7 @@ KEYS = st.sampled_from([*GOOD, "seed", "attempts", "record_frames", "unknown"])
 def test_whatever_is_wrong_the_rest_is_kept(changes: dict[str, Any]):
     base = Document.parse("labseq: 1\n", "s.yaml")
     root = node_of({**GOOD, **changes}, base.root.mark)
-    found = Collected()
+    found = ProblemCollector()
     document, spec = load_checked(
         Document(Path("s.yaml"), "s.yaml", "", root), SequenceSpec, "a sequence", STAND_INS, found
     )
@@ -46,7 +46,7 @@ def test_a_wrong_step_leaves_the_others_in_their_places(tmp_path: Path):
     path.write_text(
         "labseq: 1\nname: x\nshots: 1\ntarget: {pattern: compact}\nshot: [load, {wait: {}}, 5, {load: {}}]\n"
     )
-    found = Collected()
+    found = ProblemCollector()
     _, spec = load_sequence(path, found=found)
     assert [step.loc for step in spec.shot] == [
         ("shot", 0, "image"),

@@ -79,12 +79,12 @@ def test_motion_keys_and_the_plugin_s_share_a_mapping(loaded: tuple[Document, Pr
 
     document, spec = loaded
     loc, drop = spec.mobile_tweezers.loc, {"use", *MOTION_KEYS}
-    assert document.validate(Plugin, loc, drop=drop, also_known=MOTION_KEYS).band_centre == "100 MHz"
+    assert document.validate(Plugin, loc, drop=drop, other_keys=MOTION_KEYS).band_centre == "100 MHz"
     wrong = document.override("mobile_tweezers.sped", "1", "--set")
     with pytest.raises(
         ConfigError, match=r"^--set: 'sped' is not a .* one of band_centre, pick_up,.* 'speed'\?$"
     ):
-        wrong.validate(Plugin, loc, drop=drop, also_known=MOTION_KEYS)
+        wrong.validate(Plugin, loc, drop=drop, other_keys=MOTION_KEYS)
 
 
 def test_what_may_be_left_out() -> None:

@@ -230,14 +230,14 @@ def test_no_mapping(value: str) -> None:
 
 def test_dropped_keys_are_left_out_and_not_offered() -> None:
     assert validate("  use: psca\n  speed: fast\n", drop={"use", "speed"}).rows == 1
-    (problem,) = problems("  user: x", drop={"use"}, also_known=["speed"])
+    (problem,) = problems("  user: x", drop={"use"}, other_keys=["speed"])
     assert "did you mean" not in problem
     assert ", speed" in problem
     assert "use," not in problem
 
 
 def test_keys_of_others_are_suggested() -> None:
-    (problem,) = problems("  spede: 1", also_known=["speed"])
+    (problem,) = problems("  spede: 1", other_keys=["speed"])
     assert problem.endswith("did you mean 'speed'?")
 
 

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given, settings, strategies as st
 from hypothesis.strategies import DataObject
 
-from labseq.drawing import line_words, occupancies, on_grid, tell_batches
+from labseq.drawing import lines_label, occupancies, on_grid, summarise_batches
 from labseq.model import MotionSpec, Plan, SiteGrid, TargetPattern
 from labseq.motion import check_plan
 from labseq.testing import strategies
@@ -29,18 +29,18 @@ def test_the_last_occupancy_is_the_one_that_the_check_predicts(data: DataObject)
 def test_a_story_counts_what_moves(data: DataObject) -> None:
     before = data.draw(strategies.occupancies())
     plan = data.draw(strategies.plans(before))
-    for story, batch in zip(tell_batches(plan, before.shape), plan.batches, strict=True):
-        assert (story.n_atoms, story.n_ejected) == (len(batch), 0)
-        assert story.n_sites == int(np.abs(batch.to_sites - batch.from_sites).sum(axis=1).max())
-        column = 1 if story.axis == "column" else 0
-        assert set(story.lines) == set(batch.from_sites[:, column].tolist())
+    for summary, batch in zip(summarise_batches(plan, before.shape), plan.batches, strict=True):
+        assert (summary.n_atoms, summary.n_ejected) == (len(batch), 0)
+        assert summary.n_sites == int(np.abs(batch.to_sites - batch.from_sites).sum(axis=1).max())
+        column = 1 if summary.axis == "column" else 0
+        assert set(summary.lines) == set(batch.from_sites[:, column].tolist())
         assert np.array_equal(batch.from_sites[:, column], batch.to_sites[:, column])
 
 
 def test_ejected_atoms_leave_the_array() -> None:
     plan = Plan.from_batches([([(0, 0), (0, 2)], [(0, -1), (0, 3)])])
-    (story,) = tell_batches(plan, (1, 3))
-    assert (story.n_ejected, story.n_sites) == (2, 1)
+    (summary,) = summarise_batches(plan, (1, 3))
+    assert (summary.n_ejected, summary.n_sites) == (2, 1)
     assert occupancies(plan, np.ones((1, 3), np.bool_))[1].tolist() == [[False, True, False]]
 
 
@@ -52,7 +52,7 @@ def test_sites_on_and_off_the_grid() -> None:
 @settings(deadline=None)
 @given(st.sets(st.integers(0, 30), min_size=1))
 def test_line_words_name_every_line_once(lines: set[int]) -> None:
-    words = line_words("row", lines)
+    words = lines_label("row", lines)
     spans = words.split(" ", 1)[1].split(", ")
     named = [n for span in spans for n in range(int(span.split("-")[0]), int(span.split("-")[-1]) + 1)]
     assert named == sorted(lines)

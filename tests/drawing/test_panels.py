@@ -5,12 +5,12 @@ from itertools import pairwise
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from labseq.drawing import MAX_PANELS, BatchStory, Panel, make_panels
+from labseq.drawing import MAX_PANELS, BatchSummary, Panel, make_panels
 from labseq.drawing.batches import Axis
 
 STORIES = st.lists(
     st.builds(
-        BatchStory,
+        BatchSummary,
         axis=st.sampled_from(["row", "column"]),
         lines=st.sets(st.integers(0, 4), min_size=1, max_size=2).map(sorted).map(tuple),
         n_atoms=st.just(1),
@@ -21,37 +21,37 @@ STORIES = st.lists(
 )
 
 
-def story(axis: Axis, line: int) -> BatchStory:
-    return BatchStory(axis, (line,), 1, 0, 1)
+def summary(axis: Axis, line: int) -> BatchSummary:
+    return BatchSummary(axis, (line,), 1, 0, 1)
 
 
 @settings(deadline=None)
 @given(STORIES, st.integers(2, 40))
 def test_every_batch_is_in_one_panel_in_order_and_panels_are_few_enough(
-    stories: list[BatchStory], max_panels: int
+    summaries: list[BatchSummary], max_panels: int
 ) -> None:
-    panels = make_panels(stories, max_panels)
+    panels = make_panels(summaries, max_panels)
     assert len(panels) <= max_panels
-    assert sum(panel.n_batches for panel in panels) == len(stories)
+    assert sum(panel.n_batches for panel in panels) == len(summaries)
     assert all(after.first == before.last + 1 for before, after in pairwise(panels))
     assert (panels[0].first if panels else 0) == 0
     for panel in panels:
         named = {(axis, line) for axis, lines in panel.moves_along for line in lines}
-        here = stories[panel.first : panel.last + 1]
+        here = summaries[panel.first : panel.last + 1]
         assert named == {(told.axis, line) for told in here for line in told.lines}
 
 
 @settings(deadline=None)
 @given(STORIES)
-def test_a_batch_is_alone_while_there_is_room(stories: list[BatchStory]) -> None:
-    panels = make_panels(stories, max(1, len(stories)))
+def test_a_batch_is_alone_while_there_is_room(summaries: list[BatchSummary]) -> None:
+    panels = make_panels(summaries, max(1, len(summaries)))
     assert all(panel.n_batches == 1 for panel in panels)
-    assert len(make_panels(stories)) <= MAX_PANELS
+    assert len(make_panels(summaries)) <= MAX_PANELS
 
 
 def test_axes_are_kept_apart_while_there_is_room() -> None:
-    stories = [story("row", i) for i in range(9)] + [story("column", i) for i in range(3)]
-    panels = make_panels(stories, 4)
+    summaries = [summary("row", i) for i in range(9)] + [summary("column", i) for i in range(3)]
+    panels = make_panels(summaries, 4)
     assert [panel.title for panel in panels] == [
         "batches 1-3: rows 0-2",
         "batches 4-6: rows 3-5",

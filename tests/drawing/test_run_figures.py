@@ -37,7 +37,7 @@ def cycles(**changes: Any) -> CyclesDrawing:
         "series": (series("400 shots"),),
         "defects": (np.array([130, 120, 80, 40, 0, 2]),),
         "quoted": series("Tian et al.", 2),
-        "ceiling": series("ceiling", top=0.36, error=0.0),
+        "max_defect_free": series("max_defect_free", top=0.36, error=0.0),
     }
     return CyclesDrawing(**{**parts, **changes})
 
@@ -65,7 +65,7 @@ def n_pixels(path: Path, colour: str) -> int:
     [
         cycles(),
         cycles(series=(series("one"), series("other", 4)), defects=(np.array([1]), np.array([0, 3]))),
-        cycles(quoted=None, ceiling=None),
+        cycles(quoted=None, max_defect_free=None),
         cycles(series=(series("one cycle", 1, error=0.0),), defects=(np.array([0, 0, 5]),)),
         cycles(title="50 $ a shot", note="$x$ \\alpha"),
     ],

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
-from labseq.drawing.spectrogram import Stretches, envelope, spectrogram
+from labseq.drawing.spectrogram import WaveformPieces, envelope, spectrogram
 from labseq.model import Plan, SegmentKind
 from labseq.motion import Renderer, render, tone_program
 
@@ -26,7 +26,7 @@ def pieces() -> list[tuple[int, int]]:
 def test_places_in_the_picture_count_the_samples_of_all_pieces(spans: list[tuple[int, int]]) -> None:
     ends = np.cumsum([gap + length for gap, length in spans]).tolist()
     bounds = [(end - length, end) for end, (_, length) in zip(ends, spans, strict=True)]
-    stretches = Stretches.of(bounds)
+    stretches = WaveformPieces.of(bounds)
     expected = [n for first, stop in bounds for n in range(first, stop)]
     assert stretches.n_samples == len(expected)
     assert stretches.in_waveform(np.arange(len(expected))).tolist() == expected
@@ -34,7 +34,7 @@ def test_places_in_the_picture_count_the_samples_of_all_pieces(spans: list[tuple
 
 @pytest.mark.parametrize("channel", [0, 1])
 def test_the_strongest_frequency_is_the_strongest_tone(channel: int) -> None:
-    stretches = Stretches.of(pieces())
+    stretches = WaveformPieces.of(pieces())
     level_db, (low_hz, high_hz) = spectrogram(RENDERER, channel, stretches, 60, (82e6, 118e6))
     bin_hz = (high_hz - low_hz) / len(level_db)
     centres = stretches.in_waveform(((np.arange(60) + 0.5) * stretches.n_samples / 60).astype(np.int64))
@@ -46,12 +46,12 @@ def test_the_strongest_frequency_is_the_strongest_tone(channel: int) -> None:
 
 
 def test_a_tone_has_the_level_of_its_amplitude() -> None:
-    level_db, _ = spectrogram(RENDERER, 0, Stretches.of(pieces()), 40, (82e6, 118e6))
+    level_db, _ = spectrogram(RENDERER, 0, WaveformPieces.of(pieces()), 40, (82e6, 118e6))
     assert level_db.max(axis=0)[5:-5] == pytest.approx(20 * np.log10(1 / 20), abs=1.0)
 
 
 def test_silence_is_no_level_and_no_envelope() -> None:
-    pause = Stretches.of([(0, int(RENDERER.first_sample[1]) - 2000)])
+    pause = WaveformPieces.of([(0, int(RENDERER.first_sample[1]) - 2000)])
     level_db, _ = spectrogram(RENDERER, 1, pause, 20, (90e6, 110e6))
     assert level_db[:, :-1].max() == pytest.approx(-120)
     assert not envelope(RENDERER, 1, pause, 20).any()
@@ -60,7 +60,7 @@ def test_silence_is_no_level_and_no_envelope() -> None:
 @pytest.mark.parametrize("n_columns", [1, 7, 100, 3000])
 @pytest.mark.parametrize("channel", [0, 1])
 def test_the_envelope_looks_at_every_sample(channel: int, n_columns: int) -> None:
-    stretches = Stretches.of(pieces())
+    stretches = WaveformPieces.of(pieces())
     found = envelope(RENDERER, channel, stretches, n_columns)
     samples = np.concatenate([render(PROGRAM, RATE_HZ).samples[channel, a:b] for a, b in pieces()])
     edges = np.rint(np.linspace(0, len(samples), n_columns + 1)).astype(int)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from labseq import CameraDriver, CameraFacts, Context, Frame, Series, Taken
+from labseq import CameraDriver, CameraFacts, Context, Frame, Series, ExposureResult
 from labseq.testing.fakes import FakeClock
 
 SHAPE = (3, 4)
@@ -41,7 +41,7 @@ class TinyCamera(CameraDriver):
         self.broken: set[str] = set()
         self.tells: dict[str, Any] = {}
         self.shape: tuple[int, int] = SHAPE
-        self.coming: deque[tuple[float, Taken]] = deque()
+        self.coming: deque[tuple[float, ExposureResult]] = deque()
         self._n_made = 0
 
     @property
@@ -72,7 +72,7 @@ class TinyCamera(CameraDriver):
         self._note("fire")
         self._make()
 
-    def _take(self, timeout_s: float) -> Taken | None:
+    def _take(self, timeout_s: float) -> ExposureResult | None:
         self._note("take")
         missing_s = self.coming[0][0] - self._clock.now() if self.coming else math.inf
         self._clock.sleep(max(0.0, min(missing_s, timeout_s)))
@@ -94,12 +94,12 @@ class TinyCamera(CameraDriver):
         fault = self._lose.get(number)
         if fault is None:
             image = np.full(self.shape, number, np.uint16)
-            self.coming.append((due_s, Taken(number, image, **self.tells)))
+            self.coming.append((due_s, ExposureResult(number, image, **self.tells)))
         elif fault:
-            self.coming.append((due_s, Taken(number, None, fault)))
+            self.coming.append((due_s, ExposureResult(number, None, fault)))
 
 
-class Bench:
+class ResolvedProfile:
     """A tiny camera on a clock that costs no time; it is open."""
 
     def __init__(self, lose: Mapping[int, str] | None = None, **facts: Any) -> None:

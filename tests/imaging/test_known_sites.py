@@ -16,7 +16,7 @@ from labseq.errors import ConfigError, DeviceError, LimitError
 from labseq.imaging import ThresholdDetector, WeightedDetector, site_pixels
 from labseq.imaging.known_sites import known_sites, read_sites
 from labseq.model import CalibrationEntry, Frame, SiteGrid
-from labseq.roles import Context, SignalTeller
+from labseq.roles import Context, ReportsSignals
 from labseq.testing.fakes import fake_calibration
 
 Floats = NDArray[np.float64]
@@ -129,7 +129,7 @@ def test_thresholds_in_another_unit_are_refused() -> None:
 def test_the_signals_are_what_is_compared(make: Maker) -> None:
     image = np.random.default_rng(1).integers(480, 700, (60, 90), np.uint16)
     detector, frame = make(), Frame(image, 0.045, 0.0)
-    assert isinstance(detector, SignalTeller)
+    assert isinstance(detector, ReportsSignals)
     signals = detector.signals(frame)
     assert signals.dtype == np.float64
     cut = float(np.median(signals))

@@ -10,7 +10,7 @@ from hypothesis import given, settings, strategies as st
 from numpy.typing import NDArray
 
 from labseq.config.detectors import WeightedSettings
-from labseq.imaging.photoelectrons import Evidence, evidence
+from labseq.imaging.photoelectrons import LightLikelihood, evidence
 
 Floats = NDArray[np.float64]
 N = 8192
@@ -29,7 +29,7 @@ def law(sensor: WeightedSettings, light: float) -> Floats:
     return np.fft.irfft(np.exp(transform) * np.sinc(t / 2 / np.pi), N)
 
 
-def told(found: Evidence, light: float) -> Floats:
+def told(found: LightLikelihood, light: float) -> Floats:
     """Log-likelihood over that of the darkest light, for the counts 0 to N."""
     weight, constant = (np.interp(light, found.light, values) for values in (found.weight, found.constant))
     weight, constant = weight - found.weight[0], constant - found.constant[0]

@@ -18,7 +18,7 @@ from labseq.config.detectors import WeightedSettings
 from labseq.errors import ConfigError, DeviceError, LimitError
 from labseq.imaging import WeightedDetector, site_pixels
 from labseq.model import Frame, SiteGrid
-from labseq.roles import Context, Warmable
+from labseq.roles import Context, NeedsWarmUp
 from labseq.testing import DetectorContract
 
 Bools = NDArray[np.bool_]
@@ -180,7 +180,7 @@ def test_one_saturated_pixel_at_the_edge_is_no_atom() -> None:
 
 def test_warming_leaves_nothing_for_the_first_frame() -> None:
     known = detector()
-    assert isinstance(known, Warmable)
+    assert isinstance(known, NeedsWarmUp)
     known.warm()
     before = known._weights
     known.detect(frame(mean_image(np.zeros((3, 4), np.bool_))))

@@ -167,7 +167,7 @@ def test_tweezers_that_come_too_near_are_refused() -> None:
     each = hold_program(GRID, spec(), ALL, opposite, HOLD_S)
     assert each.n_segments == 2 * 20  # those with another offset come in another batch
     with pytest.raises(LimitError, match="the distance of column tones"):
-        hold_program(GRID, spec(rf=RfSpec(least_spacing_hz=2e6)), ALL, (0.0, 0.0), HOLD_S)
+        hold_program(GRID, spec(rf=RfSpec(min_spacing_hz=2e6)), ALL, (0.0, 0.0), HOLD_S)
 
 
 @pytest.mark.parametrize(

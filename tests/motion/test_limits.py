@@ -38,7 +38,7 @@ def program_of(*batches: Any, grid: SiteGrid = GRID, **rf: Any) -> ToneProgram:
         ),
         (
             FOUR,
-            {"least_spacing_hz": 1.7e6},
+            {"min_spacing_hz": 1.7e6},
             "the distance of column tones 0 and 1 in batch 1 is 1.6 MHz",
             "1.7 MHz at least, in the order of the sites",
         ),
@@ -82,7 +82,7 @@ def test_what_would_be_too_much(batch: Any, rf: dict[str, Any], what: str, limit
 
 def test_what_is_just_not_too_much() -> None:
     program_of(FOUR, column_amplitudes=QUARTERS, full_scale_v=2.0, amplifier_gain_db=20.0)
-    program_of(FOUR, least_spacing_hz=1.6e6, column_band_hz=(96e6, 102.4e6))
+    program_of(FOUR, min_spacing_hz=1.6e6, column_band_hz=(96e6, 102.4e6))
 
 
 def test_amplitudes_that_change_on_the_way_may_be_too_loud_in_between() -> None:
@@ -96,7 +96,7 @@ def test_frequencies_that_fall_along_the_grid() -> None:
     falling = SiteGrid(4, 6, column_frequency_hz=centred_comb(6, step_hz=-1.6e6))
     assert program_of(FOUR, grid=falling).n_segments == 4
     with pytest.raises(LimitError, match=r"column tones 0 and 1 in batch 0 is 1\.6 MHz; the limit is 2 MHz"):
-        program_of(FOUR, grid=falling, least_spacing_hz=2e6)
+        program_of(FOUR, grid=falling, min_spacing_hz=2e6)
 
 
 def test_a_grid_of_one_site_has_room_to_eject() -> None:
@@ -111,7 +111,7 @@ def test_a_grid_of_one_site_has_room_to_eject() -> None:
         ({"row_amplitudes": (0.0,)}, "an amplitude is a fraction of full scale"),
         ({"full_scale_v": 0.0}, "voltages and powers must be above 0"),
         ({"max_mean_power_w": float("nan")}, "voltages and powers must be above 0"),
-        ({"least_spacing_hz": -1.0}, "cannot be negative"),
+        ({"min_spacing_hz": -1.0}, "cannot be negative"),
         ({"snap_within_m": float("nan")}, "cannot be negative"),
         ({"amplifier_gain_db": float("nan")}, "gain is nan dB; expected a number"),
     ],

@@ -20,7 +20,7 @@ from labseq.motion import tone_program
 from labseq.testing.fakes import FakeClock
 
 
-class Bench:
+class ResolvedProfile:
     """One simulated card, the real ``spcm`` package, and a virtual clock.
 
     Attributes:
@@ -64,12 +64,12 @@ class Bench:
 
 
 @pytest.fixture
-def bench() -> Iterator[Bench]:
+def bench() -> Iterator[ResolvedProfile]:
     """A bench with an open card, which is closed whatever the test leaves behind."""
     clock = FakeClock()
     sim = SimulatedCard(clock)
     with installed(sim) as name:
-        bench = Bench(clock, sim, name)
+        bench = ResolvedProfile(clock, sim, name)
         yield bench
         sim.take_error()
         bench.card.close()

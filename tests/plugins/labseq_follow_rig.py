@@ -17,7 +17,7 @@ from labseq_follow.settings import TcpLeaderSettings
 from labseq import Context
 from labseq.roles import NeverStopped
 
-PATIENCE_S = 60.0
+MAX_WAIT_S = 60.0
 """A test fails after this time; on a busy computer nothing takes as long."""
 
 
@@ -30,7 +30,7 @@ class TcpPeer:
 
     def __init__(self, address: str) -> None:
         host, _, port = address.rpartition(":")
-        self.socket = socket.create_connection((host, int(port)), timeout=PATIENCE_S)
+        self.socket = socket.create_connection((host, int(port)), timeout=MAX_WAIT_S)
         self._lines = self.socket.makefile("rb")
 
     def say(self, *lines: str) -> None:
@@ -65,7 +65,7 @@ class PtyPeer:
         os.write(self.fd, "".join(f"{line}\n" for line in lines).encode())
 
     def hear(self) -> str:
-        end_s = time.monotonic() + PATIENCE_S
+        end_s = time.monotonic() + MAX_WAIT_S
         while b"\n" not in self._came:
             assert select.select([self.fd], [], [], end_s - time.monotonic())[0], "labseq said nothing"
             try:

@@ -23,7 +23,7 @@ from labseq.testing.fakes import Calls, FakeClock, RecordingSimulation
 
 from .needs import need_library
 
-PATIENCE_S = 60.0
+MAX_WAIT_S = 60.0
 
 
 def need_simavr() -> None:
@@ -111,7 +111,7 @@ class Firmware:
     def __init__(self) -> None:
         self.simavr = SimavrBox("lines", NeverStopped())
         self._port: Any = self.simavr.port
-        self._port.timeout = PATIENCE_S
+        self._port.timeout = MAX_WAIT_S
 
     def write(self, data: bytes) -> None:
         self._port.write(data)

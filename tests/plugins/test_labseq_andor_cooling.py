@@ -8,7 +8,7 @@ import pytest
 from labseq_andor.codes import Code
 from labseq_andor.library import load_pylablib
 
-from labseq import DeviceError, DeviceTimeoutError, Settling
+from labseq import DeviceError, DeviceTimeoutError, NeedsSettling
 
 from .labseq_andor_rig import Rig, rig
 from .needs import need_library
@@ -28,7 +28,7 @@ def status(lab: Rig) -> int:
 
 def test_it_waits_until_the_sensor_is_cold_and_the_camera_calls_it_stabilized() -> None:
     with rig(cooling=COLD) as lab:
-        assert isinstance(lab.camera, Settling)
+        assert isinstance(lab.camera, NeedsSettling)
         assert lab.camera.settling_timeout_s == 900.0
         assert status(lab) == Code.TEMP_NOT_REACHED
         lab.camera.settle()

@@ -41,5 +41,5 @@ def test_it_begins_where_the_files_are_and_ends_at_the_top() -> None:
 
 
 def test_no_point_is_visited_twice() -> None:
-    visited = climbed({DOP.address: 2, RAMP.address: 400e-6}, least_step=0.01)
+    visited = climbed({DOP.address: 2, RAMP.address: 400e-6}, min_step=0.01)
     assert len({tuple(point.values.items()) for point in visited}) == len(visited)

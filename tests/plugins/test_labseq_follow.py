@@ -17,7 +17,7 @@ from labseq_follow.settings import SerialLeaderSettings, TcpLeaderSettings
 
 from labseq import ConfigError, Context, Device, DeviceError, DeviceTimeoutError, StopRequested
 from labseq.config import Document
-from labseq.roles import KnownCommands, Leading
+from labseq.roles import ChecksCommands, LeaderLink
 from labseq.sequencer import RealClock, StopFlag
 from labseq.testing import DeviceContract
 from labseq.testing.contracts.hardware import Factory, Wait
@@ -64,8 +64,8 @@ def test_both_lead_and_know_that_they_have_no_commands() -> None:
         tcp_leader(TcpLeaderSettings(), Context("leader")),
         serial_leader(SerialLeaderSettings(port="COM7"), Context("leader")),
     ):
-        assert isinstance(leader, Leading)
-        assert isinstance(leader, KnownCommands)
+        assert isinstance(leader, LeaderLink)
+        assert isinstance(leader, ChecksCommands)
         with pytest.raises(DeviceError, match="unknown command 'go'; it has none"):
             leader.check_command("go")
 
@@ -119,7 +119,7 @@ def test_a_second_go_is_refused_and_does_not_disturb_the_first() -> None:
         assert peer.ask("go") == "failed reason=busy"
         device.tell("ready", {"shot": 0})
         assert peer.hear() == "ready shot=0"
-        assert "`go` came while labseq was busy, and was refused" in device.news()
+        assert "`go` came while labseq was busy, and was refused" in device.new_events()
 
 
 def test_at_the_deadline_it_answers_by_itself_and_a_late_ready_is_not_sent() -> None:
@@ -133,14 +133,14 @@ def test_at_the_deadline_it_answers_by_itself_and_a_late_ready_is_not_sent() -> 
         assert peer.ask("go") == "failed reason=busy", "the moves may still go on"
         assert device.tell("ready", {"shot": 3}) == "late"
         assert peer.ask("state?") == "state idle"
-        assert any("not over at the deadline" in text for text in device.news())
+        assert any("not over at the deadline" in text for text in device.new_events())
 
 
 def test_a_go_that_no_step_waits_for_is_answered_at_the_deadline() -> None:
     with led(deadline=0.05) as (device, peer):
         assert peer.ask("go") == "failed reason=deadline"
         assert peer.ask("state?") == "state idle"
-        assert any("no step waited" in text for text in device.news())
+        assert any("no step waited" in text for text in device.new_events())
 
 
 def test_a_wait_that_lasts_too_long_says_whether_anybody_is_there() -> None:
@@ -231,7 +231,7 @@ def test_a_simulated_leader_loads_and_says_go_by_itself_on_the_sessions_clock() 
     clock = FakeClock()
     world = RecordingSimulation()
     device = tcp_leader(
-        TcpLeaderSettings(leader="simulated", goes_after=0.4, deadline=2.0),
+        TcpLeaderSettings(leader="simulated", simulated_go_delay=0.4, deadline=2.0),
         Context("leader", clock=clock, simulation=world),
     )
     device.open()
@@ -256,14 +256,14 @@ EVENTS = st.lists(st.sampled_from(["go", "take", "tell", "pass", "leave", "noise
 
 @given(EVENTS)
 def test_each_go_gets_exactly_one_answer(events: list[str]) -> None:
-    dialogue, now_s, n_gos, n_lost, said = Dialogue(1.0), 0.0, 0, 0, list[str]()
+    dialogue, now_s, n_go_signals, n_lost, said = Dialogue(1.0), 0.0, 0, 0, list[str]()
     dialogue.connected("a leader")
     for event in events:
         now_s += 1.5 if event == "pass" else 0.1
         said += dialogue.overdue(now_s)
         n_answers = sum(line.startswith(("ready", "failed")) for line in said)
         if event == "go":
-            n_gos += 1
+            n_go_signals += 1
             said += dialogue.heard("go", now_s)
         elif event == "noise":
             said += dialogue.heard("gog", now_s)
@@ -272,11 +272,11 @@ def test_each_go_gets_exactly_one_answer(events: list[str]) -> None:
         elif event == "tell":
             said += dialogue.tell("ready", {"shot": 0}, now_s)[1]
         elif event == "leave":
-            n_lost += n_gos - n_lost - n_answers  # whoever leaves gives up its answer, and gets no other
+            n_lost += n_go_signals - n_lost - n_answers  # whoever leaves gives up its answer, and gets no other
             dialogue.lost("it left")
             dialogue.connected("another leader")
     said += dialogue.end()
-    assert sum(line.startswith(("ready", "failed")) for line in said) == n_gos - n_lost
+    assert sum(line.startswith(("ready", "failed")) for line in said) == n_go_signals - n_lost
 
 
 @given(st.lists(st.binary(max_size=12), max_size=8), st.integers(1, 7))

@@ -21,7 +21,7 @@ on_a_pty = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pt
 
 
 def told(device: LeaderDevice) -> str:
-    return "\n".join(device.news())
+    return "\n".join(device.new_events())
 
 
 @pytest.mark.parametrize(

@@ -224,12 +224,12 @@ def test_after_the_last_frame_the_run_ends_with_their_number(tmp_path: Path) -> 
     player = Player(write_tiff(tmp_path / "x.tif", stack_of(3))).open()
     player.firsts(3)
     for _ in range(2):
-        with pytest.raises(DeviceError, match=r"^imaging: all 3 frames of .*x.tif .*when_over: repeat"):
+        with pytest.raises(DeviceError, match=r"^imaging: all 3 frames of .*x.tif .*at_end: repeat"):
             player.take()
 
 
 def test_or_it_begins_again(tmp_path: Path) -> None:
-    player = Player(write_tiff(tmp_path / "x.tif", stack_of(3)), when_over="repeat").open()
+    player = Player(write_tiff(tmp_path / "x.tif", stack_of(3)), at_end="repeat").open()
     assert player.firsts(7) == [0, 1000, 2000, 0, 1000, 2000, 0]
 
 

@@ -167,7 +167,7 @@ def test_a_damaged_png_is_named(tmp_path: Path) -> None:
     whole = (tmp_path / "x1.png").read_bytes()
     (tmp_path / "x1.png").write_bytes(whole[: len(whole) // 2])
     assert "x1.png: is damaged: " in failure(tmp_path, 1)
-    assert "x1.png: is damaged: " in failure(tmp_path, 1, when_over="repeat")
+    assert "x1.png: is damaged: " in failure(tmp_path, 1, at_end="repeat")
     (tmp_path / "x1.png").write_bytes(b"\x89PNG")
     assert "x1.png: is not a PNG; take it from a backup" in refusal(tmp_path)
     (tmp_path / "x1.png").write_bytes(whole[:100])

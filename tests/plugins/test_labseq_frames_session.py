@@ -91,7 +91,7 @@ def test_a_run_ends_safely_when_the_frames_are_over(tmp_path: Path, look: Path) 
     assert session.run_dir is not None
     kept = labseq.open_run(session.run_dir)
     assert (kept.status, len(kept.shots)) == ("failed", 2)
-    repeated = run(look, tmp_path / "data", profile=playing(tmp_path, earlier.path, when_over="repeat"))
+    repeated = run(look, tmp_path / "data", profile=playing(tmp_path, earlier.path, at_end="repeat"))
     assert occupancies(repeated) == [occupancies(earlier)[i % 2] for i in range(5)]
 
 

@@ -176,7 +176,7 @@ def test_a_wire_that_never_comes_is_a_timeout() -> None:
 
 
 def test_a_software_trigger_that_is_not_seen_is_a_timeout(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(simulated, "PATIENCE_S", 0.1)
+    monkeypatch.setattr(simulated, "MAX_WAIT_S", 0.1)
     with rig(faults={"ignores_triggers": True}) as lab:
         lab.camera.arm(1, 0.01, "software")
         lab.camera.trigger()

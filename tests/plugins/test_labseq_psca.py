@@ -22,7 +22,7 @@ from labseq import (
     TargetPattern,
     check_plan,
 )
-from labseq.roles import Warmable
+from labseq.roles import NeedsWarmUp
 from labseq.testing.strategies import cases
 
 Bools = NDArray[np.bool_]
@@ -284,6 +284,6 @@ def test_it_registers_itself_and_can_be_warmed() -> None:
     labseq_psca.labseq_register(registry)
     entry = registry.get("planner", "psca")
     planner = entry.factory(PscaSettings(), Context())
-    assert isinstance(planner, Warmable)
+    assert isinstance(planner, NeedsWarmUp)
     planner.warm()
     assert entry.settings_model is PscaSettings

@@ -26,7 +26,7 @@ from labseq import (
     TargetPattern,
     check_plan,
 )
-from labseq.roles import Warmable
+from labseq.roles import NeedsWarmUp
 from labseq.testing import PlannerContract
 from labseq.testing.strategies import cases
 
@@ -224,7 +224,7 @@ def test_they_register_themselves_and_can_be_warmed(name: str, model: type[Any])
     labseq_scans.labseq_register(registry)
     entry = registry.get("planner", name)
     planner = entry.factory(model(), Context())
-    assert isinstance(planner, Warmable)
+    assert isinstance(planner, NeedsWarmUp)
     planner.warm()
     assert entry.settings_model is model
     assert registry.get("pattern", "interleaved").settings_model is InterleavedSettings

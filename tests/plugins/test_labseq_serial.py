@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import pytest
 from labseq_serial.device import SerialDevice
 
-from labseq import Context, DeviceError, Interlocked, KnownCommands, LimitError, Polled, SelfTesting
+from labseq import Context, DeviceError, Interlocked, ChecksCommands, LimitError, HasReadings, HasSelfTest
 from labseq.testing import DeviceContract
 from labseq.testing.fakes import FakeClock
 
@@ -157,7 +157,7 @@ def test_an_interlock_that_cannot_be_read_stops_everything(counterpart: Counterp
 
 def test_it_can_do_what_labseq_asks_of_such_devices() -> None:
     device = SerialDevice(settings(port="simulated"), Context("synth"))
-    for capability in (SelfTesting, Polled, Interlocked, KnownCommands):
+    for capability in (HasSelfTest, HasReadings, Interlocked, ChecksCommands):
         assert isinstance(device, capability)
 
 

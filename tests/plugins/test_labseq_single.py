@@ -26,7 +26,7 @@ from labseq import (
     TargetPattern,
     check_plan,
 )
-from labseq.roles import Warmable
+from labseq.roles import NeedsWarmUp
 from labseq.testing.strategies import cases
 
 from .labseq_single_cases import distance, in_the_middle, journeys, loadings, plan_and_check
@@ -233,5 +233,5 @@ def test_they_register_themselves_and_can_be_warmed() -> None:
     labseq_single.labseq_register(registry)
     for name in ("lsap", "lsap_squared", "compression", "hca"):
         planner = registry.get("planner", name).factory(None, Context())
-        assert isinstance(planner, Warmable)
+        assert isinstance(planner, NeedsWarmUp)
         planner.warm()

@@ -242,7 +242,7 @@ def test_a_command_that_comes_while_the_light_is_ramped_down_does_not_turn_it_on
     heard.put({"do": "end"})
     heard.put({"do": "ramp", "id": 3, "depth": 1.0, "duration_s": 0.0})
     ear = SimpleNamespace(heard=heard, closed=False, last_s=float("inf"))
-    setup = SimpleNamespace(ramp_s=0.1, hold=False, patience_s=5.0)
+    setup = SimpleNamespace(ramp_s=0.1, hold=False, max_wait_s=5.0)
     said: list[Any] = []
     streamer = Streamer(cast("Any", sink), cast("Any", setup), 1.2e6, cast("Any", ear), said.append)
     streamer.run()

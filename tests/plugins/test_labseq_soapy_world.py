@@ -32,7 +32,7 @@ class ListeningWorld(RecordingSimulation):
     def warm(self) -> None:
         pass
 
-    def listen(self, role: str, source: RfSource | ToneSource) -> None:
+    def connect_outputs(self, role: str, source: RfSource | ToneSource) -> None:
         assert role == "static_tweezers"
         self.source = cast("ToneSource", source)
 

@@ -9,13 +9,13 @@ import pytest
 from labseq_spcm.self_test import HOT_C, UPLOAD
 from labseq_spcm.simulator import M4I6631
 
-from labseq import DeviceError, SelfTesting
+from labseq import DeviceError, HasSelfTest
 
 
 @pytest.mark.parametrize("mode", ["replay", "fifo", "dds"])
 def test_a_card_that_is_well_passes_and_stays_silent(driver: Any, mode: str) -> None:
     with driver(mode) as lab:
-        assert isinstance(lab.tweezers, SelfTesting)
+        assert isinstance(lab.tweezers, HasSelfTest)
         lab.tweezers.self_test()
         assert lab.card.outputs_on == (False, False)
         assert not lab.card.running

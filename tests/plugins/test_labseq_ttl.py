@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 from labseq_ttl.lines import TtlLines
-from labseq_ttl.programs import MOST_EDGES, as_played, edges_of
+from labseq_ttl.programs import MAX_EDGES, as_played, edges_of
 from labseq_ttl.protocol import CHANNELS, SHORTEST, SLOTS, TICK_S, unframed
 from labseq_ttl.settings import TtlSettings
 from labseq_ttl.slots import Slots
@@ -153,7 +153,7 @@ def test_programs_come_back_from_their_edges(seed: int, steps: list[tuple[int, i
     specs = tuple(LineSpec(f"line {c}", c, frozenset(), active_low=c % 2 == 0) for c in CHANNELS)
     rng, state = np.random.default_rng(seed), np.zeros(10, np.bool_)
     t_s, on = [0.0], [state]
-    for ticks, change in steps[: MOST_EDGES - 1]:
+    for ticks, change in steps[: MAX_EDGES - 1]:
         t_s.append(t_s[-1] + ticks * TICK_S)
         on.append(on[-1] ^ np.array([bool(change >> i & 1) for i in range(10)]))
     names = tuple(spec.name for spec in specs)
@@ -218,7 +218,7 @@ def test_a_program_without_an_end_in_time_is_too_late() -> None:
 def test_facts_tell_what_the_box_can_do() -> None:
     facts = make_rig().lines.lines_facts
     assert facts.channels == CHANNELS
-    assert (facts.resolution_s, facts.shortest_s, facts.most_edges) == (0.5e-6, 5e-6, 23)
+    assert (facts.resolution_s, facts.shortest_s, facts.max_edges) == (0.5e-6, 5e-6, 23)
     assert math.isfinite(facts.latency_s)
 
 
@@ -228,14 +228,14 @@ def test_the_most_that_ten_lines_do_in_a_step_fits() -> None:
     )
     program = line_program(specs, "image", 0.045)
     assert len(program.t_s) == 20
-    assert len(edges_of(program, specs, "lines")) <= MOST_EDGES + 1
+    assert len(edges_of(program, specs, "lines")) <= MAX_EDGES + 1
 
 
 def settings(**given: Any) -> TtlSettings:
     return TtlSettings.model_validate(given)
 
 
-@pytest.mark.parametrize("wrong", [{"port": ""}, {"serial_number": 70000}, {"lights_out": "2 min"}])
+@pytest.mark.parametrize("wrong", [{"port": ""}, {"serial_number": 70000}, {"watchdog_timeout": "2 min"}])
 def test_settings_out_of_range_are_refused(wrong: dict[str, Any]) -> None:
     with pytest.raises(ValidationError):
         settings(**wrong)

@@ -101,7 +101,7 @@ class DamagesAnswers(EmulatedBox):
 
 
 def use_box(monkeypatch: pytest.MonkeyPatch, box: Any) -> None:
-    monkeypatch.setattr("labseq_ttl.connection.start_counterpart", lambda *_: box)
+    monkeypatch.setattr("labseq_ttl.connection.start_simulator", lambda *_: box)
 
 
 @pytest.mark.parametrize("cable", [DamagesLines, DamagesAnswers])
@@ -122,7 +122,7 @@ class KeepsQuiet(EmulatedBox):
 
 
 def test_an_end_that_nobody_heard_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("labseq_ttl.lines.SIMULATED_PATIENCE_S", 0.01)
+    monkeypatch.setattr("labseq_ttl.lines.SIMULATED_MAX_WAIT_S", 0.01)
     use_box(monkeypatch, KeepsQuiet())
     with rig() as lab:
         works(lab)
@@ -142,7 +142,7 @@ class Dies(EmulatedBox):
 
 
 def test_a_program_that_never_ends_is_too_late(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("labseq_ttl.lines.SIMULATED_PATIENCE_S", 0.01)
+    monkeypatch.setattr("labseq_ttl.lines.SIMULATED_MAX_WAIT_S", 0.01)
     use_box(monkeypatch, Dies())
     with rig() as lab:
         lab.connection.counterpart._edges = [(0, 0)]  # type: ignore[union-attr]
@@ -197,7 +197,7 @@ def test_a_port_at_which_no_box_answers_is_told(
     monkeypatch: pytest.MonkeyPatch, box: type[EmulatedBox], told: str
 ) -> None:
     monkeypatch.setattr(box_module, "BOOT_S", 0.0)
-    monkeypatch.setattr("labseq_ttl.connection.SIMULATED_PATIENCE_S", 0.01)
+    monkeypatch.setattr("labseq_ttl.connection.SIMULATED_MAX_WAIT_S", 0.01)
     use_box(monkeypatch, box())
     with pytest.raises(DeviceTimeoutError, match=told):
         make_rig().lines.open()

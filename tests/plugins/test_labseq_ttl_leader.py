@@ -14,7 +14,7 @@ from labseq_ttl.settings import GoSettings, TtlSettings
 from pydantic import ValidationError
 
 import labseq
-from labseq import ConfigError, Context, DeviceError, DeviceTimeoutError, Leading, LineSpec
+from labseq import ConfigError, Context, DeviceError, DeviceTimeoutError, LeaderLink, LineSpec
 from labseq.errors import StopRequested
 from labseq.lines import line_program
 from labseq.testing.contracts.lines import SPECS
@@ -192,7 +192,7 @@ class Rig:
     @property
     def leader(self) -> LeadingLines:
         assert isinstance(self.lines, LeadingLines)
-        assert isinstance(self.lines, Leading)
+        assert isinstance(self.lines, LeaderLink)
         return self.lines
 
     @property
@@ -210,7 +210,7 @@ def rig() -> Generator[Rig]:
 
 def test_without_go_nobody_leads_through_the_box() -> None:
     lines = ttl_lines(TtlSettings(), Context("lines", lines=SPECS))
-    assert not isinstance(lines, Leading)
+    assert not isinstance(lines, LeaderLink)
 
 
 @pytest.mark.parametrize("simulated_by", ["python", "simavr"])
@@ -220,9 +220,9 @@ def test_go_comes_by_the_pin_and_is_answered(simulated_by: str) -> None:
     made = Rig(simulated_by=simulated_by)
     made.lines.open()
     try:
-        for state, n_gos in (("ready", 1), ("failed", 2)):
+        for state, n_go_signals in (("ready", 1), ("failed", 2)):
             assert made.leader.wait_for("go", 10.0) == ""
-            assert made.leader._opened_pins().look().n_gos == n_gos
+            assert made.leader._opened_pins().look().n_go_signals == n_go_signals
             assert made.leader.tell(state, {"shot": 0}) == state
             assert made.leader.tell(state, {"shot": 0}) == ""  # it is owed nothing any more
     finally:
@@ -252,15 +252,15 @@ def test_a_shot_that_is_late_is_told_once(rig: Rig) -> None:
     assert rig.box.signs == 1 << BUSY | 1 << FAILED
     assert rig.leader.tell("ready", {}) == "late"
     assert rig.box.signs == 1 << FAILED
-    assert "not over at the deadline" in rig.leader.news()[-1]
+    assert "not over at the deadline" in rig.leader.new_events()[-1]
 
 
 def test_an_edge_while_labseq_is_busy_is_refused_and_told(rig: Rig) -> None:
     rig.leader.wait_for("go", 10.0)
     rig.box.start()
     rig.leader.tell("ready", {})
-    assert rig.leader.news()[-1] == MORE
-    assert rig.leader._opened_pins().look().n_gos == 1
+    assert rig.leader.new_events()[-1] == MORE
+    assert rig.leader._opened_pins().look().n_go_signals == 1
 
 
 class NoLeader(Rig):
@@ -285,7 +285,7 @@ def test_a_go_that_came_too_early_has_failed_and_the_next_counts() -> None:
     made.box.pass_deadline()
     with pytest.raises(DeviceTimeoutError, match=r"no rising edge .* within 100 ms; it is high"):
         made.leader.wait_for("go", 0.1)
-    assert "no step waited for `go`" in made.leader.news()[-1]
+    assert "no step waited for `go`" in made.leader.new_events()[-1]
     assert made.box.signs == 1 << FAILED
     made.box.start()
     assert made.leader.wait_for("go", 1.0) == ""
@@ -294,7 +294,7 @@ def test_a_go_that_came_too_early_has_failed_and_the_next_counts() -> None:
 
 def test_a_go_that_never_comes_is_told_with_the_level_of_the_input() -> None:
     made = NoLeader()
-    assert made.leader.news() == [HIGH]
+    assert made.leader.new_events() == [HIGH]
     made.box.lower()
     with pytest.raises(DeviceTimeoutError, match=r"no rising edge .* within 100 ms; it is low;"):
         made.leader.wait_for("go", 0.1)

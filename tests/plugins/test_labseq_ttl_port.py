@@ -144,7 +144,7 @@ def test_signs_of_life_go_on_past_a_failure() -> None:
 
 
 def test_a_box_with_lights_out_hears_signs_of_life_until_it_is_closed(plugged: SimavrBox) -> None:
-    with rig(port=plugged.name, lights_out="60 s") as lab:
+    with rig(port=plugged.name, watchdog_timeout="60 s") as lab:
         works(lab)
         assert any(isinstance(thread, Heartbeat) for thread in threading.enumerate())
     assert not any(isinstance(thread, Heartbeat) for thread in threading.enumerate())

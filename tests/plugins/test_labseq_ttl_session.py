@@ -25,7 +25,7 @@ lines:
     mot: {channel: 3, on: [load], lag: 2 ms}
     imaging: {channel: 4, on: [image], lead: 1 ms, lag: 1 ms}
     shutter: {channel: 9, on: [image], lead: 3 ms, lag: 2 ms, active_low: true}
-  never_together: [[mot, imaging]]
+  mutually_exclusive: [[mot, imaging]]
 """
 LIGHTS = "  lights: {loading: [mot], cooling: [cooling], imaging: [imaging, shutter]}\n"
 

@@ -15,13 +15,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from labseq_virtual.flight import KELVIN, Flight
-from labseq_virtual.hearing import Ear, Episode
+from labseq_virtual.flight import KELVIN, RfTransport
+from labseq_virtual.hearing import PulseReceiver, RfPulse
 from labseq_virtual.settings import MobileLightSettings, WorldSettings
 from numpy.typing import NDArray
 
 from labseq.model import ToneProgram, TonesNow
-from labseq.testing.rf import GRID, START_S, Recording, played, program_of, spec, with_phase_jump
+from labseq.testing.rf import GRID, START_S, PlayedRfSource, played, program_of, spec, with_phase_jump
 
 Floats = NDArray[np.float64]
 
@@ -65,17 +65,17 @@ CASES = [
 ]
 
 
-class OnceHeard(Flight):
+class OnceHeard(RfTransport):
     """A flight that demodulates each episode once: what was played does not depend on the atoms."""
 
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
         self.heard: dict[int, Any] = {}
 
-    def _listen(self, episode: Episode) -> Any:
-        if id(episode) not in self.heard:
-            self.heard[id(episode)] = super()._listen(episode)
-        return self.heard[id(episode)]
+    def _listen(self, pulse: RfPulse) -> Any:
+        if id(pulse) not in self.heard:
+            self.heard[id(pulse)] = super()._listen(pulse)
+        return self.heard[id(pulse)]
 
 
 def world_loss(case: Broken) -> tuple[int, NDArray[Any], NDArray[Any]]:
@@ -83,14 +83,14 @@ def world_loss(case: Broken) -> tuple[int, NDArray[Any], NDArray[Any]]:
     light = MobileLightSettings(offset=(case.offset_m, 0.0), depth=case.depth_k, transit_time=TRANSIT_S)
     flight = OnceHeard(GRID, spec(), WorldSettings(transport_loss=0.0, temperature=HOT_K, mobile_light=light))
     outputs, rng = played(case.program), np.random.default_rng(7)
-    episodes = [*Ear(Recording(outputs), 60e-6).hear(START_S + 10.0)]
+    episodes = [*PulseReceiver(PlayedRfSource(outputs), 60e-6).receive_until(START_S + 10.0)]
     columns = np.array(case.columns)
     n_kept, n_rows = 0, N_ATOMS // len(columns)
     for _ in range(n_rows):
         occupied = np.zeros(GRID.shape, np.bool_)
         occupied[ROW, columns] = True
-        for episode in episodes:
-            flight.carry(occupied, episode, np.ones(GRID.shape), rng, 1.0)
+        for pulse in episodes:
+            flight.carry(occupied, pulse, np.ones(GRID.shape), rng, 1.0)
         n_kept += int(np.count_nonzero(occupied[ROW, columns + WAY]))
     tables = flight.tables(START_S)
     return n_rows * len(columns) - n_kept, tables["flights"], tables["jumps"]

@@ -27,7 +27,7 @@ from labseq import (
     RandomStream,
     SiteGrid,
     ToneProgram,
-    Warmable,
+    NeedsWarmUp,
 )
 from labseq.model import AxisTones
 from labseq.testing.fakes import FakeClock
@@ -291,6 +291,6 @@ def test_no_kernel_is_left_to_be_compiled_by_the_first_image(
 ) -> None:
     kernels = "labseq_virtual._kernels_transport"  # which takes longer than a camera may
     monkeypatch.delitem(sys.modules, kernels, raising=False)
-    assert isinstance(lab.mobile, Warmable)
+    assert isinstance(lab.mobile, NeedsWarmUp)
     lab.mobile.warm()
     assert kernels in sys.modules

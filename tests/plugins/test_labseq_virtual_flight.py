@@ -10,14 +10,14 @@ import pytest
 from hypothesis import given, strategies as st
 from hypothesis.extra.numpy import arrays
 from labseq_virtual._kernels_atoms import energies
-from labseq_virtual.flight import KELVIN, Flight
-from labseq_virtual.hearing import Ear
+from labseq_virtual.flight import KELVIN, RfTransport
+from labseq_virtual.hearing import PulseReceiver
 from labseq_virtual.settings import MobileLightSettings, WorldSettings
 from labseq_virtual.thermal import draw_atoms
 from numpy.typing import NDArray
 
 from labseq.model import SiteGrid, ToneProgram
-from labseq.testing.rf import FULL_SCALE_V, GRID, START_S, Recording, SitePairs, played, program_of, spec
+from labseq.testing.rf import FULL_SCALE_V, GRID, START_S, PlayedRfSource, SitePairs, played, program_of, spec
 
 Floats = NDArray[np.float64]
 
@@ -28,13 +28,13 @@ def fly(
     program: ToneProgram, atoms: list[tuple[int, int]], settings: WorldSettings = SURE, seed: int = 1
 ) -> tuple[set[tuple[int, int]], NDArray[Any]]:
     """The sites that hold atoms afterwards, and the table of flights."""
-    flight = Flight(GRID, spec(), settings)
+    flight = RfTransport(GRID, spec(), settings)
     occupied = np.zeros(GRID.shape, np.bool_)
     for site in atoms:
         occupied[site] = True
     rng = np.random.default_rng(seed)
-    for episode in Ear(Recording(played(program)), 60e-6).hear(START_S + 10.0):
-        flight.carry(occupied, episode, np.ones(GRID.shape), rng, 1.0)
+    for pulse in PulseReceiver(PlayedRfSource(played(program)), 60e-6).receive_until(START_S + 10.0):
+        flight.carry(occupied, pulse, np.ones(GRID.shape), rng, 1.0)
     return {(int(row), int(col)) for row, col in np.argwhere(occupied)}, flight.tables(START_S)["flights"]
 
 
@@ -150,7 +150,7 @@ def test_near_a_tweezer_are_the_sites_around_it(rows: Floats, cols: Floats) -> N
     for row, col in ((r, c) for k in range(5) for r in rows[k] for c in cols[k] if r == r and c == c):
         for site in np.ndindex(*grid.shape):
             near[site] |= site[0] - math.floor(row) in (0, 1) and site[1] - math.floor(col) in (0, 1)
-    np.testing.assert_array_equal(Flight(grid, spec(), SURE)._near(rows, cols), near)
+    np.testing.assert_array_equal(RfTransport(grid, spec(), SURE)._near(rows, cols), near)
 
 
 def test_the_same_seed_gives_the_same_flights() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from labseq_virtual.hearing import Ear, Episode
+from labseq_virtual.hearing import PulseReceiver, RfPulse
 
 from labseq.model import RfSamples, RfSpan, RfTones
 
@@ -28,23 +28,23 @@ def tone(start_s: float, end_s: float) -> RfTones:
     return RfTones(start_s, end_s, 1e8 * one, 0 * one, one, 0 * one, 0 * one)
 
 
-def times(found: list[Episode]) -> list[tuple[float, float]]:
-    return [(episode.start_s, episode.end_s) for episode in found]
+def times(found: list[RfPulse]) -> list[tuple[float, float]]:
+    return [(pulse.start_s, pulse.end_s) for pulse in found]
 
 
 def test_a_long_silence_parts_and_a_short_one_does_not() -> None:
     outputs = Outputs()
     outputs.rows = [tone(1.0, 1.1), tone(1.15, 1.2), tone(2.0, 2.1)]
-    found = list(Ear(outputs, 0.1).hear(3.0))
+    found = list(PulseReceiver(outputs, 0.1).receive_until(3.0))
     assert times(found) == [(1.0, 1.2), (2.0, 2.1)]
-    assert [len(episode.rows) for episode in found] == [2, 1]
+    assert [len(pulse.rows) for pulse in found] == [2, 1]
     assert outputs.asked == [3.0]
 
 
 def test_an_episode_lasts_while_either_output_sounds() -> None:
     outputs = Outputs()
     outputs.rows, outputs.columns = [tone(1.0, 1.5)], [tone(0.8, 1.2), tone(4.0, 4.1)]
-    first, second = Ear(outputs, 0.1).hear(5.0)
+    first, second = PulseReceiver(outputs, 0.1).receive_until(5.0)
     assert times([first, second]) == [(0.8, 1.5), (4.0, 4.1)]
     assert (len(first.rows), len(first.columns), len(second.rows)) == (1, 1, 0)
 
@@ -52,16 +52,16 @@ def test_an_episode_lasts_while_either_output_sounds() -> None:
 def test_silent_samples_are_no_episode() -> None:
     outputs = Outputs()
     outputs.rows = [RfSamples(1.0, 1e6, np.zeros(1000, np.int16), 1e-5)]
-    assert list(Ear(outputs, 0.1).hear(2.0)) == []
+    assert list(PulseReceiver(outputs, 0.1).receive_until(2.0)) == []
 
 
 def test_light_that_was_cut_off_and_goes_on_says_so() -> None:
     outputs = Outputs()
-    ear = Ear(outputs, 0.1)
+    ear = PulseReceiver(outputs, 0.1)
     outputs.rows = [tone(1.0, 2.0)]
-    (before,) = ear.hear(2.0)
+    (before,) = ear.receive_until(2.0)
     outputs.rows = [tone(2.0, 2.5)]
-    (after,) = ear.hear(3.0)
+    (after,) = ear.receive_until(3.0)
     outputs.rows = [tone(3.5, 3.6)]
-    (later,) = ear.hear(4.0)
-    assert [episode.continued for episode in (before, after, later)] == [False, True, False]
+    (later,) = ear.receive_until(4.0)
+    assert [pulse.continued for pulse in (before, after, later)] == [False, True, False]

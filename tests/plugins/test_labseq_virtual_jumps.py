@@ -6,24 +6,24 @@ import math
 
 import numpy as np
 import pytest
-from labseq_virtual.flight import Flight
-from labseq_virtual.hearing import Ear
+from labseq_virtual.flight import RfTransport
+from labseq_virtual.hearing import PulseReceiver
 from labseq_virtual.settings import WorldSettings
 from numpy.typing import NDArray
 
 from labseq.model import ToneProgram
-from labseq.testing.rf import GRID, START_S, Recording, played, program_of, spec, with_phase_jump
+from labseq.testing.rf import GRID, START_S, PlayedRfSource, played, program_of, spec, with_phase_jump
 
 MOVE = ([(5, 2), (5, 5)], [(5, 5), (5, 9)])
 """Segments: 0 pause, 1 pick-up, 2 and 3 transport (one arrives before the other), 4 drop-off."""
 
 
 def jumps_of(program: ToneProgram) -> NDArray[np.void]:
-    flight = Flight(GRID, spec(), WorldSettings(transport_loss=0.0))
+    flight = RfTransport(GRID, spec(), WorldSettings(transport_loss=0.0))
     occupied = np.zeros(GRID.shape, np.bool_)
     occupied[5, 2] = occupied[5, 5] = True
-    for episode in Ear(Recording(played(program)), 60e-6).hear(START_S + 1.0):
-        flight.carry(occupied, episode, np.ones(GRID.shape), np.random.default_rng(1), 1.0)
+    for pulse in PulseReceiver(PlayedRfSource(played(program)), 60e-6).receive_until(START_S + 1.0):
+        flight.carry(occupied, pulse, np.ones(GRID.shape), np.random.default_rng(1), 1.0)
     return flight.tables(START_S)["jumps"]
 
 

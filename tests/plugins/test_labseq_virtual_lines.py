@@ -196,10 +196,10 @@ def test_the_trigger_line_starts_the_exposures(tmp_path: Path) -> None:
         ("on: [image], pulse", "on: [load], pulse", "a line that triggers the camera is on at other times"),
         (
             "  channels:",
-            "  never_together: [[mot, cooling]]\n  channels:",
+            "  mutually_exclusive: [[mot, cooling]]\n  channels:",
             "'mot' and 'cooling' must never be on together, but both are during 'load'",
         ),
-        ("  channels:", "  never_together: [[mot, x]]\n  channels:", "there is no line 'x'"),
+        ("  channels:", "  mutually_exclusive: [[mot, x]]\n  channels:", "there is no line 'x'"),
         ("  use: virtual", "  use: virtuel", "unknown lines 'virtuel'"),
     ],
 )

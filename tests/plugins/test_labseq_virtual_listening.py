@@ -7,15 +7,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from labseq_virtual.flight import Flight
-from labseq_virtual.hearing import Ear
+from labseq_virtual.flight import RfTransport
+from labseq_virtual.hearing import PulseReceiver
 from labseq_virtual.settings import WorldSettings
 from labseq_virtual.world import World
 
 from labseq import Context, DepthRamp, DeviceError, LimitError, MotionSpec, Plan, RandomStream, SiteGrid
 from labseq.motion import tone_program
 from labseq.testing.fakes import FakeClock
-from labseq.testing.rf import GRID, START_S, Recording, played, program_of, spec
+from labseq.testing.rf import GRID, START_S, PlayedRfSource, played, program_of, spec
 
 CALM = {
     "lifetime": 2e6,
@@ -56,28 +56,28 @@ def clock() -> FakeClock:
 
 def test_what_was_played_acts_before_what_comes_next(clock: FakeClock) -> None:
     world = new_world(clock)
-    world.listen("mobile_tweezers", Recording(played(PROGRAM)))
+    world.connect_outputs("mobile_tweezers", PlayedRfSource(played(PROGRAM)))
     world.expose(after(clock), 1e-3)
     assert np.argwhere(~world.truth()).tolist() == [[5, 2], [5, 3], [5, 4]]
 
 
 def test_what_earlier_outputs_played_is_heard_before_others_take_their_place(clock: FakeClock) -> None:
     world = new_world(clock)
-    world.listen("mobile_tweezers", Recording(played(PROGRAM)))
+    world.connect_outputs("mobile_tweezers", PlayedRfSource(played(PROGRAM)))
     after(clock)
-    world.listen("mobile_tweezers", Recording(([], [])))
+    world.connect_outputs("mobile_tweezers", PlayedRfSource(([], [])))
     assert not world.truth()[5, 2]
 
 
 @pytest.mark.parametrize("event", ["exposure", "ramp"])
 def test_light_that_comes_on_during_something_else_is_an_error(clock: FakeClock, event: str) -> None:
     world = new_world(clock)
-    world.listen("mobile_tweezers", Recording(([], [])))
+    world.connect_outputs("mobile_tweezers", PlayedRfSource(([], [])))
     if event == "exposure":
         world.expose(START_S - 0.1, 0.2)
     else:
         world.play("static_tweezers", DepthRamp(1.0, 0.9, 0.2), START_S - 0.1)
-    world.listen("mobile_tweezers", Recording(played(PROGRAM)))
+    world.connect_outputs("mobile_tweezers", PlayedRfSource(played(PROGRAM)))
     after(clock)
     with pytest.raises(DeviceError, match=r"were on at 3\.00\d+ s, together with something else; wait"):
         world.truth()
@@ -85,18 +85,18 @@ def test_light_that_comes_on_during_something_else_is_an_error(clock: FakeClock,
 
 def test_the_light_of_the_last_shot_moves_nothing_in_the_next(clock: FakeClock) -> None:
     world = new_world(clock)
-    world.listen("mobile_tweezers", Recording(played(PROGRAM)))
+    world.connect_outputs("mobile_tweezers", PlayedRfSource(played(PROGRAM)))
     after(clock)
     world.begin_shot()
     world.load(clock.now(), 0.1)
     assert world.truth()[5, 2]
-    assert len(world.story(0.0)["flights"]) == 0
+    assert len(world.atom_events(0.0)["flights"]) == 0
 
 
 def test_a_site_without_light_is_left_alone(clock: FakeClock) -> None:
     world = new_world(clock, lost_below_depth=0.0)
     world.play("static_tweezers", DepthRamp(1.0, 0.0, 0.1), START_S - 0.5)
-    world.listen("mobile_tweezers", Recording(played(PROGRAM)))
+    world.connect_outputs("mobile_tweezers", PlayedRfSource(played(PROGRAM)))
     after(clock)
     assert world.truth().any()
 
@@ -119,7 +119,7 @@ def test_what_blurs_the_tones_is_refused(
 ) -> None:
     world = new_world(clock, spec(**changes), mobile_light={"transit_time": transit_s})
     with pytest.raises(LimitError, match=text):
-        world.listen("mobile_tweezers", Recording(([], [])))
+        world.connect_outputs("mobile_tweezers", PlayedRfSource(([], [])))
 
 
 @pytest.mark.parametrize(
@@ -138,9 +138,9 @@ def test_what_is_just_not_refused_carries_neighbours(
     world = new_world(clock, motion, mobile_light={"transit_time": transit_s})
     sources = [(5, c) for c in (1, 2, 3, 16)]
     program = program_of((sources, [(5, 3), (5, 4), (5, 5), (5, 16)]), **changes)
-    world.listen("mobile_tweezers", Recording(played(program)))
+    world.connect_outputs("mobile_tweezers", PlayedRfSource(played(program)))
     after(clock)
-    flights = world.story(0.0)["flights"]
+    flights = world.atom_events(0.0)["flights"]
     known = {(int(f["from_row"]), int(f["from_col"])): f["fate"] for f in flights}
     # Those at 1 and 2 meet the atoms on 4 and 5, which nobody moves out of their way.
     assert known[5, 16] == b"kept"
@@ -152,7 +152,7 @@ def test_a_grid_with_one_site_has_no_tones_to_tell_apart(clock: FakeClock) -> No
     grid = SiteGrid(1, 1, row_frequency_hz=hz, column_frequency_hz=hz)
     world = World(WorldSettings(), Context("simulation", grid, spec(), clock))
     world.open()
-    world.listen("mobile_tweezers", Recording(([], [])))
+    world.connect_outputs("mobile_tweezers", PlayedRfSource(([], [])))
 
 
 def test_preassigned_amplitudes_give_the_full_depth(clock: FakeClock) -> None:
@@ -161,9 +161,9 @@ def test_preassigned_amplitudes_give_the_full_depth(clock: FakeClock) -> None:
     motion = replace(motion, rf=replace(motion.rf, row_amplitudes=amplitudes))
     world = new_world(clock, motion)
     program = tone_program(Plan.from_batches([([(5, 2)], [(9, 2)])]), GRID, motion)
-    world.listen("mobile_tweezers", Recording(played(program)))
+    world.connect_outputs("mobile_tweezers", PlayedRfSource(played(program)))
     after(clock)
-    flights = world.story(0.0)["flights"]
+    flights = world.atom_events(0.0)["flights"]
     assert flights["depth_K"][flights["from_row"] == 5] == pytest.approx([2.1e-3], rel=0.02)
 
 
@@ -177,7 +177,7 @@ def test_axes_of_different_lengths_are_heard_at_the_same_times() -> None:
     program = tone_program(Plan.from_batches([(there, back), (back, there)] * 6), grid, motion)
     occupied = np.zeros(grid.shape, np.bool_)
     occupied[5, [9, 30]] = True
-    flight = Flight(grid, motion, WorldSettings(transport_loss=0.0, temperature=1e-6))
-    for episode in Ear(Recording(played(program)), 2 * flight.margin_s).hear(START_S + 10.0):
-        flight.carry(occupied, episode, np.ones(grid.shape), np.random.default_rng(1), 1.0)
+    flight = RfTransport(grid, motion, WorldSettings(transport_loss=0.0, temperature=1e-6))
+    for pulse in PulseReceiver(PlayedRfSource(played(program)), 2 * flight.margin_s).receive_until(START_S + 10.0):
+        flight.carry(occupied, pulse, np.ones(grid.shape), np.random.default_rng(1), 1.0)
     assert np.argwhere(occupied).tolist() == [[5, 9], [5, 30]]

@@ -11,7 +11,7 @@ from labseq_virtual.transport import Transport
 from numpy.typing import NDArray
 
 from labseq import MotionSpec
-from labseq.testing.tape import GRID, ON, Tape
+from labseq.testing.tape import GRID, ON, ToneProgramBuilder
 
 FULL = np.ones(GRID.shape)
 
@@ -23,7 +23,7 @@ def atoms(*sites: tuple[int, int]) -> NDArray[np.bool_]:
     return occupied
 
 
-def remain(tape: Tape, *sites: tuple[int, int], **physics: Any) -> set[tuple[int, int]]:
+def remain(tape: ToneProgramBuilder, *sites: tuple[int, int], **physics: Any) -> set[tuple[int, int]]:
     """Where the atoms are after a program."""
     occupied = atoms(*sites)
     transport = Transport(GRID, MotionSpec(), WorldSettings.model_validate(physics))
@@ -34,7 +34,7 @@ def remain(tape: Tape, *sites: tuple[int, int], **physics: Any) -> set[tuple[int
 def survivors(n_repeats: int, n_tones: int, loss_factor: float = 1.0, **physics: float) -> int:
     """How many of 5 atoms, carried ``n_repeats`` times with ``n_tones`` column tones, survive in all."""
     cols = [(0, 1), *((c, c) for c in range(2, n_tones + 1))]
-    program = Tape().move([(r, r) for r in range(5)], cols).program()
+    program = ToneProgramBuilder().move([(r, r) for r in range(5)], cols).program()
     transport = Transport(GRID, MotionSpec(), WorldSettings.model_validate(physics))
     rng = np.random.default_rng(2)
     total = 0
@@ -62,11 +62,11 @@ def test_each_further_tone_adds_to_the_loss() -> None:
 
 
 def test_atoms_that_are_not_moved_are_not_lost() -> None:
-    tape = Tape().move([(0, 0)], [(0, 2)])
+    tape = ToneProgramBuilder().move([(0, 0)], [(0, 2)])
     assert remain(tape, (4, 4), (0, 5), transport_loss=1.0) == {(4, 4), (0, 5)}
 
 
-def lost_by(tape: Tape, *sites: tuple[int, int], depth: float = 1.0, **physics: Any) -> dict[str, int]:
+def lost_by(tape: ToneProgramBuilder, *sites: tuple[int, int], depth: float = 1.0, **physics: Any) -> dict[str, int]:
     """What the atoms of a program are lost by."""
     settings = WorldSettings.model_validate({"transport_loss": 0.0, "temperature": 1e-6} | physics)
     transport = Transport(tape.grid, MotionSpec(), settings)
@@ -79,18 +79,18 @@ def lost_by(tape: Tape, *sites: tuple[int, int], depth: float = 1.0, **physics: 
 
 
 def test_every_loss_has_its_cause() -> None:
-    assert lost_by(Tape().move([(0, 0)], [(0, 2)]), (0, 0), transport_loss=1.0) == {"hand_over": 1}
-    assert lost_by(Tape().move([(0, 0)], [(0, 2)]), (0, 0)) == {}
-    assert lost_by(Tape().move([(0, 0)], [(0, -1)]), (0, 0)) == {"ejected": 1}
-    assert lost_by(Tape().move([(0, 0)], [(0, 3)]), (0, 0), (0, 3)) == {"collision": 2}
-    assert lost_by(Tape().move([(0, 0)], [(0, 3)]), (0, 0), (0, 1)) == {"collision": 2}
-    assert lost_by(Tape().move([(0, 0)], [(0, 3), (3, 0)]), (0, 0), (0, 3)) == {"collision": 2}
-    assert lost_by(Tape().add([(0, 0, ON, ON)], [(0, 0, 0.0, ON)]), (0, 0)) == {"program": 1}
-    held = Tape().add([(0, 0, ON, ON)], [(0, 0, 0.0, ON)])
+    assert lost_by(ToneProgramBuilder().move([(0, 0)], [(0, 2)]), (0, 0), transport_loss=1.0) == {"hand_over": 1}
+    assert lost_by(ToneProgramBuilder().move([(0, 0)], [(0, 2)]), (0, 0)) == {}
+    assert lost_by(ToneProgramBuilder().move([(0, 0)], [(0, -1)]), (0, 0)) == {"ejected": 1}
+    assert lost_by(ToneProgramBuilder().move([(0, 0)], [(0, 3)]), (0, 0), (0, 3)) == {"collision": 2}
+    assert lost_by(ToneProgramBuilder().move([(0, 0)], [(0, 3)]), (0, 0), (0, 1)) == {"collision": 2}
+    assert lost_by(ToneProgramBuilder().move([(0, 0)], [(0, 3), (3, 0)]), (0, 0), (0, 3)) == {"collision": 2}
+    assert lost_by(ToneProgramBuilder().add([(0, 0, ON, ON)], [(0, 0, 0.0, ON)]), (0, 0)) == {"program": 1}
+    held = ToneProgramBuilder().add([(0, 0, ON, ON)], [(0, 0, 0.0, ON)])
     assert lost_by(held.add([], []), (0, 0)) == {"program": 1}
     light = {"adiabatic_depth": 3e-3, "shallow_loss": 1.0}
-    assert lost_by(Tape().move([(0, 0)], [(0, 2)]), (0, 0), mobile_light=light) == {}
-    slow = Tape().move([(0, 0)], [(0, 2)])
+    assert lost_by(ToneProgramBuilder().move([(0, 0)], [(0, 2)]), (0, 0), mobile_light=light) == {}
+    slow = ToneProgramBuilder().move([(0, 0)], [(0, 2)])
     assert remain(slow, (0, 0), transport_loss=0.0, mobile_light=light) == {(0, 2)}  # 9 um/ms
 
 
@@ -98,14 +98,14 @@ def test_a_shallow_tweezer_at_full_speed_loses_its_atom_on_the_way() -> None:
     occupied = atoms((0, 0))
     light = {"adiabatic_depth": 3e-3, "shallow_loss": 1.0}
     settings = WorldSettings.model_validate({"transport_loss": 0.0, "mobile_light": light})
-    program = Tape().move([(0, 0)], [(0, 2)]).program(segment_s=2 * GRID.spacing_m / 0.13)
+    program = ToneProgramBuilder().move([(0, 0)], [(0, 2)]).program(segment_s=2 * GRID.spacing_m / 0.13)
     transport = Transport(GRID, MotionSpec(), settings)
     assert transport.carry(occupied, program, 3, FULL, np.random.default_rng(0), 1.0) == {"transport": 1}
 
 
 def test_a_weak_tweezer_neither_takes_nor_throws_out_an_atom() -> None:
     weak = ON * 0.3  # 9 % of the depth, on the axis that is not ramped
-    tape = Tape().add([(0, 0, weak, weak)], [(0, 0, 0.0, ON)]).add([(0, 0, weak, weak)], [(0, 3, ON, ON)])
+    tape = ToneProgramBuilder().add([(0, 0, weak, weak)], [(0, 0, 0.0, ON)]).add([(0, 0, weak, weak)], [(0, 3, ON, ON)])
     assert remain(tape, (0, 0), (0, 2)) == {(0, 0), (0, 2)}
 
 
@@ -117,7 +117,7 @@ def test_pick_up_and_drop_off_beside_the_site_keeps_what_the_energy_allows(
     off = offset_um * 1e-6 / GRID.spacing_m
     rows = [(r + off * axis, r + off * axis, ON, ON) for r in range(5)]
     cols = [c + off * (1 - axis) for c in range(6)]
-    tape = Tape().add(rows, [(c, c, 0.0, ON) for c in cols]).add(rows, [(c, c, ON, 0.0) for c in cols])
+    tape = ToneProgramBuilder().add(rows, [(c, c, 0.0, ON) for c in cols]).add(rows, [(c, c, ON, 0.0) for c in cols])
     transport = Transport(GRID, MotionSpec(), WorldSettings(transport_loss=0.0))
     rng, total = np.random.default_rng(3), 0
     for _ in range(60):
@@ -129,14 +129,14 @@ def test_pick_up_and_drop_off_beside_the_site_keeps_what_the_energy_allows(
 
 
 def test_a_tweezer_that_splits_keeps_one_atom() -> None:
-    tape = Tape().add([(0, 0, ON, ON)], [(2, 2, 0.0, ON)])
+    tape = ToneProgramBuilder().add([(0, 0, ON, ON)], [(2, 2, 0.0, ON)])
     tape.add([(0, 0, ON, ON)], [(1.75, 1.2, ON, ON), (2.25, 2.8, ON, ON)])
     tape.add([(0, 0, ON, ON)], [(1.2, 1.2, ON, 0.0), (2.8, 2.8, ON, 0.0)])
     assert remain(tape, (0, 2), transport_loss=0.0, temperature=1e-6) == {(0, 1)}
 
 
 def test_two_tweezers_that_come_on_beside_one_atom_take_it_once() -> None:
-    tape = Tape().add([(0, 0, ON, ON)], [(1.7, 1.7, 0.0, ON), (2.3, 2.3, 0.0, ON)])
+    tape = ToneProgramBuilder().add([(0, 0, ON, ON)], [(1.7, 1.7, 0.0, ON), (2.3, 2.3, 0.0, ON)])
     tape.add([(0, 0, ON, ON)], [(1.7, 1.0, ON, ON), (2.3, 3.0, ON, ON)])
     tape.add([(0, 0, ON, ON)], [(1.0, 1.0, ON, 0.0), (3.0, 3.0, ON, 0.0)])
     assert remain(tape, (0, 2), transport_loss=0.0) == {(0, 1)}

@@ -92,7 +92,7 @@ def probability(counts: Floats, gain: int, offset: float) -> Floats:
     return np.interp((same_light - offset) / per_electron * gain, np.arange(n_values) + 0.5, below)
 
 
-def misfit(probabilities: Floats) -> tuple[float, float]:
+def setting_error(probabilities: Floats) -> tuple[float, float]:
     """Kolmogorov-Smirnov distance and chi-square of numbers that should be even from 0 to 1."""
     found = np.sort(probabilities.ravel())
     distance = np.abs(found - np.arange(0.5, len(found)) / len(found)).max() + 0.5 / len(found)
@@ -109,7 +109,7 @@ def test_without_gain_the_counts_are_normal() -> None:
     assert abs(moments.kurtosis) < 0.08
     even = np.random.default_rng(0).uniform(-0.5, 0.5, counts.shape)  # whole numbers, spread out
     scaled = (counts + even - counts.mean(axis=0)) / np.sqrt(moments.variance + 1 / 12)
-    distance, square = misfit(ndtr(scaled))
+    distance, square = setting_error(ndtr(scaled))
     assert distance * counts.size**0.5 < 1.36
     assert square < chi2.ppf(0.999, N_BINS - 3)
 
@@ -118,11 +118,11 @@ def test_without_gain_the_counts_are_normal() -> None:
 def test_with_gain_the_histogram_has_the_models_shape(gain: int) -> None:
     counts = frames(gain)
     offset = fitted_offset(gain, Moments(counts))
-    distance, square = misfit(probability(counts, gain, offset))
+    distance, square = setting_error(probability(counts, gain, offset))
     assert distance * counts.size**0.5 < 1.36
     assert square < chi2.ppf(0.999, N_BINS - 4)
     normal = (counts - counts.mean(axis=0)) / Moments(counts).variance ** 0.5
-    assert misfit(ndtr(normal))[1] > 3 * square  # a normal law is refused
+    assert setting_error(ndtr(normal))[1] > 3 * square  # a normal law is refused
 
 
 def test_the_kurtosis_is_that_which_the_skewness_foretells() -> None:
@@ -150,7 +150,7 @@ def test_one_offset_for_both_gains_gives_the_excess_noise_of_the_model() -> None
     print(f"offset {offset:.0f}({offset_error:.0f}), ratio {found:.2f}({error:.2f}) at gain 300")
     assert abs(found - third / second**2) < 2 * error
     assert found - 1 > 3 * error
-    _, square = misfit(probability(high, 300, offset))
+    _, square = setting_error(probability(high, 300, offset))
     assert square < chi2.ppf(0.999, N_BINS - 3)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 from labseq_virtual.em_register import N_ONE_BY_ONE, Register, power_of_two
-from labseq_virtual.law import Law
+from labseq_virtual.law import CountDistribution
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
@@ -120,7 +120,7 @@ def test_charge_of_the_registers_own_is_multiplied_only_by_the_stages_after_it(g
 
 @given(st.lists(st.integers(0, 5), min_size=1, max_size=40).filter(any), st.integers(0, 1000))
 def test_a_law_draws_each_number_as_often_as_it_says(weights: list[int], first: int) -> None:
-    law = Law.of(np.array(weights, float), first)
+    law = CountDistribution.of(np.array(weights, float), first)
     drawn = np.empty(4000, np.int32)
     law.draw(drawn, np.random.default_rng(7))
     often = np.bincount(drawn - first, minlength=len(weights))
@@ -130,15 +130,15 @@ def test_a_law_draws_each_number_as_often_as_it_says(weights: list[int], first: 
 
 
 def test_the_ends_of_a_law_are_the_ends_of_the_random_words() -> None:
-    law = Law.of(np.array([0.25, 0.75]))
+    law = CountDistribution.of(np.array([0.25, 0.75]))
     assert law.edges.tolist() == [2**30 - 1, 2**32 - 1]
     small = np.array([1e-15, 1.0, 1e-9, 1e-15])
-    assert Law.of(small).first == 1
-    assert len(Law.of(small).edges) == 2
+    assert CountDistribution.of(small).first == 1
+    assert len(CountDistribution.of(small).edges) == 2
 
 
 def test_sums_are_those_of_single_draws() -> None:
-    law, n_each = Law.of(np.array([0.5, 0.2, 0.3]), 3), np.array([0, 3, 1, 0, 5])
+    law, n_each = CountDistribution.of(np.array([0.5, 0.2, 0.3]), 3), np.array([0, 3, 1, 0, 5])
     drawn = np.empty(9, np.int32)
     law.draw(drawn, np.random.default_rng(1))
     ends = np.cumsum(n_each)

@@ -20,11 +20,11 @@ from labseq import (
     DepthRamp,
     DeviceError,
     DeviceTimeoutError,
-    KnownSensor,
+    ReportsSensor,
     LimitError,
     RandomStream,
     SensorMode,
-    Settling,
+    NeedsSettling,
     SiteGrid,
 )
 from labseq.testing.fakes import FakeClock
@@ -87,7 +87,7 @@ def run(folder: Path) -> None:
 
 def test_the_world_tells_of_its_sensor() -> None:
     lab = Lab()
-    assert isinstance(lab.world, KnownSensor)
+    assert isinstance(lab.world, ReportsSensor)
     assert lab.world.sensor_shape == (120, 120)
     assert lab.world.readout_fraction(SensorMode((0, 0, 60, 60), 2)) == pytest.approx(1 / 16)
 
@@ -218,7 +218,7 @@ def test_a_sensor_cools_from_room_temperature_past_its_set_point_and_back() -> N
 
 def test_the_camera_waits_until_it_is_cold() -> None:
     lab = Lab(cooling=COLD)
-    assert isinstance(lab.camera, Settling)
+    assert isinstance(lab.camera, NeedsSettling)
     assert lab.camera.settling_timeout_s == 900.0
     assert lab.said("temperature_k") == ROOM_K
     start_s = lab.clock.now()

@@ -78,34 +78,34 @@ class Outputs:
 
 def test_outputs_that_are_listened_to_make_the_light_and_nothing_else_does() -> None:
     static, outputs = array(), Outputs()
-    static.listen(outputs)
+    static.connect_outputs(outputs)
     occupied = np.zeros(GRID.shape, np.bool_)
-    assert static.hear(0.0, occupied) == 0
+    assert static.receive_until(0.0, occupied) == 0
     assert not static.holds().any()
     outputs.heard = [equal()]
-    static.hear(1.0, occupied)
+    static.receive_until(1.0, occupied)
     np.testing.assert_allclose(static.depth, np.ones(GRID.shape))
-    static.hear(2.0, occupied)
+    static.receive_until(2.0, occupied)
     np.testing.assert_allclose(static.depth, np.ones(GRID.shape))
 
 
 def test_atoms_are_lost_in_a_dark_moment_between_two_looks_at_the_outputs() -> None:
     static, outputs = array(), Outputs()
-    static.listen(outputs)
+    static.connect_outputs(outputs)
     occupied = np.ones(GRID.shape, np.bool_)
     outputs.heard = [equal(), equal(0.9)]
-    assert static.hear(0.0, occupied) == 0
+    assert static.receive_until(0.0, occupied) == 0
     outputs.heard = [equal(0.0), equal()]
-    assert static.hear(1.0, occupied) == 12 * 15
+    assert static.receive_until(1.0, occupied) == 12 * 15
     assert static.holds().all()
 
 
 def test_nobody_is_listened_to_after_the_light_was_switched_off() -> None:
     static, outputs = array(), Outputs()
-    static.listen(outputs)
+    static.connect_outputs(outputs)
     static.switch_off()
     outputs.heard = [equal()]
-    static.hear(0.0, np.zeros(GRID.shape, np.bool_))
+    static.receive_until(0.0, np.zeros(GRID.shape, np.bool_))
     assert not static.holds().any()
 
 

@@ -7,19 +7,19 @@ import math
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
-from labseq_virtual.envelope import Band, envelope, sounding
-from labseq_virtual.tones import Tracks, follow_tones
+from labseq_virtual.envelope import Band, envelope, active_spans
+from labseq_virtual.tones import Tracks, track_tones
 
 from labseq.model import RfSamples, RfSpan, RfTones, TonesNow
 from labseq.testing.rf import FULL_SCALE_V, RATE_HZ, START_S, played, program_of
 
 BAND = Band(75e6, 50e6)
 TRANSIT_S = 10e-6
-LEAST_V = FULL_SCALE_V / 20 * 0.045
+MIN_V = FULL_SCALE_V / 20 * 0.045
 
 
 def follow(spans: list[RfSpan] | list[RfSamples], start_s: float, end_s: float) -> Tracks:
-    return follow_tones(spans, start_s - 30e-6, end_s + 30e-6, BAND, TRANSIT_S, LEAST_V, 1.2e6)
+    return track_tones(spans, start_s - 30e-6, end_s + 30e-6, BAND, TRANSIT_S, MIN_V, 1.2e6)
 
 
 def parked(hz: list[float], volts: list[float], duration_s: float = 200e-6) -> RfTones:
@@ -46,7 +46,7 @@ def test_a_program_is_recovered_from_its_samples(axis: int, speed_profile: str, 
     )
     spans = played(program)[axis]
     n_compared = 0
-    for start_s, end_s in sounding(spans[0]):
+    for start_s, end_s in active_spans(spans[0]):
         tracks = follow(spans, start_s, end_s)
         for k, time_s in enumerate(tracks.t_s - START_S):
             joint = np.abs(program.joint_s - time_s).min()
@@ -111,14 +111,14 @@ def test_tones_beyond_the_band_make_no_light() -> None:
 
 def test_silence_is_heard_as_silence() -> None:
     silent = RfSamples(START_S, RATE_HZ, np.zeros(100_000, np.int16), 1e-6)
-    assert sounding(silent) == []
+    assert active_spans(silent) == []
     assert np.isnan(follow([silent], START_S, START_S + 100e-6).frequency_hz).all()
 
 
 def test_samples_sound_from_the_first_to_the_last_block_that_is_not_zero() -> None:
     samples = np.zeros(10_000, np.int16)
     samples[3000], samples[9999] = 1, -1
-    first, second = sounding(RfSamples(START_S, 1e6, samples, 1e-6))
+    first, second = active_spans(RfSamples(START_S, 1e6, samples, 1e-6))
     assert first == pytest.approx((START_S + 2048e-6, START_S + 3072e-6))
     assert second == pytest.approx((START_S + 9216e-6, START_S + 10_000e-6))
 

@@ -26,7 +26,7 @@ from labseq_virtual.transport import FASTEST, Transport
 from numpy.typing import NDArray
 
 from labseq import MotionSpec, SiteGrid, ToneProgram
-from labseq.testing.tape import ON, Tape
+from labseq.testing.tape import ON, ToneProgramBuilder
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -262,7 +262,7 @@ WORLDS = st.fixed_dictionaries(
 def test_the_kernels_do_exactly_what_the_rules_say(
     parts: list[Any], world: dict[str, Any], filling: float, segment_s: float, data: st.DataObject
 ) -> None:
-    program = Tape(GRID, [segment for part in parts for segment in part]).program(segment_s)
+    program = ToneProgramBuilder(GRID, [segment for part in parts for segment in part]).program(segment_s)
     n_segments = program.n_segments
     if data.draw(SELDOM, "cut short"):
         n_segments = data.draw(st.integers(0, n_segments), "segments")

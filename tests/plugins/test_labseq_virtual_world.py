@@ -19,7 +19,7 @@ from labseq import (
     RandomStream,
     SiteGrid,
     ToneProgram,
-    TruthTeller,
+    ReportsTruth,
 )
 from labseq.model import AxisTones
 
@@ -281,7 +281,7 @@ def test_the_same_seed_gives_the_same_shot_whatever_came_before() -> None:
 
 def test_the_world_tells_the_truth_and_keeps_it() -> None:
     world = new_world(loading=1.0)
-    assert isinstance(world, TruthTeller)
+    assert isinstance(world, ReportsTruth)
     world.load(0.0, 0.5)
     world.truth()[...] = False
     assert n_atoms(world) == 400

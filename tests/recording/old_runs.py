@@ -106,7 +106,7 @@ def a_shot(index: int) -> ShotRecord:
         readings={"laser.power_w": 0.125, "simulation.n_defects_true": 0},
         parameters={"shot.1.rearrange.window": (0.06, 0.09)[index]},
         calibrations=CALIBRATIONS,
-        story={"jumps": JUMPS},
+        atom_events={"jumps": JUMPS},
     )
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from labseq.model import RunRecord, ShotRecord
-from labseq.recording.described import ATTRIBUTES, COLUMNS, DATASETS, EVERYWHERE, TABLES, UNTOLD
+from labseq.recording.described import ATTRIBUTES, COLUMNS, DATASETS, EVERYWHERE, TABLES, UNDOCUMENTED
 from labseq.recording.layout import FORMAT_VERSION, RUN_FORMAT_VERSION
 from labseq.recording.run_file import index_row
 from labseq.recording.shot_file import ShotEncoder
@@ -29,7 +29,7 @@ def file(make_run: MakeRun, make_shot: MakeShot) -> Iterator[Any]:
     columns = {"descriptions": {"t_s": "when it jumped"}}
     jumps = np.zeros(2, np.dtype([("t_s", "f8"), ("row", "f4")], metadata=columns))
     run = make_run(sequence_text="x" * 300, profile_text="y\n")
-    data = ShotEncoder(run, "day/run").encode(make_shot(story={"jumps": jumps}))
+    data = ShotEncoder(run, "day/run").encode(make_shot(atom_events={"jumps": jumps}))
     with h5py.File(io.BytesIO(data)) as opened:
         yield opened
 
@@ -88,7 +88,7 @@ def test_every_column_is_described(file: Any) -> None:
 
 def test_a_simulation_may_describe_the_columns_of_its_story(file: Any) -> None:
     jumps = file["entry/story/jumps"]
-    assert list(jumps.attrs["descriptions"]) == ["when it jumped", UNTOLD]
+    assert list(jumps.attrs["descriptions"]) == ["when it jumped", UNDOCUMENTED]
     assert list(jumps.attrs["units"]) == ["s", ""]
 
 
@@ -124,4 +124,4 @@ def test_every_key_of_the_index_and_every_version_is_in_the_reference(
     assert {*row} <= known
     assert f"| {FORMAT_VERSION} |" in page
     assert f"| {RUN_FORMAT_VERSION} |" in page
-    assert {what.since for what in DATASETS.values()} <= {*re.findall(r"^\| (\d\.\d) \|", page, re.MULTILINE)}
+    assert {what.since_version for what in DATASETS.values()} <= {*re.findall(r"^\| (\d\.\d) \|", page, re.MULTILINE)}

@@ -28,7 +28,7 @@ def written_by(version: str, index: int) -> Any:
     """The record as far as labseq of that version could write it."""
     shot, minor = a_shot(index), int(version.partition(".")[2])
     if minor < 1:
-        shot.story = {}
+        shot.atom_events = {}
     if minor < 2:
         shot.calibrations = {}
     if minor < 3:

@@ -130,16 +130,16 @@ def test_what_a_simulation_tells_is_kept_as_tables(
 ) -> None:
     flights = np.array([(0.5, b"kept", 2e-9)], [("held_s", "f8"), ("fate", "S8"), ("offset_m", "f4")])
     shot = make_shot()
-    shot.story = {"flights": flights, "a/b": flights[:0]}
+    shot.atom_events = {"flights": flights, "a/b": flights[:0]}
     path = tmp_path / "shot.h5"
     path.write_bytes(ShotEncoder(make_run(), "day/run").encode(shot))
     with h5py.File(path) as file:
         units: Any = file["entry/story/flights"].attrs["units"]
         assert list(units) == ["s", "", "m"]
-    story = read_content(path).record.story
-    assert list(story) == ["a_b", "flights"]
-    assert story["flights"].tobytes() == flights.tobytes()
-    assert story["a_b"].dtype == flights.dtype
+    atom_events = read_content(path).record.atom_events
+    assert list(atom_events) == ["a_b", "flights"]
+    assert atom_events["flights"].tobytes() == flights.tobytes()
+    assert atom_events["a_b"].dtype == flights.dtype
 
 
 def test_a_shot_without_a_story_has_no_group_for_it(make_run: MakeRun, make_shot: MakeShot) -> None:

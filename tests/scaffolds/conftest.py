@@ -8,7 +8,7 @@ from typing import NamedTuple
 import pytest
 
 from labseq.registry import KINDS
-from labseq.scaffolds import Made, make_file, make_plugin
+from labseq.scaffolds import CreatedFiles, make_file, make_plugin
 
 
 class Folder(NamedTuple):
@@ -23,10 +23,10 @@ class Folder(NamedTuple):
     """
 
     path: Path
-    plugins: dict[str, Made]
-    package: Made
-    sequence: Made
-    profile: Made
+    plugins: dict[str, CreatedFiles]
+    package: CreatedFiles
+    sequence: CreatedFiles
+    profile: CreatedFiles
 
 
 def name_of(kind: str) -> str:

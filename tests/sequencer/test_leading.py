@@ -14,7 +14,7 @@ from labseq.errors import (
     TransientError,
 )
 from labseq.model import LineSpec, ShotRecord
-from labseq.roles import Context, Leading, StepContext
+from labseq.roles import Context, LeaderLink, StepContext
 from labseq.sequencer.leading import FollowStep, find_leader, wait_step
 from labseq.sequencer.steps import WaitStep
 from labseq.testing import StepContract
@@ -62,8 +62,8 @@ def reason(made: Rig) -> str:
 
 
 def test_the_fake_can_lead_and_an_instrument_cannot() -> None:
-    assert isinstance(RecordingLeader(), Leading)
-    assert not isinstance(RecordingDevice(), Leading)
+    assert isinstance(RecordingLeader(), LeaderLink)
+    assert not isinstance(RecordingDevice(), LeaderLink)
 
 
 def test_a_wait_is_for_a_time_or_for_a_signal() -> None:
@@ -80,7 +80,7 @@ def test_it_lasts_as_long_as_the_leader_needs_and_at_most_its_timeout() -> None:
     made = rig()
     lab = made.lab
     (bar,) = FOLLOW[1].plan_timeline(StepContext(lab.grid, lab.motion, lab.target))
-    assert (bar.label, bar.duration_s, bar.least_s, bar.kind) == ("wait for go", 10.0, 0.0, "")
+    assert (bar.label, bar.duration_s, bar.min_duration_s, bar.kind) == ("wait for go", 10.0, 0.0, "")
     made.run()
     assert made.lab.clock.now() >= 0.5
     assert made.lab.calls.names("leader")[:4] == [

@@ -36,9 +36,9 @@ SHORT = Timeouts(call_s=0.05)
 AGAIN = StepPolicy(on_failure="repeat_shot")
 
 
-def policy(step: StepPolicy, *, attempts: int = 3, used_up: Any = "stop") -> RunPolicy:
+def policy(step: StepPolicy, *, attempts: int = 3, when_exhausted: Any = "stop") -> RunPolicy:
     """For LOAD and IMAGE: this one for the image."""
-    return RunPolicy(attempts, used_up, steps=(StepPolicy(), step))
+    return RunPolicy(attempts, when_exhausted, steps=(StepPolicy(), step))
 
 
 class Slow:
@@ -94,7 +94,7 @@ def test_the_run_speaks_for_what_is_outside_of_steps() -> None:
     lost = DeviceError("shutter", "no answer")
     again = RunPolicy(otherwise=StepPolicy(on_failure="repeat_shot"))
 
-    class Polled(RecordingDevice):
+    class HasReadings(RecordingDevice):
         polls = 0
 
         def poll(self) -> dict[str, float]:
@@ -104,18 +104,18 @@ def test_the_run_speaks_for_what_is_outside_of_steps() -> None:
             return {"power_w": 1.0}
 
     made = Rig(policy=again)
-    made.lab.devices["shutter"].__class__ = Polled  # fakes are made by their role, with its methods
+    made.lab.devices["shutter"].__class__ = HasReadings  # fakes are made by their role, with its methods
     made.run()
     assert [shot.status for shot in made.sink.shots] == ["failed", "complete"]
 
 
-@pytest.mark.parametrize(("used_up", "n_shots"), [("stop", 2), ("skip_point", 4)])
-def test_attempts_are_used_up(used_up: str, n_shots: int) -> None:
+@pytest.mark.parametrize(("when_exhausted", "n_shots"), [("stop", 2), ("skip_point", 4)])
+def test_attempts_are_used_up(when_exhausted: str, n_shots: int) -> None:
     made = Rig(
-        policy=policy(AGAIN, attempts=2, used_up=used_up),
+        policy=policy(AGAIN, attempts=2, when_exhausted=when_exhausted),
         fail_on={"camera.read": [LOST, LOST, None, None]},
     )
-    if used_up == "stop":
+    if when_exhausted == "stop":
         with pytest.raises(DeviceTimeoutError):
             made.run(3)
     else:

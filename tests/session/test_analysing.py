@@ -16,7 +16,7 @@ from labseq.locks import Lock
 from labseq.recording.results import results_file
 from labseq.roles import Analysis, RecordedShot
 from labseq.session import analysts
-from labseq.session.analysing import analyses_of, make_up, prepare
+from labseq.session.analysing import analyses_of, analyse_missing, prepare
 
 PLUGIN = """
 import os, threading
@@ -130,7 +130,7 @@ def test_a_run_does_not_mind_what_its_analyses_do(tmp_path, monkeypatch):
 
     monkeypatch.chdir(tmp_path)
     Path("mended").touch()
-    made = make_up(done, {"use": "fails"})
+    made = analyse_missing(done, {"use": "fails"})
     assert (made.n_done, made.n_before, made.failures) == (1, 2, {})
     assert [set(row) for row in done.analysis("fails")] == [{"shot", "filling"}] * 3
 
@@ -158,28 +158,28 @@ def taken(tmp_path_factory: pytest.TempPathFactory) -> labseq.Run:
 
 
 def test_any_analysis_can_be_made_up(taken):
-    first = make_up(taken, {"use": "mean"})
+    first = analyse_missing(taken, {"use": "mean"})
     assert (first.n_done, first.n_before) == (3, 0)
-    again = make_up(taken, {"use": "mean"})
+    again = analyse_missing(taken, {"use": "mean"})
     assert (again.n_done, again.n_before) == (0, 3)
-    assert make_up(taken, {"use": "mean"}, anew=True).n_done == 3
+    assert analyse_missing(taken, {"use": "mean"}, anew=True).n_done == 3
     assert [row["filling"] for row in taken.analysis("mean")] == [
         s.occupancies[-1].mean() for s in taken.shots
     ]
 
 
 def test_results_of_other_settings_are_begun_again(taken):
-    make_up(taken, {"use": "survival"})
+    analyse_missing(taken, {"use": "survival"})
     rows = taken.analysis("survival")
-    moved = make_up(taken, {"use": "survival", "atoms": "moved"})
+    moved = analyse_missing(taken, {"use": "survival", "atoms": "moved"})
     assert (moved.n_done, moved.n_before) == (3, 0)
     assert taken.analysis("survival") != rows
-    assert make_up(taken, {"use": "survival"}).n_done == 3
+    assert analyse_missing(taken, {"use": "survival"}).n_done == 3
     assert taken.analysis("survival") == rows
 
 
 def test_results_say_what_made_them(taken):
-    path = make_up(taken, {"use": "survival", "atoms": "held"}).path
+    path = analyse_missing(taken, {"use": "survival", "atoms": "held"}).path
     heads = [row for line in path.read_text().splitlines() if "shot" not in (row := json.loads(line))]
     head = heads[-1]
     assert head | {"t_utc": ""} == {
@@ -199,7 +199,7 @@ def test_two_processes_never_write_the_same_results(taken):
     assert lock.take() is None
     try:
         with pytest.raises(ConfigError, match="results of 'fails' are being written by the analysis 'fails'"):
-            make_up(taken, {"use": "fails"})
+            analyse_missing(taken, {"use": "fails"})
     finally:
         lock.release()
 

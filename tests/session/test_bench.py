@@ -16,10 +16,10 @@ from labseq.session.bench import BenchRequest, compare, read_request
 from labseq.session.bench_courses import set_up
 from labseq.session.bench_figures import find_figure
 from labseq.session.bench_report import Report
-from labseq.session.bench_spec import Comparison, Condition, Entrant
+from labseq.session.bench_spec import Comparison, Condition, PlannerEntry
 from labseq.session.bench_work import draw
 
-SMALL = Comparison((Entrant("psca"),), (Condition((8, 8), "compact:5x5", 0.75, 4),), 60, 5)
+SMALL = Comparison((PlannerEntry("psca"),), (Condition((8, 8), "compact:5x5", 0.75, 4),), 60, 5)
 TIMES = {"planning_s", "duration_s"}
 
 PLUGIN = """
@@ -140,7 +140,7 @@ def test_empty_and_full_loadings() -> None:
 @pytest.mark.usefixtures("plugins")
 @pytest.mark.parametrize("n_workers", [1, 2])
 def test_wrong_plans_are_counted_and_the_first_one_named(n_workers: int) -> None:
-    comparison = replace(SMALL, entrants=(Entrant("moody"), Entrant("psca")))
+    comparison = replace(SMALL, planner_entries=(PlannerEntry("moody"), PlannerEntry("psca")))
     moody, psca = compare(comparison, n_workers).rows
     assert psca.n_failed == 0
     assert moody.counts.sum() == 60 - moody.n_failed
@@ -153,7 +153,7 @@ def test_wrong_plans_are_counted_and_the_first_one_named(n_workers: int) -> None
 
 @pytest.mark.usefixtures("plugins")
 def test_a_planner_that_cannot_be_warmed_is_named() -> None:
-    report = compare(replace(SMALL, entrants=(Entrant("cold"),)), 1)
+    report = compare(replace(SMALL, planner_entries=(PlannerEntry("cold"),)), 1)
     assert isinstance(report.ended_by, PlanError)
     assert str(report.ended_by) == "planner 'cold': warm() raised RuntimeError: no kernels"
     assert report.rows == ()
@@ -161,7 +161,7 @@ def test_a_planner_that_cannot_be_warmed_is_named() -> None:
 
 def test_csv_and_json_hold_the_same() -> None:
     report = compare(
-        replace(SMALL, entrants=(Entrant("psca"), Entrant("psca", (("degree_of_parallelism", "2"),)))), 1
+        replace(SMALL, planner_entries=(PlannerEntry("psca"), PlannerEntry("psca", (("degree_of_parallelism", "2"),)))), 1
     )
     values = json.loads(json.dumps(report.as_dict(), allow_nan=False))
     lines = list(csv.DictReader(io.StringIO(report.as_csv())))
@@ -203,7 +203,7 @@ def test_the_tone_limits_bound_the_degree_of_parallelism() -> None:
 def test_a_request_without_anything_is_the_papers_array() -> None:
     comparison, figure = read_request(BenchRequest())
     assert figure is None
-    assert comparison.entrants == (Entrant("psca"),)
+    assert comparison.planner_entries == (PlannerEntry("psca"),)
     assert comparison.conditions == (Condition((20, 20), "compact:15x15", 0.75),)
 
 
@@ -212,7 +212,7 @@ def test_a_figure_can_move_at_another_speed() -> None:
     comparison, figure = read_request(BenchRequest(figure="3b", overrides=[speed]))
     assert figure is find_figure("3b")
     conditions = tuple(replace(c, target="compact:2x2") for c in comparison.conditions)
-    courses = set_up(replace(comparison, entrants=(Entrant("psca"),), conditions=conditions))
+    courses = set_up(replace(comparison, planner_entries=(PlannerEntry("psca"),), conditions=conditions))
     assert {(c.motion.speed_m_s, c.motion.pick_up_s, c.motion.drop_off_s) for c in courses} == {
         (0.13, 15e-6, 15e-6)
     }

@@ -60,20 +60,20 @@ def test_filling_agrees_with_the_virtual_profile(
     print(f"{mode}: {found.mean():.4f}, virtual {expected.mean():.4f}, error of the difference {error:.4f}")
     assert abs(found.mean() - expected.mean()) < 4 * error
     for shot in played.shots:
-        flights = shot.story["flights"]
+        flights = shot.atom_events["flights"]
         held = flights[~np.isnan(flights["held_s"])]
         n_wrong = np.count_nonzero(np.isin(held["fate"], [b"spilled", b"paired"]))
         assert len(held) > 100
         assert n_wrong < 0.02 * len(held)
         assert held["offset_m"].max() < 5e-9
-        assert len(shot.story["jumps"]) == 0
+        assert len(shot.atom_events["jumps"]) == 0
 
 
 def test_the_same_seed_gives_the_same_flights(tmp_path: Path) -> None:
     first, again = (run(tmp_path, "bench_awg", shots=1).shots[0] for _ in range(2))
     np.testing.assert_array_equal(first.occupancies, again.occupancies)
-    assert first.story["flights"].tobytes() == again.story["flights"].tobytes()
+    assert first.atom_events["flights"].tobytes() == again.atom_events["flights"].tobytes()
 
 
 def test_the_virtual_profile_tells_no_story(tmp_path: Path) -> None:
-    assert run(tmp_path, "virtual", shots=1).shots[0].story == {}
+    assert run(tmp_path, "virtual", shots=1).shots[0].atom_events == {}

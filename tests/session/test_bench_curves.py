@@ -12,7 +12,7 @@ from labseq.session.bench_courses import set_up
 from labseq.session.bench_curves import figure_drawing, fits_as_dicts, histogram_drawing, points_of
 from labseq.session.bench_figures import FIGURES, Figure
 from labseq.session.bench_report import Report
-from labseq.session.bench_spec import Comparison, Condition, Entrant
+from labseq.session.bench_spec import Comparison, Condition, PlannerEntry
 
 CONDITIONS = tuple(Condition((4 * n, 4 * n), f"compact:{3 * n}x{3 * n}", 0.75, 5) for n in (1, 2, 3))
 
@@ -50,8 +50,8 @@ def labseq_register(registry):
 """
 
 
-def compared(conditions: tuple[Condition, ...] = CONDITIONS, *entrants: Entrant) -> Report:
-    return compare(Comparison(entrants or (Entrant("psca"),), conditions, 10, 1), 1)
+def compared(conditions: tuple[Condition, ...] = CONDITIONS, *planner_entries: PlannerEntry) -> Report:
+    return compare(Comparison(planner_entries or (PlannerEntry("psca"),), conditions, 10, 1), 1)
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +60,7 @@ def report() -> Report:
 
 
 def figure(**changes: Any) -> Figure:
-    return replace(FIGURES["2b"], entrants=(Entrant("psca"),), conditions=CONDITIONS, **changes)
+    return replace(FIGURES["2b"], planner_entries=(PlannerEntry("psca"),), conditions=CONDITIONS, **changes)
 
 
 def test_the_bound_is_drawn_beside_the_planners(report: Report) -> None:
@@ -91,7 +91,7 @@ def test_times_are_drawn_in_milliseconds(report: Report) -> None:
 
 def test_a_figure_over_the_degree_of_parallelism_has_no_law_but_histograms() -> None:
     conditions = tuple(replace(CONDITIONS[1], degree_of_parallelism=dop) for dop in (2, 3, 5))
-    over_dop = replace(FIGURES["2c"], entrants=(Entrant("psca"),), conditions=conditions)
+    over_dop = replace(FIGURES["2c"], planner_entries=(PlannerEntry("psca"),), conditions=conditions)
     report = compared(conditions)
     drawing = figure_drawing(report, over_dop)
     assert [one.law for one in points_of(report, over_dop)] == [None, None]
@@ -103,7 +103,7 @@ def test_a_figure_over_the_degree_of_parallelism_has_no_law_but_histograms() -> 
 def test_a_planner_that_scans_is_drawn_by_its_scans(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "scans.py").write_text(SCANS, "utf-8")
     monkeypatch.setenv("LABSEQ_PLUGIN_PATH", str(tmp_path))
-    report = compared(CONDITIONS, Entrant("scans"), Entrant("psca"))
+    report = compared(CONDITIONS, PlannerEntry("scans"), PlannerEntry("psca"))
     batches, times = points_of(report, figure()), points_of(report, figure(y="motion_s"))
     assert [one.label for one in batches] == ["scans (scans)", "psca", "bound"]
     assert batches[0].y.tolist() == [7.0] * 3
@@ -121,7 +121,7 @@ def test_an_incomplete_figure_says_so(report: Report) -> None:
 
 
 def test_a_plain_comparison_shows_how_batches_spread() -> None:
-    drawing = histogram_drawing(compared(CONDITIONS[:1], Entrant("psca", (("degree_of_parallelism", "3"),))))
+    drawing = histogram_drawing(compared(CONDITIONS[:1], PlannerEntry("psca", (("degree_of_parallelism", "3"),))))
     (histogram,) = drawing.histograms
     assert histogram.counts.sum() == 10
     assert drawing.title == "compact:3x3 out of 4 x 4, 75 % loading, degree of parallelism 5"
@@ -130,7 +130,7 @@ def test_a_plain_comparison_shows_how_batches_spread() -> None:
 @pytest.mark.parametrize("name", FIGURES)
 def test_every_figure_has_targets_that_its_loadings_can_mostly_fill(name: str) -> None:
     conditions = FIGURES[name].conditions
-    for course in set_up(Comparison((Entrant("psca"),), conditions, 1, 1)):
+    for course in set_up(Comparison((PlannerEntry("psca"),), conditions, 1, 1)):
         n_sites = course.grid.n_rows * course.grid.n_cols
         mean, spread = course.loading * n_sites, (course.loading * (1 - course.loading) * n_sites) ** 0.5
         assert mean - 1.9 * spread > course.target.n_atoms

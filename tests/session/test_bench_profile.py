@@ -35,7 +35,7 @@ def test_a_run_through_every_driver_is_the_one_through_virtual_devices(tmp_path:
     for shot, other in zip(bench.shots, expected.shots, strict=True):
         np.testing.assert_array_equal(shot.frames, other.frames)
         np.testing.assert_array_equal(shot.occupancies, other.occupancies)
-        flights, others = shot.story["flights"], other.story["flights"]
+        flights, others = shot.atom_events["flights"], other.atom_events["flights"]
         for column in flights.dtype.names or ():
             if flights[column].dtype.kind == "f":  # depths are measured on what the radio sent
                 np.testing.assert_allclose(flights[column], others[column], rtol=1e-4, atol=1e-12)

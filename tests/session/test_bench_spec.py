@@ -4,7 +4,7 @@ import pytest
 
 from labseq.errors import ConfigError
 from labseq.session.bench_spec import (
-    Entrant,
+    PlannerEntry,
     parse_entrants,
     parse_grid,
     parse_loading,
@@ -13,19 +13,19 @@ from labseq.session.bench_spec import (
 
 
 @pytest.mark.parametrize(
-    ("text", "entrants"),
+    ("text", "planner_entries"),
     [
-        ("psca", [Entrant("psca")]),
-        (" psca , lsap_squared", [Entrant("psca"), Entrant("lsap_squared")]),
-        ("psca:a=1,b=2,lsap", [Entrant("psca", (("a", "1"), ("b", "2"))), Entrant("lsap")]),
-        ("psca:a=1,psca:a=2", [Entrant("psca", (("a", "1"),)), Entrant("psca", (("a", "2"),))]),
+        ("psca", [PlannerEntry("psca")]),
+        (" psca , lsap_squared", [PlannerEntry("psca"), PlannerEntry("lsap_squared")]),
+        ("psca:a=1,b=2,lsap", [PlannerEntry("psca", (("a", "1"), ("b", "2"))), PlannerEntry("lsap")]),
+        ("psca:a=1,psca:a=2", [PlannerEntry("psca", (("a", "1"),)), PlannerEntry("psca", (("a", "2"),))]),
         ("psca:max_tones={row: 16, col: 5},lsap", [
-            Entrant("psca", (("max_tones", "{row: 16, col: 5}"),)), Entrant("lsap"),
+            PlannerEntry("psca", (("max_tones", "{row: 16, col: 5}"),)), PlannerEntry("lsap"),
         ]),
     ],
 )  # fmt: skip
-def test_planners_and_their_settings_are_parted_by_commas(text: str, entrants: list[Entrant]) -> None:
-    assert list(parse_entrants(text)) == entrants
+def test_planners_and_their_settings_are_parted_by_commas(text: str, planner_entries: list[PlannerEntry]) -> None:
+    assert list(parse_entrants(text)) == planner_entries
 
 
 @pytest.mark.parametrize("text", ["", ",", "psca,", "psca,,lsap", "psca:a", "psca:a=", "1", "a b", "psca:=1"])

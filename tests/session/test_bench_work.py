@@ -11,8 +11,8 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
 from labseq import Plan
-from labseq.session.bench_courses import Course, set_up
-from labseq.session.bench_spec import Comparison, Condition, Entrant
+from labseq.session.bench_courses import PreparedCondition, set_up
+from labseq.session.bench_spec import Comparison, Condition, PlannerEntry
 from labseq.session.bench_work import Job, draw, lines_to_cover, loading_seed, work
 from labseq.session.occupancies import read_source
 
@@ -68,9 +68,9 @@ class Scripted:
         return self.made
 
 
-def course_with(planner: Any) -> Course:
+def course_with(planner: Any) -> PreparedCondition:
     condition = Condition((4, 4), "compact:2x2", loading=1.0, degree_of_parallelism=1)
-    (course,) = set_up(Comparison((Entrant("psca"),), (condition,), 3, 1))
+    (course,) = set_up(Comparison((PlannerEntry("psca"),), (condition,), 3, 1))
     return replace(course, runners=(replace(course.runners[0], planner=planner),))
 
 
@@ -105,7 +105,7 @@ def test_what_a_planner_does_wrong_is_counted(made: Any, words: str) -> None:
     done = work([course_with(Scripted(made))], 1, Job(0, 1, 3))
     assert done.results["failed"].all()
     (failure,) = done.failures
-    assert (failure.entrant, failure.condition, failure.loading) == (0, 0, 1)
+    assert (failure.planner_entry, failure.condition, failure.loading) == (0, 0, 1)
     assert words in failure.message
 
 

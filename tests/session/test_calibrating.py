@@ -42,7 +42,7 @@ shot: [{load: {}}, {image: {}}]
 GRID = SiteGrid(4, 5)
 
 
-class Bench:
+class ResolvedProfile:
     """A profile with a store, and a sequence."""
 
     def __init__(self, folder: Path) -> None:
@@ -65,15 +65,15 @@ class Bench:
 
 
 @pytest.fixture
-def bench(tmp_path: Path) -> Bench:
-    return Bench(tmp_path)
+def bench(tmp_path: Path) -> ResolvedProfile:
+    return ResolvedProfile(tmp_path)
 
 
 def shifted_hz(grid: SiteGrid) -> np.ndarray[Any, Any]:
     return grid.column_frequency_hz + 2e5
 
 
-def test_every_role_is_told_and_the_simulation_keeps_the_true_grid(bench: Bench) -> None:
+def test_every_role_is_told_and_the_simulation_keeps_the_true_grid(bench: ResolvedProfile) -> None:
     bench.use("frequencies", values={"column_hz": shifted_hz(GRID)})
     lab = bench.session().build_lab()
     assert {*lab.calibrations} == {"frequencies"}
@@ -82,7 +82,7 @@ def test_every_role_is_told_and_the_simulation_keeps_the_true_grid(bench: Bench)
     assert np.array_equal(world._grid.column_frequency_hz, GRID.column_frequency_hz)
 
 
-def test_an_overlay_counts_on_top_of_the_frequencies_that_it_was_measured_with(bench: Bench) -> None:
+def test_an_overlay_counts_on_top_of_the_frequencies_that_it_was_measured_with(bench: ResolvedProfile) -> None:
     frequencies = bench.use("frequencies", values={"column_hz": shifted_hz(GRID)})
     origin = {"calibrations": {"frequencies": frequencies.id}}
     bench.use("overlay", values={"offset_m": [1e-7, -2e-7]}, origin=origin)
@@ -92,7 +92,7 @@ def test_an_overlay_counts_on_top_of_the_frequencies_that_it_was_measured_with(b
     assert np.array_equal(grid.row_frequency_hz, expected.row_frequency_hz)
 
 
-def test_an_overlay_of_other_frequencies_is_left_out_with_a_warning(bench: Bench) -> None:
+def test_an_overlay_of_other_frequencies_is_left_out_with_a_warning(bench: ResolvedProfile) -> None:
     overlay = bench.use("overlay", values={"offset_m": [1e-7, 0.0]})
     bench.use("frequencies")
     assembly = bench.session().assembly
@@ -104,7 +104,7 @@ def test_an_overlay_of_other_frequencies_is_left_out_with_a_warning(bench: Bench
     assert np.array_equal(assembly.bench.grid.column_frequency_hz, GRID.column_frequency_hz)
 
 
-def test_thresholds_of_other_sites_are_used_with_a_warning(bench: Bench) -> None:
+def test_thresholds_of_other_sites_are_used_with_a_warning(bench: ResolvedProfile) -> None:
     bench.use("thresholds")
     assert bench.session().assembly.warnings == ()
     bench.use(
@@ -115,7 +115,7 @@ def test_thresholds_of_other_sites_are_used_with_a_warning(bench: Bench) -> None
     assert "was measured with other sites" in assembly.warnings[0]
 
 
-def test_the_ids_stand_in_the_run_and_in_every_shot_and_the_entries_beside_it(bench: Bench) -> None:
+def test_the_ids_stand_in_the_run_and_in_every_shot_and_the_entries_beside_it(bench: ResolvedProfile) -> None:
     overlay = bench.use("overlay", values={"offset_m": [1e-7, 0.0]})
     run = bench.session().run()
     assert run.record["calibrations"] == {"overlay": overlay.id}
@@ -127,7 +127,7 @@ def test_the_ids_stand_in_the_run_and_in_every_shot_and_the_entries_beside_it(be
     assert run.record["resolved"]["profile"]["grid"]["row_frequency"]["table"] == []
 
 
-def test_what_is_put_to_use_during_a_run_does_not_change_it(bench: Bench) -> None:
+def test_what_is_put_to_use_during_a_run_does_not_change_it(bench: ResolvedProfile) -> None:
     old = bench.use("overlay", values={"offset_m": [1e-7, 0.0]})
 
     class Meddler:
@@ -141,21 +141,21 @@ def test_what_is_put_to_use_during_a_run_does_not_change_it(bench: Bench) -> Non
 
 
 @pytest.mark.parametrize("change", ["calibrations=off", "calibrations.use.overlay=off"])
-def test_calibrations_may_be_put_aside(bench: Bench, change: str) -> None:
+def test_calibrations_may_be_put_aside(bench: ResolvedProfile, change: str) -> None:
     bench.use("overlay", values={"offset_m": [1e-7, 0.0]})
     assembly = bench.session(f"profile.{change}").assembly
     assert not assembly.bench.calibrations
     assert np.array_equal(assembly.bench.grid.column_frequency_hz, GRID.column_frequency_hz)
 
 
-def test_another_one_than_that_in_use_may_be_chosen(bench: Bench) -> None:
+def test_another_one_than_that_in_use_may_be_chosen(bench: ResolvedProfile) -> None:
     old = bench.use("overlay", values={"offset_m": [1e-7, 0.0]})
     bench.use("overlay", values={"offset_m": [2e-7, 0.0]})
     bench.write(f"calibrations: {{use: {{overlay: {old.id[:6]}}}}}\n")
     assert bench.session().assembly.bench.calibrations["overlay"].id == old.id
 
 
-def test_a_choice_that_does_not_exist_is_told_with_its_place(bench: Bench) -> None:
+def test_a_choice_that_does_not_exist_is_told_with_its_place(bench: ResolvedProfile) -> None:
     bench.write("calibrations: {use: {overlay: abc}}\n")
     with pytest.raises(ConfigError, match="there is no calibration of overlay 'abc'") as caught:
         bench.session()
@@ -163,14 +163,14 @@ def test_a_choice_that_does_not_exist_is_told_with_its_place(bench: Bench) -> No
     assert note.startswith("asked for by the key 'calibrations.use.overlay' of ")
 
 
-def test_one_of_another_grid_is_refused(bench: Bench) -> None:
+def test_one_of_another_grid_is_refused(bench: ResolvedProfile) -> None:
     bench.use("overlay", SiteGrid(4, 6))
     with pytest.raises(ConfigError, match=r"made for another grid: 4 x 6 sites.*; expected 4 x 5 sites"):
         bench.session()
 
 
 @pytest.mark.parametrize("kind", CALIBRATION_KINDS)
-def test_a_damaged_one_that_is_in_use_is_refused(bench: Bench, kind: CalibrationKind) -> None:
+def test_a_damaged_one_that_is_in_use_is_refused(bench: ResolvedProfile, kind: CalibrationKind) -> None:
     entry = bench.use(kind)
     path = bench.store.find(entry.id).path
     path.write_text("{", "utf-8")
@@ -182,7 +182,7 @@ def test_a_damaged_one_that_is_in_use_is_refused(bench: Bench, kind: Calibration
     assert "bench.yaml' puts it aside" in problem.notes[0]
 
 
-def test_a_damaged_note_of_what_is_in_use_is_told_once(bench: Bench) -> None:
+def test_a_damaged_note_of_what_is_in_use_is_told_once(bench: ResolvedProfile) -> None:
     bench.use("overlay")
     (bench.store.folder / "active.json").write_text("{", "utf-8")
     with pytest.raises(ConfigError, match=r"active\.json: this file is damaged") as caught:
@@ -191,7 +191,7 @@ def test_a_damaged_note_of_what_is_in_use_is_told_once(bench: Bench) -> None:
     assert not bench.session("profile.calibrations=off").assembly.bench.calibrations
 
 
-def test_a_hand_edited_origin_does_no_harm(bench: Bench) -> None:
+def test_a_hand_edited_origin_does_no_harm(bench: ResolvedProfile) -> None:
     entry = bench.use("overlay")
     path = bench.store.find(entry.id).path
     path.write_text(
@@ -208,12 +208,12 @@ def test_a_dry_run_of_a_real_lab_has_a_store_of_its_own(tmp_path: Path) -> None:
     assert rehearsed == real / "dry-run"
 
 
-def test_a_dry_run_of_virtual_devices_is_the_same_lab(bench: Bench) -> None:
+def test_a_dry_run_of_virtual_devices_is_the_same_lab(bench: ResolvedProfile) -> None:
     overlay = bench.use("overlay")
     assert bench.session(dry_run="full").assembly.bench.calibrations["overlay"].id == overlay.id
 
 
-def test_a_scan_of_the_profile_keeps_them(bench: Bench) -> None:
+def test_a_scan_of_the_profile_keeps_them(bench: ResolvedProfile) -> None:
     overlay = bench.use("overlay", values={"offset_m": [1e-7, 0.0]})
     text = SEQUENCE.replace("shots: 2", "scan: {profile.camera.readout: [5 ms, 6 ms]}")
     bench.sequence.write_text(text, "utf-8")
@@ -221,7 +221,7 @@ def test_a_scan_of_the_profile_keeps_them(bench: Bench) -> None:
     assert [shot.calibrations for shot in run.shots] == [{"overlay": overlay.id}] * 2
 
 
-def test_a_tone_program_is_made_with_them(bench: Bench) -> None:
+def test_a_tone_program_is_made_with_them(bench: ResolvedProfile) -> None:
     plan = labseq.Plan.from_batches([([(0, 0)], [(0, 3)])])
     profile = bench.folder / "bench.yaml"
     before = labseq.tone_program(plan, profile=profile).tones_at(560e-6).column.frequency_hz

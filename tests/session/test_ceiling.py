@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
-from labseq.session.ceiling import Losses, ceiling
+from labseq.session.ceiling import AtomLosses, max_defect_free
 
-PAPER = Losses(lifetime_s=33.0, imaging_loss=0.00314, imaging_loss_exposure_s=0.045)
+PAPER = AtomLosses(lifetime_s=33.0, imaging_loss=0.00314, imaging_loss_exposure_s=0.045)
 TOLD: dict[str, Any] = {"lifetime": 33.0, "imaging_loss": 0.00314, "imaging_loss_exposure": 0.045}
 
 
 def perfect_rearrangement(
-    n_shots: int, n_atoms: int, period_s: float, losses: Losses, seed: int
+    n_shots: int, n_atoms: int, period_s: float, losses: AtomLosses, seed: int
 ) -> float:  # fmt: skip
     """Share of the shots seen defect-free in the end, if every move succeeds: atom by atom."""
     rng = np.random.default_rng(seed)
@@ -39,28 +39,28 @@ def test_perfect_rearrangement_reaches_it(period_s: float, missed: float | None)
     losses = replace(PAPER, false_negative=missed)
     n_shots = 6_000
     reached = perfect_rearrangement(n_shots, 225, period_s, losses, seed=3)
-    most = ceiling(225, period_s, 0.045, losses)
+    most = max_defect_free(225, period_s, 0.045, losses)
     assert reached == pytest.approx(most, abs=4 * np.sqrt(most * (1 - most) / n_shots))
 
 
 def test_the_papers_constants_give_the_papers_ceiling() -> None:
-    assert ceiling(225, 0.045, 0.045, PAPER) == pytest.approx(0.9955**225, rel=0.01)
+    assert max_defect_free(225, 0.045, 0.045, PAPER) == pytest.approx(0.9955**225, rel=0.01)
 
 
 @given(st.integers(1, 1000), st.floats(0.01, 1.0), st.floats(0.01, 0.2), st.floats(0.0, 1e-3))
 def test_it_falls_with_atoms_time_light_and_missed_atoms(n: int, t: float, s: float, missed: float) -> None:
     losses = replace(PAPER, false_negative=missed)
-    most = ceiling(n, t, s, losses)
+    most = max_defect_free(n, t, s, losses)
     assert 0.0 < most < 1.0
-    assert ceiling(n + 1, t, s, losses) < most
-    assert ceiling(n, 1.1 * t, s, losses) < most
-    assert ceiling(n, t, 1.1 * s, losses) < most
-    assert most <= ceiling(n, t, s, PAPER)
+    assert max_defect_free(n + 1, t, s, losses) < most
+    assert max_defect_free(n, 1.1 * t, s, losses) < most
+    assert max_defect_free(n, t, 1.1 * s, losses) < most
+    assert most <= max_defect_free(n, t, s, PAPER)
 
 
 def test_the_losses_are_those_that_the_simulation_tells() -> None:
-    assert Losses.of({"simulation": TOLD}) == PAPER
-    assert Losses.of({"simulation": {**TOLD, "false_negative": 6e-5}}) == replace(PAPER, false_negative=6e-5)
+    assert AtomLosses.of({"simulation": TOLD}) == PAPER
+    assert AtomLosses.of({"simulation": {**TOLD, "false_negative": 6e-5}}) == replace(PAPER, false_negative=6e-5)
 
 
 @pytest.mark.parametrize(
@@ -75,4 +75,4 @@ def test_the_losses_are_those_that_the_simulation_tells() -> None:
     ],
 )
 def test_what_is_not_told_is_not_made_up(devices: dict[str, Any]) -> None:
-    assert Losses.of(devices) is None
+    assert AtomLosses.of(devices) is None

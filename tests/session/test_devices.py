@@ -13,7 +13,7 @@ from labseq.roles import Context
 from labseq.sequencer import StopFlag
 from labseq.sequencer.lab import Timeouts
 from labseq.session import CheckedDevice, check_devices
-from labseq.session.devices import N_READINGS, try_devices
+from labseq.session.devices import N_READINGS, check_each_device
 from labseq.testing.fakes import Calls, FakeClock, Hang, RecordingDevice, RecordingSimulation
 
 TIMEOUTS = Timeouts(call_s=10.0, safe_state_s=10.0)
@@ -34,7 +34,7 @@ def make(name: str, calls: Calls, kind: type[RecordingDevice] = SelfTested, **fa
 def tried(
     *devices: RecordingDevice, timeouts: Timeouts = TIMEOUTS, stop: StopFlag | None = None
 ) -> list[CheckedDevice]:
-    return try_devices([(device.name, device) for device in devices], timeouts, stop or StopFlag())
+    return check_each_device([(device.name, device) for device in devices], timeouts, stop or StopFlag())
 
 
 def test_a_device_is_opened_identified_tested_read_made_safe_and_closed() -> None:
@@ -125,7 +125,7 @@ def test_the_simulation_is_opened_first_and_closed_last() -> None:
     calls = Calls()
     simulation = RecordingSimulation(calls)
     devices = [("one", make("one", calls, fail_on={"open": OSError("gone")}))]
-    world, one = try_devices(devices, TIMEOUTS, StopFlag(), simulation)
+    world, one = check_each_device(devices, TIMEOUTS, StopFlag(), simulation)
     assert (calls.names()[0], calls.names()[-1]) == ("simulation.open", "simulation.close")
     assert (world.name, world.ok, one.ok) == ("simulation", True, False)
 

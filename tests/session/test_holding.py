@@ -12,8 +12,8 @@ import pytest
 import labseq
 from labseq.errors import DeviceError
 from labseq.recording import lock_files, marker_roots
-from labseq.session import check_devices, make_profile_safe, set_up_bench
-from labseq.session.holding import devices_held
+from labseq.session import check_devices, make_profile_safe, resolve_profile
+from labseq.session.holding import lock_devices
 from labseq.testing.fakes import RecordingObserver
 
 PROFILE = """labseq: 1
@@ -74,7 +74,7 @@ def write(shutter: str) -> None:
 
 @pytest.fixture
 def held() -> Generator[None]:
-    with devices_held(set_up_bench("./p.yaml"), marker_roots(Path("data")), "the run x", pytest.fail):
+    with lock_devices(resolve_profile("./p.yaml"), marker_roots(Path("data")), "the run x", pytest.fail):
         yield
 
 
@@ -94,14 +94,14 @@ def test_a_second_run_is_refused_and_told_of_the_first(held: None) -> None:
 
 def test_the_devices_are_free_after_a_run_and_after_one_that_failed() -> None:
     run()
-    with devices_held(set_up_bench("./p.yaml"), marker_roots(Path("data")), "me", pytest.fail):
+    with lock_devices(resolve_profile("./p.yaml"), marker_roots(Path("data")), "me", pytest.fail):
         pass
     Path("plugins/mine.py").write_text(
         PLUGIN.replace("open(self): pass", "open(self): 1 / 0"), encoding="utf-8"
     )
     with pytest.raises(DeviceError):
         run()
-    with devices_held(set_up_bench("./p.yaml"), marker_roots(Path("data")), "me", pytest.fail):
+    with lock_devices(resolve_profile("./p.yaml"), marker_roots(Path("data")), "me", pytest.fail):
         pass
 
 

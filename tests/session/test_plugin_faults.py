@@ -194,7 +194,7 @@ def test_a_run_tells_of_the_plugins_that_it_uses() -> None:
 def test_patience_is_the_profiles() -> None:
     write(PLUGIN, PROFILE + "timeouts: {load: 12 s}\n")
     host = labseq.Session.open("s.yaml").assembly.bench.host
-    assert host.get("step", "mine").owner.patience_s == 12.0
+    assert host.get("step", "mine").owner.max_wait_s == 12.0
 
 
 WRITES = """

@@ -83,7 +83,7 @@ def stopped_at(path: Path, event: str, n: int) -> Path:
 
 
 def test_a_shot_that_fails_again_and_again_is_skipped_and_the_run_complete(tmp_path: Path) -> None:
-    policy = {"on_failure": "repeat_shot", "used_up": "skip_point"}
+    policy = {"on_failure": "repeat_shot", "when_exhausted": "skip_point"}
     seen = RecordingObserver()
     done = run(sequence(tmp_path, step="{at: [2]}", attempts=2, policy=policy), seen)
     assert done.status == "complete"
@@ -191,7 +191,7 @@ def test_a_timeout_shorter_than_the_step_is_told(tmp_path: Path) -> None:
         ("{}\n    policy: {retry: 1}", {}, "10:14: 'retry' is not a setting of the policy of 'failing'"),
         ("{}\n    policy: {timeout: 0 s}", {}, "10:23: timeout is '0 s'; expected more than 0"),
         ("{}\n    policy: 5", {}, "10:13: policy is 5; expected a mapping of settings"),
-        ("{}", {"policy": {"used_up": "repeat"}}, "used_up is 'repeat'; expected"),
+        ("{}", {"policy": {"when_exhausted": "repeat"}}, "when_exhausted is 'repeat'; expected"),
         ("{}", {"policy": {"checks": [{"value": "x"}]}}, "the check has no limit; expected 'at_least'"),
         (
             "{}",
@@ -239,7 +239,7 @@ def test_a_scan_cannot_change_a_policy(tmp_path: Path) -> None:
 
 def test_options_change_policies(tmp_path: Path) -> None:
     path = sequence(tmp_path, step="{at: [0]}", attempts=1)
-    changes = ["policy.used_up=skip_point", "policy.on_failure=repeat_shot"]
+    changes = ["policy.when_exhausted=skip_point", "policy.on_failure=repeat_shot"]
     output = tmp_path / "data"
     with labseq.Session.open(path, seed=5, overrides=changes, output=output) as session:
         assert list(session.run().skipped) == [0]

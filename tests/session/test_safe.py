@@ -10,7 +10,7 @@ import pytest
 import labseq
 from labseq.errors import ConfigError, DeviceError
 from labseq.recording import died, mark_active, marker_roots
-from labseq.session import Secured, make_profile_safe
+from labseq.session import SafeStateReport, make_profile_safe
 from labseq.testing.fakes import RecordingObserver
 
 PROFILE = """labseq: 1
@@ -74,7 +74,7 @@ def write(shutter: str, old: str = "", new: str = "", profile: str = PROFILE) ->
     Path("p.yaml").write_text(profile.replace("SHUTTER", shutter), encoding="utf-8")
 
 
-def secured(*overrides: str) -> tuple[Secured, list[Any]]:
+def secured(*overrides: str) -> tuple[SafeStateReport, list[Any]]:
     seen = RecordingObserver()
     outcome = make_profile_safe("./p.yaml", overrides, seen)
     return outcome, seen.of("safe_state")
@@ -85,7 +85,7 @@ def test_one_broken_device_never_keeps_the_others_from_being_made_safe(what: str
     old, new, shutter, says = BROKEN[what]
     write(shutter, old, new)
     outcome, told = secured()
-    assert outcome.tried == dict.fromkeys(["mobile_tweezers", "camera", "static_tweezers"])
+    assert outcome.attempted == dict.fromkeys(["mobile_tweezers", "camera", "static_tweezers"])
     assert [t["device"] for t in told] == ["mobile_tweezers", "camera", "static_tweezers", "shutter"]
     assert [t["ok"] for t in told] == [True, True, True, False]
     (error,) = outcome.failures
@@ -98,7 +98,7 @@ def test_one_broken_device_never_keeps_the_others_from_being_made_safe(what: str
 def test_all_are_safe_in_order() -> None:
     write("{use: mine}")
     outcome, told = secured()
-    assert [t["device"] for t in told] == list(outcome.tried) == SAFE_ORDER
+    assert [t["device"] for t in told] == list(outcome.attempted) == SAFE_ORDER
     assert (outcome.failures, outcome.problems) == ([], None)
 
 
@@ -114,7 +114,7 @@ def test_what_concerns_no_device_is_told_at_the_end(old: str, new: str, says: st
     assert old in PROFILE
     write("{use: mine}", profile=PROFILE.replace(old, new, 1))
     outcome, _ = secured()
-    assert "shutter" in outcome.tried
+    assert "shutter" in outcome.attempted
     assert outcome.problems is not None
     assert says in str(outcome.problems)
 
@@ -122,13 +122,13 @@ def test_what_concerns_no_device_is_told_at_the_end(old: str, new: str, says: st
 def test_a_detector_is_not_needed() -> None:
     write("{use: mine}", profile=PROFILE.replace("use: threshold", "use: gone"))
     outcome, _ = secured()
-    assert (list(outcome.tried), outcome.failures, outcome.problems) == (SAFE_ORDER, [], None)
+    assert (list(outcome.attempted), outcome.failures, outcome.problems) == (SAFE_ORDER, [], None)
 
 
 def test_without_its_world_nothing_virtual_can_be_made_safe() -> None:
     write("{use: mine}", profile=PROFILE.replace("simulation: {use: virtual}", "simulation: {use: gone}"))
     outcome, _ = secured()
-    assert list(outcome.tried) == ["shutter"]
+    assert list(outcome.attempted) == ["shutter"]
     assert set(outcome.refused) == {"mobile_tweezers", "camera", "static_tweezers", "simulation"}
 
 
@@ -161,7 +161,7 @@ def test_a_run_that_died_is_remembered_as_long_as_a_device_is_not_safe() -> None
     write("{use: mine}", "safe_state(self): pass", "safe_state(self): raise OSError('jammed')")
     roots, key = marked_as_dead()
     outcome, _ = secured()
-    assert isinstance(outcome.tried["shutter"], DeviceError)
+    assert isinstance(outcome.attempted["shutter"], DeviceError)
     assert died(roots, key) is not None
 
 
@@ -169,7 +169,7 @@ def test_a_run_that_died_is_remembered_as_long_as_a_device_may_have_been_left_ou
     write("", profile=PROFILE.replace("devices:\n  shutter: SHUTTER", "devices: 5"))
     roots, key = marked_as_dead()
     outcome, _ = secured()
-    assert (outcome.failures, "shutter" in outcome.tried) == ([], False)
+    assert (outcome.failures, "shutter" in outcome.attempted) == ([], False)
     assert "p.yaml:10:10: devices is 5" in str(outcome.problems)
     assert died(roots, key) is not None
 

@@ -13,7 +13,7 @@ from labseq.errors import ConfigError, RecordingError, StopRequested
 from labseq.recording import mark_active, marker_roots
 from labseq.recording.durable import write_file
 from labseq.recording.run_file import encode_state
-from labseq.session.stopping import ask_to_stop, find_running, is_running, told_owner
+from labseq.session.stopping import ask_to_stop, find_running, is_running, owner_text
 from labseq.testing.fakes import RecordingObserver
 
 from .small_runs import interrupted, write
@@ -67,7 +67,7 @@ def test_a_run_is_found_by_folder_profile_or_as_the_only_one(data: Path) -> None
 
     def look() -> None:
         (folder,) = (state.parent for state in data.glob("*/*/STATE"))
-        told.extend([folder, find_running(), find_running(folder / "run.json"), told_owner(folder)])
+        told.extend([folder, find_running(), find_running(folder / "run.json"), owner_text(folder)])
         told.append(find_running(profile="./p.yaml"))
         with pytest.raises(ConfigError, match="no run is in progress on the profile virtual"):
             find_running(profile="virtual")

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 import labseq
-from labseq.session.setting_up import set_up_bench
+from labseq.session.setting_up import resolve_profile
 
 PROFILE = """
 labseq: 1
@@ -52,7 +52,7 @@ def profile(folder: Path, mobile: str) -> str:
 def test_a_driver_needs_no_real_time_if_it_is_set_up_as_in_a_dry_run(
     tmp_path: Path, mobile: str, is_virtual: bool
 ) -> None:
-    assert set_up_bench(profile(tmp_path, mobile)).virtual_time is is_virtual
+    assert resolve_profile(profile(tmp_path, mobile)).virtual_time is is_virtual
 
 
 def test_a_run_with_a_simulated_card_is_on_the_virtual_clock(tmp_path: Path) -> None:

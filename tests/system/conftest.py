@@ -104,7 +104,7 @@ STEPS = """
 """
 
 
-class Bench:
+class ResolvedProfile:
     """A folder with a sequence, a profile whose devices note their calls, and a place for data."""
 
     def __init__(self, folder: Path) -> None:
@@ -194,4 +194,4 @@ def select_pause() -> None:
 
 @pytest.fixture
 def bench(tmp_path):
-    return Bench(tmp_path)
+    return ResolvedProfile(tmp_path)

@@ -253,7 +253,7 @@ class CallsItselfAndor(RecordingCamera):
 
 
 class Suite(CameraContract):
-    patience_s: ClassVar[float] = 0.2
+    max_wait_s: ClassVar[float] = 0.2
 
 
 PLANTED = Planted(

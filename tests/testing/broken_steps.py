@@ -73,23 +73,23 @@ class TakesAnotherImage(Right):
         shot.take_image(0.045)
 
 
-class Again(Right):
+class RecordedSetup(Right):
     """Right: may be tried again."""
 
     repeatable: Any = True
 
 
-class RepeatsALot(Again):
+class RepeatsALot(RecordedSetup):
     repeatable = 3
 
 
-class LowersTheTweezers(Again):
+class LowersTheTweezers(RecordedSetup):
     def run(self, shot: Shot) -> None:
         shot.static_tweezers.ramp(0.5, 0.0)
         super().run(shot)
 
 
-class WorksOnce(Again):
+class WorksOnce(RecordedSetup):
     has_run = False
 
     def run(self, shot: Shot) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from labseq.testing import BrokenPromise
+from labseq.testing import ContractViolation
 
 Factory = Callable[..., Any]
 
@@ -34,15 +34,15 @@ class Planted:
             yield plugin, (tests,) if isinstance(tests, str) else tests
 
 
-def failed_tests(suite: object, factory: Factory) -> dict[str, BrokenPromise]:
+def failed_tests(suite: object, factory: Factory) -> dict[str, ContractViolation]:
     """Run a suite against a plugin, without pytest around it: test that fails -> what it said."""
-    failed: dict[str, BrokenPromise] = {}
+    failed: dict[str, ContractViolation] = {}
     for name in promised_by(suite):
         try:
             getattr(suite, name)(factory)
         except pytest.skip.Exception:  # a promise that it cannot do without has a test that fails
             pass
-        except BrokenPromise as error:
+        except ContractViolation as error:
             failed[name] = error
     return failed
 

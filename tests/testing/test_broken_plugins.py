@@ -10,7 +10,7 @@ from labseq.errors import DeviceError, LimitError
 from labseq.model import ToneProgram
 from labseq.registry import KINDS
 from labseq.roles import Context
-from labseq.testing import SUITES, BrokenPromise, MobileTweezersContract, PlannerContract
+from labseq.testing import SUITES, ContractViolation, MobileTweezersContract, PlannerContract
 from labseq.testing.contracts import HardwareContract
 from labseq.testing.fakes import OneByOnePlanner, RecordingCamera, RecordingMobileTweezers
 
@@ -103,7 +103,7 @@ def test_all_that_a_suite_makes_is_closed(plugin: type[RecordingCamera]) -> None
 
 
 def test_a_hang_is_told_with_the_patience() -> None:
-    with pytest.raises(BrokenPromise, match=r"read\(\) without a trigger has not returned after 0.2 s"):
+    with pytest.raises(ContractViolation, match=r"read\(\) without a trigger has not returned after 0.2 s"):
         broken_hardware.Suite().test_keeps_timeouts(broken_hardware.PollsForEver)
 
 
@@ -121,7 +121,7 @@ def test_an_empty_program_may_be_refused() -> None:
     ("kind", "plugin"),
     [
         ("scanner", broken_scanners.Stops),
-        ("step", broken_steps.Again),
+        ("step", broken_steps.RecordedSetup),
         ("mobile_tweezers", broken_tweezers.TellsItsTimings),
     ],
 )

@@ -7,7 +7,7 @@ def test_every_public_name_resolves() -> None:
     for name in (
         "SUITES",
         "AnalysisContract",
-        "BrokenPromise",
+        "ContractViolation",
         "CameraContract",
         "DetectorContract",
         "DeviceContract",

@@ -9,7 +9,7 @@ import pytest
 
 from labseq.errors import PlanError
 from labseq.model import Occupancy, Plan, TargetPattern
-from labseq.testing import BrokenPromise, PlannerContract
+from labseq.testing import ContractViolation, PlannerContract
 from labseq.testing.contracts.plans import RETURNS_A_PLAN
 from labseq.testing.fakes import OneByOnePlanner, ScriptedPlanner
 
@@ -57,7 +57,7 @@ def test_but_fails_where_no_other_does() -> None:
     class Blind(Suite):
         test_creates_no_atom = Suite.test_is_pure
 
-    with pytest.raises(BrokenPromise, match="no atom is created"):
+    with pytest.raises(ContractViolation, match="no atom is created"):
         Blind().test_fills_the_target(partial(CreatesAnAtom, None))
 
 
@@ -72,22 +72,22 @@ def test_a_planner_that_hangs_is_given_up() -> None:
     class Impatient(Suite):
         time_limit_s: ClassVar[float] = 0.01
 
-    with pytest.raises(BrokenPromise, match=r"plan\(\) has not returned after 0.02 s"):
+    with pytest.raises(ContractViolation, match=r"plan\(\) has not returned after 0.02 s"):
         Impatient().test_plans_in_time(partial(Hangs, None))
     released.set()
 
 
 def test_a_message_draws_the_case_that_failed() -> None:
-    with pytest.raises(BrokenPromise, match=r"leaves 0 defects and 1 surplus atoms of\n\s*!  \(# "):
+    with pytest.raises(ContractViolation, match=r"leaves 0 defects and 1 surplus atoms of\n\s*!  \(# "):
         PlannerContract().test_fills_the_target(partial(DoesNothing, None))
 
 
 def test_the_smallest_case_is_reported() -> None:
-    with pytest.raises(BrokenPromise) as raised:
+    with pytest.raises(ContractViolation) as raised:
         PlannerContract().test_creates_no_atom(partial(CreatesAnAtom, None))
     assert raised.value.detail == "batch 0 takes an atom from (0, 0); there is none"
 
 
 def test_what_is_no_plan_is_named() -> None:
-    with pytest.raises(BrokenPromise, match="it returned a str"):
+    with pytest.raises(ContractViolation, match="it returned a str"):
         Suite().test_returns_a_plan(lambda context: ScriptedPlanner(["left, then up"]))

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from labseq.roles import Context
-from labseq.testing import BrokenPromise, CameraContract
+from labseq.testing import ContractViolation, CameraContract
 from labseq.testing.fakes import RecordingCamera
 
 
@@ -15,7 +15,7 @@ def test_the_file_that_a_constructor_reads_is_named() -> None:
         Path(os.devnull).read_bytes()
         return RecordingCamera(context)
 
-    with pytest.raises(BrokenPromise, match=r"but it did open\(.*\); open\(\) is the place"):
+    with pytest.raises(ContractViolation, match=r"but it did open\(.*\); open\(\) is the place"):
         CameraContract().test_constructor_does_no_io(camera)
 
 

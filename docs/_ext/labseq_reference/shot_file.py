@@ -16,10 +16,10 @@ from labseq_reference.tables import table
 def datasets() -> list[str]:
     """A row per dataset."""
     rows = [
-        (f"`/entry/{path}`", what.dtype, what.shape, what.units, what.meaning, what.since)
+        (f"`/entry/{path}`", what.dtype, what.shape, what.units, what.meaning, what.since_version)
         for path, what in DATASETS.items()
     ]
-    return table(("path", "type", "axes", "unit", "meaning", "since"), rows, ("shot-file", "datasets"))
+    return table(("path", "type", "axes", "unit", "meaning", "since_version"), rows, ("shot-file", "datasets"))
 
 
 def columns() -> list[str]:

@@ -15,7 +15,7 @@ from labseq import (
     Duration,
     Series,
     Settings,
-    Taken,
+    ExposureResult,
     wait_for,
 )
 
@@ -78,18 +78,18 @@ class MycamCamera(CameraDriver):
         self._camera.fire()
         self._due_s = self._clock.now() + self._exposure_s + self._settings.readout
 
-    def _take(self, timeout_s: float) -> Taken | None:
+    def _take(self, timeout_s: float) -> ExposureResult | None:
         not_yet_s = min(timeout_s, max(0.0, self._due_s - self._clock.now()))
         self._clock.sleep(not_yet_s)
         frame = wait_for(
-            lambda patience_s: self._camera.get_frame(1e3 * patience_s),
+            lambda max_wait_s: self._camera.get_frame(1e3 * max_wait_s),
             timeout_s - not_yet_s,
             self._clock,
         )
         if frame is None:
             return None
         number, pixels = frame
-        return Taken(number - 1, pixels)
+        return ExposureResult(number - 1, pixels)
 
     def _stop(self) -> None:
         self._camera.stop()

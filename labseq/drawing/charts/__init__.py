@@ -3,8 +3,8 @@
 Each chart knows how to paint itself into a panel; importing them imports no matplotlib.
 """
 
-from labseq.drawing.charts.bars import CausesChart, DefectsChart
-from labseq.drawing.charts.course import CourseChart
+from labseq.drawing.charts.bars import LossCausesChart, DefectsChart
+from labseq.drawing.charts.course import TrendChart
 from labseq.drawing.charts.curves import CurvesChart
 from labseq.drawing.charts.maps import MapChart
 from labseq.drawing.charts.sheet import Chart, RunDrawing, save_run
@@ -12,9 +12,9 @@ from labseq.drawing.charts.sites import SitesChart
 from labseq.drawing.charts.stages import StageBar, StagesChart
 
 __all__ = [
-    "CausesChart",
+    "LossCausesChart",
     "Chart",
-    "CourseChart",
+    "TrendChart",
     "CurvesChart",
     "DefectsChart",
     "MapChart",

@@ -62,7 +62,7 @@ class DefectsChart:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CausesChart:
+class LossCausesChart:
     """What atoms were lost to.
 
     Attributes:

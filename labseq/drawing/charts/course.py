@@ -20,12 +20,12 @@ MANY: Final = 500
 """From so many points on they are smaller."""
 PIXELS: Final = 2000
 """From so many points on they are pixels in a vector picture too."""
-LEAST_RANGE: Final = 1.0
+MIN_RANGE: Final = 1.0
 """Least range that is shown, in per cent."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CourseChart:
+class TrendChart:
     """A fraction against the shot.
 
     Attributes:
@@ -69,5 +69,5 @@ class CourseChart:
         if self.is_rate:
             return -4.0, 104.0
         low, high = 100 * float(np.nanmin(self.values)), 100 * float(np.nanmax(self.values))
-        room = 0.1 * max(high - low, LEAST_RANGE)
+        room = 0.1 * max(high - low, MIN_RANGE)
         return low - room, high + room

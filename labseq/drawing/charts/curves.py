@@ -18,9 +18,9 @@ COLOURS: Final = (DARK, OTHER, "#2a9d6f", "#a05195")
 MARKERS: Final = "osD^"
 ROOM: Final = 0.12
 """Room above and below the points, relative to their range."""
-LEAST_RANGE: Final = 0.5
+MIN_RANGE: Final = 0.5
 """Least range that is shown, in per cent."""
-LEAST_GAP: Final = 0.09
+MIN_GAP: Final = 0.09
 """Least distance of values, relative to their range, that are all written below the axis."""
 LONG: Final = 4
 """Letters from which on tick labels are turned where there are many."""
@@ -70,7 +70,7 @@ class CurvesChart:
             x = np.concatenate([one.x for one in self.series])
             axes.set_xlim(x.min() - 0.5, x.max() + 0.5)
         low, high = span(self.series)
-        room = ROOM * max(high - low, LEAST_RANGE)
+        room = ROOM * max(high - low, MIN_RANGE)
         axes.set_ylim(0.0 if self.from_zero else low - room, high + room)
         if len(self.series) > 1:
             axes.legend(frameon=False, fontsize=KEY_PT)
@@ -78,7 +78,7 @@ class CurvesChart:
 
 def _are_apart(x: NDArray[np.float64]) -> bool:
     """Whether every value has room for its number."""
-    return len(x) < 2 or bool(np.diff(x).min() >= LEAST_GAP * np.ptp(x) > 0)
+    return len(x) < 2 or bool(np.diff(x).min() >= MIN_GAP * np.ptp(x) > 0)
 
 
 def _make_logarithmic(axes: Axes) -> None:

@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
-MOST_WORDS: Final = 6
+MAX_WORDS: Final = 6
 """Up to so many rows and columns each cell says its value."""
-MOST_TICKS: Final = 10
+MAX_TICKS: Final = 10
 """Up to so many values of an axis are written."""
 
 
@@ -61,7 +61,7 @@ class MapChart:
         axes.grid(visible=False)
         _write_ticks(axes.xaxis, self.x_ticks)
         _write_ticks(axes.yaxis, self.y_ticks)
-        if max(self.values.shape) <= MOST_WORDS:
+        if max(self.values.shape) <= MAX_WORDS:
             self._write_values(axes, low, high)
         finish_bar(axes.figure.colorbar(image, ax=axes, pad=0.02), self.label)
 
@@ -76,6 +76,6 @@ class MapChart:
 
 
 def _write_ticks(axis: Axis, words: tuple[str, ...]) -> None:
-    every = -(-len(words) // MOST_TICKS)
+    every = -(-len(words) // MAX_TICKS)
     at = np.arange(0, len(words), every)
     axis.set_ticks(at, [plain(words[i]) for i in at])

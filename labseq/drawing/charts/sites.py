@@ -17,7 +17,7 @@ from labseq.model import SiteGrid
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-LEAST_RANGE: Final = 0.01
+MIN_RANGE: Final = 0.01
 """Least range of the colours."""
 OUTLINE: Final = "#c8102e"
 LOW_PART: Final = 0.02
@@ -75,4 +75,4 @@ class SitesChart:
         if not len(known):
             return 0.0, 1.0
         low, high = float(np.quantile(known, LOW_PART)), float(known.max())
-        return min(low, high - LEAST_RANGE), high
+        return min(low, high - MIN_RANGE), high

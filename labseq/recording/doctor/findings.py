@@ -50,7 +50,7 @@ class Report:
 
 
 @dataclass(frozen=True, slots=True)
-class Ailment:
+class Damage:
     """Something that is wrong, and the remedy.
 
     Attributes:
@@ -63,21 +63,21 @@ class Ailment:
     what: str
     where: Path
     remedy: str
-    mend: Callable[[], None] | None = None
+    repair: Callable[[], None] | None = None
 
-    def treat(self, *, dry_run: bool) -> Finding:
+    def apply_repair(self, *, dry_run: bool) -> Finding:
         """Mend it, unless that is not possible or only asked for."""
-        if self.mend is None:
+        if self.repair is None:
             return Finding(self.what, self.where, self.remedy, left=True)
         if not dry_run:
             try:
-                self.mend()
+                self.repair()
             except RecordingError as error:
                 return Finding(self.what, self.where, f"not repaired: {error}", left=True)
         return Finding(self.what, self.where, self.remedy, left=dry_run)
 
 
-def quarantined(what: str, path: Path, folder: Path) -> Ailment:
+def quarantined(what: str, path: Path, folder: Path) -> Damage:
     """A file or folder that is moved out of the way.
 
     Args:
@@ -85,7 +85,7 @@ def quarantined(what: str, path: Path, folder: Path) -> Ailment:
         path: It.
         folder: Whose quarantine it comes to.
     """
-    return Ailment(what, path, f"moved to {QUARANTINE}", lambda: move_away(what, path, folder))
+    return Damage(what, path, f"moved to {QUARANTINE}", lambda: move_away(what, path, folder))
 
 
 def move_away(what: str, path: Path, folder: Path) -> None:

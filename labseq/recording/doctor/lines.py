@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from labseq.errors import RecordingError
-from labseq.recording.doctor.findings import Ailment, keep_lines
+from labseq.recording.doctor.findings import Damage, keep_lines
 from labseq.recording.durable import parse_object, whole_lines, write_file
 from labseq.recording.plain import dumps
 
@@ -53,7 +53,7 @@ class LineFile:
         self.removed, self.is_changed = [], False
 
 
-def read_line_file(path: Path) -> tuple[LineFile, list[tuple[bytes, dict[str, Any]]], list[Ailment]]:
+def read_line_file(path: Path) -> tuple[LineFile, list[tuple[bytes, dict[str, Any]]], list[Damage]]:
     """Read a file of JSON lines.
 
     Returns:
@@ -70,17 +70,17 @@ def read_line_file(path: Path) -> tuple[LineFile, list[tuple[bytes, dict[str, An
         raise RecordingError(path, f"cannot be read: {error.strerror}; check the disk") from error
     whole = whole_lines(data)
     file = LineFile(path, whole.split(b"\n")[:-1])
-    ailments: list[Ailment] = []
+    damage: list[Damage] = []
     if torn := data[len(whole) :]:
         file.removed.append(torn)
         file.is_changed = True
-        ailments.append(Ailment("torn last line", path, "moved to quarantine", file.save))
+        damage.append(Damage("torn last line", path, "moved to quarantine", file.save))
     rows: list[tuple[bytes, dict[str, Any]]] = []
     for number, line in enumerate(list(file.lines), start=1):
         row = parse_object(line)
         if row is None:
             file.remove(line)
-            ailments.append(Ailment(f"line {number} is damaged", path, "moved to quarantine", file.save))
+            damage.append(Damage(f"line {number} is damaged", path, "moved to quarantine", file.save))
         else:
             rows.append((line, row))
-    return file, rows, ailments
+    return file, rows, damage

@@ -12,8 +12,8 @@ from typing import Final
 from labseq.errors import RecordingError
 from labseq.recording import folders
 from labseq.recording.active import Marker, markers_in
-from labseq.recording.doctor.findings import QUARANTINE, Ailment, Report, quarantined
-from labseq.recording.doctor.runs import holders_gone, is_there, names_in, treat_run, unreadable
+from labseq.recording.doctor.findings import QUARANTINE, Damage, Report, quarantined
+from labseq.recording.doctor.runs import holders_gone, is_there, names_in, repair_run, unreadable
 
 _RUN_NAME: Final = re.compile(r"\d{4,}_.*", re.DOTALL)
 _CLAIM: Final = re.compile(r"\.\d{4,}\.claim")
@@ -40,10 +40,10 @@ def examine(path: Path, *, dry_run: bool = False) -> Report:
         if run_dir.resolve() in living or _is_being_made(run_dir):
             report.in_progress.append(run_dir)
         else:
-            treat_run(run_dir, report, dry_run=dry_run)
+            repair_run(run_dir, report, dry_run=dry_run)
     if not _is_run(root):
-        ailments = [*map(_stale, (one for one in markers if not one.is_active)), *_check_leftovers(root)]
-        report.findings += [ailment.treat(dry_run=dry_run) for ailment in ailments]
+        damage = [*map(_stale, (one for one in markers if not one.is_active)), *_check_leftovers(root)]
+        report.findings += [damaged_item.apply_repair(dry_run=dry_run) for damaged_item in damage]
     return report
 
 
@@ -62,7 +62,7 @@ def _runs(root: Path, report: Report) -> Iterator[Path]:
         try:
             yield from [folder / inner for inner in names_in(folder) if _is_run(folder / inner)]
         except RecordingError as error:
-            report.findings.append(unreadable(error).treat(dry_run=True))
+            report.findings.append(unreadable(error).apply_repair(dry_run=True))
 
 
 def _is_run(folder: Path) -> bool:
@@ -83,7 +83,7 @@ def _is_young(path: Path) -> bool:
         return False
 
 
-def _check_leftovers(root: Path) -> Iterator[Ailment]:
+def _check_leftovers(root: Path) -> Iterator[Damage]:
     """Claims on numbers, notes on locks, and half-written markers that nobody takes away any more."""
     for folder in (root, *(root / name for name in names_in(root) if not name.startswith("."))):
         names: list[str] = []
@@ -99,7 +99,7 @@ def _check_leftovers(root: Path) -> Iterator[Ailment]:
             yield quarantined("half-written", active / name, active)
 
 
-def _stale(marker: Marker) -> Ailment:
+def _stale(marker: Marker) -> Damage:
     what = "a run died here without making its hardware safe"
     profile = marker.profile or "PROFILE"
-    return Ailment(what, marker.path, f"left: 'labseq safe {profile}', or the next run on it, makes it safe")
+    return Damage(what, marker.path, f"left: 'labseq safe {profile}', or the next run on it, makes it safe")

@@ -10,7 +10,7 @@ from typing import Any
 from labseq.errors import RecordingError
 from labseq.locks import Lock
 from labseq.recording import folders
-from labseq.recording.doctor.findings import Ailment, Finding, Report, move_away, quarantined
+from labseq.recording.doctor.findings import Damage, Finding, Report, move_away, quarantined
 from labseq.recording.doctor.lines import LineFile, read_line_file
 from labseq.recording.doctor.shots import check_shots
 from labseq.recording.durable import parse_object, write_file
@@ -19,7 +19,7 @@ from labseq.recording.process import Owner
 from labseq.recording.run_file import STATUSES, encode_state, is_skip_row, read_run
 
 
-def treat_run(run_dir: Path, report: Report, *, dry_run: bool) -> None:
+def repair_run(run_dir: Path, report: Report, *, dry_run: bool) -> None:
     """Look for damage in a run, and repair what can be repaired, unless it is in progress.
 
     It is looked at again when nobody else can go on with it.
@@ -28,10 +28,10 @@ def treat_run(run_dir: Path, report: Report, *, dry_run: bool) -> None:
         report.in_progress.append(run_dir)
         return
     report.findings += [
-        ailment.treat(dry_run=dry_run) for ailment in holders_gone(run_dir)
+        damaged_item.apply_repair(dry_run=dry_run) for damaged_item in holders_gone(run_dir)
     ]  # no lock keeps them
     checked = _Checked.of(run_dir)
-    if checked.ailments and not dry_run:
+    if checked.damage and not dry_run:
         lock = Lock(run_dir / folders.LOCK_FILE, "labseq doctor")
         try:
             held = lock.take() is not None
@@ -42,12 +42,12 @@ def treat_run(run_dir: Path, report: Report, *, dry_run: bool) -> None:
                 report.in_progress.append(run_dir)
                 return
             checked = _Checked.of(run_dir)
-            report.findings += [ailment.treat(dry_run=False) for ailment in checked.ailments]
+            report.findings += [damaged_item.apply_repair(dry_run=False) for damaged_item in checked.damage]
             report.findings += checked.save()
         finally:
             lock.release()
     else:
-        report.findings += [ailment.treat(dry_run=True) for ailment in checked.ailments]
+        report.findings += [damaged_item.apply_repair(dry_run=True) for damaged_item in checked.damage]
     report.n_runs += 1
     report.n_shots += checked.n_whole
 
@@ -62,7 +62,7 @@ class _Checked:
     """
 
     def __init__(self) -> None:
-        self.ailments: list[Ailment] = []
+        self.damage: list[Damage] = []
         self.files: list[LineFile] = []
         self.n_whole = 0
 
@@ -74,19 +74,19 @@ class _Checked:
             checked._look(run_dir)
         except OSError as error:
             what = f"cannot be read: {str(error.strerror).lower()}"
-            checked.ailments.append(Ailment(what, run_dir, "left: check its permissions and the disk"))
+            checked.damage.append(Damage(what, run_dir, "left: check its permissions and the disk"))
         except RecordingError as error:
-            checked.ailments.append(unreadable(error))
+            checked.damage.append(unreadable(error))
         return checked
 
     def _look(self, run_dir: Path) -> None:
         shots = run_dir / folders.SHOTS_FOLDER
         if not (run_dir / folders.RUN_FILE).exists():
-            self.ailments.append(_without_run_file(run_dir, shots))
+            self.damage.append(_without_run_file(run_dir, shots))
             return
         record = read_run(run_dir)
         results = run_dir / folders.RESULTS_FOLDER
-        self.ailments += [
+        self.damage += [
             quarantined("half-written", folder / name, run_dir)
             for folder in (run_dir, shots, results)
             for name in names_in(folder)
@@ -94,28 +94,28 @@ class _Checked:
         ]
         if (run_dir / folders.STOP_FILE).exists():
             what = "a request to stop that nobody followed"
-            self.ailments.append(quarantined(what, run_dir / folders.STOP_FILE, run_dir))
-        self.ailments += _check_state(run_dir)
+            self.damage.append(quarantined(what, run_dir / folders.STOP_FILE, run_dir))
+        self.damage += _check_state(run_dir)
         found = check_shots(run_dir, str(record.get("run_id")))
         self.n_whole = found.n_whole
-        self.ailments += found.ailments
+        self.damage += found.damage
         self.files.append(found.index)
         self._look_at_skipped(run_dir / folders.SKIPPED_FILE, record["n_shots"])
         logs = [results / name for name in names_in(results) if name.endswith(".jsonl")]
         for path in (run_dir / folders.EVENTS_FILE, *logs):
-            file, _, ailments = read_line_file(path)
+            file, _, damage = read_line_file(path)
             self.files.append(file)
-            self.ailments += ailments
+            self.damage += damage
 
     def _look_at_skipped(self, path: Path, n_shots: int) -> None:
-        file, lines, ailments = read_line_file(path)
+        file, lines, damage = read_line_file(path)
         self.files.append(file)
-        self.ailments += ailments
+        self.damage += damage
         for line, row in lines:
             if not is_skip_row(row, n_shots):
                 file.remove(line)
                 what = "a line names no shots of this run, or no reason"
-                self.ailments.append(Ailment(what, path, "moved to quarantine", file.save))
+                self.damage.append(Damage(what, path, "moved to quarantine", file.save))
 
     def save(self) -> list[Finding]:
         """Write the files of lines that have changed; what cannot be written is told."""
@@ -128,15 +128,15 @@ class _Checked:
         return findings
 
 
-def _without_run_file(run_dir: Path, shots: Path) -> Ailment:
+def _without_run_file(run_dir: Path, shots: Path) -> Damage:
     if any(name.endswith(".h5") for name in names_in(shots)):
         remedy = "left: take it from a backup, then run this again"
-        return Ailment(f"{folders.RUN_FILE} is missing", run_dir, remedy)
+        return Damage(f"{folders.RUN_FILE} is missing", run_dir, remedy)
     what = "the run died while its folder was made; it holds no shots"
     return quarantined(what, run_dir, run_dir.parent)
 
 
-def _check_state(run_dir: Path) -> list[Ailment]:
+def _check_state(run_dir: Path) -> list[Damage]:
     path = run_dir / folders.STATE_FILE
     state = _state(run_dir)
     if state.get("state") not in STATUSES:
@@ -147,7 +147,7 @@ def _check_state(run_dir: Path) -> list[Ailment]:
                 move_away(what, path, run_dir)
             write_file(path, encode_state("failed", f"interrupted: {what}"))
 
-        return [Ailment(what, path, "marked as interrupted", renew)]
+        return [Damage(what, path, "marked as interrupted", renew)]
     if state["state"] != "running":
         return []
 
@@ -155,7 +155,7 @@ def _check_state(run_dir: Path) -> list[Ailment]:
         ended = {**state, "state": "failed", "error": "interrupted: the process that ran it is gone"}
         write_file(path, dumps(ended).encode() + b"\n")
 
-    return [Ailment("the run has no end, and its process is gone", path, "marked as interrupted", close)]
+    return [Damage("the run has no end, and its process is gone", path, "marked as interrupted", close)]
 
 
 def _goes_on(run_dir: Path) -> bool:
@@ -172,7 +172,7 @@ def _state(run_dir: Path) -> dict[str, Any]:
         return {}
 
 
-def holders_gone(folder: Path) -> Iterator[Ailment]:
+def holders_gone(folder: Path) -> Iterator[Damage]:
     """Notes on who holds a lock, left by processes of this computer that are gone."""
     try:
         names = names_in(folder)
@@ -189,10 +189,10 @@ def holders_gone(folder: Path) -> Iterator[Ailment]:
             yield quarantined("a lock whose holder is gone", folder / name, folder)
 
 
-def unreadable(error: RecordingError) -> Ailment:
+def unreadable(error: RecordingError) -> Damage:
     """What cannot be read, which only the user can mend."""
     what, _, advice = str(error).removeprefix(f"{error.path}: ").partition("; ")
-    return Ailment(what, Path(error.path), f"left: {advice or what}")
+    return Damage(what, Path(error.path), f"left: {advice or what}")
 
 
 def is_there(path: Path) -> bool:

@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from labseq.errors import RecordingError
 from labseq.recording import folders
-from labseq.recording.doctor.findings import Ailment, move_away, quarantined
+from labseq.recording.doctor.findings import Damage, move_away, quarantined
 from labseq.recording.doctor.lines import LineFile, read_line_file
 from labseq.recording.run_file import NewerFormatError, index_row, is_index_row
 
@@ -30,7 +30,7 @@ class ShotsCheck:
         n_whole: Shots that are whole.
     """
 
-    ailments: list[Ailment]
+    damage: list[Damage]
     index: LineFile
     n_whole: int
 
@@ -45,7 +45,7 @@ def check_shots(run_dir: Path, run_id: str) -> ShotsCheck:
     Raises:
         RecordingError: The index or the folder of the shots cannot be read.
     """
-    index, lines, ailments = read_line_file(run_dir / folders.INDEX_FILE)
+    index, lines, damage = read_line_file(run_dir / folders.INDEX_FILE)
     of_file: dict[str, list[Line]] = {}
     for line, row in lines:
         if _fits(row):
@@ -53,17 +53,17 @@ def check_shots(run_dir: Path, run_id: str) -> ShotsCheck:
         else:
             index.remove(line)
             what = "a line of the index is no shot's"
-            ailments.append(Ailment(what, index.path, "moved to quarantine", index.save))
+            damage.append(Damage(what, index.path, "moved to quarantine", index.save))
     n_whole = 0
     for file, same in of_file.items():
         found = _check_file(run_dir / file, same, index)
-        ailments += found
+        damage += found
         n_whole += not any(one.where == run_dir / file for one in found)
     n_lines = len(index.lines)
     counted = frozenset(row["shot"] for same in of_file.values() for _, row in same if row["counts"])
     for path in _without_line(run_dir, of_file):
-        ailments.append(_check_stray(run_dir, path, run_id, index, counted))
-    return ShotsCheck(ailments, index, n_whole + len(index.lines) - n_lines)
+        damage.append(_check_stray(run_dir, path, run_id, index, counted))
+    return ShotsCheck(damage, index, n_whole + len(index.lines) - n_lines)
 
 
 def _fits(row: Mapping[str, Any]) -> bool:
@@ -90,7 +90,7 @@ def _without_line(run_dir: Path, of_file: Mapping[str, object]) -> list[Path]:
     ]
 
 
-def _check_file(path: Path, lines: list[Line], index: LineFile) -> list[Ailment]:
+def _check_file(path: Path, lines: list[Line], index: LineFile) -> list[Damage]:
     """A file that has lines in the index: it must be there as it was written, and one line is enough."""
     try:
         data = path.read_bytes()
@@ -98,7 +98,7 @@ def _check_file(path: Path, lines: list[Line], index: LineFile) -> list[Ailment]
         for line, _ in lines:
             index.remove(line)
         remedy = "its line moved to quarantine; if you find the file, put it back and run this again"
-        return [Ailment("the shot's file is missing", path, remedy, index.save)]
+        return [Damage("the shot's file is missing", path, remedy, index.save)]
     except OSError as error:
         return [_unreadable(path, error)]
     sha256 = hashlib.sha256(data).hexdigest()
@@ -106,16 +106,16 @@ def _check_file(path: Path, lines: list[Line], index: LineFile) -> list[Ailment]
     if not good:
         return [_changed(path, data, lines, index)]
     kept = max(i for i, (line, _) in enumerate(lines) if line == good[-1])
-    ailments: list[Ailment] = []
+    damage: list[Damage] = []
     for i, (line, _) in enumerate(lines):
         if i != kept:
             index.remove(line)
             what = f"a second line for {path.name}"
-            ailments.append(Ailment(what, index.path, "moved to quarantine", index.save))
-    return ailments
+            damage.append(Damage(what, index.path, "moved to quarantine", index.save))
+    return damage
 
 
-def _changed(path: Path, data: bytes, lines: list[Line], index: LineFile) -> Ailment:
+def _changed(path: Path, data: bytes, lines: list[Line], index: LineFile) -> Damage:
     n_bytes = lines[-1][1].get("bytes")
     what = "the checksum does not hold: a byte has changed since it was written"
     if not data:
@@ -123,15 +123,15 @@ def _changed(path: Path, data: bytes, lines: list[Line], index: LineFile) -> Ail
     elif isinstance(n_bytes, int) and len(data) < n_bytes:
         what = f"the shot's file is cut off: {len(data)} of {n_bytes} bytes"
 
-    def mend() -> None:
+    def repair() -> None:
         move_away(what, path, path.parent.parent)
         for line, _ in lines:
             index.remove(line)
 
-    return Ailment(what, path, "moved to quarantine, with its line", mend)
+    return Damage(what, path, "moved to quarantine, with its line", repair)
 
 
-def _check_stray(run_dir: Path, path: Path, run_id: str, index: LineFile, counted: Container[int]) -> Ailment:
+def _check_stray(run_dir: Path, path: Path, run_id: str, index: LineFile, counted: Container[int]) -> Damage:
     """A file without a line: it gets one if it is a whole shot of this run.
 
     Of a shot that has another line, that goes on to count: the last one does.
@@ -146,7 +146,7 @@ def _check_stray(run_dir: Path, path: Path, run_id: str, index: LineFile, counte
         content = read_content(path)
         read_frames(path)
     except NewerFormatError as error:
-        return Ailment("no line in the index", path, f"left: {_reason(error)}")
+        return Damage("no line in the index", path, f"left: {_reason(error)}")
     except RecordingError as error:
         return quarantined(f"no line in the index, and {_reason(error).partition('; ')[0]}", path, run_dir)
     record, file = content.record, path.relative_to(run_dir).as_posix()
@@ -158,11 +158,11 @@ def _check_stray(run_dir: Path, path: Path, run_id: str, index: LineFile, counte
     sha256 = hashlib.sha256(data).hexdigest()
     row = index_row(record, content.target, file=file, sha256=sha256, n_bytes=len(data))
     index.add(row, first=record.shot_index in counted)
-    return Ailment("no line in the index", path, "line added: the file is whole", index.save)
+    return Damage("no line in the index", path, "line added: the file is whole", index.save)
 
 
-def _unreadable(path: Path, error: OSError) -> Ailment:
-    return Ailment(f"cannot be read: {error.strerror}", path, "left: check its permissions and the disk")
+def _unreadable(path: Path, error: OSError) -> Damage:
+    return Damage(f"cannot be read: {error.strerror}", path, "left: check its permissions and the disk")
 
 
 def _reason(error: RecordingError) -> str:

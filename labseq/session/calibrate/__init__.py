@@ -2,6 +2,6 @@
 
 from labseq.session.calibrate.kinds import METHODS
 from labseq.session.calibrate.making import CalibrationRequest, Outcome, calibrate
-from labseq.session.calibrate.method import Evidence, Finding, Method
+from labseq.session.calibrate.method import CalibrationData, AnalysisResult, Method
 
-__all__ = ["METHODS", "CalibrationRequest", "Evidence", "Finding", "Method", "Outcome", "calibrate"]
+__all__ = ["METHODS", "CalibrationRequest", "CalibrationData", "AnalysisResult", "Method", "Outcome", "calibrate"]

@@ -11,10 +11,10 @@ import numpy as np
 from labseq.drawing.survival import draw_tone_offsets
 from labseq.model import CalibrationKind
 from labseq.motion import fit_frequencies
-from labseq.session.calibrate.method import Evidence, Finding, from_runs_only, packaged
-from labseq.session.calibrate.overlay import told_offset
+from labseq.session.calibrate.method import CalibrationData, AnalysisResult, from_runs_only, packaged
+from labseq.session.calibrate.overlay import offset_text
 from labseq.session.calibrate.probing import read_probed
-from labseq.session.choosing import Bench
+from labseq.session.choosing import ResolvedProfile
 from labseq.units import format_quantity
 
 _SEQUENCE: Final = packaged("frequencies")
@@ -29,7 +29,7 @@ class FrequenciesMethod:
     aside: tuple[CalibrationKind, ...] = ()
     is_blind: bool = False
 
-    def analyse(self, evidence: Evidence) -> Finding:
+    def analyse(self, evidence: CalibrationData) -> AnalysisResult:
         """Find the tones that put the tweezers of each row and column onto the sites.
 
         What an overlay makes up for is in them.
@@ -49,19 +49,19 @@ class FrequenciesMethod:
             "n_atoms": float(fit.overlay.n_atoms),
         }
         worst, error = (format_quantity(value, "length") for value in (worst_m, fit.error_m))
-        told = (
-            told_offset(fit.overlay, probed),
+        summary_lines = (
+            offset_text(fit.overlay, probed),
             f"single rows and columns stood up to {worst} beside that, known to {error} r.m.s.",
         )
-        return Finding(
+        return AnalysisResult(
             {"row_hz": fit.row_hz, "column_hz": fit.column_hz},
             quality,
-            told,
+            summary_lines,
             {"calibrations": probed.calibrations},
             lambda: draw_tone_offsets((row_m, fit.row_error_m), (column_m, fit.column_error_m)),
         )
 
-    def read(self, path: Path, bench: Bench) -> Finding:
+    def read(self, path: Path, bench: ResolvedProfile) -> AnalysisResult:
         """Refuse: they must be measured; known ones stand in the profile's ``grid``."""
         del bench
         raise from_runs_only(self.kind, path)

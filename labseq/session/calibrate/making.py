@@ -21,12 +21,12 @@ from labseq.errors import ConfigError, LabseqError, Problem, RecordingError
 from labseq.model import CALIBRATION_KINDS, CalibrationEntry, grid_facts, same_grid
 from labseq.recording import Run, open_run
 from labseq.roles import RunObserver
-from labseq.session.calibrate.method import Evidence, Finding, Method
+from labseq.session.calibrate.method import CalibrationData, AnalysisResult, Method
 from labseq.session.calibrating import store_of, why_left_out
-from labseq.session.choosing import Bench, DryRun
+from labseq.session.choosing import ResolvedProfile, DryRun
 from labseq.session.plan_inputs import recorded_machine
 from labseq.session.session import Session
-from labseq.session.setting_up import set_up_bench
+from labseq.session.setting_up import resolve_profile
 
 PICTURE_DPI: Final = 110
 VALUE_FILES: Final = (".npy", ".csv")
@@ -76,7 +76,7 @@ class Outcome:
     """
 
     stored: Stored
-    told: tuple[str, ...]
+    summary_lines: tuple[str, ...]
     before: CalibrationEntry | None
     changes: tuple[Difference, ...]
     run: Run | None
@@ -100,7 +100,7 @@ def calibrate(method: Method, request: CalibrationRequest, observer: RunObserver
     overrides = _of_profile(request.overrides)
     document, spec = load_profile(request.profile, beside=Path(), overrides=overrides)
     aside = _aside(store_of(document, spec).folder, spec, method)
-    bench = set_up_bench(request.profile, Path(), _of_profile([*request.overrides, aside]), request.dry_run)
+    bench = resolve_profile(request.profile, Path(), _of_profile([*request.overrides, aside]), request.dry_run)
     run, finding = _find(method, request, bench, aside, observer)
     entry = CalibrationEntry(
         kind=method.kind,
@@ -116,23 +116,23 @@ def calibrate(method: Method, request: CalibrationRequest, observer: RunObserver
     refused = "" if request.force else why_left_out(entry, bench.calibrations) or store.why_worse(entry)
     if not refused:
         store.use(stored, bench.grid, force=True)
-        warnings += _put_aside(store, entry)
+        warnings += _deactivate_overlay(store, entry)
     if pin := spec.calibrations.use.of(method.kind):
         warnings += (f"the profile says 'calibrations.use.{method.kind}: {clean(pin)}', and that counts",)
     changes = () if before is None else tuple(compare(before, entry)[0])
-    return Outcome(stored, finding.told, before, changes, run, refused, warnings)
+    return Outcome(stored, finding.summary_lines, before, changes, run, refused, warnings)
 
 
 def _find(
-    method: Method, request: CalibrationRequest, bench: Bench, aside: str, observer: RunObserver | None
-) -> tuple[Run | None, Finding]:
+    method: Method, request: CalibrationRequest, bench: ResolvedProfile, aside: str, observer: RunObserver | None
+) -> tuple[Run | None, AnalysisResult]:
     """Measure, or read what was measured, and analyse it."""
     source = request.source
     if source is not None and source.suffix.lower() in VALUE_FILES:
         return None, method.read(source, bench)
     run = _measure(method, request, aside, observer) if source is None else _open(source, request, bench)
     try:
-        return run, method.analyse(Evidence(run, bench))
+        return run, method.analyse(CalibrationData(run, bench))
     except LabseqError:
         if observer is not None:
             text = f"no calibration came of it, and what is in use stays; the run is kept: --from {run.path}"
@@ -157,7 +157,7 @@ def _measure(method: Method, request: CalibrationRequest, aside: str, observer: 
         return session.run()
 
 
-def _open(source: Path, request: CalibrationRequest, bench: Bench) -> Run:
+def _open(source: Path, request: CalibrationRequest, bench: ResolvedProfile) -> Run:
     """Open the run that is to be analysed.
 
     Raises:
@@ -198,7 +198,7 @@ def _of_profile(overrides: Sequence[str]) -> list[Override]:
     return split_overrides(overrides)[1]
 
 
-def _origin(method: Method, request: CalibrationRequest, bench: Bench, run: Run | None) -> dict[str, Any]:
+def _origin(method: Method, request: CalibrationRequest, bench: ResolvedProfile, run: Run | None) -> dict[str, Any]:
     origin: dict[str, Any] = {
         "command": f"labseq calibrate {method.kind}",
         "profile": bench.profile.name,
@@ -220,7 +220,7 @@ def _in_use(store: Store, entry: CalibrationEntry) -> CalibrationEntry | None:
     return stored.entry if stored is not None and same_grid(stored.entry.grid, entry.grid) else None
 
 
-def _put_aside(store: Store, entry: CalibrationEntry) -> tuple[str, ...]:
+def _deactivate_overlay(store: Store, entry: CalibrationEntry) -> tuple[str, ...]:
     """Put the overlay aside that new frequencies hold already; what was put aside, in words."""
     overlay = store.active().get("overlay")
     if entry.kind != "frequencies" or overlay is None:
@@ -229,7 +229,7 @@ def _put_aside(store: Store, entry: CalibrationEntry) -> tuple[str, ...]:
     return (f"overlay {overlay.id} is put aside: these frequencies hold what it makes up for",)
 
 
-def _picture(finding: Finding) -> tuple[bytes | None, tuple[str, ...]]:
+def _picture(finding: AnalysisResult) -> tuple[bytes | None, tuple[str, ...]]:
     """The picture as PNG, and why there is none."""
     if finding.draw is None:
         return None, ()

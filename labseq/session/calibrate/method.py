@@ -15,18 +15,18 @@ from labseq.model import CalibrationKind, Frame
 from labseq.recording import Run
 from labseq.roles import Detector
 from labseq.sequencer import StopFlag, VirtualClock
-from labseq.session.choosing import Bench
+from labseq.session.choosing import ResolvedProfile
 from labseq.session.constructing import construct
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-LEAST_FULL: Final = 20
+MIN_FULL: Final = 20
 """Saturated pixels that a frame may have whatever its size: hot ones, cosmic rays."""
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class AnalysisResult:
     """What came of an analysis.
 
     Attributes:
@@ -39,13 +39,13 @@ class Finding:
 
     values: Mapping[str, ArrayLike]
     quality: Mapping[str, float]
-    told: tuple[str, ...]
+    summary_lines: tuple[str, ...]
     origin: Mapping[str, Any] = field(default_factory=dict[str, Any])
     draw: Callable[[], Figure] | None = None
 
 
 @dataclass(frozen=True, slots=True)
-class Evidence:
+class CalibrationData:
     """A run, and the profile that it is analysed for.
 
     Attributes:
@@ -54,7 +54,7 @@ class Evidence:
     """
 
     run: Run
-    bench: Bench
+    bench: ResolvedProfile
 
     def frames(self) -> Iterator[Frame]:
         """The frame of the first image of each shot: of randomly loaded atoms, before any move.
@@ -88,7 +88,7 @@ class Evidence:
 
     def _refuse_saturated(self, frame: Frame, shot: int) -> None:
         n_full = int(np.count_nonzero(frame.image == np.iinfo(frame.image.dtype).max))
-        if n_full > max(LEAST_FULL, self.bench.grid.n_rows * self.bench.grid.n_cols // 20):
+        if n_full > max(MIN_FULL, self.bench.grid.n_rows * self.bench.grid.n_cols // 20):
             text = f"{n_full} pixels of the first frame of shot {shot + 1} are saturated"
             raise DeviceError(frame.camera, f"{text}; use less light, gain or exposure")
 
@@ -125,7 +125,7 @@ class Method(Protocol):
         """Whether the run needs no detector, which may not know yet where to look."""
         ...
 
-    def analyse(self, evidence: Evidence) -> Finding:
+    def analyse(self, evidence: CalibrationData) -> AnalysisResult:
         """Make a calibration of a run.
 
         Raises:
@@ -133,7 +133,7 @@ class Method(Protocol):
         """
         ...
 
-    def read(self, path: Path, bench: Bench) -> Finding:
+    def read(self, path: Path, bench: ResolvedProfile) -> AnalysisResult:
         """Make a calibration of a file with its values.
 
         Raises:

@@ -12,9 +12,9 @@ from labseq.drawing.survival import draw_survival
 from labseq.model import CalibrationKind
 from labseq.motion import OverlayFit, fit_overlay, overlay_offset
 from labseq.motion.survival import distance_m, unit_axes
-from labseq.session.calibrate.method import Evidence, Finding, from_runs_only, packaged
-from labseq.session.calibrate.probing import Probed, read_probed
-from labseq.session.choosing import Bench
+from labseq.session.calibrate.method import CalibrationData, AnalysisResult, from_runs_only, packaged
+from labseq.session.calibrate.probing import ProbeCounts, read_probed
+from labseq.session.choosing import ResolvedProfile
 from labseq.units import format_quantity
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ class OverlayMethod:
     aside: tuple[CalibrationKind, ...] = ()
     is_blind: bool = False
 
-    def analyse(self, evidence: Evidence) -> Finding:
+    def analyse(self, evidence: CalibrationData) -> AnalysisResult:
         """Find the offset at which most atoms survive.
 
         Raises:
@@ -49,21 +49,21 @@ class OverlayMethod:
             "n_atoms": float(fit.n_atoms),
             **shape,
         }
-        return Finding(
+        return AnalysisResult(
             {"offset_m": offset_m, **{name: np.array(value) for name, value in shape.items()}},
             quality,
-            (f"{told_offset(fit, probed)}, known to {format_quantity(float(fit.error_m.max()), 'length')}",),
+            (f"{offset_text(fit, probed)}, known to {format_quantity(float(fit.error_m.max()), 'length')}",),
             {"calibrations": probed.calibrations},
             lambda: draw_fit(probed, fit),
         )
 
-    def read(self, path: Path, bench: Bench) -> Finding:
+    def read(self, path: Path, bench: ResolvedProfile) -> AnalysisResult:
         """Refuse: it must be measured."""
         del bench
         raise from_runs_only(self.kind, path)
 
 
-def told_offset(fit: OverlayFit, probed: Probed) -> str:
+def offset_text(fit: OverlayFit, probed: ProbeCounts) -> str:
     """Where the mobile tweezers stood in the run, in words."""
     along, across = (format_quantity(float(-centre), "length") for centre in fit.centre_m)
     use = "" if not np.any(probed.in_use_m) else " beyond what the overlay in use made up for"
@@ -71,7 +71,7 @@ def told_offset(fit: OverlayFit, probed: Probed) -> str:
     return f"{fit.n_atoms} atoms: the mobile tweezers stood {where}"
 
 
-def draw_fit(probed: Probed, fit: OverlayFit) -> Figure:
+def draw_fit(probed: ProbeCounts, fit: OverlayFit) -> Figure:
     """Draw survival along both axes, and what was fitted."""
     axes = unit_axes(probed.grid)
     n = probed.n_before.sum(axis=(1, 2))

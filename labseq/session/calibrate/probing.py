@@ -17,7 +17,7 @@ _ADDRESS = ".probe.offset"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Probed:
+class ProbeCounts:
     """What a scan of the probe's offset saw.
 
     Attributes:
@@ -39,7 +39,7 @@ class Probed:
     calibrations: dict[str, str]
 
 
-def read_probed(run: Run) -> Probed:
+def read_probed(run: Run) -> ProbeCounts:
     """Count, at each offset and on each site, the atoms before and after the probe.
 
     Raises:
@@ -67,7 +67,7 @@ def read_probed(run: Run) -> Probed:
     in_use_m = np.zeros(2)
     if "overlay" in calibrations:
         in_use_m = read_entry(run.path / "calibration_overlay.json").values["offset_m"]
-    return Probed(
+    return ProbeCounts(
         np.array([*before]),
         np.stack([*before.values()]),
         np.stack([*after.values()]),

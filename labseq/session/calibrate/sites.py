@@ -13,8 +13,8 @@ from labseq.errors import ConfigError, Problem
 from labseq.imaging.known_sites import read_sites
 from labseq.imaging.lattice import FoundLattice, find_lattice
 from labseq.model import CalibrationKind
-from labseq.session.calibrate.method import Evidence, Finding, mean_of, packaged
-from labseq.session.choosing import Bench
+from labseq.session.calibrate.method import CalibrationData, AnalysisResult, mean_of, packaged
+from labseq.session.choosing import ResolvedProfile
 from labseq.units import format_quantity
 
 _SEQUENCE: Final = packaged("sites")
@@ -29,7 +29,7 @@ class SitesMethod:
     aside: tuple[CalibrationKind, ...] = ("sites", "thresholds")
     is_blind: bool = True
 
-    def analyse(self, evidence: Evidence) -> Finding:
+    def analyse(self, evidence: CalibrationData) -> AnalysisResult:
         """Find the lattice on the mean of the run's frames.
 
         Raises:
@@ -49,12 +49,12 @@ class SitesMethod:
             "pixel_size_m": found.pixel_size_m,
         }
         values = {"positions_px": found.positions_px, "frame": found.frame}
-        told = _told(found, n_frames)
-        return Finding(
-            values, quality, told, draw=lambda: draw_sites(mean, found.positions_px, found.residuals_px)
+        summary_lines = _summary_lines(found, n_frames)
+        return AnalysisResult(
+            values, quality, summary_lines, draw=lambda: draw_sites(mean, found.positions_px, found.residuals_px)
         )
 
-    def read(self, path: Path, bench: Bench) -> Finding:
+    def read(self, path: Path, bench: ResolvedProfile) -> AnalysisResult:
         """Take the sites from a file; the frames that they belong to are those of the detector's settings.
 
         Raises:
@@ -69,11 +69,11 @@ class SitesMethod:
         if np.any((positions < 0) | (positions > np.array(frame) - 1)):
             what = f"some of the sites are beside the frame of {frame[0]} x {frame[1]} pixels"
             raise ConfigError(Problem(what, str(path), expected="(y, x) of each site on the frame"))
-        told = (f"{positions[..., 0].size} sites read from {path}",)
-        return Finding({"positions_px": positions, "frame": frame}, {}, told)
+        summary_lines = (f"{positions[..., 0].size} sites read from {path}",)
+        return AnalysisResult({"positions_px": positions, "frame": frame}, {}, summary_lines)
 
 
-def _told(found: FoundLattice, n_frames: int) -> tuple[str, ...]:
+def _summary_lines(found: FoundLattice, n_frames: int) -> tuple[str, ...]:
     along, down = found.spacing_px
     angle, pixel = format_quantity(found.angle_rad, "angle"), format_quantity(found.pixel_size_m, "length")
     seen = f"{found.n_sites_found} of {found.found.size} sites found on the mean of {n_frames} frames"

@@ -13,9 +13,9 @@ from labseq.drawing.calibrations import draw_thresholds
 from labseq.errors import ConfigError, Problem
 from labseq.imaging.peaks import FittedThresholds, fit_thresholds
 from labseq.model import CalibrationKind
-from labseq.roles import SignalTeller
-from labseq.session.calibrate.method import Evidence, Finding, from_runs_only, packaged
-from labseq.session.choosing import Bench
+from labseq.roles import ReportsSignals
+from labseq.session.calibrate.method import CalibrationData, AnalysisResult, from_runs_only, packaged
+from labseq.session.choosing import ResolvedProfile
 
 MAX_NAMED: Final = 8
 """Sites that are named; of more, only the number is told."""
@@ -32,7 +32,7 @@ class ThresholdsMethod:
     aside: tuple[CalibrationKind, ...] = ("thresholds",)
     is_blind: bool = True
 
-    def analyse(self, evidence: Evidence) -> Finding:
+    def analyse(self, evidence: CalibrationData) -> AnalysisResult:
         """Fit the signals that the profile's detector makes of the run's frames.
 
         Raises:
@@ -42,7 +42,7 @@ class ThresholdsMethod:
             ConfigError: The detector does not tell its signals, or the run has no frames.
         """
         detector = evidence.detector()
-        if not isinstance(detector, SignalTeller):
+        if not isinstance(detector, ReportsSignals):
             name = evidence.bench.chosen["detector"].entry.name
             what = f"the detector '{name}' does not tell the signals that it compares"
             raise ConfigError(Problem(what, expected="'threshold', 'weighted', or another that does"))
@@ -56,21 +56,21 @@ class ThresholdsMethod:
             "n_one_peak": float((fitted.never_loaded | fitted.always_loaded).sum()),
         }
         unit = detector.signal_unit
-        return Finding(
+        return AnalysisResult(
             {"thresholds": fitted.thresholds},
             quality,
-            _told(fitted, len(signals), unit),
+            _summary_lines(fitted, len(signals), unit),
             {"unit": unit, "detector": evidence.bench.chosen["detector"].dump()},
             lambda: draw_thresholds(signals, fitted.thresholds, unit),
         )
 
-    def read(self, path: Path, bench: Bench) -> Finding:
+    def read(self, path: Path, bench: ResolvedProfile) -> AnalysisResult:
         """Refuse: a file of thresholds is a setting of the detector."""
         del bench
         raise from_runs_only(self.kind, path)
 
 
-def _told(fitted: FittedThresholds, n_frames: int, unit: str) -> tuple[str, ...]:
+def _summary_lines(fitted: FittedThresholds, n_frames: int, unit: str) -> tuple[str, ...]:
     low, high = fitted.thresholds.min(), fitted.thresholds.max()
     missed, imagined = fitted.false_negative.mean(), fitted.false_positive.mean()
     loading = f"{100 * fitted.loading.mean():.1f} % of the sites hold atoms"

@@ -14,8 +14,8 @@ from labseq.errors import ConfigError, Problem
 from labseq.model import CalibrationKind
 from labseq.recording import Run
 from labseq.sequencer.equalise import READINGS
-from labseq.session.calibrate.method import Evidence, Finding, from_runs_only, packaged
-from labseq.session.choosing import Bench
+from labseq.session.calibrate.method import CalibrationData, AnalysisResult, from_runs_only, packaged
+from labseq.session.choosing import ResolvedProfile
 
 _SEQUENCE: Final = packaged("tweezers")
 
@@ -29,7 +29,7 @@ class TweezersMethod:
     aside: tuple[CalibrationKind, ...] = ()
     is_blind: bool = True
 
-    def analyse(self, evidence: Evidence) -> Finding:
+    def analyse(self, evidence: CalibrationData) -> AnalysisResult:
         """Read what the loop found in the run's last shot.
 
         Raises:
@@ -50,14 +50,14 @@ class TweezersMethod:
         n_rounds = len(found["spreads"])
         work = f"{n_rounds} round{'s' * (n_rounds > 1)}, {found['n_measured']} measurements"
         even = f"{quality['separable_spread']:.2%} (before: {found['spreads'][0]:.2%})"
-        told = (
+        summary_lines = (
             f"{work}: rows and columns are even to {even}",
             f"what they cannot even out: {quality['residual_spread']:.1%} from site to site",
         )
         values: dict[str, NDArray[np.float64]] = {"row_amplitudes": rows, "column_amplitudes": cols}
-        return Finding(values, quality, told, draw=lambda: draw_powers(before, after, rows, cols))
+        return AnalysisResult(values, quality, summary_lines, draw=lambda: draw_powers(before, after, rows, cols))
 
-    def read(self, path: Path, bench: Bench) -> Finding:
+    def read(self, path: Path, bench: ResolvedProfile) -> AnalysisResult:
         """Refuse: it must be measured."""
         del bench
         raise from_runs_only(self.kind, path)

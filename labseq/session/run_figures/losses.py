@@ -7,14 +7,14 @@ import math
 import numpy as np
 
 from labseq.drawing import Series
-from labseq.drawing.charts import CausesChart, CurvesChart, DefectsChart, SitesChart, StageBar, StagesChart
+from labseq.drawing.charts import LossCausesChart, CurvesChart, DefectsChart, SitesChart, StageBar, StagesChart
 from labseq.model.estimate import mean
 from labseq.recording import Run
 from labseq.recording.rates import Rate, jeffreys
 from labseq.recording.statistics import Statistics
 from labseq.session.run_figures.measures import series_of
 from labseq.session.run_figures.sampling import part_of
-from labseq.session.run_figures.survival import Survival, Tracked
+from labseq.session.run_figures.survival import Survival, SurvivalCounts
 from labseq.session.run_figures.timing import STEP, RunTiming
 from labseq.session.shot_grid import grid_of
 
@@ -32,7 +32,7 @@ def survival_charts(run: Run, survival: Survival) -> tuple[SitesChart, ...]:
     )
 
 
-def _map(run: Run, tracked: Tracked, title: str) -> SitesChart:
+def _map(run: Run, tracked: SurvivalCounts, title: str) -> SitesChart:
     target = run.target
     return SitesChart(title, "there on the next image (%)", grid_of(run), tracked.fractions, target.fill)
 
@@ -56,12 +56,12 @@ def lost_by_cycle(run: Run, survival: Survival) -> CurvesChart | None:
     return CurvesChart(title, "cycle", "lost (%)", shown, whole=True, from_zero=True) if shown else None
 
 
-def _lost(tracked: Tracked) -> Rate:
+def _lost(tracked: SurvivalCounts) -> Rate:
     rate = tracked.rate
     return Rate(rate.n_trials - rate.n, rate.n_trials)
 
 
-def causes_chart(statistics: Statistics) -> CausesChart | None:
+def causes_chart(statistics: Statistics) -> LossCausesChart | None:
     """What a simulation's atoms were lost to; None where that is not known, or none were lost."""
     worst = sorted(statistics.losses.items(), key=lambda item: -item[1].value)
     shown = [(cause.replace("_", " "), loss) for cause, loss in worst if loss.value > 0]
@@ -69,7 +69,7 @@ def causes_chart(statistics: Statistics) -> CausesChart | None:
         return None
     causes, losses = zip(*shown, strict=True)
     means, errors = np.array([[loss.value, loss.error] for loss in losses]).T
-    return CausesChart("lost in a shot, by cause", "atoms (the simulation's truth)", causes, means, errors)
+    return LossCausesChart("lost in a shot, by cause", "atoms (the simulation's truth)", causes, means, errors)
 
 
 def defects_chart(run: Run, statistics: Statistics) -> DefectsChart | None:

@@ -10,7 +10,7 @@ from typing import Final, Literal
 import numpy as np
 
 from labseq.drawing import Series
-from labseq.drawing.charts import CourseChart, CurvesChart
+from labseq.drawing.charts import TrendChart, CurvesChart
 from labseq.model import TargetPattern
 from labseq.model.estimate import Estimate, mean
 from labseq.recording import Run, Shot
@@ -19,11 +19,11 @@ from labseq.recording.statistics import CycleStatistics, Statistics
 
 MeasureName = Literal["filling", "success"]
 
-LEAST_WINDOW: Final = 10
+MIN_WINDOW: Final = 10
 """Least number of shots of a running mean."""
 N_WINDOWS: Final = 10
 """So many of its windows a longer run holds."""
-MOST_POINTS: Final = 200
+MAX_POINTS: Final = 200
 """Most points of its line."""
 
 
@@ -69,7 +69,7 @@ FILLING: Final = Measure("filling", "filling", "filling (%)")
 SUCCESS: Final = Measure("success", "defect-free", "defect-free (%)")
 
 
-def course(run: Run, measure: Measure, values: Sequence[float]) -> CourseChart:
+def course(run: Run, measure: Measure, values: Sequence[float]) -> TrendChart:
     """A measure against the shot.
 
     Args:
@@ -80,14 +80,14 @@ def course(run: Run, measure: Measure, values: Sequence[float]) -> CourseChart:
     numbers = np.array([shot.index + 1.0 for shot in run.shots])
     known = np.isfinite(values)
     x, y = numbers[known], np.array(values)[known]
-    window = min(len(y), max(LEAST_WINDOW, len(y) // N_WINDOWS))
-    starts = np.unique(np.linspace(0, len(y) - window, MOST_POINTS).astype(np.int64))
+    window = min(len(y), max(MIN_WINDOW, len(y) // N_WINDOWS))
+    starts = np.unique(np.linspace(0, len(y) - window, MAX_POINTS).astype(np.int64))
     means = [measure.over(y[start : start + window].tolist()) for start in starts]
     at = [float(x[start] + x[start + window - 1]) / 2 for start in starts]
     shots = "1 shot" if window == 1 else f"{window} shots"
     title = f"{measure.title} by shot; line: mean of {shots}"
     running = series_of("", at, means)
-    return CourseChart(title, measure.label, x, y, running, is_rate=measure.is_rate)
+    return TrendChart(title, measure.label, x, y, running, is_rate=measure.is_rate)
 
 
 def by_cycle(measure: Measure, statistics: Statistics) -> CurvesChart | None:

@@ -28,7 +28,7 @@ from labseq.session.run_figures.measures import FILLING, SUCCESS, Measure, by_cy
 from labseq.session.run_figures.sampling import A_GLANCE, A_LOOK, spread
 from labseq.session.run_figures.scan import Scanned, scan_charts, scanned
 from labseq.session.run_figures.survival import Survival, steps_that_load
-from labseq.session.run_figures.timing import RunTiming, Stopwatch
+from labseq.session.run_figures.timing import RunTiming, StageTotals
 from labseq.session.run_figures.words import note_of, unfit
 
 Row = tuple[Chart, ...]
@@ -59,7 +59,7 @@ class _Sums:
     @cached_property
     def read(self) -> tuple[Survival, RunTiming]:
         """Of the shots whose files are read; those that cannot be are left out."""
-        survival, watch = Survival.of_nothing(self.run.target.shape), Stopwatch()
+        survival, watch = Survival.of_nothing(self.run.target.shape), StageTotals()
         loads = steps_that_load(self.run)
         for shot in spread(self.run.shots, self._most):
             with suppress(RecordingError):

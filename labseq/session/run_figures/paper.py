@@ -15,7 +15,7 @@ from labseq.recording import Run
 from labseq.recording.points import ScanPoint, scan_points
 from labseq.recording.rates import Rate
 from labseq.recording.statistics import Statistics, statistics_of
-from labseq.session.ceiling import Losses, ceiling, survival
+from labseq.session.ceiling import AtomLosses, max_defect_free, survival
 from labseq.session.run_figures.words import note_of, unfit
 from labseq.units import format_quantity
 
@@ -52,7 +52,7 @@ def figure_5(run: Run, other: Run | None = None) -> CyclesDrawing:
         series=tuple(series),
         defects=tuple(np.array(statistics.cycles[-1].defects, np.int64) for statistics in found),
         quoted=_quoted(run, PAPERS_DEFECT_FREE),
-        ceiling=_ceiling(run, found[0]),
+        max_defect_free=_max_defect_free(run, found[0]),
     )
 
 
@@ -69,16 +69,16 @@ def _cycles_of(run: Run) -> Statistics:
     return statistics
 
 
-def _ceiling(run: Run, statistics: Statistics) -> Series | None:
+def _max_defect_free(run: Run, statistics: Statistics) -> Series | None:
     """What losses and detection leave at most; None where the run does not tell of them."""
-    losses = Losses.of(run.record.get("devices") or {})
+    losses = AtomLosses.of(run.record.get("devices") or {})
     if losses is None:
         return None
     images = next(shot for shot in run.shots if shot.index not in statistics.unreadable).summary.images
     exposures = [s for s, cycle in zip(images.exposure_s, images.cycle, strict=True) if cycle]
     n_atoms = run.target.n_atoms
     most = [
-        ceiling(n_atoms, cycle.period_s.value, exposure_s, losses)
+        max_defect_free(n_atoms, cycle.period_s.value, exposure_s, losses)
         for cycle, exposure_s in zip(statistics.cycles, exposures, strict=False)
     ]
     counted = "losses in the light and with time"
@@ -113,7 +113,7 @@ def figure_4(run: Run, other: Run | None = None) -> ParallelismDrawing:
     parted = [_parted(one, _points_of(one)) for one in runs]
     fixed, own = ([_fillings(one, runs, points) for one, points in zip(runs, of, strict=True)]
                   for of in zip(*parted, strict=True))  # fmt: skip
-    losses = Losses.of(run.record.get("devices") or {})
+    losses = AtomLosses.of(run.record.get("devices") or {})
     lifetime_s = PAPERS_LIFETIME_S if losses is None else losses.lifetime_s
     shown = parted[0][1] or parted[0][0]
     return ParallelismDrawing(

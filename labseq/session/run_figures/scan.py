@@ -20,9 +20,9 @@ from labseq.recording.rates import Rate
 from labseq.recording.statistics import Statistics, statistics_of
 from labseq.session.run_figures.measures import Measure, ends_of, series_of
 
-MOST_MAPS: Final = 6
+MAX_MAPS: Final = 6
 """Most maps in a row."""
-LEAST_FULL: Final = 0.5
+MIN_FULL: Final = 0.5
 """Part of the cells of all maps that must have a point; below that, points are drawn in their order."""
 LOGARITHMIC: Final = 20.0
 """From this ratio of the largest value to the least on, values at equal ratios get a logarithmic axis."""
@@ -133,7 +133,7 @@ def scan_charts(found: Scanned, measure: Measure) -> tuple[CurvesChart | MapChar
     if len(found.axes) == 1:
         return (_curve(found.axes[0], [place[0] for place in found.places], means, measure),)
     n_cells = math.prod(len(axis.words) for axis in found.axes)
-    if len({*found.places}) < LEAST_FULL * n_cells:
+    if len({*found.places}) < MIN_FULL * n_cells:
         return (_in_order(found, means, measure),)
     return _maps(found, means, measure)
 
@@ -187,9 +187,9 @@ def _maps(found: Scanned, means: Sequence[Estimate | Rate], measure: Measure) ->
     limits = float(np.nanmin(values)), float(np.nanmax(values))
     combinations = list(product(*(range(len(axis.words)) for axis in others)))
     charts: list[MapChart] = []
-    for number, chosen in enumerate(combinations[:MOST_MAPS], start=1):
+    for number, chosen in enumerate(combinations[:MAX_MAPS], start=1):
         at = ", ".join(f"{axis.address} {axis.words[i]}" for axis, i in zip(others, chosen, strict=True))
-        more = f" ({number} of {len(combinations)})" if len(combinations) > MOST_MAPS else ""
+        more = f" ({number} of {len(combinations)})" if len(combinations) > MAX_MAPS else ""
         title = (at or f"{measure.title} by scanned values") + more
         charts.append(
             MapChart(title, x.address, y.address, x.words, y.words, values[chosen], measure.label, limits)

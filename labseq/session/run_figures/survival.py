@@ -19,7 +19,7 @@ Counts = NDArray[np.int64]
 
 
 @dataclass(slots=True, eq=False)
-class Tracked:
+class SurvivalCounts:
     """Atoms of one kind, by the site that they were expected on.
 
     Attributes:
@@ -61,9 +61,9 @@ class Survival:
         n_read: Shots that were looked at.
     """
 
-    moved: Tracked
-    kept: Tracked
-    by_cycle: list[tuple[Tracked, Tracked]] = field(default_factory=list[tuple[Tracked, Tracked]])
+    moved: SurvivalCounts
+    kept: SurvivalCounts
+    by_cycle: list[tuple[SurvivalCounts, SurvivalCounts]] = field(default_factory=list[tuple[SurvivalCounts, SurvivalCounts]])
     n_read: int = 0
 
     @classmethod
@@ -131,5 +131,5 @@ def expected(before: Occupancy, cycle: CycleRecord | None) -> tuple[Occupancy, O
     return moved, atoms & ~moved
 
 
-def _nothing(shape: tuple[int, ...]) -> Tracked:
-    return Tracked(np.zeros(shape, np.int64), np.zeros(shape, np.int64))
+def _nothing(shape: tuple[int, ...]) -> SurvivalCounts:
+    return SurvivalCounts(np.zeros(shape, np.int64), np.zeros(shape, np.int64))

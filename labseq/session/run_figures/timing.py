@@ -85,7 +85,7 @@ class _Durations:
 
 
 @dataclass(slots=True)
-class Stopwatch:
+class StageTotals:
     """Adds up the stages of shots."""
 
     _found: dict[str, _Durations] = field(default_factory=dict[str, _Durations])
@@ -126,7 +126,7 @@ def timing_of(run: Run, shots: Iterable[Shot]) -> RunTiming:
         run: Their run.
         shots: The shots.
     """
-    watch = Stopwatch()
+    watch = StageTotals()
     for shot in shots:
         with suppress(RecordingError):
             watch.add(shot)

@@ -12,7 +12,7 @@ from labseq.testing.contracts.lines import LinesContract
 from labseq.testing.contracts.mobile_tweezers import MobileTweezersContract
 from labseq.testing.contracts.pattern import PatternContract
 from labseq.testing.contracts.planner import PlannerContract
-from labseq.testing.contracts.promises import BrokenPromise
+from labseq.testing.contracts.promises import ContractViolation
 from labseq.testing.contracts.scanner import ScannerContract
 from labseq.testing.contracts.simulation import SimulationContract
 from labseq.testing.contracts.static_tweezers import StaticTweezersContract
@@ -37,7 +37,7 @@ SUITES: Final[Mapping[str, type[Any]]] = {
 __all__ = [
     "SUITES",
     "AnalysisContract",
-    "BrokenPromise",
+    "ContractViolation",
     "CameraContract",
     "DetectorContract",
     "DeviceContract",

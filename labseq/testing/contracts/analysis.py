@@ -15,7 +15,7 @@ from labseq.recording.plain import dumps
 from labseq.recording.results import ResultsLog
 from labseq.roles import Analysis, Context, RecordedShot
 from labseq.testing.contracts.process import quietly
-from labseq.testing.contracts.promises import BrokenPromise, doing, no_factory, promise, promised, told
+from labseq.testing.contracts.promises import ContractViolation, doing, no_factory, promise, promised, format_error
 from labseq.testing.fakes import FakeShot, fake_shot
 
 Factory: TypeAlias = Callable[[Context], Analysis]
@@ -108,7 +108,7 @@ def _shot(analysis: Analysis, shot: RecordedShot) -> Any:
     try:
         return analysis.shot(shot)
     except Exception as error:
-        raise BrokenPromise(GIVES_RESULTS, f"it {told(error)}") from error
+        raise ContractViolation(GIVES_RESULTS, f"it {format_error(error)}") from error
 
 
 def _check(value: Any, what: str) -> None:

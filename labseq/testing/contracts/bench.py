@@ -11,7 +11,7 @@ import pytest
 
 from labseq.model import SiteGrid
 from labseq.roles import Context, Hardware
-from labseq.testing.contracts.promises import HangsError, in_time, no_factory
+from labseq.testing.contracts.promises import CallHungError, in_time, no_factory
 from labseq.testing.fakes import Calls, FakeClock, RecordingSimulation
 
 D = TypeVar("D", bound=Hardware)
@@ -34,16 +34,16 @@ class Wait(Generic[D]):
     wait: Action[D]
 
 
-class HardwareBench(Generic[D]):
+class HardwareContractBase(Generic[D]):
     """What the suites of all hardware roles are told by the suite of one, and where they put a device.
 
     Attributes:
         role: Name that the device has in the profile.
-        patience_s: Real time after which a call counts as hung, in seconds.
+        max_wait_s: Real time after which a call counts as hung, in seconds.
     """
 
     role: ClassVar[str] = "device"
-    patience_s: ClassVar[float] = 10.0
+    max_wait_s: ClassVar[float] = 10.0
 
     @pytest.fixture
     def factory(self) -> Factory[D]:
@@ -134,8 +134,8 @@ class HardwareBench(Generic[D]):
     def call_in_time(self, context: Context, what: str, call: Callable[..., object], *args: object) -> None:
         """A call that must come back; one that polls the clock for ever is ended by it."""
         try:
-            in_time(self.patience_s, what, call, *args)
-        except HangsError:
+            in_time(self.max_wait_s, what, call, *args)
+        except CallHungError:
             if isinstance(context.clock, FakeClock):
                 context.clock.stop.request()
             raise

@@ -13,28 +13,28 @@ from labseq.testing.contracts.bench import (
     Action,
     D,
     Factory,
-    HardwareBench,
+    HardwareContractBase,
     Wait,
     begin_shot,
     close_quietly,
     n_calls,
 )
 from labseq.testing.contracts.process import quietly
-from labseq.testing.contracts.promises import HangsError, doing, promise, promised, refusal
+from labseq.testing.contracts.promises import CallHungError, doing, promise, promised, refusal
 
 __all__ = ["Action", "Factory", "HardwareContract", "Wait", "n_calls"]
 
 ALWAYS_SAFE: Final = "safe_state() is legal in every state, and twice"
 
 
-class HardwareContract(HardwareBench[D]):
+class HardwareContract(HardwareContractBase[D]):
     """Promises of every camera, tweezer driver and instrument.
 
     Inherit the suite of the role, not this one, and provide the fixture ``factory``.
 
     Attributes:
         role: Name that the device has in the profile.
-        patience_s: Real time after which a call counts as hung, in seconds.
+        max_wait_s: Real time after which a call counts as hung, in seconds.
     """
 
     @promise("the constructor does no I/O, and changes nothing that all code shares")
@@ -95,7 +95,7 @@ class HardwareContract(HardwareBench[D]):
                 for what, fail in failures.items():
                     try:
                         self.call_in_time(context, what, fail, device)
-                    except HangsError:  # timeouts have a test of their own
+                    except CallHungError:  # timeouts have a test of their own
                         break
                     except Exception:  # noqa: BLE001, S110 - and so have errors
                         pass

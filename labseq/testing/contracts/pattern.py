@@ -11,7 +11,7 @@ import pytest
 from labseq.errors import LabseqError
 from labseq.model import SiteGrid, TargetPattern
 from labseq.testing.contracts.process import quietly
-from labseq.testing.contracts.promises import BrokenPromise, doing, no_factory, promise, refusal, told
+from labseq.testing.contracts.promises import ContractViolation, doing, no_factory, promise, refusal, format_error
 
 Factory: TypeAlias = Callable[[SiteGrid], TargetPattern]
 
@@ -76,11 +76,11 @@ def _made(factory: Factory, grid: SiteGrid) -> TargetPattern:
     try:
         target: Any = factory(grid)
     except Exception as error:
-        raise BrokenPromise(FITS, f"on {_called(grid)} it {told(error)}") from error
+        raise ContractViolation(FITS, f"on {_called(grid)} it {format_error(error)}") from error
     if not isinstance(target, TargetPattern):
-        raise BrokenPromise(FITS, f"it made a {type(target).__name__}")
+        raise ContractViolation(FITS, f"it made a {type(target).__name__}")
     if target.shape != grid.shape:
-        raise BrokenPromise(FITS, f"on {_called(grid)} it made one of {target.shape}")
+        raise ContractViolation(FITS, f"on {_called(grid)} it made one of {target.shape}")
     return target
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from labseq.errors import LabseqError
 from labseq.model import Occupancy, Plan, PlanReport, SiteGrid, TargetPattern
 from labseq.motion import check_plan
-from labseq.roles import Context, Planner, Warmable
+from labseq.roles import Context, Planner, NeedsWarmUp
 from labseq.testing.contracts.planner_cases import (
     Case,
     cases_of,
@@ -33,15 +33,15 @@ from labseq.testing.contracts.plans import (
 )
 from labseq.testing.contracts.process import quietly
 from labseq.testing.contracts.promises import (
-    BrokenPromise,
+    ContractViolation,
     doing,
     in_time,
     no_factory,
     promise,
     promised,
     refusal,
-    retold,
-    told,
+    as_this_promise,
+    format_error,
 )
 from labseq.testing.strategies import cases, drawn
 
@@ -184,7 +184,7 @@ class PlannerContract:
             for layout, same_atoms in layouts.items():
                 with doing(f"a {layout} occupancy"):
                     plan = factory(self.context(target.shape)).plan(same_atoms, target)
-                    with retold():
+                    with as_this_promise():
                         left = target.n_defects(replay(plan, atoms))
                     assert left == expected, f"the plan leaves {left} defects, not {expected}"
 
@@ -238,8 +238,8 @@ class PlannerContract:
             return plan_of(planner, target, atoms.copy())
         except LabseqError as error:
             if self.fills_any_target or any(target is served for served in self.targets):
-                detail = f"it {told(error)} for\n{drawn(target, atoms)}"
-                raise BrokenPromise(RETURNS_A_PLAN, detail) from error
+                detail = f"it {format_error(error)} for\n{drawn(target, atoms)}"
+                raise ContractViolation(RETURNS_A_PLAN, detail) from error
             return None
 
     def checked(self, factory: Factory, target: TargetPattern, atoms: Occupancy) -> PlanReport | None:
@@ -257,7 +257,7 @@ class PlannerContract:
     def warmed(self, factory: Factory, target: TargetPattern) -> Planner:
         """A fresh planner, compiled."""
         planner = factory(self.context(target.shape))
-        if isinstance(planner, Warmable):
+        if isinstance(planner, NeedsWarmUp):
             planner.warm()
         return planner
 

@@ -9,7 +9,7 @@ import numpy as np
 from labseq.errors import LabseqError
 from labseq.model import Occupancy, Plan, TargetPattern
 from labseq.roles import Planner
-from labseq.testing.contracts.promises import BrokenPromise, told
+from labseq.testing.contracts.promises import ContractViolation, format_error
 from labseq.testing.strategies import drawn
 
 RETURNS_A_PLAN: Final = "plan() returns a Plan, whatever the grid, the loading and the target"
@@ -20,17 +20,17 @@ def plan_of(planner: Planner, target: TargetPattern, atoms: Occupancy) -> Plan:
     """What a planner plans.
 
     Raises:
-        BrokenPromise: It is no Plan, or the planner raises what is no LabseqError.
+        ContractViolation: It is no Plan, or the planner raises what is no LabseqError.
     """
     try:
         plan: Any = planner.plan(atoms, target)
     except LabseqError:
         raise
     except Exception as error:
-        detail = f"it {told(error)} for\n{drawn(target, atoms)}"
-        raise BrokenPromise(RETURNS_A_PLAN, detail) from error
+        detail = f"it {format_error(error)} for\n{drawn(target, atoms)}"
+        raise ContractViolation(RETURNS_A_PLAN, detail) from error
     if not isinstance(plan, Plan):
-        raise BrokenPromise(RETURNS_A_PLAN, f"it returned a {type(plan).__name__}")
+        raise ContractViolation(RETURNS_A_PLAN, f"it returned a {type(plan).__name__}")
     return plan
 
 
@@ -41,14 +41,14 @@ def replay(plan: Plan, atoms: Occupancy) -> Occupancy:
         Where the atoms end, bool (n_rows, n_cols).
 
     Raises:
-        BrokenPromise: A move starts where no atom is.
+        ContractViolation: A move starts where no atom is.
     """
     held = {(int(row), int(col)) for row, col in np.argwhere(atoms)}
     for index, batch in enumerate(plan.batches):
         for row, col in batch.from_sites.tolist():
             if (row, col) not in held:
                 detail = f"batch {index} takes an atom from ({row}, {col}); there is none"
-                raise BrokenPromise(NO_ATOM_CREATED, detail)
+                raise ContractViolation(NO_ATOM_CREATED, detail)
             held.remove((row, col))
         held.update((row, col) for row, col in batch.to_sites.tolist())
     end = np.zeros_like(atoms, order="C")

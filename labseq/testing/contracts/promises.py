@@ -17,7 +17,7 @@ E = TypeVar("E", bound=Exception)
 _FAILURES: Final = (Exception, pytest.fail.Exception)
 
 
-class BrokenPromise(AssertionError):  # noqa: N818 - reads as what it is in pytest's summary
+class ContractViolation(AssertionError):  # noqa: N818 - reads as what it is in pytest's summary
     """A plugin does not do what its role promises.
 
     Attributes:
@@ -31,7 +31,7 @@ class BrokenPromise(AssertionError):  # noqa: N818 - reads as what it is in pyte
         super().__init__(f"promise: {promise}; but {detail}")
 
 
-class HangsError(AssertionError):
+class CallHungError(AssertionError):
     """A call has not come back; the thread that made it is left to itself."""
 
 
@@ -41,10 +41,10 @@ def promised(promise: str) -> Generator[None]:
     __tracebackhide__ = True
     try:
         yield
-    except BrokenPromise:
+    except ContractViolation:
         raise
     except _FAILURES as error:
-        raise BrokenPromise(promise, told(error)) from error
+        raise ContractViolation(promise, format_error(error)) from error
 
 
 def promise(text: str) -> Callable[[Callable[P, None]], Callable[P, None]]:
@@ -60,12 +60,12 @@ def promise(text: str) -> Callable[[Callable[P, None]], Callable[P, None]]:
             __tracebackhide__ = True
             try:
                 test(*args, **kwargs)
-            except BrokenPromise as error:
+            except ContractViolation as error:
                 if error.promise != text and _is_told_elsewhere(error.promise, *args, *kwargs.values()):
                     pytest.skip(f"cannot go on: {error}")
                 raise
             except _FAILURES as error:
-                raise BrokenPromise(text, told(error)) from error
+                raise ContractViolation(text, format_error(error)) from error
 
         run.__dict__["promise"] = text
         return run
@@ -92,19 +92,19 @@ def doing(what: str) -> Generator[None]:
     __tracebackhide__ = True
     try:
         yield
-    except BrokenPromise:
+    except ContractViolation:
         raise
     except _FAILURES as error:
-        raise AssertionError(f"{what}: {told(error)}") from error
+        raise AssertionError(f"{what}: {format_error(error)}") from error
 
 
 @contextmanager
-def retold() -> Generator[None]:
+def as_this_promise() -> Generator[None]:
     """Count a broken promise as one of the promise that is being tested."""
     __tracebackhide__ = True
     try:
         yield
-    except BrokenPromise as error:
+    except ContractViolation as error:
         raise AssertionError(error.detail) from error
 
 
@@ -127,7 +127,7 @@ def refusal(
     except kind as error:
         return error
     except Exception as error:
-        raise AssertionError(f"{what} {told(error)}; expected {wanted}") from error
+        raise AssertionError(f"{what} {format_error(error)}; expected {wanted}") from error
     raise AssertionError(f"{what} was accepted; expected {wanted}")
 
 
@@ -135,7 +135,7 @@ def in_time(limit_s: float, what: str, call: Callable[P, T], *args: P.args, **kw
     """Make a call that must come back.
 
     Raises:
-        HangsError: It has not come back after ``limit_s`` of real time.
+        CallHungError: It has not come back after ``limit_s`` of real time.
     """
     __tracebackhide__ = True
     results: list[T] = []
@@ -153,7 +153,7 @@ def in_time(limit_s: float, what: str, call: Callable[P, T], *args: P.args, **kw
     if errors:
         raise errors[0]
     if not results:
-        raise HangsError(f"{what} has not returned after {limit_s:g} s")
+        raise CallHungError(f"{what} has not returned after {limit_s:g} s")
     return results[0]
 
 
@@ -163,7 +163,7 @@ def no_factory(suite: object, signature: str) -> NoReturn:
     pytest.fail(f"{name} needs a fixture 'factory' that returns a callable: {signature}", pytrace=False)
 
 
-def told(error: BaseException) -> str:
+def format_error(error: BaseException) -> str:
     """An error in words, as the end of a sentence."""
     if isinstance(error, AssertionError | pytest.fail.Exception) and str(error):
         return str(error).split("\nassert ")[0]  # without what pytest says of the values

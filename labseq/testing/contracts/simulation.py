@@ -12,7 +12,7 @@ import pytest
 
 from labseq.errors import LabseqError, LimitError
 from labseq.model import DepthRamp, Frame, RandomStream, SiteGrid
-from labseq.roles import Context, Simulation, TruthTeller
+from labseq.roles import Context, Simulation, ReportsTruth
 from labseq.testing.contracts.process import quietly
 from labseq.testing.contracts.promises import doing, no_factory, promise, promised, refusal
 from labseq.testing.fakes import FakeClock
@@ -54,7 +54,7 @@ class SimulationContract:
             with suppress(Exception):  # what close() promises has a test of its own
                 world.close()
 
-    def shot(self, world: Simulation, context: Context, index: int, *, lit: bool = True) -> list[Frame]:
+    def shot(self, world: Simulation, context: Context, index: int, *, lines_on: bool = True) -> list[Frame]:
         """One shot, as devices play it: the static tweezers on, loading, two frames.
 
         Args:
@@ -66,7 +66,7 @@ class SimulationContract:
         clock = context.clock
         context.random.begin_shot(index, 0)
         world.begin_shot()
-        depth = 1.0 if lit else 0.0
+        depth = 1.0 if lines_on else 0.0
         world.play("static_tweezers", DepthRamp(depth, depth), clock.now())
         world.load(clock.now(), LOADING_S)
         clock.sleep(LOADING_S)
@@ -137,7 +137,7 @@ class SimulationContract:
     def test_loads_atoms(self, factory: Factory) -> None:
         """Of a world that tells the truth."""
         with self.opened(factory) as (world, context):
-            if not isinstance(world, TruthTeller):
+            if not isinstance(world, ReportsTruth):
                 return
             shape = context.grid.shape
             self.shot(world, context, 0)
@@ -150,7 +150,7 @@ class SimulationContract:
             context.random.begin_shot(1, 0)
             world.begin_shot()
             assert not world.truth().any(), "atoms outlive begin_shot()"
-            self.shot(world, context, 2, lit=False)
+            self.shot(world, context, 2, lines_on=False)
             assert not world.truth().any(), "atoms were loaded while the static tweezers were off"
 
     @promise("an exposure that is not longer than 0 is refused with LimitError")

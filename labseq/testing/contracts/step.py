@@ -15,7 +15,7 @@ from labseq.roles import Repeatable, Step, StepContext
 from labseq.sequencer.guard import Guard
 from labseq.sequencer.shot import RunningShot
 from labseq.testing.contracts.process import quietly
-from labseq.testing.contracts.promises import BrokenPromise, doing, no_factory, promise, refusal
+from labseq.testing.contracts.promises import ContractViolation, doing, no_factory, promise, refusal
 from labseq.testing.fakes import FakeLab, fake_lab
 
 Factory: TypeAlias = Callable[[], Step]
@@ -54,7 +54,7 @@ class StepContract:
         """``labseq check`` prints it and adds it up."""
         for entry in self._timeline(factory()):
             assert entry.label, f"{entry} has no label"
-            assert 0.0 <= entry.least_s <= entry.duration_s < float("inf"), f"{entry}"
+            assert 0.0 <= entry.min_duration_s <= entry.duration_s < float("inf"), f"{entry}"
             assert entry.n_images >= 0, f"{entry}"
 
     @promise("constructor and timeline are pure, and the timeline is always the same")
@@ -131,5 +131,5 @@ class StepContract:
         entries: list[Any] = list(step.plan_timeline(StepContext(lab.grid, lab.motion, lab.target)))
         for entry in entries:
             if not isinstance(entry, TimelineEntry):
-                raise BrokenPromise(TIMELINE, f"plan_timeline() gave a {type(entry).__name__}")
+                raise ContractViolation(TIMELINE, f"plan_timeline() gave a {type(entry).__name__}")
         return entries

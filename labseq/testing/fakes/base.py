@@ -73,7 +73,7 @@ class RecordingHardware:
     def note(self, method: str, *args: Any, **kwargs: Any) -> None:
         """Note a call, then hang or fail if the test has planned it."""
         self.calls.note(self.name, method, *args, **kwargs)
-        self._faults.strike(method)
+        self._faults.inject_fault(method)
 
     def use(self, method: str, *args: Any, **kwargs: Any) -> None:
         """Note a call that needs the device to be open."""

@@ -102,7 +102,7 @@ class Faults:
         self._failures = {method: _in_turn(failure) for method, failure in fail_on.items()}
         self._hangs = hang_on
 
-    def strike(self, method: str) -> None:
+    def inject_fault(self, method: str) -> None:
         """Hang or raise if this is planned for the method."""
         if method in self._hangs:
             self._hangs[method].wait()

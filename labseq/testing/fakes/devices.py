@@ -187,13 +187,13 @@ class RecordingLines(RecordingHardware):
     def open(self) -> None:
         """Idle."""
         super().open()
-        self._tell(idle_program(self._specs))
+        self._apply_lines(idle_program(self._specs))
 
     def safe_state(self) -> None:
         """All off."""
         super().safe_state()
         if self.is_open:
-            self._tell(off_program(self._specs))
+            self._apply_lines(off_program(self._specs))
 
     def reset(self) -> None:
         """Nothing compiled, nothing armed."""
@@ -223,7 +223,7 @@ class RecordingLines(RecordingHardware):
             raise DeviceError(self.name, "fire() needs arm()")
         self._is_armed = False
         self.programs.append(self._compiled)
-        self._tell(self._compiled)
+        self._apply_lines(self._compiled)
         self._over_s = self.clock.now() + self._compiled.duration_s
 
     def wait(self, timeout_s: float) -> None:
@@ -234,7 +234,7 @@ class RecordingLines(RecordingHardware):
         if left_s > timeout_s:
             raise DeviceTimeoutError(self.name, f"it still runs after {timeout_s} s", timeout_s)
 
-    def _tell(self, program: LineProgram) -> None:
+    def _apply_lines(self, program: LineProgram) -> None:
         if self.simulation is not None:
             self.simulation.play(self.name, program, self.clock.now())
 

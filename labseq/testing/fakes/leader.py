@@ -41,16 +41,16 @@ class RecordingLeader(RecordingDevice):
         self._n_gos += 1
         return str(self._n_gos)
 
-    def tell(self, state: Literal["ready", "failed"], about: Mapping[str, bool | int | float | str]) -> str:
+    def report(self, state: Literal["ready", "failed"], about: Mapping[str, bool | int | float | str]) -> str:
         """Note the answer, if one is owed."""
-        self.use("tell", state)
+        self.use("report", state)
         if not self._is_owed:
             return ""
         self._is_owed = False
         self.answers.append((state, dict(about)))
         return state
 
-    def news(self) -> Sequence[str]:
+    def new_events(self) -> Sequence[str]:
         """What was noted."""
         noted, self.noted = self.noted, []
         return noted

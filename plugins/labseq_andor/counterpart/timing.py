@@ -12,10 +12,10 @@ from labseq_andor.counterpart.em_register import EmRegister
 from labseq_andor.counterpart.optics import Optics
 from labseq_andor.heads import ReadOut
 
-LEAST_EXPOSURE_S: Final = 10e-6
+MIN_EXPOSURE_S: Final = 10e-6
 """Shortest exposure without frame transfer; with it, that is the read-out (ours)."""
 
-MOST_EXPOSURE_S: Final = 1000.0
+MAX_EXPOSURE_S: Final = 1000.0
 """Longest exposure (ours)."""
 
 
@@ -67,7 +67,7 @@ class Timing:
     @property
     def exposure_s(self) -> float:
         """Exposure as the camera makes it, in seconds."""
-        return max(self._exposure_s, self.readout_s if self.frame_transfer else LEAST_EXPOSURE_S)
+        return max(self._exposure_s, self.readout_s if self.frame_transfer else MIN_EXPOSURE_S)
 
     @property
     def kinetic_s(self) -> float:
@@ -78,7 +78,7 @@ class Timing:
     @answers("SetExposureTime", only_idle=True)
     def set_exposure(self, seconds: float) -> int:
         """Ask for an exposure; the camera makes it as long as it must be."""
-        if not 0 <= seconds <= MOST_EXPOSURE_S:
+        if not 0 <= seconds <= MAX_EXPOSURE_S:
             return Code.P1INVALID
         self._exposure_s = seconds
         return Code.SUCCESS
@@ -86,7 +86,7 @@ class Timing:
     @answers("GetMaximumExposure")
     def get_longest(self, seconds: Any) -> int:
         """Longest exposure."""
-        seconds[0] = MOST_EXPOSURE_S
+        seconds[0] = MAX_EXPOSURE_S
         return Code.SUCCESS
 
     @answers("SetKineticCycleTime", only_idle=True)

@@ -27,7 +27,7 @@ STATUS_NAMES: Final = (
 """Names of the library's ``ArvBufferStatus``, from 0."""
 
 FRAMES_IN_SOCKET: Final = 4
-LEAST_SOCKET_BUFFER: Final = 2**20
+MIN_SOCKET_BUFFER: Final = 2**20
 """Size of the socket's buffer, in frames, and its least size, in bytes. That of one frame, the
 library's own choice, loses packets: the kernel counts each with its overhead, up to twice its size."""
 
@@ -117,7 +117,7 @@ class Stream:
             if time_s is not None:
                 self._set(name, round(time_s * 1e6), G_TYPE_UINT)
         self._set("socket-buffer", 0, lib.arv_gv_stream_socket_buffer_get_type())  # fixed
-        size = options.socket_buffer_bytes or max(FRAMES_IN_SOCKET * payload, LEAST_SOCKET_BUFFER)
+        size = options.socket_buffer_bytes or max(FRAMES_IN_SOCKET * payload, MIN_SOCKET_BUFFER)
         self._set("socket-buffer-size", size, G_TYPE_INT)
 
     def allocate(self, n_buffers: int, payload: int) -> None:

@@ -25,7 +25,7 @@ OVERHEAD: Final = 768
 BREAK_S: Final = 2e-4
 """How long to wait before it is looked at again, in seconds."""
 
-MOST_BREAKS: Final = 1000
+MAX_BREAKS: Final = 1000
 """After so many, packets are sent all the same, and no longer wait: a packet socket takes them elsewhere."""
 
 SOCKETS: Final = Path("/proc/net/udp")
@@ -80,7 +80,7 @@ class Cable(threading.Thread):
                 self._is_read = self._wait_for_room()
 
     def _wait_for_room(self) -> bool:
-        for _ in range(MOST_BREAKS):
+        for _ in range(MAX_BREAKS):
             if n_waiting(self._destination[1]) < BURST:
                 return True
             time.sleep(BREAK_S)

@@ -16,7 +16,7 @@ CHANNELS: Final = 2
 _HEADER: Final = np.dtype(
     [
         *((name, np.uint64) for name in ("magic", "ring", "sent", "underflows", "is_active", "fault")),
-        *((name, np.float64) for name in ("rate_hz", "speed", "patience_s", "t0_s")),
+        *((name, np.float64) for name in ("rate_hz", "speed", "max_wait_s", "t0_s")),
         *((name, np.float64, CHANNELS) for name in ("frequency_hz", "gain_db")),
     ]
 )
@@ -64,7 +64,7 @@ class Ring:
         if not header["is_active"] or not self._is_held():
             return False
         late_s = time.monotonic() - header["t0_s"] - header["sent"] / (header["rate_hz"] * header["speed"])
-        return bool(late_s <= header["patience_s"])
+        return bool(late_s <= header["max_wait_s"])
 
     def latest(self, n: int) -> NDArray[np.complex64]:
         """The latest samples that it was sent, complex64 (2, n); fewer if there were fewer."""

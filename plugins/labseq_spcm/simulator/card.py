@@ -22,7 +22,7 @@ from labseq_spcm.simulator.rules import ErrorInfo, Number, Refusal
 
 LOOK_S: Final = 0.05
 """How long a wait goes on before it looks again at what other threads have done."""
-LEAST_S: Final = 1e-9
+MIN_S: Final = 1e-9
 """Shortest wait, so that rounding cannot keep time from passing."""
 DRIVER_VERSION: Final = (7 << 24) | (9 << 16) | 22000
 """A version that ``spcm`` is content with; it is none of the vendor's."""
@@ -254,7 +254,7 @@ class SimulatedCard:
 
     def _pause(self, duration_s: float) -> bool:
         try:
-            self._clock.sleep(max(duration_s, LEAST_S))
+            self._clock.sleep(max(duration_s, MIN_S))
         except LabseqError:
             return False
         return True

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq_spcm.simulator import facts, registers as r
-from labseq_spcm.simulator.dds_cores import Chord, Cores
+from labseq_spcm.simulator.dds_cores import CoreOutputs, Cores
 from labseq_spcm.simulator.dds_values import LONE_CORE, DdsValues
 from labseq_spcm.simulator.rules import Number, Refusal
 
@@ -97,7 +97,7 @@ class Dds:
         self.free_running = True
         self._retrigger_s = max(self._retrigger_s, now_s)
 
-    def stop(self, now_s: float) -> list[Chord]:
+    def stop(self, now_s: float) -> list[CoreOutputs]:
         """The card stops; what is queued stays.
 
         Returns:
@@ -275,10 +275,10 @@ class Dds:
         self._timer_s = block.writes.get(r.SPC_DDS_TRG_TIMER, self._timer_s)
         self._tick_s = at_s + self._timer_s if self._source == r.SPCM_DDS_TRG_SRC_TIMER else math.inf
 
-    def played(self, now_s: float) -> list[Chord]:
+    def played(self, now_s: float) -> list[CoreOutputs]:
         """All that was put out since the start, up to now."""
         ended = [chord.until(now_s) for chord in self._cores.chords if chord.start_s < now_s]
-        return ended + self._cores.sounding(now_s, self._values.masks)
+        return ended + self._cores.current_outputs(now_s, self._values.masks)
 
     def forget(self, before_s: float) -> None:
         """Drop what ended before a time."""

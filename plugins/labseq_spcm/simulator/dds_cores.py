@@ -23,7 +23,7 @@ KIND: Final = 1000
 
 
 @dataclass(frozen=True, slots=True)
-class Chord:
+class CoreOutputs:
     """What all cores put out between two events.
 
     Attributes:
@@ -39,7 +39,7 @@ class Chord:
     cores: NDArray[np.float64]
     masks: Masks
 
-    def until(self, now_s: float) -> Chord:
+    def until(self, now_s: float) -> CoreOutputs:
         """What of it was put out by now."""
         return self if self.end_s <= now_s else replace(self, end_s=now_s)
 
@@ -69,7 +69,7 @@ class Cores:
 
     def __init__(self, n_cores: int) -> None:
         self._n_cores = n_cores
-        self.chords: list[Chord] = []
+        self.chords: list[CoreOutputs] = []
         self.silence()
 
     def silence(self) -> None:
@@ -80,7 +80,7 @@ class Cores:
 
     def go_on(self, to_s: float, masks: Masks) -> None:
         """Keep what was put out up to the next event, and carry all cores on to it."""
-        self.chords += self.sounding(to_s, masks)
+        self.chords += self.current_outputs(to_s, masks)
         duration_s = to_s - self._since_s
         self._since_s = to_s
         if duration_s > 0:
@@ -97,19 +97,19 @@ class Cores:
                 value += self._now[PHASE, core] - math.radians(before_deg)
         self._now[kind, core] = value
 
-    def sounding(self, until_s: float, masks: Masks) -> list[Chord]:
+    def current_outputs(self, until_s: float, masks: Masks) -> list[CoreOutputs]:
         """What has been put out since the last event."""
         silent = not self._now[AMPLITUDE : AMPLITUDE_SLOPE + 1].any()
         if self._since_s >= until_s or silent:
             return []
-        return [Chord(self._since_s, until_s, self._now.copy(), masks)]
+        return [CoreOutputs(self._since_s, until_s, self._now.copy(), masks)]
 
 
 def carried_on(cores: NDArray[np.float64], duration_s: float) -> NDArray[np.float64]:
     """What cores do some time later: straight lines, amplitudes within full scale.
 
     Args:
-        cores: float64 (5, n), as in :class:`Chord`.
+        cores: float64 (5, n), as in :class:`CoreOutputs`.
         duration_s: How much later.
     """
     later = cores.copy()

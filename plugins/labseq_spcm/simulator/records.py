@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
-from labseq_spcm.simulator.dds_cores import Chord
+from labseq_spcm.simulator.dds_cores import CoreOutputs
 from labseq_spcm.simulator.output import SampleSpan
 from labseq_spcm.simulator.replay import Stretch
 from labseq_spcm.simulator.rules import Number
@@ -92,7 +92,7 @@ class Records:
 
     def __init__(self) -> None:
         self.samples: list[Record] = []
-        self.chords: list[Chord] = []
+        self.chords: list[CoreOutputs] = []
 
     def keep(self, stretches: Iterable[Stretch], channels: Sequence[int], sample_rate_hz: float) -> None:
         """Add what a run has played."""

@@ -11,7 +11,7 @@ from labseq_spcm.simulator.memory import Samples
 
 AREA: Final = 1 << 21
 """Samples that are asked for at a time."""
-MOST_AHEAD: Final = 1 << 27
+MAX_AHEAD: Final = 1 << 27
 """Most samples that are asked for before they are needed."""
 
 
@@ -28,7 +28,7 @@ class Store:
 
     def reserve(self, n: int) -> None:
         """See that there is memory for a number of samples, or for as many as are asked for ahead."""
-        while len(self._free) * AREA < min(n, MOST_AHEAD):
+        while len(self._free) * AREA < min(n, MAX_AHEAD):
             area = np.empty(AREA, np.int16)
             area.fill(0)  # until then it is only promised
             self._free.append(area)

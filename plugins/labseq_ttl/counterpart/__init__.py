@@ -37,7 +37,7 @@ class Counterpart(Protocol):
         ...
 
 
-def warm_counterpart(simulated_by: str, device: str) -> None:
+def warm_simulator(simulated_by: str, device: str) -> None:
     """Compile what a simulated box needs, before it is turned on.
 
     Raises:
@@ -49,7 +49,7 @@ def warm_counterpart(simulated_by: str, device: str) -> None:
         runner(device)
 
 
-def start_counterpart(simulated_by: str, device: str, clock: Clock) -> Counterpart:
+def start_simulator(simulated_by: str, device: str, clock: Clock) -> Counterpart:
     """Make a simulated box and turn it on.
 
     Args:

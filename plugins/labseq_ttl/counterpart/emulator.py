@@ -17,7 +17,7 @@ from labseq_ttl.protocol import (
     EDGES,
     LINE,
     LONGEST,
-    MOST_MS,
+    MAX_MS,
     NAME,
     OUTPUTS,
     SHORTEST,
@@ -61,7 +61,7 @@ class EmulatedBox:
             "lead": self._begin_leading,
             "deaf": self._end_leading,
             "answer": self._answer_leader,
-            "leader": self._tell_leader,
+            "leader": self._report_to_leader,
         }
         self._out = bytearray()
         self._polarity = self._serial = 0
@@ -123,7 +123,7 @@ class EmulatedBox:
     def start(self) -> None:
         """A rising edge at the start input."""
         if self._leader.rise():
-            self._tell(f"!go {self._boots:04x} {self._leader.n_gos:04x}")
+            self._send(f"!go {self._boots:04x} {self._leader.n_go_signals:04x}")
 
     def lower(self) -> None:
         """The start input goes low."""
@@ -152,13 +152,13 @@ class EmulatedBox:
         self._armed: int | None = None
         self._runs = self.on = 0
         self._leader = LeaderInput()
-        self._tell(f"!boot {self._boots:04x} {cause:02x}")
+        self._send(f"!boot {self._boots:04x} {cause:02x}")
 
     def _take(self, byte: int) -> None:
         if byte == STOP[0]:
             self._off([])
             self._line.clear()
-            self._tell(f"!off {self._boots:04x}")
+            self._send(f"!off {self._boots:04x}")
         elif byte == ord("\n"):
             if self._line:
                 self._answer()
@@ -169,23 +169,23 @@ class EmulatedBox:
     def _answer(self) -> None:
         said = unframed(bytes(self._line)) if len(self._line) <= LINE else None
         if said is None or said[1:2] != " ":
-            self._tell("? no damaged")
+            self._send("? no damaged")
             return
         name, *words = said[2:].split(" ")
-        news = self._runs
+        new_events = self._runs
         try:
             if name not in self._commands:
                 raise RefusedError("unknown")
             answer = f"{said[0]} ok {self._commands[name](words)}".rstrip()
         except RefusedError as refusal:
             answer = f"{said[0]} no {refusal}"
-        self._tell(answer)
-        if self._runs != news:
-            self._tell(f"!done {self._boots:04x} {self._runs:04x}")
+        self._send(answer)
+        if self._runs != new_events:
+            self._send(f"!done {self._boots:04x} {self._runs:04x}")
         elif name in ("fire", "await") and " ok" in answer:  # reset in the middle
             self._boot(RESET_INPUT)
 
-    def _tell(self, text: str) -> None:
+    def _send(self, text: str) -> None:
         self._out += framed(text)
 
     def _identify(self, words: list[str]) -> str:
@@ -271,7 +271,7 @@ class EmulatedBox:
         return self._fire(words)
 
     def _begin_leading(self, words: list[str]) -> str:
-        busy, ready, failed, _ = numbers(words, OUTPUTS, OUTPUTS, OUTPUTS, MOST_MS)
+        busy, ready, failed, _ = numbers(words, OUTPUTS, OUTPUTS, OUTPUTS, MAX_MS)
         self._leader.begin(busy, ready, failed)
         return f"{self._leader.level:02x}"
 
@@ -286,10 +286,10 @@ class EmulatedBox:
             raise RefusedError("deaf")
         return self._leader.answer(is_ready=bool(is_ready))
 
-    def _tell_leader(self, words: list[str]) -> str:
+    def _report_to_leader(self, words: list[str]) -> str:
         del words
         leader = self._leader
-        return f"{leader.state:02x} {leader.n_gos:04x} {leader.more_came:02x} {leader.level:02x}"
+        return f"{leader.state:02x} {leader.n_go_signals:04x} {leader.more_came:02x} {leader.level:02x}"
 
     def _off(self, words: list[str]) -> str:
         del words

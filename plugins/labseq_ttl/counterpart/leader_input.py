@@ -11,14 +11,14 @@ class LeaderInput:
     Attributes:
         state: One of ``DEAF``, ``IDLE``, ``OWED``, ``LATE``.
         signs: Outputs that are on for the leader.
-        n_gos: Edges that were taken.
+        n_go_signals: Edges that were taken.
         more_came: Whether an edge came that could not be taken.
         level: Level of the input; it is pulled up.
     """
 
     def __init__(self) -> None:
         self.state = DEAF
-        self.signs = self.n_gos = 0
+        self.signs = self.n_go_signals = 0
         self.more_came = False
         self.level = 1
         self._busy = self._ready = self._failed = 0
@@ -41,7 +41,7 @@ class LeaderInput:
         if self.state != IDLE:
             return False
         self.state, self.signs = OWED, self._busy
-        self.n_gos = (self.n_gos + 1) & 0xFFFF
+        self.n_go_signals = (self.n_go_signals + 1) & 0xFFFF
         return True
 
     def pass_deadline(self) -> None:

@@ -19,7 +19,7 @@ GATE: Final = 1 << 13
 APART_CYCLES: Final = 3
 """The two ports of the processor do not switch in the same cycle; what is nearer than this is one edge."""
 
-PATIENCE_S: Final = 60.0
+MAX_WAIT_S: Final = 60.0
 """How long the simulated processor may take for a program, on a computer that is busy."""
 
 
@@ -137,7 +137,7 @@ class SimavrBox:
 
     def _next_line(self) -> list[str]:
         """The next line of the simulator, in words."""
-        words = wait_for(self._look, PATIENCE_S, self._clock)
+        words = wait_for(self._look, MAX_WAIT_S, self._clock)
         if words is None:
             raise DeviceError(self._device, "the simulated processor is silent; expected what it put out")
         return words

@@ -11,9 +11,9 @@ import pytest
 
 from labseq.drawing import Series
 from labseq.drawing.charts import (
-    CausesChart,
+    LossCausesChart,
     Chart,
-    CourseChart,
+    TrendChart,
     CurvesChart,
     DefectsChart,
     MapChart,
@@ -36,10 +36,10 @@ def series(n: int = 4, label: str = "") -> Series:
     return Series(label, x, y, y - 0.1, y + 0.1)
 
 
-def course(n: int, *, is_rate: bool = False) -> CourseChart:
+def course(n: int, *, is_rate: bool = False) -> TrendChart:
     shots = np.arange(1.0, n + 1)
     values = shots % 2 if is_rate else 1 - 0.01 * (shots % 3)
-    return CourseChart("filling by shot", "filling (%)", shots, values, series(min(n, 5)), is_rate=is_rate)
+    return TrendChart("filling by shot", "filling (%)", shots, values, series(min(n, 5)), is_rate=is_rate)
 
 
 def sites(fraction: float = 0.97) -> SitesChart:
@@ -61,7 +61,7 @@ CHARTS: tuple[Chart, ...] = (
     ),
     MapChart("b", "x", "y", tuple("abcdefghijkl"), ("3",), np.full((1, 12), 0.5), "filling (%)", (0.5, 0.5)),
     DefectsChart("defects", "defects", series(3, "shots"), np.array([0.5, 0.3, 0.2])),
-    CausesChart("lost", "atoms", ("imaging", "$x$"), np.array([3.0, 1.0]), np.array([0.1, NAN])),
+    LossCausesChart("lost", "atoms", ("imaging", "$x$"), np.array([3.0, 1.0]), np.array([0.1, NAN])),
     StagesChart("stages", ("modelled", "host"), (StageBar("plan", ((NAN, NAN), (1e-3, 2e-3)), NAN),)),
     StagesChart("nothing", ("measured",), (StageBar("plan", ((NAN, NAN),), NAN),)),
     sites(),

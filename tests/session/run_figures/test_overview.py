@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from labseq.drawing.charts import (
-    CausesChart,
-    CourseChart,
+    LossCausesChart,
+    TrendChart,
     CurvesChart,
     DefectsChart,
     RunDrawing,
@@ -34,8 +34,8 @@ def kinds(drawing: RunDrawing) -> list[list[type]]:
 
 def test_a_run_of_the_virtual_lab_fills_the_sheet(compact: Run) -> None:
     assert kinds(overview(compact)) == [
-        [CourseChart, CurvesChart, DefectsChart],
-        [CourseChart, CurvesChart, CausesChart],
+        [TrendChart, CurvesChart, DefectsChart],
+        [TrendChart, CurvesChart, LossCausesChart],
         [SitesChart, SitesChart, StagesChart],
     ]
 
@@ -47,7 +47,7 @@ def test_each_part_is_there_alone(compact: Run, what: str) -> None:
 
 def test_a_run_without_rearrangement_has_the_rest(write: Write, shot: Shot) -> None:
     run = write([shot(i, n_cycles=0) for i in range(3)], resolved={})
-    assert kinds(overview(run)) == [[CourseChart, DefectsChart], [CourseChart], [SitesChart, StagesChart]]
+    assert kinds(overview(run)) == [[TrendChart, DefectsChart], [TrendChart], [SitesChart, StagesChart]]
     with pytest.raises(
         ConfigError, match=r"nothing to show of lost atoms; expected readable shots with a rear"
     ):
@@ -74,8 +74,8 @@ def test_shots_that_are_not_judged_are_shown_by_the_image_that_ended_the_last_cy
 ) -> None:
     drawing = overview(write([shot(i, n_defects=i, judged=False) for i in range(3)]))
     filling, success = (row[0] for row in drawing.rows[:2])
-    assert isinstance(filling, CourseChart)
-    assert isinstance(success, CourseChart)
+    assert isinstance(filling, TrendChart)
+    assert isinstance(success, TrendChart)
     assert filling.values == pytest.approx([1, 5 / 6, 4 / 6])
     assert success.values.tolist() == [1, 0, 0]
 
@@ -124,7 +124,7 @@ def test_shots_whose_files_are_gone_are_left_out_of_what_needs_them(write: Write
     assert sites.title.endswith("1 of 3 shots")
     run.shots[2].file.write_bytes(b"nothing")
     gone = overview(open_run(run.path))
-    assert CourseChart in kinds(gone)[0]
+    assert TrendChart in kinds(gone)[0]
     with pytest.raises(ConfigError, match="nothing to show of survival by site"):
         picture_of(open_run(run.path), "survival")
 
