@@ -17,10 +17,10 @@ from pathlib import Path
 from labseq import SiteGrid, TargetPattern
 from labseq.config import Document
 from labseq.config.fields import PatternChoice
-from labseq.drawing import save_target
+from labseq.pictures.plans import save_target
 from labseq.session import load_plugins
-from labseq.session.choosing import resolve
-from labseq.session.constructing import construct_target
+from labseq.session.construct import construct_target
+from labseq.session.profile import resolve
 
 DOCS = Path(__file__).parent
 PAGE = DOCS / "reference" / "patterns.md"

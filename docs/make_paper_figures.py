@@ -23,16 +23,20 @@ from typing import Any
 import numpy as np
 
 from labseq import Session, ShotRecord
-from labseq.drawing import CyclesDrawing, ParallelismDrawing, Series, save_cycles, save_parallelism
-from labseq.recording.rates import Rate
-from labseq.sequencer import Sequencer
-from labseq.sequencer.policies import RunPolicy
-from labseq.session.ceiling import survival
-from labseq.session.run_figures import (
+from labseq.analysis.paper import (
     PAPERS_DEFECT_FREE,
     PAPERS_FILLING,
     PAPERS_LIFETIME_S,
+    CyclesDrawing,
+    ParallelismDrawing,
+    save_cycles,
+    save_parallelism,
+    survival,
 )
+from labseq.analysis.statistics import Rate
+from labseq.pictures.figures import Series
+from labseq.sequencer import Sequencer
+from labseq.sequencer.policies import RunPolicy
 
 DOCS = Path(__file__).parent
 SEQUENCES = DOCS.parent / "sequences"

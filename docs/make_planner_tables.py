@@ -14,12 +14,10 @@ import sys
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
-from labseq.drawing import save_comparison
+from labseq.bench.pictures import save_comparison
+from labseq.bench.planners import BenchRequest, compare, read_request
+from labseq.bench.report import FIGURES, Figure, Report, Row, figure_drawing, points_of
 from labseq.model.estimate import Estimate
-from labseq.session.bench import BenchRequest, compare, read_request
-from labseq.session.bench_curves import figure_drawing, points_of
-from labseq.session.bench_figures import FIGURES, Figure
-from labseq.session.bench_report import Report, Row
 from labseq.units import format_quantity
 
 DOCS = Path(__file__).parent

@@ -10,7 +10,7 @@ import importlib
 from typing import Any, Final
 
 _HOMES: Final = {
-    "labseq._markers": ("hookimpl",),
+    "labseq.hookspecs": ("LABSEQ_API", "hookimpl"),
     "labseq.api": ("make_planner", "make_target", "tone_program"),
     "labseq.config.settings": (
         "Angle",
@@ -25,8 +25,16 @@ _HOMES: Final = {
         "Temperature",
         "Voltage",
     ),
-    "labseq.config.cameras": ("CameraSettings", "CoolingSettings"),
-    "labseq.drivers": ("CameraDriver", "Cooling", "Series", "SimulatedSensor", "ExposureResult", "settle", "wait_for"),
+    "labseq.drivers.settings": ("CameraSettings", "CoolingSettings"),
+    "labseq.drivers": (
+        "CameraDriver",
+        "Cooling",
+        "Series",
+        "SimulatedSensor",
+        "ExposureResult",
+        "settle",
+        "wait_for",
+    ),
     "labseq.errors": (
         "ConfigError",
         "DeviceError",
@@ -41,7 +49,6 @@ _HOMES: Final = {
         "TransientError",
         "UnknownPluginError",
     ),
-    "labseq.hookspecs": ("LABSEQ_API",),
     "labseq.model": (
         "Batch",
         "CalibrationEntry",

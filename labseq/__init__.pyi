@@ -1,6 +1,6 @@
 """Types of the flat public namespace; the table in ``__init__.py`` resolves the same names."""
 
-from labseq._markers import (
+from labseq.hookspecs import (
     hookimpl as hookimpl,
 )
 from labseq.api import (
@@ -8,7 +8,7 @@ from labseq.api import (
     make_target as make_target,
     tone_program as tone_program,
 )
-from labseq.config.cameras import (
+from labseq.drivers.settings import (
     CameraSettings as CameraSettings,
     CoolingSettings as CoolingSettings,
 )
@@ -28,9 +28,9 @@ from labseq.config.settings import (
 from labseq.drivers import (
     CameraDriver as CameraDriver,
     Cooling as Cooling,
+    ExposureResult as ExposureResult,
     Series as Series,
     SimulatedSensor as SimulatedSensor,
-    ExposureResult as ExposureResult,
     settle as settle,
     wait_for as wait_for,
 )
@@ -97,41 +97,41 @@ from labseq.registry import (
 from labseq.roles import (
     Analysis as Analysis,
     Camera as Camera,
+    ChecksCommands as ChecksCommands,
     Clock as Clock,
     Context as Context,
     Detector as Detector,
     Device as Device,
+    HasReadings as HasReadings,
+    HasSelfTest as HasSelfTest,
     Interlocked as Interlocked,
-    ReportsCameraFacts as ReportsCameraFacts,
-    ChecksCommands as ChecksCommands,
-    ReportsLinesFacts as ReportsLinesFacts,
-    ReportsLoading as ReportsLoading,
-    ReportsSensor as ReportsSensor,
     LeaderLink as LeaderLink,
     Lines as Lines,
-    ReceivesOutput as ReceivesOutput,
-    ReportsLosses as ReportsLosses,
     MobileTweezers as MobileTweezers,
+    NeedsSettling as NeedsSettling,
+    NeedsWarmUp as NeedsWarmUp,
     Planner as Planner,
-    HasReadings as HasReadings,
+    ReceivesOutput as ReceivesOutput,
     RecordedShot as RecordedShot,
     Repeatable as Repeatable,
+    ReportsCameraFacts as ReportsCameraFacts,
+    ReportsEvents as ReportsEvents,
+    ReportsLinesFacts as ReportsLinesFacts,
+    ReportsLoading as ReportsLoading,
+    ReportsLosses as ReportsLosses,
+    ReportsSensor as ReportsSensor,
+    ReportsSignals as ReportsSignals,
+    ReportsTimings as ReportsTimings,
+    ReportsTruth as ReportsTruth,
     RfSource as RfSource,
     Scanner as Scanner,
-    HasSelfTest as HasSelfTest,
-    NeedsSettling as NeedsSettling,
     Shot as Shot,
-    ReportsSignals as ReportsSignals,
     Simulation as Simulation,
     StaticTweezers as StaticTweezers,
     Step as Step,
     StepContext as StepContext,
-    ReportsEvents as ReportsEvents,
-    ReportsTimings as ReportsTimings,
     ToneSource as ToneSource,
     Trigger as Trigger,
-    ReportsTruth as ReportsTruth,
-    NeedsWarmUp as NeedsWarmUp,
     WiresTriggers as WiresTriggers,
 )
 from labseq.session import (

@@ -9,15 +9,15 @@ from typing import Any, Final, TypeAlias
 
 from labseq import motion as _motion
 from labseq.config import load_profile
-from labseq.config.values import validate_values
+from labseq.config.validation import validate_values
 from labseq.errors import ConfigError, Problem
 from labseq.model import MotionSpec, Plan, SiteGrid, TargetPattern, ToneProgram
 from labseq.registry import Entry
 from labseq.roles import Context, Planner
 from labseq.session import load_plugins
-from labseq.session.calibrating import calibrated_grid
-from labseq.session.choosing import ChosenPlugin
-from labseq.session.constructing import construct_one, construct_target
+from labseq.session.calibrations import calibrated_grid
+from labseq.session.construct import construct_one, construct_target
+from labseq.session.profile import ChosenPlugin
 
 Folders: TypeAlias = str | Path | Sequence[str | Path]
 """A folder, or several."""

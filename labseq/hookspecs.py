@@ -1,4 +1,4 @@
-"""The hooks of labseq, all four. The docstrings are the contract.
+"""The four hooks of labseq plugins.
 
 A plugin is a module (or an installed package with an entry point of group
 ``labseq``) that implements any of these with ``@labseq.hookimpl`` and states the
@@ -9,9 +9,14 @@ from __future__ import annotations
 
 from typing import Final
 
-from labseq._markers import hookspec
+import pluggy
+
 from labseq.model import RunRecord, ShotRecord
 from labseq.registry import Registry
+
+hookspec: Final = pluggy.HookspecMarker("labseq")
+hookimpl: Final = pluggy.HookimplMarker("labseq")
+
 
 LABSEQ_API: Final = 1
 """Version of the hooks and roles; a plugin written for another one is not loaded."""

@@ -15,10 +15,10 @@ from labseq_optuna.scanner import OptunaScanner, OptunaSettings
 from labseq_pylon.library import load_pypylon
 
 import labseq.testing
-from labseq.config.drawings import read_drawing
-from labseq.drawing import check_place
+from labseq.builtin.patterns import read_drawing
 from labseq.errors import LabseqError
 from labseq.model import ScanSpace
+from labseq.pictures.figures import check_place
 from labseq.recording.export import check_export
 from labseq.recording.shot_file import _bitshuffle
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
-from labseq.lines import idle_program, line_program, margin_s, off_program, spans_on, trigger_line
 from labseq.model import LineProgram, LineSpec, TimelineEntry
+from labseq.sequencer.lines import idle_program, line_program, margin_s, off_program, spans_on, trigger_line
 
 KINDS = ("load", "image", "rearrange", "idle")
 times = st.sampled_from([0.0, 0.5e-3, 1e-3, 7e-3])

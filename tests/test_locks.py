@@ -9,12 +9,12 @@ from pathlib import Path
 import filelock
 import pytest
 
-from labseq.locks import Holder, Lock, knows_no_locks
+from labseq.files import Holder, Lock, knows_no_locks
 
 HOLD = """
 import sys
 from pathlib import Path
-from labseq.locks import Lock
+from labseq.files import Lock
 lock = Lock(Path(sys.argv[1]), "the run µ")
 assert lock.take() is None
 print("held", flush=True)

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from labseq import places
-from labseq.places import data_root, packaged_profiles_dir
+from labseq import files as places
+from labseq.files import data_root, packaged_profiles_dir
 
 
 def test_packaged_profiles() -> None:

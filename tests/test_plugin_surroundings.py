@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 
 from labseq.plugins import LOCAL_PACKAGE, PluginHost, contained
-from labseq.plugins.surroundings import SHARED
+from labseq.plugins.contained import SHARED
 from labseq.registry import Owner
 
 PLUGIN = """

@@ -19,14 +19,14 @@ import pytest
 
 import labseq
 from labseq.cli import main
-from labseq.cli.plugins import table
+from labseq.cli.devices import plugins_table as table
 from labseq.config import Document
 from labseq.errors import LabseqError, PluginLoadError
 from labseq.plugins import LOCAL_PACKAGE, PluginHost, PluginInfo
 from labseq.registry import Entry
 from labseq.roles import Context
-from labseq.session.choosing import ChosenPlugin, validate
-from labseq.session.constructing import construct_one, construct_target
+from labseq.session.construct import construct_one, construct_target
+from labseq.session.profile import ChosenPlugin, validate
 
 GOOD = '''
 from labseq import Settings, hookimpl

@@ -17,11 +17,9 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
         SystemExit: Always, with the exit code.
     """
     from labseq.cli.app import app
-    from labseq.cli.arguments import arrange
-    from labseq.cli.failures import report
-    from labseq.cli.leaving import end_process
-    from labseq.cli.output import replace_unencodable, discard_unwritten
-    from labseq.cli.usage import USAGE_ERROR, refuse
+    from labseq.cli.main import USAGE_ERROR, arrange, end_process, refuse
+    from labseq.console.errors import report
+    from labseq.console.output import discard_unwritten, replace_unencodable
 
     arranged = arrange(sys.argv[1:] if arguments is None else arguments)
     replace_unencodable()

@@ -1,30 +1,215 @@
-"""The commands and their options; each body is imported only when its command runs."""
+"""The command line: which commands there are; their code is imported when they run."""
 
 from __future__ import annotations
 
-from typing import Annotated
+from pathlib import Path
+from typing import Annotated, Final
 
 import typer
 
 from labseq import __version__
+from labseq.analysis.commands import ANALYSE_EXAMPLES, REPLAY_EXAMPLES, analyse, replay
+from labseq.bench.commands import bench
+from labseq.calibration.commands import CALIBRATE_EXAMPLES, calibrate, calibration
 from labseq.cli import plan_options, plot_options, show_options, waveform_options
-from labseq.cli.bench_app import bench
-from labseq.cli.calibration_app import CALIBRATE_EXAMPLES, calibrate, calibration
-from labseq.cli.completing import profile_names
-from labseq.cli.data_app import DOCTOR_EXAMPLES, EXPORT_EXAMPLES, doctor, export
-from labseq.cli.demo_app import demo
-from labseq.cli.new_app import NEW_EXAMPLES, SCHEMA_EXAMPLES, new, schema
-from labseq.cli.queue_app import queue
-from labseq.cli.replay_app import ANALYSE_EXAMPLES, REPLAY_EXAMPLES, analyse, replay
-from labseq.cli.run_app import RESUME_EXAMPLES, RUN_EXAMPLES, resume, run, stop
-from labseq.cli.shared_options import (
+from labseq.console.options import (
     DryRun,
     Json,
+    Output,
     Overrides,
     Profile,
+    Realtime,
     RunFolder,
+    Seed,
     SequenceFile,
+    Shots,
+    profile_names,
+    run_folders,
+    run_options,
 )
+from labseq.queue.commands import queue
+from labseq.scaffold.commands import NEW_EXAMPLES, SCHEMA_EXAMPLES, new, schema
+
+EXPORT_EXAMPLES: Final = """\b
+Examples:
+  labseq export --to csv
+  labseq export data/2026-11-20/0001_compact-225 --to netcdf -o compact.nc
+  labseq export data/2026-11-20/0001_compact-225 --to archive --frames
+"""
+
+DOCTOR_EXAMPLES: Final = """\b
+Examples:
+  labseq doctor --dry-run
+  labseq doctor data/2026-11-20/0001_compact-225
+"""
+
+
+def export(
+    run: RunFolder = None,
+    to: Annotated[
+        str,
+        typer.Option(
+            "--to",
+            metavar="csv|parquet|netcdf|archive",
+            help="Kind of file: a table of the shots (csv, parquet), a table with occupancies on the axes of "
+            "the scan (netcdf), or everything in one HDF5 file (archive).",
+        ),
+    ] = "csv",
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output", "-o", metavar="FILE", help="The file; by default one named after the run, here."
+        ),
+    ] = None,
+    frames: Annotated[bool, typer.Option("--frames", help="Keep the frames, too; archive only.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace files that are there already.")] = False,
+) -> None:
+    """Export a run to one file that other programs read."""
+    from labseq.cli.data import export_to
+
+    raise typer.Exit(export_to(run, to, output, frames=frames, replace=force))
+
+
+def doctor(
+    data: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="DATA",
+            help="A data folder or one run; LABSEQ_DATA or ./data by default.",
+            show_default=False,
+        ),
+    ] = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only tell; change nothing.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Find what crashes and faulty disks did to recorded data, and repair what can be repaired."""
+    from labseq.cli.data import examine
+
+    raise typer.Exit(examine(data, dry_run=dry_run, as_json=as_json))
+
+
+def demo(
+    shots: Annotated[
+        int | None, typer.Option(metavar="N", help="Number of shots; 10 by default.", show_default=False)
+    ] = None,
+    output: Output = None,
+    copy: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER",
+            help="Run nothing; copy the sequences and profiles that come with labseq there, to be changed.",
+        ),
+    ] = None,
+) -> None:
+    """Run a sequence that comes with labseq on its virtual lab: a first look, without any file."""
+    if copy is None:
+        from labseq.cli.run import run_demo
+
+        run_demo(shots, output)
+        return
+    if shots is not None or output is not None:
+        raise typer.BadParameter("it runs nothing; leave out --shots and --output", param_hint="--copy")
+    from labseq.cli.run import copy_files
+
+    copy_files(copy)
+
+
+RUN_EXAMPLES = """\b
+Examples:
+  labseq run sequences/compact_225.yaml
+  labseq run sequences/compact_225.yaml --shots 5 --seed 1 --json
+  labseq run sequences/compact_225.yaml --profile lab --dry-run
+  labseq run sequences/compact_225.yaml --set planner.degree_of_parallelism=2 --set shot.2.rearrange.window="200 ms"
+"""  # noqa: E501 - a command line that is to be copied
+RESUME_EXAMPLES = """\b
+Examples:
+  labseq resume data/2026-01-02/0001_compact-225
+  labseq resume data/2026-01-02/0001_compact-225 --accept-changes
+"""
+
+
+def run(
+    sequence: SequenceFile,
+    profile: Profile = None,
+    dry_run: DryRun = None,
+    shots: Shots = None,
+    seed: Seed = None,
+    overrides: Overrides = None,
+    output: Output = None,
+    as_json: Json = False,
+    realtime: Realtime = False,
+) -> None:
+    """Run a sequence and record every shot."""
+    from labseq.cli.run import run_sequence
+
+    options = run_options(
+        profile=profile,
+        dry_run=dry_run,
+        shots=shots,
+        seed=seed,
+        overrides=overrides,
+        output=output,
+        realtime=realtime,
+    )
+    run_sequence(sequence, options, as_json=as_json)
+
+
+def resume(
+    run: Annotated[
+        Path,
+        typer.Argument(
+            metavar="RUN",
+            help="The run's folder, or any file in it.",
+            show_default=False,
+            autocompletion=run_folders,
+        ),
+    ],
+    accept_changes: Annotated[
+        bool,
+        typer.Option(
+            "--accept-changes",
+            help="Go on although code, plugins or settings have changed since; run.json tells of it.",
+        ),
+    ] = False,
+    as_json: Json = False,
+    realtime: Realtime = False,
+) -> None:
+    """Take the shots that are missing in a run that was stopped, failed or died."""
+    from labseq.cli.run import resume_run
+
+    resume_run(run, accept_changes=accept_changes, realtime=realtime, as_json=as_json)
+
+
+def stop(
+    run: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="RUN",
+            help="The run's folder; the one in progress by default.",
+            show_default=False,
+            autocompletion=run_folders,
+        ),
+    ] = None,
+    profile: Annotated[
+        str | None,
+        typer.Option(
+            "--profile",
+            "-p",
+            metavar="NAME|FILE",
+            help="The run on this profile's devices.",
+            autocompletion=profile_names,
+        ),
+    ] = None,
+    queue: Annotated[
+        bool, typer.Option("--queue", help="Let labseq queue run take no further entry, too.")
+    ] = False,
+    wait: Annotated[bool, typer.Option("--wait", help="Wait until the run has ended.")] = False,
+) -> None:
+    """Ask a run in progress to end after the shot at hand; its devices are made safe."""
+    from labseq.cli.run import stop_run
+
+    stop_run(run, profile, queue=queue, wait=wait)
+
 
 app = typer.Typer(
     name="labseq",
@@ -127,9 +312,9 @@ def waveform(
     npz: waveform_options.Npz = None,
 ) -> None:
     """Show what the AWG would play for a plan: voltages, powers, spectrogram, samples."""
+    from labseq.bench.waveform import WaveformRequest
     from labseq.cli.waveform import WaveformOutput, show_waveform
     from labseq.session import PlanRequest
-    from labseq.session.waveform import WaveformRequest
 
     request = PlanRequest(
         occupancy=plan,
@@ -163,7 +348,7 @@ def show(
 @app.command(short_help="Watch a run that goes on in another process.")
 def watch(run: RunFolder = None) -> None:
     """Show a run that goes on in another process, until it ends; Ctrl-C ends only the view."""
-    from labseq.cli.watch import watch_run
+    from labseq.cli.live import watch_run
 
     watch_run(run)
 
@@ -179,7 +364,7 @@ def plot(
     output: plot_options.Output = None,
 ) -> None:
     """Draw a run, finished or not: all of it on one sheet, a part of it, a shot, or a figure of the paper."""
-    from labseq.cli.plot import PlotRequest, plot_run
+    from labseq.analysis.terminal import PlotRequest, plot_run
 
     plot_run(run, PlotRequest(what, figure, compare, shot, cycle), output)
 
@@ -211,7 +396,7 @@ def plugins(
     as_json: Json = False,
 ) -> None:
     """List the plugins: what each offers, where it comes from, why it failed to load, what else it did."""
-    from labseq.cli.plugins import list_plugins
+    from labseq.cli.devices import list_plugins
 
     list_plugins(profile, as_json=as_json)
 
@@ -230,7 +415,7 @@ def safe(
     overrides: Overrides = None,
 ) -> None:
     """Open every device of a profile, bring it to its safe state, and close it."""
-    from labseq.cli.safe import secure_profile
+    from labseq.cli.devices import secure_profile
 
     raise typer.Exit(secure_profile(profile, overrides or ()))
 

@@ -1,7 +1,8 @@
-"""``labseq check``: what a sequence will do, at most."""
+"""`labseq check`: the timeline and limits of a sequence, and every mistake in it."""
 
 from __future__ import annotations
 
+import math
 import shutil
 import sys
 from collections.abc import Mapping, Sequence
@@ -11,23 +12,129 @@ from typing import Any, Final, cast
 
 import numpy as np
 
-from labseq.cli.calibration import age_s, quality_text
-from labseq.cli.excerpt import excerpt
-from labseq.cli.failures import lines_of
-from labseq.cli.log_lines import LogLines
-from labseq.cli.output import columns, stdout_to_stderr, encodes, say
-from labseq.cli.policy_words import policy_texts
-from labseq.cli.show import as_line
-from labseq.cli.timeline import BAR_WIDTH, lines_table, timeline_table
-from labseq.cli.words import age_text, clock_time, plural, settings_text
-from labseq.config import Axis
-from labseq.config.wording import clean
+from labseq.calibration.terminal import age_s, quality_text
+from labseq.config import Axis, CheckSettings
+from labseq.config.messages import clean
+from labseq.console.errors import excerpt, lines_of
+from labseq.console.output import (
+    LogLines,
+    age_text,
+    as_line,
+    clock_time,
+    columns,
+    encodes,
+    plural,
+    say,
+    settings_text,
+    stdout_to_stderr,
+)
 from labseq.errors import ConfigError, Problem
+from labseq.model import TimelineEntry
+from labseq.sequencer.policies import StepPolicy
 from labseq.session import Assembly, CheckReport, Session, check
 from labseq.session.adaptive import Search
-from labseq.session.checking import Rehearsal
-from labseq.session.choosing import DryRun
+from labseq.session.check import Rehearsal
+from labseq.session.profile import DryRun
 from labseq.units import format_quantity
+
+BAR_WIDTH: Final = 30
+
+Timeline = Sequence[tuple[str, Sequence[TimelineEntry]]]
+
+
+def timeline_table(timeline: Timeline, block: str, width: int = BAR_WIDTH) -> list[str]:
+    """A row per bar of the timeline: step, start, length, and the bar itself.
+
+    Args:
+        timeline: Name of each step and its bars.
+        block: What bars are made of.
+        width: Characters of the longest bar; 0 for none.
+    """
+    total_s = sum(bar.duration_s for _, bars in timeline for bar in bars)
+    rows = [("step", "", "start", "at most", "")]
+    start_s = 0.0
+    for number, (name, bars) in enumerate(timeline):
+        for i, bar in enumerate(bars):
+            label = bar.label if bar.label != name else ""
+            length = format_quantity(bar.duration_s, "time")
+            drawn = _bar(start_s, bar.duration_s, total_s, block, width)
+            step = f"{number} {name}" if i == 0 else ""
+            rows.append((step, label, format_quantity(start_s, "time"), length, drawn))
+            start_s += bar.duration_s
+    return columns(rows, right=(2, 3))
+
+
+def _bar(start_s: float, duration_s: float, total_s: float, block: str, width: int) -> str:
+    if not total_s or not width:
+        return ""
+    first, last = (round(width * t / total_s) for t in (start_s, start_s + duration_s))
+    first = min(first, width - 1)
+    return " " * first + block * max(1, last - first)
+
+
+def lines_table(
+    lines: Mapping[str, Sequence[tuple[float, float]]], total_s: float, block: str, width: int = BAR_WIDTH
+) -> list[str]:
+    """A row per line: for how long it is on, and a bar for when.
+
+    Args:
+        lines: Name -> (start, end) of each time that it is on, in seconds.
+        total_s: Duration of the shot, in seconds.
+        block: What bars are made of.
+        width: Characters of the longest bar; 0 for none.
+    """
+    if not lines:
+        return []
+    rows = [("line", "", "times on", "at most", "")]
+    for name, spans in lines.items():
+        lit_s = sum(end_s - start_s for start_s, end_s in spans)
+        drawn = [" "] * width
+        for start_s, end_s in spans:
+            for place, mark in enumerate(_bar(start_s, end_s - start_s, total_s, block, width)):
+                drawn[place] = mark if mark != " " else drawn[place]
+        rows.append((name, "", str(len(spans)), format_quantity(lit_s, "time"), "".join(drawn).rstrip()))
+    return columns(rows, right=(2, 3))
+
+
+_THEN = {"repeat_shot": "repeats the shot", "skip_point": "skips its point", "stop": "stops the run"}
+
+
+def policy_texts(assembly: Assembly) -> list[str]:
+    """What differs from doing without policies, a line for the run, each step and each check."""
+    policy, spec = assembly.policy, assembly.sequence
+    texts = [text for text in [_differing(policy.otherwise, StepPolicy())] if text]
+    if policy.when_exhausted == "skip_point":
+        texts.append("a shot whose attempts are used up skips its point")
+    for number, (step, own) in enumerate(zip(spec.shot, policy.steps, strict=True)):
+        if text := _differing(own, policy.otherwise):
+            texts.append(f"step {number} ({step.name or step.kind}): {text}")
+    return texts + [_check(check) for check in spec.policy.checks]
+
+
+def _differing(own: StepPolicy, otherwise: StepPolicy) -> str:
+    parts: list[str] = []
+    if own.timeout_s < math.inf:
+        parts.append(f"{format_quantity(own.timeout_s, 'time')} at most")
+    if own.retries:
+        parts.append("tried again once" if own.retries == 1 else f"tried again {own.retries} times")
+    if own.on_failure and own.on_failure != otherwise.on_failure:
+        parts.append(f"a failure {_THEN[own.on_failure]}")
+    if own.over_budget != otherwise.over_budget:
+        then = {"record": "is just recorded", "warn": "is a warning"} | _THEN
+        parts.append(f"a stage over its budget {then[own.over_budget]}")
+    return ", ".join(parts)
+
+
+def _check(check: CheckSettings) -> str:
+    limits = [
+        f"{word} {limit:g}"
+        for word, limit in (("at least", check.at_least), ("at most", check.at_most))
+        if limit is not None
+    ]
+    of = "each shot" if check.shots == 1 else f"the mean of {check.shots} shots"
+    then = {"warn": "a warning"} | _THEN
+    return f"{check.value} of {of} {' and '.join(limits)}; else {then[check.then]}"
+
 
 _TEXT_WIDTH: Final = 48  # of the timeline without its bars
 

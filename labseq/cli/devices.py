@@ -1,19 +1,25 @@
-"""``labseq devices``: what is connected, and whether it works."""
+"""`labseq devices`, `labseq safe` and `labseq plugins`."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from labseq.cli.check import refusal
-from labseq.cli.output import columns, stdout_to_stderr, say, report_compiling
-from labseq.config.wording import clean
+from labseq.config import load_profile, plugin_paths
+from labseq.config.messages import clean
+from labseq.console.errors import report
+from labseq.console.output import as_line, columns, report_compiling, say, stdout_to_stderr
 from labseq.errors import ConfigError, DeviceError
-from labseq.kernels.compile import announcing
-from labseq.recording.plain import dumps
-from labseq.session import CheckedDevice, DevicesReport, check_devices
-from labseq.session.choosing import DryRun
+from labseq.kernel import announcing
+from labseq.plugins import PluginHost, PluginInfo
+from labseq.recording.durable import dumps
+from labseq.registry import LOAD_S
+from labseq.scaffold.new import PLUGINS
+from labseq.session import CheckedDevice, DevicesReport, check_devices, load_plugins, make_profile_safe
+from labseq.session.profile import DryRun
 from labseq.units import format_quantity
 
 _HEADER = ("device", "plugin", "model", "serial number", "firmware", "latency", "state")
@@ -100,3 +106,88 @@ def _as_values(report: DevicesReport) -> dict[str, Any]:
         for found in report.devices
     ]
     return {"devices": devices, "warnings": report.warnings, "problems": []}
+
+
+def secure_profile(profile: str, overrides: Sequence[str]) -> int:
+    """Make a profile's devices safe; prints a line per device as it is done.
+
+    Args:
+        profile: Name or path of the profile.
+        overrides: ``"address=value"`` strings.
+
+    Returns:
+        The exit code: 0 if every device is safe and the profile right, 3 if a device
+        failed, else 2.
+
+    Raises:
+        ConfigError: The profile cannot be read; no device was touched.
+    """
+    secured = make_profile_safe(profile, overrides, _Lines())
+    if secured.problems is not None:
+        report(secured.problems)
+    if any(secured.attempted.values()):
+        return DeviceError.exit_code
+    return ConfigError.exit_code if secured.refused or secured.problems else 0
+
+
+class _Lines:
+    """Implements ``RunObserver`` with a line per device."""
+
+    def event(self, name: str, values: Mapping[str, Any]) -> None:
+        if name == "safe_state":
+            state = "safe" if values["ok"] else f"NOT SAFE: {values['error']}"
+            say(f"{values['device']:<20} {state}")
+        elif name == "closed" and not values["ok"]:
+            say(f"{values['device']:<20} could not be closed: {values['error']}")
+        elif name == "warning":
+            say(f"warning: {values['text']}")
+
+
+def list_plugins(profile: str | None, *, as_json: bool = False) -> None:
+    """Print a table of the plugins.
+
+    Args:
+        profile: Name or path of a profile whose plugin folders are searched too; without one, it is the
+            folder ``plugins``, if there is one.
+        as_json: Whether to print one line of JSON instead.
+
+    Raises:
+        ConfigError: The profile is wrong, or one of its folders does not exist.
+    """
+    answer = stdout_to_stderr() if as_json else None
+    folders, max_wait_s = _folders(profile)
+    host = load_plugins(folders, max_wait_s=max_wait_s)
+    if answer is None:
+        say(*plugins_table(host))
+    else:
+        answer(as_line({"plugins": [_values(host, info) for info in host.infos]}))
+
+
+def plugins_table(host: PluginHost) -> list[str]:
+    """A row per plugin, and below them why one failed to load, and what one did besides."""
+    rows = [("plugin", "state", "version", "origin", "offers")]
+    told: list[str] = []
+    for info in host.infos:
+        rows.append(
+            (info.name, info.state, info.version or "-", info.origin, ", ".join(_offers(host, info)) or "-")
+        )
+        told += [f"{info.name}: {info.reason}"] if info.reason else []
+        told += [f"{info.name}: warning: {note}" for note in info.notes]
+    return [*columns(rows), *([""] if told else []), *told]
+
+
+def _offers(host: PluginHost, info: PluginInfo) -> list[str]:
+    return [f"{entry.kind}:{entry.name}" for entry in host.registry.entries(info.name)]
+
+
+def _values(host: PluginHost, info: PluginInfo) -> dict[str, Any]:
+    names = ("name", "state", "version", "origin", "source", "reason", "notes")
+    return {**{name: getattr(info, name) for name in names}, "offers": _offers(host, info)}
+
+
+def _folders(profile: str | None) -> tuple[list[Path], float]:
+    """The profile's plugin folders and patience; the plugins that it names need not exist for that."""
+    if profile is None:
+        return [path for path in (Path(PLUGINS),) if path.is_dir()], LOAD_S
+    document, spec = load_profile(profile, beside=Path())
+    return plugin_paths(document, spec.plugin_folders), spec.timeouts.load

@@ -1,17 +1,38 @@
-"""``labseq plan``: one plan, to look at."""
+"""`labseq plan`: the moves for one occupancy, printed or drawn."""
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, NoReturn, TextIO
 
-from labseq.cli.files import STDOUT, check_different, json_writer
-from labseq.cli.output import say, report_compiling
-from labseq.cli.words import plural
-from labseq.kernels.compile import interpret
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.text import Text
+
+from labseq.cli.live import DENSE, ROOMY, Scale, draw_array, kinds
+from labseq.console.output import (
+    STDOUT,
+    Glyphs,
+    check_different,
+    columns,
+    count_of,
+    encodes,
+    glyphs_for,
+    json_writer,
+    plural,
+    report_compiling,
+    say,
+    writing_to,
+)
+from labseq.kernel import interpret
+from labseq.model import Batch, Occupancy, TargetPattern
+from labseq.pictures.plans import occupancies, on_grid
 from labseq.session import PlannedMoves, PlanRequest, plan_moves, read_source
+from labseq.units import format_quantity
 
 INTERPRETED_SITES: Final = 64 * 64
 """Up to this size a plan in plain Python takes less time than numba to load."""
@@ -48,7 +69,7 @@ def plan_once(request: PlanRequest, output: PlanOutput) -> None:
     write = json_writer(output.json)
     source = read_source(request.occupancy, request.seed)
     if output.png is not None:
-        from labseq.drawing import check_picture
+        from labseq.pictures.plans import check_picture
 
         check_picture(output.png, source.occupancy.shape)
     if source.occupancy.size <= INTERPRETED_SITES:
@@ -59,8 +80,6 @@ def plan_once(request: PlanRequest, output: PlanOutput) -> None:
     if output.json != STDOUT:
         write(moves.as_dict())
     if output.step or output.json != STDOUT:
-        from labseq.cli.plan_report import print_plan
-
         print_plan(moves, sys.stdout, step=output.step)
     say(*(f"warning: {text}" for text in warnings(moves, request)), stream=sys.stderr)
     if output.json == STDOUT:
@@ -88,10 +107,300 @@ def warnings(moves: PlannedMoves, request: PlanRequest) -> list[str]:
 
 
 def _draw(moves: PlannedMoves, path: Path) -> None:
-    from labseq.cli.plan_report import title
-    from labseq.drawing import PlanDrawing, save_plan
+    from labseq.pictures.plans import PlanDrawing, save_plan
 
     drawing = PlanDrawing(
         title(moves), moves.source, moves.grid, moves.occupancy, moves.target, moves.plan, moves.report
     )
     save_plan(path, drawing)
+
+
+GAP: Final = 4
+"""Characters between two arrays."""
+LEAST: Final = len("before")
+"""Characters that an array takes at least."""
+
+Sites = NDArray[np.int16]
+NOWHERE: Final[Sites] = np.empty((0, 2), np.int16)
+
+_KEY: Final = (
+    ("atom on a target site", True, True, False),
+    ("empty target site", False, True, False),
+    ("surplus atom", True, False, True),
+    ("atom in the reservoir", True, False, False),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Canvas:
+    """Draws arrays of one grid.
+
+    Attributes:
+        target: What the array shall look like.
+        shear: As of :class:`labseq.model.SiteGrid`; 0 on a square lattice.
+        width: Characters per line.
+        glyphs: The characters to draw with.
+    """
+
+    target: TargetPattern
+    shear: int
+    width: int
+    glyphs: Glyphs
+
+    def pair(
+        self,
+        titles: Sequence[str],
+        arrays: Sequence[Occupancy],
+        marked: Sequence[Sites] = (NOWHERE, NOWHERE),
+    ) -> list[Text]:
+        """Draw two arrays, as large as there is room; no arrays where even small ones find none.
+
+        Args:
+            titles: What stands above the one and the other.
+            arrays: Both occupancies, bool (n_rows, n_cols).
+            marked: Sites on the grid that are shown inverted in them, int16 (n, 2) each.
+        """
+        beside, scale = self._arrangement
+        if scale is None:
+            n_rows, n_cols = self.target.shape
+            return [Text(f"({n_rows} x {n_cols} sites find no room in {self.width} characters)", "dim")]
+        drawn = [
+            [Text(title, "bold"), *self._numbered(self._draw(array, sites, scale), scale)]
+            for title, array, sites in zip(titles, arrays, marked, strict=True)
+        ]
+        if not beside:
+            return [*drawn[0], Text(), *drawn[1]]
+        left_width = max(line.cell_len for line in drawn[0])
+        lines: list[Text] = []
+        for left, right in zip(*drawn, strict=True):
+            left.pad_right(left_width + GAP - left.cell_len)
+            lines.append(Text.assemble(left, right))
+        return lines
+
+    def key(self, *arrays: Occupancy) -> Text:
+        """Explain the characters that occur in these arrays; empty if none does."""
+        if self._arrangement[1] is None:
+            return Text()
+        shown = {int(kind) for array in arrays for kind in np.unique(kinds(array, self.target))}
+        parts: list[Text] = []
+        for text, atom, fill, clear in _KEY:
+            site = np.array([[atom]])
+            target = TargetPattern(np.array([[fill]]), np.array([[clear]]))
+            if int(kinds(site, target)[0, 0]) in shown:
+                parts.append(Text.assemble(draw_array(site, target, 0, DENSE, self.glyphs)[0], f" {text}"))
+        return Text("   ").join(parts)
+
+    @property
+    def _arrangement(self) -> tuple[bool, Scale | None]:
+        """Whether two arrays stand side by side, and the scale; None if there is no room."""
+        widths = [(scale, scale.size(*self.target.shape, self.shear != 0)[0]) for scale in (ROOMY, DENSE)]
+        for beside in (True, False):
+            for scale, width in widths:
+                each = max(width + self._margin, LEAST)
+                if (2 * each + GAP if beside else each) <= self.width:
+                    return beside, scale
+        return False, None
+
+    @property
+    def _margin(self) -> int:
+        """Characters that the row numbers take."""
+        return len(str(self.target.shape[0] - 1)) + 1
+
+    def _draw(self, array: Occupancy, marked: Sites, scale: Scale) -> list[Text]:
+        lines = draw_array(array, self.target, self.shear, scale, self.glyphs)
+        for row, col in marked.tolist():
+            line, at = lines[row], self._column(row, col, scale)
+            line.pad_right(max(0, at + 1 - line.cell_len))
+            line.stylize("reverse", at, at + 1)
+        return lines
+
+    def _column(self, row: int, col: int, scale: Scale) -> int:
+        """Where a site stands in its line."""
+        return scale.indent(row, self.target.shape[0], self.shear) + col * scale.cell
+
+    def _numbered(self, lines: list[Text], scale: Scale) -> list[Text]:
+        """Number the rows on the left, and every fifth column above the first row."""
+        head = ""
+        for col in range(0, self.target.shape[1], 5):
+            head = head.ljust(self._margin + self._column(0, col, scale)) + str(col)
+        width = self._margin + scale.size(*self.target.shape, self.shear != 0)[0]
+        numbered = [Text(head if len(head) <= width else head.rstrip("0123456789"), "dim")]
+        for i, line in enumerate(lines):
+            number = f"{i:>{self._margin - 1}} "
+            numbered.append(Text.assemble((number, "dim"), line))
+        return numbered
+
+
+@dataclass(frozen=True, slots=True)
+class Steps:
+    """What is shown of each batch.
+
+    Attributes:
+        moves: The plan.
+        canvas: Draws the array.
+        arrow: Stands between the ends of a move.
+    """
+
+    moves: PlannedMoves
+    canvas: Canvas
+    arrow: str
+
+    def __iter__(self) -> Iterator[list[Text]]:
+        plan, shape = self.moves.plan, self.moves.grid.shape
+        arrays = occupancies(plan, self.moves.occupancy)
+        for i, batch in enumerate(plan.batches):
+            landed = batch.to_sites[on_grid(batch.to_sites, shape)]
+            drawn = self.canvas.pair(("before", "after"), arrays[i : i + 2], (batch.from_sites, landed))
+            yield [
+                Text.assemble((f"batch {i + 1} of {plan.n_batches}", "bold"), "  ", self._words(i, batch)),
+                *(Text(f"  {line}") for line in moves_text(batch, shape, self.arrow)),
+                *drawn,
+            ]
+
+    def _words(self, index: int, batch: Batch) -> str:
+        report = self.moves.report
+        n_ejected = int(np.count_nonzero(~on_grid(batch.to_sites, self.moves.grid.shape)))
+        parts = [
+            plural(len(batch), "atom") + (f", {n_ejected} ejected" if n_ejected else ""),
+            plural(int(report.n_tweezers[index]), "tweezer"),
+            f"done at {format_quantity(float(report.batch_end_s[index]), 'time')}",
+        ]
+        if batch.linked:
+            parts.append("with the tweezers still on from the batch before")
+        return ", ".join(parts)
+
+
+def moves_text(batch: Batch, shape: tuple[int, int], arrow: str = "->") -> list[str]:
+    """Name the moves of a batch, a line of text per row or column.
+
+    Args:
+        batch: The batch.
+        shape: (n_rows, n_cols) of the grid.
+        arrow: Stands between the ends of a move.
+
+    Example:
+        >>> moves_text(Batch([(2, 0), (2, 4)], [(2, 3), (2, 5)]), (5, 5))
+        ['row 2: columns 0->3, 4->ejected']
+    """
+    along_column = bool(np.any(batch.from_sites[:, 0] != batch.to_sites[:, 0]))
+    line_index, place = (1, 0) if along_column else (0, 1)
+    line_name, place_name = ("column", "row") if along_column else ("row", "column")
+    stays = on_grid(batch.to_sites, shape).tolist()
+    found: dict[int, list[str]] = {}
+    for start, end, lands in zip(batch.from_sites.tolist(), batch.to_sites.tolist(), stays, strict=True):
+        goal = end[place] if lands else "ejected"
+        found.setdefault(start[line_index], []).append(f"{start[place]}{arrow}{goal}")
+    return [
+        f"{line_name} {line}: {place_name}{'s' if len(ways) > 1 else ''} {', '.join(ways)}"
+        for line, ways in sorted(found.items())
+    ]
+
+
+PLAIN_WIDTH: Final = 132
+"""Characters per line where there is no terminal."""
+
+
+class _Console(Console):
+    """One that leaves it to others what a closed pipe means, where rich would end the process."""
+
+    def on_broken_pipe(self) -> NoReturn:
+        raise  # noqa: PLE0704 - rich calls this while it handles the error
+
+
+def print_plan(moves: PlannedMoves, stream: TextIO, *, step: bool) -> None:
+    """Print a plan.
+
+    Args:
+        moves: The plan.
+        stream: Where to; if it is a terminal, and the keyboard is there too, the
+            batches wait for Enter.
+        step: Whether to print it batch by batch first.
+
+    Raises:
+        RecordingError: It cannot be written, for example to a full disk.
+    """
+    console = _Console(file=stream, highlight=False, soft_wrap=True)
+    with writing_to(stream):
+        _print_all(console, moves, step=step)
+
+
+def _print_all(console: Console, moves: PlannedMoves, *, step: bool) -> None:
+    width = console.width if console.is_terminal else PLAIN_WIDTH
+    shear = moves.grid.shear if moves.grid.lattice == "triangular" else 0
+    canvas = Canvas(moves.target, shear, width, glyphs_for(console.encoding))
+    _print(console, *map(Text, columns(what(moves))), Text())
+    if step:
+        arrow = "→" if encodes(console.encoding, "→") else "->"
+        _print_steps(console, Steps(moves, canvas, arrow))
+    before, after = moves.occupancy, moves.report.predicted
+    _print(console, *canvas.pair(("before", "after"), (before, after)), Text())
+    if key := canvas.key(before, after):
+        _print(console, key, Text())
+    _print(console, *map(Text, columns(totals(moves))))
+
+
+def _print_steps(console: Console, steps: Iterable[list[Text]]) -> None:
+    waits = console.is_terminal and sys.stdin.isatty()
+    for lines in steps:
+        _print(console, *lines, Text())
+        if waits and not _goes_on(console):
+            break
+
+
+def _goes_on(console: Console) -> bool:
+    """Wait for Enter; False for "q" or the end of the input."""
+    console.print(Text("Enter: next batch, q: skip the rest ", "dim"), end="")
+    answer = sys.stdin.readline()
+    console.print()
+    return bool(answer) and answer.strip().lower() != "q"
+
+
+def _print(console: Console, *lines: Text) -> None:
+    for line in lines:
+        line.rstrip()
+        console.print(line)
+
+
+def title(moves: PlannedMoves) -> str:
+    """The plan in a line."""
+    plan = moves.plan
+    parts = [
+        moves.target.name,
+        "1 batch" if plan.n_batches == 1 else f"{plan.n_batches} batches",
+        plural(plan.n_atom_moves, "atom move"),
+        format_quantity(moves.report.duration_s, "time"),
+    ]
+    return f"{moves.planner}, degree of parallelism {moves.degree_of_parallelism}: {', '.join(parts)}"
+
+
+def what(moves: PlannedMoves) -> list[tuple[str, str]]:
+    """What was planned from what."""
+    grid, target = moves.grid, moves.target
+    sites = (
+        f"{grid.n_rows} x {grid.n_cols} sites, {grid.lattice}, {format_quantity(grid.spacing_m, 'length')}"
+    )
+    atoms = f"{plural(target.n_atoms, 'atom')}, {plural(int(target.clear.sum()), 'site')} to be empty"
+    dop = f", degree of parallelism {moves.degree_of_parallelism}"
+    settings = [f", {key} {value}" for key, value in moves.settings.items() if key != "degree_of_parallelism"]
+    return [
+        ("occupancy", f"{moves.source}: {plural(int(moves.occupancy.sum()), 'atom')} on {sites}"),
+        ("target", f"{target.name}: {atoms}"),
+        ("planner", "".join([moves.planner, dop, *settings])),
+    ]
+
+
+def totals(moves: PlannedMoves) -> list[tuple[str, str]]:
+    """The plan in numbers."""
+    plan, report = moves.plan, moves.report
+    n_atoms = moves.target.n_atoms
+    rows = [
+        ("batches", str(plan.n_batches)),
+        ("atom moves", str(plan.n_atom_moves)),
+        ("duration", format_quantity(report.duration_s, "time")),
+        ("tweezers", f"at most {moves.max_tweezers} on at once"),
+        ("ejected", plural(moves.n_ejected, "atom")),
+        ("filled", f"{count_of(moves.n_filled, n_atoms)} target sites"),
+    ]
+    if report.n_surplus:
+        rows.append(("surplus", f"{plural(report.n_surplus, 'atom')} on sites that must be empty"))
+    return rows

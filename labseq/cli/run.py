@@ -1,21 +1,29 @@
-"""``labseq run`` and ``labseq resume``: a session with a view, and what came of it."""
+"""`labseq run`, `labseq resume` and `labseq stop`."""
 
 from __future__ import annotations
 
+import importlib.util
+import shutil
 import sys
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any, Final
 
-from labseq.cli.failures import lines_of
 from labseq.cli.live import observer_for
-from labseq.cli.output import stdout_to_stderr, say
-from labseq.cli.show import as_line, existing, json_summary, summary_lines
-from labseq.errors import LabseqError, RecordingError, StopRequested
-from labseq.recording import Run, open_run
+from labseq.cli.show import existing, json_summary, summary_lines
+from labseq.config import packaged_profiles_dir, packaged_sequences_dir
+from labseq.config.messages import visible
+from labseq.console.errors import lines_of
+from labseq.console.output import as_line, columns, plural, say, stdout_to_stderr
+from labseq.errors import ConfigError, LabseqError, Problem, RecordingError, StopRequested
+from labseq.queue.queue import Queue
+from labseq.recording import Run, data_root, open_run
 from labseq.roles import RunObserver
 from labseq.session import Options, Session
+from labseq.session.between_shots import ask_to_stop, find_running, is_running, owner_text, running_here
 
 
 def run_sequence(sequence: Path, options: Options, *, as_json: bool) -> None:
@@ -130,3 +138,135 @@ def _read_back(session: Session | None) -> Run | None:
         return open_run(session.run_dir)
     except LabseqError:
         return None
+
+
+LOOK_S: Final = 0.1
+"""How often ``--wait`` looks."""
+
+
+def stop_run(run: Path | None, profile: str | None, *, queue: bool, wait: bool) -> None:
+    """Ask a run in progress to end after the shot at hand, and say what will happen.
+
+    Args:
+        run: Its folder; the only one in progress if left out.
+        profile: Its profile, in place of its folder.
+        queue: Whether the queue shall end as well.
+        wait: Whether to wait for its end.
+
+    Raises:
+        ConfigError: No run is in progress, or several are; or the queue is not at work.
+        RecordingError: Its folder cannot be written to.
+    """
+    if queue:
+        if not Queue(data_root()).ask_to_stop():
+            raise ConfigError("the queue is not at work; 'labseq stop' without --queue ends a run")
+        say("the queue takes no further runs")
+        if run is None and not running_here(profile):
+            return
+    folder = find_running(None if run is None else existing(run), profile)
+    ask_to_stop(folder)
+    say(f"{folder} ({owner_text(folder)}) ends after the shot at hand")
+    say(f"go on later with: labseq resume {folder}")
+    while wait and is_running(folder):
+        time.sleep(LOOK_S)
+    if wait:
+        say("it has ended")
+
+
+SEQUENCE: Final = "compact_225"
+PROFILE: Final = "virtual"
+SHOTS: Final = 10
+
+
+def run_demo(shots: int | None, output: Path | None) -> None:
+    """Run a packaged sequence on the packaged virtual lab; say before and after what that is.
+
+    Args:
+        shots: Number of shots; None for :data:`SHOTS`.
+        output: Folder for the data; None for LABSEQ_DATA or ./data.
+
+    Raises:
+        LabseqError: Whatever ended the run.
+    """
+    opened: list[Session] = []
+    profile = str(packaged_profiles_dir() / f"{PROFILE}.yaml")  # not one of that name in this folder
+    options = Options(profile, SHOTS if shots is None else shots, output=output)
+
+    def start(observer: RunObserver | None) -> Session:
+        sequence = packaged_sequences_dir() / f"{SEQUENCE}.yaml"
+        opened.append(Session.open(sequence, **asdict(options), observer=observer))
+        say(*beginning(opened[0]))
+        return opened[0]
+
+    run_session(start, as_json=False)
+    if opened[0].run_dir is not None:
+        say("", *ending(opened[0].run_dir))
+
+
+def beginning(session: Session) -> list[str]:
+    """What is about to happen."""
+    assembly = session.assembly
+    target, grid = assembly.target.fill, assembly.bench.grid
+    steps: list[Any] = [step for _, step in assembly.steps]
+    cycles = max(getattr(getattr(step, "settings", None), "cycles", 0) for step in steps)
+    rows, cols = (int(target.any(axis=axis).sum()) for axis in (1, 0))
+    grid_is, shots = f"{grid.n_rows} x {grid.n_cols}", plural(assembly.sequence.shots, "shot")
+    return [
+        f"This is {SEQUENCE}, a sequence that comes with labseq, on its virtual lab: no hardware is touched.",
+        f"Each of {shots} loads atoms at random into {grid_is} tweezers, takes an image, rearranges",
+        f"the atoms into an array of {rows} x {cols} in up to {cycles} cycles of plan, check, move, image,",
+        "and takes the image on which it is judged. The first time, labseq compiles its kernels.",
+        "",
+    ]
+
+
+def ending(run_dir: Path) -> list[str]:
+    """What to type next."""
+    run = f'"{run_dir}"' if " " in str(run_dir) else str(run_dir)
+    has_matplotlib = importlib.util.find_spec("matplotlib") is not None
+    needs = "" if has_matplotlib else '; first: pip install "labseq[plot]"'
+    rows = [
+        (f"  labseq show {run}", "these numbers again; --shots and --timing tell more"),
+        (f"  labseq plot {run}", f"the run as a picture{needs}"),
+        (f"  labseq check {SEQUENCE}", "what a shot does, step by step"),
+        (f"  labseq run {SEQUENCE} --set planner.degree_of_parallelism=15", "with one value changed"),
+        ("  labseq demo --copy .", "copies of the sequences and profiles, for you to change"),
+    ]
+    return [f"The data are in {run_dir}, a file per shot. What next:", *columns(rows)]
+
+
+def copy_files(folder: Path) -> None:
+    """Copy the packaged sequences and profiles, to be changed; what is there is never replaced.
+
+    Args:
+        folder: Gets the folders ``sequences`` and ``hardware_profiles``.
+
+    Raises:
+        ConfigError: One of the files is there already, and none was copied; or it cannot be written to.
+    """
+    copies = list(_copies(folder))
+    if taken := [new for _, new in copies if new.exists()]:
+        more = f" (and {plural(len(taken) - 1, 'more file')})" if len(taken) > 1 else ""
+        what = f"this is there already{more}; nothing was copied"
+        raise ConfigError(Problem(what, visible(str(taken[0])), expected="a folder without them"))
+    for old, new in copies:
+        try:
+            new.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(old, new)
+        except OSError as error:
+            raise ConfigError(
+                Problem(f"it cannot be written: {error.strerror}", visible(str(new)))
+            ) from error
+    say(
+        f"{plural(len(copies), 'file')} copied to sequences and hardware_profiles in {visible(str(folder))}. "
+        "There:",
+        f"  labseq run sequences/{SEQUENCE}.yaml",
+        "A sequence that says 'profile: virtual' takes the copy in ./hardware_profiles now.",
+    )
+
+
+def _copies(folder: Path) -> Iterator[tuple[Path, Path]]:
+    """Each packaged file, and where its copy goes."""
+    for source in (packaged_sequences_dir(), packaged_profiles_dir()):
+        for path in sorted(path for path in source.iterdir() if path.is_file()):
+            yield path, folder / source.name / path.name

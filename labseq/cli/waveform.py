@@ -6,15 +6,19 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+from labseq.bench.waveform import AxisStatistics, PlannedWaveform, WaveformRequest, plan_waveform
 from labseq.cli.check import size_text
-from labseq.cli.files import check_different, json_writer
-from labseq.cli.output import columns, say, report_compiling
-from labseq.cli.plan import warnings
-from labseq.cli.plan_report import what
-from labseq.cli.words import percent, plural
+from labseq.cli.plan import warnings, what
+from labseq.console.output import (
+    check_different,
+    columns,
+    json_writer,
+    percent,
+    plural,
+    report_compiling,
+    say,
+)
 from labseq.model import RfSpec
-from labseq.session.waveform import PlannedWaveform, WaveformRequest, plan_waveform
-from labseq.session.waveform_statistics import AxisStatistics
 from labseq.units import format_quantity
 
 Both = tuple[AxisStatistics, AxisStatistics]
@@ -55,7 +59,7 @@ def show_waveform(request: WaveformRequest, output: WaveformOutput) -> None:
     waveform = plan_waveform(request, announce=report_compiling)
     both = waveform.statistics()
     if output.npz is not None:
-        from labseq.session.waveform_file import save_samples
+        from labseq.bench.waveform import save_samples
 
         save_samples(output.npz, waveform)
     if output.png is not None:
@@ -68,17 +72,17 @@ def show_waveform(request: WaveformRequest, output: WaveformOutput) -> None:
 
 def _check_files(output: WaveformOutput) -> None:
     if output.png is not None:
-        from labseq.drawing import check_picture
+        from labseq.pictures.plans import check_picture
 
         check_picture(output.png, (1, 1))
     if output.npz is not None:
-        from labseq.session.waveform_file import check_samples_file
+        from labseq.bench.waveform import check_samples_file
 
         check_samples_file(output.npz)
 
 
 def _draw(waveform: PlannedWaveform, both: Both, path: Path) -> None:
-    from labseq.drawing import WaveformDrawing, save_waveform
+    from labseq.pictures.waveforms import WaveformDrawing, save_waveform
 
     drawing = WaveformDrawing(
         title(waveform),

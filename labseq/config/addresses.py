@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from typing import Final, NamedTuple
 
-from labseq.config.nodes import Loc, Node
-from labseq.config.wording import clean, did_you_mean, listing, shown, visible
+from labseq.config.messages import clean, did_you_mean, listing, shown, visible
+from labseq.config.yaml_nodes import Loc, Node
 from labseq.errors import ConfigError, Problem
 
 _PROFILE: Final = "profile."

@@ -1,7 +1,8 @@
-"""Types of fields that sequences and profiles share."""
+"""Settings types that several parts of sequence and profile share."""
 
 from __future__ import annotations
 
+import re
 import unicodedata
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,11 +21,11 @@ from pydantic import (
 from pydantic_core import PydanticCustomError
 
 from labseq.config.document import Document
-from labseq.config.nodes import Loc
-from labseq.config.reading import beside, is_folder
+from labseq.config.messages import clean, shown, visible
 from labseq.config.settings import Settings
-from labseq.config.wording import clean, shown, visible
+from labseq.config.yaml_nodes import Loc, beside, is_folder
 from labseq.errors import ConfigError, Problem
+from labseq.units import parse_any
 
 C = TypeVar("C", bound="Choice")
 
@@ -198,3 +199,34 @@ def plugin_paths(document: Document, folders: Sequence[str]) -> list[Path]:
     if problems:
         raise ConfigError(problems)
     return paths
+
+
+VARIABLES: Final = "variables"
+"""The key."""
+
+_NAME: Final = re.compile(r"[^\W\d]\w*")
+
+
+def si_of(value: Any) -> Any:
+    """The value of a variable, SI, from what is written."""
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        return value
+    try:
+        return parse_any(value if isinstance(value, str) else "")[0]
+    except ValueError:
+        what = f"a variable is {shown(value)}"
+        raise setting_error(what, "a number, or a number with a unit such as '20 ms'") from None
+
+
+def _named(variables: dict[str, int | float]) -> dict[str, int | float]:
+    for name in variables:
+        if not _NAME.fullmatch(name):
+            what = f"a variable is called '{clean(name)}'"
+            raise setting_error(what, "letters, digits and '_', a letter first", at=(name,), key=True)
+    return variables
+
+
+Variables: TypeAlias = Annotated[
+    dict[str, Annotated[int | float, BeforeValidator(si_of)]], AfterValidator(_named), empty_is({})
+]
+"""Name -> value, SI."""

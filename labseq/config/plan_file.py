@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, model_validator
 
 from labseq.config.fields import Name, setting_error
-from labseq.config.motion import Sites
-from labseq.config.reading import decode
+from labseq.config.messages import shown
+from labseq.config.profile import Sites
 from labseq.config.settings import Settings
-from labseq.config.values import validate_values
-from labseq.config.wording import shown
+from labseq.config.validation import validate_values
+from labseq.config.yaml_nodes import decode
 from labseq.errors import ConfigError, Problem
 from labseq.model import Batch, Occupancy, Plan, SiteGrid, TargetPattern
 

@@ -1,20 +1,19 @@
-"""Hardware profiles: what a run runs on."""
+"""The hardware profile."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
+from itertools import combinations
 from pathlib import Path
-from typing import Annotated, Final, Literal, Self
+from typing import Annotated, Any, Final, Literal, Self, TypeAlias, cast
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, Field, field_validator, model_validator
+from pydantic import AfterValidator, Field, NonNegativeInt, field_validator, model_validator
 
 from labseq.config.addresses import Override
-from labseq.config.calibrations import CalibrationSettings
-from labseq.config.collect import ProblemCollector
-from labseq.config.devices import DeviceChoice, named
-from labseq.config.document import Document, StoredText
+from labseq.config.document import Document, FallbackValues, StoredText, load_checked
 from labseq.config.fields import (
     FORMAT,
     MAY_ADD,
@@ -23,25 +22,395 @@ from labseq.config.fields import (
     Folders,
     FormatVersion,
     Name,
+    Text,
+    Variables,
     check_kind,
     empty_is,
-    setting_error,
     placed_by_field,
+    setting_error,
 )
 from labseq.config.find import find_profile
-from labseq.config.lines import LinesChoice
-from labseq.config.mending import FallbackValues, load_checked
-from labseq.config.motion import MobileTweezersChoice, Sites
-from labseq.config.policies import BudgetSettings
-from labseq.config.scan import Scan
-from labseq.config.scan_reading import bind_scan
-from labseq.config.settings import Frequency, Length, Settings
-from labseq.config.timeouts import TimeoutSettings
-from labseq.config.variables import Variables
-from labseq.model import MotionSpec, SiteGrid
+from labseq.config.messages import ProblemCollector, clean
+from labseq.config.scan import Scan, bind_scan
+from labseq.config.sequence import BudgetSettings
+from labseq.config.settings import (
+    Duration,
+    FilePath,
+    Fraction,
+    Frequency,
+    Length,
+    Power,
+    Settings,
+    Speed,
+    Voltage,
+)
+from labseq.model import CALIBRATION_KINDS, MotionSpec, RfSpec, SiteGrid
 from labseq.model.grid import centred_comb
 from labseq.model.lines import LineSpec
+from labseq.model.motion import PhaseChoice, SpeedProfile
 from labseq.units import format_quantity
+
+_DEVICE_NAME: Final = re.compile(r"[^\W\d][\w-]*")
+
+
+class BlindingSettings(Settings):
+    """When a device's light would blind a camera with EM gain."""
+
+    value: Text = Field(default="state", description="the value of the device that tells")
+    when: Annotated[tuple[bool | int | float | str, ...], Field(min_length=1)] = Field(
+        default=("on",), description="what the value is while the light is on"
+    )
+
+
+class DeviceChoice(Choice):
+    """The plugin of an instrument, and what the core must know of it."""
+
+    blinding: BlindingSettings | None = Field(
+        default=None,
+        description="no exposure with EM gain while its light is on: `{value: state, when: [on]}`",
+    )
+
+
+DEVICE_KEYS: Final = ("blinding",)
+"""Keys of a device that belong to the core, not to the plugin."""
+
+
+def device_name(name: str, what: str) -> None:
+    """Refuse what cannot be a name in an address or a file."""
+    if not _DEVICE_NAME.fullmatch(name):
+        expected = "a word of letters, digits, '_' and '-' that begins with a letter"
+        raise setting_error(f"{what} is called '{clean(name)}'", expected, at=(name,), key=True)
+
+
+def named(devices: dict[str, DeviceChoice]) -> dict[str, DeviceChoice]:
+    """Refuse names that a device cannot have, and tell each choice its place."""
+    for name in devices:
+        if name in (*ROLES, "planner"):
+            raise setting_error(
+                f"a device is called '{name}', like a role", "another name", at=(name,), key=True
+            )
+        device_name(name, "a device")
+    return {name: choice.placed("devices", name) for name, choice in devices.items()}
+
+
+OFF: Final = "off"
+"""In place of an id, or of a folder: none."""
+
+
+class CalibrationChoices(Settings):
+    """A calibration of each kind that takes the place of the one that is in use otherwise."""
+
+    sites: Text | None = Field(
+        default=None, description="where the sites are on the frames: an id, or `off` for none"
+    )
+    thresholds: Text | None = Field(default=None, description="the detector's thresholds: an id, or `off`")
+    tweezers: Text | None = Field(
+        default=None, description="amplitudes of the static tweezers' tones: an id, or `off`"
+    )
+    frequencies: Text | None = Field(
+        default=None, description="tones of the mobile tweezers: an id, or `off`"
+    )
+    overlay: Text | None = Field(
+        default=None, description="how the mobile tweezers stand on the static ones: an id, or `off`"
+    )
+
+    def of(self, kind: str) -> str | None:
+        """The choice for a kind: an id, "off", or None for what is in use."""
+        return cast("str | None", getattr(self, kind))
+
+
+class CalibrationSettings(Settings):
+    """Where the profile's calibrations are kept, and which of them count.
+
+    Just a folder, or `off` for none at all, may stand in place of the mapping.
+    """
+
+    folder: FilePath | None = Field(
+        default=None,
+        description="folder of the calibrations, relative to this file; without it `calibrations/NAME` "
+        "beside a file `NAME.yaml`",
+    )
+    use: Annotated[CalibrationChoices, empty_is({})] = Field(
+        default=CalibrationChoices(),
+        description="calibrations that count in place of those put to use by `labseq calibration use`",
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _may_be_one_word(cls, value: Any) -> Any:
+        if value == OFF:
+            return {"use": dict.fromkeys(CALIBRATION_KINDS, OFF)}
+        return {"folder": value} if isinstance(value, str) else value
+
+
+LINES_KEYS: Final = ("channels", "mutually_exclusive")
+"""Keys of ``lines`` that belong to the core, not to the plugin."""
+
+MAX_PULSE_S: Final = 1.0
+
+
+class ChannelSettings(Settings):
+    """One line: its output on the timing box, and when it is on."""
+
+    channel: NonNegativeInt = Field(description="output of the timing box")
+    on: tuple[Text, ...] = Field(
+        default=(),
+        description="kinds of step during which it is on: `load`, `image`, `rearrange`, `ramp`, `wait`; "
+        "`idle`: between steps, and before and after a shot",
+    )
+    lead: Duration = Field(default=0.0, description="how long before such a step it is turned on")
+    lag: Duration = Field(default=0.0, description="how long after such a step it is turned off")
+    pulse: Annotated[Duration, Field(le=MAX_PULSE_S)] = Field(
+        default=0.0,
+        description="a pulse of this length at the beginning of such a step, instead of being on throughout",
+    )
+    triggers: Literal["", "camera"] = Field(
+        default="",
+        description="the role whose trigger input it is wired to: its exposures begin with the line",
+    )
+    blinding: bool = Field(
+        default=False, description="its light would harm a camera with EM gain: never on during an exposure"
+    )
+    active_low: bool = Field(default=False, description="the output is low while the line is on")
+
+    @model_validator(mode="after")
+    def _makes_sense(self) -> Self:
+        if self.pulse and self.lag:
+            raise setting_error(
+                "lag is set beside pulse", "one of the two: a pulse ends by itself", at=("lag",), key=True
+            )
+        if self.pulse and "idle" in self.on:
+            raise setting_error(
+                "a pulse has 'idle' among its steps", "kinds of step, which have a beginning", at=("on",)
+            )
+        if self.triggers == "camera" and set(self.on) != {"image"}:
+            raise setting_error(
+                "a line that triggers the camera is on at other times", "`on: [image]`", at=("on",)
+            )
+        if self.triggers and self.lead:
+            raise setting_error(
+                "lead is set for a trigger", "none: the step begins with it", at=("lead",), key=True
+            )
+        return self
+
+    def spec(self, name: str) -> LineSpec:
+        """The same for the core."""
+        return LineSpec(
+            name,
+            self.channel,
+            frozenset(self.on),
+            self.lead,
+            self.lag,
+            self.pulse,
+            self.triggers,
+            self.blinding,
+            self.active_low,
+        )
+
+
+def _distinct(channels: dict[str, ChannelSettings]) -> dict[str, ChannelSettings]:
+    for (first, a), (second, b) in combinations(channels.items(), 2):
+        if a.channel == b.channel:
+            what = f"'{first}' and '{second}' are both on channel {a.channel}"
+            raise setting_error(what, "a channel for each line", at=(second, "channel"))
+    triggers = [name for name, channel in channels.items() if channel.triggers == "camera"]
+    if len(triggers) > 1:
+        what = f"'{triggers[0]}' and '{triggers[1]}' both trigger the camera"
+        raise setting_error(what, "one line for that", at=(triggers[1], "triggers"))
+    for name in channels:
+        device_name(name, "a line")
+    return channels
+
+
+class LinesChoice(Choice):
+    """The timing box, and what is wired to it."""
+
+    channels: Annotated[dict[str, ChannelSettings], AfterValidator(_distinct)] = Field(
+        default={}, description="name of each line -> its channel, and when it is on"
+    )
+    mutually_exclusive: tuple[tuple[Text, Text], ...] = Field(
+        default=(), description="pairs of lines that must never be on at the same time"
+    )
+
+    @model_validator(mode="after")
+    def _never_together(self) -> Self:
+        for number, pair in enumerate(self.mutually_exclusive):
+            for place, name in enumerate(pair):
+                if name not in self.channels:
+                    known = ", ".join(f"'{line}'" for line in self.channels) or "none is declared"
+                    raise setting_error(
+                        f"there is no line '{name}'", known, at=("mutually_exclusive", number, place)
+                    )
+            first, second = (self.channels[name] for name in pair)
+            if both := sorted(set(first.on) & set(second.on)):
+                what = (
+                    f"'{pair[0]}' and '{pair[1]}' must never be on together, but both are during '{both[0]}'"
+                )
+                raise setting_error(what, "one of them off then", at=("channels", pair[1], "on"))
+        return self
+
+    def specs(self) -> tuple[LineSpec, ...]:
+        """The lines for the core, in the order of their channels."""
+        specs = [channel.spec(name) for name, channel in self.channels.items()]
+        return tuple(sorted(specs, key=lambda spec: spec.channel))
+
+
+_RF: Final = RfSpec()
+
+
+def _rises(band: tuple[float, float]) -> tuple[float, float]:
+    low, high = band
+    if not 0 <= low < high:
+        from_, to = (format_quantity(hz, "frequency") for hz in band)
+        raise ValueError(f"the band goes from {from_} to {to}; expected [lowest, highest], both above 0 Hz")
+    return band
+
+
+Band: TypeAlias = Annotated[tuple[Frequency, Frequency], AfterValidator(_rises)]
+Amplitudes: TypeAlias = tuple[Annotated[Fraction, Field(gt=0)], ...]
+
+
+class RfSettings(Settings):
+    """What drives the AODs of the mobile tweezers, and what they bear."""
+
+    row_band: Band = Field(
+        default=_RF.row_band_hz, description="[lowest, highest] frequency of the row axis' AOD"
+    )
+    column_band: Band = Field(
+        default=_RF.column_band_hz, description="[lowest, highest] frequency of the column axis' AOD"
+    )
+    min_spacing: Annotated[Frequency, Field(ge=0)] = Field(
+        default=_RF.min_spacing_hz, description="least distance of two tones of an axis"
+    )
+    row_amplitudes: Amplitudes = Field(
+        default=_RF.row_amplitudes,
+        description="amplitude of each row's tone, as a fraction of full scale; none: all equal, such that "
+        "`max_row_tones` reach full scale together",
+    )
+    column_amplitudes: Amplitudes = Field(
+        default=_RF.column_amplitudes,
+        description="amplitude of each column's tone, as a fraction of full scale; none: all equal, such "
+        "that `max_column_tones` reach full scale together",
+    )
+    phases: PhaseChoice = Field(
+        default=_RF.phases,
+        description="phases of the tones at pick-up: random, but always the same for a site, or chosen for "
+        "each batch so that the tones' sum has a low crest",
+    )
+    phase_seed: int = Field(default=_RF.phase_seed, ge=0, description="seed of the random phases")
+    full_scale: Annotated[Voltage, Field(gt=0)] = Field(
+        default=_RF.full_scale_v, description="peak voltage of the output at full scale, across 50 Ohm"
+    )
+    max_peak: Annotated[Voltage, Field(gt=0)] = Field(
+        default=_RF.max_peak_v, description="greatest peak voltage that the amplifiers bear"
+    )
+    amplifier_gain: float = Field(
+        default=_RF.amplifier_gain_db, description="power gain between the output and each AOD, in dB"
+    )
+    max_mean_power: Annotated[Power, Field(gt=0)] = Field(
+        default=_RF.max_mean_power_w, description="greatest mean RF power at each AOD"
+    )
+    snap_within: Annotated[Length, Field(ge=0)] = Field(
+        default=_RF.snap_within_m,
+        description="distance in the atom plane within which calibrated tones are moved to an equally "
+        "spaced comb; 0: none is moved",
+    )
+
+    def spec(self) -> RfSpec:
+        """The same for the core."""
+        return RfSpec(
+            row_band_hz=self.row_band,
+            column_band_hz=self.column_band,
+            min_spacing_hz=self.min_spacing,
+            row_amplitudes=self.row_amplitudes,
+            column_amplitudes=self.column_amplitudes,
+            phases=self.phases,
+            phase_seed=self.phase_seed,
+            full_scale_v=self.full_scale,
+            max_peak_v=self.max_peak,
+            amplifier_gain_db=self.amplifier_gain,
+            max_mean_power_w=self.max_mean_power,
+            snap_within_m=self.snap_within,
+        )
+
+
+_MOTION: Final = MotionSpec()
+
+Sites: TypeAlias = Annotated[int, Field(ge=1, le=1000)]
+"""A number of sites, tweezers or tones."""
+
+
+class MotionSettings(Settings):
+    """How the mobile tweezers move, whatever their driver."""
+
+    pick_up: Duration = Field(default=_MOTION.pick_up_s, description="duration of the pick-up ramp")
+    drop_off: Duration = Field(default=_MOTION.drop_off_s, description="duration of the drop-off ramp")
+    speed: Speed = Field(default=_MOTION.speed_m_s, description="transport speed")
+    speed_profile: SpeedProfile = Field(
+        default=_MOTION.speed_profile,
+        description="course of the speed during a transport; `speed` is the mean on the longest way of a "
+        "batch, and with a course other than constant all atoms of a batch start and arrive together",
+    )
+    overhead_per_batch: Duration = Field(
+        default=_MOTION.overhead_per_batch_s, description="time that passes before each batch, tweezers off"
+    )
+    overhead_per_cycle: Duration = Field(
+        default=_MOTION.overhead_per_cycle_s, description="time that passes before the first batch of a cycle"
+    )
+    max_tweezers: Sites = Field(default=_MOTION.max_tweezers, description="most mobile tweezers on at once")
+    max_row_tones: Sites = Field(
+        default=_MOTION.max_row_tones, description="most tones on the row axis at once"
+    )
+    max_column_tones: Sites = Field(
+        default=_MOTION.max_column_tones, description="most tones on the column axis at once"
+    )
+    eject_slots: int = Field(
+        default=_MOTION.eject_slots,
+        ge=0,
+        le=100,
+        description="how many sites beyond the grid the tones reach, on each side",
+    )
+    rf: Annotated[RfSettings, empty_is({})] = Field(
+        default=RfSettings(), description="what drives the AODs, and what they bear"
+    )
+
+    def spec(self) -> MotionSpec:
+        """The same for the core."""
+        return MotionSpec(
+            pick_up_s=self.pick_up,
+            drop_off_s=self.drop_off,
+            speed_m_s=self.speed,
+            speed_profile=self.speed_profile,
+            overhead_per_batch_s=self.overhead_per_batch,
+            overhead_per_cycle_s=self.overhead_per_cycle,
+            max_tweezers=self.max_tweezers,
+            max_row_tones=self.max_row_tones,
+            max_column_tones=self.max_column_tones,
+            eject_slots=self.eject_slots,
+            rf=self.rf.spec(),
+        )
+
+
+MOTION_KEYS: Final = tuple(MotionSettings.model_fields)
+"""Keys of ``mobile_tweezers`` that belong to the core, not to the plugin."""
+
+
+class MobileTweezersChoice(MotionSettings, Choice):
+    """The plugin of the mobile tweezers, and how they move."""
+
+
+Timeout: TypeAlias = Annotated[Duration, Field(gt=0)]
+
+
+class TimeoutSettings(Settings):
+    """How long plugins may take before they count as hung."""
+
+    call: Timeout = Field(default=10.0, description="longest device call, beyond what it does by itself")
+    safe_state: Timeout = Field(default=5.0, description="longest way of a device to its safe state")
+    plan: Timeout = Field(default=5.0, description="longest planning of a cycle")
+    load: Timeout = Field(
+        default=30.0, description="longest loading of a plugin, and longest way of a constructor"
+    )
 
 
 class FrequencyComb(Settings):

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Final, TypeAlias, cast
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationInfo
 
-from labseq.config.reading import beside
+from labseq.config.yaml_nodes import beside
 from labseq.units import expected, parse_quantity
 
 FOLDER: Final = "folder"

@@ -1,28 +1,78 @@
-"""A mapping of the file against a settings model: pydantic's errors, placed and put in words."""
+"""Values checked against a settings model; each error names its place."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Final, TypeVar, cast
+from enum import Enum
+from pathlib import Path, PurePath
+from typing import Any, Final, TypeVar, cast, get_args, overload
 
+import numpy as np
 from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
 
-from labseq.config.nodes import Loc, Mark, Node
-from labseq.config.schema import description_of, keys_of, models_at
-from labseq.config.settings import FOLDER
-from labseq.config.wording import (
+from labseq.config.messages import (
     EXPECTED_TYPES,
     ErrorText,
     clean,
     closest,
     comma_hint,
-    listing,
     explain_validation_error,
+    listing,
     shown,
 )
+from labseq.config.settings import FOLDER, NoSettings
+from labseq.config.yaml_nodes import Loc, Mark, Node
+from labseq.errors import ConfigError
+
+
+def models_at(model: type[BaseModel], loc: Loc) -> list[type[BaseModel]]:
+    """The settings models that can stand at a location below a model: several in a union."""
+    models = [model]
+    for step in loc:
+        # A step that is no field is a list index or the key of a dict of models.
+        fields = [found for one in models if (found := field_of(one, step)) is not None]
+        if fields:
+            models = [inner for found in fields for inner in _models_in(found.annotation)]
+    return models
+
+
+def field_of(model: type[BaseModel], key: str | int) -> FieldInfo | None:
+    """The field that a key of the file sets."""
+    return next((field for name, field in model.model_fields.items() if key == _key(name, field)), None)
+
+
+def keys_of(models: list[type[BaseModel]]) -> list[str]:
+    """The keys that the models know, in order."""
+    keys = [_key(name, field) for model in models for name, field in model.model_fields.items()]
+    return list(dict.fromkeys(keys))
+
+
+def description_of(models: list[type[BaseModel]], key: str) -> str:
+    """First sentence of what a key's field says about itself, or ""."""
+    for model in models:
+        field = field_of(model, key)
+        if field is not None and field.description:
+            sentence = field.description.split(". ")[0].rstrip(".")
+            return sentence[0].lower() + sentence[1:] if sentence[1:2].islower() else sentence
+    return ""
+
+
+def _key(name: str, field: FieldInfo) -> str:
+    """What a field is called in the file."""
+    return field.validation_alias if isinstance(field.validation_alias, str) else name
+
+
+def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
+    """The models that an annotation names, inside of unions, lists, dicts and Annotated."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+        return
+    for inner in get_args(annotation):
+        yield from _models_in(inner)
+
 
 M = TypeVar("M", bound=BaseModel)
 
@@ -118,7 +168,9 @@ def _is_long_enough(error: Mapping[str, Any]) -> bool:
     return error["type"] == "too_short" and len(error["input"]) >= error["ctx"]["min_length"]
 
 
-def _findings(error: ValidationError, model: type[BaseModel], top: Node, asked: ValidationContext) -> list[Finding]:
+def _findings(
+    error: ValidationError, model: type[BaseModel], top: Node, asked: ValidationContext
+) -> list[Finding]:
     found = cast("list[Mapping[str, Any]]", error.errors(include_url=False))
     errors = [_place(one, top) for one in found if not (_is_list_for_tuple(one) or _is_long_enough(one))]
     chosen = [one for one in errors if one.union is None]
@@ -198,10 +250,14 @@ def _wrong_value(one: _Placed, top: Node, asked: ValidationContext) -> Finding:
     if "[key]" in one.error["loc"]:
         words = explain_validation_error(one.error, f"the key '{clean(str(one.loc[-1]))}'", one.loc[-1], "")
         return Finding(loc, words, key=True)
-    return Finding(loc, explain_validation_error(one.error, name, node.plain(), node.raw), bool(context.get("key")))
+    return Finding(
+        loc, explain_validation_error(one.error, name, node.plain(), node.raw), bool(context.get("key"))
+    )
 
 
-def _unknown_key(one: _Placed, meant: str, model: type[BaseModel], top: Node, asked: ValidationContext) -> Finding:
+def _unknown_key(
+    one: _Placed, meant: str, model: type[BaseModel], top: Node, asked: ValidationContext
+) -> Finding:
     loc, key = one.loc, clean(str(one.loc[-1]))
     node = top.at(loc)
     comma = comma_hint(key, node.value) if node is not None else ""
@@ -255,3 +311,54 @@ def _name(loc: Loc, asked: ValidationContext) -> str:
     """Name of a value: its key, and the indices of the lists within."""
     last = next((i for i in reversed(range(len(loc))) if isinstance(loc[i], str)), 0)
     return ".".join(str(step) for step in loc[last:]) if loc else asked.name
+
+
+@overload
+def validate_values(model: type[M], values: Mapping[str, Any], called: str) -> M: ...
+@overload
+def validate_values(model: None, values: Mapping[str, Any], called: str) -> None: ...
+def validate_values(model: type[M] | None, values: Mapping[str, Any], called: str) -> M | None:
+    """Make settings of Python values, by the same rules as those of a file.
+
+    Args:
+        model: The settings model; None for what takes no settings.
+        values: Setting -> value; numpy's numbers and arrays count as plain ones.
+        called: What the settings belong to, for messages: "planner 'psca'".
+
+    Raises:
+        ConfigError: Everything that is wrong with them.
+    """
+    root = node_of(dict(values), Mark(0, 0, called))
+    result = validate(model or NoSettings, root, ValidationContext("", "it"))
+    if isinstance(result, list):
+        raise ConfigError(
+            [root.mark.problem("", w.what, w.expected, w.hint) for w in (found.words for found in result)]
+        )
+    return None if model is None else cast("M", result)
+
+
+def node_of(value: Any, mark: Mark) -> Node:
+    """Plain values as nodes that all stand at one place.
+
+    Raises:
+        ConfigError: A value that no file could hold.
+    """
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    if isinstance(value, Mapping):
+        nodes = {str(key): node_of(inner, mark) for key, inner in cast("Mapping[Any, Any]", value).items()}
+        return Node(nodes, mark, dict.fromkeys(nodes, mark))
+    if isinstance(value, list | tuple | set | frozenset):
+        return Node([node_of(inner, mark) for inner in cast("list[Any]", value)], mark)
+    if isinstance(value, Enum):
+        return node_of(value.value, mark)
+    if isinstance(value, PurePath):
+        return Node(str(value), mark)
+    if isinstance(value, str) and any("\ud800" <= char <= "\udfff" for char in value):
+        raise ConfigError(mark.problem("", f"half of a character stands in '{clean(value)}'", "text"))
+    if value is None or isinstance(value, str | int | float):
+        return Node(value, mark)
+    kind = type(cast("object", value)).__name__
+    raise ConfigError(
+        mark.problem("", f"a value of type {kind} is no setting", "a number, text, list or dict")
+    )

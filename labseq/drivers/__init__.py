@@ -4,9 +4,7 @@ A driver need not use any of it: a role is a Protocol. But a camera's series, it
 its lost frames and its errors are the same for all cameras, and are made once, here.
 """
 
-from labseq.drivers.camera import CameraDriver, Series, ExposureResult
-from labseq.drivers.cooling import Cooling, settle
-from labseq.drivers.sensor import SimulatedSensor
-from labseq.drivers.waiting import wait_for
+from labseq.drivers.camera import CameraDriver, Cooling, ExposureResult, Series, SimulatedSensor, settle
+from labseq.drivers.serial_port import wait_for
 
 __all__ = ["CameraDriver", "Cooling", "Series", "SimulatedSensor", "ExposureResult", "settle", "wait_for"]

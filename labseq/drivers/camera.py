@@ -1,18 +1,62 @@
-"""What all camera drivers have in common: the series, its limits, and what is lost of it."""
+"""The base class of camera drivers, its settings, and simulated sensors."""
 
 from __future__ import annotations
 
 import math
+import threading
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections import deque
+from collections.abc import Callable, Mapping
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import Any, Final
 
-from labseq.drivers.series import Series, ExposureResult
+import numpy as np
+from numpy.typing import NDArray
+
 from labseq.errors import DeviceError, DeviceTimeoutError, LimitError, TransientError, one_of
-from labseq.model import CameraFacts, Frame
-from labseq.roles import Context, Trigger
-from labseq.units import format_quantity
+from labseq.model import CameraFacts, Frame, SensorMode
+from labseq.roles import Clock, Context, Simulation, Trigger
+from labseq.units import ZERO_CELSIUS_K, format_quantity
+
+
+@dataclass(frozen=True, slots=True)
+class Series:
+    """What a camera was armed for.
+
+    Attributes:
+        n_frames: Number of exposures.
+        exposure_s: Exposure time, in seconds.
+        trigger: What starts each exposure.
+        em_gain: Mean gain of the EM register; 1 for none.
+    """
+
+    n_frames: int
+    exposure_s: float
+    trigger: Trigger
+    em_gain: float = 1.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ExposureResult:
+    """What came of one exposure.
+
+    Attributes:
+        number: Its place in the series as the camera counted it, from 0.
+        image: uint16 (height, width), nobody else's; None if the frame was lost.
+        fault: What happened to a frame that was lost.
+        exposure_s: Exposure time as the camera made it, in seconds; nan: as asked for.
+        t_start_s: Start of the exposure on the session's clock; nan: worked out from the trigger.
+        device_time_s: The camera's own time stamp, in seconds; nan if it gives none.
+    """
+
+    number: int
+    image: NDArray[np.uint16] | None
+    fault: str = ""
+    exposure_s: float = math.nan
+    t_start_s: float = math.nan
+    device_time_s: float = math.nan
+
 
 TEST_EXPOSURE_S: Final = 10e-3
 
@@ -238,3 +282,164 @@ class CameraDriver(ABC):
     def _check_open(self) -> None:
         if not self._is_open:
             raise DeviceError(self._name, "not open; call open() first")
+
+
+LOOK_S: Final = 1.0
+"""How often the temperature is read, in seconds."""
+
+
+@dataclass(frozen=True, slots=True)
+class Cooling:
+    """How cold a sensor shall be.
+
+    Attributes:
+        setpoint_k: Temperature, in kelvins.
+        tolerance_k: How far from it the sensor may be, in kelvins.
+        steady_s: How long it must have been within that, in seconds.
+        timeout_s: How long it may take, in seconds.
+    """
+
+    setpoint_k: float
+    tolerance_k: float = 1.0
+    steady_s: float = 5.0
+    timeout_s: float = 900.0
+
+
+def settle(cooling: Cooling, read_k: Callable[[], float], clock: Clock, name: str) -> None:
+    """Wait until a sensor is as cold as it shall be, and stays so.
+
+    Args:
+        cooling: How cold, how steady, how long.
+        read_k: Reads the temperature, in kelvins.
+        clock: The session's clock.
+        name: Name of the device, for the error.
+
+    Raises:
+        DeviceTimeoutError: It does not get there in time.
+        StopRequested: The operator asked the run to stop.
+    """
+    start_s = clock.now()
+    within_since_s: float | None = None
+    while True:
+        now_s, temperature_k = clock.now(), read_k()
+        if abs(temperature_k - cooling.setpoint_k) > cooling.tolerance_k:
+            within_since_s = None
+        elif within_since_s is None:
+            within_since_s = now_s
+        if within_since_s is not None and now_s - within_since_s >= cooling.steady_s:
+            return
+        if now_s - start_s >= cooling.timeout_s:
+            raise DeviceTimeoutError(name, _too_late(cooling, temperature_k), cooling.timeout_s)
+        clock.sleep(LOOK_S)
+
+
+def _too_late(cooling: Cooling, temperature_k: float) -> str:
+    waited = format_quantity(cooling.timeout_s, "time")
+    came, wanted = (f"{kelvin - ZERO_CELSIUS_K:.1f} degC" for kelvin in (temperature_k, cooling.setpoint_k))
+    text = f"the sensor is at {came} after {waited}; expected {wanted} within {cooling.tolerance_k:g} K"
+    return f"{text}; look after its cooling water or fan, or choose a higher temperature"
+
+
+class SimulatedSensor:
+    """Exposes the simulated world for a camera, and knows when each frame could be read.
+
+    A virtual camera reads its frames here. The simulated counterpart of a real driver takes only the
+    pixels from here and sends them on the way that a real camera would; its driver then waits here until
+    the frame is due. Exposures may be asked for by another thread than frames.
+
+    Args:
+        world: The simulated world.
+        clock: The session's clock.
+    """
+
+    def __init__(self, world: Simulation, clock: Clock) -> None:
+        self._world = world
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._frames: deque[tuple[float, Frame]] = deque()
+        self.clear()
+
+    def arm(self, series: Series, mode: SensorMode, readout_s: float, period_s: float | None = None) -> None:
+        """Get ready for a series; frames not yet taken are dropped.
+
+        Args:
+            series: How many, how long, and what starts them: with the internal trigger the first
+                exposure begins now, the others at the ends of the read-outs before.
+            mode: How the sensor is read.
+            readout_s: From the end of an exposure until its frame can be read, in seconds.
+            period_s: With the internal trigger, from one exposure to the next, in seconds; shorter than
+                both together where they overlap.
+        """
+        with self._lock:
+            self._frames.clear()
+            self._series, self._mode, self._readout_s = series, mode, readout_s
+            self._period_s = series.exposure_s + readout_s if period_s is None else period_s
+            self._n_exposed = 0
+            self._armed_s = self._clock.now()
+
+    def expose(self, late_s: float = 0.0, t_start_s: float | None = None) -> Frame | None:
+        """Begin the next exposure of the series.
+
+        Args:
+            late_s: How much later than it should its frame is due, in seconds: a failure to rehearse.
+            t_start_s: When it begins, on the session's clock; None: now, or with the internal trigger in
+                its turn.
+
+        Returns:
+            Its frame, which can be read when it is due; None if no further exposure is armed.
+
+        Raises:
+            DeviceError: The world is further in time already.
+        """
+        with self._lock:
+            series = self._series
+            if series is None or self._n_exposed == series.n_frames:
+                return None
+            if t_start_s is None and series.trigger == "internal":
+                t_start_s = self._armed_s + self._n_exposed * self._period_s
+            elif t_start_s is None:
+                t_start_s = self._clock.now()
+            frame = self._world.expose(t_start_s, series.exposure_s, self._mode)
+            self._n_exposed += 1
+            self._frames.append((t_start_s + series.exposure_s + self._readout_s + late_s, frame))
+            return frame
+
+    def skip(self) -> None:
+        """Let an exposure of the series pass without a frame: a trigger that was not seen."""
+        with self._lock:
+            self._n_exposed += 1
+
+    def take(self, timeout_s: float) -> Frame | None:
+        """Wait on the clock for the oldest frame not yet taken.
+
+        Returns:
+            None if it is not due within ``timeout_s``, which has passed then.
+        """
+        with self._lock:
+            due_s = self._frames[0][0] if self._frames else float("inf")
+        missing_s = due_s - self._clock.now()
+        self._clock.sleep(max(0.0, min(missing_s, timeout_s)))
+        if missing_s > timeout_s:
+            return None
+        with self._lock:
+            return self._frames.popleft()[1] if self._frames else None
+
+    def clear(self) -> None:
+        """Forget the series and its frames."""
+        with self._lock:
+            self._frames.clear()
+            self._series: Series | None = None
+            self._mode = SensorMode()
+            self._readout_s = self._period_s = self._armed_s = 0.0
+            self._n_exposed = 0
+
+
+def nearest(value: int, low: int, high: int, step: int) -> int:
+    """The number nearest to a value, from low to high in steps.
+
+    Example:
+        >>> nearest(37, 0, 100, 4), nearest(39, 2, 100, 4), nearest(200, 0, 99, 4)
+        (36, 38, 96)
+    """
+    n_steps = (min(max(value, low), high) - low + step // 2) // step
+    return low + step * min(n_steps, (high - low) // step)

@@ -1,15 +1,52 @@
-"""Serial ports of this computer, opened by pyserial."""
+"""Serial lines, and waiting for a condition with a deadline."""
 
 from __future__ import annotations
 
 import errno
 import importlib
 import re
-from typing import Any, Final, Protocol
+import time
+from collections.abc import Callable
+from typing import Any, Final, Protocol, TypeVar
 from urllib.parse import urlsplit
 
-from labseq.drivers.waiting import SLICE_S
 from labseq.errors import DeviceError
+from labseq.roles import Clock
+
+T = TypeVar("T")
+
+SLICE_S: Final = 0.02
+"""Longest single wait in seconds: how soon a stop request is seen."""
+
+
+def wait_for(poll: Callable[[float], T | None], timeout_s: float, clock: Clock) -> T | None:
+    """Wait until something comes from a device that runs in real time.
+
+    A wait in vain passes on a virtual clock too, so that it counts there as long as it was.
+
+    Args:
+        poll: Waits for at most so many seconds; None if nothing came.
+        timeout_s: How long to wait in all, in seconds; 0 looks once.
+        clock: The session's clock: asked for a stop request before each look.
+
+    Returns:
+        What came; None if nothing did.
+
+    Raises:
+        StopRequested: The operator asked the run to stop.
+    """
+    deadline_s = time.monotonic() + timeout_s
+    while True:
+        clock.check()
+        left_s = max(0.0, deadline_s - time.monotonic())
+        came = poll(min(left_s, SLICE_S))
+        if came is not None:
+            return came
+        if left_s == 0.0:
+            break
+    if clock.virtual:
+        clock.sleep(timeout_s)
+    return None
 
 
 class Port(Protocol):

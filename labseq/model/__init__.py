@@ -8,21 +8,20 @@ from labseq.model.calibration import (
     grid_facts,
     same_grid,
 )
-from labseq.model.frame import CameraFacts, Frame, SensorMode
-from labseq.model.grid import SiteGrid
+from labseq.model.camera import CameraFacts, Frame, SensorMode
+from labseq.model.grid import SiteGrid, TargetPattern
 from labseq.model.lines import LineProgram, LinesFacts, LineSpec
-from labseq.model.motion import MotionSpec, RfSpec
-from labseq.model.output import RfSamples, RfSpan, RfTones
+from labseq.model.motion import MotionSpec, RfSamples, RfSpan, RfSpec, RfTones
 from labseq.model.plan import Batch, Plan, PlanReport
-from labseq.model.random import RandomStream
 from labseq.model.records import (
     CycleRecord,
     ImageRecord,
     RunRecord,
     ShotRecord,
     StageTiming,
+    TimelineEntry,
 )
-from labseq.model.scanning import ScanRange, ScanSpace, VisitedPoint
+from labseq.model.scanning import RandomStream, ScanRange, ScanSpace, VisitedPoint
 from labseq.model.signals import (
     AxisTones,
     DepthRamp,
@@ -34,8 +33,6 @@ from labseq.model.signals import (
     TweezerAmplitudes,
     Waveform,
 )
-from labseq.model.target import TargetPattern
-from labseq.model.timeline import TimelineEntry
 
 __all__ = [
     "CALIBRATION_KINDS",

@@ -1,4 +1,4 @@
-"""Plans: which atoms move where, in which order."""
+"""Plans: batches of atom moves, and the report of a checked plan."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What happened, in memory; ``labseq.recording`` puts it on disk."""
+"""What happened in a run, a shot, an image and a cycle; the timeline planned beforehand."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from typing import Any, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.model.frame import Frame
+from labseq.model.camera import Frame
+from labseq.model.grid import TargetPattern
 from labseq.model.plan import Plan, PlanReport
-from labseq.model.target import TargetPattern
 
 ShotStatus = Literal["complete", "interrupted", "failed"]
 RunStatus = Literal["running", "complete", "stopped", "failed"]
@@ -198,3 +198,24 @@ class RunRecord:
     scan: Mapping[str, Any] = field(default_factory=dict[str, Any])
     calibrations: Mapping[str, str] = field(default_factory=dict[str, str])
     resumed: tuple[Mapping[str, Any], ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class TimelineEntry:
+    """One bar of a shot's timeline.
+
+    Attributes:
+        label: What happens, for example "image" or "cycle 3: move".
+        duration_s: How long it takes at most, in seconds.
+        least_s: How long it takes at least; 0 if it may be left out.
+        n_images: Images that it takes at most.
+        exposure_s: Exposure of each image, in seconds.
+        kind: Kind of step that the profile's lines know it by, "image"; "" for one that they do not go with.
+    """
+
+    label: str
+    duration_s: float
+    min_duration_s: float
+    n_images: int = 0
+    exposure_s: float = 0.0
+    kind: str = ""

@@ -6,27 +6,29 @@ with :func:`warm` and :func:`warm_rendering`.
 
 import importlib
 
-from labseq.motion.axes import Drive, drive
-from labseq.motion.calibration import (
+from labseq.motion.axes import (
     AffineCalibration,
     Calibration,
     CombFit,
+    Drive,
     TableCalibration,
     calibrated,
+    drive,
     fit_comb,
     standing_on_sites,
 )
-from labseq.motion.check import check_plan
-from labseq.motion.fast_overlay import FastOffset, fast_offset, group_counts
-from labseq.motion.frequencies import FrequenciesFit, fit_frequencies
-from labseq.motion.holding import cross_offsets_m, hold_program, hold_time_s
-from labseq.motion.overlay import OverlayFit, fit_overlay, overlay_offset
-from labseq.motion.render_comb import comb_sample_rate
-from labseq.motion.rendering import Renderer, RenderPath, render, render_chunks
-from labseq.motion.rules import RULES
-from labseq.motion.survival import SurvivalShape
-from labseq.motion.timing import fitting_batches
-from labseq.motion.tones import tone_program
+from labseq.motion.check import RULES, check_plan
+from labseq.motion.overlay import (
+    FastOffset,
+    OverlayFit,
+    SurvivalShape,
+    fast_offset,
+    fit_overlay,
+    group_counts,
+    overlay_offset,
+)
+from labseq.motion.rendering import Renderer, RenderPath, comb_sample_rate, render, render_chunks
+from labseq.motion.tones import cross_offsets_m, fitting_batches, hold_program, hold_time_s, tone_program
 
 __all__ = [
     "RULES",
@@ -35,7 +37,6 @@ __all__ = [
     "CombFit",
     "Drive",
     "FastOffset",
-    "FrequenciesFit",
     "OverlayFit",
     "RenderPath",
     "Renderer",
@@ -48,7 +49,6 @@ __all__ = [
     "drive",
     "fast_offset",
     "fit_comb",
-    "fit_frequencies",
     "fit_overlay",
     "fitting_batches",
     "group_counts",
@@ -66,14 +66,14 @@ __all__ = [
 
 def warm() -> None:
     """Compile the kernels of checks and tone programs, or load them from the cache."""
-    _load("plan_check", "tone_build", "tone_limits")
+    _load("check_kernels", "tone_kernels")
 
 
 def warm_rendering() -> None:
     """The same for those of rendering, which only drivers need that play samples."""
-    _load("render_axis", "render_paths", "render_teeth", "render_tones")
+    _load("render_direct_kernels", "render_comb_kernels")
 
 
 def _load(*kernels: str) -> None:
     for module in kernels:
-        importlib.import_module(f"labseq.kernels.{module}")
+        importlib.import_module(f"labseq.motion.{module}")

@@ -1,4 +1,4 @@
-"""Where the mobile tweezers stand beside the sites, from the survival of pick-up, hold and drop.
+"""Where the mobile tweezers stand on the sites, from the survival of pick-up, hold and drop.
 
 A probe at a commanded offset puts a tweezer at that offset and the unknown one. So atoms survive
 best at the *centre*, where both cancel: the mobile tweezers stand beside the sites by minus the
@@ -8,26 +8,151 @@ centre, which is what :func:`overlay_offset` tells.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from typing import Final, NoReturn
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from labseq.errors import DeviceError
-from labseq.model import SiteGrid
-from labseq.motion.survival import (
-    REACH,
-    SurvivalShape,
-    covariance,
-    deviance_residuals,
-    dispersion,
-    distance_m,
-    unit_axes,
-)
+from labseq.model import Occupancy, SiteGrid
 from labseq.units import format_quantity
 
 Floats = NDArray[np.float64]
+Counts = NDArray[np.int64]
+
+MIN_P: Final = 1e-4
+"""Probabilities this near to 0 or 1 are not told apart: a single false detection in so many atoms."""
+
+
+REACH: Final = 1.5
+"""In half-widths: half survive at about a waist; from 1.6 waists on, wells of 2.1 and 0.3 mK are two."""
+
+
+@dataclass(frozen=True, slots=True)
+class SurvivalShape:
+    """The bump of survival around a site.
+
+    An atom picked up and dropped near its site survives; one that is dropped on the slope of
+    the site's light is lost. Far beside the site the mobile tweezer does not take the atom at all,
+    and it survives again: the bump stands in a ring of loss, whose far side is not described here.
+
+    Attributes:
+        half_width_m: Distance at which half of the atoms that the bump makes a difference to survive.
+        edge_m: Width of its edge, 1 sigma of the error function.
+        floor: Survival in the ring.
+        ceiling: Survival at the centre.
+    """
+
+    half_width_m: float
+    edge_m: float
+    floor: float = 0.0
+    ceiling: float = 1.0
+
+    @property
+    def reach_m(self) -> float:
+        """Distance up to which the shape holds: short of the far side of the ring."""
+        return REACH * self.half_width_m
+
+    def survival(self, distance_m: ArrayLike) -> Floats:
+        """Probability that an atom survives, for tweezers at some distances from their sites.
+
+        Example:
+            >>> shape = SurvivalShape(half_width_m=0.95e-6, edge_m=0.12e-6, floor=0.02, ceiling=0.98)
+            >>> shape.survival([0.0, 0.95e-6, 1.5e-6]).round(3).tolist()
+            [0.98, 0.5, 0.02]
+        """
+        from scipy.special import ndtr
+
+        bump = ndtr((self.half_width_m - np.asarray(distance_m, np.float64)) / self.edge_m)
+        return self.floor + (self.ceiling - self.floor) * bump
+
+    def values(self) -> dict[str, float]:
+        """What a calibration keeps of it."""
+        return {
+            "half_width_m": self.half_width_m,
+            "edge_m": self.edge_m,
+            "floor": self.floor,
+            "ceiling": self.ceiling,
+        }
+
+    @classmethod
+    def from_values(cls, values: Mapping[str, ArrayLike]) -> SurvivalShape | None:
+        """The shape that a calibration kept; None if it kept none."""
+        names = ("half_width_m", "edge_m", "floor", "ceiling")
+        if any(name not in values for name in names):
+            return None
+        return cls(*(float(np.asarray(values[name])) for name in names))
+
+
+def unit_axes(grid: SiteGrid) -> Floats:
+    """Directions of a1 and a2, float64 (2, 2): an offset times them is the place beside the site.
+
+    Example:
+        >>> unit_axes(SiteGrid(2, 2)).round(3).tolist()
+        [[1.0, 0.0], [0.5, 0.866]]
+    """
+    return grid.axes / grid.spacing_m
+
+
+def distance_m(offset_m: Floats, axes: Floats) -> Floats:
+    """Distance of tweezers from their sites, float64 (...,).
+
+    Args:
+        offset_m: float64 (..., 2), along a1 and a2.
+        axes: float64 (2, 2), of :func:`unit_axes`.
+    """
+    place = offset_m @ axes
+    return np.hypot(place[..., 0], place[..., 1])
+
+
+def deviance_residuals(n_survived: Floats, n_before: Floats, p: Floats) -> Floats:
+    """Signed roots of the binomial deviance; their sum of squares is least at the greatest likelihood."""
+    from scipy.special import xlog1py
+
+    p = np.clip(p, MIN_P, 1 - MIN_P)
+    share = np.divide(n_survived, n_before, out=p.copy(), where=n_before > 0)
+    over = share - p
+    deviance = 2 * n_before * (xlog1py(share, over / p) + xlog1py(1 - share, -over / (1 - p)))
+    return np.sign(over) * np.sqrt(np.maximum(deviance, 0.0))
+
+
+def covariance(theta: Floats, n_before: Floats, model: Callable[[Floats], Floats], prior: Floats) -> Floats:
+    """Covariance of parameters fitted to binomial counts: the inverse of the Fisher information.
+
+    Args:
+        theta: float64 (n,), the parameters.
+        n_before: float64 (n_points,), atoms that were probed.
+        model: Parameters -> probability of survival, float64 (n_points,).
+        prior: float64 (n,), how well each parameter was known before, 1 sigma; it keeps
+            those that the counts say nothing about from spoiling the inverse.
+    """
+    jacobian = slopes(theta, model, 1e-4 * prior)
+    p = np.clip(model(theta), MIN_P, 1 - MIN_P)
+    information = (jacobian.T * (n_before / (p * (1 - p)))) @ jacobian
+    scaled = information * np.outer(prior, prior) + np.eye(len(theta))
+    return np.linalg.inv(scaled) * np.outer(prior, prior)
+
+
+def slopes(theta: Floats, model: Callable[[Floats], Floats], step: Floats) -> Floats:
+    """Derivatives of a model by its parameters, float64 (n_points, n)."""
+    return np.stack(
+        [(model(theta + one) - model(theta - one)) / (2 * np.abs(one).sum()) for one in np.diag(step)], axis=1
+    )
+
+
+def dispersion(n_survived: Floats, n_before: Floats, p: Floats, n_parameters: int) -> float:
+    """How much more counts scatter than binomial ones: Pearson's chi squared over its degrees, at least 1.
+
+    Losses that are common to the atoms of a shot make it greater.
+    """
+    asked = n_before > 0
+    n, k = n_before[asked], n_survived[asked]
+    p = np.clip(p[asked], np.minimum(0.5, 0.5 / n), 1 - np.minimum(0.5, 0.5 / n))
+    chi_squared = float((((k - n * p) ** 2) / (n * p * (1 - p))).sum())
+    return max(1.0, chi_squared / max(1, len(n) - n_parameters))
+
 
 WORST_ERROR_M: Final = 50e-9
 """A centre that is known less well is no calibration."""
@@ -229,3 +354,117 @@ def _refuse_open_ends(fit: OverlayFit, offset: Floats, axes: Floats) -> None:
 
 def _refuse(why: str) -> NoReturn:
     raise DeviceError("mobile_tweezers", f"no overlay found: {why}")
+
+
+DRIFT: Final = 0.1
+"""How far the half-width may have changed since it was measured, relative, 1 sigma: with temperature."""
+WORST_DEVIANCE: Final = 25.0
+"""With four groups and three parameters, one in a million is greater; but a common loss adds to it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FastOffset:
+    """How far the mobile tweezers stand beside the sites.
+
+    Attributes:
+        offset_m: float64 (2,), beside what is already made up for, along a1 and a2.
+        error_m: float64 (2,), its standard errors.
+        n_atoms: Atoms that were probed.
+        deviance: How badly the counts go with the bump at the best offset; about 1 if they do.
+    """
+
+    offset_m: Floats
+    error_m: Floats
+    n_atoms: int
+    deviance: float = 0.0
+
+    @property
+    def fits(self) -> bool:
+        """Whether the counts go with the bump at all."""
+        return self.deviance < WORST_DEVIANCE
+
+    @property
+    def length_m(self) -> float:
+        """The greater of both parts, in metres; nan if they are not known."""
+        return float(np.abs(self.offset_m).max())
+
+
+def fast_offset(
+    offset_m: ArrayLike,
+    n_before: ArrayLike,
+    n_survived: ArrayLike,
+    shape: SurvivalShape,
+    grid: SiteGrid,
+) -> FastOffset:
+    """Find where the mobile tweezers stand from a few offsets on the edge of a known bump.
+
+    The likelihood is greatest at the answer; the half-width may have drifted by :data:`DRIFT`.
+    With offsets of +x and -x, +y and -y on the edge, a shift by a small part of its width makes one
+    group of each pair survive more often and the other less. A shift by half the half-width and
+    more cannot be measured in this way: it comes out wrong, but not small, or as one that does not
+    fit.
+
+    Args:
+        offset_m: float64 (n_groups, 2), commanded offsets along a1 and a2.
+        n_before: int (n_groups,), atoms that were probed.
+        n_survived: int (n_groups,), how many of them were seen afterwards.
+        shape: The bump, from the last overlay calibration.
+        grid: The grid of sites, for its axes.
+
+    Raises:
+        ValueError: The arrays do not belong together.
+    """
+    offset, n, k = checked_counts(offset_m, n_before, n_survived)
+    if not n.any():
+        return FastOffset(np.full(2, np.nan), np.full(2, np.inf), 0)
+    offset, axes = offset / UM, unit_axes(grid)
+    half_width = shape.half_width_m / UM
+    in_um = replace(shape, half_width_m=half_width, edge_m=shape.edge_m / UM)
+
+    def survival(theta: Floats) -> Floats:
+        bump = replace(in_um, half_width_m=half_width * float(np.exp(theta[2])))
+        return bump.survival(distance_m(offset - theta[:2], axes))
+
+    def residuals(theta: Floats) -> Floats:
+        return np.append(deviance_residuals(k, n, survival(theta)), theta[2] / DRIFT)
+
+    theta = _least(residuals, half_width)
+    spread = covariance(theta, n, survival, np.array([half_width, half_width, DRIFT]))
+    deviance = float((residuals(theta) ** 2).sum())
+    return FastOffset(-theta[:2] * UM, np.sqrt(np.diag(spread)[:2]) * UM, int(n.sum()), deviance)
+
+
+def group_counts(
+    offset_m: ArrayLike, before: Occupancy, after: Occupancy
+) -> tuple[Floats, NDArray[np.int64], NDArray[np.int64]]:
+    """Count survivors by the offset at which they were probed.
+
+    Args:
+        offset_m: float64 (n_rows, n_cols, 2), offset of each site, or (2,) for all.
+        before: bool (n_rows, n_cols), the atoms that were probed.
+        after: bool (n_rows, n_cols), those seen afterwards.
+
+    Returns:
+        The offsets, float64 (n_groups, 2), and the atoms before and after, int64 (n_groups,).
+
+    Example:
+        >>> before, after = np.array([[1, 1, 0]], bool), np.array([[0, 1, 1]], bool)
+        >>> [each.tolist() for each in group_counts((0.5, 0.0), before, after)]
+        [[[0.5, 0.0]], [2], [1]]
+    """
+    offsets = np.broadcast_to(np.asarray(offset_m, np.float64), (*before.shape, 2))
+    kinds, group = np.unique(offsets.reshape(-1, 2), axis=0, return_inverse=True)
+    n_before = np.bincount(group.ravel(), before.ravel(), len(kinds)).astype(np.int64)
+    n_survived = np.bincount(group.ravel(), (before & after).ravel(), len(kinds)).astype(np.int64)
+    return kinds, n_before, n_survived
+
+
+def _least(residuals: Callable[[Floats], Floats], reach: float) -> Floats:
+    """Centre and drift with the least sum of squares; begun at the best of a grid of centres."""
+    from scipy.optimize import least_squares
+
+    places = reach * np.arange(-7, 8) / 7  # 0 is exact: from a dust of it the first step would be as small
+    starts = [np.array([along, across, 0.0]) for along in places for across in places]
+    start = min(starts, key=lambda theta: float((residuals(theta) ** 2).sum()))
+    bounds = np.array([1.5 * reach, 1.5 * reach, 5 * DRIFT])
+    return least_squares(residuals, start, bounds=(-bounds, bounds), x_scale=[0.1, 0.1, DRIFT]).x

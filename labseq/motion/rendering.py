@@ -1,11 +1,14 @@
-"""From tones to the samples that an AWG plays."""
+"""From a tone program to samples."""
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from enum import IntEnum
+from fractions import Fraction
 from functools import lru_cache
 from typing import TYPE_CHECKING, Final, NoReturn
 
@@ -13,11 +16,138 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.errors import LimitError
-from labseq.model import ToneProgram, Waveform
-from labseq.motion.render_comb import find_comb
+from labseq.model import AxisTones, SiteGrid, ToneProgram, Waveform
 
 if TYPE_CHECKING:
-    from labseq.kernels.render_types import Axis, Room
+    from labseq.motion.render_kernels import Axis, Room
+
+CLOCK_STEP_HZ: Final = 8
+"""Sample rates of the AWG are multiples of this (Spectrum M4i.66xx)."""
+
+MAX_PERIOD: Final = 4096
+"""Longest period of a comb, in samples, that is worth its tables."""
+
+BLOCK: Final = 1536
+"""Blocks have at least so many samples."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Comb:
+    """The comb of an axis at a sample rate.
+
+    Attributes:
+        origin: Frequency of the first tooth, in cycles per sample.
+        step: Spacing of the teeth, in cycles per sample; ``step * period`` is whole.
+        teeth: float64 (2 n_teeth, period), cosine and sine of each tooth's
+            distance from the first; of no length if there is no comb.
+        block: Samples that are rendered at a time, a multiple of the period.
+    """
+
+    origin: float
+    step: float
+    teeth: NDArray[np.float64]
+    block: int
+
+    @property
+    def n_teeth(self) -> int:
+        """Number of teeth."""
+        return len(self.teeth) // 2
+
+
+NO_COMB: Final = Comb(0.0, 1.0, np.empty((0, 0)), 1024)
+
+
+def comb_sample_rate(
+    grid: SiteGrid, max_hz: float = 625e6, min_hz: float = 50e6, clock_step_hz: int = CLOCK_STEP_HZ
+) -> float:
+    """Find the fastest sample rate at which the sites of both axes make a comb of whole samples.
+
+    The sum of tones on a comb of spacing D repeats after fs / D samples. Where that is
+    a whole number, on both axes, :func:`labseq.render` is at its fastest.
+
+    Args:
+        grid: Its row and column frequencies, equally spaced on each axis.
+        max_hz: Fastest sample rate allowed.
+        min_hz: Slowest sample rate allowed.
+        clock_step_hz: Sample rates are multiples of this.
+
+    Returns:
+        The rate in Hz, a whole number of clock steps. If the spacing is no round number
+        the teeth miss it by half a clock step divided by fs / D at most, which rendering
+        takes into account.
+
+    Raises:
+        LimitError: No rate in the range suits both axes.
+
+    Example:
+        >>> comb_sample_rate(SiteGrid())
+        624000000.0
+    """
+    steps = [_spacing(grid.row_frequency_hz), _spacing(grid.column_frequency_hz)]
+    steps = [step for step in steps if step > 0.0]
+    if not steps:
+        return max_hz // clock_step_hz * clock_step_hz
+    first = max(steps)
+    for period in range(int(max_hz / first), int(min_hz / first), -1):
+        rate_hz = round(period * first / clock_step_hz) * clock_step_hz
+        off = [abs(rate_hz / step - round(rate_hz / step)) * step for step in steps]
+        if rate_hz <= max_hz and max(off) <= clock_step_hz:
+            return float(rate_hz)
+    raise LimitError(
+        "the spacing of row and column tones",
+        " and ".join(f"{step:.9g} Hz" for step in steps),
+        f"what one sample rate from {min_hz:.9g} to {max_hz:.9g} Hz holds a whole number of times",
+        "make them equal, or multiples of one another",
+    )
+
+
+def find_comb(axis: AxisTones, sample_rate_hz: float) -> Comb:
+    """Find the comb that most tones of an axis stand on, if there is one that suits the sample rate."""
+    from labseq.motion.render_comb_kernels import (
+        MAX_TEETH,
+        MAX_TONES,
+        TOLERANCE_HZ,
+        common_spacing,
+        distinct_tones,
+    )
+
+    tones_hz = np.empty(MAX_TONES)
+    n_tones = distinct_tones(axis.start_hz, tones_hz)
+    spacing = common_spacing(tones_hz[:n_tones]) if n_tones > 0 else -1.0
+    if spacing < 0.0:
+        return NO_COMB
+    origin = float(axis.start_hz.min()) / sample_rate_hz
+    if spacing == 0.0:  # then it may as well be on a tooth of 0 Hz's comb, and repeat itself
+        spacing = sample_rate_hz / Fraction(origin).limit_denominator(MAX_PERIOD).denominator
+    ratio = Fraction(spacing / sample_rate_hz).limit_denominator(MAX_PERIOD)
+    period, step = ratio.denominator, float(ratio)
+    span = (tones_hz[n_tones - 1] - tones_hz[0]) / sample_rate_hz
+    near = abs(step * sample_rate_hz - spacing) <= TOLERANCE_HZ
+    if step <= 0.0 or not near or round(span / step) >= MAX_TEETH:
+        return NO_COMB
+    n_teeth = round(span / step) + 1
+    teeth = _teeth(ratio.numerator, period, 1 << (n_teeth - 1).bit_length())
+    return Comb(origin, step, teeth[: 2 * n_teeth], period * math.ceil(BLOCK / period))
+
+
+@lru_cache(maxsize=8)
+def _teeth(numerator: int, period: int, n_teeth: int) -> NDArray[np.float64]:
+    """What :attr:`Comb.teeth` holds, kept for the next program."""
+    from labseq.motion.render_comb_kernels import fill_teeth
+
+    angles = 2 * np.pi / period * np.arange(period)
+    teeth = np.empty((2 * n_teeth, period))
+    fill_teeth(np.cos(angles), np.sin(angles), numerator, teeth)
+    teeth.flags.writeable = False
+    return teeth
+
+
+def _spacing(site_hz: NDArray[np.float64]) -> float:
+    """Mean spacing of the sites' frequencies; 0 for a single site."""
+    if len(site_hz) < 2:
+        return 0.0
+    return float(site_hz[-1] - site_hz[0]) / (len(site_hz) - 1)
+
 
 FULL_SCALE: Final = 32767
 """Sample at which the amplitudes of an axis add up to 1."""
@@ -112,8 +242,8 @@ class Renderer:
             start: First sample, counted from the start of the program.
             out: Result, int16 (n,), contiguous.
         """
-        from labseq.kernels.render_axis import render
-        from labseq.kernels.render_types import new_room
+        from labseq.motion.render_direct_kernels import render
+        from labseq.motion.render_kernels import new_room
 
         axis = self._axes[channel]
         free = _free_rooms(axis[-1])
@@ -210,8 +340,7 @@ def _prepare(
     Raises:
         LimitError: See :class:`Renderer`.
     """
-    from labseq.kernels.render_paths import choose_paths
-    from labseq.kernels.render_tones import FINE, N_FIELDS, take_tones
+    from labseq.motion.render_kernels import FINE, N_FIELDS, choose_paths, take_tones
 
     axis, (first_sample, delta, length) = (program.row, program.column)[channel], times
     n_tones = len(axis.start_hz)
@@ -255,7 +384,7 @@ def _check_durations(program: ToneProgram, sample_rate_hz: float) -> None:
 
 def _refuse(fault: int, where: int, program: ToneProgram, channel: int, sample_rate_hz: float) -> NoReturn:
     """Put into words what cannot be played."""
-    from labseq.kernels.render_tones import SUM
+    from labseq.motion.render_kernels import SUM
 
     axis, name = ((program.row, "row"), (program.column, "column"))[channel]
     if fault == SUM:

@@ -6,9 +6,8 @@ where a sequence or profile names what it would have offered. Plugins' code that
 before a run has a thread of its own, a time limit, and leaves the process as it was.
 """
 
-from labseq.plugins.contained import contained
+from labseq.plugins.contained import LOCAL_PACKAGE, contained
 from labseq.plugins.host import ENTRY_POINT_GROUP, PATH_VARIABLE, PluginHost, PluginInfo
-from labseq.plugins.importing import LOCAL_PACKAGE
 
 __all__ = [
     "ENTRY_POINT_GROUP",

@@ -1,7 +1,8 @@
 """Runs on disk: a folder per run, one HDF5 file per shot, and the way back."""
 
-from labseq.places import data_root
-from labseq.recording.active import (
+from labseq.files import data_root
+from labseq.recording.columns import figures_in
+from labseq.recording.folders import (
     clear_active,
     died,
     lock_files,
@@ -10,7 +11,6 @@ from labseq.recording.active import (
     runs_in_progress,
 )
 from labseq.recording.reader import Run, open_run
-from labseq.recording.row_values import figures_in
 from labseq.recording.shot import Shot
 from labseq.recording.writer import RunWriter
 

@@ -1,21 +1,22 @@
-"""The shots of a run as columns: what the index tells of each, with units and in words."""
+"""The columns of a run's table of shots."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from labseq.errors import RecordingError
-from labseq.recording.layout import unit_of
-from labseq.recording.plain import dumps
+from labseq.recording.durable import dumps
 from labseq.recording.reader import Run
-from labseq.recording.shot import Shot
-from labseq.recording.summaries import SIMULATION, flat_readings
+from labseq.recording.run_file import SIMULATION, flat_readings
+from labseq.recording.schema import unit_of
+from labseq.recording.shot import Shot, load_content
 from labseq.units import si_unit_of
 
 _FIXED: Final[Mapping[str, tuple[str, str]]] = {
@@ -206,3 +207,20 @@ def _text(value: object) -> str:
     if value is None:
         return ""
     return value if isinstance(value, str) else dumps(value)
+
+
+def figures_in(row: Mapping[str, Any]) -> dict[str, float]:
+    """The numbers that came of a shot.
+
+    Args:
+        row: The shot's line in the index.
+
+    Returns:
+        Name -> value, as :meth:`labseq.Run.to_dataframe` calls its column: "filling_fraction",
+        "stage.plan_s", "reading.laser.power_w". No nan is among them.
+
+    Example:
+        >>> figures_in({"shot": 0, "filling_fraction": 0.5, "stage_s": {"plan": 0.1}})
+        {'filling_fraction': 0.5, 'stage.plan_s': 0.1}
+    """
+    return figures_of(Shot(Path(), dict(row), load_content))

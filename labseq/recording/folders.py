@@ -1,18 +1,28 @@
-"""Where runs lie: data root / local date / counter_name."""
+"""Folders of runs, and which run is in progress in which process.
+
+A marker belongs to a profile (its hardware) and to a process. It stands in the folder
+``.active`` of the data root, and in that of the user's state folder for runs whose data
+lie elsewhere, from before the devices are opened until they are safe again.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
+import platform
 import re
 import sys
 import unicodedata
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from labseq.errors import RecordingError
-from labseq.recording.durable import explained, sync_folder
+from labseq.recording.durable import dumps, explained, parse_object, sync_folder, write_file
 
 RUN_FILE: Final = "run.json"
 STATE_FILE: Final = "STATE"
@@ -165,3 +175,240 @@ def _without_run_file(folder: Path) -> str:
     if any((folder / SHOTS_FOLDER).glob("*.h5")):
         return f"holds shots, but its {RUN_FILE} is gone; take that from a backup"
     return f"has no {RUN_FILE}: the run died while its folder was made; it holds no shots, delete it"
+
+
+@dataclass(frozen=True, slots=True)
+class Owner:
+    """A process, told apart from a later one that was given the same number.
+
+    Attributes:
+        pid: Process id.
+        started: When it started, in the system's own terms; "" if that is unknown.
+        host: The computer that it runs on.
+    """
+
+    pid: int
+    started: str
+    host: str
+
+    @classmethod
+    def current(cls) -> Owner:
+        """This process."""
+        return cls(os.getpid(), _started(os.getpid()) or "", platform.node())
+
+    @classmethod
+    def from_plain(cls, values: Mapping[str, Any]) -> Owner | None:
+        """Read back what ``dataclasses.asdict`` made; None if it is not that."""
+        pid = values.get("pid")
+        if not isinstance(pid, int) or isinstance(pid, bool) or pid <= 0:
+            return None
+        return cls(pid, str(values.get("started") or ""), str(values.get("host") or ""))
+
+    @property
+    def is_here(self) -> bool:
+        """Whether it belongs to this computer, so that :attr:`lives` can be known."""
+        return self.host == platform.node()
+
+    @property
+    def lives(self) -> bool:
+        """Whether it still runs; meaningful on its own computer only."""
+        started = _started(self.pid)
+        if started is None:
+            return False
+        return not (self.started and started) or started == self.started
+
+
+if sys.platform == "win32":
+
+    def _started(pid: int) -> str | None:
+        """When a process started; None if there is no such process, "" if nobody says."""
+        import ctypes
+        from ctypes import wintypes
+
+        query_limited_information, still_active, access_denied = 0x1000, 259, 5
+        kernel = ctypes.WinDLL("kernel32", use_last_error=True)
+        kernel.OpenProcess.restype = wintypes.HANDLE
+        kernel.OpenProcess.argtypes = (wintypes.DWORD, wintypes.BOOL, wintypes.DWORD)
+        kernel.CloseHandle.argtypes = (wintypes.HANDLE,)
+        kernel.GetExitCodeProcess.argtypes = (wintypes.HANDLE, ctypes.POINTER(wintypes.DWORD))
+        kernel.GetProcessTimes.argtypes = (wintypes.HANDLE, *[ctypes.POINTER(wintypes.FILETIME)] * 4)
+        handle = kernel.OpenProcess(query_limited_information, False, pid)
+        if not handle:
+            return "" if ctypes.get_last_error() == access_denied else None
+        try:
+            code = wintypes.DWORD()
+            if kernel.GetExitCodeProcess(handle, ctypes.byref(code)) and code.value != still_active:
+                return None
+            times = [wintypes.FILETIME() for _ in range(4)]
+            if not kernel.GetProcessTimes(handle, *[ctypes.byref(time) for time in times]):
+                return ""
+            return f"{times[0].dwHighDateTime:08x}{times[0].dwLowDateTime:08x}"
+        finally:
+            kernel.CloseHandle(handle)
+
+else:
+
+    def _started(pid: int) -> str | None:
+        """When a process started; None if there is no such process, "" if nobody says."""
+        try:
+            os.kill(pid, 0)
+        except (ProcessLookupError, OverflowError):
+            return None
+        except PermissionError:
+            pass  # it exists and belongs to somebody else
+        try:
+            stat = Path(f"/proc/{pid}/stat").read_bytes()
+            boot = Path("/proc/sys/kernel/random/boot_id").read_text("ascii").strip()
+        except OSError:
+            return ""  # not Linux, or hidden
+        # The name in parentheses may hold anything; state is the 1st field after it, the start time the 20th.
+        fields = stat[stat.rindex(b")") + 1 :].split()
+        if fields[0] in {b"Z", b"X"}:
+            return None  # ended; its parent has not yet asked how
+        return f"{boot}/{fields[19].decode('ascii')}"
+
+
+_FOLDER: Final = ".active"
+
+
+@dataclass(frozen=True, slots=True)
+class Marker:
+    """A marker, as its file has it.
+
+    Attributes:
+        path: The file.
+        owner: The process; None if the file cannot be read.
+        run_dir: The run's folder; None likewise.
+        profile: What stands for the profile; "" likewise.
+    """
+
+    path: Path
+    owner: Owner | None
+    run_dir: Path | None
+    profile: str
+
+    @property
+    def is_active(self) -> bool:
+        """Whether its process is known to live; of one on another computer nobody knows."""
+        return self.owner is not None and self.owner.is_here and self.owner.lives
+
+
+def marker_roots(root: Path) -> tuple[Path, ...]:
+    """Where the markers of a run stand: in its data root, and in the user's state folder if there is one.
+
+    The paths are absolute: some vendors' libraries change the working folder.
+    """
+    state = state_root()
+    return (root.absolute(), *(() if state is None else (state.absolute(),)))
+
+
+def mark_active(roots: Sequence[Path], profile_key: str, run_dir: Path) -> None:
+    """Mark that this process has a run in progress on a profile's hardware.
+
+    Args:
+        roots: See :func:`marker_roots`; the first must take the marker, the others need not.
+        profile_key: What stands for the profile, for example its absolute path.
+        run_dir: The run's folder.
+
+    Raises:
+        RecordingError: The first root cannot be written to.
+    """
+    _mark(roots[0], profile_key, run_dir)
+    for root in roots[1:]:
+        with suppress(RecordingError):
+            _mark(root, profile_key, run_dir)
+
+
+def clear_active(roots: Sequence[Path], profile_key: str) -> None:
+    """Remove this process's markers, and those of runs that died, now that the hardware is safe.
+
+    Markers of other living processes stay.
+
+    Raises:
+        RecordingError: A marker cannot be removed; all others are.
+    """
+    current = Owner.current()
+    failures: list[RecordingError] = []
+    for marker in _markers(roots, profile_key):
+        if not marker.is_active or (marker.owner and marker.owner.pid == current.pid):
+            try:
+                with explained(marker.path):
+                    marker.path.unlink(missing_ok=True)
+                    sync_folder(marker.path.parent)
+            except RecordingError as failure:
+                failures.append(failure)
+    if failures:
+        raise failures[0]
+
+
+def died(roots: Sequence[Path], profile_key: str) -> Path | None:
+    """The run, if there is one, that died on a profile's hardware without making it safe.
+
+    Returns:
+        Its folder, or the marker itself if that cannot be read. A run on another
+        computer counts as dead: nobody here can tell, and being safe twice harms
+        nothing.
+    """
+    for marker in _markers(roots, profile_key):
+        if not marker.is_active:
+            return marker.run_dir or marker.path
+    return None
+
+
+def lock_files(roots: Sequence[Path], profile_key: str) -> tuple[Path, ...]:
+    """What to lock so that nobody else uses a profile's hardware: one file in each root."""
+    return tuple(root / _FOLDER / f"{_stem(profile_key)}.lock" for root in roots)
+
+
+def runs_in_progress(roots: Sequence[Path]) -> dict[Path, str]:
+    """The runs that living processes here have in progress: folder -> what stands for the profile."""
+    markers = [marker for root in roots for marker in markers_in(root) if marker.is_active]
+    return {marker.run_dir: marker.profile for marker in markers if marker.run_dir is not None}
+
+
+def markers_in(root: Path) -> list[Marker]:
+    """The markers of all profiles in a data root."""
+    return [_read(path) for path in _files(root)]
+
+
+def _mark(root: Path, profile_key: str, run_dir: Path) -> None:
+    owner = Owner.current()
+    marker = root / _FOLDER / f"{_stem(profile_key)}.{owner.pid}.json"
+    with explained(marker):
+        marker.parent.mkdir(parents=True, exist_ok=True)
+        sync_folder(root)
+    values = {"profile": profile_key, "run_dir": str(run_dir.resolve()), **asdict(owner)}
+    write_file(marker, dumps(values).encode() + b"\n")
+
+
+def _stem(profile_key: str) -> str:
+    digest = hashlib.sha256(profile_key.encode("utf-8", "backslashreplace")).hexdigest()[:12]
+    return f"{slug(profile_key)[-40:]}-{digest}"
+
+
+def _markers(roots: Sequence[Path], profile_key: str) -> list[Marker]:
+    """The markers of a profile, oldest name first."""
+    return [_read(path) for root in roots for path in _files(root, _stem(profile_key)) if path.exists()]
+
+
+def _read(path: Path) -> Marker:
+    try:
+        values = parse_object(path.read_bytes()) or {}
+    except OSError:
+        values = {}
+    run_dir, profile = values.get("run_dir"), values.get("profile")
+    return Marker(
+        path,
+        Owner.from_plain(values),
+        Path(run_dir) if isinstance(run_dir, str) else None,
+        profile if isinstance(profile, str) else "",
+    )
+
+
+def _files(root: Path, stem: str = "") -> list[Path]:
+    folder = root / _FOLDER
+    try:
+        names = sorted(entry.name for entry in folder.iterdir())
+    except OSError:  # there is none, or none that can be looked into
+        return []
+    return [folder / name for name in names if name.startswith(stem) and name.endswith(".json")]

@@ -1,29 +1,79 @@
-"""Reads a run back, finished or not."""
+"""A recorded run, read back."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Generator, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from labseq.errors import RecordingError
 from labseq.model import TargetPattern
 from labseq.model.estimate import mean
 from labseq.model.records import RunStatus
 from labseq.recording import folders
-from labseq.recording.chosen_points import SCANNER, completed
-from labseq.recording.durable import read_lines
-from labseq.recording.plain import to_plain
+from labseq.recording.durable import dumps, parse_object, read_lines, to_plain
+from labseq.recording.folders import RUN_FILE
 from labseq.recording.results import rows_of
 from labseq.recording.run_file import is_index_row, is_skip_row, read_run, read_state, target_of
 from labseq.recording.shot import Shot, load_content
+from labseq.units import written
 
 if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
+
+SCANNER: Final = "scanner"
+"""Key of a scan's record that only an adaptive one has: the scanner and its settings."""
+
+
+class ChosenPoints:
+    """The points that were chosen, each once, in the order in which they were first taken.
+
+    Args:
+        scan: What run.json says of the scan.
+
+    Attributes:
+        points: The values of each point, SI.
+        written: The same in the units of the sequence.
+    """
+
+    def __init__(self, scan: Mapping[str, Any]) -> None:
+        self.points: list[list[Any]] = []
+        self.written: list[list[str]] = []
+        self._addresses = [str(address) for address in scan["addresses"]]
+        self._units = [str(unit) for unit in scan["units"]]
+        self._numbers: dict[str, int] = {}
+
+    def number(self, parameters: Mapping[str, Any]) -> int:
+        """The number of a shot's point, counted from 0.
+
+        Args:
+            parameters: Address -> value, as the shot's line of the index has it.
+        """
+        values = [parameters[address] for address in self._addresses]
+        number = self._numbers.setdefault(dumps(values), len(self.points))
+        if number == len(self.points):
+            self.points.append(values)
+            self.written.append([written(v, unit) for v, unit in zip(values, self._units, strict=True)])
+        return number
+
+
+def completed(scan: Mapping[str, Any], rows: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
+    """What run.json says of an adaptive scan, with the points as those of any other scan.
+
+    Args:
+        scan: What run.json says.
+        rows: The lines of the index, in any order; ``point_of_shot`` is -1 for a shot without one.
+    """
+    chosen = ChosenPoints(scan)
+    of_shot: dict[int, int] = {}
+    for row in sorted(rows, key=lambda row: (row["shot"], row["attempt"])):
+        of_shot[row["shot"]] = chosen.number(row["parameters"])
+    point_of_shot = [of_shot.get(shot, -1) for shot in range(max(of_shot, default=-1) + 1)]
+    return {**scan, "points": chosen.points, "written": chosen.written, "point_of_shot": point_of_shot}
 
 
 def open_run(path: str | Path) -> Run:
@@ -193,7 +243,7 @@ class Run:
         Raises:
             ConfigError: pandas is not installed.
         """
-        from labseq.recording.tabular import dataframe_of
+        from labseq.recording.export import dataframe_of
 
         return dataframe_of(self, attempts=attempts)
 
@@ -212,6 +262,84 @@ class Run:
             ConfigError: xarray is not installed.
             RecordingError: A shot's file is missing or damaged, or the scan is.
         """
-        from labseq.recording.tabular import dataset_of
+        from labseq.recording.export import dataset_of
 
         return dataset_of(self, occupancies=occupancies)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScanPoint:
+    """A point of a scan and its shots.
+
+    Attributes:
+        parameters: Scanned address -> value, SI.
+        written: The same as the sequence has it: "60 ms".
+        shots: The shots there that count, in order.
+    """
+
+    parameters: Mapping[str, Any]
+    written: Mapping[str, str]
+    shots: tuple[Shot, ...]
+
+
+def scan_points(run: Run) -> list[ScanPoint]:
+    """The points of a run's scan that have a shot, in the scan's own order; none without a scan.
+
+    Raises:
+        RecordingError: What run.json says of the scan is damaged.
+    """
+    scan: Mapping[str, Any] = run.scan
+    if not scan:
+        return []
+    shots: dict[int, list[Shot]] = {}
+    try:
+        for shot in run.shots:
+            shots.setdefault(int(scan["point_of_shot"][shot.index]), []).append(shot)
+        addresses = scan["addresses"]
+        return [
+            ScanPoint(
+                dict(zip(addresses, scan["points"][point], strict=True)),
+                dict(zip(addresses, scan["written"][point], strict=True)),
+                tuple(shots[point]),
+            )
+            for point in sorted(shots)
+        ]
+    except (KeyError, IndexError, TypeError, ValueError) as error:
+        reason = f"has a damaged scan: {error!r}; take it from a backup"
+        raise RecordingError(run.path / RUN_FILE, reason) from error
+
+
+class Follower:
+    """Gives each shot that counts once, when it is in the index of its run.
+
+    It keeps nothing but its place in the index.
+
+    Args:
+        run_dir: The run's folder.
+    """
+
+    def __init__(self, run_dir: Path) -> None:
+        self._run_dir = run_dir
+        self._offset = 0
+
+    def new(self) -> Generator[Shot]:
+        """The shots since the last time, until there are no more for now.
+
+        Raises:
+            RecordingError: The index cannot be read.
+        """
+        path = self._run_dir / folders.INDEX_FILE
+        try:
+            with path.open("rb") as index:
+                index.seek(self._offset)
+                for line in index:
+                    if not line.endswith(b"\n"):
+                        return
+                    self._offset += len(line)
+                    row = parse_object(line)
+                    if row is not None and is_index_row(row) and row["counts"]:
+                        yield Shot(self._run_dir / row["file"], row, load_content)
+        except FileNotFoundError:
+            return
+        except OSError as error:
+            raise RecordingError(path, f"cannot be read: {error.strerror}; check the disk") from error

@@ -14,9 +14,11 @@ from numpy.typing import NDArray
 import labseq
 from labseq.errors import RecordingError
 from labseq.model import CycleRecord, ImageRecord, RunRecord, ShotRecord
-from labseq.recording import layout, tables
-from labseq.recording.described import DATASETS, column_meanings
-from labseq.recording.nodes import (
+from labseq.recording import schema as layout, schema as tables
+from labseq.recording.run_file import sha256_of_text
+from labseq.recording.schema import (
+    DATASETS,
+    column_meanings,
     describe,
     describe_columns,
     link_name,
@@ -24,7 +26,6 @@ from labseq.recording.nodes import (
     write_json,
     write_values,
 )
-from labseq.recording.run_file import sha256_of_text
 
 
 class ShotEncoder:

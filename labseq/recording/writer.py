@@ -18,8 +18,7 @@ from labseq.errors import RecordingError
 from labseq.model import RunRecord, ShotRecord
 from labseq.model.records import RunStatus
 from labseq.recording import folders
-from labseq.recording.durable import LineLog, explained, sync_folder, write_file
-from labseq.recording.plain import dumps
+from labseq.recording.durable import LineLog, dumps, explained, sync_folder, write_file
 from labseq.recording.run_file import encode_run, encode_state, encode_text, index_row, read_run
 
 if TYPE_CHECKING:

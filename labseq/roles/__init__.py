@@ -10,42 +10,48 @@ Failures: a device raises ``DeviceError`` (or ``DeviceTimeoutError``),
 ``TransientError`` when a repetition of the shot may help.
 """
 
-from labseq.roles.clock import Clock, NeverStopped
-from labseq.roles.deciding import Analysis, Detector, Planner, RecordedShot, Scanner, ReportsSignals, NeedsWarmUp
+from labseq.roles.deciding import (
+    Analysis,
+    Detector,
+    NeedsWarmUp,
+    Planner,
+    RecordedShot,
+    ReportsSignals,
+    Scanner,
+)
 from labseq.roles.hardware import (
     Camera,
+    ChecksCommands,
     Device,
     Hardware,
+    HasReadings,
+    HasSelfTest,
     Interlocked,
-    ReportsCameraFacts,
-    ChecksCommands,
-    ReportsLinesFacts,
     LeaderLink,
     Lines,
     MobileTweezers,
-    HasReadings,
-    HasSelfTest,
     NeedsSettling,
-    StaticTweezers,
+    ReportsCameraFacts,
+    ReportsLinesFacts,
     ReportsTimings,
+    StaticTweezers,
     Trigger,
 )
-from labseq.roles.shot import Context, Shot
+from labseq.roles.shot import Clock, Context, NeverStopped, Repeatable, RunObserver, Shot, Step, StepContext
 from labseq.roles.simulation import (
     WHOLE_SENSOR,
-    ReportsLoading,
-    ReportsSensor,
     ReceivesOutput,
+    ReportsEvents,
+    ReportsLoading,
     ReportsLosses,
+    ReportsSensor,
+    ReportsTruth,
     RfSource,
     Signal,
     Simulation,
-    ReportsEvents,
     ToneSource,
-    ReportsTruth,
     WiresTriggers,
 )
-from labseq.roles.step import Repeatable, RunObserver, Step, StepContext
 
 __all__ = [
     "WHOLE_SENSOR",

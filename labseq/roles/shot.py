@@ -1,14 +1,15 @@
-"""What plugins are given, and the role of a step."""
+"""What a step works with: the clock, the shot, and the step itself."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
-from typing import Any, ParamSpec, Protocol, TypeVar
+from typing import Any, ParamSpec, Protocol, TypeVar, runtime_checkable
 
 from labseq.model import (
     CalibrationEntry,
+    CameraFacts,
     CycleRecord,
     Frame,
     LineSpec,
@@ -17,11 +18,58 @@ from labseq.model import (
     RandomStream,
     SiteGrid,
     TargetPattern,
+    TimelineEntry,
 )
-from labseq.roles.clock import Clock, NeverStopped
 from labseq.roles.deciding import Detector, Planner
 from labseq.roles.hardware import Device, MobileTweezers, StaticTweezers
 from labseq.roles.simulation import Simulation
+
+
+class Clock(Protocol):
+    """The session's time: real, or virtual where no device needs real time."""
+
+    @property
+    def virtual(self) -> bool:
+        """Whether waiting costs no real time."""
+        ...
+
+    def now(self) -> float:
+        """Monotonic time in seconds; its zero is arbitrary."""
+        ...
+
+    def sleep(self, duration_s: float) -> None:
+        """Wait. Looks for a stop request at least every 50 ms.
+
+        Raises:
+            StopRequested: The operator asked the run to stop.
+        """
+        ...
+
+    def check(self) -> None:
+        """Raise ``StopRequested`` if the operator asked the run to stop; else return at once."""
+        ...
+
+
+class NeverStopped:
+    """A real clock that nobody stops; for plugins used outside of a run."""
+
+    virtual = False
+
+    def now(self) -> float:
+        """Monotonic time in seconds."""
+        import time
+
+        return time.monotonic()
+
+    def sleep(self, duration_s: float) -> None:
+        """Wait."""
+        import threading
+
+        threading.Event().wait(max(0.0, duration_s))
+
+    def check(self) -> None:
+        """Nothing to look for."""
+
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -247,4 +295,62 @@ class Shot(Protocol):
 
     def log(self, event: str, **values: Any) -> None:
         """Add a line to the run's event log."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class StepContext:
+    """What a step needs to know to lay out its timeline before anything is opened.
+
+    Attributes:
+        grid: The grid of sites.
+        motion: How the mobile tweezers move.
+        target: What the array shall look like.
+        camera: What the camera says of itself before it is opened.
+        lines: What is wired to the timing box.
+    """
+
+    grid: SiteGrid
+    motion: MotionSpec
+    target: TargetPattern
+    camera: CameraFacts = field(default_factory=CameraFacts)
+    lines: tuple[LineSpec, ...] = ()
+
+
+class Step(Protocol):
+    """One step of a shot.
+
+    Attributes:
+        needs_image: Whether an image must have been taken before it in the shot.
+        takes_image: Whether later steps find an image of it.
+    """
+
+    needs_image: bool
+    takes_image: bool
+
+    def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:
+        """What the step will do, at most, for ``labseq check``."""
+        ...
+
+    def run(self, shot: Shot) -> None:
+        """Do it."""
+        ...
+
+
+@runtime_checkable
+class Repeatable(Protocol):
+    """A step that may be tried again in the same shot when it fails: it leaves the atoms where they are.
+
+    Attributes:
+        repeatable: Whether it may; others can only be repeated with the whole shot.
+    """
+
+    repeatable: bool
+
+
+class RunObserver(Protocol):
+    """Somebody who watches a run: the live view, a log. Failures never stop the run."""
+
+    def event(self, name: str, values: Mapping[str, Any]) -> None:
+        """Something happened: "run_started", "shot_started", "stage", "image", ..."""
         ...

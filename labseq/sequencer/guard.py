@@ -6,11 +6,14 @@ import math
 import queue
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
 from functools import partial
 from typing import Any, Final, ParamSpec, TypeVar
 
 from labseq.errors import DeviceError, DeviceHungError, LabseqError, PlanError, StopRequested
+from labseq.model import TimelineEntry
+from labseq.roles import Shot, Step, StepContext
 from labseq.sequencer.clock import LOOK_S, StopFlag
 
 P = ParamSpec("P")
@@ -156,3 +159,46 @@ def _translated(owner: str, name: str, error: BaseException) -> BaseException:
     named = PlanError(text) if owner == "planner" else DeviceError(owner, text)
     named.__cause__ = error
     return named
+
+
+def lay_out(step: Step, number: int, name: str, context: StepContext) -> list[TimelineEntry]:
+    """A step's timeline. For a guarded call."""
+    with _named(number, name):
+        return list(step.plan_timeline(context))
+
+
+def budget_s(step: Step, number: int, name: str, context: StepContext, detect_s: float) -> float:
+    """What a step may take at most, in seconds. For a guarded call.
+
+    Args:
+        step: The step.
+        number: Its index.
+        name: Its name.
+        context: What it lays out its timeline by.
+        detect_s: What finding the atoms on an image may take; a timeline leaves that out.
+
+    Returns:
+        Nan if it does not say how long it takes.
+    """
+    with _named(number, name):
+        bars = step.plan_timeline(context)
+        planned_s = sum(bar.duration_s for bar in bars)
+        return planned_s + detect_s * sum(bar.n_images for bar in bars) if planned_s else math.nan
+
+
+def run_step(step: Step, number: int, name: str, shot: Shot) -> None:
+    """Run a step. For a guarded call."""
+    with _named(number, name):
+        step.run(shot)
+
+
+@contextmanager
+def _named(number: int, name: str) -> Generator[None]:
+    """Name the step in whatever it raises; labseq's own errors pass as they are."""
+    try:
+        yield
+    except LabseqError:
+        raise
+    except BaseException as error:
+        text = f"step {number} ({name}) raised {type(error).__name__}: {error}"
+        raise LabseqError(text) from error

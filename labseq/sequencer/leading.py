@@ -1,4 +1,4 @@
-"""Another control system leads: the step that waits for its word, and what it is told of the outcome."""
+"""Another control system leads: waiting for its signal, and reporting the outcome to it."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
+from labseq.builtin.steps import WaitStep
 from labseq.errors import ConfigError, LabseqError, one_of
 from labseq.model import ShotRecord, TimelineEntry
 from labseq.roles import LeaderLink, Shot, StepContext
 from labseq.sequencer.guard import LATE_S, Guard
 from labseq.sequencer.lab import Lab
-from labseq.sequencer.steps import WaitStep
 
 Emit = Callable[[str, Mapping[str, Any]], None]
 

@@ -1,29 +1,124 @@
-"""The sequencer: shot after shot, and every way out of them."""
+"""The sequencer: shot after shot, its states, and every way out of them."""
 
 from __future__ import annotations
 
 import itertools
 import math
 import time
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from datetime import UTC, datetime
+from enum import Enum
 from functools import partial
-from typing import Any, Protocol
+from types import MappingProxyType
+from typing import Any, Final, Protocol
 
 from labseq.errors import LabseqError, StopRequested
 from labseq.model import ShotRecord
 from labseq.model.records import ShotStatus
-from labseq.roles import RunObserver, Step
-from labseq.sequencer.calling import budget_s, run_step
+from labseq.roles import NeedsSettling, RunObserver, Step
 from labseq.sequencer.clock import StopFlag
-from labseq.sequencer.guard import Guard
+from labseq.sequencer.guard import LATE_S, Guard, budget_s, run_step
 from labseq.sequencer.lab import Lab, Outcome, close_all, make_safe
-from labseq.sequencer.leading import LeaderHandshakes
-from labseq.sequencer.opening import close_devices, open_devices
+from labseq.sequencer.leading import Emit, LeaderHandshakes
 from labseq.sequencer.policies import RunPolicy, StepPolicy, Then, may_be_retried
-from labseq.sequencer.shot import RunningShot
-from labseq.sequencer.stages import Stages
-from labseq.sequencer.states import State, StateTable
+from labseq.sequencer.shot import RunningShot, Stages
+
+
+class State(Enum):
+    """Where a run stands."""
+
+    CLOSED = "closed"
+    OPENING = "opening"
+    IDLE = "idle"
+    """Between shots: mobile tweezers silent, camera not exposing, static tweezers on."""
+    SHOT = "shot"
+    WRITING = "writing"
+    RECOVERING = "recovering"
+    """After a failure that does not end the run: what may be busy is silenced."""
+    REOPENING = "reopening"
+    """Between shots: devices whose settings change are closed through their safe state and opened anew."""
+    MAKING_SAFE = "making safe"
+    SAFE = "safe"
+    CLOSING = "closing"
+
+
+TRANSITIONS: Final = MappingProxyType(
+    {
+        State.CLOSED: frozenset({State.OPENING}),
+        State.OPENING: frozenset({State.IDLE, State.MAKING_SAFE}),
+        State.IDLE: frozenset({State.SHOT, State.REOPENING, State.MAKING_SAFE}),
+        State.REOPENING: frozenset({State.IDLE, State.MAKING_SAFE}),
+        State.SHOT: frozenset({State.WRITING, State.RECOVERING, State.MAKING_SAFE}),
+        State.RECOVERING: frozenset({State.WRITING, State.SHOT, State.MAKING_SAFE}),
+        State.WRITING: frozenset({State.IDLE, State.MAKING_SAFE}),
+        State.MAKING_SAFE: frozenset({State.SAFE, State.MAKING_SAFE}),
+        State.SAFE: frozenset({State.CLOSING}),
+        State.CLOSING: frozenset({State.CLOSED, State.MAKING_SAFE}),
+    }
+)
+"""The state table: state -> states that may follow.
+
+Every state in which a device may be on leads to MAKING_SAFE; an ending that was itself cut short begins anew.
+"""
+
+
+class StateTable:
+    """Holds the state and refuses a change that the table does not declare."""
+
+    def __init__(self, changed: Callable[[State], None]) -> None:
+        self.state = State.CLOSED
+        self._changed = changed
+
+    def to(self, state: State) -> None:
+        """Change the state."""
+        if state not in TRANSITIONS[self.state]:
+            raise AssertionError(f"a run cannot go from {self.state.value} to {state.value}")
+        self.state = state
+        self._changed(state)
+
+
+def open_devices(lab: Lab, guard: Guard, stop: StopFlag, emit: Emit, names: Collection[str]) -> None:
+    """Open the simulation and the devices of these names; then wait for those that need time.
+
+    Static tweezers among them are turned on.
+
+    Raises:
+        LabseqError: One of them fails, or the run is asked to stop.
+    """
+    timeout_s = lab.timeouts.call_s
+    simulation = () if lab.simulation is None else (("simulation", lab.simulation),)
+    for name, part in (*simulation, *lab.hardware()):
+        if name in names:
+            stop.check()
+            # Nothing is made safe beside an open() that is only slow: what that does last would undo it.
+            guard.call_to_the_end(name, timeout_s, part.open)
+    if "static_tweezers" in names:
+        guard.call("static_tweezers", timeout_s, lab.static_tweezers.load, None)
+        guard.call("static_tweezers", timeout_s, lab.static_tweezers.start)
+    for name, device in lab.hardware():
+        if (
+            name in names
+            and isinstance(device, NeedsSettling)
+            and (longest_s := device.settling_timeout_s) > 0
+        ):
+            emit("settling", {"device": name, "timeout_s": longest_s})
+            guard.call(name, longest_s + LATE_S, device.settle)
+
+
+def close_devices(lab: Lab, guard: Guard, names: Collection[str]) -> None:
+    """Make the devices of these names safe, all of them first, then close them.
+
+    Raises:
+        LabseqError: One of them fails.
+    """
+    timeout_s = lab.timeouts.safe_state_s
+    devices = [(name, device) for name, device in lab.safe_order() if name in names]
+    for name, device in devices:
+        guard.call_to_the_end(name, timeout_s, device.safe_state)
+    for name, device in devices:
+        guard.call_to_the_end(name, timeout_s, device.close)
+    if lab.simulation is not None and "simulation" in names:
+        guard.call_to_the_end("simulation", timeout_s, lab.simulation.close)
 
 
 class ShotSink(Protocol):

@@ -1,23 +1,27 @@
-"""A run's adaptive scan: what chooses its points, from what, and what for; checked before it begins."""
+"""Adaptive scans: a scanner chooses the next point from the results of the last ones."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any, Final
+from dataclasses import asdict, dataclass, field
+from types import MappingProxyType
+from typing import Any, Final, cast
 
 from labseq.config import ProblemCollector
-from labseq.config.adaptive import SCANNER_KEYS, Adaptive, Ends
-from labseq.config.scan import Axis
-from labseq.config.wording import clean
-from labseq.errors import ConfigError
-from labseq.model import ScanRange, ScanSpace
-from labseq.recording.chosen_points import SCANNER
-from labseq.roles import Step
-from labseq.session.choosing import ChosenPlugin, resolve
-from labseq.session.constructing import construct_one
-from labseq.session.figure_names import check_figure
+from labseq.config.messages import clean
+from labseq.config.scan import SCANNER_KEYS, Adaptive, Axis, Ends
+from labseq.errors import ConfigError, DeviceError
+from labseq.model import ScanRange, ScanSpace, VisitedPoint
+from labseq.recording import Shot
+from labseq.recording.columns import figures_of
+from labseq.recording.durable import dumps
+from labseq.recording.reader import SCANNER
+from labseq.roles import Scanner, Step
+from labseq.sequencer import Guard, StopFlag
+from labseq.session.construct import construct_one
+from labseq.session.policies import check_figure, missing_figure
+from labseq.session.profile import ChosenPlugin, resolve
 from labseq.session.scan import Point, Scanned
 from labseq.units import written
 
@@ -57,7 +61,9 @@ class Search:
         """What the scanner is constructed with."""
         return ScanSpace(self.ranges, self.adaptive.n_points, self.scanned.scan.repeats, seed)
 
-    def at(self, values: Mapping[str, float], planner: ChosenPlugin, steps: tuple[tuple[str, Step], ...]) -> Point:
+    def at(
+        self, values: Mapping[str, float], planner: ChosenPlugin, steps: tuple[tuple[str, Step], ...]
+    ) -> Point:
         """The settings of a point.
 
         Args:
@@ -94,7 +100,9 @@ class Search:
         }
 
 
-def make_search(scanned: Scanned, planner: ChosenPlugin, steps: Steps, found: ProblemCollector) -> Search | None:
+def make_search(
+    scanned: Scanned, planner: ChosenPlugin, steps: Steps, found: ProblemCollector
+) -> Search | None:
     """Check what chooses a scan's points; None if nothing does, or something is wrong.
 
     The scanner is constructed once, to see whether it can be.
@@ -148,3 +156,188 @@ def _range(axis: Axis, ends: Ends, resolved: tuple[Any, Any], present: Any, name
 
 def _is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+@dataclass(slots=True)
+class PointScore:
+    """How a point stands.
+
+    Attributes:
+        first: Its first visit.
+        values: Address -> value, SI.
+        total: Sum of the scores of its visits.
+        n_scores: How many of them have one.
+    """
+
+    first: int
+    values: Mapping[str, Any]
+    total: float = 0.0
+    n_scores: int = 0
+
+    @property
+    def mean(self) -> float:
+        """Its mean score."""
+        return self.total / self.n_scores
+
+
+@dataclass(slots=True, eq=False)
+class Results:
+    """What came of the points of an adaptive scan.
+
+    Attributes:
+        search: What chooses the points.
+        shots: The shots that count: index -> shot.
+    """
+
+    search: Search
+    shots: dict[int, Shot]
+    _visited: list[VisitedPoint] = field(default_factory=list[VisitedPoint])
+    _given_up: dict[int, dict[str, float]] = field(default_factory=dict[int, dict[str, float]])
+    _point_scores: dict[str, PointScore] = field(default_factory=dict[str, PointScore])
+    _n_counted: int = 0
+    _warned: bool = False
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether no shot has been tried."""
+        return not (self.shots or self._given_up)
+
+    def add(self, shot: Shot) -> None:
+        """Take in one more."""
+        self.shots[shot.index] = shot
+
+    def give_up(self, shot: int, parameters: Mapping[str, Any]) -> None:
+        """Remember the point of a shot that was given up: the scanner is told that nothing came of it."""
+        visit = shot // self.search.scanned.scan.repeats
+        self._given_up[visit] = self._values_in(parameters)
+
+    def values(self, visit: int) -> dict[str, float] | None:
+        """The values of a point of which a shot was tried; None if none was."""
+        shots = self._shots_of(visit)
+        return self._values_in(shots[0].row["parameters"]) if shots else self._given_up.get(visit)
+
+    def _values_in(self, parameters: Mapping[str, Any]) -> dict[str, float]:
+        return {one.address: parameters[one.address] for one in self.search.ranges}
+
+    def before(self, visit: int) -> list[VisitedPoint]:
+        """What came of the points before one: those of which a shot was tried."""
+        while len(self._visited) < visit:
+            self._visited.append(self._visit(len(self._visited)))
+        return [one for one in self._visited[:visit] if one.values]
+
+    def missing_figure(self, shot: int) -> str:
+        """What to say, once, of a shot that has not what the scan climbs on; "" if it has."""
+        figure, figures = self.search.adaptive.figure, figures_of(self.shots[shot])
+        if self._warned or figure in figures:
+            return ""
+        self._warned = True
+        return missing_figure(shot, figure, CLIMBED, figures)
+
+    def told(self, visit: int) -> dict[str, Any]:
+        """A point and the best one so far, JSON-ready, for the run's events."""
+        own = self._visit(visit)
+        sign = 1.0 if self.search.adaptive.maximise else -1.0
+
+        def plain(number: int, values: Mapping[str, Any], score: float) -> dict[str, Any]:
+            value = None if math.isnan(score) else sign * score
+            return {"point": number, "written": self.search.told(values), "value": value}
+
+        while self._n_counted <= visit:
+            self._count(self._n_counted)
+        known = [one for one in self._point_scores.values() if one.n_scores]
+        best = max(known, key=lambda one: (one.mean, -one.first), default=None)
+        return {
+            "figure": self.search.adaptive.figure,
+            **plain(visit, own.values, own.score),
+            "best": None if best is None else plain(best.first, best.values, best.mean),
+        }
+
+    def _count(self, visit: int) -> None:
+        """Add a visit to those of its point: all of them count together."""
+        one = self._visit(visit)
+        standing = self._point_scores.setdefault(dumps(dict(one.values)), PointScore(visit, one.values))
+        if not math.isnan(one.score):
+            standing.total += one.score
+            standing.n_scores += 1
+        self._n_counted += 1
+
+    def _shots_of(self, visit: int) -> list[Shot]:
+        repeats = self.search.scanned.scan.repeats
+        indices = range(visit * repeats, (visit + 1) * repeats)
+        return [self.shots[index] for index in indices if index in self.shots]
+
+    def _visit(self, visit: int) -> VisitedPoint:
+        figures = [MappingProxyType(figures_of(shot)) for shot in self._shots_of(visit)]
+        name, sign = self.search.adaptive.figure, 1.0 if self.search.adaptive.maximise else -1.0
+        known = [sign * one[name] for one in figures if name in one]
+        score = math.fsum(known) / len(known) if known else math.nan
+        return VisitedPoint(MappingProxyType(self.values(visit) or {}), score, tuple(figures))
+
+
+class ScannerCall:
+    """A scanner, with a deadline, and a check of each answer.
+
+    Args:
+        search: What chooses, and from what.
+        seed: The run's seed.
+        stop: The request to stop.
+
+    Raises:
+        ConfigError: The scanner refuses its settings; with their place.
+        PluginLoadError: Its constructor raised.
+    """
+
+    def __init__(self, search: Search, seed: int, stop: StopFlag) -> None:
+        self._search = search
+        self._stop = stop
+        self._timeout_s = search.scanned.bench.profile.timeouts.call
+        self._scanner: Scanner = construct_one(search.chosen, search.space(seed))
+
+    def ask(self, visited: Sequence[VisitedPoint]) -> dict[str, float] | None:
+        """The next point, address -> value; None if the scanner wants no more.
+
+        Raises:
+            DeviceError: It raised, or gave something else than a point of its ranges; names it.
+            DeviceTimeoutError: It did not answer in time.
+            StopRequested: The run is to stop.
+        """
+        guard = Guard(self._stop)
+        try:
+            return guard.call(self._search.name, self._timeout_s, self.next_point, tuple(visited))
+        finally:
+            guard.end()
+
+    def next_point(self, visited: Sequence[VisitedPoint]) -> dict[str, float] | None:
+        """The scanner's answer, checked; for a guarded call, which names this function."""
+        try:
+            answer: Any = self._scanner.next_point(visited)
+            given = dict(cast("Mapping[Any, Any]", answer)) if isinstance(answer, Mapping) else None
+        except Exception as error:
+            text = f"next_point() raised {type(error).__name__}"
+            raise self._error(f"{text}: {error}" if str(error) else text) from error
+        if answer is None:
+            return None
+        ranges = {one.address: one for one in self._search.ranges}
+        if given is None or {*given} != {*ranges}:
+            came = f"a {type(answer).__name__}" if given is None else f"values for {_names(given)}"
+            raise self._error(f"next_point() gave {came}; expected a value for each of {_names(ranges)}")
+        units = dict(zip(ranges, self._search.units, strict=True))
+        return {address: self._value(one, given[address], units[address]) for address, one in ranges.items()}
+
+    def _value(self, range_: ScanRange, value: object, unit: str) -> float:
+        """A value that its range allows, without the dust of rounding."""
+        what = "a whole number" if range_.is_whole else "a number"
+        expected = f"{what} from {written(range_.low, unit)} to {written(range_.high, unit)}"
+        expected += f" on one of its {range_.n_steps} steps" if range_.n_steps else ""
+        near = range_.allowed(value)
+        if near is not None:
+            return near
+        came = f"{value:.12g} (SI)" if isinstance(value, float) and unit else clean(repr(value))
+        raise self._error(f"next_point() gave {came} for '{range_.address}'; expected {expected}")
+
+    def _error(self, text: str) -> DeviceError:
+        return DeviceError(self._search.name, text)
+
+
+def _names(addresses: Mapping[Any, Any]) -> str:
+    return ", ".join(f"'{clean(str(address))}'" for address in addresses) or "no address"

@@ -19,8 +19,8 @@ from typing import Final
 
 from labseq.errors import LabseqError
 from labseq.recording import Shot, open_run
-from labseq.recording.following import Follower
-from labseq.session.analysing import FAILED, USE, analyse, analyses_of, prepare, results_of
+from labseq.recording.reader import Follower
+from labseq.session.analyses import FAILED, USE, analyse, analyses_of, prepare, results_of
 
 LOOK_S: Final = 0.1
 """How often it looks for new shots."""

@@ -1,4 +1,4 @@
-"""Puts a run together: files, plugins, settings, and objects, without opening anything."""
+"""Puts a run together: files, plugins, settings and objects, without opening anything."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from labseq import builtins
+from labseq import builtin as builtins
 from labseq.config import (
     ROLES,
-    ProblemCollector,
     Document,
-    StoredText,
     Override,
+    ProblemCollector,
     Scan,
     SequenceSpec,
+    StoredText,
     bind_scan,
     find_sequence,
     load_sequence,
@@ -29,19 +29,20 @@ from labseq.plugins import PluginHost
 from labseq.roles import Step
 from labseq.sequencer.policies import RunPolicy
 from labseq.session.adaptive import Search, make_search
-from labseq.session.calibrating import with_tones
-from labseq.session.choosing import (
-    ResolvedProfile,
+from labseq.session.calibrations import with_tones
+from labseq.session.construct import make_analyses, make_steps, make_target
+from labseq.session.policies import make_policy, with_policies
+from labseq.session.profile import (
     ChosenPlugin,
     DryRun,
+    RecordedSetup,
+    ResolvedProfile,
     check_dry_run,
     resolve,
+    resolve_profile,
     validate,
 )
-from labseq.session.contents import make_analyses, make_steps, make_target
-from labseq.session.policies import make_policy, with_policies
 from labseq.session.scan import Point, Scanned
-from labseq.session.setting_up import RecordedSetup, resolve_profile
 
 
 @dataclass(frozen=True, slots=True)

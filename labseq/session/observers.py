@@ -11,7 +11,7 @@ from labseq.model import CycleRecord, ShotRecord, StageTiming
 from labseq.plugins import PluginHost
 from labseq.roles import RunObserver
 from labseq.sequencer import Guard, StopFlag
-from labseq.session.analysts import AnalysisProcesses
+from labseq.session.analyses import AnalysisProcesses
 
 _QUIET: Final = frozenset({"image", "cycle", "state", "compiling", "compiled", "run_finished"})
 """Events that the shot files tell better than the log would, and the one that the writer logs itself."""
@@ -54,7 +54,9 @@ class Observers:
 
     def analyse(self, run_dir: Path, analyses: Sequence[Mapping[str, Any]]) -> None:
         """Start what analyses the run's shots, each in a process of its own."""
-        self._analysts = AnalysisProcesses(run_dir, analyses, lambda text: self.event("warning", {"text": text}))
+        self._analysts = AnalysisProcesses(
+            run_dir, analyses, lambda text: self.event("warning", {"text": text})
+        )
 
     def finish_analyses(self) -> None:
         """Let the analyses finish; when the devices are safe."""

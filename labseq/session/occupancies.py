@@ -14,8 +14,8 @@ import numpy as np
 from numpy.lib.format import read_array
 from numpy.typing import NDArray
 
-from labseq.config.reading import decode, files_in, is_file, something_else
-from labseq.config.wording import clean, did_you_mean, shown, visible
+from labseq.config.messages import clean, did_you_mean, shown, visible
+from labseq.config.yaml_nodes import decode, files_in, is_file, something_else
 from labseq.errors import ConfigError, Problem, RecordingError
 from labseq.model import CycleRecord, ImageRecord, Occupancy, TargetPattern, as_occupancy
 from labseq.units import parse_quantity
@@ -181,7 +181,7 @@ def _checked(array: NDArray[Any], name: str) -> Occupancy:
 
 
 def _shot(path: Path, cycle: str | None) -> Source:
-    from labseq.recording.shot_reader import read_content  # h5py takes 0.1 s to import
+    from labseq.recording.shot import read_content
 
     name = visible(str(path))
     try:

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any, Final, Self
 
 from labseq.config import Override
-from labseq.config.wording import clean
+from labseq.config.messages import clean
 from labseq.errors import ConfigError, Problem
-from labseq.session.choosing import DryRun
+from labseq.session.profile import DryRun
 
 _NOT_SET: Final = ("profile", "dry_run")
 """Options that are no values of the sequence."""

@@ -1,23 +1,263 @@
-"""One plan without a run: for looking at what a planner does."""
+"""One plan without a run: what a planner does with an occupancy."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Any
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.config import Settings
-from labseq.errors import LabseqError, PlanError
+from labseq.config import (
+    MOTION_KEYS,
+    Choice,
+    Document,
+    MotionSettings,
+    Override,
+    Settings,
+    load_profile,
+    load_sequence,
+    plugin_paths,
+    split_overrides,
+    validate_values,
+)
+from labseq.config.fields import PatternChoice
+from labseq.config.messages import clean, visible
+from labseq.config.plan_file import PlanFile, parse_plan
+from labseq.config.profile import GridSettings
+from labseq.config.sequence import DEFAULT_PLANNER
+from labseq.config.yaml_nodes import YAML_SUFFIXES
+from labseq.errors import ConfigError, LabseqError, LimitError, PlanError, Problem
 from labseq.model import MotionSpec, Occupancy, Plan, PlanReport, SiteGrid, TargetPattern
 from labseq.motion import check_plan
+from labseq.plugins import PluginHost
 from labseq.roles import NeverStopped, Planner
-from labseq.session.constructing import construct
-from labseq.session.labs import parallelism_of
+from labseq.session.calibrations import calibrated_grid
+from labseq.session.construct import construct, construct_target
+from labseq.session.lab import parallelism_of
 from labseq.session.occupancies import Source, read_source
-from labseq.session.plan_inputs import PlanRequest, read_inputs
+from labseq.session.profile import ChosenPlugin, load_plugins, resolve
+
+_TARGET: Final = re.compile(r"([^\W\d][\w-]*)(?::(.*))?", re.DOTALL)
+_NAME: Final = re.compile(r"[^\W\d][\w.-]*")
+_SIZE: Final = re.compile(r"\s*(\d{1,6})\s*[xX]\s*(\d{1,6})\s*")
+_ORIGIN: Final = re.compile(r"\s*(-?\d{1,6})\s*,\s*(-?\d{1,6})\s*")
+_NEXT_SETTING: Final = re.compile(r",(?=\s*[^\W\d]\w*\s*=)")
+_TARGET_FORMS: Final = (
+    "a pattern such as kagome:15x15 or ring:radius=4, or a sequence file, whose target is taken"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class PlanRequest:
+    """What is to be planned, in the words of the command line.
+
+    Attributes:
+        occupancy: See :func:`labseq.session.occupancies.read_source`.
+        target: "kagome:15x15", "kagome:rows=15,cols=15" or a sequence file; None
+            for the target that a shot was taken with.
+        planner: Its name.
+        degree_of_parallelism: The planner's setting of that name; None for its default.
+        overrides: ``"key=value"`` each: further settings of the planner, with or
+            without "planner." before the key; after "profile.", values of the profile.
+        seed: Seed of a drawn occupancy; None for a fresh one.
+        origin: "R,C", the top left site of the target; None for the pattern's own.
+        profile: Name or path of a profile for grid, motion and plugin folders.
+    """
+
+    occupancy: str
+    target: str | None = None
+    planner: str = DEFAULT_PLANNER
+    degree_of_parallelism: int | None = None
+    overrides: Sequence[str] = ()
+    seed: int | None = None
+    origin: str | None = None
+    profile: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Machine:
+    """What a plan has to fit: the sites, and how atoms move between them."""
+
+    grid: SiteGrid
+    motion: MotionSpec
+
+
+@dataclass(frozen=True, slots=True)
+class PlanInputs:
+    """What a plan is made from, the occupancy aside."""
+
+    machine: Machine
+    target: TargetPattern
+    planner: ChosenPlugin
+
+
+def read_inputs(request: PlanRequest, source: Source) -> PlanInputs:
+    """Read and validate all that a request names.
+
+    Args:
+        request: The request.
+        source: Its occupancy.
+
+    Raises:
+        ConfigError: Something is wrong; says what was expected.
+        PluginLoadError: A plugin that is named failed to load.
+    """
+    for_planner, for_profile = split_overrides(request.overrides)
+    machine, folders = read_machine(request, for_profile, source)
+    document, choice, more_folders = _target_choice(request, source)
+    host = load_plugins([*folders, *more_folders])
+    target = source.target if choice is None else _make_target(host, document, choice, machine.grid)
+    assert target is not None  # see _target_choice
+    return PlanInputs(machine, target, _planner(host, request, for_planner))
+
+
+def read_machine(
+    request: PlanRequest, overrides: Sequence[Override], source: Source
+) -> tuple[Machine, list[Path]]:
+    """Read grid and motion, and the profile's plugin folders.
+
+    Args:
+        request: Names the profile, if there is one.
+        overrides: Values that replace those of the profile.
+        source: The occupancy; without a profile it brings its machine.
+
+    Raises:
+        ConfigError: Something is wrong with the profile, or its grid is of another shape.
+    """
+    shape = source.occupancy.shape
+    if request.profile is None:
+        if overrides:
+            raise ConfigError(Problem("there is no --profile to change", overrides[0].source))
+        return _default_machine(source), []
+    document, spec = load_profile(request.profile, beside=Path(), overrides=overrides)
+    grid = calibrated_grid(document, spec)
+    if grid.shape != shape:
+        what = f"the occupancy has {shape[0]} x {shape[1]} sites"
+        expected = f"{grid.n_rows} x {grid.n_cols}, as in {visible(str(document.path))}"
+        raise ConfigError(Problem(what, visible(source.label), expected=expected))
+    return Machine(grid, spec.motion), plugin_paths(document, spec.plugin_folders)
+
+
+def _default_machine(source: Source) -> Machine:
+    """What a shot was taken with; else the paper's spacing and motion."""
+    if source.machine is None:
+        n_rows, n_cols = source.occupancy.shape
+        return Machine(SiteGrid(n_rows, n_cols), MotionSpec())
+    return recorded_machine(source.machine, "the profile in the shot's file")
+
+
+def recorded_machine(machine: Mapping[str, Any], called: str) -> Machine:
+    """What a run was taken with, the tones of calibrations included.
+
+    Args:
+        machine: The profile, as the run has it.
+        called: What to call it in messages.
+
+    Raises:
+        ConfigError: It makes no sense.
+    """
+    tweezers = machine.get("mobile_tweezers", {})
+    motion = {key: tweezers[key] for key in MOTION_KEYS if key in tweezers}
+    return Machine(
+        validate_values(GridSettings, machine.get("grid", {}), called).model(),
+        validate_values(MotionSettings, motion, called).spec(),
+    )
+
+
+def _target_choice(request: PlanRequest, source: Source) -> tuple[Document, PatternChoice | None, list[Path]]:
+    """The target's pattern, the document that names it, and that document's plugin folders.
+
+    The pattern is None where the target is the one that a shot was taken with.
+    """
+    text, origin = request.target, _origin(request.origin)
+    empty = Document.parse("{}", "the command line")
+    if text is None:
+        if source.target is None:
+            raise ConfigError(Problem("--target is missing", expected=_TARGET_FORMS))
+        if origin:
+            raise ConfigError(Problem("there is no --target to move", origin[0].source))
+        return empty, None, []
+    if text.lower().endswith(YAML_SUFFIXES):
+        document, sequence = load_sequence(Path(text), origin)
+        return document, sequence.target, plugin_paths(document, sequence.plugin_folders)
+    name, settings = parse_target(text)
+    option = f"--target {text}"
+    overrides = [Override(f"target.{key}", value, option) for key, value in settings.items()]
+    document = empty.override_all(
+        [Override("target.pattern", name, option), *overrides, *origin], may_add=("target",)
+    )
+    return document, PatternChoice(pattern=name).placed("target"), []
+
+
+def parse_target(text: str) -> tuple[str, dict[str, str]]:
+    """Part "pattern:settings" into the name and the settings as written.
+
+    Raises:
+        ConfigError: It is not of this form.
+
+    Example:
+        >>> parse_target("kagome:15x15")
+        ('kagome', {'rows': '15', 'cols': '15'})
+        >>> parse_target("ring:radius=4, origin=[2, 3]")
+        ('ring', {'radius': '4', 'origin': '[2, 3]'})
+    """
+    match = _TARGET.fullmatch(text)
+    wrong = Problem("this is no target", clean(f"--target {text}"), expected=_TARGET_FORMS)
+    if match is None:
+        raise ConfigError(wrong)
+    settings: dict[str, str] = {}
+    parts = _NEXT_SETTING.split(match[2]) if match[2] is not None else []
+    for i, part in enumerate(parts):
+        size = _SIZE.fullmatch(part) if i == 0 else None
+        key, equals, value = part.partition("=")
+        if size is not None:
+            settings |= {"rows": size[1], "cols": size[2]}
+        elif equals and key.strip().isidentifier():
+            settings[key.strip()] = value.strip()
+        else:
+            raise ConfigError(wrong)
+    return match[1], settings
+
+
+def _origin(text: str | None) -> list[Override]:
+    if text is None:
+        return []
+    match = _ORIGIN.fullmatch(text)
+    if match is None:
+        what, expected = "this is no site", "row and column of the target's top left site, for example 2,3"
+        raise ConfigError(Problem(what, clean(f"--origin {text}"), expected=expected))
+    return [Override("target.origin", f"[{match[1]}, {match[2]}]", f"--origin {text}")]
+
+
+def _make_target(
+    host: PluginHost, document: Document, choice: PatternChoice, grid: SiteGrid
+) -> TargetPattern:
+    chosen = resolve(host, document, "pattern", choice)
+    try:
+        return construct_target(chosen, grid)
+    except LimitError as error:
+        raise document.error(choice.loc, str(error)) from error
+
+
+def _planner(host: PluginHost, request: PlanRequest, settings: Sequence[Override]) -> ChosenPlugin:
+    option = f"--planner {request.planner}"
+    if not _NAME.fullmatch(request.planner):
+        raise ConfigError(Problem("this is no name of a planner", clean(option), expected="a name"))
+    overrides = [Override("planner.use", request.planner, option)]
+    if request.degree_of_parallelism is not None:
+        dop = str(request.degree_of_parallelism)
+        overrides.append(Override("planner.degree_of_parallelism", dop, f"--dop {dop}"))
+    for setting in settings:
+        address = f"planner.{setting.address.removeprefix('planner.')}"
+        overrides.append(Override(address, setting.value, setting.source))
+    parts = [override.address.split(".") for override in overrides]
+    parents = {".".join(path[:n]) for path in parts for n in range(1, len(path))}
+    document = Document.parse("{}", "the command line").override_all(overrides, may_add=parents)
+    return resolve(host, document, "planner", Choice(use=request.planner).placed("planner"))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,7 +355,7 @@ def plan_moves(
         PluginLoadError: A plugin that is named failed to load.
         PlanError: The planner failed, or its plan breaks a rule.
     """
-    from labseq.kernels.compile import announcing
+    from labseq.kernel import announcing
 
     source = source or read_source(request.occupancy, request.seed)
     occupancy, seed = source.occupancy, request.seed if source.seed is None else source.seed
@@ -165,3 +405,70 @@ def changed_settings(settings: Settings | None) -> dict[str, Any]:
 
 def _bits(sites: NDArray[np.bool_]) -> list[list[int]]:
     return sites.astype(int).tolist()
+
+
+_OPTIONS = {"target": "--target", "planner": "--planner", "degree_of_parallelism": "--dop"} | {
+    "seed": "--seed",
+    "origin": "--origin",
+}
+"""Field of a request -> the option that only planning takes."""
+
+
+def read_plan(
+    data: bytes, name: str, request: PlanRequest, *, announce: Callable[[str], None] = lambda _: None
+) -> PlannedMoves:
+    """Read the JSON of a plan, and check the plan as a run does.
+
+    Args:
+        data: UTF-8, what ``labseq plan --json`` writes.
+        name: What messages call it.
+        request: Names the profile with grid and motion; without one the grid is that of
+            the file, and the motion the paper's. Nothing is planned.
+        announce: Called with the name of a module before its kernels are compiled.
+
+    Raises:
+        ConfigError: It is no plan, it does not fit the grid or breaks a rule, or the request
+            asks for something to be planned.
+    """
+    from labseq.kernel import announcing
+
+    file = parse_plan(data, name)
+    machine = _machine(file, name, request)
+    with announcing(announce):
+        try:
+            report = check_plan(
+                file.plan,
+                file.occupancy,
+                file.target,
+                file.degree_of_parallelism,
+                machine.grid,
+                machine.motion,
+            )
+        except PlanError as error:
+            raise ConfigError(Problem(str(error), name)) from error
+    return PlannedMoves(
+        source=name,
+        occupancy=file.occupancy,
+        target=file.target,
+        grid=machine.grid,
+        motion=machine.motion,
+        planner=file.planner,
+        settings={},
+        degree_of_parallelism=file.degree_of_parallelism,
+        seed=file.seed,
+        plan=file.plan,
+        report=report,
+    )
+
+
+def _machine(file: PlanFile, name: str, request: PlanRequest) -> Machine:
+    for_planner, for_profile = split_overrides(request.overrides)
+    given = [field.name for field in fields(request) if getattr(request, field.name) != field.default]
+    options = [option for key, option in _OPTIONS.items() if key in given]
+    if options or for_planner:
+        option = for_planner[0].source if for_planner else options[0]
+        what = f"{name} is a plan already: there is nothing to plan"
+        raise ConfigError(Problem(what, option, hint="leave the option out, or give an occupancy"))
+    if request.profile is None and not for_profile:
+        return Machine(file.grid, MotionSpec())
+    return read_machine(request, for_profile, Source(file.occupancy, name))[0]

@@ -1,4 +1,4 @@
-"""The policies of a sequence: what the sequencer is told of them, and the checks between two shots."""
+"""The policies of a sequence: retries, timeouts, and checks on values between shots."""
 
 from __future__ import annotations
 
@@ -10,12 +10,67 @@ from typing import Any, Final
 
 import numpy as np
 
-from labseq.config import CheckSettings, ProblemCollector, Document, SequenceSpec, StepPolicySettings, StepSpec
+from labseq.config import (
+    CheckSettings,
+    Document,
+    ProblemCollector,
+    SequenceSpec,
+    StepPolicySettings,
+    StepSpec,
+)
+from labseq.config.messages import clean, did_you_mean, listing
+from labseq.config.yaml_nodes import Loc
 from labseq.errors import CheckFailedError
 from labseq.recording import figures_in
+from labseq.recording.columns import FIGURES
 from labseq.roles import Repeatable, Step
 from labseq.sequencer.policies import RunPolicy, StepPolicy
-from labseq.session.figure_names import check_figure, missing_figure
+
+_JUDGED: Final = frozenset(
+    {"success", "filling_fraction", "n_defects", "n_surplus", "seen_defect_free_cycle"}
+)
+"""Figures that only a shot with an image has."""
+_UNFORESEEN: Final = ("reading.", "stage.")
+"""What the names of figures begin with that only a shot can tell."""
+
+
+def check_figure(
+    document: Document, place: Loc, figure: str, purpose: str, steps: Sequence[tuple[str, Step]] | None
+) -> None:
+    """See whether shots may have a figure.
+
+    Args:
+        document: The sequence.
+        place: Where it is named.
+        figure: Its name.
+        purpose: What it is for: "to climb on".
+        steps: The steps of a shot, if all are known.
+
+    Raises:
+        ConfigError: No shot can have it.
+    """
+    if figure not in FIGURES and not figure.startswith(_UNFORESEEN):
+        what = f"there is no figure '{clean(figure)}' {purpose}"
+        known = [*FIGURES, "reading.<name>", "stage.<name>_s"]
+        raise document.error(place, what, listing(known), did_you_mean(figure, FIGURES))
+    if figure in _JUDGED and steps is not None and not any(step.takes_image for _, step in steps):
+        what = f"no shot has a {figure}: it takes no image"
+        raise document.error(place, what, "an 'image' step in the shot, or another figure")
+
+
+def missing_figure(shot: int, figure: str, purpose: str, figures: Iterable[str]) -> str:
+    """What to say of a shot that has not the figure that it should have.
+
+    Args:
+        shot: Its index.
+        figure: Name of the figure.
+        purpose: What it is for: "to climb on".
+        figures: Names of those that it has.
+    """
+    known = list(figures)
+    hint = did_you_mean(figure, known) or f"it has {listing(known)}"
+    return f"shot {shot + 1} has no '{clean(figure)}' {purpose} ({hint})"
+
 
 _CHECKED: Final = "to check"
 

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
 
-from labseq.calibrations import read_entry
+from labseq.calibration.store import read_entry
 from labseq.config import StoredText
-from labseq.config.reading import beside
+from labseq.config.yaml_nodes import beside
 from labseq.errors import RecordingError
 from labseq.model import CalibrationEntry, RandomStream
 from labseq.plugins import PluginHost
@@ -16,8 +16,8 @@ from labseq.recording import Run
 from labseq.recording.folders import RUN_FILE
 from labseq.recording.run_file import sha256_of_text
 from labseq.roles import Context
-from labseq.session.plan_inputs import Machine, recorded_machine
-from labseq.session.setting_up import load_plugins
+from labseq.session.planning import Machine, recorded_machine
+from labseq.session.profile import load_plugins
 
 
 def resolved_of(run: Run) -> dict[str, Any]:

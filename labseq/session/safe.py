@@ -1,25 +1,98 @@
-"""``labseq safe``: open each device of a profile, make it safe, close it."""
+"""`labseq safe` and `labseq devices`: open each device of a profile, test it or make it safe, close it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import ExitStack, suppress
-from dataclasses import dataclass, replace
+import statistics
+import time
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
 from labseq.config import ProblemCollector, load_profile, plugin_paths, profile_overrides
-from labseq.errors import ConfigError, LabseqError, RecordingError, StopRequested
-from labseq.recording import clear_active, data_root, died, marker_roots
-from labseq.roles import Clock, Hardware, RunObserver, Simulation
+from labseq.errors import ConfigError, DeviceError, LabseqError, RecordingError, StopRequested
+from labseq.files import Holder, Lock, knows_no_locks
+from labseq.recording import clear_active, data_root, died, lock_files, marker_roots
+from labseq.roles import Clock, Hardware, HasSelfTest, NeedsWarmUp, ReceivesOutput, RunObserver, Simulation
 from labseq.sequencer import Guard, RealClock, StopFlag, VirtualClock
 from labseq.sequencer.lab import Timeouts, in_safe_order
-from labseq.session.choosing import HARDWARE_KINDS, ResolvedProfile
-from labseq.session.constructing import construct_each
-from labseq.session.holding import lock_devices
-from labseq.session.labs import timeouts_of
-from labseq.session.setting_up import choose_plugins, load_plugins
+from labseq.session.construct import construct_each
+from labseq.session.lab import WARM_S, timeouts_of
+from labseq.session.profile import (
+    HARDWARE_KINDS,
+    DryRun,
+    ResolvedProfile,
+    check_dry_run,
+    choose_plugins,
+    load_plugins,
+    resolve_profile,
+)
 from labseq.session.signals import stop_on_signals
+
+
+@contextmanager
+def lock_devices(
+    bench: ResolvedProfile,
+    roots: Sequence[Path],
+    what: str,
+    warn: Callable[[str], object],
+    *,
+    in_spite: bool = False,
+) -> Generator[Callable[[str], None]]:
+    """Keep everybody else from a profile's devices in the block.
+
+    A lock goes with its process: one that is killed leaves none. It stands in the data root and in the
+    user's state folder, as the markers of runs do, so that it counts whatever ``--output`` says.
+
+    Args:
+        bench: The profile.
+        roots: See :func:`labseq.recording.marker_roots`; those that do not exist are passed over, but
+            for the user's own.
+        what: What the devices are held for, for whoever finds them held.
+        warn: Told what the user should know: that nothing keeps others from the devices.
+        in_spite: Whether to go on where somebody else holds them, and only tell.
+
+    Yields:
+        What tells anew what the devices are held for.
+
+    Raises:
+        DeviceError: Somebody else holds them; says who.
+    """
+    standing = [root for root in roots if root.is_dir() or root not in roots[:1]]
+    locks: list[Lock] = []
+    with ExitStack() as stack:
+        for file in lock_files(standing, bench.hardware_key):
+            lock = Lock(file, what)
+            try:
+                holder = lock.take()
+            except OSError as error:
+                if knows_no_locks(error):
+                    text = f"the folder {file.parent} knows no locks: nothing keeps a run on another computer"
+                    warn(f"{text} from the same devices")
+                continue
+            if holder is None:
+                stack.callback(lock.release)
+                locks.append(lock)
+            elif in_spite:
+                warn(f"its devices are in use by {holder}")
+                break
+            else:
+                raise DeviceError(bench.profile.name, _refusal(holder))
+        else:
+            if not locks:
+                warn("no lock could be had: nothing keeps another run from the same devices")
+
+        def describe(text: str) -> None:
+            for lock in locks:
+                lock.describe(text)
+
+        yield describe
+
+
+def _refusal(holder: Holder) -> str:
+    return f"its devices are in use by {holder}; wait for its end, or end a run with 'labseq stop'"
+
 
 _NEEDED_KINDS: Final = HARDWARE_KINDS | {"simulation"}
 
@@ -114,7 +187,9 @@ def construct_hardware(bench: ResolvedProfile, clock: Clock) -> tuple[dict[str, 
     return made, {role: chosen[role].placed(error) for role, error in failures.items()}
 
 
-def make_profile_devices_safe(bench: ResolvedProfile, stop: StopFlag, observer: RunObserver | None = None) -> SafeStateReport:
+def make_profile_devices_safe(
+    bench: ResolvedProfile, stop: StopFlag, observer: RunObserver | None = None
+) -> SafeStateReport:
     """Construct each device of a profile, open it, make it safe and close it.
 
     One that cannot be constructed never keeps the others from it; it is told at the end.
@@ -225,3 +300,161 @@ def _read(profile: str, overrides: Sequence[str], found: ProblemCollector) -> Re
         with suppress(ConfigError):  # told already
             folders += plugin_paths(document, [folder])
     return choose_plugins(document, spec, load_plugins(folders, found, spec.timeouts.load), "off", found)
+
+
+N_READINGS: Final = 5
+"""How often a device is read for its latency, which is their median."""
+
+_OPENING: Final = {"static_tweezers": 0, "camera": 1, "mobile_tweezers": 3}
+"""Place in the order of opening; further devices have 2."""
+
+
+@dataclass(frozen=True, slots=True)
+class CheckedDevice:
+    """What was found out about one device.
+
+    Attributes:
+        name: Its role, or its name in the profile.
+        described: What it says of itself; empty if it did not get so far.
+        tested: Whether it passed its self test; False also if it has none.
+        latency_s: Time of a ``describe()``, from the call to the answer; None if it did not get so far.
+        constructed: Whether its plugin made it at all; if not, ``failure`` says why.
+        failure: Why it could not be opened, identified or tested, or what broke that off; or None.
+        unsafe: Why it is not in its safe state, or None.
+        unclosed: Why it could not be closed, or None.
+    """
+
+    name: str
+    described: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    tested: bool = False
+    latency_s: float | None = None
+    constructed: bool = True
+    failure: LabseqError | None = None
+    unsafe: LabseqError | None = None
+    unclosed: LabseqError | None = None
+
+    @property
+    def ok(self) -> bool:
+        """Whether nothing went wrong."""
+        return self.failure is None and self.unsafe is None and self.unclosed is None
+
+
+@dataclass(frozen=True, slots=True)
+class DevicesReport:
+    """What was found out about the devices of a profile.
+
+    Attributes:
+        devices: Each that was tried, in order, then those that could not be constructed.
+        plugins: Name of a device -> what plays it, as after ``use:`` in the profile.
+        warnings: What the user should know although it is no error.
+        stopped: The request to stop that broke it off, or None.
+    """
+
+    devices: Sequence[CheckedDevice]
+    plugins: Mapping[str, str]
+    warnings: Sequence[str] = ()
+    stopped: StopRequested | None = None
+
+
+def check_devices(profile: str, overrides: Sequence[str] = (), dry_run: DryRun = "off") -> DevicesReport:
+    """Open each device of a profile in turn, identify and test it, make it safe and close it.
+
+    One that fails or hangs never keeps the others from being tried. After Ctrl-C the
+    device at hand is made safe and closed, and no other is opened.
+
+    Args:
+        profile: Name or path of the profile.
+        overrides: ``"profile.address=value"`` strings, as given to ``--set``.
+        dry_run: "off", "full" or "fast".
+
+    Raises:
+        ConfigError: The profile is wrong; no device was touched.
+        DeviceError: Somebody else uses the same devices, real ones; none was touched.
+    """
+    check_dry_run(dry_run)
+    roots = marker_roots(data_root())
+    bench = resolve_profile(profile, overrides=profile_overrides(overrides), dry_run=dry_run)
+    stop = StopFlag()
+    is_virtual = dry_run != "off" or bench.virtual_time
+    clock = VirtualClock(stop) if is_virtual else RealClock(stop)
+    warnings = [*bench.warnings]
+    with ExitStack() as stack:
+        if not is_virtual:
+            stack.enter_context(lock_devices(bench, roots, "labseq devices", warnings.append))
+        stack.enter_context(stop_on_signals(stop))
+        made, refused = construct_hardware(bench, clock)
+        simulation = made.pop("simulation", None)
+        in_order = sorted(made.items(), key=lambda item: _OPENING.get(item[0], 2))
+        devices = check_each_device(in_order, timeouts_of(bench.profile), stop, simulation)
+    devices += [CheckedDevice(name, constructed=False, failure=error) for name, error in refused.items()]
+    plugins = {name: chosen.entry.name for name, chosen in bench.chosen.items()}
+    stopped = StopRequested(stop.signal_number) if stop.is_set else None
+    return DevicesReport(devices, plugins, [*warnings, *bench.host.notes], stopped)
+
+
+def check_each_device(
+    devices: Iterable[tuple[str, Hardware]],
+    timeouts: Timeouts,
+    stop: StopFlag,
+    simulation: Simulation | None = None,
+) -> list[CheckedDevice]:
+    """Open, identify, test, make safe and close one device after the other.
+
+    Args:
+        devices: Name and device, in the order of opening.
+        timeouts: How long each call may take.
+        stop: The request to stop: the device at hand is made safe and closed, the rest left alone.
+        simulation: The world that virtual devices act on: opened before them, closed after them.
+
+    Returns:
+        Those that were tried, the simulation first.
+    """
+    guard = Guard(stop)
+    tried: list[CheckedDevice] = []
+    if simulation is not None and not stop.is_set:
+        tried.append(_examined(guard, "simulation", simulation, timeouts))
+    try:
+        for name, device in devices:
+            if stop.is_set:
+                break
+            try:
+                found = _examined(guard, name, device, timeouts)
+            finally:
+                with stop.held():
+                    unsafe = attempt(guard, name, timeouts.safe_state_s, device.safe_state)
+                    unclosed = attempt(guard, name, timeouts.safe_state_s, device.close)
+            tried.append(replace(found, unsafe=unsafe, unclosed=unclosed))
+    finally:
+        if simulation is not None and tried:
+            with stop.held():
+                unclosed = attempt(guard, "simulation", timeouts.safe_state_s, simulation.close)
+            tried[0] = replace(tried[0], unclosed=unclosed)
+        guard.end()
+    return tried
+
+
+def _examined(guard: Guard, name: str, device: Hardware | Simulation, timeouts: Timeouts) -> CheckedDevice:
+    """Open, identify and test a device, as far as it goes."""
+    found = CheckedDevice(name)
+    try:
+        if isinstance(device, NeedsWarmUp) and not isinstance(device, ReceivesOutput):
+            guard.call(name, WARM_S, device.warm)  # else a self test might have to compile within its timeout
+        guard.call_to_the_end(name, timeouts.call_s, device.open)
+        described: Any = guard.call(name, timeouts.call_s, device.describe)
+        if not isinstance(described, Mapping):
+            text = f"describe() gave a {type(described).__name__}; expected a mapping"
+            raise DeviceError(name, text)
+        found = replace(found, described=described)
+        if isinstance(device, HasSelfTest):
+            guard.call(name, timeouts.call_s, device.self_test)
+            found = replace(found, tested=True)
+        readings_s = [_reading_s(guard, name, device, timeouts.call_s) for _ in range(N_READINGS)]
+        return replace(found, latency_s=statistics.median(readings_s))
+    except LabseqError as failure:
+        return replace(found, failure=failure)
+
+
+def _reading_s(guard: Guard, name: str, device: Hardware | Simulation, timeout_s: float) -> float:
+    start_s = time.perf_counter()
+    guard.call(name, timeout_s, device.describe)
+    return time.perf_counter() - start_s

@@ -1,4 +1,4 @@
-"""A run's scan: what each point changes, checked and put together before anything is opened.
+"""A scan: what each point changes, checked and put together before anything is opened; running it point by point.
 
 The points of a scan are many, what they are made of is little: a *part* is the settings
 of one plugin (the planner, a step, a role or device of the profile). A part is validated for
@@ -16,16 +16,16 @@ from typing import Any, Final
 
 import numpy as np
 
-from labseq.config import ROLES, Axis, Choice, ProblemCollector, Document, Loc, Scan, SequenceSpec
-from labseq.config.motion import MobileTweezersChoice
-from labseq.config.nodes import Node
+from labseq.config import ROLES, Axis, Choice, Document, Loc, ProblemCollector, Scan, SequenceSpec
+from labseq.config.fields import VARIABLES
+from labseq.config.messages import clean
+from labseq.config.profile import MobileTweezersChoice
 from labseq.config.scan import PROFILE
-from labseq.config.variables import VARIABLES
-from labseq.config.wording import clean
+from labseq.config.yaml_nodes import Node
 from labseq.errors import ConfigError
 from labseq.roles import Step
-from labseq.session.choosing import HARDWARE_KINDS, ResolvedProfile, ChosenPlugin, DryRun, choose, resolve
-from labseq.session.contents import make_step
+from labseq.session.construct import make_step
+from labseq.session.profile import HARDWARE_KINDS, ChosenPlugin, DryRun, ResolvedProfile, choose, resolve
 from labseq.units import parse_any
 
 MAX_PROBLEMS: Final = 20
@@ -86,8 +86,12 @@ class Scanned:
     sequence: SequenceSpec
     bench: ResolvedProfile
     dry_run: DryRun
-    _made: dict[tuple[Part, tuple[int, ...]], PartSettings] = field(default_factory=dict[Any, PartSettings], repr=False)
-    _benches: dict[tuple[int, ...], ResolvedProfile] = field(default_factory=dict[Any, ResolvedProfile], repr=False)
+    _made: dict[tuple[Part, tuple[int, ...]], PartSettings] = field(
+        default_factory=dict[Any, PartSettings], repr=False
+    )
+    _benches: dict[tuple[int, ...], ResolvedProfile] = field(
+        default_factory=dict[Any, ResolvedProfile], repr=False
+    )
 
     def check(self, found: ProblemCollector) -> None:
         """Validate every part with every combination of the values that go into it.

@@ -5,35 +5,96 @@ from __future__ import annotations
 import gc
 import itertools
 import secrets
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 from typing import ParamSpec, Self
 
-from labseq.errors import ConfigError, DeviceError, LabseqError
+from labseq.builtin.steps import DeviceStep
+from labseq.config import Loc
+from labseq.errors import ConfigError, DeviceError, LabseqError, Problem
 from labseq.model import RunRecord, TimelineEntry
 from labseq.recording import Run, RunWriter, clear_active, data_root, mark_active, marker_roots, open_run
-from labseq.roles import RunObserver
+from labseq.roles import ChecksCommands, RunObserver
 from labseq.sequencer import Guard, Sequencer, StopFlag
-from labseq.sequencer.calling import lay_out
+from labseq.sequencer.guard import lay_out
 from labseq.sequencer.lab import Lab, describe
-from labseq.session.adaptive_run import course_of
+from labseq.sequencer.leading import FollowStep, find_leader, leaders
 from labseq.session.assembly import Assembly, assemble
-from labseq.session.between import ShotHooks
-from labseq.session.choosing import DryRun
-from labseq.session.commands import check_commands
-from labseq.session.holding import lock_devices
-from labseq.session.labs import build_lab, clock_for
+from labseq.session.between_shots import ShotHooks
+from labseq.session.course import course_of
+from labseq.session.lab import build_lab, clock_for, warm
 from labseq.session.observers import Observers
 from labseq.session.options import Options, path_of
 from labseq.session.policies import Checks
+from labseq.session.profile import DryRun
+from labseq.session.provenance import copies, ending, run_record
 from labseq.session.resume import ResumableRun, reopened
-from labseq.session.run_record import copies, ending, run_record
-from labseq.session.safe import make_safe_after_crash
+from labseq.session.safe import lock_devices, make_safe_after_crash
 from labseq.session.scan import Point
 from labseq.session.signals import stop_on_signals
-from labseq.session.warming import warm
+
+
+def check_commands(assembly: Assembly, points: Iterable[Point], build: Callable[[Point], Lab]) -> None:
+    """Refuse what a device does not know, or would refuse, and waits for a leader that there is not.
+
+    Nothing is opened.
+
+    Args:
+        assembly: The run.
+        points: The points of its scan.
+        build: Constructs the devices of a point.
+
+    Raises:
+        ConfigError: Everything that is wrong with them, with its place.
+    """
+    if not any(isinstance(step, DeviceStep | FollowStep) for _, step in assembly.steps):
+        return
+    labs: dict[int, Lab] = {}
+    problems: dict[str, Problem] = {}
+    guard = Guard(StopFlag())
+    for point in points:
+        lab = labs.get(id(point.bench)) or labs.setdefault(id(point.bench), build(point))
+        for spec, (_, step) in zip(assembly.sequence.shot, point.steps, strict=True):
+            problem: Problem | None = None
+            if isinstance(step, DeviceStep) and (failure := _failure(guard, lab, step)) is not None:
+                problem = assembly.document.problem((*spec.loc, "do"), str(failure))
+            elif isinstance(step, FollowStep):
+                problem = _leaderless(assembly, lab, spec.loc, step)
+            if problem is not None:
+                problems[str(problem)] = problem
+    guard.end()
+    if problems:
+        raise ConfigError([*problems.values()])
+
+
+def _failure(guard: Guard, lab: Lab, step: DeviceStep) -> LabseqError | None:
+    device = lab.devices.get(step.device)
+    if not isinstance(device, ChecksCommands):
+        return None
+    check, timeout_s = device.check_command, lab.timeouts.call_s
+    try:
+        guard.call(step.device, timeout_s, check, step.command, **step.arguments)
+    except LabseqError as failure:
+        return failure
+    return None
+
+
+def _leaderless(assembly: Assembly, lab: Lab, loc: Loc, step: FollowStep) -> Problem | None:
+    """Why nobody can lead whom a step could wait for."""
+    try:
+        find_leader(dict(lab.hardware()), step.device)
+    except ConfigError as error:
+        hint = ""
+        if assembly.dry_run == "fast":
+            hint = "virtual twins do not lead: '--dry-run' without 'fast' has one that says `go` by itself"
+        elif not dict(leaders(dict(lab.hardware()))):
+            hint = "add one to its `devices`: `leader: {use: tcp_leader}`"
+        key = "device" if step.device else "for"
+        return assembly.document.problem((*loc, key), str(error), hint=hint)
+    return None
+
 
 P = ParamSpec("P")
 
@@ -215,7 +276,7 @@ class Session:
         return build_lab(point or self.assembly.begun, self.assembly.target, clock, self.seed)
 
     def warm(self, lab: Lab, *, devices: bool = True) -> None:
-        """Compile what a lab will need; see :func:`labseq.session.warming.warm`."""
+        """Compile what a lab will need; see :func:`labseq.session.lab.warm`."""
         warm(lab, self.stop_flag, self._observers, devices=devices)
 
     def _run(self, lab: Lab, roots: Sequence[Path]) -> Run:

@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     from labseq.testing.contracts import (
         SUITES as SUITES,
         AnalysisContract as AnalysisContract,
-        ContractViolation as ContractViolation,
         CameraContract as CameraContract,
+        ContractViolation as ContractViolation,
         DetectorContract as DetectorContract,
         DeviceContract as DeviceContract,
         LinesContract as LinesContract,

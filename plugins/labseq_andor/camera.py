@@ -13,11 +13,11 @@ from labseq import (
     ConfigError,
     Context,
     DeviceError,
-    ReportsSensor,
+    ExposureResult,
     LimitError,
+    ReportsSensor,
     SensorMode,
     Series,
-    ExposureResult,
     wait_for,
 )
 from labseq.units import format_quantity

@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 
 from labseq import Duration, Settings
 from labseq.config.fields import setting_error
-from labseq.config.wording import clean
+from labseq.config.messages import clean
 
 SIMULATED: Final = "simulated"
 
@@ -52,7 +52,9 @@ class TcpLeaderSettings(LeaderSettings):
         if not self.allow_remote and not _is_loopback(self.host):
             what = f"host is '{clean(self.host)}', which other computers reach"
             hint = "or set 'allow_remote: true' in a network where everybody may lead"
-            raise setting_error(what, "an address of this computer alone, such as 127.0.0.1", hint, at=("host",))
+            raise setting_error(
+                what, "an address of this computer alone, such as 127.0.0.1", hint, at=("host",)
+            )
         return self
 
 

@@ -8,7 +8,7 @@ from collections.abc import Generator, Mapping
 from contextlib import suppress
 from typing import Any, Final
 
-from labseq import CameraDriver, CameraFacts, ConfigError, Context, DeviceError, Series, ExposureResult
+from labseq import CameraDriver, CameraFacts, ConfigError, Context, DeviceError, ExposureResult, Series
 from labseq.errors import Problem
 from labseq_frames.picture import BadFramesError, Picture, told
 from labseq_frames.settings import FramesSettings

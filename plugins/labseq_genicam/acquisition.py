@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import Final, Literal, TypeAlias
 
-from labseq import DeviceError, LimitError, Series, ExposureResult
+from labseq import DeviceError, ExposureResult, LimitError, Series
 from labseq.units import format_quantity
 from labseq_genicam.aravis import Buffer, Camera, Stream, StreamOptions
 from labseq_genicam.counting import FrameCounter

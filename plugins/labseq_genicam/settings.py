@@ -7,7 +7,7 @@ from typing import Annotated, Final, Literal, TypeAlias
 from pydantic import Field, NonNegativeInt, field_validator
 
 from labseq import Duration, Fraction, Frequency, Settings
-from labseq.config.cameras import IndustrialCameraSettings
+from labseq.drivers.settings import IndustrialCameraSettings
 
 PixelFormat: TypeAlias = Literal["Mono8", "Mono10", "Mono12", "Mono14", "Mono16"]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from labseq import DeviceError, LimitError
-from labseq.drivers.increments import nearest
+from labseq.drivers.camera import nearest
 from labseq.errors import one_of
 from labseq.units import ZERO_CELSIUS_K
 from labseq_genicam.aravis import Camera
@@ -51,7 +51,11 @@ def set_up(link: Link, settings: GenicamSettings) -> dict[str, Any]:
     """
     with link.doing("set the camera up") as camera:
         camera.stop()
-        for feature, value in (("ExposureAuto", "Off"), ("GainAuto", "Off"), ("ExposureMode", "ReportsTimings")):
+        for feature, value in (
+            ("ExposureAuto", "Off"),
+            ("GainAuto", "Off"),
+            ("ExposureMode", "ReportsTimings"),
+        ):
             if camera.is_available(feature):
                 camera.set_string(feature, value)
         pixel_format = _set_pixel_format(link.name, camera, settings.pixel_format)

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from labseq import Clock, DeviceError, DeviceTimeoutError, LimitError, ExposureResult, Trigger, wait_for
+from labseq import Clock, DeviceError, DeviceTimeoutError, ExposureResult, LimitError, Trigger, wait_for
 from labseq.units import format_quantity
 from labseq_pylon import nodes as n
 from labseq_pylon.library import Sdk

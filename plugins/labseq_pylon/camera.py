@@ -12,8 +12,8 @@ from labseq import (
     CameraFacts,
     Context,
     DeviceError,
-    Series,
     ExposureResult,
+    Series,
     Trigger,
     wait_for,
 )

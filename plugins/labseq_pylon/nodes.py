@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any, Final, TypeAlias
 
 from labseq import DeviceError, LimitError
-from labseq.drivers.increments import nearest
+from labseq.drivers.camera import nearest
 from labseq.errors import one_of
 from labseq_pylon.library import Sdk
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from labseq import LimitError
-from labseq.drivers.increments import nearest
+from labseq.drivers.camera import nearest
 from labseq_pylon.library import Sdk
 from labseq_pylon.nodes import SENSOR_HEIGHT, SENSOR_WIDTH, Nodes
 from labseq_pylon.settings import PylonSettings

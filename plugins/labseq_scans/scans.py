@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq import MotionSpec, Plan, SiteGrid
-from labseq.motion.timing import site_time_s
+from labseq.motion.tones import site_time_s
 
 
 @dataclass(frozen=True, slots=True, eq=False)

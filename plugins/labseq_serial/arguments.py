@@ -10,7 +10,7 @@ from pydantic_core import PydanticCustomError
 
 from labseq import Settings
 from labseq.config.fields import Text, setting_error
-from labseq.config.wording import clean
+from labseq.config.messages import clean
 from labseq_serial.templates import Sent
 from labseq_serial.units import Unit
 
@@ -149,7 +149,9 @@ class ArgumentSettings(TypedSettings):
     @model_validator(mode="after")
     def _numbers_have_limits(self) -> Self:
         if self.choices and self.type != "text":
-            raise setting_error(f"'choices' do not go with type {self.type}", "type text", at=("choices",), key=True)
+            raise setting_error(
+                f"'choices' do not go with type {self.type}", "type text", at=("choices",), key=True
+            )
         for key in ("min", "max") if self.is_number else ():
             if getattr(self, key) is None:
                 raise setting_error(f"'{key}' is missing", "both limits of a number that is sent")

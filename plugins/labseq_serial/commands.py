@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 
 from labseq import Duration, Settings
 from labseq.config.fields import Text, setting_error
-from labseq.config.wording import clean, closest
+from labseq.config.messages import clean, closest
 from labseq_serial.arguments import ArgumentSettings, Scalar, placed
 from labseq_serial.replies import compiled, example_of
 from labseq_serial.templates import Sent, Template
@@ -136,11 +136,15 @@ class CommandSettings(Settings):
             if name not in self.arguments:
                 meant = closest(name, self.arguments)
                 hint = f"did you mean '{meant}'?" if meant else f"declare '{name}' below 'arguments'"
-                raise setting_error(f"'{{{name}}}' is not an argument", _listed(self.arguments), hint, at=("send",))
+                raise setting_error(
+                    f"'{{{name}}}' is not an argument", _listed(self.arguments), hint, at=("send",)
+                )
         for name in self.arguments:
             if name not in names:
                 what = f"the argument '{name}' has no place in '{clean(self.send)}'"
-                raise setting_error(what, f"a placeholder {{{name}}} in 'send'", at=("arguments", name), key=True)
+                raise setting_error(
+                    what, f"a placeholder {{{name}}} in 'send'", at=("arguments", name), key=True
+                )
         return self
 
     @model_validator(mode="after")
@@ -168,7 +172,9 @@ class CommandSettings(Settings):
         if not low - slack <= value <= high + slack:
             key = "min" if value < low else "max"
             what = f"as '{clean(text)}' it would be {argument.quantity.shown(value)}, beyond the limit"
-            raise setting_error(what, "a limit with no more digits than are sent", at=("arguments", name, key))
+            raise setting_error(
+                what, "a limit with no more digits than are sent", at=("arguments", name, key)
+            )
 
     @model_validator(mode="after")
     def _replies_fit(self) -> Self:

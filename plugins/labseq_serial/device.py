@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from labseq import Context, DeviceError, LabseqError, LimitError, TransientError
-from labseq.config.wording import clean
+from labseq.config.messages import clean
 from labseq_serial.arguments import Scalar
 from labseq_serial.instrument import Instrument
 from labseq_serial.line import Line

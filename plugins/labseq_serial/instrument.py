@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Final, TypeVar
 
 from labseq import Clock, DeviceError, DeviceTimeoutError, LabseqError
-from labseq.config.wording import clean
+from labseq.config.messages import clean
 from labseq.units import format_quantity
 from labseq_serial.arguments import Scalar
 from labseq_serial.commands import Call, call_of

@@ -8,7 +8,7 @@ from contextlib import contextmanager, suppress
 from typing import Final
 
 from labseq import Clock, DeviceError, DeviceTimeoutError, TransientError, wait_for
-from labseq.config.wording import clean
+from labseq.config.messages import clean
 from labseq.drivers.serial_port import BROKEN, Port, is_write_timeout
 from labseq.units import format_quantity
 from labseq_serial.settings import SerialSettings

@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 
 from labseq import Duration, Settings
 from labseq.config.fields import Text, setting_error
-from labseq.config.wording import clean, closest
+from labseq.config.messages import clean, closest
 from labseq.drivers.serial_port import is_network_port
 from labseq.errors import one_of
 from labseq_serial.arguments import Scalar, placed
@@ -140,7 +140,9 @@ class SerialSettings(Settings):
                     at=(key,),
                 )
             if not _can_be(text, self.encoding):
-                raise setting_error(f"'{clean(text)}' is not {self.encoding}", "another encoding", at=("encoding",))
+                raise setting_error(
+                    f"'{clean(text)}' is not {self.encoding}", "another encoding", at=("encoding",)
+                )
         for at, text in self.asked():
             if problem := self.why_unsendable(text):
                 raise placed(ValueError(problem), *at)
@@ -186,7 +188,9 @@ class SerialSettings(Settings):
                 at = ("commands", name, "makes", made)
                 value = self.values.get(made)
                 if value is None:
-                    raise setting_error(f"there is no value '{clean(made)}'", known(self.values), at=at, key=True)
+                    raise setting_error(
+                        f"there is no value '{clean(made)}'", known(self.values), at=at, key=True
+                    )
                 kind, expected = _MADE.get(value.type, (None, "a value of another type"))
                 if type(state) is not kind:
                     raise setting_error(f"the value '{made}' is of type {value.type}", expected, at=at)

@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 
 from labseq import Duration, Settings
 from labseq.config.fields import Text, setting_error
-from labseq.config.wording import clean
+from labseq.config.messages import clean
 from labseq.errors import one_of
 from labseq_serial.arguments import Number, Scalar, TypedSettings, check_limits, format_limits, placed
 from labseq_serial.replies import VALUE, compiled, example_of
@@ -161,7 +161,9 @@ class ValueSettings(TypedSettings):
         if lock is None:
             return self
         if lock.min is None and lock.max is None and not lock.one_of:
-            raise setting_error("the interlock allows everything", "min, max or one_of", at=("interlock",), key=True)
+            raise setting_error(
+                "the interlock allows everything", "min, max or one_of", at=("interlock",), key=True
+            )
         wrong = ("one_of",) if self.is_number else ("min", "max")
         for key in wrong:
             if getattr(lock, key) not in (None, ()):
@@ -172,7 +174,9 @@ class ValueSettings(TypedSettings):
         for i, good in enumerate(lock.one_of):
             if type(good) is not kind:
                 expected = "true or false" if kind is bool else "text, in quotes"
-                raise setting_error(f"the value is of type {self.type}", expected, at=("interlock", "one_of", i))
+                raise setting_error(
+                    f"the value is of type {self.type}", expected, at=("interlock", "one_of", i)
+                )
         check_limits(self.unit, lock.min, lock.max, "interlock")
         return self
 

@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from labseq import Clock, DeviceError, wait_for
-from labseq.recording.folders import state_root
-from labseq.recording.process import Owner
+from labseq.recording.folders import Owner, state_root
 
 END_S: Final = 10.0
 """How long a process that was left alone may take to ramp down and let its radio go."""

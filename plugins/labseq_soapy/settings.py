@@ -10,8 +10,8 @@ from pydantic import Field, model_validator
 
 from labseq import Duration, Frequency, Settings
 from labseq.config.fields import setting_error
+from labseq.config.messages import clean, closest
 from labseq.config.profile import FrequencyComb
-from labseq.config.wording import clean, closest
 from labseq.errors import one_of
 
 SIMULATED = "simulated"

@@ -97,7 +97,13 @@ class Streamer:
     def __init__(
         self, stream: Stream, setup: Setup, rate_hz: float, ear: CommandReader, post: Callable[[Any], None]
     ) -> None:
-        self._stream, self._setup, self._rate_hz, self._commands, self._say = stream, setup, rate_hz, ear, post
+        self._stream, self._setup, self._rate_hz, self._commands, self._say = (
+            stream,
+            setup,
+            rate_hz,
+            ear,
+            post,
+        )
         self._output = Output()
         self._written = self._buffered = self._due = 0
         self._task: int | None = None

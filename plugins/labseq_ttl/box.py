@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from labseq import Clock, DeviceError, DeviceTimeoutError
-from labseq.config.wording import clean
+from labseq.config.messages import clean
 from labseq.drivers.serial_port import Port
 from labseq_ttl.conversation import TRIES, Conversation
 from labseq_ttl.protocol import NAME, PER_LINE, VERSION, Edge

@@ -9,7 +9,7 @@ from contextlib import contextmanager, suppress
 from typing import Final, TypeVar
 
 from labseq import Clock, DeviceError, DeviceTimeoutError, wait_for
-from labseq.config.wording import clean
+from labseq.config.messages import clean
 from labseq.drivers.serial_port import BROKEN, Port
 from labseq.units import format_quantity
 from labseq_ttl.protocol import STOP, framed, unframed

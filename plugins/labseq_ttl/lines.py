@@ -16,7 +16,7 @@ from labseq import (
     LinesFacts,
 )
 from labseq.errors import one_of
-from labseq.lines import idle_program, off_program
+from labseq.sequencer.lines import idle_program, off_program
 from labseq_ttl import faults
 from labseq_ttl.box import Box
 from labseq_ttl.connection import SIMULATED_MAX_WAIT_S, Connection

@@ -70,7 +70,9 @@ class GoSettings(Settings):
             raise setting_error(f"'{missing}' has no output", "outputs for 'ready' and 'failed'")
         for (first, a), (second, b) in combinations(pins.items(), 2):
             if a == b:
-                raise setting_error(f"'{first}' and '{second}' are both on output {a}", "one each", at=(second,))
+                raise setting_error(
+                    f"'{first}' and '{second}' are both on output {a}", "one each", at=(second,)
+                )
         return self
 
 
@@ -114,7 +116,9 @@ class TtlSettings(Settings):
     @model_validator(mode="after")
     def _somebody_starts_it(self) -> Self:
         if self.is_simulated and self.start == "external":
-            raise setting_error("nobody gives a simulated box its external start", "`start: serial`", at=("start",))
+            raise setting_error(
+                "nobody gives a simulated box its external start", "`start: serial`", at=("start",)
+            )
         if self.go is not None and self.start == "external":
             what = "the start input cannot be a leader's and start programs too"
             raise setting_error(what, "`start: serial` beside 'go'", at=("start",))

@@ -12,15 +12,15 @@ from labseq import (
     CameraFacts,
     ConfigError,
     Context,
+    ExposureResult,
     ReportsSensor,
     SensorMode,
     Series,
     SimulatedSensor,
-    ExposureResult,
     WiresTriggers,
     settle,
 )
-from labseq.lines import trigger_line
+from labseq.sequencer.lines import trigger_line
 from labseq_virtual.cooler import ROOM_K, Cooler
 from labseq_virtual.driver import simulated_world
 from labseq_virtual.settings import CameraSettings
@@ -145,7 +145,9 @@ class VirtualCamera(CameraDriver):
         if self._happens(self._settings.faults.transient):
             return ExposureResult(number, None, "it did not come over the wire whole (rehearsed failure)")
         t_start_s = frame.t_start_s
-        return ExposureResult(number, frame.image, t_start_s=t_start_s, device_time_s=t_start_s - self._opened_s)
+        return ExposureResult(
+            number, frame.image, t_start_s=t_start_s, device_time_s=t_start_s - self._opened_s
+        )
 
     def _stop(self) -> None:
         self._sensor.clear()

@@ -59,7 +59,9 @@ class Register:
     def one(self) -> CountDistribution:
         """Law of the output for one electron in, without the spurious ones."""
         n_values = power_of_two(45 * self.gain + 64)
-        return CountDistribution.of(np.fft.irfft(_transforms(self.n_stages, self.gain, n_values)[0], n_values))
+        return CountDistribution.of(
+            np.fft.irfft(_transforms(self.n_stages, self.gain, n_values)[0], n_values)
+        )
 
     @cached_property
     def _added(self) -> CountDistribution:

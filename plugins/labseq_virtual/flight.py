@@ -18,7 +18,7 @@ from labseq_virtual.jumps import JUMPS, depth_jumps, phase_jumps
 from labseq_virtual.places import Places
 from labseq_virtual.settings import WorldSettings
 from labseq_virtual.thermal import draw_atoms
-from labseq_virtual.tones import HOPS, WINDOW, Tracks, track_tones, refuse_blur
+from labseq_virtual.tones import HOPS, WINDOW, Tracks, refuse_blur, track_tones
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]

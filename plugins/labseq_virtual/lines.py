@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from labseq import Context, DeviceError, DeviceTimeoutError, LimitError, LineProgram, LinesFacts
-from labseq.lines import idle_program, off_program
+from labseq.sequencer.lines import idle_program, off_program
 from labseq.units import format_quantity
 from labseq_virtual.driver import VirtualDriver
 from labseq_virtual.settings import LinesSettings

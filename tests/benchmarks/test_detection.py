@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from labseq import Context, Frame, SiteGrid
-from labseq.config.detectors import ThresholdSettings, WeightedSettings
-from labseq.imaging import ThresholdDetector, WeightedDetector
+from labseq.builtin.detectors import ThresholdSettings, WeightedSettings
+from labseq.detection.threshold import ThresholdDetector
+from labseq.detection.weighted import WeightedDetector
 
 
 @pytest.fixture

@@ -17,11 +17,11 @@ from labseq_virtual.settings import WorldSettings
 from labseq_virtual.world import World
 
 from labseq import Context, DepthRamp, Frame, MotionSpec, RandomStream, SiteGrid, TargetPattern
-from labseq.config.detectors import ThresholdSettings
-from labseq.imaging import ThresholdDetector
+from labseq.bench.latency import CHUNK
+from labseq.builtin.detectors import ThresholdSettings
+from labseq.detection.threshold import ThresholdDetector
 from labseq.model import ToneProgram
 from labseq.motion import Renderer, check_plan, comb_sample_rate, render_chunks, tone_program
-from labseq.session.bench_latency import CHUNK
 
 GRID = SiteGrid()
 RATE_HZ = comb_sample_rate(GRID)

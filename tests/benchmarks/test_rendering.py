@@ -13,17 +13,11 @@ import numpy as np
 import pytest
 from labseq_psca.planner import PscaPlanner, PscaSettings
 
+from labseq.bench.rendering import STORED, render_all, stored_waveforms, sum_all_stored, uniform_program
 from labseq.model import FrequencyCourse, MotionSpec, SiteGrid, TargetPattern, ToneProgram
 from labseq.motion import Renderer, comb_sample_rate, tone_program
 from labseq.motion.render_reference import render_reference
 from labseq.roles import Context
-from labseq.session.bench_waveform import (
-    STORED,
-    render_all,
-    stored_waveforms,
-    sum_all_stored,
-    uniform_program,
-)
 
 GRID = SiteGrid()
 RATE_HZ = comb_sample_rate(GRID)

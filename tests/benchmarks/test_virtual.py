@@ -13,8 +13,8 @@ from labseq_virtual.transport import Transport
 from labseq_virtual.world import World
 
 from labseq import Context, DepthRamp, MotionSpec, Plan, RandomStream, SiteGrid, tone_program
-from labseq.config.detectors import ThresholdSettings
-from labseq.imaging import ThresholdDetector
+from labseq.builtin.detectors import ThresholdSettings
+from labseq.detection.threshold import ThresholdDetector
 
 GRID = SiteGrid()
 

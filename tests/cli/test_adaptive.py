@@ -10,14 +10,9 @@ from pathlib import Path
 import pytest
 
 import labseq
-from labseq.cli.following import Follower
-from labseq.cli.glyphs import UNICODE
-from labseq.cli.log_lines import LogLines
-from labseq.cli.picture import draw
-from labseq.cli.scan_plot import draw_scan
+from labseq.cli.live import Follower, Tally, draw, draw_scan
 from labseq.cli.show import Tables, show_run
-from labseq.cli.tally import Tally
-from labseq.cli.telling import tell
+from labseq.console.output import UNICODE, LogLines, tell
 from labseq.recording.export import export_run
 from tests.session.small_runs import PROFILE
 

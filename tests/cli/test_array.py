@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
-from labseq.cli.array import (
+from labseq.cli.live import (
     ATOM,
     DEFECT,
     DENSE,
@@ -19,7 +19,7 @@ from labseq.cli.array import (
     kinds,
     scales,
 )
-from labseq.cli.glyphs import ASCII, UNICODE
+from labseq.console.output import ASCII, UNICODE
 from labseq.model import TargetPattern
 
 FILL = np.array([[0, 1, 1], [0, 0, 0]], np.bool_)

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from labseq.cli import main
-from labseq.session.plan_inputs import PlanRequest
-from labseq.session.planning import plan_moves
+from labseq.session.planning import PlanRequest, plan_moves
 
 SMALL = ("--grid", "8x8", "--target", "compact:5x5", "--loadings", "20", "--workers", "1")
 
@@ -73,11 +72,13 @@ def test_a_figure_is_drawn_where_one_stands(
 ) -> None:
     from dataclasses import replace
 
-    from labseq.session import bench_figures
-    from labseq.session.bench_spec import Condition, PlannerEntry
+    from labseq.bench import report as bench_figures
+    from labseq.bench.comparison import Condition, PlannerEntry
 
     conditions = tuple(Condition((4 * n, 4 * n), f"compact:{3 * n}x{3 * n}", 0.75, 5) for n in (1, 2, 3))
-    figure = replace(bench_figures.FIGURES["2b"], planner_entries=(PlannerEntry("psca"),), conditions=conditions)
+    figure = replace(
+        bench_figures.FIGURES["2b"], planner_entries=(PlannerEntry("psca"),), conditions=conditions
+    )
     monkeypatch.setattr(bench_figures, "FIGURES", {"2b": figure})
     monkeypatch.chdir(tmp_path)
     assert code_of("--figure", "2b", "--loadings", "10", "--workers", "1", "--json", "figure.json") == 0

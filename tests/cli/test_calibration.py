@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from labseq.calibrations import Store, Stored
+from labseq.calibration.store import Store, Stored
 from labseq.cli import main
 from labseq.model import CalibrationKind, SiteGrid
 from labseq.testing.fakes import fake_calibration

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, strategies as st
 
 from labseq.cli import main
-from labseq.cli.timeline import BAR_WIDTH, lines_table, timeline_table
+from labseq.cli.check import BAR_WIDTH, lines_table, timeline_table
 from labseq.model import TimelineEntry
 
 SEQUENCE = str(Path(__file__).parents[2] / "sequences" / "compact_225.yaml")

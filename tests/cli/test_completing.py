@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from labseq.cli import main
-from labseq.cli.completing import MAX_RUNS, file_kinds, new_kinds, profile_names, run_folders
+from labseq.console.options import MAX_RUNS, file_kinds, new_kinds, profile_names, run_folders
 from labseq.registry import KINDS
 
 

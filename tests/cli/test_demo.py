@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import labseq
-from labseq.cli import demo, main
+from labseq.cli import main, run as demo
 from labseq.config import packaged_profiles_dir, packaged_sequences_dir
 from labseq.errors import ConfigError
 from labseq.session import Session

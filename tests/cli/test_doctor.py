@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from labseq.cli import main
-from labseq.cli.doctor import MAX_ROWS
+from labseq.cli.data import MAX_ROWS
 from labseq.recording import RunWriter
 
 

@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given, strategies as st
 
-from labseq.cli.excerpt import excerpt
+from labseq.console.errors import excerpt
 from labseq.errors import Problem
 
 

@@ -2,7 +2,7 @@ import errno
 
 import pytest
 
-from labseq.cli.failures import MAX_REPORTED, exit_code_of, lines_of, report
+from labseq.console.errors import MAX_REPORTED, exit_code_of, lines_of, report
 from labseq.errors import (
     ConfigError,
     DeviceTimeoutError,

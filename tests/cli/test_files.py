@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from labseq.cli.files import check_different, json_writer, check_writable
+from labseq.console.output import check_different, check_writable, json_writer
 from labseq.errors import ConfigError
 
 

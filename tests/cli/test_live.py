@@ -10,7 +10,7 @@ import pytest
 from rich.console import Console
 
 from labseq.cli.live import REDRAW_S, LiveView, observer_for
-from labseq.cli.log_lines import LogLines
+from labseq.console.output import LogLines
 
 
 class Screen(io.TextIOWrapper):

@@ -6,8 +6,7 @@ from typing import Any
 
 import pytest
 
-from labseq.cli.log_lines import LogLines
-from labseq.cli.telling import event_text
+from labseq.console.output import LogLines, event_text
 
 
 def lines_of(events: Any) -> list[str]:
@@ -80,7 +79,10 @@ def test_missing_atoms_are_told(fake: Any) -> None:
 
 def test_a_window_that_was_too_short(fake: Any) -> None:
     values = {"shot": 0, "cycle": 2, "n_batches": 40, "n_batches_played": 12}
-    assert event_text("window_too_short", values, fake.run()) == "shot 1, cycle 2: 12 of 40 batches fit the window"
+    assert (
+        event_text("window_too_short", values, fake.run())
+        == "shot 1, cycle 2: 12 of 40 batches fit the window"
+    )
 
 
 def test_whom_a_run_waits_for(fake: Any) -> None:
@@ -92,9 +94,9 @@ def test_whom_a_run_waits_for(fake: Any) -> None:
 def test_compiling_is_announced_module_by_module() -> None:
     stream = io.StringIO()
     log = LogLines(stream)
-    log.event("compiling", {"module": "labseq.kernels.plan_check"})
+    log.event("compiling", {"module": "labseq.motion.check_kernels"})
     log.event("compiled", {"duration_s": 7.25})
     assert stream.getvalue().splitlines() == [
-        "compiling labseq.kernels.plan_check; later runs find it in the cache",
+        "compiling labseq.motion.check_kernels; later runs find it in the cache",
         "compiled in 7.25 s",
     ]

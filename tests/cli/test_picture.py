@@ -6,9 +6,8 @@ from typing import Any
 
 import pytest
 
-from labseq.cli.glyphs import ASCII, UNICODE
-from labseq.cli.picture import draw
-from labseq.cli.tally import Tally
+from labseq.cli.live import Tally, draw
+from labseq.console.output import ASCII, UNICODE
 
 RECENT = ["first", "second", "third"]
 

@@ -11,9 +11,7 @@ import pytest
 from rich.text import Text
 
 from labseq.cli import main
-from labseq.cli.plan import PlanOutput, plan_once, warnings
-from labseq.cli.plan_report import print_plan, title, totals
-from labseq.cli.plan_steps import moves_text
+from labseq.cli.plan import PlanOutput, moves_text, plan_once, print_plan, title, totals, warnings
 from labseq.errors import ConfigError
 from labseq.model import Batch
 from labseq.session import PlannedMoves, PlanRequest, plan_moves

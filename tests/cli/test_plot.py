@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 import labseq
+from labseq.analysis.terminal import PlotRequest, plot_run
 from labseq.cli import main
-from labseq.cli.plot import PlotRequest, plot_run
 from labseq.errors import ConfigError
 
 ROOT = Path(__file__).parents[2]

@@ -10,10 +10,9 @@ from typing import Any
 import pytest
 
 import labseq
-from labseq.cli.analyse import analyse_run
-from labseq.cli.replay import replay_run
+from labseq.analysis.replay import ReplayRequest
+from labseq.analysis.terminal import analyse_run, replay_run
 from labseq.errors import ConfigError
-from labseq.session.replay import ReplayRequest
 
 SEQUENCE = """labseq: 1
 name: replayed

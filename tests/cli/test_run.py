@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 
-from labseq.cli.output import discard_unwritten
 from labseq.cli.run import run_sequence
+from labseq.console.output import discard_unwritten
 from labseq.errors import ConfigError, DeviceError, Problem, RecordingError, StopRequested
 from labseq.recording import RunWriter
 from labseq.session import Options
@@ -181,7 +181,7 @@ def test_a_broken_screen_does_not_hide_the_outcome(perform: Any, monkeypatch: py
     def fail(_: object) -> None:
         raise OSError("no screen")
 
-    monkeypatch.setattr("labseq.cli.log_lines.LogLines.close", fail)
+    monkeypatch.setattr("labseq.console.output.LogLines.close", fail)
     _, out, _, caught = perform()
     assert caught is None
     assert json.loads(out)["status"] == "complete"
@@ -194,7 +194,7 @@ FULL = Path("/dev/full")
 def test_a_full_disk_behind_stdout_takes_nothing_from_the_run(perform: Any) -> None:
     with FULL.open("w", encoding="utf-8") as full, pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "stdout", full)
-        patch.setattr("labseq.cli.log_lines.LogLines.event", lambda *_: None)  # a session gives it up
+        patch.setattr("labseq.console.output.LogLines.event", lambda *_: None)  # a session gives it up
         session, _, err, caught = perform(as_json=False)
         discard_unwritten()
     assert caught is None
@@ -221,7 +221,7 @@ def test_an_answer_that_cannot_be_given_hides_no_failure(perform: Any, error: Ba
 
 LATE_PRINTS = """
 import atexit, ctypes, ctypes.util, sys
-from labseq.cli.output import stdout_to_stderr, say
+from labseq.console.output import stdout_to_stderr, say
 answer = stdout_to_stderr()
 atexit.register(print, "said at the end")
 library = ctypes.CDLL(None)

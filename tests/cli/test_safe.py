@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from labseq.cli.safe import secure_profile
+from labseq.cli.devices import secure_profile
 
 PROFILE = """labseq: 1
 name: bench

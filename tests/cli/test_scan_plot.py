@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 from hypothesis import given, strategies as st
 
-from labseq.cli.glyphs import ASCII, UNICODE
-from labseq.cli.scan_plot import ScanTally, draw_scan
+from labseq.cli.live import ScanTally, draw_scan
+from labseq.console.output import ASCII, UNICODE
 from labseq.model import ShotRecord
 
 

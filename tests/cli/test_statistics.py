@@ -9,10 +9,9 @@ from typing import Any
 
 import pytest
 
-from labseq.cli.statistics import NOT_JUDGED, cycle_table, statistics_rows
+from labseq.analysis.statistics import CycleStatistics, Rate, Statistics
+from labseq.cli.show import NOT_JUDGED, cycle_table, statistics_rows
 from labseq.model.estimate import Estimate
-from labseq.recording.rates import Rate
-from labseq.recording.statistics import CycleStatistics, Statistics
 
 UNKNOWN = Estimate(math.nan, math.nan)
 CYCLE = CycleStatistics(

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from hypothesis import given, strategies as st
 
-from labseq.cli.tally import StageTally, Tally
+from labseq.cli.live import StageTally, Tally
 from labseq.model import ShotRecord, StageTiming
 
 

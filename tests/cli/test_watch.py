@@ -10,9 +10,7 @@ from typing import Any
 
 import pytest
 
-from labseq.cli.following import Follower, Tail, record_of
-from labseq.cli.tally import Tally
-from labseq.cli.watch import POLL_S, watch_run
+from labseq.cli.live import POLL_S, Follower, Tail, Tally, record_of, watch_run
 from labseq.errors import ConfigError
 from labseq.recording import RunWriter, open_run
 

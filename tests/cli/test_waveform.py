@@ -8,10 +8,10 @@ import numba
 import numpy as np
 import pytest
 
+from labseq.bench.waveform import PlannedWaveform, WaveformRequest, plan_waveform
 from labseq.cli import main
 from labseq.cli.waveform import WaveformOutput, note, report, show_waveform, title
 from labseq.session import PlanRequest
-from labseq.session.waveform import PlannedWaveform, WaveformRequest, plan_waveform
 
 assert numba  # loaded already, so that a command does not turn compiling off for the tests after it
 
@@ -184,6 +184,6 @@ def test_every_mistake_is_told_in_words(
 def test_a_picture_without_matplotlib_is_refused_before_anything_is_done(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    monkeypatch.setattr("labseq.drawing.saving.find_spec", lambda _: None)
+    monkeypatch.setattr("labseq.pictures.figures.find_spec", lambda _: None)
     assert code_of("waveform", *WORDS, "--png", str(tmp_path / "a.png")) == 2
     assert "needs matplotlib, which is not installed; pip install 'labseq[plot]'" in capsys.readouterr().err

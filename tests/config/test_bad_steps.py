@@ -8,20 +8,18 @@ from pathlib import Path
 
 import pytest
 
-from labseq.config import (
+from labseq.builtin.steps import (
     CheckOverlaySettings,
     CheckSitesSettings,
-    ProblemCollector,
     DeviceSettings,
     ImageSettings,
     LoadSettings,
     ProbeSettings,
     RampSettings,
     RearrangeSettings,
-    Settings,
     WaitSettings,
-    load_sequence,
 )
+from labseq.config import ProblemCollector, Settings, load_sequence
 from labseq.errors import ConfigError
 
 GOOD = (Path(__file__).parent / "data" / "sequence.yaml").read_text(encoding="utf-8")

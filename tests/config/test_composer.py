@@ -2,8 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from labseq.config.composer import compose
-from labseq.config.nodes import MAX_DEPTH, MAX_VALUES
+from labseq.config.yaml_nodes import MAX_DEPTH, MAX_VALUES, compose
 from labseq.errors import ConfigError
 
 

@@ -14,8 +14,7 @@ from hypothesis import given, settings, strategies as st
 from PIL import Image
 
 import labseq
-from labseq.config.drawings import MAX_PIXELS, read_drawing
-from labseq.config.patterns import BitmapSettings
+from labseq.builtin.patterns import MAX_PIXELS, BitmapSettings, read_drawing
 from labseq.errors import ConfigError
 
 ROOT = Path(__file__).parents[2]

@@ -10,8 +10,7 @@ import pytest
 from hypothesis import given, strategies as st
 
 from labseq.config import Document, load_sequence
-from labseq.config.expressions_parsing import MAX_DEPTH, MAX_LENGTH
-from labseq.config.expressions_values import POWERS
+from labseq.config.expressions import MAX_DEPTH, MAX_LENGTH, POWERS
 from labseq.errors import ConfigError
 from labseq.units import UNITS, parse_any
 

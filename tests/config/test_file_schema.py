@@ -12,11 +12,10 @@ import pytest
 from pydantic import Field, PlainValidator
 
 import labseq
-from labseq.config.composer import compose
-from labseq.config.file_schema import FileKind, file_schema
-from labseq.config.json_schema import model_schema, quantity_schema
+from labseq.config.yaml_nodes import compose
 from labseq.errors import ConfigError
 from labseq.registry import Registry
+from labseq.scaffold.schemas import FileKind, file_schema, model_schema, quantity_schema
 from labseq.session import load_plugins
 from labseq.units import UNITS
 
@@ -161,7 +160,11 @@ shot: [{load: {}}, {image: {}}]
         ("{image: {}}", "{policy: {retries: 2}}", False),
         ("{image: {}}", "{name: x, policy: {retries: 2}}", False),
         ("{image: {}}", "{image: {}, load: {}, name: x, policy: {retries: 2}}", False),
-        ("shots: 1", "shots: 1\npolicy: {when_exhausted: skip_point, checks: [{value: n, at_least: 1}]}", True),
+        (
+            "shots: 1",
+            "shots: 1\npolicy: {when_exhausted: skip_point, checks: [{value: n, at_least: 1}]}",
+            True,
+        ),
         ("shots: 1", "shots: 1\npolicy: {checks: [{at_least: 1}]}", False),
         ("shots: 1", "shots: 1\nvariables: {t: 20 ms, n: 3, f: 1.5 MHz, x: = 2 * variables.n}", True),
         ("shots: 1", "shots: 1\nvariables: {t: long}", False),

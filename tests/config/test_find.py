@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from labseq import places
-from labseq.config import Document, find, find_profile, find_sequence, profile_dir, packaged_profiles_dir
+from labseq import files as places
+from labseq.config import Document, find, find_profile, find_sequence, packaged_profiles_dir, profile_dir
 from labseq.errors import ConfigError
 
 

@@ -8,19 +8,8 @@ from pathlib import Path
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from labseq.config import (
-    ProblemCollector,
-    DeviceSettings,
-    ImageSettings,
-    LoadSettings,
-    Override,
-    RearrangeSettings,
-    Settings,
-    WaitSettings,
-    load_profile,
-    load_sequence,
-    split_overrides,
-)
+from labseq.builtin.steps import DeviceSettings, ImageSettings, LoadSettings, RearrangeSettings, WaitSettings
+from labseq.config import Override, ProblemCollector, Settings, load_profile, load_sequence, split_overrides
 from labseq.errors import ConfigError
 
 DATA = Path(__file__).parent / "data"

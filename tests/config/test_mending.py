@@ -5,9 +5,9 @@ from typing import Any
 
 from hypothesis import given, settings, strategies as st
 
-from labseq.config import ProblemCollector, Document, SequenceSpec, load_sequence
-from labseq.config.mending import FallbackValues, load_checked
-from labseq.config.values import node_of
+from labseq.config import Document, ProblemCollector, SequenceSpec, load_sequence
+from labseq.config.document import FallbackValues, load_checked
+from labseq.config.validation import node_of
 
 STAND_INS = FallbackValues(
     values={

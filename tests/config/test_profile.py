@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from labseq.config import MOTION_KEYS, Document, MotionSettings, ProfileSpec, Settings, load_profile
-from labseq.config.profile import GridSettings
-from labseq.config.timeouts import TimeoutSettings
+from labseq.config.profile import GridSettings, TimeoutSettings
 from labseq.errors import ConfigError
 from labseq.model import MotionSpec, SiteGrid
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from labseq.config import Document
-from labseq.config.reading import MAX_BYTES
+from labseq.config.yaml_nodes import MAX_BYTES
 from labseq.errors import ConfigError
 
 SAVE = "expected a file in UTF-8; save the file as UTF-8"

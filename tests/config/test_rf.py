@@ -8,8 +8,7 @@ import pytest
 from pydantic import ValidationError
 
 from labseq.config import load_profile
-from labseq.config.profile import GridSettings
-from labseq.config.rf import RfSettings
+from labseq.config.profile import GridSettings, RfSettings
 from labseq.errors import ConfigError
 from labseq.model import RfSpec
 

@@ -3,11 +3,10 @@ from __future__ import annotations
 import pytest
 from pydantic import BaseModel
 
-from labseq.config import (
+from labseq.builtin.steps import (
     CheckOverlaySettings,
     CheckSitesSettings,
     DeviceSettings,
-    Document,
     ImageSettings,
     LoadSettings,
     ProbeSettings,
@@ -15,6 +14,7 @@ from labseq.config import (
     RearrangeSettings,
     WaitSettings,
 )
+from labseq.config import Document
 
 STEPS: list[type[BaseModel]] = [
     LoadSettings,

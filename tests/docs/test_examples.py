@@ -14,10 +14,10 @@ from markdown_it import MarkdownIt
 
 import labseq
 from labseq.cli.app import app
-from labseq.cli.arguments import arrange
-from labseq.cli.failures import told
+from labseq.cli.main import arrange
 from labseq.config import ProfileSpec, SequenceSpec
-from labseq.config.composer import compose
+from labseq.config.yaml_nodes import compose
+from labseq.console.errors import told
 
 from .blocks import BLOCKS, COMMENT, PAGES, ROOT, Block, commands_of, inline_of
 from .running import split

@@ -13,8 +13,8 @@ import pytest
 from PIL import Image
 
 import labseq
-from labseq import builtins
-from labseq.drawing import target_text
+from labseq import builtin as builtins
+from labseq.pictures.plans import target_text
 from labseq.registry import Registry
 
 from .scripts import load_script

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from labseq.session.bench_figures import FIGURES
+from labseq.bench.report import FIGURES
 
 from .scripts import load_script
 

@@ -17,9 +17,8 @@ from pydantic.fields import FieldInfo
 
 import labseq
 from labseq import errors, hookspecs, roles, testing
-from labseq.builtins import labseq_register
+from labseq.builtin import labseq_register
 from labseq.cli.app import app
-from labseq.cli.failures import exit_code_of
 from labseq.config import (
     CalibrationSettings,
     Choice,
@@ -29,11 +28,11 @@ from labseq.config import (
     load_profile,
     load_sequence,
 )
-from labseq.config.composer import compose
 from labseq.config.fields import PatternChoice
-from labseq.config.motion import MobileTweezersChoice
-from labseq.config.policies import BudgetSettings, PolicySettings, StepPolicySettings
-from labseq.config.profile import GridSettings
+from labseq.config.profile import GridSettings, MobileTweezersChoice
+from labseq.config.sequence import BudgetSettings, PolicySettings, StepPolicySettings
+from labseq.config.yaml_nodes import compose
+from labseq.console.errors import exit_code_of
 from labseq.registry import KINDS, Entry, Registry
 from labseq.testing.contracts import HardwareContract
 

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from hypothesis import given, strategies as st
 
-from labseq import CameraFacts, Context, DeviceError, DeviceTimeoutError, Frame, LimitError, HasSelfTest
+from labseq import CameraFacts, Context, DeviceError, DeviceTimeoutError, Frame, HasSelfTest, LimitError
 from labseq.roles import Trigger
 from labseq.testing import CameraContract
 

@@ -2,7 +2,7 @@
 
 from hypothesis import given, strategies as st
 
-from labseq.drivers.increments import nearest
+from labseq.drivers.camera import nearest
 
 
 @given(

@@ -7,7 +7,7 @@ import threading
 import pytest
 
 from labseq import StopRequested, wait_for
-from labseq.drivers.waiting import SLICE_S
+from labseq.drivers.serial_port import SLICE_S
 from labseq.roles import NeverStopped
 from labseq.sequencer.clock import RealClock, StopFlag
 from labseq.testing.fakes import FakeClock

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, strategies as st
 from pydantic import ValidationError
 
-from labseq.config.patterns import BitmapSettings, CompactSettings
+from labseq.builtin.patterns import BitmapSettings, CompactSettings
 from labseq.errors import LimitError
 from labseq.geometry import bitmap, compact, pattern, place, read_bitmap
 from labseq.model import SiteGrid

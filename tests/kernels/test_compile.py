@@ -14,20 +14,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from labseq.kernels import compile as compiling
-from labseq.kernels.compile import announcing, cache_root, const, kernel
+from labseq import kernel as compiling
+from labseq.kernel import announcing, cache_root, const, kernel
 
 MAX_LACK = 3
 
 LEAF = """
-    from labseq.kernels.compile import kernel
+    from labseq.kernel import kernel
 
     @kernel("int64(int64)")
     def leaf(x):
         return x + {step}
 """
 MIDDLE = """
-    from labseq.kernels.compile import kernel
+    from labseq.kernel import kernel
     from {package}.leaf import leaf
 
     @kernel("int64(int64)")
@@ -35,7 +35,7 @@ MIDDLE = """
         return 2 * leaf(x)
 """
 TOP = """
-    from labseq.kernels.compile import kernel
+    from labseq.kernel import kernel
     from {package} import middle
     from {package}.constants import OFFSET
 
@@ -233,7 +233,7 @@ def run_python(code: str, **environment: str) -> str:
 def test_numba_is_imported_only_with_a_kernel() -> None:
     code = """
         import sys
-        import labseq.motion, labseq.kernels.compile, labseq_psca
+        import labseq.motion, labseq.kernel, labseq_psca
         print("numba" in sys.modules)
     """
     assert run_python(code) == "False"

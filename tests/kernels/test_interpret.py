@@ -11,10 +11,10 @@ import pytest
 CODE = """
 import sys
 {before}
-from labseq.kernels.compile import announcing, interpret
+from labseq.kernel import announcing, interpret
 interpret()
 with announcing(print):
-    from labseq.kernels.plan_check import longest_move
+    from labseq.motion.check_kernels import longest_move
 import types
 print(isinstance(longest_move, types.FunctionType), "numba" in sys.modules)
 """

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, strategies as st
 from numpy.typing import NDArray
 
-from labseq.kernels import render_teeth as teeth
+from labseq.motion import render_comb_kernels as teeth
 
 SPACING_HZ = 1.6e6
 

@@ -4,9 +4,18 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from labseq.kernels import render_tones
-from labseq.kernels.render_paths import END, END_AMPLITUDE, PHASE, START, START_AMPLITUDE
-from labseq.kernels.render_tones import FINE, N_FIELDS, SUM, take_tones
+from labseq.motion import render_kernels as render_tones
+from labseq.motion.render_kernels import (
+    END,
+    END_AMPLITUDE,
+    FINE,
+    N_FIELDS,
+    PHASE,
+    START,
+    START_AMPLITUDE,
+    SUM,
+    take_tones,
+)
 
 RATE_HZ = 625e6
 OFFSETS = np.array([0, 2, 2, 5], np.int32)

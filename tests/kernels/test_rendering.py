@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
-from labseq.kernels import (
-    render_comb,
-    render_direct,
-    render_paths,
-    render_store,
-    render_stored,
-    render_tables,
-)
 from labseq.model import FrequencyCourse
+from labseq.motion import (
+    render_comb_kernels as render_comb,
+    render_direct_kernels as render_direct,
+    render_direct_kernels as render_stored,
+    render_kernels as render_paths,
+    render_kernels as render_store,
+    render_kernels as render_tables,
+)
 
 
 @given(st.integers(-(2**31), 2**31 - 1))

@@ -7,12 +7,16 @@ import pytest
 from hypothesis import given, strategies as st
 from numpy.typing import NDArray
 
-from labseq.kernels.tone_build import END_AMPLITUDE, END_HZ, N_FIELDS, START_AMPLITUDE, START_HZ
-from labseq.kernels.tone_limits import (
+from labseq.motion.tone_kernels import (
     AMPLITUDES,
     BAND,
+    END_AMPLITUDE,
+    END_HZ,
+    N_FIELDS,
     POWER,
     SPACING,
+    START_AMPLITUDE,
+    START_HZ,
     WITHIN,
     first_excess,
     greatest_sum,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from hypothesis import given, strategies as st
 
-from labseq.kernels.weigh_sites import undo_neighbours, weigh_sites
+from labseq.detection.kernels import undo_neighbours, weigh_sites
 
 
 @given(

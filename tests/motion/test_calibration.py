@@ -20,7 +20,7 @@ from labseq.motion import (
     standing_on_sites,
     tone_program,
 )
-from labseq.motion.calibration import axis_positions_m
+from labseq.motion.axes import axis_positions_m
 
 SPACING_M = 4.49e-6
 SLOPE = 1.6e6 / SPACING_M

@@ -7,10 +7,9 @@ import pytest
 from numpy.typing import NDArray
 
 from labseq.errors import InvalidPlanError, LimitError
-from labseq.kernels import plan_rules
 from labseq.model import Batch, MotionSpec, Plan, PlanReport, SiteGrid, TargetPattern
-from labseq.motion import RULES, check_plan
-from labseq.motion.rules import FAULTS
+from labseq.motion import RULES, check_kernels as plan_rules, check_plan
+from labseq.motion.check import FAULTS
 
 Move = tuple[int, int, int, int]
 

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given, strategies as st
 from numpy.typing import NDArray
 
+from labseq.calibration.frequencies import fit_frequencies, smoothed
 from labseq.errors import DeviceError
 from labseq.model import MotionSpec, RfSpec, SiteGrid
-from labseq.motion.frequencies import fit_frequencies, smoothed
 
 GRID = SiteGrid(12, 16)
 HZ_PER_M = 1.6e6 / GRID.spacing_m

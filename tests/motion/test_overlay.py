@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from labseq.errors import DeviceError
 from labseq.model import SiteGrid
-from labseq.motion.calibration import standing_on_sites
+from labseq.motion.axes import standing_on_sites
 from labseq.motion.overlay import fit_overlay, overlay_offset
 
 GRIDS = {lattice: SiteGrid(20, 20, lattice=lattice) for lattice in ("triangular", "square")}  # type: ignore[arg-type]

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, strategies as st
 
 from labseq.model import SiteGrid
-from labseq.motion.survival import (
+from labseq.motion.overlay import (
     SurvivalShape,
     covariance,
     deviance_residuals,

@@ -6,7 +6,7 @@ from hypothesis import given, strategies as st
 
 from labseq.model import Plan, PlanReport
 from labseq.motion import fitting_batches
-from labseq.motion.timing import default_grid
+from labseq.motion.tones import default_grid
 
 
 def report(ends: list[float]) -> PlanReport:

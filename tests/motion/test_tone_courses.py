@@ -27,7 +27,7 @@ from labseq.model import (
 )
 from labseq.model.motion import SpeedProfile
 from labseq.motion import check_plan, tone_program
-from labseq.motion.timing import SPEED_PROFILES
+from labseq.motion.tones import SPEED_PROFILES
 from labseq.roles import Context
 from labseq.testing.strategies import cases, tone_programs
 

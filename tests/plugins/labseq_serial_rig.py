@@ -15,7 +15,7 @@ from labseq_serial.settings import SerialSettings
 
 from labseq import Clock, Context
 from labseq.config import Document
-from labseq.config.composer import compose
+from labseq.config.yaml_nodes import compose
 from labseq.testing.fakes import FakeClock
 
 PROFILE = r"""

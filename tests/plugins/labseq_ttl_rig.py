@@ -16,8 +16,8 @@ from labseq_ttl.protocol import framed, unframed
 from labseq_ttl.settings import TtlSettings
 
 from labseq import Context, LineProgram, LineSpec
-from labseq.lines import line_program
-from labseq.roles.clock import NeverStopped
+from labseq.roles.shot import NeverStopped
+from labseq.sequencer.lines import line_program
 from labseq.testing.contracts.lines import SPECS
 from labseq.testing.fakes import Calls, FakeClock, RecordingSimulation
 

@@ -272,7 +272,9 @@ def test_each_go_gets_exactly_one_answer(events: list[str]) -> None:
         elif event == "tell":
             said += dialogue.tell("ready", {"shot": 0}, now_s)[1]
         elif event == "leave":
-            n_lost += n_go_signals - n_lost - n_answers  # whoever leaves gives up its answer, and gets no other
+            n_lost += (
+                n_go_signals - n_lost - n_answers
+            )  # whoever leaves gives up its answer, and gets no other
             dialogue.lost("it left")
             dialogue.connected("another leader")
     said += dialogue.end()

@@ -13,7 +13,7 @@ import pytest
 
 import labseq
 from labseq import ConfigError, DeviceTimeoutError, Session, StopRequested
-from labseq.config.composer import compose
+from labseq.config.yaml_nodes import compose
 from labseq.session import check
 
 from .labseq_follow_rig import TcpPeer

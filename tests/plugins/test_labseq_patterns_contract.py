@@ -11,7 +11,7 @@ from labseq_patterns import checkerboard, honeycomb, kagome, ring, settings, sie
 from labseq_scans.pattern import InterleavedSettings, interleaved
 
 from labseq import SiteGrid, TargetPattern
-from labseq.config.patterns import BitmapSettings, CompactSettings
+from labseq.builtin.patterns import BitmapSettings, CompactSettings
 from labseq.geometry import bitmap, compact
 from labseq.testing import PatternContract
 
@@ -40,10 +40,10 @@ def test_every_pattern_is_held_to_them() -> None:
     import labseq_patterns
     import labseq_scans
 
-    import labseq.builtins
+    import labseq.builtin
     from labseq.registry import Registry
 
-    registry, modules = Registry(), (labseq.builtins, labseq_patterns, labseq_scans)
+    registry, modules = Registry(), (labseq.builtin, labseq_patterns, labseq_scans)
     for module in modules:
         plugin: Any = module
         plugin.labseq_register(registry)

@@ -9,7 +9,7 @@ import pytest
 from labseq_pylon.library import load_pypylon
 
 from labseq import Run, Session
-from labseq.session.choosing import DryRun
+from labseq.session.profile import DryRun
 
 from .needs import need_library
 

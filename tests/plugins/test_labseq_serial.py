@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import pytest
 from labseq_serial.device import SerialDevice
 
-from labseq import Context, DeviceError, Interlocked, ChecksCommands, LimitError, HasReadings, HasSelfTest
+from labseq import ChecksCommands, Context, DeviceError, HasReadings, HasSelfTest, Interlocked, LimitError
 from labseq.testing import DeviceContract
 from labseq.testing.fakes import FakeClock
 

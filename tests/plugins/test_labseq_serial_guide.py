@@ -14,7 +14,7 @@ from labseq_serial.settings import SerialSettings
 
 from labseq import Context
 from labseq.config import Document
-from labseq.config.composer import compose
+from labseq.config.yaml_nodes import compose
 from labseq.testing.fakes import FakeClock
 
 GUIDE = Path(__file__).parents[2] / "docs" / "how-to" / "serial-devices.md"

@@ -14,10 +14,10 @@ import pytest
 
 from labseq import ConfigError, DeviceError, Session
 from labseq.config import find_profile
-from labseq.config.composer import compose
+from labseq.config.yaml_nodes import compose
 from labseq.recording import Run
 from labseq.session import check_devices
-from labseq.session.checking import check
+from labseq.session.check import check
 
 from .labseq_serial_rig import PROFILE, Counterpart
 

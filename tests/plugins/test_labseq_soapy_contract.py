@@ -12,7 +12,7 @@ from labseq_soapy.settings import SoapySettings
 from labseq_soapy.static_tweezers import SoapyStaticTweezers
 
 from labseq import Context, LimitError
-from labseq.roles import Interlocked, HasSelfTest
+from labseq.roles import HasSelfTest, Interlocked
 from labseq.testing import StaticTweezersContract
 
 from .labseq_soapy_rig import GRID, SMALL, made, need_radio, opened

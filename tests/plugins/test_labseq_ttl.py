@@ -20,7 +20,7 @@ from pydantic import ValidationError
 
 from labseq import ConfigError, Context, LineProgram, LineSpec
 from labseq.errors import DeviceError, DeviceTimeoutError, LimitError, StopRequested
-from labseq.lines import line_program
+from labseq.sequencer.lines import line_program
 from labseq.testing import LinesContract
 
 from .labseq_ttl_rig import make_rig, need_simavr, rig

@@ -16,7 +16,7 @@ from pydantic import ValidationError
 import labseq
 from labseq import ConfigError, Context, DeviceError, DeviceTimeoutError, LeaderLink, LineSpec
 from labseq.errors import StopRequested
-from labseq.lines import line_program
+from labseq.sequencer.lines import line_program
 from labseq.testing.contracts.lines import SPECS
 from labseq.testing.fakes import Calls, FakeClock, RecordingSimulation
 

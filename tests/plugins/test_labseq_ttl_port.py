@@ -11,7 +11,7 @@ from labseq_ttl.counterpart.simavr import SimavrBox
 from labseq_ttl.heartbeat import Heartbeat
 
 from labseq.errors import DeviceError, DeviceTimeoutError, StopRequested
-from labseq.roles.clock import NeverStopped
+from labseq.roles.shot import NeverStopped
 
 from .labseq_ttl_rig import Rig, make_rig, need_simavr, rig, works
 

@@ -12,9 +12,9 @@ from labseq import (
     Context,
     DeviceError,
     DeviceTimeoutError,
+    HasSelfTest,
     LimitError,
     RandomStream,
-    HasSelfTest,
     TransientError,
 )
 from labseq.testing.fakes import FakeClock, RecordingSimulation

@@ -24,10 +24,10 @@ from labseq import (
     DeviceError,
     DeviceTimeoutError,
     LimitError,
+    NeedsWarmUp,
     RandomStream,
     SiteGrid,
     ToneProgram,
-    NeedsWarmUp,
 )
 from labseq.model import AxisTones
 from labseq.testing.fakes import FakeClock

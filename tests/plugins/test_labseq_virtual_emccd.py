@@ -15,8 +15,8 @@ from labseq_virtual.world import World
 from numpy.typing import NDArray
 
 from labseq import Context, DepthRamp, RandomStream
-from labseq.config.detectors import ThresholdSettings
-from labseq.imaging import ThresholdDetector
+from labseq.builtin.detectors import ThresholdSettings
+from labseq.detection.threshold import ThresholdDetector
 
 EXPOSURE_S = 45e-3
 NOWHERE = np.empty((0, 2))

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from labseq import Context, DepthRamp, LimitError, RandomStream, SensorMode, SiteGrid
-from labseq.imaging import site_pixels
+from labseq.detection.sites import site_pixels
 from labseq.roles import WHOLE_SENSOR
 
 GRID = SiteGrid()

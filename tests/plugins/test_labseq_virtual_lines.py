@@ -13,9 +13,9 @@ from labseq_virtual.world import World
 
 import labseq
 from labseq.errors import ConfigError
-from labseq.lines import line_program
 from labseq.model import LineProgram, LineSpec, RandomStream, SiteGrid
 from labseq.roles import Context
+from labseq.sequencer.lines import line_program
 from labseq.testing import LinesContract
 from labseq.testing.fakes import FakeClock
 

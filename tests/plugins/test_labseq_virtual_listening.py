@@ -178,6 +178,8 @@ def test_axes_of_different_lengths_are_heard_at_the_same_times() -> None:
     occupied = np.zeros(grid.shape, np.bool_)
     occupied[5, [9, 30]] = True
     flight = RfTransport(grid, motion, WorldSettings(transport_loss=0.0, temperature=1e-6))
-    for pulse in PulseReceiver(PlayedRfSource(played(program)), 2 * flight.margin_s).receive_until(START_S + 10.0):
+    for pulse in PulseReceiver(PlayedRfSource(played(program)), 2 * flight.margin_s).receive_until(
+        START_S + 10.0
+    ):
         flight.carry(occupied, pulse, np.ones(grid.shape), np.random.default_rng(1), 1.0)
     assert np.argwhere(occupied).tolist() == [[5, 9], [5, 30]]

@@ -11,7 +11,7 @@ from labseq_virtual.transport import Transport
 from numpy.typing import NDArray
 
 from labseq import MotionSpec
-from labseq.testing.tape import GRID, ON, ToneProgramBuilder
+from labseq.testing.rf import ON, TAPE_GRID as GRID, ToneProgramBuilder
 
 FULL = np.ones(GRID.shape)
 
@@ -66,7 +66,9 @@ def test_atoms_that_are_not_moved_are_not_lost() -> None:
     assert remain(tape, (4, 4), (0, 5), transport_loss=1.0) == {(4, 4), (0, 5)}
 
 
-def lost_by(tape: ToneProgramBuilder, *sites: tuple[int, int], depth: float = 1.0, **physics: Any) -> dict[str, int]:
+def lost_by(
+    tape: ToneProgramBuilder, *sites: tuple[int, int], depth: float = 1.0, **physics: Any
+) -> dict[str, int]:
     """What the atoms of a program are lost by."""
     settings = WorldSettings.model_validate({"transport_loss": 0.0, "temperature": 1e-6} | physics)
     transport = Transport(tape.grid, MotionSpec(), settings)
@@ -79,7 +81,9 @@ def lost_by(tape: ToneProgramBuilder, *sites: tuple[int, int], depth: float = 1.
 
 
 def test_every_loss_has_its_cause() -> None:
-    assert lost_by(ToneProgramBuilder().move([(0, 0)], [(0, 2)]), (0, 0), transport_loss=1.0) == {"hand_over": 1}
+    assert lost_by(ToneProgramBuilder().move([(0, 0)], [(0, 2)]), (0, 0), transport_loss=1.0) == {
+        "hand_over": 1
+    }
     assert lost_by(ToneProgramBuilder().move([(0, 0)], [(0, 2)]), (0, 0)) == {}
     assert lost_by(ToneProgramBuilder().move([(0, 0)], [(0, -1)]), (0, 0)) == {"ejected": 1}
     assert lost_by(ToneProgramBuilder().move([(0, 0)], [(0, 3)]), (0, 0), (0, 3)) == {"collision": 2}
@@ -105,7 +109,11 @@ def test_a_shallow_tweezer_at_full_speed_loses_its_atom_on_the_way() -> None:
 
 def test_a_weak_tweezer_neither_takes_nor_throws_out_an_atom() -> None:
     weak = ON * 0.3  # 9 % of the depth, on the axis that is not ramped
-    tape = ToneProgramBuilder().add([(0, 0, weak, weak)], [(0, 0, 0.0, ON)]).add([(0, 0, weak, weak)], [(0, 3, ON, ON)])
+    tape = (
+        ToneProgramBuilder()
+        .add([(0, 0, weak, weak)], [(0, 0, 0.0, ON)])
+        .add([(0, 0, weak, weak)], [(0, 3, ON, ON)])
+    )
     assert remain(tape, (0, 0), (0, 2)) == {(0, 0), (0, 2)}
 
 
@@ -117,7 +125,11 @@ def test_pick_up_and_drop_off_beside_the_site_keeps_what_the_energy_allows(
     off = offset_um * 1e-6 / GRID.spacing_m
     rows = [(r + off * axis, r + off * axis, ON, ON) for r in range(5)]
     cols = [c + off * (1 - axis) for c in range(6)]
-    tape = ToneProgramBuilder().add(rows, [(c, c, 0.0, ON) for c in cols]).add(rows, [(c, c, ON, 0.0) for c in cols])
+    tape = (
+        ToneProgramBuilder()
+        .add(rows, [(c, c, 0.0, ON) for c in cols])
+        .add(rows, [(c, c, ON, 0.0) for c in cols])
+    )
     transport = Transport(GRID, MotionSpec(), WorldSettings(transport_loss=0.0))
     rng, total = np.random.default_rng(3), 0
     for _ in range(60):

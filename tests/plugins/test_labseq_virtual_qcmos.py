@@ -14,8 +14,9 @@ from labseq_virtual.world import World
 from numpy.typing import NDArray
 
 from labseq import Context, DepthRamp, RandomStream, SensorMode
-from labseq.config.detectors import ThresholdSettings, WeightedSettings
-from labseq.imaging import ThresholdDetector, WeightedDetector
+from labseq.builtin.detectors import ThresholdSettings, WeightedSettings
+from labseq.detection.threshold import ThresholdDetector
+from labseq.detection.weighted import WeightedDetector
 from labseq.roles import WHOLE_SENSOR
 
 Floats = NDArray[np.float64]

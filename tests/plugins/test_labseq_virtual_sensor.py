@@ -20,11 +20,11 @@ from labseq import (
     DepthRamp,
     DeviceError,
     DeviceTimeoutError,
-    ReportsSensor,
     LimitError,
-    RandomStream,
-    SensorMode,
     NeedsSettling,
+    RandomStream,
+    ReportsSensor,
+    SensorMode,
     SiteGrid,
 )
 from labseq.testing.fakes import FakeClock

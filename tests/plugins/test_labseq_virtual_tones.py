@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
-from labseq_virtual.envelope import Band, envelope, active_spans
+from labseq_virtual.envelope import Band, active_spans, envelope
 from labseq_virtual.tones import Tracks, track_tones
 
 from labseq.model import RfSamples, RfSpan, RfTones, TonesNow

@@ -12,7 +12,7 @@ from labseq_virtual.transport import Transport
 from numpy.typing import NDArray
 
 from labseq import MotionSpec, SiteGrid
-from labseq.testing.tape import GRID, ON, ToneProgramBuilder
+from labseq.testing.rf import ON, TAPE_GRID as GRID, ToneProgramBuilder
 
 FULL = np.ones(GRID.shape)
 
@@ -81,7 +81,10 @@ def test_an_atom_that_ends_outside_of_the_grid_is_gone(rows: Any, cols: Any) -> 
 
 
 def test_ejection_takes_the_outermost_atom_only() -> None:
-    assert after(ToneProgramBuilder().move([(2, 2)], [(0, -1), (1, 0)]), (2, 0), (2, 1), (2, 2)) == {(2, 0), (2, 2)}
+    assert after(ToneProgramBuilder().move([(2, 2)], [(0, -1), (1, 0)]), (2, 0), (2, 1), (2, 2)) == {
+        (2, 0),
+        (2, 2),
+    }
 
 
 def test_two_atoms_on_one_site_are_both_lost() -> None:

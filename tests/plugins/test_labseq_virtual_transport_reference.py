@@ -26,7 +26,7 @@ from labseq_virtual.transport import FASTEST, Transport
 from numpy.typing import NDArray
 
 from labseq import MotionSpec, SiteGrid, ToneProgram
-from labseq.testing.tape import ON, ToneProgramBuilder
+from labseq.testing.rf import ON, ToneProgramBuilder
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]

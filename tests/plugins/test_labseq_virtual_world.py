@@ -17,9 +17,9 @@ from labseq import (
     DeviceError,
     LimitError,
     RandomStream,
+    ReportsTruth,
     SiteGrid,
     ToneProgram,
-    ReportsTruth,
 )
 from labseq.model import AxisTones
 

@@ -28,7 +28,7 @@ from labseq.model import (
     StageTiming,
     TargetPattern,
 )
-from labseq.recording import RunWriter, layout
+from labseq.recording import RunWriter, schema as layout
 
 START = "2026-11-20T10:00:00.000000+00:00"
 END = "2026-11-20T10:00:01.250000+00:00"

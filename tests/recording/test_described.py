@@ -14,9 +14,17 @@ import numpy as np
 import pytest
 
 from labseq.model import RunRecord, ShotRecord
-from labseq.recording.described import ATTRIBUTES, COLUMNS, DATASETS, EVERYWHERE, TABLES, UNDOCUMENTED
-from labseq.recording.layout import FORMAT_VERSION, RUN_FORMAT_VERSION
 from labseq.recording.run_file import index_row
+from labseq.recording.schema import (
+    ATTRIBUTES,
+    COLUMNS,
+    DATASETS,
+    EVERYWHERE,
+    FORMAT_VERSION,
+    RUN_FORMAT_VERSION,
+    TABLES,
+    UNDOCUMENTED,
+)
 from labseq.recording.shot_file import ShotEncoder
 
 MakeRun = Callable[..., RunRecord]
@@ -124,4 +132,6 @@ def test_every_key_of_the_index_and_every_version_is_in_the_reference(
     assert {*row} <= known
     assert f"| {FORMAT_VERSION} |" in page
     assert f"| {RUN_FORMAT_VERSION} |" in page
-    assert {what.since_version for what in DATASETS.values()} <= {*re.findall(r"^\| (\d\.\d) \|", page, re.MULTILINE)}
+    assert {what.since_version for what in DATASETS.values()} <= {
+        *re.findall(r"^\| (\d\.\d) \|", page, re.MULTILINE)
+    }

@@ -105,7 +105,7 @@ def test_a_run_in_progress_is_not_touched(run_dir: Path) -> None:
 LOCK = """
 import sys
 from pathlib import Path
-from labseq.locks import Lock
+from labseq.files import Lock
 lock = Lock(Path(sys.argv[1]), "labseq resume")
 assert lock.take() is None
 print("taken", flush=True)

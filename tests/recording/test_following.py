@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from labseq.recording import RunWriter
 from labseq.recording.folders import INDEX_FILE
-from labseq.recording.following import Follower
+from labseq.recording.reader import Follower
 
 
 def test_every_shot_that_counts_comes_once(tmp_path, make_run, make_shot):

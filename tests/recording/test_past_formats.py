@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from labseq.analysis.statistics import statistics_of
 from labseq.recording import Shot, open_run
-from labseq.recording.layout import FORMAT_VERSION
-from labseq.recording.points import scan_points
-from labseq.recording.shot_reader import read_content
-from labseq.recording.statistics import statistics_of
+from labseq.recording.reader import scan_points
+from labseq.recording.schema import FORMAT_VERSION
+from labseq.recording.shot import read_content
 
 from .old_runs import a_run, a_shot
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
-from labseq.recording.plain import dumps, plain_text, to_plain
+from labseq.recording.durable import dumps, plain_text, to_plain
 
 
 class Colour(Enum):

@@ -4,7 +4,7 @@ import subprocess
 import sys
 from dataclasses import asdict, replace
 
-from labseq.recording.process import Owner
+from labseq.recording.folders import Owner
 
 
 def test_this_process_lives_here() -> None:

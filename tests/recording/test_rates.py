@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, strategies as st
 from scipy.stats import beta, binom
 
-from labseq.recording.rates import ONE_SIGMA, Rate, jeffreys
+from labseq.analysis.statistics import ONE_SIGMA, Rate, jeffreys
 
 
 @pytest.mark.parametrize(

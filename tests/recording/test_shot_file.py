@@ -18,9 +18,9 @@ import pytest
 
 from labseq.errors import RecordingError
 from labseq.model import Frame, RunRecord, ShotRecord
-from labseq.recording.layout import FORMAT_VERSION
+from labseq.recording.schema import FORMAT_VERSION
+from labseq.recording.shot import read_content
 from labseq.recording.shot_file import ShotEncoder
-from labseq.recording.shot_reader import read_content
 
 MakeRun = Callable[..., RunRecord]
 MakeShot = Callable[..., ShotRecord]

@@ -12,11 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from labseq.analysis.statistics import Rate, statistics_of
 from labseq.model import CycleRecord, ImageRecord, Plan, PlanReport, RunRecord, ShotRecord
 from labseq.recording import Run, RunWriter, open_run
-from labseq.recording.rates import Rate
-from labseq.recording.statistics import statistics_of
-from labseq.recording.summaries import summarise, summary_in
+from labseq.recording.run_file import summarise, summary_in
 
 MakeRun = Callable[..., RunRecord]
 MakeShot = Callable[..., ShotRecord]

@@ -17,7 +17,7 @@ import pytest
 from labseq.errors import RecordingError
 from labseq.model import RunRecord, ShotRecord
 from labseq.recording import RunWriter, open_run
-from labseq.recording.summaries import summarise
+from labseq.recording.run_file import summarise
 
 MakeRun = Callable[..., RunRecord]
 MakeShot = Callable[..., ShotRecord]

@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from labseq.config import EqualiseSettings
+from labseq.builtin.equalise import READINGS, EqualiseStep, factors
+from labseq.builtin.steps import EqualiseSettings
 from labseq.errors import ConfigError, DeviceError, StopRequested
-from labseq.imaging.equalising import factors
 from labseq.model import CalibrationEntry, ShotRecord, SiteGrid
 from labseq.sequencer import Sequencer
-from labseq.sequencer.equalise import READINGS, EqualiseStep
 from labseq.testing.fakes import FakeLab, ListSink, RecordingObserver, fake_calibration, fake_lab
 
 Floats = NDArray[np.float64]

@@ -5,12 +5,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from labseq.builtin.steps import DeviceStep, RearrangeStep
 from labseq.errors import DeviceError, DeviceTimeoutError, StopRequested
 from labseq.model import CameraFacts, SiteGrid, TargetPattern
 from labseq.roles import Context
-from labseq.sequencer.interlock import Blinding
-from labseq.sequencer.rearrange import RearrangeStep
-from labseq.sequencer.steps import DeviceStep
+from labseq.sequencer.lab import Blinding
 from labseq.testing.fakes import RecordingCamera, RecordingDevice, ScriptedDetector
 from tests.sequencer.rig import IMAGE, LOAD, Rig, given
 

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from labseq.builtin.steps import WaitStep
 from labseq.errors import (
     ConfigError,
     DeviceError,
@@ -16,7 +17,6 @@ from labseq.errors import (
 from labseq.model import LineSpec, ShotRecord
 from labseq.roles import Context, LeaderLink, StepContext
 from labseq.sequencer.leading import FollowStep, find_leader, wait_step
-from labseq.sequencer.steps import WaitStep
 from labseq.testing import StepContract
 from labseq.testing.contracts.step import Factory
 from labseq.testing.fakes import FakeLab, ListSink, RecordingDevice, RecordingLeader

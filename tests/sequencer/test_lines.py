@@ -5,10 +5,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from labseq.builtin.steps import RearrangeStep, WaitStep
 from labseq.errors import DeviceError, DeviceTimeoutError
 from labseq.model import CameraFacts, LineSpec
-from labseq.sequencer.rearrange import RearrangeStep
-from labseq.sequencer.steps import WaitStep
 from labseq.testing.fakes import RecordingCamera, RecordingLines
 from tests.sequencer.rig import IMAGE, LOAD, Rig, given
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from labseq.builtin.steps import RearrangeStep
 from labseq.errors import (
     DeviceError,
     DeviceHungError,
@@ -25,7 +26,6 @@ from labseq.model import TimelineEntry
 from labseq.roles import Shot, StepContext
 from labseq.sequencer.lab import Timeouts
 from labseq.sequencer.policies import RunPolicy, StepPolicy, may_be_retried
-from labseq.sequencer.rearrange import RearrangeStep
 from labseq.testing.fakes import RecordingCamera, RecordingDevice
 from labseq.testing.fakes.devices import RecordingMobileTweezers
 

@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from labseq.config import ProbeSettings
+from labseq.builtin.probes import ProbeStep
+from labseq.builtin.steps import ImageStep, ProbeSettings
 from labseq.errors import ConfigError, DeviceError, LimitError
 from labseq.model import MotionSpec, SegmentKind, SiteGrid, ToneProgram
 from labseq.roles import StepContext
 from labseq.sequencer import Sequencer
-from labseq.sequencer.probe import ProbeStep
-from labseq.sequencer.steps import ImageStep
 from labseq.testing.fakes import FakeLab, ListSink, RecordingObserver, fake_lab
 
 GRID = SiteGrid(4, 6)
@@ -22,7 +21,7 @@ SEEN = np.array([[1, 0, 1, 1, 0, 0], [0, 0, 0, 0, 0, 0], [1, 1, 1, 1, 1, 1], [0,
 
 
 def image() -> tuple[str, Any]:
-    from labseq.config import ImageSettings
+    from labseq.builtin.steps import ImageSettings
 
     return "image", ImageStep(ImageSettings(exposure=0.045))
 

@@ -4,10 +4,10 @@ from typing import Any
 
 import pytest
 
+from labseq.builtin.steps import RampStep
 from labseq.errors import DeviceTimeoutError, TransientError
 from labseq.model import LineSpec
 from labseq.sequencer.lab import Timeouts
-from labseq.sequencer.ramp import RampStep
 from labseq.testing.fakes import RecordingLines
 from tests.sequencer.rig import IMAGE, LOAD, SAFE_ORDER, Rig, given
 

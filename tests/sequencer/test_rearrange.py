@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from labseq.builtin.steps import RearrangeStep
 from labseq.errors import DeviceError, InvalidPlanError, PlanError
 from labseq.model import Plan
 from labseq.sequencer.lab import Timeouts
-from labseq.sequencer.rearrange import RearrangeStep
 from labseq.testing.fakes import ScriptedPlanner
 
 from .rig import IMAGE, LOAD, SAFE_ORDER, Rig, given

@@ -2,10 +2,10 @@
 
 import pytest
 
+from labseq.builtin.steps import DeviceStep, WaitStep
 from labseq.errors import DeviceError, TransientError
 from labseq.model import Frame
 from labseq.sequencer import State
-from labseq.sequencer.steps import DeviceStep, WaitStep
 
 from .rig import EMPTY, FULL, IMAGE, LOAD, SAFE_ORDER, Rig, given
 

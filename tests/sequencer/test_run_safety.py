@@ -5,10 +5,10 @@ from types import SimpleNamespace
 
 import pytest
 
+from labseq.builtin.steps import WaitStep
 from labseq.errors import DeviceError, DeviceTimeoutError, RecordingError, StopRequested, TransientError
 from labseq.sequencer import State
 from labseq.sequencer.lab import Timeouts
-from labseq.sequencer.steps import WaitStep
 from labseq.testing.fakes import ListSink
 
 from .rig import IMAGE, LOAD, SAFE_ORDER, Rig, given

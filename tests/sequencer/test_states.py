@@ -1,6 +1,6 @@
 import pytest
 
-from labseq.sequencer.states import TRANSITIONS, State, StateTable
+from labseq.sequencer.run import TRANSITIONS, State, StateTable
 
 
 def test_every_state_is_declared():

@@ -8,27 +8,29 @@ import numpy as np
 import pytest
 
 from labseq import Context
-from labseq.config.detectors import ThresholdSettings
-from labseq.config.steps import (
+from labseq.builtin.detectors import ThresholdSettings
+from labseq.builtin.equalise import EqualiseStep
+from labseq.builtin.probes import CheckOverlayStep, CheckSitesStep, ProbeStep
+from labseq.builtin.steps import (
     CheckOverlaySettings,
     CheckSitesSettings,
     DeviceSettings as DeviceStepSettings,
+    DeviceStep,
     EqualiseSettings,
     ImageSettings,
+    ImageStep,
     LoadSettings,
+    LoadStep,
     ProbeSettings,
     RampSettings,
+    RampStep,
     RearrangeSettings,
+    RearrangeStep,
     WaitSettings,
+    WaitStep,
 )
-from labseq.imaging import ThresholdDetector
+from labseq.detection.threshold import ThresholdDetector
 from labseq.model import SiteGrid
-from labseq.sequencer.equalise import EqualiseStep
-from labseq.sequencer.probe import ProbeStep
-from labseq.sequencer.ramp import RampStep
-from labseq.sequencer.rearrange import RearrangeStep
-from labseq.sequencer.steps import DeviceStep, ImageStep, LoadStep, WaitStep
-from labseq.sequencer.watching import CheckOverlayStep, CheckSitesStep
 from labseq.testing import (
     StepContract,
 )

@@ -8,17 +8,16 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from labseq.config import CheckOverlaySettings, CheckSitesSettings, ImageSettings
-from labseq.config.detectors import ThresholdSettings
+from labseq.builtin.detectors import ThresholdSettings
+from labseq.builtin.probes import CheckOverlayStep, CheckSitesStep
+from labseq.builtin.steps import CheckOverlaySettings, CheckSitesSettings, ImageSettings, ImageStep
+from labseq.detection.threshold import ThresholdDetector
 from labseq.errors import ConfigError, DeviceError
-from labseq.imaging import ThresholdDetector
 from labseq.model import CalibrationEntry, Frame, SegmentKind, ShotRecord, SiteGrid
 from labseq.model.calibration import grid_facts
 from labseq.motion import SurvivalShape
 from labseq.roles import Context, Step
 from labseq.sequencer import Sequencer
-from labseq.sequencer.steps import ImageStep
-from labseq.sequencer.watching import CheckOverlayStep, CheckSitesStep
 from labseq.testing.fakes import FakeLab, ListSink, RecordingObserver, fake_lab
 
 GRID = SiteGrid(20, 20)

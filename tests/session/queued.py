@@ -8,9 +8,8 @@ from pathlib import Path
 import pytest
 
 from labseq.errors import LabseqError
+from labseq.queue.queue import Entry, Opening, Queue, QueueRun
 from labseq.session import Options
-from labseq.session.queue import Entry, Queue
-from labseq.session.queue_run import Opening, QueueRun
 
 SEQUENCE = """
 labseq: 1

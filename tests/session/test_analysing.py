@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 import labseq
+from labseq.builtin.analyses import SurvivalAnalysis
 from labseq.errors import ConfigError
-from labseq.imaging.survival import SurvivalAnalysis
-from labseq.locks import Lock
+from labseq.files import Lock
 from labseq.recording.results import results_file
 from labseq.roles import Analysis, RecordedShot
-from labseq.session import analysts
-from labseq.session.analysing import analyses_of, analyse_missing, prepare
+from labseq.session import analyses as analysts
+from labseq.session.analyses import analyse_missing, analyses_of, prepare
 
 PLUGIN = """
 import os, threading
@@ -185,7 +185,7 @@ def test_results_say_what_made_them(taken):
     assert head | {"t_utc": ""} == {
         "analysis": "survival",
         "settings": {"atoms": "held"},
-        "plugin": "labseq.builtins",
+        "plugin": "labseq.builtin",
         "version": labseq.__version__,
         "labseq": labseq.__version__,
         "t_utc": "",

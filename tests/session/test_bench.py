@@ -10,14 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from labseq.bench import planners as bench
+from labseq.bench.comparison import Comparison, Condition, PlannerEntry, draw, set_up
+from labseq.bench.planners import BenchRequest, compare, read_request
+from labseq.bench.report import Report, find_figure
 from labseq.errors import ConfigError, PlanError
-from labseq.session import bench
-from labseq.session.bench import BenchRequest, compare, read_request
-from labseq.session.bench_courses import set_up
-from labseq.session.bench_figures import find_figure
-from labseq.session.bench_report import Report
-from labseq.session.bench_spec import Comparison, Condition, PlannerEntry
-from labseq.session.bench_work import draw
 
 SMALL = Comparison((PlannerEntry("psca"),), (Condition((8, 8), "compact:5x5", 0.75, 4),), 60, 5)
 TIMES = {"planning_s", "duration_s"}
@@ -161,7 +158,11 @@ def test_a_planner_that_cannot_be_warmed_is_named() -> None:
 
 def test_csv_and_json_hold_the_same() -> None:
     report = compare(
-        replace(SMALL, planner_entries=(PlannerEntry("psca"), PlannerEntry("psca", (("degree_of_parallelism", "2"),)))), 1
+        replace(
+            SMALL,
+            planner_entries=(PlannerEntry("psca"), PlannerEntry("psca", (("degree_of_parallelism", "2"),))),
+        ),
+        1,
     )
     values = json.loads(json.dumps(report.as_dict(), allow_nan=False))
     lines = list(csv.DictReader(io.StringIO(report.as_csv())))

@@ -7,12 +7,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from labseq.session.bench import compare
-from labseq.session.bench_courses import set_up
-from labseq.session.bench_curves import figure_drawing, fits_as_dicts, histogram_drawing, points_of
-from labseq.session.bench_figures import FIGURES, Figure
-from labseq.session.bench_report import Report
-from labseq.session.bench_spec import Comparison, Condition, PlannerEntry
+from labseq.bench.comparison import Comparison, Condition, PlannerEntry, set_up
+from labseq.bench.planners import compare
+from labseq.bench.report import (
+    FIGURES,
+    Figure,
+    Report,
+    figure_drawing,
+    fits_as_dicts,
+    histogram_drawing,
+    points_of,
+)
 
 CONDITIONS = tuple(Condition((4 * n, 4 * n), f"compact:{3 * n}x{3 * n}", 0.75, 5) for n in (1, 2, 3))
 
@@ -121,7 +126,9 @@ def test_an_incomplete_figure_says_so(report: Report) -> None:
 
 
 def test_a_plain_comparison_shows_how_batches_spread() -> None:
-    drawing = histogram_drawing(compared(CONDITIONS[:1], PlannerEntry("psca", (("degree_of_parallelism", "3"),))))
+    drawing = histogram_drawing(
+        compared(CONDITIONS[:1], PlannerEntry("psca", (("degree_of_parallelism", "3"),)))
+    )
     (histogram,) = drawing.histograms
     assert histogram.counts.sum() == 10
     assert drawing.title == "compact:3x3 out of 4 x 4, 75 % loading, degree of parallelism 5"

@@ -6,9 +6,16 @@ from pathlib import Path
 
 import pytest
 
+from labseq.bench.latency import (
+    BETWEEN,
+    FALLBACK_RATE_HZ,
+    HAND_OVER,
+    HOST_STAGES,
+    LatencyReport,
+    LatencyRequest,
+    measure_latency,
+)
 from labseq.errors import ConfigError
-from labseq.session.bench_latency import FALLBACK_RATE_HZ, LatencyRequest, measure_latency
-from labseq.session.bench_latency_report import BETWEEN, HAND_OVER, HOST_STAGES, LatencyReport
 
 ROOT = Path(__file__).parents[2]
 SMALL = LatencyRequest(ROOT / "sequences" / "compact_225.yaml", n_loadings=3)

@@ -2,14 +2,8 @@ from __future__ import annotations
 
 import pytest
 
+from labseq.bench.comparison import PlannerEntry, parse_entrants, parse_grid, parse_loading, parse_overrides
 from labseq.errors import ConfigError
-from labseq.session.bench_spec import (
-    PlannerEntry,
-    parse_entrants,
-    parse_grid,
-    parse_loading,
-    parse_overrides,
-)
 
 
 @pytest.mark.parametrize(
@@ -24,7 +18,9 @@ from labseq.session.bench_spec import (
         ]),
     ],
 )  # fmt: skip
-def test_planners_and_their_settings_are_parted_by_commas(text: str, planner_entries: list[PlannerEntry]) -> None:
+def test_planners_and_their_settings_are_parted_by_commas(
+    text: str, planner_entries: list[PlannerEntry]
+) -> None:
     assert list(parse_entrants(text)) == planner_entries
 
 

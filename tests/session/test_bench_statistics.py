@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
-from labseq.session.bench_statistics import fit_power_law, ratio_of_means
+from labseq.bench.report import fit_power_law, ratio_of_means
 
 POSITIVE = st.floats(1e-3, 1e3)
 

@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 
+from labseq.bench.rendering import bench_waveform, stored_waveforms, uniform_program
 from labseq.model import SiteGrid
 from labseq.motion import Renderer, RenderPath
-from labseq.session.bench_waveform import bench_waveform, stored_waveforms, uniform_program
 
 GRID = SiteGrid()
 

@@ -11,9 +11,18 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
 from labseq import Plan
-from labseq.session.bench_courses import PreparedCondition, set_up
-from labseq.session.bench_spec import Comparison, Condition, PlannerEntry
-from labseq.session.bench_work import Job, draw, lines_to_cover, loading_seed, work
+from labseq.bench.comparison import (
+    Comparison,
+    Condition,
+    Job,
+    PlannerEntry,
+    PreparedCondition,
+    draw,
+    lines_to_cover,
+    loading_seed,
+    set_up,
+    work,
+)
 from labseq.session.occupancies import read_source
 
 

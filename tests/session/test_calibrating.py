@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 import labseq
-from labseq.calibrations import Store, read_entry
+from labseq.calibration.store import Store, read_entry
 from labseq.errors import ConfigError
 from labseq.model import CALIBRATION_KINDS, CalibrationEntry, CalibrationKind, SiteGrid
 from labseq.motion import standing_on_sites
 from labseq.session import assemble
-from labseq.session.calibrating import open_store
+from labseq.session.calibrations import open_store
 from labseq.testing.fakes import fake_calibration
 
 PROFILE = """labseq: 1
@@ -82,7 +82,9 @@ def test_every_role_is_told_and_the_simulation_keeps_the_true_grid(bench: Resolv
     assert np.array_equal(world._grid.column_frequency_hz, GRID.column_frequency_hz)
 
 
-def test_an_overlay_counts_on_top_of_the_frequencies_that_it_was_measured_with(bench: ResolvedProfile) -> None:
+def test_an_overlay_counts_on_top_of_the_frequencies_that_it_was_measured_with(
+    bench: ResolvedProfile,
+) -> None:
     frequencies = bench.use("frequencies", values={"column_hz": shifted_hz(GRID)})
     origin = {"calibrations": {"frequencies": frequencies.id}}
     bench.use("overlay", values={"offset_m": [1e-7, -2e-7]}, origin=origin)

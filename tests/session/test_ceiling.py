@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
-from labseq.session.ceiling import AtomLosses, max_defect_free
+from labseq.analysis.paper import AtomLosses, max_defect_free
 
 PAPER = AtomLosses(lifetime_s=33.0, imaging_loss=0.00314, imaging_loss_exposure_s=0.045)
 TOLD: dict[str, Any] = {"lifetime": 33.0, "imaging_loss": 0.00314, "imaging_loss_exposure": 0.045}
@@ -60,7 +60,9 @@ def test_it_falls_with_atoms_time_light_and_missed_atoms(n: int, t: float, s: fl
 
 def test_the_losses_are_those_that_the_simulation_tells() -> None:
     assert AtomLosses.of({"simulation": TOLD}) == PAPER
-    assert AtomLosses.of({"simulation": {**TOLD, "false_negative": 6e-5}}) == replace(PAPER, false_negative=6e-5)
+    assert AtomLosses.of({"simulation": {**TOLD, "false_negative": 6e-5}}) == replace(
+        PAPER, false_negative=6e-5
+    )
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import pytest
 
 import labseq
 from labseq.session import CheckReport, check
-from labseq.session.checking import N_LOADINGS
+from labseq.session.check import N_LOADINGS
 
 ROOT = Path(__file__).parents[2]
 COMPACT = ROOT / "sequences" / "compact_225.yaml"

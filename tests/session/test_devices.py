@@ -13,7 +13,7 @@ from labseq.roles import Context
 from labseq.sequencer import StopFlag
 from labseq.sequencer.lab import Timeouts
 from labseq.session import CheckedDevice, check_devices
-from labseq.session.devices import N_READINGS, check_each_device
+from labseq.session.safe import N_READINGS, check_each_device
 from labseq.testing.fakes import Calls, FakeClock, Hang, RecordingDevice, RecordingSimulation
 
 TIMEOUTS = Timeouts(call_s=10.0, safe_state_s=10.0)

@@ -13,7 +13,7 @@ import labseq
 from labseq.errors import DeviceError
 from labseq.recording import lock_files, marker_roots
 from labseq.session import check_devices, make_profile_safe, resolve_profile
-from labseq.session.holding import lock_devices
+from labseq.session.safe import lock_devices
 from labseq.testing.fakes import RecordingObserver
 
 PROFILE = """labseq: 1

@@ -9,7 +9,7 @@ from hypothesis import given, settings, strategies as st
 
 from labseq.errors import ConfigError
 from labseq.session import PlanRequest, plan_moves
-from labseq.session.plan_files import read_plan
+from labseq.session.planning import read_plan
 
 
 def planned(**options: Any) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import pytest
 import labseq
 from labseq.config import CheckSettings
 from labseq.errors import CheckFailedError, ConfigError, DeviceError
-from labseq.session.checking import check
+from labseq.session.check import check
 from labseq.session.policies import Checks
 from labseq.testing.fakes import RecordingObserver
 

@@ -11,9 +11,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings, strategies as st
 
 from labseq.errors import ConfigError, RecordingError
-from labseq.recording.process import Owner
+from labseq.queue.queue import Entry, Queue
+from labseq.recording.folders import Owner
 from labseq.session import Options
-from labseq.session.queue import Entry, Queue
 
 from .queued import SEQUENCE, add, queue
 

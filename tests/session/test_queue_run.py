@@ -11,12 +11,11 @@ from typing import Any
 import pytest
 
 from labseq.errors import ConfigError, DeviceError, RecordingError, StopRequested
+from labseq.queue.queue import Opening, Queue, QueueRun
 from labseq.recording import open_run
-from labseq.recording.process import Owner
+from labseq.recording.folders import Owner
 from labseq.session import Session
-from labseq.session.queue import Queue
-from labseq.session.queue_run import Opening, QueueRun
-from labseq.session.stopping import ask_to_stop
+from labseq.session.between_shots import ask_to_stop
 
 from .queued import PROFILE, SEQUENCE, Taking, add, queue, states
 

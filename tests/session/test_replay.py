@@ -10,14 +10,14 @@ import pytest
 from hypothesis import given, strategies as st
 
 import labseq
-from labseq.calibrations import Store
+from labseq.analysis.replay import ReplayRequest, replay, shots_of
+from labseq.calibration.store import Store
 from labseq.config import packaged_profiles_dir
 from labseq.errors import ConfigError, RecordingError
 from labseq.model import SiteGrid
 from labseq.recording import open_run
 from labseq.recording.folders import INDEX_FILE, STATE_FILE
-from labseq.session.replay import ReplayRequest, replay, shots_of
-from labseq.testing.fakes.calibrations import fake_calibration
+from labseq.testing.fakes.records import fake_calibration
 
 PLUGIN = """
 import labseq

@@ -14,7 +14,7 @@ import labseq
 from labseq.errors import RecordingError
 from labseq.model import RunRecord
 from labseq.recording import durable
-from labseq.session import run_record as recording_of
+from labseq.session import provenance as recording_of
 from labseq.testing.fakes import RecordingObserver
 
 from .small_runs import interrupted, no_git, resumed, stopped, stopped_home, table, write

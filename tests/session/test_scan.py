@@ -12,9 +12,9 @@ import pytest
 
 import labseq
 from labseq.errors import ConfigError
-from labseq.recording.points import scan_points
+from labseq.recording.reader import scan_points
 from labseq.session import check
-from labseq.session.labs import _reopened, rebuild_lab
+from labseq.session.lab import _reopened, rebuild_lab
 from labseq.testing.fakes import RecordingObserver
 
 ROOT = Path(__file__).parents[2]

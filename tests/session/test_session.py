@@ -68,7 +68,7 @@ def test_a_run_reads_back(tmp_path):
     assert (planner["use"], planner["degree_of_parallelism"], planner["variant"]) == ("psca", 7, "fewest")
     assert done.record["resolved"]["profile"]["mobile_tweezers"]["speed"] == 0.13
     assert done.record["devices"]["camera"]
-    assert {p["name"] for p in done.record["plugins"]} == {"labseq_psca", "labseq_virtual", "labseq.builtins"}
+    assert {p["name"] for p in done.record["plugins"]} == {"labseq_psca", "labseq_virtual", "labseq.builtin"}
     assert done.record["sequence_text"] == COMPACT.read_text(encoding="utf-8")
     assert "numpy" in done.record["provenance"]["packages"]
     assert not done.events[-1]["values"]["error"]

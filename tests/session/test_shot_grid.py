@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from labseq.calibrations import encode_entry
+from labseq.analysis.overview import grid_of, sites_of
+from labseq.calibration.store import encode_entry
 from labseq.model import CalibrationEntry, SiteGrid
 from labseq.model.calibration import grid_facts
 from labseq.recording import Run, open_run
-from labseq.session.shot_grid import grid_of, sites_of
 
 Floats = NDArray[np.float64]
 

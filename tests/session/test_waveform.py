@@ -10,11 +10,17 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 import labseq
+from labseq.bench.waveform import (
+    DEFAULT_RATE_HZ,
+    PlannedWaveform,
+    WaveformRequest,
+    plan_waveform,
+    read_batches,
+    read_sample_rate,
+)
 from labseq.errors import ConfigError, LimitError
 from labseq.model import Plan, SegmentKind
 from labseq.session import PlanRequest, plan_moves
-from labseq.session.waveform import PlannedWaveform, WaveformRequest, plan_waveform
-from labseq.session.waveform_inputs import DEFAULT_RATE_HZ, read_batches, read_sample_rate
 
 RATE = "250 MHz"
 ONE_ATOM = json.dumps(

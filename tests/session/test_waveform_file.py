@@ -8,10 +8,15 @@ import numpy as np
 import pytest
 
 import labseq
+from labseq.bench.waveform import (
+    PlannedWaveform,
+    WaveformRequest,
+    check_samples_file,
+    plan_waveform,
+    save_samples,
+)
 from labseq.errors import ConfigError
 from labseq.session import PlanRequest
-from labseq.session.waveform import PlannedWaveform, WaveformRequest, plan_waveform
-from labseq.session.waveform_file import check_samples_file, save_samples
 
 REQUEST = PlanRequest("random:6x6@0.7", "checkerboard:4x4", seed=3)
 
@@ -70,8 +75,8 @@ import resource, sys
 from pathlib import Path
 from labseq.errors import ConfigError
 from labseq.session import PlanRequest
-from labseq.session.waveform import WaveformRequest, plan_waveform
-from labseq.session.waveform_file import save_samples
+from labseq.bench.waveform import WaveformRequest, plan_waveform
+from labseq.bench.waveform import save_samples
 
 request = PlanRequest("random:6x6@0.7", "checkerboard:4x4", seed=3)
 made = plan_waveform(WaveformRequest(request, "2-3", "250 MHz"))

@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 from labseq import Session
-from labseq.recording.statistics import Statistics, statistics_of
-from labseq.session.ceiling import Losses, after_moves, max_defect_free
+from labseq.analysis.paper import Losses, after_moves, max_defect_free
+from labseq.analysis.statistics import Statistics, statistics_of
 
 SEQUENCES = Path(__file__).parents[2] / "sequences"
 N_SHOTS = int(os.environ.get("LABSEQ_FIGURE_SHOTS", "120"))
@@ -53,7 +53,9 @@ def test_figure_5_ends_where_light_time_detection_and_moves_leave_it(
     later = statistics.cycles[4:]
     reached = sum(cycle.defect_free.value for cycle in later) / len(later)
     expected = [
-        after_moves(max_defect_free(225, cycle.period_s.value, 0.045, losses), cycle.n_atom_moves.value, 0.0203)
+        after_moves(
+            max_defect_free(225, cycle.period_s.value, 0.045, losses), cycle.n_atom_moves.value, 0.0203
+        )
         for cycle in later
     ]
     assert reached == pytest.approx(sum(expected) / len(later), abs=allowed(2.0, 0.3, 3 * N_SHOTS))

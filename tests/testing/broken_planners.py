@@ -13,7 +13,7 @@ from hypothesis import Phase, settings
 from labseq.errors import PlanError
 from labseq.model import Batch, Occupancy, Plan, TargetPattern
 from labseq.testing import PlannerContract
-from labseq.testing.contracts.planner_cases import Case, loaded
+from labseq.testing.contracts.planner import Case, loaded
 from labseq.testing.fakes import OneByOnePlanner
 
 from .planted import Planted

@@ -10,7 +10,7 @@ import pytest
 from labseq.errors import PlanError
 from labseq.model import Occupancy, Plan, TargetPattern
 from labseq.testing import ContractViolation, PlannerContract
-from labseq.testing.contracts.plans import RETURNS_A_PLAN
+from labseq.testing.contracts.planner import RETURNS_A_PLAN
 from labseq.testing.fakes import OneByOnePlanner, ScriptedPlanner
 
 from .broken_planners import CreatesAnAtom, DoesNothing, Suite

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from labseq.roles import Context
-from labseq.testing import ContractViolation, CameraContract
+from labseq.testing import CameraContract, ContractViolation
 from labseq.testing.fakes import RecordingCamera
 
 

@@ -10,9 +10,9 @@ from typing import Final
 
 from pydantic import BaseModel
 
-from labseq import builtins
+from labseq import builtin as builtins
 from labseq.config import ProfileSpec, SequenceSpec, StepPolicySettings
-from labseq.config.schema import keys_of, models_at
+from labseq.config.validation import keys_of, models_at
 from labseq.errors import UnknownPluginError
 from labseq.plugins import ENTRY_POINT_GROUP, PluginHost
 from labseq.registry import KINDS, Entry

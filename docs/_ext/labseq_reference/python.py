@@ -8,7 +8,7 @@ from signal import SIGINT, SIGTERM
 from typing import Any
 
 from labseq import errors, hookspecs, roles
-from labseq.cli.failures import exit_code_of
+from labseq.console.errors import exit_code_of
 from labseq.errors import LabseqError, StopRequested
 from labseq.motion import RULES
 from labseq_reference import prose

@@ -7,8 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from labseq.recording.described import ATTRIBUTES, COLUMNS, DATASETS, EVERYWHERE, TABLES
-from labseq.recording.layout import units_of
+from labseq.recording.schema import ATTRIBUTES, COLUMNS, DATASETS, EVERYWHERE, TABLES, units_of
 from labseq_reference.known import UnknownNameError
 from labseq_reference.tables import table
 
@@ -19,7 +18,9 @@ def datasets() -> list[str]:
         (f"`/entry/{path}`", what.dtype, what.shape, what.units, what.meaning, what.since_version)
         for path, what in DATASETS.items()
     ]
-    return table(("path", "type", "axes", "unit", "meaning", "since_version"), rows, ("shot-file", "datasets"))
+    return table(
+        ("path", "type", "axes", "unit", "meaning", "since_version"), rows, ("shot-file", "datasets")
+    )
 
 
 def columns() -> list[str]:

@@ -8,7 +8,7 @@ from typing import Final, get_args, get_origin
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from labseq import builtins
+from labseq import builtin as builtins
 from labseq.config import Choice, SequenceSpec
 from labseq.config.sequence import DEFAULT_PLANNER
 from labseq.registry import Entry

@@ -16,7 +16,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
 from labseq.config import Choice, settings
-from labseq.config.composer import compose
+from labseq.config.yaml_nodes import compose
 from labseq.errors import ConfigError
 from labseq.units import EXAMPLES, format_quantity, parse_quantity
 

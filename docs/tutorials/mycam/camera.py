@@ -13,9 +13,9 @@ from labseq import (
     Context,
     DeviceError,
     Duration,
+    ExposureResult,
     Series,
     Settings,
-    ExposureResult,
     wait_for,
 )
 

@@ -11,11 +11,18 @@ import pytest
 
 from labseq.errors import LabseqError
 from labseq.model import SiteGrid
-from labseq.recording.plain import dumps
+from labseq.recording.durable import dumps
 from labseq.recording.results import ResultsLog
 from labseq.roles import Analysis, Context, RecordedShot
 from labseq.testing.contracts.process import quietly
-from labseq.testing.contracts.promises import ContractViolation, doing, no_factory, promise, promised, format_error
+from labseq.testing.contracts.promises import (
+    ContractViolation,
+    doing,
+    format_error,
+    no_factory,
+    promise,
+    promised,
+)
 from labseq.testing.fakes import FakeShot, fake_shot
 
 Factory: TypeAlias = Callable[[Context], Analysis]

@@ -9,9 +9,9 @@ from typing import ClassVar, Final
 import numpy as np
 
 from labseq.errors import DeviceError
-from labseq.lines import line_program
 from labseq.model import LineProgram, LineSpec
 from labseq.roles import Context, Lines
+from labseq.sequencer.lines import line_program
 from labseq.testing.contracts.hardware import Action, Factory, HardwareContract, Wait
 from labseq.testing.contracts.promises import doing, promise, refusal
 from labseq.testing.fakes import RecordingSimulation

@@ -11,7 +11,14 @@ import pytest
 from labseq.errors import LabseqError
 from labseq.model import SiteGrid, TargetPattern
 from labseq.testing.contracts.process import quietly
-from labseq.testing.contracts.promises import ContractViolation, doing, no_factory, promise, refusal, format_error
+from labseq.testing.contracts.promises import (
+    ContractViolation,
+    doing,
+    format_error,
+    no_factory,
+    promise,
+    refusal,
+)
 
 Factory: TypeAlias = Callable[[SiteGrid], TargetPattern]
 

@@ -3,47 +3,146 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, TypeAlias
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, ClassVar, Final, TypeAlias
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given, settings, strategies as st
+from hypothesis.strategies import SearchStrategy
 from numpy.typing import NDArray
 
 from labseq.errors import LabseqError
 from labseq.model import Occupancy, Plan, PlanReport, SiteGrid, TargetPattern
 from labseq.motion import check_plan
-from labseq.roles import Context, Planner, NeedsWarmUp
-from labseq.testing.contracts.planner_cases import (
-    Case,
-    cases_of,
-    extreme_cases,
-    loaded,
-    paper_cases,
-    small_targets,
-)
-from labseq.testing.contracts.plans import (
-    NO_ATOM_CREATED,
-    RETURNS_A_PLAN,
-    equal,
-    plan_of,
-    replay,
-    same,
-)
+from labseq.roles import Context, NeedsWarmUp, Planner
 from labseq.testing.contracts.process import quietly
 from labseq.testing.contracts.promises import (
     ContractViolation,
+    as_this_promise,
     doing,
+    format_error,
     in_time,
     no_factory,
     promise,
     promised,
     refusal,
-    as_this_promise,
-    format_error,
 )
-from labseq.testing.strategies import cases, drawn
+from labseq.testing.strategies import cases, drawn, occupancies
+
+Case: TypeAlias = tuple[TargetPattern, Occupancy]
+
+
+def cases_of(targets: Sequence[TargetPattern]) -> SearchStrategy[Case]:
+    """One of the targets, with any occupancy."""
+    return st.sampled_from(targets).flatmap(lambda t: st.tuples(st.just(t), occupancies(t.shape)))
+
+
+def paper_cases() -> list[Case]:
+    """The paper's 15 x 15 out of 20 x 20, and a checkerboard whose other sites must be empty."""
+    compact = np.zeros((20, 20), np.bool_)
+    compact[2:17, 2:17] = True
+    inside = compact.copy()
+    board = inside & (np.indices(inside.shape).sum(axis=0) % 2 == 0)
+    return [
+        loaded(TargetPattern(compact, np.zeros_like(compact), "compact")),
+        loaded(TargetPattern(board, inside & ~board, "checkerboard")),
+    ]
+
+
+def loaded(target: TargetPattern, filling: float = 0.75) -> Case:
+    """The target with a random loading, always the same, that has enough atoms for it."""
+    order = np.random.default_rng(225).permutation(target.fill.size)
+    n_atoms = max(target.n_atoms, round(filling * target.fill.size))
+    atoms = np.zeros(target.fill.size, np.bool_)
+    atoms[order[:n_atoms]] = True
+    return target, atoms.reshape(target.shape)
+
+
+def small_targets() -> list[TargetPattern]:
+    """On the smallest grids: all sites, none, every other one, and none with all to be empty."""
+    made: list[TargetPattern] = []
+    for shape in ((1, 1), (1, 2), (1, 9), (9, 1), (2, 2), (3, 3)):
+        none, every = np.zeros(shape, np.bool_), np.ones(shape, np.bool_)
+        other = _every_other(shape)
+        made += [TargetPattern(every, none), TargetPattern(none, none), TargetPattern(none, every)]
+        made += [TargetPattern(other, ~other), TargetPattern(other, none)]
+    return made
+
+
+def extreme_cases(targets: Iterable[TargetPattern]) -> list[Case]:
+    """Each target with no atom, with all, and with one on every other site."""
+    return [
+        (target, atoms)
+        for target in targets
+        for atoms in (
+            np.zeros(target.shape, np.bool_),
+            np.ones(target.shape, np.bool_),
+            ~_every_other(target.shape),
+        )
+    ]
+
+
+def _every_other(shape: tuple[int, int]) -> NDArray[np.bool_]:
+    return np.indices(shape).sum(axis=0) % 2 == 0
+
+
+RETURNS_A_PLAN: Final = "plan() returns a Plan, whatever the grid, the loading and the target"
+NO_ATOM_CREATED: Final = "no atom is created: every move starts with an atom of its own"
+
+
+def plan_of(planner: Planner, target: TargetPattern, atoms: Occupancy) -> Plan:
+    """What a planner plans.
+
+    Raises:
+        ContractViolation: It is no Plan, or the planner raises what is no LabseqError.
+    """
+    try:
+        plan: Any = planner.plan(atoms, target)
+    except LabseqError:
+        raise
+    except Exception as error:
+        detail = f"it {format_error(error)} for\n{drawn(target, atoms)}"
+        raise ContractViolation(RETURNS_A_PLAN, detail) from error
+    if not isinstance(plan, Plan):
+        raise ContractViolation(RETURNS_A_PLAN, f"it returned a {type(plan).__name__}")
+    return plan
+
+
+def replay(plan: Plan, atoms: Occupancy) -> Occupancy:
+    """Follow every atom, however illegal its way may be.
+
+    Returns:
+        Where the atoms end, bool (n_rows, n_cols).
+
+    Raises:
+        ContractViolation: A move starts where no atom is.
+    """
+    held = {(int(row), int(col)) for row, col in np.argwhere(atoms)}
+    for index, batch in enumerate(plan.batches):
+        for row, col in batch.from_sites.tolist():
+            if (row, col) not in held:
+                detail = f"batch {index} takes an atom from ({row}, {col}); there is none"
+                raise ContractViolation(NO_ATOM_CREATED, detail)
+            held.remove((row, col))
+        held.update((row, col) for row, col in batch.to_sites.tolist())
+    end = np.zeros_like(atoms, order="C")
+    for row, col in held:
+        if 0 <= row < end.shape[0] and 0 <= col < end.shape[1]:
+            end[row, col] = True
+    return end
+
+
+def equal(plan: Plan, other: Plan) -> bool:
+    """Whether two plans are the same, batch for batch."""
+    fields = ("moves", "batch_offsets", "linked")
+    return all(np.array_equal(getattr(plan, name), getattr(other, name)) for name in fields)
+
+
+def same(target: TargetPattern) -> TargetPattern:
+    """A copy, for a planner that may write into what it is given."""
+    return TargetPattern(target.fill.copy(), target.clear.copy(), target.name)
+
 
 Factory: TypeAlias = Callable[[Context], Planner]
 Check: TypeAlias = Callable[[TargetPattern, Occupancy], None]

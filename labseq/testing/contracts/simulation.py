@@ -12,7 +12,7 @@ import pytest
 
 from labseq.errors import LabseqError, LimitError
 from labseq.model import DepthRamp, Frame, RandomStream, SiteGrid
-from labseq.roles import Context, Simulation, ReportsTruth
+from labseq.roles import Context, ReportsTruth, Simulation
 from labseq.testing.contracts.process import quietly
 from labseq.testing.contracts.promises import doing, no_factory, promise, promised, refusal
 from labseq.testing.fakes import FakeClock

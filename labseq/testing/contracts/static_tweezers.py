@@ -12,7 +12,7 @@ from labseq.model import SiteGrid
 from labseq.roles import Context, StaticTweezers
 from labseq.testing.contracts.hardware import Action, Factory, HardwareContract, n_calls
 from labseq.testing.contracts.promises import doing, promise
-from labseq.testing.fakes.deciders import RecordingSimulation
+from labseq.testing.fakes.lab import RecordingSimulation
 
 
 class StaticTweezersContract(HardwareContract[StaticTweezers]):

@@ -1,25 +1,30 @@
 """Stand-ins for tests: a clock, devices that note every call, deciders that follow a script."""
 
-from labseq.testing.fakes.calibrations import fake_calibration
-from labseq.testing.fakes.calls import Call, Calls, Failure, Hang
-from labseq.testing.fakes.clock import FakeClock
-from labseq.testing.fakes.deciders import (
-    FixedDetector,
-    RecordingSimulation,
-    ScriptedDetector,
-    ScriptedPlanner,
-    ScriptedScanner,
-)
 from labseq.testing.fakes.devices import (
+    Call,
+    Calls,
+    Failure,
+    FakeClock,
+    Hang,
     RecordingCamera,
     RecordingDevice,
+    RecordingLeader,
     RecordingLines,
     RecordingMobileTweezers,
     RecordingStaticTweezers,
 )
-from labseq.testing.fakes.lab import FakeLab, ListSink, RecordingObserver, fake_lab
-from labseq.testing.fakes.leader import RecordingLeader
-from labseq.testing.fakes.shots import FakeShot, fake_shot
+from labseq.testing.fakes.lab import (
+    FakeLab,
+    FixedDetector,
+    ListSink,
+    RecordingObserver,
+    RecordingSimulation,
+    ScriptedDetector,
+    ScriptedPlanner,
+    ScriptedScanner,
+    fake_lab,
+)
+from labseq.testing.fakes.records import FakeShot, fake_calibration, fake_shot
 from labseq.testing.planner import OneByOnePlanner
 
 __all__ = [

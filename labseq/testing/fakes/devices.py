@@ -1,20 +1,237 @@
-"""In-memory devices of every hardware role; they note what they are asked to do."""
+"""In-memory devices of every role; they record every call."""
 
 from __future__ import annotations
 
+import math
+import threading
 from collections import deque
-from collections.abc import Mapping
-from typing import Any, ClassVar, Final
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, ClassVar, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.errors import DeviceError, DeviceTimeoutError, one_of
-from labseq.lines import idle_program, off_program
+from labseq.errors import DeviceError, DeviceTimeoutError, LimitError, one_of
 from labseq.model import DepthRamp, Frame, LineProgram, ToneProgram
-from labseq.roles import Context, Trigger
-from labseq.testing.fakes.base import RecordingHardware, require_within
-from labseq.testing.fakes.calls import Calls, Failure, Hang
+from labseq.roles import Clock, Context, Trigger
+from labseq.sequencer.clock import StopFlag, VirtualClock
+from labseq.sequencer.lines import idle_program, off_program
+
+Failure: TypeAlias = BaseException | Sequence[BaseException | None]
+"""Raised at every call; or one after the other, where None lets the call pass, and then no more."""
+
+TEST_IS_OVER_S: Final = 30.0
+"""A call that hangs goes on after this time, so that a test that forgot it still ends."""
+
+
+class Call(NamedTuple):
+    """One call.
+
+    Attributes:
+        device: Whose method it was.
+        method: Its name.
+        args: Its positional arguments.
+        kwargs: Its keyword arguments.
+        t_s: When, on the clock that the calls are noted with.
+    """
+
+    device: str
+    method: str
+    args: tuple[Any, ...] = ()
+    kwargs: Mapping[str, Any] = {}
+    t_s: float = 0.0
+
+    @property
+    def name(self) -> str:
+        """For example "camera.arm"."""
+        return f"{self.device}.{self.method}"
+
+    def __str__(self) -> str:
+        given = [repr(value) for value in self.args]
+        given += [f"{key}={value!r}" for key, value in self.kwargs.items()]
+        return f"{self.name}({', '.join(given)})"
+
+
+class Calls(list[Call]):
+    """The list that all fakes of a test share.
+
+    Args:
+        clock: Gives each call its time; without one all times are 0.
+
+    Example:
+        >>> calls = Calls()
+        >>> calls.note("camera", "arm", 1, exposure_s=0.045)
+        >>> calls.note("shutter", "open")
+        >>> calls.names(), str(calls[0])
+        (['camera.arm', 'shutter.open'], 'camera.arm(1, exposure_s=0.045)')
+        >>> calls.names("shutter")
+        ['shutter.open']
+    """
+
+    def __init__(self, clock: Clock | None = None) -> None:
+        super().__init__()
+        self._clock = clock
+
+    def note(self, device: str, method: str, *args: Any, **kwargs: Any) -> None:
+        """Add a call."""
+        t_s = self._clock.now() if self._clock is not None else 0.0
+        self.append(Call(device, method, args, kwargs, t_s))
+
+    def names(self, *devices: str) -> list[str]:
+        """The calls in short, "camera.arm"; of some devices, or of all."""
+        return [call.name for call in self if not devices or call.device in devices]
+
+    def of(self, name: str) -> list[Call]:
+        """The calls of one method, for example "camera.arm"."""
+        return [call for call in self if call.name == name]
+
+
+class Hang:
+    """A call that does not come back until the test lets it.
+
+    Attributes:
+        reached: Set when the call has begun to hang; wait for it in the test.
+        release: Set it to let the call go on.
+    """
+
+    def __init__(self) -> None:
+        self.reached = threading.Event()
+        self.release = threading.Event()
+
+    def wait(self) -> None:
+        """Hang."""
+        self.reached.set()
+        self.release.wait(TEST_IS_OVER_S)
+
+
+class Faults:
+    """The failures and hangs that a test has planned for one device, by method."""
+
+    def __init__(self, fail_on: Mapping[str, Failure], hang_on: Mapping[str, Hang]) -> None:
+        self._failures = {method: _in_turn(failure) for method, failure in fail_on.items()}
+        self._hangs = hang_on
+
+    def inject_fault(self, method: str) -> None:
+        """Hang or raise if this is planned for the method."""
+        if method in self._hangs:
+            self._hangs[method].wait()
+        failure = next(self._failures.get(method, iter(())), None)
+        if failure is not None:
+            raise failure
+
+
+def _in_turn(failure: Failure) -> Iterator[BaseException | None]:
+    if not isinstance(failure, BaseException):
+        yield from failure
+        return
+    while True:
+        yield failure
+
+
+class FakeClock(VirtualClock):
+    """Virtual time that notes every wait.
+
+    Attributes:
+        stop: The request to stop that its waits look for.
+        sleeps: Every wait in seconds, in order.
+
+    Example:
+        >>> clock = FakeClock()
+        >>> clock.sleep(0.5)
+        >>> clock.now(), clock.sleeps
+        (0.5, [0.5])
+    """
+
+    def __init__(self, stop: StopFlag | None = None) -> None:
+        self.stop = stop or StopFlag()
+        self.sleeps: list[float] = []
+        super().__init__(self.stop)
+
+    def sleep(self, duration_s: float) -> None:
+        """Let time pass and note it."""
+        super().sleep(duration_s)
+        self.sleeps.append(duration_s)
+
+
+class RecordingHardware:
+    """Notes every call in a list and keeps the promises of its role, in memory only.
+
+    Args:
+        context: As a plugin's factory is given it; by default the role's name and
+            a :class:`FakeClock`.
+        calls: Where calls are noted; share one list between the devices of a test.
+        fail_on: Method -> what it raises, for example ``{"play": DeviceError(...)}``.
+        hang_on: Method -> the :class:`Hang` that it waits for.
+
+    Attributes:
+        calls: Every call so far.
+        is_open: Whether it was opened and not closed since.
+    """
+
+    role: ClassVar[str] = "device"
+
+    def __init__(
+        self,
+        context: Context | None = None,
+        calls: Calls | None = None,
+        *,
+        fail_on: Mapping[str, Failure] | None = None,
+        hang_on: Mapping[str, Hang] | None = None,
+    ) -> None:
+        context = context or Context(self.role, clock=FakeClock())
+        self.name = context.name or self.role
+        self.grid = context.grid
+        self.clock = context.clock
+        self.simulation = context.simulation
+        self.calls = Calls(context.clock) if calls is None else calls
+        self.is_open = False
+        self._faults = Faults(fail_on or {}, hang_on or {})
+
+    def open(self) -> None:
+        """Note it."""
+        self.note("open")
+        self.is_open = True
+
+    def close(self) -> None:
+        """Note it and forget the state."""
+        self.note("close")
+        self.is_open = False
+        self.reset()
+
+    def safe_state(self) -> None:
+        """Note it and forget the state."""
+        self.note("safe_state")
+        self.reset()
+
+    def describe(self) -> Mapping[str, Any]:
+        """Say that it is a fake."""
+        self.note("describe")
+        return {"model": type(self).__name__, "serial_number": "fake"}
+
+    def reset(self) -> None:
+        """Forget what the role's methods have left; roles with a state do more."""
+
+    def note(self, method: str, *args: Any, **kwargs: Any) -> None:
+        """Note a call, then hang or fail if the test has planned it."""
+        self.calls.note(self.name, method, *args, **kwargs)
+        self._faults.inject_fault(method)
+
+    def use(self, method: str, *args: Any, **kwargs: Any) -> None:
+        """Note a call that needs the device to be open."""
+        self.note(method, *args, **kwargs)
+        if not self.is_open:
+            raise DeviceError(self.name, f"{method}() was called while it is not open")
+
+
+def require_within(what: str, value: float, lowest: float, highest: float) -> None:
+    """Refuse a number outside of its limits, nan included.
+
+    Raises:
+        LimitError: It is outside.
+    """
+    if not (math.isfinite(value) and lowest <= value <= highest):
+        raise LimitError(what, value, f"{lowest:g} to {highest:g}")
+
 
 MAX_EXPOSURE_S: Final = 10.0
 BAND_HZ: Final = (50e6, 150e6)
@@ -274,3 +491,48 @@ class RecordingDevice(RecordingHardware):
             known = one_of(tuple(self.values))
             raise DeviceError(self.name, f"unknown value '{name}'; expected {known}")
         return self.values[name]
+
+
+class RecordingLeader(RecordingDevice):
+    """Says `go` by itself, some time after it is waited for, and notes the answers.
+
+    Attributes:
+        goes_after_s: That time, in seconds.
+        answers: State and what was told with it, for each `go`.
+        noted: What it tells as news, once.
+    """
+
+    role: ClassVar[str] = "leader"
+    deadline_s = 10.0
+
+    def __init__(self, context: Context | None = None, calls: Calls | None = None, **faults: Any) -> None:
+        super().__init__(context, calls, **faults)
+        self.goes_after_s = 0.5
+        self.answers: list[tuple[str, dict[str, Any]]] = []
+        self.noted: list[str] = []
+        self._n_gos = 0
+        self._is_owed = False
+
+    def wait_for(self, signal: str, timeout_s: float) -> str:
+        """Wait, then count the signals: "1", "2", ..."""
+        self.use("wait_for", signal, timeout_s)
+        self.clock.sleep(min(self.goes_after_s, timeout_s))
+        if self.goes_after_s > timeout_s:
+            raise DeviceTimeoutError(self.name, f"no '{signal}' within {timeout_s} s", timeout_s)
+        self._is_owed = True
+        self._n_gos += 1
+        return str(self._n_gos)
+
+    def report(self, state: Literal["ready", "failed"], about: Mapping[str, bool | int | float | str]) -> str:
+        """Note the answer, if one is owed."""
+        self.use("report", state)
+        if not self._is_owed:
+            return ""
+        self._is_owed = False
+        self.answers.append((state, dict(about)))
+        return state
+
+    def new_events(self) -> Sequence[str]:
+        """What was noted."""
+        noted, self.noted = self.noted, []
+        return noted

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Final
 
 from labseq import DeviceError
-from labseq.kernels.compile import cache_root
+from labseq.kernel import cache_root
 
 SOURCE: Final = Path(__file__).with_name("runner.c")
 FIRMWARE: Final = Path(__file__).parents[1] / "firmware" / "labseq_ttl.hex"

@@ -12,10 +12,10 @@ from labseq_virtual.image_settings import ImageSettings
 from labseq_virtual.optics import site_spots
 
 import labseq
-from labseq.calibrations import Store
+from labseq.calibration.measure import METHODS, CalibrationRequest, Outcome, calibrate
+from labseq.calibration.store import Store
 from labseq.errors import ConfigError, DeviceError, LimitError
 from labseq.model import CalibrationKind, SiteGrid
-from labseq.session.calibrate import METHODS, CalibrationRequest, Outcome, calibrate
 from labseq.testing.fakes import RecordingObserver, fake_calibration
 
 PROFILE = """labseq: 1

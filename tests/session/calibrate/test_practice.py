@@ -14,16 +14,14 @@ from numpy.typing import NDArray
 
 import labseq
 from labseq import Context, DepthRamp, RandomStream, Run, TweezerAmplitudes
+from labseq.builtin.detectors import ThresholdSettings
+from labseq.builtin.equalise import factors
+from labseq.calibration.measure import METHODS, CalibrationRequest, calibrate
 from labseq.config import load_profile
-from labseq.config.detectors import ThresholdSettings
-from labseq.imaging import ThresholdDetector
-from labseq.imaging.equalising import factors
-from labseq.imaging.known_sites import known_sites
-from labseq.imaging.regions import region_corners
-from labseq.imaging.spots import spot_light
+from labseq.detection.sites import known_sites, region_corners, spot_light
+from labseq.detection.threshold import ThresholdDetector
 from labseq.model import CalibrationEntry
 from labseq.motion import standing_on_sites
-from labseq.session.calibrate import METHODS, CalibrationRequest, calibrate
 
 Floats = NDArray[np.float64]
 

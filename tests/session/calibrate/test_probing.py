@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import labseq
-from labseq.calibrations import Store
+from labseq.calibration.measure import METHODS, CalibrationRequest, Outcome, calibrate
+from labseq.calibration.store import Store
 from labseq.errors import ConfigError, DeviceError
 from labseq.session import assemble
-from labseq.session.calibrate import METHODS, CalibrationRequest, Outcome, calibrate
 
 PROFILE = """labseq: 1
 name: beside

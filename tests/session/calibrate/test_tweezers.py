@@ -12,10 +12,10 @@ from labseq_virtual.world import World
 from PIL import Image
 
 from labseq import Context, DepthRamp, RandomStream, SiteGrid, TweezerAmplitudes
-from labseq.calibrations import Store
+from labseq.builtin.equalise import factors
+from labseq.calibration.measure import METHODS, CalibrationRequest, Outcome, calibrate
+from labseq.calibration.store import Store
 from labseq.errors import ConfigError, DeviceError
-from labseq.imaging.equalising import factors
-from labseq.session.calibrate import METHODS, CalibrationRequest, Outcome, calibrate
 
 PROFILE = """labseq: 1
 name: uneven

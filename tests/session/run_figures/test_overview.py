@@ -9,20 +9,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from labseq.drawing.charts import (
-    LossCausesChart,
-    TrendChart,
+from labseq.analysis import overview
+from labseq.analysis.charts import (
     CurvesChart,
     DefectsChart,
+    LossCausesChart,
     RunDrawing,
     SitesChart,
     StagesChart,
+    TrendChart,
 )
+from labseq.analysis.overview import CHOICES, picture_of
+from labseq.analysis.statistics import jeffreys
 from labseq.errors import ConfigError
 from labseq.model import ShotRecord
 from labseq.recording import Run, open_run
-from labseq.recording.rates import jeffreys
-from labseq.session.run_figures import CHOICES, overview, picture_of
 
 Shot = Callable[..., ShotRecord]
 Write = Callable[..., Run]

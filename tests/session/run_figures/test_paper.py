@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 import labseq
+from labseq.analysis.paper import figure_4, figure_5
+from labseq.analysis.statistics import statistics_of
 from labseq.errors import ConfigError, RecordingError
 from labseq.recording import Run, open_run
-from labseq.recording.statistics import statistics_of
-from labseq.session.run_figures import figure_4, figure_5
 
 ROOT = Path(__file__).parents[3]
 PROFILE = str(ROOT / "hardware_profiles" / "virtual.yaml")

@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from labseq.drawing.charts import CurvesChart, MapChart
+from labseq.analysis import overview
+from labseq.analysis.charts import CurvesChart, MapChart
+from labseq.analysis.overview import picture_of
 from labseq.errors import ConfigError
 from labseq.model import ShotRecord
 from labseq.recording import Run
-from labseq.session.run_figures import overview, picture_of
 
 Shot = Callable[..., ShotRecord]
 Write = Callable[..., Run]

@@ -8,11 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from labseq.drawing.shot import save_shot
+from labseq.analysis.shot import save_shot, shot_picture
 from labseq.errors import ConfigError
 from labseq.model import ShotRecord
 from labseq.recording import Run
-from labseq.session.run_figures import shot_picture
 
 Shot = Callable[..., ShotRecord]
 Write = Callable[..., Run]
@@ -94,7 +93,7 @@ def test_a_shot_without_images_has_no_picture(write: Write, shot: Shot) -> None:
 def test_an_array_that_cannot_be_made_out_is_told(
     write: Write, shot: Shot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("labseq.session.run_figures.shot.MAX_SITES", 4)
+    monkeypatch.setattr("labseq.analysis.shot.MAX_SITES", 4)
     with pytest.raises(ConfigError, match="4 x 5 sites are too many"):
         shot_picture(write([shot(0)]), 1)
 

@@ -7,11 +7,11 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from labseq.analysis.overview import Survival, expected, steps_that_load
+from labseq.analysis.statistics import Rate
 from labseq.errors import RecordingError
 from labseq.model import CycleRecord, Plan, PlanReport, ShotRecord
 from labseq.recording import Run
-from labseq.recording.rates import Rate
-from labseq.session.run_figures.survival import Survival, expected, steps_that_load
 
 Shot = Callable[..., ShotRecord]
 Write = Callable[..., Run]

@@ -10,10 +10,10 @@ from itertools import pairwise
 import pytest
 from hypothesis import given, strategies as st
 
+from labseq.analysis.overview import spread
+from labseq.analysis.timing import quantiles, timing_of, writing_s
 from labseq.model import ShotRecord
 from labseq.recording import Run, open_run
-from labseq.session.run_figures import spread, timing_of
-from labseq.session.run_figures.timing import quantiles, writing_s
 
 Shot = Callable[..., ShotRecord]
 Write = Callable[..., Run]

@@ -1,0 +1,1 @@
+"""What runs have recorded, worked out and drawn: statistics, plots, replay."""

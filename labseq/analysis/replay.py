@@ -1,0 +1,540 @@
+"""A run's images again: through another planner or detector, or the same ones."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from time import perf_counter
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq.config import Choice, Override, split_overrides
+from labseq.config.messages import clean
+from labseq.errors import ConfigError, LabseqError, Problem, RecordingError
+from labseq.model import (
+    CalibrationEntry,
+    CycleRecord,
+    ImageRecord,
+    MotionSpec,
+    Plan,
+    PlanReport,
+    RandomStream,
+    SiteGrid,
+    StageTiming,
+    TargetPattern,
+)
+from labseq.model.estimate import Estimate, mean
+from labseq.motion import check_plan
+from labseq.recording import Run, Shot
+from labseq.recording.folders import PROFILE_FILE, SEQUENCE_FILE
+from labseq.roles import Detector, NeedsWarmUp, NeverStopped, Planner
+from labseq.sequencer import StopFlag
+from labseq.session.assembly import Assembly, assemble
+from labseq.session.construct import construct
+from labseq.session.course import course_of, point_of
+from labseq.session.lab import parallelism_of
+from labseq.session.occupancies import image_before
+from labseq.session.options import Options
+from labseq.session.planning import call_planner, changed_settings
+from labseq.session.profile import ChosenPlugin, RecordedSetup, resolve
+from labseq.session.recorded import calibrations_of, machine_of, stored_text
+from labseq.session.scan import Point
+
+N_ATOMS_TRUE = "simulation.n_atoms_true"
+"""Reading of a simulated shot: how many atoms there really are at its end."""
+
+
+@dataclass(frozen=True, slots=True)
+class ReplayedImage:
+    """An image whose frame was kept, and what a detector makes of it.
+
+    Attributes:
+        shot: Index of the shot, from 0.
+        image: Index of the image in the shot, from 0.
+        n_atoms: Atoms that were seen in the run.
+        n_atoms_replayed: Atoms that the detector sees.
+        n_appeared: Sites where the detector alone sees an atom.
+        n_vanished: Sites where the run alone saw one.
+        confidence: Mean confidence in the run.
+        confidence_replayed: That of the detector.
+        n_atoms_true: How many there really are after the shot's last image; None if nobody knows.
+    """
+
+    shot: int
+    image: int
+    n_atoms: int
+    n_atoms_replayed: int
+    n_appeared: int
+    n_vanished: int
+    confidence: float
+    confidence_replayed: float
+    n_atoms_true: int | None
+
+
+@dataclass(slots=True, eq=False)
+class ReplayedImages:
+    """What a detector sees on the frames of a run.
+
+    Attributes:
+        images: Each image whose frame was kept.
+        appeared: On how many of them the detector alone sees an atom, int64 (n_rows, n_cols).
+        vanished: On how many of them the run alone saw one, int64 (n_rows, n_cols).
+        n_without_frame: Images whose frame was not kept.
+        failures: Index of a shot, of an image -> what the detector raised.
+    """
+
+    images: list[ReplayedImage]
+    appeared: NDArray[np.int64]
+    vanished: NDArray[np.int64]
+    n_without_frame: int = 0
+    failures: dict[tuple[int, int], str] = field(default_factory=dict[tuple[int, int], str])
+
+    @classmethod
+    def none(cls, shape: tuple[int, int]) -> ReplayedImages:
+        """To begin with.
+
+        Args:
+            shape: n_rows and n_cols of the grid.
+        """
+        return cls([], np.zeros(shape, np.int64), np.zeros(shape, np.int64))
+
+    @property
+    def n_differing(self) -> int:
+        """Sites that differ, over all images."""
+        return int(self.appeared.sum() + self.vanished.sum())
+
+    def add(self, shot: Shot, detector: Detector) -> None:
+        """Let the frames of a shot go through a detector.
+
+        Raises:
+            RecordingError: The shot cannot be read.
+        """
+        images, truth = shot.record().images, shot.readings.get(N_ATOMS_TRUE)
+        for i, image in enumerate(images):
+            if image.frame is None:
+                self.n_without_frame += 1
+                continue
+            try:
+                occupancy, confidence = detector.detect(image.frame)
+                seen = np.asarray(occupancy, np.bool_).reshape(image.occupancy.shape)
+                told = float(np.mean(confidence))
+            except (Exception, SystemExit) as error:  # noqa: BLE001 - a plugin may raise anything
+                self.failures[shot.index, i] = f"{type(error).__name__}: {error}"
+                continue
+            is_last = i == len(images) - 1
+            self._note(
+                shot.index, i, image, seen, told, int(truth) if is_last and truth is not None else None
+            )
+
+    def _note(
+        self,
+        shot: int,
+        number: int,
+        image: ImageRecord,
+        seen: NDArray[np.bool_],
+        confidence: float,
+        n_atoms_true: int | None,
+    ) -> None:
+        appeared, vanished = seen & ~image.occupancy, image.occupancy & ~seen
+        self.appeared += appeared
+        self.vanished += vanished
+        self.images.append(
+            ReplayedImage(
+                shot=shot,
+                image=number,
+                n_atoms=int(np.count_nonzero(image.occupancy)),
+                n_atoms_replayed=int(np.count_nonzero(seen)),
+                n_appeared=int(np.count_nonzero(appeared)),
+                n_vanished=int(np.count_nonzero(vanished)),
+                confidence=float(np.mean(image.confidence)),
+                confidence_replayed=confidence,
+                n_atoms_true=n_atoms_true,
+            )
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class PlanCounts:
+    """A plan in numbers.
+
+    Attributes:
+        n_batches: Its batches.
+        n_atom_moves: Its atom moves.
+        duration_s: From the start of the cycle to the end of its last batch.
+        planning_s: Time that it took to plan on this computer, or then on that of the run; nan if unknown.
+        filling: Filling of the target after it, if no atom is lost.
+        meets_target: Whether the target is then met.
+    """
+
+    n_batches: int
+    n_atom_moves: int
+    duration_s: float
+    planning_s: float
+    filling: float
+    meets_target: bool
+
+    @classmethod
+    def of(cls, plan: Plan, report: PlanReport, target: TargetPattern, planning_s: float) -> PlanCounts:
+        """Count a plan that was checked."""
+        filling = 1.0 - report.n_defects / target.n_atoms if target.n_atoms else 1.0
+        return cls(
+            plan.n_batches, plan.n_atom_moves, report.duration_s, planning_s, filling, report.meets_target
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class ReplayedPlan:
+    """A plan that was recorded, and what a planner plans on the same image.
+
+    Attributes:
+        shot: Index of the shot, from 0.
+        step: Index of the step in the shot.
+        cycle: Counted from 1.
+        recorded: The plan of the run.
+        replayed: The planner's; None if it failed, or its plan breaks a rule.
+        same: Whether both are the same, move by move.
+        failure: Why there is none, or "".
+    """
+
+    shot: int
+    step: int
+    cycle: int
+    recorded: PlanCounts
+    replayed: PlanCounts | None
+    same: bool
+    failure: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class MeanCounts:
+    """Plans, summed up.
+
+    Attributes:
+        n_plans: How many.
+        n_met: How many of them meet the target, if no atom is lost.
+        n_batches: Batches.
+        n_atom_moves: Atom moves.
+        duration_s: From the start of the cycle to the end of the last batch.
+        planning_s: Time that planning took.
+        filling: Filling of the target afterwards, if no atom is lost.
+    """
+
+    n_plans: int
+    n_met: int
+    n_batches: Estimate
+    n_atom_moves: Estimate
+    duration_s: Estimate
+    planning_s: Estimate
+    filling: Estimate
+
+    @classmethod
+    def over(cls, plans: Sequence[PlanCounts]) -> MeanCounts:
+        """Sum up plans; times that are not known are left out."""
+        return cls(
+            n_plans=len(plans),
+            n_met=sum(plan.meets_target for plan in plans),
+            n_batches=mean([plan.n_batches for plan in plans]),
+            n_atom_moves=mean([plan.n_atom_moves for plan in plans]),
+            duration_s=mean([plan.duration_s for plan in plans]),
+            planning_s=mean([s for plan in plans if not math.isnan(s := plan.planning_s)]),
+            filling=mean([plan.filling for plan in plans]),
+        )
+
+
+def replay_plans(
+    shot: Shot, planner: Planner, name: str, degree_of_parallelism: int, grid: SiteGrid, motion: MotionSpec
+) -> list[ReplayedPlan]:
+    """Plan again on every image of a shot that was planned on.
+
+    Args:
+        shot: The shot.
+        planner: What plans.
+        name: Its name, for messages.
+        degree_of_parallelism: Most tweezers on at once that its plans are checked for.
+        grid: The grid of sites.
+        motion: How the mobile tweezers move.
+
+    Raises:
+        RecordingError: The shot cannot be read.
+    """
+    found: list[ReplayedPlan] = []
+    for cycle in shot.cycles:
+        seen = image_before(cycle, shot.images)
+        if seen is None:
+            continue
+        recorded = PlanCounts.of(cycle.plan, cycle.report, shot.target, _planning_s(shot.timing, cycle))
+        replayed, same, failure = None, False, ""
+        try:
+            start_s = perf_counter()
+            plan = call_planner(planner, name, seen.occupancy, shot.target)
+            planning_s = perf_counter() - start_s
+            report = check_plan(plan, seen.occupancy, shot.target, degree_of_parallelism, grid, motion, name)
+            replayed, same = PlanCounts.of(plan, report, shot.target, planning_s), is_same(plan, cycle.plan)
+        except LabseqError as error:
+            failure = str(error)
+        found.append(ReplayedPlan(shot.index, cycle.step, cycle.cycle, recorded, replayed, same, failure))
+    return found
+
+
+def is_same(one: Plan, other: Plan) -> bool:
+    """Whether two plans are the same, move by move."""
+    return all(
+        np.array_equal(getattr(one, name), getattr(other, name))
+        for name in ("moves", "batch_offsets", "linked")
+    )
+
+
+def _planning_s(timing: Sequence[StageTiming], cycle: CycleRecord) -> float:
+    """How long it took to plan, on the run's computer; nan if nobody wrote that down."""
+    place = ("plan", cycle.step, cycle.cycle)
+    return next((one.host_s for one in timing if (one.stage, one.step, one.cycle) == place), math.nan)
+
+
+_RANGE: Final = re.compile(r"\s*(\d{1,9})\s*(?:-\s*(\d{1,9})\s*)?")
+
+
+@dataclass(frozen=True, slots=True)
+class ReplayRequest:
+    """What is to be tried, in the words of the command line.
+
+    If that is nothing, the run's own planner and detector are.
+
+    Attributes:
+        planner: Another planner, with its default settings; None for the run's own.
+        degree_of_parallelism: The planner's setting of that name.
+        detector: Another detector, with its default settings; None for the run's own.
+        overrides: ``"planner.key=value"`` and ``"profile.detector.key=value"`` strings.
+        shots: Which shots, counted from 1: "3,5-9"; None for all.
+    """
+
+    planner: str | None = None
+    degree_of_parallelism: int | None = None
+    detector: str | None = None
+    overrides: Sequence[str] = ()
+    shots: str | None = None
+
+    def changes(self) -> dict[str, list[Override]]:
+        """What differs from the run: "planner" and "detector" -> overrides; neither where it is the same.
+
+        Raises:
+            ConfigError: An override is of something else.
+        """
+        found: dict[str, list[Override]] = {"planner": [], "detector": []}
+        for kind, name in (("planner", self.planner), ("detector", self.detector)):
+            if name is not None:
+                found[kind] += [Override(kind, "{}", f"--{kind} {name}")]
+                found[kind] += [Override(f"{kind}.use", name, f"--{kind} {name}")]
+        if (dop := self.degree_of_parallelism) is not None:
+            found["planner"].append(Override("planner.degree_of_parallelism", str(dop), f"--dop {dop}"))
+        for_sequence, for_profile = split_overrides(self.overrides)
+        for kind, options in (("planner", for_sequence), ("detector", for_profile)):
+            for one in options:
+                if not one.address.startswith(f"{kind}."):
+                    what = "a replay changes nothing but the planner and the detector"
+                    expected = "an address that begins with 'planner.' or 'profile.detector.'"
+                    raise ConfigError(Problem(what, one.source, expected=expected))
+                found[kind].append(one._replace(origin=one.source))
+        return {kind: options for kind, options in found.items() if options}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Replay:
+    """What came of a run's images.
+
+    Attributes:
+        run: The run.
+        is_own: Whether its own planner and detector were tried: all must come out the same.
+        used: "planner" or "detector" -> what was tried; of a scan, at its first point.
+        changed: Those of its settings that are not the defaults.
+        n_shots: Shots that were read.
+        plans: Each recorded plan, and what the planner plans on the same image.
+        images: What the detector sees on the frames that were kept.
+        unreadable: Index of a shot -> why it was left out.
+    """
+
+    run: Run
+    is_own: bool
+    used: dict[str, dict[str, Any]]
+    changed: dict[str, dict[str, Any]]
+    n_shots: int
+    plans: tuple[ReplayedPlan, ...]
+    images: ReplayedImages
+    unreadable: dict[int, str]
+
+    @property
+    def is_reproduced(self) -> bool:
+        """Whether everything came out as it was recorded."""
+        plans_same = all(plan.same for plan in self.plans)
+        return plans_same and not self.images.n_differing and not self.images.failures and not self.unreadable
+
+
+@dataclass(slots=True)
+class _Pipeline:
+    """What images go through at a point of the scan."""
+
+    planner: Planner | None
+    planner_name: str
+    degree_of_parallelism: int
+    detector: Detector | None
+    motion: MotionSpec
+    chosen: dict[str, ChosenPlugin]
+    streams: tuple[RandomStream, ...]
+
+
+@dataclass(slots=True)
+class _Replayer:
+    """Makes what images go through, once for each kind of point."""
+
+    run: Run
+    assembly: Assembly
+    grid: SiteGrid
+    calibrations: dict[str, CalibrationEntry]
+    changes: dict[str, list[Override]]
+    _crews: dict[tuple[int, int], _Pipeline] = field(default_factory=dict[tuple[int, int], _Pipeline])
+    _points: list[Point] = field(default_factory=list[Point])  # alive, so that no id is given twice
+
+    def at(self, point: Point) -> _Pipeline:
+        key = id(point.planner), id(point.bench)
+        if key not in self._crews:
+            self._points.append(point)
+            self._crews[key] = self._make(point)
+        return self._crews[key]
+
+    def _make(self, point: Point) -> _Pipeline:
+        own = {"planner": point.planner, "detector": point.bench.chosen["detector"]}
+        names = self.changes or own
+        chosen = {kind: self._changed(kind, one) for kind, one in own.items() if kind in names}
+        motion = point.bench.profile.motion
+        made, streams = construct(
+            chosen, self.grid, motion, NeverStopped(), self.run.seed, calibrations=self.calibrations
+        )
+        for one in made.values():
+            if isinstance(one, NeedsWarmUp):
+                one.warm()
+        planner = made.get("planner")
+        return _Pipeline(
+            planner=planner,
+            planner_name=chosen["planner"].entry.name if planner is not None else "",
+            degree_of_parallelism=parallelism_of(chosen["planner"], planner, motion)
+            if planner is not None
+            else 0,
+            detector=made.get("detector"),
+            motion=motion,
+            chosen=chosen,
+            streams=streams,
+        )
+
+    def _changed(self, kind: str, own: ChosenPlugin) -> ChosenPlugin:
+        """The run's own planner or detector, or what is tried in place of it."""
+        options = self.changes.get(kind)
+        if not options:
+            return own
+        assert own.document is not None
+        document = own.document.override_all(options, may_add=(kind,))
+        choice = document.validate(Choice, (kind,)).placed(kind)
+        return resolve(self.assembly.bench.host, document, kind, choice)
+
+
+def replay(run: Run, request: ReplayRequest, *, announce: Callable[[str], None] = lambda _: None) -> Replay:
+    """Let a run's images go through a planner or detector, and compare with what was done.
+
+    Settings, calibrations and motion are the run's own, from its folder.
+
+    Args:
+        run: The run, finished or not.
+        request: What is to be tried.
+        announce: Called with the name of a module before its kernels are compiled.
+
+    Raises:
+        ConfigError: Something in the request is wrong, or the run cannot be put together today.
+        PluginLoadError: A plugin that is named failed to load.
+        RecordingError: The run does not say what it was taken with.
+    """
+    from labseq.kernel import announcing
+
+    changes, wanted = request.changes(), shots_of(run, request.shots)
+    assembly = assembly_of(run)
+    course = course_of(assembly, run.seed, StopFlag())
+    replayer = _Replayer(run, assembly, machine_of(run).grid, calibrations_of(run), changes)
+    plans: list[ReplayedPlan] = []
+    images = ReplayedImages.none(replayer.grid.shape)
+    unreadable: dict[int, str] = {}
+    with announcing(announce):
+        chosen = replayer.at(assembly.begun).chosen
+        for shot in wanted:
+            crew = replayer.at(point_of(assembly, shot, course))
+            for stream in crew.streams:
+                stream.begin_shot(shot.index, shot.attempt)
+            try:
+                if crew.detector is not None:
+                    images.add(shot, crew.detector)
+                if crew.planner is not None:
+                    name, dop = crew.planner_name, crew.degree_of_parallelism
+                    plans += replay_plans(shot, crew.planner, name, dop, replayer.grid, crew.motion)
+            except RecordingError as error:
+                unreadable[shot.index] = str(error)
+    return Replay(
+        run=run,
+        is_own=not changes,
+        used={kind: one.dump() for kind, one in chosen.items()},
+        changed={kind: changed_settings(one.settings) for kind, one in chosen.items()},
+        n_shots=len(wanted) - len(unreadable),
+        plans=tuple(plans),
+        images=images,
+        unreadable=unreadable,
+    )
+
+
+def assembly_of(run: Run) -> Assembly:
+    """A run put together of its own texts and options, without its hardware and its calibrations.
+
+    Raises:
+        ConfigError: That cannot be done today.
+        RecordingError: Its texts are gone.
+    """
+    record = run.record
+    options = Options.of(record["overrides"])
+    return assemble(
+        Path(record["sequence_path"]),
+        profile=Path(record["profile_path"]),
+        overrides=options.overrides,
+        given=options.own(),
+        dry_run="fast",
+        kept=stored_text(run.path / SEQUENCE_FILE, record["sequence_sha256"]),
+        again=RecordedSetup(stored_text(run.path / PROFILE_FILE, record["profile_sha256"]), {}),
+    )
+
+
+def shots_of(run: Run, text: str | None) -> list[Shot]:
+    """The shots that are meant by "3,5-9", counted from 1.
+
+    Raises:
+        ConfigError: It is no such text, or one of them is not there.
+    """
+    if text is None:
+        return list(run.shots)
+    by_number = {shot.index + 1: shot for shot in run.shots}
+    return [by_number[number] for number in sorted({*_numbers(text, by_number)})]
+
+
+def _numbers(text: str, known: Collection[int]) -> Iterator[int]:
+    source = clean(f"--shots {text}")
+    for part in text.split(","):
+        match = _RANGE.fullmatch(part)
+        if match is None:
+            raise ConfigError(
+                Problem(f"'{clean(part)}' is no shot", source, expected="numbers such as 3,5-9")
+            )
+        first, last = int(match[1]), int(match[2] or match[1])
+        if last < first:
+            raise ConfigError(Problem(f"{first}-{last} goes backwards", source, expected=f"{last}-{first}"))
+        for number in range(first, last + 1):
+            if number not in known:
+                there_are = f"1 to {max(known)}" if known else "none: the run has no shots"
+                raise ConfigError(Problem(f"there is no shot {number}", source, expected=there_are))
+            yield number

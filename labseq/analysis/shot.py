@@ -1,0 +1,342 @@
+"""Pictures of one shot: frames, occupancies and moves."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq.analysis.overview import grid_of, note_of, sites_of, unfit
+from labseq.config.messages import clean
+from labseq.errors import ConfigError, Problem
+from labseq.model import CycleRecord, ImageRecord, Occupancy, ShotRecord, SiteGrid, TargetPattern
+from labseq.pictures.figures import (
+    PANEL_IN,
+    Sheet,
+    extent_of_sites,
+    lay_out,
+    make_figure,
+    outline,
+    place_sites,
+    save_figure,
+)
+from labseq.pictures.plans import (
+    ATOM_LOOK,
+    DEFECT_LOOK,
+    EJECTED_LOOK,
+    EMPTY_LOOK,
+    RESERVOIR_LOOK,
+    SURPLUS_LOOK,
+    MarkerStyle,
+    frame,
+    on_grid,
+    paint_moves,
+    paint_numbers,
+    paint_sites,
+)
+from labseq.recording import Run, Shot
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Floats = NDArray[np.float64]
+Moves = NDArray[np.int16]
+
+DPI: Final = 150
+LARGE_IN: Final = 6.5
+"""Width of a panel where there are two at most, in inches."""
+ON_FRAME: Final = (
+    MarkerStyle("atom on a target site", "o", 0.86, "none", "#56b4e9"),
+    MarkerStyle("empty target site", "o", 0.86, "none", "#ff7f0e"),
+    MarkerStyle("surplus atom", "s", 0.8, "none", "#f0e442"),
+    MarkerStyle("atom in the reservoir", "o", 0.86, "none", "0.62"),
+)
+"""Rings around sites, in the colours of Okabe and Ito, that stand out from grey for all eyes."""
+OUTLINE: Final = "#c8102e"
+OUTLINE_LABEL: Final = "border of the target"
+COLOURS: Final = ("plasma", 0.25, 0.95)
+"""Colour map of the order of batches, and the part of it that can be seen on black and on white."""
+RIM_PT: Final = 6
+"""White rim of a frame, which keeps it apart from others; half of it is seen."""
+RANGE: Final = (0.01, 0.998)
+"""Quantiles of the pixels that are shown black and white."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ShotPanel:
+    """An image, and what was moved next.
+
+    Attributes:
+        title: Stands above it.
+        occupancy: bool (n_rows, n_cols), as detected.
+        image: uint16 (height, width); None if the frame was not kept.
+        moves: int16 (n, 4), the atom moves that followed: from row, from column, to row, to column.
+        batch: int64 (n,), the batch of each, from 0.
+    """
+
+    title: str
+    occupancy: Occupancy
+    image: NDArray[np.uint16] | None
+    moves: Moves
+    batch: NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ShotDrawing:
+    """What is drawn.
+
+    Attributes:
+        title: Stands at the top.
+        note: Stands below it.
+        grid: The grid of sites.
+        target: What the array shall look like.
+        sites_px: float64 (n_rows, n_cols, 2), (y, x) of each site on the frames; None if that is not known:
+            then no frames are shown.
+        panels: The images, in order; at least one.
+    """
+
+    title: str
+    note: str
+    grid: SiteGrid
+    target: TargetPattern
+    sites_px: Floats | None
+    panels: tuple[ShotPanel, ...]
+
+
+def save_shot(path: Path, drawing: ShotDrawing) -> None:
+    """Draw the images of a shot, each laid under the lattice.
+
+    Args:
+        path: The PNG, SVG or PDF file.
+        drawing: What is drawn.
+
+    Raises:
+        ConfigError: The file cannot be written.
+    """
+    save_figure(path, lambda: _draw(drawing), dpi=DPI)
+
+
+def _draw(drawing: ShotDrawing) -> Figure:
+    grid, panels = drawing.grid, drawing.panels
+    moved = np.concatenate([panel.moves for panel in panels])
+    panel_in = PANEL_IN if len(panels) > 2 else LARGE_IN
+    sheet = lay_out(extent_of_sites(moved[:, 2:], grid), len(panels), panel_in)
+    figure = make_figure(sheet.width_in, sheet.height_in)
+    n_rows, n_cols = grid.shape
+    edge = place_sites(np.array([[0, 0], [0, n_cols], [n_rows, n_cols], [n_rows, 0]]) - 0.5, grid)
+    limits = _limits(drawing)
+    looks: dict[MarkerStyle, None] = {}
+    for i, panel in enumerate(panels):
+        axes = figure.add_axes(sheet.place(i))
+        looks |= dict.fromkeys(_paint(axes, sheet, drawing, panel, limits))
+        frame(axes, sheet, panel.title, edge)
+        if i == 0:
+            paint_numbers(axes, grid, "0.4" if panel.image is None or drawing.sites_px is None else "0.8")
+    if not on_grid(moved[:, 2:], grid.shape).all():
+        looks[EJECTED_LOOK] = None
+    _write_head(figure, sheet, drawing, list(looks))
+    return figure
+
+
+def _paint(
+    axes: Axes, sheet: Sheet, drawing: ShotDrawing, panel: ShotPanel, limits: tuple[float, float]
+) -> list[MarkerStyle]:
+    """Paint the frame if there is one, the sites, the target's border and the moves."""
+    from matplotlib.collections import LineCollection
+
+    grid, target = drawing.grid, drawing.target
+    if panel.image is None or drawing.sites_px is None:
+        looks = paint_sites(axes, sheet, grid, panel.occupancy, target, final=False)
+    else:
+        _lay_under(axes, panel.image, drawing.sites_px, grid, limits)
+        looks = _mark(axes, sheet, grid, panel.occupancy, target)
+    border: dict[str, Any] = {"colors": OUTLINE, "linewidths": 0.8, "capstyle": "round", "zorder": 1.5}
+    axes.add_collection(LineCollection(list(outline(target.fill, grid)), **border))
+    if len(panel.moves):
+        of_batch = [_colour(i, int(panel.batch[-1]) + 1) for i in range(int(panel.batch[-1]) + 1)]
+        paint_moves(axes, sheet, grid, panel.moves, np.array(of_batch)[panel.batch])
+    return looks
+
+
+def _lay_under(
+    axes: Axes, image: NDArray[np.uint16], sites_px: Floats, grid: SiteGrid, limits: tuple[float, float]
+) -> None:
+    """Show a frame turned and scaled so that its sites lie on the lattice, with a white rim."""
+    from matplotlib.patches import Rectangle
+    from matplotlib.transforms import Affine2D
+
+    rows, cols = np.indices(grid.shape)
+    places = place_sites(np.stack([rows.ravel(), cols.ravel()], axis=1), grid)
+    y, x = sites_px.reshape(-1, 2).T
+    onto, *_ = np.linalg.lstsq(np.stack([x, y, np.ones_like(x)], axis=1), places, rcond=None)
+    matrix = np.eye(3)
+    matrix[:2] = onto.T
+    low, high = limits
+    shown = axes.imshow(image, cmap="gray", vmin=low, vmax=high, interpolation="nearest", zorder=0)
+    shown.set_transform(Affine2D(matrix) + axes.transData)
+    rim: dict[str, Any] = {"fill": False, "edgecolor": "white", "linewidth": RIM_PT, "zorder": 5}
+    axes.add_patch(Rectangle((0.0, 0.0), 1.0, 1.0, transform=axes.transAxes, **rim))
+
+
+def _mark(
+    axes: Axes, sheet: Sheet, grid: SiteGrid, occupancy: Occupancy, target: TargetPattern
+) -> list[MarkerStyle]:
+    here = (
+        occupancy & target.fill,
+        ~occupancy & target.fill,
+        occupancy & target.clear,
+        occupancy & ~target.fill & ~target.clear,
+    )
+    marked: list[MarkerStyle] = []
+    for look, sites in zip(ON_FRAME, here, strict=True):
+        if sites.any():
+            x, y = place_sites(np.argwhere(sites), grid).T
+            axes.plot(x, y, **look.keywords(sheet.site_in), zorder=1)
+            marked.append(look)
+    return marked
+
+
+def _limits(drawing: ShotDrawing) -> tuple[float, float]:
+    """Counts that are black and white, the same in all panels."""
+    images = [panel.image for panel in drawing.panels if panel.image is not None]
+    if not images:
+        return 0.0, 1.0
+    low, high = np.quantile(np.concatenate([image.ravel() for image in images]), RANGE)
+    return float(low), float(max(high, low + 1))
+
+
+def _colour(index: int, n_batches: int) -> Any:
+    from matplotlib import colormaps
+
+    name, first, last = COLOURS
+    return colormaps[name](first + (last - first) * index / max(1, n_batches - 1))
+
+
+def _write_head(figure: Figure, sheet: Sheet, drawing: ShotDrawing, looks: list[MarkerStyle]) -> None:
+    """The title, and what the marks stand for."""
+    from matplotlib.lines import Line2D
+
+    across, down = sheet.width_in, sheet.height_in
+    text: dict[str, Any] = {"va": "top", "parse_math": False}
+    figure.text(0.2 / across, 1 - 0.12 / down, drawing.title, fontsize=11, **text)
+    figure.text(0.2 / across, 1 - 0.36 / down, drawing.note, fontsize=8, color="0.4", **text)
+    order = (*ON_FRAME, ATOM_LOOK, DEFECT_LOOK, SURPLUS_LOOK, RESERVOIR_LOOK, EMPTY_LOOK, EJECTED_LOOK)
+    handles = [Line2D([], [], label=look.label, **look.keywords(0.16)) for look in order if look in looks]
+    handles.append(Line2D([], [], color=OUTLINE, linewidth=1, label=OUTLINE_LABEL))
+    if any(len(panel.moves) for panel in drawing.panels):
+        for index, name in ((0, "first batch"), (1, "last batch")):
+            handles.append(Line2D([], [], color=_colour(index, 2), linewidth=2, label=name))
+    figure.legend(
+        handles=handles,
+        loc="center left",
+        bbox_to_anchor=(0.1 / across, 1 - 0.66 / down),
+        ncols=len(handles),
+        frameon=False,
+        fontsize=8,
+        handletextpad=0.4,
+        columnspacing=1.2,
+    )
+
+
+MAX_SITES = 128
+"""Most rows, and most columns, of an array that can be made out in a picture."""
+
+
+def shot_picture(run: Run, number: int, cycle: int | None = None) -> ShotDrawing:
+    """The images of a shot with what was seen on them and the moves that followed.
+
+    Args:
+        run: The run.
+        number: The shot, counted from 1 as ``labseq show`` does. Of one that did not complete, the last
+            attempt.
+        cycle: Only this cycle, counted from 1 over all rearrangements of the shot: the image that it was
+            planned on, and the one that ended it.
+
+    Raises:
+        ConfigError: There is no such shot or cycle, it has no images, or the array is too large.
+        RecordingError: The shot's file is damaged.
+    """
+    shot = _shot(run, number)
+    record, target = shot.record(), run.target
+    if max(target.shape) > MAX_SITES:
+        what = f"{target.shape[0]} x {target.shape[1]} sites are too many to be made out"
+        raise unfit(run, what, f"at most {MAX_SITES} rows and columns", "picture")
+    if not record.images:
+        raise unfit(run, f"shot {number} has no images", "a shot with an 'image' step", "picture")
+    panels = _panels(record, target)
+    if cycle is not None:
+        panels = _of_cycle(run, number, record, panels, cycle)
+    sites = sites_of(run)
+    frames = [panel.image for panel in panels if panel.image is not None]
+    fits = sites is not None and all(image.shape == sites.frame for image in frames)
+    kept = (
+        "" if frames and fits else "; no frames: " + ("not kept" if not frames else "not of the sites' size")
+    )
+    ended = "" if shot.status == "complete" else f", {shot.status}: {clean(record.error)}"
+    return ShotDrawing(
+        title=f"shot {number}{ended}",
+        note=note_of(run) + kept,
+        grid=grid_of(run),
+        target=target,
+        sites_px=sites.positions_px if sites is not None and fits else None,
+        panels=tuple(panels),
+    )
+
+
+def _shot(run: Run, number: int) -> Shot:
+    of_number = [shot for shot in (*run.attempts, *run.shots) if shot.index == number - 1]
+    if not of_number:
+        known = sorted({shot.index + 1 for shot in (*run.shots, *run.attempts)})
+        expected = f"one from {known[0]} to {known[-1]}" if known else "a run that has shots"
+        raise ConfigError(Problem(f"the run has no shot {number}", "--shot", expected=expected))
+    return of_number[-1]
+
+
+def _panels(record: ShotRecord, target: TargetPattern) -> list[ShotPanel]:
+    """A panel for each image, with the moves of the cycle that was planned on it."""
+    made = iter(record.cycles)
+    ended_by = [next(made, None) if image.cycle else None for image in record.images]
+    after = [*ended_by[1:], next(made, None)]  # a shot that was interrupted may lack the last image
+    numbers = iter(range(1, len(record.cycles) + 1))
+    titles = [f"after cycle {next(numbers, 0)}" if cycle else "image" for cycle in ended_by]
+    return [
+        _panel(image, f"{title}: {_seen(image, target)}", cycle)
+        for image, title, cycle in zip(record.images, titles, after, strict=True)
+    ]
+
+
+def _seen(image: ImageRecord, target: TargetPattern) -> str:
+    n_defects, n_surplus = target.n_defects(image.occupancy), target.n_surplus(image.occupancy)
+    seen = f"{int(image.occupancy.sum())} atoms, {n_defects or 'no'} defect{'s' * (n_defects != 1)}"
+    return seen + (f", {n_surplus} surplus" if n_surplus else "")
+
+
+def _panel(image: ImageRecord, title: str, cycle: CycleRecord | None) -> ShotPanel:
+    pixels = None if image.frame is None else image.frame.image
+    if cycle is None:
+        return ShotPanel(title, image.occupancy, pixels, np.empty((0, 4), np.int16), np.empty(0, np.int64))
+    offsets = cycle.plan.batch_offsets[: cycle.n_batches_played + 1]
+    batch = np.repeat(np.arange(cycle.n_batches_played), np.diff(offsets))
+    played, planned = cycle.n_batches_played, cycle.plan.n_batches
+    moves = cycle.plan.moves[: int(offsets[-1])]
+    batches = (
+        f"{played} of {planned} batches" if played < planned else f"{played} batch{'es' * (played != 1)}"
+    )
+    told = f"{title}; then {len(moves)} move{'s' * (len(moves) != 1)} in {batches}"
+    return ShotPanel(told, image.occupancy, pixels, moves, batch)
+
+
+def _of_cycle(
+    run: Run, number: int, record: ShotRecord, panels: list[ShotPanel], cycle: int
+) -> list[ShotPanel]:
+    ends = [i for i, image in enumerate(record.images) if image.cycle]
+    if not 1 <= cycle <= len(ends):
+        made = f"one from 1 to {len(ends)}" if ends else "a shot that rearranges"
+        text = f"shot {number} of {clean(run.path.name)} has no cycle {cycle}"
+        raise ConfigError(Problem(text, "--cycle", expected=made))
+    after = ends[cycle - 1]
+    return panels[max(0, after - 1) : after + 1]

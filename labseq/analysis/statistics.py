@@ -1,0 +1,283 @@
+"""Statistics of a run's shots: filling, defect-free fraction and losses, with their errors."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import accumulate
+from typing import Any, Final
+
+import numpy as np
+
+from labseq.errors import RecordingError
+from labseq.model import TargetPattern
+from labseq.model.estimate import Estimate, mean
+from labseq.recording.durable import to_plain
+from labseq.recording.run_file import ShotSummary
+from labseq.recording.shot import Shot
+
+ONE_SIGMA: Final = math.erf(math.sqrt(0.5))
+"""Probability within one standard deviation of a normal distribution, 68.3 %."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rate:
+    """How many of how many."""
+
+    n: int
+    n_trials: int
+
+    @property
+    def value(self) -> float:
+        """The fraction; nan of nothing."""
+        return self.n / self.n_trials if self.n_trials else math.nan
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Its 1 sigma interval, see :func:`jeffreys`."""
+        return jeffreys(self.n, self.n_trials)
+
+
+def jeffreys(n: int, n_trials: int, level: float = ONE_SIGMA) -> tuple[float, float]:
+    """The equal-tailed interval of a probability, after Jeffreys' prior.
+
+    Between the quantiles of the beta distribution with ``n + 1/2`` and ``n_trials - n + 1/2``. The
+    lower end is 0 if it never happened, and the upper end 1 if it always did (Brown, Cai, DasGupta,
+    Statist. Sci. 16, 101, 2001).
+
+    Args:
+        n: How often it happened.
+        n_trials: Of how many times.
+        level: Probability of the interval, between 0 and 1.
+
+    Returns:
+        Its lower and upper end; 0 and 1 without trials.
+
+    Raises:
+        ValueError: ``n`` is negative, or more than ``n_trials``.
+
+    Example:
+        >>> [round(end, 4) for end in jeffreys(33, 100)]
+        [0.2849, 0.3785]
+        >>> [round(end, 4) for end in jeffreys(0, 10)]
+        [0.0, 0.0923]
+    """
+    if not 0 <= n <= n_trials:
+        raise ValueError(f"{n} of {n_trials}; expected at least 0, and at most all")
+    if not n_trials:
+        return 0.0, 1.0
+    from scipy.special import betaincinv  # takes 0.3 s to import
+
+    a, b, tail = n + 0.5, n_trials - n + 0.5, (1.0 - level) / 2
+    low = float(betaincinv(a, b, tail)) if n else 0.0
+    high = float(betaincinv(a, b, 1.0 - tail)) if n < n_trials else 1.0
+    return low, high
+
+
+LOST: Final = "lost."
+"""What the names of a simulation's losses begin with."""
+
+
+@dataclass(frozen=True, slots=True)
+class CycleStatistics:
+    """What came of one cycle, in the shots that made it.
+
+    Standard errors are over shots, not sites: the losses within a shot are correlated.
+
+    Attributes:
+        cycle: Which one, counted from 1 over all rearrangements of the shot.
+        n_shots: How many shots made it.
+        defect_free: In how many of them the image that ended it shows the target met.
+        seen: In how many of all shots that image or one that ended an earlier cycle does.
+        filling: Filling of the target on that image.
+        n_atom_moves: Atom moves that were played.
+        n_batches: Batches that were played.
+        n_left_out: Batches that did not fit into the window.
+        period_s: From the start of the exposure before it to the start of its own.
+        defects: How many shots have 0, 1, 2, ... empty target sites on its image.
+    """
+
+    cycle: int
+    n_shots: int
+    defect_free: Rate
+    seen: Rate
+    filling: Estimate
+    n_atom_moves: Estimate
+    n_batches: Estimate
+    n_left_out: Estimate
+    period_s: Estimate
+    defects: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Statistics:
+    """What came of some shots.
+
+    Attributes:
+        n_shots: How many shots.
+        unreadable: Indices of shots whose index line tells nothing of their cycles and whose file
+            cannot be read: they are left out of all but ``defect_free``, ``seen`` and ``filling``.
+        defect_free: How many of the shots that were judged met the target. A shot is judged on
+            its last ``image`` step, if it does not rearrange after that.
+        seen: In how many shots some image after a rearrangement shows the target met.
+        filling: Filling of the target in those that were judged.
+        cycles: What came of each cycle.
+        defects: How many shots that were judged have 0, 1, 2, ... empty target sites on that image.
+        too_short: In how many shots the plan of some cycle did not fit into its window.
+        losses: Cause -> atoms lost in a shot, the truth of a simulation; empty on real hardware.
+        defects_true: Empty target sites at the end of a shot, the truth of a simulation.
+        defects_seen: Those on the last image of the same shots.
+    """
+
+    n_shots: int
+    unreadable: tuple[int, ...]
+    defect_free: Rate
+    seen: Rate
+    filling: Estimate
+    cycles: tuple[CycleStatistics, ...]
+    defects: tuple[int, ...]
+    too_short: Rate
+    losses: Mapping[str, Estimate]
+    defects_true: Estimate
+    defects_seen: Estimate
+
+    def as_dict(self) -> dict[str, Any]:
+        """Everything, JSON-ready: rates and means with their errors; None for what is not known."""
+        return to_plain(_named(self))
+
+
+def statistics_of(shots: Iterable[Shot], target: TargetPattern) -> Statistics:
+    """Sum up shots; no frames are read, and of runs since format 1.1 the index alone.
+
+    Args:
+        shots: The shots that count.
+        target: The target of their run.
+    """
+    all_shots = list(shots)
+    read: list[tuple[Shot, ShotSummary]] = []
+    unreadable: list[Shot] = []
+    for shot in all_shots:
+        try:
+            read.append((shot, shot.summary))
+        except RecordingError:
+            unreadable.append(shot)
+    judged = [(shot, of) for shot, of in read if _has_filling(shot) and of.is_judged]
+    rated = [shot for shot, _ in judged] + [shot for shot in unreadable if _has_filling(shot)]
+    summaries = [summary for _, summary in read]
+    told = [of for of in summaries if "n_defects_true" in of.simulation and len(of.images)]
+    return Statistics(
+        n_shots=len(all_shots),
+        unreadable=tuple(shot.index for shot in unreadable),
+        defect_free=Rate(sum(shot.success for shot in rated), len(rated)),
+        seen=Rate(sum(map(_is_seen, all_shots)), len(all_shots)),
+        filling=mean([shot.filling_fraction for shot in rated]),
+        cycles=_cycles(summaries, target),
+        defects=_histogram([of.images.n_defects[-1] for _, of in judged if len(of.images)]),
+        too_short=Rate(sum(of.cycles.n_batches_played != of.cycles.n_batches for of in summaries), len(read)),
+        losses=_losses(summaries),
+        defects_true=mean([of.simulation["n_defects_true"] for of in told]),
+        defects_seen=mean([of.images.n_defects[-1] for of in told]),
+    )
+
+
+def _has_filling(shot: Shot) -> bool:
+    return not math.isnan(shot.filling_fraction)
+
+
+def _is_seen(shot: Shot) -> bool:
+    return shot.success or shot.seen_defect_free_cycle > 0
+
+
+@dataclass(frozen=True, slots=True)
+class _ShotCycle:
+    """One cycle of one shot."""
+
+    is_met: bool
+    n_defects: int
+    n_atom_moves: int
+    n_batches: int
+    n_left_out: int
+    period_s: float
+
+
+def _made(summary: ShotSummary) -> list[_ShotCycle]:
+    """The cycles of a shot, as far as each has an image that ended it."""
+    images, cycles = summary.images, summary.cycles
+    ends = [i for i, cycle in enumerate(images.cycle) if cycle > 0]
+    return [
+        _ShotCycle(
+            is_met=not images.n_defects[i] and not images.n_surplus[i],
+            n_defects=images.n_defects[i],
+            n_atom_moves=cycles.n_atom_moves[k],
+            n_batches=cycles.n_batches_played[k],
+            n_left_out=cycles.n_batches[k] - cycles.n_batches_played[k],
+            period_s=images.t_start_s[i] - images.t_start_s[i - 1] if i else math.nan,
+        )
+        for k, i in enumerate(ends[: len(cycles)])
+    ]
+
+
+def _cycles(summaries: Sequence[ShotSummary], target: TargetPattern) -> tuple[CycleStatistics, ...]:
+    per_shot = list(map(_made, summaries))
+    seen = [list(accumulate((one.is_met for one in made), max)) for made in per_shot]
+    n_most = max(map(len, per_shot), default=0)
+    return tuple(
+        _cycle(
+            cycle,
+            [made[cycle - 1] for made in per_shot if len(made) >= cycle],
+            Rate(sum(any(of[:cycle][-1:]) for of in seen), len(seen)),
+            target.n_atoms,
+        )
+        for cycle in range(1, n_most + 1)
+    )
+
+
+def _cycle(cycle: int, made: Sequence[_ShotCycle], seen: Rate, n_atoms: int) -> CycleStatistics:
+    defects = np.array([one.n_defects for one in made])
+    return CycleStatistics(
+        cycle=cycle,
+        n_shots=len(made),
+        defect_free=Rate(sum(one.is_met for one in made), len(made)),
+        seen=seen,
+        filling=mean(1.0 - defects / n_atoms if n_atoms else np.ones(len(made))),
+        n_atom_moves=mean([one.n_atom_moves for one in made]),
+        n_batches=mean([one.n_batches for one in made]),
+        n_left_out=mean([one.n_left_out for one in made]),
+        period_s=mean([one.period_s for one in made]),
+        defects=_histogram(defects.tolist()),
+    )
+
+
+def _histogram(numbers: Sequence[int]) -> tuple[int, ...]:
+    return tuple(np.bincount(np.array(numbers, np.int64)).tolist())
+
+
+def _losses(summaries: Sequence[ShotSummary]) -> dict[str, Estimate]:
+    causes = dict.fromkeys(name for of in summaries for name in of.simulation if name.startswith(LOST))
+    return {
+        name.removeprefix(LOST): mean([of.simulation[name] for of in summaries if name in of.simulation])
+        for name in causes
+    }
+
+
+def _named(value: Any) -> Any:
+    """Dataclasses as mappings, each rate with its interval."""
+    match value:
+        case Rate():
+            return {
+                "n": value.n,
+                "n_trials": value.n_trials,
+                "rate": value.value,
+                "interval": [*value.interval],
+            }
+        case Estimate():
+            return {"mean": value.value, "error": value.error}
+        case Statistics() | CycleStatistics():
+            return {name: _named(getattr(value, name)) for name in value.__slots__}
+        case Mapping():
+            return {name: _named(one) for name, one in value.items()}
+        case tuple():
+            return [_named(one) for one in value]
+        case _:
+            return value

@@ -1,0 +1,416 @@
+"""What `labseq replay`, `labseq analyse` and `labseq plot` print."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from labseq.analysis.overview import overview
+from labseq.analysis.charts import save_run
+from labseq.analysis.overview import CHOICES, picture_of
+from labseq.analysis.paper import figure_4, figure_5, save_cycles, save_parallelism
+from labseq.analysis.replay import MeanCounts, Replay, ReplayedImages, ReplayedPlan, ReplayRequest, replay
+from labseq.analysis.shot import save_shot, shot_picture
+from labseq.cli.show import chosen_run
+from labseq.config import Document, split_overrides
+from labseq.config.messages import clean
+from labseq.console.output import (
+    as_line,
+    columns,
+    count_of,
+    json_writer,
+    percent,
+    plural,
+    report_compiling,
+    say,
+    settings_text,
+    stdout_to_stderr,
+)
+from labseq.errors import ConfigError, Problem, one_of
+from labseq.model.estimate import Estimate, mean
+from labseq.pictures.figures import check_place
+from labseq.recording import Run
+from labseq.recording.durable import to_plain
+from labseq.session.analyses import USE, AnalysisOutcome, analyse_missing, analyses_of
+from labseq.units import format_quantity
+
+MAX_REPORTED: Final = 5
+"""Failures that are told one by one."""
+WIDEST: Final = 64
+"""Widest array whose differing sites are drawn."""
+
+
+def replay_run(path: Path | None, request: ReplayRequest, output: Path | None, *, as_json: bool) -> int:
+    """Replay a run, and print what came of it.
+
+    Args:
+        path: The run's folder or any file in it; None for the newest run.
+        request: What is to be tried.
+        output: File for all of it as JSON, or None.
+        as_json: Whether to print that as one line instead.
+
+    Returns:
+        The exit code: 1 if the run's own planner or detector did not give what was recorded.
+
+    Raises:
+        LabseqError: Something in the request is wrong, or the run cannot be replayed.
+    """
+    run = chosen_run(path)
+    write = json_writer(None if output is None else str(output))
+    answer = stdout_to_stderr() if as_json else None
+    found = replay(run, request, announce=report_compiling)
+    values = as_values(found)
+    write(values)
+    if answer is not None:
+        answer(as_line(values))
+    else:
+        say(*report_lines(found))
+    say(*_failure_lines(found), stream=sys.stderr)
+    return 1 if found.is_own and not found.is_reproduced else 0
+
+
+def report_lines(found: Replay) -> list[str]:
+    """What came of a replay, in tables."""
+    lines = [f"{found.run.path}: {plural(found.n_shots, 'shot')}"]
+    if found.plans:
+        lines += ["", *_plan_lines(found)]
+    elif "planner" in found.used:
+        lines += ["", "planner: nothing was planned in these shots"]
+    if "detector" in found.used:
+        lines += ["", *_image_lines(found)]
+    if found.is_own:
+        lines += ["", _verdict(found)]
+    return lines
+
+
+def _verdict(found: Replay) -> str:
+    if not found.is_reproduced:
+        return "NOT REPRODUCED: the run's own planner or detector gives something else than was recorded"
+    n_images = len(found.images.images)
+    if not found.plans and not n_images:
+        return "nothing to reproduce: no plans, and no frames were kept"
+    parts = [plural(n, what) for n, what in ((len(found.plans), "plan"), (n_images, "image")) if n]
+    return f"reproduced: {' and '.join(parts)}, all as recorded"
+
+
+def _title(role: str, used: Mapping[str, Any], changed: Mapping[str, Any]) -> str:
+    settings = settings_text(changed)
+    return f"{role} {used['use']}" + (f": {settings}" if settings else "")
+
+
+def _plan_lines(found: Replay) -> list[str]:
+    header = ("", "plans", "batches", "atom moves", "duration", "planning", "filling", "target met")
+    rows: list[tuple[str, ...]] = []
+    for label, plans in _groups(found.plans):
+        made = [plan.replayed for plan in plans if plan.replayed is not None]
+        rows.append(_row(f"{label}, recorded", MeanCounts.over([plan.recorded for plan in plans])))
+        rows.append(_row(f"{label}, replayed", MeanCounts.over(made)))
+    n_same, n_failed = sum(plan.same for plan in found.plans), sum(bool(p.failure) for p in found.plans)
+    lines = [_title("planner", found.used["planner"], found.changed["planner"])]
+    lines += columns([header, *rows], right=range(1, len(header)))
+    lines.append("means per plan; filling and target as predicted if no atom is lost")
+    lines.append(f"the same as recorded: {count_of(n_same, len(found.plans))}")
+    return [*lines, f"INVALID: {count_of(n_failed, len(found.plans))}"] if n_failed else lines
+
+
+def _groups(plans: Sequence[ReplayedPlan]) -> Iterator[tuple[str, list[ReplayedPlan]]]:
+    """The plans of each cycle, then all; cycles are counted over all rearrangements of the shot."""
+    by_cycle: dict[int, list[ReplayedPlan]] = {}
+    numbers: dict[int, int] = {}
+    for plan in plans:
+        numbers[plan.shot] = numbers.get(plan.shot, 0) + 1
+        by_cycle.setdefault(numbers[plan.shot], []).append(plan)
+    for cycle in sorted(by_cycle):
+        yield f"cycle {cycle}", by_cycle[cycle]
+    if len(by_cycle) > 1:
+        yield "all", list(plans)
+
+
+def _row(label: str, means: MeanCounts) -> tuple[str, ...]:
+    return (
+        label,
+        str(means.n_plans),
+        str(means.n_batches),
+        str(means.n_atom_moves),
+        _time(means.duration_s),
+        _time(means.planning_s),
+        percent(means.filling.value, 2),
+        count_of(means.n_met, means.n_plans),
+    )
+
+
+def _time(duration_s: Estimate) -> str:
+    return "-" if math.isnan(duration_s.value) else format_quantity(duration_s.value, "time")
+
+
+def _image_lines(found: Replay) -> list[str]:
+    images, lines = found.images, [_title("detector", found.used["detector"], found.changed["detector"])]
+    if not images.images:
+        kept = (
+            "no frames were kept in these shots" if images.n_without_frame else "these shots have no images"
+        )
+        return [*lines, kept]
+    n_sites = len(images.images) * images.appeared.size
+    appeared, vanished = int(images.appeared.sum()), int(images.vanished.sum())
+    differing = sum(1 for one in images.images if one.n_appeared or one.n_vanished)
+    rows = [
+        ("images", str(len(images.images)) + _without(images)),
+        ("sites that differ", f"{images.n_differing} of {n_sites}, on {plural(differing, 'image')}"),
+        ("  atom, before none", str(appeared)),
+        ("  none, before an atom", str(vanished)),
+        (
+            "atoms on an image",
+            f"recorded {_mean(images, 'n_atoms')}, now {_mean(images, 'n_atoms_replayed')}",
+        ),
+        ("confidence", f"recorded {_mean(images, 'confidence')}, now {_mean(images, 'confidence_replayed')}"),
+    ]
+    known = [one for one in images.images if one.n_atoms_true is not None]
+    if known:
+        told = (
+            (name, str(mean([getattr(one, key) for one in known])))
+            for name, key in (("recorded", "n_atoms"), ("now", "n_atoms_replayed"), ("truth", "n_atoms_true"))
+        )
+        rows.append(("on a last image", ", ".join(f"{name} {value}" for name, value in told)))
+    return [*lines, *columns(rows), *_map(images)]
+
+
+def _without(images: ReplayedImages) -> str:
+    return f", and {images.n_without_frame} without a frame" if images.n_without_frame else ""
+
+
+def _mean(images: ReplayedImages, name: str) -> str:
+    return str(mean([getattr(one, name) for one in images.images]))
+
+
+def _map(images: ReplayedImages) -> list[str]:
+    """The sites that differ: + an atom where there was none, - none where there was one, * both."""
+    if not images.n_differing or images.appeared.shape[1] > WIDEST:
+        return []
+    kinds = np.array([".", "+", "-", "*"])[(images.appeared > 0) + 2 * (images.vanished > 0)]
+    rows = [" ".join(row) for row in kinds.tolist()]
+    return ["", "+ an atom, before none; - none, before an atom; * both", *rows]
+
+
+def _failure_lines(found: Replay) -> list[str]:
+    lines = [
+        f"shot {plan.shot + 1}, cycle {plan.cycle}: {plan.failure}" for plan in found.plans if plan.failure
+    ]
+    lines += [f"shot {s + 1}, image {i + 1}: {text}" for (s, i), text in found.images.failures.items()]
+    lines += [f"shot {shot + 1} is left out: {text}" for shot, text in found.unreadable.items()]
+    more = len(lines) - MAX_REPORTED
+    return [
+        *lines[:MAX_REPORTED],
+        *([f"and {more} more; all of them with --output FILE"] if more > 0 else []),
+    ]
+
+
+def as_values(found: Replay) -> dict[str, Any]:
+    """Everything, JSON-ready; shots and images count from 0, times are in seconds, None is not known."""
+    images = found.images
+    return to_plain(
+        {
+            "run_dir": str(found.run.path),
+            "shots": found.n_shots,
+            "used": found.used,
+            "reproduced": found.is_reproduced if found.is_own else None,
+            "planner": _plan_values(found.plans) if "planner" in found.used else None,
+            "detector": {
+                "n_images": len(images.images),
+                "n_without_frame": images.n_without_frame,
+                "appeared": images.appeared,
+                "vanished": images.vanished,
+                "images": [asdict(image) for image in images.images],
+                "failures": [
+                    {"shot": shot, "image": image, "error": text}
+                    for (shot, image), text in images.failures.items()
+                ],
+            }
+            if "detector" in found.used
+            else None,
+            "unreadable": found.unreadable,
+        }
+    )
+
+
+def _plan_values(plans: Sequence[ReplayedPlan]) -> dict[str, Any]:
+    made = [plan.replayed for plan in plans if plan.replayed is not None]
+    return {
+        "recorded": _means_values(MeanCounts.over([plan.recorded for plan in plans])),
+        "replayed": _means_values(MeanCounts.over(made)),
+        "n_same": sum(plan.same for plan in plans),
+        "n_invalid": sum(bool(plan.failure) for plan in plans),
+        "plans": [asdict(plan) for plan in plans],
+    }
+
+
+def _means_values(means: MeanCounts) -> dict[str, Any]:
+    named = {name: getattr(means, name) for name in means.__slots__}
+    return {
+        name: {"mean": value.value, "error": value.error} if isinstance(value, Estimate) else value
+        for name, value in named.items()
+    }
+
+
+def analyse_run(path: Path | None, use: str | None, overrides: Sequence[str], *, anew: bool) -> int:
+    """Analyse the shots of a run that have no result yet, and say what came of it.
+
+    Args:
+        path: The run's folder or any file in it; None for the newest run.
+        use: One analysis; None for those of the run's sequence.
+        overrides: ``"key=value"`` strings: settings of that one.
+        anew: Whether to analyse all shots again.
+
+    Returns:
+        The exit code: 1 if there is no result of a shot.
+
+    Raises:
+        LabseqError: Something that was asked for is wrong, or the results cannot be written.
+    """
+    run = chosen_run(path)
+    failed = False
+    for settings in _wanted(run, use, overrides):
+        done = analyse_missing(run, settings, anew=anew)
+        _report(done)
+        failed = failed or bool(done.failures)
+    return int(failed)
+
+
+def _wanted(run: Run, use: str | None, overrides: Sequence[str]) -> list[dict[str, Any]]:
+    """The settings of each analysis that is meant.
+
+    Raises:
+        ConfigError: None is meant, or an option is wrong.
+    """
+    own = analyses_of(run)
+    if use is not None:
+        settings = next((one for one in own if one[USE] == use), {USE: use})
+        return [{**settings, **_changes(overrides)}]
+    if overrides:
+        what, hint = "it is not said of which analysis this is a setting", "name it with --use"
+        raise ConfigError(Problem(what, clean(f"--set {overrides[0]}"), hint=hint))
+    if not own:
+        what, hint = "the run's sequence asks for no analysis", "name one with --use"
+        raise ConfigError(Problem(what, clean(str(run.path)), hint=hint))
+    return own
+
+
+def _changes(overrides: Sequence[str]) -> dict[str, Any]:
+    """The values of ``--set``.
+
+    Raises:
+        ConfigError: One is not of the form key=value, or its value is no YAML.
+    """
+    for_sequence, for_profile = split_overrides(overrides)
+    if for_profile:
+        what = "an analysis has no part of the profile"
+        raise ConfigError(Problem(what, for_profile[0].source, expected="key=value"))
+    parents = {one.address.rpartition(".")[0] for one in for_sequence}
+    return Document.parse("{}", "the command line").override_all(for_sequence, may_add=parents).data
+
+
+def _report(done: AnalysisOutcome) -> None:
+    before = f", {done.n_before} had a result already" if done.n_before else ""
+    say(f"{done.name}: {plural(done.n_done, 'shot')} analysed{before}; see {done.path}")
+    told = [f"{done.name}: shot {shot + 1} failed: {text}" for shot, text in done.failures.items()]
+    more = len(told) - MAX_REPORTED
+    say(*told[:MAX_REPORTED], *([f"and {more} more shots failed"] if more > 0 else []), stream=sys.stderr)
+
+
+FIGURES: Final = ("4", "5")
+"""Figures of the paper that a run can be drawn as."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlotRequest:
+    """What is to be drawn of a run; at most one of ``figure``, ``what`` and ``shot`` is given.
+
+    Attributes:
+        what: A part of the overview; None for all of it.
+        figure: One of :data:`FIGURES`, a figure of the paper.
+        compare: Another run for that figure.
+        shot: A shot, counted from 1.
+        cycle: A cycle of it.
+    """
+
+    what: str | None = None
+    figure: str | None = None
+    compare: Path | None = None
+    shot: int | None = None
+    cycle: int | None = None
+
+    def check(self) -> None:
+        """Find out whether the options go together.
+
+        Raises:
+            ConfigError: They do not, or there is no such picture.
+        """
+        given = [
+            option
+            for option, value in (("--what", self.what), ("--figure", self.figure), ("--shot", self.shot))
+            if value is not None
+        ]
+        if len(given) > 1:
+            raise ConfigError(
+                Problem("these are different pictures", " and ".join(given), expected="one of them")
+            )
+        if self.cycle is not None and self.shot is None:
+            raise ConfigError(Problem("a cycle is one of a shot", "--cycle", expected="--shot as well"))
+        if self.compare is not None and self.figure is None:
+            expected = "--figure 4 or --figure 5 as well"
+            raise ConfigError(
+                Problem("only figures of the paper compare runs", "--compare", expected=expected)
+            )
+        for option, value, known in (
+            ("--figure", self.figure, FIGURES),
+            ("--what", self.what, sorted(CHOICES)),
+        ):
+            if value is not None and value not in known:
+                problem = Problem(f"there is no figure '{value}' of a run", option, expected=one_of(known))
+                raise ConfigError(problem)
+
+    @property
+    def name(self) -> str:
+        """What the file is called if nothing is said, without its ending.
+
+        Example:
+            >>> PlotRequest(shot=3, cycle=1).name, PlotRequest(figure="5").name, PlotRequest().name
+            ('shot-3-cycle-1', 'figure-5', 'overview')
+        """
+        if self.shot is not None:
+            return f"shot-{self.shot}" + (f"-cycle-{self.cycle}" if self.cycle is not None else "")
+        return f"figure-{self.figure}" if self.figure is not None else self.what or "overview"
+
+
+def plot_run(run: Path | None, request: PlotRequest, output: Path | None) -> None:
+    """Draw a run.
+
+    Args:
+        run: The run's folder or any file in it; None for the newest run.
+        request: What is to be drawn.
+        output: The picture; None for a name of its own in the current folder.
+
+    Raises:
+        ConfigError: There is no such run or picture, the run has nothing to show in it, or the
+            picture cannot be written.
+        RecordingError: A run is damaged.
+    """
+    request.check()
+    path = Path(f"{request.name}.png") if output is None else output
+    check_place(path)
+    chosen = chosen_run(run)
+    other = None if request.compare is None else chosen_run(request.compare)
+    if request.shot is not None:
+        save_shot(path, shot_picture(chosen, request.shot, request.cycle))
+    elif request.figure == "4":
+        save_parallelism(path, figure_4(chosen, other))
+    elif request.figure == "5":
+        save_cycles(path, figure_5(chosen, other))
+    else:
+        save_run(path, overview(chosen) if request.what is None else picture_of(chosen, request.what))
+    say(f"written: {path}")

@@ -1,0 +1,1 @@
+"""Planners, rendering and latency compared without a run."""

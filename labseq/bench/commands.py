@@ -1,0 +1,171 @@
+"""`labseq bench`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+bench = typer.Typer(
+    name="bench",
+    help="Measure and compare parts of labseq.",
+    short_help="Compare planners; measure rendering, and the time to the light.",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+)
+
+PLANNERS_EXAMPLES = """\b
+Examples:
+  labseq bench planners --planners psca,lsap --dop 15 --loadings 10000
+  labseq bench planners --planners psca,psca:variant=paper --grid 30x30 --target kagome:20x20 --loading "60 %"
+  labseq bench planners --planners psca --dop 15 --json - | jq .rows[0].n_batches
+  labseq bench planners --figure 2b --loadings 10000
+  labseq bench planners --figure 3b --set profile.mobile_tweezers.speed="130 um/ms"
+"""
+
+LATENCY_EXAMPLES = """\b
+Examples:
+  labseq bench latency sequences/compact_225.yaml --profile bench_awg
+  labseq bench latency sequences/compact_225.yaml --set planner.degree_of_parallelism=15 --json latency.json
+  labseq bench latency sequences/compact_225.yaml --profile bench_awg --set profile.mobile_tweezers.mode=fifo
+"""
+
+JsonFile = Annotated[
+    str | None,
+    typer.Option(
+        metavar="FILE|-", help="Write the result as JSON; with '-' to stdout, and all else to stderr."
+    ),
+]
+
+
+@bench.command(epilog=PLANNERS_EXAMPLES, short_help="Compare planners on the same random loadings.")
+def planners(
+    figure: Annotated[
+        str | None,
+        typer.Option(
+            metavar="2b|2c|3a|3b",
+            help="Reproduce a figure of the paper; draws figure-2b.png and writes figure-2b.csv unless other "
+            "files are named.",
+        ),
+    ] = None,
+    planners: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME,...",
+            help="Planners, each perhaps with settings that only it has: psca,psca:variant=paper. "
+            "Default: psca.",
+        ),
+    ] = None,
+    grid: Annotated[
+        str | None, typer.Option(metavar="ROWSxCOLS", help="Sites of the grid. Default: 20x20.")
+    ] = None,
+    target: Annotated[
+        str | None,
+        typer.Option(metavar="PATTERN", help="A pattern such as kagome:15x15. Default: compact:15x15."),
+    ] = None,
+    loading: Annotated[
+        str | None, typer.Option(metavar="P", help="Probability that a site is loaded. Default: 75 %.")
+    ] = None,
+    dop: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N",
+            help="Degree of parallelism of all planners that have one; each planner's default if left out.",
+        ),
+    ] = None,
+    loadings: Annotated[
+        int, typer.Option(metavar="N", min=1, help="Random loadings; the paper's figures have 10000.")
+    ] = 1000,
+    seed: Annotated[
+        int, typer.Option(metavar="N", min=0, help="Seed of all loadings: the same seed, the same result.")
+    ] = 1,
+    overrides: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="ADDRESS=VALUE",
+            help="planner.KEY=VALUE changes every planner, profile.mobile_tweezers.KEY=VALUE how tweezers "
+            "move; may be given several times.",
+        ),
+    ] = None,
+    workers: Annotated[
+        int | None,
+        typer.Option(metavar="N", min=1, help="Processes that share the work; all cores if left out."),
+    ] = None,
+    json: JsonFile = None,
+    csv: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write the table as CSV, in SI units.")
+    ] = None,
+    png: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Draw the figure, or how the numbers of batches spread."),
+    ] = None,
+) -> None:
+    """Let planners plan the same random loadings, check every plan, and compare what comes of it."""
+    from labseq.bench.planners import BenchRequest
+    from labseq.bench.terminal import BenchOutput, bench_planners
+
+    request = BenchRequest(
+        figure=figure,
+        planners=planners,
+        grid=grid,
+        target=target,
+        loading=loading,
+        dop=dop,
+        loadings=loadings,
+        seed=seed,
+        overrides=tuple(overrides or ()),
+        workers=workers,
+    )
+    bench_planners(request, BenchOutput(json=json, csv=csv, png=png))
+
+
+@bench.command(epilog=LATENCY_EXAMPLES, short_help="Measure the time from a frame to the light.")
+def latency(
+    sequence: Annotated[
+        Path,
+        typer.Argument(
+            metavar="SEQUENCE",
+            help="A sequence: its target, its planner, and how its first image is taken.",
+            show_default=False,
+        ),
+    ],
+    profile: Annotated[
+        str | None,
+        typer.Option(
+            "--profile",
+            "-p",
+            metavar="NAME|FILE",
+            help="Hardware profile, instead of the one that the sequence names.",
+        ),
+    ] = None,
+    loadings: Annotated[int, typer.Option(metavar="N", min=1, help="Random loadings.")] = 200,
+    seed: Annotated[int, typer.Option(metavar="N", min=0, help="Seed of all loadings.")] = 1,
+    overrides: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="ADDRESS=VALUE", help="As for run; may be given several times."),
+    ] = None,
+    json: JsonFile = None,
+) -> None:
+    """Measure what passes between the end of an exposure and the first light of the mobile tweezers.
+
+    Shots are taken in a dry run up to the first image, and carried on to the start of the moves.
+    """
+    from labseq.bench.latency import LatencyRequest
+    from labseq.bench.terminal import bench_latency
+
+    bench_latency(LatencyRequest(sequence, profile, tuple(overrides or ()), loadings, seed), json)
+
+
+@bench.command(short_help="Measure how fast tones become samples.")
+def waveform(
+    repeats: Annotated[
+        int, typer.Option(metavar="N", min=1, help="How often everything is rendered; the best one counts.")
+    ] = 15,
+    json: JsonFile = None,
+) -> None:
+    """Measure rendering: by kind of segment, for a plan, and beside the stored-waveform way and numpy."""
+    from labseq.bench.terminal import bench_rendering
+
+    bench_rendering(repeats, json)

@@ -1,0 +1,574 @@
+"""What a comparison of planners consists of, and the planning, checking and counting that its processes do."""
+
+from __future__ import annotations
+
+import importlib
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from time import perf_counter
+from typing import Any, Final, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq.config import Choice, Document, MotionSettings, Override, ProblemCollector
+from labseq.config.fields import PatternChoice
+from labseq.config.messages import clean
+from labseq.errors import ConfigError, LimitError, PlanError, Problem
+from labseq.model import MotionSpec, Occupancy, Plan, SiteGrid, TargetPattern
+from labseq.motion import check_plan
+from labseq.plugins import PluginHost
+from labseq.roles import NeedsWarmUp, NeverStopped, Planner
+from labseq.session.construct import construct, construct_target
+from labseq.session.occupancies import MAX_SITES
+from labseq.session.planning import parse_target
+from labseq.session.profile import ChosenPlugin, dump, load_plugins, resolve
+from labseq.units import parse_quantity
+
+Words = tuple[tuple[str, str], ...]
+"""Key and value, as typed, of some settings."""
+
+BARE_MOTION: Final[Words] = (("overhead_per_batch", "0"), ("overhead_per_cycle", "0"))
+"""What is compared is the motion itself: ramps and transport."""
+
+_BETWEEN_ENTRANTS: Final = re.compile(r",(?=\s*[^\W\d][\w.-]*\s*(?:,|\Z|:\s*[^\W\d]\w*\s*=))")
+_BETWEEN_SETTINGS: Final = re.compile(r",(?=\s*[^\W\d]\w*\s*=)")
+_NAME: Final = re.compile(r"[^\W\d][\w.-]*")
+_GRID: Final = re.compile(r"\s*(\d{1,6})\s*[xX]\s*(\d{1,6})\s*")
+
+
+@dataclass(frozen=True, slots=True)
+class PlannerEntry:
+    """A planner as it enters a comparison.
+
+    Attributes:
+        planner: Its name.
+        settings: Its settings, as typed; all others have their defaults.
+    """
+
+    planner: str
+    settings: Words = ()
+
+    @property
+    def label(self) -> str:
+        """What tables call it.
+
+        Example:
+            >>> Entrant("psca", (("variant", "paper"),)).label
+            'psca variant=paper'
+        """
+        return " ".join([self.planner, *(f"{key}={value}" for key, value in self.settings)])
+
+
+@dataclass(frozen=True, slots=True)
+class Condition:
+    """What the planners are given: random loadings of a grid, and what to make of them.
+
+    Attributes:
+        shape: Rows and columns of the grid.
+        target: A pattern, as after ``--target``.
+        loading: Probability that a site is loaded.
+        degree_of_parallelism: For every planner that has such a setting; None for its own.
+        motion: Settings of the motion that differ from the defaults, as typed.
+    """
+
+    shape: tuple[int, int]
+    target: str
+    loading: float
+    degree_of_parallelism: int | None = None
+    motion: Words = BARE_MOTION
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """Planners on the same loadings.
+
+    Attributes:
+        entrants: The planners.
+        conditions: What they are given.
+        n_loadings: How many loadings of each condition.
+        seed: What all loadings are drawn from.
+        settings: What ``--set`` changes in every planner, as typed.
+        called: What messages name as the place of anything wrong: an option or a figure.
+    """
+
+    planner_entries: tuple[PlannerEntry, ...]
+    conditions: tuple[Condition, ...]
+    n_loadings: int
+    seed: int
+    settings: Words = ()
+    called: str = "--planners"
+
+
+def parse_entrants(text: str) -> tuple[PlannerEntry, ...]:
+    """Read a list of planners, each with the settings that only it has.
+
+    Raises:
+        ConfigError: It is no such list, or names something twice.
+
+    Example:
+        >>> [entrant.label for entrant in parse_entrants("psca,psca:variant=paper,lsap")]
+        ['psca', 'psca variant=paper', 'lsap']
+    """
+    option = clean(f"--planners {text}")
+    planner_entries: list[PlannerEntry] = []
+    for part in _BETWEEN_ENTRANTS.split(text):
+        name, _, rest = part.partition(":")
+        settings = [setting.partition("=") for setting in _BETWEEN_SETTINGS.split(rest)] if rest else []
+        if not _NAME.fullmatch(name.strip()) or not all(key.strip() and value for key, _, value in settings):
+            expected = "names with commas between them, each perhaps with settings: psca,psca:variant=paper"
+            raise ConfigError(Problem("this is no list of planners", option, expected=expected))
+        words = tuple((key.strip(), value.strip()) for key, _, value in settings)
+        planner_entry = PlannerEntry(name.strip(), words)
+        if planner_entry in planner_entries:
+            raise ConfigError(
+                Problem(f"'{clean(planner_entry.label)}' is named twice", option, expected="once")
+            )
+        planner_entries.append(planner_entry)
+    return tuple(planner_entries)
+
+
+def parse_grid(text: str) -> tuple[int, int]:
+    """Read the size of a grid.
+
+    Raises:
+        ConfigError: It is none.
+
+    Example:
+        >>> parse_grid("20x24")
+        (20, 24)
+    """
+    match = _GRID.fullmatch(text)
+    shape = (int(match[1]), int(match[2])) if match else (0, 0)
+    if not all(1 <= n <= MAX_SITES for n in shape):
+        expected = f"ROWSxCOLS, 1 to {MAX_SITES} each, for example 20x20"
+        raise ConfigError(Problem("this is no size of a grid", clean(f"--grid {text}"), expected=expected))
+    return shape
+
+
+def parse_loading(text: str) -> float:
+    """Read the probability that a site is loaded.
+
+    Raises:
+        ConfigError: It is none.
+
+    Example:
+        >>> parse_loading("75 %"), parse_loading("0.55")
+        (0.75, 0.55)
+    """
+    try:
+        probability = parse_quantity(text, "fraction")
+    except ValueError:
+        probability = -1.0
+    if not 0.0 <= probability <= 1.0:
+        expected = "a number from 0 to 1, or 0 % to 100 %"
+        raise ConfigError(Problem("this is no probability", clean(f"--loading {text}"), expected=expected))
+    return probability
+
+
+def parse_overrides(texts: Sequence[str]) -> tuple[Words, Words]:
+    """Part what ``--set`` changes in every planner from what it changes in the motion.
+
+    Returns:
+        Settings of the planners, and settings of ``profile.mobile_tweezers``.
+
+    Raises:
+        ConfigError: One is not of the form ``address=value``, or its address leads elsewhere.
+
+    Example:
+        >>> parse_overrides(["planner.row_order=fullest", "profile.mobile_tweezers.speed=75 um/ms"])
+        ((('row_order', 'fullest'),), (('speed', '75 um/ms'),))
+    """
+    planner: list[tuple[str, str]] = []
+    motion: list[tuple[str, str]] = []
+    for text in texts:
+        address, equals, value = text.partition("=")
+        where, _, key = address.strip().rpartition(".")
+        settings = {"": planner, "planner": planner, "profile.mobile_tweezers": motion}.get(where)
+        if not equals or not key or settings is None:
+            example = "planner.KEY=VALUE or profile.mobile_tweezers.KEY=VALUE"
+            raise ConfigError(
+                Problem("there is nothing to set here", clean(f"--set {text}"), expected=example)
+            )
+        settings.append((key, value))
+    return tuple(planner), tuple(motion)
+
+
+_DOP: Final = "degree_of_parallelism"
+_MOTION_ADDRESS: Final = "profile.mobile_tweezers"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Runner:
+    """A planner, ready to plan.
+
+    Attributes:
+        planner: The planner.
+        name: Its name.
+        settings: All its settings, JSON-ready.
+        degree_of_parallelism: Most tweezers on at once that its plans are checked for.
+    """
+
+    planner: Planner
+    name: str
+    settings: Mapping[str, Any]
+    degree_of_parallelism: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PreparedCondition:
+    """A condition, ready for planning.
+
+    Attributes:
+        grid: The grid of sites.
+        motion: How the mobile tweezers move.
+        target: What the array shall look like.
+        loading: Probability that a site is loaded.
+        runners: A planner per entrant.
+    """
+
+    grid: SiteGrid
+    motion: MotionSpec
+    target: TargetPattern
+    loading: float
+    runners: tuple[Runner, ...]
+
+
+def set_up(comparison: Comparison) -> list[PreparedCondition]:
+    """Read and validate a comparison, one course per condition.
+
+    Raises:
+        ConfigError: Something in it is wrong; says what was expected.
+        PluginLoadError: A plugin that is named failed to load.
+    """
+    host = load_plugins()
+    return [_course(host, comparison, condition) for condition in comparison.conditions]
+
+
+def warm(courses: list[PreparedCondition]) -> None:
+    """Compile all kernels that will be needed, or load them from the cache.
+
+    Raises:
+        PlanError: A planner failed in it; names the planner.
+    """
+    importlib.import_module("labseq.motion.check_kernels")
+    for runner in [runner for course in courses for runner in course.runners]:
+        if isinstance(runner.planner, NeedsWarmUp):
+            try:
+                runner.planner.warm()
+            except Exception as error:
+                raise PlanError(f"warm() raised {type(error).__name__}: {error}", runner.name) from error
+
+
+def _course(host: PluginHost, comparison: Comparison, condition: Condition) -> PreparedCondition:
+    found = ProblemCollector()
+    grid, motion, target = SiteGrid(*condition.shape), _motion(condition), None
+    with found:
+        target = _target(host, condition, grid)
+    runners: list[Runner] = []
+    for planner_entry in comparison.planner_entries:
+        with found:
+            chosen = _planner(host, comparison, condition, planner_entry)
+            runners.append(_runner(chosen, grid, motion, comparison.seed))
+    found.raise_any()
+    assert target is not None
+    return PreparedCondition(grid, motion, target, condition.loading, tuple(runners))
+
+
+def _motion(condition: Condition) -> MotionSpec:
+    overrides = [
+        Override(f"motion.{key}", value, f"--set {_MOTION_ADDRESS}.{key}={value}")
+        for key, value in condition.motion
+    ]
+    document = _document(overrides, "motion")
+    motion = document.validate(MotionSettings, ("motion",), called=_MOTION_ADDRESS).spec()
+    n, limit = condition.degree_of_parallelism, motion.max_tweezers
+    if n is not None and not 1 <= n <= limit:
+        hint = f"or raise the limit: --set {_MOTION_ADDRESS}.max_tweezers={n}" if n > limit else ""
+        what = f"the degree of parallelism is {n}"
+        expected = f"1 to {limit}, the most tweezers that can be on at once"
+        raise ConfigError(Problem(what, f"--dop {n}", expected=expected, hint=hint))
+    tones = max(motion.max_row_tones, motion.max_column_tones)
+    if n is not None and n > tones:
+        expected = f"at most {tones}, the most tones of an axis"
+        raise ConfigError(Problem(f"the degree of parallelism is {n}", f"--dop {n}", expected=expected))
+    return motion
+
+
+def _target(host: PluginHost, condition: Condition, grid: SiteGrid) -> TargetPattern:
+    option = f"--target {condition.target}"
+    name, settings = parse_target(condition.target)
+    overrides = [Override(f"pattern.{key}", value, option) for key, value in settings.items()]
+    try:
+        return construct_target(_choose(host, PatternChoice(pattern=name), overrides, option), grid)
+    except LimitError as error:
+        raise ConfigError(Problem(str(error), option)) from error
+
+
+def _planner(
+    host: PluginHost, comparison: Comparison, condition: Condition, planner_entry: PlannerEntry
+) -> ChosenPlugin:
+    name, dop = planner_entry.planner, condition.degree_of_parallelism
+    overrides: list[Override] = []
+    entry = host.registry.find("planner", name)
+    if entry is not None and dop is not None and _DOP in getattr(entry.settings_model, "model_fields", {}):
+        overrides.append(Override(f"planner.{_DOP}", str(dop), f"--dop {dop}"))
+    for key, value in comparison.settings:
+        overrides.append(Override(f"planner.{key}", value, f"--set planner.{key}={value}"))
+    for key, value in planner_entry.settings:
+        overrides.append(Override(f"planner.{key}", value, comparison.called))
+    return _choose(host, Choice(use=name), overrides, comparison.called)
+
+
+def _choose(host: PluginHost, choice: Choice, overrides: list[Override], option: str) -> ChosenPlugin:
+    """Resolve a plugin that was named in an option."""
+    kind = "pattern" if choice.key == "pattern" else "planner"
+    named = Override(f"{kind}.{choice.key}", choice.use, option)
+    return resolve(host, _document([named, *overrides], kind), kind, choice.placed(kind))
+
+
+def _document(overrides: list[Override], top: str) -> Document:
+    return Document.parse("{}", "the command line").override_all(overrides, may_add=(top,))
+
+
+def _runner(chosen: ChosenPlugin, grid: SiteGrid, motion: MotionSpec, seed: int) -> Runner:
+    planner: Planner = construct({"planner": chosen}, grid, motion, NeverStopped(), seed)[0]["planner"]
+    dop = getattr(planner, _DOP, None)
+    dop = dop if isinstance(dop, int) else motion.max_tweezers
+    return Runner(planner, chosen.entry.name, dump(chosen.entry, chosen.settings), dop)
+
+
+RESULT: Final = np.dtype(
+    [
+        ("n_batches", np.int32),
+        ("n_atoms_moved", np.int32),
+        ("distance_m", np.float64),
+        ("motion_s", np.float64),
+        ("n_scans", np.float64),
+        ("scan_s", np.float64),
+        ("planning_s", np.float64),
+        ("n_defects", np.int32),
+        ("n_surplus", np.int32),
+        ("failed", np.bool_),
+    ]
+)
+"""What is counted of one plan; linked batches, the way of one pick-up, count as one. NaN for no scans."""
+
+LOADING: Final = np.dtype([("n_atoms", np.int32), ("n_lines", np.int32)])
+"""What is counted of one loading; ``n_lines`` as in :func:`lines_to_cover`."""
+
+_NO_SCANS: Final = (math.nan, math.nan)
+_FAILED: Final = (0, 0, 0.0, 0.0, *_NO_SCANS, 0.0, 0, 0, True)
+
+
+class Scanned(Protocol):
+    """A plan that was made of scans: tweezers that pick up and drop atoms in passing."""
+
+    @property
+    def plan(self) -> Plan:
+        """The batches that do the same."""
+        ...
+
+    @property
+    def n_scans(self) -> int:
+        """Number of scans: what the algorithm's source counts as moves."""
+        ...
+
+    def duration_s(self, grid: SiteGrid, motion: MotionSpec) -> float:
+        """Time that the scans would take, in seconds."""
+        ...
+
+
+@runtime_checkable
+class ScanningPlanner(Protocol):
+    """A planner whose source counts scans, not batches; an optional capability."""
+
+    def scan(self, occupancy: Occupancy, target: TargetPattern) -> Scanned:
+        """Plan as ``plan()`` does, and tell the scans."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """Loadings ``start`` to ``stop`` (exclusive) of a condition."""
+
+    condition: int
+    start: int
+    stop: int
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """A planner raised, or its plan breaks a rule.
+
+    Attributes:
+        entrant: Index of the planner.
+        condition: Index of the condition.
+        loading: Index of the loading.
+        message: What went wrong.
+    """
+
+    planner_entry: int
+    condition: int
+    loading: int
+    message: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Done:
+    """What came of a job.
+
+    Attributes:
+        job: The job.
+        results: :data:`RESULT` (n_entrants, n_loadings).
+        loadings: :data:`LOADING` (n_loadings,).
+        failures: The first failure of each planner.
+    """
+
+    job: Job
+    results: NDArray[Any]
+    loadings: NDArray[Any]
+    failures: tuple[Failure, ...]
+
+
+Scan = Callable[[Occupancy, TargetPattern], Scanned]
+
+
+def loading_seed(seed: int, index: int) -> int:
+    """The seed that loading ``index`` is drawn with: the first word of what the seed's index-th child gives.
+
+    A loading is ``numpy.random.default_rng(loading_seed).random((rows, cols)) <
+    loading``, as for ``labseq plan random:ROWSxCOLS@LOADING --seed LOADING_SEED``.
+
+    Example:
+        >>> child = np.random.SeedSequence(5).spawn(3)[2]
+        >>> loading_seed(5, 2) == int(child.generate_state(1)[0])
+        True
+    """
+    return int(np.random.SeedSequence(seed, spawn_key=(index,)).generate_state(1)[0])
+
+
+def draw(shape: tuple[int, int], loading: float, seed: int, index: int) -> Occupancy:
+    """Draw a loading, bool ``shape``; see :func:`loading_seed`."""
+    return np.random.default_rng(loading_seed(seed, index)).random(shape) < loading
+
+
+def lines_to_cover(vacancies: NDArray[np.bool_]) -> NDArray[np.int32]:
+    """Count the rows and columns that it takes to cover all vacancies.
+
+    Every vacancy is filled by a batch that moves along its row or its column, so
+    no planner that moves one line at a time needs fewer batches. Vacancies as
+    edges between rows and columns make a bipartite graph, whose smallest vertex
+    cover is as large as its largest matching (D. Konig, 1931).
+
+    Args:
+        vacancies: bool (n_loadings, n_rows, n_cols), fill sites that are empty.
+
+    Returns:
+        int32 (n_loadings,).
+
+    Example:
+        >>> lines_to_cover(np.array([[[1, 1, 1], [0, 1, 0], [0, 0, 0]]], np.bool_))
+        array([2], dtype=int32)
+    """
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import maximum_bipartite_matching
+
+    n_loadings, n_rows, n_cols = vacancies.shape
+    loading, row, col = np.nonzero(vacancies)
+    ones = np.ones(len(loading), np.bool_)
+    shape = (n_loadings * n_rows, n_loadings * n_cols)  # one graph of parts that do not touch: one call
+    graph = csr_array((ones, (loading * n_rows + row, loading * n_cols + col)), shape=shape)
+    matched = maximum_bipartite_matching(graph, perm_type="column")
+    return np.count_nonzero(matched.reshape(n_loadings, n_rows) >= 0, axis=1).astype(np.int32)
+
+
+def work(courses: list[PreparedCondition], seed: int, job: Job) -> Done:
+    """Let every planner plan the loadings of a job, and check and count its plans.
+
+    Args:
+        courses: One per condition.
+        seed: What all loadings are drawn from.
+        job: Which loadings.
+    """
+    course = courses[job.condition]
+    indices = range(job.start, job.stop)
+    occupancies = [draw(course.grid.shape, course.loading, seed, index) for index in indices]
+    loadings = np.empty(len(occupancies), LOADING)
+    stack = np.array(occupancies)
+    loadings["n_atoms"] = np.count_nonzero(stack, axis=(1, 2))
+    loadings["n_lines"] = lines_to_cover(course.target.fill & ~stack)
+    results = np.empty((len(course.runners), len(occupancies)), RESULT)
+    failures: list[Failure] = []
+    for i, runner in enumerate(course.runners):
+        rows: list[tuple[Any, ...]] = []
+        scan = runner.planner.scan if isinstance(runner.planner, ScanningPlanner) else None
+        for index, occupancy in zip(indices, occupancies, strict=True):
+            try:
+                rows.append(_run(course, runner, scan, occupancy))
+            except Exception as error:  # noqa: BLE001 - a planner may raise anything; it is counted
+                if not any(failure.planner_entry == i for failure in failures):
+                    failures.append(Failure(i, job.condition, index, _format_error(error)))
+                rows.append(_FAILED)
+        results[i] = rows
+    return Done(job, results, loadings, tuple(failures))
+
+
+def prepare(comparison: Comparison) -> Callable[[Job], Done]:
+    """Make ready for jobs; every planner is called once, so that no time that counts is a first time's."""
+    courses = set_up(comparison)
+    warm(courses)
+    for i in range(len(courses)):
+        work(courses, comparison.seed, Job(i, 0, 1))
+    return lambda job: work(courses, comparison.seed, job)
+
+
+def _run(
+    course: PreparedCondition, runner: Runner, scan: Scan | None, occupancy: Occupancy
+) -> tuple[Any, ...]:
+    own = occupancy.copy()  # so that a planner that writes into its input harms only itself
+    scanned: Scanned | None = None
+    start_s = perf_counter()
+    if scan is None:
+        plan = runner.planner.plan(own, course.target)
+    else:
+        scanned = scan(own, course.target)
+        plan = scanned.plan
+    planning_s = perf_counter() - start_s
+    dop = runner.degree_of_parallelism
+    report = check_plan(plan, occupancy, course.target, dop, course.grid, course.motion)
+    scans = _NO_SCANS
+    if scanned is not None:
+        scans = float(scanned.n_scans), scanned.duration_s(course.grid, course.motion)
+    return (
+        *_batches_and_atoms(plan),
+        _n_sites(plan) * course.grid.spacing_m,
+        report.duration_s,
+        *scans,
+        planning_s,
+        report.n_defects,
+        report.n_surplus,
+        False,
+    )
+
+
+def _batches_and_atoms(plan: Plan) -> tuple[int, int]:
+    """Number of batches, and atoms that they move, with linked ones counted as one."""
+    if not plan.linked.any():
+        return plan.n_batches, plan.n_atom_moves
+    starts = ~plan.linked
+    return int(np.count_nonzero(starts)), int(np.diff(plan.batch_offsets)[starts].sum())
+
+
+def _n_sites(plan: Plan) -> int:
+    """How far all atoms move together, in sites."""
+    return int(np.abs(plan.moves[:, 2:] - plan.moves[:, :2]).sum())
+
+
+def _format_error(error: Exception) -> str:
+    if isinstance(error, PlanError):
+        return str(error)
+    text = str(error)
+    return f"plan() raised {type(error).__name__}" + (f": {text}" if text else "")

@@ -1,0 +1,233 @@
+"""How fast tone programs become samples, beside the paper's way and plain numpy."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Generator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq.model import AxisTones, FrequencyCourse, SiteGrid, ToneProgram
+from labseq.motion import Renderer, comb_sample_rate, tone_program, warm_rendering
+from labseq.motion.render_reference import render_reference
+from labseq.session.planning import PlannedMoves, PlanRequest, plan_moves
+
+N_CHANNELS: Final = 2
+CHUNK: Final = 1 << 18
+"""Samples that are rendered into the same buffer again and again, as a streaming driver does."""
+
+STORED: Final = 1 << 21
+"""Samples of each stored waveform: 84 MB in all."""
+
+STORED_5: Final = "stored waveforms, 5 tones"
+STORED_20: Final = "stored waveforms, 20 tones"
+NUMPY_20: Final = "numpy, 20 tones"
+
+SITE_S: Final = 4.49e-6 / 0.130
+SITES: Final = 5
+"""Sites per transport of the programs that stand for one kind of segment: about a plan's mean."""
+
+
+PLAN: Final = PlanRequest("random:20x20@75%", "compact:15x15", "psca", 7, seed=1)
+"""A plan as it is played: 225 atoms out of 20 x 20 sites, seven at a time."""
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One measurement.
+
+    Attributes:
+        name: What was rendered, and how.
+        gigasamples_per_s: Samples of both channels per second, in 1e9.
+        playing_over_rendering: Playing time over rendering time.
+        goal: Least value of that; None if there is none.
+    """
+
+    name: str
+    gigasamples_per_s: float
+    playing_over_rendering: float
+    goal: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Ratio:
+    """Two rendering times in relation.
+
+    Attributes:
+        name: Which.
+        value: The ratio.
+        goal: What it should be, at most or at least.
+        at_most: Which of both.
+    """
+
+    name: str
+    value: float
+    goal: float
+    at_most: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class WaveformReport:
+    """What came of it.
+
+    Attributes:
+        rows: A row for each kind of segment and for a plan; the stored-waveform way and numpy last.
+        ratios: Those that there are goals for.
+        sample_rate_hz: Sample rate of all rows.
+        repeats: How often everything was rendered; the best one counts.
+    """
+
+    rows: tuple[Row, ...]
+    ratios: tuple[Ratio, ...]
+    sample_rate_hz: float
+    repeats: int
+
+    def as_dict(self) -> dict[str, Any]:
+        """Everything, JSON-ready."""
+        return asdict(self)
+
+
+def bench_waveform(repeats: int = 5, *, announce: Callable[[str], None] = lambda _: None) -> WaveformReport:
+    """Measure rendering into buffers that are used again, in two threads, the best of some repeats.
+
+    Args:
+        repeats: How often everything is rendered.
+        announce: Called with the name of a module before its kernels are compiled.
+    """
+    from labseq.kernel import announcing
+
+    moves = plan_moves(PLAN, announce=announce)
+    grid, rate_hz = moves.grid, comb_sample_rate(moves.grid)
+    with announcing(announce):
+        warm_rendering()
+        rows = [*_comb_rows(moves, rate_hz, repeats), *_other_ways(grid, rate_hz, repeats)]
+    time_of = {row.name: 1.0 / row.gigasamples_per_s for row in rows}
+    fast, stored, numpy = (time_of[name] for name in ("1 group, 20 tones", STORED_20, NUMPY_20))
+    ratios = (
+        Ratio("20 tones over 5 tones", fast / time_of["1 group, 5 tones"], 1.3, at_most=True),
+        Ratio("stored waveforms over comb, 20 tones", stored / fast, 5.0),
+        Ratio("numpy over comb, 20 tones", numpy / fast, 100.0),
+    )
+    return WaveformReport(tuple(rows), ratios, rate_hz, repeats)
+
+
+def _comb_rows(moves: PlannedMoves, rate_hz: float, repeats: int) -> Generator[Row]:
+    grid = moves.grid
+    bare = replace(moves.motion, overhead_per_batch_s=0.0)
+    plan = tone_program(moves.plan, grid, bare)
+    jerk = uniform_program(grid, 7, (1,), FrequencyCourse.MINIMUM_JERK)
+    for name, program, goal in (
+        ("1 group, 5 tones", uniform_program(grid, 5, (1,)), 3.0),
+        ("1 group, 20 tones", uniform_program(grid, 20, (1,)), 3.0),
+        ("3 groups, 7 tones", uniform_program(grid, 7, (1, 0, -1)), 2.0),
+        ("3 groups, 20 tones", uniform_program(grid, 20, (1, 0, -1)), 2.0),
+        ("minimum jerk, 7 tones", jerk, 1.0),
+        ("plan 20 -> 15 at 7, pauses left out", plan, 2.5),
+    ):
+        renderer = Renderer(program, rate_hz)
+        taken_s = _best(partial(render_all, renderer), repeats)
+        yield _row(name, renderer.n_samples, rate_hz, taken_s, goal)
+
+
+def _other_ways(grid: SiteGrid, rate_hz: float, repeats: int) -> Generator[Row]:
+    stored = stored_waveforms(grid, rate_hz)
+    for name, n_tones in ((STORED_5, 5), (STORED_20, 20)):
+        yield _row(name, STORED, rate_hz, _best(partial(sum_all_stored, stored, n_tones), repeats))
+    n, program = CHUNK // 8, uniform_program(grid, 20, (1,))
+    yield _row(NUMPY_20, n, rate_hz, _best(partial(render_reference, program, rate_hz, 0, n), 1))
+
+
+def uniform_program(
+    grid: SiteGrid, n_tones: int, directions: tuple[int, ...], course: int = FrequencyCourse.LINEAR
+) -> ToneProgram:
+    """A program of 100 transports: column tones that move in given directions, a row tone that stands.
+
+    They go there and back, so that the tones stay in the band.
+    """
+    n_segments = 100
+    hz = grid.column_frequency_hz[:n_tones]
+    step_hz = float(grid.column_frequency_hz[1] - grid.column_frequency_hz[0])
+    way_hz = SITES * step_hz * np.array([directions[k % len(directions)] for k in range(n_tones)])
+    forth = np.arange(n_segments)[:, None] % 2 == 0
+    start_hz = np.where(forth, hz, hz + way_hz).ravel()
+    end_hz = np.where(forth, hz + way_hz, hz).ravel()
+    phase_rad = np.random.default_rng(0).uniform(0, 2 * np.pi, start_hz.size)
+    amplitude = np.full(start_hz.size, 1 / 20)
+    offsets = np.arange(n_segments + 1, dtype=np.int32)
+    column = AxisTones(offsets * n_tones, start_hz, end_hz, amplitude, amplitude, phase_rad)
+    row_hz = np.full(n_segments, grid.row_frequency_hz[0])
+    one = np.full(n_segments, 1 / 20)
+    row = AxisTones(offsets, row_hz, row_hz, one, one, np.zeros(n_segments))
+    kinds, batches = np.full(n_segments, 2, np.int8), np.arange(n_segments, dtype=np.int32)
+    duration_s = np.full(n_segments, SITES * SITE_S)
+    return ToneProgram(row, column, duration_s, kinds, batches, np.full(n_segments, course, np.int8))
+
+
+def render_all(renderer: Renderer) -> None:
+    """Render a whole program in two threads, each into a buffer of its own, half of the time each."""
+
+    def work(start: int, stop: int) -> None:
+        out = np.empty(CHUNK, np.int16)
+        for at in range(start, stop, CHUNK):
+            for channel in range(N_CHANNELS):
+                renderer.write(channel, at, out[: min(CHUNK, stop - at)])
+
+    half = renderer.n_samples // 2
+    with ThreadPoolExecutor(1) as other:
+        later = other.submit(work, half, renderer.n_samples)
+        work(0, half)
+        later.result()
+
+
+def stored_waveforms(grid: SiteGrid, sample_rate_hz: float) -> NDArray[np.int16]:
+    """The paper's store: waveforms of each tone, at a twentieth of full scale.
+
+    A waveform for each tone, each kind of segment and each distance does not fit into the
+    processor's caches; nor does this.
+
+    Returns:
+        int16 (n_sites, STORED).
+    """
+    period = round(sample_rate_hz / float(np.diff(grid.column_frequency_hz[:2])[0]))
+    cycles = np.outer(grid.column_frequency_hz / sample_rate_hz, np.arange(period)) % 1.0
+    waves = np.rint(32767 / 20 * np.cos(2 * np.pi * cycles)).astype(np.int16)
+    return np.tile(waves, (1, -(-STORED // period)))[:, :STORED].copy()
+
+
+def sum_all_stored(stored: NDArray[np.int16], n_tones: int) -> None:
+    """The paper's way: pick ``n_tones`` waveforms and sum them, and one for the other channel.
+
+    As in :func:`render_all`, two threads do half of the time each, into the same buffers.
+    """
+    from labseq.motion.render_direct_kernels import sum_stored
+
+    def work(start: int, stop: int) -> None:
+        out = np.empty(CHUNK, np.int16)
+        for at in range(start, stop, CHUNK):
+            for picked in (np.arange(1), np.arange(n_tones)):
+                sum_stored(stored, picked, at, out[: min(CHUNK, stop - at)])
+
+    half = STORED // 2
+    with ThreadPoolExecutor(1) as other:
+        later = other.submit(work, half, STORED)
+        work(0, half)
+        later.result()
+
+
+def _best(call: Callable[[], object], repeats: int) -> float:
+    """Shortest duration of some calls, in seconds."""
+    taken: list[float] = []
+    for _ in range(repeats):
+        start_s = time.perf_counter()
+        call()
+        taken.append(time.perf_counter() - start_s)
+    return min(taken)
+
+
+def _row(name: str, n_samples: int, sample_rate_hz: float, taken_s: float, goal: float | None = None) -> Row:
+    return Row(name, N_CHANNELS * n_samples / taken_s / 1e9, n_samples / sample_rate_hz / taken_s, goal)

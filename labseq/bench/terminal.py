@@ -1,0 +1,392 @@
+"""What `labseq bench` prints."""
+
+from __future__ import annotations
+
+import math
+import shlex
+import sys
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from labseq.bench.comparison import BARE_MOTION, loading_seed
+from labseq.bench.latency import GOAL_S, LatencyReport, LatencyRequest, Stage, measure_latency
+from labseq.bench.pictures import save_comparison
+from labseq.bench.planners import BenchRequest, compare, read_request
+from labseq.bench.rendering import WaveformReport, bench_waveform
+from labseq.bench.report import (
+    Figure,
+    Report,
+    Row,
+    figure_drawing,
+    fits_as_dicts,
+    histogram_drawing,
+    points_of,
+)
+from labseq.console.output import (
+    STDOUT,
+    as_line,
+    check_different,
+    check_writable,
+    columns,
+    json_writer,
+    percent,
+    plural,
+    report_compiling,
+    say,
+    stdout_to_stderr,
+    write_text,
+)
+from labseq.errors import PlanError
+from labseq.model.estimate import Estimate
+from labseq.pictures.plans import check_picture
+from labseq.units import format_quantity
+
+_STEPS: Final = 10
+"""How often progress is told where there is no terminal."""
+
+
+@contextmanager
+def progress_of(what: str) -> Generator[Callable[[int, int], None]]:
+    """A bar on stderr if that is a terminal, else a line now and then.
+
+    Args:
+        what: What is counted, in the plural.
+    """
+    if not sys.stderr.isatty():
+        told = 0
+
+        def report_progress(done: int, wanted: int) -> None:
+            nonlocal told
+            if done * _STEPS // wanted > told:
+                told = done * _STEPS // wanted
+                say(f"{done} of {wanted} {what}", stream=sys.stderr)
+
+        yield report_progress
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    parts = (TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*parts, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(what, total=None)
+        yield lambda done, wanted: bar.update(task, completed=done, total=wanted)
+
+
+_TEXT_COLUMNS: Final = {"planner", "target", "grid"}
+
+
+def table(report: Report) -> list[str]:
+    """A line per planner and condition; conditions are named only where they differ."""
+    if not report.rows:
+        return ["nothing was done"]
+    rows = [_cells(row, report) for row in report.rows]
+    header = list(rows[0])
+    right = [i for i, name in enumerate(header) if name not in _TEXT_COLUMNS]
+    return columns([header, *([row[name] for name in header] for row in rows)], right)
+
+
+def notes(report: Report, figure: Figure | None) -> list[str]:
+    """What the table cannot say: fits, what is left out, what went wrong."""
+    lines = [_extent(report)]
+    if any(row.scans for row in report.rows):
+        lines.append("scans: what the source of the planner counts instead of batches, and their time")
+    lines += _shortages(report)
+    if figure is not None:
+        lines += [*_fits(report, figure), f"the paper, figure {figure.name}: {figure.paper}"]
+    for row in report.rows:
+        lines += _failure(report, row)
+    return ["", *lines]
+
+
+def _cells(row: Row, report: Report) -> dict[str, str]:
+    conditions = report.comparison.conditions
+    rows, cols = row.condition.shape
+    cells: dict[str, str] = {"planner": row.planner_entry.label}
+    if len({condition.shape for condition in conditions}) > 1:
+        cells["grid"] = f"{rows}x{cols}"
+    if len({condition.target for condition in conditions}) > 1:
+        cells |= {"target": row.condition.target, "atoms": str(row.n_target_atoms)}
+    cells |= {
+        "DOP": str(row.degree_of_parallelism),
+        "batches": str(row.n_batches),
+        "atoms moved": str(row.n_atoms_moved),
+        "distance/mm": str(row.distance_m.scaled(1e3)),
+        "motion/ms": str(row.motion_s.scaled(1e3)),
+    }
+    if any(other.scans for other in report.rows):
+        cells |= {"scans": str(row.n_scans), "scans/ms": str(row.scan_s.scaled(1e3))}
+    return cells | {
+        "planning": _time(row.planning_median_s),
+        "99 %": _time(row.planning_p99_s),
+        "filled": percent(row.filling_fraction.value, 2),
+        "met": percent(row.target_met.value, 2),
+        "/bound": str(row.ratio_to_bound),
+    }
+
+
+def _fits(report: Report, figure: Figure) -> list[str]:
+    """The power laws, and what the curves come to at the last point."""
+    every = [points for points in points_of(report, figure) if points.law is not None]
+    if not every:
+        return []
+    what, unit, factor = ("time", " ms", 1e3) if figure.y == "motion_s" else ("number", "", 1.0)
+    lines = [f"{points.label}: {what} ~ N^{points.law.exponent}" for points in every if points.law]
+    first = every[0].y[-1]
+    last = [
+        f"{points.label} {Estimate(points.y[-1], points.error[-1]).scaled(factor)}{unit}"
+        f" (x {points.y[-1] / first:.3g})"
+        for points in every
+    ]
+    return [*lines, f"at {every[0].x[-1]:.0f} atoms: {', '.join(last)}"]
+
+
+def _time(duration_s: float) -> str:
+    return "-" if math.isnan(duration_s) else format_quantity(duration_s, "time")
+
+
+def _extent(report: Report) -> str:
+    comparison, n_conditions = report.comparison, len(report.comparison.conditions)
+    text = plural(comparison.n_loadings, "loading")
+    text += f" for each of {n_conditions} conditions" if n_conditions > 1 else ""
+    if report.ended_by is not None:
+        text = f"INCOMPLETE: {report.n_done} of {report.n_wanted} loadings"
+    if report.rows and n_conditions == 1:
+        text += f"; bound {report.rows[0].bound} batches"
+    return f"{text}; seed {comparison.seed}; {format_quantity(report.duration_s, 'time')}"
+
+
+def _shortages(report: Report) -> list[str]:
+    short = {row.condition: row for row in report.rows if row.n_short}
+    return [
+        f"{row.n_short} of {row.n_loadings} loadings hold fewer atoms than {condition.target} has sites"
+        for condition, row in short.items()
+    ]
+
+
+def _failure(report: Report, row: Row) -> list[str]:
+    failure = row.first_failure
+    if failure is None:
+        return []
+    what = f"{row.n_failed} of {row.n_loadings} plans are wrong; the first, of loading {failure.loading}"
+    return [
+        f"{row.planner_entry.label}: {what}: {failure.message}",
+        f"  see it with: {_again(report, row, failure.loading)}",
+    ]
+
+
+def _again(report: Report, row: Row, loading: int) -> str:
+    """How one loading is planned again."""
+    condition, comparison = row.condition, report.comparison
+    rows, cols = condition.shape
+    seed = loading_seed(comparison.seed, loading)
+    if condition.motion != BARE_MOTION:  # which takes a profile
+        return f"numpy.random.default_rng({seed}).random(({rows}, {cols})) < {condition.loading:g}"
+    words = ["labseq", "plan", f"random:{rows}x{cols}@{condition.loading:g}", "--seed", str(seed)]
+    words += ["--target", condition.target, "--planner", row.planner_entry.planner]
+    if "degree_of_parallelism" in row.settings and condition.degree_of_parallelism is not None:
+        words += ["--dop", str(condition.degree_of_parallelism)]
+    for key, value in (*comparison.settings, *row.planner_entry.settings):
+        words += ["--set", f"{key}={value}"]
+    return shlex.join(words)
+
+
+@dataclass(frozen=True, slots=True)
+class BenchOutput:
+    """What is written besides the table.
+
+    Attributes:
+        json: Name of the file for everything as JSON; "-" for stdout, which then holds nothing else.
+        csv: The file for the table as CSV.
+        png: The file for the picture.
+    """
+
+    json: str | None = None
+    csv: Path | None = None
+    png: Path | None = None
+
+
+def bench_planners(request: BenchRequest, output: BenchOutput) -> None:
+    """Compare planners and tell what came of it, also when it was stopped.
+
+    Args:
+        request: What is to be compared.
+        output: What is written besides the table.
+
+    Raises:
+        ConfigError: Something in the request is wrong, or a file cannot be written.
+        PluginLoadError: A plugin that is named failed to load.
+        PlanError: A planner failed, or a plan breaks a rule, for some loadings.
+        StopRequested: It was stopped; what was done until then has been told.
+    """
+    answer = stdout_to_stderr() if output.json == STDOUT else None
+    comparison, figure = read_request(request)
+    files = _files(output, figure)
+    check_different(*files.values())
+    for kind, path in files.items():
+        if kind == "png":
+            check_picture(path, (1, 1))
+        check_writable(path)
+    with progress_of("loadings") as progress:
+        report = compare(comparison, request.workers, announce=report_compiling, progress=progress)
+    say(*table(report), *notes(report, figure))
+    if report.rows:
+        _write_files(files, report, figure)
+    if answer is not None:
+        answer(as_line(_as_dict(report, figure)))
+    if report.ended_by is not None:
+        raise report.ended_by
+    _raise_failures(report)
+
+
+def _files(output: BenchOutput, figure: Figure | None) -> dict[str, Path]:
+    """The files that are to be written, by kind."""
+    named = {"csv": output.csv, "png": output.png}
+    if output.json not in (None, STDOUT):
+        named["json"] = Path(output.json)
+    if figure is not None:
+        named = {kind: path or Path(f"figure-{figure.name}.{kind}") for kind, path in named.items()}
+    return {kind: path for kind, path in named.items() if path is not None}
+
+
+def _write_files(files: dict[str, Path], report: Report, figure: Figure | None) -> None:
+    for kind, path in files.items():
+        if kind == "png":
+            save_comparison(path, figure_drawing(report, figure) if figure else histogram_drawing(report))
+            continue
+        write_text(path, report.as_csv() if kind == "csv" else f"{as_line(_as_dict(report, figure))}\n")
+    if files:
+        say(f"written: {', '.join(map(str, files.values()))}")
+
+
+def _as_dict(report: Report, figure: Figure | None) -> dict[str, Any]:
+    values = report.as_dict()
+    if figure is not None:
+        values |= {"figure": figure.name, "fits": fits_as_dicts(points_of(report, figure))}
+    return values
+
+
+def _raise_failures(report: Report) -> None:
+    failed = [row for row in report.rows if row.n_failed]
+    if failed:
+        n, of = sum(row.n_failed for row in failed), sum(row.n_loadings for row in failed)
+        names = ", ".join(dict.fromkeys(f"'{row.planner_entry.planner}'" for row in failed))
+        raise PlanError(f"{n} of {of} plans of {names} are wrong; they do not count in the table")
+
+
+def bench_latency(request: LatencyRequest, json: str | None = None) -> None:
+    """Measure and tell.
+
+    Args:
+        request: What is to be measured.
+        json: Name of the file for everything as JSON; "-" for stdout, which then holds nothing else.
+
+    Raises:
+        ConfigError: Something in the request is wrong, or the file cannot be written.
+        PluginLoadError: A plugin that is named failed to load.
+        LabseqError: Whatever ended a shot.
+    """
+    write = json_writer(json)
+    with progress_of("loadings") as progress:
+        report = measure_latency(request, announce=report_compiling, progress=progress)
+    say(*bench_latency_table(report), "", *light_table(report), "", *bench_latency_notes(report))
+    say(*(f"warning: {text}" for text in report.warnings), stream=sys.stderr)
+    write(report.as_dict())
+
+
+def bench_latency_table(report: LatencyReport) -> list[str]:
+    """From a frame in memory to the first chunk of samples."""
+    rows = [("stage", "median", "99 %", "share")]
+    for stage in (*report.stages, report.total):
+        share = percent(stage.median_s / report.total.median_s, 0)
+        rows.append(
+            (stage.name, _bench_latency_time(stage.median_s), _bench_latency_time(stage.p99_s), share)
+        )
+    return columns(rows, right=(1, 2, 3))
+
+
+def light_table(report: LatencyReport) -> list[str]:
+    """From the end of the exposure to the output; what the hardware takes is modelled."""
+    parts = (
+        Stage("camera read-out", 0.0, 0.0, report.readout_s),
+        report.planned,
+        report.prepare,
+        report.start,
+        Stage("trigger", 0.0, 0.0, report.trigger_s),
+    )
+    rows = [("to the light", "here", "99 %", "modelled")]
+    rows += [(s.name, _or_none(s.median_s), _or_none(s.p99_s), _or_none(s.modelled_s)) for s in parts]
+    here_s = sum(stage.median_s for stage in parts)
+    rows.append(
+        (
+            "end of exposure to light",
+            _bench_latency_time(here_s),
+            "-",
+            _bench_latency_time(report.to_light_s - here_s),
+        )
+    )
+    return columns(rows, right=(1, 2, 3))
+
+
+def bench_latency_notes(report: LatencyReport) -> list[str]:
+    """What was measured, where, and what the tables cannot say."""
+    device = f"{report.device}, mode {report.mode}" if report.mode else report.device
+    load = "" if report.load is None else f", load {report.load:.2g}"
+    playing, rate = format_quantity(report.playing_s, "time"), report.sample_rate_hz
+    planner = f"{report.planner}, degree of parallelism {report.degree_of_parallelism}"
+    return [
+        f"frame to first chunk: {_bench_latency_time(report.total.median_s)}; the goal is {_bench_latency_time(GOAL_S)}",
+        f"{plural(report.n_loadings, 'loading')}, seed {report.seed}; {plural(report.n_cores, 'core')}{load}",
+        f"{planner}: {report.n_batches:g} batches, played in {playing}",
+        f"profile {report.profile}: {device}; first chunk at {format_quantity(rate, 'frequency')}",
+        "prepare: the driver's own rendering included, and the work of a simulated device",
+    ]
+
+
+def _bench_latency_time(duration_s: float) -> str:
+    return format_quantity(duration_s, "time")
+
+
+def _or_none(duration_s: float) -> str:
+    return _bench_latency_time(duration_s) if duration_s else "-"
+
+
+def bench_rendering(repeats: int, json: str | None = None) -> None:
+    """Measure and tell.
+
+    Args:
+        repeats: How often everything is rendered.
+        json: Name of the file for everything as JSON; "-" for stdout, which then holds nothing else.
+
+    Raises:
+        ConfigError: The file cannot be written.
+    """
+    write = json_writer(json)
+    report = bench_waveform(repeats, announce=report_compiling)
+    say(*bench_waveform_table(report), "", *ratios(report), "", _bench_waveform_extent(report))
+    write(report.as_dict())
+
+
+def bench_waveform_table(report: WaveformReport) -> list[str]:
+    """A line per measurement."""
+    rows = [("two channels", "Gsample/s", "playing/rendering", "goal")]
+    for row in report.rows:
+        goal = "-" if row.goal is None else f">= {row.goal:g}"
+        rows.append((row.name, f"{row.gigasamples_per_s:.3g}", f"{row.playing_over_rendering:.3g}", goal))
+    return columns(rows, right=(1, 2, 3))
+
+
+def ratios(report: WaveformReport) -> list[str]:
+    """A line per ratio of rendering times."""
+    rows = [("rendering times", "ratio", "goal")]
+    for ratio in report.ratios:
+        sign = "<=" if ratio.at_most else ">="
+        rows.append((ratio.name, f"{ratio.value:.3g}", f"{sign} {ratio.goal:g}"))
+    return columns(rows, right=(1, 2))
+
+
+def _bench_waveform_extent(report: WaveformReport) -> str:
+    rate = format_quantity(report.sample_rate_hz, "frequency")
+    return f"{rate}, two threads; the best of {report.repeats}"

@@ -1,0 +1,58 @@
+"""The steps, patterns, detectors and analyses that labseq itself offers, registered like any plugin's."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from labseq.hookspecs import LABSEQ_API as _API, hookimpl
+from labseq.registry import Registry
+
+LABSEQ_API: Final = _API
+
+
+@hookimpl
+def labseq_register(registry: Registry) -> None:
+    """Offer the built-in steps, patterns, detectors and analyses."""
+    from labseq.builtin.analyses import SurvivalAnalysis, SurvivalSettings
+    from labseq.builtin.detectors import ThresholdSettings, WeightedSettings
+    from labseq.builtin.equalise import EqualiseStep
+    from labseq.builtin.patterns import BitmapSettings, CompactSettings
+    from labseq.builtin.probes import CheckOverlayStep, CheckSitesStep, ProbeStep
+    from labseq.builtin.steps import (
+        CheckOverlaySettings,
+        CheckSitesSettings,
+        DeviceSettings,
+        DeviceStep,
+        EqualiseSettings,
+        ImageSettings,
+        ImageStep,
+        LoadSettings,
+        LoadStep,
+        ProbeSettings,
+        RampSettings,
+        RampStep,
+        RearrangeSettings,
+        RearrangeStep,
+        WaitSettings,
+    )
+    from labseq.detection.threshold import BlindDetector, ThresholdDetector
+    from labseq.detection.weighted import WeightedDetector
+    from labseq.geometry import bitmap, compact
+    from labseq.sequencer.leading import wait_step
+
+    registry.step("load", LoadStep, LoadSettings)
+    registry.step("image", ImageStep, ImageSettings)
+    registry.step("rearrange", RearrangeStep, RearrangeSettings)
+    registry.step("ramp", RampStep, RampSettings)
+    registry.step("probe", ProbeStep, ProbeSettings)
+    registry.step("check_sites", CheckSitesStep, CheckSitesSettings)
+    registry.step("check_overlay", CheckOverlayStep, CheckOverlaySettings)
+    registry.step("equalise", EqualiseStep, EqualiseSettings)
+    registry.step("wait", wait_step, WaitSettings)
+    registry.step("device", DeviceStep, DeviceSettings)
+    registry.pattern("compact", compact, CompactSettings)
+    registry.pattern("bitmap", bitmap, BitmapSettings)
+    registry.detector("threshold", ThresholdDetector, ThresholdSettings)
+    registry.detector("weighted", WeightedDetector, WeightedSettings)
+    registry.detector("blind", BlindDetector)
+    registry.analysis("survival", SurvivalAnalysis, SurvivalSettings)

@@ -1,0 +1,150 @@
+"""Settings of the built-in target patterns."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Annotated, Any, Final, Literal, Self, cast
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, PrivateAttr, model_validator
+
+from labseq.config.fields import setting_error
+from labseq.config.messages import visible
+from labseq.config.settings import FilePath, Settings
+from labseq.config.yaml_nodes import decode, read_bytes
+from labseq.errors import ConfigError, Problem
+from labseq.geometry import DrawingError, read_bitmap
+
+MAX_PIXELS: Final = 1024
+"""Longest side of a picture, in pixels: far more than any grid has sites."""
+
+MAX_BYTES: Final = 1 << 20
+"""Largest file with a drawing, in bytes."""
+
+_HALF: Final = 128
+_SUFFIXES: Final = (".txt", ".png")
+
+
+def read_drawing(path: Path, fill: str = "#") -> NDArray[np.bool_]:
+    """Read a pattern that is drawn in a file.
+
+    A file whose name ends in .png is a picture; any other is text.
+
+    Args:
+        path: The file.
+        fill: Characters that stand for an atom, in a text.
+
+    Returns:
+        bool (rows, cols), True where an atom must be.
+
+    Raises:
+        ConfigError: It cannot be read, or it is no drawing; with the line that is wrong.
+    """
+    data = read_bytes(path, "a text file or a PNG", _SUFFIXES, MAX_BYTES)
+    name = visible(str(path))
+    if path.suffix.lower() == ".png":
+        return _picture(data, name)
+    try:
+        return read_bitmap(decode(data, name), fill)
+    except DrawingError as error:
+        column = 1 if error.line else 0
+        raise ConfigError(Problem(str(error), name, error.line, column)) from None
+
+
+def _picture(data: bytes, name: str) -> NDArray[np.bool_]:
+    """Dark pixels are atoms; in a picture with transparent pixels, opaque ones."""
+    try:
+        from PIL import Image
+    except ImportError:
+        hint = 'pip install "labseq[plot]", or draw it as text'
+        raise ConfigError(
+            Problem("reading a PNG needs Pillow, which is not installed", name, hint=hint)
+        ) from None
+    try:
+        with Image.open(io.BytesIO(data), formats=["PNG"]) as image:
+            if max(image.size) > MAX_PIXELS:
+                what = f"the picture has {image.height} x {image.width} pixels"
+                raise ConfigError(Problem(what, name, expected="one pixel per site", hint="scale it down"))
+            # Grey levels of 16 bits fit into no other mode; the upper 8 are enough.
+            grey = np.asarray(image) // 257 if image.mode.startswith("I") else np.asarray(image.convert("L"))
+            opacity = np.asarray(cast("Any", image).convert("RGBA"))[..., 3]
+    except ConfigError:
+        raise
+    except (
+        Exception
+    ) as error:  # damaged data make Pillow raise SyntaxError, OSError, ValueError, zlib.error ...
+        raise ConfigError(Problem(f"this is not a readable PNG: {error}", name)) from error
+    mask = opacity >= _HALF if opacity.min() < _HALF else grey < _HALF
+    if not mask.any():
+        hint = "make the pixels of atoms dark, or all others transparent"
+        raise ConfigError(Problem("the picture holds no atom", name, hint=hint))
+    return mask
+
+
+Index = Annotated[int, Field(ge=0)]
+"""Index of a row or a column, from 0."""
+
+
+class CompactSettings(Settings):
+    """A full block of sites."""
+
+    rows: int = Field(ge=1, description="rows of the block")
+    cols: int = Field(ge=1, description="columns of the block")
+    origin: tuple[Index, Index] | None = Field(
+        default=None, description="[row, column] of its top left site, from 0; centred if left out"
+    )
+
+
+class BitmapSettings(Settings):
+    r"""Sites as they are drawn, in the sequence or in a file.
+
+    Example:
+        >>> BitmapSettings(sites="#.#\n.#.").mask.astype(int).tolist()
+        [[1, 0, 1], [0, 1, 0]]
+    """
+
+    sites: str | None = Field(
+        default=None, description="the drawing: one line of text per row, all of the same length"
+    )
+    file: FilePath | None = Field(
+        default=None,
+        description="a file with the drawing, instead of sites: text, or a PNG with one pixel per site",
+    )
+    fill: str = Field(
+        default="#",
+        min_length=1,
+        description="characters of a text that stand for an atom; all others are empty sites",
+    )
+    origin: tuple[Index, Index] | None = Field(
+        default=None, description="[row, column] of its top left site, from 0; centred if left out"
+    )
+    clear: Literal["bounding_box", "none"] = Field(
+        default="bounding_box",
+        description="bounding_box: all other sites of the drawing must be empty; none: they are reservoir",
+    )
+    _mask: NDArray[np.bool_] = PrivateAttr()
+
+    @property
+    def mask(self) -> NDArray[np.bool_]:
+        """What is drawn: bool (rows, cols), True where an atom must be."""
+        return self._mask
+
+    @model_validator(mode="after")
+    def _read(self) -> Self:
+        if self.sites is not None and self.file is not None:
+            raise setting_error("'file' stands beside 'sites'", "one of them", at=("file",), key=True)
+        if self.file is not None:
+            try:
+                self._mask = read_drawing(self.file, self.fill)
+            except ConfigError as error:
+                raise setting_error(str(error), at=("file",)) from None
+        elif self.sites is not None:
+            try:
+                self._mask = read_bitmap(self.sites, self.fill)
+            except DrawingError as error:
+                raise setting_error(str(error), at=("sites",)) from None
+        else:
+            raise setting_error("a bitmap needs a drawing", "'sites' or 'file'")
+        return self

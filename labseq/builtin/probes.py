@@ -1,0 +1,300 @@
+"""Steps that probe the overlay and watch for drifts."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Final, Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq.builtin.steps import play
+from labseq.detection.drift import measure_shift
+from labseq.errors import ConfigError, DeviceError
+from labseq.model import Occupancy, SiteGrid, TimelineEntry
+from labseq.motion import (
+    FastOffset,
+    SurvivalShape,
+    cross_offsets_m,
+    fast_offset,
+    group_counts,
+    hold_program,
+    hold_time_s,
+)
+from labseq.roles import ReportsSignals, Shot, StepContext
+from labseq.units import format_quantity
+
+Pattern = Literal["same", "cross"]
+
+
+class HoldSettings(Protocol):
+    """How atoms are held, from the settings of a step."""
+
+    @property
+    def hold(self) -> float:
+        """Time between the ramps, in seconds."""
+        ...
+
+    @property
+    def drop_off(self) -> float:
+        """Duration of the drop-off, in seconds."""
+        ...
+
+
+class _Settings(HoldSettings, Protocol):
+    @property
+    def offset(self) -> tuple[float, float]: ...
+    @property
+    def pattern(self) -> Pattern: ...
+    @property
+    def sites(self) -> Literal["seen", "all"]: ...
+
+
+class ProbeStep:
+    """Picks atoms up, holds them and sets them down, beside their sites by an offset.
+
+    Who survives tells where the mobile tweezers stand; an image after it shows that.
+    """
+
+    needs_image = True
+    takes_image = False
+
+    def __init__(self, settings: _Settings) -> None:
+        self.settings = settings
+
+    def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:
+        """One bar, with all sites held.
+
+        Raises:
+            LimitError: At this offset, tones of the grid break a limit.
+        """
+        settings = self.settings
+        duration_s = longest_s(context, self._offsets_m(context.grid), settings)
+        return [TimelineEntry("probe", duration_s, duration_s if settings.sites == "all" else 0.0)]
+
+    def run(self, shot: Shot) -> None:
+        """Hold the atoms that the last image saw, or those of all sites."""
+        seen = shot.occupancy
+        if seen is None:
+            raise ConfigError("probe needs an image before it in the shot")
+        sites = np.ones_like(seen) if self.settings.sites == "all" else seen
+        hold(shot, sites, self._offsets_m(shot.grid), self.settings)
+
+    def _offsets_m(self, grid: SiteGrid) -> NDArray[np.float64]:
+        offset_m = self.settings.offset
+        if self.settings.pattern == "cross":
+            return cross_offsets_m(grid.shape, offset_m)
+        return np.broadcast_to(np.asarray(offset_m, np.float64), (*grid.shape, 2))
+
+
+def hold(shot: Shot, sites: Occupancy, offsets_m: NDArray[np.float64], hold_settings: HoldSettings) -> None:
+    """Pick up, hold and drop the atoms of some sites, each beside its site by an offset.
+
+    Args:
+        shot: The running shot.
+        sites: bool (n_rows, n_cols); without any, nothing is played.
+        offsets_m: float64 (n_rows, n_cols, 2), along a1 and a2.
+        holding: How long.
+    """
+    if sites.any():
+        start_s = shot.clock.now()
+        times_s = hold_settings.hold, hold_settings.drop_off
+        play(shot, lambda: hold_program(shot.grid, shot.motion, sites, offsets_m, *times_s), start_s)
+
+
+def longest_s(context: StepContext, offsets_m: NDArray[np.float64], hold_settings: HoldSettings) -> float:
+    """How long :func:`hold` takes if every site holds an atom.
+
+    Raises:
+        LimitError: The tone of a site leaves its band.
+    """
+    time_s = hold_time_s(context.grid, context.motion, offsets_m, hold_settings.hold, hold_settings.drop_off)
+    return context.motion.overhead_per_cycle_s + time_s
+
+
+Exceeded = Literal["warn", "stop"]
+
+MIN_ATOMS: Final = 10
+"""With fewer, noise may pass for atoms that stand elsewhere."""
+SURE: Final = 1.0
+"""A shift counts as too large if it exceeds the limit by this many of its errors."""
+
+
+class _SitesSettings(Protocol):
+    @property
+    def every(self) -> int: ...
+    @property
+    def limit_px(self) -> float: ...
+    @property
+    def spot_px(self) -> float: ...
+    @property
+    def exceeded(self) -> Exceeded: ...
+
+
+class _OverlaySettings(HoldSettings, Protocol):
+    @property
+    def every(self) -> int: ...
+    @property
+    def offset(self) -> float: ...
+    @property
+    def exposure(self) -> float: ...
+    @property
+    def limit(self) -> float: ...
+    @property
+    def exceeded(self) -> Exceeded: ...
+    @property
+    def half_width(self) -> float: ...
+    @property
+    def edge(self) -> float: ...
+
+
+class CheckSitesStep:
+    """Sees on the last image whether the atoms still stand where the detector looks for them."""
+
+    needs_image = True
+    takes_image = False
+    repeatable = True
+
+    def __init__(self, settings: _SitesSettings) -> None:
+        self.settings = settings
+
+    def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:  # noqa: ARG002 - Protocol
+        """One bar without a length: it takes some milliseconds of the computer's time."""
+        return [TimelineEntry("check sites", 0.0, 0.0)]
+
+    def run(self, shot: Shot) -> None:
+        """Measure the common shift, note it, and warn or stop if it is too large.
+
+        Raises:
+            ConfigError: The detector does not tell where it looks for the atoms.
+            DeviceError: The shift is too large, and ``exceeded`` is "stop".
+        """
+        settings, detector = self.settings, shot.detector
+        if shot.index % settings.every:
+            return
+        if shot.frame is None or shot.occupancy is None:
+            raise ConfigError("check_sites needs an image before it in the shot")
+        if not isinstance(detector, ReportsSignals):
+            raise ConfigError(
+                "check_sites needs a detector that tells where it looks for the atoms; "
+                "'threshold' and 'weighted' do"
+            )
+        image, sites_px = shot.frame.image, detector.sites_px[shot.occupancy]
+        dy = dx = error = math.inf
+        if len(sites_px) >= MIN_ATOMS:
+            with shot.stage("check sites"):
+                limit_s = shot.call_timeout_s
+                dy, dx, error = shot.call(
+                    "detector", limit_s, measure_shift, image, sites_px, settings.spot_px
+                )
+        if not error <= settings.limit_px:
+            _warn(
+                shot,
+                f"check_sites cannot tell where the sites are with {len(sites_px)} atoms seen on them: "
+                "few were loaded, or the sites are far from where the detector looks",
+            )
+            return
+        for name, value in (("shift_y_px", dy), ("shift_x_px", dx), ("shift_error_px", error)):
+            shot.note(f"sites.{name}", value)
+        if math.hypot(dy, dx) > settings.limit_px + SURE * error:
+            _handle_exceeded(
+                shot,
+                settings.exceeded,
+                "camera",
+                f"the sites have moved by {dy:+.2f} px down and {dx:+.2f} px to the right on the frame "
+                f"(+-{error:.2f}); the limit is {settings.limit_px:g} px: run `labseq calibrate sites`",
+            )
+
+
+class CheckOverlayStep:
+    """Sees by a probe of four groups of sites whether the mobile tweezers still stand on the sites.
+
+    It costs the atoms of a shot that are probed, so it comes after everything else, every so many shots.
+    """
+
+    needs_image = True
+    takes_image = False
+
+    def __init__(self, settings: _OverlaySettings) -> None:
+        self.settings = settings
+
+    def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:
+        """Probe and image, left out in most shots.
+
+        Raises:
+            LimitError: At this offset, tones of the grid break a limit.
+        """
+        settings = self.settings
+        offsets_m = self._offsets_m(context.grid.shape)
+        probe_s = longest_s(context, offsets_m, settings)
+        image_s = settings.exposure + context.camera.readout_s
+        return [
+            TimelineEntry("check overlay: probe", probe_s, 0.0),
+            TimelineEntry(
+                "check overlay: image", image_s, image_s if settings.every == 1 else 0.0, 1, settings.exposure
+            ),
+        ]
+
+    def run(self, shot: Shot) -> None:
+        """Probe, take an image, note the offset, and warn or stop if it is too large.
+
+        Raises:
+            DeviceError: The offset is too large, and ``exceeded`` is "stop".
+        """
+        settings, before = self.settings, shot.occupancy
+        if shot.index % settings.every:
+            return
+        if before is None:
+            raise ConfigError("check_overlay needs an image before it in the shot")
+        offsets_m = self._offsets_m(shot.grid.shape)
+        with shot.stage("check overlay"):
+            hold(shot, before, offsets_m, settings)
+            after = shot.take_image(settings.exposure)
+        entry = shot.calibrations.get("overlay")
+        calibrated = None if entry is None else SurvivalShape.from_values(entry.values)
+        shape = calibrated or SurvivalShape(settings.half_width, settings.edge)
+        found = fast_offset(*group_counts(offsets_m, before, after), shape, shot.grid)
+        if found.n_atoms:
+            along_m, across_m = (float(value) for value in found.offset_m)
+            shot.note("overlay.along_row_m", along_m)
+            shot.note("overlay.row_to_row_m", across_m)
+            shot.note("overlay.error_m", float(found.error_m.max()))
+        self._judge(shot, found)
+
+    def _judge(self, shot: Shot, found: FastOffset) -> None:
+        settings = self.settings
+        offset_m, error_m = np.abs(found.offset_m), found.error_m
+        parts = " and ".join(
+            f"{format_quantity(float(at), 'length')} {way} (+-{format_quantity(float(error), 'length')})"
+            for at, error, way in zip(
+                found.offset_m, error_m, ("along a row", "from row to row"), strict=True
+            )
+        )
+        limit = format_quantity(settings.limit, "length")
+        if not found.fits:
+            text = "the survival of the probed atoms goes with no small offset of the mobile tweezers"
+            _handle_exceeded(
+                shot, settings.exceeded, "mobile_tweezers", f"{text}: run `labseq calibrate overlay`"
+            )
+        elif (offset_m > settings.limit + SURE * error_m).any():
+            text = f"the mobile tweezers stand {parts} beside the sites; the limit is {limit}"
+            _handle_exceeded(
+                shot, settings.exceeded, "mobile_tweezers", f"{text}: run `labseq calibrate overlay`"
+            )
+        elif not (error_m <= settings.limit).all():
+            n_atoms = "1 atom" if found.n_atoms == 1 else f"{found.n_atoms} atoms"
+            _warn(shot, f"check_overlay cannot tell the overlay to {limit} with {n_atoms} on this shot")
+
+    def _offsets_m(self, shape: tuple[int, int]) -> NDArray[np.float64]:
+        return cross_offsets_m(shape, (self.settings.offset, self.settings.offset))
+
+
+def _handle_exceeded(shot: Shot, exceeded: Exceeded, device: str, text: str) -> None:
+    if exceeded == "stop":
+        raise DeviceError(device, text)
+    _warn(shot, text)
+
+
+def _warn(shot: Shot, text: str) -> None:
+    shot.log("warning", text=f"shot {shot.index + 1}: {text}")

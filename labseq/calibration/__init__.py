@@ -1,0 +1,1 @@
+"""Everything about calibrations: their store, how each is measured, their pictures and commands."""

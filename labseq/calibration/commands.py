@@ -1,0 +1,157 @@
+"""`labseq calibrate` and `labseq calibration`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from labseq.console.options import DryRun as RunDry, DryRunKind, Json, Overrides, profile_names
+
+calibration = typer.Typer(
+    name="calibration",
+    help="List, compare and choose the calibrations of a profile.",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+)
+
+ID_HELP = "Id of a calibration, or so much of its beginning that no other one is meant."
+
+USE_EXAMPLES = """\b
+Examples:
+  labseq calibration use f102b3 --profile lab
+  labseq calibration use overlay=off --profile lab
+"""
+
+CALIBRATE_EXAMPLES = """\b
+Examples:
+  labseq calibrate sites --profile lab
+  labseq calibrate thresholds --profile lab --shots 400 --set shot.1.image.exposure="30 ms"
+  labseq calibrate thresholds --profile lab --from data/2026-11-20/0012_calibrate-thresholds
+  labseq calibrate sites --profile lab --from sites.csv
+"""
+
+Profile = Annotated[
+    str,
+    typer.Option(
+        "--profile", "-p", metavar="NAME|FILE", help="Hardware profile.", autocompletion=profile_names
+    ),
+]
+DryRun = Annotated[
+    DryRunKind | None,
+    typer.Option(
+        "--dry-run",
+        help="Those of dry runs: what is measured on virtual devices does not count for real ones.",
+        metavar="[=fast]",
+        show_choices=False,
+    ),
+]
+Id = Annotated[str, typer.Argument(metavar="ID", help=ID_HELP, show_default=False)]
+
+
+def _mode(dry_run: DryRunKind | None) -> str:
+    return "off" if dry_run is None else dry_run.value
+
+
+@calibration.command("list", short_help="List the calibrations of a profile.")
+def list_all(profile: Profile = "virtual", dry_run: DryRun = None, as_json: Json = False) -> None:
+    """List the calibrations of a profile, damaged ones included, and mark those in use."""
+    from labseq.calibration.terminal import list_calibrations
+
+    list_calibrations(profile, _mode(dry_run), as_json=as_json)
+
+
+@calibration.command(short_help="Show what a calibration found.")
+def show(
+    calibration_id: Id, profile: Profile = "virtual", dry_run: DryRun = None, as_json: Json = False
+) -> None:
+    """Show what a calibration found, how good it is, and where it comes from."""
+    from labseq.calibration.terminal import show_calibration
+
+    show_calibration(calibration_id, profile, _mode(dry_run), as_json=as_json)
+
+
+@calibration.command(epilog=USE_EXAMPLES, short_help="Put a calibration to use, or aside.")
+def use(
+    choice: Annotated[
+        str,
+        typer.Argument(
+            metavar="ID", help=f"{ID_HELP} With overlay=off, none of that kind.", show_default=False
+        ),
+    ],
+    profile: Profile = "virtual",
+    dry_run: DryRun = None,
+    force: Annotated[
+        bool, typer.Option("--force", help="Use also one that is worse than the one in use.")
+    ] = False,
+) -> None:
+    """Put a calibration to use from the next run on; runs in progress keep theirs."""
+    from labseq.calibration.terminal import use_calibration
+
+    use_calibration(choice, profile, _mode(dry_run), force=force)
+
+
+@calibration.command(short_help="Compare two calibrations of one kind.")
+def diff(
+    before: Annotated[str, typer.Argument(metavar="ID", help=ID_HELP, show_default=False)],
+    after: Annotated[str, typer.Argument(metavar="ID", help=ID_HELP, show_default=False)],
+    profile: Profile = "virtual",
+    dry_run: DryRun = None,
+    as_json: Json = False,
+) -> None:
+    """Compare two calibrations of one kind: how far every value has moved, and the figures of merit."""
+    from labseq.calibration.terminal import compare_calibrations
+
+    compare_calibrations(before, after, profile, _mode(dry_run), as_json=as_json)
+
+
+def calibrate(
+    kind: Annotated[
+        str,
+        typer.Argument(
+            metavar="KIND",
+            help="What is calibrated: sites, thresholds, tweezers, frequencies or overlay.",
+            show_default=False,
+        ),
+    ],
+    profile: Profile = "virtual",
+    source: Annotated[
+        Path | None,
+        typer.Option(
+            "--from",
+            metavar="RUN|FILE",
+            help="Analyse a run that was taken before; or take the sites of an irregular array from a .npy "
+            "or .csv file.",
+        ),
+    ] = None,
+    shots: Annotated[
+        int | None, typer.Option(metavar="N", help="Number of shots, instead of the sequence's own.")
+    ] = None,
+    seed: Annotated[int | None, typer.Option(metavar="N", help="Seed of all random numbers.")] = None,
+    overrides: Overrides = None,
+    output: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Folder for the data, instead of LABSEQ_DATA or ./data."),
+    ] = None,
+    dry_run: RunDry = None,
+    force: Annotated[
+        bool, typer.Option("--force", help="Use it even if it is worse than the one in use.")
+    ] = False,
+    as_json: Json = False,
+) -> None:
+    """Calibrate a profile: take a run, analyse it, keep the result, and use it unless it is worse."""
+    from labseq.calibration.measure import CalibrationRequest
+    from labseq.calibration.terminal import calibrate_kind
+
+    request = CalibrationRequest(
+        profile=profile,
+        source=source,
+        shots=shots,
+        seed=seed,
+        overrides=tuple(overrides or ()),
+        output=output,
+        dry_run="off" if dry_run is None else dry_run.value,
+        force=force,
+    )
+    calibrate_kind(kind, request, as_json=as_json)

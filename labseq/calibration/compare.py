@@ -1,0 +1,92 @@
+"""What changed between two calibrations of a kind."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from labseq.errors import ConfigError, Problem
+from labseq.model import CalibrationEntry
+
+_UNITS: Final = ("hz", "m", "px", "rad", "s")
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """How a value or a figure differs.
+
+    Attributes:
+        name: Its name.
+        unit: "Hz", "m", "px", "rad", "s" or "".
+        before: Of a figure; None of a value with many numbers.
+        after: Likewise.
+        greatest: Greatest change of any of its numbers, positive; nan if the shapes differ.
+        rms: Root mean square of the changes.
+        mean: Mean change of each column of the last axis where that has two, such as (y, x); else of all.
+    """
+
+    name: str
+    unit: str
+    before: float | None
+    after: float | None
+    greatest: float
+    rms: float
+    mean: tuple[float, ...]
+
+
+def compare(before: CalibrationEntry, after: CalibrationEntry) -> tuple[list[Difference], list[Difference]]:
+    """Compare two calibrations of one kind.
+
+    Returns:
+        The differences of the values, and of the figures of merit that both have.
+
+    Raises:
+        ConfigError: They are of different kinds.
+    """
+    if before.kind != after.kind:
+        what = f"{before.id} is of the kind '{before.kind}', {after.id} of the kind '{after.kind}'"
+        raise ConfigError(Problem(what, expected="two calibrations of one kind"))
+    values = [
+        _of_values(name, before.values[name], value)
+        for name, value in after.values.items()
+        if name in before.values
+    ]
+    figures = [
+        _of_figure(name, before.quality[name], value)
+        for name, value in after.quality.items()
+        if name in before.quality
+    ]
+    return values, figures
+
+
+def unit_of(name: str) -> str:
+    """The unit that a name ends with.
+
+    Example:
+        >>> unit_of("row_hz"), unit_of("error_m"), unit_of("error")
+        ('Hz', 'm', '')
+    """
+    end = name.rpartition("_")[2] if "_" in name else ""
+    return end.replace("hz", "Hz") if end in _UNITS else ""
+
+
+def _of_values(
+    name: str,
+    before: np.ndarray[tuple[int, ...], np.dtype[np.float64]],
+    after: np.ndarray[tuple[int, ...], np.dtype[np.float64]],
+) -> Difference:
+    if before.shape != after.shape:
+        return Difference(name, unit_of(name), None, None, np.nan, np.nan, ())
+    change = after - before
+    is_pair = change.ndim > 0 and change.shape[-1] == 2
+    mean: Sequence[float] = change.reshape(-1, 2 if is_pair else 1).mean(axis=0).tolist()
+    greatest, rms = float(np.abs(change).max(initial=0.0)), float(np.sqrt(np.mean(change**2)))
+    return Difference(name, unit_of(name), None, None, greatest, rms, tuple(mean))
+
+
+def _of_figure(name: str, before: float, after: float) -> Difference:
+    change = after - before
+    return Difference(name, unit_of(name), before, after, abs(change), abs(change), (change,))

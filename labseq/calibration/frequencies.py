@@ -1,0 +1,247 @@
+"""The tone of each row and column, measured by a run of probes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from labseq.calibration.method import AnalysisResult, CalibrationData, from_runs_only, packaged, read_probed
+from labseq.calibration.overlay import offset_text
+from labseq.calibration.pictures import draw_tone_offsets
+from labseq.errors import DeviceError
+from labseq.model import CalibrationKind, MotionSpec, SiteGrid
+from labseq.motion.axes import drive
+from labseq.motion.overlay import (
+    MIN_P,
+    OverlayFit,
+    SurvivalShape,
+    checked_counts,
+    distance_m,
+    fit_overlay,
+    unit_axes,
+)
+from labseq.session.profile import ResolvedProfile
+from labseq.units import format_quantity
+
+Floats = NDArray[np.float64]
+
+ROUNDS: Final = 30
+SETTLED_M: Final = 0.1e-9
+KNOWN_BEFORE_M: Final = 0.5e-6
+"""How far a row or column may stand from the centre of all, 1 sigma, before anything is measured."""
+WORST_ERROR_M: Final = 50e-9
+SLOPE_STEP_M: Final = 1e-9
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrequenciesFit:
+    """Tones that put the mobile tweezers onto the sites.
+
+    Attributes:
+        row_hz: float64 (n_rows,), frequency of each row's tone.
+        column_hz: float64 (n_cols,), of each column's.
+        row_offset_m: float64 (n_rows,), how far each row's tweezers stood beside their sites, along a2.
+        column_offset_m: float64 (n_cols,), the same for the columns, along a1.
+        row_error_m: float64 (n_rows,), standard errors.
+        column_error_m: float64 (n_cols,), standard errors.
+        overlay: The fit of all sites together.
+    """
+
+    row_hz: Floats
+    column_hz: Floats
+    row_offset_m: Floats
+    column_offset_m: Floats
+    row_error_m: Floats
+    column_error_m: Floats
+    overlay: OverlayFit
+
+    @property
+    def error_m(self) -> float:
+        """The rms of all standard errors, in metres."""
+        return float(np.sqrt(np.mean(np.concatenate([self.row_error_m, self.column_error_m]) ** 2)))
+
+
+def fit_frequencies(
+    offset_m: ArrayLike,
+    n_before: ArrayLike,
+    n_survived: ArrayLike,
+    grid: SiteGrid,
+    motion: MotionSpec,
+    worst_error_m: float = WORST_ERROR_M,
+) -> FrequenciesFit:
+    """Find where each row's and each column's tone puts its tweezers, and the tones that put them right.
+
+    The bump of survival is that of all sites (:func:`labseq.motion.fit_overlay`). Its centre on the
+    site (i, j) is that of column j along a1 and of row i along a2; all are fitted together by maximum
+    likelihood. Each is then drawn to a parabola through the others of its axis, as much as
+    its own error and the scatter of all about the parabola ask for: one with few atoms takes that
+    of its neighbours. What comes out is where the tones stand altogether, the common part included:
+    an overlay that was made up for in the measurement is no longer needed.
+
+    Args:
+        offset_m: float64 (n_points, 2), commanded offsets along a1 and a2.
+        n_before: int (n_points, n_rows, n_cols), atoms that were probed on each site.
+        n_survived: int, of the same shape: how many of them were seen afterwards.
+        grid: The grid of sites, with the tones that were played.
+        motion: How the tweezers move.
+        worst_error_m: Refuse rows and columns that are known less well, on average.
+
+    Raises:
+        DeviceError: As :func:`labseq.motion.fit_overlay`, or there are too few atoms for a fit by rows.
+        ValueError: The arrays do not belong together.
+    """
+    offset, n, k = checked_counts(offset_m, n_before, n_survived)
+    if n.shape[1:] != grid.shape:
+        raise ValueError(f"counts of shape {n.shape}; expected (n_points, {grid.n_rows}, {grid.n_cols})")
+    overlay = fit_overlay(offset, n, k, grid)
+    near = distance_m(offset - overlay.centre_m, unit_axes(grid)) < overlay.shape.reach_m
+    columns_m, rows_m, spread = _centres(offset[near], n[near], k[near], overlay, grid)
+    errors_m = np.sqrt(np.diag(spread))
+    columns_m, column_error_m = smoothed(columns_m, errors_m[: grid.n_cols])
+    rows_m, row_error_m = smoothed(rows_m, errors_m[grid.n_cols :])
+    hz = [
+        driven.site_hz + driven.step_hz * centre_m / grid.spacing_m
+        for driven, centre_m in ((drive(grid, motion, 0), rows_m), (drive(grid, motion, 1), columns_m))
+    ]
+    fit = FrequenciesFit(hz[0], hz[1], -rows_m, -columns_m, row_error_m, column_error_m, overlay)
+    if fit.error_m > worst_error_m:
+        text = f"rows and columns are known to {fit.error_m * 1e9:.0f} nm only"
+        raise DeviceError("mobile_tweezers", f"no frequencies found: too few atoms: {text}")
+    return fit
+
+
+def smoothed(values: Floats, errors: Floats) -> tuple[Floats, Floats]:
+    """Draw measured values to the parabola through all of them, as far as their errors ask for it.
+
+    The scatter about the parabola beyond the errors is found so that chi squared equals its degrees of
+    freedom (Paule and Mandel, J. Res. Natl. Bur. Stand. 87, 377, 1982). A value takes the mean of its own
+    and the parabola's, weighted by the inverse of its error and of that scatter, squared. One that is
+    further than three times both from the parabola stays as it was measured.
+
+    Args:
+        values: float64 (n,), in the order of rows or columns.
+        errors: float64 (n,), above 0.
+
+    Returns:
+        The values and their errors, float64 (n,).
+
+    Example:
+        >>> measured = np.array([0.0, 1.0, 2.0, 9.0, 4.0])
+        >>> value, _ = smoothed(measured, np.array([0.1, 0.1, 0.1, 50.0, 0.1]))
+        >>> value.round(2).tolist()
+        [0.0, 1.0, 2.0, 3.0, 4.0]
+    """
+    n = len(values)
+    degree = 2 if n >= 6 else 1 if n >= 3 else 0
+    basis = np.vander(np.linspace(-1, 1, n), degree + 1)
+    low, high = 0.0, float(np.ptp(values)) + 1e-30
+    for _ in range(60):
+        middle = (low + high) / 2
+        curve, _ = _through(basis, values, errors**2 + middle**2)
+        is_too_small = ((values - curve) ** 2 / (errors**2 + middle**2)).sum() > n - degree - 1
+        low, high = (middle, high) if is_too_small else (low, middle)
+    variance = errors**2 + high**2
+    curve, curve_variance = _through(basis, values, variance)
+    own = np.where(np.abs(values - curve) > 3 * np.sqrt(variance), 1.0, high**2 / variance)
+    return curve + own * (values - curve), np.sqrt(own * errors**2 + (1 - own) ** 2 * curve_variance)
+
+
+def _through(basis: Floats, values: Floats, variance: Floats) -> tuple[Floats, Floats]:
+    """The curve of least squares at each place, and its variance there."""
+    covariance = np.linalg.inv((basis.T / variance) @ basis)
+    curve = basis @ (covariance @ (basis.T @ (values / variance)))
+    return curve, ((basis @ covariance) * basis).sum(axis=1)
+
+
+def _centres(
+    offset: Floats, n: Floats, k: Floats, overlay: OverlayFit, grid: SiteGrid
+) -> tuple[Floats, Floats, Floats]:
+    """The centres of columns and rows of greatest likelihood, by Fisher's scoring, and their covariance."""
+    common = np.concatenate([np.full(m, c) for m, c in zip(grid.shape[::-1], overlay.centre_m, strict=True)])
+    centres, n_cols = common.copy(), grid.n_cols
+    spread: Floats = np.zeros((len(centres), len(centres)))
+    for _ in range(ROUNDS):
+        of_site = np.stack(np.broadcast_arrays(centres[:n_cols], centres[n_cols:, None]), axis=-1)
+        p, slopes = _slopes(offset[:, None, None] - of_site, overlay.shape, grid)
+        certainty, surprise = n / (p * (1 - p)), (k - n * p) / (p * (1 - p))
+        information = np.zeros_like(spread)
+        crossed = (certainty * slopes[..., 0] * slopes[..., 1]).sum(axis=0)
+        information[n_cols:, :n_cols], information[:n_cols, n_cols:] = crossed, crossed.T
+        squared = (certainty[..., None] * slopes**2).sum(axis=0)
+        own = np.concatenate([squared[..., 0].sum(axis=0), squared[..., 1].sum(axis=1)])
+        np.fill_diagonal(information, own + KNOWN_BEFORE_M**-2)
+        pull = (surprise[..., None] * slopes).sum(axis=0)
+        force = np.concatenate([pull[..., 0].sum(axis=0), pull[..., 1].sum(axis=1)])
+        spread = np.asarray(np.linalg.inv(information), np.float64)
+        step = spread @ (force - (centres - common) * KNOWN_BEFORE_M**-2)
+        centres += np.clip(step, -overlay.shape.edge_m, overlay.shape.edge_m)
+        if np.abs(step).max() < SETTLED_M:
+            break
+    excess = 1 + (overlay.dispersion - 1) / min(grid.shape)
+    return centres[:n_cols], centres[n_cols:], spread * excess
+
+
+def _slopes(offset: Floats, shape: SurvivalShape, grid: SiteGrid) -> tuple[Floats, Floats]:
+    """Survival at some offsets from the centre, and its derivatives by the centre, (..., 2)."""
+    axes = unit_axes(grid)
+    distance = distance_m(offset, axes)
+    p = np.clip(shape.survival(distance), MIN_P, 1 - MIN_P)
+    outwards = (shape.survival(distance + SLOPE_STEP_M) - shape.survival(distance - SLOPE_STEP_M)) / (
+        2 * SLOPE_STEP_M
+    )
+    direction = (offset @ axes) @ axes.T / np.maximum(distance, SLOPE_STEP_M)[..., None]
+    return p, -outwards[..., None] * direction
+
+
+_SEQUENCE: Final = packaged("frequencies")
+
+
+@dataclass(frozen=True, slots=True)
+class FrequenciesMethod:
+    """Implements ``Method`` for the tones of the mobile tweezers."""
+
+    kind: CalibrationKind = "frequencies"
+    sequence: Path = _SEQUENCE
+    aside: tuple[CalibrationKind, ...] = ()
+    is_blind: bool = False
+
+    def analyse(self, evidence: CalibrationData) -> AnalysisResult:
+        """Find the tones that put the tweezers of each row and column onto the sites.
+
+        What an overlay makes up for is in them.
+
+        Raises:
+            DeviceError: There are too few atoms, or no offset at which most survive; says why.
+            ConfigError: The run is no scan of a probe's offset.
+        """
+        probed = read_probed(evidence.run)
+        counts = probed.n_before, probed.n_survived
+        fit = fit_frequencies(probed.offset_m, *counts, probed.grid, probed.motion)
+        row_m, column_m = fit.row_offset_m, fit.column_offset_m
+        worst_m = float(np.abs(np.concatenate([row_m - row_m.mean(), column_m - column_m.mean()])).max())
+        quality = {
+            "error_m": fit.error_m,
+            "spread_m": float(np.sqrt((row_m.var() + column_m.var()) / 2)),
+            "n_atoms": float(fit.overlay.n_atoms),
+        }
+        worst, error = (format_quantity(value, "length") for value in (worst_m, fit.error_m))
+        summary_lines = (
+            offset_text(fit.overlay, probed),
+            f"single rows and columns stood up to {worst} beside that, known to {error} r.m.s.",
+        )
+        return AnalysisResult(
+            {"row_hz": fit.row_hz, "column_hz": fit.column_hz},
+            quality,
+            summary_lines,
+            {"calibrations": probed.calibrations},
+            lambda: draw_tone_offsets((row_m, fit.row_error_m), (column_m, fit.column_error_m)),
+        )
+
+    def read(self, path: Path, bench: ResolvedProfile) -> AnalysisResult:
+        """Refuse: they must be measured; known ones stand in the profile's ``grid``."""
+        del bench
+        raise from_runs_only(self.kind, path)

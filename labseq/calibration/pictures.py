@@ -1,0 +1,222 @@
+"""Pictures of calibrations."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq.pictures.figures import make_figure
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
+    from matplotlib.figure import Figure
+
+Floats = NDArray[np.float64]
+
+WIDTH_IN: Final = 9.0
+N_BINS: Final = 120
+ARROW_SPACINGS: Final = 0.5
+"""Length of the longest arrow, in spacings."""
+MARGIN_SPACINGS: Final = 2.0
+"""Room around the outermost sites, in spacings."""
+SITE, ARROW = "#e8a33d", "#c8102e"
+
+
+def draw_sites(mean: Floats, positions_px: Floats, residuals_px: Floats) -> Figure:
+    """Draw an averaged frame with the sites on it, and how far each spot lies beside its site.
+
+    Args:
+        mean: float64 (height, width), the averaged frame, in counts.
+        positions_px: float64 (n_rows, n_cols, 2), (y, x) of each site in pixels.
+        residuals_px: float64 (n_rows, n_cols, 2), (y, x) of each spot less that; NaN where none was found.
+    """
+    spacing = _spacing_px(positions_px)
+    y, x = positions_px.reshape(-1, 2).T
+    room = MARGIN_SPACINGS * spacing
+    wide, high = np.ptp(x) + 2 * room, np.ptp(y) + 2 * room
+    figure = make_figure(WIDTH_IN, WIDTH_IN * high / wide + 0.6, layout="constrained")
+    axes = figure.add_subplot()
+    dark, bright = np.quantile(mean, [0.01, 0.999])
+    axes.imshow(mean, cmap="gray", vmin=dark, vmax=max(bright, dark + 1e-9), interpolation="nearest")
+    axes.set_xlim(x.min() - room, x.max() + room)
+    axes.set_ylim(y.max() + room, y.min() - room)
+    found = np.isfinite(residuals_px[..., 0]).ravel()
+    size = 0.6 * spacing / wide * WIDTH_IN * 72
+    for here, marker, label in ((found, "o", "site"), (~found, "x", "site without a spot")):
+        if here.any():
+            look: dict[str, Any] = {
+                "color": SITE,
+                "markersize": size,
+                "fillstyle": "none",
+                "markeredgewidth": 0.8,
+            }
+            axes.plot(x[here], y[here], marker, label=label, **look)
+    axes.plot(x[:1], y[:1], "s", color=SITE, markersize=1.4 * size, fillstyle="none", label="row 0, column 0")
+    longest = _draw_arrows(axes, x[found], y[found], residuals_px.reshape(-1, 2)[found], spacing)
+    axes.set_title(f"arrows: spots beside their sites, {longest:.2g} px at most")
+    axes.set_xlabel("x (px)")
+    axes.set_ylabel("y (px)")
+    axes.legend(loc="upper right", fontsize="small", markerscale=0.5)
+    return figure
+
+
+def _draw_arrows(axes: Axes, x: Floats, y: Floats, off_px: Floats, spacing_px: float) -> float:
+    """Draw how far spots lie beside their sites, enlarged; the longest distance, in pixels."""
+    longest = float(np.hypot(*off_px.T).max(initial=0.0))
+    if longest > 0:
+        along_y, along_x = ARROW_SPACINGS * spacing_px / longest * off_px.T
+        look: dict[str, Any] = {
+            "color": ARROW,
+            "angles": "xy",
+            "scale_units": "xy",
+            "scale": 1.0,
+            "width": 0.0015,
+        }
+        axes.quiver(x, y, along_x, along_y, **look)
+    return longest
+
+
+def draw_thresholds(signals: Floats, thresholds: Floats, unit: str) -> Figure:
+    """Draw the histogram of all signals, and each site's signals with its threshold.
+
+    Args:
+        signals: float64 (n_frames, n_rows, n_cols), what the detector compares.
+        thresholds: float64 (n_rows, n_cols).
+        unit: Of both: "counts", "log-odds".
+    """
+    figure = make_figure(WIDTH_IN, 7.0, layout="constrained")
+    above, below = figure.subplots(2, 1, height_ratios=[2, 3])
+    low, high = np.quantile(signals, [0.001, 0.999])
+    edges = np.linspace(low, high, N_BINS + 1)
+    above.hist(signals.ravel(), edges, color="0.6", log=True)
+    above.axvspan(float(thresholds.min()), float(thresholds.max()), color=SITE, alpha=0.5, label="thresholds")
+    above.set_xlabel(f"signal of all sites ({unit})")
+    above.set_ylabel("signals")
+    above.legend(loc="upper right", fontsize="small")
+    _draw_each(below, signals.reshape(len(signals), -1), thresholds.ravel(), edges)
+    below.set_ylabel(f"signal ({unit})")
+    return figure
+
+
+def _draw_each(axes: Axes, by_site: Floats, thresholds: Floats, edges: Floats) -> None:
+    n_sites = by_site.shape[1]
+    counts = np.stack([np.histogram(by_site[:, site], edges)[0] for site in range(n_sites)], axis=1)
+    extent = (-0.5, n_sites - 0.5, edges[0], edges[-1])
+    axes.imshow(np.log1p(counts), cmap="gray_r", aspect="auto", origin="lower", extent=extent)
+    axes.step(np.arange(n_sites), thresholds, where="mid", color=ARROW, linewidth=0.8, label="threshold")
+    axes.set_xlabel("site, row by row")
+    axes.legend(loc="upper right", fontsize="small")
+
+
+def _spacing_px(positions_px: Floats) -> float:
+    """Least distance of neighbours along rows and columns; that of a single site is a guess."""
+    steps = [np.diff(positions_px, axis=axis).reshape(-1, 2) for axis in (0, 1)]
+    lengths = np.hypot(*np.concatenate(steps).T)
+    return float(np.median(lengths)) if len(lengths) else 10.0
+
+
+DIRECTIONS: Final = ("along a row", "from row to row")
+ON_LINE_M: Final = 1e-9
+POINT, CURVE = "#1b5e8c", "#c8102e"
+
+
+def draw_survival(
+    offset_m: Floats,
+    n_before: NDArray[np.int64],
+    n_survived: NDArray[np.int64],
+    survival: Callable[[Floats], Floats],
+) -> Figure:
+    """Draw survival against the offset on each axis.
+
+    Args:
+        offset_m: float64 (n_points, 2), commanded offsets along a1 and a2.
+        n_before: int64 (n_points,), atoms that were probed.
+        n_survived: int64 (n_points,), how many of them survived.
+        survival: What was fitted: offsets (n, 2) -> probabilities (n,).
+    """
+    figure = make_figure(8.0, 4.0, layout="constrained")
+    middle = np.median(offset_m, axis=0)
+    for axis, axes in enumerate(figure.subplots(1, 2, sharey=True)):
+        on_line = np.abs(offset_m[:, 1 - axis] - middle[1 - axis]) < ON_LINE_M
+        x_m, n, k = offset_m[on_line, axis], np.maximum(n_before[on_line], 1), n_survived[on_line]
+        error = np.sqrt((k + 0.5) * (n - k + 0.5) / (n + 1)) / (n + 1)
+        axes.errorbar(1e6 * x_m, k / n, error, fmt="o", color=POINT, markersize=4, label="atoms")
+        line_m = np.repeat(middle[None], 200, axis=0)
+        line_m[:, axis] = np.linspace(offset_m[:, axis].min(), offset_m[:, axis].max(), 200)
+        axes.plot(1e6 * line_m[:, axis], survival(line_m), color=CURVE, label="fit")
+        axes.set_xlabel(f"offset {DIRECTIONS[axis]} (um)")
+        axes.set_ylim(-0.02, 1.02)
+    figure.axes[0].set_ylabel("survival")
+    figure.axes[0].legend(fontsize="small")
+    return figure
+
+
+def draw_tone_offsets(rows: tuple[Floats, Floats], columns: tuple[Floats, Floats]) -> Figure:
+    """Draw how far the tweezers of each row and column stood beside their sites.
+
+    Args:
+        rows: Offset from row to row and its standard error, each float64 (n_rows,), in metres.
+        columns: Offset along a row and its standard error, each float64 (n_cols,).
+    """
+    figure = make_figure(8.0, 4.0, layout="constrained")
+    for axes, name, (off_m, error_m), direction in zip(
+        figure.subplots(1, 2), ("row", "column"), (rows, columns), reversed(DIRECTIONS), strict=True
+    ):
+        axes.errorbar(np.arange(len(off_m)), 1e9 * off_m, 1e9 * error_m, fmt="o", color=POINT, markersize=4)
+        axes.set_xlabel(name)
+        axes.set_ylabel(f"offset {direction} (nm)")
+    return figure
+
+
+SIZE_IN: Final = (8.4, 5.6)
+MIN_RANGE: Final = 0.05
+"""Least deviation from the mean that the colours go to."""
+TITLE_PT: Final = 10
+LABEL_PT: Final = 9
+TICK_PT: Final = 8
+
+
+def draw_powers(before: Floats, after: Floats, rows: Floats, cols: Floats) -> Figure:
+    """Draw maps of the powers, relative to their means, and the amplitudes that were found.
+
+    Args:
+        before: float64 (n_rows, n_cols), powers at first; nan where they are not known.
+        after: float64 (n_rows, n_cols), powers in the end.
+        rows: float64 (n_rows,), amplitudes of the rows' tones, fractions of full scale.
+        cols: float64 (n_cols,), amplitudes of the columns' tones.
+    """
+    figure = make_figure(*SIZE_IN, layout="constrained")
+    panels = figure.subplots(2, 2, height_ratios=(2.2, 1.0))
+    maps = [power / np.nanmean(power) - 1 for power in (before, after)]
+    most = max(MIN_RANGE, *(float(np.nanmax(np.abs(each))) for each in maps))
+    for axes, each, title in zip(panels[0], maps, ("before", "after"), strict=True):
+        axes.imshow(100 * each, cmap="RdBu_r", vmin=-100 * most, vmax=100 * most)
+        axes.set_title(f"{title}: {100 * float(np.nanstd(each)):.1f} % r.m.s.", fontsize=TITLE_PT)
+        _label(axes, "column", "row")
+        _count(axes.xaxis)
+        _count(axes.yaxis)
+    bar = figure.colorbar(panels[0][0].images[0], ax=panels[0], shrink=0.9)
+    _label(bar.ax, "", "power beside the mean (%)")
+    for axes, amplitudes, name in zip(panels[1], (rows, cols), ("row", "column"), strict=True):
+        axes.bar(np.arange(len(amplitudes)), 100 * amplitudes, color="#1f4e8c")
+        axes.set_ylim(0, 115 * float(amplitudes.max()))
+        _label(axes, name, "tone (% of full scale)")
+        _count(axes.xaxis)
+    return figure
+
+
+def _label(axes: Axes, x: str, y: str) -> None:
+    axes.set_xlabel(x, fontsize=LABEL_PT)
+    axes.set_ylabel(y, fontsize=LABEL_PT)
+    axes.tick_params(labelsize=TICK_PT)
+
+
+def _count(axis: Axis) -> None:
+    """Let an axis tick at whole numbers only."""
+    from matplotlib.ticker import MaxNLocator
+
+    axis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))

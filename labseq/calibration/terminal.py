@@ -1,0 +1,347 @@
+"""What `labseq calibrate` and `labseq calibration` print."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from datetime import UTC, datetime
+from shlex import quote
+from typing import Any, Final, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq.calibration.compare import Difference, compare, unit_of
+from labseq.calibration.measure import METHODS, CalibrationRequest, Outcome, calibrate
+from labseq.calibration.store import DECIDING, Damaged, Store, Stored, figure_of, grid_text
+from labseq.config import CalibrationChoices
+from labseq.config.messages import clean, did_you_mean, listing
+from labseq.config.profile import OFF
+from labseq.console.output import LASTING, age_text, as_line, columns, event_text, say, stdout_to_stderr
+from labseq.errors import ConfigError, Problem
+from labseq.model import CALIBRATION_KINDS, CalibrationEntry, CalibrationKind, RunRecord
+from labseq.session.calibrations import open_store
+from labseq.session.profile import DryRun
+from labseq.units import format_quantity
+
+MAX_LISTED: Final = 4
+"""Numbers of a value that are all shown; of more, only lowest, highest and mean."""
+
+_DIMENSIONS: Final = {"m": "length", "Hz": "frequency", "rad": "angle", "s": "time"}
+
+
+def list_calibrations(profile: str, dry_run: str, *, as_json: bool) -> None:
+    """Print a row per calibration, oldest first.
+
+    Args:
+        profile: Name or path of the profile.
+        dry_run: "off", "full" or "fast".
+        as_json: Whether to print one line of JSON instead.
+
+    Raises:
+        ConfigError: The profile is wrong, or the folder of its calibrations cannot be read.
+    """
+    store, spec = open_store(profile, cast("DryRun", dry_run))
+    found, problems = store.entries(), list[str]()
+    try:
+        used = in_use(store, spec.calibrations.use)
+    except ConfigError as error:
+        used, problems = {}, [str(error)]
+    if as_json:
+        rows = [_values_of(one, used) for one in found]
+        say(as_line({"folder": str(store.folder), "calibrations": rows, "problems": problems}))
+        return
+    if not found:
+        say(f"there are no calibrations in {store.folder}")
+    else:
+        header = ("kind", "id", "taken", "age", "quality", "", "from")
+        say(*columns([header, *(_row(one, used) for one in found)]))
+    problems += [str(one.error) for one in found if isinstance(one, Damaged)]
+    say(*([""] if problems else []), *problems)
+
+
+def show_calibration(wanted: str, profile: str, dry_run: str, *, as_json: bool) -> None:
+    """Print one calibration.
+
+    Raises:
+        ConfigError: There is none, there are several, or it is damaged.
+    """
+    store, spec = open_store(profile, cast("DryRun", dry_run))
+    stored, used = store.find(wanted), in_use(store, spec.calibrations.use)
+    if as_json:
+        say(as_line(_values_of(stored, used)))
+        return
+    entry = stored.entry
+    quality = [(name, quantity(value, name)) for name, value in entry.quality.items()]
+    say(
+        *columns(
+            [
+                ("calibration", f"{entry.kind} {entry.id}"),
+                ("taken", f"{_time_text(entry.taken_utc)}, {age_text(age_s(entry))} ago"),
+                ("in use", "yes" if _is_used(stored, used) else "no"),
+                ("grid", grid_text(entry.grid)),
+                ("file", str(stored.path)),
+                ("picture", str(stored.picture or "-")),
+                *((f"origin.{name}", _origin_text(value)) for name, value in entry.origin.items()),
+                *((f"quality.{name}", text) for name, text in quality),
+                *((name, _summary(name, value)) for name, value in entry.values.items()),
+            ]
+        )
+    )
+
+
+def use_calibration(choice: str, profile: str, dry_run: str, *, force: bool) -> None:
+    """Put a calibration to use, or none of a kind.
+
+    Args:
+        choice: Its id, or "KIND=off".
+        profile: Name or path of the profile.
+        dry_run: "off", "full" or "fast".
+        force: Whether also one that is worse than the one in use.
+
+    Raises:
+        ConfigError: There is no such calibration, it is of another grid, or it is worse.
+    """
+    store, spec = open_store(profile, cast("DryRun", dry_run))
+    name, equals, value = choice.partition("=")
+    if equals:
+        kind = _kind(name, value)
+        store.use_none(kind)
+        say(f"no calibration of {kind} is in use any more")
+    else:
+        stored = store.find(choice)
+        kind = stored.entry.kind
+        store.use(stored, spec.grid_model(), force=force)
+        say(f"{kind} {stored.entry.id} is in use from the next run on")
+    if pin := spec.calibrations.use.of(kind):
+        say(f"warning: the profile says 'calibrations.use.{kind}: {clean(pin)}', and that counts")
+
+
+def compare_calibrations(before: str, after: str, profile: str, dry_run: str, *, as_json: bool) -> None:
+    """Print what changed from one calibration to another.
+
+    Raises:
+        ConfigError: They are of different kinds, or one of them cannot be had.
+    """
+    store, _ = open_store(profile, cast("DryRun", dry_run))
+    one, other = store.find(before).entry, store.find(after).entry
+    values, figures = compare(one, other)
+    if as_json:
+        dumps = {name: [_dump(d) for d in ds] for name, ds in (("values", values), ("quality", figures))}
+        say(as_line({"kind": one.kind, "before": one.id, "after": other.id, **dumps}))
+        return
+    ends = (f"{entry.id} ({_time_text(entry.taken_utc)})" for entry in (one, other))
+    say(f"{one.kind}: {' to '.join(ends)}", "", *difference_table(values))
+    rows = [(d.name, quantity(d.before, d.name), quantity(d.after, d.name)) for d in figures]
+    say(*(["", *columns([("figure", "before", "after"), *rows])] if rows else []))
+
+
+def difference_table(differences: Sequence[Difference]) -> list[str]:
+    """A row per value: greatest change, root mean square, mean."""
+    rows = [
+        (
+            one.name,
+            quantity(one.greatest, one.name),
+            quantity(one.rms, one.name),
+            ", ".join(quantity(mean, one.name) for mean in one.mean) or "-",
+        )
+        for one in differences
+    ]
+    return columns([("value", "greatest change", "rms", "mean"), *rows])
+
+
+def in_use(store: Store, choices: CalibrationChoices) -> dict[str, str]:
+    """Kind -> id, or name of the file, of the calibration that counts."""
+    used = {kind: one.file for kind, one in store.active().items()}
+    for kind in CALIBRATION_KINDS:
+        pin = choices.of(kind)
+        if pin == OFF:
+            used.pop(kind, None)
+        elif pin is not None:
+            used[kind] = store.find(pin, kind).path.name
+    return used
+
+
+def age_s(entry: CalibrationEntry) -> float:
+    """Time since a calibration was made, in seconds."""
+    return (datetime.now(UTC) - datetime.fromisoformat(entry.taken_utc)).total_seconds()
+
+
+def quantity(value: float | None, name: str) -> str:
+    """A value with the unit that its name ends with.
+
+    Example:
+        >>> quantity(2.5e-8, "error_m"), quantity(84.8e6, "row_hz"), quantity(0.031, "residual_px")
+        ('25 nm', '84.8 MHz', '0.031 px')
+    """
+    if value is None or math.isnan(value):
+        return "-"
+    unit = unit_of(name)
+    if unit in _DIMENSIONS:
+        return format_quantity(value, _DIMENSIONS[unit], 7 if unit == "Hz" else 3)
+    return f"{value:.4g} {unit}".rstrip()
+
+
+def quality_text(entry: CalibrationEntry) -> str:
+    """The deciding figure of a calibration in words; "-" if it has none."""
+    deciding, figure = DECIDING[entry.kind], figure_of(entry)
+    return "-" if math.isnan(figure) else f"{deciding.words} {quantity(figure, deciding.figure)}"
+
+
+def _row(one: Stored | Damaged, used: Mapping[str, str]) -> tuple[str, ...]:
+    mark = "in use" if _is_used(one, used) else ""
+    if isinstance(one, Damaged):
+        return (one.kind, one.id, "-", "-", "damaged", mark, "-")
+    entry = one.entry
+    origin = entry.origin.get("run") or entry.origin.get("command") or "-"
+    taken, age = _time_text(entry.taken_utc), age_text(age_s(entry))
+    return (entry.kind, entry.id, taken, age, quality_text(entry), mark, clean(str(origin)))
+
+
+def _values_of(one: Stored | Damaged, used: Mapping[str, str]) -> dict[str, Any]:
+    head = {"file": str(one.path), "in_use": _is_used(one, used)}
+    if isinstance(one, Damaged):
+        return {"kind": one.kind, "id": one.id, **head, "error": str(one.error)}
+    entry = one.entry
+    return {
+        "kind": entry.kind,
+        "id": entry.id,
+        **head,
+        "taken_utc": entry.taken_utc,
+        "age_s": age_s(entry),
+        "quality": {name: _or_none(value) for name, value in entry.quality.items()},
+        "grid": entry.grid,
+        "origin": entry.origin,
+        "picture": None if one.picture is None else str(one.picture),
+        "error": None,
+    }
+
+
+def _is_used(one: Stored | Damaged, used: Mapping[str, str]) -> bool:
+    kind = one.kind if isinstance(one, Damaged) else one.entry.kind
+    return used.get(kind) == one.path.name
+
+
+def _kind(name: str, value: str) -> CalibrationKind:
+    for kind in CALIBRATION_KINDS:
+        if (kind, value) == (name, OFF):
+            return kind
+    if name in CALIBRATION_KINDS:
+        raise ConfigError(Problem(f"{name} is '{clean(value)}'", expected=f"'{OFF}', or just an id"))
+    what, hint = f"'{clean(name)}' is no kind of calibration", did_you_mean(name, CALIBRATION_KINDS)
+    raise ConfigError(Problem(what, expected=listing(CALIBRATION_KINDS), hint=hint))
+
+
+def _summary(name: str, value: NDArray[np.float64]) -> str:
+    if value.size <= MAX_LISTED:
+        return ", ".join(quantity(float(number), name) for number in value.flat)
+    shape = " x ".join(map(str, value.shape))
+    low, high, mean = (quantity(float(f(value)), name) for f in (np.min, np.max, np.mean))
+    return f"{shape} numbers, {low} to {high}, mean {mean}"
+
+
+def _origin_text(value: Any) -> str:
+    if isinstance(value, Mapping):
+        items = cast("Mapping[str, Any]", value).items()
+        return ", ".join(f"{name} {each}" for name, each in items) or "-"
+    return clean(str(value))
+
+
+def _time_text(taken_utc: str) -> str:
+    return f"{datetime.fromisoformat(taken_utc).astimezone(UTC):%Y-%m-%d %H:%M} UTC"
+
+
+def _dump(difference: Difference) -> dict[str, Any]:
+    values = asdict(difference)
+    return {name: _or_none(value) if isinstance(value, float) else value for name, value in values.items()}
+
+
+def _or_none(value: float) -> float | None:
+    return None if math.isnan(value) else value
+
+
+N_MARKS: Final = 10
+"""How often the progress of a run is told."""
+
+
+def calibrate_kind(kind: str, request: CalibrationRequest, *, as_json: bool) -> None:
+    """Make a calibration, keep it, and put it to use unless it is worse.
+
+    Args:
+        kind: What is calibrated.
+        request: For what, and of what.
+        as_json: Whether to print the outcome as one line of JSON, alone on stdout.
+
+    Raises:
+        ConfigError: Something in the request is wrong; or the calibration is worse than the one in
+            use, and was kept only.
+        LabseqError: Nothing came of it.
+    """
+    method = METHODS.get(kind)
+    if method is None:
+        what, hint = f"'{clean(kind)}' cannot be calibrated", did_you_mean(kind, METHODS)
+        raise ConfigError(Problem(what, expected=listing(METHODS), hint=hint))
+    answer = stdout_to_stderr() if as_json else None
+    outcome = calibrate(method, request, _Progress())
+    if answer is None:
+        say(*summary_lines(outcome))
+    else:
+        answer(as_line(_calibrate_values_of(outcome)))
+    if outcome.refused:
+        entry = outcome.stored.entry
+        what = f"{entry.kind} {entry.id} is kept but not in use: {outcome.refused}"
+        options = f"--force --profile {quote(request.profile)}"
+        options += "" if request.dry_run == "off" else " --dry-run"
+        hint = f"look at it, then 'labseq calibration use {entry.id} {options}'"
+        raise ConfigError(Problem(what, hint=hint))
+
+
+def summary_lines(outcome: Outcome) -> list[str]:
+    """What was found, how far it is from what was in use, and where it is kept."""
+    entry, picture = outcome.stored.entry, outcome.stored.picture
+    state = "in use from the next run on" if not outcome.refused else "not in use"
+    figures = [(name, quantity(value, name)) for name, value in entry.quality.items()]
+    lines = [f"{entry.kind} {entry.id}: {state}", *outcome.summary_lines]
+    lines += ["", *columns(figures)] if figures else []
+    if outcome.before is not None:
+        lines += ["", f"against {outcome.before.id}, which was in use:", *difference_table(outcome.changes)]
+    lines += ["", f"kept as {outcome.stored.path}", *([f"look at {picture}"] if picture else [])]
+    return [*lines, *(f"warning: {text}" for text in outcome.warnings)]
+
+
+def _calibrate_values_of(outcome: Outcome) -> dict[str, Any]:
+    entry, picture = outcome.stored.entry, outcome.stored.picture
+    return {
+        "kind": entry.kind,
+        "id": entry.id,
+        "in_use": not outcome.refused,
+        "refused": outcome.refused or None,
+        "quality": {name: None if math.isnan(value) else value for name, value in entry.quality.items()},
+        "before": None if outcome.before is None else outcome.before.id,
+        "file": str(outcome.stored.path),
+        "picture": None if picture is None else str(picture),
+        "run_dir": None if outcome.run is None else str(outcome.run.path),
+        "warnings": list(outcome.warnings),
+    }
+
+
+class _Progress:
+    """Implements ``RunObserver`` with a line for every tenth of the shots; the detector is blind in them."""
+
+    def __init__(self) -> None:
+        self._run: RunRecord | None = None
+        self._n_done = 0
+
+    def event(self, name: str, values: Mapping[str, Any]) -> None:
+        """Print what lasts, and how far it is."""
+        if name == "run_starting":
+            self._run = values["record"]
+        if name in LASTING and (text := event_text(name, values, self._run)):
+            say(text, stream=sys.stderr)
+        if name == "shot_finished" and self._run is not None:
+            self._n_done += 1
+            n, before = (k * N_MARKS // self._run.n_shots for k in (self._n_done, self._n_done - 1))
+            if n > before:
+                say(f"{self._n_done} of {self._run.n_shots} shots", stream=sys.stderr)

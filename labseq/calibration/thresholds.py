@@ -1,0 +1,441 @@
+"""Thresholds of the detector: the two peaks of each site's signals."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq.calibration.method import AnalysisResult, CalibrationData, from_runs_only, packaged
+from labseq.calibration.pictures import draw_thresholds
+from labseq.errors import ConfigError, DeviceError, LimitError, Problem
+from labseq.model import CalibrationKind
+from labseq.roles import ReportsSignals
+from labseq.session.profile import ResolvedProfile
+
+Floats = NDArray[np.float64]
+
+N_BINS: Final = 1000
+OUTER: Final = 0.5
+"""Widths from the middle of a peak, on its outer side, beyond which signals are only counted."""
+
+FLATTEST: Final = 1e-5
+"""Skewness below which a peak is a Gaussian."""
+
+
+@dataclass(frozen=True, slots=True)
+class Peak:
+    """A Pearson type III law: a gamma law moved, scaled, and mirrored if its skewness is below 0.
+
+    The counts of k photoelectrons behind an EM register follow a gamma law, and those
+    of a Poisson number of them have its skewness and, within an eighth, its excess kurtosis.
+
+    Attributes:
+        mean: Mean.
+        width: Standard deviation.
+        skewness: Third standardized moment.
+    """
+
+    mean: float
+    width: float
+    skewness: float
+
+    def log_density(self, at: Floats) -> Floats:
+        """Logarithm of the density; -700 where there is none."""
+        from scipy.special import gammaln
+
+        z = (at - self.mean) / self.width
+        if abs(self.skewness) < FLATTEST:
+            return -0.5 * z**2 - np.log(self.width * np.sqrt(2 * np.pi))
+        order = 4 / self.skewness**2
+        part = z * np.sign(self.skewness) / np.sqrt(order)  # of the gamma law's mean, from there on
+        inside = np.maximum(part, -1 + 1e-12)
+        norm = (order - 0.5) * np.log(order) - order - gammaln(order)
+        if order > 1e4:
+            norm = -0.5 * np.log(2 * np.pi) - 1 / (12 * order)  # Stirling: the line above cancels
+        log_p = order * (np.log1p(inside) - inside) - np.log1p(inside) + norm - np.log(self.width)
+        return np.where(part > -1, np.maximum(log_p, -700.0), -700.0)
+
+    def below(self, at: Floats) -> Floats:
+        """Probability of less."""
+        from scipy.special import gammainc, gammaincc, ndtr
+
+        z = (at - self.mean) / self.width
+        if abs(self.skewness) < FLATTEST:
+            return ndtr(z)
+        order = 4 / self.skewness**2
+        rising = np.maximum(order + z * np.sqrt(order) * np.sign(self.skewness), 0.0)
+        return gammainc(order, rising) if self.skewness > 0 else gammaincc(order, rising)
+
+    def above(self, at: Floats) -> Floats:
+        """Probability of more."""
+        return Peak(-self.mean, self.width, -self.skewness).below(-at)
+
+    def widened(self, factor: float) -> Peak:
+        """The same with another width."""
+        return Peak(self.mean, self.width * factor, self.skewness)
+
+
+@dataclass(frozen=True, slots=True)
+class Shapes:
+    """The law of signals that are 0 in the middle of a site's lower peak and 1 in that of its upper.
+
+    Attributes:
+        empty: The lower peak.
+        full: The upper peak.
+        between: Fraction of the signals that lie anywhere between: atoms lost during the exposure.
+    """
+
+    empty: Peak
+    full: Peak
+    between: float
+
+
+def fit_shapes(signals: Floats, loading: float, width_empty: float, width_full: float) -> Shapes:
+    """Fit two peaks and a floor between them by maximum likelihood.
+
+    The floor keeps the atoms that are lost during the exposure, which shine for a
+    part of it, from making the tails of the peaks too long. On the outer side of each
+    peak signals are only counted, for it is the inner sides that must be right.
+
+    Args:
+        signals: float64 (n,), 0 and 1 in the middle of the peaks.
+        loading: Fraction in the upper peak, roughly.
+        width_empty: Width of the lower peak, roughly.
+        width_full: Width of the upper peak, roughly.
+    """
+    from scipy.optimize import minimize
+
+    low, high = -OUTER * width_empty, 1 + OUTER * width_full
+    counts, edges = np.histogram(signals, N_BINS, (low, high))
+    n_low, n_high = (float(np.count_nonzero(side)) for side in (signals < low, signals > high))
+    occupied = counts > 0
+    at, counts = ((edges[:-1] + edges[1:]) / 2)[occupied], counts[occupied].astype(np.float64)
+    ends, floor = np.array([low, high]), ((at >= 0) & (at <= 1)).astype(np.float64)
+
+    def unlikelihood(x: Floats) -> float:
+        shapes, full = _shapes(x)
+        log_empty, log_full = (peak.log_density(at) for peak in (shapes.empty, shapes.full))
+        peaks = (1 - full) * np.exp(log_empty) + full * np.exp(log_full)
+        density = (1 - shapes.between) * peaks + shapes.between * floor
+        below = (1 - full) * shapes.empty.below(ends)[0] + 1e-12
+        above = full * shapes.full.above(ends)[1] + 1e-12
+        outer = n_low * np.log((1 - shapes.between) * below) + n_high * np.log((1 - shapes.between) * above)
+        return -float(counts @ np.log(density + 1e-7) + outer)
+
+    full = np.clip(loading, 0.02, 0.98)
+    start = np.array(
+        [0.0, np.log(width_empty), 0.3, 1.0, np.log(width_full), 0.3, np.log(full / (1 - full)), -6.0]
+    )
+    unit = np.array([width_empty / 3, 0.1, 0.3, width_full / 3, 0.1, 0.3, 0.3, 1.0])
+    bounds = [(low / one, high / one) for (low, high), one in zip(_bounds(start), unit, strict=True)]
+
+    def in_units(x: Floats) -> float:
+        return unlikelihood(x * unit)
+
+    options = {"maxiter": 500, "ftol": 1e-13, "gtol": 1e-3}
+    found = minimize(in_units, start / unit, method="L-BFGS-B", bounds=bounds, options=options)
+    return _shapes(found.x * unit)[0]
+
+
+def _bounds(start: Floats) -> list[tuple[float, float]]:
+    narrow, wide = np.log(0.4), np.log(2.5)
+    return [
+        (-0.3, 0.3),
+        (start[1] + narrow, start[1] + wide),
+        (-1.8, 1.8),
+        (0.7, 1.3),
+        (start[4] + narrow, start[4] + wide),
+        (-1.8, 1.8),
+        (-6.0, 6.0),
+        (-12.0, -2.0),
+    ]
+
+
+def _shapes(x: Floats) -> tuple[Shapes, float]:
+    empty = Peak(float(x[0]), float(np.exp(x[1])), float(x[2]))
+    full = Peak(float(x[3]), float(np.exp(x[4])), float(x[5]))
+    return Shapes(empty, full, float(1 / (1 + np.exp(-x[7])))), float(1 / (1 + np.exp(-x[6])))
+
+
+Bools = NDArray[np.bool_]
+
+MIN_FRAMES: Final = 30
+MIN_IN_PEAK: Final = 5
+APART: Final = 3.0
+"""Least distance of two peaks, in their joint widths; a single peak cut in two has 2."""
+
+FAINT: Final = 0.4
+"""Least distance of a site's peaks, of the usual."""
+
+MAX_ONE_PEAK: Final = 0.2
+"""Most sites with one peak, of all."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FittedThresholds:
+    """Thresholds of the sites, and what is expected of them.
+
+    Attributes:
+        thresholds: float64 (n_rows, n_cols), in the unit of the signals.
+        false_negative: float64 (n_rows, n_cols), probability that an atom is missed.
+        false_positive: float64 (n_rows, n_cols), probability that an empty site is taken for full.
+        loading: float64 (n_rows, n_cols), fraction of the frames above the threshold.
+        never_loaded: bool (n_rows, n_cols), sites with the lower peak alone; their threshold has
+            the usual distance from it.
+        always_loaded: bool (n_rows, n_cols), sites with the upper peak alone; theirs stands
+            between the usual lower peak and their upper.
+        lost: Fraction of the signals between the peaks: atoms lost during the exposure.
+    """
+
+    thresholds: Floats
+    false_negative: Floats
+    false_positive: Floats
+    loading: Floats
+    never_loaded: Bools
+    always_loaded: Bools
+    lost: float
+
+    @property
+    def error(self) -> float:
+        """Mean of both kinds of errors and of all sites."""
+        return float((self.false_negative.mean() + self.false_positive.mean()) / 2)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _SitePeaks:
+    """Where the peaks of each site are; float64 (n_sites,) but for ``two``."""
+
+    empty: Floats
+    full: Floats
+    width_empty: Floats
+    width_full: Floats
+    n_empty: Floats
+    n_full: Floats
+    two: Bools
+
+
+def fit_thresholds(signals: Floats, miss_cost: float = 3.0, detector: str = "detector") -> FittedThresholds:
+    """Fit the two peaks of each site and put the threshold where errors cost least.
+
+    All sites share the shape of the peaks, for the errors are in tails that a site
+    shows once in thousands of frames. Places and widths are each site's own, drawn
+    towards those of all by as much as chance explains (James and Stein, Proc. 4th
+    Berkeley Symp. 1, 361, 1961).
+
+    Args:
+        signals: float64 (n_frames, n_rows, n_cols), what the detector compares, from
+            frames of randomly loaded atoms.
+        miss_cost: What a missed atom costs, in imagined ones. A second atom is sent onto a
+            missed one and both are lost, which leaves a site empty; an imagined atom
+            leaves one empty.
+        detector: Its name, for messages.
+
+    Raises:
+        LimitError: Fewer than 30 frames, or a cost that is not above 0.
+        DeviceError: More than 20 % of the sites show one peak only.
+    """
+    n_frames, *shape = signals.shape
+    if n_frames < MIN_FRAMES:
+        raise LimitError("the number of frames for thresholds", n_frames, f"{MIN_FRAMES} or more")
+    if not 0 < miss_cost < np.inf:
+        raise LimitError("the cost of a missed atom", miss_cost, "more than 0 imagined ones")
+    by_site = np.ascontiguousarray(signals.reshape(n_frames, -1).T, np.float64)
+    if not np.isfinite(by_site).all():
+        raise DeviceError(detector, "some of the signals are not finite numbers; no thresholds fitted")
+    peaks = _site_peaks(by_site)
+    _check_enough(peaks.two, by_site, detector)
+    places, never, always = _with_single_peaks(peaks, by_site)
+    shapes = _common_shapes(by_site[peaks.two], places, peaks.two)
+    steps, widths_empty, widths_full = places.full - places.empty, places.width_empty, places.width_full
+    ratio_empty, ratio_full = (
+        w / steps / np.median((w / steps)[peaks.two]) for w in (widths_empty, widths_full)
+    )
+    at, missed, imagined = _cheapest(shapes, ratio_empty, ratio_full, miss_cost)
+    thresholds = places.empty + at * steps
+    return FittedThresholds(
+        thresholds.reshape(shape),
+        missed.reshape(shape),
+        imagined.reshape(shape),
+        (by_site > thresholds[:, None]).mean(axis=1).reshape(shape),
+        never.reshape(shape),
+        always.reshape(shape),
+        shapes.between,
+    )
+
+
+def _site_peaks(by_site: Floats) -> _SitePeaks:
+    """Cut each site's signals in two, again and again in the middle of the two parts' middles."""
+    low, high = np.quantile(by_site, [0.02, 0.98], axis=1)
+    cut = (low + high) / 2
+    for _ in range(12):
+        empty = _middle(by_site, by_site <= cut[:, None])
+        full = _middle(by_site, by_site > cut[:, None])
+        cut = np.where(np.isfinite(empty + full), (empty + full) / 2, cut)
+    parts = [_described(by_site, part) for part in (by_site <= cut[:, None], by_site > cut[:, None])]
+    (empty, width_empty, n_empty), (full, width_full, n_full) = parts
+    apart = (full - empty) / np.maximum(np.hypot(width_empty, width_full), 1e-300)
+    few = np.minimum(n_empty, n_full) < max(MIN_IN_PEAK, 0.02 * by_site.shape[1])
+    two = np.isfinite(apart) & (apart > APART) & ~few
+    if two.any():
+        two &= full - empty > FAINT * np.median((full - empty)[two])
+    return _SitePeaks(empty, full, width_empty, width_full, n_empty, n_full, two)
+
+
+def _middle(by_site: Floats, part: Bools) -> Floats:
+    counts = part.sum(axis=1)
+    ordered = np.sort(np.where(part, by_site, np.inf), axis=1)
+    middle = np.take_along_axis(ordered, np.maximum(counts // 2, 0)[:, None], axis=1)[:, 0]
+    return np.where(counts > 0, middle, np.nan)
+
+
+def _described(by_site: Floats, part: Bools) -> tuple[Floats, Floats, Floats]:
+    """Mean and standard deviation without what is far off, and how many there are."""
+    middle = _middle(by_site, part)
+    off = np.abs(by_site - middle[:, None])
+    near = part & (off < 4 * 1.4826 * _middle(off, part)[:, None] + 1e-12)
+    n = near.sum(axis=1).astype(np.float64)
+    count = np.maximum(n, 1)
+    mean = np.where(near, by_site, 0.0).sum(axis=1) / count
+    spread = np.where(near, (by_site - mean[:, None]) ** 2, 0.0).sum(axis=1)
+    return np.where(n > 0, mean, np.nan), np.sqrt(spread / np.maximum(count - 1, 1)), n
+
+
+def _check_enough(two: Bools, by_site: Floats, detector: str) -> None:
+    n_one = int((~two).sum())
+    if n_one > MAX_ONE_PEAK * len(two):
+        spread = (
+            "all signals are equal: black or saturated frames"
+            if np.ptp(by_site) == 0
+            else ("check the loading, the light, and that the sites are where the atoms are")
+        )
+        raise DeviceError(detector, f"{n_one} of {len(two)} sites show one peak, not two; {spread}")
+
+
+def _with_single_peaks(peaks: _SitePeaks, by_site: Floats) -> tuple[_SitePeaks, Bools, Bools]:
+    """Peaks drawn towards those of all; a site with one peak gets the other from all."""
+    two = peaks.two
+    empty = _drawn(peaks.empty, peaks.width_empty / np.sqrt(np.maximum(peaks.n_empty, 1)), two)
+    full = _drawn(peaks.full, peaks.width_full / np.sqrt(np.maximum(peaks.n_full, 1)), two)
+    width_empty = _drawn(
+        peaks.width_empty, peaks.width_empty * 0.85 / np.sqrt(np.maximum(peaks.n_empty, 1)), two
+    )
+    width_full = _drawn(peaks.width_full, peaks.width_full * 0.85 / np.sqrt(np.maximum(peaks.n_full, 1)), two)
+    usual_empty, usual_full = np.median(peaks.empty[two]), np.median(peaks.full[two])
+    middle = np.median(by_site, axis=1)
+    always = ~two & (np.abs(middle - usual_full) < np.abs(middle - usual_empty))
+    never = ~two & ~always
+    empty = np.where(never, middle, empty)
+    full = np.where(never, middle + usual_full - usual_empty, np.where(always, middle, full))
+    return _SitePeaks(empty, full, width_empty, width_full, peaks.n_empty, peaks.n_full, two), never, always
+
+
+def _drawn(values: Floats, chance: Floats, known: Bools) -> Floats:
+    """Values drawn towards their mean by as much as chance explains, at most by its standard deviation."""
+    mean = float(np.median(values[known]))
+    spread = 1.4826 * float(np.median(np.abs(values[known] - mean)))
+    real = max(0.0, spread**2 - float(np.median(chance[known] ** 2)))
+    drawn = mean + (values - mean) * real / np.maximum(real + chance**2, 1e-300)
+    return np.where(known, np.clip(drawn, values - 1.5 * chance, values + 1.5 * chance), mean)
+
+
+def _common_shapes(by_site: Floats, places: _SitePeaks, two: Bools) -> Shapes:
+    empty, step = places.empty[two], (places.full - places.empty)[two]
+    signals = ((by_site - empty[:, None]) / step[:, None]).ravel()
+    widths = [float(np.median(width[two] / step)) for width in (places.width_empty, places.width_full)]
+    return fit_shapes(signals, float((signals > 0.5).mean()), widths[0], widths[1])
+
+
+def _cheapest(
+    shapes: Shapes, ratio_empty: Floats, ratio_full: Floats, miss_cost: float
+) -> tuple[Floats, Floats, Floats]:
+    """Threshold of each site between 0 and 1, and both probabilities of error there."""
+    at = np.linspace(0.02, 0.98, 1921)
+    steps = np.exp(np.linspace(np.log(0.5), np.log(2.0), 57))
+    imagined = np.stack([shapes.empty.widened(step).above(at) for step in steps])
+    missed = np.stack([shapes.full.widened(step).below(at) for step in steps])
+    found = list[tuple[float, float, float]]()
+    places = np.arange(len(steps))
+    for of_empty, of_full in zip(ratio_empty, ratio_full, strict=True):
+        i, j = (int(np.rint(np.interp(np.log(r), np.log(steps), places))) for r in (of_empty, of_full))
+        best = int(np.argmin(imagined[i] + miss_cost * missed[j]))
+        found.append((float(at[best]), float(missed[j, best]), float(imagined[i, best])))
+    at_best, missed_best, imagined_best = np.array(found).T
+    return at_best, missed_best, imagined_best
+
+
+MAX_NAMED: Final = 8
+"""Sites that are named; of more, only the number is told."""
+
+_SEQUENCE: Final = packaged("thresholds")
+
+
+@dataclass(frozen=True, slots=True)
+class ThresholdsMethod:
+    """Implements ``Method`` for the thresholds."""
+
+    kind: CalibrationKind = "thresholds"
+    sequence: Path = _SEQUENCE
+    aside: tuple[CalibrationKind, ...] = ("thresholds",)
+    is_blind: bool = True
+
+    def analyse(self, evidence: CalibrationData) -> AnalysisResult:
+        """Fit the signals that the profile's detector makes of the run's frames.
+
+        Raises:
+            DeviceError: The frames are of another size than the sites belong to, or too many sites
+                show one peak only.
+            LimitError: There are too few frames.
+            ConfigError: The detector does not tell its signals, or the run has no frames.
+        """
+        detector = evidence.detector()
+        if not isinstance(detector, ReportsSignals):
+            name = evidence.bench.chosen["detector"].entry.name
+            what = f"the detector '{name}' does not tell the signals that it compares"
+            raise ConfigError(Problem(what, expected="'threshold', 'weighted', or another that does"))
+        signals = np.stack([detector.signals(frame) for frame in evidence.frames()])
+        fitted = fit_thresholds(signals)
+        quality = {
+            "error": fitted.error,
+            "false_negative": float(fitted.false_negative.mean()),
+            "false_positive": float(fitted.false_positive.mean()),
+            "loading": float(fitted.loading.mean()),
+            "n_one_peak": float((fitted.never_loaded | fitted.always_loaded).sum()),
+        }
+        unit = detector.signal_unit
+        return AnalysisResult(
+            {"thresholds": fitted.thresholds},
+            quality,
+            _summary_lines(fitted, len(signals), unit),
+            {"unit": unit, "detector": evidence.bench.chosen["detector"].dump()},
+            lambda: draw_thresholds(signals, fitted.thresholds, unit),
+        )
+
+    def read(self, path: Path, bench: ResolvedProfile) -> AnalysisResult:
+        """Refuse: a file of thresholds is a setting of the detector."""
+        del bench
+        raise from_runs_only(self.kind, path)
+
+
+def _summary_lines(fitted: FittedThresholds, n_frames: int, unit: str) -> tuple[str, ...]:
+    low, high = fitted.thresholds.min(), fitted.thresholds.max()
+    missed, imagined = fitted.false_negative.mean(), fitted.false_positive.mean()
+    loading = f"{100 * fitted.loading.mean():.1f} % of the sites hold atoms"
+    lines = [
+        f"thresholds from {low:.4g} to {high:.4g} {unit}, of {n_frames} frames; {loading}",
+        f"expected: {missed:.1e} of the atoms missed, {imagined:.1e} of the empty sites taken for full",
+    ]
+    for sites, what in ((fitted.never_loaded, "never"), (fitted.always_loaded, "always")):
+        if sites.any():
+            lines.append(f"warning: {_named(sites)} {what} loaded; the threshold is that of the others")
+    return tuple(lines)
+
+
+def _named(sites: NDArray[np.bool_]) -> str:
+    places = [f"({row}, {col})" for row, col in np.argwhere(sites)]
+    if len(places) > MAX_NAMED:
+        return f"{len(places)} sites were"
+    return f"site {places[0]} was" if len(places) == 1 else f"sites {', '.join(places)} were"

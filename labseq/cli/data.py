@@ -1,0 +1,138 @@
+"""`labseq doctor` and `labseq export`."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any, Final
+
+from labseq.cli.show import chosen_run
+from labseq.config.messages import visible
+from labseq.console.output import as_line, columns, plural, say
+from labseq.errors import ConfigError, Problem, RecordingError
+from labseq.recording import Run, data_root
+from labseq.recording.doctor import Report, examine as look_for_damage
+from labseq.recording.export import ENDINGS, check_export, export_run, files_of
+
+MAX_ROWS: Final = 200
+"""Findings that are told; of more only how many there are."""
+
+
+def examine(data: Path | None, *, dry_run: bool, as_json: bool) -> int:
+    """Look for damage, repair what can be repaired, and print what was found.
+
+    Args:
+        data: A data folder or a run's; None for LABSEQ_DATA or ./data.
+        dry_run: Whether to change nothing.
+        as_json: Whether to print one line of JSON instead of a table.
+
+    Returns:
+        The exit code: 0 if nothing is left that is wrong, else 1.
+
+    Raises:
+        ConfigError: There is no such folder.
+        RecordingError: It cannot be read.
+    """
+    root = data_root() if data is None else data.expanduser()
+    if not root.is_dir():
+        hint = "give a data folder or a run's folder, or set LABSEQ_DATA"
+        raise ConfigError(Problem("there is no such folder", visible(str(root)), hint=hint))
+    report = look_for_damage(root, dry_run=dry_run)
+    if as_json:
+        say(as_line(_as_values(report)))
+    else:
+        say(*table(report, root, dry_run=dry_run), *summary(report, dry_run=dry_run))
+    return RecordingError.exit_code if any(one.left for one in report.findings) else 0
+
+
+def table(report: Report, root: Path, *, dry_run: bool) -> list[str]:
+    """A row per finding, and an empty line; nothing if all is well."""
+    if not report.findings:
+        return []
+    shown = report.findings[:MAX_ROWS]
+    rows = [
+        ("what", "where", "to do" if dry_run else "done"),
+        *((visible(one.what), visible(_shown(one.where, root)), visible(one.done)) for one in shown),
+    ]
+    n_more = len(report.findings) - MAX_ROWS
+    return [*columns(rows), *([f"and {n_more} more"] if n_more > 0 else []), ""]
+
+
+def summary(report: Report, *, dry_run: bool) -> list[str]:
+    """What was looked at, and what came of it."""
+    lines = [f"{plural(report.n_runs, 'run')} looked at, {plural(report.n_shots, 'shot')} whole"]
+    if report.in_progress:
+        lines.append(f"{plural(len(report.in_progress), 'run')} in progress left alone")
+    n_left = sum(one.left for one in report.findings)
+    if not report.findings:
+        lines.append("nothing is wrong")
+    elif dry_run:
+        lines.append(f"{plural(len(report.findings), 'thing')} wrong; nothing was changed")
+    else:
+        n_done = len(report.findings) - n_left
+        lines.append(f"{plural(len(report.findings), 'thing')} wrong: {n_done} put right, {n_left} left")
+    return lines
+
+
+def _shown(path: Path, root: Path) -> str:
+    try:
+        return str(path.relative_to(root.absolute())) if path != root.absolute() else path.name
+    except ValueError:
+        return str(path)
+
+
+def _as_values(report: Report) -> dict[str, Any]:
+    findings = [
+        {"what": one.what, "where": str(one.where), "done": one.done, "left": one.left}
+        for one in report.findings
+    ]
+    return {
+        "runs": report.n_runs,
+        "shots": report.n_shots,
+        "in_progress": [str(path) for path in report.in_progress],
+        "findings": findings,
+    }
+
+
+def export_to(run: Path | None, kind: str, output: Path | None, *, frames: bool, replace: bool) -> int:
+    """Export a run, and say what was written.
+
+    Args:
+        run: The run's folder or any file in it; None for the newest run.
+        kind: One of :data:`labseq.recording.export.ENDINGS`.
+        output: The file; None for one named after the run, in the current folder.
+        frames: Whether an archive holds the frames.
+        replace: Whether files that are there may be replaced.
+
+    Returns:
+        The exit code: 1 if shots had to be left out.
+
+    Raises:
+        ConfigError: There is no such run, or the file cannot be written.
+        RecordingError: The run is damaged.
+    """
+    if output is not None:
+        check_export(kind, output, frames=frames, replace=replace)
+    opened = chosen_run(run)
+    path = output or Path(f"{opened.path.parent.name}_{opened.path.name}{ENDINGS.get(kind, '')}")
+    check_export(kind, path, frames=frames, replace=replace)
+    left_out = export_run(opened, kind, path, frames=frames)
+    for line in (*state_lines(opened), *(f"left out: {text}" for text in left_out)):
+        say(f"warning: {line}", stream=sys.stderr)
+    for file in files_of(kind, path):
+        say(f"written: {file}")
+    return RecordingError.exit_code if left_out else 0
+
+
+def state_lines(run: Run) -> list[str]:
+    """What is to be known of a run that did not complete."""
+    shots = f"{plural(len(run.shots), 'shot')} of {run.n_shots}"
+    if run.status == "running":
+        return [f"the run still goes on; exported are the {shots} that it had"]
+    lines = (
+        [] if run.status == "complete" else [f"the run did not complete ({run.status}); exported are {shots}"]
+    )
+    if run.n_damaged_lines:
+        damaged = plural(run.n_damaged_lines, "line")
+        lines.append(f"{damaged} of the index cannot be read; see labseq doctor")
+    return lines

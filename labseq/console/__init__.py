@@ -1,0 +1,1 @@
+"""How every command prints: text, tables, errors, and the options that commands share."""

@@ -1,0 +1,148 @@
+"""Errors on the terminal: the excerpt of the file with its caret, and exit codes."""
+
+from __future__ import annotations
+
+import codecs
+import errno
+import re
+import shutil
+import sys
+import traceback
+import unicodedata
+from contextlib import suppress
+from pathlib import Path
+from typing import Final
+
+from labseq.console.output import plural, say
+from labseq.errors import ConfigError, LabseqError, Problem, RecordingError, StopRequested
+
+_WIDEST: Final = 100
+_MARGIN: Final = 8  # "   12 | "
+_PLAIN: Final = r"(?:[^\s,:\[\]{}]|:(?=[^\s,\[\]{}]))+"
+_WORD: Final = re.compile(rf"\"[^\"]*\"?|'[^']*'?|{_PLAIN}(?: (?!#){_PLAIN})*")
+
+
+def excerpt(problem: Problem) -> list[str]:
+    """Show the line as compilers do.
+
+    Args:
+        problem: A problem; without a line, or if its file cannot be read, nothing is shown.
+
+    Returns:
+        The line with its number, and a line with carets below the word that is meant.
+    """
+    line = _line_of(problem)
+    if line is None or not line.strip():
+        return []
+    widest = max(20, min(_WIDEST, shutil.get_terminal_size((_WIDEST + _MARGIN, 24)).columns - _MARGIN))
+    start = min(problem.column - 1, len(line))
+    word = _WORD.match(line, start)
+    end = max(start + 1, word.end() if word else 0)
+    shift = min(start, max(0, end + _MARGIN - widest)) if len(line) > widest else 0
+    while _width(line[shift:start]) >= widest:
+        shift += 1
+    shown = line[shift : shift + widest].rstrip()
+    while _width(shown) > widest:
+        shown = shown[:-1]
+    # A tab takes as much room above as below.
+    pad = "".join("\t" if char == "\t" else " " * _width(char) for char in line[shift:start])
+    carets = "^" * max(1, min(_width(line[start:end]), widest - _width(line[shift:start])))
+    return [f"{problem.line:>5} | {shown}", " " * 5 + " | " + pad + carets]
+
+
+def _width(text: str) -> int:
+    """Columns of a terminal that a text takes."""
+    narrow = len(text) - sum(unicodedata.combining(char) != 0 for char in text)
+    return narrow + sum(unicodedata.east_asian_width(char) in "WF" for char in text)
+
+
+def _line_of(problem: Problem) -> str | None:
+    if not problem.line or not problem.column:
+        return None
+    try:
+        data = Path(problem.source).read_bytes()
+    except (OSError, ValueError):
+        return None
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return None
+    text = data.decode("utf-8-sig", errors="replace")
+    lines = re.split(r"\r\n|\r|\n", text)
+    if problem.line > len(lines):
+        return None
+    line = lines[problem.line - 1]
+    return "".join(char if char.isprintable() or char == "\t" else "?" for char in line)
+
+
+EXIT_SIGNALLED: Final = 128
+"""Added to the signal's number, as shells do: 130 for Ctrl-C, 143 for SIGTERM."""
+EXIT_INTERRUPTED: Final = EXIT_SIGNALLED + 2
+EXIT_INTERNAL: Final = 1
+MAX_REPORTED: Final = 50
+"""Problems of a file that are told; a file with more of them is not what it was taken for."""
+
+
+def report(error: BaseException, *, debug: bool = False) -> int:
+    """Say on stderr what went wrong.
+
+    Args:
+        error: What ended the command.
+        debug: Whether to print the traceback as well.
+
+    Returns:
+        The exit code.
+    """
+    if debug:
+        traceback.print_exception(error)
+    lines = format_config_error(error) if isinstance(error, ConfigError) else lines_of(error)
+    with suppress(OSError, RecordingError):  # the exit code says it, too
+        say(*lines, stream=sys.stderr)
+    return exit_code_of(error)
+
+
+def format_config_error(error: ConfigError) -> list[str]:
+    """Every problem with the line that it is in, and what else there is to look at.
+
+    Of very many problems only the first are told.
+    """
+    lines: list[str] = []
+    for problem, text in zip(error.problems[:MAX_REPORTED], lines_of(error), strict=False):
+        lines += [text, *excerpt(problem), *(f"      = {note}" for note in problem.notes)]
+    n_more = len(error.problems) - MAX_REPORTED
+    return [*lines, f"and {plural(n_more, 'more problem')}"] if n_more > 0 else lines
+
+
+def lines_of(error: BaseException) -> list[str]:
+    """The message for the user.
+
+    A problem in a file starts with its place, as compilers print it.
+
+    Example:
+        >>> lines_of(ConfigError("a session runs once"))
+        ['error: a session runs once']
+    """
+    if isinstance(error, ConfigError):
+        return [str(p) if p.source else f"error: {p}" for p in error.problems]
+    if isinstance(error, StopRequested):
+        return [str(error)]
+    if isinstance(error, LabseqError):
+        return [f"error: {error}"]
+    if isinstance(error, KeyboardInterrupt):
+        return ["stopped by Ctrl-C"]
+    if isinstance(error, OSError) and error.errno == errno.ENOSPC:
+        return [f"error: {error.filename or 'output'} cannot be written: {error.strerror}"]
+    text = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+    return [f"internal error: {text}; please report it; run again with --debug to see where"]
+
+
+def exit_code_of(error: BaseException) -> int:
+    """The exit code of a command that ended so.
+
+    Example:
+        >>> exit_code_of(StopRequested(15))
+        143
+    """
+    if isinstance(error, StopRequested):
+        return EXIT_SIGNALLED + error.signal_number
+    if isinstance(error, LabseqError):
+        return error.exit_code
+    return EXIT_INTERRUPTED if isinstance(error, KeyboardInterrupt) else EXIT_INTERNAL

@@ -1,0 +1,150 @@
+"""Options that several commands share, and their completion.
+
+A shell asks at every press of the tab key: nothing heavy is imported here, no plugin is loaded, and
+nothing that goes wrong is told.
+"""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Final
+
+import typer
+
+from labseq.files import PROFILES, data_root, packaged_profiles_dir
+from labseq.registry import KINDS
+
+if TYPE_CHECKING:
+    from labseq.session import Options
+
+_FILES: Final = ("sequence", "profile")
+_YAML: Final = (".yaml", ".yml")
+MAX_RUNS: Final = 20
+"""Most runs that are offered, the newest first."""
+
+
+def new_kinds(incomplete: str) -> list[str]:
+    """What ``labseq new`` can make.
+
+    Example:
+        >>> new_kinds("st")
+        ['static_tweezers', 'step']
+    """
+    return [kind for kind in (*_FILES, *KINDS) if kind.startswith(incomplete)]
+
+
+def file_kinds(incomplete: str) -> list[str]:
+    """Kinds of file."""
+    return [kind for kind in _FILES if kind.startswith(incomplete)]
+
+
+def profile_names(incomplete: str) -> list[str]:
+    """Profiles in ./hardware_profiles and those that come with labseq, by name."""
+    found: set[str] = set()
+    for folder in (Path(PROFILES), packaged_profiles_dir()):
+        with suppress(OSError):
+            found |= {path.stem for path in folder.iterdir() if path.suffix.lower() in _YAML}
+    return sorted(name for name in found if name.startswith(incomplete))
+
+
+def run_folders(incomplete: str) -> list[str]:
+    """Folders of runs, the newest first."""
+    with suppress(OSError):
+        runs = sorted(data_root().glob("????-??-??/[0-9]*/run.json"), reverse=True)
+        found = (str(path.parent) for path in runs)
+        return [run for run in found if run.startswith(incomplete)][:MAX_RUNS]
+    return []
+
+
+class DryRunKind(StrEnum):
+    """What ``--dry-run`` may be followed by."""
+
+    FULL = "full"
+    FAST = "fast"
+
+
+Profile = Annotated[
+    str | None,
+    typer.Option(
+        "--profile",
+        "-p",
+        metavar="NAME|FILE",
+        help="Hardware profile, instead of the one that the sequence names.",
+        autocompletion=profile_names,
+    ),
+]
+Overrides = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="ADDRESS=VALUE",
+        help="Change one value, for example planner.degree_of_parallelism=2 or profile.mobile_tweezers.speed="
+        '"100 um/ms"; may be given several times.',
+    ),
+]
+DryRun = Annotated[
+    DryRunKind | None,
+    typer.Option(
+        "--dry-run",
+        metavar="[=fast]",
+        help="Open no hardware: every device is replaced by its driver's own simulation where it has one, "
+        "else by its virtual twin; with =fast by virtual twins only.",
+        show_choices=False,
+    ),
+]
+Json = Annotated[
+    bool, typer.Option("--json", help="Print the outcome as one line of JSON on stdout, all else on stderr.")
+]
+SequenceFile = Annotated[
+    Path,
+    typer.Argument(
+        metavar="SEQUENCE",
+        help="The sequence file, or the name of one in ./sequences or of one that comes with labseq.",
+        show_default=False,
+    ),
+]
+Shots = Annotated[
+    int | None, typer.Option(metavar="N", help="Number of shots, instead of the sequence's own.")
+]
+Seed = Annotated[
+    int | None, typer.Option(metavar="N", help="Seed of all random numbers: the same seed, the same run.")
+]
+Output = Annotated[
+    Path | None, typer.Option(metavar="DIR", help="Folder for the data, instead of LABSEQ_DATA or ./data.")
+]
+Realtime = Annotated[bool, typer.Option("--realtime", help="Let a simulated run take as long as a real one.")]
+RunFolder = Annotated[
+    Path | None,
+    typer.Argument(
+        metavar="RUN",
+        help="A run's folder; the newest run by default.",
+        show_default=False,
+        autocompletion=run_folders,
+    ),
+]
+
+
+def run_options(
+    *,
+    profile: str | None,
+    dry_run: DryRunKind | None,
+    shots: int | None,
+    seed: int | None,
+    overrides: list[str] | None,
+    output: Path | None,
+    realtime: bool,
+) -> Options:
+    """What was chosen for a run, now or later."""
+    from labseq.session import Options
+
+    return Options(
+        profile=profile,
+        shots=shots,
+        seed=seed,
+        overrides=tuple(overrides or ()),
+        output=output,
+        dry_run="off" if dry_run is None else dry_run.value,
+        realtime=realtime,
+    )

@@ -1,0 +1,318 @@
+"""Site positions on the camera, regions around them, and the light they collect."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq.errors import ConfigError, DeviceError, LimitError
+from labseq.model import CalibrationEntry, Frame, SiteGrid
+from labseq.model.arrays import read_only
+
+
+def site_pixels(
+    grid: SiteGrid, pixel_size_m: float, centre_px: tuple[float, float], angle_rad: float = 0.0
+) -> NDArray[np.float64]:
+    """Map the sites onto the camera.
+
+    Args:
+        grid: The grid of sites; its centre is the origin of its positions.
+        pixel_size_m: Size of a camera pixel in the atom plane, in metres.
+        centre_px: (y, x) of the grid's centre. Whole numbers are the middles of
+            pixels, so the centre of a 512 x 512 frame is (255.5, 255.5).
+        angle_rad: Rotation of the grid about its centre; positive is clockwise on
+            the screen, where y points down.
+
+    Returns:
+        float64 (n_rows, n_cols, 2), (y, x) of each site in pixels.
+
+    Example:
+        >>> grid = SiteGrid(1, 2, spacing_m=4e-6)
+        >>> site_pixels(grid, 1e-6, (10.0, 20.0)).tolist()
+        [[[10.0, 18.0], [10.0, 22.0]]]
+    """
+    x_m, y_m = grid.positions_m[..., 0], grid.positions_m[..., 1]
+    cos, sin = math.cos(angle_rad), math.sin(angle_rad)
+    y_px = centre_px[0] + (x_m * sin + y_m * cos) / pixel_size_m
+    x_px = centre_px[1] + (x_m * cos - y_m * sin) / pixel_size_m
+    return np.stack([y_px, x_px], axis=-1)
+
+
+Floats = NDArray[np.float64]
+
+COLUMNS: Final = ("row", "col", "y", "x")
+
+
+class ContextLike(Protocol):
+    """What a detector needs of a ``labseq.Context``."""
+
+    @property
+    def name(self) -> str:
+        """Role in the profile."""
+        ...
+
+    @property
+    def grid(self) -> SiteGrid:
+        """The grid of sites."""
+        ...
+
+    @property
+    def calibrations(self) -> Mapping[str, CalibrationEntry]:
+        """Calibrations in use: kind -> entry."""
+        ...
+
+
+class GeometryLike(Protocol):
+    """Where the sites are on the frames; SI and pixels."""
+
+    @property
+    def sites(self) -> Path | None:
+        """File with the place of each site; None for none."""
+        ...
+
+    @property
+    def frame(self) -> tuple[int, int]:
+        """(height, width) of the frames that file and geometry belong to."""
+        ...
+
+    @property
+    def centre_px(self) -> tuple[float, float]:
+        """(y, x) of the grid's centre."""
+        ...
+
+    @property
+    def pixel_size(self) -> float:
+        """Size of a pixel in the atom plane, in metres."""
+        ...
+
+    @property
+    def angle(self) -> float:
+        """Rotation of the grid, in radians, clockwise on the screen."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KnownSites:
+    """Where the sites are.
+
+    Attributes:
+        positions_px: float64 (n_rows, n_cols, 2), (y, x) of each site in pixels; read-only.
+        frame: (height, width) of the frames that they belong to.
+        source: Who says so, in words: "the calibration of sites a1b2c3d4e5f6".
+        mend: What to do if they do not fit.
+    """
+
+    positions_px: Floats
+    frame: tuple[int, int]
+    source: str
+    remedy: str
+
+    def __post_init__(self) -> None:
+        positions = read_only(self.positions_px, np.float64, (-1, -1, 2), "positions_px")
+        object.__setattr__(self, "positions_px", positions)
+
+
+def known_sites(settings: GeometryLike, context: ContextLike) -> KnownSites:
+    """Where the sites are: by the file in ``sites``, else by the calibration in use, else by the geometry.
+
+    Args:
+        settings: See :class:`GeometryLike`.
+        context: Grid and calibrations.
+
+    Raises:
+        ConfigError: The file cannot be read, or has not one place for each site.
+    """
+    if settings.sites is not None:
+        return KnownSites(
+            read_sites(settings.sites, context.grid.shape),
+            settings.frame,
+            f"the sites in {settings.sites}",
+            "check the file, and `frame` of the detector",
+        )
+    entry = context.calibrations.get("sites")
+    if entry is not None:
+        height, width = (int(n) for n in entry.values["frame"])
+        return KnownSites(
+            entry.values["positions_px"],
+            (height, width),
+            f"the calibration of sites {entry.id}",
+            "calibrate the sites with this camera, crop it as it was then, or take another calibration",
+        )
+    return KnownSites(
+        site_pixels(context.grid, settings.pixel_size, settings.centre_px, settings.angle),
+        settings.frame,
+        "the detector's settings",
+        "calibrate the sites, or check `centre_px`, `pixel_size`, `angle` and `frame` of the detector",
+    )
+
+
+def read_sites(path: Path, shape: tuple[int, int]) -> Floats:
+    """Read the places of the sites of an irregular array.
+
+    Args:
+        path: A .npy file of floats (n_rows, n_cols, 2) with (y, x) in pixels, or a
+            table in text with the columns row, col, y and x, named in its first
+            line and separated by commas, and a line for each site.
+        shape: (n_rows, n_cols) of the grid.
+
+    Returns:
+        float64 (n_rows, n_cols, 2).
+
+    Raises:
+        ConfigError: It cannot be read, or has not one place for each site.
+    """
+    try:
+        positions = _array(path) if path.suffix == ".npy" else _table(path, shape)
+    except (OSError, ValueError, TypeError, csv.Error) as error:
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        raise ConfigError(
+            f"the sites cannot be read from '{path}': {reason}; expected a .npy file of floats "
+            f"(n_rows, n_cols, 2), (y, x) in pixels, or a .csv file with the columns {', '.join(COLUMNS)}"
+        ) from error
+    if positions.shape != (*shape, 2) or not np.isfinite(positions).all():
+        came = f"of shape {positions.shape}" if positions.shape != (*shape, 2) else "not all finite"
+        raise ConfigError(
+            f"the sites in '{path}' are {came}; expected (y, x) for each of {shape[0]} x {shape[1]} sites: "
+            f"{(*shape, 2)}"
+        )
+    return positions
+
+
+def _array(path: Path) -> Floats:
+    with path.open("rb") as file:
+        return np.lib.format.read_array(file, allow_pickle=False).astype(np.float64)
+
+
+def _table(path: Path, shape: tuple[int, int]) -> Floats:
+    positions = np.full((*shape, 2), np.nan)
+    with path.open(newline="", encoding="utf-8-sig") as file:
+        table = csv.DictReader(file, skipinitialspace=True)
+        missing = [name for name in COLUMNS if name not in (table.fieldnames or ())]
+        if missing:
+            raise ValueError(f"it has no column '{missing[0]}'")
+        for line in table:
+            try:
+                row, col = int(line["row"]), int(line["col"])
+                place = float(line["y"]), float(line["x"])
+            except (TypeError, ValueError):
+                raise ValueError(f"line {table.line_num} has not four numbers") from None
+            if not (0 <= row < shape[0] and 0 <= col < shape[1]):
+                raise ValueError(
+                    f"line {table.line_num} is of site ({row}, {col}), which the grid does not have"
+                )
+            if not np.isnan(positions[row, col, 0]):
+                raise ValueError(
+                    f"line {table.line_num} is of site ({row}, {col}), which stands above already"
+                )
+            positions[row, col] = place
+    left = np.argwhere(np.isnan(positions[..., 0]))
+    if len(left):
+        raise ValueError(f"{len(left)} sites are missing, ({left[0, 0]}, {left[0, 1]}) among them")
+    return positions
+
+
+class RegionsLike(GeometryLike, Protocol):
+    """Where the sites are on the frames, and how wide a square of pixels each has; SI and pixels."""
+
+    @property
+    def region(self) -> int:
+        """Width of the square of pixels, odd."""
+        ...
+
+
+def region_corners(known: KnownSites, region: int) -> NDArray[np.int64]:
+    """(y, x) of the first pixel of each site's square, int64 (n_sites, 2), row by row.
+
+    The square is centred on the pixel nearest to the site.
+
+    Args:
+        known: Where the sites are.
+        region: Width of the squares, odd.
+
+    Raises:
+        LimitError: A square reaches over the edge of the frame.
+    """
+    height, width = known.frame
+    corners = np.rint(known.positions_px.reshape(-1, 2)).astype(np.int64) - region // 2
+    outside = np.any((corners < 0) | (corners + region > (height, width)), axis=1)
+    if outside.any():
+        first = int(np.argmax(outside))
+        row, col = divmod(first, known.positions_px.shape[1])
+        y, x = corners[first]
+        last = region - 1
+        raise LimitError(
+            f"the region of interest of site ({row}, {col}), by {known.source},",
+            f"rows {y} to {y + last} and columns {x} to {x + last} of the frame",
+            f"a frame of {height} x {width} pixels",
+            f"{known.remedy}; or take a smaller `region`",
+        )
+    return corners
+
+
+def checked_image(frame: Frame, known: KnownSites, name: str) -> NDArray[np.uint16]:
+    """The image of a frame of the size that the sites belong to.
+
+    Raises:
+        DeviceError: It is of another size or dtype; ``name`` is the detector's.
+    """
+    image = frame.image
+    if image.shape != known.frame or image.dtype != np.uint16:
+        height, width = known.frame
+        raise DeviceError(
+            name,
+            f"the frame is {image.dtype} {image.shape}; by {known.source} the sites are on uint16 frames of "
+            f"({height}, {width}); {known.remedy}",
+        )
+    return image
+
+
+def spot_light(
+    centres_px: NDArray[np.float64], corners: NDArray[np.int64], region: int, width_px: float
+) -> NDArray[np.float64]:
+    """Fraction of the light of Gaussian spots on the pixels of squares.
+
+    Args:
+        centres_px: float64 (n, 2), (y, x) of each spot.
+        corners: int64 (n, 2), (y, x) of the first pixel of each square.
+        region: Width of the squares, in pixels.
+        width_px: Width of the spots (1 sigma), in pixels.
+
+    Returns:
+        float64 (n, region, region).
+
+    Example:
+        >>> import numpy as np
+        >>> spot_light(np.array([[3.0, 3.0]]), np.array([[2, 2]]), 3, 0.1).round(3)[0, 1]
+        array([0., 1., 0.])
+    """
+    from scipy.special import ndtr
+
+    edges = (corners[:, :, None] + np.arange(region + 1) - 0.5 - centres_px[:, :, None]) / width_px
+    along_y, along_x = np.diff(ndtr(edges), axis=2).transpose(1, 0, 2)
+    return along_y[:, :, None] * along_x[:, None, :]
+
+
+def pairs_within(positions: NDArray[np.float64], distance: float) -> NDArray[np.int64]:
+    """Ordered pairs of different points within a distance, int64 (n_pairs, 2), by the first.
+
+    Args:
+        positions: float64 (n, 2).
+        distance: In the same unit.
+
+    Example:
+        >>> import numpy as np
+        >>> pairs_within(np.array([[0.0, 0.0], [0.0, 1.0], [0.0, 3.0]]), 1.5).tolist()
+        [[0, 1], [1, 0]]
+    """
+    from scipy.spatial import KDTree
+
+    pairs = KDTree(positions).query_pairs(distance, output_type="ndarray").astype(np.int64)
+    both = np.concatenate([pairs, pairs[:, ::-1]])
+    return both[np.lexsort((both[:, 1], both[:, 0]))]

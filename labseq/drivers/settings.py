@@ -1,0 +1,128 @@
+"""Settings that camera drivers share."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Protocol, Self, cast
+
+from pydantic import Field, NonNegativeInt, PositiveInt, model_validator
+
+from labseq.config.settings import Duration, Settings, Temperature
+from labseq.drivers import Cooling
+from labseq.errors import ConfigError
+from labseq.model import SensorMode
+from labseq.roles import Context, ReportsSensor, Simulation
+from labseq.units import ZERO_CELSIUS_K, format_quantity
+
+
+class SimulationWithSensor(Simulation, ReportsSensor, Protocol):
+    """A simulated world that tells of its sensor."""
+
+
+class RegionSettings(Settings):
+    """The part of the sensor that is read, in pixels of the sensor."""
+
+    y: NonNegativeInt = Field(default=0, description="first row")
+    x: NonNegativeInt = Field(default=0, description="first column")
+    height: PositiveInt = Field(description="number of rows")
+    width: PositiveInt = Field(description="number of columns")
+
+
+class CameraSettings(Settings):
+    """What every camera can be told of its sensor; a plugin's own settings come on top."""
+
+    region: RegionSettings | None = Field(
+        default=None, description="the part of the sensor that is read; none: all of it"
+    )
+    binning: PositiveInt = Field(
+        default=1, description="pixels of the sensor per pixel of a frame, along each axis"
+    )
+    max_exposure: Annotated[Duration, Field(gt=0)] = Field(default=10.0, description="longest exposure")
+
+    @property
+    def mode(self) -> SensorMode:
+        """How the sensor is read."""
+        region = self.region
+        place = None if region is None else (region.y, region.x, region.height, region.width)
+        return SensorMode(place, self.binning)
+
+    def sensor_conflict(self, sensor_shape: tuple[int, int]) -> str:
+        """Why region and binning do not go with a sensor of (height, width) pixels; "" if they do."""
+        y, x, height, width = self.mode.region or (0, 0, *sensor_shape)
+        if y + height > sensor_shape[0] or x + width > sensor_shape[1]:
+            rows, cols = sensor_shape
+            ends = f"`region` ends at row {y + height} and column {x + width}"
+            return f"{ends}, beyond the sensor of {rows} x {cols} pixels; choose a smaller or another one"
+        return _unbinnable(height, width, self.binning)
+
+    def simulated_world(self, context: Context) -> SimulationWithSensor:
+        """The simulated world that the simulated counterpart of a camera shows.
+
+        Raises:
+            ConfigError: There is none, it does not know its sensor, or the region is beyond that.
+        """
+        world = context.simulation
+        if world is None or not isinstance(world, ReportsSensor):
+            text = "a simulated camera needs a simulated world that tells of its sensor"
+            raise ConfigError(f"{text}; add `simulation: {{use: virtual}}` to the profile")
+        if setting_error := self.sensor_conflict(world.sensor_shape):
+            raise ConfigError(setting_error)
+        return cast("SimulationWithSensor", world)
+
+    @model_validator(mode="after")
+    def _region_can_be_binned(self) -> Self:
+        if self.region is not None and (
+            text := _unbinnable(self.region.height, self.region.width, self.binning)
+        ):
+            raise ValueError(text)
+        return self
+
+
+class IndustrialCameraSettings(CameraSettings):
+    """What cameras on GigE Vision and USB3 Vision can be told besides."""
+
+    readout: Duration = Field(
+        default=5e-3,
+        description="time from the end of an exposure until its frame can be read, for budgets; the "
+        "simulated camera takes so long",
+    )
+    trigger_line: str = Field(
+        default="Line1", min_length=1, description="input of the external trigger, as the camera calls it"
+    )
+    trigger_edge: Literal["rising", "falling"] = Field(
+        default="rising", description="edge of the external trigger that starts an exposure"
+    )
+    packet_delay: Duration | None = Field(
+        default=None,
+        description="pause between two network packets (GigE), for cameras that share a cable; none: as the "
+        "camera is set",
+    )
+
+
+class CoolingSettings(Settings):
+    """How cold the sensor shall be."""
+
+    temperature: Temperature = Field(description='of the sensor, "-70 degC"')
+    tolerance: Annotated[float, Field(gt=0, le=20)] = Field(
+        default=1.0, description="how far from it the sensor may be, in kelvins"
+    )
+    steady: Duration = Field(default=5.0, description="how long it must have been within that")
+    timeout: Annotated[Duration, Field(gt=0)] = Field(default=900.0, description="how long it may take")
+
+    def spec(self) -> Cooling:
+        """The same for drivers."""
+        return Cooling(self.temperature, self.tolerance, self.steady, self.timeout)
+
+    @model_validator(mode="after")
+    def _is_a_temperature_of_sensors(self) -> Self:
+        if not 150.0 <= self.temperature <= 323.0:
+            came = format_quantity(self.temperature, "temperature")
+            celsius = f"{self.temperature - ZERO_CELSIUS_K:.0f} degC"
+            raise ValueError(f"temperature is {came} ({celsius}); expected -123 to 50 degC, as '-70 degC'")
+        return self
+
+
+def _unbinnable(height: int, width: int, binning: int) -> str:
+    if height % binning == 0 and width % binning == 0:
+        return ""
+    text = f"{height} x {width} pixels cannot be binned by {binning}"
+    return f"{text}; choose a `region` whose height and width are multiples of it"

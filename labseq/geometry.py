@@ -1,0 +1,295 @@
+"""Target patterns on a grid: centring, blocks, bitmaps."""
+
+from __future__ import annotations
+
+from typing import Literal, Protocol, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq.errors import LimitError
+from labseq.model import SiteGrid, TargetPattern
+
+
+def from_the_centre(fill: NDArray[np.bool_], grid: SiteGrid) -> NDArray[np.intp]:
+    """List fill sites, those nearest to their common centre first.
+
+    Distances are those on the lattice; of sites equally far the one in the upper
+    row, then in the left column, comes first.
+
+    Args:
+        fill: bool (n_rows, n_cols).
+        grid: Tells the lattice.
+
+    Returns:
+        int (n_fill,), row * n_cols + column of each: indices of ``fill.reshape(-1)``.
+
+    Example:
+        >>> from_the_centre(np.ones((1, 5), np.bool_), SiteGrid()).tolist()
+        [2, 1, 3, 0, 4]
+    """
+    rows, cols = np.nonzero(fill)
+    down = len(rows) * rows - rows.sum()  # from the centre, times the number of sites: exact in integers
+    right = len(cols) * cols - cols.sum()
+    shear = grid.shear if grid.lattice == "triangular" else 0
+    distance = down**2 + right**2 + shear * down * right  # |right a1 + down a2|^2 / a^2
+    nearest_first: NDArray[np.intp] = (rows * fill.shape[1] + cols)[np.lexsort((cols, rows, distance))]
+    return nearest_first
+
+
+def nearest_to_centre(fill: NDArray[np.bool_], n_sites: int, grid: SiteGrid) -> NDArray[np.bool_]:
+    """Keep the fill sites that lie nearest to their common centre, see :func:`from_the_centre`.
+
+    This is what a planner fills when it has only ``n_sites`` atoms.
+
+    Args:
+        fill: bool (n_rows, n_cols).
+        n_sites: How many sites to keep at most.
+        grid: Tells the lattice.
+
+    Returns:
+        bool (n_rows, n_cols); ``fill`` itself if it has no more sites.
+
+    Example:
+        >>> nearest_to_centre(np.ones((1, 5), np.bool_), 2, SiteGrid()).tolist()
+        [[False, True, True, False, False]]
+    """
+    if np.count_nonzero(fill) <= n_sites:
+        return fill
+    nearest = np.zeros(fill.shape, np.bool_)
+    nearest.reshape(-1)[from_the_centre(fill, grid)[:n_sites]] = True
+    return nearest
+
+
+class DrawingError(ValueError):
+    """A drawing is wrong.
+
+    Attributes:
+        line: The line of the text that is wrong, from 1; 0 if it is the whole.
+    """
+
+    def __init__(self, what: str, line: int = 0) -> None:
+        self.line = line
+        super().__init__(what)
+
+
+def read_bitmap(text: str, fill: str = "#") -> NDArray[np.bool_]:
+    """Read a drawing, one line per row; empty lines before and after it do not count.
+
+    Args:
+        text: The drawing.
+        fill: Characters that stand for an atom; all others stand for none.
+
+    Returns:
+        bool (rows, cols).
+
+    Raises:
+        DrawingError: The drawing is empty, holds no atom, or its rows differ in length.
+
+    Example:
+        >>> read_bitmap("#.#").astype(int).tolist()
+        [[1, 0, 1]]
+    """
+    lines = text.splitlines()
+    first = next((i for i, line in enumerate(lines) if line), len(lines))
+    drawn = "\n".join(lines[first:]).rstrip("\n").splitlines()
+    if not drawn:
+        raise DrawingError("the drawing is empty; draw rows such as '#.#', with '#' for an atom")
+    for row, line in enumerate(drawn, start=1):
+        if len(line) != len(drawn[0]):
+            raise DrawingError(
+                f"row {row} of the drawing has {len(line)} characters and row 1 has {len(drawn[0])}; "
+                "every row must have the same number",
+                first + row,
+            )
+    mask = np.array([[character in fill for character in line] for line in drawn], np.bool_)
+    if not mask.any():
+        raise DrawingError(f"the drawing holds no atom; draw an atom as one of '{fill}', or set `fill`")
+    return mask
+
+
+def check_size(shape: tuple[int, int], grid_shape: tuple[int, int]) -> None:
+    """Refuse a target that is larger than the grid, before anything of its size is made.
+
+    Args:
+        shape: (rows, cols) of the target's block.
+        grid_shape: (n_rows, n_cols) of the grid.
+
+    Raises:
+        LimitError: The block has more rows or more columns than the grid.
+    """
+    rows, cols = shape
+    n_rows, n_cols = grid_shape
+    if rows > n_rows or cols > n_cols:
+        raise LimitError(
+            "the size of the target",
+            f"{rows} rows x {cols} columns",
+            f"the grid of {n_rows} rows x {n_cols} columns",
+            "choose a smaller target, or a profile with a larger grid",
+        )
+
+
+def block(rows: int, cols: int, grid_shape: tuple[int, int]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Row and column of every site of a block: what the rule of a pattern is written in.
+
+    Args:
+        rows: Rows of the block.
+        cols: Columns of the block.
+        grid_shape: (n_rows, n_cols) of the grid, which must be able to hold it.
+
+    Returns:
+        int64 (rows, cols) each, from 0 at the block's top left site.
+
+    Raises:
+        LimitError: The block is larger than the grid.
+
+    Example:
+        >>> row, col = block(2, 3, (20, 20))
+        >>> ((row + col) % 2).tolist()
+        [[0, 1, 0], [1, 0, 1]]
+    """
+    check_size((rows, cols), grid_shape)
+    row, col = np.indices((rows, cols), np.int64)
+    return row, col
+
+
+def place(
+    mask: NDArray[np.bool_], grid_shape: tuple[int, int], origin: tuple[int, int] | None = None
+) -> NDArray[np.bool_]:
+    """Put a small mask onto the grid.
+
+    Args:
+        mask: bool (rows, cols).
+        grid_shape: (n_rows, n_cols) of the grid.
+        origin: (row, col) of the mask's top left site; None centres it. If the
+            free rows or columns cannot be shared evenly, the mask sits one site
+            nearer to the top and to the left.
+
+    Returns:
+        bool (n_rows, n_cols), False outside of the mask.
+
+    Raises:
+        LimitError: The mask is larger than the grid or sticks out of it.
+
+    Example:
+        >>> place(np.ones((1, 2), np.bool_), (1, 5)).astype(int).tolist()
+        [[0, 1, 1, 0, 0]]
+        >>> place(np.ones((1, 2), np.bool_), (1, 5), origin=(0, 3)).astype(int).tolist()
+        [[0, 0, 0, 1, 1]]
+    """
+    check_size(mask.shape, grid_shape)
+    rows, cols = mask.shape
+    n_rows, n_cols = grid_shape
+    last_row, last_col = n_rows - rows, n_cols - cols
+    row, col = (last_row // 2, last_col // 2) if origin is None else origin
+    if not (0 <= row <= last_row and 0 <= col <= last_col):
+        raise LimitError(
+            f"the origin of a target of {rows} rows x {cols} columns",
+            f"row {row}, column {col}",
+            f"rows 0 to {last_row} and columns 0 to {last_col} on a grid of {n_rows} x {n_cols}",
+            "move the origin, or leave it out to centre the target",
+        )
+    placed = np.zeros(grid_shape, np.bool_)
+    placed[row : row + rows, col : col + cols] = mask
+    return placed
+
+
+Origin: TypeAlias = tuple[int, int] | None
+"""(row, col) of the pattern's top left site; None centres it."""
+Clear: TypeAlias = Literal["bounding_box", "none"]
+"""Which sites must be empty: every other site of the pattern's block, or none."""
+
+
+class CompactLike(Protocol):
+    """Settings of :func:`compact`."""
+
+    @property
+    def rows(self) -> int:
+        """Rows of the block."""
+        ...
+
+    @property
+    def cols(self) -> int:
+        """Columns of the block."""
+        ...
+
+    @property
+    def origin(self) -> Origin:
+        """Where it sits."""
+        ...
+
+
+class BitmapLike(Protocol):
+    """Settings of :func:`bitmap`."""
+
+    @property
+    def mask(self) -> NDArray[np.bool_]:
+        """What is drawn: bool (rows, cols), True where an atom must be."""
+        ...
+
+    @property
+    def origin(self) -> Origin:
+        """Where it sits."""
+        ...
+
+    @property
+    def clear(self) -> Clear:
+        """Which sites must be empty."""
+        ...
+
+
+def pattern(
+    mask: NDArray[np.bool_],
+    grid: SiteGrid,
+    *,
+    origin: Origin = None,
+    clear: Clear = "bounding_box",
+    name: str = "target",
+) -> TargetPattern:
+    """Make a target of a mask; what a plugin's own pattern ends with.
+
+    Args:
+        mask: bool (rows, cols), True where an atom must be.
+        grid: The grid that the target lies on.
+        origin: (row, col) of the mask's top left site; None centres it (one site
+            nearer to the top and to the left if it cannot be even).
+        clear: "bounding_box": all other sites of the mask's block must be empty;
+            "none": they are reservoir.
+        name: For records and the screen.
+
+    Raises:
+        LimitError: The mask holds no atom, is larger than the grid or sticks out of it.
+
+    Example:
+        >>> target = pattern(np.eye(2, dtype=np.bool_), SiteGrid(2, 3), name="diagonal")
+        >>> target.clear.astype(int).tolist()
+        [[0, 1, 0], [1, 0, 0]]
+    """
+    if not mask.any():
+        raise LimitError(f"the number of atoms of {name}", 0, "at least 1", "choose a larger target")
+    fill = place(mask, grid.shape, origin)
+    empty = ~mask if clear == "bounding_box" else np.zeros_like(mask)
+    return TargetPattern(fill, place(empty, grid.shape, origin), name)
+
+
+def compact(settings: CompactLike, grid: SiteGrid) -> TargetPattern:
+    """A full block of sites, for example the paper's 15 x 15 out of 20 x 20.
+
+    Raises:
+        LimitError: It is larger than the grid or sticks out of it.
+    """
+    check_size((settings.rows, settings.cols), grid.shape)
+    mask = np.ones((settings.rows, settings.cols), np.bool_)
+    name = f"compact {settings.rows} x {settings.cols}"
+    return pattern(mask, grid, origin=settings.origin, name=name)
+
+
+def bitmap(settings: BitmapLike, grid: SiteGrid) -> TargetPattern:
+    """Sites as they are drawn; the bounding box is the whole drawing, margins included.
+
+    Raises:
+        LimitError: It is larger than the grid or sticks out of it.
+    """
+    mask = settings.mask
+    name = f"bitmap {mask.shape[0]} x {mask.shape[1]}"
+    return pattern(mask, grid, origin=settings.origin, clear=settings.clear, name=name)

@@ -1,0 +1,80 @@
+"""Frames, and what a camera and its sensor can do."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq.model.arrays import read_only
+
+
+@dataclass(frozen=True, slots=True)
+class SensorMode:
+    """How a sensor is exposed and read.
+
+    Attributes:
+        region: (y, x, height, width) of the part of the sensor that is read, in its own pixels; None: all
+            of it.
+        binning: Pixels of the sensor per pixel of a frame, along each axis.
+        em_gain: Mean gain of the EM register; None where the camera does not set one.
+        shutter_open: Whether light reaches the sensor.
+    """
+
+    region: tuple[int, int, int, int] | None = None
+    binning: int = 1
+    em_gain: float | None = None
+    shutter_open: bool = True
+
+    def frame_shape(self, sensor_shape: tuple[int, int]) -> tuple[int, int]:
+        """(height, width) of the frames of a sensor of this size."""
+        height, width = sensor_shape if self.region is None else self.region[2:]
+        return height // self.binning, width // self.binning
+
+
+@dataclass(frozen=True, slots=True)
+class CameraFacts:
+    """What a camera can say of itself before it is opened, from its settings.
+
+    Attributes:
+        readout_s: From the end of an exposure until the frame can be read, in seconds.
+        max_exposure_s: Longest exposure, in seconds.
+        frame_shape: (height, width) of its frames; None if not known.
+        em_gain: Mean gain of the EM register in an exposure; 1 for a camera without one.
+        triggers: What may start its exposures: "software", "internal", "external".
+    """
+
+    readout_s: float = 0.0
+    max_exposure_s: float = float("inf")
+    frame_shape: tuple[int, int] | None = None
+    em_gain: float = 1.0
+    triggers: tuple[str, ...] = ("software",)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """One exposure as the camera delivered it.
+
+    Attributes:
+        image: uint16 (height, width), in camera counts (ADU), pixel (y, x).
+        exposure_s: Exposure time, in seconds.
+        t_start_s: Start of the exposure on the session's clock, in seconds.
+        camera: Name of the camera.
+        number: Place in its series as the camera counted it, from 0.
+        device_time_s: The camera's own time stamp, in seconds from a zero of its own; nan if it gives none.
+    """
+
+    image: NDArray[np.uint16]
+    exposure_s: float
+    t_start_s: float
+    camera: str = "camera"
+    number: int = 0
+    device_time_s: float = math.nan
+
+    def __post_init__(self) -> None:
+        image = np.asarray(self.image)
+        if image.dtype != np.uint16:  # never a silent conversion of raw data
+            raise ValueError(f"a frame is uint16, not {image.dtype}")
+        object.__setattr__(self, "image", read_only(image, np.uint16, (-1, -1), "image"))

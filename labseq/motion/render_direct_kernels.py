@@ -1,0 +1,360 @@
+"""Kernels that sum tone by tone, for any frequency course.
+
+Frequencies are in cycles per sample, times in samples, phases in cycles. The phase is
+worked out in float64 every :data:`LANES` samples, with its first and second derivative;
+between them in integers of 2^-32 cycles, where whole cycles drop out by themselves.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq.kernel import const, kernel
+from labseq.motion.render_comb_kernels import render_comb
+from labseq.motion.render_kernels import (
+    AXIS,
+    DIRECT,
+    END,
+    END_AMPLITUDE,
+    FULL_SCALE,
+    LANES,
+    PHASE,
+    ROOM,
+    SAMPLES,
+    SILENT,
+    START,
+    START_AMPLITUDE,
+    Axis,
+    Room,
+    apply_envelope,
+    envelope,
+    store,
+    strip_samples,
+)
+
+Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
+Nodes = NDArray[np.int32]
+
+LINEAR: Final = 0  # as labseq.model.FrequencyCourse
+MINIMUM_JERK: Final = 1
+CONSTANT_JERK: Final = 2
+
+MIDDLE: Final = LANES // 2
+TURN: Final = 2.0**32
+MOST: Final = 2.0**31 - 1.0
+BEND_BITS: Final = 8
+"""How much finer than the phase its second derivative is held."""
+
+MAX_CHIRP: Final = 2.0**-17
+"""Chirp, in cycles per sample squared, beyond which a tone is steep: left to :func:`add_steep`."""
+
+MAX_JERK: Final = 5e-11
+"""Change of the chirp, in cycles per sample cubed, beyond which it is: worth 1e-8 cycles at most."""
+
+QUARTER: Final = np.int32(1 << 30)
+PER_UNIT: Final = np.float32(2.0**-32)
+# sin(2 pi z) for |z| <= 1/4, fitted one coefficient after the other, each rounded first; error below 8e-9
+C1: Final = np.float32(6.2831855)
+C3: Final = np.float32(-41.341713)
+C5: Final = np.float32(81.60403)
+C7: Final = np.float32(-76.61017)
+C9: Final = np.float32(39.94631)
+
+F32: Final = "float32[::1]"
+
+
+@kernel("UniTuple(float64, 4)(float64)")
+def minimum_jerk(u: float) -> tuple[float, float, float, float]:
+    """See :func:`course`."""
+    v = u * u
+    return (
+        v * v * (2.5 - u * (3.0 - u)),
+        v * u * (10.0 - u * (15.0 - 6.0 * u)),
+        30.0 * v * (1.0 - u) * (1.0 - u),
+        60.0 * u * (1.0 - u) * (1.0 - 2.0 * u),
+    )
+
+
+@kernel("UniTuple(float64, 4)(float64)")
+def constant_jerk(u: float) -> tuple[float, float, float, float]:
+    """See :func:`course`; the third derivative is 32, changes by -64 at 1/4 and by 64 at 3/4."""
+    v, w = max(0.0, u - 0.25), max(0.0, u - 0.75)
+    uu, vv, ww = u * u, v * v, w * w
+    return (
+        4.0 / 3.0 * uu * uu - 8.0 / 3.0 * (vv * vv - ww * ww),
+        16.0 / 3.0 * uu * u - 32.0 / 3.0 * (vv * v - ww * w),
+        16.0 * uu - 32.0 * (vv - ww),
+        32.0 * u - 64.0 * (v - w),
+    )
+
+
+@kernel("UniTuple(float64, 4)(int64, float64)")
+def course(kind: int, u: float) -> tuple[float, float, float, float]:
+    """How far a frequency has come at a fraction ``u`` of the segment.
+
+    Returns:
+        Integral of that from 0 to u; itself, from 0 to 1; its first and second derivative.
+    """
+    if kind == MINIMUM_JERK:
+        return minimum_jerk(u)
+    if kind == CONSTANT_JERK:
+        return constant_jerk(u)
+    return 0.5 * u * u, u, 1.0, 0.0
+
+
+@kernel("boolean(int64, float64, float64)")
+def is_steep(kind: int, sweep: float, length: float) -> bool:
+    """Whether the frequency of a tone changes too fast for :func:`add_tone`.
+
+    Args:
+        kind: Its course.
+        sweep: Its change in the segment, in cycles per sample.
+        length: Length of the segment, in samples.
+    """
+    chirp = abs(sweep) / length
+    if kind == LINEAR:
+        return chirp > MAX_CHIRP
+    return 2.0 * chirp > MAX_CHIRP or 8.0 * chirp / length > MAX_JERK
+
+
+@kernel("int32(float64)")
+def as_int32(cycles: float) -> int:
+    """A phase in 2^-32 cycles, whole cycles left out."""
+    return np.int32(min(np.rint((cycles - np.rint(cycles)) * TURN), MOST))  # pyright: ignore[reportReturnType]
+
+
+@kernel("void(int64, float64, float64, float64, float64, float64, int64, int32[::1], int32[::1], int32[::1])")
+def fill_course(
+    kind: int,
+    phase: float,
+    frequency: float,
+    sweep: float,
+    length: float,
+    x: float,
+    n: int,
+    phases: Nodes,
+    frequencies: Nodes,
+    bends: Nodes,
+) -> None:
+    """Do the work of :func:`fill_nodes`, for a course that is known when it is compiled."""
+    per_length = 1.0 / length
+    third = 0.125 * MIDDLE * MIDDLE * sweep * per_length * per_length
+    for q in range(n):
+        at = x + MIDDLE + q * LANES
+        whole, part, slope, bend = course(kind, at * per_length)
+        cycles = phase + frequency * at + sweep * length * whole
+        now = frequency + sweep * part + third * bend
+        phases[q] = as_int32(cycles)
+        frequencies[q] = as_int32(now)
+        bends[q] = np.int32(np.rint(sweep * slope * per_length * (0.5 * TURN * (1 << BEND_BITS))))
+
+
+@kernel("void(float64, float64, float64, float64, int64, int32[::1], int32[::1], int32[::1])")
+def fill_linear(
+    phase: float,
+    frequency: float,
+    chirp: float,
+    x: float,
+    n: int,
+    phases: Nodes,
+    frequencies: Nodes,
+    bends: Nodes,
+) -> None:
+    """Do the work of :func:`fill_nodes` for constant speed."""
+    for q in range(n):
+        at = x + MIDDLE + q * LANES
+        phases[q] = as_int32(phase + at * (frequency + 0.5 * chirp * at))
+        frequencies[q] = as_int32(frequency + chirp * at)
+        bends[q] = np.int32(np.rint(chirp * (0.5 * TURN * (1 << BEND_BITS))))
+
+
+@kernel("void(int64, float64, float64, float64, float64, float64, int64, int32[:, ::1])")
+def fill_nodes(
+    kind: int,
+    phase: float,
+    frequency: float,
+    sweep: float,
+    length: float,
+    x: float,
+    n: int,
+    nodes: Nodes,
+) -> None:
+    """Work out phase, frequency and chirp of a tone in the middle of every LANES samples.
+
+    The third derivative is made part of the frequency such that its error is least.
+
+    Args:
+        kind: Course of the frequency.
+        phase: At the start of the segment, in cycles.
+        frequency: There, in cycles per sample.
+        sweep: Change of the frequency in the segment.
+        length: Length of the segment, in samples.
+        x: Samples from its start to the first sample.
+        n: Number of nodes.
+        nodes: Result, int32 (3, >= n), in 2^-32 cycles; the chirp halved and finer by BEND_BITS.
+    """
+    a, b, c = nodes[0], nodes[1], nodes[2]
+    if kind == MINIMUM_JERK:
+        fill_course(MINIMUM_JERK, phase, frequency, sweep, length, x, n, a, b, c)
+    elif kind == CONSTANT_JERK:
+        fill_course(CONSTANT_JERK, phase, frequency, sweep, length, x, n, a, b, c)
+    else:
+        fill_linear(phase, frequency, sweep / length, x, n, a, b, c)
+
+
+@kernel("float32(int32, int32, int32, int64)", fused=True)
+def wave(phase: int, frequency: int, bend: int, r: int) -> float:
+    """Cosine of a phase, ``r`` samples from its node; cos(2 pi t) = sin(2 pi (1/4 - |t|))."""
+    near = np.int32(r)
+    t = np.int32(phase + frequency * near)
+    t = np.int32(t + (np.int32(bend * np.int32(near * near)) >> BEND_BITS))
+    z = np.float32(np.int32(QUARTER - np.int32(t ^ (t >> 31)))) * PER_UNIT
+    w = z * z
+    return z * (C1 + w * (C3 + w * (C5 + w * (C7 + w * C9))))  # pyright: ignore[reportReturnType]
+
+
+@kernel(f"void({F32}, int64, int32[:, ::1], float64)", fused=True)
+def add_tone(acc: Singles, n: int, nodes: Nodes, amplitude: float) -> None:
+    """Add a tone of constant amplitude to ``n`` times LANES samples."""
+    a = np.float32(amplitude)
+    for q in range(n):
+        phase, frequency, bend = nodes[0, q], nodes[1, q], nodes[2, q]
+        for r in range(LANES):
+            z = wave(phase, frequency, bend, r - MIDDLE)
+            acc[q * LANES + r] += a * z
+
+
+@kernel(f"void({F32}, int64, int32[:, ::1], float64, float64)", fused=True)
+def add_ramped_tone(acc: Singles, n: int, nodes: Nodes, start: float, slope: float) -> None:
+    """Add a tone to ``n`` times LANES samples whose squared amplitude changes linearly."""
+    by = np.float32(slope)
+    for q in range(n):
+        phase, frequency, bend = nodes[0, q], nodes[1, q], nodes[2, q]
+        first = np.float32(start + slope * (q * LANES))
+        for r in range(LANES):
+            z = wave(phase, frequency, bend, r - MIDDLE)
+            acc[q * LANES + r] += np.sqrt(max(np.float32(0.0), first + by * np.float32(r))) * z
+
+
+@kernel(f"void({F32}, int64, int64, float64, float64, float64, float64, float64, float64, float64)")
+def add_steep(
+    acc: Singles,
+    n: int,
+    kind: int,
+    phase: float,
+    frequency: float,
+    sweep: float,
+    length: float,
+    x: float,
+    start: float,
+    slope: float,
+) -> None:
+    """Add a tone of any steepness to ``n`` samples, all in float64.
+
+    ``start`` and ``slope`` are its squared amplitude at the first sample and what it changes
+    by from sample to sample; the others as in :func:`fill_nodes`.
+    """
+    for j in range(n):
+        at = x + j
+        cycles = phase + frequency * at + sweep * length * course(kind, at / length)[0]
+        amplitude = math.sqrt(max(0.0, start + slope * j))
+        acc[j] += np.float32(amplitude * math.cos(2.0 * math.pi * (cycles - np.rint(cycles))))
+
+
+@kernel(f"void({AXIS}, int64, int64, float64, int64, boolean, {ROOM})")
+def add_direct(axis: Axis, i: int, k: int, x: float, n: int, shared: bool, room: Room) -> None:
+    """Add tone ``k`` of segment ``i`` to ``n`` samples, the first of them ``x`` samples after its start."""
+    tones, _, course, _, _, _, _, _, _, length, _, _ = axis
+    work, nodes = room[1], room[7]
+    a, b = tones[START_AMPLITUDE, k], tones[END_AMPLITUDE, k]
+    if shared:
+        a = b = max(a, b)
+    phase, frequency, sweep = tones[PHASE, k], tones[START, k], tones[END, k] - tones[START, k]
+    slope = FULL_SCALE**2 * (b * b - a * a) / length[i]
+    start = FULL_SCALE**2 * a * a + slope * x
+    if is_steep(course[i], sweep, length[i]):
+        add_steep(work[SAMPLES], n, course[i], phase, frequency, sweep, length[i], x, start, slope)
+        return
+    n_nodes = (n + LANES - 1) // LANES
+    fill_nodes(course[i], phase, frequency, sweep, length[i], x, n_nodes, nodes)
+    if a == b:
+        add_tone(work[SAMPLES], n_nodes, nodes, FULL_SCALE * a)
+    else:
+        add_ramped_tone(work[SAMPLES], n_nodes, nodes, start, slope)
+
+
+@kernel(f"void({AXIS}, int64, int64, int16[::1], {ROOM})")
+def render_direct(axis: Axis, i: int, skip: int, out: NDArray[np.int16], room: Room) -> None:
+    """Render a stretch of segment ``i`` tone by tone; see :func:`render_comb`."""
+    tones, offsets, _, _, _, _, _, _, delta, length, _, block = axis
+    work = room[1]
+    shared, first, last = envelope(tones, offsets[i], offsets[i + 1])
+    slope = (last - first) / length[i]
+    strip = strip_samples(block)
+    for s in range(skip // strip, (skip + len(out) - 1) // strip + 1):
+        x = s * strip + delta[i]
+        start, stop = max(0, skip - s * strip), min(strip, skip + len(out) - s * strip)
+        work[SAMPLES, :stop] = np.float32(0.0)
+        for k in range(offsets[i], offsets[i + 1]):
+            add_direct(axis, i, k, x, stop, shared, room)
+        if first != last:
+            apply_envelope(work[SAMPLES], stop, first + slope * x, slope)
+        store(out[s * strip + start - skip :], stop - start, work[SAMPLES], start)
+
+
+@kernel(f"void({AXIS}, int64, int16[::1], {ROOM})")
+def render(axis: Axis, start: int, out: NDArray[np.int16], room: Room) -> None:
+    """Render a stretch of an axis; what lies after its end is silent.
+
+    Args:
+        axis: The axis.
+        start: First sample, counted from the start of the program.
+        out: Result, int16 (n,).
+        room: Room to work in, for this thread alone.
+    """
+    path, first = axis[3], axis[7]
+    stop = start + len(out)
+    i = int(np.searchsorted(first, start, "right")) - 1
+    at = start
+    while at < stop and i < len(path):
+        until = min(stop, first[i + 1])
+        if at < until:
+            piece = out[at - start : until - start]
+            if path[i] == SILENT:
+                piece[:] = 0
+            elif path[i] == DIRECT:
+                render_direct(axis, i, at - first[i], piece, room)
+            else:
+                render_comb(axis, i, at - first[i], piece, room)
+            at = until
+        i += 1
+    out[at - start :] = 0
+
+
+STORED_BLOCK: Final = 4096
+
+
+@kernel(f"void({const('int16', 2)}, int64[::1], int64, int16[::1])")
+def sum_stored(
+    stored: NDArray[np.int16], picked: NDArray[np.int64], first: int, out: NDArray[np.int16]
+) -> None:
+    """Sum stored waveforms, block by block so that the sums stay in the fastest cache.
+
+    Args:
+        stored: int16 (n_tones, >= first + n_samples).
+        picked: int64 (n_picked,), which of them.
+        first: First sample.
+        out: Result, int16 (n_samples,).
+    """
+    for start in range(0, len(out), STORED_BLOCK):
+        part = out[start : start + STORED_BLOCK]
+        part[:] = 0
+        for k in picked:
+            one = stored[k, first + start : first + start + STORED_BLOCK]
+            for j in range(len(part)):
+                part[j] += one[j]

@@ -1,0 +1,451 @@
+"""Kernels that build tone programs and check them against limits.
+
+The tones of an axis are kept as rows of a float64 array: frequency in Hz at the
+start and at the end of the segment, amplitude at the start and at the end, and
+phase at the start, in cycles.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq.kernel import const, kernel
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Moves = NDArray[np.int16]
+
+MOVES: Final = const("int16", 2)
+SITES: Final = const("float64", 1)
+TONES: Final = "int64[:, ::1]"
+
+
+@kernel(f"int64({MOVES}, int64, int64, int64, int64, {TONES})")
+def collect_tones(moves: Moves, start: int, stop: int, axis: int, n_sites: int, tones: Ints) -> int:
+    """Collect the tones that a batch needs on an axis.
+
+    Args:
+        moves: int16 (n, 4) of the plan; the batch is ``moves[start:stop]``.
+        start: Where the batch starts.
+        stop: Where it stops.
+        axis: 0 for rows, 1 for columns.
+        n_sites: Sites of the axis.
+        tones: Result, int64 (2, >= n_sites), site and goal of each tone, by site.
+
+    Returns:
+        Number of tones.
+    """
+    on = np.zeros(n_sites, np.bool_)
+    goal = np.zeros(n_sites, np.int64)
+    for i in range(start, stop):
+        on[moves[i, axis]] = True
+        goal[moves[i, axis]] = moves[i, axis + 2]
+    n = 0
+    for site in range(n_sites):
+        if on[site]:
+            tones[0, n] = site
+            tones[1, n] = goal[site]
+            n += 1
+    return n
+
+
+@kernel(f"int64({TONES}, int64, int64)")
+def next_arrival(tones: Ints, n_tones: int, travelled: int) -> int:
+    """Distance, in sites, at which the next tones arrive; ``travelled`` if all have."""
+    nearest = travelled
+    for k in range(n_tones):
+        distance = abs(tones[1, k] - tones[0, k])
+        if distance > travelled and (nearest == travelled or distance < nearest):
+            nearest = distance
+    return nearest
+
+
+@kernel(f"int64({TONES}, int64)")
+def last_arrival(tones: Ints, n_tones: int) -> int:
+    """The longest way of all tones, in sites."""
+    longest = 0
+    for k in range(n_tones):
+        longest = max(longest, abs(tones[1, k] - tones[0, k]))
+    return longest
+
+
+@kernel(f"float64({SITES}, float64, int64)")
+def frequency(site_hz: Floats, step_hz: float, site: int) -> float:
+    """Frequency of a tone at a site, continued linearly beyond the grid.
+
+    ``step_hz`` is the step from site to site of an axis with a single one.
+    """
+    last = len(site_hz) - 1
+    if 0 <= site <= last:
+        return site_hz[site]
+    if last == 0:
+        return site_hz[0] + step_hz * site
+    if site < 0:
+        return site_hz[0] + (site_hz[1] - site_hz[0]) * site
+    return site_hz[last] + (site_hz[last] - site_hz[last - 1]) * (site - last)
+
+
+@kernel(f"float64({SITES}, int64, int64, int64)")
+def amplitude(site_amplitude: Floats, site: int, goal: int, travelled: int) -> float:
+    """Amplitude of a tone on its way: its square changes evenly from that of the site to that of the goal.
+
+    Beyond the grid it is that of the outermost site.
+
+    Args:
+        site_amplitude: float64 (n_sites,), amplitude preassigned to each site.
+        site: Where the tone starts.
+        goal: Where it goes.
+        travelled: Sites that it has travelled, or more if it has arrived.
+    """
+    last = len(site_amplitude) - 1
+    start, end = site_amplitude[site], site_amplitude[min(max(goal, 0), last)]
+    way = abs(goal - site)
+    if travelled <= 0 or start == end:
+        return start
+    if travelled >= way:
+        return end
+    return np.sqrt(start**2 + (end**2 - start**2) * travelled / way)
+
+
+@kernel(f"void({TONES}, int64, {SITES}, boolean, {SITES}, float64[::1])")
+def first_phases(
+    tones: Ints, n_tones: int, preassigned: Floats, low_crest: bool, site_amplitude: Floats, phase: Floats
+) -> None:
+    """Choose the phases of a batch's tones at pick-up.
+
+    For a low crest factor they follow Schroeder (IEEE Trans. Inf. Theory 16, 85, 1970):
+    on a comb of teeth with relative powers p_l, the k-th has the phase
+    ``-2 pi sum_(l < k) (k - l) p_l``. Tones that are off count as teeth without power.
+
+    Args:
+        tones: int64 (2, >= n_tones), site and goal of each tone.
+        n_tones: Number of tones.
+        preassigned: float64 (n_sites,), phase of each site's tone, in cycles.
+        low_crest: Whether to choose by Schroeder's rule instead.
+        site_amplitude: float64 (n_sites,), amplitude of each site's tone.
+        phase: Result, float64 (>= n_tones,), in cycles, 0 <= phase < 1.
+    """
+    if not low_crest:
+        for k in range(n_tones):
+            phase[k] = preassigned[tones[0, k]]
+        return
+    total = 0.0
+    for k in range(n_tones):
+        total += site_amplitude[tones[0, k]] ** 2
+    below = now = 0.0
+    for k in range(n_tones):
+        if k > 0 and total > 0.0:
+            now -= (tones[0, k] - tones[0, k - 1]) * below / total
+        phase[k] = now % 1.0
+        below += site_amplitude[tones[0, k]] ** 2
+
+
+Labels = NDArray[np.int8]
+Offsets = NDArray[np.int32]
+
+START_HZ: Final = 0
+END_HZ: Final = 1
+START_AMPLITUDE: Final = 2
+END_AMPLITUDE: Final = 3
+PHASE: Final = 4
+N_FIELDS: Final = 5
+
+IDLE: Final = 0  # as labseq.model.SegmentKind
+PICK_UP: Final = 1
+TRANSPORT: Final = 2
+DROP_OFF: Final = 3
+LINEAR: Final = 0  # as labseq.model.FrequencyCourse
+
+
+@kernel(
+    f"int64(float64[:, ::1], int64, {SITES}, float64, {SITES}, {TONES}, int64, int64, int64, float64,"
+    " float64, float64, float64[::1])"
+)
+def add_tones(
+    values: Floats,
+    n: int,
+    site_hz: Floats,
+    step_hz: float,
+    site_amplitude: Floats,
+    tones: Ints,
+    n_tones: int,
+    travelled: int,
+    arriving: int,
+    on_start: float,
+    on_end: float,
+    duration_s: float,
+    phase: Floats,
+) -> int:
+    """Add one segment of an axis.
+
+    Args:
+        values: float64 (5, capacity), the axis' tones so far; updated.
+        n: How many there are.
+        site_hz: float64 (n_sites,), frequency of each site.
+        step_hz: See :func:`frequency`.
+        site_amplitude: float64 (n_sites,), amplitude of each site's tone.
+        tones: int64 (2, >= n_tones), site and goal of each tone.
+        n_tones: Number of tones.
+        travelled: Sites travelled at the start; tones with a shorter way have arrived.
+        arriving: Sites travelled at the end.
+        on_start: 0 if the tones are off at the start, 1 if they are on.
+        on_end: The same for the end.
+        duration_s: Duration of the segment.
+        phase: float64 (>= n_tones,), phases in cycles; advanced to the segment's end.
+
+    Returns:
+        How many tones there are then.
+    """
+    for k in range(n_tones):
+        site, goal = tones[0, k], tones[1, k]
+        way = goal - site
+        sign = 1 if way >= 0 else -1
+        start_hz = frequency(site_hz, step_hz, site + sign * min(abs(way), travelled))
+        end_hz = frequency(site_hz, step_hz, site + sign * min(abs(way), arriving))
+        values[START_HZ, n + k] = start_hz
+        values[END_HZ, n + k] = end_hz
+        values[START_AMPLITUDE, n + k] = on_start * amplitude(site_amplitude, site, goal, travelled)
+        values[END_AMPLITUDE, n + k] = on_end * amplitude(site_amplitude, site, goal, arriving)
+        values[PHASE, n + k] = phase[k]
+        phase[k] = (phase[k] + 0.5 * (start_hz + end_hz) * duration_s) % 1.0  # right for every course
+    return n + n_tones
+
+
+@kernel(
+    "int64(int8[:, ::1], int32[::1], float64[::1], int32[::1], int64, int64, int64, int64, float64, int64)"
+)
+def add_segment(
+    labels: Labels,
+    batch_of: Offsets,
+    duration_s: Floats,
+    offsets: Offsets,
+    n: int,
+    kind: int,
+    course: int,
+    batch: int,
+    its_duration_s: float,
+    n_tones: int,
+) -> int:
+    """Write down a segment that ends with ``n_tones`` tones in all; return how many segments there are."""
+    labels[0, n] = kind
+    labels[1, n] = course
+    batch_of[n] = batch
+    duration_s[n] = its_duration_s
+    offsets[n + 1] = n_tones
+    return n + 1
+
+
+@kernel(f"int64({TONES}, int64, {TONES}, int64, int64, int64)")
+def next_joint(tones: Ints, n_tones: int, others: Ints, n_others: int, travelled: int, course: int) -> int:
+    """Distance, in sites, at which a transport is cut next; ``travelled`` if it is over.
+
+    At constant speed that is where tones of either axis arrive; otherwise all start and
+    stop together.
+    """
+    if course != LINEAR:
+        return max(last_arrival(tones, n_tones), last_arrival(others, n_others))
+    arriving = next_arrival(tones, n_tones, travelled)
+    other = next_arrival(others, n_others, travelled)
+    if arriving == travelled or (travelled < other < arriving):
+        return other
+    return arriving
+
+
+@kernel(
+    f"UniTuple(int64, 2)({MOVES}, {const('int32', 1)}, {const('bool_', 1)}, int64, int64, int64, {SITES},"
+    f" float64, {SITES}, {SITES}, boolean, int64, {SITES}, int8[:, ::1], int32[::1], float64[::1],"
+    " int32[::1], float64[:, ::1])"
+)
+def build_axis(
+    moves: Moves,
+    batch_offsets: Offsets,
+    linked: NDArray[np.bool_],
+    n_batches: int,
+    axis: int,
+    n_other_sites: int,
+    site_hz: Floats,
+    step_hz: float,
+    site_amplitude: Floats,
+    preassigned: Floats,
+    low_crest: bool,
+    course: int,
+    times_s: Floats,
+    labels: Labels,
+    batch_of: Offsets,
+    duration_s: Floats,
+    offsets: Offsets,
+    values: Floats,
+) -> tuple[int, int]:
+    """Write down all segments of a plan, and the tones that one axis plays in them.
+
+    At constant speed, tones with a shorter way arrive earlier; the transport is cut
+    there, so that each tone's frequency changes linearly, or not at all, within a
+    segment. With another course a transport is one segment. The axis that moves is
+    ramped at pick-up and drop-off; the other one is on before and off after. A batch
+    in which no atom moves counts as moving along its row.
+
+    Args:
+        moves: int16 (n, 4), sources on the grid.
+        batch_offsets: int32 (>= n_batches + 1,).
+        linked: bool (>= n_batches,).
+        n_batches: How many batches to write down.
+        axis: 0 for the row tones, 1 for the column tones.
+        n_other_sites: Sites of the other axis.
+        site_hz: float64 (n_sites,), frequency of each site of the axis.
+        step_hz: See :func:`frequency`.
+        site_amplitude: float64 (n_sites,), amplitude of each site's tone, as a fraction of full scale.
+        preassigned: float64 (n_sites,), phase of each site's tone at pick-up, in cycles.
+        low_crest: See :func:`first_phases`.
+        course: Of the transports, a value of :class:`labseq.model.FrequencyCourse`.
+        times_s: float64 (4,): the pause before each batch that is not linked, the pick-up
+            ramp, the move by one site, the drop-off ramp.
+        labels: Result, int8 (2, >= n_segments), kind and course.
+        batch_of: Result, int32 (>= n_segments,).
+        duration_s: Result, float64 (>= n_segments,).
+        offsets: Result, int32 (> n_segments,), where each segment's tones start.
+        values: Result, float64 (5, >= n_tones), the tones.
+
+    Returns:
+        Number of segments and number of tones.
+    """
+    pause_s, pick_up_s, site_s, drop_off_s = times_s[0], times_s[1], times_s[2], times_s[3]
+    tones = np.empty((2, len(site_hz)), np.int64)
+    others = np.empty((2, n_other_sites), np.int64)
+    phase = np.zeros(len(site_hz), np.float64)
+    offsets[0] = 0
+    m = n = 0
+    for batch in range(n_batches):
+        start, stop = batch_offsets[batch], batch_offsets[batch + 1]
+        n_tones = collect_tones(moves, start, stop, axis, len(site_hz), tones)
+        n_others = collect_tones(moves, start, stop, 1 - axis, n_other_sites, others)
+        moving = last_arrival(tones, n_tones) > 0
+        ramped = moving or (axis == 1 and last_arrival(others, n_others) == 0)
+        off = 0.0 if ramped else 1.0
+        if not linked[batch]:
+            first_phases(tones, n_tones, preassigned, low_crest, site_amplitude, phase)
+            if pause_s > 0.0:
+                m = add_segment(labels, batch_of, duration_s, offsets, m, IDLE, LINEAR, batch, pause_s, n)
+            if pick_up_s > 0.0:
+                n = add_tones(
+                    values, n, site_hz, step_hz, site_amplitude, tones, n_tones, 0, 0, off, 1.0, pick_up_s,
+                    phase,
+                )  # fmt: skip
+                m = add_segment(
+                    labels, batch_of, duration_s, offsets, m, PICK_UP, LINEAR, batch, pick_up_s, n
+                )
+        travelled = 0
+        while True:
+            arriving = next_joint(tones, n_tones, others, n_others, travelled, course)
+            if arriving == travelled:
+                break
+            took_s = (arriving - travelled) * site_s
+            n = add_tones(
+                values, n, site_hz, step_hz, site_amplitude, tones, n_tones, travelled, arriving, 1.0, 1.0,
+                took_s, phase,
+            )  # fmt: skip
+            m = add_segment(labels, batch_of, duration_s, offsets, m, TRANSPORT, course, batch, took_s, n)
+            travelled = arriving
+        if drop_off_s > 0.0 and not (batch + 1 < n_batches and linked[batch + 1]):
+            n = add_tones(
+                values, n, site_hz, step_hz, site_amplitude, tones, n_tones, travelled, travelled, 1.0, off,
+                drop_off_s, phase,
+            )  # fmt: skip
+            m = add_segment(labels, batch_of, duration_s, offsets, m, DROP_OFF, LINEAR, batch, drop_off_s, n)
+    return m, n
+
+
+WITHIN: Final = 0
+BAND: Final = 1
+SPACING: Final = 2
+AMPLITUDES: Final = 3
+POWER: Final = 4
+
+HALVINGS: Final = 40
+VALUES: Final = "float64[:, ::1]"
+
+
+@kernel(f"UniTuple(float64, 2)({VALUES}, int64, int64, float64)")
+def amplitudes_at(values: Floats, first: int, last: int, u: float) -> tuple[float, float]:
+    """Sum of the amplitudes of some tones at a fraction of their segment, and the sign of its slope."""
+    total = slope = 0.0
+    for i in range(first, last):
+        start, end = values[START_AMPLITUDE, i] ** 2, values[END_AMPLITUDE, i] ** 2
+        now = np.sqrt(start + (end - start) * u)
+        total += now
+        if now > 0.0:
+            slope += (end - start) / now
+    return total, slope
+
+
+@kernel(f"float64({VALUES}, int64, int64, float64)")
+def greatest_sum(values: Floats, first: int, last: int, limit: float) -> float:
+    """The greatest sum that amplitudes reach in a segment; exact only where it exceeds ``limit``.
+
+    Amplitudes squared are linear in time, so the sum is concave: where some rise and others
+    fall, it may be greatest in between, where its slope is 0.
+    """
+    at_start = at_end = bound = 0.0
+    for i in range(first, last):
+        start, end = values[START_AMPLITUDE, i], values[END_AMPLITUDE, i]
+        at_start += start
+        at_end += end
+        bound += max(start, end)
+    if bound <= limit:
+        return bound
+    most = max(at_start, at_end)
+    low, high = 0.0, 1.0
+    for _ in range(HALVINGS):
+        u = 0.5 * (low + high)
+        total, slope = amplitudes_at(values, first, last, u)
+        most = max(most, total)
+        if slope > 0.0:
+            low = u
+        else:
+            high = u
+    return most
+
+
+@kernel(f"Tuple((int64, int64, float64))({const('int32', 1)}, {VALUES}, {const('float64', 1)})")
+def first_excess(offsets: Offsets, values: Floats, limits: Floats) -> tuple[int, int, float]:
+    """Find the first tone of an axis that breaks a limit.
+
+    Frequencies all follow the same course in a segment, so the distance of two tones is
+    least at its start or its end, unless they pass one another; then its sign changes.
+    The power is linear in time, so it is greatest at the start or the end.
+
+    Args:
+        offsets: int32 (n_segments + 1,), where each segment's tones start.
+        values: float64 (5, n_tones), see :mod:`labseq.motion.tone_kernels`.
+        limits: float64 (6,): lowest and highest frequency, least spacing, 1 or -1 where
+            frequencies rise or fall from tone to tone, greatest sum of the amplitudes, greatest
+            sum of their squares.
+
+    Returns:
+        The limit (WITHIN: none is broken), the tone, which is a segment's first where all
+        its tones are at fault, and the value that came.
+    """
+    low_hz, high_hz, spacing_hz, direction = limits[0], limits[1], limits[2], limits[3]
+    for segment in range(len(offsets) - 1):
+        first, last = offsets[segment], offsets[segment + 1]
+        power_start = power_end = 0.0
+        for i in range(first, last):
+            for end in (START_HZ, END_HZ):
+                hz = values[end, i]
+                if not low_hz <= hz <= high_hz:
+                    return BAND, i, hz
+                if i > first:
+                    gap = direction * (hz - values[end, i - 1])
+                    if not gap >= spacing_hz:
+                        return SPACING, i, gap
+            power_start += values[START_AMPLITUDE, i] ** 2
+            power_end += values[END_AMPLITUDE, i] ** 2
+        total = greatest_sum(values, first, last, limits[4])
+        if not total <= limits[4]:
+            return AMPLITUDES, first, total
+        power = max(power_start, power_end)
+        if not power <= limits[5]:
+            return POWER, first, power
+    return WITHIN, -1, 0.0

@@ -1,0 +1,392 @@
+"""Matplotlib figures with common sizes and colours, saved whole."""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from importlib.util import find_spec
+from itertools import product
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq.errors import ConfigError, Problem
+from labseq.files import whole_file
+from labseq.model import Plan, SiteGrid
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+ENDINGS: Final = (".png", ".svg", ".pdf")
+"""Kinds of pictures."""
+_UNDATED: Final = {".png": {"Software": None}, ".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
+
+
+def check_place(path: Path, endings: Sequence[str] = ENDINGS) -> None:
+    """Find out whether a picture can be drawn and where it is to go, before anything is worked out.
+
+    Args:
+        path: The file.
+        endings: Those that its name may have.
+
+    Raises:
+        ConfigError: The file has another ending, its folder does not exist, or matplotlib is not installed.
+    """
+    name, wanted = str(path), f"a file that ends in {' or '.join(endings)}"
+    if path.suffix.lower() not in endings:
+        what = f"this is no name of a {' or '.join(ending[1:].upper() for ending in endings)} file"
+        raise ConfigError(Problem(what, name, expected=wanted))
+    try:
+        has_folder, is_folder = path.parent.is_dir(), path.is_dir()
+        is_odd = path.exists() and not path.is_file()
+    except OSError as error:  # a name that is too long
+        raise ConfigError(Problem(f"this is no name of a file: {error.strerror}", name)) from error
+    if not has_folder:
+        raise ConfigError(Problem("there is no such folder", str(path.parent), expected="one that exists"))
+    if is_odd:
+        what = "this is a folder" if is_folder else "this is not an ordinary file"
+        raise ConfigError(Problem(what, name, expected=wanted))
+    if not can_draw():
+        what = "drawing a picture needs matplotlib, which is not installed"
+        raise ConfigError(Problem(what, hint="pip install 'labseq[plot]'"))
+
+
+def make_figure(width_in: float, height_in: float, **options: Any) -> Figure:
+    """Make a figure that needs no screen.
+
+    Args:
+        width_in: Width in inches.
+        height_in: Height in inches.
+        options: Of matplotlib's ``Figure``.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width_in, height_in), **options)
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def encode_figure(draw: Callable[[], Figure], kind: str = ".png", **options: Any) -> bytes:
+    """Draw a picture, whatever the user's matplotlibrc says: the same picture, the same bytes.
+
+    Args:
+        draw: Makes the figure.
+        kind: One of :data:`ENDINGS`.
+        options: Of matplotlib's ``savefig``.
+    """
+    from matplotlib import style
+
+    with style.context(["default", {"svg.hashsalt": "labseq"}]):
+        data = io.BytesIO()
+        options.setdefault("metadata", _UNDATED[kind])
+        draw().savefig(data, format=kind[1:], **options)
+    return data.getvalue()
+
+
+def can_draw() -> bool:
+    """Whether matplotlib is installed."""
+    return find_spec("matplotlib") is not None
+
+
+def save_figure(path: Path, draw: Callable[[], Figure], **options: Any) -> None:
+    """Draw a picture and save it, whatever the user's matplotlibrc says.
+
+    The file is there whole or not at all, and an older one stays until then.
+
+    Args:
+        path: The file; its ending says of which kind it is, PNG where that is none of them.
+        draw: Makes the figure.
+        options: Of matplotlib's ``savefig``.
+
+    Raises:
+        ConfigError: The file cannot be written.
+    """
+    ending = path.suffix.lower()
+    data = encode_figure(draw, ending if ending in ENDINGS else ".png", **options)
+    try:
+        with whole_file(path) as file:
+            file.write(data)
+    except OSError as error:
+        problem = Problem(f"the picture cannot be written: {error.strerror or error}", str(path))
+        raise ConfigError(problem) from error
+
+
+Floats = NDArray[np.float64]
+
+DARK, LIGHT, OTHER, ANOTHER = "#1f4e8c", "#86b6e0", "#f28e2b", "#f7c48f"
+QUOTED, LIMIT = "#c8102e", "0.5"
+FRAME: Final = "0.35"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Series:
+    """Points that belong together.
+
+    Attributes:
+        label: What the key calls them; plain text.
+        x: float64 (n,), rising.
+        y: float64 (n,), fractions.
+        low: float64 (n,), lower ends of their errors; NaN where the error is not known.
+        high: float64 (n,), upper ends.
+    """
+
+    label: str
+    x: Floats
+    y: Floats
+    low: Floats
+    high: Floats
+
+
+def span(series: Iterable[Series | None]) -> tuple[float, float]:
+    """The lowest and the highest end of any point, in per cent."""
+    ends = [values for one in series if one is not None for values in (one.y, one.low, one.high)]
+    return 100 * float(np.nanmin(np.concatenate(ends))), 100 * float(np.nanmax(np.concatenate(ends)))
+
+
+def paint_series(axes: Axes, series: Series, colour: str, marker: str, *, joined: bool) -> None:
+    """Paint points with error bars, in per cent.
+
+    Args:
+        axes: The panel.
+        series: The points.
+        colour: Of points and bars.
+        marker: matplotlib's name of the shape.
+        joined: Whether a thin line leads from point to point.
+    """
+    y, low, high = (100 * values for values in (series.y, series.low, series.high))
+    bars = np.nan_to_num(np.stack([y - low, high - y])).clip(min=0.0)
+    look: dict[str, Any] = {"color": colour, "markersize": 5, "linewidth": 0.9, "capsize": 2, "capthick": 0.9}
+    line = "-" if joined else "none"
+    axes.errorbar(
+        series.x, y, bars, label=plain(series.label), marker=marker, linestyle=line, zorder=3, **look
+    )
+
+
+def paint_quoted(axes: Axes, series: Series) -> None:
+    """Paint points that were not measured here, as stars."""
+    y, low, high = (100 * values for values in (series.y, series.low, series.high))
+    look: dict[str, Any] = {
+        "color": QUOTED,
+        "marker": "*",
+        "markersize": 11,
+        "linestyle": "none",
+        "capsize": 2,
+    }
+    rim: dict[str, Any] = {"markeredgecolor": "white", "markeredgewidth": 0.6}
+    bars = np.stack([y - low, high - y])
+    axes.errorbar(series.x, y, bars, label=plain(series.label), zorder=4, **look, **rim)
+
+
+def tidy(axes: Axes) -> None:
+    """Thin grey frame and ticks, a faint grid behind everything."""
+    for spine in axes.spines.values():
+        spine.set(color=FRAME, linewidth=0.7)
+    axes.tick_params(color=FRAME, width=0.7, labelsize=9)
+    axes.grid(visible=True, axis="y", color="0.92", linewidth=0.7)
+    axes.set_axisbelow(True)
+
+
+def plain(text: str) -> str:
+    """A text in which mathtext finds nothing to set."""
+    return text.replace("$", r"\$")
+
+
+PANEL_IN: Final = 4.4
+"""Width of a panel, in inches, as long as its sites are neither too small nor too large in it."""
+SITE_IN: Final = (0.05, 0.3)
+"""Least and largest distance between neighbours, in inches."""
+MARGIN: Final = 1.4
+"""Room around the outermost sites and landing places, in units of the spacing."""
+TITLE_IN: Final = 0.3
+"""Room above each panel for its title, in inches."""
+HEAD_IN: Final = 0.9
+"""Room at the top of the sheet for its title and key, in inches."""
+MIN_WIDTH_IN: Final = 9.0
+"""So wide are a sheet's title and key."""
+
+
+@dataclass(frozen=True, slots=True)
+class Extent:
+    """The part of the lattice that a panel shows, in units of the spacing, y down the image."""
+
+    left: float
+    right: float
+    top: float
+    bottom: float
+
+    @property
+    def width(self) -> float:
+        """Its width."""
+        return self.right - self.left
+
+    @property
+    def height(self) -> float:
+        """Its height."""
+        return self.bottom - self.top
+
+
+@dataclass(frozen=True, slots=True)
+class Sheet:
+    """The sheet.
+
+    Attributes:
+        n_cols: Panels beside one another.
+        n_rows: Panels below one another.
+        site_in: Distance between neighbours, in inches.
+        width_in: Width, in inches.
+        height_in: Height, in inches.
+        extent: What each panel shows.
+    """
+
+    n_cols: int
+    n_rows: int
+    site_in: float
+    width_in: float
+    height_in: float
+    extent: Extent
+
+    def place(self, index: int) -> tuple[float, float, float, float]:
+        """Left, bottom, width and height of a panel, in fractions of the sheet."""
+        row, col = divmod(index, self.n_cols)
+        width, height = self.extent.width * self.site_in, self.extent.height * self.site_in
+        aside = (self.width_in - self.n_cols * width) / 2
+        left = aside + col * width
+        below = self.height_in - HEAD_IN - (row + 1) * (height + TITLE_IN)
+        return (
+            left / self.width_in,
+            below / self.height_in,
+            width / self.width_in,
+            height / self.height_in,
+        )
+
+
+def place_sites(sites: NDArray[np.generic], grid: SiteGrid) -> NDArray[np.float64]:
+    """Where sites are, on the grid or off it.
+
+    Args:
+        sites: (..., 2), row and column.
+        grid: The grid of sites.
+
+    Returns:
+        float64 (..., 2), x and y in units of the spacing, from the site (0, 0); y down the image.
+
+    Example:
+        >>> place_sites(np.array([[0, 3], [2, -1]]), SiteGrid(lattice="square")).tolist()
+        [[3.0, 0.0], [-1.0, 2.0]]
+    """
+    axes = grid.axes / grid.spacing_m
+    return sites[..., 1:] * axes[0] + sites[..., :1] * axes[1]
+
+
+def extent_of(plan: Plan, grid: SiteGrid) -> Extent:
+    """What has to be seen of a plan: all sites, and where atoms are ejected to."""
+    return extent_of_sites(plan.moves[:, 2:], grid)
+
+
+def extent_of_sites(others: NDArray[np.integer], grid: SiteGrid) -> Extent:
+    """What has to be seen: all sites of the grid, and others, int (n, 2), that may lie beside it."""
+    rows, cols = np.mgrid[: grid.n_rows : max(1, grid.n_rows - 1), : grid.n_cols : max(1, grid.n_cols - 1)]
+    corners = np.stack([rows.ravel(), cols.ravel()], axis=1)
+    places = place_sites(np.concatenate([corners, others]), grid)
+    (left, top), (right, bottom) = places.min(axis=0) - MARGIN, places.max(axis=0) + MARGIN
+    return Extent(float(left), float(right), float(top), float(bottom))
+
+
+def lay_out(extent: Extent, n_panels: int, panel_in: float = PANEL_IN) -> Sheet:
+    """Choose the size of the panels, and how many stand side by side.
+
+    The sheet shall be somewhat wider than high, and few of its places empty.
+
+    Args:
+        extent: What each panel shows.
+        n_panels: How many there are.
+        panel_in: Width of a panel, in inches, as long as its sites are neither too small nor too large in it.
+
+    Example:
+        >>> sheet = lay_out(Extent(-1, 11, -1, 11), 6)
+        >>> sheet.n_cols, sheet.n_rows, sheet.site_in
+        (3, 2, 0.3)
+    """
+    site_in = min(max(panel_in / extent.width, SITE_IN[0]), SITE_IN[1])
+    width, height = extent.width * site_in, extent.height * site_in + TITLE_IN
+
+    def size(n_cols: int) -> tuple[float, float]:
+        return n_cols * width, math.ceil(n_panels / n_cols) * height + HEAD_IN
+
+    def fault(n_cols: int) -> float:
+        across, down = size(n_cols)
+        return abs(math.log(across / down / 1.5)) + 1.5 * (-n_panels % n_cols) / n_panels
+
+    n_cols = min(range(1, n_panels + 1), key=fault)
+    across, down = size(n_cols)
+    n_rows = math.ceil(n_panels / n_cols)
+    return Sheet(n_cols, n_rows, site_in, max(across, MIN_WIDTH_IN), down, extent)
+
+
+_TOUCHING = 1.01
+"""Distance up to which sites are neighbours, in units of the spacing."""
+
+
+def neighbours(grid: SiteGrid) -> NDArray[np.int64]:
+    """How far the nearest sites are, in rows and columns, counter-clockwise as seen in a picture.
+
+    Returns:
+        int64 (n, 2), 6 of them on a triangular lattice and 4 on a square one.
+
+    Example:
+        >>> neighbours(SiteGrid(lattice="square")).tolist()
+        [[-1, 0], [0, 1], [1, 0], [0, -1]]
+    """
+    steps = np.array([step for step in product((-1, 0, 1), repeat=2) if any(step)])
+    x, y = place_sites(steps, grid).T
+    near = np.hypot(x, y) < _TOUCHING
+    order = np.argsort(np.arctan2(y[near], x[near]), kind="stable")
+    return steps[near][order]
+
+
+def cell(grid: SiteGrid) -> Floats:
+    """Corners of the cell around a site at the origin, float64 (n, 2), x and y in units of the spacing.
+
+    Example:
+        >>> cell(SiteGrid(lattice="square")).tolist()
+        [[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]]
+    """
+    return _edges(grid)[:, 0]
+
+
+def outline(sites: NDArray[np.bool_], grid: SiteGrid) -> Floats:
+    """The border around some sites.
+
+    Args:
+        sites: bool (n_rows, n_cols).
+        grid: The grid that they lie on.
+
+    Returns:
+        float64 (n, 2, 2): start and end (x, y) of each stretch, in units of the spacing.
+
+    Example:
+        >>> len(outline(np.array([[True, True]]), SiteGrid(1, 2)))
+        10
+    """
+    padded = np.pad(sites, 1)
+    stretches: list[Floats] = []
+    for (row, col), edge in zip(neighbours(grid), _edges(grid), strict=True):
+        beside = np.roll(padded, (-row, -col), axis=(0, 1))[1:-1, 1:-1]
+        open_here = np.argwhere(sites & ~beside)
+        stretches.append(place_sites(open_here, grid)[:, None] + edge)
+    return np.concatenate(stretches)
+
+
+def _edges(grid: SiteGrid) -> Floats:
+    """The stretch of the border towards each neighbour, float64 (n, 2, 2); each begins where one ends."""
+    to = place_sites(neighbours(grid), grid)
+    aside = np.stack([-to[:, 1], to[:, 0]], axis=1)
+    half = np.tan(np.pi / len(to)) / 2
+    edges: Floats = np.stack([to / 2 - half * aside, to / 2 + half * aside], axis=1)
+    return edges.round(12)

@@ -1,0 +1,717 @@
+"""Pictures of plans and targets."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from itertools import groupby, pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq.errors import ConfigError, Problem
+from labseq.model import Batch, Occupancy, Plan, PlanReport, SiteGrid, TargetPattern
+from labseq.pictures.figures import (
+    MARGIN,
+    Sheet,
+    check_place,
+    extent_of,
+    lay_out,
+    make_figure,
+    place_sites,
+    save_figure,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+HEIGHT: Final = (0.28, 0.85)
+"""Least and largest height of a hop, in units of the spacing."""
+STEP: Final = 0.17
+"""Height between lanes, in the same unit, while there is room for all of them."""
+GAP: Final = 0.16
+"""Distance of an arrow's ends from the centres of its sites, in the same unit."""
+HEAD: Final = (0.42, 0.2)
+"""Length and half width of an arrow's head, in the same unit."""
+
+N_POINTS: Final = 16
+
+
+def lanes(moves: NDArray[np.integer]) -> NDArray[np.intp]:
+    """Part the ways that share a stretch of a line, so that they can be drawn beside one another.
+
+    Short ways get the low lanes. Opposite ways along a line need not be parted:
+    they are drawn on opposite sides of it.
+
+    Args:
+        moves: (n, 4), from row, from column, to row, to column; each along a row or a column.
+
+    Returns:
+        The lane of each, from 0.
+
+    Example:
+        >>> lanes(np.array([[0, 0, 0, 3], [0, 1, 0, 2], [0, 5, 0, 6], [1, 0, 1, 3]])).tolist()
+        [1, 0, 0, 0]
+    """
+    way = moves[:, 2:] - moves[:, :2]
+    axis = (way[:, 0] != 0).astype(np.intp)  # 1 along a column, whose moves count rows
+    each = np.arange(len(moves))
+    line, start, end = moves[each, axis], moves[each, 1 - axis], moves[each, 3 - axis]
+    found = np.zeros(len(moves), np.intp)
+    taken: dict[tuple[int, ...], list[tuple[int, int]]] = {}
+    for i in np.argsort(np.abs(end - start), kind="stable"):
+        low, high = sorted((int(start[i]), int(end[i])))
+        where = int(axis[i]), int(line[i]), int(end[i] > start[i])
+        lane = 0
+        while any(a < high and low < b for a, b in taken.get((*where, lane), ())):
+            lane += 1
+        taken.setdefault((*where, lane), []).append((low, high))
+        found[i] = lane
+    return found
+
+
+def heights(lane: NDArray[np.intp]) -> NDArray[np.float64]:
+    """Heights of hops, in units of the spacing: lanes lie closer together if there are many.
+
+    Example:
+        >>> heights(np.array([0, 1])).round(2).tolist()
+        [0.28, 0.45]
+    """
+    low, high = HEIGHT
+    step = min(STEP, (high - low) / max(1, int(lane.max(initial=0))))
+    return low + step * lane.astype(np.float64)
+
+
+def hops(
+    start: NDArray[np.float64], end: NDArray[np.float64], height: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Draw each arrow as a flat arc to the left of its way, so that opposite ways differ.
+
+    The arc is a quadratic Bezier curve.
+
+    Args:
+        start: float64 (n, 2), in units of the spacing.
+        end: float64 (n, 2); no arrow may have length 0.
+        height: float64 (n,), in the same unit.
+
+    Returns:
+        The shafts, float64 (n, points, 2), and the heads, float64 (n, 3, 2).
+
+    Example:
+        >>> shafts, heads = hops(np.zeros((1, 2)), np.array([[3.0, 0.0]]), np.array([0.3]))
+        >>> shafts.shape, heads.shape
+        ((1, 16, 2), (1, 3, 2))
+    """
+    way = end - start
+    length = np.hypot(way[:, 0], way[:, 1])[:, None]
+    along = way / length
+    aside = np.stack([along[:, 1], -along[:, 0]], axis=1)
+    start, end = start + GAP * along, end - GAP * along
+    bend = (start + end) / 2 + 2 * height[:, None] * aside
+    landing = end - bend
+    landing /= np.hypot(landing[:, 0], landing[:, 1])[:, None]
+    size = np.minimum(1.0, 0.8 * length)
+    neck = end - HEAD[0] * size * landing
+    side = HEAD[1] * size * np.stack([landing[:, 1], -landing[:, 0]], axis=1)
+    t = np.linspace(0.0, 1.0, N_POINTS)[None, :, None]
+    shafts = (1 - t) ** 2 * start[:, None] + 2 * t * (1 - t) * bend[:, None] + t**2 * neck[:, None]
+    return shafts, np.stack([end, neck + side, neck - side], axis=1)
+
+
+Axis = Literal["row", "column"]
+
+
+@dataclass(frozen=True, slots=True)
+class BatchSummary:
+    """A batch in a few numbers.
+
+    Attributes:
+        axis: Whether its atoms move along rows or along columns.
+        lines: The rows, or the columns, that they move along; sorted.
+        n_atoms: How many atoms move.
+        n_ejected: How many of them leave the grid.
+        n_sites: The longest way, in sites.
+    """
+
+    axis: Axis
+    lines: tuple[int, ...]
+    n_atoms: int
+    n_ejected: int
+    n_sites: int
+
+
+def summarise_batches(plan: Plan, shape: tuple[int, int]) -> list[BatchSummary]:
+    """Sum up each batch of a checked plan.
+
+    Args:
+        plan: The plan.
+        shape: (n_rows, n_cols) of the grid.
+
+    Example:
+        >>> summarise_batches(Plan.from_batches([([(2, 0), (2, 1)], [(2, 3), (2, 4)])]), (5, 4))
+        [BatchSummary(axis='row', lines=(2,), n_atoms=2, n_ejected=1, n_sites=3)]
+    """
+    return [_summarise(batch, shape) for batch in plan.batches]
+
+
+def _summarise(batch: Batch, shape: tuple[int, int]) -> BatchSummary:
+    way = batch.to_sites - batch.from_sites
+    axis: Axis = "column" if way[:, 0].any() else "row"
+    lines = np.unique(batch.from_sites[:, 1 if axis == "column" else 0])
+    return BatchSummary(
+        axis=axis,
+        lines=tuple(lines.tolist()),
+        n_atoms=len(batch),
+        n_ejected=int(np.count_nonzero(~on_grid(batch.to_sites, shape))),
+        n_sites=int(np.abs(way).max(initial=0)),
+    )
+
+
+def on_grid(sites: NDArray[np.integer], shape: tuple[int, int]) -> NDArray[np.bool_]:
+    """Which sites are on the grid.
+
+    Args:
+        sites: (n, 2), row and column.
+        shape: (n_rows, n_cols) of the grid.
+
+    Returns:
+        bool (n,).
+    """
+    inside = (sites >= 0) & (sites < shape)
+    return inside[:, 0] & inside[:, 1]
+
+
+def occupancies(plan: Plan, occupancy: Occupancy) -> list[Occupancy]:
+    """The occupancy before each batch, and after the last: n_batches + 1 of them.
+
+    Args:
+        plan: A plan that was checked for this occupancy.
+        occupancy: bool (n_rows, n_cols), before the plan.
+
+    Example:
+        >>> plan = Plan.from_batches([([(0, 0), (0, 1)], [(0, 1), (0, 2)])])
+        >>> [a.astype(int).tolist() for a in occupancies(plan, np.array([[True, True, False]]))]
+        [[[1, 1, 0]], [[0, 1, 1]]]
+    """
+    before = [occupancy]
+    for batch in plan.batches:
+        atoms = before[-1].copy()
+        atoms[tuple(batch.from_sites.T)] = False
+        atoms[tuple(batch.to_sites[on_grid(batch.to_sites, occupancy.shape)].T)] = True
+        before.append(atoms)
+    return before
+
+
+def lines_label(axis: Axis, lines: Iterable[int]) -> str:
+    """Name rows or columns, counted from 0.
+
+    Example:
+        >>> lines_label("row", [7]), lines_label("column", [2, 3, 4, 9])
+        ('row 7', 'columns 2-4, 9')
+    """
+    numbers = sorted(set(lines))
+    starts = [n for n, before in zip(numbers, [None, *numbers], strict=False) if before != n - 1]
+    bounds = pairwise([*starts, 1 << 31])
+    spans = [[n for n in numbers if start <= n < stop] for start, stop in bounds]
+    words = [str(span[0]) if span[0] == span[-1] else f"{span[0]}-{span[-1]}" for span in spans]
+    return f"{axis}{'s' if len(numbers) > 1 else ''} {', '.join(words)}"
+
+
+POINTS_PER_INCH: Final = 72
+ATOM, SURPLUS, RESERVOIR = "0.45", "#86c5ea", "0.80"
+DEFECT, RING, DOT, BAND = "#c8102e", "0.45", "0.82", "#dff0e0"
+
+
+@dataclass(frozen=True, slots=True)
+class MarkerStyle:
+    """A marker and how it is painted.
+
+    Attributes:
+        label: What it stands for, in the key.
+        marker: matplotlib's name of the shape.
+        size: Diameter, in units of the spacing.
+        face: Colour inside; "none" for a ring.
+        edge: Colour of the rim.
+    """
+
+    label: str
+    marker: str
+    size: float
+    face: str
+    edge: str
+
+    def keywords(self, site_in: float) -> dict[str, Any]:
+        """How matplotlib is told, for neighbours so far apart."""
+        points = site_in * POINTS_PER_INCH
+        return {
+            "linestyle": "none",
+            "marker": self.marker,
+            "markersize": self.size * points,
+            "markerfacecolor": self.face,
+            "markeredgecolor": self.edge,
+            "markeredgewidth": min(1.0, 0.07 * points),
+        }
+
+
+ATOM_LOOK: Final = MarkerStyle("atom on a target site", "o", 0.62, ATOM, ATOM)
+DEFECT_LOOK: Final = MarkerStyle("empty target site", "o", 0.62, "white", RING)
+SURPLUS_LOOK: Final = MarkerStyle("surplus atom", "o", 0.5, SURPLUS, SURPLUS)
+RESERVOIR_LOOK: Final = MarkerStyle("atom in the reservoir", "o", 0.5, RESERVOIR, RESERVOIR)
+EMPTY_LOOK: Final = MarkerStyle("empty site", "o", 0.14, DOT, DOT)
+MISSING_LOOK: Final = MarkerStyle("target site that stays empty", "o", 0.62, "white", DEFECT)
+EJECTED_LOOK: Final = MarkerStyle("ejected", "X", 0.55, DEFECT, DEFECT)
+
+
+def paint_sites(
+    axes: Axes, sheet: Sheet, grid: SiteGrid, occupancy: Occupancy, target: TargetPattern, *, final: bool
+) -> list[MarkerStyle]:
+    """Paint every site as what it is.
+
+    Args:
+        axes: The panel.
+        sheet: Its size.
+        grid: The grid of sites.
+        occupancy: bool (n_rows, n_cols).
+        target: What the array shall look like.
+        final: Whether target sites that are empty now stay so.
+
+    Returns:
+        The looks that occur, in the order of the key.
+    """
+    wanted, unwanted = target.fill, target.clear
+    layers = (
+        (EMPTY_LOOK, ~occupancy & ~wanted),
+        (MISSING_LOOK if final else DEFECT_LOOK, ~occupancy & wanted),
+        (RESERVOIR_LOOK, occupancy & ~wanted & ~unwanted),
+        (SURPLUS_LOOK, occupancy & unwanted),
+        (ATOM_LOOK, occupancy & wanted),
+    )
+    painted: list[MarkerStyle] = []
+    for look, here in layers:
+        if here.any():
+            x, y = place_sites(np.argwhere(here), grid).T
+            axes.plot(x, y, **look.keywords(sheet.site_in), zorder=1)
+            painted.append(look)
+    return painted
+
+
+def paint_moves(axes: Axes, sheet: Sheet, grid: SiteGrid, moves: NDArray[np.int16], colours: Any) -> None:
+    """Paint atom moves as arrows, with a cross where an atom is ejected.
+
+    Args:
+        axes: The panel.
+        sheet: Its size.
+        grid: The grid of sites.
+        moves: int16 (n, 4), from row, from column, to row, to column.
+        colours: One per move, as matplotlib takes them.
+    """
+    from matplotlib.collections import LineCollection, PolyCollection
+
+    start, end = place_sites(moves[:, :2], grid), place_sites(moves[:, 2:], grid)
+    shafts, heads = hops(start, end, heights(lanes(moves)))
+    points = sheet.site_in * POINTS_PER_INCH
+    thick = min(1.5, 0.11 * points)
+    rings: dict[str, Any] = {"s": (0.62 * points) ** 2, "facecolors": "none", "linewidths": thick}
+    axes.scatter(start[:, 0], start[:, 1], edgecolors=colours, zorder=2, **rings)
+    lost = ~on_grid(moves[:, 2:], grid.shape)
+    axes.plot(end[lost, 0], end[lost, 1], **EJECTED_LOOK.keywords(sheet.site_in), zorder=2)
+    axes.add_collection(LineCollection(list(shafts), colors=colours, linewidths=thick, zorder=3))
+    axes.add_collection(PolyCollection(list(heads), facecolors=colours, linewidths=0, zorder=4))
+
+
+def paint_lines(axes: Axes, sheet: Sheet, grid: SiteGrid, moves: NDArray[np.int16]) -> None:
+    """Lay a pale band along each row and column that atoms move along."""
+    thick = 0.8 * sheet.site_in * POINTS_PER_INCH
+    n_rows, n_cols = grid.shape
+    along_column = moves[:, 0] != moves[:, 2]
+    rows, cols = np.unique(moves[~along_column, 0]), np.unique(moves[along_column, 1])
+    ends = [[(row, -0.1), (row, n_cols - 0.9)] for row in rows] + [
+        [(-0.1, col), (n_rows - 0.9, col)] for col in cols
+    ]
+    for pair in ends:
+        x, y = place_sites(np.array(pair), grid).T
+        axes.plot(x, y, color=BAND, linewidth=thick, solid_capstyle="round", zorder=0.5)
+
+
+def paint_numbers(axes: Axes, grid: SiteGrid, colour: str = "0.4") -> None:
+    """Number rows on the left and columns at the top, every one or every fifth."""
+    rows = [(row, -1, row) for row in range(0, grid.n_rows, 1 if grid.n_rows < 10 else 5)]
+    cols = [(-1, col, col) for col in range(0, grid.n_cols, 1 if grid.n_cols < 10 else 5)]
+    for row, col, number in rows + cols:
+        x, y = place_sites(np.array([row, col]), grid)
+        axes.text(x, y, str(number), fontsize=6, color=colour, ha="center", va="center")
+
+
+def frame(axes: Axes, sheet: Sheet, title: str, edge: NDArray[np.float64]) -> None:
+    """Set a panel's limits and title, and draw a thin line around the array.
+
+    Args:
+        axes: The panel.
+        sheet: Its size.
+        title: What stands above it.
+        edge: float64 (n, 2), corners of the array.
+    """
+    extent = sheet.extent
+    axes.set_xlim(extent.left, extent.right)
+    axes.set_ylim(extent.bottom, extent.top)
+    axes.set_axis_off()
+    axes.set_title(title, fontsize=8, pad=2, y=1.0)  # a fixed y spares matplotlib a search
+    closed = np.concatenate([edge, edge[:1]])
+    axes.plot(closed[:, 0], closed[:, 1], color="0.88", linewidth=0.6, zorder=0)
+
+
+MAX_PANELS: Final = 38
+"""Most panels of batches; with the ones before and after that makes 40."""
+MAX_WORDS: Final = 24
+"""Characters for the lines in a panel's title; if they are more, the lines are only counted."""
+
+
+@dataclass(frozen=True, slots=True)
+class Panel:
+    """Batches that are drawn together.
+
+    Attributes:
+        first: Index of the first batch.
+        last: Index of the last one.
+        moves_along: Axis and sorted lines, one pair for each axis.
+    """
+
+    first: int
+    last: int
+    moves_along: tuple[tuple[Axis, tuple[int, ...]], ...]
+
+    @property
+    def n_batches(self) -> int:
+        """How many batches."""
+        return self.last - self.first + 1
+
+    @property
+    def title(self) -> str:
+        """Numbers of the batches, from 1, and the lines that they move along.
+
+        Example:
+            >>> Panel(2, 4, (("row", (7, 9)),)).title
+            'batches 3-5: rows 7, 9'
+        """
+        numbers = f"batch {self.first + 1}" if self.n_batches == 1 else f"batches {self._numbers}"
+        return f"{numbers}: " + "; ".join(_words(axis, lines) for axis, lines in self.moves_along)
+
+    @property
+    def _numbers(self) -> str:
+        return f"{self.first + 1}-{self.last + 1}"
+
+
+def make_panels(summaries: Sequence[BatchSummary], max_panels: int = MAX_PANELS) -> list[Panel]:
+    """Share out batches among panels, in order.
+
+    A batch has a panel of its own if there are enough. If not, successive batches
+    along the same lines share one; then as many successive batches along the same
+    axis as it takes, evenly; and only if the axis changes too often, any.
+
+    Args:
+        stories: The batches.
+        max_panels: Most panels, at least 1.
+
+    Example:
+        >>> rows = [BatchSummary("row", (i // 2,), 3, 0, 5) for i in range(8)]
+        >>> [(panel.first, panel.last) for panel in make_panels(rows, 4)]
+        [(0, 1), (2, 3), (4, 5), (6, 7)]
+    """
+    groups = [[i] for i in range(len(summaries))]
+    if len(groups) > max_panels:
+        groups = _together(summaries, lambda summary: (summary.axis, summary.lines))
+    if len(groups) > max_panels:
+        phases = _together(summaries, lambda summary: summary.axis)
+        if len(phases) > max_panels:
+            phases = [list(range(len(summaries)))]
+        groups = _evenly(phases, max_panels)
+    return [_panel(summaries, group) for group in groups]
+
+
+def _words(axis: Axis, lines: tuple[int, ...]) -> str:
+    words = lines_label(axis, lines)
+    return words if len(words) <= MAX_WORDS else f"{len(lines)} {axis}s"
+
+
+def _together(summaries: Sequence[BatchSummary], key: Callable[[BatchSummary], Any]) -> list[list[int]]:
+    runs = groupby(range(len(summaries)), lambda i: key(summaries[i]))
+    return [list(run) for _, run in runs]
+
+
+def _evenly(phases: list[list[int]], max_panels: int) -> list[list[int]]:
+    """Cut phases into pieces of about the same length, the shortest that are few enough."""
+    size = 1
+    while sum(-(-len(phase) // size) for phase in phases) > max_panels:
+        size += 1
+    pieces: list[list[int]] = []
+    for phase in phases:
+        n = -(-len(phase) // size)
+        cuts = [round(i * len(phase) / n) for i in range(n + 1)]
+        pieces += [phase[a:b] for a, b in pairwise(cuts)]
+    return pieces
+
+
+def _panel(summaries: Sequence[BatchSummary], group: list[int]) -> Panel:
+    lines: dict[Axis, set[int]] = {}
+    for i in group:
+        lines.setdefault(summaries[i].axis, set()).update(summaries[i].lines)
+    return Panel(group[0], group[-1], tuple((axis, tuple(sorted(found))) for axis, found in lines.items()))
+
+
+DPI: Final = 150
+MAX_SITES: Final = 128
+"""Most rows, and most columns, of an array that can be made out in a picture."""
+COLOURS: Final = ("plasma", 0.0, 0.82)
+"""Colour map of the order of batches, and the part of it that can be seen on white."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlanDrawing:
+    """What is drawn.
+
+    Attributes:
+        title: Stands at the top.
+        source: Where the occupancy comes from; stands below it.
+        grid: The grid of sites.
+        occupancy: bool (n_rows, n_cols), before.
+        target: What the array shall look like.
+        plan: The plan, checked.
+        report: What the check says of it.
+    """
+
+    title: str
+    source: str
+    grid: SiteGrid
+    occupancy: Occupancy
+    target: TargetPattern
+    plan: Plan
+    report: PlanReport
+
+
+def check_picture(path: Path, shape: tuple[int, int]) -> None:
+    """Find out whether a picture can be drawn and where it is to go, before anything is planned.
+
+    Args:
+        path: The file.
+        shape: (n_rows, n_cols) of the grid.
+
+    Raises:
+        ConfigError: The file has another ending than .png, its folder does not
+            exist, the array is too large, or matplotlib is not installed.
+    """
+    if max(shape) > MAX_SITES:
+        what = f"{shape[0]} x {shape[1]} sites are too many for a picture"
+        raise ConfigError(Problem(what, str(path), expected=f"at most {MAX_SITES} rows and columns"))
+    check_place(path, (".png",))
+
+
+def save_plan(path: Path, drawing: PlanDrawing) -> None:
+    """Draw the array before and after, and between them a panel for each batch or some of them.
+
+    Args:
+        path: The PNG file.
+        drawing: What is drawn.
+
+    Raises:
+        ConfigError: The file cannot be written.
+    """
+    told = {"Title": drawing.title, "Software": None}
+    save_figure(path, lambda: _draw(drawing), dpi=DPI, metadata=told)
+
+
+def _draw(drawing: PlanDrawing) -> Figure:
+    plan, grid = drawing.plan, drawing.grid
+    panels = make_panels(summarise_batches(plan, grid.shape))
+    sheet = lay_out(extent_of(plan, grid), len(panels) + 2)
+    figure = make_figure(sheet.width_in, sheet.height_in)
+    looks = _fill(figure, sheet, drawing, panels)
+    _write_head(figure, sheet, drawing, looks)
+    if len(panels) < plan.n_batches:
+        _colour_bar(figure, sheet, "batches of a panel", ("first", "last"))
+    elif panels:
+        _colour_bar(figure, sheet, "batch", ("1", str(plan.n_batches)))
+    return figure
+
+
+def _fill(figure: Figure, sheet: Sheet, drawing: PlanDrawing, panels: list[Panel]) -> list[MarkerStyle]:
+    """Paint all panels; return what the key has to explain."""
+    plan, grid, target = drawing.plan, drawing.grid, drawing.target
+    n_rows, n_cols = grid.shape
+    edge = place_sites(np.array([[0, 0], [0, n_cols], [n_rows, n_cols], [n_rows, 0]]) - 0.5, grid)
+    before = occupancies(plan, drawing.occupancy)
+    shown = [before[0], *(before[panel.first] for panel in panels), before[-1]]
+    titles = [
+        f"before: {int(before[0].sum())} atoms",
+        *(panel.title for panel in panels),
+        f"after: {target.n_atoms - drawing.report.n_defects} of {target.n_atoms} target sites filled",
+    ]
+    looks: dict[MarkerStyle, None] = {}
+    for i, (atoms, title) in enumerate(zip(shown, titles, strict=True)):
+        axes = figure.add_axes(sheet.place(i))
+        final = i == len(shown) - 1
+        looks |= dict.fromkeys(paint_sites(axes, sheet, grid, atoms, target, final=final))
+        frame(axes, sheet, title, edge)
+        if 0 < i <= len(panels):
+            _paint_panel(axes, sheet, drawing, panels[i - 1], alone=len(panels) == plan.n_batches)
+        elif i == 0:
+            paint_numbers(axes, grid)
+            _scale_bar(axes, sheet, grid)
+    if drawing.occupancy.sum() > before[-1].sum():
+        looks[EJECTED_LOOK] = None
+    return list(looks)
+
+
+def _paint_panel(axes: Axes, sheet: Sheet, drawing: PlanDrawing, panel: Panel, *, alone: bool) -> None:
+    plan = drawing.plan
+    offsets = plan.batch_offsets[panel.first : panel.last + 2]
+    moves = plan.moves[offsets[0] : offsets[-1]]
+    of_batch = [colour_of(*place) for place in _order(panel, plan.n_batches, alone=alone)]
+    colours = np.repeat(of_batch, np.diff(offsets), axis=0)
+    paint_lines(axes, sheet, drawing.grid, moves)
+    paint_moves(axes, sheet, drawing.grid, moves, colours)
+
+
+def _order(panel: Panel, n_batches: int, *, alone: bool) -> list[tuple[int, int]]:
+    """Each batch's place and of how many: in the plan if all are alone in their panels, else in the panel."""
+    if alone:
+        return [(panel.first, n_batches)]
+    return [(i, panel.n_batches) for i in range(panel.n_batches)]
+
+
+def colour_of(index: int, n_batches: int) -> Any:
+    """Colour of a batch by its place among others."""
+    from matplotlib import colormaps
+
+    name, first, last = COLOURS
+    return colormaps[name](first + (last - first) * index / max(1, n_batches - 1))
+
+
+def _scale_bar(axes: Axes, sheet: Sheet, grid: SiteGrid) -> None:
+    """A bar of a round length in the lower left corner."""
+    quarter_um = 0.25 * sheet.extent.width * grid.spacing_m * 1e6
+    length_um = max(um for um in (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 0.0) if um <= quarter_um)
+    if not length_um:
+        return
+    left, y = sheet.extent.left + 0.3, sheet.extent.bottom - 0.25
+    length = length_um * 1e-6 / grid.spacing_m
+    axes.plot([left, left + length], [y, y], color="black", linewidth=1.5, solid_capstyle="butt")
+    axes.text(left + length + 0.25, y, f"{length_um:g} µm", fontsize=7, ha="left", va="center")
+
+
+def _write_head(figure: Figure, sheet: Sheet, drawing: PlanDrawing, looks: list[MarkerStyle]) -> None:
+    """The title, and what the markers stand for."""
+    from matplotlib.lines import Line2D
+
+    across, down = sheet.width_in, sheet.height_in
+    plain: dict[str, Any] = {"va": "top", "parse_math": False}  # a file may be called $x$
+    figure.text(0.2 / across, 1 - 0.12 / down, drawing.title, fontsize=11, **plain)
+    figure.text(0.2 / across, 1 - 0.36 / down, drawing.source, fontsize=8, color="0.4", **plain)
+    figure.legend(
+        handles=[Line2D([], [], label=look.label, **look.keywords(0.16)) for look in looks],
+        loc="center left",
+        bbox_to_anchor=(0.1 / across, 1 - 0.66 / down),
+        ncols=len(looks),
+        frameon=False,
+        fontsize=8,
+        handletextpad=0.2,
+        columnspacing=1.2,
+    )
+
+
+def _colour_bar(figure: Figure, sheet: Sheet, title: str, ends: tuple[str, str]) -> None:
+    """What the colours of arrows stand for."""
+    across, down = sheet.width_in, sheet.height_in
+    axes = figure.add_axes((1 - 1.9 / across, 1 - 0.7 / down, 1.0 / across, 0.1 / down))
+    axes.imshow([[colour_of(i, 100) for i in range(100)]], aspect="auto")
+    axes.set_axis_off()
+    axes.set_title(title, fontsize=8, pad=3)
+    axes.text(-4, 0, ends[0], fontsize=7, ha="right", va="center")
+    axes.text(104, 0, ends[1], fontsize=7, ha="left", va="center")
+
+
+TARGETS_DPI: Final = 100
+SITE_IN: Final = 0.18
+"""Distance between neighbours in a picture of :func:`save_target`, in inches."""
+
+FILL_LOOK: Final = MarkerStyle("atom", "o", 0.76, "#1b5e8c", "#1b5e8c")
+CLEAR_LOOK: Final = MarkerStyle("must be empty", "o", 0.34, "white", "0.78")
+OTHER_LOOK: Final = MarkerStyle("reservoir", "o", 0.16, "0.6", "0.6")
+
+
+def draw_target(axes: Axes, target: TargetPattern, grid: SiteGrid, site_in: float = SITE_IN) -> None:
+    """Draw a target: atoms filled, sites that must be empty as rings, the reservoir as dots.
+
+    Args:
+        axes: Where; gets limits that show the whole grid, and no axes.
+        target: What the array shall look like.
+        grid: The grid that it lies on.
+        site_in: Distance between neighbours in the finished picture, in inches.
+
+    Raises:
+        ValueError: Target and grid differ in shape.
+    """
+    if target.shape != grid.shape:
+        raise ValueError(f"the target has {target.shape} sites and the grid {grid.shape}; expected the same")
+    for look, here in (
+        (OTHER_LOOK, ~target.fill & ~target.clear),
+        (CLEAR_LOOK, target.clear),
+        (FILL_LOOK, target.fill),
+    ):
+        x, y = place_sites(np.argwhere(here), grid).T
+        axes.plot(x, y, **look.keywords(site_in))
+    left, right, top, bottom = _extent(grid)
+    axes.set_xlim(left, right)
+    axes.set_ylim(bottom, top)
+    axes.set_aspect("equal")
+    axes.set_axis_off()
+
+
+def save_target(path: Path, target: TargetPattern, grid: SiteGrid) -> None:
+    """Save a target as a PNG, with the target's name and :func:`target_text` in its text chunks.
+
+    Args:
+        path: The file.
+        target: What the array shall look like.
+        grid: The grid that it lies on.
+
+    Raises:
+        ConfigError: The file cannot be written.
+    """
+    told = {"Title": target.name, "Description": target_text(target), "Software": None}
+    save_figure(
+        path,
+        lambda: _targets_draw(target, grid),
+        dpi=TARGETS_DPI,
+        metadata=told,
+        pil_kwargs={"optimize": True},
+    )
+
+
+def _targets_draw(target: TargetPattern, grid: SiteGrid) -> Figure:
+    left, right, top, bottom = _extent(grid)
+    figure = make_figure((right - left) * SITE_IN, (bottom - top) * SITE_IN)
+    draw_target(figure.add_axes((0.0, 0.0, 1.0, 1.0)), target, grid)
+    return figure
+
+
+def target_text(target: TargetPattern) -> str:
+    r"""A target as text, one line per row: "#" an atom, "o" must be empty, "." reservoir.
+
+    Example:
+        >>> fill = np.array([[True, False, False]])
+        >>> target_text(TargetPattern(fill, np.array([[False, True, False]])))
+        '#o.'
+    """
+    signs = np.where(target.fill, "#", np.where(target.clear, "o", "."))
+    return "\n".join("".join(row) for row in signs)
+
+
+def _extent(grid: SiteGrid) -> tuple[float, float, float, float]:
+    """Left, right, top and bottom of the grid with a margin, in units of the spacing."""
+    corners = np.array([[row, col] for row in (0, grid.n_rows - 1) for col in (0, grid.n_cols - 1)])
+    places = place_sites(corners, grid)
+    (left, top), (right, bottom) = places.min(axis=0) - MARGIN, places.max(axis=0) + MARGIN
+    return float(left), float(right), float(top), float(bottom)

@@ -1,0 +1,383 @@
+"""Pictures of waveforms: the power of each tone against time."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq.model import AxisTones, FrequencyCourse, RfSpec, SegmentKind, ToneProgram
+from labseq.motion import Renderer
+from labseq.motion.rendering import FULL_SCALE
+from labseq.pictures.figures import make_figure, save_figure
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+WINDOW_S: Final = 6e-6
+"""Length of a Hann window: tones 0.5 MHz apart are told from one another, and a chirp of 1.6 MHz
+per site, of about 35 us, moves by less than that."""
+
+MAX_WINDOWS: Final = 8
+"""Windows whose power is averaged in a column, at most; a long program is only sampled."""
+
+AT_ONCE: Final = 32
+"""Windows that are transformed together: a few megabytes."""
+
+CHUNK: Final = 1 << 18
+"""Samples that are looked at together."""
+
+FLOOR: Final = 1e-12
+"""Power that counts as none, relative to a tone at full scale."""
+
+
+@dataclass(frozen=True, slots=True)
+class WaveformPieces:
+    """Pieces of a waveform, laid end to end: what a picture shows of it.
+
+    Attributes:
+        first: int64 (n,), first sample of each piece in the waveform.
+        at: int64 (n + 1,), where each piece starts in the picture, in samples, and the end.
+    """
+
+    first: NDArray[np.int64]
+    at: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, pieces: list[tuple[int, int]]) -> WaveformPieces:
+        """Lay pieces end to end.
+
+        Args:
+            pieces: First sample of each, and the one after its last.
+
+        Example:
+            >>> Stretches.of([(10, 14), (20, 25)]).at.tolist()
+            [0, 4, 9]
+        """
+        bounds = np.array(pieces, np.int64).reshape(-1, 2)
+        lengths = bounds[:, 1] - bounds[:, 0]
+        return cls(bounds[:, 0], np.concatenate([[0], np.cumsum(lengths)]))
+
+    @property
+    def n_samples(self) -> int:
+        """Samples in all pieces together."""
+        return int(self.at[-1])
+
+    def in_waveform(self, place: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Samples of the waveform at places in the picture, in samples."""
+        piece = np.searchsorted(self.at[1:-1], place, side="right")
+        return place - self.at[piece] + self.first[piece]
+
+
+def spectrogram(
+    renderer: Renderer, channel: int, stretches: WaveformPieces, n_columns: int, band_hz: tuple[float, float]
+) -> tuple[NDArray[np.float32], tuple[float, float]]:
+    """Find out how strong each frequency is, column by column, without ever holding all samples.
+
+    Args:
+        renderer: Makes the samples.
+        channel: 0 for the row tones, 1 for the column tones.
+        stretches: What is shown.
+        n_columns: How many columns.
+        band_hz: Lowest and highest frequency that are asked for.
+
+    Returns:
+        float32 (n_bins, n_columns), in dB relative to a tone at full scale, low frequencies first,
+        and the frequencies of the lower edge of the first bin and the upper edge of the last.
+    """
+    rate_hz = renderer.sample_rate_hz
+    length = max(16, round(WINDOW_S * rate_hz))
+    n_fft = 2 << (length - 1).bit_length()
+    window = np.hanning(length).astype(np.float32)
+    low, high = (int(np.rint(hz / rate_hz * n_fft)) for hz in band_hz)
+    low, high = max(0, low), min(n_fft // 2, max(low, high))
+    wide = stretches.n_samples / n_columns
+    n_windows = min(MAX_WINDOWS, math.ceil(2 * wide / length))
+    centre = (np.arange(n_columns * n_windows) + 0.5) * (wide / n_windows)
+    start = np.maximum(0, stretches.in_waveform(centre.astype(np.int64)) - length // 2)
+    samples = np.empty((AT_ONCE, length), np.int16)
+    power = np.empty((len(start), high - low + 1), np.float32)
+    for i in range(0, len(start), AT_ONCE):
+        its = start[i : i + AT_ONCE]
+        for out, first in zip(samples, its, strict=False):
+            renderer.write(channel, int(first), out)
+        spectrum = np.fft.rfft(samples[: len(its)] * window, n_fft)[:, low : high + 1]
+        power[i : i + len(its)] = (2 / (window.sum() * FULL_SCALE) * np.abs(spectrum)) ** 2
+    mean = power.reshape(n_columns, n_windows, -1).mean(axis=1)
+    level_db = 10 * np.log10(np.maximum(mean, FLOOR))
+    edges_hz = (low - 0.5) * rate_hz / n_fft, (high + 0.5) * rate_hz / n_fft
+    return level_db.T.astype(np.float32), edges_hz
+
+
+def envelope(
+    renderer: Renderer, channel: int, stretches: WaveformPieces, n_columns: int
+) -> NDArray[np.float64]:
+    """Find the largest sample of each column, looking at every sample.
+
+    Args:
+        renderer: Makes the samples.
+        channel: 0 for the row tones, 1 for the column tones.
+        stretches: What is shown.
+        n_columns: How many columns.
+
+    Returns:
+        float64 (n_columns,), absolute values as fractions of full scale.
+    """
+    edges = np.rint(np.linspace(0, stretches.n_samples, n_columns + 1)).astype(np.int64)
+    cuts = np.unique(np.concatenate([edges, stretches.at]))
+    column = np.searchsorted(edges, cuts[:-1], side="right") - 1
+    first = stretches.in_waveform(cuts[:-1])
+    out = np.empty(CHUNK, np.int16)
+    largest = np.zeros(n_columns)
+    for k, start, n in zip(column.tolist(), first.tolist(), np.diff(cuts).tolist(), strict=True):
+        for at in range(0, n, CHUNK):
+            part = out[: min(CHUNK, n - at)]
+            renderer.write(channel, start + at, part)
+            largest[k] = max(largest[k], int(part.max()), -int(part.min()))
+    return largest / FULL_SCALE
+
+
+Floats = NDArray[np.float64]
+
+DPI: Final = 150
+SIZE_IN: Final = (11.0, 8.5)
+HEIGHTS: Final = (0.5, 3.0, 1.0, 3.0, 1.0)
+"""Of the strip with the batches, and of spectrogram and envelope of each axis; relative."""
+HEAD_BELOW: Final = 0.945
+"""Height below which everything but the head is laid out, as a part of the picture's."""
+N_COLUMNS: Final = 1400
+"""Columns of a spectrogram, about as many as the picture has pixels."""
+ENVELOPE_S: Final = 2e-6
+"""Least width of a column of an envelope: some periods of the beat of neighbouring tones."""
+MARGIN_HZ: Final = 2.5e6
+RANGE_DB: Final = 50.0
+"""Range of levels that is shown, from the strongest tone down."""
+N_POINTS: Final = 25
+"""Points of the line of a tone whose speed changes."""
+
+KINDS: Final = {
+    SegmentKind.PICK_UP: ("pick-up", "#59a14f"),
+    SegmentKind.TRANSPORT: ("transport", "#4e79a7"),
+    SegmentKind.DROP_OFF: ("drop-off", "#f28e2b"),
+}
+INTENDED, PEAK, CUT = "#c8102e", "#4e79a7", "0.35"
+SHADES: Final = ("white", "0.75", "0.4")
+"""From the weakest level to the strongest; the intended tones must stand out."""
+N_SHADES: Final = 25
+"""One per 2 dB: steps that the eye hardly sees halve the file."""
+DASHES: Final = (0, (4, 3))
+LABELS: Final = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
+"""Every how many batches one is numbered."""
+LABEL_PART: Final = (0.008, 0.0067)
+"""The space beside a number, and the width of a digit, as parts of the picture's width."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WaveformDrawing:
+    """What is drawn.
+
+    Attributes:
+        title: Stands at the top.
+        source: Where the plan comes from; stands below it.
+        notes: What stands above the row axis and above the column axis.
+        program: The tones that are intended.
+        renderer: Makes the samples.
+        segments: The segments of the program that are drawn; at least one has tones.
+        rf: What drives the AODs.
+    """
+
+    title: str
+    source: str
+    notes: tuple[str, str]
+    program: ToneProgram
+    renderer: Renderer
+    segments: range
+    rf: RfSpec
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Timeline:
+    """Where the segments with tones are in the picture, the pauses between them left out.
+
+    Attributes:
+        on: Their indices in the program.
+        at_s: float64 (n + 1,), where each starts in the picture, and the end.
+        stretches: The same in samples.
+    """
+
+    on: list[int]
+    at_s: Floats
+    stretches: WaveformPieces
+
+
+def save_waveform(path: Path, drawing: WaveformDrawing) -> None:
+    """Draw spectrogram and envelope of both axes, with the intended tones on top.
+
+    Args:
+        path: The PNG file.
+        drawing: What is drawn.
+
+    Raises:
+        ConfigError: The file cannot be written.
+    """
+    told = {"Title": drawing.title, "Software": None}
+    save_figure(path, lambda: _draw(drawing), dpi=DPI, metadata=told)
+
+
+def _draw(drawing: WaveformDrawing) -> Figure:
+    program, timeline = drawing.program, _lay_out(drawing)
+    figure = make_figure(*SIZE_IN)
+    figure.set_layout_engine("constrained", rect=(0.0, 0.0, 1.0, HEAD_BELOW))
+    panels: list[Axes] = list(
+        figure.subplots(len(HEIGHTS), 1, sharex=True, gridspec_kw={"height_ratios": HEIGHTS})
+    )
+    _draw_batches(panels[0], program, timeline)
+    images: list[Any] = []
+    for channel, name in enumerate(("row", "column")):
+        above, below = panels[1 + 2 * channel : 3 + 2 * channel]
+        images.append(_draw_spectrogram(above, drawing, channel, timeline))
+        above.set_title(drawing.notes[channel], fontsize=8, loc="left", pad=3)
+        above.set_ylabel(f"{name} tones / MHz")
+        _draw_envelope(below, drawing, channel, timeline)
+        below.set_ylabel(f"{name} axis\npeak / V")
+    strongest_db = max(float(image.get_array().max()) for image in images)
+    top_db = 5 * np.ceil(strongest_db / 5)
+    for image in images:
+        image.set_clim(top_db - RANGE_DB, top_db)
+    bar = figure.colorbar(images[0], ax=panels[1:], pad=0.01, aspect=40)
+    bar.set_label("samples: level / dB of a tone at full scale")
+    left_out = " (vertical lines: pauses left out)" if _cuts(program, timeline) else ""
+    panels[-1].set_xlabel(f"playing time with tones on / ms{left_out}")
+    panels[-1].set_xlim(0.0, 1e3 * float(timeline.at_s[-1]))
+    _write_head(figure, drawing)
+    return figure
+
+
+def _write_head(figure: Figure, drawing: WaveformDrawing) -> None:
+    """The title, and what lines and colours stand for."""
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    plain: dict[str, Any] = {"va": "top", "parse_math": False}  # a file may be called $x$
+    figure.text(0.01, 0.99, drawing.title, fontsize=11, **plain)
+    figure.text(0.01, 0.965, drawing.source, fontsize=8, color="0.4", **plain)
+    handles: list[Any] = [Patch(color=colour, label=label) for label, colour in KINDS.values()]
+    handles += [
+        Line2D([], [], color=INTENDED, linewidth=1, linestyle=DASHES, label="intended tone"),
+        Line2D([], [], color="black", linewidth=0.8, linestyle=":", label="edge of the AOD's band"),
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), fontsize=8, frameon=False)
+
+
+def _lay_out(drawing: WaveformDrawing) -> _Timeline:
+    program, first = drawing.program, drawing.renderer.first_sample
+    on = [i for i in drawing.segments if program.kind[i] != SegmentKind.IDLE]
+    at_s = np.concatenate([[0.0], np.cumsum(program.duration_s[on])])
+    return _Timeline(on, at_s, WaveformPieces.of([(int(first[i]), int(first[i + 1])) for i in on]))
+
+
+def _cuts(program: ToneProgram, timeline: _Timeline) -> list[float]:
+    """Where a pause was left out, in ms."""
+    pairs = enumerate(pairwise(timeline.on), start=1)
+    return [1e3 * float(timeline.at_s[k]) for k, (a, b) in pairs if program.duration_s[a + 1 : b].sum() > 0.0]
+
+
+def _draw_batches(axes: Axes, program: ToneProgram, timeline: _Timeline) -> None:
+    """A strip that says which batch plays, and what it does."""
+    at_ms, on = 1e3 * timeline.at_s, np.array(timeline.on)
+    for kind, (_, colour) in KINDS.items():
+        its = np.flatnonzero(program.kind[on] == kind)
+        spans = list(zip(at_ms[its], np.diff(at_ms)[its], strict=True))
+        axes.broken_barh(spans, (0.0, 1.0), facecolors=colour, linewidth=0)
+    batch = program.batch[on]
+    starts = np.flatnonzero(np.diff(batch, prepend=-1))
+    edges = np.append(at_ms[starts], at_ms[-1])
+    middles, numbers = (edges[1:] + edges[:-1]) / 2, batch[starts] + 1
+    for x in edges[1:-1]:
+        axes.axvline(x, color="white", linewidth=0.8)
+    needed = (LABEL_PART[0] + LABEL_PART[1] * len(str(numbers[-1]))) * at_ms[-1]
+    every = next((n for n in LABELS if _fit(middles[numbers % n == 0], needed)), LABELS[-1])
+    for x, number in zip(middles, numbers, strict=True):
+        if number % every == 0:
+            axes.text(x, 1.15, str(number), fontsize=7, ha="center", va="bottom", clip_on=True)
+    axes.set_ylim(0.0, 2.2)
+    axes.set_axis_off()
+    axes.text(-0.005, 0.75, "batch", fontsize=8, ha="right", va="center", transform=axes.transAxes)
+
+
+def _fit(places: Floats, needed: float) -> bool:
+    """Whether things at these places have as much room as each needs."""
+    return len(places) < 2 or float(np.diff(places).min()) >= needed
+
+
+def _draw_spectrogram(axes: Axes, drawing: WaveformDrawing, channel: int, timeline: _Timeline) -> Any:
+    """Spectrogram of the samples, and the intended tones on top."""
+    from matplotlib.collections import LineCollection
+    from matplotlib.colors import LinearSegmentedColormap
+
+    tones = (drawing.program.row, drawing.program.column)[channel]
+    lines = tone_lines(drawing.program, tones, timeline.on, timeline.at_s)
+    hz = np.concatenate([line[:, 1] for line in lines])
+    low_hz, high_hz = float(hz.min()) - MARGIN_HZ, float(hz.max()) + MARGIN_HZ
+    n_columns = min(N_COLUMNS, timeline.stretches.n_samples)
+    level_db, edges_hz = spectrogram(
+        drawing.renderer, channel, timeline.stretches, n_columns, (low_hz, high_hz)
+    )
+    extent = 0.0, 1e3 * float(timeline.at_s[-1]), 1e-6 * edges_hz[0], 1e-6 * edges_hz[1]
+    shades = LinearSegmentedColormap.from_list("samples", SHADES, N=N_SHADES)
+    image = axes.imshow(
+        level_db, extent=extent, origin="lower", aspect="auto", cmap=shades, interpolation="nearest"
+    )
+    shown = [line * (1e3, 1e-6) for line in lines]
+    axes.add_collection(LineCollection(shown, colors=INTENDED, linewidths=0.7, linestyles=[DASHES]))
+    for edge_hz in (drawing.rf.row_band_hz, drawing.rf.column_band_hz)[channel]:
+        axes.axhline(1e-6 * edge_hz, color="black", linewidth=0.8, linestyle=":")
+    _mark_cuts(axes, drawing.program, timeline)
+    axes.set_ylim(1e-6 * low_hz, 1e-6 * high_hz)
+    return image
+
+
+def tone_lines(program: ToneProgram, tones: AxisTones, on: list[int], at_s: Floats) -> list[Floats]:
+    """Lines of the intended tones of an axis: time in the picture in s, frequency in Hz.
+
+    Args:
+        program: The tone program.
+        tones: Its tones of the axis.
+        on: The segments that are drawn.
+        at_s: Where each starts in the picture, and the end.
+
+    Returns:
+        One float64 (n_points, 2) per tone and segment.
+    """
+    lines: list[Floats] = []
+    for k, i in enumerate(on):
+        course = FrequencyCourse(int(program.course[i]))
+        n_points = 2 if course is FrequencyCourse.LINEAR else N_POINTS
+        u = np.linspace(0.0, 1.0, n_points)
+        s = np.array([course.fraction(float(x)) for x in u])
+        t_s = at_s[k] + u * (at_s[k + 1] - at_s[k])
+        for n in range(tones.offsets[i], tones.offsets[i + 1]):
+            hz = tones.start_hz[n] + (tones.end_hz[n] - tones.start_hz[n]) * s
+            lines.append(np.stack([t_s, hz], axis=1))
+    return lines
+
+
+def _draw_envelope(axes: Axes, drawing: WaveformDrawing, channel: int, timeline: _Timeline) -> None:
+    n_columns = max(1, min(N_COLUMNS, int(timeline.at_s[-1] / ENVELOPE_S)))
+    volts = drawing.rf.full_scale_v * envelope(drawing.renderer, channel, timeline.stretches, n_columns)
+    edges_ms = np.linspace(0.0, 1e3 * timeline.at_s[-1], n_columns + 1)
+    axes.stairs(volts, edges_ms, fill=True, color=PEAK)
+    _mark_cuts(axes, drawing.program, timeline)
+    axes.set_ylim(0.0, 1.1 * float(volts.max()) or 1.0)
+
+
+def _mark_cuts(axes: Axes, program: ToneProgram, timeline: _Timeline) -> None:
+    cuts = _cuts(program, timeline)
+    for x in cuts:
+        axes.axvline(x, color=CUT, linewidth=0.5 * min(1.0, 40 / len(cuts)), linestyle=(0, (2, 2)))

@@ -1,0 +1,1 @@
+"""Runs taken one after the other."""

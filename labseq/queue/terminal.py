@@ -1,0 +1,137 @@
+"""What `labseq queue` prints."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from labseq.cli.run import run_session
+from labseq.config.messages import clean
+from labseq.console.errors import excerpt, exit_code_of, report
+from labseq.console.output import columns, plural, say
+from labseq.queue.queue import Entry, Opening, Queue, QueueRun
+from labseq.recording import data_root
+from labseq.recording.durable import dumps
+from labseq.session import Options
+
+_HEADER = ("id", "state", "sequence", "added", "options")
+
+
+def add_entry(sequence: Path, options: Options) -> None:
+    """Check a sequence and add it to the queue.
+
+    Raises:
+        LabseqError: Something is wrong with it; nothing is added.
+    """
+    entry, checked = Queue(data_root()).add(sequence, options)
+    for warning in checked.warnings:
+        say(f"warning: {warning}", *excerpt(warning), stream=sys.stderr)
+    say(f"{entry.id}: {clean(str(sequence))}, {plural(checked.n_shots, 'shot')}, as it is written now")
+
+
+def list_entries(*, as_json: bool) -> None:
+    """Print the entries of the queue, in order.
+
+    Raises:
+        RecordingError: One is damaged.
+    """
+    queue = Queue(data_root())
+    entries = queue.entries()
+    if as_json:
+        say(dumps({"entries": [_as_values(entry) for entry in entries]}))
+        return
+    holder = queue.holder()
+    notes = [note for entry in entries for note in _notes(entry)]
+    table = columns([_HEADER, *map(_row, entries)], right=(0,)) if entries else ["the queue is empty"]
+    say(*table, *([""] if notes else []), *notes, *([] if holder is None else ["", f"at work: {holder}"]))
+
+
+def remove_entries(ids: Sequence[int]) -> None:
+    """Take entries out of the queue.
+
+    Raises:
+        ConfigError: There is no such entry, or it is running.
+    """
+    Queue(data_root()).remove(ids)
+
+
+def move_entry(number: int, before: int) -> None:
+    """Put an entry before another one.
+
+    Raises:
+        ConfigError: There is no such entry.
+    """
+    Queue(data_root()).move(number, before)
+
+
+def run_entries(*, keep_going: bool, watch: bool) -> int:
+    """Run what is queued.
+
+    Returns:
+        The exit code: that of the first entry that failed, or 0.
+
+    Raises:
+        LabseqError: Whatever ended a run; or somebody else runs the queue.
+    """
+
+    def take(opening: Opening) -> None:
+        run_session(opening, as_json=False)
+
+    runs = QueueRun(Queue(data_root()), take, _report, report, keep_going=keep_going)
+    runs.run(watch=watch)
+    return 0 if runs.first_error is None else exit_code_of(runs.first_error)
+
+
+def _report(entry: Entry) -> None:
+    again = f", goes on with {entry.run_dir}" if entry.run_dir is not None else ""
+    say(f"queue: {entry.id} {clean(str(entry.sequence))}{again}")
+
+
+def _row(entry: Entry) -> tuple[str, ...]:
+    added = f"{datetime.fromisoformat(entry.added_utc).astimezone():%Y-%m-%d %H:%M}"
+    return (
+        str(entry.id),
+        entry.state,
+        clean(_short(entry.sequence)),
+        added,
+        clean(_options_text(entry.options)),
+    )
+
+
+def _options_text(options: Options) -> str:
+    changes = options.changes()
+    return ", ".join(f"{address}={value}" for address, value in changes.items())
+
+
+def _short(path: Path) -> str:
+    """The path from here, where it is below."""
+    return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else str(path)
+
+
+def _notes(entry: Entry) -> list[str]:
+    notes: list[str] = []
+    if entry.has_changed and not entry.is_complete:
+        what = "has been changed or removed since; what it said then is run"
+        notes.append(f"{entry.id}: {clean(_short(entry.sequence))} {what}")
+    if entry.error:
+        notes.append(f"{entry.id}: {entry.error.splitlines()[0]}")
+    if entry.state in {"stopped", "failed"} and entry.run_dir is not None:
+        notes.append(f"{entry.id}: labseq resume {entry.run_dir}")
+    return notes
+
+
+def _as_values(entry: Entry) -> dict[str, Any]:
+    return {
+        "id": entry.id,
+        "state": entry.state,
+        "sequence": str(entry.sequence),
+        "changed": entry.has_changed,
+        "added_utc": entry.added_utc,
+        "options": {key: str(v) if isinstance(v, Path) else v for key, v in asdict(entry.options).items()},
+        "run_dir": None if entry.run_dir is None else str(entry.run_dir),
+        "error": entry.error or None,
+    }

@@ -1,0 +1,1 @@
+"""`labseq new` and the schemas of files for editors."""

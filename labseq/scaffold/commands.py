@@ -1,0 +1,95 @@
+"""`labseq new` and `labseq schema`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Final
+
+import typer
+
+from labseq.console.options import file_kinds, new_kinds, profile_names
+
+NEW_EXAMPLES: Final = """\b
+Examples:
+  labseq new sequence first
+  labseq new planner spiral
+  labseq new camera mycam --package
+"""
+SCHEMA_EXAMPLES: Final = """\b
+Examples:
+  labseq schema sequence -o .labseq/sequence.schema.json
+  labseq schema profile --plugins my_plugins
+"""
+
+
+def new(
+    kind: Annotated[
+        str,
+        typer.Argument(
+            metavar="KIND",
+            help=f"What to make: {', '.join(new_kinds(''))}.",
+            show_default=False,
+            autocompletion=new_kinds,
+        ),
+    ],
+    name: Annotated[
+        str,
+        typer.Argument(metavar="NAME", help="Its name, for sequences and profiles.", show_default=False),
+    ],
+    package: Annotated[
+        bool,
+        typer.Option("--package", help="Make a plugin a Python package of its own, to be installed."),
+    ] = False,
+    profile: Annotated[
+        str | None,
+        typer.Option(
+            "--profile",
+            "-p",
+            metavar="NAME|FILE",
+            help="Profile that a new sequence runs on.",
+            autocompletion=profile_names,
+        ),
+    ] = None,
+    folder: Annotated[
+        Path,
+        typer.Option(
+            metavar="DIR", help="Folder of your sequences and profiles; the current one by default."
+        ),
+    ] = Path(),
+) -> None:
+    """Make a plugin, a sequence or a profile that runs at once.
+
+    A plugin goes into the folder `plugins`: the plugin, its settings, tests of the promises of its role, a
+    README. New sequences and profiles look there. Nothing that exists is changed.
+    """
+    from labseq.scaffold.terminal import make_new
+
+    make_new(kind, name, folder, package=package, profile=profile)
+
+
+def schema(
+    kind: Annotated[
+        str,
+        typer.Argument(
+            metavar="KIND",
+            help="Kind of file: sequence or profile.",
+            show_default=False,
+            autocompletion=file_kinds,
+        ),
+    ],
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="FILE", help="Write it there instead of stdout.")
+    ] = None,
+    plugins: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="DIR",
+            help="Folder of plugins whose settings belong to it; may be given several times. Default: the "
+            "folder plugins, if there is one.",
+        ),
+    ] = None,
+) -> None:
+    """Write the JSON schema of sequences or profiles, with the settings of every plugin, for editors."""
+    from labseq.scaffold.terminal import write_schema
+
+    write_schema(kind, output, plugins)

@@ -1,0 +1,86 @@
+"""What `labseq new` and `labseq schema` print."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+
+from labseq.config.messages import clean, did_you_mean, listing
+from labseq.console.output import say, write_text
+from labseq.errors import ConfigError, Problem
+from labseq.registry import KINDS
+from labseq.scaffold.new import FILE_KINDS, PLUGINS, CreatedFiles, make_file, make_plugin
+from labseq.scaffold.schemas import SCHEMA_FOLDER, schema_text
+from labseq.session import load_plugins
+
+
+def make_new(kind: str, name: str, folder: Path, *, package: bool, profile: str | None) -> None:
+    """Make it and say so.
+
+    Args:
+        kind: A kind of plugin, "sequence" or "profile".
+        name: Its name.
+        folder: Folder of the sequences and profiles.
+        package: Whether a plugin shall be a distribution of its own.
+        profile: Profile that a sequence runs on.
+
+    Raises:
+        ConfigError: The name cannot be or is taken, an option does not go with the kind, or something
+            cannot be written.
+    """
+    if kind not in (*KINDS, *FILE_KINDS):
+        known = (*KINDS, *FILE_KINDS)
+        what = f"there is no kind '{clean(kind)}'"
+        raise ConfigError(Problem(what, expected=listing(known), hint=did_you_mean(kind, known)))
+    if package and kind in FILE_KINDS:
+        raise ConfigError(Problem(f"--package does not go with a {kind}", hint="leave it out"))
+    if profile is not None and kind != "sequence":
+        raise ConfigError(Problem(f"--profile does not go with a {_called(kind)}", hint="leave it out"))
+    if kind in KINDS:
+        made = make_plugin(kind, name, folder, package=package)
+    else:
+        made = make_file(kind, name, folder, profile=profile or "virtual")
+    say(*lines_of(kind, name, made))
+
+
+def lines_of(kind: str, name: str, made: CreatedFiles) -> list[str]:
+    """What is printed.
+
+    Example:
+        >>> lines_of("sequence", "a", Made(Path("a.yaml"), (Path("a.yaml"),), ("labseq run a.yaml",)))
+        ['made the sequence a:', '  a.yaml', '', 'go on with', '  labseq run a.yaml']
+    """
+    files = [f"  {path}" for path in made.files]
+    return [f"made the {_called(kind)} {name}:", *files, "", "go on with", *(f"  {c}" for c in made.commands)]
+
+
+def _called(kind: str) -> str:
+    return kind.replace("_", " ")
+
+
+def write_schema(kind: str, output: Path | None, plugins: Sequence[Path] | None) -> None:
+    """Write the schema to a file, or print it.
+
+    Args:
+        kind: "sequence" or "profile".
+        output: The file; None prints it.
+        plugins: Folders of plugins; None for the folder ``plugins``, if there is one.
+
+    Raises:
+        ConfigError: There is no such kind or folder, or the file cannot be written.
+    """
+    if kind not in FILE_KINDS:
+        what = f"there is no schema of a '{clean(kind)}'"
+        raise ConfigError(Problem(what, expected=listing(FILE_KINDS), hint=did_you_mean(kind, FILE_KINDS)))
+    if plugins is None:
+        plugins = [Path(PLUGINS)] if Path(PLUGINS).is_dir() else []
+    text = schema_text(kind, load_plugins(plugins).registry)
+    if output is None:
+        say(text.rstrip())
+        return
+    if output.parent.name == SCHEMA_FOLDER:  # where new files look for it
+        with suppress(OSError):  # the writing tells of it
+            output.parent.mkdir(exist_ok=True)
+    write_text(output, text)
+    say(f"wrote {output}")

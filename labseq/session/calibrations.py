@@ -1,0 +1,232 @@
+"""The calibrations that a profile uses, and what they change in it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from shlex import quote
+from typing import Any, Final, Literal
+
+from labseq.calibration.store import Store, Stored, check_grid
+from labseq.config import Document, ProblemCollector, ProfileSpec, load_profile, profile_dir
+from labseq.config.profile import OFF
+from labseq.errors import ConfigError, LimitError
+from labseq.model import CALIBRATION_KINDS, CalibrationEntry, CalibrationKind, SiteGrid
+from labseq.motion import standing_on_sites
+from labseq.registry import VIRTUAL_TWIN
+
+FOLDER: Final = "calibrations"
+DRY_RUN_FOLDER: Final = "dry-run"
+"""Within a store: that of dry runs, because what is measured on virtual atoms is not true of real ones."""
+
+BASIS: Final[Mapping[CalibrationKind, CalibrationKind]] = {"overlay": "frequencies", "thresholds": "sites"}
+"""Kind -> the kind that it was measured on top of: without that one it says nothing, or less."""
+
+
+PLACES: Final = frozenset({"threshold", "width", "sites", "frame", "centre_px", "angle"})
+"""Settings of detectors that do not change what is compared with a threshold, where sites are calibrated."""
+
+
+@dataclass(frozen=True, slots=True)
+class ActiveCalibrations:
+    """A profile's calibrations in use.
+
+    Attributes:
+        entries: Kind -> entry.
+        grid: The grid, with the tones that they give.
+        warnings: What the user should know although it is no error.
+    """
+
+    entries: Mapping[str, CalibrationEntry]
+    grid: SiteGrid
+    warnings: tuple[str, ...] = ()
+
+
+def store_of(
+    document: Document, profile: ProfileSpec, dry_run: Literal["off", "full", "fast"] = "off"
+) -> Store:
+    """The store of a profile.
+
+    Args:
+        document: The profile's file.
+        profile: What it says.
+        dry_run: "off", "full" or "fast"; a profile of virtual devices alone is the same lab in a dry run.
+    """
+    folder = profile.calibrations.folder or profile_dir(document.path) / FOLDER / document.path.stem
+    choices = [profile.camera, profile.static_tweezers, profile.mobile_tweezers, *profile.devices.values()]
+    is_other = dry_run != "off" and any(not choice.use.startswith(VIRTUAL_TWIN) for choice in choices)
+    return Store(Path(folder) / DRY_RUN_FOLDER if is_other else Path(folder))
+
+
+def open_store(profile: str, dry_run: Literal["off", "full", "fast"] = "off") -> tuple[Store, ProfileSpec]:
+    """The store of a profile, and what the profile says.
+
+    Args:
+        profile: Name or path of the profile.
+        dry_run: "off", "full" or "fast".
+
+    Raises:
+        ConfigError: The profile is wrong, or does not exist.
+    """
+    document, spec = load_profile(profile, beside=Path())
+    return store_of(document, spec, dry_run), spec
+
+
+def calibrated(
+    document: Document,
+    profile: ProfileSpec,
+    found: ProblemCollector,
+    dry_run: Literal["off", "full", "fast"] = "off",
+    detector: Mapping[str, Any] | None = None,
+    pins: Mapping[str, str] | None = None,
+) -> ActiveCalibrations:
+    """Read the calibrations that a profile goes by, and apply those of the tones.
+
+    Args:
+        document: The profile's file.
+        profile: What it says.
+        found: Where the problems go; a calibration that has one is not used.
+        dry_run: "off", "full" or "fast".
+        detector: Settings of the detector in use, for the record; None where they do not matter.
+        pins: The ids of those that count, by kind, and no others; None for what profile and store say.
+    """
+    grid, store = profile.grid_model(), store_of(document, profile, dry_run)
+    entries: dict[str, CalibrationEntry] = {}
+    if pins is None and any(profile.calibrations.use.of(kind) is None for kind in CALIBRATION_KINDS):
+        try:
+            store.active()
+        except ConfigError as error:  # told once, not for each kind
+            found.add(error)
+            return ActiveCalibrations(entries, grid)
+    for kind in CALIBRATION_KINDS:
+        with found:
+            if pins is None:
+                stored = _chosen(document, profile, store, kind)
+            else:
+                stored = store.find(pins[kind], kind) if kind in pins else None
+            if stored is not None:
+                check_grid(stored.entry, grid, str(stored.path))
+                entries[kind] = stored.entry
+    warnings = [*_dropped(entries), *_doubtful(entries, detector or {})]
+    tones = grid
+    with found:
+        tones = _with_tones(document, grid, entries)
+    return ActiveCalibrations(entries, tones, tuple(warnings))
+
+
+def calibrated_grid(document: Document, profile: ProfileSpec) -> SiteGrid:
+    """The grid of a profile, with the tones that its calibrations give.
+
+    Raises:
+        ConfigError: A calibration that it goes by cannot be used.
+    """
+    found = ProblemCollector()
+    grid = calibrated(document, profile, found).grid
+    found.raise_any()
+    return grid
+
+
+def with_tones(resolved: dict[str, Any], grid: SiteGrid, own: SiteGrid) -> dict[str, Any]:
+    """The ``grid`` of a profile for the record, with the tones in use where calibrations changed them.
+
+    Args:
+        resolved: As the profile has it.
+        grid: The grid in use.
+        own: The profile's own grid.
+    """
+    axes = (
+        ("row_frequency", grid.row_frequency_hz, own.row_frequency_hz),
+        ("column_frequency", grid.column_frequency_hz, own.column_frequency_hz),
+    )
+    changed = {
+        name: {**resolved[name], "table": tones.tolist()}
+        for name, tones, before in axes
+        if tones.tolist() != before.tolist()
+    }
+    return {**resolved, **changed}
+
+
+def _chosen(document: Document, profile: ProfileSpec, store: Store, kind: CalibrationKind) -> Stored | None:
+    """The entry of a kind that the profile goes by.
+
+    Raises:
+        ConfigError: It is missing or damaged.
+    """
+    pin = profile.calibrations.use.of(kind)
+    if pin == OFF:
+        return None
+    try:
+        return store.entry_in_use(kind) if pin is None else store.find(pin, kind)
+    except ConfigError as error:
+        where = document.problem(("calibrations", "use", kind), "").source
+        note = (
+            f"it is in use as the calibration '{kind}'; "
+            f"'labseq calibration use {kind}=off --profile {quote(document.name)}' puts it aside"
+            if pin is None
+            else f"asked for by the key 'calibrations.use.{kind}' of {where or document.name}"
+        )
+        raise ConfigError([replace(one, notes=(*one.notes, note)) for one in error.problems]) from error
+
+
+def why_left_out(entry: CalibrationEntry, entries: Mapping[str, CalibrationEntry]) -> str:
+    """Why runs would leave out a calibration although it is in use; "" if they would not.
+
+    Args:
+        entry: The calibration.
+        entries: Kind -> those that count beside it.
+    """
+    if entry.kind != "overlay" or _stands_on(entry, entries):
+        return ""
+    return "it was measured with other frequencies of the mobile tweezers"
+
+
+def _dropped(entries: dict[str, CalibrationEntry]) -> list[str]:
+    """Leave out an overlay that was measured with other frequencies: their tones hold it already, or not."""
+    overlay = entries.get("overlay")
+    if overlay is None or not (reason := why_left_out(overlay, entries)):
+        return []
+    del entries["overlay"]
+    return [f"calibration overlay {overlay.id} is not used: {reason}; measure it again"]
+
+
+def _doubtful(entries: Mapping[str, CalibrationEntry], detector: Mapping[str, Any]) -> list[str]:
+    """What is used although something else would be better."""
+    thresholds = entries.get("thresholds")
+    if thresholds is None:
+        return []
+    what = f"calibration thresholds {thresholds.id} was measured with"
+    doubts = [] if _stands_on(thresholds, entries) else [f"{what} other sites; measure it again"]
+    then = thresholds.origin.get("detector")
+    if isinstance(then, dict) and then.get("use") == detector.get("use"):
+        other = [
+            key for key, value in detector.items() if key not in PLACES and then.get(key, value) != value
+        ]
+        if other:
+            doubts.append(f"{what} another {', '.join(other)} of the detector; measure it again")
+    return doubts
+
+
+def _stands_on(entry: CalibrationEntry, entries: Mapping[str, CalibrationEntry]) -> bool:
+    """Whether what an entry was measured on top of is in use."""
+    basis = BASIS[entry.kind]
+    now = entries[basis].id if basis in entries else None
+    then = entry.origin.get("calibrations")
+    return (then.get(basis) if isinstance(then, dict) else None) == now
+
+
+def _with_tones(document: Document, grid: SiteGrid, entries: Mapping[str, CalibrationEntry]) -> SiteGrid:
+    """Apply frequencies, then overlay.
+
+    Raises:
+        ConfigError: A tone makes no sense.
+    """
+    if (frequencies := entries.get("frequencies")) is not None:
+        row_hz, column_hz = frequencies.values["row_hz"], frequencies.values["column_hz"]
+        grid = replace(grid, row_frequency_hz=row_hz, column_frequency_hz=column_hz)
+    if (overlay := entries.get("overlay")) is not None:
+        try:
+            grid = standing_on_sites(grid, overlay.values["offset_m"])
+        except LimitError as error:
+            raise document.error(("calibrations",), f"calibration overlay {overlay.id}: {error}") from error
+    return grid

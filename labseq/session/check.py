@@ -1,0 +1,316 @@
+"""`labseq check`: everything that can be known of a run without opening a device."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq.errors import LabseqError, Problem
+from labseq.model import TimelineEntry
+from labseq.motion import check_plan
+from labseq.roles import ReportsLoading, Step
+from labseq.sequencer import Guard, StopFlag
+from labseq.sequencer.guard import lay_out
+from labseq.sequencer.lab import Lab
+from labseq.sequencer.leading import FollowStep, find_leader
+from labseq.sequencer.lines import spans_on
+from labseq.session.assembly import Assembly
+from labseq.session.session import Session, check_commands
+from labseq.units import format_quantity
+
+
+def timeout_warnings(
+    assembly: Assembly, timeline: Sequence[tuple[str, Sequence[TimelineEntry]]]
+) -> list[Problem]:
+    """Steps that may need longer than the timeout of their policy.
+
+    Args:
+        assembly: The run.
+        timeline: Name of each step and its bars.
+    """
+    problems: list[Problem] = []
+    for spec, policy, (_, bars) in zip(assembly.sequence.shot, assembly.policy.steps, timeline, strict=True):
+        longest_s = sum(bar.duration_s for bar in bars)
+        if longest_s > policy.timeout_s:
+            longest = format_quantity(longest_s, "time")
+            what = f"the step takes up to {longest}, longer than its timeout of "
+            what += format_quantity(policy.timeout_s, "time")
+            place = (*spec.policy_loc, "timeout")
+            problems.append(assembly.document.problem(place, what, f"more than {longest}"))
+    return problems
+
+
+N_LOADINGS: Final = 200
+"""Random loadings that the planner is tried on."""
+MAX_WAIT_S: Final = 5.0
+"""Host time after which no further loading is tried."""
+PAPERS_LOADING: Final = 0.75
+"""Loading probability where the profile has no simulation that tells it."""
+SHOT_OVERHEAD_BYTES: Final = 60_000
+"""Size of a shot file without frames, roughly."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rehearsal:
+    """What the planner made of random loadings.
+
+    Attributes:
+        n_loadings: How many were tried.
+        n_filled: How many had atoms enough, and a plan that meets the target.
+        duration_s: float64 (n_loadings,), from the start of a cycle to the end of its last batch.
+        first_batch_s: float64 (n_loadings,), the same for its first batch.
+    """
+
+    n_loadings: int
+    n_filled: int
+    duration_s: NDArray[np.float64]
+    first_batch_s: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class CheckReport:
+    """What a run will do and need.
+
+    Attributes:
+        timeline: Name of each step and its bars; of a scan, as all else but ``run_s``, at its first point.
+        n_shots: Shots of the run.
+        n_points: Points of the scan that these shots are at; None without a scan.
+        run_s: Duration of the run, at least and at most.
+        warnings: What is allowed but hardly meant, with its place in the files.
+        rehearsal: What the planner made of random loadings; None without a rearrangement.
+        shot_bytes: Size of a shot on disk at most; None if the camera does not tell its frames.
+        lines: Name of each line -> when it is on in the longest shot, as (start, end) in seconds.
+    """
+
+    timeline: Sequence[tuple[str, Sequence[TimelineEntry]]]
+    n_shots: int
+    n_points: int | None
+    run_s: tuple[float, float]
+    warnings: tuple[Problem, ...]
+    rehearsal: Rehearsal | None
+    shot_bytes: int | None
+    lines: Mapping[str, Sequence[tuple[float, float]]] = field(default_factory=dict[str, Any])
+
+    @property
+    def bars(self) -> list[TimelineEntry]:
+        """The bars of all steps."""
+        return [bar for _, bars in self.timeline for bar in bars]
+
+    @property
+    def longest_shot_s(self) -> float:
+        """Duration of a shot that uses every cycle and window."""
+        return sum(bar.duration_s for bar in self.bars)
+
+    @property
+    def shortest_shot_s(self) -> float:
+        """Duration of a shot that leaves out what it may leave out."""
+        return sum(bar.min_duration_s for bar in self.bars)
+
+    @property
+    def n_images(self) -> int:
+        """Images of a shot at most."""
+        return sum(bar.n_images for bar in self.bars)
+
+
+def check(session: Session) -> CheckReport:
+    """Find out what a run will do and need; nothing is opened.
+
+    Args:
+        session: An opened session; its sequence and profile have no errors.
+
+    Raises:
+        ConfigError: A step sends a command that its device does not know.
+    """
+    assembly = session.assembly
+    check_commands(assembly, session.course.each(), session.build_lab)
+    lab = session.build_lab()
+    timeline = session.timeline()
+    windows = _windows(assembly.steps)
+    if windows:
+        session.warm(lab, devices=False)
+    rehearsal, failure = _rehearse(lab) if windows else (None, "")
+    warnings = [Problem(text) for text in assembly.warnings]
+    document = assembly.document
+    if failure:
+        warnings.append(document.problem((*assembly.sequence.planner.loc, "use"), failure))
+    if rehearsal is not None:
+        warnings += _window_warnings(session, windows, rehearsal)
+    warnings += _exposure_warnings(session, lab, timeline)
+    warnings += _judgement_warnings(session, [number for number, _ in windows])
+    warnings += _parallelism_warnings(session)
+    warnings += _deadline_warnings(session, lab, timeline)
+    warnings += timeout_warnings(assembly, timeline)
+    for point in session.course.representative_labs():
+        session.build_lab(point)  # whether the constructors accept the settings
+    warnings += [Problem(text) for text in assembly.bench.host.notes]
+    return CheckReport(
+        timeline,
+        assembly.sequence.shots,
+        None if assembly.scanned is None else session.course.n_points,
+        _run_s(session, lab),
+        tuple(warnings),
+        rehearsal,
+        _shot_bytes(session, lab, timeline),
+        spans_on(lab.line_specs, (bar for _, bars in timeline for bar in bars)),
+    )
+
+
+def _run_s(session: Session, lab: Lab) -> tuple[float, float]:
+    """Least and most duration of the run, each shot at its own point of the scan, or at any corner of it."""
+    guard = Guard(StopFlag())
+    min_duration_s, most_s = list[float](), list[float]()
+    for point, n in session.course.counted():
+        context = replace(lab.step_context, motion=point.bench.profile.motion)
+        bars = [
+            bar
+            for i, (name, step) in enumerate(point.steps)
+            for bar in guard.call("step", lab.timeouts.call_s, lay_out, step, i, name, context)
+        ]
+        min_duration_s.append(n * sum(bar.min_duration_s for bar in bars))
+        most_s.append(n * sum(bar.duration_s for bar in bars))
+    guard.end()
+    return (
+        (min(min_duration_s), max(most_s))
+        if session.course.is_adaptive
+        else (sum(min_duration_s), sum(most_s))
+    )
+
+
+def _windows(steps: Sequence[tuple[str, Step]]) -> list[tuple[int, list[float]]]:
+    """Step number and window per cycle, of each rearrangement."""
+    found: list[tuple[int, list[float]]] = []
+    for number, (_, step) in enumerate(steps):
+        settings: Any = getattr(step, "settings", None)
+        if hasattr(settings, "window_of"):
+            cycles = range(1, settings.cycles + 1)
+            found.append((number, [float(settings.window_of(cycle)) for cycle in cycles]))
+    return found
+
+
+def _rehearse(lab: Lab) -> tuple[Rehearsal | None, str]:
+    """Plan for random loadings; what the planner does wrong is told, not raised."""
+    loading = (
+        lab.simulation.loading_probability if isinstance(lab.simulation, ReportsLoading) else PAPERS_LOADING
+    )
+    rng, guard = np.random.default_rng(0), Guard(StopFlag())
+    durations, firsts, n_filled = list[float](), list[float](), 0
+    deadline = time.monotonic() + MAX_WAIT_S
+    try:
+        while len(durations) < N_LOADINGS and time.monotonic() < deadline:
+            occupancy = rng.random(lab.grid.shape) < loading
+            plan = guard.call("planner", lab.timeouts.plan_s, lab.planner.plan, occupancy.copy(), lab.target)
+            report = check_plan(
+                plan, occupancy, lab.target, lab.degree_of_parallelism, lab.grid, lab.motion, lab.planner_name
+            )
+            n_filled += report.meets_target
+            durations.append(report.duration_s)
+            firsts.append(float(report.batch_end_s[0]) if len(report.batch_end_s) else 0.0)
+    except LabseqError as error:
+        return None, f"on a random loading (75 % of the sites unless the simulation says else): {error}"
+    finally:
+        guard.end()
+    return Rehearsal(len(durations), n_filled, np.array(durations), np.array(firsts)), ""
+
+
+def _window_warnings(
+    session: Session, windows: Sequence[tuple[int, list[float]]], rehearsal: Rehearsal
+) -> list[Problem]:
+    document, sequence = session.assembly.document, session.assembly.sequence
+    problems: list[Problem] = []
+    for number, window_s in windows:
+        loc = (*sequence.shot[number].loc, "window")
+        first, shortest = window_s[0], min(window_s)
+        n_fit = int(np.count_nonzero(rehearsal.duration_s <= first + 1e-9))
+        enough = format_quantity(float(np.quantile(rehearsal.duration_s, 0.95)), "time")
+        if 2 * n_fit < rehearsal.n_loadings:
+            what = f"the first cycle's window of {format_quantity(first, 'time')} is too short for most plans"
+            told = f"{n_fit} of {rehearsal.n_loadings} fit"
+            problems.append(
+                document.problem(loc, f"{what} ({told})", f"about {enough}, which 19 of 20 fit into")
+            )
+        elif shortest < np.median(rehearsal.first_batch_s):
+            what = f"a window of {format_quantity(shortest, 'time')} is over before the first batch is"
+            problems.append(document.problem(loc, what, "more than the overheads of a cycle and a batch"))
+    if rehearsal.n_filled < 0.9 * rehearsal.n_loadings:
+        what = f"only {rehearsal.n_filled} of {rehearsal.n_loadings} loadings allow to fill the target"
+        problems.append(document.problem(sequence.target.loc, what, "a smaller target, or better loading"))
+    return problems
+
+
+def _exposure_warnings(
+    session: Session, lab: Lab, timeline: Sequence[tuple[str, Sequence[TimelineEntry]]]
+) -> list[Problem]:
+    limit_s = lab.step_context.camera.max_exposure_s
+    document, sequence = session.assembly.document, session.assembly.sequence
+    problems: list[Problem] = []
+    for spec, (_, bars) in zip(sequence.shot, timeline, strict=True):
+        longest_s = max((bar.exposure_s for bar in bars), default=0.0)
+        if longest_s > limit_s:
+            what = f"an exposure of {format_quantity(longest_s, 'time')} is more than the camera can do"
+            expected = f"at most {format_quantity(limit_s, 'time')}"
+            problems.append(document.problem((*spec.loc, "exposure"), what, expected))
+    return problems
+
+
+def _judgement_warnings(session: Session, rearrangements: Sequence[int]) -> list[Problem]:
+    """Success is judged on an ``image`` step at the end; cycles that are all made are judged on their own."""
+    assembly = session.assembly
+    images = [n for n, (_, step) in enumerate(assembly.steps) if step.takes_image and n not in rearrangements]
+    if not rearrangements or max(images, default=-1) > rearrangements[-1]:
+        return []
+    settings: Any = getattr(assembly.steps[rearrangements[-1]][1], "settings", None)
+    if getattr(settings, "stop_when", "") == "never":
+        return []
+    loc = assembly.sequence.shot[rearrangements[-1]].loc
+    what = "no image follows the last rearrangement, so the shots are not judged"
+    return [assembly.document.problem(loc, what, "an 'image' step at the end of the shot", key=True)]
+
+
+def _parallelism_warnings(session: Session) -> list[Problem]:
+    assembly = session.assembly
+    asked = getattr(assembly.planner.settings, "degree_of_parallelism", None)
+    limit = assembly.bench.profile.motion.max_tweezers
+    if not isinstance(asked, int) or asked <= limit:
+        return []
+    loc = (*assembly.sequence.planner.loc, "degree_of_parallelism")
+    what = f"degree_of_parallelism is {asked}, but the profile allows {limit} mobile tweezers at once"
+    return [assembly.document.problem(loc, what, f"at most {limit}")]
+
+
+def _deadline_warnings(
+    session: Session, lab: Lab, timeline: Sequence[tuple[str, Sequence[TimelineEntry]]]
+) -> list[Problem]:
+    """What comes after a wait for a leader, up to the next or the end, must fit into its deadline."""
+    problems: list[Problem] = []
+    steps = [step for _, step in session.assembly.steps]
+    for number, step in enumerate(steps):
+        if not isinstance(step, FollowStep):
+            continue
+        name, leader = find_leader(dict(lab.hardware()), step.device)
+        until = next((n for n in range(number + 1, len(steps)) if isinstance(steps[n], FollowStep)), None)
+        longest_s = sum(bar.duration_s for _, bars in timeline[number + 1 : until] for bar in bars)
+        if longest_s > leader.deadline_s:
+            longest = format_quantity(longest_s, "time")
+            what = f"what follows takes up to {longest}, but '{name}' must be answered within "
+            what += format_quantity(leader.deadline_s, "time")
+            loc = (*session.assembly.sequence.shot[number].loc, "for")
+            hint = "raise 'deadline' in the profile, or it is told that the shot failed"
+            problems.append(session.assembly.document.problem(loc, what, hint=hint))
+    return problems
+
+
+def _shot_bytes(
+    session: Session, lab: Lab, timeline: Sequence[tuple[str, Sequence[TimelineEntry]]]
+) -> int | None:
+    shape = lab.step_context.camera.frame_shape
+    n_images = sum(bar.n_images for _, bars in timeline for bar in bars)
+    kept = {"all": n_images, "last": min(1, n_images), "none": 0}[session.assembly.sequence.record_frames]
+    if shape is None and kept:
+        return None
+    return SHOT_OVERHEAD_BYTES + kept * 2 * math.prod(shape or (0,))

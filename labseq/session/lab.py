@@ -1,0 +1,220 @@
+"""From an assembled run to the devices that the sequencer works on, and from one scan point to the next."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from typing import Any, Final
+
+from labseq import motion
+from labseq.config import MotionSettings, ProfileSpec
+from labseq.errors import PlanError
+from labseq.kernel import announcing
+from labseq.model import MotionSpec, RandomStream, TargetPattern
+from labseq.plugins import contained
+from labseq.roles import Clock, NeedsWarmUp, RunObserver
+from labseq.sequencer import Guard, PacedClock, RealClock, StopFlag, VirtualClock
+from labseq.sequencer.lab import Blinding, Lab, Timeouts
+from labseq.session.construct import construct
+from labseq.session.profile import ChosenPlugin, ResolvedProfile, refuse_wrong_wiring
+from labseq.session.scan import Point
+
+DRIVERS_MOTION: Final = frozenset({"rf", "max_row_tones", "max_column_tones", "eject_slots"})
+"""Keys of the motion that the mobile tweezers are opened with; all others are the core's alone."""
+
+
+def clock_for(stop: StopFlag, *, virtual: bool, paced: bool = False) -> Clock:
+    """The clock that a run keeps to.
+
+    Args:
+        stop: The request to stop.
+        virtual: Whether time passes only when somebody waits.
+        paced: Whether virtual time takes as long as it says.
+    """
+    if not virtual:
+        return RealClock(stop)
+    return PacedClock(stop) if paced else VirtualClock(stop)
+
+
+def build_lab(point: Point, target: TargetPattern, clock: Clock, seed: int) -> Lab:
+    """Construct every role's object; nothing is opened.
+
+    Raises:
+        ConfigError: A constructor refuses its settings, or the lines do not go with the devices.
+    """
+    bench = point.bench
+    profile, motion = bench.profile, bench.profile.motion
+    chosen = {**bench.chosen, "planner": point.planner}
+    made, streams = construct(
+        chosen,
+        bench.grid,
+        motion,
+        clock,
+        seed,
+        calibrations=bench.calibrations,
+        world_grid=profile.grid_model(),
+        lines=profile.line_specs,
+    )
+    lab = Lab(
+        grid=bench.grid,
+        motion=motion,
+        target=target,
+        clock=clock,
+        camera=made["camera"],
+        static_tweezers=made["static_tweezers"],
+        mobile_tweezers=made["mobile_tweezers"],
+        detector=made["detector"],
+        planner=made["planner"],
+        planner_name=point.planner.entry.name,
+        degree_of_parallelism=parallelism_of(point.planner, made["planner"], motion),
+        devices={name: made[name] for name in profile.devices},
+        simulation=made.get("simulation"),
+        random_streams=streams,
+        timeouts=timeouts_of(profile),
+        calibrations=bench.calibrations,
+        blinding=_blinding(profile),
+        lines=made.get("lines"),
+        line_specs=profile.line_specs,
+        budgets=profile.budgets.model_dump(),
+    )
+    refuse_wrong_wiring(bench.document, lab)
+    return lab
+
+
+def rebuild_lab(lab: Lab, before: Point, after: Point, seed: int) -> tuple[Lab, frozenset[str]]:
+    """Construct anew what differs between two points; all else stays as it is, open.
+
+    A device of which a setting differs must be closed before and opened after. The mobile
+    tweezers stay open while only such motion differs as they are told with each program. A
+    simulated lab stays open only if nothing of its devices and of the motion differs: its devices hold
+    on to the simulation, and that to the motion.
+
+    Args:
+        lab: As it is at the point before.
+        before: The point that the lab is at.
+        after: The point that it shall be at.
+        seed: The run's seed.
+
+    Returns:
+        The lab, and the names of the devices that must be reopened, "simulation" among them.
+    """
+    reopened = _reopened(lab, before.bench, after.bench)
+    motion = after.bench.profile.motion
+    names = {*reopened, "planner"}
+    if _differs(before.bench, after.bench, "detector"):
+        names.add("detector")
+    chosen = {**after.bench.chosen, "planner": after.planner}
+    made, streams = construct(
+        {name: chosen[name] for name in chosen if name in names},
+        lab.grid,
+        motion,
+        lab.clock,
+        seed,
+        lab.simulation,
+        after.bench.calibrations,
+        after.bench.profile.grid_model(),
+        after.bench.profile.line_specs,
+    )
+    roles = ("camera", "static_tweezers", "mobile_tweezers", "detector", "planner", "lines", "simulation")
+    return replace(
+        lab,
+        **{role: made[role] for role in roles if role in made},
+        devices={name: made.get(name, device) for name, device in lab.devices.items()},
+        motion=motion,
+        planner_name=after.planner.entry.name,
+        degree_of_parallelism=parallelism_of(after.planner, made["planner"], motion),
+        random_streams=_streams(lab.random_streams, streams),
+    ), reopened
+
+
+def _reopened(lab: Lab, before: ResolvedProfile, after: ResolvedProfile) -> frozenset[str]:
+    names = {name for name, _ in lab.hardware()} | ({"simulation"} if lab.simulation is not None else set())
+    changed = {name for name in names if _differs(before, after, name)}
+    moved = _changed_motion(before.profile.mobile_tweezers, after.profile.mobile_tweezers)
+    if lab.simulation is not None:
+        return frozenset(names if changed or moved else ())
+    if moved & DRIVERS_MOTION:
+        changed.add("mobile_tweezers")
+    return frozenset(changed)
+
+
+def _differs(before: ResolvedProfile, after: ResolvedProfile, name: str) -> bool:
+    old, new = before.chosen[name], after.chosen[name]
+    return (old.entry, old.settings) != (new.entry, new.settings)
+
+
+def _changed_motion(before: MotionSettings, after: MotionSettings) -> set[str]:
+    return {key for key in MotionSettings.model_fields if getattr(before, key) != getattr(after, key)}
+
+
+def _streams(old: tuple[RandomStream, ...], new: tuple[RandomStream, ...]) -> tuple[RandomStream, ...]:
+    """The streams of a lab: the new ones, and the old ones of what stays."""
+    names = {stream.name for stream in new}
+    return (*(stream for stream in old if stream.name not in names), *new)
+
+
+def _blinding(profile: ProfileSpec) -> dict[str, Blinding]:
+    marks = {name: device.blinding for name, device in profile.devices.items()}
+    return {name: Blinding(mark.value, mark.when) for name, mark in marks.items() if mark is not None}
+
+
+def parallelism_of(planner: ChosenPlugin, made: Any, motion: MotionSpec) -> int:
+    """Most mobile tweezers that a batch of a planner may use, as it says, else what the motion bears."""
+    dop = contained(
+        planner.entry.owner,
+        "its degree_of_parallelism",
+        lambda: getattr(made, "degree_of_parallelism", motion.max_tweezers),
+        watch=False,
+    )
+    return dop if isinstance(dop, int) else motion.max_tweezers
+
+
+def timeouts_of(profile: ProfileSpec) -> Timeouts:
+    """The profile's timeouts."""
+    timeouts = profile.timeouts
+    return Timeouts(timeouts.call, timeouts.safe_state, timeouts.plan)
+
+
+WARM_S: Final = 300.0
+"""How long a plugin may compile; a slow computer needs half a minute."""
+
+
+def warm(lab: Lab, stop_flag: StopFlag, observer: RunObserver, *, devices: bool = True) -> None:
+    """Compile before the first shot: a compile in mid-shot would cost the atoms.
+
+    Args:
+        lab: What will need kernels.
+        stop_flag: Looked at before each compile.
+        observer: Told what is compiled, and how long it took.
+        devices: Whether the devices will need theirs, too; else only what plans and detects.
+
+    Raises:
+        StopRequested: The operator asked to stop.
+        PlanError: The planner's kernels failed.
+        DeviceError: Those of a device or the detector did.
+    """
+    start_s, compiled = time.monotonic(), list[str]()
+
+    def announce(module: str) -> None:
+        stop_flag.check()
+        compiled.append(module)
+        observer.event("compiling", {"module": module})
+
+    with announcing(announce):
+        motion.warm()
+        _warm_plugins(lab, stop_flag, devices)
+    if compiled:
+        observer.event("compiled", {"duration_s": time.monotonic() - start_s})
+
+
+def _warm_plugins(lab: Lab, stop_flag: StopFlag, devices: bool) -> None:
+    guard = Guard(stop_flag)
+    parts = (("planner", lab.planner), ("detector", lab.detector))
+    for name, part in (*parts, *(lab.hardware() if devices else ())):
+        if isinstance(part, NeedsWarmUp):
+            try:
+                guard.call(name, WARM_S, part.warm)
+            except PlanError as error:
+                raise error if error.planner else PlanError(str(error), lab.planner_name) from error
+        stop_flag.check()
+    guard.end()

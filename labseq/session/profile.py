@@ -1,0 +1,462 @@
+"""The profile with its plugins: entries found by name, settings validated, objects constructed; nothing is opened."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Final, Literal, NamedTuple, get_args
+
+from labseq import builtin as builtins
+from labseq.config import (
+    DEVICE_KEYS,
+    LINES_KEYS,
+    MOTION_KEYS,
+    ROLES,
+    Choice,
+    Document,
+    Loc,
+    Override,
+    ProblemCollector,
+    ProfileSpec,
+    Scan,
+    StoredText,
+    load_profile,
+    plugin_paths,
+)
+from labseq.config.messages import clean, did_you_mean
+from labseq.config.settings import Settings
+from labseq.errors import ConfigError, LabseqError, PluginLoadError, Problem, UnknownPluginError, one_of
+from labseq.model import CalibrationEntry, SiteGrid
+from labseq.model.lines import IDLE
+from labseq.plugins import PluginHost, contained
+from labseq.registry import LOAD_S, VIRTUAL_TWIN, Entry
+from labseq.roles import ReportsLinesFacts
+from labseq.sequencer.lab import Lab
+from labseq.sequencer.lines import blinding_lines, trigger_line
+from labseq.session.calibrations import ActiveCalibrations, calibrated
+
+DryRun = Literal["off", "full", "fast"]
+
+_CORE_KEYS: Final = {
+    "mobile_tweezers": frozenset(MOTION_KEYS),
+    "device": frozenset(DEVICE_KEYS),
+    "lines": frozenset(LINES_KEYS),
+}
+"""Keys that stand beside a plugin's own, and belong to the core."""
+
+HARDWARE_KINDS: Final = frozenset({"camera", "static_tweezers", "mobile_tweezers", "device", "lines"})
+
+
+@dataclass(frozen=True, slots=True)
+class ChosenPlugin:
+    """A registry entry and the settings it will be constructed with.
+
+    Attributes:
+        entry: What was chosen.
+        settings: Its settings; None if it takes none.
+        document: The file that chose it; None if nobody did.
+        loc: Where its settings are in that file.
+    """
+
+    entry: Entry
+    settings: Settings | None
+    document: Document | None = None
+    loc: Loc = ()
+
+    @property
+    def virtual_time(self) -> bool:
+        """Whether it keeps to the session's clock only: always, or with the settings of a dry run."""
+        simulated = self.entry.simulated
+        if self.entry.virtual_time or simulated is None or self.settings is None:
+            return self.entry.virtual_time
+        return self.settings.model_copy(update=dict(simulated)) == self.settings
+
+    def dump(self) -> dict[str, Any]:
+        """Settings for the record, SI, JSON-ready."""
+        return {"use": self.entry.name, **dump(self.entry, self.settings)}
+
+    def placed(self, error: LabseqError) -> LabseqError:
+        """Why it cannot be constructed, with the place that its settings stand in."""
+        is_placed = isinstance(error, ConfigError) and any(problem.source for problem in error.problems)
+        if self.document is None or is_placed:
+            return error
+        return self.document.error(self.loc, str(error))
+
+
+@dataclass(frozen=True, slots=True)
+class ResolvedProfile:
+    """A profile with its plugins chosen, before anything is opened.
+
+    Attributes:
+        document: The profile's file.
+        profile: What it says.
+        host: The plugins.
+        grid: The grid of sites, with calibrated tones.
+        chosen: Role or device name -> what plays it; no planner.
+        warnings: What the user should know although it is no error.
+        refused: Role or device name -> why nothing could be chosen.
+        calibrations: Those in use: kind -> entry.
+    """
+
+    document: Document
+    profile: ProfileSpec
+    host: PluginHost
+    grid: SiteGrid
+    chosen: Mapping[str, ChosenPlugin]
+    warnings: tuple[str, ...]
+    refused: Mapping[str, ConfigError] = field(default_factory=dict[str, ConfigError])
+    calibrations: Mapping[str, CalibrationEntry] = field(default_factory=dict[str, CalibrationEntry])
+
+    @property
+    def hardware_key(self) -> str:
+        """What its hardware is known by in the markers of runs."""
+        return str(self.document.path.resolve())
+
+    @property
+    def virtual_time(self) -> bool:
+        """Whether no device needs real time."""
+        return all(c.virtual_time for c in self.chosen.values() if c.entry.kind in HARDWARE_KINDS)
+
+
+def resolve(
+    host: PluginHost, document: Document, kind: str, choice: Choice, drop: frozenset[str] = frozenset()
+) -> ChosenPlugin:
+    """Find what a file names and validate the settings given there.
+
+    Args:
+        host: The plugins.
+        document: The file.
+        kind: Kind of plugin that is wanted.
+        choice: Name, and place in the file.
+        drop: Keys at that place that belong to the core.
+
+    Raises:
+        ConfigError: Unknown name, a plugin that failed to load, or wrong settings, with file, line
+            and column.
+    """
+    entry = named(host, document, kind, choice.use, (*choice.loc, choice.key))
+    settings = validate(document, entry, choice.loc, drop | {choice.key})
+    return ChosenPlugin(entry, settings, document, choice.loc)
+
+
+def named(
+    host: PluginHost, document: Document, kind: str, name: str, loc: Loc, *, key: bool = False
+) -> Entry:
+    """Find the entry that a file names.
+
+    Args:
+        host: The plugins.
+        document: The file.
+        kind: Kind of plugin that is wanted.
+        name: Its name.
+        loc: Where the name stands in the file.
+        key: Whether the name is the key there.
+
+    Raises:
+        ConfigError: Nothing offers it, or what would have did not load.
+    """
+    try:
+        return host.get(kind, name)
+    except UnknownPluginError as error:
+        what = f"unknown {kind.replace('_', ' ')} '{clean(name)}'"
+        raise document.error(loc, what, one_of(error.known), error.hint, key) from None
+    except PluginLoadError as error:
+        raise document.error(loc, str(error), key=key) from None
+
+
+def validate(
+    document: Document, entry: Entry, loc: tuple[str | int, ...], drop: frozenset[str] = frozenset()
+) -> Settings | None:
+    """Validate the settings of an entry; None if it takes none.
+
+    Raises:
+        ConfigError: They are wrong, or the plugin's own validators fail; with their place.
+    """
+    other_keys = sorted(drop - {"use", "pattern"})
+    called = f"{entry.kind.replace('_', ' ')} '{entry.name}'"
+    try:
+        return contained(
+            entry.owner,
+            f"the settings model of {called}",
+            lambda: document.validate(
+                entry.settings_model, loc, drop=drop, other_keys=other_keys, called=called
+            ),
+            watch=False,
+        )
+    except PluginLoadError as error:
+        raise document.error(loc, str(error)) from error
+
+
+def choose(
+    host: PluginHost,
+    document: Document,
+    kind: str,
+    choice: Choice,
+    dry_run: DryRun = "off",
+) -> tuple[ChosenPlugin, str]:
+    """Choose the entry that plays a role, in a dry run its simulated counterpart.
+
+    Returns:
+        The choice, and a warning for the user or "".
+    """
+    drop = _CORE_KEYS.get(kind, frozenset[str]())
+    if dry_run == "off" or kind not in HARDWARE_KINDS or choice.use == VIRTUAL_TWIN:
+        return resolve(host, document, kind, choice, drop), ""
+    entry = host.registry.get(kind, VIRTUAL_TWIN)
+    twin = ChosenPlugin(entry, _defaults(entry), document, choice.loc)
+    if dry_run == "fast":
+        return twin, ""
+    if absence := _absence(host, kind, choice.use):
+        return twin, f"{absence}; its virtual twin takes its place and its settings were not checked"
+    chosen = resolve(host, document, kind, choice, drop)
+    if chosen.entry.virtual_time:
+        return chosen, ""
+    if chosen.entry.simulated is not None and chosen.settings is not None:
+        settings = chosen.settings.model_copy(update=dict(chosen.entry.simulated))
+        return replace(chosen, settings=settings), ""
+    return twin, ""
+
+
+def _absence(host: PluginHost, kind: str, name: str) -> str:
+    """Why nothing offers a name: its plugin did not load, or there is none; "" if something does."""
+    if host.registry.find(kind, name) is not None:
+        return ""
+    try:
+        host.get(kind, name)
+    except PluginLoadError as error:
+        return str(error)
+    except UnknownPluginError as error:
+        hint = f" ({error.hint})" if error.hint else ""
+        return f"plugin '{clean(name)}' is not installed{hint}"
+    return ""
+
+
+def check_dry_run(dry_run: object) -> None:
+    """Refuse what is no kind of dry run: a wrong word must not open hardware, or fail to.
+
+    Raises:
+        ConfigError: It is none.
+    """
+    if dry_run not in get_args(DryRun):
+        raise ConfigError(
+            Problem(f"dry_run is {dry_run!r}", expected=f"one of {', '.join(map(repr, get_args(DryRun)))}")
+        )
+
+
+def dump(entry: Entry, settings: Settings | None) -> dict[str, Any]:
+    """Settings for the record, SI, JSON-ready.
+
+    Raises:
+        PluginLoadError: The plugin's own serializers fail.
+    """
+    if settings is None:
+        return {}
+    what = f"the settings of {entry.kind} '{entry.name}'"
+    return contained(entry.owner, what, lambda: settings.model_dump(mode="json", by_alias=True), watch=False)
+
+
+def _defaults(entry: Entry) -> Settings | None:
+    return entry.settings_model() if entry.settings_model is not None else None
+
+
+_LINELESS: Final = frozenset({"device", "check_sites", "check_overlay", "equalise"})
+"""Steps that take no time of their own."""
+
+
+def check_kinds(document: Document, spec: ProfileSpec, host: PluginHost, found: ProblemCollector) -> None:
+    """Find lines that belong to steps that nobody offers.
+
+    Args:
+        document: The profile's file.
+        spec: What it says.
+        host: The plugins.
+        found: Where the problems go.
+    """
+    if spec.lines is None:
+        return
+    known = [IDLE, *(step for step in host.registry.names("step") if step not in _LINELESS)]
+    for name, channel in spec.lines.channels.items():
+        for place, kind in enumerate(channel.on):
+            if kind not in known:
+                loc = ("lines", "channels", name, "on", place)
+                hint = did_you_mean(kind, known)
+                found.add(
+                    document.error(loc, f"there is no kind of step '{clean(kind)}'", one_of(known), hint)
+                )
+
+
+def wiring_problems(document: Document, lab: Lab) -> list[Problem]:
+    """What the timing box cannot do, and what would harm or leave out the camera; with its place.
+
+    Args:
+        document: The profile's file.
+        lab: Its devices; nothing is open.
+    """
+    problems: list[Problem] = []
+    camera = lab.step_context.camera
+    if isinstance(lab.lines, ReportsLinesFacts):
+        channels = lab.lines.lines_facts.channels
+        for spec in lab.line_specs:
+            if spec.channel not in channels:
+                loc = ("lines", "channels", spec.name, "channel")
+                expected = f"one of {', '.join(map(str, channels))}"
+                problems.append(document.problem(loc, f"the box has no channel {spec.channel}", expected))
+    if camera.em_gain > 1.0:
+        for name in blinding_lines(lab.line_specs, "image"):
+            what = f"'{name}' is blinding and on during `image`, with an EM gain of {camera.em_gain:g}"
+            loc = ("lines", "channels", name, "on")
+            problems.append(document.problem(loc, what, "a line that is off in an exposure"))
+    wired = trigger_line(lab.line_specs, "camera")
+    if wired is not None and "external" not in camera.triggers:
+        what = "the camera takes no external trigger"
+        loc = ("lines", "channels", wired.name, "triggers")
+        expected = f"a camera that does; this one takes {one_of(camera.triggers)}"
+        problems.append(document.problem(loc, what, expected))
+    return problems
+
+
+def refuse_wrong_wiring(document: Document, lab: Lab) -> None:
+    """The same, raised.
+
+    Raises:
+        ConfigError: Something is wrong; says what and where.
+    """
+    problems = wiring_problems(document, lab)
+    if problems:
+        raise ConfigError(problems)
+
+
+class RecordedSetup(NamedTuple):
+    """What a run goes by that was begun before, whatever files and calibrations say today.
+
+    Attributes:
+        profile: The text of the profile.
+        calibrations: The ids of the calibrations, by kind, and no others.
+    """
+
+    profile: StoredText
+    calibrations: Mapping[str, str]
+
+
+def resolve_profile(
+    profile: str | Path,
+    beside: Path = Path(),
+    overrides: Sequence[Override] = (),
+    dry_run: DryRun = "off",
+    *,
+    named_in: Document | None = None,
+    plugin_folders: Sequence[Path] = (),
+    scan: Scan | None = None,
+    found: ProblemCollector | None = None,
+    again: RecordedSetup | None = None,
+) -> ResolvedProfile:
+    """Read a profile, load the plugins and choose what plays each role.
+
+    Args:
+        profile: Name or path of the profile.
+        beside: Folder of the file that names it.
+        overrides: Values that replace those of the file.
+        dry_run: "off", "full" or "fast".
+        named_in: The sequence that names the profile, for messages.
+        plugin_folders: Folders with plugins beside those that the profile names.
+        scan: The sequence's scan; the profile's values are those of its first point.
+        found: Where the problems of a profile that can be read go; without it they are raised.
+        again: The profile's text and calibrations, if the run was begun before.
+
+    Raises:
+        ConfigError: The profile is wrong.
+        PluginLoadError: A plugin that it names failed to load.
+    """
+    document, spec = load_profile(
+        profile,
+        beside=beside,
+        overrides=overrides,
+        named_in=named_in,
+        scan=scan,
+        found=found,
+        kept=None if again is None else again.profile,
+    )
+    folders = [*plugin_paths(document, spec.plugin_folders), *plugin_folders]
+    host = load_plugins(folders, max_wait_s=spec.timeouts.load)
+    problems = ProblemCollector() if found is None else found
+    pins = None if again is None else again.calibrations
+    bench = choose_plugins(document, spec, host, dry_run, problems, pins)
+    if found is None:
+        problems.raise_any()
+    return bench
+
+
+def choose_plugins(
+    document: Document,
+    spec: ProfileSpec,
+    host: PluginHost,
+    dry_run: DryRun,
+    found: ProblemCollector,
+    calibrations: Mapping[str, str] | None = None,
+) -> ResolvedProfile:
+    """Choose what plays each role of a profile.
+
+    Args:
+        document: The profile's file.
+        spec: What it says; stand-ins for what was wrong, if anything was found.
+        host: The plugins.
+        dry_run: "off", "full" or "fast".
+        found: Where the problems go.
+        calibrations: The ids of those that count, by kind; None for what profile and store say.
+    """
+    mended = bool(found.problems)
+    chosen: dict[str, ChosenPlugin] = {}
+    warnings: list[str] = []
+    refused: dict[str, ConfigError] = {}
+    for role, choice in {**spec.choices, **spec.devices}.items():
+        kind = role if role in ROLES else "device"
+        if mended and _is_stand_in(document, choice):
+            refused[role] = ConfigError("what the profile says of it is wrong")
+            continue
+        try:
+            chosen[role], warning = choose(host, document, kind, choice, dry_run)
+            warnings += [f"{role}: {warning}"] if warning else []
+        except ConfigError as error:
+            refused[role] = error
+            found.add(error)
+    check_kinds(document, spec, host, found)
+    detector = chosen["detector"].dump() if "detector" in chosen else {}
+    made = (
+        ActiveCalibrations({}, spec.grid_model())
+        if mended
+        else calibrated(document, spec, found, dry_run, detector, calibrations)
+    )
+    warnings += made.warnings
+    return ResolvedProfile(document, spec, host, made.grid, chosen, tuple(warnings), refused, made.entries)
+
+
+def _is_stand_in(document: Document, choice: Choice) -> bool:
+    """Whether nobody wrote this, in a profile of which something was wrong: it has no place of its own."""
+    here, around = document.locate(choice.loc), document.locate(choice.loc[:-1])
+    return choice.use == VIRTUAL_TWIN and here == around
+
+
+def load_plugins(
+    folders: Sequence[Path] = (), found: ProblemCollector | None = None, max_wait_s: float = LOAD_S
+) -> PluginHost:
+    """Load labseq's own, the installed and the folders' plugins.
+
+    Args:
+        folders: Folders with plugins, beside those of LABSEQ_PLUGIN_PATH.
+        found: Where the problem of a folder that cannot be read goes; without it it is raised.
+        max_wait_s: How long a plugin may take to load, and a constructor to return.
+
+    Raises:
+        ConfigError: A folder does not exist, or cannot be read.
+    """
+    host = PluginHost(max_wait_s)
+    host.load_builtin(builtins)
+    host.load_entry_points()
+    try:
+        host.load_folders(folders)
+    except ConfigError as error:
+        if found is None:
+            raise
+        found.add(error)
+    return host

@@ -1,0 +1,168 @@
+"""Thresholds from two peaks, against laws that are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+from numpy.typing import NDArray
+
+from labseq.calibration.thresholds import FittedThresholds, Peak, fit_thresholds
+from labseq.errors import DeviceError, LimitError
+
+Floats = NDArray[np.float64]
+
+N_SITES = 144
+LADDER = np.arange(-2000.0, 14_384.0, 2.0)
+
+
+class Emccd:
+    """Sums over regions: 60 counts a photoelectron, exponential gain, read noise of 16 counts a pixel."""
+
+    def __init__(self, rng: np.random.Generator, spread: float = 0.05) -> None:
+        self.rng = rng
+        self.dark, self.light = (mean * np.exp(rng.normal(0, spread, N_SITES)) for mean in (9.4, 56.0))
+
+    def counts(self, light: Floats) -> Floats:
+        electrons = self.rng.poisson(light)
+        signal = 60 * self.rng.gamma(np.maximum(electrons, 1e-9)) * (electrons > 0)
+        return signal + self.rng.normal(0, 80, light.shape)
+
+    def draw(self, n: int, loading: float, lost: float = 0.0) -> Floats:
+        shape = (n, N_SITES)
+        shone = np.where(self.rng.random(shape) < lost, self.rng.random(shape), 1.0)
+        return self.counts(self.dark + self.light * shone * (self.rng.random(shape) < loading))
+
+    def law(self, light: Floats) -> Floats:
+        """Probability of less than each of the ``LADDER``, exact: (n_sites, n_steps)."""
+        t = 2 * np.pi * np.fft.rfftfreq(len(LADDER), LADDER[1] - LADDER[0])
+        transform = light[:, None] * (1 / (1 + 60j * t) - 1) - (80 * t) ** 2 / 2 + 1j * t * LADDER[0]
+        return np.fft.irfft(np.exp(transform), len(LADDER), axis=1).cumsum(axis=1)
+
+    def cost(self, thresholds: Floats, miss_cost: float) -> tuple[float, float]:
+        """Mean cost at the thresholds, and at the best of each site."""
+        costs = miss_cost * self.law(self.dark + self.light) + 1 - self.law(self.dark)
+        ours = [np.interp(at, LADDER, of_site) for at, of_site in zip(thresholds, costs, strict=True)]
+        return float(np.mean(ours)), float(costs.min(axis=1).mean())
+
+
+def fitted(signals: Floats, miss_cost: float = 3.0) -> FittedThresholds:
+    return fit_thresholds(signals.reshape(-1, 12, 12), miss_cost)
+
+
+@pytest.mark.parametrize(
+    ("n_frames", "loading", "lost", "miss_cost"),
+    [(100, 0.6, 0.0, 3.0), (150, 0.75, 0.0045, 3.0), (400, 0.5, 0.0045, 1.0), (400, 0.6, 0.0045, 10.0)],
+)
+def test_errors_cost_at_most_a_fifth_more_than_at_the_best_thresholds(
+    n_frames: int, loading: float, lost: float, miss_cost: float
+) -> None:
+    lab = Emccd(np.random.default_rng(n_frames))
+    found = fitted(lab.draw(n_frames, loading, lost), miss_cost)
+    ours, best = lab.cost(found.thresholds.ravel(), miss_cost)
+    assert ours < 1.2 * best
+    expected = (miss_cost * found.false_negative + found.false_positive).mean()
+    assert 0.6 * ours < expected < 1.6 * ours
+
+
+def test_sites_of_different_brightness_get_their_own_thresholds() -> None:
+    lab = Emccd(np.random.default_rng(1), spread=0.15)
+    found = fitted(lab.draw(300, 0.6))
+    ours, best = lab.cost(found.thresholds.ravel(), 3.0)
+    assert ours < 1.2 * best
+    assert np.corrcoef(found.thresholds.ravel(), lab.dark + lab.light)[0, 1] > 0.5
+
+
+def test_thresholds_of_calibrated_log_odds_are_minus_the_log_of_the_cost() -> None:
+    """Two Gaussians of the same width, a distance d^2 apart: their log-odds are the signal itself."""
+    rng, d = np.random.default_rng(2), 7.0
+    full = rng.random((300, N_SITES)) < 0.6
+    signals = rng.normal(np.where(full, d**2 / 2, -(d**2) / 2), d)
+    for cost in (1.0, 10.0):
+        found = fitted(signals, cost)
+        assert np.median(found.thresholds) == pytest.approx(-np.log(cost), abs=0.8)
+        assert found.lost < 1e-3
+
+
+def test_a_missed_atom_that_costs_more_is_missed_less() -> None:
+    signals = Emccd(np.random.default_rng(3)).draw(200, 0.6)
+    cheap, dear = fitted(signals, 1.0), fitted(signals, 10.0)
+    assert (dear.thresholds < cheap.thresholds).all()
+    assert dear.false_negative.mean() < cheap.false_negative.mean() / 2
+    assert dear.false_positive.mean() > cheap.false_positive.mean()
+
+
+@settings(max_examples=5)
+@given(
+    st.integers(0, 2**32 - 1),
+    st.floats(0.3, 0.85),
+    st.floats(1e-3, 1e3),
+    st.floats(-1e4, 1e4),
+    st.floats(5, 9),
+)
+def test_any_unit_will_do(seed: int, loading: float, unit: float, zero: float, apart: float) -> None:
+    rng = np.random.default_rng(seed)
+    full = rng.random((120, 36)) < loading
+    signals = rng.normal(np.where(full, apart + 1, 0.0), np.where(full, 1.2, 1.0))
+    found = fit_thresholds((zero + unit * signals).reshape(-1, 6, 6))
+    as_told = (found.thresholds - zero) / unit
+    assert (as_told > 0.5).all()
+    assert (as_told < apart + 0.5).all()
+    np.testing.assert_allclose(found.loading.ravel(), full.mean(axis=0), atol=0.1)
+
+
+def test_atoms_lost_during_the_exposure_are_told_apart() -> None:
+    lab = Emccd(np.random.default_rng(4))
+    found = fitted(lab.draw(1000, 0.6, lost=0.02))
+    assert found.lost == pytest.approx(0.012, abs=0.005)
+
+
+def test_sites_with_one_peak_are_listed_and_get_the_others_threshold() -> None:
+    lab = Emccd(np.random.default_rng(5))
+    signals = lab.draw(200, 0.6)
+    signals[:, 7] = lab.counts(np.tile(lab.dark, (200, 1)))[:, 7]
+    signals[:, 90] = lab.counts(np.tile(lab.dark + lab.light, (200, 1)))[:, 90]
+    found = fitted(signals)
+    assert np.flatnonzero(found.never_loaded).tolist() == [7]
+    assert np.flatnonzero(found.always_loaded).tolist() == [90]
+    others = np.median(found.thresholds)
+    for site in (7, 90):
+        assert found.thresholds.ravel()[site] == pytest.approx(others, rel=0.15)
+    assert found.loading.ravel()[7] < 0.02
+    assert found.loading.ravel()[90] > 0.98
+
+
+@pytest.mark.parametrize("loading", [0.0, 1.0])
+def test_one_peak_on_all_sites_is_an_error(loading: float) -> None:
+    signals = Emccd(np.random.default_rng(6)).draw(200, loading)
+    with pytest.raises(
+        DeviceError, match=r"detector: .* of 144 sites show one peak, not two; check the loading"
+    ):
+        fitted(signals)
+
+
+def test_equal_frames_say_that_they_are_black_or_saturated() -> None:
+    with pytest.raises(DeviceError, match=r"144 of 144 sites show one peak.* black or saturated"):
+        fitted(np.zeros((50, N_SITES)))
+
+
+def test_signals_that_cannot_be_fitted_are_refused() -> None:
+    with pytest.raises(LimitError, match="number of frames"):
+        fitted(np.zeros((10, N_SITES)))
+    with pytest.raises(DeviceError, match="not finite"):
+        fitted(np.full((50, N_SITES), np.nan))
+    for cost in (0.0, -1.0, np.inf, np.nan):
+        with pytest.raises(LimitError, match="cost of a missed atom"):
+            fitted(Emccd(np.random.default_rng(7)).draw(50, 0.6), cost)
+
+
+@settings(max_examples=40)
+@given(st.floats(-5, 5), st.floats(0.1, 3), st.floats(-1.5, 1.5))
+def test_a_peak_has_the_moments_that_it_tells(mean: float, width: float, skewness: float) -> None:
+    peak, at = Peak(mean, width, skewness), mean + width * np.linspace(-15, 25, 40_001)
+    p = np.exp(peak.log_density(at))
+    p /= p.sum()
+    assert p @ at == pytest.approx(mean, abs=0.01 * width)
+    assert p @ (at - mean) ** 2 == pytest.approx(width**2, rel=0.02)
+    np.testing.assert_allclose(peak.below(at)[::2000], np.cumsum(p)[::2000], atol=0.01)
+    np.testing.assert_allclose(peak.below(at) + peak.above(at), 1.0, atol=1e-9)

@@ -1,0 +1,182 @@
+"""What cannot be made is refused, and nothing that exists is touched."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+import pytest
+from hypothesis import example, given, settings, strategies as st
+
+from labseq.errors import ConfigError
+from labseq.plugins import PluginHost
+from labseq.registry import KINDS
+from labseq.scaffold.new import (
+    check_file_name,
+    check_plugin_name,
+    class_prefix,
+    make_file,
+    make_plugin,
+    plugin_sections,
+)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_has_a_template(kind: str) -> None:
+    sections = plugin_sections(kind)
+    assert {"about", "__init__.py", f"{kind}.py", "test_${name}.py", "use"} == {*sections}
+    assert sections["about"].strip().endswith(".")
+
+
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [
+        ("my-planner", "no name for a part of Python; expected .* for example 'my_planner'"),
+        ("Spiral", "for example 'spiral'"),
+        ("2spiral", "a lower-case word"),
+        ("", "a lower-case word"),
+        ("spiral_", "for example 'spiral'"),
+        ("ü", "a lower-case word"),
+        ("x" * 41, "at most 40 letters"),
+        ("../spiral", "for example 'spiral'"),
+        ("class", "a word of Python itself; .*'my_class'"),
+        ("print", "a word of Python itself"),
+        ("json", "a part of Python or labseq"),
+        ("labseq", "a part of Python or labseq"),
+        ("nul", "no name for a file on Windows"),
+        ("psca", "the plugin 'labseq_psca' offers a planner of that name"),
+        ("labseq_psca", "there is a plugin 'labseq_psca'"),
+        ("pydantic", "there is a Python package 'pydantic'"),
+    ],
+)
+def test_names_that_a_plugin_cannot_have(name: str, why: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=f"a planner cannot be called '.*': .*{why}"):
+        make_plugin("planner", name, tmp_path)
+    assert [*tmp_path.iterdir()] == []
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "why"),
+    [
+        ("sequence", "a.yaml", "without an ending; for example 'a'"),
+        ("sequence", "a/b", "for example 'a_b'"),
+        ("sequence", "-a", "for example 'a'"),
+        ("sequence", "", "letters, digits"),
+        ("sequence", "Con", "no name for a file on Windows"),
+        ("sequence", "True", "in YAML it is no text"),
+        ("profile", "virtual", "yours would hide it"),
+    ],
+)
+def test_names_that_a_file_cannot_have(kind: str, name: str, why: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=f"cannot be called '.*': .*{why}"):
+        make_file("sequence" if kind == "sequence" else "profile", name, tmp_path)
+    assert [*tmp_path.iterdir()] == []
+
+
+def test_a_name_can_be_had_again_by_another_kind(tmp_path: Path) -> None:
+    make_plugin("planner", "mine", tmp_path)
+    with pytest.raises(ConfigError, match="there is a plugin 'mine'"):
+        make_plugin("camera", "mine", tmp_path)
+    with pytest.raises(ConfigError, match="the plugin 'mine' offers a planner of that name"):
+        make_plugin("planner", "mine", tmp_path, package=True)
+    make_plugin("camera", "mine", tmp_path, package=True)
+
+
+def test_what_exists_is_never_written_over(tmp_path: Path) -> None:
+    (tmp_path / "plugins" / "spiral").mkdir(parents=True)
+    (tmp_path / "first.yaml").write_text("mine")
+    with pytest.raises(ConfigError, match="spiral: it exists already; choose another name"):
+        make_plugin("planner", "spiral", tmp_path)
+    with pytest.raises(ConfigError, match=r"first\.yaml: it exists already"):
+        make_file("sequence", "first", tmp_path)
+    assert (tmp_path / "first.yaml").read_text() == "mine"
+    assert [*(tmp_path / "plugins").iterdir()] == [tmp_path / "plugins" / "spiral"]
+
+
+def test_a_folder_that_is_not_there_is_told(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="nowhere: there is no such folder"):
+        make_plugin("planner", "spiral", tmp_path / "nowhere")
+
+
+def test_a_file_in_the_way_is_told(tmp_path: Path) -> None:
+    (tmp_path / "plugins").write_text("")
+    with pytest.raises(ConfigError, match="it cannot be made"):
+        make_plugin("planner", "spiral", tmp_path)
+
+
+@pytest.mark.parametrize("name", ["plugins", ".labseq"])
+def test_a_file_in_the_way_of_a_folder_is_told(name: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_text("")
+    with pytest.raises(ConfigError, match=rf"{name}.*: it (exists already|cannot be made)"):
+        make_file("sequence", "first", tmp_path)
+    assert not (tmp_path / "first.yaml").exists()
+    assert (tmp_path / name).read_text() == ""
+
+
+@given(name=st.text(max_size=50))
+@example(name="x\n")
+@settings(max_examples=50)
+def test_any_text_is_a_name_or_refused_in_words(name: str) -> None:
+    host = PluginHost()
+    for check in (
+        lambda: check_plugin_name("planner", name, name, host),
+        lambda: check_file_name("sequence", name, Path()),
+    ):
+        try:
+            check()
+        except ConfigError as error:
+            assert "cannot be called" in str(error)
+            assert str(error).isprintable()
+        else:
+            assert name.replace("-", "_").isidentifier()
+
+
+@pytest.mark.skipif(sys.platform == "win32" or os.geteuid() == 0, reason="nothing is forbidden here")
+def test_a_folder_that_cannot_be_written_is_told(tmp_path: Path) -> None:
+    tmp_path.chmod(0o500)
+    try:
+        with pytest.raises(ConfigError, match="Permission denied"):
+            make_plugin("planner", "spiral", tmp_path)
+    finally:
+        tmp_path.chmod(0o700)
+
+
+def test_a_disk_that_is_full_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(path: Path, *_: object, **__: object) -> int:
+        raise OSError(28, "No space left on device", str(path))
+
+    monkeypatch.setattr(Path, "write_text", fail)
+    with pytest.raises(ConfigError, match="spiral: it cannot be made: No space left on device"):
+        make_plugin("planner", "spiral", tmp_path)
+    assert not list(tmp_path.rglob("*spiral*"))
+
+
+def test_a_sequence_may_be_made_for_a_profile(tmp_path: Path) -> None:
+    make_file("profile", "mine", tmp_path)
+    made = make_file("sequence", "first", tmp_path, profile="mine")
+    assert "\nprofile: mine\n" in made.path.read_text(encoding="utf-8")
+    with pytest.raises(ConfigError, match="no hardware profile 'yours'"):
+        make_file("sequence", "second", tmp_path, profile="yours")
+
+
+def test_a_new_plugin_is_in_the_schemas_that_are_there(tmp_path: Path) -> None:
+    make_file("sequence", "first", tmp_path)
+    schema = tmp_path / ".labseq" / "sequence.schema.json"
+    assert "spiral" not in schema.read_text(encoding="utf-8")
+    make_plugin("planner", "spiral", tmp_path)
+    assert '"spiral"' in schema.read_text(encoding="utf-8")
+    assert not (tmp_path / ".labseq" / "profile.schema.json").exists()
+
+
+def test_class_names() -> None:
+    assert class_prefix("spiral") == "Spiral"
+    assert class_prefix("my_2nd_spiral") == "My2ndSpiral"
+
+
+def test_what_the_tests_need_is_told_where_it_is_missing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("labseq.scaffold.new.find_spec", lambda _: None)
+    commands = make_plugin("planner", "spiral", tmp_path).commands
+    assert commands[:2] == ('pip install "labseq[testing]"', "pytest plugins/spiral")
