@@ -1,6 +1,6 @@
 """Andor EMCCD cameras, for example iXon, through Andor's SDK2 and pylablib."""
 
-from labseq import Registry, hookimpl
+from labseq.plugin import Registry, hookimpl
 
 LABSEQ_API = 1
 

@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import replace
 from typing import Any, Final
 
-from labseq import (
+from labseq.plugin import (
     CameraDriver,
     CameraFacts,
     ConfigError,
@@ -18,9 +18,9 @@ from labseq import (
     ReportsSensor,
     SensorMode,
     Series,
+    format_quantity,
     wait_for,
 )
-from labseq.units import format_quantity
 from labseq_andor.codes import Code, Triggers
 from labseq_andor.cold import temperature_k, wait_until_cold
 from labseq_andor.counterpart import SimulatedCamera, SimulatedSdk

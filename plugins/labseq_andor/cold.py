@@ -2,8 +2,15 @@
 
 from __future__ import annotations
 
-from labseq import Clock, Cooling, DeviceError, DeviceTimeoutError, settle
-from labseq.units import ZERO_CELSIUS_K, format_quantity
+from labseq.plugin import (
+    ZERO_CELSIUS_K,
+    Clock,
+    Cooling,
+    DeviceError,
+    DeviceTimeoutError,
+    format_quantity,
+    settle,
+)
 from labseq_andor.codes import Code
 from labseq_andor.sdk import Sdk
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-from labseq import SensorMode
+from labseq.plugin import SensorMode
 
 ROW_OVERHEAD_S: Final = 3e-6
 """Time that a row takes beyond its pixels, in seconds (ours)."""

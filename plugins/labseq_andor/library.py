@@ -9,7 +9,7 @@ from functools import lru_cache, partial
 from types import SimpleNamespace
 from typing import Any, Final
 
-from labseq import DeviceError
+from labseq.plugin import DeviceError
 from labseq_andor.counterpart import SimulatedCamera, SimulatedSdk, simulated_sdk
 
 OTHERWISE: Final = "to try things without a camera, set `camera: simulated`"

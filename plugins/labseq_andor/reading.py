@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from labseq import DeviceError, ExposureResult
+from labseq.plugin import DeviceError, ExposureResult
 from labseq_andor.codes import Code, Features
 from labseq_andor.errors import GONE, NOT_TAKEN, explain_code
 from labseq_andor.sdk import Sdk, code_of

@@ -8,7 +8,7 @@ from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any, Final, Protocol
 
-from labseq import DeviceError, LabseqError
+from labseq.plugin import DeviceError, LabseqError
 from labseq_andor.codes import Code
 from labseq_andor.errors import explain
 

@@ -7,7 +7,7 @@ from typing import Annotated, Final, Literal, Self
 
 from pydantic import Field, PositiveFloat, PositiveInt, model_validator
 
-from labseq import CameraSettings, CoolingSettings, Duration, Frequency
+from labseq.plugin import CameraSettings, CoolingSettings, Duration, Frequency
 from labseq_andor.heads import HEADS, IXON_897, Head, ReadOut, known_head
 
 SIMULATED: Final = "simulated"

@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, Final
 
-from labseq import ConfigError, DeviceError
-from labseq.errors import one_of
-from labseq.units import ZERO_CELSIUS_K, format_quantity
+from labseq.plugin import ZERO_CELSIUS_K, ConfigError, DeviceError, format_quantity, one_of
 from labseq_andor.codes import EM_GAIN_REAL, REAL_GAIN_MODE, AcqModes, Features, SetFunctions
 from labseq_andor.sdk import Sdk
 from labseq_andor.settings import HIGH_GAIN, AndorSettings

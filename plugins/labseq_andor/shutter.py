@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Final
 
-from labseq import Clock
+from labseq.plugin import Clock
 from labseq_andor.codes import Features
 from labseq_andor.sdk import Sdk
 from labseq_andor.settings import AndorSettings

@@ -10,7 +10,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from labseq import ScanSpace, Settings, VisitedPoint
+from labseq.plugin import ScanSpace, Settings, VisitedPoint
 
 Part = Annotated[float, Field(ge=0.001, le=1)]
 

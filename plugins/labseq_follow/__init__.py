@@ -1,6 +1,6 @@
 """Another control system leads, over TCP or a serial line; labseq images and rearranges when it says `go`."""
 
-from labseq import Registry, hookimpl
+from labseq.plugin import Registry, hookimpl
 
 LABSEQ_API = 1
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
 
-from labseq.config.messages import clean, visible
+from labseq.plugin import clean, visible
 
 GO: Final = "go"
 VERSION: Final = 1

@@ -7,9 +7,16 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
-from labseq import ConfigError, Context, DeviceError, DeviceTimeoutError, ReportsTruth, wait_for
-from labseq.errors import one_of
-from labseq.units import format_quantity
+from labseq.plugin import (
+    ConfigError,
+    Context,
+    DeviceError,
+    DeviceTimeoutError,
+    ReportsTruth,
+    format_quantity,
+    one_of,
+    wait_for,
+)
 from labseq_follow.dialogue import GO, VERSION, About, Dialogue, Splitter, encoded
 from labseq_follow.links import Link
 from labseq_follow.serial_line import SerialLink

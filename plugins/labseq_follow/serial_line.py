@@ -7,8 +7,7 @@ import time
 from contextlib import suppress
 from typing import Final
 
-from labseq import DeviceError
-from labseq.drivers.serial_port import BROKEN, Port, open_port
+from labseq.plugin import BROKEN, DeviceError, Port, open_port
 from labseq_follow.links import SEND_S, SLICE_S, Listener
 from labseq_follow.settings import SerialLeaderSettings
 

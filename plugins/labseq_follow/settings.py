@@ -7,9 +7,7 @@ from typing import Annotated, Final, Literal, Self, TypeAlias
 
 from pydantic import Field, model_validator
 
-from labseq import Duration, Settings
-from labseq.config.fields import setting_error
-from labseq.config.messages import clean
+from labseq.plugin import Duration, Settings, clean, setting_error
 
 SIMULATED: Final = "simulated"
 

@@ -8,7 +8,7 @@ import threading
 from contextlib import suppress
 from typing import Final
 
-from labseq import DeviceError
+from labseq.plugin import DeviceError
 from labseq_follow.dialogue import encoded
 from labseq_follow.links import SEND_S, SLICE_S, Listener
 from labseq_follow.settings import TcpLeaderSettings

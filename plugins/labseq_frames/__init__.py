@@ -1,6 +1,6 @@
 """A camera that plays back frames from files."""
 
-from labseq import Registry, hookimpl
+from labseq.plugin import Registry, hookimpl
 
 LABSEQ_API = 1
 

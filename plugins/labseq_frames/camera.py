@@ -8,8 +8,16 @@ from collections.abc import Generator, Mapping
 from contextlib import suppress
 from typing import Any, Final
 
-from labseq import CameraDriver, CameraFacts, ConfigError, Context, DeviceError, ExposureResult, Series
-from labseq.errors import Problem
+from labseq.plugin import (
+    CameraDriver,
+    CameraFacts,
+    ConfigError,
+    Context,
+    DeviceError,
+    ExposureResult,
+    Problem,
+    Series,
+)
 from labseq_frames.picture import BadFramesError, Picture, told
 from labseq_frames.settings import FramesSettings
 from labseq_frames.sources import Source, find_source

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.errors import Problem
+from labseq.plugin import Problem
 
 
 class BadFramesError(Exception):

@@ -6,8 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from labseq import Duration, Settings
-from labseq.config.settings import FilePath
+from labseq.plugin import Duration, FilePath, Settings
 
 
 class FramesSettings(Settings):

@@ -8,7 +8,7 @@ from collections.abc import Generator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, Literal, Protocol
 
-from labseq import RecordingError, Run, open_run
+from labseq.plugin import RecordingError, Run, open_run
 from labseq_frames.picture import BadFramesError, Picture
 from labseq_frames.png import PngFiles
 from labseq_frames.tiff import TiffFiles

@@ -1,6 +1,6 @@
 """Cameras that speak GenICam: GigE Vision and USB3 Vision, through Aravis."""
 
-from labseq import Registry, hookimpl
+from labseq.plugin import Registry, hookimpl
 
 LABSEQ_API = 1
 

@@ -6,8 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import Final, Literal, TypeAlias
 
-from labseq import DeviceError, ExposureResult, LimitError, Series
-from labseq.units import format_quantity
+from labseq.plugin import DeviceError, ExposureResult, LimitError, Series, format_quantity
 from labseq_genicam.aravis import Buffer, Camera, Stream, StreamOptions
 from labseq_genicam.counting import FrameCounter
 from labseq_genicam.link import Link

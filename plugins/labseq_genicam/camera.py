@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, Final
 
-from labseq import CameraDriver, CameraFacts, Context, DeviceError, ExposureResult, Series, wait_for
+from labseq.plugin import CameraDriver, CameraFacts, Context, DeviceError, ExposureResult, Series, wait_for
 from labseq_genicam.acquisition import Acquisition, Start
 from labseq_genicam.link import Link
 from labseq_genicam.settings import SIMULATED, GenicamSettings

@@ -7,7 +7,7 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from typing import Final
 
-from labseq import DeviceError
+from labseq.plugin import DeviceError
 from labseq_genicam.aravis import AravisError, Camera, LibraryMissingError
 
 GONE: Final = frozenset({"timeout", "not connected"})

@@ -6,8 +6,7 @@ from typing import Annotated, Final, Literal, TypeAlias
 
 from pydantic import Field, NonNegativeInt, field_validator
 
-from labseq import Duration, Fraction, Frequency, Settings
-from labseq.drivers.settings import IndustrialCameraSettings
+from labseq.plugin import Duration, Fraction, Frequency, IndustrialCameraSettings, Settings
 
 PixelFormat: TypeAlias = Literal["Mono8", "Mono10", "Mono12", "Mono14", "Mono16"]
 

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from labseq import DeviceError, LimitError
-from labseq.drivers.camera import nearest
-from labseq.errors import one_of
-from labseq.units import ZERO_CELSIUS_K
+from labseq.plugin import ZERO_CELSIUS_K, DeviceError, LimitError, nearest, one_of
 from labseq_genicam.aravis import Camera
 from labseq_genicam.link import Link
 from labseq_genicam.settings import FORMATS, GenicamSettings, PixelFormat

@@ -9,8 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq import Context, DeviceError, Frame, Series, SimulatedSensor, WiresTriggers
-from labseq.sequencer.lines import trigger_line
+from labseq.plugin import Context, DeviceError, Frame, Series, SimulatedSensor, WiresTriggers, trigger_line
 from labseq_genicam.acquisition import Acquisition, Start
 from labseq_genicam.counterpart.fake import FakeCamera
 from labseq_genicam.counterpart.faults import Faults

@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from labseq import ConfigError, ScanRange, ScanSpace, Settings, VisitedPoint
+from labseq.plugin import ConfigError, ScanRange, ScanSpace, Settings, VisitedPoint
 
 
 class OptunaSettings(Settings):

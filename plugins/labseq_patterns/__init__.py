@@ -1,6 +1,6 @@
 """Target patterns: diluted triangular lattices, fractals, rings."""
 
-from labseq import Registry, hookimpl
+from labseq.plugin import Registry, hookimpl
 
 LABSEQ_API = 1
 

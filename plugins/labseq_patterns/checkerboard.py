@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from labseq import SiteGrid, TargetPattern
-from labseq.geometry import block, pattern
+from labseq.plugin import SiteGrid, TargetPattern, block, pattern
 from labseq_patterns.settings import BlockSettings
 
 

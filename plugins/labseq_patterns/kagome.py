@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from labseq import SiteGrid, TargetPattern
+from labseq.plugin import SiteGrid, TargetPattern
 from labseq_patterns.settings import BlockSettings
 from labseq_patterns.triangular import Ints, Mask, diluted
 

@@ -7,8 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from labseq import SiteGrid, TargetPattern
-from labseq.geometry import block, pattern
+from labseq.plugin import SiteGrid, TargetPattern, block, pattern
 from labseq_patterns.settings import RingSettings
 
 _ROUNDING: Final = 1e-9

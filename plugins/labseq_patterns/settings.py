@@ -6,7 +6,7 @@ from typing import Annotated, Literal, Self, TypeAlias
 
 from pydantic import Field, model_validator
 
-from labseq import Settings
+from labseq.plugin import Settings
 
 Index: TypeAlias = Annotated[int, Field(ge=0)]
 """Index of a row or a column, from 0."""

@@ -8,9 +8,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq import ConfigError, SiteGrid, TargetPattern
-from labseq.errors import Problem
-from labseq.geometry import block, pattern
+from labseq.plugin import ConfigError, Problem, SiteGrid, TargetPattern, block, pattern
 from labseq_patterns.settings import BlockSettings
 
 Ints: TypeAlias = NDArray[np.int64]

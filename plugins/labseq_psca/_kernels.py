@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from labseq.kernel import kernel
+from labseq.plugin import kernel
 from labseq_psca._kernels_build import (
     GRID,
     GROWING,

@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.kernel import const, kernel
+from labseq.plugin import const, kernel
 from labseq_psca._kernels_lines import fill_batch
 
 Bools = NDArray[np.bool_]

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.kernel import const, kernel
+from labseq.plugin import const, kernel
 
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]

@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from labseq.kernel import kernel
+from labseq.plugin import kernel
 from labseq_psca._kernels_build import GRID, Bools, Ints, Moves, Offsets, add_line, empty_plan, ended
 
 # What a shift costs: moving an atom loses 1.8 % of one, and the about 1 ms of a batch 0.7 % of one out of

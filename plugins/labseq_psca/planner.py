@@ -10,8 +10,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
-from labseq import Context, Occupancy, Plan, PlanError, Settings, TargetPattern, as_occupancy
-from labseq.geometry import nearest_to_centre
+from labseq.plugin import (
+    Context,
+    Occupancy,
+    Plan,
+    PlanError,
+    Settings,
+    TargetPattern,
+    as_occupancy,
+    nearest_to_centre,
+)
 
 Kernel = Callable[..., tuple[NDArray[np.int16], NDArray[np.int32]]]
 RowOrder = Literal["half_filled", "fullest", "emptiest"]

@@ -7,8 +7,16 @@ from typing import Any, Final
 
 import numpy as np
 
-from labseq import Clock, DeviceError, DeviceTimeoutError, ExposureResult, LimitError, Trigger, wait_for
-from labseq.units import format_quantity
+from labseq.plugin import (
+    Clock,
+    DeviceError,
+    DeviceTimeoutError,
+    ExposureResult,
+    LimitError,
+    Trigger,
+    format_quantity,
+    wait_for,
+)
 from labseq_pylon import nodes as n
 from labseq_pylon.library import Sdk
 from labseq_pylon.nodes import Nodes

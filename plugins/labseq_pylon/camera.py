@@ -7,7 +7,7 @@ from contextlib import nullcontext, suppress
 from dataclasses import replace
 from typing import Any, Final
 
-from labseq import (
+from labseq.plugin import (
     CameraDriver,
     CameraFacts,
     Context,

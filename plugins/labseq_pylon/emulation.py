@@ -22,7 +22,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq import Context, DeviceError, Frame, ReportsSensor, Series, SimulatedSensor, Trigger
+from labseq.plugin import Context, DeviceError, Frame, ReportsSensor, Series, SimulatedSensor, Trigger
 from labseq_pylon.finding import EMULATION
 from labseq_pylon.library import Sdk
 from labseq_pylon.nodes import Nodes

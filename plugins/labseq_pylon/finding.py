@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Final
 
-from labseq import DeviceError
+from labseq.plugin import DeviceError
 from labseq_pylon.library import Sdk
 from labseq_pylon.settings import PylonSettings
 

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
-from labseq import DeviceError
+from labseq.plugin import DeviceError
 
 OTHERWISE = "to try things without it, use another camera, for example `use: virtual`"
 

@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Final, TypeAlias
 
-from labseq import DeviceError, LimitError
-from labseq.drivers.camera import nearest
-from labseq.errors import one_of
+from labseq.plugin import DeviceError, LimitError, nearest, one_of
 from labseq_pylon.library import Sdk
 
 Names: TypeAlias = tuple[str, ...]

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from labseq import LimitError
-from labseq.drivers.camera import nearest
+from labseq.plugin import LimitError, nearest
 from labseq_pylon.library import Sdk
 from labseq_pylon.nodes import SENSOR_HEIGHT, SENSOR_WIDTH, Nodes
 from labseq_pylon.settings import PylonSettings

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from labseq import DeviceError
-from labseq.units import ZERO_CELSIUS_K
+from labseq.plugin import ZERO_CELSIUS_K, DeviceError
 from labseq_pylon import nodes as n
 from labseq_pylon.library import Sdk
 from labseq_pylon.nodes import Nodes

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from labseq import Registry, hookimpl
+from labseq.plugin import Registry, hookimpl
 
 LABSEQ_API = 1
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.kernel import kernel
+from labseq.plugin import kernel
 from labseq_scans._kernels_columns import column_sums, supply_columns
 from labseq_scans._kernels_lines import GRID, GROWING, Growing, Log, record, settle
 from labseq_scans._kernels_presort import SCANNED, Scanned, count_scan, presort

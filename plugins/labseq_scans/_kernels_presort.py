@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.kernel import kernel
+from labseq.plugin import kernel
 from labseq_scans._kernels_lines import GRID, Log, record
 
 Bools = NDArray[np.bool_]

@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
-from labseq import Plan, PlanError, Settings, SiteGrid, TargetPattern, as_occupancy
-from labseq.geometry import nearest_to_centre
+from labseq.plugin import Plan, PlanError, Settings, SiteGrid, TargetPattern, as_occupancy, nearest_to_centre
 
 Bools = NDArray[np.bool_]
 

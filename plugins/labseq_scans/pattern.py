@@ -7,8 +7,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from labseq import Settings, SiteGrid, TargetPattern
-from labseq.geometry import check_size, pattern
+from labseq.plugin import Settings, SiteGrid, TargetPattern, check_size, pattern
 
 Index = Annotated[int, Field(ge=0)]
 

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq import MotionSpec, Plan, SiteGrid
-from labseq.motion.tones import site_time_s
+from labseq.plugin import MotionSpec, Plan, SiteGrid, site_time_s
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -7,7 +7,7 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
-from labseq import Context, Plan, TargetPattern
+from labseq.plugin import Context, Plan, TargetPattern
 from labseq_scans._planning import LineSettings, as_plan, read_task
 
 

@@ -1,6 +1,6 @@
 """Instruments on a serial line, described in the profile."""
 
-from labseq import Registry, hookimpl
+from labseq.plugin import Registry, hookimpl
 
 LABSEQ_API = 1
 

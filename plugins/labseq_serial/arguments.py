@@ -8,9 +8,7 @@ from typing import Final, Literal, Self, TypeAlias
 from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
 
-from labseq import Settings
-from labseq.config.fields import Text, setting_error
-from labseq.config.messages import clean
+from labseq.plugin import Settings, Text, clean, setting_error
 from labseq_serial.templates import Sent
 from labseq_serial.units import Unit
 

@@ -8,9 +8,7 @@ from typing import Annotated, Final, Self, TypeAlias
 
 from pydantic import Field, model_validator
 
-from labseq import Duration, Settings
-from labseq.config.fields import Text, setting_error
-from labseq.config.messages import clean, closest
+from labseq.plugin import Duration, Settings, Text, clean, closest, setting_error
 from labseq_serial.arguments import ArgumentSettings, Scalar, placed
 from labseq_serial.replies import compiled, example_of
 from labseq_serial.templates import Sent, Template

@@ -6,8 +6,7 @@ import threading
 from collections.abc import Mapping
 from typing import Any
 
-from labseq import Context, DeviceError, LabseqError, LimitError, TransientError
-from labseq.config.messages import clean
+from labseq.plugin import Context, DeviceError, LabseqError, LimitError, TransientError, clean
 from labseq_serial.arguments import Scalar
 from labseq_serial.instrument import Instrument
 from labseq_serial.line import Line

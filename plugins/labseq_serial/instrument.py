@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from typing import Final, TypeVar
 
-from labseq import Clock, DeviceError, DeviceTimeoutError, LabseqError
-from labseq.config.messages import clean
-from labseq.units import format_quantity
+from labseq.plugin import Clock, DeviceError, DeviceTimeoutError, LabseqError, clean, format_quantity
 from labseq_serial.arguments import Scalar
 from labseq_serial.commands import Call, call_of
 from labseq_serial.line import Line

@@ -7,10 +7,18 @@ from collections.abc import Generator
 from contextlib import contextmanager, suppress
 from typing import Final
 
-from labseq import Clock, DeviceError, DeviceTimeoutError, TransientError, wait_for
-from labseq.config.messages import clean
-from labseq.drivers.serial_port import BROKEN, Port, is_write_timeout
-from labseq.units import format_quantity
+from labseq.plugin import (
+    BROKEN,
+    Clock,
+    DeviceError,
+    DeviceTimeoutError,
+    Port,
+    TransientError,
+    clean,
+    format_quantity,
+    is_write_timeout,
+    wait_for,
+)
 from labseq_serial.settings import SerialSettings
 
 MAX_REPLY: Final = 4096

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from labseq.drivers.serial_port import Port, open_port, ports_here, ports_text
-from labseq.errors import DeviceError
+from labseq.plugin import DeviceError, Port, open_port, ports_here, ports_text
 from labseq_serial.settings import SerialSettings, UsbSettings
 
 

@@ -7,11 +7,7 @@ from typing import Final, Literal, Self
 
 from pydantic import Field, model_validator
 
-from labseq import Duration, Settings
-from labseq.config.fields import Text, setting_error
-from labseq.config.messages import clean, closest
-from labseq.drivers.serial_port import is_network_port
-from labseq.errors import one_of
+from labseq.plugin import Duration, Settings, Text, clean, closest, is_network_port, one_of, setting_error
 from labseq_serial.arguments import Scalar, placed
 from labseq_serial.commands import Call, CommandSettings, IdentifySettings, PositiveDuration, call_of
 from labseq_serial.values import ValueSettings

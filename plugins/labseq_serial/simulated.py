@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from typing import Final
 
-from labseq import Clock
+from labseq.plugin import Clock
 from labseq_serial.arguments import Scalar
 from labseq_serial.commands import CommandSettings
 from labseq_serial.settings import SerialSettings

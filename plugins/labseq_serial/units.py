@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Final, Self
 
-from labseq.units import UNITS, ZERO_CELSIUS_K, expected, format_quantity, parse_quantity, scaled
+from labseq.plugin import UNITS, ZERO_CELSIUS_K, expected, format_quantity, parse_quantity, scaled
 
 _DIMENSION_OF: Final = {unit: dimension for dimension, units in UNITS.items() for unit in units if unit}
 _DIGITS: Final = 9

@@ -7,10 +7,7 @@ from typing import Annotated, Final, Self
 
 from pydantic import Field, model_validator
 
-from labseq import Duration, Settings
-from labseq.config.fields import Text, setting_error
-from labseq.config.messages import clean
-from labseq.errors import one_of
+from labseq.plugin import Duration, Settings, Text, clean, one_of, setting_error
 from labseq_serial.arguments import Number, Scalar, TypedSettings, check_limits, format_limits, placed
 from labseq_serial.replies import VALUE, compiled, example_of
 from labseq_serial.units import Unit

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.kernel import const, kernel
+from labseq.plugin import const, kernel
 from labseq_single._kernels_moves import GROWING, Growing, carry, clear_surplus
 from labseq_single._kernels_paths import GRID, SITES, grid_sites, sites_with_margin, with_margin
 

@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.kernel import kernel
+from labseq.plugin import kernel
 from labseq_single._kernels_paths import NO_END, SITES, UNWANTED, cheapest_path
 
 Bools = NDArray[np.bool_]

@@ -9,8 +9,7 @@ from typing import ClassVar, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from labseq import Context, Plan, PlanError, TargetPattern, as_occupancy
-from labseq.geometry import from_the_centre
+from labseq.plugin import Context, Plan, PlanError, TargetPattern, as_occupancy, from_the_centre
 
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]

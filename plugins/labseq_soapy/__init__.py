@@ -1,6 +1,6 @@
 """Static tweezers on a software-defined radio, by SoapySDR."""
 
-from labseq import Registry, hookimpl
+from labseq.plugin import Registry, hookimpl
 
 LABSEQ_API = 1
 

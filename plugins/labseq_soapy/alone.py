@@ -8,8 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
-from labseq import Clock, DeviceError, wait_for
-from labseq.recording.folders import Owner, state_root
+from labseq.plugin import Clock, DeviceError, Owner, state_root, wait_for
 
 END_S: Final = 10.0
 """How long a process that was left alone may take to ramp down and let its radio go."""

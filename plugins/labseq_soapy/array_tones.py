@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq import DeviceError, LimitError
+from labseq.plugin import DeviceError, LimitError
 from labseq_soapy import tones
 from labseq_soapy.output import Samples
 from labseq_soapy.radio import Facts

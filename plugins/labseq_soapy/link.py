@@ -14,7 +14,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from labseq import Clock, DeviceError, wait_for
+from labseq.plugin import Clock, DeviceError, wait_for
 from labseq_soapy.messages import Setup, received, send
 from labseq_soapy.output import Samples
 from labseq_soapy.radio import Facts

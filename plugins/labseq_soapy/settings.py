@@ -8,11 +8,7 @@ from typing import Annotated, Final, Literal, Self, TypeAlias
 
 from pydantic import Field, model_validator
 
-from labseq import Duration, Frequency, Settings
-from labseq.config.fields import setting_error
-from labseq.config.messages import clean, closest
-from labseq.config.profile import FrequencyComb
-from labseq.errors import one_of
+from labseq.plugin import Duration, Frequency, FrequencyComb, Settings, clean, closest, one_of, setting_error
 
 SIMULATED = "simulated"
 """The device that needs no radio."""

@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq import ReceivesOutput, Simulation
+from labseq.plugin import ReceivesOutput, Simulation
 from labseq_soapy.capture import CapturedOutputs, Ring, built
 from labseq_soapy.settings import SoapySettings
 

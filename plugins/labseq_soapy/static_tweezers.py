@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from labseq import Context, DeviceError, LimitError, TransientError
+from labseq.plugin import Context, DeviceError, LimitError, TransientError
 from labseq_soapy.alone import end_stale_process, marker_of, place
 from labseq_soapy.array_tones import Amplitudes, ArrayTones
 from labseq_soapy.capture import built

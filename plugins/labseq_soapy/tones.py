@@ -13,8 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq import LimitError
-from labseq.units import format_quantity
+from labseq.plugin import LimitError, format_quantity
 
 Floats = NDArray[np.float64]
 

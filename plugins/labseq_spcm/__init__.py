@@ -1,6 +1,6 @@
 """Mobile tweezers on a Spectrum M4i.66xx arbitrary waveform generator."""
 
-from labseq import Registry, hookimpl
+from labseq.plugin import Registry, hookimpl
 
 LABSEQ_API = 1
 

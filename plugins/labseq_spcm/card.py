@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq import Clock, DeviceError, DeviceTimeoutError
+from labseq.plugin import Clock, DeviceError, DeviceTimeoutError
 
 POLL_S: Final = 0.2e-3
 """How often a wait looks at the card."""

@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from labseq import DeviceTimeoutError, ToneProgram, TransientError
+from labseq.plugin import DeviceTimeoutError, ToneProgram, TransientError
 from labseq_spcm.card import POLL_S, TRANSFER_TIMEOUT_S, AwgCard
 from labseq_spcm.dds_program import ENTRY, TYPE_INT64, Commands, Cores, compile_commands
 

@@ -8,8 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq import ConfigError, LimitError, ToneProgram
-from labseq.model import AxisTones, MotionSpec
+from labseq.plugin import AxisTones, ConfigError, LimitError, MotionSpec, ToneProgram
 from labseq_spcm import limits
 from labseq_spcm.settings import SpcmSettings
 

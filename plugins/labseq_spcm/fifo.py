@@ -6,7 +6,7 @@ import math
 import time
 from typing import Final
 
-from labseq import DeviceError, DeviceTimeoutError, ToneProgram, TransientError
+from labseq.plugin import DeviceError, DeviceTimeoutError, ToneProgram, TransientError
 from labseq_spcm.card import POLL_S, TRANSFER_TIMEOUT_S, AwgCard, Buffer
 from labseq_spcm.interleaved import CHUNK, InterleavedRenderer
 from labseq_spcm.settings import SpcmSettings

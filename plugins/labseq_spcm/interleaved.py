@@ -8,8 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq import ToneProgram
-from labseq.motion import Renderer
+from labseq.plugin import Renderer, ToneProgram
 from labseq_spcm.limits import SAMPLE_STEP
 
 CHUNK: Final = 1 << 18

@@ -8,7 +8,7 @@ import io
 import sys
 from typing import Any
 
-from labseq import DeviceError
+from labseq.plugin import DeviceError
 
 OTHERWISE = "to try things without a card, set `card: simulated`"
 

@@ -11,9 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq import LimitError, RfSpec, ToneProgram
-from labseq.model import AxisTones
-from labseq.units import format_quantity
+from labseq.plugin import AxisTones, LimitError, RfSpec, ToneProgram, format_quantity
 
 FAMILY: Final = 0x66
 """Second byte of the card type: M4i.66xx."""

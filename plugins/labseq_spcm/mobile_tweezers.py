@@ -8,16 +8,16 @@ import time
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Protocol
 
-from labseq import (
+from labseq.plugin import (
     Context,
     DeviceError,
     DeviceTimeoutError,
     ReceivesOutput,
     ToneProgram,
     TransientError,
+    format_quantity,
+    warm_rendering,
 )
-from labseq.motion import warm_rendering
-from labseq.units import format_quantity
 from labseq_spcm import limits
 from labseq_spcm.card import POLL_S, AwgCard
 from labseq_spcm.dds import Dds

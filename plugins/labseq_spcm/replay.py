@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 
-from labseq import LimitError, ToneProgram
+from labseq.plugin import LimitError, ToneProgram
 from labseq_spcm.card import AwgCard, Buffer
 from labseq_spcm.interleaved import InterleavedRenderer
 from labseq_spcm.settings import SpcmSettings

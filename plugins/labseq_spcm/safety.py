@@ -7,7 +7,7 @@ from contextlib import suppress
 from functools import partial
 from typing import Final
 
-from labseq import LabseqError
+from labseq.plugin import LabseqError
 from labseq_spcm import limits
 from labseq_spcm.card import AwgCard
 from labseq_spcm.setup import output_registers

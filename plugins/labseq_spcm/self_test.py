@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from labseq import DeviceError
-from labseq.units import format_quantity
+from labseq.plugin import DeviceError, format_quantity
 from labseq_spcm.card import AwgCard, Buffer
 from labseq_spcm.settings import SpcmSettings
 

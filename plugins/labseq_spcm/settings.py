@@ -6,8 +6,7 @@ from typing import Annotated, Literal, Self, TypeAlias
 
 from pydantic import Field, field_validator, model_validator
 
-from labseq import Duration, Frequency, Settings, Voltage
-from labseq.units import format_quantity
+from labseq.plugin import Duration, Frequency, Settings, Voltage, format_quantity
 from labseq_spcm import limits
 
 Mode: TypeAlias = Literal["replay", "fifo", "dds"]

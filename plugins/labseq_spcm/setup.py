@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Final
 
-from labseq import DeviceError
+from labseq.plugin import DeviceError
 from labseq_spcm import limits
 from labseq_spcm.card import AwgCard
 from labseq_spcm.settings import SpcmSettings

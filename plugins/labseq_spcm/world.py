@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from labseq.model import RfSamples, RfSpan, RfTones
+from labseq.plugin import RfSamples, RfSpan, RfTones
 
 if TYPE_CHECKING:
     from labseq_spcm.simulator import SimulatedCard, Span

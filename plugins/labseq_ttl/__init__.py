@@ -1,6 +1,6 @@
 """A timing box with open firmware, on a serial line."""
 
-from labseq import Registry, hookimpl
+from labseq.plugin import Registry, hookimpl
 
 LABSEQ_API = 1
 

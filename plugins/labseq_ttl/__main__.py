@@ -6,8 +6,7 @@ import sys
 from argparse import ArgumentParser
 from collections.abc import Sequence
 
-from labseq import LabseqError
-from labseq.roles.shot import NeverStopped
+from labseq.plugin import LabseqError, NeverStopped
 from labseq_ttl.box import Box
 from labseq_ttl.connection import MAX_WAIT_S
 from labseq_ttl.port import open_box

@@ -7,9 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from labseq import Clock, DeviceError, DeviceTimeoutError
-from labseq.config.messages import clean
-from labseq.drivers.serial_port import Port
+from labseq.plugin import Clock, DeviceError, DeviceTimeoutError, Port, clean
 from labseq_ttl.conversation import TRIES, Conversation
 from labseq_ttl.protocol import NAME, PER_LINE, VERSION, Edge
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from labseq import Clock, DeviceError
+from labseq.plugin import Clock, DeviceError
 from labseq_ttl.box import Box
 from labseq_ttl.counterpart import Counterpart, start_simulator
 from labseq_ttl.heartbeat import Heartbeat

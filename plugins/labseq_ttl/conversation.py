@@ -8,10 +8,16 @@ from collections.abc import Callable, Generator
 from contextlib import contextmanager, suppress
 from typing import Final, TypeVar
 
-from labseq import Clock, DeviceError, DeviceTimeoutError, wait_for
-from labseq.config.messages import clean
-from labseq.drivers.serial_port import BROKEN, Port
-from labseq.units import format_quantity
+from labseq.plugin import (
+    BROKEN,
+    Clock,
+    DeviceError,
+    DeviceTimeoutError,
+    Port,
+    clean,
+    format_quantity,
+    wait_for,
+)
 from labseq_ttl.protocol import STOP, framed, unframed
 
 T = TypeVar("T")

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from labseq import DeviceError, DeviceTimeoutError
-from labseq.units import format_quantity
+from labseq.plugin import DeviceError, DeviceTimeoutError, format_quantity
 from labseq_ttl.box import cause_text
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Final
 
-from labseq import DeviceError
+from labseq.plugin import DeviceError
 
 PER_TIMEOUT: Final = 4
 """How often within its timeout the box hears something."""

@@ -6,8 +6,7 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
-from labseq import ConfigError, Context, DeviceError, DeviceTimeoutError, ReportsTruth
-from labseq.units import format_quantity
+from labseq.plugin import ConfigError, Context, DeviceError, DeviceTimeoutError, ReportsTruth, format_quantity
 from labseq_ttl.box import Box
 from labseq_ttl.connection import SIMULATED_MAX_WAIT_S
 from labseq_ttl.leader import HIGH, MORE, LeaderPins

@@ -7,16 +7,17 @@ from collections.abc import Mapping
 from contextlib import suppress
 from typing import Any, Final, NoReturn
 
-from labseq import (
+from labseq.plugin import (
     ConfigError,
     Context,
     DeviceError,
     DeviceTimeoutError,
     LineProgram,
     LinesFacts,
+    idle_program,
+    off_program,
+    one_of,
 )
-from labseq.errors import one_of
-from labseq.sequencer.lines import idle_program, off_program
 from labseq_ttl import faults
 from labseq_ttl.box import Box
 from labseq_ttl.connection import SIMULATED_MAX_WAIT_S, Connection

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from labseq.drivers.serial_port import Port, open_port
+from labseq.plugin import Port, open_port
 
 BAUD_RATE: Final = 500_000
 WRITE_TIMEOUT_S: Final = 1.0

@@ -7,8 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from labseq import LimitError, LineProgram, LineSpec
-from labseq.units import format_quantity
+from labseq.plugin import LimitError, LineProgram, LineSpec, format_quantity
 from labseq_ttl.protocol import EDGES, LONGEST, SHORTEST, TICK_S, Edge
 
 MAX_EDGES: Final = EDGES - 1

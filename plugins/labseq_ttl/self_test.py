@@ -5,8 +5,7 @@ from __future__ import annotations
 import time
 from typing import Final
 
-from labseq import DeviceError
-from labseq.units import format_quantity
+from labseq.plugin import DeviceError, format_quantity
 from labseq_ttl.connection import SIMULATED_MAX_WAIT_S, Connection
 from labseq_ttl.protocol import EDGES, LONGEST, OUTPUTS, SHORTEST, TICK_S, Edge
 

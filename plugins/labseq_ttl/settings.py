@@ -7,8 +7,7 @@ from typing import Annotated, Final, Literal, Self, TypeAlias
 
 from pydantic import AfterValidator, Field, model_validator
 
-from labseq import Duration, Settings
-from labseq.config.fields import setting_error
+from labseq.plugin import Duration, Settings, setting_error
 from labseq_ttl.protocol import CHANNELS
 
 SIMULATED: Final = "simulated"

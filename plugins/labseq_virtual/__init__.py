@@ -1,6 +1,6 @@
 """Virtual hardware on one simulated world."""
 
-from labseq import Registry, hookimpl
+from labseq.plugin import Registry, hookimpl
 
 LABSEQ_API = 1
 

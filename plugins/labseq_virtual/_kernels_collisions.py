@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.kernel import const, kernel
+from labseq.plugin import const, kernel
 from labseq_virtual.axis_tones import AT_REST, DARK, EMPTY, END, HELD, MIXING, ON_END, ON_START, START
 
 Floats = NDArray[np.float64]

@@ -12,7 +12,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.kernel import const, kernel
+from labseq.plugin import const, kernel
 from labseq_virtual.axis_tones import DARK, EMPTY, END, HELD, NEW, ON_END, START
 from labseq_virtual.handover import (
     ADIABATIC_DEPTH,

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.kernel import const, kernel
+from labseq.plugin import const, kernel
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

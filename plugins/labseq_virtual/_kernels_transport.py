@@ -16,7 +16,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.kernel import const, kernel
+from labseq.plugin import const, kernel
 from labseq_virtual._kernels_collisions import N_WAY, mix, moves, sweep
 from labseq_virtual._kernels_handover import mobile_depth, pick_up, set_down, shallow
 from labseq_virtual.axis_tones import (

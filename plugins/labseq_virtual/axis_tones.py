@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.model import AxisTones, MotionSpec, SiteGrid
+from labseq.plugin import AxisTones, MotionSpec, SiteGrid
 
 Floats = NDArray[np.float64]
 

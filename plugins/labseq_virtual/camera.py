@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from labseq import (
+from labseq.plugin import (
     CameraDriver,
     CameraFacts,
     ConfigError,
@@ -19,8 +19,8 @@ from labseq import (
     SimulatedSensor,
     WiresTriggers,
     settle,
+    trigger_line,
 )
-from labseq.sequencer.lines import trigger_line
 from labseq_virtual.cooler import ROOM_K, Cooler
 from labseq_virtual.driver import simulated_world
 from labseq_virtual.settings import CameraSettings

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from labseq import Clock
+from labseq.plugin import Clock
 
 ROOM_K: Final = 293.15
 """Temperature of a sensor whose cooler is off (ours)."""

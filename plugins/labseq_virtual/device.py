@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from labseq import Context, DeviceError
-from labseq.errors import one_of
+from labseq.plugin import Context, DeviceError, one_of
 from labseq_virtual.settings import DeviceSettings
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 
-from labseq import ConfigError, Context, DeviceError, Simulation
+from labseq.plugin import ConfigError, Context, DeviceError, Simulation
 
 
 class VirtualDriver(ABC):

@@ -10,7 +10,7 @@ from typing import Final, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.model import RfSamples, RfSpan, RfTones
+from labseq.plugin import RfSamples, RfSpan, RfTones
 
 BLOCK: Final = 1024
 """Samples that are looked at together when silence is searched for."""

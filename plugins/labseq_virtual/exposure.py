@@ -10,8 +10,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.model import Occupancy, SensorMode, SiteGrid
-from labseq.roles import WHOLE_SENSOR
+from labseq.plugin import WHOLE_SENSOR, Occupancy, SensorMode, SiteGrid
 from labseq_virtual.images import Images
 from labseq_virtual.settings import WorldSettings
 from labseq_virtual.view import View

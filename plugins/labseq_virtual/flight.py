@@ -9,8 +9,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq import MotionSpec
-from labseq.model import SiteGrid
+from labseq.plugin import MotionSpec, SiteGrid
 from labseq_virtual.axis_tones import full_amplitudes
 from labseq_virtual.envelope import Band
 from labseq_virtual.hearing import RfPulse

@@ -31,7 +31,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.model import SiteGrid
+from labseq.plugin import SiteGrid
 from labseq_virtual.settings import WorldSettings
 
 Floats = NDArray[np.float64]

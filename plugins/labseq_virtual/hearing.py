@@ -7,8 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from labseq.model import RfSpan
-from labseq.roles import RfSource
+from labseq.plugin import RfSource, RfSpan
 from labseq_virtual.envelope import active_spans
 
 ROUNDING_S: Final = 1e-8

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
-from labseq import Angle, Duration, Fraction, Length, Settings
+from labseq.plugin import Angle, Duration, Fraction, Length, Settings
 
 PositiveDuration = Annotated[Duration, Field(gt=0)]
 PositiveLength = Annotated[Length, Field(gt=0)]

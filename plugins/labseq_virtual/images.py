@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq import RandomStream, SensorMode, SiteGrid
-from labseq.roles import WHOLE_SENSOR
+from labseq.plugin import WHOLE_SENSOR, RandomStream, SensorMode, SiteGrid
 from labseq_virtual.emccd import Emccd
 from labseq_virtual.image_settings import ImageSettings
 from labseq_virtual.optics import photoelectrons, site_brightness, site_spots

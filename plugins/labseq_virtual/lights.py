@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import Final
 
-from labseq import ConfigError, LineProgram, LineSpec
+from labseq.plugin import ConfigError, LineProgram, LineSpec
 from labseq_virtual.settings import LightSettings
 
 N_REMEMBERED: Final = 8

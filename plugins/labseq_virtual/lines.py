@@ -5,9 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from labseq import Context, DeviceError, DeviceTimeoutError, LimitError, LineProgram, LinesFacts
-from labseq.sequencer.lines import idle_program, off_program
-from labseq.units import format_quantity
+from labseq.plugin import (
+    Context,
+    DeviceError,
+    DeviceTimeoutError,
+    LimitError,
+    LineProgram,
+    LinesFacts,
+    format_quantity,
+    idle_program,
+    off_program,
+)
 from labseq_virtual.driver import VirtualDriver
 from labseq_virtual.settings import LinesSettings
 

@@ -9,9 +9,15 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq import Context, DeviceError, DeviceTimeoutError, LimitError, ToneProgram
-from labseq.model import AxisTones
-from labseq.units import format_quantity
+from labseq.plugin import (
+    AxisTones,
+    Context,
+    DeviceError,
+    DeviceTimeoutError,
+    LimitError,
+    ToneProgram,
+    format_quantity,
+)
 from labseq_virtual.driver import VirtualDriver
 from labseq_virtual.settings import MobileTweezersSettings
 

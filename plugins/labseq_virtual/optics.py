@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq import SiteGrid
+from labseq.plugin import SiteGrid
 from labseq_virtual.image_settings import ImageSettings
 from labseq_virtual.view import View
 

@@ -7,8 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.errors import LimitError
-from labseq.model import SiteGrid
+from labseq.plugin import LimitError, SiteGrid
 from labseq_virtual.settings import MobileLightSettings
 
 Floats = NDArray[np.float64]

@@ -12,8 +12,17 @@ from typing import Annotated, Self
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
 
 import labseq
-from labseq import CoolingSettings, Duration, Fraction, Frequency, Length, Settings, Temperature, Voltage
-from labseq.units import format_quantity
+from labseq.plugin import (
+    CoolingSettings,
+    Duration,
+    Fraction,
+    Frequency,
+    Length,
+    Settings,
+    Temperature,
+    Voltage,
+    format_quantity,
+)
 from labseq_virtual.image_settings import ImageSettings
 
 PositiveDuration = Annotated[Duration, Field(gt=0)]

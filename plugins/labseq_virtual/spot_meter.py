@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq import Context, DeviceError
+from labseq.plugin import Context, DeviceError
 from labseq_virtual.driver import VirtualDriver
 from labseq_virtual.settings import SpotMeterSettings
 

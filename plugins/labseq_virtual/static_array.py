@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.model import DepthRamp, SiteGrid, TweezerAmplitudes
-from labseq.roles import ToneSource
+from labseq.plugin import DepthRamp, SiteGrid, ToneSource, TweezerAmplitudes
 from labseq_virtual.settings import WorldSettings
 
 Floats = NDArray[np.float64]

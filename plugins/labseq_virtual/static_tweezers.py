@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq import Context, DepthRamp, DeviceError, LimitError, TweezerAmplitudes
+from labseq.plugin import Context, DepthRamp, DeviceError, LimitError, TweezerAmplitudes
 from labseq_virtual.driver import VirtualDriver
 from labseq_virtual.settings import StaticTweezersSettings
 

@@ -15,9 +15,7 @@ from typing import Final, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.errors import LimitError
-from labseq.model import MotionSpec, RfSpan, SiteGrid
-from labseq.units import format_quantity
+from labseq.plugin import LimitError, MotionSpec, RfSpan, SiteGrid, format_quantity
 from labseq_virtual.envelope import Band, envelope
 
 Floats = NDArray[np.float64]

@@ -33,7 +33,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.model import FrequencyCourse, MotionSpec, SiteGrid, ToneProgram
+from labseq.plugin import FrequencyCourse, MotionSpec, SiteGrid, ToneProgram
 from labseq_virtual.axis_tones import full_amplitudes, tone_table
 from labseq_virtual.handover import constants, merging_distance
 from labseq_virtual.places import Places

@@ -6,8 +6,7 @@ from typing import Self
 
 from pydantic import Field
 
-from labseq import LimitError, SensorMode
-from labseq.roles import WHOLE_SENSOR
+from labseq.plugin import WHOLE_SENSOR, LimitError, SensorMode
 from labseq_virtual.image_settings import ImageSettings
 
 

@@ -11,7 +11,8 @@ from typing import Any, Final, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq import (
+from labseq.plugin import (
+    WHOLE_SENSOR,
     Context,
     DepthRamp,
     DeviceError,
@@ -22,11 +23,11 @@ from labseq import (
     RandomStream,
     RfSource,
     SensorMode,
+    Signal,
     ToneProgram,
     ToneSource,
     TweezerAmplitudes,
 )
-from labseq.roles import WHOLE_SENSOR, Signal
 from labseq_virtual.exposure import Exposure, SensorMixin
 from labseq_virtual.flight import RfTransport
 from labseq_virtual.hearing import PulseReceiver

@@ -7,7 +7,7 @@ import time
 from collections import deque
 from typing import Any, Final
 
-from labseq import Clock, Frame, Series, SimulatedSensor
+from labseq.plugin import Clock, Frame, Series, SimulatedSensor
 from labseq_andor.codes import EXTERNAL_TRIGGER, SOFTWARE_TRIGGER, Code
 from labseq_andor.counterpart.calls import answers
 from labseq_andor.counterpart.faults import Faults

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from labseq import Clock, LabseqError, SimulatedSensor, Simulation
+from labseq.plugin import Clock, LabseqError, SimulatedSensor, Simulation
 from labseq_andor.codes import Code
 from labseq_andor.counterpart.acquisition import Acquisition
 from labseq_andor.counterpart.amplifiers import Amplifiers

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any, Final
 
-from labseq import Clock
+from labseq.plugin import Clock
 from labseq_andor.codes import Code
 from labseq_andor.counterpart.calls import answers
 from labseq_andor.counterpart.faults import Faults

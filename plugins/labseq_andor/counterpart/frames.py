@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from labseq import Frame
+from labseq.plugin import Frame
 from labseq_andor.codes import Code
 
 

@@ -9,7 +9,7 @@ from functools import lru_cache
 from types import SimpleNamespace
 from typing import Any, Final
 
-from labseq import LabseqError
+from labseq.plugin import LabseqError
 from labseq_andor.codes import Code
 from labseq_andor.counterpart.camera import FUNCTIONS, SimulatedCamera
 from labseq_andor.counterpart.texts import put_text

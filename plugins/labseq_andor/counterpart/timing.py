@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Final
 
-from labseq import SensorMode
+from labseq.plugin import SensorMode
 from labseq_andor.codes import Code
 from labseq_andor.counterpart.amplifiers import Amplifiers
 from labseq_andor.counterpart.calls import answers

@@ -11,7 +11,7 @@ import tempfile
 from pathlib import Path
 from typing import Final
 
-from labseq.kernel import cache_root
+from labseq.plugin import cache_root
 from labseq_soapy.library import SoapyError, library
 
 SOURCE: Final = Path(__file__).with_name("capture.cpp")

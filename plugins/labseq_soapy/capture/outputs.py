@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq import TweezerAmplitudes
+from labseq.plugin import TweezerAmplitudes
 from labseq_soapy.capture.ring import Ring
 
 DECIMALS: Final = 6

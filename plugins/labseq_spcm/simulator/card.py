@@ -9,8 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.errors import LabseqError
-from labseq.roles import Clock
+from labseq.plugin import Clock, LabseqError
 from labseq_spcm.simulator import registers as r
 from labseq_spcm.simulator.calls import list_writes, real_values
 from labseq_spcm.simulator.facts import M4I6631, CardModel

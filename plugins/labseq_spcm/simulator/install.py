@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from types import SimpleNamespace
 from typing import Any, Final
 
-from labseq.errors import DeviceError
+from labseq.plugin import DeviceError
 from labseq_spcm.simulator.card import SimulatedCard
 from labseq_spcm.simulator.library import LIBRARY, Library
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from labseq import Clock
-from labseq.drivers.serial_port import Port
+from labseq.plugin import Clock, Port
 from labseq_ttl.protocol import Edge
 
 

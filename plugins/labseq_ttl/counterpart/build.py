@@ -10,8 +10,7 @@ import tempfile
 from pathlib import Path
 from typing import Final
 
-from labseq import DeviceError
-from labseq.kernel import cache_root
+from labseq.plugin import DeviceError, cache_root
 
 SOURCE: Final = Path(__file__).with_name("runner.c")
 FIRMWARE: Final = Path(__file__).parents[1] / "firmware" / "labseq_ttl.hex"

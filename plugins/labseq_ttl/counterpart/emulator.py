@@ -9,7 +9,7 @@ import threading
 from collections.abc import Callable, Mapping
 from typing import Final
 
-from labseq.drivers.serial_port import Port
+from labseq.plugin import Port
 from labseq_ttl.counterpart.leader_input import LeaderInput
 from labseq_ttl.counterpart.words import RefusedError, numbers
 from labseq_ttl.protocol import (

@@ -8,8 +8,7 @@ import subprocess
 from contextlib import suppress
 from typing import Final
 
-from labseq import Clock, DeviceError, wait_for
-from labseq.drivers.serial_port import BROKEN, Port
+from labseq.plugin import BROKEN, Clock, DeviceError, Port, wait_for
 from labseq_ttl.counterpart.build import FIRMWARE, runner
 from labseq_ttl.port import open_box
 from labseq_ttl.protocol import OUTPUTS, Edge
