@@ -1,16 +1,9 @@
 """Types of the flat public namespace; the table in ``__init__.py`` resolves the same names."""
 
-from labseq.hookspecs import (
-    hookimpl as hookimpl,
-)
 from labseq.api import (
     make_planner as make_planner,
     make_target as make_target,
     tone_program as tone_program,
-)
-from labseq.drivers.settings import (
-    CameraSettings as CameraSettings,
-    CoolingSettings as CoolingSettings,
 )
 from labseq.config.settings import (
     Angle as Angle,
@@ -34,6 +27,10 @@ from labseq.drivers import (
     settle as settle,
     wait_for as wait_for,
 )
+from labseq.drivers.settings import (
+    CameraSettings as CameraSettings,
+    CoolingSettings as CoolingSettings,
+)
 from labseq.errors import (
     ConfigError as ConfigError,
     DeviceError as DeviceError,
@@ -50,6 +47,7 @@ from labseq.errors import (
 )
 from labseq.hookspecs import (
     LABSEQ_API as LABSEQ_API,
+    hookimpl as hookimpl,
 )
 from labseq.model import (
     Batch as Batch,

@@ -11,9 +11,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from labseq.analysis.overview import overview
 from labseq.analysis.charts import save_run
-from labseq.analysis.overview import CHOICES, picture_of
+from labseq.analysis.overview import CHOICES, overview, picture_of
 from labseq.analysis.paper import figure_4, figure_5, save_cycles, save_parallelism
 from labseq.analysis.replay import MeanCounts, Replay, ReplayedImages, ReplayedPlan, ReplayRequest, replay
 from labseq.analysis.shot import save_shot, shot_picture

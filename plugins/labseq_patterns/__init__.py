@@ -8,7 +8,14 @@ LABSEQ_API = 1
 @hookimpl
 def labseq_register(registry: Registry) -> None:
     """Offer the patterns."""
-    from labseq_patterns import checkerboard, honeycomb, kagome, ring, settings, sierpinski
+    from labseq_patterns import (
+        patterns as checkerboard,
+        patterns as honeycomb,
+        patterns as kagome,
+        patterns as ring,
+        patterns as settings,
+        patterns as sierpinski,
+    )
 
     registry.pattern("kagome", kagome.kagome, settings.BlockSettings)
     registry.pattern("link_kagome", kagome.link_kagome, settings.BlockSettings)

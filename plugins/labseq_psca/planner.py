@@ -24,7 +24,7 @@ from labseq.plugin import (
 Kernel = Callable[..., tuple[NDArray[np.int16], NDArray[np.int32]]]
 RowOrder = Literal["half_filled", "fullest", "emptiest"]
 
-_ORDERS: Final[dict[RowOrder, int]] = {"half_filled": 0, "fullest": -1, "emptiest": 1}  # see _kernels_rows
+_ORDERS: Final[dict[RowOrder, int]] = {"half_filled": 0, "fullest": -1, "emptiest": 1}  # see kernels
 
 
 class ToneLimits(Settings):
@@ -100,11 +100,11 @@ class PscaPlanner:
     def warm(self) -> None:
         """Compile the kernels, or load them from the cache."""
         if self._settings.variant == "paper":
-            from labseq_psca._kernels_paper import plan_as_in_paper as kernel
+            from labseq_psca.kernels_paper import plan_as_in_paper as kernel
         else:
-            from labseq_psca._kernels import plan_best_way as kernel
+            from labseq_psca.kernels import plan_best_way as kernel
 
-            importlib.import_module("labseq_psca._kernels_repair")  # so that it is ready too
+            importlib.import_module("labseq_psca.kernels")  # so that it is ready too
         self._kernel = kernel
 
     def plan(self, occupancy: ArrayLike, target: TargetPattern) -> Plan:
@@ -151,7 +151,7 @@ class PscaPlanner:
         self, occupied: Occupancy, fill: NDArray[np.bool_], clear: NDArray[np.bool_]
     ) -> tuple[NDArray[np.int16], NDArray[np.int32]]:
         """Fill each defect from the side that takes fewest atoms; sort and compress what that leaves."""
-        from labseq_psca._kernels_repair import plan_repair
+        from labseq_psca.kernels import plan_repair
 
         moves, offsets, atoms = plan_repair(occupied, fill, *self._limits)
         more_moves, more_offsets = self._sort_and_compress(atoms, fill, clear)
@@ -160,7 +160,7 @@ class PscaPlanner:
 
 def _cost(plan: tuple[NDArray[np.int16], NDArray[np.int32]]) -> int:
     """What a plan of few moves loses."""
-    from labseq_psca._kernels_repair import ATOM_MOVE, BATCH
+    from labseq_psca.kernels import ATOM_MOVE, BATCH
 
     moves, offsets = plan
     return ATOM_MOVE * len(moves) + BATCH * (len(offsets) - 1)

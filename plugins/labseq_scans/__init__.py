@@ -10,7 +10,7 @@ LABSEQ_API = 1
 @hookimpl
 def labseq_register(registry: Registry) -> None:
     """Offer the planners ``mta1`` and ``tetris`` and the pattern ``interleaved``."""
-    from labseq_scans import mta1, pattern, tetris
+    from labseq_scans import pattern, planners as mta1, planners as tetris
 
     registry.planner("mta1", mta1.Mta1Planner, mta1.Mta1Settings)
     registry.planner("tetris", tetris.TetrisPlanner, tetris.TetrisSettings)

@@ -103,7 +103,7 @@ class LsapPlanner(SingleTweezerPlanner):
     def _load(self) -> Callable[..., Moves]:
         from scipy.optimize import linear_sum_assignment
 
-        from labseq_single._kernels_lsap import plan_assignment
+        from labseq_single.kernels import plan_assignment
 
         self._assign: Callable[..., tuple[Ints, Ints]] = linear_sum_assignment
         return plan_assignment
@@ -131,7 +131,7 @@ class CompressionPlanner(SingleTweezerPlanner):
     name = "compression"
 
     def _load(self) -> Callable[..., Moves]:
-        from labseq_single._kernels_compression import plan_compression
+        from labseq_single.kernels import plan_compression
 
         return plan_compression
 
@@ -148,7 +148,7 @@ class HcaPlanner(SingleTweezerPlanner):
     name = "hca"
 
     def _load(self) -> Callable[..., Moves]:
-        from labseq_single._kernels_hca import plan_clusters
+        from labseq_single.kernels import plan_clusters
 
         return plan_clusters
 

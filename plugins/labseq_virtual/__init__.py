@@ -10,12 +10,12 @@ def labseq_register(registry: Registry) -> None:
     """Offer the world, and a virtual twin for each hardware role."""
     from labseq_virtual import (
         camera,
-        device,
-        lines,
-        mobile_tweezers,
+        devices as device,
+        devices as lines,
+        devices as spot_meter,
         settings,
-        spot_meter,
-        static_tweezers,
+        tweezers as mobile_tweezers,
+        tweezers as static_tweezers,
         world,
     )
 

@@ -1,4 +1,4 @@
-"""Where played waveforms take the atoms: tones, tweezers, and Newton's law."""
+"""Atoms carried by what an AWG has played."""
 
 from __future__ import annotations
 
@@ -7,19 +7,182 @@ from collections import Counter
 from typing import Any, Final
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from labseq.plugin import MotionSpec, SiteGrid
-from labseq_virtual.axis_tones import full_amplitudes
-from labseq_virtual.envelope import Band
-from labseq_virtual.hearing import RfPulse
-from labseq_virtual.jumps import JUMPS, depth_jumps, phase_jumps
-from labseq_virtual.places import Places
+from labseq_virtual.handover import full_amplitudes
+from labseq_virtual.played import HOPS, WINDOW, Band, RfPulse, Tracks, refuse_blur, track_tones
 from labseq_virtual.settings import WorldSettings
-from labseq_virtual.thermal import draw_atoms
-from labseq_virtual.tones import HOPS, WINDOW, Tracks, refuse_blur, track_tones
+from labseq_virtual.transport import Places
 
 Floats = NDArray[np.float64]
+
+JUMPS: Final = np.dtype(
+    [
+        ("t_s", np.float64),
+        ("kind", "S5"),
+        ("row", np.float32),
+        ("col", np.float32),
+        ("size", np.float32),
+    ],
+    metadata={
+        "descriptions": {
+            "t_s": "when, from the start of the shot",
+            "kind": "phase, of a tone; or depth, of a tweezer",
+            "row": "row in sites; nan for the phase of a column's tone",
+            "col": "column in sites; nan for the phase of a row's tone",
+            "size": "in rad, or as a fraction of the full depth",
+        }
+    },
+)
+"""A jump: when, of which kind, where in sites, and how large.
+
+A "phase" jump is that of one tone, in rad: of the column's tone where ``row`` is nan, and the other
+way round. A "depth" jump is that of a tweezer, as a fraction of the full depth.
+"""
+
+INNER: Final = 3 * HOPS // 4
+OUTER: Final = 2 * HOPS
+"""Frames on each side of a place, from which to which a tone is looked at: the nearer ones see the jump."""
+MIN_RAD: Final = 0.5
+RESIDUAL_RAD: Final = 0.02
+"""Greatest misfit of a smooth course; where it is worse, something else happens, such as a second start."""
+CHIRP_RAD: Final = 0.3
+"""What a change of the chirp must amount to within the inner frames to tell its place."""
+MIN_DEPTH: Final = 0.6
+"""Change of the depth in a transit time; a ramp of 60 us makes a sixth."""
+
+
+def phase_jumps(tracks: Tracks, j: int) -> list[tuple[float, int, float]]:
+    """The phase jumps of one of the tones.
+
+    A phase jump is the difference between what a tone's course before and after leads one to expect.
+    Both courses are quadratic in time (constant chirp). Where the chirp changes too, the jump is taken
+    where both have the same frequency: motion is continuous.
+
+    Args:
+        tracks: The tones.
+        j: Which one.
+
+    Returns:
+        Time, frame and size in rad of each.
+    """
+    hz, phase = tracks.frequency_hz[:, j], tracks.phase_rad[:, j]
+    n_span = 2 * OUTER + 1
+    if len(hz) < n_span:
+        return []
+    step_s = float(tracks.t_s[1] - tracks.t_s[0])
+    advance = np.pi * step_s * (hz[1:] + hz[:-1])
+    advance += _wrapped(np.diff(phase) - advance)
+    # Relative to the frequency in the middle of each window.
+    steps = sliding_window_view(advance, n_span - 1) - 2 * np.pi * step_s * hz[OUTER:-OUTER, None]
+    courses = np.concatenate([np.zeros((len(steps), 1)), np.cumsum(steps, axis=1)], axis=1)
+    before, after = np.arange(OUTER - INNER + 1), np.arange(OUTER + INNER, n_span)
+    at_s = np.arange(-OUTER, OUTER + 1, dtype=np.float64) * step_s
+    first, setting_error = _fit(courses[:, before], at_s[before])
+    second, other_misfit = _fit(courses[:, after], at_s[after])
+    shift, slope, bend = (second - first).T
+    inner_s = INNER * step_s
+    bent = np.abs(bend) * inner_s**2 > CHIRP_RAD
+    place_s = np.where(bent, -slope / np.where(bent, 2 * bend, 1.0), 0.0)
+    size = _wrapped(shift + slope * place_s + bend * place_s**2)
+    fine = (np.maximum(setting_error, other_misfit) < RESIDUAL_RAD) & (np.abs(place_s) <= inner_s)
+    found = peaks(np.where(fine, np.abs(size), 0.0), MIN_RAD, 2 * INNER)
+    return [(float(tracks.t_s[k + OUTER] + place_s[k]), k + OUTER, float(size[k])) for k in found]
+
+
+def depth_jumps(depth: Floats) -> list[tuple[int, float]]:
+    """The jumps of a tweezer's depth.
+
+    Args:
+        depth: Fraction of the full depth in each frame, (n_frames,), 0 where off.
+
+    Returns:
+        Frame and size of each.
+    """
+    change = depth[HOPS:] - depth[:-HOPS]
+    return [(k + HOPS // 2, float(change[k])) for k in peaks(np.abs(change), MIN_DEPTH, HOPS)]
+
+
+def peaks(values: Floats, least: float, apart: int) -> list[int]:
+    """The middle of each stretch of values above a limit; what is at most ``apart`` apart is one stretch."""
+    above = np.flatnonzero(values > least)
+    if not len(above):
+        return []
+    groups = np.split(above, np.flatnonzero(np.diff(above) > apart) + 1)
+    return [int(group[len(group) // 2]) for group in groups]
+
+
+def _fit(courses: Floats, at_s: Floats) -> tuple[Floats, Floats]:
+    """Coefficients of the quadratics through some courses, and their worst misfits."""
+    powers = np.vander(at_s, 3, increasing=True)
+    fit = courses @ np.linalg.pinv(powers).T
+    return fit, np.abs(courses - fit @ powers.T).max(axis=1)
+
+
+def _wrapped(phase_rad: Floats) -> Floats:
+    return (phase_rad + np.pi) % (2 * np.pi) - np.pi
+
+
+WIDER: Final = np.array([2.2, 2.2, 4.0])
+"""How much wider than the harmonic law positions are proposed: enough for a beam's weaker flanks."""
+PROPOSALS: Final = 32
+"""Proposals at once for each atom that is still to be placed; one in twenty is taken."""
+
+
+def draw_atoms(
+    depth: Floats, temperature: float, waist: float, rayleigh: float, rng: np.random.Generator
+) -> Floats:
+    """Draw atoms from the Boltzmann law of a Gaussian beam, as far as the beam binds them.
+
+    Positions have the density ``exp(a) P(a)``, where ``a = -U / kT`` and
+    ``P(a) = erf(sqrt(a)) - 2 sqrt(a / pi) exp(-a)`` is the part of the Maxwell law that is slow enough
+    to be bound there. They are drawn by rejection from a wider Gaussian. Atoms drawn so stay
+    distributed as they are; those of the harmonic law would breathe. In tweezers that are too shallow for
+    the temperature they are as hot as half of the depth: hotter ones have evaporated.
+
+    Args:
+        depth: Depth of each atom's tweezer per mass, (n_atoms,), above 0.
+        temperature: kT per mass.
+        waist: 1/e^2 radius of the intensity.
+        rayleigh: Rayleigh length.
+        rng: Random numbers.
+
+    Returns:
+        Positions from the tweezers' foci, and velocities, (n_atoms, 6).
+    """
+    from scipy.special import erf
+
+    kt = np.minimum(temperature, depth / 2)
+    most = depth / kt
+    size = np.array([waist, waist, rayleigh])
+    spread = WIDER / np.sqrt(np.array([4.0, 4.0, 2.0]) * most[:, None])
+    atoms = np.empty((len(depth), 6))
+    bound = np.zeros(len(depth))
+    left = np.arange(len(depth))
+    while len(left):
+        normal = rng.standard_normal((len(left), PROPOSALS, 3))
+        place = normal * spread[left, None]
+        s = 1.0 + place[..., 2] ** 2
+        a = most[left, None] / s * np.exp(-2 * (place[..., 0] ** 2 + place[..., 1] ** 2) / s)
+        slow = erf(np.sqrt(a)) - 2 * np.sqrt(a / np.pi) * np.exp(-a)
+        weight = np.exp(a - most[left, None] + 0.5 * (normal**2).sum(axis=-1)) * slow
+        taken = rng.random(weight.shape) < weight
+        first = taken.argmax(axis=1)
+        done = taken[np.arange(len(left)), first]
+        atoms[left[done], :3] = place[done, first[done]] * size
+        bound[left[done]] = a[done, first[done]]
+        left = left[~done]
+    left = np.arange(len(depth))
+    while len(left):
+        velocity = rng.standard_normal((len(left), 3))
+        slow = 0.5 * (velocity**2).sum(axis=1) < bound[left]
+        atoms[left[slow], 3:] = np.sqrt(kt[left[slow], None]) * velocity[slow]
+        left = left[~slow]
+    return atoms
+
+
 Mask = NDArray[np.bool_]
 
 BOLTZMANN: Final = 1.380649e-23
@@ -31,7 +194,7 @@ STEP_S: Final = 0.1e-6
 """Step of the integration: a seventieth of a period in a tweezer of 2.1 mK."""
 BAND_HZ: Final = 50e6
 """Least width of the AODs' band."""
-MIN_DEPTH: Final = 2e-3
+FLIGHT_MIN_DEPTH: Final = 2e-3
 """Fraction of the full depth of an axis below which a tone is not heard."""
 SLEW_HZ: Final = 4e6
 """Most that a tone's frequency leaves its course in a transit time: 1100 um/ms at 1.6 MHz per site."""
@@ -115,7 +278,7 @@ class RfTransport:
         self._jumps: list[tuple[Any, ...]] = []
 
     def refuse_blur(self) -> None:
-        """Refuse tones that :func:`labseq_virtual.tones.track_tones` cannot tell apart.
+        """Refuse tones that :func:`labseq_virtual.played.track_tones` cannot tell apart.
 
         Raises:
             LimitError: They are too near, or too fast, for the time that the sound takes across the beam.
@@ -138,11 +301,11 @@ class RfTransport:
     def carry(
         self, occupied: Mask, pulse: RfPulse, depth: Floats, rng: np.random.Generator, loss_factor: float
     ) -> Counter[str]:
-        """Let an episode act on the atoms.
+        """Let a pulse act on the atoms.
 
         Args:
             occupied: bool (n_rows, n_cols), sites that hold an atom; changed in place.
-            episode: What was played.
+            pulse: What was played.
             depth: float64 (n_rows, n_cols), depths of the static tweezers, of the nominal one.
             rng: Random numbers of the shot.
             loss_factor: The shot's factor on the transport loss.
@@ -150,7 +313,7 @@ class RfTransport:
         Returns:
             How many atoms were lost by each cause: hand_over, transport, collision, ejected.
         """
-        from labseq_virtual._kernels_atoms import DEPTH, HELD_S, LOST_S, N_DIARY, OFFSET, PAIRED, follow_atoms
+        from labseq_virtual.atom_kernels import DEPTH, HELD_S, LOST_S, N_DIARY, OFFSET, PAIRED, follow_atoms
 
         tones = self._listen(pulse)
         if tones is None:
@@ -194,7 +357,7 @@ class RfTransport:
             if not spans:
                 return None
             start_s, end_s = pulse.start_s - self.margin_s, pulse.end_s + 2 * self.margin_s
-            min_v = float(self._full_v[axis].min()) * math.sqrt(MIN_DEPTH)
+            min_v = float(self._full_v[axis].min()) * math.sqrt(FLIGHT_MIN_DEPTH)
             transit_s = self._light.transit_time
             found.append(track_tones(spans, start_s, end_s, self._bands[axis], transit_s, min_v, SLEW_HZ))
         n_frames = min(len(tracks.t_s) for tracks in found)
@@ -230,7 +393,7 @@ class RfTransport:
 
     def _arrivals(self, state: Floats, static: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp], Mask]:
         """The sites that are nearest to some atoms, -1 beyond the grid, and whether they bind the atoms."""
-        from labseq_virtual._kernels_atoms import energies
+        from labseq_virtual.atom_kernels import energies
 
         waist, rayleigh = self._beams[:2]
         place = np.rint((state[:, :2] - self._plane[0]) @ self._plane[3:].T).astype(np.intp)

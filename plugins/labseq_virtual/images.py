@@ -1,16 +1,115 @@
-"""What the virtual camera sees of the atoms: optics and sensor together."""
+"""Images of atoms: settings, optics, exposure."""
 
 from __future__ import annotations
+
+import importlib
+import math
+from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.plugin import WHOLE_SENSOR, RandomStream, SensorMode, SiteGrid
-from labseq_virtual.emccd import Emccd
-from labseq_virtual.image_settings import ImageSettings
-from labseq_virtual.optics import photoelectrons, site_brightness, site_spots
-from labseq_virtual.qcmos import Qcmos
-from labseq_virtual.view import View
+from labseq.plugin import WHOLE_SENSOR, Occupancy, RandomStream, SensorMode, SiteGrid
+from labseq_virtual.sensors import Emccd, Qcmos, View
+from labseq_virtual.settings import ImageSettings, WorldSettings
+
+
+def site_spots(settings: ImageSettings, grid: SiteGrid) -> NDArray[np.float64]:
+    """Centres of the sites' spots on the full sensor.
+
+    The grid is turned, stretched along an axis of the frame, put on its place, and bent by the
+    radial distortion of the lenses.
+
+    Returns:
+        float64 (n_rows, n_cols, 2), (y, x) in pixels.
+    """
+    to_axis, ratio = settings.stretch_angle, math.sqrt(1 + settings.stretch)
+    stretched = _rotation(to_axis) @ np.diag([1 / ratio, ratio]) @ _rotation(-to_axis)
+    to_frame = stretched @ _rotation(settings.angle)
+    straight = grid.positions_m[..., ::-1] @ to_frame.T / settings.pixel_size + settings.centre_px
+    bent = 1 - settings.barrel * corner_distance(settings, straight) ** 2
+    return middle(settings) + (straight - middle(settings)) * bent[..., None]
+
+
+def site_brightness(
+    settings: ImageSettings, spots: NDArray[np.float64], rng: np.random.Generator
+) -> NDArray[np.float64]:
+    """How bright an atom on each site is, relative to one in the middle of the frame.
+
+    Args:
+        settings: Constants of the optics.
+        spots: What :func:`site_spots` found.
+        rng: Random numbers of the machine.
+
+    Returns:
+        float64 (n_rows, n_cols).
+    """
+    spread = np.maximum(0.0, 1 + settings.brightness_spread * rng.standard_normal(spots.shape[:2]))
+    return spread * np.maximum(0.0, 1 - settings.vignetting * corner_distance(settings, spots) ** 2)
+
+
+def photoelectrons(
+    settings: View,
+    spots: NDArray[np.float64],
+    mean: NDArray[np.float64],
+    rng: np.random.Generator,
+    binning: int = 1,
+) -> NDArray[np.int32]:
+    """Draw the photoelectrons of atoms on each pixel that is read.
+
+    Each is drawn by itself: how many an atom gives (Poisson), and where each falls. In the
+    spot that is a Gaussian, sampled by the pixels without any approximation. The fraction
+    ``halo`` falls in wings of the density w / (2 pi (r^2 + w^2)^(3/2)), which fall as the mean
+    of an Airy pattern does.
+
+    Args:
+        settings: Constants of the optics, and the part of the sensor that is read.
+        spots: float64 (n_atoms, 2), (y, x) of each atom's spot on the sensor.
+        mean: float64 (n_atoms,), mean photoelectrons of each.
+        rng: Random numbers of the shot.
+        binning: Pixels of the sensor per pixel of the frame, along each axis.
+
+    Returns:
+        int32 (height, width).
+    """
+    from labseq_virtual import image_kernels as kernels
+
+    n_each = rng.poisson(mean)
+    n = int(n_each.sum())
+    beside = rng.standard_normal((n, 2), np.float32)
+    beside *= np.float32(settings.spot / settings.pixel_size)
+    if settings.halo > 0:
+        wide = np.flatnonzero(rng.random(n, np.float32) < settings.halo)
+        beside[wide] = _wings(len(wide), rng) * (settings.halo_width / settings.pixel_size)
+    top, left, height, width = settings.region
+    light = np.zeros((height // binning, width // binning), np.int32)
+    kernels.scatter(beside, spots, n_each, top, left, binning, light)
+    return light
+
+
+def middle(settings: ImageSettings) -> NDArray[np.float64]:
+    """The middle of the sensor, (y, x)."""
+    return (np.array(settings.frame) - 1) / 2
+
+
+def corner_distance(settings: ImageSettings, places: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Distance of places (..., 2) from the middle of the sensor; 1 is its corner."""
+    return np.linalg.norm(places - middle(settings), axis=-1) / math.hypot(*(np.array(settings.frame) / 2))
+
+
+def _wings(n: int, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Places in wings of width 1 (n, 2): where an even light from a unit above meets the plane."""
+    cosine = 1.0 - rng.random(n)
+    radius = np.sqrt(1 / cosine**2 - 1)
+    angle = 2 * np.pi * rng.random(n)
+    return np.stack([radius * np.sin(angle), radius * np.cos(angle)], axis=1)
+
+
+def _rotation(angle_rad: float) -> NDArray[np.float64]:
+    """Rotation of (y, x) clockwise on the screen."""
+    cos, sin = math.cos(angle_rad), math.sin(angle_rad)
+    return np.array([[cos, sin], [-sin, cos]])
 
 
 class Images:
@@ -65,3 +164,103 @@ class Images:
         mean = full * shining * self._brightness[row, col] * self._is_lit
         light = photoelectrons(view, self._spots[row, col], mean, rng, self._sensor.binning)
         return self._sensor.read(light, exposure_s, rng)
+
+
+class SensorMixin:
+    """The part of a world that tells of its sensor; implements ``labseq.ReportsSensor``."""
+
+    _exposure: Exposure
+
+    @property
+    def sensor_shape(self) -> tuple[int, int]:
+        """(height, width) of the sensor in pixels."""
+        return self._exposure.sensor_shape
+
+    def readout_fraction(self, mode: SensorMode) -> float:
+        """Time to read a frame, relative to that of the whole sensor without binning."""
+        return self._exposure.readout_fraction(mode)
+
+    def prepare_sensor(self, mode: SensorMode) -> None:
+        """Work out what all frames of a mode have in common, and load the kernels."""
+        importlib.import_module("labseq_virtual.image_kernels")
+        self._exposure.prepare(mode)
+
+
+class Exposure:
+    """Takes frames of the atoms.
+
+    Args:
+        grid: The grid of sites.
+        settings: Losses and image.
+        seed: Seed of the machine's own disorder.
+    """
+
+    def __init__(self, grid: SiteGrid, settings: WorldSettings, seed: int) -> None:
+        self._settings = settings
+        self._grid = grid
+        self._seed = seed
+        self._images: dict[SensorMode, Images] = {}
+        self._light_hz = -math.log1p(-settings.imaging_loss) / settings.imaging_loss_exposure
+
+    @property
+    def sensor_shape(self) -> tuple[int, int]:
+        """(height, width) of the sensor in pixels."""
+        return self._settings.image.frame
+
+    def readout_fraction(self, mode: SensorMode) -> float:
+        """Time to read a frame, relative to that of the whole sensor without binning.
+
+        Raises:
+            LimitError: The sensor cannot be used so.
+        """
+        return View.of(self._settings.image, mode).readout_fraction
+
+    def prepare(self, mode: SensorMode) -> None:
+        """Work out what all frames of a mode have in common.
+
+        Raises:
+            LimitError: The sensor cannot be used so.
+        """
+        self._images_of(mode).warm()
+
+    def take(
+        self,
+        occupied: Occupancy,
+        exposure_s: float,
+        random: np.random.Generator,
+        mode: SensorMode = WHOLE_SENSOR,
+        lit: float = 1.0,
+    ) -> tuple[NDArray[np.uint16], Counter[str]]:
+        """Take a frame; the imaging light heats some atoms out, and they shine until they are lost.
+
+        It does so behind a closed shutter too, which keeps it from the sensor only.
+
+        Args:
+            occupied: bool (n_rows, n_cols), sites that hold an atom; changed in place.
+            exposure_s: Exposure time, in seconds.
+            random: Random numbers of the shot.
+            mode: How the sensor is exposed and read.
+            lit: Fraction of the exposure with imaging light; without any there is no stray light either.
+
+        Returns:
+            The frame, uint16 (height, width), read-only, and how many atoms were lost to imaging and vacuum.
+        """
+        images = self._images_of(mode if lit > 0 else replace(mode, shutter_open=False))
+        row, col = np.nonzero(occupied)
+        light_hz = self._light_hz * lit
+        rate_hz = light_hz + 1.0 / self._settings.lifetime
+        life_s = random.exponential(1.0 / rate_hz, len(row))
+        shining = np.minimum(life_s / exposure_s, 1.0) * lit
+        image = images.take(row, col, shining, exposure_s, random)
+        image.flags.writeable = False
+        lost = life_s < exposure_s
+        occupied[row[lost], col[lost]] = False
+        n_lost = int(np.count_nonzero(lost))
+        n_by_light = int(random.binomial(n_lost, light_hz / rate_hz))
+        return image, Counter(imaging=n_by_light, vacuum=n_lost - n_by_light)
+
+    def _images_of(self, mode: SensorMode) -> Images:
+        """The same machine in each mode: a region is exactly that part of the sensor."""
+        if mode not in self._images:
+            self._images[mode] = Images(self._settings.image, self._grid, self._seed, mode)
+        return self._images[mode]

@@ -1,11 +1,12 @@
-"""The simulated world: one seeded array of atoms that all virtual hardware acts on."""
+"""The simulation: atoms, lights and tweezers of one run."""
 
 from __future__ import annotations
 
 import importlib
 import math
 from collections import Counter, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
 from typing import Any, Final, cast
 
 import numpy as np
@@ -13,29 +14,191 @@ from numpy.typing import NDArray
 
 from labseq.plugin import (
     WHOLE_SENSOR,
+    ConfigError,
     Context,
     DepthRamp,
     DeviceError,
     Frame,
     LimitError,
     LineProgram,
+    LineSpec,
     Occupancy,
     RandomStream,
     RfSource,
     SensorMode,
     Signal,
+    SiteGrid,
     ToneProgram,
     ToneSource,
     TweezerAmplitudes,
 )
-from labseq_virtual.exposure import Exposure, SensorMixin
 from labseq_virtual.flight import RfTransport
-from labseq_virtual.hearing import PulseReceiver
-from labseq_virtual.lights import Lights
-from labseq_virtual.places import Places
-from labseq_virtual.settings import WorldSettings
-from labseq_virtual.static_array import StaticArray
-from labseq_virtual.transport import CAUSES, Playing, Transport
+from labseq_virtual.images import Exposure, SensorMixin
+from labseq_virtual.played import PulseReceiver
+from labseq_virtual.settings import LightSettings, WorldSettings
+from labseq_virtual.transport import CAUSES, Places, Playing, Transport
+
+N_REMEMBERED: Final = 8
+"""Programs that are kept: an event asks about the last one or two."""
+
+
+class Lights:
+    """What the lines do to the light; without lines all of it is on whenever it is needed.
+
+    Args:
+        settings: Which lines each kind of light needs.
+        specs: The lines of the profile.
+
+    Raises:
+        ConfigError: The settings name a line that the profile does not have.
+    """
+
+    def __init__(self, settings: LightSettings, specs: Sequence[LineSpec]) -> None:
+        names = [spec.name for spec in specs]
+        self._needs = {kind: getattr(settings, kind) for kind in LightSettings.model_fields}
+        for kind, needed in self._needs.items():
+            if names and (missing := [name for name in needed if name not in names]):
+                known = ", ".join(f"'{name}'" for name in names)
+                raise ConfigError(f"`lights.{kind}` names a line '{missing[0]}'; the profile has {known}")
+        self._triggers = {spec.name: spec.triggers for spec in specs if spec.triggers}
+        self._wires: dict[str, Callable[[float], object]] = {}
+        self._played: deque[tuple[float, LineProgram]] = deque(maxlen=N_REMEMBERED)
+
+    def forget(self) -> None:
+        """All light is on whenever it is needed, until the lines are told of again."""
+        self._played.clear()
+        self._wires.clear()
+
+    def wire(self, role: str, on_edge: Callable[[float], object]) -> None:
+        """Tell a device of the edges of the line that triggers its role, from now on."""
+        self._wires[role] = on_edge
+
+    def switch(self, program: LineProgram, t_start_s: float) -> None:
+        """Let the lines do as a program says, and trigger what is wired to them; the last one ends."""
+        self._played.append((t_start_s, program))
+        edges = [
+            (t_start_s + t_s, role) for line, role in self._triggers.items() for t_s in program.rising(line)
+        ]
+        for t_s, role in sorted(edges):
+            if role in self._wires:
+                self._wires[role](t_s)
+
+    def fraction_on(self, kind: str, start_s: float, end_s: float) -> float:
+        """For which part of a time a kind of light is on: all lines that it needs are.
+
+        Args:
+            kind: "loading", "cooling" or "imaging".
+            start_s: Start on the session's clock.
+            end_s: End; not before the start.
+        """
+        needed = self._needs[kind]
+        if not self._played or not needed:
+            return 1.0
+        if end_s <= start_s:
+            return float(self._all_on(needed, start_s))
+        edges = [start_s, *(t for t in self._edges() if start_s < t < end_s), end_s]
+        lit_s = sum(b - a for a, b in pairwise(edges) if self._all_on(needed, (a + b) / 2))
+        return lit_s / (end_s - start_s)
+
+    def _edges(self) -> list[float]:
+        return sorted({t_start_s + t for t_start_s, program in self._played for t in program.t_s.tolist()})
+
+    def _all_on(self, names: Sequence[str], t_s: float) -> bool:
+        """The state at a time is that of the last program that began before it."""
+        before = [(start_s, program) for start_s, program in self._played if start_s <= t_s]
+        if not before:
+            return False
+        start_s, program = before[-1]
+        edge = int((program.t_s <= t_s - start_s).sum()) - 1
+        return all(bool(program.on[edge, program.lines.index(name)]) for name in names)
+
+
+Floats = NDArray[np.float64]
+
+
+class StaticArray:
+    """Depths of all sites, as fractions of the nominal one.
+
+    At full light the depth of a site is the product of its row's and its column's power, of what the AODs
+    make of these two tones (``tone_response``), and of the site's own disorder (``depth_disorder``), which
+    no choice of amplitudes mends. The power of a tone goes as its amplitude squared; equal amplitudes that
+    reach full scale together give the nominal depth.
+
+    Args:
+        grid: The grid of sites.
+        settings: The constants.
+    """
+
+    def __init__(self, grid: SiteGrid, settings: WorldSettings) -> None:
+        self._grid, self._settings = grid, settings
+        self._site: Floats = np.ones(grid.shape)
+        self._response: tuple[Floats, Floats] = np.ones(grid.n_rows), np.ones(grid.n_cols)
+        self._power: tuple[Floats, Floats] = self._response
+        self._level = 0.0
+        self._source: ToneSource | None = None
+
+    def draw(self, random: np.random.Generator) -> None:
+        """Draw the disorder of the machine; all light off, amplitudes equal."""
+        n_rows, n_cols = self._grid.shape
+        disorder = random.standard_normal((n_rows, n_cols))
+        self._site = np.maximum(0.0, 1.0 + self._settings.depth_disorder * disorder)
+        row, col = (
+            np.exp(self._settings.tone_response * random.standard_normal(n)) for n in (n_rows, n_cols)
+        )
+        self._response = row, col
+        self._power = np.ones(n_rows), np.ones(n_cols)
+        self._level = 0.0
+
+    @property
+    def depth(self) -> Floats:
+        """Depth of each site now, float64 (n_rows, n_cols)."""
+        rows, cols = (power * response for power, response in zip(self._power, self._response, strict=True))
+        return self._level * self._site * rows[:, None] * cols
+
+    def holds(self) -> NDArray[np.bool_]:
+        """Which sites are deep enough to hold an atom, bool (n_rows, n_cols)."""
+        return self.depth >= self._settings.lost_below_depth
+
+    def switch_off(self) -> None:
+        """No light, and nobody to listen to."""
+        self._level = 0.0
+        self._source = None
+
+    def connect_outputs(self, source: ToneSource) -> None:
+        """From now on the light is what these outputs play."""
+        rows, cols = self._grid.shape
+        self.drive(TweezerAmplitudes(np.zeros(rows), np.zeros(cols)))
+        self._source, self._level = source, 1.0
+
+    def receive_until(self, until_s: float, occupied: NDArray[np.bool_]) -> int:
+        """Follow what the outputs played; atoms in too shallow tweezers are gone from ``occupied``.
+
+        Returns:
+            How many were lost.
+        """
+        before = np.count_nonzero(occupied)
+        for amplitudes in () if self._source is None else self._source.played(until_s):
+            self.drive(amplitudes)
+            occupied &= self.holds()
+        return int(before - np.count_nonzero(occupied))
+
+    def drive(self, amplitudes: TweezerAmplitudes) -> None:
+        """Take over the amplitudes of the tones."""
+        rows, cols = amplitudes.row, amplitudes.column
+        self._power = (rows * len(rows)) ** 2, (cols * len(cols)) ** 2
+
+    def ramp(self, ramp: DepthRamp, occupied: NDArray[np.bool_]) -> int:
+        """Change the depth; atoms in tweezers that become too shallow are gone from ``occupied``.
+
+        Returns:
+            How many were lost.
+        """
+        before = np.count_nonzero(occupied)
+        for level in (ramp.start, ramp.end):
+            self._level = level
+            occupied &= self.holds()
+        return int(before - np.count_nonzero(occupied))
+
 
 ROUNDING_S: Final = 1e-6
 """How far into the past an event may lie because sums of times were rounded."""
@@ -44,9 +207,9 @@ ROUNDING_S: Final = 1e-6
 class World(SensorMixin):
     """Atoms in static tweezers, what light does to them, and what a camera sees of it.
 
-    Implements ``labseq.Simulation``, ``labseq.ReportsSensor``, ``labseq.ReportsTruth``, ``labseq.ReportsLosses``,
-    ``labseq.ReceivesOutput`` and ``labseq.ReportsEvents``. Events come in the order of time. A program of the mobile
-    tweezers is carried out when it has ended, or as far as it came when another program takes
+    Implements ``labseq.Simulation``, ``labseq.ReportsSensor``, ``labseq.ReportsTruth``,
+    ``labseq.ReportsLosses``, ``labseq.ReceivesOutput`` and ``labseq.ReportsEvents``.
+    Events come in the order of time. A program of the mobile tweezers is carried out when it has ended, or as far as it came when another program takes
     its place: playing a program without segments cuts it short, and atoms in flight are lost. A
     ramp of the static tweezers that comes during a program or an exposure acts at its end.
 
@@ -92,8 +255,8 @@ class World(SensorMixin):
 
     def warm(self) -> None:
         """Compile the kernels of what is heard and of atoms on their way, or load them."""
-        for kernels in ("tones", "atoms", "transport"):
-            importlib.import_module(f"labseq_virtual._kernels_{kernels}")
+        for kernels in ("atom_kernels", "transport_kernels"):
+            importlib.import_module(f"labseq_virtual.{kernels}")
 
     def close(self) -> None:
         """Forget everything."""
@@ -209,7 +372,7 @@ class World(SensorMixin):
 
         Returns:
             "flights" (:data:`labseq_virtual.flight.FLIGHTS`) and "jumps"
-            (:data:`labseq_virtual.jumps.JUMPS`); nothing if it listens to nobody.
+            (:data:`labseq_virtual.flight.JUMPS`); nothing if it listens to nobody.
         """
         if self._pulse_receiver is None:
             return {}

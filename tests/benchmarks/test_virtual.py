@@ -6,9 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from labseq_virtual.image_settings import ImageSettings
 from labseq_virtual.images import Images
-from labseq_virtual.settings import WorldSettings
+from labseq_virtual.settings import ImageSettings, WorldSettings
 from labseq_virtual.transport import Transport
 from labseq_virtual.world import World
 

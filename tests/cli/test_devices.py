@@ -33,7 +33,7 @@ PLUGIN = """
 import threading
 
 import labseq
-from labseq_virtual.device import VirtualDevice
+from labseq_virtual.devices import VirtualDevice
 from labseq_virtual.settings import DeviceSettings
 
 LABSEQ_API = 1

@@ -23,7 +23,7 @@ plugin_folders: [plugins]
 
 JAMMED = """
 import labseq
-from labseq_virtual.device import VirtualDevice
+from labseq_virtual.devices import VirtualDevice
 from labseq_virtual.settings import DeviceSettings
 
 LABSEQ_API = 1

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 from hypothesis import given, settings as hypothesis_settings, strategies as st
-from labseq_patterns.settings import BlockSettings, RingSettings, SierpinskiSettings
+from labseq_patterns.patterns import BlockSettings, RingSettings, SierpinskiSettings
 from numpy.typing import NDArray
 from pydantic import BaseModel, ValidationError
 

@@ -7,7 +7,14 @@ from functools import partial
 from typing import Any
 
 import pytest
-from labseq_patterns import checkerboard, honeycomb, kagome, ring, settings, sierpinski
+from labseq_patterns import (
+    patterns as checkerboard,
+    patterns as honeycomb,
+    patterns as kagome,
+    patterns as ring,
+    patterns as settings,
+    patterns as sierpinski,
+)
 from labseq_scans.pattern import InterleavedSettings, interleaved
 
 from labseq import SiteGrid, TargetPattern

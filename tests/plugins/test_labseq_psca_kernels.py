@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings, strategies as st
-from labseq_psca import _kernels_lines, _kernels_rows
+from labseq_psca import kernels
 
 from .labseq_psca_arrays import bools, ints
 
@@ -23,7 +23,7 @@ class TestCompress:
         goal = np.zeros(n, np.int64)
         cost, step = np.zeros((n, 2 * n + 1), np.int64), np.zeros((n, 2 * n + 1), np.int16)
         padded = ints(source + [0] * (n - len(source)))
-        assert _kernels_lines.compress(
+        assert kernels.compress(
             padded, len(source), bools(fill), bools(clear), limit, slots, cost, step, goal
         )
         return goal[: len(source)].tolist()
@@ -67,7 +67,7 @@ class TestCompress:
     def test_too_few_atoms_for_the_fill_sites(self) -> None:
         cost, step = np.zeros((2, 5), np.int64), np.zeros((2, 5), np.int16)
         fill, clear = bools([True, True]), bools([False, False])
-        assert not _kernels_lines.compress(ints([0, 0]), 1, fill, clear, 1, 1, cost, step, ints([0, 0]))
+        assert not kernels.compress(ints([0, 0]), 1, fill, clear, 1, 1, cost, step, ints([0, 0]))
 
 
 class TestFillBatch:
@@ -89,9 +89,7 @@ class TestFillBatch:
         batch = 0
         while 0 in turn:
             batch += 1
-            chosen = _kernels_lines.fill_batch(
-                ints(source), ints(goal), len(source), n, limit, slots, turn, batch
-            )
+            chosen = kernels.fill_batch(ints(source), ints(goal), len(source), n, limit, slots, turn, batch)
             going = [i for i in place if turn[i] == batch]
             assert 0 < len(going) == chosen <= limit
             assert sum(goal[i] < 0 for i in going) <= slots
@@ -138,7 +136,7 @@ class TestBestExchange:
         gain = data.draw(st.lists(st.integers(0, 12), min_size=n, max_size=n), "gain")
         cost = data.draw(st.lists(st.integers(-1, 5), min_size=n, max_size=n), "cost")
         change = np.zeros(n, np.int64)
-        found = _kernels_rows.best_exchange(
+        found = kernels.best_exchange(
             bools(atoms),
             ints(gain),
             ints(cost),
@@ -153,8 +151,8 @@ class TestBestExchange:
         row = bools(atoms)
         before = np.flatnonzero(row)
         source, goal = np.zeros(n, np.int64), np.zeros(n, np.int64)
-        n_moved = _kernels_rows.n_moved(row, change)
-        n_atoms = _kernels_rows.exchange(row, change, source, goal)
+        n_moved = kernels.n_moved(row, change)
+        n_atoms = kernels.exchange(row, change, source, goal)
         assert source[:n_atoms].tolist() == before.tolist()
         assert goal[:n_atoms].tolist() == np.flatnonzero(row).tolist()
         assert n_moved == np.count_nonzero(source[:n_atoms] != goal[:n_atoms])
@@ -168,12 +166,12 @@ class TestChooseRow:
         leave: Sites,
         fill: Any = None,
         limit: int = 9,
-        order: int = _kernels_rows.HALF_FILLED,
+        order: int = kernels.HALF_FILLED,
     ) -> tuple[int, Sites]:
         grid = bools(atoms)
         n = grid.shape[1]
         change = np.zeros(n, np.int64)
-        row = _kernels_rows.choose_row(
+        row = kernels.choose_row(
             grid,
             np.zeros_like(grid) if fill is None else bools(fill),
             ints(weight),
@@ -200,7 +198,7 @@ class TestChooseRow:
     @pytest.mark.parametrize(("order", "row"), [("HALF_FILLED", 1), ("FULLEST", 0), ("EMPTIEST", 2)])
     def test_of_equals_takes_the_first_in_the_order(self, order: str, row: int) -> None:
         atoms = [[1, 0, 1, 1], [1, 0, 0, 1], [1, 0, 0, 0]]
-        chosen, _ = self.choose(atoms, [0, 90, 0, 0], [0, -1, -1, -1], order=getattr(_kernels_rows, order))
+        chosen, _ = self.choose(atoms, [0, 90, 0, 0], [0, -1, -1, -1], order=getattr(kernels, order))
         assert chosen == row
 
     def test_prefers_to_land_on_fill_sites(self) -> None:

@@ -8,9 +8,8 @@ import labseq_scans
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
-from labseq_scans.mta1 import Mta1Planner, Mta1Settings
 from labseq_scans.pattern import InterleavedSettings
-from labseq_scans.tetris import TetrisPlanner, TetrisSettings
+from labseq_scans.planners import Mta1Planner, Mta1Settings, TetrisPlanner, TetrisSettings
 from numpy.typing import NDArray
 from pydantic import ValidationError
 

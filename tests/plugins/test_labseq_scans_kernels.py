@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings, strategies as st
-from labseq_scans import _kernels_columns, _kernels_lines
-from labseq_scans._planning import as_plan
+from labseq_scans import kernels
+from labseq_scans.planners import as_plan
 from numpy.typing import NDArray
 
 from labseq import MotionSpec, TargetPattern, check_plan
@@ -22,7 +22,7 @@ def bools(values: Any) -> NDArray[np.bool_]:
 
 def settled(atoms: Line, fill: Line, clear: Line, low: bool, high: bool) -> tuple[list[int], list[int]]:
     source, goal = np.zeros(len(atoms), np.int64), np.zeros(len(atoms), np.int64)
-    n = _kernels_lines.settle(bools(atoms), bools(fill), bools(clear), low, high, source, goal)
+    n = kernels.settle(bools(atoms), bools(fill), bools(clear), low, high, source, goal)
     return source[:n].tolist(), goal[:n].tolist()
 
 
@@ -91,7 +91,7 @@ class TestAddLine:
         n = len(atoms)
         source, goal = settled(atoms, fill, clear, low=True, high=True)
         log = np.zeros((0, 5), np.int32)
-        made = _kernels_lines.add_line(
+        made = kernels.add_line(
             log,
             0,
             0,
@@ -127,7 +127,7 @@ class TestSupplyColumns:
         assume(need.sum() <= np.count_nonzero(atoms))
         limit = data.draw(st.integers(1, 4), "limit")
         after, spare = atoms.copy(), atoms.sum(axis=0).astype(np.int64) - need
-        made = _kernels_columns.supply_columns(np.zeros((1, 5), np.int32), 0, 0, after, spare, limit)
+        made = kernels.supply_columns(np.zeros((1, 5), np.int32), 0, 0, after, spare, limit)
         nothing = np.zeros(atoms.shape, np.bool_)
         report = check_plan(as_plan(*made), atoms, TargetPattern(nothing, nothing), limit)
         assert np.array_equal(report.predicted, after)
@@ -137,9 +137,7 @@ class TestSupplyColumns:
     def test_all_exchanges_of_a_row_are_made_at_once(self) -> None:
         atoms = bools([[1, 1, 1, 1, 0, 0], [0, 0, 0, 0, 1, 1]])
         spare = np.array([1, 1, 0, 0, -1, -1], np.int64)
-        log, n_moves, n_batches = _kernels_columns.supply_columns(
-            np.zeros((1, 5), np.int32), 0, 0, atoms, spare, 4
-        )
+        log, n_moves, n_batches = kernels.supply_columns(np.zeros((1, 5), np.int32), 0, 0, atoms, spare, 4)
         assert n_batches == 1
         assert log[:n_moves, [2, 4]].tolist() == [[0, 2], [1, 3], [2, 4], [3, 5]]
         assert spare.tolist() == [0] * 6
@@ -150,6 +148,6 @@ class TestSupplyColumns:
         if upwards:
             atoms = atoms[::-1].copy()
         spare = np.array([1, -1], np.int64)
-        log, n_moves, _ = _kernels_columns.supply_columns(np.zeros((9, 5), np.int32), 0, 0, atoms, spare, 1)
+        log, n_moves, _ = kernels.supply_columns(np.zeros((9, 5), np.int32), 0, 0, atoms, spare, 1)
         start, end = (1, 0) if upwards else (0, 1)
         assert log[:n_moves, 1:].tolist() == [[start, 0, end, 0], [end, 0, end, 1]]

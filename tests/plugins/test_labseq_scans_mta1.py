@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from labseq_scans.mta1 import Mta1Planner, Mta1Settings
 from labseq_scans.pattern import InterleavedSettings, interleaved
-from labseq_scans.scans import ScannedPlan
+from labseq_scans.planners import Mta1Planner, Mta1Settings, ScannedPlan
 from numpy.typing import NDArray
 
 from labseq import Context, MotionSpec, Plan, SiteGrid, TargetPattern, check_plan

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from labseq_scans.tetris import TetrisPlanner, TetrisSettings
+from labseq_scans.planners import TetrisPlanner, TetrisSettings
 from numpy.typing import NDArray
 
 from labseq import Context, Plan, TargetPattern, check_plan

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
-from labseq_single import _kernels_hca, _kernels_lsap, _kernels_moves, _kernels_paths
-from labseq_single._kernels_paths import CROSSED, NO_END, STEP, TURN, UNWANTED
+from labseq_single import kernels
+from labseq_single.kernels import CROSSED, NO_END, STEP, TURN, UNWANTED
 from numpy.typing import NDArray
 
 from labseq.testing.strategies import masks, shapes
@@ -50,9 +50,9 @@ def all_paths(start: int, inside: Bools, width: int, end_cost: Ints) -> list[lis
 @pytest.mark.parametrize("shape", [(1, 1), (2, 3)])
 def test_the_margin_is_empty_and_outside(shape: tuple[int, int]) -> None:
     full = np.ones(shape, np.bool_)
-    assert _kernels_paths.with_margin(full).tolist() == padded(full).tolist()
-    assert _kernels_paths.grid_sites(*shape).tolist() == padded(full).tolist()
-    numbers = _kernels_paths.sites_with_margin(np.arange(full.size), shape[1])
+    assert kernels.with_margin(full).tolist() == padded(full).tolist()
+    assert kernels.grid_sites(*shape).tolist() == padded(full).tolist()
+    numbers = kernels.sites_with_margin(np.arange(full.size), shape[1])
     assert numbers.tolist() == np.flatnonzero(padded(full)).tolist()
 
 
@@ -66,7 +66,7 @@ def test_the_cheapest_path_is_found(data: st.DataObject) -> None:
     if data.draw(st.booleans(), "ends outside"):
         end_cost[~inside] = UNWANTED
     paths = [p for start in np.flatnonzero(starts) for p in all_paths(int(start), inside, width, end_cost)]
-    path = _kernels_paths.cheapest_path(atoms, inside, width, starts, end_cost).tolist()
+    path = kernels.cheapest_path(atoms, inside, width, starts, end_cost).tolist()
     if not paths:
         assert path == []
         return
@@ -86,15 +86,15 @@ def test_distances_in_the_open_are_those_of_paths_over_free_sites(data: st.DataO
         for site in np.flatnonzero(inside & ~atoms & (expected < 0)):
             if any(expected[site + step] == length - 1 for step in (-width, -1, 1, width)):
                 expected[site] = length
-    distance = _kernels_hca.distance_in_the_open(starts, atoms, inside, width)
+    distance = kernels.distance_in_the_open(starts, atoms, inside, width)
     assert distance.tolist() == expected.tolist()
 
 
 def test_the_farthest_site_is_the_first_of_equals() -> None:
     distance = np.array([0, 3, 1, 3, -1], np.int64)
-    assert _kernels_hca.farthest(distance, np.ones(5, np.bool_)) == 1
-    assert _kernels_hca.farthest(distance, np.array([True, False, True, False, True])) == 2
-    assert _kernels_hca.farthest(distance, np.array([True, False, False, False, True])) == -1
+    assert kernels.farthest(distance, np.ones(5, np.bool_)) == 1
+    assert kernels.farthest(distance, np.array([True, False, True, False, True])) == 2
+    assert kernels.farthest(distance, np.array([True, False, False, False, True])) == -1
 
 
 @pytest.mark.parametrize(
@@ -107,15 +107,15 @@ def test_the_farthest_site_is_the_first_of_equals() -> None:
     ],
 )
 def test_an_l_goes_along_one_axis_and_then_the_other(goal: int, row_first: bool, path: list[int]) -> None:
-    assert _kernels_lsap.l_shaped(11, goal, 10, row_first).tolist() == path
-    assert _kernels_lsap.l_shaped(goal, 11, 10, not row_first).tolist() == path[::-1]
+    assert kernels.l_shaped(11, goal, 10, row_first).tolist() == path
+    assert kernels.l_shaped(goal, 11, 10, not row_first).tolist() == path[::-1]
 
 
 def test_every_atom_on_a_path_goes_on_to_the_next_free_place() -> None:
     width = 7
     atoms, inside = padded([[0, 1, 0, 1, 0], [0, 0, 0, 1, 1]]), padded(np.ones((2, 5)))
     path = np.array([8, 9, 10, 11, 18, 19], np.int64)
-    moves, linked, n = _kernels_moves.shift(
+    moves, linked, n = kernels.shift(
         np.zeros((1, 4), np.int16), np.zeros(1, np.bool_), 0, atoms, inside, width, path
     )
     assert n == 4
@@ -128,7 +128,7 @@ def test_an_atom_carried_off_the_grid_is_gone_and_its_turns_are_linked() -> None
     width = 5
     atoms, inside = padded([[0, 0, 0], [0, 1, 0]]), padded(np.ones((2, 3)))
     path = np.array([5, 6, 7, 12], np.int64)
-    moves, linked, n = _kernels_moves.shift(
+    moves, linked, n = kernels.shift(
         np.zeros((4, 4), np.int16), np.zeros(4, np.bool_), 0, atoms, inside, width, path
     )
     assert moves[:n].tolist() == [[1, 1, 0, 1], [0, 1, 0, -1]]
@@ -147,9 +147,7 @@ def test_any_assignment_can_be_carried_out(data: st.DataObject) -> None:
     chosen = np.array(data.draw(st.permutations(sources.tolist()), "sources")[:n], np.int64)
     wanted = np.zeros(shape, np.bool_)
     wanted.ravel()[goals[:n]] = True
-    moves, _, n_moves = _kernels_lsap.plan_assignment(
-        atoms, wanted, np.zeros_like(wanted), chosen, goals[:n], True
-    )
+    moves, _, n_moves = kernels.plan_assignment(atoms, wanted, np.zeros_like(wanted), chosen, goals[:n], True)
     now = atoms.copy()
     for row, col, to_row, to_col in moves[:n_moves].tolist():
         assert now[row, col]

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
-from labseq_virtual._kernels_atoms import (
+from labseq_virtual.atom_kernels import (
     DEPTH,
     HELD_S,
     LOST_S,

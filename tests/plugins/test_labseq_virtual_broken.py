@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 from labseq_virtual.flight import KELVIN, RfTransport
-from labseq_virtual.hearing import PulseReceiver, RfPulse
+from labseq_virtual.played import PulseReceiver, RfPulse
 from labseq_virtual.settings import MobileLightSettings, WorldSettings
 from numpy.typing import NDArray
 

@@ -9,8 +9,7 @@ from typing import ClassVar
 
 import pytest
 from labseq_virtual.camera import VirtualCamera
-from labseq_virtual.device import VirtualDevice
-from labseq_virtual.mobile_tweezers import VirtualMobileTweezers
+from labseq_virtual.devices import VirtualDevice
 from labseq_virtual.settings import (
     CameraSettings,
     DeviceSettings,
@@ -18,7 +17,7 @@ from labseq_virtual.settings import (
     StaticTweezersSettings,
     WorldSettings,
 )
-from labseq_virtual.static_tweezers import VirtualStaticTweezers
+from labseq_virtual.tweezers import VirtualMobileTweezers, VirtualStaticTweezers
 from labseq_virtual.world import World
 
 from labseq import Context

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from labseq_virtual.device import VirtualDevice
+from labseq_virtual.devices import VirtualDevice
 from labseq_virtual.settings import DeviceSettings
 
 from labseq import Context, DeviceError

@@ -8,14 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 from labseq_virtual.camera import VirtualCamera
-from labseq_virtual.mobile_tweezers import VirtualMobileTweezers
 from labseq_virtual.settings import (
     CameraSettings,
     MobileTweezersSettings,
     StaticTweezersSettings,
     WorldSettings,
 )
-from labseq_virtual.static_tweezers import VirtualStaticTweezers
+from labseq_virtual.tweezers import VirtualMobileTweezers, VirtualStaticTweezers
 from labseq_virtual.world import World
 
 from labseq import (
@@ -289,7 +288,7 @@ def test_the_mobile_tweezers_tell_a_site_that_is_out_of_reach(lab: Lab) -> None:
 def test_no_kernel_is_left_to_be_compiled_by_the_first_image(
     lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    kernels = "labseq_virtual._kernels_transport"  # which takes longer than a camera may
+    kernels = "labseq_virtual.transport_kernels"  # which takes longer than a camera may
     monkeypatch.delitem(sys.modules, kernels, raising=False)
     assert isinstance(lab.mobile, NeedsWarmUp)
     lab.mobile.warm()

@@ -6,11 +6,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from labseq_virtual.emccd import Emccd
-from labseq_virtual.image_settings import ImageSettings
-from labseq_virtual.optics import photoelectrons
-from labseq_virtual.settings import WorldSettings
-from labseq_virtual.view import View
+from labseq_virtual.images import photoelectrons
+from labseq_virtual.sensors import Emccd, View
+from labseq_virtual.settings import ImageSettings, WorldSettings
 from labseq_virtual.world import World
 from numpy.typing import NDArray
 

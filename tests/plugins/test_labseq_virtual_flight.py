@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 from hypothesis.extra.numpy import arrays
-from labseq_virtual._kernels_atoms import energies
-from labseq_virtual.flight import KELVIN, RfTransport
-from labseq_virtual.hearing import PulseReceiver
+from labseq_virtual.atom_kernels import energies
+from labseq_virtual.flight import KELVIN, RfTransport, draw_atoms
+from labseq_virtual.played import PulseReceiver
 from labseq_virtual.settings import MobileLightSettings, WorldSettings
-from labseq_virtual.thermal import draw_atoms
 from numpy.typing import NDArray
 
 from labseq.model import SiteGrid, ToneProgram

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st
-from labseq_virtual import _kernels_handover as kernels
+from labseq_virtual import transport_kernels as kernels
 from labseq_virtual.handover import SLOW, constants, merging_distance
 from labseq_virtual.settings import WorldSettings
 from numpy.typing import NDArray

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from labseq_virtual.hearing import PulseReceiver, RfPulse
+from labseq_virtual.played import PulseReceiver, RfPulse
 
 from labseq.model import RfSamples, RfSpan, RfTones
 

@@ -8,11 +8,9 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 from labseq_virtual.camera import VirtualCamera
-from labseq_virtual.image_settings import ImageSettings
-from labseq_virtual.images import Images
-from labseq_virtual.optics import corner_distance, photoelectrons, site_brightness, site_spots
-from labseq_virtual.settings import CameraSettings, WorldSettings
-from labseq_virtual.view import View
+from labseq_virtual.images import Images, corner_distance, photoelectrons, site_brightness, site_spots
+from labseq_virtual.sensors import View
+from labseq_virtual.settings import CameraSettings, ImageSettings, WorldSettings
 from labseq_virtual.world import World
 from numpy.typing import NDArray
 from pydantic import ValidationError

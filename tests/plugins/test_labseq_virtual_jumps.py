@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 from labseq_virtual.flight import RfTransport
-from labseq_virtual.hearing import PulseReceiver
+from labseq_virtual.played import PulseReceiver
 from labseq_virtual.settings import WorldSettings
 from numpy.typing import NDArray
 

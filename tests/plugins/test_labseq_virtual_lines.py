@@ -6,10 +6,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from labseq_virtual.lights import Lights
-from labseq_virtual.lines import VirtualLines
+from labseq_virtual.devices import VirtualLines
 from labseq_virtual.settings import LightSettings, LinesSettings, WorldSettings
-from labseq_virtual.world import World
+from labseq_virtual.world import Lights, World
 
 import labseq
 from labseq.errors import ConfigError

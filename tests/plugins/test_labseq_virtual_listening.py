@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from labseq_virtual.flight import RfTransport
-from labseq_virtual.hearing import PulseReceiver
+from labseq_virtual.played import PulseReceiver
 from labseq_virtual.settings import WorldSettings
 from labseq_virtual.world import World
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from labseq_virtual.em_register import Register, power_of_two
+from labseq_virtual.sensors import Register, power_of_two
 from numpy.typing import NDArray
 from scipy.special import ndtr
 from scipy.stats import chi2

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from labseq_virtual.places import FrequencyMap, Places
 from labseq_virtual.settings import WorldSettings
+from labseq_virtual.transport import FrequencyMap, Places
 from numpy.typing import NDArray
 
 from labseq import LimitError, SiteGrid

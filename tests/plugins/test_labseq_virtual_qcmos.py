@@ -6,10 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from labseq_virtual.image_settings import ImageSettings
-from labseq_virtual.qcmos import Qcmos
-from labseq_virtual.settings import WorldSettings
-from labseq_virtual.view import View
+from labseq_virtual.sensors import Qcmos, View
+from labseq_virtual.settings import ImageSettings, WorldSettings
 from labseq_virtual.world import World
 from numpy.typing import NDArray
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st
-from labseq_virtual.em_register import N_ONE_BY_ONE, Register, power_of_two
-from labseq_virtual.law import CountDistribution
+from labseq_virtual.sensors import N_ONE_BY_ONE, CountDistribution, Register, power_of_two
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]

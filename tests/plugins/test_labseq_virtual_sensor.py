@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from labseq_virtual.camera import VirtualCamera
-from labseq_virtual.cooler import COLDEST_K, ROOM_K, Cooler
+from labseq_virtual.camera import COLDEST_K, ROOM_K, Cooler, VirtualCamera
 from labseq_virtual.settings import CameraSettings, WorldSettings
 from labseq_virtual.world import World
 from numpy.typing import NDArray

@@ -8,8 +8,8 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
+from labseq_virtual.devices import VirtualSpotMeter
 from labseq_virtual.settings import SpotMeterSettings, WorldSettings
-from labseq_virtual.spot_meter import VirtualSpotMeter
 from labseq_virtual.world import World
 
 from labseq import Context, DepthRamp, DeviceError, RandomStream, SiteGrid, TweezerAmplitudes

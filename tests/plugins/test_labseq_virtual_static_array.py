@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from labseq_virtual.settings import WorldSettings
-from labseq_virtual.static_array import StaticArray
+from labseq_virtual.world import StaticArray
 
 from labseq import DepthRamp, SiteGrid, TweezerAmplitudes
 

@@ -9,20 +9,11 @@ from typing import Any
 
 import numpy as np
 from hypothesis import event, given, settings, strategies as st
-from labseq_virtual import _kernels_handover as laws
-from labseq_virtual._kernels_transport import most_let_go
-from labseq_virtual.axis_tones import (
-    AT_REST,
-    END,
-    MIXING,
-    ON_END,
-    ON_START,
-    POWER_END,
-    POWER_START,
-    START,
-)
+from labseq_virtual import transport_kernels as laws
+from labseq_virtual.handover import AT_REST, END, MIXING, ON_END, ON_START, POWER_END, POWER_START, START
 from labseq_virtual.settings import WorldSettings
 from labseq_virtual.transport import FASTEST, Transport
+from labseq_virtual.transport_kernels import most_let_go
 from numpy.typing import NDArray
 
 from labseq import MotionSpec, SiteGrid, ToneProgram

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from labseq_virtual.mobile_tweezers import SILENCE
 from labseq_virtual.settings import WorldSettings
+from labseq_virtual.tweezers import SILENCE
 from labseq_virtual.world import World
 
 from labseq import (

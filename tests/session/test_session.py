@@ -43,7 +43,7 @@ def test_the_same_seed_gives_the_same_data(tmp_path, options):
 
 
 def test_what_has_kernels_compiles_before_anything_is_opened(tmp_path, monkeypatch):
-    from labseq_virtual import camera, mobile_tweezers
+    from labseq_virtual import camera, tweezers as mobile_tweezers
 
     told: list[str] = []
     for driver in (camera.VirtualCamera, mobile_tweezers.VirtualMobileTweezers):

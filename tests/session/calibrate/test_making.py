@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from labseq_virtual.image_settings import ImageSettings
-from labseq_virtual.optics import site_spots
+from labseq_virtual.images import site_spots
+from labseq_virtual.settings import ImageSettings
 
 import labseq
 from labseq.calibration.measure import METHODS, CalibrationRequest, Outcome, calibrate

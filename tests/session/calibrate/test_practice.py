@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from labseq_virtual.optics import site_spots
+from labseq_virtual.images import site_spots
 from labseq_virtual.settings import WorldSettings
 from labseq_virtual.world import World
 from numpy.typing import NDArray

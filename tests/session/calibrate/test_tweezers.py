@@ -34,7 +34,7 @@ HALF_BLIND = """
 import labseq
 import numpy as np
 from labseq_virtual.settings import SpotMeterSettings
-from labseq_virtual.spot_meter import VirtualSpotMeter
+from labseq_virtual.devices import VirtualSpotMeter
 
 LABSEQ_API = 1
 

@@ -1,9 +1,12 @@
-"""The virtual timing box."""
+"""Virtual lines, a virtual device, and the meter that measures the power of each static tweezer."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from labseq.plugin import (
     Context,
@@ -15,9 +18,10 @@ from labseq.plugin import (
     format_quantity,
     idle_program,
     off_program,
+    one_of,
 )
-from labseq_virtual.driver import VirtualDriver
-from labseq_virtual.settings import LinesSettings
+from labseq_virtual.settings import DeviceSettings, LinesSettings, SpotMeterSettings
+from labseq_virtual.tweezers import VirtualDriver
 
 ROUNDING_S = 1e-9
 """How far from its limit a time may be because sums were rounded."""
@@ -129,3 +133,115 @@ class VirtualLines(VirtualDriver):
 
     def _play(self, program: LineProgram) -> None:
         self._world.play("lines", program, self._clock.now())
+
+
+class VirtualDevice:
+    """Remembers what it was told.
+
+    The value ``state`` is the last command ("closed" before ``open``, "ready"
+    after it, "safe" in the safe state). Arguments of a command are kept as values
+    of the same name: after ``command("set", power=0.5)``, ``read("power")`` is 0.5.
+
+    Args:
+        settings: Its commands and values.
+        context: Its name.
+    """
+
+    def __init__(self, settings: DeviceSettings, context: Context) -> None:
+        self._name = context.name or "device"
+        self._commands = settings.commands
+        self._values: dict[str, Any] = {**settings.values, "state": "closed"}
+        self._is_open = False
+
+    def open(self) -> None:
+        """Get ready."""
+        self._is_open = True
+        self._values["state"] = "ready"
+
+    def close(self) -> None:
+        """Disconnect; legal in any state."""
+        self._is_open = False
+        self._values["state"] = "closed"
+
+    def safe_state(self) -> None:
+        """Make the output harmless; legal in any state."""
+        if self._is_open:
+            self._values["state"] = "safe"
+
+    def command(self, name: str, **arguments: Any) -> None:
+        """Carry out a command.
+
+        Raises:
+            DeviceError: Not open, or a command that it does not know.
+        """
+        self._check_open()
+        if self._commands and name not in self._commands:
+            raise DeviceError(self._name, f"unknown command '{name}'; expected {one_of(self._commands)}")
+        self._values.update(arguments)
+        self._values["state"] = name
+
+    def read(self, name: str) -> Any:
+        """Read a value.
+
+        Raises:
+            DeviceError: Not open, or a value that it does not know.
+        """
+        self._check_open()
+        if name not in self._values:
+            raise DeviceError(self._name, f"unknown value '{name}'; expected {one_of(sorted(self._values))}")
+        return self._values[name]
+
+    def describe(self) -> Mapping[str, Any]:
+        """Model, commands and values."""
+        return {"model": "virtual device", "commands": list(self._commands), "values": dict(self._values)}
+
+    def _check_open(self) -> None:
+        if not self._is_open:
+            raise DeviceError(self._name, "not open; call open() first")
+
+
+VALUE = "spot_powers"
+
+
+class VirtualSpotMeter(VirtualDriver):
+    """Measures the power of each static tweezer, with noise.
+
+    Its only value is ``spot_powers``, float64 (n_rows, n_cols), over the nominal power.
+
+    Args:
+        settings: Noise and time of a measurement.
+        context: Clock, random numbers and the simulated world.
+    """
+
+    def __init__(self, settings: SpotMeterSettings, context: Context) -> None:
+        super().__init__(context, "spot_meter")
+        self._settings = settings
+
+    def safe_state(self) -> None:
+        """Nothing to do: it only looks."""
+
+    def command(self, name: str, **arguments: Any) -> None:
+        """Refuse: it knows no commands.
+
+        Raises:
+            DeviceError: Always.
+        """
+        del arguments
+        raise DeviceError(self._name, f"unknown command '{name}'; it only measures: read '{VALUE}'")
+
+    def read(self, name: str) -> NDArray[np.float64]:
+        """Measure once.
+
+        Raises:
+            DeviceError: Not open, or a value that it does not know.
+        """
+        self._check_open()
+        if name != VALUE:
+            raise DeviceError(self._name, f"unknown value '{name}'; expected '{VALUE}'")
+        self._clock.sleep(self._settings.duration)
+        powers: NDArray[np.float64] = self._world.spot_powers()  # pyright: ignore[reportAttributeAccessIssue]
+        return powers * (1 + self._settings.noise * self._random.shot.standard_normal(powers.shape))
+
+    def describe(self) -> Mapping[str, Any]:
+        """Model and settings."""
+        return {"model": "virtual spot meter", **self._settings.model_dump(mode="json")}

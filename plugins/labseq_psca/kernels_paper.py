@@ -1,12 +1,11 @@
-"""Kernels of the variant ``paper``: one column at a time, as plainly as the paper tells it."""
+"""The kernels of PSCA as the paper describes it."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from labseq.plugin import kernel
-from labseq_psca._kernels import compress_columns, count_columns
-from labseq_psca._kernels_build import (
+from labseq_psca.kernels import (
     GRID,
     GROWING,
     PLAN,
@@ -16,10 +15,15 @@ from labseq_psca._kernels_build import (
     Moves,
     Offsets,
     add_line,
+    choose_unlocking,
+    compress_columns,
+    count_columns,
     empty_plan,
     ended,
+    exchange,
+    place_in_order,
+    weigh_columns,
 )
-from labseq_psca._kernels_rows import choose_unlocking, exchange, place_in_order, weigh_columns
 
 
 @kernel("int64(bool_[::1], int64[::1], int64[::1], int64)")
@@ -187,7 +191,7 @@ def plan_as_in_paper(
 ) -> tuple[Moves, Offsets]:
     """Plan row sorting, one column at a time, and column compression.
 
-    Arguments and result as for :func:`labseq_psca._kernels.plan_best_way`.
+    Arguments and result as for :func:`labseq_psca.kernels.plan_best_way`.
     """
     atoms = occupied.copy()
     moves, offsets = empty_plan(atoms.size)

@@ -1,0 +1,353 @@
+"""Target patterns on the lattice, with their settings."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Annotated, Final, Literal, Self, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from labseq.plugin import ConfigError, Problem, Settings, SiteGrid, TargetPattern, block, pattern
+
+Index: TypeAlias = Annotated[int, Field(ge=0)]
+"""Index of a row or a column, from 0."""
+Origin: TypeAlias = Annotated[
+    tuple[Index, Index] | None,
+    Field(description="[row, column] of the block's top left site, from 0; centred if left out"),
+]
+Clear: TypeAlias = Annotated[
+    Literal["bounding_box", "none"],
+    Field(description="bounding_box: all other sites of the block must be empty; none: they are reservoir"),
+]
+
+
+class BlockSettings(Settings):
+    """A pattern that goes on and on, cut to a block."""
+
+    rows: int = Field(ge=1, description="rows of the block")
+    cols: int = Field(ge=1, description="columns of the block")
+    origin: Origin = None
+    clear: Clear = "bounding_box"
+
+
+class SierpinskiSettings(Settings):
+    """A Sierpinski triangle, of a whole order or cut to a block.
+
+    Example:
+        >>> SierpinskiSettings(order=4).size
+        (16, 16)
+        >>> SierpinskiSettings(rows=15, cols=15).size
+        (15, 15)
+    """
+
+    order: Annotated[int, Field(ge=0, le=12)] | None = Field(
+        default=None, description="how often the triangle is divided; order n takes 2^n rows and columns"
+    )
+    rows: Annotated[int, Field(ge=1)] | None = Field(
+        default=None, description="rows of the block, counted from the tip; instead of the order"
+    )
+    cols: Annotated[int, Field(ge=1)] | None = Field(
+        default=None, description="columns of the block, counted from the tip; instead of the order"
+    )
+    origin: Origin = None
+    clear: Clear = "bounding_box"
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(rows, cols) of the block."""
+        if self.order is not None:
+            return 2**self.order, 2**self.order
+        assert self.rows is not None  # see _has_one_size
+        assert self.cols is not None
+        return self.rows, self.cols
+
+    @model_validator(mode="after")
+    def _has_one_size(self) -> Self:
+        check_one_size("order", self.order, self.rows, self.cols)
+        return self
+
+
+class RingSettings(Settings):
+    """A ring, of a radius or as large as fits into a block.
+
+    Example:
+        >>> RingSettings(radius=6).width
+        2.0
+    """
+
+    radius: Annotated[float, Field(ge=0, le=10_000)] | None = Field(
+        default=None, description="outer radius, in units of the spacing of the sites"
+    )
+    rows: Annotated[int, Field(ge=1)] | None = Field(
+        default=None, description="rows of the block that the ring fits into; instead of the radius"
+    )
+    cols: Annotated[int, Field(ge=1)] | None = Field(
+        default=None, description="columns of the block that the ring fits into; instead of the radius"
+    )
+    width: float = Field(
+        default=2.0,
+        ge=1,
+        description="how thick the ring is, in units of the spacing; beyond the radius it is a full disc",
+    )
+    origin: Origin = None
+    clear: Clear = "bounding_box"
+
+    @model_validator(mode="after")
+    def _has_one_size(self) -> Self:
+        check_one_size("radius", self.radius, self.rows, self.cols)
+        return self
+
+
+def check_one_size(name: str, value: float | None, rows: int | None, cols: int | None) -> None:
+    """Refuse a pattern with no size, half a size or two sizes.
+
+    Args:
+        name: Name of the setting that stands for rows and columns.
+        value: Its value.
+        rows: Rows of the block.
+        cols: Columns of the block.
+
+    Raises:
+        ValueError: With what was expected.
+    """
+    n_given = (rows is not None) + (cols is not None)
+    if n_given == (2 if value is None else 0):
+        return
+    came = "two sizes are given" if n_given and value is not None else "the size is missing, or half of it"
+    raise ValueError(f"{came}; expected either '{name}', or 'rows' and 'cols'")
+
+
+def checkerboard(settings: BlockSettings, grid: SiteGrid) -> TargetPattern:
+    """Every other site of each row and column, the top left one included.
+
+    On a square grid that is a square lattice of sqrt(2) times the spacing, turned
+    by 45 degrees. A triangular lattice has no checkerboard: there the sites of each
+    diagonal line stay together, and lines with and without atoms take turns.
+
+    Args:
+        settings: Size and place.
+        grid: Any grid.
+
+    Raises:
+        LimitError: The block is larger than the grid or sticks out of it.
+
+    Example:
+        >>> grid = SiteGrid(2, 3, lattice="square")
+        >>> checkerboard(BlockSettings(rows=2, cols=3), grid).fill.astype(int).tolist()
+        [[1, 0, 1], [0, 1, 0]]
+    """
+    row, col = block(settings.rows, settings.cols, grid.shape)
+    name = f"checkerboard {settings.rows} x {settings.cols}"
+    mask = (row + col) % 2 == 0
+    return pattern(mask, grid, origin=settings.origin, clear=settings.clear, name=name)
+
+
+Ints: TypeAlias = NDArray[np.int64]
+Mask: TypeAlias = NDArray[np.bool_]
+
+
+def diluted(
+    name: str, settings: BlockSettings, grid: SiteGrid, keep: Callable[[Ints, Ints], Mask]
+) -> TargetPattern:
+    """A block of a triangular lattice, of which only some sites hold atoms.
+
+    Args:
+        name: Name of the pattern.
+        settings: Size and place.
+        grid: A triangular grid.
+        keep: Says of the sites' rows and columns, counted from the block's top left site, which of
+            them hold an atom.
+
+    Raises:
+        ConfigError: The grid is square.
+        LimitError: The block is larger than the grid or sticks out of it.
+    """
+    need_triangular(grid, name)
+    mask = as_sheared(keep(*block(settings.rows, settings.cols, grid.shape)), grid)
+    title = f"{name.replace('_', '-')} {settings.rows} x {settings.cols}"
+    return pattern(mask, grid, origin=settings.origin, clear=settings.clear, name=title)
+
+
+def need_triangular(grid: SiteGrid, name: str) -> None:
+    """Refuse a square grid, on which the pattern would be another lattice.
+
+    Raises:
+        ConfigError: The grid is square.
+    """
+    if grid.lattice != "triangular":
+        raise ConfigError(
+            Problem(
+                f"the pattern '{name}' dilutes a triangular lattice, and the grid is {grid.lattice}",
+                expected="a profile with 'lattice: triangular'",
+                hint="draw what you mean with the pattern 'bitmap'",
+            )
+        )
+
+
+def as_sheared(mask: Mask, grid: SiteGrid) -> Mask:
+    """A mask made for ``shear: +1``, mirrored left to right on a grid with ``shear: -1``.
+
+    So the array of atoms is the mirror image too.
+    """
+    return mask if grid.shear > 0 else mask[:, ::-1]
+
+
+def honeycomb(settings: BlockSettings, grid: SiteGrid) -> TargetPattern:
+    """The honeycomb lattice: a third of the triangular lattice's sites is left out.
+
+    The three sublattices of the triangular lattice are row - column modulo 3; left
+    out is the one of the block's top left site (its top right site with
+    ``shear: -1``). In a block with as many rows as columns the two acute corners
+    are empty; if that number is 3 n or 3 n + 1, no atom hangs on by a single
+    neighbour. In the bulk each atom has 3 nearest neighbours.
+
+    Args:
+        settings: Size and place.
+        grid: A triangular grid.
+
+    Raises:
+        ConfigError: The grid is square.
+        LimitError: The block is larger than the grid or sticks out of it.
+
+    Example:
+        >>> honeycomb(BlockSettings(rows=3, cols=3), SiteGrid(3, 3)).fill.astype(int).tolist()
+        [[0, 1, 1], [1, 0, 1], [1, 1, 0]]
+    """
+    return diluted("honeycomb", settings, grid, lambda row, col: (row - col) % 3 != 0)
+
+
+def kagome(settings: BlockSettings, grid: SiteGrid) -> TargetPattern:
+    """The kagome lattice: a quarter of the triangular lattice's sites is left out.
+
+    The unit cell is 2 x 2 sites with 3 atoms; in the bulk each atom has 4 nearest
+    neighbours. Left out are the odd rows' odd sites, counted from 0 at the top
+    left (at the top right with ``shear: -1``): the block's edges are full lines.
+
+    Args:
+        settings: Size and place.
+        grid: A triangular grid.
+
+    Raises:
+        ConfigError: The grid is square.
+        LimitError: The block is larger than the grid or sticks out of it.
+
+    Example:
+        >>> kagome(BlockSettings(rows=3, cols=3), SiteGrid(3, 3)).fill.astype(int).tolist()
+        [[1, 1, 1], [1, 0, 1], [1, 1, 1]]
+    """
+    return diluted("kagome", settings, grid, lambda row, col: (row % 2 == 0) | (col % 2 == 0))
+
+
+def link_kagome(settings: BlockSettings, grid: SiteGrid) -> TargetPattern:
+    """One atom on every link of a kagome lattice, also called ruby lattice.
+
+    The sites of even row and even column make a triangular lattice of twice the
+    spacing; with every fourth of them left out it is a kagome lattice. Atoms sit
+    halfway between its neighbours, so a block of (2 m - 1) x (2 n - 1) sites holds
+    the links of m x n sites of the pattern ``kagome``. The unit cell is 4 x 4 sites
+    with 6 atoms. In the bulk each atom has 2 neighbours at one spacing a (the
+    triangles of the kagome lattice), 2 at sqrt(3) a and 2 at 2 a: the six other
+    links at the ends of its link, as in Semeghini et al., "Probing topological
+    spin liquids on a programmable quantum simulator", Science 374, 1242 (2021).
+
+    Args:
+        settings: Size and place.
+        grid: A triangular grid.
+
+    Raises:
+        ConfigError: The grid is square.
+        LimitError: The block is larger than the grid or sticks out of it.
+
+    Example:
+        >>> target = link_kagome(BlockSettings(rows=3, cols=4), SiteGrid(3, 4))
+        >>> target.fill.astype(int).tolist()
+        [[0, 1, 0, 1], [1, 1, 0, 0], [0, 0, 0, 0]]
+    """
+    return diluted("link_kagome", settings, grid, _is_on_a_link)
+
+
+def _is_on_a_link(row: Ints, col: Ints) -> Mask:
+    """Both ends of a link are kagome sites: not both of their coordinates, halved, are odd."""
+    odd_row, odd_col = row % 2 == 1, col % 2 == 1
+    along_row = (row % 4 == 0) & odd_col
+    along_column = odd_row & (col % 4 == 0)
+    along_diagonal = odd_row & odd_col & ((row + col) % 4 == 2)
+    return along_row | along_column | along_diagonal
+
+
+_ROUNDING: Final = 1e-9
+
+
+def ring(settings: RingSettings, grid: SiteGrid) -> TargetPattern:
+    """The sites between two circles about the middle of the block, on any grid.
+
+    Sites on the outer circle belong to the ring, those on the inner one do not: on
+    a triangular grid ``radius: 1, width: 1`` is a hexagon of 6 atoms. With ``rows``
+    and ``cols`` the outer circle is the largest one within the block's outermost
+    lines of sites; with ``radius`` the block is the smallest with a site in its
+    middle that holds the circle.
+
+    Args:
+        settings: Size and place.
+        grid: Any grid.
+
+    Raises:
+        LimitError: The block is larger than the grid or sticks out of it.
+
+    Example:
+        >>> target = ring(RingSettings(radius=1, width=1), SiteGrid(3, 3))
+        >>> target.fill.astype(int).tolist()
+        [[0, 1, 1], [1, 0, 1], [1, 1, 0]]
+    """
+    triangular = grid.lattice == "triangular"
+    line_distance = math.sqrt(3) / 2 if triangular else 1.0
+    if settings.radius is not None:
+        radius = settings.radius
+        rows = cols = 2 * math.floor(radius / line_distance + _ROUNDING) + 1
+    else:
+        assert settings.rows is not None  # see RingSettings
+        assert settings.cols is not None
+        rows, cols = settings.rows, settings.cols
+        radius = (min(rows, cols) - 1) / 2 * line_distance
+    row, col = block(rows, cols, grid.shape)
+    down, right = row - (rows - 1) / 2, col - (cols - 1) / 2
+    skew = grid.shear * down * right if triangular else 0.0
+    distance = np.sqrt(down**2 + right**2 + skew)  # |right a1 + down a2| / a
+    inner = radius - settings.width
+    mask = (distance <= radius + _ROUNDING) & (distance > inner + _ROUNDING)
+    name = f"ring {rows} x {cols}"
+    return pattern(mask, grid, origin=settings.origin, clear=settings.clear, name=name)
+
+
+def sierpinski(settings: SierpinskiSettings, grid: SiteGrid) -> TargetPattern:
+    """The odd numbers of Pascal's triangle, tip up: 3^n atoms in 2^n rows.
+
+    On a triangular grid the triangle is equilateral: its tip is the block's top
+    right site (the top left one with ``shear: -1``), its base the whole lowest row.
+    On a square grid it has a right angle at the lower left, below its tip. A block
+    that is no power of two is a larger triangle, cut below or at the side away
+    from the tip.
+
+    Args:
+        settings: Size and place.
+        grid: Any grid.
+
+    Raises:
+        LimitError: The block is larger than the grid or sticks out of it.
+
+    Example:
+        >>> grid = SiteGrid(4, 4, shear=-1)
+        >>> sierpinski(SierpinskiSettings(order=2), grid).fill.astype(int).tolist()
+        [[1, 0, 0, 0], [1, 1, 0, 0], [1, 0, 1, 0], [1, 1, 1, 1]]
+    """
+    rows, cols = settings.size
+    row, col = block(rows, cols, grid.shape)
+    # Lucas' theorem: the binomial coefficient is odd if no digit of `col` exceeds that of `row`.
+    mask = (col & ~row) == 0
+    if grid.lattice == "triangular" and grid.shear > 0:
+        mask = mask[:, ::-1]
+    name = f"sierpinski {rows} x {cols}"
+    return pattern(mask, grid, origin=settings.origin, clear=settings.clear, name=name)

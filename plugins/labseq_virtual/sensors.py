@@ -1,0 +1,456 @@
+"""EMCCD and qCMOS sensors: from photoelectrons to counts."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import Final, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from labseq.plugin import WHOLE_SENSOR, LimitError, SensorMode
+from labseq_virtual.settings import ImageSettings
+
+NEVER: Final = 1e-13
+"""Numbers at the ends of a law that are rarer than this together are left out."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CountDistribution:
+    """A law of whole numbers: its distribution function in a table, inverted by 32 random bits.
+
+    Probabilities are rounded to whole multiples of 2^-32.
+
+    Attributes:
+        first: The least number.
+        edges: uint32 (n_numbers,), the last random word of each number.
+        starts: int32, where in ``edges`` to start looking, by the leading bits of the word.
+    """
+
+    first: int
+    edges: NDArray[np.uint32]
+    starts: NDArray[np.int32]
+
+    @classmethod
+    def of(cls, probability: NDArray[np.float64], first: int = 0) -> CountDistribution:
+        """Tabulate a law.
+
+        Args:
+            probability: float64 (n,), of the numbers from ``first`` on; need not add up to 1.
+            first: See there.
+        """
+        from labseq_virtual import image_kernels as kernels
+
+        below = np.cumsum(np.maximum(probability, 0.0))
+        below /= below[-1]
+        low, high = np.searchsorted(below, [NEVER, 1 - NEVER])
+        part = below[low : high + 1] / below[high]
+        edges = np.maximum(np.ceil(part * 2.0**32) - 1, 0).astype(np.uint32)
+        words = np.arange(1 << kernels.START_BITS, dtype=np.uint32) << np.uint32(32 - kernels.START_BITS)
+        return cls(first + int(low), edges, np.searchsorted(edges, words).astype(np.int32))
+
+    def draw(self, drawn: NDArray[np.uint16] | NDArray[np.int32], rng: np.random.Generator) -> None:
+        """Fill an array (n,) with numbers."""
+        from labseq_virtual import image_kernels as kernels
+
+        kernels.draw(_words(len(drawn), rng), self.edges, self.starts, self.first, drawn)
+
+    def draw_sums(self, n_each: NDArray[np.int64], rng: np.random.Generator) -> NDArray[np.int64]:
+        """Draw sums of ``n_each`` numbers, int64 (n_sums,)."""
+        from labseq_virtual import image_kernels as kernels
+
+        sums = np.empty(len(n_each), np.int64)
+        words = _words(int(n_each.sum()), rng)
+        kernels.draw_sums(words, self.edges, self.starts, self.first, n_each, sums)
+        return sums
+
+
+def _words(n: int, rng: np.random.Generator) -> NDArray[np.uint32]:
+    """Random words of 32 bits; two are drawn at once, which is twice as fast."""
+    return rng.integers(0, 2**64 - 1, (n + 1) // 2, np.uint64, endpoint=True).view(np.uint32)[:n]
+
+
+Complex = NDArray[np.complex128]
+
+N_ONE_BY_ONE: Final = 32
+"""Up to so many electrons into the register, each one's output is drawn by itself."""
+
+
+@dataclass(frozen=True)
+class Register:
+    """A register of equal stages.
+
+    In a stage, each electron frees another with the probability p, where (1 + p)^n_stages is
+    the gain. With the generating function of a stage, f(s) = (1 - p) s + p s^2, that of the
+    whole register is f applied n_stages times, and its Fourier transform the exact law of what
+    comes out.
+
+    Attributes:
+        n_stages: Number of stages.
+        gain: Mean electrons out for one in; 1 is a plain CCD.
+        spurious: Mean electrons that the stages add to each pixel read, before later stages multiply
+            them, as clock-induced charge does (spread evenly over the stages).
+    """
+
+    n_stages: int
+    gain: float
+    spurious: float = 0.0
+
+    @property
+    def p(self) -> float:
+        """Probability that an electron frees another in a stage."""
+        return math.expm1(math.log(self.gain) / self.n_stages)
+
+    @property
+    def excess_noise(self) -> float:
+        """F^2: variance of the output over gain^2 times that of a Poisson input.
+
+        M. Robbins, B. Hadwen, IEEE Trans. Electron Devices 50, 1227 (2003).
+
+        Example:
+            >>> round(Register(536, 300.0).excess_noise, 3), Register(536, 1.0).excess_noise
+            (1.976, 1.0)
+        """
+        return 2 * (self.gain - 1) * self.gain ** (-(self.n_stages + 1) / self.n_stages) + 1 / self.gain
+
+    @cached_property
+    def one(self) -> CountDistribution:
+        """Law of the output for one electron in, without the spurious ones."""
+        n_values = power_of_two(45 * self.gain + 64)
+        return CountDistribution.of(
+            np.fft.irfft(_transforms(self.n_stages, self.gain, n_values)[0], n_values)
+        )
+
+    @cached_property
+    def _added(self) -> CountDistribution:
+        """Law of what the spurious electrons add to the output."""
+        return CountDistribution.of(
+            self.output(0.0, power_of_two((self.spurious + 9 * self.spurious**0.5 + 45) * self.gain))
+        )
+
+    def output(self, mean_electrons: float, n_values: int) -> NDArray[np.float64]:
+        """Law of the output for a Poisson number of electrons in, spurious ones included.
+
+        Args:
+            mean_electrons: Mean number of electrons in.
+            n_values: A power of two; larger outputs must be as good as impossible.
+
+        Returns:
+            float64 (n_values,), probability of 0, 1, ... electrons out.
+        """
+        one, spurious = _transforms(self.n_stages, self.gain, n_values)
+        return np.fft.irfft(np.exp(mean_electrons * (one - 1) + self.spurious * spurious), n_values)
+
+    def multiply(self, n_electrons: NDArray[np.int64], rng: np.random.Generator) -> NDArray[np.int64]:
+        """Draw the output for each number of electrons in.
+
+        Up to N_ONE_BY_ONE electrons it has the exact law. For more, what the stages free is
+        drawn from a negative binomial law with the exact mean and variance, which is the exact
+        law in the limit of many stages.
+
+        Args:
+            n_electrons: int64 (n,).
+            rng: Random numbers.
+
+        Returns:
+            int64 (n,), electrons out.
+        """
+        out = n_electrons.copy()
+        if self.p > 0:
+            few = n_electrons <= N_ONE_BY_ONE
+            out[few] = self.one.draw_sums(n_electrons[few], rng)
+            many = n_electrons[~few]
+            odds = math.expm1(math.log(self.gain) - 2 * math.atanh(self.p))
+            out[~few] += rng.negative_binomial(many * ((self.gain - 1) / odds), 1 / (1 + odds))
+        if self.spurious > 0:
+            added = np.empty(len(out), np.int32)
+            self._added.draw(added, rng)
+            out += added
+        return out
+
+
+def power_of_two(least: float) -> int:
+    """The first power of two that is not below a number."""
+    return 1 << max(0, int(np.ceil(np.log2(least))))
+
+
+@lru_cache(maxsize=16)
+def _transforms(n_stages: int, gain: float, n_values: int) -> tuple[Complex, Complex]:
+    """Fourier transforms of a register's output for one electron, and of the mean of f_m - 1 over m.
+
+    f_m is the generating function of the last m stages.
+    """
+    p = Register(n_stages, gain).p
+    s: Complex = np.exp(-2j * np.pi * np.fft.rfftfreq(n_values))
+    total = np.zeros_like(s)
+    for _ in range(n_stages):
+        total += s
+        s *= 1 - p + p * s
+    return s, total / n_stages - 1
+
+
+class View(ImageSettings):
+    """Image settings with the part of the sensor that is read, and the gain and light in force."""
+
+    region: tuple[int, int, int, int] = Field(description="[y, x, height, width] of the part that is read")
+    binning: int = Field(
+        description="pixels of the sensor per pixel of a frame along each axis: added up before the register "
+        "of an EMCCD, and after the read-out of a qCMOS camera"
+    )
+
+    @classmethod
+    def of(cls, settings: ImageSettings, mode: SensorMode = WHOLE_SENSOR) -> Self:
+        """The settings as a mode makes them; no stray light behind a closed shutter.
+
+        Raises:
+            LimitError: The sensor has no such part, cannot be binned so, or has no EM register.
+        """
+        region = mode.region or (0, 0, *settings.frame)
+        _check(settings, mode, region)
+        made: dict[str, object] = {"region": region, "binning": mode.binning}
+        if mode.em_gain is not None:
+            made["em_gain"] = mode.em_gain
+        if not mode.shutter_open:
+            made["background"] = 0.0
+        return cls.model_validate(settings.model_dump() | made)
+
+    @property
+    def readout_fraction(self) -> float:
+        """Time to read a frame, relative to that of the whole sensor without binning.
+
+        An EMCCD reads its pixels one after the other, a qCMOS camera its rows.
+        """
+        height, width = self.frame
+        rows, cols = self.region[2:]
+        if self.sensor == "qcmos":
+            return rows / height
+        return rows * cols / (height * width * self.binning**2)
+
+
+def _check(settings: ImageSettings, mode: SensorMode, region: tuple[int, int, int, int]) -> None:
+    y, x, height, width = region
+    rows, cols = settings.frame
+    if min(y, x) < 0 or min(height, width) < 1 or y + height > rows or x + width > cols:
+        text = f"[y, x, height, width] = {list(region)}"
+        raise LimitError("the region of the sensor", text, f"its {rows} x {cols} pixels")
+    if mode.binning < 1 or height % mode.binning or width % mode.binning:
+        raise LimitError(
+            "the binning", mode.binning, f"what divides the {height} x {width} pixels of the region"
+        )
+    if settings.sensor == "qcmos" and mode.em_gain not in (None, 1.0):
+        hint = "leave the camera's `em_gain` out, or set the simulation's `image.sensor: emccd`"
+        raise LimitError("the EM gain", f"{mode.em_gain:g}", "1: a qCMOS sensor has no EM register", hint)
+
+
+FULL_SCALE: Final = 65535
+"""Counts at which the converter of 16 bit ends."""
+
+MAX_WORK: Final = 2**23
+"""Outputs of the register times counts that the read noise reaches, above which no table is made."""
+
+MAX_ELECTRONS: Final = 300
+"""Mean electrons of a dark pixel above which none is made; fewer never fill a well."""
+
+
+@dataclass(frozen=True)
+class Output:
+    """What comes behind the register.
+
+    Attributes:
+        well: Electrons that the register holds.
+        read_noise: Electrons r.m.s.
+        electrons_per_adu: Electrons per count.
+        offset: Counts of a dark pixel.
+    """
+
+    well: float
+    read_noise: float
+    electrons_per_adu: float
+    offset: float
+
+    def counts(self, electrons: NDArray[np.int64], rng: np.random.Generator) -> NDArray[np.float64]:
+        """Counts of electrons behind the register, not yet rounded."""
+        counts = np.minimum(electrons, self.well) + self.read_noise * rng.standard_normal(len(electrons))
+        return counts / self.electrons_per_adu + self.offset
+
+
+class Emccd:
+    """An EMCCD camera.
+
+    The electrons of a pixel (photoelectrons, and the clock-induced charge of the sensor) pass the EM
+    register, then come read noise, offset and an analogue-to-digital converter of 16 bit. Pixels
+    without an atom's light all have one law, which is worked out once for an exposure time and
+    drawn from a table; the others are followed step by step.
+
+    Args:
+        settings: Constants of the camera, and how it is read.
+    """
+
+    quantum_efficiency: Final = 1.0
+    """The photoelectrons of the settings are this camera's."""
+
+    def __init__(self, settings: View) -> None:
+        self.binning = settings.binning
+        self._settings = settings
+        gain, spurious = settings.em_gain, settings.register_clock_induced_charge
+        self.register = Register(settings.register_stages, gain, spurious)
+        self._output = Output(
+            settings.register_well, settings.read_noise, settings.electrons_per_adu, settings.offset
+        )
+
+    def warm(self) -> None:
+        """Work out the tables for the exposure of the settings."""
+        _ = self.register.one
+        _dark_law(self.register, self._output, self._dark_electrons(self._settings.exposure))
+
+    def read(
+        self, light: NDArray[np.int32], exposure_s: float, rng: np.random.Generator
+    ) -> NDArray[np.uint16]:
+        """Draw the counts of a frame.
+
+        Args:
+            light: int32 (height, width), photoelectrons of the atoms on each pixel.
+            exposure_s: Exposure time, in seconds.
+            rng: Random numbers of the shot.
+
+        Returns:
+            uint16 (height, width).
+        """
+        dark_electrons = self._dark_electrons(exposure_s)
+        dark = _dark_law(self.register, self._output, dark_electrons)
+        image = np.empty(light.size, np.uint16)
+        if dark is None:
+            lit = slice(None)
+        else:
+            dark.draw(image, rng)
+            lit = np.flatnonzero(light > 0)
+        n_electrons = light.ravel()[lit].astype(np.int64)
+        n_electrons += rng.poisson(dark_electrons, len(n_electrons))
+        n_electrons = np.minimum(n_electrons, round(self._settings.full_well))
+        counts = self._output.counts(self.register.multiply(n_electrons, rng), rng)
+        image[lit] = np.clip(np.rint(counts), 0, FULL_SCALE)
+        return image.reshape(light.shape)
+
+    def _dark_electrons(self, exposure_s: float) -> float:
+        """Mean electrons of a pixel without an atom's light."""
+        settings = self._settings
+        per_pixel = settings.background * exposure_s / settings.exposure + settings.clock_induced_charge
+        return per_pixel * settings.binning**2
+
+
+@lru_cache(maxsize=64)
+def _dark_law(register: Register, output: Output, mean_electrons: float) -> CountDistribution | None:
+    """Law of the counts of a pixel without an atom's light; None where a table would be too long."""
+    most = mean_electrons + register.spurious
+    n_values = power_of_two((most + 9 * (2 * most) ** 0.5 + 45) * register.gain)
+    spread = output.read_noise / output.electrons_per_adu
+    reach = int(np.ceil(6.5 * spread)) + 1
+    if n_values * reach > MAX_WORK or mean_electrons > MAX_ELECTRONS:
+        return None
+    p = np.maximum(register.output(mean_electrons, n_values), 0.0)
+    p = p[: np.flatnonzero(p > 1e-15)[-1] + 1]
+    value = np.minimum(np.arange(len(p)), output.well) / output.electrons_per_adu + output.offset
+    nearest = np.rint(value).astype(np.int64)
+    law = np.zeros(FULL_SCALE + 1)
+    for beside in range(-reach, reach + 1):
+        count = nearest + beside
+        share = _rounded(count - value, spread) * p
+        law += np.bincount(np.clip(count, 0, FULL_SCALE), share, len(law))
+    return CountDistribution.of(law)
+
+
+def _rounded(distance: NDArray[np.float64], spread: float) -> NDArray[np.float64]:
+    """Probability that a normal number about 0 is rounded to a count at a distance."""
+    from scipy.special import ndtr
+
+    if spread == 0:
+        return (np.abs(distance) <= 0.5).astype(float)
+    return ndtr((distance + 0.5) / spread) - ndtr((distance - 0.5) / spread)
+
+
+Floats = NDArray[np.float32]
+
+
+class Qcmos:
+    """A qCMOS camera.
+
+    Photoelectrons and dark current fill the pixel's well; its own gain, read noise and offset follow,
+    then an analogue-to-digital converter of 16 bit. Binned pixels are added up after that.
+
+    Args:
+        settings: Constants of the camera, and how it is read.
+        rng: Random numbers of the machine, for what differs from pixel to pixel.
+    """
+
+    binning: Final = 1
+    """Binning before the read-out."""
+
+    def __init__(self, settings: View, rng: np.random.Generator) -> None:
+        self.quantum_efficiency = settings.qcmos.quantum_efficiency
+        self._settings = settings
+        self._rng = rng
+
+    def warm(self) -> None:
+        """Draw what differs from pixel to pixel."""
+        _ = self._pixels
+
+    def read(
+        self, light: NDArray[np.int32], exposure_s: float, rng: np.random.Generator
+    ) -> NDArray[np.uint16]:
+        """Draw the counts of a frame.
+
+        Args:
+            light: int32, photoelectrons of the atoms on each pixel of the part that is read.
+            exposure_s: Exposure time, in seconds.
+            rng: Random numbers of the shot.
+
+        Returns:
+            uint16 (height, width), binned.
+        """
+        adu_per_electron, read_noise, offset = self._pixels
+        electrons = np.empty(light.shape, np.int32)
+        _poisson(self._dark_electrons(exposure_s)).draw(electrons.ravel(), rng)
+        electrons += light
+        counts = np.minimum(electrons, round(self._settings.qcmos.full_well)).astype(np.float32)
+        counts *= adu_per_electron
+        counts += offset
+        noise = rng.standard_normal(light.shape, np.float32)
+        noise *= read_noise
+        counts += noise
+        np.clip(np.rint(counts, out=counts), 0, FULL_SCALE, out=counts)
+        b = self._settings.binning
+        if b > 1:
+            height, width = light.shape
+            summed = counts.reshape(height // b, b, width // b, b).sum(axis=(1, 3))
+            counts = np.minimum(summed, FULL_SCALE)
+        return counts.astype(np.uint16)
+
+    @cached_property
+    def _pixels(self) -> tuple[Floats, Floats, Floats]:
+        """Counts per electron, read noise and offset in counts of each pixel that is read."""
+        settings, frame = self._settings.qcmos, self._settings.frame
+        normal = self._rng.standard_normal((3, *frame), np.float32)
+        top, left, height, width = self._settings.region
+        normal = normal[:, top : top + height, left : left + width]
+        adu_per_electron = np.maximum(0, 1 + settings.gain_spread * normal[0]) / settings.electrons_per_adu
+        spread = settings.read_noise_spread  # the mean square of exp(spread * normal) is exp(2 * spread^2)
+        read_noise = settings.read_noise * np.exp(spread * normal[1] - spread**2) * adu_per_electron
+        offset = settings.offset + settings.offset_spread * normal[2]
+        return adu_per_electron, read_noise, offset
+
+    def _dark_electrons(self, exposure_s: float) -> float:
+        """Mean electrons of a pixel without an atom's light."""
+        settings = self._settings
+        stray = settings.background * settings.qcmos.quantum_efficiency * exposure_s / settings.exposure
+        return stray + settings.qcmos.dark_current * exposure_s
+
+
+@lru_cache(maxsize=16)
+def _poisson(mean: float) -> CountDistribution:
+    from scipy.special import gammaln, xlogy
+
+    k = np.arange(int(mean + 9 * mean**0.5) + 45)
+    return CountDistribution.of(np.exp(xlogy(k, mean) - mean - gammaln(k + 1)))

@@ -1,0 +1,673 @@
+"""Kernels of an atom's transport by a mobile tweezer: hand-over, flight, collisions.
+
+``row``, ``col``, ``state``, ``depth``, ``work``, ``ways``: see ``transport_kernels.py``.
+
+``law`` stands for the constants of a world, see :func:`labseq_virtual.handover.constants`; ``reach`` for
+the logarithm of the mobile over the static depth and the distance in m below which both wells are one
+(2, n). For the other arrays see ``transport_kernels.py``.
+
+Some arrays stand for several numbers:
+
+- ``law``, ``reach``: see ``transport_kernels.py``.
+- ``row``, ``col``: the tones of a segment, with the columns of ``handover.py`` (n_tones, N_COLUMNS).
+- ``state``, ``depth``, ``risk``: what each crossing of these tones is, its depth in kelvin, and the
+  probability that an atom fell out of it on the way; at least as many rows and columns as there are tones.
+- ``work``: room for a whole number for each crossing; ``ways`` likewise for N_WAY numbers.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq.plugin import const, kernel
+from labseq_virtual.handover import (
+    ADIABATIC_DEPTH,
+    AT_REST,
+    DARK,
+    DEPTH_DROP,
+    EMPTY,
+    END,
+    HELD,
+    INTERMODULATION,
+    MIXING,
+    MOBILE_DEPTH,
+    NEW,
+    ON_END,
+    ON_START,
+    PER_TONE,
+    POWER_END,
+    POWER_START,
+    REFERENCE_SPEED_M_S,
+    REFERENCE_TONES,
+    SHALLOW_LOSS,
+    SKEW,
+    SLOW,
+    SPACING,
+    START,
+    STATIC_DEPTH,
+    STATIC_WAIST,
+    SUDDEN_S,
+    TEMPERATURE,
+    TOLERANCE,
+    TRANSPORT_LOSS,
+)
+from labseq_virtual.transport import COLLISION, EJECTED, HAND_OVER, PROGRAM, TRANSPORT
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+States = NDArray[np.int8]
+Mask = NDArray[np.bool_]
+
+TABLE = const("float64", 2)
+
+N_WAY = 5
+"""Columns of a way: row and column at its start, the steps along both, and the square of its length."""
+
+
+@kernel(f"boolean({TABLE})")
+def moves(tones: Floats) -> bool:
+    """Whether any tone moves."""
+    furthest = 0.0
+    for tone in range(len(tones)):
+        furthest = max(furthest, abs(tones[tone, END] - tones[tone, START]))
+    return furthest > AT_REST
+
+
+@kernel(f"boolean({TABLE})")
+def crowded(tones: Floats) -> bool:
+    """Whether a tone is too near to the next in the list; if not, none mix."""
+    for k in range(1, len(tones)):
+        for at in (START, END):
+            if tones[k, at] - tones[k - 1, at] < MIXING:
+                return True
+    return False
+
+
+@kernel(f"boolean[::1]({TABLE})")
+def find_mixed(tones: Floats) -> Mask:
+    """Which tones come too near to another, or pass it (n_tones,)."""
+    mixed = np.zeros(len(tones), np.bool_)
+    for k in range(len(tones)):
+        for m in range(k):
+            before, after = tones[k, START] - tones[m, START], tones[k, END] - tones[m, END]
+            near = abs(before) < MIXING or abs(after) < MIXING or before * after < 0.0
+            one_on = tones[k, ON_START] + tones[k, ON_END] > 0.0
+            if near and one_on and tones[m, ON_START] + tones[m, ON_END] > 0.0:
+                mixed[k] = mixed[m] = True
+    return mixed
+
+
+@kernel(f"int64({TABLE}, {TABLE}, int8[:, ::1])")
+def mix(row: Floats, col: Floats, state: States) -> int:
+    """Rule 3: the atoms on tones that mix are lost; returns how many."""
+    if not (crowded(row) or crowded(col)):
+        return 0
+    n_lost = 0
+    by_row, by_col = find_mixed(row), find_mixed(col)
+    for i in range(len(row)):
+        for j in range(len(col)):
+            if state[i, j] == HELD and (by_row[i] or by_col[j]):
+                state[i, j] = EMPTY
+                n_lost += 1
+    return n_lost
+
+
+@kernel(f"int64({TABLE}, {TABLE}, int8[:, ::1], {TABLE}, float64, float64[:, ::1], int64[::1])")
+def find_ways(
+    row: Floats, col: Floats, state: States, depth: Floats, min_depth: float, ways: Floats, work: Ints
+) -> int:
+    """Find the crossings that move and are deep enough to throw atoms out; returns how many."""
+    n = 0
+    for i in range(len(row)):
+        down = row[i, END] - row[i, START]
+        for j in range(len(col)):
+            right = col[j, END] - col[j, START]
+            still = abs(down) <= AT_REST and abs(right) <= AT_REST
+            if still or state[i, j] == DARK or depth[i, j] <= min_depth:
+                continue
+            ways[n, 0], ways[n, 1], ways[n, 2], ways[n, 3] = row[i, START], col[j, START], down, right
+            ways[n, 4] = down * down + right * right
+            work[n] = i * len(col) + j
+            n += 1
+    return n
+
+
+@kernel(f"UniTuple(int64, 2)({TABLE}, int64, int64, int64, float64)")
+def span(ways: Floats, n: int, axis: int, n_sites: int, tolerance: float) -> tuple[int, int]:
+    """The first of the rows (axis 0) or columns (1) that n ways come near to, and the one after the last."""
+    low, high = math.inf, -math.inf
+    for k in range(n):
+        start, end = ways[k, axis], ways[k, axis] + ways[k, 2 + axis]
+        low, high = min(low, start, end), max(high, start, end)
+    first, last = math.floor(low - tolerance), math.ceil(high + tolerance)
+    return max(first, 0), min(last + 1, n_sites)
+
+
+@kernel(f"int64({TABLE}, int64, int64, int64, float64)")
+def first_to_hit(ways: Floats, n: int, r: int, c: int, tolerance: float) -> int:
+    """Which of n ways comes first over an atom at a site; -1: none."""
+    first, soonest = -1, math.inf
+    for k in range(n):
+        to_r, to_c, down, right = r - ways[k, 0], c - ways[k, 1], ways[k, 2], ways[k, 3]
+        when = min(max((to_r * down + to_c * right) / ways[k, 4], 0.0), 1.0)
+        miss_r, miss_c = to_r - when * down, to_c - when * right
+        if miss_r * miss_r + miss_c * miss_c <= tolerance * tolerance and when < soonest:
+            first, soonest = k, when
+    return first
+
+
+@kernel(
+    f"int64(boolean[:, ::1], {TABLE}, {TABLE}, int8[:, ::1], {TABLE}, float64, float64, float64[:, ::1], "
+    "int64[::1])"
+)
+def sweep(
+    occupied: Mask,
+    row: Floats,
+    col: Floats,
+    state: States,
+    depth: Floats,
+    min_depth: float,
+    tolerance: float,
+    ways: Floats,
+    work: Ints,
+) -> int:
+    """Rule 4: moving crossings throw out standing atoms; returns how many atoms are lost.
+
+    Judged on straight lines between the two ends of a segment. The first crossing to arrive loses its
+    own atom too.
+    """
+    n_lost = 0
+    n = find_ways(row, col, state, depth, min_depth, ways, work)
+    top, bottom = span(ways, n, 0, occupied.shape[0], tolerance) if n > 0 else (0, 0)
+    left, right = span(ways, n, 1, occupied.shape[1], tolerance) if n > 0 else (0, 0)
+    for r in range(top, bottom):
+        for c in range(left, right):
+            first = first_to_hit(ways, n, r, c, tolerance) if occupied[r, c] else -1
+            if first < 0:
+                continue
+            occupied[r, c] = False
+            n_lost += 1
+            i, j = work[first] // len(col), work[first] % len(col)
+            if state[i, j] == HELD:
+                state[i, j] = EMPTY
+                n_lost += 1
+    return n_lost
+
+
+LIST = const("float64", 1)
+SITES = "boolean[:, ::1]"
+STATES = "int8[:, ::1]"
+NUMBERS = "int64[::1]"
+
+
+@kernel(f"float64(float64, {TABLE})")
+def interpolate(x: float, table: Floats) -> float:
+    """Go along straight lines through the points (x rising, y) of a table (2, n); flat beyond its ends."""
+    if x <= table[0, 0]:
+        return float(table[1, 0])
+    for k in range(1, table.shape[1]):
+        if x < table[0, k]:
+            slope = (table[1, k] - table[1, k - 1]) / (table[0, k] - table[0, k - 1])
+            return float(table[1, k - 1] + slope * (x - table[0, k - 1]))
+    return float(table[1, -1])
+
+
+@kernel("float64(float64)")
+def exceeds(energy_over_kt: float) -> float:
+    """Probability that the thermal energy in a harmonic well in three dimensions exceeds a value."""
+    x = max(energy_over_kt, 0.0)
+    return math.exp(-x) * (1.0 + x + x * x / 2.0)
+
+
+@kernel("float64(float64)")
+def kinetic_exceeds(energy_over_kt: float) -> float:
+    """Probability that the kinetic energy in three dimensions exceeds a value (Maxwell's law)."""
+    root = math.sqrt(max(energy_over_kt, 0.0))
+    return math.erfc(root) + 2.0 / math.sqrt(math.pi) * root * math.exp(-root * root)
+
+
+@kernel(f"float64(float64, int64, {LIST})")
+def mobile_depth(power: float, n_further: int, law: Floats) -> float:
+    """Depth of a mobile tweezer in kelvin; ``power``: of its tones over the one meant."""
+    return float(law[MOBILE_DEPTH] * power / (1.0 + law[DEPTH_DROP] * n_further))
+
+
+@kernel(f"boolean(float64, float64, float64, {TABLE})")
+def takes(mobile: float, static: float, distance_m: float, reach: Floats) -> bool:
+    """Whether a mobile tweezer that comes on takes the atom of a static one; depths in kelvin."""
+    if mobile <= static:
+        return False
+    log_ratio = math.log(mobile / static) if static > 0.0 else math.inf
+    return distance_m < interpolate(log_ratio, reach)
+
+
+@kernel(f"float64(float64, float64, int64, {LIST})")
+def shallow(mobile: float, speed_m_s: float, n_further: int, law: Floats) -> float:
+    """Probability that an atom falls out of a mobile tweezer that is too shallow for its speed."""
+    if law[ADIABATIC_DEPTH] == 0.0:
+        return 0.0
+    missing = law[ADIABATIC_DEPTH] * (speed_m_s / REFERENCE_SPEED_M_S) ** 2 - mobile
+    scatter = law[INTERMODULATION] * math.sqrt(n_further / REFERENCE_TONES) * mobile
+    if scatter > 0.0:
+        part = 0.5 * math.erfc(-missing / scatter / math.sqrt(2.0))
+    elif missing == 0.0:
+        part = 0.5
+    else:
+        part = 1.0 if missing > 0.0 else 0.0
+    return float(law[SHALLOW_LOSS] * part)
+
+
+@kernel(f"float64(float64, float64, float64, float64, {LIST})")
+def spilled(static: float, ratio: float, distance_m: float, ramp_s: float, law: Floats) -> float:
+    """Probability that an atom that is let go beside a site does not stay there.
+
+    Args:
+        static: Depth of the site, in kelvin.
+        ratio: The mobile tweezer's depth over it, while it was on.
+        distance_m: Distance of the atom from the site.
+        ramp_s: Duration of the drop-off.
+        law: The constants.
+    """
+    waists = distance_m / law[STATIC_WAIST]
+    slow = max(interpolate(waists, SLOW), exceeds(static / law[TEMPERATURE]))
+    left = static * math.exp(-2.0 * waists * waists)
+    sudden = kinetic_exceeds(left / (law[TEMPERATURE] * math.sqrt(1.0 + ratio)))
+    part = math.exp(-((ramp_s / SUDDEN_S) ** 2))
+    return slow + part * (max(sudden, slow) - slow)
+
+
+@kernel(f"UniTuple(float64, 3)(float64, float64, float64, float64, int64, float64, float64, {LIST})")
+def risks(
+    static: float,
+    mobile: float,
+    distance_m: float,
+    fallen: float,
+    n_further: int,
+    ramp_s: float,
+    factor: float,
+    law: Floats,
+) -> tuple[float, float, float]:
+    """Probabilities that an atom that is let go near a site is lost.
+
+    Args:
+        static: Depth of the site, in kelvin.
+        mobile: Depth of the mobile tweezer while it was on.
+        distance_m: Distance of the atom from the site.
+        fallen: Probability of :func:`shallow` on the way.
+        n_further: Tones that were on beyond one per axis.
+        ramp_s: Duration of the drop-off, in seconds.
+        factor: The shot's factor on the losses.
+        law: The constants.
+
+    Returns:
+        That it falls beside the site or out of it; by pick-up and drop-off; on the way.
+    """
+    ratio = math.inf if mobile > 0.0 else 0.0
+    if static > 0.0:
+        ratio = mobile / static
+    hand_over = 0.0
+    if law[TRANSPORT_LOSS] * factor > 0.0:
+        nominal = law[MOBILE_DEPTH] / law[STATIC_DEPTH]
+        hand_over = min(1.0, factor * law[TRANSPORT_LOSS] * ratio / nominal)
+    per_tone = min(1.0, factor * law[PER_TONE] * n_further)
+    return spilled(static, ratio, distance_m, ramp_s, law), hand_over, 1.0 - (1.0 - per_tone) * (1.0 - fallen)
+
+
+@kernel(f"Tuple((int64, int64, float64, boolean))(float64, float64, {TABLE}, {LIST})")
+def nearest_site(row: float, col: float, static: Floats, law: Floats) -> tuple[int, int, float, bool]:
+    """The site nearest to a place, how far it is in metres, and whether the place is in the grid."""
+    r, c = round(row), round(col)
+    down, right = row - r, col - c
+    away_m = math.sqrt(
+        (down * down + right * right) * (law[SPACING] * law[SPACING]) + down * right * law[SKEW]
+    )
+    inside = 0 <= r < static.shape[0] and 0 <= c < static.shape[1]
+    r, c = min(max(r, 0), static.shape[0] - 1), min(max(c, 0), static.shape[1] - 1)
+    return r, c, away_m, inside
+
+
+@kernel(f"void({SITES}, {TABLE}, {TABLE}, {TABLE}, {STATES}, {TABLE}, {LIST}, {TABLE})")
+def pick_up(
+    occupied: Mask,
+    static: Floats,
+    row: Floats,
+    col: Floats,
+    state: States,
+    depth: Floats,
+    law: Floats,
+    reach: Floats,
+) -> None:
+    """Rule 2: crossings that come on take the atoms of the sites near to them, row by row."""
+    for i in range(len(row)):
+        for j in range(len(col)):
+            if state[i, j] != NEW:
+                continue
+            state[i, j] = EMPTY
+            r, c, away_m, inside = nearest_site(row[i, START], col[j, START], static, law)
+            if inside and occupied[r, c] and takes(depth[i, j], static[r, c], away_m, reach):
+                state[i, j] = HELD
+                occupied[r, c] = False
+
+
+@kernel("int64(boolean[:, ::1], int64[::1], int64)")
+def land(occupied: Mask, sites: Ints, n: int) -> int:
+    """Put n atoms on their sites, all at once; where two meet, all are lost; returns how many."""
+    n_lost = 0
+    for k in range(n):
+        site, n_here = int(sites[k]), 0
+        if site < 0:
+            continue
+        for other in range(k, n):
+            if sites[other] == site:
+                sites[other] = -1
+                n_here += 1
+        r, c = site // occupied.shape[1], site % occupied.shape[1]
+        n_here += int(occupied[r, c])
+        occupied[r, c] = n_here == 1
+        n_lost += n_here if n_here > 1 else 0
+    return n_lost
+
+
+@kernel(
+    f"int64({SITES}, {TABLE}, {TABLE}, {TABLE}, {STATES}, {TABLE}, {TABLE}, int64, float64, float64, "
+    f"{TABLE}, int64, {LIST}, {NUMBERS}, {NUMBERS})"
+)
+def set_down(
+    occupied: Mask,
+    static: Floats,
+    row: Floats,
+    col: Floats,
+    state: States,
+    depth: Floats,
+    risk: Floats,
+    n_further: int,
+    ramp_s: float,
+    factor: float,
+    draws: Floats,
+    n_drawn: int,
+    law: Floats,
+    work: Ints,
+    lost: Ints,
+) -> int:
+    """Rule 5: crossings that go out set their atoms down; returns how many draws are used up by now."""
+    n = 0
+    for i in range(len(row)):
+        for j in range(len(col)):
+            if row[i, ON_END] * col[j, ON_END] > 0.0:
+                continue
+            held, state[i, j] = state[i, j] == HELD, DARK
+            if not held:
+                continue
+            r, c, away_m, inside = nearest_site(row[i, END], col[j, END], static, law)
+            spilled, hand_over, transport = risks(
+                static[r, c], depth[i, j], away_m, risk[i, j], n_further, ramp_s, factor, law
+            )
+            draw = draws[n_drawn]
+            n_drawn += 1
+            if not inside:
+                lost[EJECTED] += 1
+            elif draw[0] < spilled or draw[1] < hand_over:
+                lost[HAND_OVER] += 1
+            elif draw[2] < transport:
+                lost[TRANSPORT] += 1
+            else:
+                work[n] = r * static.shape[1] + c
+                n += 1
+    lost[COLLISION] += land(occupied, work, n)
+    return n_drawn
+
+
+Offsets = NDArray[np.int32]
+
+OFFSETS = const("int32", 1)
+OWN = "float64[:, ::1]"
+
+INSTANT_S = 1e-12
+"""Duration that a segment without one is taken for."""
+
+
+@kernel(f"int64({TABLE}, int64, int64)")
+def count_on(tones: Floats, one: int, other: int) -> int:
+    """How many tones are on in both of two columns (start and end; or twice the same)."""
+    n = 0
+    for tone in range(len(tones)):
+        n += tones[tone, one] * tones[tone, other] > 0.0
+    return n
+
+
+@kernel(f"int64({TABLE})")
+def count_lit(tones: Floats) -> int:
+    """How many tones are on at the start or at the end."""
+    n = 0
+    for tone in range(len(tones)):
+        n += tones[tone, ON_START] + tones[tone, ON_END] > 0.0
+    return n
+
+
+@kernel(f"boolean({TABLE}, {TABLE})")
+def any_lit(row: Floats, col: Floats) -> bool:
+    """Whether any crossing is on at the start or at the end."""
+    at_start = count_on(row, ON_START, ON_START) * count_on(col, ON_START, ON_START)
+    return at_start + count_on(row, ON_END, ON_END) * count_on(col, ON_END, ON_END) > 0
+
+
+@kernel(f"int64({TABLE}, {OFFSETS}, {TABLE}, {OFFSETS}, int64)")
+def most_let_go(
+    rows: Floats, row_offsets: Offsets, cols: Floats, col_offsets: Offsets, n_segments: int
+) -> int:
+    """How many crossings go out within the first segments: no more atoms are let go."""
+    n = 0
+    for k in range(n_segments):
+        row, col = rows[row_offsets[k] : row_offsets[k + 1]], cols[col_offsets[k] : col_offsets[k + 1]]
+        n += count_on(row, ON_START, ON_START) * count_on(col, ON_START, ON_START)
+        n -= count_on(row, ON_START, ON_END) * count_on(col, ON_START, ON_END)
+    return n
+
+
+@kernel(f"int64({STATES}, {TABLE}, {TABLE})")
+def count_held(state: States, row: Floats, col: Floats) -> int:
+    """How many crossings hold an atom."""
+    n = 0
+    for i in range(len(row)):
+        for j in range(len(col)):
+            n += state[i, j] == HELD
+    return n
+
+
+@kernel(f"boolean({TABLE}, {TABLE}, float64)")
+def unchanged(before: Floats, now: Floats, tolerance: float) -> bool:
+    """Whether the tones are the same in the same order: nearly always so."""
+    if len(before) != len(now):
+        return False
+    furthest = 0.0
+    for tone in range(len(now)):
+        furthest = max(furthest, abs(now[tone, START] - before[tone, END]))
+    return furthest <= tolerance
+
+
+@kernel(f"{NUMBERS}({TABLE}, {TABLE}, float64)")
+def match(before: Floats, now: Floats, tolerance: float) -> Ints:
+    """For each tone the nearest of the segment before (n_tones,); -1 where none is near enough.
+
+    One that is the nearest of several goes on as the nearest of these, or the first of them.
+    """
+    nearest, distance = np.full(len(now), -1), np.empty(len(now))
+    for tone in range(len(now)):
+        least = math.inf
+        for other in range(len(before)):
+            away = abs(now[tone, START] - before[other, END])
+            if away < least:
+                least = away
+                nearest[tone] = other if away <= tolerance else -1
+        distance[tone] = least
+        for rival in range(tone):
+            if nearest[rival] == nearest[tone]:
+                nearest[tone if distance[rival] <= least else rival] = -1
+    return nearest
+
+
+@kernel(f"void({TABLE}, {TABLE}, {STATES}, {OWN}, {TABLE}, {TABLE}, {STATES}, {OWN}, float64)")
+def follow(
+    old_row: Floats,
+    old_col: Floats,
+    old_state: States,
+    old_risk: Floats,
+    row: Floats,
+    col: Floats,
+    state: States,
+    risk: Floats,
+    tolerance: float,
+) -> None:
+    """Rule 1: tweezers that were on before and still are keep their atoms; others are new or dark."""
+    if unchanged(old_row, row, tolerance) and unchanged(old_col, col, tolerance):
+        from_row, from_col = np.arange(len(row)), np.arange(len(col))
+    else:
+        from_row, from_col = match(old_row, row, tolerance), match(old_col, col, tolerance)
+    for i in range(len(row)):
+        for j in range(len(col)):
+            on = row[i, ON_START] * col[j, ON_START] > 0.0
+            m, n = from_row[i], from_col[j]
+            if on and m >= 0 and n >= 0 and old_state[m, n] != DARK:
+                state[i, j], risk[i, j] = old_state[m, n], old_risk[m, n]
+            else:
+                lit = on or row[i, ON_END] * col[j, ON_END] > 0.0
+                state[i, j], risk[i, j] = NEW if lit else DARK, 0.0
+
+
+@kernel(f"void({TABLE}, {TABLE}, {STATES}, {TABLE}, {OWN}, int64, float64, {LIST})")
+def run_risks(
+    row: Floats,
+    col: Floats,
+    state: States,
+    depth: Floats,
+    risk: Floats,
+    n_further: int,
+    speed: float,
+    law: Floats,
+) -> None:
+    """The risk of tweezers too shallow for their speed; ``speed``: of one that moves by 1 m."""
+    for i in range(len(row)):
+        for j in range(len(col)):
+            if state[i, j] != HELD:
+                continue
+            down, right = row[i, END] - row[i, START], col[j, END] - col[j, START]
+            speed_m_s = math.hypot(down, right) * law[SPACING] * speed
+            if speed_m_s > 0.0:
+                risk[i, j] = max(risk[i, j], shallow(depth[i, j], speed_m_s, n_further, law))
+
+
+@kernel(f"int64({OFFSETS}, int64)")
+def max_tones(offsets: Offsets, n_segments: int) -> int:
+    """The most tones of an axis in one of the first segments."""
+    most = 0
+    for k in range(n_segments):
+        most = max(most, offsets[k + 1] - offsets[k])
+    return most
+
+
+@kernel(
+    f"int64({SITES}, {TABLE}, {TABLE}, {TABLE}, {STATES}, {OWN}, {OWN}, float64, float64, float64, {TABLE}, "
+    f"int64, {LIST}, {TABLE}, {OWN}, {NUMBERS}, {NUMBERS})"
+)
+def play(
+    occupied: Mask,
+    static: Floats,
+    row: Floats,
+    col: Floats,
+    state: States,
+    depth: Floats,
+    risk: Floats,
+    duration_s: float,
+    fastest: float,
+    factor: float,
+    draws: Floats,
+    n_drawn: int,
+    law: Floats,
+    reach: Floats,
+    ways: Floats,
+    work: Ints,
+    lost: Ints,
+) -> int:
+    """Rules 2 to 5 for a segment; returns how many draws are used up by now."""
+    n_further = count_lit(row) + count_lit(col) - 2
+    for i in range(len(row)):
+        for j in range(len(col)):
+            start, end = row[i, POWER_START] * col[j, POWER_START], row[i, POWER_END] * col[j, POWER_END]
+            depth[i, j] = mobile_depth(max(start, end), n_further, law)
+    pick_up(occupied, static, row, col, state, depth, law, reach)
+    lost[COLLISION] += mix(row, col, state)
+    if moves(row) or moves(col):
+        lost[COLLISION] += sweep(
+            occupied, row, col, state, depth, law[STATIC_DEPTH], law[TOLERANCE], ways, work
+        )
+        speed = fastest / max(duration_s, INSTANT_S)
+        run_risks(row, col, state, depth, risk, n_further, speed, law)
+    return set_down(
+        occupied, static, row, col, state, depth, risk, n_further, duration_s, factor, draws, n_drawn, law,
+        work, lost,
+    )  # fmt: skip
+
+
+@kernel(
+    f"{NUMBERS}({SITES}, {TABLE}, {TABLE}, {OFFSETS}, {TABLE}, {OFFSETS}, {LIST}, {LIST}, int64, "
+    f"float64, {TABLE}, {LIST}, {TABLE})"
+)
+def carry_atoms(
+    occupied: Mask,
+    static: Floats,
+    rows: Floats,
+    row_offsets: Offsets,
+    cols: Floats,
+    col_offsets: Offsets,
+    duration_s: Floats,
+    fastest: Floats,
+    n_segments: int,
+    factor: float,
+    draws: Floats,
+    law: Floats,
+    reach: Floats,
+) -> Ints:
+    """Carry atoms by the first segments of a program.
+
+    Args:
+        occupied: Sites that hold an atom (n_rows, n_cols); changed in place.
+        static: Depths of the static tweezers (n_rows, n_cols).
+        rows: Row tones of all segments (n_row_tones, N_COLUMNS).
+        row_offsets: The first of each segment (at least n_segments + 1,).
+        cols: Column tones, likewise.
+        col_offsets: Likewise.
+        duration_s: Durations of the segments.
+        fastest: Their greatest speeds over the mean.
+        n_segments: How many segments are played.
+        factor: The shot's factor on the transport loss.
+        draws: Uniform random numbers (at least :func:`most_let_go`, 3).
+        law: The constants.
+        reach: The distances of merging.
+
+    Returns:
+        How many atoms were lost by each cause (5,).
+    """
+    shape = max_tones(row_offsets, n_segments), max_tones(col_offsets, n_segments)
+    old_state, state = np.zeros(shape, np.int8), np.zeros(shape, np.int8)
+    old_risk, risk, depth = np.zeros(shape), np.zeros(shape), np.zeros(shape)
+    ways = np.zeros((shape[0] * shape[1], N_WAY))
+    work, lost, n_drawn = np.zeros(shape[0] * shape[1], np.int64), np.zeros(5, np.int64), 0
+    old_row, old_col = rows[:0], cols[:0]
+    for k in range(n_segments):
+        row, col = rows[row_offsets[k] : row_offsets[k + 1]], cols[col_offsets[k] : col_offsets[k + 1]]
+        lost[PROGRAM] += count_held(old_state, old_row, old_col)
+        if any_lit(row, col):
+            follow(old_row, old_col, old_state, old_risk, row, col, state, risk, law[TOLERANCE])
+            lost[PROGRAM] -= count_held(state, row, col)
+            n_drawn = play(
+                occupied, static, row, col, state, depth, risk, duration_s[k], fastest[k], factor, draws,
+                n_drawn, law, reach, ways, work, lost,
+            )  # fmt: skip
+            old_row, old_col, old_state, old_risk, state, risk = row, col, state, risk, old_state, old_risk
+        else:
+            old_row, old_col = row[:0], col[:0]
+    lost[PROGRAM] += count_held(old_state, old_row, old_col)
+    return lost
