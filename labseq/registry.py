@@ -51,7 +51,7 @@ class Owner:
         source: Its file, or the distribution that it came with, in words; "" for labseq's own.
         home: The file or the folder that its code is in; None if that is not known.
         max_wait_s: How long it may take to load, and a constructor to return.
-        notes: What else it did to the process when it was loaded, or in a constructor.
+        notes: What it printed when it was loaded, or in a constructor.
     """
 
     name: str
@@ -65,7 +65,7 @@ class Owner:
         return PluginLoadError(self.name, reason, self.source)
 
     def note(self, text: str) -> None:
-        """Keep what it did, once."""
+        """Keep a sentence about it, once."""
         if text not in self.notes:
             self.notes.append(text)
 

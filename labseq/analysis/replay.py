@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from labseq.config import Choice, Override, split_overrides
 from labseq.config.messages import clean
 from labseq.errors import ConfigError, LabseqError, Problem, RecordingError
+from labseq.guard import StopFlag
 from labseq.model import (
     CalibrationEntry,
     CycleRecord,
@@ -33,7 +34,6 @@ from labseq.motion import check_plan
 from labseq.recording import Run, Shot
 from labseq.recording.folders import PROFILE_FILE, SEQUENCE_FILE
 from labseq.roles import Detector, NeedsWarmUp, NeverStopped, Planner
-from labseq.sequencer import StopFlag
 from labseq.session.assembly import Assembly, assemble
 from labseq.session.construct import construct
 from labseq.session.course import course_of, point_of

@@ -34,11 +34,11 @@ def labseq_register(registry: Registry) -> None:
         RearrangeSettings,
         RearrangeStep,
         WaitSettings,
+        wait_step,
     )
     from labseq.detection.threshold import BlindDetector, ThresholdDetector
     from labseq.detection.weighted import WeightedDetector
     from labseq.geometry import bitmap, compact
-    from labseq.sequencer.leading import wait_step
 
     registry.step("load", LoadStep, LoadSettings)
     registry.step("image", ImageStep, ImageSettings)

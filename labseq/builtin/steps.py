@@ -111,6 +111,33 @@ class WaitStep:
             shot.clock.sleep(self.duration_s)
 
 
+class FollowStep:
+    """Waits until another control system says to go on."""
+
+    needs_image = False
+    takes_image = False
+
+    def __init__(self, signal: str, timeout_s: float, device: str = "") -> None:
+        self.signal = signal
+        self.timeout_s = timeout_s
+        self.device = device
+
+    def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:  # noqa: ARG002 - Protocol
+        """One bar, at most the timeout; lines are idle, because nobody knows how long it takes."""
+        return [TimelineEntry(f"wait for {self.signal}", self.timeout_s, 0.0)]
+
+    def run(self, shot: Shot) -> None:
+        """Wait for the signal."""
+        shot.follow(self.signal, self.timeout_s, self.device)
+
+
+def wait_step(settings: WaitSettings) -> WaitStep | FollowStep:
+    """The step ``wait``: for a time, or for a signal."""
+    if settings.signal is None or settings.timeout is None:
+        return WaitStep(settings)
+    return FollowStep(settings.signal, settings.timeout, settings.device or "")
+
+
 class DeviceStep:
     """Sends a command to a named device of the profile."""
 

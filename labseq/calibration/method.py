@@ -12,10 +12,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from labseq.calibration.store import read_entry
 from labseq.errors import ConfigError, DeviceError, Problem
+from labseq.guard import StopFlag
 from labseq.model import CalibrationKind, Frame, MotionSpec, SiteGrid
 from labseq.recording import Run
 from labseq.roles import Detector
-from labseq.sequencer import StopFlag, VirtualClock
+from labseq.sequencer import VirtualClock
 from labseq.session.construct import construct
 from labseq.session.planning import recorded_machine
 from labseq.session.profile import ResolvedProfile

@@ -7,4 +7,4 @@ its lost frames and its errors are the same for all cameras, and are made once, 
 from labseq.drivers.camera import CameraDriver, Cooling, ExposureResult, Series, SimulatedSensor, settle
 from labseq.drivers.serial_port import wait_for
 
-__all__ = ["CameraDriver", "Cooling", "Series", "SimulatedSensor", "ExposureResult", "settle", "wait_for"]
+__all__ = ["CameraDriver", "Cooling", "ExposureResult", "Series", "SimulatedSensor", "settle", "wait_for"]

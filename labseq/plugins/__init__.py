@@ -1,12 +1,10 @@
-"""Finds, loads, blocks and reports plugins; fills the registry.
+"""Finds and loads plugins, reports those that fail, and calls their code with a time limit.
 
-Entry points of the group ``labseq`` come first, then folders. A plugin that
-fails to load takes nothing down with it: it is reported, and it is an error only
-where a sequence or profile names what it would have offered. Plugins' code that runs
-before a run has a thread of its own, a time limit, and leaves the process as it was.
+Entry points of the group ``labseq`` come first, then folders. A plugin that fails to load does not affect
+the others: it is reported, and it is an error only where a sequence or profile names what it would offer.
 """
 
-from labseq.plugins.contained import LOCAL_PACKAGE, contained
+from labseq.plugins.calls import LOCAL_PACKAGE, call_plugin
 from labseq.plugins.host import ENTRY_POINT_GROUP, PATH_VARIABLE, PluginHost, PluginInfo
 
 __all__ = [
@@ -15,5 +13,5 @@ __all__ = [
     "PATH_VARIABLE",
     "PluginHost",
     "PluginInfo",
-    "contained",
+    "call_plugin",
 ]

@@ -18,8 +18,8 @@ import pluggy
 from labseq import hookspecs
 from labseq.errors import ConfigError, PluginLoadError, Problem, UnknownPluginError, one_of
 from labseq.hookspecs import LABSEQ_API
-from labseq.plugins.contained import (
-    contained,
+from labseq.plugins.calls import (
+    call_plugin,
     forget,
     format_error,
     import_file,
@@ -116,7 +116,7 @@ class PluginInfo:
         state: "loaded" or "failed".
         reason: Why it failed, or "".
         source: Its file or its distribution, in words; "" for labseq's own.
-        notes: What else it did to the process when it was loaded, or in a constructor: a sentence each.
+        notes: What it printed when it was loaded, or in a constructor: a sentence each.
     """
 
     name: str
@@ -153,7 +153,7 @@ class PluginHost:
 
     @property
     def notes(self) -> list[str]:
-        """What the plugins that were asked for did to the process, a sentence each."""
+        """What the plugins in use printed when they were loaded and constructed, a sentence each."""
         used = [info for info in self._infos.values() if info.name in self._used]
         return [f"plugin '{info.name}' ({info.source}): {note}" for info in used for note in info.notes]
 
@@ -238,7 +238,7 @@ class PluginHost:
         where = None if home is None else home()
         owner = Owner(info.name, info.source, where, self._patience_s, info.notes)
         with self.registry.opened_for(owner) as registry:
-            module = contained(owner, "", partial(_prepare, importing, owner, registry))
+            module = call_plugin(owner, "", partial(_prepare, importing, owner, registry))
             self._pluggy.register(module, info.name)
             try:
                 self._pluggy.check_pending()

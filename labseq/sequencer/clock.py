@@ -1,65 +1,10 @@
-"""The session's time, and the request to stop."""
+"""The session's time: real, virtual, or virtual at the speed of real time."""
 
 from __future__ import annotations
 
-import threading
 import time
-from collections.abc import Generator
-from contextlib import contextmanager
-from typing import Final
 
-from labseq.errors import StopRequested
-
-LOOK_S: Final = 0.05
-"""How often everything that waits looks for a stop request; Windows wakes no waiting thread for Ctrl-C."""
-
-
-class StopFlag:
-    """Set by a signal, looked at by every wait.
-
-    While it is held (the devices are being made safe) waits no longer raise, so
-    that a driver can ramp down in peace.
-    """
-
-    def __init__(self) -> None:
-        self._event = threading.Event()
-        self._n_holds = 0
-        self.signal_number = 2
-
-    def request(self, signal_number: int = 2) -> None:
-        """Ask the run to stop; safe to call from a signal handler."""
-        if not self._event.is_set():
-            self.signal_number = signal_number
-        self._event.set()
-
-    @contextmanager
-    def held(self) -> Generator[None]:
-        """Within the block let waits finish."""
-        self._n_holds += 1
-        try:
-            yield
-        finally:
-            self._n_holds -= 1
-
-    @property
-    def is_set(self) -> bool:
-        """Whether the run was asked to stop, even if held."""
-        return self._event.is_set()
-
-    def check(self) -> None:
-        """Raise ``StopRequested`` if the run was asked to stop."""
-        if self._event.is_set() and not self._n_holds:
-            raise StopRequested(self.signal_number)
-
-    def wait(self, duration_s: float) -> None:
-        """Wait in real time, or raise ``StopRequested`` as soon as it is asked for."""
-        deadline_s = time.monotonic() + duration_s
-        self.check()
-        while (left_s := deadline_s - time.monotonic()) > 0:
-            if self._n_holds:
-                time.sleep(min(left_s, LOOK_S))
-            elif self._event.wait(min(left_s, LOOK_S)):
-                self.check()
+from labseq.guard import StopFlag
 
 
 class RealClock:

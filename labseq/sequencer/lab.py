@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from labseq.errors import DeviceError, LabseqError
+from labseq.guard import Guard
 from labseq.model import (
     CalibrationEntry,
     CameraFacts,
@@ -30,7 +31,6 @@ from labseq.roles import (
     StaticTweezers,
     StepContext,
 )
-from labseq.sequencer.guard import Guard
 from labseq.sequencer.lines import blinding_lines
 
 

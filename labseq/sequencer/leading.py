@@ -3,56 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
-from labseq.builtin.steps import WaitStep
 from labseq.errors import ConfigError, LabseqError, one_of
-from labseq.model import ShotRecord, TimelineEntry
-from labseq.roles import LeaderLink, Shot, StepContext
-from labseq.sequencer.guard import LATE_S, Guard
+from labseq.guard import DRIVER_MARGIN_S, Guard
+from labseq.model import ShotRecord
+from labseq.roles import LeaderLink
 from labseq.sequencer.lab import Lab
 
 Emit = Callable[[str, Mapping[str, Any]], None]
-
-
-class _Settings(Protocol):
-    @property
-    def duration(self) -> float | None: ...
-    @property
-    def signal(self) -> str | None: ...
-    @property
-    def timeout(self) -> float | None: ...
-    @property
-    def device(self) -> str | None: ...
-
-
-class FollowStep:
-    """Waits until another control system says to go on."""
-
-    needs_image = False
-    takes_image = False
-
-    def __init__(self, signal: str, timeout_s: float, device: str = "") -> None:
-        self.signal = signal
-        self.timeout_s = timeout_s
-        self.device = device
-
-    def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:  # noqa: ARG002 - Protocol
-        """One bar, at most the timeout; lines are idle, because nobody knows how long it takes."""
-        return [TimelineEntry(f"wait for {self.signal}", self.timeout_s, 0.0)]
-
-    def run(self, shot: Shot) -> None:
-        """Wait for the signal."""
-        shot.follow(self.signal, self.timeout_s, self.device)
-
-
-def wait_step(settings: _Settings) -> WaitStep | FollowStep:
-    """The step ``wait``: for a time, or for a signal."""
-    if settings.signal is None or settings.timeout is None:
-        return WaitStep(settings)
-    return FollowStep(settings.signal, settings.timeout, settings.device or "")
 
 
 def leaders(devices: Mapping[str, object]) -> Iterator[tuple[str, LeaderLink]]:
@@ -109,7 +70,7 @@ class LeaderHandshakes:
         awaited = {"shot": self.record.shot_index, "device": name, "signal": signal, "timeout_s": timeout_s}
         self.emit("leader_awaited", awaited)
         try:
-            text = self.guard.call(name, timeout_s + LATE_S, leader.wait_for, signal, timeout_s)
+            text = self.guard.call(name, timeout_s + DRIVER_MARGIN_S, leader.wait_for, signal, timeout_s)
         finally:
             self._log_news(name, leader)
         self._note(f"{name}.{signal}", text)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import itertools
 import math
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Generator, Mapping, Sequence
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from enum import Enum
 from functools import partial
@@ -13,11 +14,10 @@ from types import MappingProxyType
 from typing import Any, Final, Protocol
 
 from labseq.errors import LabseqError, StopRequested
-from labseq.model import ShotRecord
+from labseq.guard import DRIVER_MARGIN_S, Guard, StopFlag
+from labseq.model import ShotRecord, TimelineEntry
 from labseq.model.records import ShotStatus
-from labseq.roles import NeedsSettling, RunObserver, Step
-from labseq.sequencer.clock import StopFlag
-from labseq.sequencer.guard import LATE_S, Guard, budget_s, run_step
+from labseq.roles import NeedsSettling, RunObserver, Step, StepContext
 from labseq.sequencer.lab import Lab, Outcome, close_all, make_safe
 from labseq.sequencer.leading import Emit, LeaderHandshakes
 from labseq.sequencer.policies import RunPolicy, StepPolicy, Then, may_be_retried
@@ -102,7 +102,7 @@ def open_devices(lab: Lab, guard: Guard, stop: StopFlag, emit: Emit, names: Coll
             and (longest_s := device.settling_timeout_s) > 0
         ):
             emit("settling", {"device": name, "timeout_s": longest_s})
-            guard.call(name, longest_s + LATE_S, device.settle)
+            guard.call(name, longest_s + DRIVER_MARGIN_S, device.settle)
 
 
 def close_devices(lab: Lab, guard: Guard, names: Collection[str]) -> None:
@@ -119,6 +119,48 @@ def close_devices(lab: Lab, guard: Guard, names: Collection[str]) -> None:
         guard.call_to_the_end(name, timeout_s, device.close)
     if lab.simulation is not None and "simulation" in names:
         guard.call_to_the_end("simulation", timeout_s, lab.simulation.close)
+
+
+def lay_out(
+    lab: Lab, guard: Guard, steps: Sequence[tuple[str, Step]], context: StepContext | None = None
+) -> list[list[TimelineEntry]]:
+    """The timeline of each step.
+
+    Args:
+        lab: The devices.
+        guard: Runs the calls.
+        steps: The steps with their names.
+        context: What the steps lay out their timelines by; by default the lab's.
+
+    Raises:
+        LabseqError: A step fails; the error names it.
+    """
+    context = context or lab.step_context
+
+    def entries(number: int, name: str, step: Step) -> list[TimelineEntry]:
+        with _named(number, name):
+            return list(step.plan_timeline(context))
+
+    return [
+        guard.call("step", lab.timeouts.call_s, entries, number, name, step)
+        for number, (name, step) in enumerate(steps)
+    ]
+
+
+def _run_step(step: Step, number: int, name: str, shot: RunningShot) -> None:
+    with _named(number, name):
+        step.run(shot)
+
+
+@contextmanager
+def _named(number: int, name: str) -> Generator[None]:
+    """Name the step in whatever it raises that is not one of labseq's own errors."""
+    try:
+        yield
+    except LabseqError:
+        raise
+    except BaseException as error:
+        raise LabseqError(f"step {number} ({name}) raised {type(error).__name__}: {error}") from error
 
 
 class ShotSink(Protocol):
@@ -211,13 +253,14 @@ class Sequencer:
         self._budgets = self._lay_out()
 
     def _lay_out(self) -> list[float]:
-        """What each step may take, in seconds; nan for one that does not know."""
-        context, timeout_s = self.lab.step_context, self.lab.timeouts.call_s
-        detect_s = self.lab.budgets.get("detect", 0.0)
-        return [
-            self.guard.call("step", timeout_s, budget_s, step, number, name, context, detect_s)
-            for number, (name, step) in enumerate(self._steps)
-        ]
+        """Budget of each step in seconds: the length of its timeline; nan for one without a length."""
+        detect_s = self.lab.budgets.get("detect", 0.0)  # a timeline leaves out the detection
+        budgets: list[float] = []
+        for entries in lay_out(self.lab, self.guard, self._steps):
+            planned_s = sum(entry.duration_s for entry in entries)
+            detection_s = detect_s * sum(entry.n_images for entry in entries)
+            budgets.append(planned_s + detection_s if planned_s else math.nan)
+        return budgets
 
     def run(self, shot_indices: Sequence[int]) -> dict[int, str]:
         """Take the shots, and repeat those that fail, as the policy says.
@@ -333,7 +376,7 @@ class Sequencer:
             shot.stages.begin_attempt()
             try:
                 longest_s = policy.timeout_s + self.lab.timeouts.call_s
-                self.guard.run_step(partial(run_step, step, number, name, shot), longest_s)
+                self.guard.run_step(partial(_run_step, step, number, name, shot), longest_s)
                 shot.stages.check_timeout()
             except LabseqError as error:
                 if not (left and may_be_retried(error)):

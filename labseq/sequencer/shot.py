@@ -11,10 +11,10 @@ from typing import Any, ParamSpec, TypeVar
 import numpy as np
 
 from labseq.errors import ConfigError, DeviceError, InterlockError, OverBudgetError, StepTimeoutError
+from labseq.guard import DRIVER_MARGIN_S, Guard
 from labseq.model import CycleRecord, Frame, ImageRecord, Occupancy, ShotRecord, StageTiming
 from labseq.model.records import OVERSHOOT_S
 from labseq.roles import Device, HasReadings, Interlocked, ReportsEvents, ReportsLosses, ReportsTruth
-from labseq.sequencer.guard import LATE_S, Guard
 from labseq.sequencer.lab import Lab, check_blinding
 from labseq.sequencer.leading import Emit, LeaderHandshakes
 from labseq.sequencer.lines import line_program, margin_s, trigger_line
@@ -238,7 +238,7 @@ class RunningShot:
         self.clock.sleep(max(0.0, program.begin_s - (self.clock.now() - fired_s)))
         yield
         left_s = max(0.0, program.duration_s - (self.clock.now() - fired_s)) + timeout_s
-        self.call("lines", left_s + LATE_S, lines.wait, left_s)
+        self.call("lines", left_s + DRIVER_MARGIN_S, lines.wait, left_s)
 
     def stage(self, name: str, budget_s: float = math.nan, cycle: int = 0) -> AbstractContextManager[None]:
         """Time a stage against its budget; see ``labseq.sequencer.shot``."""
@@ -284,7 +284,7 @@ class RunningShot:
                 if not by_line:
                     self.call("camera", limit_s, camera.trigger)
                 end_s, host_start_s = self.elapsed_s + exposure_s, time.perf_counter()
-                frame = self.call("camera", limit_s + LATE_S, camera.read, limit_s)
+                frame = self.call("camera", limit_s + DRIVER_MARGIN_S, camera.read, limit_s)
                 host_s = time.perf_counter() - host_start_s
                 late_s = max(0.0, self.elapsed_s - end_s)
                 waited_s = 0.0 if self.clock.virtual else exposure_s

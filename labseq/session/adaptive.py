@@ -12,13 +12,13 @@ from labseq.config import ProblemCollector
 from labseq.config.messages import clean
 from labseq.config.scan import SCANNER_KEYS, Adaptive, Axis, Ends
 from labseq.errors import ConfigError, DeviceError
+from labseq.guard import Guard, StopFlag
 from labseq.model import ScanRange, ScanSpace, VisitedPoint
 from labseq.recording import Shot
 from labseq.recording.columns import figures_of
 from labseq.recording.durable import dumps
 from labseq.recording.reader import SCANNER
 from labseq.roles import Scanner, Step
-from labseq.sequencer import Guard, StopFlag
 from labseq.session.construct import construct_one
 from labseq.session.policies import check_figure, missing_figure
 from labseq.session.profile import ChosenPlugin, resolve

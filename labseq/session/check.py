@@ -11,15 +11,16 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from labseq.builtin.steps import FollowStep
 from labseq.errors import LabseqError, Problem
+from labseq.guard import Guard
 from labseq.model import TimelineEntry
 from labseq.motion import check_plan
 from labseq.roles import ReportsLoading, Step
-from labseq.sequencer import Guard, StopFlag
-from labseq.sequencer.guard import lay_out
 from labseq.sequencer.lab import Lab
-from labseq.sequencer.leading import FollowStep, find_leader
+from labseq.sequencer.leading import find_leader
 from labseq.sequencer.lines import spans_on
+from labseq.sequencer.run import lay_out
 from labseq.session.assembly import Assembly
 from labseq.session.session import Session, check_commands
 from labseq.units import format_quantity
@@ -163,15 +164,11 @@ def check(session: Session) -> CheckReport:
 
 def _run_s(session: Session, lab: Lab) -> tuple[float, float]:
     """Least and most duration of the run, each shot at its own point of the scan, or at any corner of it."""
-    guard = Guard(StopFlag())
+    guard = Guard()
     min_duration_s, most_s = list[float](), list[float]()
     for point, n in session.course.counted():
         context = replace(lab.step_context, motion=point.bench.profile.motion)
-        bars = [
-            bar
-            for i, (name, step) in enumerate(point.steps)
-            for bar in guard.call("step", lab.timeouts.call_s, lay_out, step, i, name, context)
-        ]
+        bars = [bar for bars in lay_out(lab, guard, point.steps, context) for bar in bars]
         min_duration_s.append(n * sum(bar.min_duration_s for bar in bars))
         most_s.append(n * sum(bar.duration_s for bar in bars))
     guard.end()
@@ -198,7 +195,7 @@ def _rehearse(lab: Lab) -> tuple[Rehearsal | None, str]:
     loading = (
         lab.simulation.loading_probability if isinstance(lab.simulation, ReportsLoading) else PAPERS_LOADING
     )
-    rng, guard = np.random.default_rng(0), Guard(StopFlag())
+    rng, guard = np.random.default_rng(0), Guard()
     durations, firsts, n_filled = list[float](), list[float](), 0
     deadline = time.monotonic() + MAX_WAIT_S
     try:

@@ -19,7 +19,7 @@ from labseq.model import (
     SiteGrid,
     TargetPattern,
 )
-from labseq.plugins import contained
+from labseq.plugins import call_plugin
 from labseq.registry import Entry
 from labseq.roles import (
     Analysis,
@@ -157,7 +157,7 @@ def construct_role(entry: Entry, *arguments: Any) -> Any:
         check_role(entry, made)
         return made
 
-    return contained(entry.owner, f"the constructor of {entry.kind} '{entry.name}'", make)
+    return call_plugin(entry.owner, f"the constructor of {entry.kind} '{entry.name}'", make)
 
 
 def construct_target(chosen: ChosenPlugin, grid: SiteGrid) -> TargetPattern:
@@ -168,7 +168,7 @@ def construct_target(chosen: ChosenPlugin, grid: SiteGrid) -> TargetPattern:
         PluginLoadError: The pattern's plugin is at fault; names it.
     """
     entry = chosen.entry
-    target = contained(entry.owner, f"pattern '{entry.name}'", lambda: entry.factory(chosen.settings, grid))
+    target = call_plugin(entry.owner, f"pattern '{entry.name}'", lambda: entry.factory(chosen.settings, grid))
     if not isinstance(target, TargetPattern) or target.shape != grid.shape:
         came = "" if isinstance(target, TargetPattern) else f", but {_called(target)}"
         raise entry.owner.fault(f"pattern '{entry.name}' made no TargetPattern of shape {grid.shape}{came}")

@@ -10,11 +10,12 @@ from functools import cached_property
 from typing import Any
 
 from labseq.errors import DeviceError
+from labseq.guard import StopFlag
 from labseq.recording import Run, RunWriter, Shot
 from labseq.recording.durable import dumps
 from labseq.recording.shot import load_content
 from labseq.roles import RunObserver
-from labseq.sequencer import Sequencer, StopFlag
+from labseq.sequencer import Sequencer
 from labseq.sequencer.lab import Lab
 from labseq.session.adaptive import Results, ScannerCall, Search
 from labseq.session.assembly import Assembly

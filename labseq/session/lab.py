@@ -9,11 +9,12 @@ from typing import Any, Final
 from labseq import motion
 from labseq.config import MotionSettings, ProfileSpec
 from labseq.errors import PlanError
+from labseq.guard import Guard, StopFlag
 from labseq.kernel import announcing
 from labseq.model import MotionSpec, RandomStream, TargetPattern
-from labseq.plugins import contained
+from labseq.plugins import call_plugin
 from labseq.roles import Clock, NeedsWarmUp, RunObserver
-from labseq.sequencer import Guard, PacedClock, RealClock, StopFlag, VirtualClock
+from labseq.sequencer import PacedClock, RealClock, VirtualClock
 from labseq.sequencer.lab import Blinding, Lab, Timeouts
 from labseq.session.construct import construct
 from labseq.session.profile import ChosenPlugin, ResolvedProfile, refuse_wrong_wiring
@@ -160,11 +161,10 @@ def _blinding(profile: ProfileSpec) -> dict[str, Blinding]:
 
 def parallelism_of(planner: ChosenPlugin, made: Any, motion: MotionSpec) -> int:
     """Most mobile tweezers that a batch of a planner may use, as it says, else what the motion bears."""
-    dop = contained(
+    dop = call_plugin(
         planner.entry.owner,
         "its degree_of_parallelism",
         lambda: getattr(made, "degree_of_parallelism", motion.max_tweezers),
-        watch=False,
     )
     return dop if isinstance(dop, int) else motion.max_tweezers
 

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any, Final
 
 from labseq.errors import DeviceTimeoutError, LabseqError
+from labseq.guard import Guard
 from labseq.model import CycleRecord, ShotRecord, StageTiming
 from labseq.plugins import PluginHost
 from labseq.roles import RunObserver
-from labseq.sequencer import Guard, StopFlag
 from labseq.session.analyses import AnalysisProcesses
 
 _QUIET: Final = frozenset({"image", "cycle", "state", "compiling", "compiled", "run_finished"})
@@ -34,7 +34,7 @@ class Observers:
     def __init__(self, host: PluginHost, observer: RunObserver | None) -> None:
         self._host = host
         self._observer = observer
-        self._guard = Guard(StopFlag())
+        self._guard = Guard()
         self._given_up: set[str] = set()
         self._analysts: AnalysisProcesses | None = None
         self.log: Callable[..., None] | None = None

@@ -29,7 +29,7 @@ from labseq.config.settings import Settings
 from labseq.errors import ConfigError, LabseqError, PluginLoadError, Problem, UnknownPluginError, one_of
 from labseq.model import CalibrationEntry, SiteGrid
 from labseq.model.lines import IDLE
-from labseq.plugins import PluginHost, contained
+from labseq.plugins import PluginHost, call_plugin
 from labseq.registry import LOAD_S, VIRTUAL_TWIN, Entry
 from labseq.roles import ReportsLinesFacts
 from labseq.sequencer.lab import Lab
@@ -176,13 +176,12 @@ def validate(
     other_keys = sorted(drop - {"use", "pattern"})
     called = f"{entry.kind.replace('_', ' ')} '{entry.name}'"
     try:
-        return contained(
+        return call_plugin(
             entry.owner,
             f"the settings model of {called}",
             lambda: document.validate(
                 entry.settings_model, loc, drop=drop, other_keys=other_keys, called=called
             ),
-            watch=False,
         )
     except PluginLoadError as error:
         raise document.error(loc, str(error)) from error
@@ -253,7 +252,7 @@ def dump(entry: Entry, settings: Settings | None) -> dict[str, Any]:
     if settings is None:
         return {}
     what = f"the settings of {entry.kind} '{entry.name}'"
-    return contained(entry.owner, what, lambda: settings.model_dump(mode="json", by_alias=True), watch=False)
+    return call_plugin(entry.owner, what, lambda: settings.model_dump(mode="json", by_alias=True))
 
 
 def _defaults(entry: Entry) -> Settings | None:

@@ -14,13 +14,13 @@ from labseq.config.messages import visible
 from labseq.config.yaml_nodes import decode, read_bytes
 from labseq.errors import ConfigError, Problem, RecordingError
 from labseq.files import Lock, knows_no_locks
+from labseq.guard import StopFlag
 from labseq.model import RunRecord
 from labseq.recording import Run, RunWriter, open_run
 from labseq.recording.durable import LineLog, dumps, explained
 from labseq.recording.folders import INDEX_FILE, LOCK_FILE, PROFILE_FILE, RUN_FILE, SEQUENCE_FILE, find_run
 from labseq.recording.reader import SCANNER
 from labseq.recording.run_file import encode_run, read_owner, read_run, read_state
-from labseq.sequencer import StopFlag
 from labseq.session.assembly import Assembly, assemble
 from labseq.session.course import course_of
 from labseq.session.options import Options

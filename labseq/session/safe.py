@@ -13,9 +13,10 @@ from typing import Any, Final
 from labseq.config import ProblemCollector, load_profile, plugin_paths, profile_overrides
 from labseq.errors import ConfigError, DeviceError, LabseqError, RecordingError, StopRequested
 from labseq.files import Holder, Lock, knows_no_locks
+from labseq.guard import Guard, StopFlag
 from labseq.recording import clear_active, data_root, died, lock_files, marker_roots
 from labseq.roles import Clock, Hardware, HasSelfTest, NeedsWarmUp, ReceivesOutput, RunObserver, Simulation
-from labseq.sequencer import Guard, RealClock, StopFlag, VirtualClock
+from labseq.sequencer import RealClock, VirtualClock
 from labseq.sequencer.lab import Timeouts, in_safe_order
 from labseq.session.construct import construct_each
 from labseq.session.lab import WARM_S, timeouts_of
@@ -135,7 +136,7 @@ def make_each_safe(
         Device name -> why it is not safe, or None. One that is safe and only cannot be
         closed is told to the observer alone, as at the end of a run.
     """
-    guard = Guard(StopFlag())
+    guard = Guard()
     outcome: dict[str, LabseqError | None] = {}
     if simulation is not None:
         guard.call_to_the_end("simulation", timeouts.call_s, simulation.open)

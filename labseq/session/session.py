@@ -11,16 +11,17 @@ from pathlib import Path
 from types import TracebackType
 from typing import ParamSpec, Self
 
-from labseq.builtin.steps import DeviceStep
+from labseq.builtin.steps import DeviceStep, FollowStep
 from labseq.config import Loc
 from labseq.errors import ConfigError, DeviceError, LabseqError, Problem
+from labseq.guard import Guard, StopFlag
 from labseq.model import RunRecord, TimelineEntry
 from labseq.recording import Run, RunWriter, clear_active, data_root, mark_active, marker_roots, open_run
 from labseq.roles import ChecksCommands, RunObserver
-from labseq.sequencer import Guard, Sequencer, StopFlag
-from labseq.sequencer.guard import lay_out
+from labseq.sequencer import Sequencer
 from labseq.sequencer.lab import Lab, describe
-from labseq.sequencer.leading import FollowStep, find_leader, leaders
+from labseq.sequencer.leading import find_leader, leaders
+from labseq.sequencer.run import lay_out
 from labseq.session.assembly import Assembly, assemble
 from labseq.session.between_shots import ShotHooks
 from labseq.session.course import course_of
@@ -53,7 +54,7 @@ def check_commands(assembly: Assembly, points: Iterable[Point], build: Callable[
         return
     labs: dict[int, Lab] = {}
     problems: dict[str, Problem] = {}
-    guard = Guard(StopFlag())
+    guard = Guard()
     for point in points:
         lab = labs.get(id(point.bench)) or labs.setdefault(id(point.bench), build(point))
         for spec, (_, step) in zip(assembly.sequence.shot, point.steps, strict=True):
@@ -221,12 +222,12 @@ class Session:
     def timeline(self) -> list[tuple[str, list[TimelineEntry]]]:
         """What a shot will do: name of each step and its bars."""
         lab, guard = self.build_lab(), Guard(self.stop_flag)
-        timeline = [
-            (name, guard.call("step", lab.timeouts.call_s, lay_out, step, number, name, lab.step_context))
-            for number, (name, step) in enumerate(self.assembly.steps)
-        ]
-        guard.end()
-        return timeline
+        steps = self.assembly.steps
+        try:
+            entries = lay_out(lab, guard, steps)
+        finally:
+            guard.end()
+        return [(name, own) for (name, _), own in zip(steps, entries, strict=True)]
 
     def run(self) -> Run:
         """Take all shots.

@@ -8,7 +8,7 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from typing import Final
 
-from labseq.sequencer import StopFlag
+from labseq.guard import StopFlag
 
 _SIGHUP: Final = getattr(signal, "SIGHUP", None)
 _EXIT_SIGNALS: Final = {  # signal -> what the run says it was stopped by

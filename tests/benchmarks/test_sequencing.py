@@ -13,9 +13,10 @@ from typing import Any
 import pytest
 
 import labseq
+from labseq.guard import StopFlag
 from labseq.model import ShotRecord
 from labseq.roles import Step
-from labseq.sequencer import Sequencer, StopFlag
+from labseq.sequencer import Sequencer
 from tests.system.null_devices import write
 
 SHOTS = {"1 step": 1, "101 steps": 101}

@@ -8,8 +8,9 @@ import pytest
 
 from labseq import StopRequested, wait_for
 from labseq.drivers.serial_port import SLICE_S
+from labseq.guard import StopFlag
 from labseq.roles import NeverStopped
-from labseq.sequencer.clock import RealClock, StopFlag
+from labseq.sequencer.clock import RealClock
 from labseq.testing.fakes import FakeClock
 
 

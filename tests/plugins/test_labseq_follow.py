@@ -17,8 +17,9 @@ from labseq_follow.settings import SerialLeaderSettings, TcpLeaderSettings
 
 from labseq import ConfigError, Context, Device, DeviceError, DeviceTimeoutError, StopRequested
 from labseq.config import Document
+from labseq.guard import StopFlag
 from labseq.roles import ChecksCommands, LeaderLink
-from labseq.sequencer import RealClock, StopFlag
+from labseq.sequencer import RealClock
 from labseq.testing import DeviceContract
 from labseq.testing.contracts.hardware import Factory, Wait
 from labseq.testing.fakes import FakeClock, RecordingSimulation

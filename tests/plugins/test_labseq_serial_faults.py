@@ -14,7 +14,8 @@ from hypothesis import HealthCheck, given, settings as hypothesis_settings, stra
 from labseq_serial.device import SerialDevice
 
 from labseq import Context, DeviceError, DeviceTimeoutError, LabseqError, StopRequested, TransientError
-from labseq.sequencer import RealClock, StopFlag
+from labseq.guard import StopFlag
+from labseq.sequencer import RealClock
 
 from .labseq_serial_rig import Counterpart, opened, settings
 

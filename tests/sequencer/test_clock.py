@@ -4,7 +4,8 @@ import time
 import pytest
 
 from labseq.errors import StopRequested
-from labseq.sequencer import PacedClock, RealClock, StopFlag, VirtualClock
+from labseq.guard import StopFlag
+from labseq.sequencer import PacedClock, RealClock, VirtualClock
 
 
 def test_virtual_time_passes_only_by_waiting():

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from labseq.builtin.steps import WaitStep
+from labseq.builtin.steps import FollowStep, WaitStep, wait_step
 from labseq.errors import (
     ConfigError,
     DeviceError,
@@ -16,7 +16,7 @@ from labseq.errors import (
 )
 from labseq.model import LineSpec, ShotRecord
 from labseq.roles import Context, LeaderLink, StepContext
-from labseq.sequencer.leading import FollowStep, find_leader, wait_step
+from labseq.sequencer.leading import find_leader
 from labseq.testing import StepContract
 from labseq.testing.contracts.step import Factory
 from labseq.testing.fakes import FakeLab, ListSink, RecordingDevice, RecordingLeader
@@ -85,9 +85,9 @@ def test_it_lasts_as_long_as_the_leader_needs_and_at_most_its_timeout() -> None:
     assert made.lab.clock.now() >= 0.5
     assert made.lab.calls.names("leader")[:4] == [
         "leader.open",
-        "leader.tell",
+        "leader.report",
         "leader.wait_for",
-        "leader.tell",
+        "leader.report",
     ]
 
 
@@ -127,7 +127,7 @@ def test_a_second_wait_in_the_shot_says_first_that_the_first_part_is_ready() -> 
     assert made.record().readings["leader.told"] == ["ready", "ready"]
     names = made.lab.calls.names("leader", "camera")
     after_the_image = names[names.index("camera.read") + 1 :]
-    assert after_the_image[:3] == ["leader.tell", "leader.wait_for", "camera.arm"]
+    assert after_the_image[:3] == ["leader.report", "leader.wait_for", "camera.arm"]
 
 
 def test_each_attempt_waits_for_atoms_of_its_own() -> None:
@@ -142,7 +142,7 @@ def test_it_is_told_of_a_passing_failure_after_the_devices_are_silent_again() ->
     made = rig(fail_on={"camera.read": [TransientError("a frame was lost", "camera"), None]})
     made.run()
     names = made.lab.calls.names("leader", "camera", "mobile_tweezers")
-    told = [n for n, name in enumerate(names) if name == "leader.tell"][1]
+    told = [n for n, name in enumerate(names) if name == "leader.report"][1]
     assert names[told - 2 : told] == ["mobile_tweezers.safe_state", "camera.safe_state"]
 
 
@@ -152,7 +152,7 @@ def test_a_failure_is_told_after_all_devices_are_safe_and_before_they_are_closed
         made.run()
     assert "cable" in reason(made)
     names = made.lab.calls.names()
-    told = len(names) - 1 - names[::-1].index("leader.tell")
+    told = len(names) - 1 - names[::-1].index("leader.report")
     assert names.index("static_tweezers.safe_state") < told < names.index("leader.close")
     assert made.record().readings["leader.told"] == ["failed"]
 

@@ -31,8 +31,8 @@ def test_no_device_is_made_safe_beside_an_open_that_is_only_slow(monkeypatch):
         opened()
 
     monkeypatch.setattr(camera, "open", slow)
-    monkeypatch.setattr("labseq.sequencer.guard.GRACE_S", 0.0)
-    monkeypatch.setattr("labseq.sequencer.guard.time", SimpleNamespace(monotonic=now))
+    monkeypatch.setattr("labseq.guard.GRACE_S", 0.0)
+    monkeypatch.setattr("labseq.guard.time", SimpleNamespace(monotonic=now))
     with pytest.raises(StopRequested):
         rig.run()
     names = rig.lab.calls.names()

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from labseq.errors import ConfigError, DeviceError, DeviceTimeoutError, StopRequested
+from labseq.guard import StopFlag
 from labseq.roles import Context
-from labseq.sequencer import StopFlag
 from labseq.sequencer.lab import Timeouts
 from labseq.session import CheckedDevice, check_devices
 from labseq.session.safe import N_READINGS, check_each_device
@@ -78,7 +78,7 @@ def test_a_device_that_hangs_is_given_up_made_safe_and_closed(method: str) -> No
     found, other = tried(make("bad", calls, hang_on={method: hang}), make("good", calls), timeouts=SHORT)
     hang.release.set()
     assert isinstance(found.failure, DeviceTimeoutError)
-    assert f"{method}() did not answer within 1 s and is given up" in str(found.failure)
+    assert f"{method}() did not answer within 1 s and is abandoned" in str(found.failure)
     assert calls.names("bad")[-2:] == ["bad.safe_state", "bad.close"]
     assert other.ok
 

@@ -167,13 +167,13 @@ def test_a_dry_run_does_not_choose_between_two_plugins_of_one_name() -> None:
         warnings_of_a_dry_run("ixon")
 
 
-def test_what_a_constructor_changes_is_told() -> None:
-    write(PLUGIN.replace("pass  # constructor", "import random; random.seed(1)"))
+def test_what_a_constructor_prints_is_a_warning() -> None:
+    write(PLUGIN.replace("pass  # constructor", "print('hello')"))
     session = labseq.Session.open("s.yaml")
     (warning,) = check(session).warnings
     assert str(warning) == (
-        f"plugin 'mine' ({Path('plugins/mine.py')}): in the constructor of step 'mine' it seeded or used "
-        "Python's global random numbers; this was put back: draw from context.random"
+        f"plugin 'mine' ({Path('plugins/mine.py')}): in the constructor of step 'mine' it printed "
+        "('hello'); this went to stderr: use 'logging.getLogger(__name__)'"
     )
 
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from labseq.errors import DeviceError, StopRequested, TransientError
+from labseq.guard import Guard
 from labseq.model import Frame, Plan, TargetPattern
-from labseq.sequencer.guard import Guard
 from labseq.testing.fakes import (
     Calls,
     FakeClock,

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from labseq.errors import StopRequested
+from labseq.guard import Guard
 from labseq.model import ShotRecord, TimelineEntry
 from labseq.roles import Repeatable, Step, StepContext
-from labseq.sequencer.guard import Guard
 from labseq.sequencer.shot import RunningShot
 from labseq.testing.contracts.process import quietly
 from labseq.testing.contracts.promises import ContractViolation, doing, no_factory, promise, refusal

@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.errors import DeviceError, DeviceTimeoutError, LimitError, one_of
+from labseq.guard import StopFlag
 from labseq.model import DepthRamp, Frame, LineProgram, ToneProgram
 from labseq.roles import Clock, Context, Trigger
-from labseq.sequencer.clock import StopFlag, VirtualClock
+from labseq.sequencer.clock import VirtualClock
 from labseq.sequencer.lines import idle_program, off_program
 
 Failure: TypeAlias = BaseException | Sequence[BaseException | None]

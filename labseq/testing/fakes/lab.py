@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from labseq.errors import DeviceError
+from labseq.guard import StopFlag
 from labseq.model import (
     Frame,
     LineSpec,
@@ -24,7 +25,6 @@ from labseq.model import (
     as_occupancy,
 )
 from labseq.roles import WHOLE_SENSOR, Clock, Context, Signal
-from labseq.sequencer.clock import StopFlag
 from labseq.sequencer.lab import Lab, Timeouts
 from labseq.testing.fakes.devices import (
     Calls,

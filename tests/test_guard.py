@@ -4,7 +4,7 @@ from functools import partial
 import pytest
 
 from labseq.errors import DeviceError, DeviceTimeoutError, LimitError, PlanError, StopRequested
-from labseq.sequencer import Guard, StopFlag
+from labseq.guard import Guard, StopFlag
 
 
 @pytest.fixture
@@ -91,12 +91,12 @@ def test_no_call_is_made_while_a_stop_request_is_held(guard, stop):
     called = threading.Event()
     stop.request()
     with stop.held(), pytest.raises(StopRequested):
-        guard.call("static_tweezers", 10.0, called.set)  # a step that was given up and has come back
+        guard.call("static_tweezers", 10.0, called.set)  # a step that was abandoned and has come back
     assert not called.is_set()
 
 
 def test_a_step_that_hangs_is_left_at_a_stop_request(guard, stop, monkeypatch):
-    monkeypatch.setattr("labseq.sequencer.guard.STEP_GRACE_S", 0.01)
+    monkeypatch.setattr("labseq.guard.STEP_GRACE_S", 0.01)
     release = threading.Event()
 
     def hang():
@@ -116,7 +116,7 @@ def test_safe_states_are_called_after_a_stop_request(guard, stop):
 
 
 def test_a_stop_request_does_not_wait_for_a_call_that_hangs(guard, stop, monkeypatch):
-    monkeypatch.setattr("labseq.sequencer.guard.GRACE_S", 0.01)
+    monkeypatch.setattr("labseq.guard.GRACE_S", 0.01)
     release, entered = threading.Event(), threading.Event()
 
     def hang():

@@ -1,0 +1,173 @@
+"""Code of plugins that runs outside of a run: importing, registering, validating settings, constructing."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+import traceback
+from collections.abc import Callable
+from contextlib import redirect_stdout
+from functools import partial
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Final, TypeVar, cast
+
+from labseq.errors import LabseqError, PluginLoadError
+from labseq.guard import Guard
+from labseq.registry import Owner
+
+T = TypeVar("T")
+
+MAX_PRINTED: Final = 60
+"""Characters of what a plugin printed that are quoted."""
+MAX_ERROR: Final = 500
+"""Characters of a plugin's own error that are quoted."""
+LOCAL_PACKAGE: Final = "labseq_local"
+"""Package in which the plugins of folders are modules."""
+
+
+def call_plugin(owner: Owner, what: str, work: Callable[[], T]) -> T:
+    """Run code of a plugin, and name the plugin in whatever goes wrong.
+
+    The code runs in a thread of its own: if it hangs it is abandoned after ``owner.max_wait_s``, and a
+    ``SystemExit`` or ``KeyboardInterrupt`` that it raises ends nothing else. What it prints goes to stderr,
+    because a program may read JSON from stdout, and is noted with the owner.
+
+    Args:
+        owner: Whose code it is.
+        what: What runs, for messages; "" for the loading of the plugin.
+        work: The code.
+
+    Returns:
+        What the code returned.
+
+    Raises:
+        PluginLoadError: It raised, or did not return in time.
+        LabseqError: It raised this one of labseq's own.
+    """
+    guard, printed = Guard(), _PrintsToStderr(sys.stdout)
+    try:
+        with redirect_stdout(cast("Any", printed)):
+            call = guard.run(f"plugin {owner.name}", owner.max_wait_s, partial(work))
+    finally:
+        guard.end()
+        if text := printed.end():
+            where = f"in {what}" if what else "while it was loaded"
+            advice = "this went to stderr: use 'logging.getLogger(__name__)'"
+            owner.note(f"{where} it printed ('{text[:MAX_PRINTED]}'); {advice}")
+    if call is None:
+        did = f"{what} did not return" if what else "it did not finish loading"
+        remedy = "if it is only slow, raise 'timeouts: {load: ...}' in the profile"
+        raise owner.fault(f"{did} within {owner.max_wait_s:.3g} s and was abandoned; {remedy}")
+    if call.error is not None:
+        raise _named(owner, what, call.error) from call.error
+    return call.result
+
+
+class _PrintsToStderr:
+    """Replaces ``sys.stdout`` while a plugin's code runs.
+
+    A plugin may keep it, for example in a logging handler; afterwards it writes to the real stdout.
+    """
+
+    def __init__(self, real: Any) -> None:
+        self._real = real
+        self._is_over = False
+        self._text = ""
+
+    def write(self, text: str) -> int:
+        if not self._is_over:
+            self._text = (self._text + text)[: 4 * MAX_PRINTED]
+        return len(text) if self._stream is None else self._stream.write(text)
+
+    def end(self) -> str:
+        """Lead to the real stdout from now on; returns the beginning of what was printed, on one line."""
+        self._is_over = True
+        return " ".join(self._text.split())
+
+    @property
+    def _stream(self) -> Any:
+        return self._real if self._is_over else sys.stderr
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
+def _named(owner: Owner, what: str, error: BaseException) -> LabseqError:
+    is_own = isinstance(error, PluginLoadError) and error.plugin == owner.name
+    if isinstance(error, LabseqError) and (what or is_own):
+        return error
+    text = f"{type(error).__name__}: {error.msg}" if isinstance(error, SyntaxError) else format_error(error)
+    if place := error_location(error, owner.home):
+        text = f"{text} ({place})"
+    return owner.fault(f"{what} raised {text}" if what else text)
+
+
+def format_error(error: BaseException) -> str:
+    """Type and text of an error that a plugin raised, on one line of limited length.
+
+    Example:
+        >>> format_error(KeyError("typo"))
+        "KeyError: 'typo'"
+    """
+    try:
+        text = str(error)
+    except (Exception, SystemExit) as another:  # noqa: BLE001 - it may raise anything
+        text = f"(its text cannot be had: {type(another).__name__})"
+    text = " ".join(f"{type(error).__name__}: {text[: 2 * MAX_ERROR]}".split()).rstrip(":")
+    text = "".join(c if c.isprintable() else "?" for c in text)
+    return text if len(text) <= MAX_ERROR else f"{text[:MAX_ERROR]} ..."
+
+
+def error_location(error: BaseException, home: Path | None) -> str:
+    """File and line that an error came from, in the plugin's own code if possible; "" if unknown."""
+    if isinstance(error, SyntaxError) and error.filename:
+        return f"{error.filename}:{error.lineno or 1}"
+    chain = [error]
+    while (cause := chain[0].__cause__ or chain[0].__context__) is not None and cause not in chain:
+        chain.insert(0, cause)
+    frames = [frame for one in chain for frame in traceback.extract_tb(one.__traceback__)]
+    own = [f for f in frames if home is not None and home in (Path(f.filename), *Path(f.filename).parents)]
+    labseqs = (Path(__file__).parent, Path(__file__).parent.parent / "guard.py")
+    foreign = [f for f in frames if not {Path(f.filename), Path(f.filename).parent} & {*labseqs}]
+    frame = (own or foreign or [None])[-1]
+    return "" if frame is None else f"{frame.filename}:{frame.lineno}"
+
+
+def import_file(name: str, path: Path) -> ModuleType:
+    """Import a single file, or a package by its ``__init__.py``, as ``labseq_local.<name>``."""
+    if LOCAL_PACKAGE not in sys.modules:
+        sys.modules[LOCAL_PACKAGE] = ModuleType(LOCAL_PACKAGE)
+        sys.modules[LOCAL_PACKAGE].__path__ = []
+    full_name = f"{LOCAL_PACKAGE}.{name}"
+    inside = [str(path.parent)] if path.name == "__init__.py" else None
+    spec = importlib.util.spec_from_file_location(full_name, path, submodule_search_locations=inside)
+    if spec is None or spec.loader is None:
+        raise PluginLoadError(name, f"{path} is not a Python module")
+    forget(name)  # one of another folder, or as it was before it was edited
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[full_name] = module  # before execution, as dataclasses and relative imports need it
+    spec.loader.exec_module(module)
+    return module
+
+
+def forget(name: str) -> None:
+    """Remove the modules of a folder's plugin, so that they are imported again."""
+    full_name = f"{LOCAL_PACKAGE}.{name}"
+    for module in [m for m in sys.modules if m == full_name or m.startswith(f"{full_name}.")]:
+        del sys.modules[module]
+
+
+def plugin_location(path: Path) -> Path:
+    """The file of a folder's plugin, or the folder of its package."""
+    path = path.absolute()
+    return path.parent if path.name == "__init__.py" else path
+
+
+def module_location(name: str) -> Path | None:
+    """The folder of an installed package, or its file; None if unknown. Nothing is imported."""
+    try:
+        spec = importlib.util.find_spec(name.partition(".")[0])
+    except (ImportError, ValueError, AttributeError):
+        return None
+    return None if spec is None or spec.origin is None else plugin_location(Path(spec.origin))
