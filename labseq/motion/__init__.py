@@ -18,6 +18,7 @@ from labseq.motion.axes import (
     standing_on_sites,
 )
 from labseq.motion.check import RULES, check_plan
+from labseq.motion.hold import cross_offsets_m, hold_program, hold_time_s
 from labseq.motion.overlay import (
     FastOffset,
     OverlayFit,
@@ -28,7 +29,7 @@ from labseq.motion.overlay import (
     overlay_offset,
 )
 from labseq.motion.rendering import Renderer, RenderPath, comb_sample_rate, render, render_chunks
-from labseq.motion.tones import cross_offsets_m, fitting_batches, hold_program, hold_time_s, tone_program
+from labseq.motion.tones import fitting_batches, tone_program
 
 __all__ = [
     "RULES",

@@ -149,7 +149,7 @@ def check_plan(
         n_tweezers,
     )
     if fault:
-        _refuse(fault, where, plan, atoms.shape, max_tweezers, motion.eject_slots, planner)
+        _raise_plan_error(fault, where, plan, atoms.shape, max_tweezers, motion.eject_slots, planner)
     n_defects, n_surplus = count_wrong(atoms, target.fill, target.clear)
     for array in (atoms, end_s, n_tweezers):
         array.flags.writeable = False
@@ -173,7 +173,7 @@ def _check_types(plan: Any, target: Any, dop: Any, grid: Any, motion: Any, plann
     raise InvalidPlanError("shape", f"{what} was expected, {type(came).__name__} came", planner=planner)
 
 
-def _refuse(
+def _raise_plan_error(
     fault: int,
     where: list[int],
     plan: Plan,
@@ -183,10 +183,10 @@ def _refuse(
     planner: str,
 ) -> NoReturn:
     """Put a fault into words."""
-    from labseq.motion import check_kernels as plan_rules
+    from labseq.motion import check_kernels
 
     batch, move, a, b = (int(number) for number in where)
-    rule, wording = next(FAULTS[name] for name in FAULTS if getattr(plan_rules, name) == fault)
+    rule, wording = next(FAULTS[name] for name in FAULTS if getattr(check_kernels, name) == fault)
     row = col = to_row = to_col = -1  # only worded where an atom move is at fault
     if move >= 0:
         row, col, to_row, to_col = plan.moves[plan.batch_offsets[batch] + move].tolist()

@@ -518,7 +518,7 @@ def apply_envelope(values: Singles, n: int, start: float, slope: float) -> None:
 
 N_FIELDS: Final = 5
 SUM: Final = 5
-"""Amplitudes that add up to more than full scale, beside the fields of :mod:`labseq.motion.render_kernels`."""
+"""Amplitudes that add up to more than full scale; see :data:`N_FIELDS` for the other fields."""
 FINE: Final = -1
 
 ROUNDING: Final = 1e-9

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from labseq.errors import LimitError
 from labseq.model import Batch, MotionSpec, Plan, RfSpec, SegmentKind, SiteGrid, ToneProgram
 from labseq.motion import tone_program
-from labseq.motion.tones import cross_offsets_m, hold_program, hold_time_s
+from labseq.motion.hold import cross_offsets_m, hold_program, hold_time_s
 
 GRID = SiteGrid(5, 6)
 HOLD_S = 0.2e-3

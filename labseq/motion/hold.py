@@ -1,0 +1,215 @@
+"""Tweezers that pick atoms up, hold them beside their sites and drop them, to probe the overlay."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from labseq.errors import LimitError
+from labseq.model import AxisTones, MotionSpec, SegmentKind, SiteGrid, ToneProgram
+from labseq.motion.axes import AXES, AxisIndex, Drive, drive
+from labseq.motion.tones import AXIS_INDICES, check_limits
+from labseq.units import format_quantity
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Batch:
+    """Sites of one row that are held together; ``offset_m`` float64 (2,) along a1 and a2."""
+
+    row: int
+    columns: Ints
+    offset_m: Floats
+
+
+def hold_program(
+    grid: SiteGrid,
+    motion: MotionSpec,
+    sites: Mask,
+    offset_m: ArrayLike,
+    hold_s: float,
+    drop_off_s: float | None = None,
+) -> ToneProgram:
+    """Pick atoms up, hold them and set them down, all beside their sites by an offset.
+
+    Nothing is moved: the tones of a batch stand still, at the frequencies of their sites and an
+    offset more. Amplitudes, phases and, but for the drop-off, times are those of
+    :func:`labseq.motion.tone_program`; the columns' tones are ramped. A batch holds atoms of one row
+    that have the same offset, so that each crossing is a site that was asked for, as many at once
+    as the motion allows. A drop-off that is fast against the swing of the atoms lets go of them where
+    they are; a slow one leads many of them back.
+
+    Args:
+        grid: The grid of sites.
+        motion: How the tweezers move: ramps, overheads, and limits.
+        sites: bool (n_rows, n_cols), the sites to hold.
+        offset_m: How far beside its site each tweezer shall stand, along a1 (the columns' tones)
+            and a2 (the rows'): (2,) for all, or (n_rows, n_cols, 2).
+        hold_s: Time between the ramps, in seconds; 0 for none.
+        drop_off_s: Duration of the drop-off, in seconds; by default the motion's.
+
+    Returns:
+        The tones of both axes; a batch for each row and offset, or more.
+
+    Raises:
+        LimitError: A tone leaves its band, comes too near to another, or breaks another limit.
+        ValueError: Sites or offsets are not of the grid's shape, or a value is no number.
+    """
+    _check_band(grid, motion, sites, offset_m)
+    batches = list(_batches(grid, motion, sites, offset_m))
+    phase_s = _phase_times_s(motion, hold_s, drop_off_s)
+    kinds = np.array([kind for kind, _ in phase_s], np.int8)
+    times_s = np.array([time_s for _, time_s in phase_s])
+    kind, duration_s = np.tile(kinds, len(batches)), np.tile(times_s, len(batches))
+    batch = np.repeat(np.arange(len(batches), dtype=np.int32), len(kinds))
+    axes = [
+        _axis(axis, drive(grid, motion, axis), motion, grid.spacing_m, batches, kinds, times_s, batch)
+        for axis in AXIS_INDICES
+    ]
+    return ToneProgram(axes[0], axes[1], duration_s, kind, batch)
+
+
+def hold_time_s(
+    grid: SiteGrid,
+    motion: MotionSpec,
+    offset_m: ArrayLike,
+    hold_s: float,
+    drop_off_s: float | None = None,
+) -> float:
+    """Playing time of a :func:`hold_program` for every site of the grid: the most that it may be.
+
+    Raises:
+        LimitError: The tone of a site leaves its band at its offset.
+    """
+    every = np.ones(grid.shape, np.bool_)
+    _check_band(grid, motion, every, offset_m)
+    n_batches = sum(1 for _ in _batches(grid, motion, every, offset_m))
+    return n_batches * sum(time_s for _, time_s in _phase_times_s(motion, hold_s, drop_off_s))
+
+
+def cross_offsets_m(shape: tuple[int, int], offset_m: ArrayLike) -> Floats:
+    """Offsets of four groups of sites: +x and -x along a1 in even rows, +y and -y along a2 in odd ones.
+
+    In even rows even columns go forward and odd ones back; in odd rows likewise. So each group
+    holds a quarter of the sites, spread over the whole grid.
+
+    Args:
+        shape: (n_rows, n_cols).
+        offset_m: float64 (2,), x and y.
+
+    Returns:
+        float64 (n_rows, n_cols, 2).
+
+    Example:
+        >>> cross_offsets_m((2, 2), (0.9, 0.8)).tolist()
+        [[[0.9, 0.0], [-0.9, 0.0]], [[0.0, 0.8], [0.0, -0.8]]]
+    """
+    row, col = np.indices(shape)
+    sign = 1.0 - 2.0 * (col % 2)
+    along = np.stack([row % 2 == 0, row % 2 == 1], axis=-1)
+    return np.where(along, sign[..., None] * np.asarray(offset_m, np.float64), 0.0)
+
+
+def _check_band(grid: SiteGrid, motion: MotionSpec, sites: Mask, offset_m: ArrayLike) -> None:
+    """Refuse an offset at which the tone of a site leaves its band; no kernel is needed for that."""
+    if np.shape(sites) != grid.shape:
+        raise ValueError(f"sites has shape {np.shape(sites)}; expected {grid.shape}")
+    offsets = np.broadcast_to(np.asarray(offset_m, np.float64), (*grid.shape, 2))
+    if not np.isfinite(offsets).all():
+        raise ValueError("an offset is not a number")
+    for axis in AXIS_INDICES:
+        driven = drive(grid, motion, axis)
+        along_m = offsets[..., 1 - axis]
+        site_hz = driven.site_hz[:, None] if axis == 0 else driven.site_hz
+        hz = site_hz + driven.step_hz * along_m / grid.spacing_m
+        low_hz, high_hz = (motion.rf.row_band_hz, motion.rf.column_band_hz)[axis]
+        outside = np.argwhere(sites & ((hz < low_hz) | (hz > high_hz)))
+        if len(outside):
+            site = tuple(outside[0])
+            at = format_quantity(float(along_m[site]), "length")
+            raise LimitError(
+                f"the frequency of the tone of {AXES[axis]} {site[axis]} at an offset of {at}",
+                f"{hz[site] / 1e6:.6g} MHz",
+                f"the band of {low_hz / 1e6:.6g} to {high_hz / 1e6:.6g} MHz",
+                "choose a smaller offset, or sites further from the edge",
+            )
+
+
+def _batches(grid: SiteGrid, motion: MotionSpec, sites: Mask, offset_m: ArrayLike) -> Iterator[_Batch]:
+    offsets = np.broadcast_to(np.asarray(offset_m, np.float64), (*grid.shape, 2))
+    most = min(motion.max_tweezers, motion.max_column_tones)
+    for row in range(grid.n_rows):
+        columns = np.flatnonzero(sites[row])
+        kinds, of_kind = np.unique(offsets[row, columns], axis=0, return_inverse=True)
+        for i, offset in enumerate(kinds):
+            together = columns[of_kind.ravel() == i]
+            for first in range(0, len(together), most):
+                yield _Batch(row, together[first : first + most], offset)
+
+
+def _phase_times_s(
+    motion: MotionSpec, hold_s: float, drop_off_s: float | None
+) -> list[tuple[SegmentKind, float]]:
+    """The segments of a batch and how long each takes."""
+    drop_off_s = motion.drop_off_s if drop_off_s is None else drop_off_s
+    for name, time_s in (("hold", hold_s), ("drop off", drop_off_s)):
+        if not 0 <= time_s < float("inf"):
+            raise ValueError(f"the time to {name} is {time_s} s; expected 0 or more")
+    segments = [
+        (SegmentKind.IDLE, motion.overhead_per_batch_s),
+        (SegmentKind.PICK_UP, motion.pick_up_s),
+        (SegmentKind.TRANSPORT, hold_s),
+        (SegmentKind.DROP_OFF, drop_off_s),
+    ]
+    return [one for one in segments if one[0] is not SegmentKind.TRANSPORT or hold_s > 0]
+
+
+def _axis(
+    axis: AxisIndex,
+    driven: Drive,
+    motion: MotionSpec,
+    spacing_m: float,
+    batches: list[_Batch],
+    kinds: NDArray[np.int8],
+    times_s: Floats,
+    batch: NDArray[np.int32],
+) -> AxisTones:
+    """The tones of an axis over all batches, held against its limits."""
+    starts_off = (axis == 1) & (kinds == SegmentKind.PICK_UP)
+    ends_off = (axis == 1) & (kinds == SegmentKind.DROP_OFF)
+    sounding = kinds != SegmentKind.IDLE
+    before_s = np.cumsum(np.where(sounding, times_s, 0.0)) - times_s
+    columns: list[Floats] = [np.empty((5, 0))]
+    n_tones: list[int] = [0]
+    for one in batches:
+        tones = np.array([one.row]) if axis == 0 else one.columns
+        shift_hz = driven.step_hz * one.offset_m[1 - axis] / spacing_m  # offsets are along a1, a2
+        hz = driven.site_hz[tones] + shift_hz
+        first = _first_phases(tones, driven, motion)
+        for segment in range(len(kinds)):
+            n_tones.append(n_tones[-1] + (len(tones) if sounding[segment] else 0))
+            if sounding[segment]:
+                amplitude = driven.amplitude[tones]
+                start, end = amplitude * (not starts_off[segment]), amplitude * (not ends_off[segment])
+                columns.append(np.stack([hz, hz, start, end, (first + hz * before_s[segment]) % 1.0]))
+    values, offsets = np.ascontiguousarray(np.hstack(columns)), np.array(n_tones, np.int32)
+    check_limits(axis, driven, motion.rf, batch, offsets, values)
+    start_hz, end_hz, start, end, phase = values
+    return AxisTones(offsets, start_hz, end_hz, start, end, 2 * np.pi * phase)
+
+
+def _first_phases(tones: Ints, driven: Drive, motion: MotionSpec) -> Floats:
+    """Phases of the tones of a batch when they come on, in cycles."""
+    from labseq.motion.tone_kernels import first_phases
+
+    phase = np.empty(len(tones))
+    chosen = np.ascontiguousarray(np.stack([tones, tones]).astype(np.int64))
+    low_crest = motion.rf.phases == "low_crest"
+    first_phases(chosen, len(tones), driven.phase, low_crest, driven.amplitude, phase)
+    return phase
