@@ -1,4 +1,4 @@
-"""From a request to an entry in the store: measure, analyse, keep, compare, use."""
+"""Making a calibration: measure, analyse, store, compare, use."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ import numpy as np
 
 import labseq
 from labseq.calibration.compare import Difference, compare
-from labseq.calibration.frequencies import FrequenciesMethod
+from labseq.calibration.frequencies import analyse_frequencies
 from labseq.calibration.method import AnalysisResult, CalibrationData, Method
-from labseq.calibration.overlay import OverlayMethod
-from labseq.calibration.sites import SitesMethod
+from labseq.calibration.overlay import analyse_overlay
+from labseq.calibration.sites import analyse_sites, read_site_file
 from labseq.calibration.store import Store, Stored, grid_text
-from labseq.calibration.thresholds import ThresholdsMethod
-from labseq.calibration.tweezers import TweezersMethod
+from labseq.calibration.thresholds import analyse_thresholds
+from labseq.calibration.tweezers import analyse_tweezers
 from labseq.config import Override, ProfileSpec, load_profile, split_overrides
 from labseq.config.messages import clean
 from labseq.config.profile import OFF
@@ -35,25 +35,34 @@ from labseq.session.session import Session
 
 PICTURE_DPI: Final = 110
 VALUE_FILES: Final = (".npy", ".csv")
-"""Endings of files with values; anything else that is named is a run."""
+"""Suffixes of files of values; any other source is a run."""
 
-_BLIND: Final = "profile.detector={use: blind}"
-_DETECTOR: Final = "profile.detector."
+METHODS: Final[Mapping[str, Method]] = {
+    method.kind: method
+    for method in (
+        Method("sites", analyse_sites, read_site_file, ignored=("sites", "thresholds"), uses_detector=False),
+        Method("thresholds", analyse_thresholds, ignored=("thresholds",), uses_detector=False),
+        Method("tweezers", analyse_tweezers, uses_detector=False),
+        Method("frequencies", analyse_frequencies),
+        Method("overlay", analyse_overlay),
+    )
+}
+"""Kind of calibration -> how it is made."""
 
 
 @dataclass(frozen=True, slots=True)
 class CalibrationRequest:
-    """What is to be calibrated.
+    """What to calibrate, and how to measure it.
 
     Attributes:
         profile: Name or path of the profile.
-        source: A run's folder, or a file with values, in place of a new run.
+        source: A run's folder, or a file of values, instead of a new run.
         shots: Number of shots, instead of the sequence's own.
         seed: Seed of the run.
         overrides: ``"address=value"`` strings, as given to ``--set``.
         output: Folder for the data of the run.
         dry_run: "off", "full" or "fast".
-        force: Whether it is put to use even if it is worse than what is in use.
+        force: Whether to use the result even if it is worse than the calibration in use.
     """
 
     profile: str
@@ -68,14 +77,14 @@ class CalibrationRequest:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What came of a calibration.
+    """The result of a calibration.
 
     Attributes:
-        stored: The entry; kept, whether it is in use or not.
-        told: What was found, in lines.
-        before: The entry that was in use; None for none, or one that cannot be compared.
+        stored: The entry, stored whether it is in use or not.
+        summary_lines: Lines that summarise the result for the user.
+        before: The entry that was in use; None if there was none, or none to compare with.
         changes: How far the values have moved since then.
-        run: The run that it was made of; None for a file.
+        run: The run that was analysed; None for a file.
         refused: Why it is not in use; "" if it is.
         warnings: What the user should know although it is no error.
     """
@@ -90,71 +99,80 @@ class Outcome:
 
 
 def calibrate(method: Method, request: CalibrationRequest, observer: RunObserver | None = None) -> Outcome:
-    """Calibrate.
+    """Measure, analyse and store a calibration, and use it unless it is worse than the one in use.
 
     Args:
-        method: How calibrations of the kind are made.
-        request: For what, and of what.
-        observer: Told everything that happens in the run.
+        method: One of :data:`METHODS`.
+        request: What to calibrate, and how to measure it.
+        observer: Receives the events of the run.
 
     Raises:
         ConfigError: Something in the request is wrong, or the folder cannot be written to.
-        DeviceError: A device failed, or the frames do not show what is looked for; what is in use stays.
-        LabseqError: Whatever ended the run.
+        DeviceError: A device failed, or the frames do not show what is searched for. The calibration
+            in use stays in use.
+        LabseqError: Another error ended the run.
     """
-    overrides = _of_profile(request.overrides)
-    document, spec = load_profile(request.profile, beside=Path(), overrides=overrides)
-    aside = _aside(store_of(document, spec).folder, spec, method)
+    document, spec = load_profile(request.profile, beside=Path(), overrides=_of_profile(request.overrides))
+    ignoring = _ignoring(store_of(document, spec).folder, spec, method)
     bench = resolve_profile(
-        request.profile, Path(), _of_profile([*request.overrides, aside]), request.dry_run
+        request.profile, Path(), _of_profile([*request.overrides, ignoring]), request.dry_run
     )
-    run, finding = _find(method, request, bench, aside, observer)
+    run, result = _analysed(method, request, bench, ignoring, observer)
     entry = CalibrationEntry(
         kind=method.kind,
-        values={name: np.asarray(value) for name, value in finding.values.items()},
-        quality=finding.quality,
+        values={name: np.asarray(value) for name, value in result.values.items()},
+        quality=result.quality,
         grid=grid_facts(bench.grid),
-        origin={**_origin(method, request, bench, run), **finding.origin},
+        origin={**_origin(method, request, bench, run), **result.origin},
         taken_utc=_now() if run is None else str(run.record["t_start_utc"]),
     )
     store = store_of(document, spec, request.dry_run)
-    before, (picture, warnings) = _in_use(store, entry), _picture(finding)
+    before, (picture, warnings) = _in_use(store, entry), _picture(result)
     stored = store.add(entry, picture)
     refused = "" if request.force else why_left_out(entry, bench.calibrations) or store.why_worse(entry)
     if not refused:
         store.use(stored, bench.grid, force=True)
-        warnings += _deactivate_overlay(store, entry)
+        overlay = store.active().get("overlay")
+        if entry.kind == "frequencies" and overlay is not None:
+            store.use_none("overlay")
+            warnings += (f"overlay {overlay.id} is no longer used: these frequencies include its correction",)
     if pin := spec.calibrations.use.of(method.kind):
-        warnings += (f"the profile says 'calibrations.use.{method.kind}: {clean(pin)}', and that counts",)
+        text = f"the profile says 'calibrations.use.{method.kind}: {clean(pin)}', which takes precedence"
+        warnings += (text,)
     changes = () if before is None else tuple(compare(before, entry)[0])
-    return Outcome(stored, finding.summary_lines, before, changes, run, refused, warnings)
+    return Outcome(stored, result.summary_lines, before, changes, run, refused, warnings)
 
 
-def _find(
+def _analysed(
     method: Method,
     request: CalibrationRequest,
     bench: ResolvedProfile,
-    aside: str,
+    ignoring: str,
     observer: RunObserver | None,
 ) -> tuple[Run | None, AnalysisResult]:
-    """Measure, or read what was measured, and analyse it."""
+    """Take or open a run and analyse it, or read a file of values."""
     source = request.source
     if source is not None and source.suffix.lower() in VALUE_FILES:
+        if method.read is None:
+            what = f"a calibration of {method.kind} cannot be made from a file"
+            raise ConfigError(Problem(what, str(source), expected="a run's folder"))
         return None, method.read(source, bench)
-    run = _measure(method, request, aside, observer) if source is None else _open(source, request, bench)
+    run = _measure(method, request, ignoring, observer) if source is None else _open(source, request, bench)
     try:
         return run, method.analyse(CalibrationData(run, bench))
     except LabseqError:
         if observer is not None:
-            text = f"no calibration came of it, and what is in use stays; the run is kept: --from {run.path}"
+            again = f"analyse the run again with --from {run.path}"
+            text = f"the calibration failed, and the one in use is unchanged; {again}"
             observer.event("warning", {"text": text})
         raise
 
 
-def _measure(method: Method, request: CalibrationRequest, aside: str, observer: RunObserver | None) -> Run:
-    overrides = [*request.overrides, aside]
-    if method.is_blind:
-        overrides = [one for one in overrides if not one.lstrip().startswith(_DETECTOR)] + [_BLIND]
+def _measure(method: Method, request: CalibrationRequest, ignoring: str, observer: RunObserver | None) -> Run:
+    overrides = [*request.overrides, ignoring]
+    if not method.uses_detector:  # its settings may be wrong before it is calibrated
+        overrides = [one for one in overrides if not one.lstrip().startswith("profile.detector.")]
+        overrides.append("profile.detector={use: blind}")
     with Session.open(
         method.sequence,
         profile=request.profile,
@@ -169,10 +187,10 @@ def _measure(method: Method, request: CalibrationRequest, aside: str, observer: 
 
 
 def _open(source: Path, request: CalibrationRequest, bench: ResolvedProfile) -> Run:
-    """Open the run that is to be analysed.
+    """Open a run of the profile's sites and devices.
 
     Raises:
-        ConfigError: It is no run, or not one of this profile's sites and devices.
+        ConfigError: It is not a run, or has other sites or devices.
     """
     try:
         run = open_run(source)
@@ -196,12 +214,14 @@ def _open(source: Path, request: CalibrationRequest, bench: ResolvedProfile) -> 
     return run
 
 
-def _aside(folder: Path, spec: ProfileSpec, method: Method) -> str:
-    """The override that lets the method's own kinds, damaged ones perhaps, not count."""
-    pins = {kind: spec.calibrations.use.of(kind) for kind in CALIBRATION_KINDS}
-    use = {kind: OFF if kind in method.aside else pin for kind, pin in pins.items()}
-    chosen = {kind: pin for kind, pin in use.items() if pin is not None}
-    text = json.dumps({"folder": str(folder.resolve()), "use": chosen}, ensure_ascii=False)
+def _ignoring(folder: Path, spec: ProfileSpec, method: Method) -> str:
+    """The override that makes runs ignore the method's own kinds, which may be damaged."""
+    use = {
+        kind: OFF if kind in method.ignored else pin
+        for kind in CALIBRATION_KINDS
+        if (pin := spec.calibrations.use.of(kind)) is not None or kind in method.ignored
+    }
+    text = json.dumps({"folder": str(folder.resolve()), "use": use}, ensure_ascii=False)
     return f"profile.calibrations={text}"
 
 
@@ -225,7 +245,7 @@ def _origin(
 
 
 def _in_use(store: Store, entry: CalibrationEntry) -> CalibrationEntry | None:
-    """The entry that it would replace, where the two can be compared."""
+    """The entry that it would replace, if the two can be compared."""
     try:
         stored = store.entry_in_use(entry.kind)
     except ConfigError:
@@ -233,35 +253,14 @@ def _in_use(store: Store, entry: CalibrationEntry) -> CalibrationEntry | None:
     return stored.entry if stored is not None and same_grid(stored.entry.grid, entry.grid) else None
 
 
-def _deactivate_overlay(store: Store, entry: CalibrationEntry) -> tuple[str, ...]:
-    """Put the overlay aside that new frequencies hold already; what was put aside, in words."""
-    overlay = store.active().get("overlay")
-    if entry.kind != "frequencies" or overlay is None:
-        return ()
-    store.use_none("overlay")
-    return (f"overlay {overlay.id} is put aside: these frequencies hold what it makes up for",)
-
-
-def _picture(finding: AnalysisResult) -> tuple[bytes | None, tuple[str, ...]]:
-    """The picture as PNG, and why there is none."""
-    if finding.draw is None:
+def _picture(result: AnalysisResult) -> tuple[bytes | None, tuple[str, ...]]:
+    """The picture as PNG, and a warning if it cannot be drawn."""
+    if result.draw is None:
         return None, ()
     if not can_draw():
         return None, ("there is no picture: matplotlib is not installed (pip install 'labseq[plot]')",)
-    return encode_figure(finding.draw, dpi=PICTURE_DPI), ()
+    return encode_figure(result.draw, dpi=PICTURE_DPI), ()
 
 
 def _now() -> str:
     return datetime.now(UTC).isoformat(timespec="seconds")
-
-
-_ALL: Final[tuple[Method, ...]] = (
-    SitesMethod(),
-    ThresholdsMethod(),
-    TweezersMethod(),
-    FrequenciesMethod(),
-    OverlayMethod(),
-)
-
-METHODS: Final[Mapping[str, Method]] = {method.kind: method for method in _ALL}
-"""Kind of calibration -> how it is made."""

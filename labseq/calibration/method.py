@@ -1,11 +1,11 @@
-"""What a way to calibrate must offer and what it is given; runs that probe the overlay."""
+"""What a kind of calibration defines, and the data that its analysis receives."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,6 +15,7 @@ from labseq.errors import ConfigError, DeviceError, Problem
 from labseq.guard import StopFlag
 from labseq.model import CalibrationKind, Frame, MotionSpec, SiteGrid
 from labseq.recording import Run
+from labseq.recording.shot import read_frames
 from labseq.roles import Detector
 from labseq.sequencer import VirtualClock
 from labseq.session.construct import construct
@@ -24,20 +25,23 @@ from labseq.session.profile import ResolvedProfile
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-MIN_FULL: Final = 20
-"""Saturated pixels that a frame may have whatever its size: hot ones, cosmic rays."""
+MIN_SATURATED: Final = 20
+"""Saturated pixels that are allowed in any frame: hot pixels and cosmic rays."""
+
+PROBE_ADDRESS: Final = ".probe.offset"
+"""End of the address of a probe's offset among the parameters of a shot."""
 
 
 @dataclass(frozen=True, slots=True)
 class AnalysisResult:
-    """What came of an analysis.
+    """The result of analysing a run or a file.
 
     Attributes:
-        values: What the machine will use; see :class:`labseq.CalibrationEntry`.
+        values: The values that the machine will use; see :class:`labseq.CalibrationEntry`.
         quality: Figures of merit.
-        told: Lines for people.
-        origin: What else must be known of where it comes from, JSON-ready.
-        draw: Draws the picture to look at; None for none.
+        summary_lines: Lines that summarise the result for the user.
+        origin: Additions to the entry's ``origin``, JSON-ready.
+        draw: Draws a picture of the result; None if there is none.
     """
 
     values: Mapping[str, ArrayLike]
@@ -53,125 +57,81 @@ class CalibrationData:
 
     Attributes:
         run: The run.
-        bench: The profile, with the calibrations that count in the analysis.
+        bench: The profile, with the calibrations that the analysis uses.
     """
 
     run: Run
     bench: ResolvedProfile
 
     def frames(self) -> Iterator[Frame]:
-        """The frame of the first image of each shot: of randomly loaded atoms, before any move.
+        """The first frame of each shot: randomly loaded atoms, before any move.
 
         Raises:
             ConfigError: The run has no shots, or kept no frames of them.
             DeviceError: The frames differ in size, or one is saturated.
             RecordingError: A shot's file is damaged.
         """
+        path = str(self.run.path)
         if not self.run.shots:
-            raise ConfigError(
-                Problem("the run has no shots", str(self.run.path), expected="a run with frames")
-            )
-        from labseq.recording.shot import read_frames
-
-        first: Frame | None = None
+            raise ConfigError(Problem("the run has no shots", path, expected="a run with frames"))
+        shape: tuple[int, ...] | None = None
         for shot in self.run.shots:
             frame = read_frames(shot.file).get(0)
             if frame is None:
                 what = f"the first image of shot {shot.index + 1} was not kept"
                 hint = "take a run with 'record_frames: all'"
-                raise ConfigError(
-                    Problem(what, str(self.run.path), expected="a frame of each shot", hint=hint)
-                )
-            first = first or frame
-            if frame.image.shape != first.image.shape:
-                sizes = f"{first.image.shape} and {frame.image.shape}"
+                raise ConfigError(Problem(what, path, expected="a frame of each shot", hint=hint))
+            shape = shape or frame.image.shape
+            if frame.image.shape != shape:
+                sizes = f"{shape} and {frame.image.shape}"
                 raise DeviceError(frame.camera, f"frames of the run differ in size: {sizes}")
-            self._refuse_saturated(frame, shot.index)
+            n_saturated = int(np.count_nonzero(frame.image == np.iinfo(frame.image.dtype).max))
+            if n_saturated > max(MIN_SATURATED, self.bench.grid.n_rows * self.bench.grid.n_cols // 20):
+                what = f"{n_saturated} pixels of the first frame of shot {shot.index + 1} are saturated"
+                raise DeviceError(frame.camera, f"{what}; use less light, gain or exposure")
             yield frame
 
-    def _refuse_saturated(self, frame: Frame, shot: int) -> None:
-        n_full = int(np.count_nonzero(frame.image == np.iinfo(frame.image.dtype).max))
-        if n_full > max(MIN_FULL, self.bench.grid.n_rows * self.bench.grid.n_cols // 20):
-            text = f"{n_full} pixels of the first frame of shot {shot + 1} are saturated"
-            raise DeviceError(frame.camera, f"{text}; use less light, gain or exposure")
-
     def detector(self) -> Detector:
-        """The profile's detector, with the calibrations that count in the analysis."""
+        """The profile's detector, with the calibrations that the analysis uses."""
         bench = self.bench
-        chosen, clock = {"detector": bench.chosen["detector"]}, VirtualClock(StopFlag())
         made, _ = construct(
-            chosen, bench.grid, bench.profile.motion, clock, 0, calibrations=bench.calibrations
+            {"detector": bench.chosen["detector"]},
+            bench.grid,
+            bench.profile.motion,
+            VirtualClock(StopFlag()),
+            0,
+            calibrations=bench.calibrations,
         )
         return made["detector"]
 
 
-class Method(Protocol):
-    """How calibrations of a kind are made."""
+@dataclass(frozen=True, slots=True)
+class Method:
+    """How calibrations of one kind are made.
 
-    @property
-    def kind(self) -> CalibrationKind:
-        """The kind."""
-        ...
+    Attributes:
+        kind: The kind.
+        analyse: Makes a calibration from a run; raises a ``LabseqError`` that says why if it cannot.
+        read: Makes a calibration from a file of values; None if this kind needs a run.
+        ignored: Kinds that are not used, neither in the run nor in the analysis.
+        uses_detector: Whether the run detects atoms. The others run before the detector is calibrated.
+    """
+
+    kind: CalibrationKind
+    analyse: Callable[[CalibrationData], AnalysisResult]
+    read: Callable[[Path, ResolvedProfile], AnalysisResult] | None = None
+    ignored: tuple[CalibrationKind, ...] = ()
+    uses_detector: bool = True
 
     @property
     def sequence(self) -> Path:
-        """The sequence that is run."""
-        ...
-
-    @property
-    def aside(self) -> Collection[CalibrationKind]:
-        """Kinds that do not count, neither while it is measured nor in the analysis."""
-        ...
-
-    @property
-    def is_blind(self) -> bool:
-        """Whether the run needs no detector, which may not know yet where to look."""
-        ...
-
-    def analyse(self, evidence: CalibrationData) -> AnalysisResult:
-        """Make a calibration of a run.
-
-        Raises:
-            LabseqError: Nothing can be made of it; says why.
-        """
-        ...
-
-    def read(self, path: Path, bench: ResolvedProfile) -> AnalysisResult:
-        """Make a calibration of a file with its values.
-
-        Raises:
-            ConfigError: The file is wrong, or calibrations of this kind come from runs only.
-        """
-        ...
-
-
-def from_runs_only(kind: CalibrationKind, path: Path) -> ConfigError:
-    """The error of a kind that comes from no file."""
-    what = f"a calibration of {kind} cannot be made of a file"
-    return ConfigError(Problem(what, str(path), expected="a run's folder"))
-
-
-def packaged(kind: CalibrationKind) -> Path:
-    """The sequence of a kind, as it comes with labseq."""
-    return Path(__file__).with_name(f"{kind}.yaml")
-
-
-def mean_of(frames: Iterator[Frame]) -> tuple[np.ndarray[tuple[int, int], np.dtype[np.float64]], int]:
-    """Mean of frames, float64 (height, width), and how many they are; one at a time is in memory."""
-    first = next(frames)
-    total, n = first.image.astype(np.float64), 1
-    for frame in frames:
-        total += frame.image
-        n += 1
-    return total / n, n
-
-
-_ADDRESS = ".probe.offset"
+        """The sequence that is run; it comes with labseq."""
+        return Path(__file__).with_name(f"{self.kind}.yaml")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ProbeCounts:
-    """What a scan of the probe's offset saw.
+    """Atoms counted before and after a probe, at each of its offsets.
 
     Attributes:
         offset_m: float64 (n_points, 2), commanded offsets along a1 and a2.
@@ -179,7 +139,7 @@ class ProbeCounts:
         n_survived: int64, likewise: how many of them were seen afterwards.
         grid: The grid, with the tones that were played.
         motion: How the tweezers moved.
-        in_use_m: float64 (2,), the offset that an overlay calibration made up for in the run.
+        in_use_m: float64 (2,), the offset that the overlay calibration of the run corrected.
         calibrations: Those in use in the run: kind -> id.
     """
 
@@ -192,40 +152,32 @@ class ProbeCounts:
     calibrations: dict[str, str]
 
 
-def read_probed(run: Run) -> ProbeCounts:
-    """Count, at each offset and on each site, the atoms before and after the probe.
+def count_probed(run: Run) -> ProbeCounts:
+    """Count the atoms before and after the probe, at each offset and on each site.
 
     Raises:
         ConfigError: The run does not scan the offset of a probe between two images.
         RecordingError: A shot's file is damaged.
     """
-    before: dict[tuple[float, float], NDArray[np.int64]] = {}
-    after: dict[tuple[float, float], NDArray[np.int64]] = {}
+    counts: dict[tuple[float, float], NDArray[np.int64]] = {}
     for shot in run.shots:
-        offset = next((v for k, v in shot.parameters.items() if k.endswith(_ADDRESS)), None)
+        offset = next((v for k, v in shot.parameters.items() if k.endswith(PROBE_ADDRESS)), None)
         seen = shot.occupancies
         if offset is None or len(seen) < 2:
             what = "the run does not scan the offset of a probe between two images"
             expected = "one such as 'labseq calibrate overlay' takes"
             raise ConfigError(Problem(what, str(run.path), expected=expected))
         point = float(offset[0]), float(offset[1])
-        before[point] = before.get(point, 0) + seen[0].astype(np.int64)
-        after[point] = after.get(point, 0) + (seen[0] & seen[-1]).astype(np.int64)
-    if not before:
-        raise ConfigError(
-            Problem("the run has no shots", str(run.path), expected="a scan of a probe's offset")
-        )
+        counts[point] = counts.get(point, 0) + np.stack([seen[0], seen[0] & seen[-1]]).astype(np.int64)
+    if not counts:
+        expected = "a scan of a probe's offset"
+        raise ConfigError(Problem("the run has no shots", str(run.path), expected=expected))
     machine = recorded_machine(run.record["resolved"]["profile"], "the profile of the run")
     calibrations: dict[str, str] = dict(run.record.get("calibrations") or {})
     in_use_m = np.zeros(2)
     if "overlay" in calibrations:
         in_use_m = read_entry(run.path / "calibration_overlay.json").values["offset_m"]
+    n_before, n_survived = np.stack([*counts.values()], axis=1)
     return ProbeCounts(
-        np.array([*before]),
-        np.stack([*before.values()]),
-        np.stack([*after.values()]),
-        machine.grid,
-        machine.motion,
-        in_use_m,
-        calibrations,
+        np.array([*counts]), n_before, n_survived, machine.grid, machine.motion, in_use_m, calibrations
     )

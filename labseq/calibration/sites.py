@@ -2,78 +2,67 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
 from labseq.calibration.lattice import FoundLattice, find_lattice
-from labseq.calibration.method import AnalysisResult, CalibrationData, mean_of, packaged
+from labseq.calibration.method import AnalysisResult, CalibrationData
 from labseq.calibration.pictures import draw_sites
+from labseq.detection.drift import FrameAverage
 from labseq.detection.sites import read_sites
 from labseq.errors import ConfigError, Problem
-from labseq.model import CalibrationKind
 from labseq.session.profile import ResolvedProfile
 from labseq.units import format_quantity
 
-_SEQUENCE: Final = packaged("sites")
+
+def analyse_sites(data: CalibrationData) -> AnalysisResult:
+    """Find the lattice on the mean of the run's frames.
+
+    Raises:
+        DeviceError: There is none; says why.
+        ConfigError: The run has no frames.
+    """
+    average = FrameAverage()
+    for frame in data.frames():
+        average.add(frame)
+    mean = average.image
+    found = find_lattice(mean, data.bench.grid)
+    quality = {
+        "residual_px": found.residual_px,
+        "n_sites_found": float(found.n_sites_found),
+        "spacing_px": sum(found.spacing_px) / 2,
+        "angle_rad": found.angle_rad,
+        "stretch": found.stretch,
+        "spot_px": found.spot_px,
+        "pixel_size_m": found.pixel_size_m,
+    }
+    return AnalysisResult(
+        {"positions_px": found.positions_px, "frame": found.frame},
+        quality,
+        _summary_lines(found, average.n_frames),
+        draw=lambda: draw_sites(mean, found.positions_px, found.residuals_px),
+    )
 
 
-@dataclass(frozen=True, slots=True)
-class SitesMethod:
-    """Implements ``Method`` for the sites."""
+def read_site_file(path: Path, bench: ResolvedProfile) -> AnalysisResult:
+    """Read the positions of the sites from a file, on frames of the size in the detector's settings.
 
-    kind: CalibrationKind = "sites"
-    sequence: Path = _SEQUENCE
-    aside: tuple[CalibrationKind, ...] = ("sites", "thresholds")
-    is_blind: bool = True
-
-    def analyse(self, evidence: CalibrationData) -> AnalysisResult:
-        """Find the lattice on the mean of the run's frames.
-
-        Raises:
-            DeviceError: There is none; says why.
-            ConfigError: The run has no frames.
-        """
-        mean, n_frames = mean_of(evidence.frames())
-        found = find_lattice(mean, evidence.bench.grid)
-        along, down = found.spacing_px
-        quality = {
-            "residual_px": found.residual_px,
-            "n_sites_found": float(found.n_sites_found),
-            "spacing_px": (along + down) / 2,
-            "angle_rad": found.angle_rad,
-            "stretch": found.stretch,
-            "spot_px": found.spot_px,
-            "pixel_size_m": found.pixel_size_m,
-        }
-        values = {"positions_px": found.positions_px, "frame": found.frame}
-        summary_lines = _summary_lines(found, n_frames)
-        return AnalysisResult(
-            values,
-            quality,
-            summary_lines,
-            draw=lambda: draw_sites(mean, found.positions_px, found.residuals_px),
-        )
-
-    def read(self, path: Path, bench: ResolvedProfile) -> AnalysisResult:
-        """Take the sites from a file; the frames that they belong to are those of the detector's settings.
-
-        Raises:
-            ConfigError: The file is wrong, or the detector does not say how large its frames are.
-        """
-        settings: Any = bench.chosen["detector"].settings
-        frame = getattr(settings, "frame", None)
-        if frame is None:
-            what = "the detector does not say how large the frames are that the sites are on"
-            raise ConfigError(Problem(what, expected="a detector with the setting 'frame'"))
-        positions = read_sites(path, bench.grid.shape)
-        if np.any((positions < 0) | (positions > np.array(frame) - 1)):
-            what = f"some of the sites are beside the frame of {frame[0]} x {frame[1]} pixels"
-            raise ConfigError(Problem(what, str(path), expected="(y, x) of each site on the frame"))
-        summary_lines = (f"{positions[..., 0].size} sites read from {path}",)
-        return AnalysisResult({"positions_px": positions, "frame": frame}, {}, summary_lines)
+    Raises:
+        ConfigError: The file is wrong, or the detector has no setting for the size of its frames.
+    """
+    settings: Any = bench.chosen["detector"].settings
+    frame = getattr(settings, "frame", None)
+    if frame is None:
+        what = "the detector does not say how large the frames are that the sites are on"
+        raise ConfigError(Problem(what, expected="a detector with the setting 'frame'"))
+    positions = read_sites(path, bench.grid.shape)
+    if np.any((positions < 0) | (positions > np.array(frame) - 1)):
+        what = f"some of the sites are outside of the frame of {frame[0]} x {frame[1]} pixels"
+        raise ConfigError(Problem(what, str(path), expected="(y, x) of each site on the frame"))
+    summary_lines = (f"{positions[..., 0].size} sites read from {path}",)
+    return AnalysisResult({"positions_px": positions, "frame": frame}, {}, summary_lines)
 
 
 def _summary_lines(found: FoundLattice, n_frames: int) -> tuple[str, ...]:
@@ -81,8 +70,8 @@ def _summary_lines(found: FoundLattice, n_frames: int) -> tuple[str, ...]:
     angle, pixel = format_quantity(found.angle_rad, "angle"), format_quantity(found.pixel_size_m, "length")
     seen = f"{found.n_sites_found} of {found.found.size} sites found on the mean of {n_frames} frames"
     size = f"spacing {along:.2f} px along rows, {down:.2f} px from row to row"
-    form = f"turned by {angle}, stretched by {100 * (found.stretch - 1):.1f} %"
+    form = f"rotated by {angle}, stretched by {100 * (found.stretch - 1):.1f} %"
     return (
-        f"{seen}, {found.residual_px:.3f} px r.m.s. beside a smooth lattice",
+        f"{seen}, {found.residual_px:.3f} px r.m.s. from a smooth lattice",
         f"{size}; {form}; a pixel is {pixel} wide if the grid's spacing is true",
     )

@@ -187,7 +187,7 @@ def quantity(value: float | None, name: str) -> str:
 def quality_text(entry: CalibrationEntry) -> str:
     """The deciding figure of a calibration in words; "-" if it has none."""
     deciding, figure = DECIDING[entry.kind], figure_of(entry)
-    return "-" if math.isnan(figure) else f"{deciding.words} {quantity(figure, deciding.figure)}"
+    return "-" if math.isnan(figure) else f"{deciding.label} {quantity(figure, deciding.figure)}"
 
 
 def _row(one: Stored | Damaged, used: Mapping[str, str]) -> tuple[str, ...]:

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.calibration.method import AnalysisResult, CalibrationData, from_runs_only, packaged
+from labseq.calibration.method import AnalysisResult, CalibrationData
 from labseq.calibration.pictures import draw_thresholds
 from labseq.errors import ConfigError, DeviceError, LimitError, Problem
-from labseq.model import CalibrationKind
 from labseq.roles import ReportsSignals
-from labseq.session.profile import ResolvedProfile
 
 Floats = NDArray[np.float64]
 
@@ -368,56 +365,38 @@ def _cheapest(
 
 
 MAX_NAMED: Final = 8
-"""Sites that are named; of more, only the number is told."""
-
-_SEQUENCE: Final = packaged("thresholds")
+"""Sites that a message names; of more it gives the number only."""
 
 
-@dataclass(frozen=True, slots=True)
-class ThresholdsMethod:
-    """Implements ``Method`` for the thresholds."""
+def analyse_thresholds(data: CalibrationData) -> AnalysisResult:
+    """Fit the signals that the profile's detector computes from the run's frames.
 
-    kind: CalibrationKind = "thresholds"
-    sequence: Path = _SEQUENCE
-    aside: tuple[CalibrationKind, ...] = ("thresholds",)
-    is_blind: bool = True
-
-    def analyse(self, evidence: CalibrationData) -> AnalysisResult:
-        """Fit the signals that the profile's detector makes of the run's frames.
-
-        Raises:
-            DeviceError: The frames are of another size than the sites belong to, or too many sites
-                show one peak only.
-            LimitError: There are too few frames.
-            ConfigError: The detector does not tell its signals, or the run has no frames.
-        """
-        detector = evidence.detector()
-        if not isinstance(detector, ReportsSignals):
-            name = evidence.bench.chosen["detector"].entry.name
-            what = f"the detector '{name}' does not tell the signals that it compares"
-            raise ConfigError(Problem(what, expected="'threshold', 'weighted', or another that does"))
-        signals = np.stack([detector.signals(frame) for frame in evidence.frames()])
-        fitted = fit_thresholds(signals)
-        quality = {
-            "error": fitted.error,
-            "false_negative": float(fitted.false_negative.mean()),
-            "false_positive": float(fitted.false_positive.mean()),
-            "loading": float(fitted.loading.mean()),
-            "n_one_peak": float((fitted.never_loaded | fitted.always_loaded).sum()),
-        }
-        unit = detector.signal_unit
-        return AnalysisResult(
-            {"thresholds": fitted.thresholds},
-            quality,
-            _summary_lines(fitted, len(signals), unit),
-            {"unit": unit, "detector": evidence.bench.chosen["detector"].dump()},
-            lambda: draw_thresholds(signals, fitted.thresholds, unit),
-        )
-
-    def read(self, path: Path, bench: ResolvedProfile) -> AnalysisResult:
-        """Refuse: a file of thresholds is a setting of the detector."""
-        del bench
-        raise from_runs_only(self.kind, path)
+    Raises:
+        DeviceError: The frames are of another size than those of the sites, or too many sites
+            show one peak only.
+        LimitError: There are too few frames.
+        ConfigError: The detector does not report its signals, or the run has no frames.
+    """
+    detector, chosen = data.detector(), data.bench.chosen["detector"]
+    if not isinstance(detector, ReportsSignals):
+        what = f"the detector '{chosen.entry.name}' does not report the signals that it compares"
+        raise ConfigError(Problem(what, expected="'threshold', 'weighted', or another that does"))
+    signals = np.stack([detector.signals(frame) for frame in data.frames()])
+    fitted, unit = fit_thresholds(signals), detector.signal_unit
+    quality = {
+        "error": fitted.error,
+        "false_negative": float(fitted.false_negative.mean()),
+        "false_positive": float(fitted.false_positive.mean()),
+        "loading": float(fitted.loading.mean()),
+        "n_one_peak": float((fitted.never_loaded | fitted.always_loaded).sum()),
+    }
+    return AnalysisResult(
+        {"thresholds": fitted.thresholds},
+        quality,
+        _summary_lines(fitted, len(signals), unit),
+        {"unit": unit, "detector": chosen.dump()},
+        lambda: draw_thresholds(signals, fitted.thresholds, unit),
+    )
 
 
 def _summary_lines(fitted: FittedThresholds, n_frames: int, unit: str) -> tuple[str, ...]:

@@ -87,7 +87,7 @@ def changed(tmp_path: Path, **changes: Any) -> Path:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"values": {"offset_m": [1e-9, 0.0]}}, "its content has the id"),
+        ({"values": {"offset_m": [1e-9, 0.0]}}, "the id of its content is"),
         ({"values": {"offset_m": [0.0, 0.0, 0.0]}}, r"'offset_m' has shape \(3,\); expected \(2,\)"),
         ({"values": {"offset_m": [[0.0], 0.0]}}, "damaged"),
         ({"values": {"offset_m": [math.nan, 0.0]}}, "not finite"),
@@ -97,7 +97,7 @@ def changed(tmp_path: Path, **changes: Any) -> Path:
         ({"quality": {"error_m": "good"}}, "damaged"),
         ({"origin": 5}, "damaged"),
         ({"taken_utc": 5}, "damaged"),
-        ({"format": "else"}, "not of the format 'labseq-calibration'"),
+        ({"format": "else"}, "its format is not 'labseq-calibration'"),
         ({"format_version": "x"}, "its format version is 'x'"),
     ],
 )

@@ -17,7 +17,7 @@ def entry(kind: CalibrationKind, figure: float, **others: float) -> CalibrationE
 
 @pytest.mark.parametrize("kind", CALIBRATION_KINDS)
 def test_a_figure_half_as_large_again_is_worse_where_it_matters(kind: CalibrationKind) -> None:
-    matters = DECIDING[kind].matters
+    matters = DECIDING[kind].good_enough
     assert not why_worse(entry(kind, 1.4 * matters), entry(kind, matters))
     assert why_worse(entry(kind, 1.6 * matters), entry(kind, matters))
     assert not why_worse(entry(kind, 0.9 * matters), entry(kind, 0.1 * matters))
@@ -33,7 +33,7 @@ def test_fewer_sites_are_worse() -> None:
 
 def test_one_that_does_not_say_how_good_it_is_replaces_only_its_like() -> None:
     unknown = entry("overlay", math.nan)
-    assert "does not say how good it is" in why_worse(unknown, entry("overlay", 1.0))
+    assert "it has no quality figure" in why_worse(unknown, entry("overlay", 1.0))
     assert not why_worse(unknown, unknown)
     assert not why_worse(entry("overlay", 1.0), unknown)
 

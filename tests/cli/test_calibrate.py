@@ -80,7 +80,7 @@ def test_an_analysis_that_fails(store: Store, capsys: pytest.CaptureFixture[str]
     assert (code, out) == (3, "")
     (run,) = Path("data").glob("*/*_calibrate-sites")
     warning, error = err.splitlines()[-2:]
-    assert warning.endswith(f"the run is kept: --from {run.resolve()}")
+    assert warning.endswith(f"analyse the run again with --from {run.resolve()}")
     assert error.startswith("error: camera: no lattice found: ")
     assert store.entries() == []
 

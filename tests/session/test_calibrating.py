@@ -167,7 +167,7 @@ def test_a_choice_that_does_not_exist_is_told_with_its_place(bench: ResolvedProf
 
 def test_one_of_another_grid_is_refused(bench: ResolvedProfile) -> None:
     bench.use("overlay", SiteGrid(4, 6))
-    with pytest.raises(ConfigError, match=r"made for another grid: 4 x 6 sites.*; expected 4 x 5 sites"):
+    with pytest.raises(ConfigError, match=r"is of another grid: 4 x 6 sites.*; expected 4 x 5 sites"):
         bench.session()
 
 

@@ -56,7 +56,7 @@ def test_a_hidden_offset_is_found_and_undone(lab: Lab) -> None:
     assert first.stored.picture is not None
     again = lab.calibrate("overlay", seed=2, shots=N_POINTS)
     assert again.stored.entry.values["offset_m"] == pytest.approx(HIDDEN_M, abs=100e-9)
-    assert "beyond what the overlay in use made up for" in again.told[0]
+    assert "beyond the correction of the overlay in use" in again.summary_lines[0]
     lab.store.use_none("overlay")
     for outcome in (again, first):  # whatever is in use now, what was in use then counts
         assert outcome.run is not None
@@ -71,7 +71,7 @@ def test_frequencies_hold_the_offset_and_put_the_overlay_aside(lab: Lab) -> None
     entry = outcome.stored.entry
     assert entry.origin["calibrations"] == {"overlay": overlay.id}
     assert outcome.warnings == (
-        f"overlay {overlay.id} is put aside: these frequencies hold what it makes up for",
+        f"overlay {overlay.id} is no longer used: these frequencies include its correction",
     )
     assert {*lab.store.active()} == {"frequencies"}
     step_hz_per_m = 1.6e6 / 4.49e-6
@@ -106,7 +106,7 @@ def test_a_run_without_a_probe_is_refused(lab: Lab) -> None:
     for kind in ("overlay", "frequencies"):
         with pytest.raises(ConfigError, match="the run does not scan the offset of a probe"):
             lab.calibrate(kind, source=run.path)
-        with pytest.raises(ConfigError, match=f"a calibration of {kind} cannot be made of a file"):
+        with pytest.raises(ConfigError, match=f"a calibration of {kind} cannot be made from a file"):
             lab.calibrate(kind, source=lab.folder / "x.npy")
 
 

@@ -97,8 +97,8 @@ def test_uneven_rows_and_columns_are_made_even_and_stay_so(lab: Lab) -> None:
     assert entry.quality["separable_spread"] <= 0.005
     assert entry.quality["residual_spread"] == pytest.approx(0.04, rel=0.3)
     assert (outcome.refused, entry.origin["n_shots"]) == ("", 1)
-    assert "rows and columns are even to 0." in outcome.told[0]
-    assert "what they cannot even out: " in outcome.told[1]
+    assert "rows and columns are equal to 0." in outcome.summary_lines[0]
+    assert "left from site to site, which the tones cannot change: " in outcome.summary_lines[1]
     for axis in ("row", "column"):
         assert entry.values[f"{axis}_amplitudes"].sum() <= 1 + 1e-9
     again = lab.calibrate(seed=2)  # it begins where the first has ended
@@ -143,7 +143,7 @@ def test_a_run_without_the_step_is_refused(lab: Lab) -> None:
         ConfigError, match=r"no shot of it equalised the tweezers; expected a run with the step"
     ):
         lab.calibrate(source=run.path)
-    with pytest.raises(ConfigError, match="a calibration of tweezers cannot be made of a file"):
+    with pytest.raises(ConfigError, match="a calibration of tweezers cannot be made from a file"):
         lab.calibrate(source=lab.folder / "x.npy")
     assert "tweezers" not in lab.store.active()
 

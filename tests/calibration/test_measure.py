@@ -171,7 +171,7 @@ def test_an_analysis_that_fails_says_why_and_keeps_what_is_in_use(
     assert lab.store.active()["sites"].id == old.entry.id
     assert len(lab.store.entries()) == 1
     (warning,) = (values["text"] for name, values in lab.observer.events if name == "warning")
-    assert warning.startswith("no calibration came of it, and what is in use stays; the run is kept: --from ")
+    assert warning.startswith("the calibration failed, and the one in use is unchanged; analyse the run again with --from ")
 
 
 def test_too_few_frames_for_thresholds(lab: Lab) -> None:
@@ -193,10 +193,10 @@ def test_sites_of_an_irregular_array_come_from_a_file(lab: Lab) -> None:
 @pytest.mark.parametrize(
     ("kind", "name", "message"),
     [
-        ("sites", "beside.npy", "beside the frame of 160 x 176 pixels"),
+        ("sites", "beside.npy", "outside of the frame of 160 x 176 pixels"),
         ("sites", "shape.npy", "the sites in '.*' are of shape"),
         ("sites", "none.npy", "the sites cannot be read from '.*': No such file"),
-        ("thresholds", "beside.npy", "a calibration of thresholds cannot be made of a file"),
+        ("thresholds", "beside.npy", "a calibration of thresholds cannot be made from a file"),
         ("sites", "none", "--from: .*no such file or folder"),
     ],
 )
@@ -252,7 +252,7 @@ def test_a_run_without_frames_is_refused(lab: Lab) -> None:
 def test_a_choice_in_the_profile_is_told(lab: Lab) -> None:
     lab.profile.write_text(PROFILE + "calibrations: {use: {sites: off}}\n", "utf-8")
     (warning,) = lab.calibrate("sites").warnings
-    assert warning == "the profile says 'calibrations.use.sites: off', and that counts"
+    assert warning == "the profile says 'calibrations.use.sites: off', which takes precedence"
 
 
 @pytest.mark.parametrize("kind", ["sites", "thresholds"])
