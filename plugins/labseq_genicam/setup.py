@@ -51,7 +51,7 @@ def set_up(link: Link, settings: GenicamSettings) -> dict[str, Any]:
         for feature, value in (
             ("ExposureAuto", "Off"),
             ("GainAuto", "Off"),
-            ("ExposureMode", "ReportsTimings"),
+            ("ExposureMode", "Timed"),
         ):
             if camera.is_available(feature):
                 camera.set_string(feature, value)

@@ -33,7 +33,7 @@ def set_up(sdk: Sdk, nodes: Nodes, settings: PylonSettings, sensor_shape: tuple[
     """
     for auto in ("ExposureAuto", "GainAuto"):
         nodes.choose((auto,), auto, "Off", if_there=True)
-    nodes.choose(("ExposureMode",), "exposure mode", "ReportsTimings", if_there=True)
+    nodes.choose(("ExposureMode",), "exposure mode", "Timed", if_there=True)
     nodes.switch_off(n.FRAME_RATE_ON)
     pixel_format = _set_pixel_format(sdk, nodes, settings.pixel_format)
     frame_shape = set_sensor(sdk, nodes, settings, sensor_shape)
