@@ -16,11 +16,11 @@ from pathlib import Path
 
 from labseq import SiteGrid, TargetPattern
 from labseq.config import Document
-from labseq.config.fields import PatternChoice
 from labseq.pictures.plans import save_target
 from labseq.session import load_plugins
 from labseq.session.construct import construct_target
 from labseq.session.profile import resolve
+from labseq.settings import PatternChoice
 
 DOCS = Path(__file__).parent
 PAGE = DOCS / "reference" / "patterns.md"

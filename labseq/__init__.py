@@ -12,7 +12,7 @@ from typing import Any, Final
 _HOMES: Final = {
     "labseq.hookspecs": ("LABSEQ_API", "hookimpl"),
     "labseq.api": ("make_planner", "make_target", "tone_program"),
-    "labseq.config.settings": (
+    "labseq.settings": (
         "Angle",
         "Duration",
         "FilePath",

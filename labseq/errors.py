@@ -9,7 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, TypeAlias
+
+Loc: TypeAlias = tuple[str | int, ...]
+"""Where a value is in a document: keys and list indices from the top, ("shot", 2, "rearrange")."""
 
 
 class LabseqError(Exception):

@@ -5,22 +5,6 @@ A plugin needs no other module of labseq, except :mod:`labseq.testing` in its te
 
 from __future__ import annotations
 
-from labseq.config.fields import Text, setting_error
-from labseq.config.messages import clean, closest, visible
-from labseq.config.profile import FrequencyComb
-from labseq.config.settings import (
-    Angle,
-    Duration,
-    FilePath,
-    Fraction,
-    Frequency,
-    Length,
-    Power,
-    Settings,
-    Speed,
-    Temperature,
-    Voltage,
-)
 from labseq.drivers import CameraDriver, Cooling, ExposureResult, Series, SimulatedSensor, settle, wait_for
 from labseq.drivers.camera import nearest
 from labseq.drivers.serial_port import (
@@ -52,6 +36,7 @@ from labseq.errors import (
 from labseq.geometry import block, check_size, from_the_centre, nearest_to_centre, pattern
 from labseq.hookspecs import LABSEQ_API, hookimpl
 from labseq.kernel import cache_root, const, kernel
+from labseq.messages import clean, closest, visible
 from labseq.model import (
     AxisTones,
     Batch,
@@ -135,6 +120,22 @@ from labseq.roles import (
 )
 from labseq.roles.shot import NeverStopped
 from labseq.sequencer.lines import idle_program, off_program, trigger_line
+from labseq.settings import (
+    Angle,
+    Duration,
+    FilePath,
+    Fraction,
+    Frequency,
+    FrequencyComb,
+    Length,
+    Power,
+    Settings,
+    Speed,
+    Temperature,
+    Text,
+    Voltage,
+    setting_error,
+)
 from labseq.units import UNITS, ZERO_CELSIUS_K, expected, format_quantity, parse_quantity, scaled
 
 __all__ = [

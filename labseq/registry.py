@@ -37,7 +37,7 @@ LOAD_S: Final = 30.0
 _NAME: Final = re.compile(r"[^\W\d][\w-]{0,63}")
 _NOT_NAMES: Final = {"true", "false", "null"}
 """Words that YAML takes for something else."""
-_SETTINGS: Final = ("labseq.config.settings", "Settings")
+_SETTINGS: Final = ("labseq.settings", "Settings")
 
 Factory = Callable[..., Any]
 

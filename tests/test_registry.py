@@ -3,9 +3,9 @@ from contextlib import suppress
 import pytest
 from pydantic import BaseModel
 
-from labseq.config import Settings
 from labseq.errors import PluginLoadError, UnknownPluginError
 from labseq.registry import KINDS, Owner, Registry
+from labseq.settings import Settings
 
 
 def factory(settings, context):

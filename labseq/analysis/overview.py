@@ -31,9 +31,9 @@ from labseq.analysis.charts import (
 from labseq.analysis.statistics import CycleStatistics, Rate, Statistics, jeffreys, statistics_of
 from labseq.analysis.timing import STEP, RunTiming, StageTotals
 from labseq.calibration.store import read_entry
-from labseq.config.messages import clean
 from labseq.detection.sites import KnownSites, known_sites
 from labseq.errors import ConfigError, Problem, RecordingError, one_of
+from labseq.messages import clean
 from labseq.model import CalibrationEntry, CycleRecord, Occupancy, SiteGrid, TargetPattern
 from labseq.model.estimate import Estimate, mean
 from labseq.pictures.figures import Series

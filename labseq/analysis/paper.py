@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from labseq.analysis.overview import note_of, unfit
 from labseq.analysis.statistics import Rate, Statistics, statistics_of
-from labseq.config.messages import clean
+from labseq.messages import clean
 from labseq.model.estimate import Estimate
 from labseq.pictures.figures import (
     ANOTHER,

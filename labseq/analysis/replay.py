@@ -13,10 +13,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.config import Choice, Override, split_overrides
-from labseq.config.messages import clean
+from labseq.config import Override, split_overrides
 from labseq.errors import ConfigError, LabseqError, Problem, RecordingError
 from labseq.guard import StopFlag
+from labseq.messages import clean
 from labseq.model import (
     CalibrationEntry,
     CycleRecord,
@@ -44,6 +44,7 @@ from labseq.session.planning import call_planner, changed_settings
 from labseq.session.profile import ChosenPlugin, RecordedSetup, resolve
 from labseq.session.recorded import calibrations_of, machine_of, stored_text
 from labseq.session.scan import Point
+from labseq.settings import Choice
 
 N_ATOMS_TRUE = "simulation.n_atoms_true"
 """Reading of a simulated shot: how many atoms there really are at its end."""

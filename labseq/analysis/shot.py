@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.analysis.overview import grid_of, note_of, sites_of, unfit
-from labseq.config.messages import clean
 from labseq.errors import ConfigError, Problem
+from labseq.messages import clean
 from labseq.model import CycleRecord, ImageRecord, Occupancy, ShotRecord, SiteGrid, TargetPattern
 from labseq.pictures.figures import (
     PANEL_IN,

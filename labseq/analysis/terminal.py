@@ -18,7 +18,6 @@ from labseq.analysis.replay import MeanCounts, Replay, ReplayedImages, ReplayedP
 from labseq.analysis.shot import save_shot, shot_picture
 from labseq.cli.show import chosen_run
 from labseq.config import Document, split_overrides
-from labseq.config.messages import clean
 from labseq.console.output import (
     as_line,
     columns,
@@ -32,6 +31,7 @@ from labseq.console.output import (
     stdout_to_stderr,
 )
 from labseq.errors import ConfigError, Problem, one_of
+from labseq.messages import clean
 from labseq.model.estimate import Estimate, mean
 from labseq.pictures.figures import check_place
 from labseq.recording import Run

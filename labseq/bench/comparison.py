@@ -13,10 +13,9 @@ from typing import Any, Final, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.config import Choice, Document, MotionSettings, Override, ProblemCollector
-from labseq.config.fields import PatternChoice
-from labseq.config.messages import clean
+from labseq.config import Document, MotionSettings, Override, ProblemCollector
 from labseq.errors import ConfigError, LimitError, PlanError, Problem
+from labseq.messages import clean
 from labseq.model import MotionSpec, Occupancy, Plan, SiteGrid, TargetPattern
 from labseq.motion import check_plan
 from labseq.plugins import PluginHost
@@ -25,6 +24,7 @@ from labseq.session.construct import construct, construct_target
 from labseq.session.occupancies import MAX_SITES
 from labseq.session.planning import parse_target
 from labseq.session.profile import ChosenPlugin, dump, load_plugins, resolve
+from labseq.settings import Choice, PatternChoice
 from labseq.units import parse_quantity
 
 Words = tuple[tuple[str, str], ...]

@@ -31,8 +31,8 @@ from labseq.bench.comparison import (
     Words,
 )
 from labseq.bench.pictures import ComparisonDrawing, Curve, Histogram
-from labseq.config.messages import clean, did_you_mean
 from labseq.errors import ConfigError, LabseqError, Problem, one_of
+from labseq.messages import clean, did_you_mean
 from labseq.model.estimate import Estimate, mean
 
 

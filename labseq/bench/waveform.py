@@ -19,11 +19,10 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from labseq.config import load_profile, plugin_paths, split_overrides
-from labseq.config.messages import clean, visible
 from labseq.config.plan_file import MAX_BYTES
-from labseq.config.yaml_nodes import is_folder, read_bytes, something_else
 from labseq.errors import ConfigError, LimitError, Problem
 from labseq.files import whole_file
+from labseq.messages import clean, visible
 from labseq.model import AxisTones, MotionSpec, Plan, RfSpec, SegmentKind, SiteGrid, ToneProgram
 from labseq.model.motion import LOAD_OHM
 from labseq.motion import Renderer, RenderPath, drive, tone_program
@@ -32,6 +31,7 @@ from labseq.motion.rendering import FULL_SCALE, N_CHANNELS
 from labseq.session.occupancies import read_source
 from labseq.session.planning import PlannedMoves, PlanRequest, plan_moves, read_plan
 from labseq.session.profile import choose, load_plugins
+from labseq.text_files import is_folder, read_bytes, something_else
 from labseq.units import format_quantity, parse_quantity
 
 DEFAULT_RATE_HZ: Final = 625e6

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Annotated, Any, Final, Literal, Protocol, TypeAlias
+from typing import Any, Literal, Protocol
 
 import numpy as np
-from pydantic import AfterValidator, Field
+from pydantic import Field
 
-from labseq.config.fields import Choice, empty_is, setting_error
-from labseq.config.settings import Duration, Settings
 from labseq.model import CycleRecord, ImageRecord, Occupancy, Plan
+from labseq.settings import Settings
 
 
 class _Settings(Protocol):
@@ -102,32 +101,6 @@ def after_moves(held: Occupancy, moved: Occupancy, plan: Plan) -> tuple[Occupanc
 def _place(record: ImageRecord | CycleRecord) -> tuple[int, int]:
     """Where it stands in the shot: the image that ends a cycle has the cycle's own place."""
     return record.step, record.cycle
-
-
-ANALYSIS_KEYS: Final = frozenset({"finish_within"})
-"""Keys that stand beside the settings of an analysis, and belong to the core."""
-
-
-class AnalysisChoice(Choice):
-    """An analysis chosen by name; its settings stand beside the name."""
-
-    finish_within: Duration = Field(
-        default=10.0, description="how long it may go on after the run, for the shots it has not come to"
-    )
-
-
-def _listed(choices: tuple[AnalysisChoice, ...]) -> tuple[AnalysisChoice, ...]:
-    """Give each its location, and each name to one only: it names the file of the results."""
-    first: dict[str, int] = {}
-    for i, choice in enumerate(choices):
-        if first.setdefault(choice.use, i) != i:
-            what = f"the analysis '{choice.use}' stands here a second time"
-            raise setting_error(what, "each analysis once", at=(i, "use"))
-    return tuple(choice.placed("analysis", i) for i, choice in enumerate(choices))
-
-
-Analyses: TypeAlias = Annotated[tuple[AnalysisChoice, ...], empty_is(()), AfterValidator(_listed)]
-"""The analyses of a sequence."""
 
 
 class SurvivalSettings(Settings):

@@ -6,7 +6,7 @@ from typing import Annotated, Literal, TypeAlias
 
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, field_validator
 
-from labseq.config.settings import Angle, FilePath, Fraction, Length, Settings
+from labseq.settings import Angle, FilePath, Fraction, Length, Settings
 
 PositiveLength = Annotated[Length, Field(gt=0)]
 Thresholds: TypeAlias = float | FilePath | tuple[tuple[float, ...], ...]

@@ -10,12 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr, model_validator
 
-from labseq.config.fields import setting_error
-from labseq.config.messages import visible
-from labseq.config.settings import FilePath, Settings
-from labseq.config.yaml_nodes import decode, read_bytes
 from labseq.errors import ConfigError, Problem
 from labseq.geometry import DrawingError, read_bitmap
+from labseq.messages import visible
+from labseq.settings import FilePath, Settings, setting_error
+from labseq.text_files import decode, read_bytes
 
 MAX_PIXELS: Final = 1024
 """Longest side of a picture, in pixels: far more than any grid has sites."""

@@ -9,13 +9,12 @@ from typing import Annotated, Any, Literal, Protocol, Self, TypeAlias
 
 from pydantic import Field, model_validator
 
-from labseq.config.fields import Text, empty_is, setting_error
-from labseq.config.settings import Duration, Fraction, Length, Settings
 from labseq.errors import DeviceError, PlanError
 from labseq.model import CycleRecord, Plan, PlanReport, TimelineEntry, ToneProgram
 from labseq.motion import check_plan, fitting_batches, tone_program
 from labseq.roles import ReportsTimings, Shot, StepContext
 from labseq.sequencer.lines import margin_s
+from labseq.settings import Duration, Fraction, Length, Settings, Text, empty_is, setting_error
 from labseq.units import format_quantity
 
 

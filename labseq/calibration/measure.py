@@ -21,9 +21,9 @@ from labseq.calibration.store import Store, Stored, grid_text
 from labseq.calibration.thresholds import analyse_thresholds
 from labseq.calibration.tweezers import analyse_tweezers
 from labseq.config import Override, ProfileSpec, load_profile, split_overrides
-from labseq.config.messages import clean
 from labseq.config.profile import OFF
 from labseq.errors import ConfigError, LabseqError, Problem, RecordingError
+from labseq.messages import clean
 from labseq.model import CALIBRATION_KINDS, CalibrationEntry, grid_facts, same_grid
 from labseq.pictures.figures import can_draw, encode_figure
 from labseq.recording import Run, open_run

@@ -17,10 +17,10 @@ from labseq.calibration.compare import Difference, compare, unit_of
 from labseq.calibration.measure import METHODS, CalibrationRequest, Outcome, calibrate
 from labseq.calibration.store import DECIDING, Damaged, Store, Stored, figure_of, grid_text
 from labseq.config import CalibrationChoices
-from labseq.config.messages import clean, did_you_mean, listing
 from labseq.config.profile import OFF
 from labseq.console.output import LASTING, age_text, as_line, columns, event_text, say, stdout_to_stderr
 from labseq.errors import ConfigError, Problem
+from labseq.messages import clean, did_you_mean, listing
 from labseq.model import CALIBRATION_KINDS, CalibrationEntry, CalibrationKind, RunRecord
 from labseq.session.calibrations import open_store
 from labseq.session.profile import DryRun

@@ -14,7 +14,6 @@ import numpy as np
 
 from labseq.calibration.terminal import age_s, quality_text
 from labseq.config import Axis, CheckSettings
-from labseq.config.messages import clean
 from labseq.console.errors import excerpt, lines_of
 from labseq.console.output import (
     LogLines,
@@ -29,6 +28,7 @@ from labseq.console.output import (
     stdout_to_stderr,
 )
 from labseq.errors import ConfigError, Problem
+from labseq.messages import clean
 from labseq.model import TimelineEntry
 from labseq.sequencer.policies import StepPolicy
 from labseq.session import Assembly, CheckReport, Session, check

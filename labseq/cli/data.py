@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from labseq.cli.show import chosen_run
-from labseq.config.messages import visible
 from labseq.console.output import as_line, columns, plural, say
 from labseq.errors import ConfigError, Problem, RecordingError
+from labseq.messages import visible
 from labseq.recording import Run, data_root
 from labseq.recording.doctor import Report, examine as look_for_damage
 from labseq.recording.export import ENDINGS, check_export, export_run, files_of

@@ -9,11 +9,11 @@ from typing import Any
 
 from labseq.cli.check import refusal
 from labseq.config import load_profile, plugin_paths
-from labseq.config.messages import clean
 from labseq.console.errors import report
 from labseq.console.output import as_line, columns, report_compiling, say, stdout_to_stderr
 from labseq.errors import ConfigError, DeviceError
 from labseq.kernel import announcing
+from labseq.messages import clean
 from labseq.plugins import PluginHost, PluginInfo
 from labseq.recording.durable import dumps
 from labseq.registry import LOAD_S

@@ -15,10 +15,10 @@ from typing import Any, Final
 from labseq.cli.live import observer_for
 from labseq.cli.show import existing, json_summary, summary_lines
 from labseq.config import packaged_profiles_dir, packaged_sequences_dir
-from labseq.config.messages import visible
 from labseq.console.errors import lines_of
 from labseq.console.output import as_line, columns, plural, say, stdout_to_stderr
 from labseq.errors import ConfigError, LabseqError, Problem, RecordingError, StopRequested
+from labseq.messages import visible
 from labseq.queue.queue import Queue
 from labseq.recording import Run, data_root, open_run
 from labseq.roles import RunObserver

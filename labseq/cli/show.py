@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, cast
 
 from labseq.analysis.statistics import CycleStatistics, Rate, Statistics, statistics_of
-from labseq.config.messages import clean, visible
 from labseq.console.errors import lines_of
 from labseq.console.output import as_line, columns, count_of, outcome, percent, plural, say, settings_text
 from labseq.errors import ConfigError, LabseqError, Problem, RecordingError
+from labseq.messages import clean, visible
 from labseq.model.estimate import Estimate
 from labseq.recording import Run, Shot, data_root, open_run
 from labseq.recording.durable import to_plain

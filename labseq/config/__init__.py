@@ -2,7 +2,7 @@
 
 from labseq.config.addresses import Override, profile_overrides, split_overrides
 from labseq.config.document import Document, StoredText
-from labseq.config.fields import ROLES, Choice, plugin_paths
+from labseq.config.fields import ROLES, plugin_paths
 from labseq.config.find import find_profile, find_sequence
 from labseq.config.messages import ProblemCollector
 from labseq.config.profile import (
@@ -18,9 +18,7 @@ from labseq.config.profile import (
 )
 from labseq.config.scan import Axis, Scan, bind_scan, read_scan
 from labseq.config.sequence import CheckSettings, SequenceSpec, StepPolicySettings, StepSpec, load_sequence
-from labseq.config.settings import Settings
 from labseq.config.validation import validate_values
-from labseq.config.yaml_nodes import Loc
 from labseq.files import packaged_profiles_dir, packaged_sequences_dir, profile_dir
 
 __all__ = [
@@ -32,29 +30,26 @@ __all__ = [
     "CalibrationChoices",
     "CalibrationSettings",
     "CheckSettings",
-    "Choice",
-    "ProblemCollector",
     "Document",
-    "StoredText",
-    "Loc",
     "MotionSettings",
     "Override",
+    "ProblemCollector",
     "ProfileSpec",
     "Scan",
     "SequenceSpec",
-    "Settings",
     "StepPolicySettings",
     "StepSpec",
+    "StoredText",
     "TimeoutSettings",
     "bind_scan",
     "find_profile",
     "find_sequence",
-    "profile_dir",
     "load_profile",
     "load_sequence",
     "packaged_profiles_dir",
     "packaged_sequences_dir",
     "plugin_paths",
+    "profile_dir",
     "profile_overrides",
     "read_scan",
     "split_overrides",

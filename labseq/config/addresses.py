@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from typing import Final, NamedTuple
 
-from labseq.config.messages import clean, did_you_mean, listing, shown, visible
-from labseq.config.yaml_nodes import Loc, Node
-from labseq.errors import ConfigError, Problem
+from labseq.config.yaml_nodes import Node
+from labseq.errors import ConfigError, Loc, Problem
+from labseq.messages import clean, did_you_mean, listing, shown, visible
 
 _PROFILE: Final = "profile."
 _SHOWN: Final = 80

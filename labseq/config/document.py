@@ -11,11 +11,13 @@ from pydantic import BaseModel
 
 from labseq.config.addresses import Override, find
 from labseq.config.expressions import Expressions, evaluate
-from labseq.config.messages import ProblemCollector, shown, visible
-from labseq.config.settings import NoSettings
+from labseq.config.messages import ProblemCollector
 from labseq.config.validation import ValidationContext, node_of, validate
-from labseq.config.yaml_nodes import Loc, Mark, Node, compose, decode, read_bytes
-from labseq.errors import ConfigError, Problem
+from labseq.config.yaml_nodes import Mark, Node, compose
+from labseq.errors import ConfigError, Loc, Problem
+from labseq.messages import shown, visible
+from labseq.settings import NoSettings
+from labseq.text_files import decode, read_bytes
 
 M = TypeVar("M", bound=BaseModel)
 

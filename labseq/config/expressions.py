@@ -25,9 +25,9 @@ from functools import lru_cache
 from typing import Final, NamedTuple
 
 from labseq.config.addresses import find
-from labseq.config.messages import clean, did_you_mean, listing, shown
-from labseq.config.yaml_nodes import Loc, Mark, Node
-from labseq.errors import ConfigError, Problem
+from labseq.config.yaml_nodes import Mark, Node
+from labseq.errors import ConfigError, Loc, Problem
+from labseq.messages import clean, did_you_mean, listing, shown
 from labseq.units import UNITS, ZERO_CELSIUS_K, dimension_of, parse_any, scaled, unit_names
 
 Number = int | float

@@ -5,29 +5,21 @@ from __future__ import annotations
 import re
 import unicodedata
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Final, Literal, Self, TypeAlias, TypeVar
+from typing import Annotated, Any, Final, Literal, TypeAlias
 
 from pydantic import (
     AfterValidator,
     BeforeValidator,
-    ConfigDict,
     Field,
-    PrivateAttr,
-    ValidationInfo,
-    model_validator,
 )
-from pydantic_core import PydanticCustomError
 
 from labseq.config.document import Document
-from labseq.config.messages import clean, shown, visible
-from labseq.config.settings import Settings
-from labseq.config.yaml_nodes import Loc, beside, is_folder
 from labseq.errors import ConfigError, Problem
+from labseq.messages import clean, shown, visible
+from labseq.settings import Text, empty_is, setting_error
+from labseq.text_files import beside, is_folder
 from labseq.units import parse_any
-
-C = TypeVar("C", bound="Choice")
 
 FORMAT: Final = 1
 """Version of the file format that this labseq reads."""
@@ -46,74 +38,6 @@ MAY_ADD: Final = (
     "calibrations.use",
 )
 """Addresses of mappings that an option may set something in although the profile has none."""
-
-Text: TypeAlias = Annotated[str, Field(min_length=1)]
-"""Any text but the empty one."""
-
-
-def setting_error(
-    what: str, expected: str = "", hint: str = "", *, at: Loc = (), key: bool = False
-) -> PydanticCustomError:
-    """An error for a validator to raise that keeps its words, and its place within the value.
-
-    Args:
-        what: What is wrong.
-        expected: What would have been right.
-        hint: What to do.
-        at: Where, below the value that is validated.
-        key: Whether the key there is meant.
-    """
-    context: dict[str, Any] = {"what": what, "expected": expected, "hint": hint, "at": at, "key": key}
-    return PydanticCustomError("setting_error", "{what}; expected {expected}", context)
-
-
-class Choice(Settings):
-    """A plugin chosen by name; its settings stand beside the name.
-
-    Attributes:
-        use: Name of what is used.
-        key: The key that holds the name, to be dropped before the settings are validated.
-    """
-
-    model_config = ConfigDict(extra="ignore")  # the plugin's settings, validated later
-
-    key: ClassVar[str] = "use"
-    use: Text = Field(description="the name of a plugin")
-    _loc: Loc = PrivateAttr(())
-
-    @property
-    def loc(self) -> Loc:
-        """Where its mapping is in the document."""
-        return self._loc
-
-    def placed(self, *loc: str | int) -> Self:
-        """A copy that says where its mapping is."""
-        copy = self.model_copy()
-        copy._loc = loc  # noqa: SLF001 - its own
-        return copy
-
-    @model_validator(mode="before")
-    @classmethod
-    def _is_no_bare_name(cls, value: Any) -> Any:
-        if isinstance(value, str):
-            name = clean(value)
-            raise setting_error(f"just '{name}' stands here", "a mapping", f"write '{{{cls.key}: {name}}}'")
-        return value
-
-
-class PatternChoice(Choice):
-    """A target pattern: ``{pattern: compact, rows: 15, cols: 15}``."""
-
-    key: ClassVar[str] = "pattern"
-    use: Text = Field(alias="pattern", description="the name of a target pattern")
-
-
-def _placed_by_field(choice: C, info: ValidationInfo) -> C:
-    return choice.placed(info.field_name or "")
-
-
-placed_by_field: Final = AfterValidator(_placed_by_field)
-"""For a field that is a :class:`Choice`: its location is the field's name."""
 
 
 def _is_version(value: Any) -> Any:
@@ -134,26 +58,6 @@ def _is_name(name: str) -> str:
     if name != name.strip():
         raise setting_error(f"name is '{clean(name)}'", "no space at either end")
     return name
-
-
-@dataclass(frozen=True, slots=True, eq=False)  # a default may be a dict, which has no hash
-class DefaultIfEmpty:
-    """Puts a default in the place of an empty value.
-
-    Attributes:
-        default: The default.
-    """
-
-    default: Any
-
-    def __call__(self, value: Any) -> Any:
-        """The default for None; any other value as it is."""
-        return self.default if value is None else value
-
-
-def empty_is(default: Any) -> BeforeValidator:
-    """Let a key that is there without a value count as ``default``."""
-    return BeforeValidator(DefaultIfEmpty(default))
 
 
 FormatVersion: TypeAlias = Annotated[Literal[1], BeforeValidator(_is_version)]

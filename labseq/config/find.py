@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from labseq.config import yaml_nodes as reading
+from labseq import text_files as reading
 from labseq.config.document import Document
-from labseq.config.messages import clean, did_you_mean, listing, visible
 from labseq.errors import ConfigError, Problem
 from labseq.files import PROFILES, SEQUENCES, packaged_profiles_dir, packaged_sequences_dir
+from labseq.messages import clean, did_you_mean, listing, visible
 
 
 def is_path(name: str) -> bool:

@@ -6,14 +6,14 @@ Under YAML 1.1, PyYAML's default, ``do: off`` is False, ``10:30`` is 630 and
 
 from __future__ import annotations
 
-import difflib
 import re
-from collections.abc import Iterable, Mapping, Sized
+from collections.abc import Mapping, Sized
 from dataclasses import dataclass
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final, cast
 
 from labseq.errors import ConfigError, Problem
+from labseq.messages import did_you_mean, shown
 
 if TYPE_CHECKING:
     from labseq.config.yaml_nodes import Scalar
@@ -56,8 +56,6 @@ def resolve(text: str) -> Scalar:
     return int(text, 0) if text[:2] in ("0x", "0o") else float(text)
 
 
-_SHOWN: Final = 60
-
 _MAPPING: Final = "a mapping (key: value)"
 _LIST: Final = "a list ([a, b], or lines that begin with '- ')"
 EXPECTED_TYPES: Final[Mapping[str, str]] = {
@@ -97,63 +95,11 @@ class ErrorText:
     hint: str = ""
 
 
-def did_you_mean(name: str, names: Iterable[str]) -> str:
-    """A hint at the known name that is spelled most alike, or "".
-
-    Example:
-        >>> did_you_mean("winow", ["cycles", "window"])
-        "did you mean 'window'?"
-    """
-    close = closest(name, names)
-    return f"did you mean '{close}'?" if close else ""
-
-
-def closest(name: str, names: Iterable[str]) -> str:
-    """The known name that is spelled most alike, whatever its case and dashes, or ""."""
-    folded = {known.lower().replace("-", "_"): known for known in names}
-    found = difflib.get_close_matches(name.lower().replace("-", "_")[:_SHOWN], folded, n=1)
-    return folded[found[0]] if found else ""
-
-
 def comma_hint(key: str, value: Any) -> str:
     """What to do about a key such as "5 ms" without a value, out of ``{exposure: 4,5 ms}``, or ""."""
     if value is None and key[:1].isdigit():
         return "a ',' begins another key: write 4.5 for 4,5 and [4, 5] for a list"
     return ""
-
-
-def listing(names: Iterable[str]) -> str:
-    """Name the keys that are known: "one of rows, cols"."""
-    known = list(names)
-    return ("one of " if len(known) > 1 else "") + ", ".join(known)
-
-
-def shown(value: Any, raw: str = "") -> str:
-    """A value in words, short enough for a message.
-
-    Example:
-        >>> shown("45 ms"), shown(True), shown([1, 2]), shown(None)
-        ("'45 ms'", 'true', 'a list', 'empty')
-    """
-    if value is None:
-        return "empty"
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, str):
-        return f"'{clean(value)}'"
-    if isinstance(value, Mapping):
-        return "a mapping"
-    return "a list" if isinstance(value, list) else clean(raw or str(value))
-
-
-def clean(text: str) -> str:
-    """A text on one line, shortened, with everything visible."""
-    return visible(text if len(text) <= _SHOWN else text[: _SHOWN - 3] + "...")
-
-
-def visible(text: str) -> str:
-    """A text with what cannot be seen, or printed, as escapes."""
-    return "".join(char if char.isprintable() else repr(char)[1:-1] for char in text)
 
 
 def explain_validation_error(error: Mapping[str, Any], name: str, value: Any, raw: str) -> ErrorText:

@@ -8,46 +8,36 @@ from itertools import combinations
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self, TypeAlias, cast
 
-import numpy as np
-from numpy.typing import NDArray
-from pydantic import AfterValidator, Field, NonNegativeInt, field_validator, model_validator
+from pydantic import AfterValidator, Field, NonNegativeInt, model_validator
 
 from labseq.config.addresses import Override
 from labseq.config.document import Document, FallbackValues, StoredText, load_checked
-from labseq.config.fields import (
-    FORMAT,
-    MAY_ADD,
-    ROLES,
-    Choice,
-    Folders,
-    FormatVersion,
-    Name,
-    Text,
-    Variables,
-    check_kind,
-    empty_is,
-    placed_by_field,
-    setting_error,
-)
+from labseq.config.fields import FORMAT, MAY_ADD, ROLES, Folders, FormatVersion, Name, Variables, check_kind
 from labseq.config.find import find_profile
-from labseq.config.messages import ProblemCollector, clean
+from labseq.config.messages import ProblemCollector
 from labseq.config.scan import Scan, bind_scan
 from labseq.config.sequence import BudgetSettings
-from labseq.config.settings import (
+from labseq.messages import clean
+from labseq.model import CALIBRATION_KINDS, MotionSpec, RfSpec, SiteGrid
+from labseq.model.lines import LineSpec
+from labseq.model.motion import PhaseChoice, SpeedProfile
+from labseq.settings import (
+    Choice,
     Duration,
     FilePath,
     Fraction,
     Frequency,
+    FrequencyComb,
     Length,
     Power,
     Settings,
     Speed,
+    Text,
     Voltage,
+    empty_is,
+    placed_by_field,
+    setting_error,
 )
-from labseq.model import CALIBRATION_KINDS, MotionSpec, RfSpec, SiteGrid
-from labseq.model.grid import centred_comb
-from labseq.model.lines import LineSpec
-from labseq.model.motion import PhaseChoice, SpeedProfile
 from labseq.units import format_quantity
 
 _DEVICE_NAME: Final = re.compile(r"[^\W\d][\w-]*")
@@ -411,37 +401,6 @@ class TimeoutSettings(Settings):
     load: Timeout = Field(
         default=30.0, description="longest loading of a plugin, and longest way of a constructor"
     )
-
-
-class FrequencyComb(Settings):
-    """Tones of the rows or columns of the grid: equally spaced, or a table from a calibration."""
-
-    centre: Frequency = Field(default=100e6, gt=0, description="frequency of the grid's centre")
-    step: Frequency = Field(
-        default=1.6e6, description="frequency from one row or column to the next; negative if it falls"
-    )
-    table: tuple[Annotated[Frequency, Field(gt=0)], ...] = Field(
-        default=(), description="calibrated frequency of each row or column, in place of centre and step"
-    )
-
-    @field_validator("step")
-    @classmethod
-    def _tones_differ(cls, step: float) -> float:
-        if step == 0:
-            raise ValueError("a step of 0 puts all tones at one frequency; expected another value")
-        return step
-
-    @field_validator("table")
-    @classmethod
-    def _tones_in_order(cls, table: tuple[float, ...]) -> tuple[float, ...]:
-        steps_hz = np.diff(table)
-        if not (np.all(steps_hz > 0) or np.all(steps_hz < 0)):
-            raise ValueError("the tones neither rise nor fall all along; expected the sites' in order")
-        return table
-
-    def tones(self, n_sites: int) -> NDArray[np.float64]:
-        """Frequencies of the tones of so many sites, in Hz."""
-        return np.array(self.table) if self.table else centred_comb(n_sites, self.centre, self.step)
 
 
 class GridSettings(Settings):

@@ -22,11 +22,12 @@ from pydantic import Field, WithJsonSchema, model_validator
 
 from labseq.config.addresses import Override, find
 from labseq.config.document import Document
-from labseq.config.fields import MAY_ADD, ROLES, VARIABLES, Choice, Text, setting_error
-from labseq.config.messages import ProblemCollector, clean, did_you_mean, listing, shown
-from labseq.config.settings import Settings
-from labseq.config.yaml_nodes import Loc, Mark, Node
-from labseq.errors import ConfigError, Problem
+from labseq.config.fields import MAY_ADD, ROLES, VARIABLES
+from labseq.config.messages import ProblemCollector
+from labseq.config.yaml_nodes import Mark, Node
+from labseq.errors import ConfigError, Loc, Problem
+from labseq.messages import clean, did_you_mean, listing, shown
+from labseq.settings import Choice, Settings, Text, setting_error
 from labseq.units import UNITS, factor_of, scaled, written
 
 ScanOrder = Literal["sequential", "shuffled"]

@@ -10,27 +10,23 @@ from typing import Annotated, Any, Final, Literal, Self, TypeAlias, cast
 
 from pydantic import AfterValidator, Field, PlainValidator, model_validator
 
-from labseq.builtin.analyses import Analyses
 from labseq.config.addresses import Override
 from labseq.config.document import Document, FallbackValues, StoredText, load_checked
-from labseq.config.fields import (
-    FORMAT,
+from labseq.config.fields import FORMAT, Folders, FormatVersion, Name, Variables, check_kind
+from labseq.config.messages import ProblemCollector
+from labseq.config.scan import Scan, ScanOrder, read_scan
+from labseq.errors import Loc
+from labseq.messages import clean, shown
+from labseq.settings import (
     Choice,
-    Folders,
-    FormatVersion,
-    Name,
+    Duration,
     PatternChoice,
+    Settings,
     Text,
-    Variables,
-    check_kind,
     empty_is,
     placed_by_field,
     setting_error,
 )
-from labseq.config.messages import ProblemCollector, clean, shown
-from labseq.config.scan import Scan, ScanOrder, read_scan
-from labseq.config.settings import Duration, Settings
-from labseq.config.yaml_nodes import Loc
 
 
 class StepPolicySettings(Settings):
@@ -108,6 +104,31 @@ class BudgetSettings(Settings):
     tones: Duration = Field(default=2e-3, description="making the tone program of a plan")
     write: Duration = Field(default=50e-3, description="writing a shot to the disk")
 
+
+ANALYSIS_KEYS: Final = frozenset({"finish_within"})
+"""Keys of an analysis that belong to the core, not to the plugin."""
+
+
+class AnalysisChoice(Choice):
+    """An analysis chosen by name, with the plugin's settings as further keys of the same mapping."""
+
+    finish_within: Duration = Field(
+        default=10.0, description="how long it may go on after the run, for the shots it has not come to"
+    )
+
+
+def _listed(choices: tuple[AnalysisChoice, ...]) -> tuple[AnalysisChoice, ...]:
+    """Give each its location; refuse a name that is given twice: it names the file of the results."""
+    first: dict[str, int] = {}
+    for i, choice in enumerate(choices):
+        if first.setdefault(choice.use, i) != i:
+            what = f"the analysis '{choice.use}' stands here a second time"
+            raise setting_error(what, "each analysis once", at=(i, "use"))
+    return tuple(choice.placed("analysis", i) for i, choice in enumerate(choices))
+
+
+Analyses: TypeAlias = Annotated[tuple[AnalysisChoice, ...], empty_is(()), AfterValidator(_listed)]
+"""The analyses of a sequence."""
 
 DEFAULT_PLANNER: Final = "psca"
 

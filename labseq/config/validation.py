@@ -13,19 +13,11 @@ import numpy as np
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
-from labseq.config.messages import (
-    EXPECTED_TYPES,
-    ErrorText,
-    clean,
-    closest,
-    comma_hint,
-    explain_validation_error,
-    listing,
-    shown,
-)
-from labseq.config.settings import FOLDER, NoSettings
-from labseq.config.yaml_nodes import Loc, Mark, Node
-from labseq.errors import ConfigError
+from labseq.config.messages import EXPECTED_TYPES, ErrorText, comma_hint, explain_validation_error
+from labseq.config.yaml_nodes import Mark, Node
+from labseq.errors import ConfigError, Loc
+from labseq.messages import clean, closest, listing, shown
+from labseq.settings import FOLDER, NoSettings
 
 
 def models_at(model: type[BaseModel], loc: Loc) -> list[type[BaseModel]]:

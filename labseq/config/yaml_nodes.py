@@ -6,14 +6,11 @@ no constructor, so no tag can run code, and the limits hold before anything grow
 
 from __future__ import annotations
 
-import codecs
 import re
-import stat
 import unicodedata
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
-from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeAlias, cast
 
 from yaml.error import Mark as YamlMark, MarkedYAMLError
@@ -32,20 +29,9 @@ from yaml.parser import Parser
 from yaml.reader import Reader
 from yaml.scanner import Scanner
 
-from labseq.config.messages import (
-    ErrorText,
-    clean,
-    closest,
-    comma_hint,
-    did_you_mean,
-    resolve,
-    shown,
-    visible,
-)
-from labseq.errors import ConfigError, Problem
-
-Loc: TypeAlias = tuple[str | int, ...]
-"""Where a value is in a document: keys and list indices from the top, ("shot", 2, "rearrange")."""
+from labseq.config.messages import ErrorText, comma_hint, resolve
+from labseq.errors import ConfigError, Loc, Problem
+from labseq.messages import clean, did_you_mean, shown, visible
 
 Scalar: TypeAlias = str | int | float | bool | None
 
@@ -366,11 +352,6 @@ def _mark(mark: YamlMark) -> Mark:
     return Mark(mark.line + 1, mark.column + 1)
 
 
-MAX_BYTES: Final = 1 << 18
-"""Largest YAML file, in bytes; reading it takes a quarter of a second."""
-
-YAML_SUFFIXES: Final = (".yaml", ".yml")
-
 _LINE_BREAK: Final = re.compile(r"\r\n|\r|\n")
 # U+0085, U+2028 and U+2029 are line breaks for PyYAML but for few editors, so
 # that all line numbers after them would be wrong; U+FEFF cannot be seen.
@@ -379,87 +360,6 @@ _FORBIDDEN: Final = re.compile(
 )
 # At the beginning of a line, all other spaces are text to YAML and indentation to the eye.
 _ODD_INDENT: Final = re.compile("^[ \t-]*([\u00a0\u1680\u2000-\u200a\u202f\u205f\u3000])", re.MULTILINE)
-_UTF16: Final = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
-_UTF32: Final = (codecs.BOM_UTF32_LE, codecs.BOM_UTF32_BE)
-
-
-def read_bytes(
-    path: Path,
-    expected: str = "a YAML file",
-    suffixes: Collection[str] = YAML_SUFFIXES,
-    max_bytes: int = MAX_BYTES,
-) -> bytes:
-    """Read a file of limited size.
-
-    Args:
-        path: The file.
-        expected: What it should be, in words.
-        suffixes: Endings of the names that come into question if there is no such file.
-        max_bytes: Most bytes that it may have.
-
-    Raises:
-        ConfigError: Missing, a folder, no regular file, unreadable or too large.
-    """
-    name = visible(str(path))
-    try:
-        data = _bytes_of(path, max_bytes)
-    except (FileNotFoundError, NotADirectoryError):
-        hint = alike_file(path, suffixes)
-        raise ConfigError(Problem("there is no such file", name, hint=hint)) from None
-    except (OSError, ValueError) as error:  # ValueError: a NUL character in the path
-        reason = error.strerror if isinstance(error, OSError) else str(error)
-        what = f"the file cannot be read: {str(reason or error).lower()}"
-        raise ConfigError(Problem(what, name)) from error
-    if isinstance(data, str):
-        raise ConfigError(Problem(data, name, expected=expected))
-    if len(data) > max_bytes:
-        what = f"the file is larger than {max_bytes >> 10} KiB"
-        raise ConfigError(Problem(what, name, expected="a few kilobytes"))
-    return data
-
-
-def _bytes_of(path: Path, max_bytes: int) -> bytes | str:
-    """The first bytes of a file, one more than allowed; or why this is none."""
-    if what := _no_file(path.stat().st_mode):  # reading a pipe could wait for ever
-        return what
-    with path.open("rb") as file:
-        return file.read(max_bytes + 1)
-
-
-def _no_file(mode: int) -> str:
-    if stat.S_ISDIR(mode):
-        return "this is a folder"
-    return "" if stat.S_ISREG(mode) else "this is not an ordinary file"
-
-
-def something_else(path: Path) -> str:
-    """What there is in place of a file, in words; "" for a file, for nothing, and if it cannot be told."""
-    try:
-        return _no_file(path.stat().st_mode)
-    except (OSError, ValueError):
-        return ""
-
-
-def decode(data: bytes, name: str) -> str:
-    """Decode UTF-8, with or without a byte order mark; the mark is left out.
-
-    Raises:
-        ConfigError: Not UTF-8; with the place of the first wrong byte.
-    """
-    if data.startswith((*_UTF16, *_UTF32)):
-        came = "UTF-32" if data.startswith(_UTF32) else "UTF-16"
-        raise ConfigError(Problem(f"the file is {came}", name, 1, 1, "UTF-8", "save it as UTF-8"))
-    body = data.removeprefix(codecs.BOM_UTF8)
-    try:
-        return body.decode("utf-8")
-    except UnicodeDecodeError as error:
-        byte = body[error.start]
-        offset = error.start + len(data) - len(body)
-        latin = bytes([byte]).decode("latin-1")
-        likely = f" (in Latin-1 it is '{latin}')" if latin.isprintable() else ""
-        mark = _mark_at(body[: error.start].decode("utf-8"), error.start)
-        what = f"byte 0x{byte:02X} at offset {offset} is not UTF-8{likely}"
-        raise ConfigError(mark.problem(name, what, "a file in UTF-8", "save the file as UTF-8")) from None
 
 
 def check_characters(text: str, name: str, origin: str = "") -> None:
@@ -500,46 +400,6 @@ def _mark_at(text: str, index: int) -> Mark:
     breaks = [match.end() for match in _LINE_BREAK.finditer(text, 0, index)]
     start = breaks[-1] if breaks else 0
     return Mark(len(breaks) + 1, min(index, len(text)) - start + 1)
-
-
-def files_in(folder: Path, suffixes: Collection[str] = YAML_SUFFIXES) -> list[str]:
-    """Names of the files in a folder with one of the suffixes, sorted; none if it cannot be read."""
-    try:
-        return sorted(path.name for path in folder.iterdir() if path.suffix in suffixes)
-    except (OSError, ValueError):
-        return []
-
-
-def alike_file(path: Path, suffixes: Collection[str] = YAML_SUFFIXES) -> str:
-    """A hint at the file in the same folder that is spelled most alike, whatever its suffix, or ""."""
-    names = {Path(name).stem: name for name in files_in(path.parent, suffixes) if name != path.name}
-    stem = path.stem if path.suffix in suffixes else path.name
-    meant = closest(stem, names)
-    return f"did you mean '{clean(names[meant])}'?" if meant else ""
-
-
-def beside(folder: Path, path: str) -> Path:
-    """A path that a file in ``folder`` names; ``~`` is the user's home."""
-    try:
-        return folder / Path(path).expanduser()
-    except RuntimeError:  # "~nobody"
-        return folder / path
-
-
-def is_file(path: Path) -> bool:
-    """Whether there is such a file; False where that cannot be told."""
-    try:
-        return path.is_file()
-    except OSError:
-        return False
-
-
-def is_folder(path: Path) -> bool:
-    """Whether there is such a folder; False where that cannot be told."""
-    try:
-        return path.is_dir()
-    except OSError:
-        return False
 
 
 _FLOW: Final = "one value: 5, '45 ms', [a, b] or {key: value}"

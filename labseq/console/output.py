@@ -13,11 +13,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, TextIO, cast
 
-from labseq.config.messages import visible
-from labseq.config.yaml_nodes import is_file
 from labseq.errors import ConfigError, Problem, RecordingError
 from labseq.files import whole_file
+from labseq.messages import visible
 from labseq.model import RunRecord, ShotRecord
+from labseq.text_files import is_file
 from labseq.units import format_quantity
 
 

@@ -6,11 +6,11 @@ from typing import Annotated, Literal, Protocol, Self, cast
 
 from pydantic import Field, NonNegativeInt, PositiveInt, model_validator
 
-from labseq.config.settings import Duration, Settings, Temperature
 from labseq.drivers import Cooling
 from labseq.errors import ConfigError
 from labseq.model import SensorMode
 from labseq.roles import Context, ReportsSensor, Simulation
+from labseq.settings import Duration, Settings, Temperature
 from labseq.units import ZERO_CELSIUS_K, format_quantity
 
 

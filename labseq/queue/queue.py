@@ -14,10 +14,9 @@ from pathlib import Path
 from typing import Any, Final, Literal, cast, get_args
 
 from labseq.config import StoredText, find_profile
-from labseq.config.messages import visible
-from labseq.config.yaml_nodes import decode, read_bytes
 from labseq.errors import ConfigError, LabseqError, Problem, RecordingError, StopRequested
 from labseq.files import Holder, Lock
+from labseq.messages import visible
 from labseq.recording.durable import dumps, explained, parse_object, write_file
 from labseq.recording.folders import STOP_FILE, Owner
 from labseq.recording.run_file import read_state
@@ -27,6 +26,7 @@ from labseq.session.check import CheckReport, check
 from labseq.session.options import Options
 from labseq.session.provenance import now_utc
 from labseq.session.session import Session
+from labseq.text_files import decode, read_bytes
 
 FOLDER: Final = "queue"
 FORMAT: Final = 1

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from labseq.cli.run import run_session
-from labseq.config.messages import clean
 from labseq.console.errors import excerpt, exit_code_of, report
 from labseq.console.output import columns, plural, say
+from labseq.messages import clean
 from labseq.queue.queue import Entry, Opening, Queue, QueueRun
 from labseq.recording import data_root
 from labseq.recording.durable import dumps

@@ -22,8 +22,8 @@ from typing import Final
 
 from labseq import __version__
 from labseq.config import find_profile, packaged_profiles_dir
-from labseq.config.messages import clean, visible
 from labseq.errors import ConfigError, Problem
+from labseq.messages import clean, visible
 from labseq.plugins import PluginHost
 from labseq.scaffold.schemas import KINDS as FILE_KINDS, FileKind, refresh_schemas, schema_path, write_schema
 from labseq.session import load_plugins

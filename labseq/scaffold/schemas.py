@@ -18,14 +18,13 @@ from pydantic import BaseModel
 from pydantic.json_schema import GenerateJsonSchema
 from pydantic_core import core_schema
 
-from labseq.builtin.analyses import AnalysisChoice
-from labseq.config.fields import Choice, DefaultIfEmpty, PatternChoice, si_of
+from labseq.config.fields import si_of
 from labseq.config.profile import DeviceChoice, LinesChoice, MobileTweezersChoice, ProfileSpec
 from labseq.config.scan import AdaptiveChoice
-from labseq.config.sequence import SequenceSpec, StepPolicySettings
-from labseq.config.settings import Quantity, Settings
+from labseq.config.sequence import AnalysisChoice, SequenceSpec, StepPolicySettings
 from labseq.files import whole_file
 from labseq.registry import Entry, Registry
+from labseq.settings import Choice, DefaultIfEmpty, PatternChoice, Quantity, Settings
 from labseq.units import EXAMPLES, UNITS, expected, format_quantity, parse_quantity
 
 JsonSchema: TypeAlias = dict[str, Any]

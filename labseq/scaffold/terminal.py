@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from labseq.config.messages import clean, did_you_mean, listing
 from labseq.console.output import say, write_text
 from labseq.errors import ConfigError, Problem
+from labseq.messages import clean, did_you_mean, listing
 from labseq.registry import KINDS
 from labseq.scaffold.new import FILE_KINDS, PLUGINS, CreatedFiles, make_file, make_plugin
 from labseq.scaffold.schemas import SCHEMA_FOLDER, schema_text

@@ -9,10 +9,10 @@ from types import MappingProxyType
 from typing import Any, Final, cast
 
 from labseq.config import ProblemCollector
-from labseq.config.messages import clean
 from labseq.config.scan import SCANNER_KEYS, Adaptive, Axis, Ends
 from labseq.errors import ConfigError, DeviceError
 from labseq.guard import Guard, StopFlag
+from labseq.messages import clean
 from labseq.model import ScanRange, ScanSpace, VisitedPoint
 from labseq.recording import Shot
 from labseq.recording.columns import figures_of

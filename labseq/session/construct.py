@@ -6,9 +6,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, Final
 
-from labseq.builtin.analyses import ANALYSIS_KEYS
 from labseq.config import Document, ProblemCollector, SequenceSpec, StepSpec
-from labseq.config.settings import Settings
+from labseq.config.sequence import ANALYSIS_KEYS
 from labseq.errors import ConfigError, LabseqError, LimitError, PluginLoadError, one_of
 from labseq.model import (
     CalibrationEntry,
@@ -37,6 +36,7 @@ from labseq.roles import (
     Step,
 )
 from labseq.session.profile import ChosenPlugin, ResolvedProfile, dump, named, resolve, validate
+from labseq.settings import Settings
 
 _ROLES: Final[Mapping[str, type]] = {
     "camera": Camera,

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.lib.format import read_array
 from numpy.typing import NDArray
 
-from labseq.config.messages import clean, did_you_mean, shown, visible
-from labseq.config.yaml_nodes import decode, files_in, is_file, something_else
 from labseq.errors import ConfigError, Problem, RecordingError
+from labseq.messages import clean, did_you_mean, shown, visible
 from labseq.model import CycleRecord, ImageRecord, Occupancy, TargetPattern, as_occupancy
+from labseq.text_files import decode, files_in, is_file, something_else
 from labseq.units import parse_quantity
 
 MAX_SITES: Final = 1000

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any, Final, Self
 
 from labseq.config import Override
-from labseq.config.messages import clean
 from labseq.errors import ConfigError, Problem
+from labseq.messages import clean
 from labseq.session.profile import DryRun
 
 _NOT_SET: Final = ("profile", "dry_run")

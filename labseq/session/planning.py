@@ -13,24 +13,20 @@ from numpy.typing import NDArray
 
 from labseq.config import (
     MOTION_KEYS,
-    Choice,
     Document,
     MotionSettings,
     Override,
-    Settings,
     load_profile,
     load_sequence,
     plugin_paths,
     split_overrides,
     validate_values,
 )
-from labseq.config.fields import PatternChoice
-from labseq.config.messages import clean, visible
 from labseq.config.plan_file import PlanFile, parse_plan
 from labseq.config.profile import GridSettings
 from labseq.config.sequence import DEFAULT_PLANNER
-from labseq.config.yaml_nodes import YAML_SUFFIXES
 from labseq.errors import ConfigError, LabseqError, LimitError, PlanError, Problem
+from labseq.messages import clean, visible
 from labseq.model import MotionSpec, Occupancy, Plan, PlanReport, SiteGrid, TargetPattern
 from labseq.motion import check_plan
 from labseq.plugins import PluginHost
@@ -40,6 +36,8 @@ from labseq.session.construct import construct, construct_target
 from labseq.session.lab import parallelism_of
 from labseq.session.occupancies import Source, read_source
 from labseq.session.profile import ChosenPlugin, load_plugins, resolve
+from labseq.settings import Choice, PatternChoice, Settings
+from labseq.text_files import YAML_SUFFIXES
 
 _TARGET: Final = re.compile(r"([^\W\d][\w-]*)(?::(.*))?", re.DOTALL)
 _NAME: Final = re.compile(r"[^\W\d][\w.-]*")

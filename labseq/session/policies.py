@@ -18,9 +18,8 @@ from labseq.config import (
     StepPolicySettings,
     StepSpec,
 )
-from labseq.config.messages import clean, did_you_mean, listing
-from labseq.config.yaml_nodes import Loc
-from labseq.errors import CheckFailedError
+from labseq.errors import CheckFailedError, Loc
+from labseq.messages import clean, did_you_mean, listing
 from labseq.recording import figures_in
 from labseq.recording.columns import FIGURES
 from labseq.roles import Repeatable, Step

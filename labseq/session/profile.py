@@ -13,9 +13,7 @@ from labseq.config import (
     LINES_KEYS,
     MOTION_KEYS,
     ROLES,
-    Choice,
     Document,
-    Loc,
     Override,
     ProblemCollector,
     ProfileSpec,
@@ -24,9 +22,8 @@ from labseq.config import (
     load_profile,
     plugin_paths,
 )
-from labseq.config.messages import clean, did_you_mean
-from labseq.config.settings import Settings
-from labseq.errors import ConfigError, LabseqError, PluginLoadError, Problem, UnknownPluginError, one_of
+from labseq.errors import ConfigError, LabseqError, Loc, PluginLoadError, Problem, UnknownPluginError, one_of
+from labseq.messages import clean, did_you_mean
 from labseq.model import CalibrationEntry, SiteGrid
 from labseq.model.lines import IDLE
 from labseq.plugins import PluginHost, call_plugin
@@ -35,6 +32,7 @@ from labseq.roles import ReportsLinesFacts
 from labseq.sequencer.lab import Lab
 from labseq.sequencer.lines import blinding_lines, trigger_line
 from labseq.session.calibrations import ActiveCalibrations, calibrated
+from labseq.settings import Choice, Settings
 
 DryRun = Literal["off", "full", "fast"]
 

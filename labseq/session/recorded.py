@@ -8,7 +8,6 @@ from typing import Any, cast
 
 from labseq.calibration.store import read_entry
 from labseq.config import StoredText
-from labseq.config.yaml_nodes import beside
 from labseq.errors import RecordingError
 from labseq.model import CalibrationEntry, RandomStream
 from labseq.plugins import PluginHost
@@ -18,6 +17,7 @@ from labseq.recording.run_file import sha256_of_text
 from labseq.roles import Context
 from labseq.session.planning import Machine, recorded_machine
 from labseq.session.profile import load_plugins
+from labseq.text_files import beside
 
 
 def resolved_of(run: Run) -> dict[str, Any]:

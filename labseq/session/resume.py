@@ -10,11 +10,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, NamedTuple, Self, cast
 
-from labseq.config.messages import visible
-from labseq.config.yaml_nodes import decode, read_bytes
 from labseq.errors import ConfigError, Problem, RecordingError
 from labseq.files import Lock, knows_no_locks
 from labseq.guard import StopFlag
+from labseq.messages import visible
 from labseq.model import RunRecord
 from labseq.recording import Run, RunWriter, open_run
 from labseq.recording.durable import LineLog, dumps, explained
@@ -27,6 +26,7 @@ from labseq.session.options import Options
 from labseq.session.profile import RecordedSetup
 from labseq.session.provenance import now_utc, run_record
 from labseq.session.recorded import stored_text
+from labseq.text_files import decode, read_bytes
 
 _NOTHING: Final = "nothing"
 _UNKNOWN: Final = "unknown"

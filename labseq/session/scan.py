@@ -16,16 +16,17 @@ from typing import Any, Final
 
 import numpy as np
 
-from labseq.config import ROLES, Axis, Choice, Document, Loc, ProblemCollector, Scan, SequenceSpec
+from labseq.config import ROLES, Axis, Document, ProblemCollector, Scan, SequenceSpec
 from labseq.config.fields import VARIABLES
-from labseq.config.messages import clean
 from labseq.config.profile import MobileTweezersChoice
 from labseq.config.scan import PROFILE
 from labseq.config.yaml_nodes import Node
-from labseq.errors import ConfigError
+from labseq.errors import ConfigError, Loc
+from labseq.messages import clean
 from labseq.roles import Step
 from labseq.session.construct import make_step
 from labseq.session.profile import HARDWARE_KINDS, ChosenPlugin, DryRun, ResolvedProfile, choose, resolve
+from labseq.settings import Choice
 from labseq.units import parse_any
 
 MAX_PROBLEMS: Final = 20

@@ -12,8 +12,7 @@ from types import TracebackType
 from typing import ParamSpec, Self
 
 from labseq.builtin.steps import DeviceStep, FollowStep
-from labseq.config import Loc
-from labseq.errors import ConfigError, DeviceError, LabseqError, Problem
+from labseq.errors import ConfigError, DeviceError, LabseqError, Loc, Problem
 from labseq.guard import Guard, StopFlag
 from labseq.model import RunRecord, TimelineEntry
 from labseq.recording import Run, RunWriter, clear_active, data_root, mark_active, marker_roots, open_run

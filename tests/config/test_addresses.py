@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from labseq.config import Document, Loc, Override, profile_overrides, split_overrides
+from labseq.config import Document, Override, profile_overrides, split_overrides
 from labseq.config.addresses import find
-from labseq.errors import ConfigError
+from labseq.errors import ConfigError, Loc
 
 DOCUMENT = Document.parse(
     """\

@@ -19,8 +19,9 @@ from labseq.builtin.steps import (
     RearrangeSettings,
     WaitSettings,
 )
-from labseq.config import ProblemCollector, Settings, load_sequence
+from labseq.config import ProblemCollector, load_sequence
 from labseq.errors import ConfigError
+from labseq.settings import Settings
 
 GOOD = (Path(__file__).parent / "data" / "sequence.yaml").read_text(encoding="utf-8")
 MODELS: dict[str, type[Settings]] = {

@@ -9,8 +9,9 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from labseq.builtin.steps import DeviceSettings, ImageSettings, LoadSettings, RearrangeSettings, WaitSettings
-from labseq.config import Override, ProblemCollector, Settings, load_profile, load_sequence, split_overrides
+from labseq.config import Override, ProblemCollector, load_profile, load_sequence, split_overrides
 from labseq.errors import ConfigError
+from labseq.settings import Settings
 
 DATA = Path(__file__).parent / "data"
 SEQUENCE = (DATA / "sequence.yaml").read_text(encoding="utf-8").encode()

@@ -7,8 +7,9 @@ from typing import Any, Self
 import pytest
 from pydantic import field_validator, model_validator
 
-from labseq.config import Document, Settings
+from labseq.config import Document
 from labseq.errors import ConfigError
+from labseq.settings import Settings
 
 
 class Custom(Settings):

@@ -9,7 +9,8 @@ from typing import Any, cast
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from labseq.config import Document, Loc
+from labseq.config import Document
+from labseq.errors import Loc
 
 BLOCK = """\
 # comment

@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from labseq.config import MOTION_KEYS, Document, MotionSettings, ProfileSpec, Settings, load_profile
+from labseq.config import MOTION_KEYS, Document, MotionSettings, ProfileSpec, load_profile
 from labseq.config.profile import GridSettings, TimeoutSettings
 from labseq.errors import ConfigError
 from labseq.model import MotionSpec, SiteGrid
+from labseq.settings import Settings
 
 DATA = Path(__file__).parent / "data"
 

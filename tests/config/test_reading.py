@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from labseq.config import Document
-from labseq.config.yaml_nodes import MAX_BYTES
 from labseq.errors import ConfigError
+from labseq.text_files import MAX_BYTES
 
 SAVE = "expected a file in UTF-8; save the file as UTF-8"
 

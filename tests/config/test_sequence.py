@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from labseq.config import Override, SequenceSpec, StepSpec, load_sequence, plugin_paths
-from labseq.config.fields import PatternChoice
 from labseq.errors import ConfigError
+from labseq.settings import PatternChoice
 
 DATA = Path(__file__).parent / "data"
 SMALL = "labseq: 1\nname: s\nshots: 1\ntarget: {pattern: compact}\nshot: [{load: {}}]\n"

@@ -3,8 +3,17 @@ from __future__ import annotations
 import pytest
 from pydantic import ValidationError
 
-from labseq.config import Settings
-from labseq.config.settings import Angle, Duration, Fraction, Frequency, Length, Speed, Temperature, Voltage
+from labseq.settings import (
+    Angle,
+    Duration,
+    Fraction,
+    Frequency,
+    Length,
+    Settings,
+    Speed,
+    Temperature,
+    Voltage,
+)
 
 
 class Model(Settings):

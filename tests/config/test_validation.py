@@ -10,10 +10,10 @@ from typing import Annotated, Any, Literal
 import pytest
 from pydantic import Field
 
-from labseq.config import Document, Settings
-from labseq.config.settings import Duration, Fraction, Length
+from labseq.config import Document
 from labseq.config.validation import MAX_HINTS
 from labseq.errors import ConfigError
+from labseq.settings import Duration, Fraction, Length, Settings
 
 LENGTH = "a length such as '4.49 um' (m, mm, um, nm) or a plain number in m"
 TIME = "a time such as '45 ms' (s, ms, us, ns, min, h) or a plain number in s"

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from labseq.config import Settings, validate_values
-from labseq.config.settings import Duration
+from labseq.config import validate_values
 from labseq.errors import ConfigError
+from labseq.settings import Duration, Settings
 
 
 class Colour(Enum):

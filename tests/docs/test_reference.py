@@ -21,19 +21,18 @@ from labseq.builtin import labseq_register
 from labseq.cli.app import app
 from labseq.config import (
     CalibrationSettings,
-    Choice,
     ProfileSpec,
     SequenceSpec,
     TimeoutSettings,
     load_profile,
     load_sequence,
 )
-from labseq.config.fields import PatternChoice
 from labseq.config.profile import GridSettings, MobileTweezersChoice
 from labseq.config.sequence import BudgetSettings, PolicySettings, StepPolicySettings
 from labseq.config.yaml_nodes import compose
 from labseq.console.errors import exit_code_of
 from labseq.registry import KINDS, Entry, Registry
+from labseq.settings import Choice, PatternChoice
 from labseq.testing.contracts import HardwareContract
 
 Pages = Mapping[str, Element]

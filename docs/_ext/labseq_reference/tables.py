@@ -9,9 +9,10 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from labseq import builtin as builtins
-from labseq.config import Choice, SequenceSpec
+from labseq.config import SequenceSpec
 from labseq.config.sequence import DEFAULT_PLANNER
 from labseq.registry import Entry
+from labseq.settings import Choice
 from labseq.units import EXAMPLES, UNITS, unit_names
 from labseq_reference import prose
 from labseq_reference.known import entries, settings_of

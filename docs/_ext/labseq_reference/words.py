@@ -15,9 +15,10 @@ from pydantic import BaseModel, BeforeValidator
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
-from labseq.config import Choice, settings
+from labseq import settings
 from labseq.config.yaml_nodes import compose
 from labseq.errors import ConfigError
+from labseq.settings import Choice
 from labseq.units import EXAMPLES, format_quantity, parse_quantity
 
 _ALIASES: Final = {

@@ -1,0 +1,65 @@
+"""Wording of error messages: values as the user wrote them, lists of names, the nearest name."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Mapping
+from typing import Any, Final
+
+_MAX_LENGTH: Final = 60
+
+
+def visible(text: str) -> str:
+    """A text with unprintable characters as escapes."""
+    return "".join(char if char.isprintable() else repr(char)[1:-1] for char in text)
+
+
+def clean(text: str) -> str:
+    """A text on one line, shortened to 60 characters, with unprintable characters as escapes."""
+    return visible(text if len(text) <= _MAX_LENGTH else text[: _MAX_LENGTH - 3] + "...")
+
+
+def shown(value: Any, raw: str = "") -> str:
+    """A value as a message quotes it.
+
+    Args:
+        value: The value.
+        raw: The value as it is written in the file; used for numbers.
+
+    Example:
+        >>> shown("45 ms"), shown(True), shown([1, 2]), shown(None)
+        ("'45 ms'", 'true', 'a list', 'empty')
+    """
+    if value is None:
+        return "empty"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):
+        return f"'{clean(value)}'"
+    if isinstance(value, Mapping):
+        return "a mapping"
+    return "a list" if isinstance(value, list) else clean(raw or str(value))
+
+
+def listing(names: Iterable[str]) -> str:
+    """The known names: "one of rows, cols"."""
+    known = list(names)
+    return ("one of " if len(known) > 1 else "") + ", ".join(known)
+
+
+def closest(name: str, names: Iterable[str]) -> str:
+    """The known name with the most similar spelling, ignoring case and dashes; "" if none is similar."""
+    folded = {known.lower().replace("-", "_"): known for known in names}
+    found = difflib.get_close_matches(name.lower().replace("-", "_")[:_MAX_LENGTH], folded, n=1)
+    return folded[found[0]] if found else ""
+
+
+def did_you_mean(name: str, names: Iterable[str]) -> str:
+    """A hint at the known name with the most similar spelling, or "".
+
+    Example:
+        >>> did_you_mean("winow", ["cycles", "window"])
+        "did you mean 'window'?"
+    """
+    close = closest(name, names)
+    return f"did you mean '{close}'?" if close else ""

@@ -1,0 +1,232 @@
+"""Settings models of plugins, sequences and profiles: their base class, quantities with units, common types."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Final, Self, TypeAlias, TypeVar, cast
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PrivateAttr,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
+from pydantic_core import PydanticCustomError
+
+from labseq.errors import Loc
+from labseq.messages import clean
+from labseq.model.grid import centred_comb
+from labseq.text_files import beside
+from labseq.units import expected, parse_quantity
+
+FOLDER: Final = "folder"
+"""Key of pydantic's validation context: the folder of the file that the settings are in."""
+
+MAX_DURATION_S: Final = 30 * 86_400.0
+"""Longest duration of any setting: far more than any run, and every clock can count it."""
+
+
+class Settings(BaseModel):
+    """Base of every settings model: immutable, refuses unknown keys, values in SI units.
+
+    Subclass it for your plugin; give each field a description and, if possible, a default.
+    Quantities take a number in SI units or text such as "45 ms".
+
+    Example:
+        >>> class Mine(Settings):
+        ...     exposure: Duration = 45e-3
+        >>> Mine(exposure="20 ms").exposure
+        0.02
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, validate_default=False)
+
+
+class NoSettings(Settings):
+    """The settings of a plugin that takes none."""
+
+
+def setting_error(
+    what: str, expected: str = "", hint: str = "", *, at: Loc = (), key: bool = False
+) -> PydanticCustomError:
+    """An error for a validator to raise, with its own wording and its place within the value.
+
+    Args:
+        what: What is wrong.
+        expected: What would have been right.
+        hint: What to do.
+        at: Keys and indices from the value that is validated to the wrong one.
+        key: Whether the key at that place is wrong, not its value.
+    """
+    context: dict[str, Any] = {"what": what, "expected": expected, "hint": hint, "at": at, "key": key}
+    return PydanticCustomError("setting_error", "{what}; expected {expected}", context)
+
+
+@dataclass(frozen=True, slots=True)
+class Quantity:
+    """Converts a number, or text with a unit, to SI.
+
+    Attributes:
+        dimension: A key of :data:`labseq.units.UNITS`.
+    """
+
+    dimension: str
+
+    def __call__(self, value: Any) -> Any:
+        """Convert text; a number is in SI already."""
+        if isinstance(value, str):
+            return parse_quantity(value, self.dimension)
+        if value is None or isinstance(value, bool | list | tuple | dict):
+            raise ValueError(f"expected {expected(self.dimension)}")
+        return value
+
+
+@dataclass(frozen=True, slots=True, eq=False)  # a default may be a dict, which has no hash
+class DefaultIfEmpty:
+    """Replaces an empty value by a default.
+
+    Attributes:
+        default: The default.
+    """
+
+    default: Any
+
+    def __call__(self, value: Any) -> Any:
+        """The default for None; any other value unchanged."""
+        return self.default if value is None else value
+
+
+def empty_is(default: Any) -> BeforeValidator:
+    """Let a key without a value mean ``default``."""
+    return BeforeValidator(DefaultIfEmpty(default))
+
+
+def _quantity(dimension: str) -> BeforeValidator:
+    return BeforeValidator(Quantity(dimension))
+
+
+def _not_too_long(duration_s: float) -> float:
+    if duration_s > MAX_DURATION_S:
+        raise ValueError("expected at most 720 h, which is 30 days")
+    return duration_s
+
+
+def _beside_its_file(path: Path, info: ValidationInfo) -> Path:
+    context = cast("Mapping[str, Path]", info.context or {})
+    return beside(context.get(FOLDER, Path()), str(path))
+
+
+Text: TypeAlias = Annotated[str, Field(min_length=1)]
+"""Any text except the empty one."""
+FilePath: TypeAlias = Annotated[Path, AfterValidator(_beside_its_file)]
+"""A file, relative to the sequence or profile that names it; in Python, to the working folder."""
+Duration: TypeAlias = Annotated[float, _quantity("time"), Field(ge=0), AfterValidator(_not_too_long)]
+"""Seconds, 0 to :data:`MAX_DURATION_S`; "45 ms"."""
+Length: TypeAlias = Annotated[float, _quantity("length")]
+"""Metres; "4.49 um"."""
+Frequency: TypeAlias = Annotated[float, _quantity("frequency")]
+"""Hertz; "80 MHz"."""
+Speed: TypeAlias = Annotated[float, _quantity("speed"), Field(gt=0)]
+"""Metres per second, more than 0; "130 um/ms"."""
+Voltage: TypeAlias = Annotated[float, _quantity("voltage")]
+"""Volts; "200 mV"."""
+Power: TypeAlias = Annotated[float, _quantity("power")]
+"""Watts; "10 mW"."""
+Temperature: TypeAlias = Annotated[float, _quantity("temperature")]
+"""Kelvins; "300 uK"."""
+Angle: TypeAlias = Annotated[float, _quantity("angle")]
+"""Radians; "60 deg"."""
+Fraction: TypeAlias = Annotated[float, _quantity("fraction"), Field(ge=0, le=1)]
+"""0 to 1; "75 %"."""
+
+
+class Choice(Settings):
+    """A plugin chosen by name, with the plugin's settings as further keys of the same mapping.
+
+    Attributes:
+        use: Name of the plugin.
+        key: The key that holds the name, to be dropped before the plugin's settings are validated.
+    """
+
+    model_config = ConfigDict(extra="ignore")  # the plugin's settings, validated later
+
+    key: ClassVar[str] = "use"
+    use: Text = Field(description="the name of a plugin")
+    _loc: Loc = PrivateAttr(())
+
+    @property
+    def loc(self) -> Loc:
+        """Where its mapping is in the document."""
+        return self._loc
+
+    def placed(self, *loc: str | int) -> Self:
+        """A copy that knows where its mapping is."""
+        copy = self.model_copy()
+        copy._loc = loc  # noqa: SLF001 - of the same class
+        return copy
+
+    @model_validator(mode="before")
+    @classmethod
+    def _is_no_bare_name(cls, value: Any) -> Any:
+        if isinstance(value, str):
+            name = clean(value)
+            raise setting_error(f"just '{name}' stands here", "a mapping", f"write '{{{cls.key}: {name}}}'")
+        return value
+
+
+class PatternChoice(Choice):
+    """A target pattern: ``{pattern: compact, rows: 15, cols: 15}``."""
+
+    key: ClassVar[str] = "pattern"
+    use: Text = Field(alias="pattern", description="the name of a target pattern")
+
+
+_C = TypeVar("_C", bound=Choice)
+
+
+def _placed_by_field(choice: _C, info: ValidationInfo) -> _C:
+    return choice.placed(info.field_name or "")
+
+
+placed_by_field: Final = AfterValidator(_placed_by_field)
+"""For a field that is a :class:`Choice`: its location is the field's name."""
+
+
+class FrequencyComb(Settings):
+    """Tones of the rows or columns of the grid: equally spaced, or a table from a calibration."""
+
+    centre: Frequency = Field(default=100e6, gt=0, description="frequency of the grid's centre")
+    step: Frequency = Field(
+        default=1.6e6, description="frequency from one row or column to the next; negative if it falls"
+    )
+    table: tuple[Annotated[Frequency, Field(gt=0)], ...] = Field(
+        default=(), description="calibrated frequency of each row or column, in place of centre and step"
+    )
+
+    @field_validator("step")
+    @classmethod
+    def _tones_differ(cls, step: float) -> float:
+        if step == 0:
+            raise ValueError("a step of 0 puts all tones at one frequency; expected another value")
+        return step
+
+    @field_validator("table")
+    @classmethod
+    def _tones_in_order(cls, table: tuple[float, ...]) -> tuple[float, ...]:
+        steps_hz = np.diff(table)
+        if not (np.all(steps_hz > 0) or np.all(steps_hz < 0)):
+            raise ValueError("the tones neither rise nor fall all along; expected the sites' in order")
+        return table
+
+    def tones(self, n_sites: int) -> NDArray[np.float64]:
+        """Frequency of the tone of each of ``n_sites`` rows or columns, in Hz."""
+        return np.array(self.table) if self.table else centred_comb(n_sites, self.centre, self.step)

@@ -1,0 +1,142 @@
+"""Reads the text files that users write: limited size, UTF-8, a hint at the file that was meant."""
+
+from __future__ import annotations
+
+import codecs
+import stat
+from collections.abc import Collection
+from pathlib import Path
+from typing import Final
+
+from labseq.errors import ConfigError, Problem
+from labseq.messages import clean, closest, visible
+
+MAX_BYTES: Final = 1 << 18
+"""Largest YAML file, in bytes; reading it takes a quarter of a second."""
+
+YAML_SUFFIXES: Final = (".yaml", ".yml")
+
+_UTF16: Final = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+_UTF32: Final = (codecs.BOM_UTF32_LE, codecs.BOM_UTF32_BE)
+
+
+def read_bytes(
+    path: Path,
+    expected: str = "a YAML file",
+    suffixes: Collection[str] = YAML_SUFFIXES,
+    max_bytes: int = MAX_BYTES,
+) -> bytes:
+    """Read a file of limited size.
+
+    Args:
+        path: The file.
+        expected: What the file should be, for the message if it is a folder or a pipe.
+        suffixes: If the file is missing, the hint names a similar file with one of these suffixes.
+        max_bytes: Largest size.
+
+    Raises:
+        ConfigError: The file is missing, a folder, not a regular file, unreadable or too large.
+    """
+    name = visible(str(path))
+    try:
+        if what := _other_kind(path.stat().st_mode):  # reading a pipe could block for ever
+            raise ConfigError(Problem(what, name, expected=expected))
+        with path.open("rb") as file:
+            data = file.read(max_bytes + 1)
+    except ConfigError:
+        raise
+    except (FileNotFoundError, NotADirectoryError):
+        hint = alike_file(path, suffixes)
+        raise ConfigError(Problem("there is no such file", name, hint=hint)) from None
+    except (OSError, ValueError) as error:  # ValueError: a NUL character in the path
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        what = f"the file cannot be read: {str(reason or error).lower()}"
+        raise ConfigError(Problem(what, name)) from error
+    if len(data) > max_bytes:
+        what = f"the file is larger than {max_bytes >> 10} KiB"
+        raise ConfigError(Problem(what, name, expected="a few kilobytes"))
+    return data
+
+
+def decode(data: bytes, name: str) -> str:
+    """Decode UTF-8, without the byte order mark.
+
+    Raises:
+        ConfigError: Not UTF-8; with the place of the first wrong byte.
+    """
+    if data.startswith((*_UTF16, *_UTF32)):
+        came = "UTF-32" if data.startswith(_UTF32) else "UTF-16"
+        raise ConfigError(Problem(f"the file is {came}", name, 1, 1, "UTF-8", "save it as UTF-8"))
+    body = data.removeprefix(codecs.BOM_UTF8)
+    try:
+        return body.decode("utf-8")
+    except UnicodeDecodeError as error:
+        byte, before = body[error.start], body[: error.start].decode("utf-8")
+        latin = bytes([byte]).decode("latin-1")
+        likely = f" (in Latin-1 it is '{latin}')" if latin.isprintable() else ""
+        offset = error.start + len(data) - len(body)
+        what = f"byte 0x{byte:02X} at offset {offset} is not UTF-8{likely}"
+        place = line_and_column(before, len(before))
+        raise ConfigError(
+            Problem(visible(what), name, *place, "a file in UTF-8", "save the file as UTF-8")
+        ) from None
+
+
+def line_and_column(text: str, index: int) -> tuple[int, int]:
+    """Line and column, from 1, of a character of a text; lines end with LF, CR or CR LF."""
+    lines = text[:index].replace("\r\n", "\n").replace("\r", "\n").split("\n")
+    return len(lines), len(lines[-1]) + 1
+
+
+def files_in(folder: Path, suffixes: Collection[str] = YAML_SUFFIXES) -> list[str]:
+    """Names of the files in a folder with one of the suffixes, sorted; none if it cannot be read."""
+    try:
+        return sorted(path.name for path in folder.iterdir() if path.suffix in suffixes)
+    except (OSError, ValueError):
+        return []
+
+
+def alike_file(path: Path, suffixes: Collection[str] = YAML_SUFFIXES) -> str:
+    """A hint at the file in the same folder with the most similar name, or ""."""
+    names = {Path(name).stem: name for name in files_in(path.parent, suffixes) if name != path.name}
+    stem = path.stem if path.suffix in suffixes else path.name
+    meant = closest(stem, names)
+    return f"did you mean '{clean(names[meant])}'?" if meant else ""
+
+
+def beside(folder: Path, path: str) -> Path:
+    """A path that a file in ``folder`` names; ``~`` is the user's home."""
+    try:
+        return folder / Path(path).expanduser()
+    except RuntimeError:  # "~nobody"
+        return folder / path
+
+
+def is_file(path: Path) -> bool:
+    """Whether this is a file; False if that cannot be found out."""
+    try:
+        return path.is_file()
+    except OSError:
+        return False
+
+
+def is_folder(path: Path) -> bool:
+    """Whether this is a folder; False if that cannot be found out."""
+    try:
+        return path.is_dir()
+    except OSError:
+        return False
+
+
+def something_else(path: Path) -> str:
+    """What is at a path instead of a file: "this is a folder"; "" for a file, and if nothing is there."""
+    try:
+        return _other_kind(path.stat().st_mode)
+    except (OSError, ValueError):
+        return ""
+
+
+def _other_kind(mode: int) -> str:
+    if stat.S_ISDIR(mode):
+        return "this is a folder"
+    return "" if stat.S_ISREG(mode) else "this is not an ordinary file"
