@@ -1,4 +1,8 @@
-"""Where profiles, sequences and data are; files written whole; locks."""
+"""Files that survive a crash, the folders where labseq keeps things, processes, and locks.
+
+:func:`whole_file` and :func:`write_file` are the one way to write a whole file, :class:`LineLog` the one way
+to append to a file.
+"""
 
 from __future__ import annotations
 
@@ -7,12 +11,15 @@ import json
 import os
 import platform
 import warnings
-from collections.abc import Generator
+from collections.abc import Generator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, Final
+
+from labseq.errors import RecordingError
+from labseq.plain import dumps, parse_object
 
 if TYPE_CHECKING:
     from filelock import BaseFileLock
@@ -22,18 +29,19 @@ if TYPE_CHECKING:
 def whole_file(path: Path, *, alone: bool = False) -> Generator[IO[bytes]]:
     """Write a file that gets its name only when it is whole and on the disk.
 
-    Until then an older file of that name stays as it is; where a link stands, the file that it
-    leads to is replaced. What is no ordinary file, such as a pipe, is written to directly.
+    It is written as ``<name>.part``, flushed to the disk and renamed. Until then an older file of that name
+    stays as it is. If the path is a link, the file that it points to is replaced. A pipe or another special
+    file is written to directly.
 
     Args:
         path: The file.
-        alone: Whether to refuse while another process writes the same file in this way; what is read
+        alone: Refuse while another process writes the same file in this way; what is read
             in the block is then still true when the file gets its name.
 
     Raises:
-        FileExistsError: ``alone``, and another process writes it; ``filename`` is what it writes to, which
-            a process that was killed leaves behind.
-        OSError: It cannot be written; nothing is left of it.
+        FileExistsError: ``alone``, and another process writes it; ``filename`` is the ``.part`` file, which
+            a killed process leaves behind.
+        OSError: It cannot be written; no ``.part`` file is left.
     """
     if path.exists() and not path.is_file():
         with path.open("wb") as file:
@@ -46,14 +54,156 @@ def whole_file(path: Path, *, alone: bool = False) -> Generator[IO[bytes]]:
             yield file
             file.flush()
             os.fsync(file.fileno())
-            file.close()  # Windows renames no open file
+            file.close()  # Windows cannot rename an open file
             part.replace(real)
         except BaseException:
-            with suppress(OSError):  # of a full disk, which has been told
+            with suppress(OSError):  # closing flushes, which fails again on a full disk
                 file.close()
             with suppress(OSError):
                 part.unlink(missing_ok=True)
             raise
+    sync_folder(real.parent)
+
+
+def write_file(path: Path, data: bytes | memoryview) -> None:
+    """Write a whole file at once, see :func:`whole_file`.
+
+    Raises:
+        RecordingError: The disk is full or the folder cannot be written to.
+    """
+    with explained(path), whole_file(path) as file:
+        _write_all(file, data)
+
+
+def sync_folder(folder: Path) -> None:
+    """Flush a folder's list of files to the disk, where the system can (Windows cannot)."""
+    if os.name == "nt":
+        return
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    except OSError as error:
+        if error.errno not in {errno.EINVAL, errno.ENOTSUP}:  # some network folders cannot either
+            raise
+    finally:
+        os.close(handle)
+
+
+_ELSEWHERE: Final = "choose another place with --output or LABSEQ_DATA"
+_ADVICE: Final = {
+    errno.ENOSPC: f"the disk is full; free some space, or {_ELSEWHERE}",
+    errno.EDQUOT: f"your disk quota is used up; free some space, or {_ELSEWHERE}",
+    errno.EACCES: f"labseq may not write there; {_ELSEWHERE}",
+    errno.EPERM: f"labseq may not write there; {_ELSEWHERE}",
+    errno.EROFS: f"the disk is read-only; {_ELSEWHERE}",
+    errno.ENOTDIR: f"a file is in the way of a folder; move it, or {_ELSEWHERE}",
+    errno.EEXIST: f"a file is in the way of a folder; move it, or {_ELSEWHERE}",
+    errno.ENOENT: "the folder is gone; do not move or delete a run while it is written",
+    errno.EIO: f"the disk reports a fault; check it and its cable, or {_ELSEWHERE}",
+}
+
+
+@contextmanager
+def explained(path: Path) -> Generator[None]:
+    """Turn an ``OSError`` while writing ``path`` into a ``RecordingError`` that says what to do.
+
+    Raises:
+        RecordingError: The body raised an ``OSError``.
+    """
+    try:
+        yield
+    except OSError as error:
+        reason = error.strerror or str(error)
+        advice = _ADVICE.get(error.errno or 0, f"check the disk, or {_ELSEWHERE}")
+        raise RecordingError(path, f"cannot be written: {reason}; {advice}") from error
+
+
+def read_file(path: Path) -> bytes:
+    """Read a whole file.
+
+    Raises:
+        RecordingError: It cannot be read.
+    """
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise RecordingError(path, f"cannot be read: {error.strerror}; check the disk") from error
+
+
+class LineLog:
+    """An append-only file of JSON lines. Only what ends with a newline counts.
+
+    A line that a killed process left unfinished is kept as a line of its own. An append that failed in this
+    process leaves nothing: the next one overwrites it.
+
+    Args:
+        path: The file; it is made if it does not exist.
+
+    Raises:
+        RecordingError: The file cannot be made or read.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        with explained(path), path.open("a+b", buffering=0) as file:
+            self._length = file.seek(0, os.SEEK_END)
+            file.seek(max(0, self._length - 1))
+            if file.read(1) not in (b"", b"\n"):
+                self._length += file.write(b"\n")
+
+    def append(self, values: object, *, sync: bool) -> None:
+        """Add a line; ``sync`` waits until it is on the disk.
+
+        Raises:
+            RecordingError: It could not be written; the file is as it was before.
+        """
+        line = dumps(values).encode() + b"\n"
+        with explained(self.path), self.path.open("r+b", buffering=0) as file:
+            start = min(self._length, file.seek(0, os.SEEK_END))
+            try:
+                file.seek(start)
+                file.truncate()
+                _write_all(file, line)
+                if sync:
+                    os.fsync(file.fileno())
+            except OSError:
+                with suppress(OSError):
+                    file.truncate(start)
+                raise
+        self._length = start + len(line)
+
+
+def _write_all(file: IO[bytes], data: bytes | memoryview) -> None:
+    rest = memoryview(data)
+    while rest:
+        rest = rest[os.write(file.fileno(), rest) :]
+
+
+def whole_lines(data: bytes) -> bytes:
+    r"""The data without an unfinished last line.
+
+    Example:
+        >>> whole_lines(b'{"a": 1}\n{"b"')
+        b'{"a": 1}\n'
+    """
+    return data[: data.rfind(b"\n") + 1]
+
+
+def read_lines(path: Path) -> tuple[list[dict[str, Any]], list[int]]:
+    """Read a file of JSON lines, whatever state it is in.
+
+    Returns:
+        The lines that are whole, and the numbers (from 1) of damaged lines. An unfinished last line is
+        neither: it was never reported as written. Without the file, none of both.
+
+    Raises:
+        RecordingError: The file exists but cannot be read.
+    """
+    if not path.exists():
+        return [], []
+    found = [parse_object(line) for line in whole_lines(read_file(path)).split(b"\n")[:-1]]
+    rows = [row for row in found if row is not None]
+    return rows, [number for number, row in enumerate(found, start=1) if row is None]
 
 
 PROFILES: Final = "hardware_profiles"
@@ -96,6 +246,96 @@ def profile_dir(profile: Path) -> Path:
 def data_root() -> Path:
     """Where runs are kept if nothing else is said: LABSEQ_DATA, else ``./data``."""
     return Path(os.environ.get("LABSEQ_DATA") or "data").expanduser()
+
+
+def state_root() -> Path | None:
+    """Folder where labseq keeps what it must remember for this user between runs.
+
+    ``LABSEQ_STATE`` if set, else the platform's folder for state; None for a user without a home.
+    """
+    import platformdirs
+
+    try:
+        folder = os.environ.get("LABSEQ_STATE") or platformdirs.user_state_dir("labseq", appauthor=False)
+        return Path(folder).expanduser()
+    except RuntimeError:
+        return None
+
+
+def cache_root() -> Path:
+    """Folder of labseq's cache for this user.
+
+    ``LABSEQ_CACHE`` if set, else ``labseq`` in numba's ``NUMBA_CACHE_DIR`` if that is set, else the
+    platform's folder for caches.
+
+    Raises:
+        RuntimeError: The user has no home.
+    """
+    if own := os.environ.get("LABSEQ_CACHE"):
+        return Path(own).expanduser()
+    if numba_folder := os.environ.get("NUMBA_CACHE_DIR"):
+        return Path(numba_folder) / "labseq"
+    import platformdirs
+
+    return Path(platformdirs.user_cache_dir("labseq", appauthor=False)).expanduser()
+
+
+@dataclass(frozen=True, slots=True)
+class Process:
+    """A process; a later one that was given the same number is another.
+
+    Attributes:
+        pid: Process id.
+        started: When it started, in seconds since 1970; 0 if that is unknown.
+        host: The computer that it runs on.
+    """
+
+    pid: int
+    started: float
+    host: str
+
+    @classmethod
+    def current(cls) -> Process:
+        """This process."""
+        return cls(os.getpid(), _start_time(os.getpid()) or 0.0, platform.node())
+
+    @classmethod
+    def from_plain(cls, values: Mapping[str, Any]) -> Process | None:
+        """Read back what ``dataclasses.asdict`` made; None if it is something else."""
+        pid, started = values.get("pid"), values.get("started", 0.0)
+        if type(pid) is not int or pid <= 0 or type(started) not in (int, float):
+            return None
+        return cls(pid, float(started), str(values.get("host") or ""))
+
+    @property
+    def is_here(self) -> bool:
+        """Whether it belongs to this computer, so that :attr:`is_running` can be known."""
+        return self.host == platform.node()
+
+    @property
+    def is_running(self) -> bool:
+        """Whether it still runs; meaningful on its own computer only."""
+        started = _start_time(self.pid)
+        if started is None:
+            return False
+        return not (self.started and started) or abs(started - self.started) < _SAME_START_S
+
+
+_SAME_START_S: Final = 2.0
+"""The system's clock may be corrected while a process runs, which moves its start time a little."""
+
+
+def _start_time(pid: int) -> float | None:
+    """When a process started, in seconds since 1970; None if there is no such process, 0 if that is hidden."""
+    import psutil  # takes 0.03 s to import
+
+    try:
+        process = psutil.Process(pid)
+        return None if process.status() == psutil.STATUS_ZOMBIE else process.create_time()
+    except psutil.AccessDenied:
+        return 0.0
+    except (psutil.NoSuchProcess, OverflowError):
+        return None
 
 
 _NO_LOCKS: Final = frozenset({errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOTSUP})

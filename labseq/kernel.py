@@ -31,10 +31,9 @@ from typing import Any, Final, TypeVar, cast
 
 import numpy as np
 
-F = TypeVar("F", bound=Callable[..., Any])
+from labseq.files import cache_root
 
-CACHE_VARIABLE: Final = "LABSEQ_CACHE"
-"""Environment variable that moves labseq's cache to another folder."""
+F = TypeVar("F", bound=Callable[..., Any])
 
 UNUSED_DAYS: Final = 30
 """Compiled kernels that no process has loaded for so long are deleted."""
@@ -115,24 +114,6 @@ def announcing(announce: Callable[[str], None]) -> Generator[None]:
 
     with event.install_listener("numba:compile", Announcer()):
         yield
-
-
-def cache_root() -> Path:
-    """Folder of labseq's cache for this user.
-
-    ``LABSEQ_CACHE`` if set, else ``labseq`` in numba's ``NUMBA_CACHE_DIR`` if that
-    is set, else the platform's place for caches.
-    """
-    environ = os.environ
-    if own := environ.get(CACHE_VARIABLE):
-        return Path(own).expanduser()
-    if numbas := environ.get("NUMBA_CACHE_DIR"):
-        return Path(numbas) / "labseq"
-    if sys.platform == "win32":
-        return Path(environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local") / "labseq" / "Cache"
-    if sys.platform == "darwin":
-        return Path.home() / "Library" / "Caches" / "labseq"
-    return Path(environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "labseq"
 
 
 def _numba() -> Any:

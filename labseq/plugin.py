@@ -33,9 +33,10 @@ from labseq.errors import (
     UnknownPluginError,
     one_of,
 )
+from labseq.files import Process, cache_root, state_root
 from labseq.geometry import block, check_size, from_the_centre, nearest_to_centre, pattern
 from labseq.hookspecs import LABSEQ_API, hookimpl
-from labseq.kernel import cache_root, const, kernel
+from labseq.kernel import const, kernel
 from labseq.messages import clean, closest, visible
 from labseq.model import (
     AxisTones,
@@ -74,7 +75,6 @@ from labseq.model import (
 from labseq.motion import Renderer, check_plan, render, warm_rendering
 from labseq.motion.tones import site_time_s
 from labseq.recording import Run, open_run
-from labseq.recording.folders import Owner, state_root
 from labseq.registry import Registry
 from labseq.roles import (
     WHOLE_SENSOR,
@@ -188,7 +188,7 @@ __all__ = [
     "NeedsWarmUp",
     "NeverStopped",
     "Occupancy",
-    "Owner",
+    "Process",
     "Plan",
     "PlanError",
     "PlanReport",

@@ -14,7 +14,7 @@ from types import SimpleNamespace
 import pytest
 from hypothesis import settings
 
-from labseq.kernel import cache_root
+from labseq.files import cache_root
 
 # A busy computer is no failure, and what passed once passes again; ``poe fuzz`` looks for new examples.
 settings.register_profile("labseq", deadline=None, derandomize=True)

@@ -1,12 +1,37 @@
+"""Files that survive a crash, places, processes and locks."""
+
 from __future__ import annotations
 
+import errno
 import os
+import stat
+import subprocess
 import sys
+from collections.abc import Callable
+from dataclasses import asdict, replace
 from pathlib import Path
 
+import filelock
 import pytest
+from hypothesis import given, strategies as st
 
-from labseq.files import whole_file
+from labseq import files
+from labseq.errors import RecordingError
+from labseq.files import (
+    Holder,
+    LineLog,
+    Lock,
+    Process,
+    cache_root,
+    data_root,
+    explained,
+    knows_no_locks,
+    packaged_profiles_dir,
+    read_lines,
+    state_root,
+    whole_file,
+    write_file,
+)
 
 
 def test_an_older_file_stays_until_the_new_one_is_whole(tmp_path: Path) -> None:
@@ -62,3 +87,324 @@ def test_who_writes_alone_refuses_a_second_one(tmp_path: Path) -> None:
         file.write(b"second")
     assert path.read_bytes() == b"second"
     assert [*tmp_path.iterdir()] == [path]
+
+
+def test_a_written_file_replaces_the_older_one(tmp_path: Path) -> None:
+    path = tmp_path / "file"
+    write_file(path, b"one")
+    write_file(path, memoryview(b"two"))
+    assert path.read_bytes() == b"two"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("call", ["write", "fsync", "replace"])
+def test_a_write_that_fails_leaves_the_older_file(
+    call: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "file"
+    write_file(path, b"one")
+
+    def full(*args: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, call, full)
+    with pytest.raises(RecordingError, match=r"file: cannot be written: No space.*; the disk is full; free"):
+        write_file(path, b"two")
+    assert path.read_bytes() == b"one"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize(
+    ("number", "advice"),
+    [
+        (errno.EDQUOT, "quota"),
+        (errno.EACCES, "may not write there; choose another place with --output or LABSEQ_DATA"),
+        (errno.EROFS, "read-only"),
+        (errno.ENOTDIR, "a file is in the way"),
+        (errno.EIO, "the disk reports a fault"),
+        (errno.EMFILE, "check the disk"),
+    ],
+)
+def test_the_error_says_what_to_do(number: int, advice: str, tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match=advice) as caught, explained(tmp_path):
+        raise OSError(number, os.strerror(number))
+    assert caught.value.path == str(tmp_path)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows opens no folders")
+def test_a_folder_that_cannot_be_flushed_is_no_fault(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    real = os.fsync
+
+    def network_folder(handle: int) -> None:
+        if stat.S_ISDIR(os.fstat(handle).st_mode):
+            raise OSError(errno.EINVAL, "Invalid argument")
+        real(handle)
+
+    monkeypatch.setattr(os, "fsync", network_folder)
+    write_file(tmp_path / "file", b"one")
+    assert (tmp_path / "file").read_bytes() == b"one"
+
+
+def test_a_log_goes_on_after_a_torn_line(tmp_path: Path) -> None:
+    path = tmp_path / "log"
+    LineLog(path).append({"a": 1}, sync=True)
+    path.write_bytes(path.read_bytes() + b'{"a": 2, "torn')
+    assert read_lines(path) == ([{"a": 1}], [])
+    LineLog(path).append({"a": 3}, sync=False)
+    assert read_lines(path) == ([{"a": 1}, {"a": 3}], [2])
+    assert path.read_bytes() == b'{"a": 1}\n{"a": 2, "torn\n{"a": 3}\n'
+
+
+@given(st.binary(max_size=60).filter(lambda torn: b"\n" not in torn))
+def test_no_torn_line_of_a_process_that_is_gone_is_lost_or_glued(
+    tmp_path_factory: pytest.TempPathFactory, torn: bytes
+) -> None:
+    path = tmp_path_factory.mktemp("log") / "log"
+    path.write_bytes(b'{"a": 1}\n' + torn)
+    for b in (2, 3):
+        LineLog(path).append({"b": b}, sync=False)
+    rest = torn + b"\n" if torn else b""
+    assert path.read_bytes() == b'{"a": 1}\n' + rest + b'{"b": 2}\n{"b": 3}\n'
+
+
+@given(st.binary(max_size=60).filter(lambda torn: b"\n" not in torn))
+def test_no_torn_line_confuses_reader_or_log(tmp_path_factory: pytest.TempPathFactory, torn: bytes) -> None:
+    path = tmp_path_factory.mktemp("log") / "log"
+    log = LineLog(path)
+    log.append({"µ": 1}, sync=False)
+    path.write_bytes(path.read_bytes() + torn)
+    assert read_lines(path) == ([{"µ": 1}], [])
+    log.append({"b": "\n"}, sync=False)
+    assert read_lines(path) == ([{"µ": 1}, {"b": "\n"}], [])
+    assert path.read_bytes().endswith(b"\n")
+
+
+@pytest.mark.parametrize("call", ["write", "fsync"])
+def test_an_append_that_fails_leaves_no_trace(
+    call: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = LineLog(tmp_path / "log")
+    log.append({"a": 1}, sync=True)
+    before = log.path.read_bytes()
+    write = os.write
+
+    def full(handle: int, data: bytes = b"") -> None:
+        if data:
+            write(handle, data[:5])
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, call, full)
+        with pytest.raises(RecordingError, match="disk is full"):
+            log.append({"a": 2}, sync=True)
+    assert log.path.read_bytes() == before
+    log.append({"a": 3}, sync=True)
+    assert read_lines(log.path)[0] == [{"a": 1}, {"a": 3}]
+
+
+def test_damaged_lines_in_the_middle_are_counted(tmp_path: Path) -> None:
+    path = tmp_path / "log"
+    path.write_bytes(b'{"a": 1}\n\x00\x00\n[1]\n{"a": 2}\n')
+    assert read_lines(path) == ([{"a": 1}, {"a": 2}], [2, 3])
+
+
+def test_a_log_that_is_not_there_is_empty(tmp_path: Path) -> None:
+    assert read_lines(tmp_path / "log") == ([], [])
+
+
+def test_a_log_that_cannot_be_read_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match="cannot be read"):
+        read_lines(tmp_path)
+
+
+def test_packaged_profiles() -> None:
+    folder = packaged_profiles_dir()
+    assert folder.name == "hardware_profiles"
+    assert (folder / "virtual.yaml").is_file()
+
+
+def test_packaged_profiles_of_a_wheel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(files, "__file__", str(tmp_path / "labseq" / "places.py"))
+    assert packaged_profiles_dir() == tmp_path.resolve() / "hardware_profiles"
+    inside = tmp_path / "labseq" / "config" / "hardware_profiles"
+    inside.mkdir(parents=True)
+    assert packaged_profiles_dir() == inside.resolve()
+
+
+def test_the_data_root_comes_from_the_environment(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.delenv("LABSEQ_DATA", raising=False)
+    assert data_root() == Path("data")
+    monkeypatch.setenv("LABSEQ_DATA", "")
+    assert data_root() == Path("data")
+    monkeypatch.setenv("LABSEQ_DATA", str(tmp_path))
+    assert data_root() == tmp_path
+
+
+@pytest.mark.parametrize("folder", [state_root, cache_root])
+def test_the_users_folders_can_be_chosen(
+    folder: Callable[[], Path | None], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    for kind in ("STATE", "CACHE"):
+        monkeypatch.setenv(f"XDG_{kind}_HOME", str(tmp_path / "xdg"))
+        monkeypatch.setenv(f"LABSEQ_{kind}", "")
+    if sys.platform == "linux":
+        assert folder() == tmp_path / "xdg" / "labseq"
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "numba"))
+    assert cache_root() == tmp_path / "numba" / "labseq"
+    for kind in ("STATE", "CACHE"):
+        monkeypatch.setenv(f"LABSEQ_{kind}", "~/own")
+    assert folder() == Path.home() / "own"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="on Windows every user has a home")
+def test_a_user_without_a_home_has_no_state(monkeypatch: pytest.MonkeyPatch) -> None:
+    import pwd
+
+    def no_such_user(_: int) -> None:
+        raise KeyError
+
+    monkeypatch.setattr(pwd, "getpwuid", no_such_user)
+    for name in ("HOME", "LABSEQ_STATE", "XDG_STATE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    assert state_root() is None
+
+
+def test_this_process_runs_here() -> None:
+    owner = Process.current()
+    assert owner.is_here
+    assert owner.is_running
+
+
+def test_it_comes_back_from_plain_values() -> None:
+    owner = Process.current()
+    assert Process.from_plain(asdict(owner)) == owner
+    assert Process.from_plain({}) is None
+    assert Process.from_plain({"pid": "12"}) is None
+    assert Process.from_plain({"pid": -1}) is None
+
+
+def test_a_process_that_ended_is_not_running() -> None:
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as child:
+        owner = replace(Process.current(), pid=child.pid, started=0.0)
+        assert owner.is_running
+    assert not owner.is_running
+
+
+def test_a_killed_process_that_nobody_has_waited_for_is_not_running() -> None:
+    code = "print(flush=True); input()"
+    child = subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    with child:
+        assert child.stdout is not None
+        child.stdout.readline()
+        child.kill()
+        child.stdout.read()  # ends when the child's descriptors are closed, which is when it dies
+        owner = replace(Process.current(), pid=child.pid, started=0.0)
+        for _ in range(100_000):  # its state changes a moment later
+            if not owner.is_running:
+                break
+        assert not owner.is_running
+
+
+def test_a_later_process_of_the_same_number_is_another_one() -> None:
+    owner = replace(Process.current(), started=Process.current().started - 60)
+    assert not owner.is_running
+
+
+def test_an_impossible_number_is_no_process() -> None:
+    assert not replace(Process.current(), pid=2**40).is_running
+
+
+def test_another_computer_is_not_here() -> None:
+    assert not replace(Process.current(), host="another").is_here
+
+
+HOLD = """
+import sys
+from pathlib import Path
+from labseq.files import Lock
+lock = Lock(Path(sys.argv[1]), "the run µ")
+assert lock.take() is None
+print("held", flush=True)
+input()
+"""
+
+
+def test_a_lock_has_one_holder(tmp_path: Path) -> None:
+    first, second = (
+        Lock(tmp_path / "new" / "lab.lock", "labseq devices"),
+        Lock(tmp_path / "new/lab.lock", "me"),
+    )
+    assert first.take() is None
+    holder = second.take()
+    assert holder is not None
+    assert (holder.what, holder.pid) == ("labseq devices", os.getpid())
+    first.describe("the run data/1")
+    assert str(second.take()).startswith(f"the run data/1 (process {os.getpid()} on ")
+    second.release()  # it holds nothing
+    assert second.take() is not None
+    first.release()
+    first.release()
+    assert second.take() is None
+    second.release()
+    assert not list(tmp_path.rglob("*.holder"))
+
+
+def test_a_holder_that_is_killed_loses_its_lock(tmp_path: Path) -> None:
+    path = tmp_path / "lab.lock"
+    mine = Lock(path, "mine")
+    command = [sys.executable, "-c", HOLD, str(path)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as child:
+        assert child.stdout is not None
+        child.stdout.readline()
+        holder = mine.take()
+        assert holder is not None
+        assert (holder.what, holder.pid) == ("the run µ", child.pid)
+        child.kill()
+        child.wait()
+        assert mine.take() is None
+    mine.release()
+
+
+@pytest.mark.parametrize("content", [None, b"", b"[]", b'{"what": "x"}', b"\xff"])
+def test_a_holder_that_cannot_be_read_is_still_one(tmp_path: Path, content: bytes | None) -> None:
+    first, second = Lock(tmp_path / "a.lock", "x"), Lock(tmp_path / "a.lock", "y")
+    first.take()
+    about = tmp_path / "a.lock.holder"
+    about.unlink() if content is None else about.write_bytes(content)
+    assert second.take() == Holder("", 0, "", "")
+    assert str(second.take()) == "a process that has not said what it does"
+    first.release()
+
+
+def test_an_odd_time_is_told_as_it_is() -> None:
+    assert str(Holder("a run", 5, "pc", "yesterday")) == "a run (process 5 on pc, since yesterday)"
+
+
+@pytest.mark.parametrize("number", [errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP])
+def test_a_folder_without_locks_is_told_from_one_that_cannot_be_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError(number, os.strerror(number))
+
+    fcntl = pytest.importorskip("fcntl")
+    with monkeypatch.context() as patch:
+        patch.setattr(fcntl, "flock", refuse)
+        with pytest.raises(OSError, match=r".") as caught:
+            Lock(tmp_path / "a.lock", "x").take()
+    assert knows_no_locks(caught.value)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OSError, match=r".") as caught:
+        Lock(tmp_path / "file" / "a.lock", "x").take()
+    assert not knows_no_locks(caught.value)
+
+
+def test_an_older_package_says_it_otherwise(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise NotImplementedError("FileSystem does not appear to support flock")
+
+    monkeypatch.setattr(filelock.FileLock, "acquire", refuse)
+    with pytest.raises(OSError, match="support flock") as caught:
+        Lock(tmp_path / "a.lock", "x").take()
+    assert knows_no_locks(caught.value)

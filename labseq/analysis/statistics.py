@@ -13,7 +13,7 @@ import numpy as np
 from labseq.errors import RecordingError
 from labseq.model import TargetPattern
 from labseq.model.estimate import Estimate, mean
-from labseq.recording.durable import to_plain
+from labseq.plain import to_plain
 from labseq.recording.run_file import ShotSummary
 from labseq.recording.shot import Shot
 

@@ -34,8 +34,8 @@ from labseq.errors import ConfigError, Problem, one_of
 from labseq.messages import clean
 from labseq.model.estimate import Estimate, mean
 from labseq.pictures.figures import check_place
+from labseq.plain import to_plain
 from labseq.recording import Run
-from labseq.recording.durable import to_plain
 from labseq.session.analyses import USE, AnalysisOutcome, analyse_missing, analyses_of
 from labseq.units import format_quantity
 

@@ -14,8 +14,8 @@ from labseq.console.output import as_line, columns, report_compiling, say, stdou
 from labseq.errors import ConfigError, DeviceError
 from labseq.kernel import announcing
 from labseq.messages import clean
+from labseq.plain import dumps
 from labseq.plugins import PluginHost, PluginInfo
-from labseq.recording.durable import dumps
 from labseq.registry import LOAD_S
 from labseq.scaffold.new import PLUGINS
 from labseq.session import CheckedDevice, DevicesReport, check_devices, load_plugins, make_profile_safe

@@ -43,9 +43,10 @@ from labseq.console.output import (
     say,
 )
 from labseq.errors import RecordingError
+from labseq.files import whole_lines
 from labseq.model import ImageRecord, Occupancy, RunRecord, ShotRecord, StageTiming, TargetPattern
+from labseq.plain import parse_object
 from labseq.recording import Run, Shot, open_run
-from labseq.recording.durable import parse_object, whole_lines
 from labseq.recording.folders import EVENTS_FILE, INDEX_FILE
 from labseq.recording.reader import SCANNER, ChosenPoints
 from labseq.recording.run_file import is_index_row, read_state

@@ -17,8 +17,8 @@ from labseq.console.output import as_line, columns, count_of, outcome, percent, 
 from labseq.errors import ConfigError, LabseqError, Problem, RecordingError
 from labseq.messages import clean, visible
 from labseq.model.estimate import Estimate
+from labseq.plain import to_plain
 from labseq.recording import Run, Shot, data_root, open_run
-from labseq.recording.durable import to_plain
 from labseq.recording.folders import find_run
 from labseq.recording.reader import scan_points
 from labseq.units import format_quantity

@@ -76,6 +76,11 @@ class ImageRecord:
     t_start_s: float
     exposure_s: float
 
+    @property
+    def event(self) -> str:
+        """What it shows: "image", or "cycle_3" for the image that ended cycle 3."""
+        return f"cycle_{self.cycle}" if self.cycle else "image"
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CycleRecord:
@@ -101,10 +106,17 @@ class CycleRecord:
     t_start_s: float
     moves_s: float
 
+    @property
+    def n_atom_moves_played(self) -> int:
+        """Atom moves in the batches that were played."""
+        return int(self.plan.batch_offsets[self.n_batches_played])
+
 
 @dataclass(slots=True, eq=False)
 class ShotRecord:
-    """Everything that one attempt at a shot left behind. Filled while it runs.
+    """Everything recorded about one attempt at a shot. Filled while the attempt runs.
+
+    To record something new, add an attribute here and its row in :mod:`labseq.recording.schema`.
 
     Attributes:
         shot_index: Index of the shot in the run, from 0.
@@ -125,7 +137,7 @@ class ShotRecord:
         readings: Values read from devices during the shot.
         parameters: What differs from the files in this shot: address -> value.
         calibrations: Those in use: kind -> id.
-        story: What the simulation tells of the atoms: name -> structured array.
+        atom_events: What a simulation reports about the atoms: name -> structured array.
     """
 
     shot_index: int
@@ -146,6 +158,26 @@ class ShotRecord:
     parameters: Mapping[str, Any] = field(default_factory=dict[str, Any])
     calibrations: Mapping[str, str] = field(default_factory=dict[str, str])
     atom_events: dict[str, NDArray[Any]] = field(default_factory=dict[str, NDArray[Any]])
+
+    @property
+    def n_images(self) -> int:
+        """Number of images."""
+        return len(self.images)
+
+    @property
+    def n_cycles(self) -> int:
+        """Number of rearrangement cycles."""
+        return len(self.cycles)
+
+    @property
+    def n_batches(self) -> int:
+        """Batches that were played."""
+        return sum(cycle.n_batches_played for cycle in self.cycles)
+
+    @property
+    def n_atom_moves(self) -> int:
+        """Atom moves that were played."""
+        return sum(cycle.n_atom_moves_played for cycle in self.cycles)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -15,10 +15,10 @@ from typing import Any, Final, Literal, cast, get_args
 
 from labseq.config import StoredText, find_profile
 from labseq.errors import ConfigError, LabseqError, Problem, RecordingError, StopRequested
-from labseq.files import Holder, Lock
+from labseq.files import Holder, Lock, Process, explained, write_file
 from labseq.messages import visible
-from labseq.recording.durable import dumps, explained, parse_object, write_file
-from labseq.recording.folders import STOP_FILE, Owner
+from labseq.plain import dumps, parse_object
+from labseq.recording.folders import STOP_FILE
 from labseq.recording.run_file import read_state
 from labseq.roles import RunObserver
 from labseq.session.assembly import assemble
@@ -61,7 +61,7 @@ class Entry:
     status: EntryStatus = "waiting"
     run_dir: Path | None = None
     error: str = ""
-    owner: Owner | None = None
+    owner: Process | None = None
 
     @property
     def kept(self) -> StoredText:
@@ -71,7 +71,7 @@ class Entry:
     @property
     def is_interrupted(self) -> bool:
         """Whether the process that ran it is gone before its end."""
-        gone = self.owner is None or not (self.owner.is_here and self.owner.lives)
+        gone = self.owner is None or not (self.owner.is_here and self.owner.is_running)
         return self.status == "running" and gone
 
     @property
@@ -282,7 +282,7 @@ def _entry(values: dict[str, Any]) -> Entry:
         status=cast("EntryStatus", values["status"]),
         run_dir=None if run_dir is None else Path(run_dir),
         error=str(values["error"]),
-        owner=None if owner is None else Owner.from_plain(owner),
+        owner=None if owner is None else Process.from_plain(owner),
     )
 
 
@@ -366,7 +366,9 @@ class QueueRun:
     def _work(self, entry: Entry) -> None:
         self._tried.add(entry.id)
         self._begin(entry)
-        note = _EntryObserver(self._queue, replace(entry, status="running", owner=Owner.current(), error=""))
+        note = _EntryObserver(
+            self._queue, replace(entry, status="running", owner=Process.current(), error="")
+        )
         note.write()
         try:
             self._take(lambda observer: _open(entry, note.beside(observer)))

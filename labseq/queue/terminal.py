@@ -13,9 +13,9 @@ from labseq.cli.run import run_session
 from labseq.console.errors import excerpt, exit_code_of, report
 from labseq.console.output import columns, plural, say
 from labseq.messages import clean
+from labseq.plain import dumps
 from labseq.queue.queue import Entry, Opening, Queue, QueueRun
 from labseq.recording import data_root
-from labseq.recording.durable import dumps
 from labseq.session import Options
 
 _HEADER = ("id", "state", "sequence", "added", "options")

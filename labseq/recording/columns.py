@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.errors import RecordingError
-from labseq.recording.durable import dumps
+from labseq.plain import dumps
 from labseq.recording.reader import Run
 from labseq.recording.run_file import SIMULATION, flat_readings
 from labseq.recording.schema import unit_of

@@ -14,18 +14,10 @@ from pathlib import Path
 from typing import Any, Final
 
 from labseq.errors import RecordingError
-from labseq.files import Lock
+from labseq.files import LineLog, Lock, Process, explained, sync_folder, whole_lines, write_file
+from labseq.plain import dumps, parse_object
 from labseq.recording import folders
-from labseq.recording.durable import (
-    LineLog,
-    dumps,
-    explained,
-    parse_object,
-    sync_folder,
-    whole_lines,
-    write_file,
-)
-from labseq.recording.folders import Marker, Owner, markers_in
+from labseq.recording.folders import Marker, markers_in
 from labseq.recording.run_file import (
     STATUSES,
     NewerFormatError,
@@ -538,8 +530,8 @@ def _check_state(run_dir: Path) -> list[Damage]:
 def _goes_on(run_dir: Path) -> bool:
     """Whether a process has it in progress, as far as anybody here can tell."""
     state = _state(run_dir)
-    owner = Owner.from_plain(state)
-    return state.get("state") == "running" and owner is not None and (not owner.is_here or owner.lives)
+    owner = Process.from_plain(state)
+    return state.get("state") == "running" and owner is not None and (not owner.is_here or owner.is_running)
 
 
 def _state(run_dir: Path) -> dict[str, Any]:
@@ -559,10 +551,10 @@ def holders_gone(folder: Path) -> Iterator[Damage]:
         if not name.endswith(".lock.holder"):
             continue
         try:
-            owner = Owner.from_plain(json.loads((folder / name).read_bytes()))
+            owner = Process.from_plain(json.loads((folder / name).read_bytes()))
         except (OSError, ValueError, AttributeError):
             continue  # it is just being taken away, or half of it is written
-        if owner is not None and owner.is_here and not owner.lives:
+        if owner is not None and owner.is_here and not owner.is_running:
             yield quarantined("a lock whose holder is gone", folder / name, folder)
 
 

@@ -31,9 +31,9 @@ from numpy.typing import NDArray
 import labseq
 from labseq.errors import ConfigError, Problem, RecordingError, one_of
 from labseq.files import whole_file
+from labseq.plain import dumps, plain_text
 from labseq.recording import folders, schema as layout
 from labseq.recording.columns import Column, columns_of
-from labseq.recording.durable import dumps, plain_text
 from labseq.recording.folders import RUN_FILE
 from labseq.recording.reader import Run
 from labseq.recording.schema import link_name, set_attributes

@@ -9,20 +9,18 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import os
-import platform
 import re
-import sys
 import unicodedata
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from labseq.errors import RecordingError
-from labseq.recording.durable import dumps, explained, parse_object, sync_folder, write_file
+from labseq.files import Process, explained, state_root, sync_folder, write_file
+from labseq.plain import dumps, parse_object
 
 RUN_FILE: Final = "run.json"
 STATE_FILE: Final = "STATE"
@@ -47,25 +45,6 @@ OWN_NAMES: Final = frozenset(
 
 _COUNTER = re.compile(r"\.?(\d{4,})[_.]")
 _MAX_SLUG: Final = 60
-
-
-def state_root() -> Path | None:
-    """Folder of what labseq remembers for this user between runs, wherever their data lie.
-
-    ``LABSEQ_STATE`` if set, else the platform's place for such things; None for a
-    user who has no home.
-    """
-    environ = os.environ
-    try:
-        if own := environ.get("LABSEQ_STATE"):
-            return Path(own).expanduser()
-        if sys.platform == "win32":
-            return Path(environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local") / "labseq" / "State"
-        if sys.platform == "darwin":
-            return Path.home() / "Library" / "Application Support" / "labseq"
-        return Path(environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "labseq"
-    except RuntimeError:
-        return None
 
 
 def slug(name: str) -> str:
@@ -177,97 +156,6 @@ def _without_run_file(folder: Path) -> str:
     return f"has no {RUN_FILE}: the run died while its folder was made; it holds no shots, delete it"
 
 
-@dataclass(frozen=True, slots=True)
-class Owner:
-    """A process, told apart from a later one that was given the same number.
-
-    Attributes:
-        pid: Process id.
-        started: When it started, in the system's own terms; "" if that is unknown.
-        host: The computer that it runs on.
-    """
-
-    pid: int
-    started: str
-    host: str
-
-    @classmethod
-    def current(cls) -> Owner:
-        """This process."""
-        return cls(os.getpid(), _started(os.getpid()) or "", platform.node())
-
-    @classmethod
-    def from_plain(cls, values: Mapping[str, Any]) -> Owner | None:
-        """Read back what ``dataclasses.asdict`` made; None if it is not that."""
-        pid = values.get("pid")
-        if not isinstance(pid, int) or isinstance(pid, bool) or pid <= 0:
-            return None
-        return cls(pid, str(values.get("started") or ""), str(values.get("host") or ""))
-
-    @property
-    def is_here(self) -> bool:
-        """Whether it belongs to this computer, so that :attr:`lives` can be known."""
-        return self.host == platform.node()
-
-    @property
-    def lives(self) -> bool:
-        """Whether it still runs; meaningful on its own computer only."""
-        started = _started(self.pid)
-        if started is None:
-            return False
-        return not (self.started and started) or started == self.started
-
-
-if sys.platform == "win32":
-
-    def _started(pid: int) -> str | None:
-        """When a process started; None if there is no such process, "" if nobody says."""
-        import ctypes
-        from ctypes import wintypes
-
-        query_limited_information, still_active, access_denied = 0x1000, 259, 5
-        kernel = ctypes.WinDLL("kernel32", use_last_error=True)
-        kernel.OpenProcess.restype = wintypes.HANDLE
-        kernel.OpenProcess.argtypes = (wintypes.DWORD, wintypes.BOOL, wintypes.DWORD)
-        kernel.CloseHandle.argtypes = (wintypes.HANDLE,)
-        kernel.GetExitCodeProcess.argtypes = (wintypes.HANDLE, ctypes.POINTER(wintypes.DWORD))
-        kernel.GetProcessTimes.argtypes = (wintypes.HANDLE, *[ctypes.POINTER(wintypes.FILETIME)] * 4)
-        handle = kernel.OpenProcess(query_limited_information, False, pid)
-        if not handle:
-            return "" if ctypes.get_last_error() == access_denied else None
-        try:
-            code = wintypes.DWORD()
-            if kernel.GetExitCodeProcess(handle, ctypes.byref(code)) and code.value != still_active:
-                return None
-            times = [wintypes.FILETIME() for _ in range(4)]
-            if not kernel.GetProcessTimes(handle, *[ctypes.byref(time) for time in times]):
-                return ""
-            return f"{times[0].dwHighDateTime:08x}{times[0].dwLowDateTime:08x}"
-        finally:
-            kernel.CloseHandle(handle)
-
-else:
-
-    def _started(pid: int) -> str | None:
-        """When a process started; None if there is no such process, "" if nobody says."""
-        try:
-            os.kill(pid, 0)
-        except (ProcessLookupError, OverflowError):
-            return None
-        except PermissionError:
-            pass  # it exists and belongs to somebody else
-        try:
-            stat = Path(f"/proc/{pid}/stat").read_bytes()
-            boot = Path("/proc/sys/kernel/random/boot_id").read_text("ascii").strip()
-        except OSError:
-            return ""  # not Linux, or hidden
-        # The name in parentheses may hold anything; state is the 1st field after it, the start time the 20th.
-        fields = stat[stat.rindex(b")") + 1 :].split()
-        if fields[0] in {b"Z", b"X"}:
-            return None  # ended; its parent has not yet asked how
-        return f"{boot}/{fields[19].decode('ascii')}"
-
-
 _FOLDER: Final = ".active"
 
 
@@ -283,14 +171,14 @@ class Marker:
     """
 
     path: Path
-    owner: Owner | None
+    owner: Process | None
     run_dir: Path | None
     profile: str
 
     @property
     def is_active(self) -> bool:
         """Whether its process is known to live; of one on another computer nobody knows."""
-        return self.owner is not None and self.owner.is_here and self.owner.lives
+        return self.owner is not None and self.owner.is_here and self.owner.is_running
 
 
 def marker_roots(root: Path) -> tuple[Path, ...]:
@@ -327,7 +215,7 @@ def clear_active(roots: Sequence[Path], profile_key: str) -> None:
     Raises:
         RecordingError: A marker cannot be removed; all others are.
     """
-    current = Owner.current()
+    current = Process.current()
     failures: list[RecordingError] = []
     for marker in _markers(roots, profile_key):
         if not marker.is_active or (marker.owner and marker.owner.pid == current.pid):
@@ -372,7 +260,7 @@ def markers_in(root: Path) -> list[Marker]:
 
 
 def _mark(root: Path, profile_key: str, run_dir: Path) -> None:
-    owner = Owner.current()
+    owner = Process.current()
     marker = root / _FOLDER / f"{_stem(profile_key)}.{owner.pid}.json"
     with explained(marker):
         marker.parent.mkdir(parents=True, exist_ok=True)
@@ -399,7 +287,7 @@ def _read(path: Path) -> Marker:
     run_dir, profile = values.get("run_dir"), values.get("profile")
     return Marker(
         path,
-        Owner.from_plain(values),
+        Process.from_plain(values),
         Path(run_dir) if isinstance(run_dir, str) else None,
         profile if isinstance(profile, str) else "",
     )

@@ -10,11 +10,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from labseq.errors import RecordingError
+from labseq.files import read_lines
 from labseq.model import TargetPattern
 from labseq.model.estimate import mean
 from labseq.model.records import RunStatus
+from labseq.plain import dumps, parse_object, to_plain
 from labseq.recording import folders
-from labseq.recording.durable import dumps, parse_object, read_lines, to_plain
 from labseq.recording.folders import RUN_FILE
 from labseq.recording.results import rows_of
 from labseq.recording.run_file import is_index_row, is_skip_row, read_run, read_state, target_of

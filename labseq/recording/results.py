@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any, Final, cast
 
 from labseq.errors import RecordingError
+from labseq.files import LineLog, explained, read_lines
 from labseq.recording import folders
-from labseq.recording.durable import LineLog, explained, read_lines
 
 SHOT: Final = "shot"
 ERROR: Final = "error"

@@ -19,11 +19,12 @@ from numpy.typing import NDArray
 
 import labseq
 from labseq.errors import RecordingError
+from labseq.files import Process
 from labseq.model import RunRecord, ShotRecord, TargetPattern
 from labseq.model.records import RunStatus
+from labseq.plain import dumps, parse_object, to_plain
 from labseq.recording import schema as layout
-from labseq.recording.durable import dumps, parse_object, to_plain
-from labseq.recording.folders import PROFILE_FILE, RUN_FILE, SEQUENCE_FILE, STATE_FILE, Owner
+from labseq.recording.folders import PROFILE_FILE, RUN_FILE, SEQUENCE_FILE, STATE_FILE
 
 SIMULATION: Final = "simulation."
 """What the names of readings begin with that only a simulation can know."""
@@ -277,7 +278,7 @@ def _grid(rows: list[str]) -> NDArray[np.bool_]:
 
 def encode_state(status: RunStatus, error: str = "") -> bytes:
     """The content of STATE: one line, with the process that the run belongs to."""
-    return dumps({"state": status, **asdict(Owner.current()), "error": error}).encode() + b"\n"
+    return dumps({"state": status, **asdict(Process.current()), "error": error}).encode() + b"\n"
 
 
 def read_state(folder: Path) -> tuple[RunStatus, str]:
@@ -295,16 +296,16 @@ def read_state(folder: Path) -> tuple[RunStatus, str]:
     status = cast("RunStatus", state["state"])
     if status != "running":
         return status, str(state.get("error") or "")
-    owner = Owner.from_plain(state)
-    if owner is None or (owner.is_here and not owner.lives):
+    owner = Process.from_plain(state)
+    if owner is None or (owner.is_here and not owner.is_running):
         return "failed", "the process that ran it is gone"
     return "running", ""
 
 
-def read_owner(folder: Path) -> Owner | None:
+def read_owner(folder: Path) -> Process | None:
     """The process that a run belongs to, or belonged to; None if that is not known."""
     try:
-        return Owner.from_plain(parse_object((folder / STATE_FILE).read_bytes()) or {})
+        return Process.from_plain(parse_object((folder / STATE_FILE).read_bytes()) or {})
     except OSError:
         return None
 

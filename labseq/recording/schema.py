@@ -31,7 +31,7 @@ from h5py import h5a, h5s, h5t  # pyright: ignore[reportAttributeAccessIssue] - 
 from numpy.typing import NDArray
 
 from labseq.model import CycleRecord, Plan, PlanReport, StageTiming
-from labseq.recording.durable import dumps, plain_text, to_plain
+from labseq.plain import dumps, plain_text, to_plain
 
 FORMAT: Final = "labseq-shot"
 FORMAT_VERSION: Final = "1.4"

@@ -15,10 +15,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from labseq.errors import RecordingError
+from labseq.files import LineLog, explained, sync_folder, write_file
 from labseq.model import RunRecord, ShotRecord
 from labseq.model.records import RunStatus
+from labseq.plain import dumps
 from labseq.recording import folders
-from labseq.recording.durable import LineLog, dumps, explained, sync_folder, write_file
 from labseq.recording.run_file import encode_run, encode_state, encode_text, index_row, read_run
 
 if TYPE_CHECKING:

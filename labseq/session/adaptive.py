@@ -14,9 +14,9 @@ from labseq.errors import ConfigError, DeviceError
 from labseq.guard import Guard, StopFlag
 from labseq.messages import clean
 from labseq.model import ScanRange, ScanSpace, VisitedPoint
+from labseq.plain import dumps
 from labseq.recording import Shot
 from labseq.recording.columns import figures_of
-from labseq.recording.durable import dumps
 from labseq.recording.reader import SCANNER
 from labseq.roles import Scanner, Step
 from labseq.session.construct import construct_one

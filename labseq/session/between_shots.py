@@ -10,9 +10,10 @@ from typing import Any
 
 from labseq.config import find_profile
 from labseq.errors import ConfigError, Problem, StopRequested
+from labseq.files import Process, write_file
+from labseq.plain import dumps
 from labseq.recording import RunWriter, data_root, marker_roots, runs_in_progress
-from labseq.recording.durable import dumps, write_file
-from labseq.recording.folders import STOP_FILE, Owner, find_run
+from labseq.recording.folders import STOP_FILE, find_run
 from labseq.recording.run_file import read_owner, read_state
 from labseq.session.policies import Checks
 
@@ -33,7 +34,7 @@ def ask_to_stop(run_dir: Path) -> None:
     Raises:
         RecordingError: Its folder cannot be written to.
     """
-    write_file(run_dir / STOP_FILE, dumps(asdict(Owner.current())).encode() + b"\n")
+    write_file(run_dir / STOP_FILE, dumps(asdict(Process.current())).encode() + b"\n")
 
 
 def is_running(run_dir: Path) -> bool:

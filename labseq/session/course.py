@@ -11,8 +11,8 @@ from typing import Any
 
 from labseq.errors import DeviceError
 from labseq.guard import StopFlag
+from labseq.plain import dumps
 from labseq.recording import Run, RunWriter, Shot
-from labseq.recording.durable import dumps
 from labseq.recording.shot import load_content
 from labseq.roles import RunObserver
 from labseq.sequencer import Sequencer

@@ -8,7 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
-from labseq.plugin import Clock, DeviceError, Owner, state_root, wait_for
+from labseq.plugin import Clock, DeviceError, Process, state_root, wait_for
 
 END_S: Final = 10.0
 """How long a process that was left alone may take to ramp down and let its radio go."""
@@ -46,8 +46,8 @@ def end_stale_process(name: str, marker: Path, clock: Clock) -> None:
         marker.unlink()
     except (OSError, ValueError):
         return
-    here = Owner.current()
-    one = Owner(number, "", here.host)
+    here = Process.current()
+    one = Process(number, 0.0, here.host)
     if not wait_for(lambda longest_s: _gone(one, longest_s), END_S, clock):
         text = (
             f"process {number}, left behind with this radio, does not end within {END_S:g} s; end it yourself"
@@ -55,8 +55,8 @@ def end_stale_process(name: str, marker: Path, clock: Clock) -> None:
         raise DeviceError(name, text)
 
 
-def _gone(one: Owner, longest_s: float) -> bool | None:
-    if not one.lives:
+def _gone(one: Process, longest_s: float) -> bool | None:
+    if not one.is_running:
         return True
     import threading
 

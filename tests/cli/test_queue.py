@@ -178,8 +178,8 @@ def test_what_has_changed_is_told_line_by_line(stopped: Path, capsys: pytest.Cap
 
 
 def test_a_run_in_progress_is_asked(stopped: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from labseq.files import write_file
     from labseq.recording import mark_active, marker_roots
-    from labseq.recording.durable import write_file
     from labseq.recording.run_file import encode_state
 
     write_file(stopped / "STATE", encode_state("running"))

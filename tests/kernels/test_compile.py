@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from labseq import kernel as compiling
-from labseq.kernel import announcing, cache_root, const, kernel
+from labseq.kernel import announcing, const, kernel
 
 MAX_LACK = 3
 
@@ -192,30 +191,6 @@ def test_the_lock_of_python_is_free_while_a_kernel_runs(cache: Path) -> None:
 
     options: Any = same
     assert options.targetoptions["nogil"]
-
-
-@pytest.mark.parametrize(
-    ("platform", "environment", "expected"),
-    [
-        ("linux", {"LABSEQ_CACHE": "/own", "NUMBA_CACHE_DIR": "/numba"}, "/own"),
-        ("linux", {"NUMBA_CACHE_DIR": "/numba", "XDG_CACHE_HOME": "/xdg"}, "/numba/labseq"),
-        ("linux", {"XDG_CACHE_HOME": "/xdg"}, "/xdg/labseq"),
-        ("linux", {}, "/home/me/.cache/labseq"),
-        ("darwin", {}, "/home/me/Library/Caches/labseq"),
-        ("win32", {"LOCALAPPDATA": "/local"}, "/local/labseq/Cache"),
-        ("win32", {}, "/home/me/AppData/Local/labseq/Cache"),
-    ],
-)
-def test_the_cache_is_where_the_platform_keeps_caches(
-    platform: str, environment: dict[str, str], expected: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for name in ("LABSEQ_CACHE", "NUMBA_CACHE_DIR", "XDG_CACHE_HOME", "LOCALAPPDATA"):
-        monkeypatch.delenv(name, raising=False)
-    for name, value in environment.items():
-        monkeypatch.setenv(name, value)
-    monkeypatch.setattr(compiling.sys, "platform", platform)
-    monkeypatch.setattr(Path, "home", lambda: Path("/home/me"))
-    assert cache_root() == Path(expected)
 
 
 def run_python(code: str, **environment: str) -> str:

@@ -148,7 +148,7 @@ def damaged_state(run_dir: Path) -> None:
 
 
 def dead_run(run_dir: Path) -> None:
-    rewrite_state(run_dir, state="running", pid=2**22 + 1, started="")
+    rewrite_state(run_dir, state="running", pid=2**22 + 1, started=0.0)
 
 
 def stop_left(run_dir: Path) -> None:

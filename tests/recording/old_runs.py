@@ -131,7 +131,7 @@ def make(folder: Path) -> Path:
         for index in range(2):
             writer.write_shot(a_shot(index))
         writer.finish("complete")
-        state = {"state": "complete", "pid": 1, "started": "", "host": "lab", "error": ""}  # nobody's process
+        state = {"state": "complete", "pid": 1, "started": 0.0, "host": "lab", "error": ""}  # nobody's process
         (writer.run_dir / "STATE").write_text(json.dumps(state) + "\n", "utf-8")
         made = folder / f"shot_{layout.FORMAT_VERSION}"
         shutil.rmtree(made, ignore_errors=True)

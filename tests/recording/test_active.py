@@ -48,7 +48,7 @@ def test_clearing_leaves_what_belongs_to_others(tmp_path: Path) -> None:
     values = json.loads(living.read_text())
     with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as child:
         other = living.with_name(living.name.replace(f".{values['pid']}.", f".{child.pid}."))
-        other.write_text(json.dumps({**values, "pid": child.pid, "started": ""}))
+        other.write_text(json.dumps({**values, "pid": child.pid, "started": 0.0}))
         clear_active([tmp_path], "lab")
         assert died([tmp_path], "lab") is None
         assert sorted(path.name for path in (tmp_path / ".active").iterdir() if "lab" in path.name) == [

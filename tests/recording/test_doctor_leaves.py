@@ -47,7 +47,7 @@ def test_a_run_without_shots_or_run_file_goes_to_the_quarantine_of_its_day(run_d
     dead = run_dir.parent / "0002_dead"
     (dead / "shots").mkdir(parents=True)
     shutil.copy(run_dir / "STATE", dead)
-    rewrite_state(dead, state="running", pid=2**22 + 1, started="")
+    rewrite_state(dead, state="running", pid=2**22 + 1, started=0.0)
     root = run_dir.parents[1]
     report = examine(root)
     assert report.in_progress == [dead]  # it may just be being made
@@ -87,7 +87,7 @@ def test_a_run_in_progress_is_not_touched(run_dir: Path) -> None:
     root = run_dir.parents[1]
     for plant in (lost_line, part_left, torn_events, empty_file):
         plant(run_dir)
-    rewrite_state(run_dir, state="running", pid=os.getpid(), started="")
+    rewrite_state(run_dir, state="running", pid=os.getpid(), started=0.0)
     before = {path: path.read_bytes() for path in root.rglob("*") if path.is_file()}
     report = examine(root)
     assert (report.findings, report.in_progress) == ([], [run_dir])
@@ -202,7 +202,7 @@ def test_a_disk_that_takes_nothing_leaves_all_as_it_was(
     dead_run(run_dir)
     before = {p: p.read_bytes() for p in run_dir.rglob("*") if p.is_file()}
     with monkeypatch.context() as patch:
-        patch.setattr("labseq.recording.durable.os.fsync", full)
+        patch.setattr("os.fsync", full)
         report = examine(run_dir)
     assert all(one.left and "the disk is full" in one.done for one in report.findings)
     assert {p: p.read_bytes() for p in run_dir.rglob("*") if p.is_file() and p.name != ".lock"} == before

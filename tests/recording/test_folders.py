@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, strategies as st
 
 from labseq.errors import RecordingError
-from labseq.recording.folders import find_run, make_run_folder, slug, state_root
+from labseq.recording.folders import find_run, make_run_folder, slug
 
 NOON = datetime(2026, 11, 20, 12, tzinfo=UTC)
 
@@ -24,39 +24,6 @@ input()
 for i in range(10):
     print(make_run_folder(Path(sys.argv[1]), sys.argv[2], noon))
 """
-
-
-@pytest.mark.parametrize(
-    ("platform", "environment", "expected"),
-    [
-        ("linux", {"LABSEQ_STATE": "/own", "XDG_STATE_HOME": "/xdg"}, "/own"),
-        ("linux", {"LABSEQ_STATE": "", "XDG_STATE_HOME": "/xdg"}, "/xdg/labseq"),
-        ("linux", {}, "/home/me/.local/state/labseq"),
-        ("darwin", {}, "/home/me/Library/Application Support/labseq"),
-        ("win32", {"LOCALAPPDATA": "/local"}, "/local/labseq/State"),
-        ("win32", {}, "/home/me/AppData/Local/labseq/State"),
-    ],
-)
-def test_the_state_is_where_the_platform_keeps_it(
-    platform: str, environment: dict[str, str], expected: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for name in ("LABSEQ_STATE", "XDG_STATE_HOME", "LOCALAPPDATA"):
-        monkeypatch.delenv(name, raising=False)
-    for name, value in environment.items():
-        monkeypatch.setenv(name, value)
-    monkeypatch.setattr("labseq.recording.folders.sys.platform", platform)
-    monkeypatch.setattr(Path, "home", lambda: Path("/home/me"))
-    assert state_root() == Path(expected)
-
-
-def test_a_user_without_a_home_has_no_state(monkeypatch: pytest.MonkeyPatch) -> None:
-    def homeless() -> Path:
-        raise RuntimeError("could not determine home directory")
-
-    monkeypatch.setattr(Path, "home", homeless)
-    for name in ("LABSEQ_STATE", "XDG_STATE_HOME", "LOCALAPPDATA"):
-        monkeypatch.delenv(name, raising=False)
-    assert state_root() is None
 
 
 def test_counters_go_on_whatever_the_name(tmp_path: Path) -> None:

@@ -132,7 +132,7 @@ def test_a_shot_written_again_counts_once(tmp_path: Path, make_run: MakeRun, mak
 
 def test_a_run_whose_process_is_gone_has_failed(run_dir: Path) -> None:
     with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as child:
-        rewrite_json(run_dir / "STATE", state="running", pid=child.pid, started="")
+        rewrite_json(run_dir / "STATE", state="running", pid=child.pid, started=0.0)
         assert open_run(run_dir).status == "running"
     run = open_run(run_dir)
     assert (run.status, run.error) == ("failed", "the process that ran it is gone")
@@ -140,7 +140,7 @@ def test_a_run_whose_process_is_gone_has_failed(run_dir: Path) -> None:
 
 
 def test_a_run_on_another_computer_is_believed(run_dir: Path) -> None:
-    rewrite_json(run_dir / "STATE", state="running", started="long ago", host="another")
+    rewrite_json(run_dir / "STATE", state="running", started=1.0, host="another")
     assert open_run(run_dir).status == "running"
 
 

@@ -11,8 +11,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings, strategies as st
 
 from labseq.errors import ConfigError, RecordingError
+from labseq.files import Process
 from labseq.queue.queue import Entry, Queue
-from labseq.recording.folders import Owner
 from labseq.session import Options
 
 from .queued import SEQUENCE, add, queue
@@ -68,7 +68,7 @@ def test_entries_move_as_in_a_list(
 
 def test_an_entry_reads_back(queue: Queue) -> None:
     entry = add(queue, shots=2, overrides=("attempts=5",), dry_run="fast", realtime=True)
-    full = replace(entry, run_dir=Path("data/µ"), error="nein", status="failed", owner=Owner.current())
+    full = replace(entry, run_dir=Path("data/µ"), error="nein", status="failed", owner=Process.current())
     queue.write(full)
     (read,) = queue.entries()
     assert asdict(read) == asdict(full)

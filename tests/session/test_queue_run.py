@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 
 from labseq.errors import ConfigError, DeviceError, RecordingError, StopRequested
+from labseq.files import Process
 from labseq.queue.queue import Opening, Queue, QueueRun
 from labseq.recording import open_run
-from labseq.recording.folders import Owner
 from labseq.session import Session
 from labseq.session.between_shots import ask_to_stop
 
@@ -177,7 +177,7 @@ def test_ctrl_c_is_meant_and_a_computer_that_shuts_down_is_not(
     assert (first.status, second.status) == (status, "waiting")
     assert first.run_dir == session.run_dir
     if status == "running":  # by a process that will be gone
-        queue.write(replace(first, owner=replace(Owner.current(), started="another time")))
+        queue.write(replace(first, owner=replace(Process.current(), started=1.0)))
     taking = Taking()
     taking.run(queue)
     assert taking.begun == ([2] if status == "stopped" else [1, 2])
@@ -190,7 +190,7 @@ def test_an_interrupted_entry_comes_first_and_goes_on(queue: Queue) -> None:
     (entry,) = queue.entries()
     add(queue)
     queue.move(3, 1)
-    gone = replace(Owner.current(), started="another time")
+    gone = replace(Process.current(), started=1.0)
     queue.write(replace(entry, status="running", owner=gone))
     assert states(queue) == {3: "waiting", 1: "interrupted"}
     taking = Taking()
@@ -202,7 +202,7 @@ def test_an_interrupted_entry_comes_first_and_goes_on(queue: Queue) -> None:
 
 def test_an_entry_of_a_living_process_is_left_alone(queue: Queue) -> None:
     entry = add(queue)
-    queue.write(replace(entry, status="running", owner=Owner.current()))
+    queue.write(replace(entry, status="running", owner=Process.current()))
     assert states(queue) == {1: "running"}
     Taking().run(queue)
     assert states(queue) == {1: "running"}

@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, given, settings, strategies as st
 
 import labseq
 from labseq.errors import ConfigError, RecordingError, StopRequested
-from labseq.recording.durable import write_file
+from labseq.files import write_file
 from labseq.recording.run_file import encode_state
 from labseq.testing.fakes import RecordingObserver
 

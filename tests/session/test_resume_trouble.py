@@ -13,7 +13,6 @@ import pytest
 import labseq
 from labseq.errors import RecordingError
 from labseq.model import RunRecord
-from labseq.recording import durable
 from labseq.session import provenance as recording_of
 from labseq.testing.fakes import RecordingObserver
 
@@ -34,7 +33,7 @@ def fill_disk(patch: pytest.MonkeyPatch, n_good: int, number: int = errno.ENOSPC
             write_some(handle, bytes(data)[: len(data) // 2])
         raise OSError(number, os.strerror(number))
 
-    patch.setattr(durable.os, "write", limited)
+    patch.setattr(os, "write", limited)
 
 
 @pytest.mark.parametrize("n_good", [13, 15, 18])

@@ -10,8 +10,8 @@ import pytest
 
 import labseq
 from labseq.errors import ConfigError, RecordingError, StopRequested
+from labseq.files import write_file
 from labseq.recording import mark_active, marker_roots
-from labseq.recording.durable import write_file
 from labseq.recording.run_file import encode_state
 from labseq.session.between_shots import ask_to_stop, find_running, is_running, owner_text
 from labseq.testing.fakes import RecordingObserver

@@ -11,7 +11,7 @@ import pytest
 
 from labseq.errors import LabseqError
 from labseq.model import SiteGrid
-from labseq.recording.durable import dumps
+from labseq.plain import dumps
 from labseq.recording.results import ResultsLog
 from labseq.roles import Analysis, Context, RecordedShot
 from labseq.testing.contracts.process import quietly

@@ -1,0 +1,107 @@
+"""Any value as plain JSON: what run.json, the index, the event log and JSON texts are made of."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Mapping, Set as AbstractSet
+from datetime import date, time
+from enum import Enum
+from pathlib import PurePath
+from typing import Any, Final, cast
+
+_MAX_DEPTH: Final = 32
+_MAX_BITS: Final = 4096  # Python refuses to write much longer integers in decimal
+
+
+def to_plain(value: Any) -> Any:
+    """Turn any value into one that JSON can hold; never raises.
+
+    nan and infinities become None, numpy scalars and arrays plain numbers and
+    lists, keys text. Anything else becomes its ``repr``.
+
+    Example:
+        >>> import numpy as np
+        >>> to_plain({1: np.float32(0.5), "b": (float("nan"), np.arange(2))})
+        {'1': 0.5, 'b': [None, [0, 1]]}
+    """
+    return _plain(value, ())
+
+
+def dumps(value: Any, *, indent: int | None = None) -> str:
+    """Any value as JSON, by way of :func:`to_plain`; one line unless indented.
+
+    Example:
+        >>> dumps({"t_s": float("inf")})
+        '{"t_s": null}'
+    """
+    text = json.dumps(to_plain(value), ensure_ascii=False, allow_nan=False, indent=indent)
+    # Lone surrogates, left over from undecodable bytes, have no UTF-8; "\udc80" is its JSON escape.
+    return text.encode("utf-8", "backslashreplace").decode("utf-8")
+
+
+def plain_text(text: str) -> str:
+    r"""Text that every file format takes: no NUL characters and no lone surrogates.
+
+    Example:
+        >>> print(plain_text("a\0b"))
+        a\x00b
+    """
+    return text.replace("\0", r"\x00").encode("utf-8", "backslashreplace").decode("utf-8")
+
+
+def _plain(value: Any, parents: tuple[int, ...]) -> Any:
+    if value is None or isinstance(value, (bool, str)):
+        return value
+    if isinstance(value, int) and not isinstance(value, Enum):
+        return int(value) if value.bit_length() <= _MAX_BITS else hex(value)
+    if isinstance(value, float):
+        return float(value) if math.isfinite(value) else None
+    if isinstance(value, PurePath):
+        return str(value)
+    if id(value) in parents or len(parents) >= _MAX_DEPTH:
+        return _repr(value)
+    try:
+        return _plain_container(value, (*parents, id(value)))
+    except Exception:  # noqa: BLE001 - a plugin's container may raise anything
+        return _repr(value)
+
+
+def _plain_container(value: Any, parents: tuple[int, ...]) -> Any:
+    if isinstance(value, Enum):
+        return _plain(value.value, parents)
+    if hasattr(value, "tolist"):  # arrays and scalars of numpy
+        return _plain(value.tolist(), parents)
+    if isinstance(value, Mapping):
+        items = cast("Mapping[Any, Any]", value).items()
+        return {_key(key): _plain(item, parents) for key, item in items}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item, parents) for item in cast("list[Any]", value)]
+    if isinstance(value, AbstractSet):
+        return [_plain(item, parents) for item in sorted(cast("AbstractSet[Any]", value), key=_repr)]
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {item.name: _plain(getattr(value, item.name), parents) for item in dataclasses.fields(value)}
+    if isinstance(value, date | time):
+        return value.isoformat()
+    return _repr(value)
+
+
+def _key(key: Any) -> str:
+    return key if isinstance(key, str) else str(_plain(key, ()))
+
+
+def _repr(value: Any) -> str:
+    try:
+        return repr(value)
+    except Exception:  # noqa: BLE001 - a plugin's repr may raise anything
+        return f"<{type(value).__name__}>"
+
+
+def parse_object(data: bytes) -> dict[str, Any] | None:
+    """Read a JSON object; None if it is anything else."""
+    try:
+        value = json.loads(data)
+    except (ValueError, RecursionError):
+        return None
+    return cast("dict[str, Any]", value) if isinstance(value, dict) else None
