@@ -1,4 +1,4 @@
-"""Settings models of plugins, sequences and profiles: their base class, quantities with units, common types."""
+"""Settings models of plugins, sequences and profiles: base class, quantities with units, common types."""
 
 from __future__ import annotations
 

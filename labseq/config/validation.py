@@ -13,8 +13,8 @@ import numpy as np
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
-from labseq.config.messages import EXPECTED_TYPES, ErrorText, comma_hint, explain_validation_error
-from labseq.config.yaml_nodes import Mark, Node
+from labseq.config.messages import EXPECTED_TYPES, ErrorText, explain_validation_error
+from labseq.config.yaml_nodes import Mark, Node, comma_hint
 from labseq.errors import ConfigError, Loc
 from labseq.messages import clean, closest, listing, shown
 from labseq.settings import FOLDER, NoSettings

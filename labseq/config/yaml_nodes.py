@@ -1,7 +1,9 @@
-"""YAML read into nodes that know their line and column.
+"""YAML text read into nodes that know their line and column.
 
-PyYAML's reader, scanner and parser give events; the tree is made here. There is
-no constructor, so no tag can run code, and the limits hold before anything grows.
+PyYAML composes its node graph; here it is checked while it grows and converted to :class:`Node`.
+PyYAML's constructor is not used, so no tag can run code. Scalars follow the core rules of YAML 1.2.
+Under YAML 1.1, PyYAML's default, ``off`` would be False, ``10:30`` 630 and ``2026-01-01`` a date. Here
+they are text.
 """
 
 from __future__ import annotations
@@ -11,41 +13,33 @@ import unicodedata
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Any, Final, NamedTuple, TypeAlias, cast
+from typing import Any, Final, NamedTuple, NoReturn, TypeAlias, cast
 
+import yaml
 from yaml.error import Mark as YamlMark, MarkedYAMLError
-from yaml.events import (
-    AliasEvent,
-    DocumentStartEvent,
-    Event,
-    MappingEndEvent,
-    MappingStartEvent,
-    NodeEvent,
-    ScalarEvent,
-    SequenceEndEvent,
-    StreamEndEvent,
-)
-from yaml.parser import Parser
-from yaml.reader import Reader
-from yaml.scanner import Scanner
+from yaml.events import AliasEvent, Event
 
-from labseq.config.messages import ErrorText, comma_hint, resolve
+from labseq.config.yaml_errors import explain
 from labseq.errors import ConfigError, Loc, Problem
 from labseq.messages import clean, did_you_mean, shown, visible
+from labseq.text_files import line_and_column
 
 Scalar: TypeAlias = str | int | float | bool | None
 
 MAX_VALUES: Final = 10_000
-"""Most values (scalars, lists and mappings, aliases written out) in one document."""
+"""Largest number of values (scalars, lists and mappings, aliases expanded) in one document."""
 
 MAX_DEPTH: Final = 32
 """Deepest nesting of lists and mappings."""
+
+MAX_DIGITS: Final = 100
+"""Longest number, in characters; Python refuses to convert much longer ones, or takes long."""
 
 
 class Mark(NamedTuple):
     """A place: line and column from 1, or an option such as ``--set shots=5``.
 
-    With both, ``origin`` is the file of a value that was put into another one.
+    With both, ``origin`` is the file of a value that was put into another document.
     """
 
     line: int
@@ -53,40 +47,34 @@ class Mark(NamedTuple):
     origin: str = ""
 
     def problem(self, name: str, what: str, expected: str = "", hint: str = "") -> Problem:
-        """Say that something is wrong here, in the file called ``name`` or in the origin.
+        """A problem at this place, in the file called ``name`` or in the origin.
 
-        What cannot be seen becomes visible: validators, those of plugins too, quote values as they are.
+        Unprintable characters are escaped: validators, those of plugins too, quote values unchanged.
         """
-        what, expected, hint = visible(what), visible(expected), visible(hint)
-        if self.origin:
-            return Problem(what, self.origin, self.line, self.column, expected, hint)
-        return Problem(what, name, self.line, self.column, expected, hint)
+        texts = visible(expected), visible(hint)
+        return Problem(visible(what), self.origin or name, self.line, self.column, *texts)
 
     @property
     def order(self) -> tuple[bool, int, int]:
-        """Sorting key: file order, then what came from options."""
+        """Sorting key: the file in its order, then the options."""
         return bool(self.origin), self.line, self.column
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Node:
-    """One value.
+    """One value. Immutable: copies share what they have in common.
 
     Attributes:
         value: A scalar, or the nodes of a list or mapping.
         mark: Where the value begins.
         keys: Where each key of a mapping begins.
         raw: An unquoted scalar as it is written; "" for everything else.
-        size: Number of values in it, itself included, aliases written out.
-        height: Levels of lists and mappings in it.
     """
 
     value: Scalar | list[Node] | dict[str, Node]
     mark: Mark
     keys: Mapping[str, Mark] = field(default_factory=dict[str, Mark])
     raw: str = ""
-    size: int = 1
-    height: int = 0
 
     def plain(self) -> Any:
         """The value as plain dicts, lists and scalars."""
@@ -97,7 +85,7 @@ class Node:
         return self.value
 
     def child(self, step: str | int) -> Node | None:
-        """The value of a key, or of a list index; None if there is none."""
+        """The value of a key or of a list index; None if it is missing."""
         if isinstance(self.value, dict):
             return self.value.get(step) if isinstance(step, str) else None
         if isinstance(self.value, list) and isinstance(step, int) and 0 <= step < len(self.value):
@@ -105,14 +93,14 @@ class Node:
         return None
 
     def at(self, loc: Loc) -> Node | None:
-        """The node at a location; None if there is none."""
+        """The node at a location; None if it is missing."""
         node: Node | None = self
         for step in loc:
             node = node.child(step) if node is not None else None
         return node
 
     def mark_at(self, loc: Loc, key: bool = False) -> Mark:
-        """Where the value at ``loc`` (or its key) begins; where it is missing, its nearest parent."""
+        """Where the value at ``loc`` (or its key) begins; if it is missing, its nearest parent."""
         node = self
         for i, step in enumerate(loc):
             child = node.child(step)
@@ -139,220 +127,220 @@ class Node:
             return Node(items, self.mark)
         values = dict(self.value) if isinstance(self.value, dict) else {}
         values[step] = inner
-        # An option that replaces a whole value, or adds one, is where its key comes from too.
+        # Where an option replaces or adds a whole value, problems of the key belong to the option too.
         keys = dict(self.keys) if rest and child is not None else {**self.keys, step: new.mark}
         return Node(values, self.mark, keys)
 
 
-_QUOTE_IT: Final = "put text with special characters in quotes"
-
-_CLOSER: Final = {"[": "]", "{": "}"}
-_MISALIGNED: Final = "the indentation of this line fits no line above"
-
-
-@dataclass(frozen=True, slots=True)
-class _Rule:
-    """Words for the errors whose problem and context match; ``{0}`` is the problem's first group."""
-
-    problem: str
-    words: ErrorText
-    context: str = ""
-    at_context: bool = False
-
-
-_RULES: Final = (
-    _Rule(
-        r"found character (.+) that cannot start any token",
-        ErrorText("a value cannot begin with {0}", "", _QUOTE_IT),
-    ),
-    _Rule(
-        "sequence entries are not allowed here",
-        ErrorText("a list item ('- ') cannot begin here", "it on a line of its own"),
-    ),
-    _Rule("mapping keys are not allowed here", ErrorText("a '?' cannot stand here", "", _QUOTE_IT)),
-    _Rule(
-        "found unexpected (?:end of stream|document separator)",
-        ErrorText("the quotation mark that opens here is never closed"),
-        context="quoted scalar",
-        at_context=True,
-    ),
-    _Rule(
-        "found unknown escape character (.+)",
-        ErrorText(
-            "a backslash and {0} mean nothing in double quotes",
-            "",
-            r"use single quotes, or write '\\' for a backslash",
-        ),
-    ),
-    _Rule(
-        "expected escape sequence of (.+) hexadecimal numbers",
-        ErrorText("this escape in double quotes needs {0} hexadecimal digits", "", "use single quotes"),
-    ),
-    _Rule(
-        "expected alphabetic or numeric character",
-        ErrorText("'&' and '*' begin anchors and aliases, and a name must follow", "", _QUOTE_IT),
-        context="while scanning an",
-        at_context=True,
-    ),
-    _Rule("", ErrorText("YAML tags ('!') are not allowed", "plain values", _QUOTE_IT), context="a tag"),
-    _Rule("tag handle", ErrorText("YAML tags ('!') are not allowed", "plain values", _QUOTE_IT)),
-    _Rule(
-        "",
-        ErrorText("'|' and '>' begin a block of text on the lines below", "nothing else on their line"),
-        context="a block scalar",
-    ),
-    _Rule(
-        "expected the node content, but found (.+)",
-        ErrorText("a value is missing before {0}"),
-    ),
-    _Rule(
-        "expected '<document start>', but found",
-        ErrorText("this follows after the end of the file's mapping", "one mapping and nothing after it"),
-    ),
-    _Rule(
-        "YAML d(?:irective|ocument)", ErrorText("this is not a version of YAML that labseq reads", "YAML 1.2")
-    ),
-    _Rule("", ErrorText("this is no YAML directive", "", _QUOTE_IT), context="a directive"),
-)
-_TOKENS: Final = {
-    "'<stream end>'": "the end of the file",
-    "'<document end>'": "the end of the document",
-    "'<document start>'": "'---'",
-    "'<block end>'": "the end of the block",
-    "'<block mapping start>'": "the next key",
-    "'<block sequence start>'": "'- '",
-}
-
-
-def explain(
-    error: MarkedYAMLError, text: str, last: Event | None, opened: YamlMark | None
-) -> tuple[Mark, ErrorText]:
-    """Say where a syntax error is and what it is.
+@lru_cache(maxsize=8)  # nodes are immutable, and most sessions of a process read the same profile
+def compose(text: str, name: str, origin: str = "") -> Node | None:
+    """Read YAML text.
 
     Args:
-        error: The error.
-        text: The text that it is in.
-        last: What was read before it.
-        opened: The innermost bracket that is open, if it is in one.
+        text: The text, without a byte order mark.
+        name: File name for the messages.
+        origin: The option that holds the text; "" for a file.
+
+    Returns:
+        The top node, or None for an empty text.
+
+    Raises:
+        ConfigError: Everything that was found before reading had to stop.
     """
-    problem, context = error.problem or "", error.context or ""
-    at = cast("YamlMark", error.problem_mark or error.context_mark)
-    since = error.context_mark or at
-    if text[at.index : at.index + 1] == "\t":
-        return _mark(at), _tab(text, at)
-    if "expected ':'" in problem:
-        return _mark(since), _no_colon(text, since)
-    if problem.startswith("mapping values"):
-        return _mark(at), _stray_colon(text, at)
-    if opened and problem.endswith("'<stream end>'"):
-        words = ErrorText(
-            f"the '{text[opened.index]}' that opens here is never closed",
-            f"',' or '{_CLOSER[text[opened.index]]}'",
-        )
-        return _mark(opened), words
-    flow = re.match(r"expected ',' or '(.)', but got", problem)
-    if flow:
-        return _open_bracket(flow[1], since, at)
-    block = re.match(r"expected <block end>, but found '(.+)'", problem)
-    if block:
-        return _late_quote(last, at) or (_mark(at), _out_of_place(block[1], context, text, since, at))
-    return _by_rule(problem, context, since, at)
+    _check_characters(text, name, origin)
+    composer = _Composer(text, name, origin)
+    try:
+        root = composer.get_single_node()
+    except MarkedYAMLError as error:
+        # A stray closing bracket makes the level negative.
+        opened = composer.marks[-1] if composer.flow_level > 0 else None
+        found = explain(error, text, composer.last, opened)
+        mark = Mark(found.line, found.column)
+        composer.stop(mark, found.what, found.expected, found.hint)
+    except ConfigError:
+        raise
+    except ValueError:  # PyYAML passes the escape of a character that does not exist to chr()
+        composer.stop(Mark(composer.line + 1, composer.column + 1), "this number or escape is out of range")
+    node = None if root is None or composer.problems else composer.converted(root)
+    if composer.problems:
+        raise ConfigError(composer.problems)
+    return node
 
 
-def _by_rule(problem: str, context: str, since: YamlMark, at: YamlMark) -> tuple[Mark, ErrorText]:
-    for rule in _RULES:
-        match = re.search(rule.problem, problem)
-        if match and rule.context in context:
-            found = match[1] if match.re.groups else ""
-            what = rule.words.what.format(_TOKENS.get(found, clean(found)))
-            mark = since if rule.at_context else at
-            return _mark(mark), ErrorText(what, rule.words.expected, rule.words.hint)
-    return _mark(at), ErrorText(f"this is not valid YAML: {clean(problem)}", "", _QUOTE_IT)
+class _Alias(yaml.Node):
+    """``*name``: the node that the anchor names, and the alias's own place."""
+
+    def __init__(self, node: yaml.Node, mark: YamlMark) -> None:
+        super().__init__("alias", node, mark, mark)
 
 
-def _tab(text: str, at: YamlMark) -> ErrorText:
-    if not text[at.index - at.column : at.index].strip():
-        return ErrorText("a tab is used for indentation", "spaces")
-    return ErrorText("a tab stands here", "a space")
+class _Composer(yaml.SafeLoader):
+    """Text to PyYAML's nodes, in pure Python, with the rules and limits checked on the way."""
+
+    def __init__(self, text: str, name: str, origin: str) -> None:
+        super().__init__(text)
+        self.problems: list[Problem] = []
+        self.last: Event | None = None
+        self._name, self._origin = name, origin
+        self._depth = self._n_values = 0
+        self._sizes: dict[str, int] = {}  # number of values behind an anchor that is complete
+        self._keys: dict[int, dict[str, YamlMark]] = {}  # of each mapping
+
+    def report(self, mark: Mark | YamlMark, what: str, expected: str = "", hint: str = "") -> None:
+        """Note a problem, and continue."""
+        self.problems.append(self._mark(mark).problem(self._name, what, expected, hint))
+
+    def stop(self, mark: Mark | YamlMark, what: str, expected: str = "", hint: str = "") -> NoReturn:
+        """Note a problem after which nothing else can be read, and raise all of them."""
+        self.report(mark, what, expected, hint)
+        raise ConfigError(self.problems)
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node:
+        """Compose the next node; ``index`` is the key's node for a value of a mapping."""
+        event = self.last = cast("Any", self.peek_event())
+        if isinstance(event, AliasEvent):
+            node: yaml.Node = self._alias(cast("Any", self.get_event()))
+        else:
+            self._count(event, 1)
+            self._check(event)
+            before = self._n_values
+            self._depth += 1
+            node = cast("yaml.Node", super().compose_node(parent, index))
+            self._depth -= 1
+            if event.anchor is not None:
+                self._sizes[event.anchor] = 1 + self._n_values - before
+        if isinstance(index, yaml.Node):
+            self._check_key(self._keys.setdefault(id(parent), {}), index, node)
+        return node
+
+    def converted(self, node: yaml.Node, depth: int = 0, via: YamlMark | None = None) -> Node:
+        """A node of PyYAML as a :class:`Node`; ``via`` is the alias that it is reached through."""
+        mark = node.start_mark
+        if isinstance(node, _Alias):
+            via, node = via or mark, node.value
+        if isinstance(node, yaml.ScalarNode):
+            return self._scalar(node, mark)
+        if depth >= MAX_DEPTH:
+            self.stop(via or mark, f"lists and mappings are nested more than {MAX_DEPTH} deep")
+        if isinstance(node, yaml.SequenceNode):
+            items = [self.converted(item, depth + 1, via) for item in node.value]
+            return Node(items, self._mark(mark))
+        pairs = [(_key_text(key), key, value) for key, value in node.value]
+        values = {text: self.converted(value, depth + 1, via) for text, _, value in pairs}
+        return Node(values, self._mark(mark), {text: self._mark(key.start_mark) for text, key, _ in pairs})
+
+    def _mark(self, mark: Mark | YamlMark) -> Mark:
+        if self._origin:
+            return Mark(0, 0, self._origin)
+        return mark if isinstance(mark, Mark) else Mark(mark.line + 1, mark.column + 1)
+
+    def _count(self, event: Any, n: int) -> None:
+        self._n_values += n
+        if self._n_values > MAX_VALUES:
+            what = f"there are more than {MAX_VALUES} values up to here, aliases written out"
+            self.stop(event.start_mark, what, "a smaller file")
+
+    def _check(self, event: Any) -> None:
+        """Refuse tags, deep nesting, an anchor that is given twice, and blocks in an option."""
+        if event.tag is not None:
+            tag = clean(event.tag.replace("tag:yaml.org,2002:", "!!"))
+            what = f"'{tag}' is a YAML tag, which is not allowed"
+            self.report(event.start_mark, what, "a plain value", "put text that begins with '!' in quotes")
+        if event.anchor in self.anchors:
+            self.report(event.start_mark, f"the anchor '&{clean(event.anchor)}' is given twice")
+            del self.anchors[event.anchor]
+        is_scalar = isinstance(event, yaml.ScalarEvent)
+        if not is_scalar and self._depth >= MAX_DEPTH:
+            self.stop(event.start_mark, f"lists and mappings are nested more than {MAX_DEPTH} deep")
+        if not is_scalar and self._origin and not event.flow_style:
+            expected = "one value: 5, '45 ms', [a, b] or {key: value}"
+            self.stop(event.start_mark, "this is YAML of several lines", expected)
+
+    def _alias(self, event: Any) -> _Alias:
+        name, shown_name = event.anchor, clean(event.anchor)
+        if name not in self.anchors:
+            hint = did_you_mean(name, self.anchors) or "put text that begins with '*' in quotes"
+            what = f"'*{shown_name}' has no anchor '&{shown_name}' before it"
+            self.stop(event.start_mark, what, "", hint)
+        if name not in self._sizes:
+            self.stop(event.start_mark, f"'*{shown_name}' stands inside of '&{shown_name}' itself")
+        self._count(event, self._sizes[name])
+        return _Alias(self.anchors[name], event.start_mark)
+
+    def _check_key(self, keys: dict[str, YamlMark], node: yaml.Node, value: yaml.Node) -> None:
+        """Refuse a key that is no text, a merge key, and a key that is given twice."""
+        key, mark, n_before = self.converted(node), node.start_mark, len(self.problems)
+        if not isinstance(key.value, str):
+            hint = f"write '{clean(key.raw)}' in quotes" if key.raw else ""
+            is_empty = isinstance(value, yaml.ScalarNode) and not value.value
+            hint = comma_hint(key.raw, None if is_empty else "") or hint
+            if len(self.problems) == n_before:
+                self.report(mark, f"a key is {shown(key.plain(), key.raw)}", "text", hint)
+        elif key.raw == "<<":
+            self.report(mark, "merge keys ('<<') are not allowed", "every setting written out")
+        elif key.value in keys:
+            first = keys[key.value]
+            where = "" if self._origin else f" (first in line {first.line + 1}, column {first.column + 1})"
+            self.report(mark, f"'{clean(key.value)}' is given twice{where}", "", "remove one of them")
+        else:
+            keys[key.value] = mark
+
+    def _scalar(self, node: yaml.ScalarNode, mark: YamlMark) -> Node:
+        text = cast("str", node.value)
+        if node.style is None:
+            try:
+                return Node(resolve(text), self._mark(mark), raw=text)
+            except ValueError as error:
+                self.report(mark, str(error), "a number of a few digits")
+        elif any("\ud800" <= char <= "\udfff" for char in text):
+            self.report(mark, "an escape in this text is half of a character", "the character itself")
+        return Node(text, self._mark(mark))
 
 
-def _no_colon(text: str, at: YamlMark) -> ErrorText:
-    line = re.split(r"[\r\n]", text[at.index :], maxsplit=1)[0]
-    if ":" in line.partition(" #")[0]:
-        return ErrorText("there is no space after the ':' of this line", "'key: value'")
-    return ErrorText("this line has no ':'", "'key: value'")
+def _key_text(node: yaml.Node) -> str:
+    return cast("str", node.value.value if isinstance(node, _Alias) else node.value)
 
 
-def _stray_colon(text: str, at: YamlMark) -> ErrorText:
-    """A second colon on a line, or on a line that is indented so that it continues the text above."""
-    before = text[at.index - at.column : at.index]
-    spaces = len(before) - len(before.lstrip())
-    above, line = _line_above(text, at)
-    if ": " not in before and line and spaces > above:
-        what = f"this line is indented further than line {line}, which has a value already"
-        return ErrorText(what, f"{above} spaces as there")
-    return ErrorText(
-        "a ':' cannot stand here", "one 'key: value' on a line", "put text that holds ': ' in quotes"
-    )
+def comma_hint(key: str, value: Any) -> str:
+    """What to do about a key such as "5 ms" without a value, out of ``{exposure: 4,5 ms}``, or ""."""
+    if value is None and key[:1].isdigit():
+        return "a ',' begins another key: write 4.5 for 4,5 and [4, 5] for a list"
+    return ""
 
 
-def _line_above(text: str, at: YamlMark) -> tuple[int, int]:
-    """Column of the first key on the nearest line above that says anything, and its number, from 1."""
-    lines = re.split(r"\r\n|\r|\n", text[: at.index])[:-1]
-    for number in range(len(lines), 0, -1):
-        match = re.match(r" *(?:- +)*(?=[^ #])", lines[number - 1])
-        if match:
-            return match.end(), number
-    return 0, 0
+_WORDS: Final[dict[str, Scalar]] = {
+    **dict.fromkeys(("", "~", "null", "Null", "NULL")),
+    **dict.fromkeys(("true", "True", "TRUE"), True),
+    **dict.fromkeys(("false", "False", "FALSE"), False),
+    **dict.fromkeys((".nan", ".NaN", ".NAN"), float("nan")),
+    **{sign + word: float(sign + "inf") for sign in ("", "+", "-") for word in (".inf", ".Inf", ".INF")},
+}
+_INT: Final = re.compile(r"[-+]?[0-9]+")
+_OCTAL_OR_HEX: Final = re.compile(r"0o[0-7]+|0x[0-9a-fA-F]+")
+_FLOAT: Final = re.compile(r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?")
 
 
-def _open_bracket(closer: str, since: YamlMark, at: YamlMark) -> tuple[Mark, ErrorText]:
-    """A list or mapping in brackets that goes wrong: on its first line, or only later."""
-    pair = "[...]" if closer == "]" else "{...}"
-    if at.line == since.line:
-        words = ErrorText(
-            f"the {pair} that opens in column {since.column + 1} goes wrong here", f"',' or '{closer}'"
-        )
-        return _mark(at), words
-    what = f"the '{pair[0]}' that opens here is not closed by line {at.line + 1}"
-    return _mark(since), ErrorText(what, f"',' or '{closer}'")
+def resolve(text: str) -> Scalar:
+    """The value of an unquoted scalar by the core rules of YAML 1.2.
+
+    Raises:
+        ValueError: A number of more than :data:`MAX_DIGITS` characters.
+
+    Example:
+        >>> resolve("0x10"), resolve("1e3"), resolve("on"), resolve("10:30"), resolve("~")
+        (16, 1000.0, 'on', '10:30', None)
+    """
+    if text in _WORDS:
+        return _WORDS[text]
+    rules = ((_INT, int), (_FLOAT, float), (_OCTAL_OR_HEX, lambda digits: int(digits, 0)))
+    for pattern, convert in rules:
+        if pattern.fullmatch(text):
+            if len(text) > MAX_DIGITS:
+                raise ValueError(f"a number of {len(text)} characters is too long")
+            return convert(text)
+    return text
 
 
-def _late_quote(last: Event | None, at: YamlMark) -> tuple[Mark, ErrorText] | None:
-    """A quoted text that ends lines later than it should, at the next quotation mark."""
-    if not isinstance(last, ScalarEvent) or last.style not in ("'", '"'):
-        return None
-    start, end = cast("YamlMark", last.start_mark), cast("YamlMark", last.end_mark)
-    if start.line == end.line or end.line != at.line:
-        return None
-    what = f"the quotation mark that opens here is closed only in line {end.line + 1}"
-    return _mark(start), ErrorText(what, "a quotation mark at the end of the text")
-
-
-def _out_of_place(found: str, context: str, text: str, since: YamlMark, at: YamlMark) -> ErrorText:
-    """Something that fits neither the block that is open nor one around it."""
-    is_item = found in ("-", "<block sequence start>")
-    is_aligned = at.column == since.column
-    if is_item and is_aligned:
-        return ErrorText("a list item ('- ') stands among the keys of a mapping", "'key: value'")
-    if is_item:
-        return ErrorText(_MISALIGNED, "that of the other items of the list")
-    if is_aligned and "collection" in context:
-        return ErrorText("this line does not continue the list above", "'- '", "check the indentation")
-    if is_aligned and found == ":":
-        return ErrorText("a key is missing before this ':'", "'key: value'")
-    if not is_aligned and found in ("<block mapping start>", "?"):
-        above, line = _line_above(text, at)
-        other = f" or {since.column} as in line {since.line + 1}" if since.column != above else ""
-        return ErrorText(_MISALIGNED, f"{above} spaces as in line {line}{other}")
-    return ErrorText("this does not belong here", "the end of the line", _QUOTE_IT)
-
-
-def _mark(mark: YamlMark) -> Mark:
-    return Mark(mark.line + 1, mark.column + 1)
-
-
-_LINE_BREAK: Final = re.compile(r"\r\n|\r|\n")
 # U+0085, U+2028 and U+2029 are line breaks for PyYAML but for few editors, so
 # that all line numbers after them would be wrong; U+FEFF cannot be seen.
 _FORBIDDEN: Final = re.compile(
@@ -362,223 +350,26 @@ _FORBIDDEN: Final = re.compile(
 _ODD_INDENT: Final = re.compile("^[ \t-]*([\u00a0\u1680\u2000-\u200a\u202f\u205f\u3000])", re.MULTILINE)
 
 
-def check_characters(text: str, name: str, origin: str = "") -> None:
-    """Refuse control characters, odd line breaks and what is no character at all.
+def _check_characters(text: str, name: str, origin: str) -> None:
+    """Refuse control characters, unusual line breaks and spaces, and halves of characters.
 
     Raises:
         ConfigError: With the place of the first one.
     """
-    match = _FORBIDDEN.search(text)
+    match, group, expected, hint = _FORBIDDEN.search(text), 0, "plain text", "delete it"
     if match is None:
-        _check_indentation(text, name, origin)
+        match, group, expected, hint = _ODD_INDENT.search(text), 1, "plain spaces", ""
+    if match is None:
         return
-    char = match[0]
-    code = f"U+{ord(char):04X}"
-    hint = "delete it"
-    if char == "\0":
+    char = match[group]
+    kind, code = unicodedata.name(char, "control character").lower(), f"U+{ord(char):04X}"
+    if group:
+        what = f"{'an' if kind[0] in 'aeio' else 'a'} {kind} ({code}) is used for indentation"
+    elif char == "\0":
         what, hint = f"a NUL character ({code})", "is this a YAML file, saved as UTF-8?"
     elif "\ud800" <= char <= "\udfff":
         what = "a byte that is not UTF-8" if origin else f"half of a character ({code})"
     else:
-        kind = unicodedata.name(char, "control character").lower()
         what = f"an invisible character ({code}, {kind})"
-    mark = Mark(0, 0, origin) if origin else _mark_at(text, match.start())
-    raise ConfigError(mark.problem(name, what, "plain text", hint))
-
-
-def _check_indentation(text: str, name: str, origin: str) -> None:
-    match = _ODD_INDENT.search(text)
-    if match is not None:
-        kind = unicodedata.name(match[1]).lower()
-        mark = Mark(0, 0, origin) if origin else _mark_at(text, match.start(1))
-        what = f"{'an' if kind[0] in 'aeio' else 'a'} {kind} (U+{ord(match[1]):04X}) is used for indentation"
-        raise ConfigError(mark.problem(name, what, "plain spaces"))
-
-
-def _mark_at(text: str, index: int) -> Mark:
-    """Line and column of a character of the text."""
-    breaks = [match.end() for match in _LINE_BREAK.finditer(text, 0, index)]
-    start = breaks[-1] if breaks else 0
-    return Mark(len(breaks) + 1, min(index, len(text)) - start + 1)
-
-
-_FLOW: Final = "one value: 5, '45 ms', [a, b] or {key: value}"
-
-
-@lru_cache(maxsize=8)  # nobody changes a tree, and most sessions of a process read the same profile
-def compose(text: str, name: str, origin: str = "") -> Node | None:
-    """Read YAML text.
-
-    Args:
-        text: The text, without a byte order mark.
-        name: File name for the messages.
-        origin: The option that the text came from, or "" for a file.
-
-    Returns:
-        The top node, or None for an empty text.
-
-    Raises:
-        ConfigError: Everything that was found up to where reading had to stop.
-    """
-    check_characters(text, name, origin)
-    return _Composer(text, name, origin).document()
-
-
-class _Loader(Reader, Scanner, Parser):
-    """Text to events, in pure Python, so that positions and messages are the same everywhere."""
-
-    def __init__(self, text: str) -> None:
-        Reader.__init__(self, text)
-        Scanner.__init__(self)
-        Parser.__init__(self)
-
-
-class _Composer:
-    def __init__(self, text: str, name: str, origin: str) -> None:
-        self._text = text
-        self._name = name
-        self._origin = origin
-        self._loader = _Loader(text)
-        self._anchors: dict[str, Node | None] = {}  # None while the node is being read
-        self._n_values = 0
-        self._last: Event | None = None
-        self._problems: list[Problem] = []
-
-    def document(self) -> Node | None:
-        self._next()  # the start of the stream
-        event = self._next()
-        root = None
-        if isinstance(event, DocumentStartEvent):
-            root = self._node(self._next(), 0)
-            self._next()  # the end of the document
-            event = self._next()
-        if not isinstance(event, StreamEndEvent):
-            raise self._stop(event, "a second document begins here", "one document in a file", "remove '---'")
-        if self._problems:
-            raise ConfigError(self._problems)
-        return root
-
-    def _next(self) -> Event:
-        try:
-            self._last = cast("Event", self._loader.get_event())
-            return self._last
-        except MarkedYAMLError as error:
-            # A stray closing bracket makes the level negative.
-            opened = self._loader.marks[-1] if self._loader.flow_level > 0 else None
-            mark, words = explain(error, self._text, self._last, opened)
-            self._note(mark, words.what, words.expected, words.hint)
-            raise ConfigError(self._problems) from None
-        except ValueError:  # PyYAML passes the escape of a character that does not exist to chr()
-            mark = Mark(self._loader.line + 1, self._loader.column + 1)
-            self._note(mark, "this number or escape is out of range")
-            raise ConfigError(self._problems) from None
-
-    def _node(self, event: Event, depth: int) -> Node:
-        if isinstance(event, AliasEvent):
-            return self._alias(event, depth)
-        assert isinstance(event, NodeEvent)
-        self._count(event, 1)
-        tag = cast("str | None", cast("Any", event).tag)
-        if tag is not None:
-            what = f"'{clean(tag.replace('tag:yaml.org,2002:', '!!'))}' is a YAML tag, which is not allowed"
-            self._note(self._mark(event), what, "a plain value", "put text that begins with '!' in quotes")
-        anchor = cast("str | None", event.anchor)
-        if anchor is not None:
-            if anchor in self._anchors:
-                self._note(self._mark(event), f"the anchor '&{clean(anchor)}' is given twice")
-            self._anchors[anchor] = None
-        if isinstance(event, ScalarEvent):
-            node = self._scalar(event)
-        else:
-            if depth >= MAX_DEPTH:
-                what = f"lists and mappings are nested more than {MAX_DEPTH} deep"
-                raise self._stop(event, what)
-            if self._origin and not cast("Any", event).flow_style:
-                raise self._stop(event, "this is YAML of several lines", _FLOW)
-            is_mapping = isinstance(event, MappingStartEvent)
-            node = self._mapping(event, depth) if is_mapping else self._list(event, depth)
-        if anchor is not None:
-            self._anchors[anchor] = node
-        return node
-
-    def _scalar(self, event: ScalarEvent) -> Node:
-        mark = self._mark(event)
-        text = cast("str", event.value)
-        value: Scalar = text
-        is_plain = not event.style
-        if is_plain:
-            try:
-                value = resolve(text)
-            except ValueError as error:
-                self._note(mark, str(error), "a number of a few digits")
-        elif any("\ud800" <= char <= "\udfff" for char in text):
-            self._note(mark, "an escape in this text is half of a character", "the character itself")
-        return Node(value, mark, raw=text if is_plain else "")
-
-    def _list(self, event: Event, depth: int) -> Node:
-        items: list[Node] = []
-        while not isinstance(inner := self._next(), SequenceEndEvent):
-            items.append(self._node(inner, depth + 1))
-        size = 1 + sum(item.size for item in items)
-        height = 1 + max((item.height for item in items), default=0)
-        return Node(items, self._mark(event), size=size, height=height)
-
-    def _mapping(self, event: Event, depth: int) -> Node:
-        values: dict[str, Node] = {}
-        keys: dict[str, Mark] = {}
-        size, height = 1, 0
-        while not isinstance(inner := self._next(), MappingEndEvent):
-            key = self._node(inner, depth + 1)
-            value = self._node(self._next(), depth + 1)
-            size, height = size + key.size + value.size, max(height, value.height)
-            if not isinstance(key.value, str):
-                hint = f"write '{clean(key.raw)}' in quotes" if key.raw else ""
-                hint = comma_hint(key.raw, value.value) or hint
-                self._note(key.mark, f"a key is {shown(key.plain(), key.raw)}", "text", hint)
-            elif self._is_good_key(key, key.value, keys):
-                keys[key.value], values[key.value] = key.mark, value
-        return Node(values, self._mark(event), keys, size=size, height=height + 1)
-
-    def _is_good_key(self, node: Node, key: str, keys: dict[str, Mark]) -> bool:
-        if node.raw == "<<":
-            self._note(node.mark, "merge keys ('<<') are not allowed", "every setting written out")
-        elif key in keys:
-            line, column, _ = keys[key]
-            where = "" if self._origin else f" (first in line {line}, column {column})"
-            self._note(node.mark, f"'{clean(key)}' is given twice{where}", "", "remove one of them")
-        else:
-            return True
-        return False
-
-    def _alias(self, event: AliasEvent, depth: int) -> Node:
-        name = cast("str", event.anchor)
-        if name not in self._anchors:
-            hint = did_you_mean(name, self._anchors) or "put text that begins with '*' in quotes"
-            raise self._stop(event, f"'*{clean(name)}' has no anchor '&{clean(name)}' before it", "", hint)
-        node = self._anchors[name]
-        if node is None:
-            raise self._stop(event, f"'*{clean(name)}' stands inside of '&{clean(name)}' itself")
-        self._count(event, node.size)
-        if depth + node.height > MAX_DEPTH:
-            raise self._stop(event, f"lists and mappings are nested more than {MAX_DEPTH} deep")
-        return Node(node.value, self._mark(event), node.keys, node.raw, node.size, node.height)
-
-    def _count(self, event: Event, n: int) -> None:
-        self._n_values += n
-        if self._n_values > MAX_VALUES:
-            what = f"there are more than {MAX_VALUES} values up to here, aliases written out"
-            raise self._stop(event, what, "a smaller file")
-
-    def _mark(self, event: Event) -> Mark:
-        if self._origin:
-            return Mark(0, 0, self._origin)
-        start = cast("Any", event).start_mark
-        return Mark(start.line + 1, start.column + 1)
-
-    def _note(self, mark: Mark, what: str, expected: str = "", hint: str = "") -> None:
-        place = Mark(0, 0, self._origin) if self._origin else mark
-        self._problems.append(place.problem(self._name, what, expected, hint))
-
-    def _stop(self, event: Event, what: str, expected: str = "", hint: str = "") -> ConfigError:
-        self._note(self._mark(event), what, expected, hint)
-        return ConfigError(self._problems)
+    mark = Mark(0, 0, origin) if origin else Mark(*line_and_column(text, match.start(group)))
+    raise ConfigError(mark.problem(name, what, expected, hint))

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from labseq.config.messages import MAX_DIGITS, resolve
+from labseq.config.yaml_nodes import MAX_DIGITS, resolve
 
 
 @pytest.mark.parametrize(
