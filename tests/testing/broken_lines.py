@@ -58,11 +58,11 @@ class LeavesLightOn(RecordingLines):
 
 
 class StartsDark(RecordingLines):
-    def _tell(self, program: LineProgram) -> None:
+    def _apply_lines(self, program: LineProgram) -> None:
         if program.kind != "idle":
-            super()._tell(program)
+            super()._apply_lines(program)
         else:
-            super()._tell(replace(program, on=np.zeros_like(program.on)))
+            super()._apply_lines(replace(program, on=np.zeros_like(program.on)))
 
 
 PLANTED = Planted(

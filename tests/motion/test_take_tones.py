@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from labseq.motion import render_kernels as render_tones
+from labseq.motion import render_kernels
 from labseq.motion.render_kernels import (
     END,
     END_AMPLITUDE,
@@ -66,8 +66,8 @@ def test_what_is_not_finite_is_found(name: str, field: int, value: float) -> Non
         ("start_amplitude", -0.1, (START_AMPLITUDE, 1)),
         ("end_amplitude", 1.1, (END_AMPLITUDE, 1)),
         ("start_amplitude", 0.8, (SUM, 0)),
-        ("end_amplitude", 0.9 + render_tones.ROUNDING / 2, (FINE, -1)),
-        ("end_amplitude", 0.9 + 2 * render_tones.ROUNDING, (SUM, 0)),
+        ("end_amplitude", 0.9 + render_kernels.ROUNDING / 2, (FINE, -1)),
+        ("end_amplitude", 0.9 + 2 * render_kernels.ROUNDING, (SUM, 0)),
         ("phase_rad", -700.0, (FINE, -1)),
     ],
 )
