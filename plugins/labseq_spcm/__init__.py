@@ -9,7 +9,7 @@ LABSEQ_API = 1
 def labseq_register(registry: Registry) -> None:
     """Offer the mobile tweezers ``spcm``; in a dry run they play on a simulated card."""
     from labseq_spcm.mobile_tweezers import SpcmMobileTweezers
-    from labseq_spcm.settings import SIMULATED, SpcmSettings
+    from labseq_spcm.settings import SpcmSettings
 
-    simulated = {"card": SIMULATED, "trigger": "software", "serial": 0}
+    simulated = {"card": "simulated", "trigger": "software", "serial": 0}
     registry.mobile_tweezers("spcm", SpcmMobileTweezers, SpcmSettings, simulated=simulated)

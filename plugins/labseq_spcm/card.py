@@ -1,10 +1,14 @@
-"""The card as the driver sees it: registers that are read back, and errors in labseq's words."""
+"""An open card: registers that are read back, transfers, and errors as labseq raises them.
+
+Of the package ``spcm`` only ``Card`` and its registers are used. Its classes for channels, clock,
+transfers and DDS do not check what the card really set; the README lists their faults.
+"""
 
 from __future__ import annotations
 
 import ctypes
 import mmap
-from collections.abc import Generator, Iterable
+from collections.abc import Generator
 from contextlib import contextmanager, suppress
 from typing import Any, Final
 
@@ -12,90 +16,89 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.plugin import Clock, DeviceError, DeviceTimeoutError
+from labseq_spcm.library import Library, load_spcm
 
 POLL_S: Final = 0.2e-3
-"""How often a wait looks at the card."""
+"""Time between two reads of the card's status."""
 TRANSFER_TIMEOUT_S: Final = 1.0
-"""How long the bus may take beyond its slowest speed."""
+"""How much longer than at its slowest speed the bus may take."""
 SLOW_BUS: Final = 0.5e9
 """Bytes per second that every slot for the card reaches."""
 
 
 class Buffer:
-    """Memory that the card fetches samples from; it grows and is kept.
+    """Memory from which the card fetches samples; it grows and is kept.
 
-    The driver wants it to start at a page; ``mmap`` sees to that.
+    The driver library wants it to start at a page, as ``mmap`` does.
     """
 
     def __init__(self) -> None:
         self._memory = mmap.mmap(-1, mmap.PAGESIZE)
-        self.frames = self._view()
-
-    def _view(self) -> NDArray[np.int16]:
-        return np.frombuffer(self._memory, np.int16).reshape(-1, 2)
 
     def reserve(self, n_samples: int) -> NDArray[np.int16]:
-        """Room for samples of both outputs, int16 (n_samples, 2); what stood there is lost."""
-        if len(self.frames) < n_samples:
-            self._memory = mmap.mmap(-1, -(-4 * n_samples // mmap.PAGESIZE) * mmap.PAGESIZE)
-            self.frames = self._view()
-        return self.frames[:n_samples]
+        """Room for samples of both outputs, int16 (n_samples, 2); the old content is lost."""
+        n_bytes = 4 * n_samples
+        if len(self._memory) < n_bytes:
+            self._memory = mmap.mmap(-1, -(-n_bytes // mmap.PAGESIZE) * mmap.PAGESIZE)
+        return np.frombuffer(self._memory, np.int16).reshape(-1, 2)[:n_samples]
 
 
 class AwgCard:
     """An open card.
 
-    All goes through ``spcm.Card``'s registers. Its classes for channels, clock, transfer and DDS
-    are left alone: they do not check what was really set, and see the README for their faults.
-
     Args:
         name: Name of the device in the profile, for messages.
-        spcm: The vendor's package.
-        identifier: Device name in the vendor's driver.
+        library: Where ``spcm`` and the card come from.
         clock: The session's time.
 
+    Attributes:
+        spcm: The vendor's package.
+
     Raises:
-        DeviceError: There is no such card, or another program holds it.
+        DeviceError: No package or driver library, no such card, or another program holds it.
     """
 
-    def __init__(self, name: str, spcm: Any, identifier: str, clock: Clock) -> None:
+    def __init__(self, name: str, library: Library, clock: Clock) -> None:
         self.name = name
-        self.spcm = spcm
         self.clock = clock
+        self.spcm = spcm = load_spcm(name, library)
+        self._library = library
+        identifier = library.connect()
         self._card: Any = spcm.Card(identifier)
         try:
             self._card.open()
         except spcm.SpcmException as error:
-            reason = self._why_not() or str(error)
+            reason = self._open_error() or str(error)
             self._forget()
             hint = "see its name in Spectrum's Control Center, and close what else uses it"
             raise DeviceError(name, f"cannot open the card '{identifier}': {reason}; {hint}") from error
 
-    def _why_not(self) -> str:
-        """What the driver says about a card that it did not open; ``spcm`` does not ask for it."""
+    def _open_error(self) -> str:
+        """Why the driver library did not open the card; ``spcm`` does not ask."""
         text = ctypes.create_string_buffer(self.spcm.ERRORTEXTLEN)
         self.spcm.spcm_dwGetErrorInfo_i32(None, None, None, ctypes.byref(text))
         return text.value.decode(errors="replace")
 
     def _forget(self) -> None:
-        """Tell ``spcm`` that the handle is gone: its own close() leaves that to a second, failing one."""
+        """Keep ``spcm`` from closing the handle again when it collects the object, which would fail."""
         vars(self._card)["_closed"] = True
+        self._library.disconnect()
 
     def close(self) -> None:
-        """Close the card; the error of a card that is gone does not matter any more."""
+        """Close the card; errors of a card that is gone are ignored."""
         with suppress(self.spcm.SpcmException, self.spcm.SpcmTimeout):
             self.clear_error()
             self._card.close()
         self._forget()
 
     @contextmanager
-    def _translated_errors(self, what: str) -> Generator[None]:
+    def _translated_errors(self, action: str) -> Generator[None]:
         try:
             yield
         except self.spcm.SpcmTimeout as error:
-            raise DeviceTimeoutError(self.name, f"{what}: the card's driver timed out", 0.0) from error
+            raise DeviceTimeoutError(self.name, f"{action}: the card's driver timed out", 0.0) from error
         except self.spcm.SpcmException as error:
-            raise DeviceError(self.name, f"{what}: {error}") from error
+            raise DeviceError(self.name, f"{action}: {error}") from error
 
     @property
     def product(self) -> str:
@@ -107,8 +110,18 @@ class AwgCard:
         """Serial number."""
         return int(self._card.sn())
 
+    @property
+    def status(self) -> int:
+        """The status bits."""
+        return self.read(self.spcm.SPC_M2STATUS)
+
+    @property
+    def running(self) -> bool:
+        """Whether it was started and has not come to its end."""
+        return not self.status & self.spcm.M2STAT_CARD_READY
+
     def clear_error(self) -> str:
-        """Unlock the driver: after an error it refuses every call until somebody has asked what it was."""
+        """Read the pending error: until then the driver library refuses every other call."""
         return str(self._card.get_error_info())
 
     def read(self, register: int) -> int:
@@ -119,15 +132,6 @@ class AwgCard:
         """
         with self._translated_errors(f"reading register {register}"):
             return int(self._card.get_i(register))
-
-    def read_real(self, register: int) -> float:
-        """Read a register that holds a real number.
-
-        Raises:
-            DeviceError: The card refuses.
-        """
-        with self._translated_errors(f"reading register {register}"):
-            return float(self._card.get_d(register))
 
     def write(self, register: int, value: int, what: str) -> None:
         """Write a register that cannot be read back.
@@ -143,15 +147,15 @@ class AwgCard:
 
         Args:
             register: Its number.
-            value: What it shall hold.
+            value: The value to set.
             what: Its name, for messages.
             tolerance: By how much the card may round.
 
         Returns:
-            What it holds.
+            The value that the card reads.
 
         Raises:
-            DeviceError: The card refuses, or holds something else.
+            DeviceError: The card refuses, or reads another value.
         """
         self.write(register, value, what)
         found = self.read(register)
@@ -160,12 +164,10 @@ class AwgCard:
         return found
 
     def write_list(self, entries: NDArray[np.void], what: str) -> None:
-        """Write many registers in one call.
-
-        ``spcm``'s own ``register_list`` writes past its 1024 entries.
+        """Write many registers in one call; ``spcm``'s own ``register_list`` overruns its 1024 entries.
 
         Args:
-            entries: (n,), as the driver's ``ST_LIST_PARAM``: register, type, value.
+            entries: (n,), as the driver library's ``ST_LIST_PARAM``: register, type, value.
             what: What it does, for messages.
 
         Raises:
@@ -176,7 +178,7 @@ class AwgCard:
             self._card.set_ptr(self.spcm.SPC_REGISTER_LIST, address, entries.nbytes)
 
     def command(self, command: int, what: str) -> None:
-        """Give a command.
+        """Send a command, one or several M2CMD bits.
 
         Raises:
             DeviceError: The card refuses.
@@ -184,38 +186,20 @@ class AwgCard:
         with self._translated_errors(what):
             self._card.set_i(self.spcm.SPC_M2CMD, command)
 
-    @property
-    def status(self) -> int:
-        """The status bits."""
-        return self.read(self.spcm.SPC_M2STATUS)
-
-    @property
-    def running(self) -> bool:
-        """Whether it was started and has not come to its end."""
-        return not self.status & self.spcm.M2STAT_CARD_READY
-
     def define_transfer(self, frames: NDArray[np.int16], notify_bytes: int = 0) -> None:
-        """Name the samples of the next transfer; they must stay where they are until it is over.
+        """Name the samples of the next transfer; the array must live until the transfer is over.
 
         Raises:
             DeviceError: The card refuses.
         """
-        spcm = self.spcm
-        address = ctypes.c_void_p(frames.ctypes.data)
-        code = spcm.spcm_dwDefTransfer_i64(
-            self._card.handle(),
-            spcm.SPCM_BUF_DATA,
-            spcm.SPCM_DIR_PCTOCARD,
-            notify_bytes,
-            address,
-            0,
-            frames.nbytes,
-        )
-        if code:
+        spcm, address = self.spcm, ctypes.c_void_p(frames.ctypes.data)
+        kind, direction = spcm.SPCM_BUF_DATA, spcm.SPCM_DIR_PCTOCARD
+        handle = self._card.handle()
+        if spcm.spcm_dwDefTransfer_i64(handle, kind, direction, notify_bytes, address, 0, frames.nbytes):
             raise DeviceError(self.name, f"naming the transfer buffer: {self.clear_error()}")
 
     def upload(self, frames: NDArray[np.int16]) -> None:
-        """Transfer samples to the on-board memory, and wait until they are there.
+        """Transfer samples to the on-board memory, and wait until they have arrived.
 
         Raises:
             DeviceError: The card refuses.
@@ -238,18 +222,5 @@ class AwgCard:
         """
         spcm = self.spcm
         self.command(spcm.M2CMD_CARD_STOP | spcm.M2CMD_DATA_STOPDMA, "stop")
-        code = spcm.spcm_dwInvalidateBuf(self._card.handle(), spcm.SPCM_BUF_DATA)
-        if code:
-            raise DeviceError(self.name, f"giving the transfer buffer back: {self.clear_error()}")
-
-    def set_all(self, values: Iterable[tuple[int, int, str]]) -> None:
-        """Write registers, reading each back.
-
-        Args:
-            values: Register, value, name for messages.
-
-        Raises:
-            DeviceError: The card refuses one, or holds something else.
-        """
-        for register, value, what in values:
-            self.set(register, value, what)
+        if spcm.spcm_dwInvalidateBuf(self._card.handle(), spcm.SPCM_BUF_DATA):
+            raise DeviceError(self.name, f"releasing the transfer buffer: {self.clear_error()}")

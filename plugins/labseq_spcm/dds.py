@@ -1,38 +1,179 @@
-"""Mode ``dds``: the card makes the tones itself."""
+"""Mode ``dds``: the card generates the tones itself, from lists of register writes."""
 
 from __future__ import annotations
 
 import time
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
-from labseq.plugin import DeviceTimeoutError, ToneProgram, TransientError
+from labseq.plugin import (
+    AxisTones,
+    ConfigError,
+    DeviceTimeoutError,
+    LimitError,
+    MotionSpec,
+    ToneProgram,
+    TransientError,
+)
+from labseq_spcm import limits
 from labseq_spcm.card import POLL_S, TRANSFER_TIMEOUT_S, AwgCard
-from labseq_spcm.dds_program import ENTRY, TYPE_INT64, Commands, Cores, compile_commands
+from labseq_spcm.settings import SpcmSettings
+
+ENTRY: Final = np.dtype([("register", "<i4"), ("type", "<i4"), ("value", "<i8")])
+"""The driver library's ``ST_LIST_PARAM``; by its type the value is an integer or a double."""
+TYPE_INT64: Final = 0
+TYPE_DOUBLE: Final = 1
+
+FIXED: Final = (*range(8), *range(12, 20))
+"""Cores that always belong to output 0."""
+FLEXIBLE: Final = (8, 9, 10, 11)
+"""Cores that belong to either output, but all to the same one."""
+LONE: Final = (20,)
+"""The core that always belongs to output 1."""
 
 AMPLITUDE_STEPSIZE: Final = 64
-"""Finer amplitude slopes, in fewer and larger increments: 298 / 64 per second."""
+"""Amplitude slopes become finer, 298 / 64 per second, with fewer and larger increments."""
 ARRIVAL_S: Final = 20e-6
+"""Latency of commands sent by DMA (EDMSuite, on an M4i.9622)."""
 COMMANDS_PER_S: Final = 10e6
-"""What commands take to the card by DMA (ColdMatter/EDMSuite, on an M4i.9622)."""
+"""Rate at which commands reach the card by DMA (likewise)."""
 PORTION: Final = 1000
-"""Commands that are sent in one call, when the queue has room for them; no block has as many."""
+"""Commands sent in one call, when the queue has room for them; no block has as many."""
+
+
+@dataclass(frozen=True, slots=True)
+class Cores:
+    """The DDS cores that drive each axis.
+
+    Attributes:
+        row: int64 (n,), cores of the row axis.
+        column: int64 (n,), cores of the column axis.
+        masks: The cores of output 0 and of output 1, one bit each.
+    """
+
+    row: NDArray[np.int64]
+    column: NDArray[np.int64]
+    masks: tuple[int, int]
+
+
+def choose_cores(name: str, settings: SpcmSettings, motion: MotionSpec) -> Cores:
+    """Assign the cores to the outputs.
+
+    Raises:
+        ConfigError: The profile allows more tones than the outputs have cores.
+    """
+    row = settings.row_channel
+    n_tones = [motion.max_row_tones, motion.max_column_tones]
+    n_first, n_second = n_tones if row == 0 else n_tones[::-1]
+    for first, second in (FIXED, FLEXIBLE + LONE), (tuple(sorted(FIXED + FLEXIBLE)), LONE):
+        if n_first <= len(first) and n_second <= len(second):
+            cores = np.array(first), np.array(second)
+            masks = sum(1 << core for core in first), sum(1 << core for core in second)
+            return Cores(cores[row], cores[1 - row], masks)
+    names = ("max_row_tones", "max_column_tones")
+    first_name, second_name = names if row == 0 else names[::-1]
+    raise ConfigError(
+        f"{name}: {names[0]} is {n_tones[0]} and {names[1]} {n_tones[1]}, but the card's DDS has 20 + 1 or"
+        f" 16 + 5 tones on outputs 0 and 1; set {first_name} and {second_name} to at most 16 and 5, or to 20"
+        " and 1"
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Commands:
+    """A program as DDS commands.
+
+    Attributes:
+        entries: ``ENTRY`` (n,), the commands.
+        ends: int64 (n_blocks,), index after each block. All commands of a block take effect together.
+    """
+
+    entries: NDArray[np.void]
+    ends: NDArray[np.int64]
+
+
+NO_COMMANDS: Final = Commands(np.empty(0, ENTRY), np.zeros(0, np.int64))
+
+
+def compile_commands(name: str, program: ToneProgram, cores: Cores) -> Commands:
+    """Compile a program into DDS commands.
+
+    Args:
+        name: Name of the device, for messages.
+        program: A program that passed :func:`labseq_spcm.limits.check_program`.
+        cores: The cores of each axis.
+
+    Raises:
+        LimitError: It has more tones than cores, a segment that is too short for the DDS's timer,
+            or a slope that is too steep.
+    """
+    from labseq_spcm import kernels
+
+    row, column = _tones(program.row), _tones(program.column)
+    n_most = 5 * kernels.COURSE_STEPS * (row.shape[1] + column.shape[1]) + 200 * (program.n_segments + 1)
+    registers, values = np.empty(n_most, np.int32), np.empty(n_most)
+    ends = np.empty(kernels.COURSE_STEPS * program.n_segments + 2, np.int64)
+    axes = (program.row.offsets, row, cores.row, program.column.offsets, column, cores.column)
+    n_blocks = kernels.compile_program(program.duration_s, program.course, *axes, registers, values, ends)
+    if n_blocks == kernels.TOO_MANY:
+        raise _too_many_tones(name, program, cores, int(ends[0]))
+    if n_blocks == kernels.TOO_SHORT:
+        segment = int(ends[0])
+        what = f"{name}: duration of a segment in batch {program.batch[segment]}"
+        limit = "83.2 ns, the DDS's shortest time"
+        raise LimitError(what, f"{program.duration_s[segment]:.4g} s", limit)
+    ends = ends[:n_blocks]
+    registers, values = registers[: ends[-1]], values[: ends[-1]]
+    _check_slope(name, "frequency", kernels.FREQUENCY_SLOPE, limits.DDS_FREQUENCY_SLOPE, registers, values)
+    _check_slope(name, "amplitude", kernels.AMPLITUDE_SLOPE, limits.DDS_AMPLITUDE_SLOPE, registers, values)
+    entries = np.empty(len(registers), ENTRY)
+    entries["register"] = registers
+    whole = (registers == kernels.SOURCE) | (registers == kernels.COMMAND)
+    entries["type"] = np.where(whole, TYPE_INT64, TYPE_DOUBLE)
+    entries["value"] = np.where(whole, values.astype(np.int64), values.view(np.int64))
+    return Commands(entries, ends)
+
+
+def _tones(axis: AxisTones) -> NDArray[np.float64]:
+    turns = axis.phase_rad / (2 * np.pi)
+    return np.stack([axis.start_hz, axis.end_hz, axis.start_amplitude, axis.end_amplitude, turns])
+
+
+def _check_slope(
+    name: str,
+    quantity: str,
+    register: int,
+    most: float,
+    registers: NDArray[np.int32],
+    values: NDArray[np.float64],
+) -> None:
+    of_kind = registers // 1000 * 1000 == register
+    steepest = float(np.abs(values[of_kind]).max(initial=0.0))
+    if steepest > most:
+        raise LimitError(f"{name}: slope of a tone's {quantity}", f"{steepest:.4g} per second", f"{most:.4g}")
+
+
+def _too_many_tones(name: str, program: ToneProgram, cores: Cores, segment: int) -> LimitError:
+    n_row, n_column = (
+        int(axis.offsets[segment + 1] - axis.offsets[segment]) for axis in (program.row, program.column)
+    )
+    what = f"{name}: row and column tones in batch {program.batch[segment]}"
+    limit = f"{len(cores.row)} and {len(cores.column)}, the DDS's cores on these outputs"
+    return LimitError(what, f"{n_row} and {n_column}", limit, "lower max_row_tones and max_column_tones")
 
 
 class Dds:
-    """Queues a program's blocks, of which each waits for a tick of the timer.
+    """Queues a program's blocks, of which each waits for a tick of the timer. See ``PlayMode``.
 
-    Commands go to the card by DMA. Before each portion is sent the card must have room for it; the
-    rest is sent while it plays. A block that comes too late is noticed, by the card's own flag.
+    Commands go to the card by DMA. Before each portion is sent the queue must have room for it; the
+    rest is sent while the program plays. The card sets a flag if a block comes too late.
 
     Args:
         card: The open card.
-        cores: Which cores drive which axis.
-
-    Attributes:
-        max_wait_s: How long the card can be left alone while it plays.
-        render_s: What compiling took in the last ``prepare``, on this computer's clock.
+        cores: The cores of each axis.
     """
 
     max_wait_s = POLL_S
@@ -41,12 +182,12 @@ class Dds:
     def __init__(self, card: AwgCard, cores: Cores) -> None:
         self._card = card
         self._cores = cores
-        self._commands = Commands(np.empty(0, ENTRY), np.zeros(0, np.int64))
+        self._commands = NO_COMMANDS
         self._n_sent = 0
         self._n_events = 0
         spcm = card.spcm
         card.set(spcm.SPC_CARDMODE, spcm.SPC_REP_STD_DDS, "card mode")
-        self._most = card.read(spcm.SPC_DDS_QUEUE_CMD_MAX)
+        self._queue_length = card.read(spcm.SPC_DDS_QUEUE_CMD_MAX)
         self._reset()
 
     def _reset(self) -> None:
@@ -60,32 +201,29 @@ class Dds:
         card.set(spcm.SPC_DDS_AMP_RAMP_STEPSIZE, AMPLITUDE_STEPSIZE, "DDS amplitude ramp step size")
 
     def prepare(self, program: ToneProgram) -> float:
-        """Compile, and queue as much as there is room for.
-
-        Returns:
-            Playing time in seconds.
+        """Compile a program, and queue as much as there is room for; returns its playing time in seconds.
 
         Raises:
             LimitError: The DDS cannot play it.
             DeviceTimeoutError: The card does not take the commands.
         """
+        clock = self._card.clock
         start_s = time.perf_counter()
         self._commands = compile_commands(self._card.name, program, self._cores)
         self.render_s = time.perf_counter() - start_s
         self._n_sent = 0
         self._reset()
-        deadline_s = self._card.clock.now() + TRANSFER_TIMEOUT_S
-        while not self._n_sent:
-            if self._card.clock.now() > deadline_s:
+        deadline_s = clock.now() + TRANSFER_TIMEOUT_S
+        while not self._feed():
+            if clock.now() > deadline_s:
                 text = "the DDS takes no commands: its queue stays full"
                 raise DeviceTimeoutError(self._card.name, text, TRANSFER_TIMEOUT_S)
-            if not self._feed():
-                self._card.clock.sleep(POLL_S)
-        self._card.clock.sleep(ARRIVAL_S + self._n_sent / COMMANDS_PER_S)
+            clock.sleep(POLL_S)
+        clock.sleep(ARRIVAL_S + self._n_sent / COMMANDS_PER_S)
         return program.total_duration_s
 
     def start(self, command: int) -> None:
-        """Start the card; let it hear triggers only when the first block waits for one.
+        """Start the card; enable triggers only when the first block waits for one.
 
         Raises:
             DeviceTimeoutError: The first block did not arrive.
@@ -102,9 +240,9 @@ class Dds:
         card.command(command & ~spcm.M2CMD_CARD_START, "trigger")
 
     def finished(self) -> bool:
-        """Queue more while there is room, and see whether the last block took effect.
+        """Queue more while there is room; whether the last block took effect.
 
-        The queue's own count reaches 0 while a block still waits; only the count of events tells.
+        The number of queued commands is 0 while a block still waits, so the events are counted.
 
         Raises:
             TransientError: A block came too late.
@@ -115,38 +253,33 @@ class Dds:
         if n_events >= len(self._commands.ends) - 1:
             card.command(spcm.M2CMD_CARD_STOP, "stop")
             return True
-        if card.read(spcm.SPC_DDS_STATUS) & (
-            spcm.SPCM_DDS_STAT_QUEUE_UNDERRUN | spcm.SPCM_DDS_STAT_QUEUE_OVERRUN
-        ):
+        too_late = spcm.SPCM_DDS_STAT_QUEUE_UNDERRUN | spcm.SPCM_DDS_STAT_QUEUE_OVERRUN
+        if card.read(spcm.SPC_DDS_STATUS) & too_late:
             text = f"the DDS had no commands in time, after {n_events} of {len(self._commands.ends)} blocks"
             raise TransientError(f"{text}; use fewer tones at once, or the mode replay", card.name)
         return False
 
-    def give_up(self) -> None:
-        """Empty the queue; the card plays what is left in it at the next start otherwise."""
-        self._commands = Commands(np.empty(0, ENTRY), np.zeros(0, np.int64))
+    def abort(self) -> None:
+        """Empty the queue; otherwise the card would play the rest at the next start."""
+        self._commands = NO_COMMANDS
         self._n_sent = 0
         self._reset()
 
     def _feed(self) -> bool:
-        """Send whole blocks while there is room; returns whether any were sent.
+        """Send whole blocks while the queue has room; returns whether any were sent.
 
-        This is our own back-pressure: that of ``spcm``'s DDSCommandList never waits.
+        ``spcm``'s own DDSCommandList never waits for room.
         """
         card, spcm = self._card, self._card.spcm
         entries, ends = self._commands.entries, self._commands.ends
+        send = np.array([(spcm.SPC_DDS_CMD, TYPE_INT64, spcm.SPCM_DDS_CMD_WRITE_TO_CARD)], ENTRY)
         fed = False
         while self._n_sent < len(entries):
             portion = min(PORTION, len(entries) - self._n_sent)
-            if portion > self._most - card.read(spcm.SPC_DDS_QUEUE_CMD_COUNT):
-                return fed
+            if portion > self._queue_length - card.read(spcm.SPC_DDS_QUEUE_CMD_COUNT):
+                break
             last = int(np.searchsorted(ends, self._n_sent + portion, "right")) - 1
-            commands = np.append(entries[self._n_sent : ends[last]], self._send())
-            card.write_list(commands, "DDS commands")
+            card.write_list(np.append(entries[self._n_sent : ends[last]], send), "DDS commands")
             self._n_sent = int(ends[last])
             fed = True
         return fed
-
-    def _send(self) -> np.ndarray[tuple[int], np.dtype[np.void]]:
-        spcm = self._card.spcm
-        return np.array([(spcm.SPC_DDS_CMD, TYPE_INT64, spcm.SPCM_DDS_CMD_WRITE_TO_CARD)], ENTRY)

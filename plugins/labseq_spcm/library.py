@@ -1,49 +1,91 @@
-"""The vendor's package ``spcm``, imported only when a card is opened."""
+"""The driver library of the card: the vendor's, or the one of the simulator package."""
 
 from __future__ import annotations
 
 import contextlib
 import importlib
 import io
-import sys
-from typing import Any
+from typing import Any, Final, Protocol
 
-from labseq.plugin import DeviceError
+from labseq.plugin import Context, DeviceError
+from labseq_spcm.settings import SpcmSettings
 
-OTHERWISE = "to try things without a card, set `card: simulated`"
+SIMULATED: Final = "simulated"
+"""Device names that begin like this belong to simulated cards; the vendor's never do."""
+WITHOUT_A_CARD: Final = "to try things without a card, set `card: simulated`"
 
 
-def load_spcm(name: str, *, simulated: bool = False) -> Any:
-    """Import ``spcm``, which loads the vendor's driver library.
+class Library(Protocol):
+    """Where the package ``spcm`` and a card for it come from."""
+
+    def load(self) -> Any:
+        """Import the package ``spcm``, which loads the driver library."""
+        ...
+
+    def warm(self) -> None:
+        """Do what takes long before the first shot."""
+        ...
+
+    def connect(self) -> str:
+        """Make the card available; returns its device name in ``spcm``."""
+        ...
+
+    def disconnect(self) -> None:
+        """Release the card; no effect if it is not connected."""
+        ...
+
+
+class VendorLibrary:
+    """Spectrum's own driver library, which must be installed.
+
+    Args:
+        device_name: The card's name in Spectrum's Control Center.
+    """
+
+    def __init__(self, device_name: str) -> None:
+        self._device_name = device_name
+
+    def load(self) -> Any:
+        """Import the package ``spcm``."""
+        return importlib.import_module("spcm")
+
+    def warm(self) -> None:
+        """Nothing to do."""
+
+    def connect(self) -> str:
+        """The card is always available."""
+        return self._device_name
+
+    def disconnect(self) -> None:
+        """Nothing to do."""
+
+
+def choose_library(settings: SpcmSettings, context: Context) -> Library:
+    """The library that the setting ``card`` asks for."""
+    if not settings.card.startswith(SIMULATED):
+        return VendorLibrary(settings.card)
+    from labseq_spcm_sim import SimulatedLibrary
+
+    return SimulatedLibrary(settings.card, context.clock, context.simulation, settings.row_channel)
+
+
+def load_spcm(name: str, library: Library) -> Any:
+    """Import the package ``spcm``.
 
     Args:
         name: Name of the device, for the message.
-        simulated: Whether the card is a simulated one, which needs no library.
+        library: Where it finds its driver library.
 
     Raises:
         DeviceError: The package or the library is missing.
     """
     try:
         with contextlib.redirect_stdout(io.StringIO()):  # spcm prints, and stdout may be for JSON
-            if simulated:
-                importlib.import_module("labseq_spcm.simulator").prepare()
-            spcm = importlib.import_module("spcm")
+            return library.load()
     except ModuleNotFoundError as error:
         text = f"the Python package 'spcm' cannot be imported ({error}); install it with `pip install spcm`"
-        raise DeviceError(name, f"{text}; {OTHERWISE}") from error
-    except Exception as error:  # it raises a bare Exception without the library
-        raise _no_library(name, _first_line(error)) from error
-
-    simulator = sys.modules.get("labseq_spcm.simulator")  # it has let spcm load without a library
-    if not simulated and simulator is not None and not simulator.vendor_library_found():
-        raise _no_library(name, "only simulated cards are there")
-    return spcm
-
-
-def _no_library(name: str, reason: str) -> DeviceError:
-    text = f"the Python package 'spcm' finds no driver library ({reason}); install Spectrum's driver"
-    return DeviceError(name, f"{text} for this system; {OTHERWISE}")
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0].partition(". ")[0].rstrip(".")
+        raise DeviceError(name, f"{text}; {WITHOUT_A_CARD}") from error
+    except Exception as error:  # spcm raises a bare Exception without the library
+        reason = (str(error).splitlines() or [type(error).__name__])[0].partition(". ")[0].rstrip(".")
+        text = f"the Python package 'spcm' finds no driver library ({reason}); install Spectrum's driver"
+        raise DeviceError(name, f"{text} for this system; {WITHOUT_A_CARD}") from error

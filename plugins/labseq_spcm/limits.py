@@ -1,7 +1,8 @@
-"""What the card can do, and what is refused because it cannot.
+"""What the card can do, and the checks that refuse everything else.
 
 Source of the figures, where no other is named: Spectrum's manual "M4i.66xx/M4i.96xx", chapters on
-analog outputs, clock, generation modes, trigger and DDS20.
+analog outputs, clock, generation modes, trigger and DDS20. Figures marked (EDMSuite) were measured
+on an M4i.9622 by ColdMatter/EDMSuite.
 """
 
 from __future__ import annotations
@@ -28,43 +29,42 @@ FIFO_RATE_HZ: Final = 700e6
 AMPLITUDE_MV: Final = (80, 2000)
 """Peak voltage into 50 Ohm of an M4i.663x, in steps of 1 mV."""
 RELAY_MV: Final = (420, 480)
-"""Either path of the amplifier makes these amplitudes; which one it is depends on the past."""
+"""Both paths of the amplifier make these amplitudes; which one is used depends on the earlier amplitude."""
 RELAY_S: Final = 10e-3
 """How long the output is off when the path changes."""
 
 SAMPLE_STEP: Final = 32
 """Memory sizes are multiples of this, in samples per channel."""
-TRIGGER_CLOCKS: Final = 476.5
-"""From the trigger to the output, in sample clocks above 625 MS/s; 238.5 below."""
-TRIGGER_S: Final = 16e-9
-"""And this on top."""
-
 TRIGGER_STEP_MV: Final = 10
-"""The level of Ext0 is rounded to this."""
+"""The card rounds the level of Ext0 to this."""
 
 DDS_RATE_HZ: Final = 1.25e9
 """The DDS runs at the full sample rate."""
+DDS_TICK_S: Final = 6.4e-9
+"""Resolution of the DDS timer."""
+DDS_MIN_TICKS: Final = 13
+"""Shortest time between two blocks of commands: 83.2 ns."""
 DDS_FREQUENCY_SLOPE: Final = 1.9e14
-"""Steepest, in Hz/s; as read from an M4i.9622 (ColdMatter/EDMSuite)."""
+"""Largest slope of a frequency, in Hz/s (EDMSuite)."""
 DDS_AMPLITUDE_SLOPE: Final = 3.05e5
-"""Steepest, in 1/s; likewise."""
+"""Largest slope of an amplitude, in 1/s (EDMSuite)."""
 DDS_DELAY_S: Final = 560e-9
-"""From the trigger to the output; likewise."""
+"""From the trigger to the output (EDMSuite)."""
 
 ROUNDING: Final = 1e-9
-"""How far a sum of amplitudes may exceed its limit by rounding."""
+"""How far a sum of amplitudes may exceed its limit by rounding errors."""
 
 
 def trigger_delay_s(sample_rate_hz: float) -> float:
-    """From the trigger to the first sample, at most, in seconds."""
-    return TRIGGER_CLOCKS / sample_rate_hz + TRIGGER_S
+    """Longest time from the trigger to the first sample, in seconds: 476.5 sample clocks and 16 ns."""
+    return 476.5 / sample_rate_hz + 16e-9
 
 
-def amplitude_mv(name: str, rf: RfSpec) -> int:
-    """The amplitude that makes full scale the profile's ``rf.full_scale``, in millivolts.
+def full_scale_mv(name: str, rf: RfSpec) -> int:
+    """The output amplitude for the profile's ``rf.full_scale``, in millivolts.
 
     Raises:
-        LimitError: The card cannot make it, its relay might switch, or the amplifiers do not bear it.
+        LimitError: The card cannot make it, its relay might switch, or it is too much for the amplifiers.
     """
     what, wanted_mv = f"{name}: rf.full_scale", round(1e3 * rf.full_scale_v)
     value = format_quantity(rf.full_scale_v, "voltage")
@@ -76,75 +76,64 @@ def amplitude_mv(name: str, rf: RfSpec) -> int:
         raise LimitError(what, value, gap, "between them the card's output relay may switch, for 10 ms")
     if rf.full_scale_v > rf.max_peak_v:
         most = format_quantity(rf.max_peak_v, "voltage")
-        raise LimitError(what, value, f"rf.max_peak, {most}", "the amplifiers bear no more")
+        raise LimitError(what, value, f"rf.max_peak, {most}", "more damages the amplifiers")
     return wanted_mv
 
 
-def check_rate(name: str, sample_rate_hz: float, rf: RfSpec) -> None:
-    """Refuse a sample rate at which tones in the AODs' bands would come out mirrored.
+def check_sample_rate(name: str, sample_rate_hz: float, rf: RfSpec) -> None:
+    """Refuse a sample rate at which tones in the AODs' bands would be aliased.
 
     Raises:
         LimitError: It is not above twice the highest frequency.
     """
     max_hz = max(*rf.row_band_hz, *rf.column_band_hz)
     if sample_rate_hz <= 2 * max_hz:
-        rate, highest = (format_quantity(hz, "frequency") for hz in (sample_rate_hz, max_hz))
-        least = format_quantity(2 * max_hz, "frequency")
-        raise LimitError(
-            f"{name}: sample_rate", rate, f"above {least}, twice the end of the AODs' band, {highest}"
-        )
+        rate, highest, least = (format_quantity(f, "frequency") for f in (sample_rate_hz, max_hz, 2 * max_hz))
+        limit = f"above {least}, twice the end of the AODs' band, {highest}"
+        raise LimitError(f"{name}: sample_rate", rate, limit)
 
 
-def refuse_excess(name: str, program: ToneProgram, rf: RfSpec) -> None:
-    """Refuse what must not come to the output, whatever made the program.
+def check_program(name: str, program: ToneProgram, rf: RfSpec) -> None:
+    """Refuse what must not reach the outputs, whatever produced the program.
 
     Args:
         name: Name of the device, for the message.
-        program: What shall be played.
+        program: The program to play.
         rf: Bands of the AODs.
 
     Raises:
-        LimitError: The program has no length, leaves an AOD's band, clips, or has values that
-            are no numbers.
+        LimitError: The program has no length, leaves an AOD's band, clips, or has values that are
+            not finite.
     """
     durations = program.duration_s
     if not (np.isfinite(durations).all() and (durations >= 0).all()):
         raise LimitError(f"{name}: a segment's duration", "negative or not finite", "0 s or more")
     if not program.total_duration_s > 0:
         raise LimitError(f"{name}: length of the program", "0 s", "more than 0 s")
-    _refuse_axis(f"{name}: {{}} of a row tone", program.row, program, rf.row_band_hz)
-    _refuse_axis(f"{name}: {{}} of a column tone", program.column, program, rf.column_band_hz)
+    _check_axis(f"{name}: {{}} of a row tone", program.row, program.batch, rf.row_band_hz)
+    _check_axis(f"{name}: {{}} of a column tone", program.column, program.batch, rf.column_band_hz)
 
 
-def _refuse_axis(what: str, axis: AxisTones, program: ToneProgram, band_hz: tuple[float, float]) -> None:
+def _check_axis(what: str, axis: AxisTones, batch: NDArray[np.int32], band_hz: tuple[float, float]) -> None:
     low, high = band_hz
     band = f"the AOD's band, {low / 1e6:g} to {high / 1e6:g} MHz"
-    for values in (axis.start_hz, axis.end_hz):
-        _refuse(what.format("frequency"), values, axis, program, low, high, band)
-    _refuse(
-        what.format("phase"), axis.phase_rad, axis, program, -np.inf, np.inf, "a finite number of radians"
-    )
+    amplitudes = 0.0, 1.0 + ROUNDING, "0 to 1 of full scale"
+    for quantity, values, (least, most, limit) in (
+        ("frequency", axis.start_hz, (low, high, band)),
+        ("frequency", axis.end_hz, (low, high, band)),
+        ("phase", axis.phase_rad, (-np.inf, np.inf, "a finite number of radians")),
+        ("amplitude", axis.start_amplitude, amplitudes),
+        ("amplitude", axis.end_amplitude, amplitudes),
+    ):
+        within = np.isfinite(values) & (values >= least) & (values <= most)
+        if not within.all():
+            tone = int(within.argmin())
+            segment = int(np.searchsorted(axis.offsets, tone, "right")) - 1
+            where = f"{what.format(quantity)} in batch {batch[segment]}"
+            raise LimitError(where, f"{values[tone]:.9g}", limit)
     for values in (axis.start_amplitude, axis.end_amplitude):
-        limit = "0 to 1 of full scale"
-        _refuse(what.format("amplitude"), values, axis, program, 0.0, 1.0 + ROUNDING, limit)
         sums = np.diff(np.concatenate([[0.0], np.cumsum(values)])[axis.offsets])
         if len(sums) and sums.max() > 1.0 + ROUNDING:
             worst = int(sums.argmax())
-            where = f"{what.format('sum of the amplitudes')}s in batch {program.batch[worst]}"
+            where = f"{what.format('sum of the amplitudes')}s in batch {batch[worst]}"
             raise LimitError(where, f"{sums[worst]:.9g} of full scale", "1: the output would clip")
-
-
-def _refuse(
-    what: str,
-    values: NDArray[np.float64],
-    axis: AxisTones,
-    program: ToneProgram,
-    low: float,
-    high: float,
-    limit: str,
-) -> None:
-    fine = np.isfinite(values) & (values >= low) & (values <= high)
-    if not fine.all():
-        tone = int(fine.argmin())
-        segment = int(np.searchsorted(axis.offsets, tone, "right")) - 1
-        raise LimitError(f"{what} in batch {program.batch[segment]}", f"{values[tone]:.9g}", limit)

@@ -1,64 +1,71 @@
-"""Mobile tweezers on a Spectrum M4i.66xx."""
+"""Mobile tweezers on a Spectrum M4i.66xx arbitrary waveform generator.
+
+The order of calls follows the manual: reset, channels, clock, outputs and trigger once in ``open``;
+mode and data in ``prepare``; outputs on, start and trigger in ``play``.
+"""
 
 from __future__ import annotations
 
 import importlib
 import math
 import time
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Protocol
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from functools import partial
+from typing import Any, Final, Protocol
 
 from labseq.plugin import (
     Context,
     DeviceError,
     DeviceTimeoutError,
-    ReceivesOutput,
+    LabseqError,
     ToneProgram,
     TransientError,
     format_quantity,
     warm_rendering,
 )
 from labseq_spcm import limits
-from labseq_spcm.card import POLL_S, AwgCard
-from labseq_spcm.dds import Dds
-from labseq_spcm.dds_program import choose_cores
-from labseq_spcm.fifo import Fifo
-from labseq_spcm.library import load_spcm
-from labseq_spcm.replay import Replay
-from labseq_spcm.safety import make_safe
-from labseq_spcm.self_test import check_card
-from labseq_spcm.settings import SIMULATED, SpcmSettings
-from labseq_spcm.setup import output_registers, set_up
+from labseq_spcm.card import POLL_S, AwgCard, Buffer
+from labseq_spcm.dds import Dds, choose_cores
+from labseq_spcm.library import choose_library, load_spcm
+from labseq_spcm.replay_fifo import Fifo, Replay
+from labseq_spcm.settings import SpcmSettings
 
-if TYPE_CHECKING:
-    from labseq_spcm.simulator import SimulatedCard
+BOTH_CHANNELS: Final = 0b11
+RAMP_S: Final = 0.3e-3
+"""How long the amplifiers take to ramp down a program that is cut short."""
+RAMP_STEPS: Final = 15
+HOT_C: Final = 80
+"""Highest temperature that passes the self test, in degrees Celsius (our choice)."""
+TEST_SAMPLES: Final = 1 << 16
+"""Samples of both outputs, all 0, that the self test sends to the card's memory."""
 
 
 class PlayMode(Protocol):
     """How a program gets to the outputs.
 
     Attributes:
-        max_wait_s: How long the card can now be left alone while it plays; 0: not at all.
-        render_s: What rendering took in the last ``prepare``, on this computer's clock.
+        max_wait_s: How long the card needs no attention while it plays; 0: none at all.
+        render_s: Time for rendering in the last ``prepare``, on this computer's clock.
     """
 
     max_wait_s: float
     render_s: float
 
     def prepare(self, program: ToneProgram) -> float:
-        """Bring a program onto the card; returns the playing time in seconds."""
+        """Transfer a program to the card; returns the playing time in seconds."""
         ...
 
     def start(self, command: int) -> None:
-        """Start the card with this command, and then whatever else there is to do."""
+        """Start the card with this command."""
         ...
 
     def finished(self) -> bool:
-        """Whether it was played to its end; called again and again, it keeps the card supplied."""
+        """Whether the program was played to its end; called repeatedly, it keeps the card supplied."""
         ...
 
-    def give_up(self) -> None:
-        """The card was stopped: forget the program."""
+    def abort(self) -> None:
+        """Drop the program, after the card was stopped."""
         ...
 
 
@@ -66,16 +73,16 @@ class SpcmMobileTweezers:
     """Plays tone programs on two outputs of an arbitrary waveform generator.
 
     A program is refused before anything is uploaded if it leaves an AOD's band or would clip.
-    Each ``play`` needs a ``prepare`` of its own, so that nothing is ever replayed by mistake. The
-    output's amplitude is the profile's ``rf.full_scale``, set once, with the outputs off: it is
+    Each ``play`` needs its own ``prepare``, so that nothing is ever replayed by mistake. The
+    output amplitude is the profile's ``rf.full_scale``, set once, with the outputs off: it is
     never changed while atoms are held, except to ramp them down in ``safe_state``.
 
     Args:
         settings: The card, and how it is used.
-        context: Name, clock, and what drives the AODs.
+        context: Name, clock, simulation, and the limits of the AODs.
 
     Attributes:
-        simulated_card: The simulated card, while it is open; None for a real one.
+        library: Where the card comes from; a simulated one keeps its card as ``library.card``.
 
     Raises:
         LimitError: The card or the amplifiers cannot do the profile's ``rf.full_scale``, or the sample
@@ -88,21 +95,31 @@ class SpcmMobileTweezers:
         self._settings = settings
         self._clock = context.clock
         self._rf = context.motion.rf
-        self._amplitude_mv = limits.amplitude_mv(self._name, self._rf)
-        if settings.mode != "dds":
-            limits.check_rate(self._name, settings.sample_rate, self._rf)
-        dds = settings.mode == "dds"
-        self._cores = choose_cores(self._name, settings, context.motion) if dds else None
+        self._amplitude_mv = limits.full_scale_mv(self._name, self._rf)
+        self._cores = None
+        if settings.mode == "dds":
+            self._cores = choose_cores(self._name, settings, context.motion)
+        else:
+            limits.check_sample_rate(self._name, settings.sample_rate, self._rf)
+        self.library = choose_library(settings, context)
         self._card: AwgCard | None = None
         self._mode: PlayMode | None = None
         self._facts: dict[str, Any] = {}
         self._timings: dict[str, float] = {}
-        self._world = context.simulation
-        self._identifier = settings.card
-        self._is_simulated = settings.card.startswith(SIMULATED)
         self._duration_s: float | None = None
         self._due_s: float | None = None
-        self.simulated_card: SimulatedCard | None = None
+
+    def warm(self) -> None:
+        """Import the vendor's package, and compile the kernels of the mode or load them from the cache.
+
+        Raises:
+            DeviceError: No package or driver library.
+        """
+        load_spcm(self._name, self.library)
+        importlib.import_module("labseq_spcm.kernels")
+        if self._settings.mode != "dds":
+            warm_rendering()
+        self.library.warm()
 
     def open(self) -> None:
         """Open the card and set it up, outputs off; no effect if it is open.
@@ -113,36 +130,102 @@ class SpcmMobileTweezers:
         """
         if self._card is not None:
             return
+        self._card = card = AwgCard(self._name, self.library, self._clock)
         try:
-            spcm = load_spcm(self._name, simulated=self._is_simulated)
-            self._insert_simulated_card()
-            self._card = AwgCard(self._name, spcm, self._identifier, self._clock)
-            self._facts = set_up(self._card, self._settings, self._amplitude_mv)
+            self._check_type(card)
+            card.command(card.spcm.M2CMD_CARD_RESET, "reset")
+            card.set(card.spcm.SPC_CHENABLE, BOTH_CHANNELS, "active channels")
+            rate_hz = self._set_clock(card)
+            self._set_outputs(card)
+            self._set_trigger(card)
+            self._facts = self._read_facts(card, rate_hz)
             self._clock.sleep(limits.RELAY_S)
-            self._mode = self._new_mode(self._card)
+            self._mode = self._new_mode(card, rate_hz)
         except BaseException:
             self._disconnect()
             raise
 
-    def _new_mode(self, card: AwgCard) -> PlayMode:
+    def _check_type(self, card: AwgCard) -> None:
+        spcm, settings = card.spcm, self._settings
+        n_channels = card.read(spcm.SPC_MIINST_MODULES) * card.read(spcm.SPC_MIINST_CHPERMODULE)
+        family = (card.read(spcm.SPC_PCITYP) & spcm.TYP_FAMILYMASK) >> 8
+        if family != limits.FAMILY or n_channels != 2:
+            text = f"the card '{settings.card}' is a {card.product} with {n_channels} channels"
+            raise DeviceError(
+                self._name, f"{text}; expected {limits.FAMILY_NAME}: name another one as `card`"
+            )
+        if settings.serial and card.serial_number != settings.serial:
+            text = f"the card '{settings.card}' has the serial number {card.serial_number}"
+            raise DeviceError(self._name, f"{text}; expected {settings.serial}: name another one as `card`")
+        if settings.mode == "dds":
+            if not card.read(spcm.SPC_PCIEXTFEATURES) & spcm.SPCM_FEAT_EXTFW_DDS20:
+                text = f"the {card.product} was bought without DDS; use mode: replay"
+                raise DeviceError(self._name, text)
+            return
+        fastest_hz = card.read(spcm.SPC_MIINST_MAXADCLOCK)
+        if settings.sample_rate > fastest_hz:
+            text = f"the {card.product} makes at most {fastest_hz / 1e6:g} MS/s"
+            raise DeviceError(
+                self._name, f"{text}; lower sample_rate from {settings.sample_rate / 1e6:g} MHz"
+            )
+
+    def _set_clock(self, card: AwgCard) -> float:
+        """Set the sample clock; returns the rate that it really makes, in Hz."""
+        spcm, reference_hz = card.spcm, self._settings.reference_clock
+        if reference_hz is None:
+            card.set(spcm.SPC_CLOCKMODE, spcm.SPC_CM_INTPLL, "clock mode")
+        else:
+            card.set(spcm.SPC_CLOCKMODE, spcm.SPC_CM_EXTREFCLOCK, "clock mode")
+            card.set(spcm.SPC_REFERENCECLOCK, round(reference_hz), "reference clock in Hz")
+        rate_hz = limits.DDS_RATE_HZ if self._settings.mode == "dds" else self._settings.sample_rate
+        return float(card.set(spcm.SPC_SAMPLERATE, round(rate_hz), "sample rate in Hz", limits.RATE_STEP_HZ))
+
+    def _set_outputs(self, card: AwgCard) -> None:
+        """Relays open, then amplitude, 0 V when stopped, no filter."""
+        spcm, zero = card.spcm, card.spcm.SPCM_STOPLVL_ZERO
+        _open_relay(card, spcm.SPC_ENABLEOUT0)
+        _open_relay(card, spcm.SPC_ENABLEOUT1)
+        self._set_amplitude(card, self._amplitude_mv)
+        card.set(spcm.SPC_CH0_STOPLEVEL, zero, "output 0 when stopped")
+        card.set(spcm.SPC_CH1_STOPLEVEL, zero, "output 1 when stopped")
+        card.set(spcm.SPC_FILTER0, 0, "filter of output 0")
+        card.set(spcm.SPC_FILTER1, 0, "filter of output 1")
+
+    def _set_trigger(self, card: AwgCard) -> None:
+        """No source at all for the software trigger: it is forced, which works alike in all modes."""
+        spcm, settings = card.spcm, self._settings
+        card.set(spcm.SPC_TRIG_ANDMASK, spcm.SPC_TMASK_NONE, "trigger AND mask")
+        if settings.trigger == "software":
+            card.set(spcm.SPC_TRIG_ORMASK, spcm.SPC_TMASK_NONE, "trigger source")
+            return
+        edge = spcm.SPC_TM_POS if settings.trigger_edge == "rising" else spcm.SPC_TM_NEG
+        card.set(spcm.SPC_TRIG_ORMASK, spcm.SPC_TMASK_EXT0, "trigger source")
+        card.set(spcm.SPC_TRIG_EXT0_MODE, edge, "trigger edge")
+        card.set(spcm.SPC_TRIG_TERM, int(settings.trigger_50_ohm), "trigger termination")
+        level_mv = round(1e3 * settings.trigger_level)
+        card.set(spcm.SPC_TRIG_EXT0_LEVEL0, level_mv, "trigger level in mV", limits.TRIGGER_STEP_MV)
+
+    def _read_facts(self, card: AwgCard, rate_hz: float) -> dict[str, Any]:
+        version = card.read(card.spcm.SPC_GETDRVVERSION)
+        is_dds = self._settings.mode == "dds"
+        return {
+            "model": card.product,
+            "serial_number": card.serial_number,
+            "driver_version": f"{version >> 24}.{version >> 16 & 0xFF}.{version & 0xFFFF}",
+            "sample_rate_hz": rate_hz,
+            "trigger_delay_s": limits.DDS_DELAY_S if is_dds else limits.trigger_delay_s(rate_hz),
+            "amplitude_mv": self._amplitude_mv,
+            "trigger_level_mv": card.read(card.spcm.SPC_TRIG_EXT0_LEVEL0),
+        }
+
+    def _new_mode(self, card: AwgCard, rate_hz: float) -> PlayMode:
         if self._cores is not None:
             return Dds(card, self._cores)
         mode = Replay if self._settings.mode == "replay" else Fifo
-        return mode(card, self._settings, self._facts["sample_rate_hz"])
-
-    def _insert_simulated_card(self) -> None:
-        if self._settings.card == SIMULATED:
-            from labseq_spcm.simulator import SimulatedCard, install
-            from labseq_spcm.world import CardOutputs
-
-            self.simulated_card = SimulatedCard(self._clock)
-            self._identifier = install(self.simulated_card)
-            if isinstance(self._world, ReceivesOutput):
-                outputs = CardOutputs(self.simulated_card, self._settings.row_channel)
-                self._world.connect_outputs("mobile_tweezers", outputs)
+        return mode(card, self._settings, rate_hz)
 
     def close(self) -> None:
-        """Make the outputs harmless and let the card go; legal in any state."""
+        """Bring the outputs into the safe state and close the card; legal in any state."""
         try:
             self.safe_state()
         finally:
@@ -152,32 +235,12 @@ class SpcmMobileTweezers:
         card, self._card, self._mode = self._card, None, None
         if card is not None:
             card.close()
-        if self.simulated_card is not None:
-            from labseq_spcm.simulator import uninstall
-
-            uninstall(self._identifier)
-            self.simulated_card = None
-
-    def warm(self) -> None:
-        """Import the vendor's package, and compile the kernels of the mode or load them from the cache.
-
-        Raises:
-            DeviceError: No package or driver library.
-        """
-        load_spcm(self._name, simulated=self._is_simulated)
-        if self._settings.mode == "dds":
-            importlib.import_module("labseq_spcm._kernels_dds")
-        else:
-            importlib.import_module("labseq_spcm._kernels")
-            warm_rendering()
-        if self._settings.card == SIMULATED and isinstance(self._world, ReceivesOutput):
-            self._world.warm()
 
     def prepare(self, program: ToneProgram) -> float:
-        """Render a program and bring it onto the card.
+        """Render a program and transfer it to the card.
 
         Returns:
-            Playing time in seconds, the trigger's way to the output included.
+            Playing time in seconds, with the delay from the trigger to the output.
 
         Raises:
             LimitError: It has no length, leaves an AOD's band, clips, or is too much for the mode.
@@ -186,10 +249,8 @@ class SpcmMobileTweezers:
         card, mode = self._opened()
         self._check_idle("prepare()")
         self._duration_s = None
-        limits.refuse_excess(self._name, program, self._rf)
+        limits.check_program(self._name, program, self._rf)
         card.stop()
-        if self.simulated_card is not None and not isinstance(self._world, ReceivesOutput):
-            self.simulated_card.forget(self._clock.now())
         start_s = time.perf_counter()
         playing_s = mode.prepare(program)
         took_s = time.perf_counter() - start_s
@@ -199,11 +260,11 @@ class SpcmMobileTweezers:
         return duration_s
 
     def timings(self) -> Mapping[str, float]:
-        """What rendering, and all else of the last ``prepare``, took on this computer's clock, in seconds."""
+        """Times of the last ``prepare`` on this computer's clock, in seconds: rendering, and the rest."""
         return self._timings
 
     def play(self) -> None:
-        """Start the card, and give the trigger or arm it; returns at once.
+        """Start the card, and force the trigger or enable it; returns at once.
 
         Raises:
             DeviceError: Nothing was prepared since the last ``play``, still playing, or the card refuses.
@@ -215,15 +276,18 @@ class SpcmMobileTweezers:
             raise DeviceError(self._name, text)
         duration_s, self._duration_s = self._duration_s, None
         spcm = card.spcm
-        for register in output_registers(spcm):
-            card.set(register, 1, "output")
+        card.set(spcm.SPC_ENABLEOUT0, 1, "output")
+        card.set(spcm.SPC_ENABLEOUT1, 1, "output")
         command = spcm.M2CMD_CARD_START | spcm.M2CMD_CARD_ENABLETRIGGER
-        external = self._settings.trigger == "external"
-        self._due_s = math.inf if external else self._clock.now() + duration_s
-        mode.start(command if external else command | spcm.M2CMD_CARD_FORCETRIGGER)
+        if self._settings.trigger == "external":
+            self._due_s = math.inf
+        else:
+            self._due_s = self._clock.now() + duration_s
+            command |= spcm.M2CMD_CARD_FORCETRIGGER
+        mode.start(command)
 
     def wait(self, timeout_s: float) -> None:
-        """Wait until the program has been played to its end; at once if none is playing.
+        """Wait until the program has been played to its end; returns at once if none is playing.
 
         Raises:
             DeviceTimeoutError: It did not end within ``timeout_s``, or the trigger never came; the
@@ -231,7 +295,7 @@ class SpcmMobileTweezers:
             TransientError: The card ran out of data: what it played is not the program.
             DeviceError: Not open, or the card refuses.
         """
-        _, mode = self._opened()
+        card, mode = self._opened()
         due_s = self._due_s
         if due_s is None:
             return
@@ -240,7 +304,7 @@ class SpcmMobileTweezers:
             while not mode.finished():
                 now_s = self._clock.now()
                 if now_s >= deadline_s:
-                    raise self._late(timeout_s)
+                    raise self._timeout(card, timeout_s)
                 idle_s = max(POLL_S, due_s - now_s) if math.isfinite(due_s) else POLL_S
                 self._clock.sleep(min(deadline_s - now_s, mode.max_wait_s, idle_s))
                 if self._due_s is None:
@@ -250,40 +314,83 @@ class SpcmMobileTweezers:
             raise
         self._due_s = None
 
-    def _late(self, timeout_s: float) -> DeviceTimeoutError:
-        card, _ = self._opened()
+    def _timeout(self, card: AwgCard, timeout_s: float) -> DeviceTimeoutError:
         waited = format_quantity(timeout_s, "time")
         if card.status & card.spcm.M2STAT_CARD_TRIGGER:
             text = f"still playing after {waited}"
         else:
-            text = f"no trigger came within {waited}; look at the cable at Ext0 and at trigger_level"
+            text = f"no trigger came within {waited}; check the cable at Ext0 and trigger_level"
         return DeviceTimeoutError(self._name, text, timeout_s)
 
     def safe_state(self) -> None:
         """Ramp down, stop the card, open the output relays; the prepared program is dropped.
 
-        What plays is ramped down by the output amplifiers, as far as they go without switching
-        their relay: to a third or less of full scale on each axis.
+        A program that plays is ramped down by the output amplifiers, as far as they go without
+        switching their relay: to a third or less of full scale on each axis.
 
         Raises:
-            DeviceError: The card refused something; all the rest was done nevertheless.
+            DeviceError: The card refused a step; all other steps were done.
         """
         self._duration_s = self._due_s = None
         card, mode = self._card, self._mode
         if card is None:
             return
-        make_safe(card, self._amplitude_mv, mode.give_up if mode is not None else lambda: None)
+        with suppress(LabseqError):
+            card.clear_error()  # a pending error would block everything else
+            if card.running:
+                self._ramp_down(card)
+        steps: list[Callable[[], None]] = [
+            card.stop,
+            partial(_open_relay, card, card.spcm.SPC_ENABLEOUT0),
+            partial(_open_relay, card, card.spcm.SPC_ENABLEOUT1),
+            partial(self._set_amplitude, card, self._amplitude_mv),
+        ]
+        if mode is not None:
+            steps.append(mode.abort)
+        failures = [failure for step in steps if (failure := _attempt_twice(step)) is not None]
+        if failures:
+            raise failures[0]
+
+    def _ramp_down(self, card: AwgCard) -> None:
+        """Lower the amplitude in steps, within the amplifier's present path."""
+        above_relay = limits.RELAY_MV[1] + 1
+        end_mv = above_relay if self._amplitude_mv >= above_relay else limits.AMPLITUDE_MV[0]
+        for step in range(1, RAMP_STEPS + 1):
+            self._clock.sleep(RAMP_S / RAMP_STEPS)
+            drop_mv = (self._amplitude_mv - end_mv) * step / RAMP_STEPS
+            self._set_amplitude(card, round(self._amplitude_mv - drop_mv))
+
+    def _set_amplitude(self, card: AwgCard, amplitude_mv: int) -> None:
+        card.set(card.spcm.SPC_AMP0, amplitude_mv, "amplitude of output 0 in mV")
+        card.set(card.spcm.SPC_AMP1, amplitude_mv, "amplitude of output 1 in mV")
 
     def self_test(self) -> None:
-        """See whether the card is cool, and its clock and memory are right; the prepared program is dropped.
+        """Check the card's temperatures, its clock and its memory, outputs off; drops the prepared program.
+
+        Samples are sent in the mode ``replay`` only: the others do not use the memory as a whole.
 
         Raises:
-            DeviceError: Not open, still playing, or something is wrong.
+            DeviceError: Not open, still playing, or a check failed.
         """
         card, _ = self._opened()
         self._check_idle("self_test()")
         self._duration_s = None
-        check_card(card, self._settings, self._facts["sample_rate_hz"])
+        spcm = card.spcm
+        sensors = (("base card", spcm.SPC_MON_TC_BASE_CTRL), ("output module", spcm.SPC_MON_TC_MODULE_0))
+        for place, register in sensors:
+            temperature_c = card.read(register)
+            if temperature_c > HOT_C:
+                text = f"the {place} has {temperature_c} degrees Celsius; expected at most {HOT_C}"
+                raise DeviceError(self._name, f"{text}: check the fans")
+        rates_hz = card.read(spcm.SPC_SAMPLERATE), self._facts["sample_rate_hz"]
+        if rates_hz[0] != rates_hz[1]:
+            found, expected = (format_quantity(hz, "frequency") for hz in rates_hz)
+            raise DeviceError(self._name, f"the sample rate is {found}; expected {expected}, as it was set")
+        if self._settings.mode == "replay":
+            frames = Buffer().reserve(TEST_SAMPLES)
+            frames[:] = 0
+            card.set(spcm.SPC_MEMSIZE, TEST_SAMPLES, "memory size")
+            card.upload(frames)
 
     def describe(self) -> Mapping[str, Any]:
         """Settings; once opened, also the card and every value that it read back."""
@@ -297,3 +404,19 @@ class SpcmMobileTweezers:
     def _check_idle(self, call: str) -> None:
         if self._due_s is not None:
             raise DeviceError(self._name, f"{call} while a program plays; call wait() first")
+
+
+def _open_relay(card: AwgCard, register: int) -> None:
+    card.set(register, 0, "output")
+
+
+def _attempt_twice(step: Callable[[], None]) -> LabseqError | None:
+    """Do something, once more if an earlier error still blocked the driver library; returns the failure."""
+    with suppress(LabseqError):
+        step()
+        return None
+    try:
+        step()
+    except LabseqError as failure:
+        return failure
+    return None

@@ -12,9 +12,6 @@ from labseq_spcm import limits
 Mode: TypeAlias = Literal["replay", "fifo", "dds"]
 Channel: TypeAlias = Literal[0, 1]
 
-SIMULATED = "simulated"
-"""The card that needs no card."""
-
 
 class SpcmSettings(Settings):
     """Mobile tweezers on a Spectrum M4i.66xx."""
@@ -58,7 +55,7 @@ class SpcmSettings(Settings):
 
     @field_validator("sample_rate")
     @classmethod
-    def _makes_a_clock(cls, rate_hz: float) -> float:
+    def _check_rate(cls, rate_hz: float) -> float:
         low, high = limits.SAMPLE_RATE_HZ
         if not low <= rate_hz <= high:
             raise ValueError(f"expected {_hz(low)} to {_hz(high)}")
@@ -69,7 +66,7 @@ class SpcmSettings(Settings):
         return rate_hz
 
     @model_validator(mode="after")
-    def _fits_together(self) -> Self:
+    def _check_channels_and_rate(self) -> Self:
         if self.row_channel == self.column_channel:
             raise ValueError(f"row_channel and column_channel are both {self.row_channel}; expected 0 and 1")
         if self.mode == "fifo" and self.sample_rate > limits.FIFO_RATE_HZ:

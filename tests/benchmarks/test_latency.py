@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from labseq_psca.planner import PscaPlanner, PscaSettings
-from labseq_spcm.dds_program import choose_cores, compile_commands
+from labseq_spcm.dds import choose_cores, compile_commands
 from labseq_spcm.settings import SpcmSettings
 from labseq_virtual.settings import WorldSettings
 from labseq_virtual.world import World

@@ -15,19 +15,17 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Final
 
 from markdown_it import MarkdownIt
 
 ROOT: Final = Path(__file__).parents[2]
-PLUGINS: Final = sorted(point.value for point in entry_points(group="labseq"))
 PAGES: Final = sorted(
     [
         *(ROOT / name for name in ("README.md", "CONTRIBUTING.md")),
         *(ROOT / "docs").rglob("*.md"),
-        *(page for name in PLUGINS for page in (ROOT / "plugins" / name).rglob("*.md")),
+        *(ROOT / "plugins").rglob("*.md"),
     ]
 )
 COMMENT: Final = re.compile(r"<!-- (file|output|run with|exit code|not run)\b(.*) -->")

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from labseq_spcm.mobile_tweezers import SpcmMobileTweezers
 from labseq_spcm.settings import SpcmSettings
-from labseq_spcm.simulator import M4I6631, CardModel, SampleSpan, SimulatedCard, installed
+from labseq_spcm_sim import M4I6631, CardModel, SampleSpan, SimulatedCard, installed
 from numpy.typing import NDArray
 
 from labseq import Context, MotionSpec, Plan, ToneProgram
@@ -20,7 +20,7 @@ from labseq.motion import tone_program
 from labseq.testing.fakes import FakeClock
 
 
-class ResolvedProfile:
+class OpenCard:
     """One simulated card, the real ``spcm`` package, and a virtual clock.
 
     Attributes:
@@ -64,12 +64,12 @@ class ResolvedProfile:
 
 
 @pytest.fixture
-def bench() -> Iterator[ResolvedProfile]:
+def bench() -> Iterator[OpenCard]:
     """A bench with an open card, which is closed whatever the test leaves behind."""
     clock = FakeClock()
     sim = SimulatedCard(clock)
     with installed(sim) as name:
-        bench = ResolvedProfile(clock, sim, name)
+        bench = OpenCard(clock, sim, name)
         yield bench
         sim.take_error()
         bench.card.close()

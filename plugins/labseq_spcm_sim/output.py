@@ -9,7 +9,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq_spcm.simulator.facts import CardModel
+from labseq_spcm_sim.setup import CardModel
 
 FULL_SCALE = 32767
 """Sample that stands for the amplitude that is set."""

@@ -1,21 +1,37 @@
-"""The card without its driver: registers, memory, one run at a time, and what it puts out."""
+"""The card behind its driver: registers, memory, one run at a time, and what it plays."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Final
 
-from labseq_spcm.simulator import registers as r
-from labseq_spcm.simulator.dds import Dds
-from labseq_spcm.simulator.dds_values import DdsValues
-from labseq_spcm.simulator.facts import CardModel, trigger_delay_s
-from labseq_spcm.simulator.fifo import Fifo
-from labseq_spcm.simulator.memory import Buffer, Memory
-from labseq_spcm.simulator.modes import crosses, new_run
-from labseq_spcm.simulator.output import Amplifier
-from labseq_spcm.simulator.records import Records
-from labseq_spcm.simulator.replay import Run, Sequence, Step
-from labseq_spcm.simulator.rules import Number, Refusal, Setup, refuse
-from labseq_spcm.simulator.store import Store
+from labseq_spcm_sim import registers as r
+from labseq_spcm_sim.dds import CoreOutputs, Dds, DdsValues
+from labseq_spcm_sim.modes import Buffer, Fifo, Memory, Replay, Run, Store, Stretch
+from labseq_spcm_sim.output import Amplifier, SampleSpan, Span
+from labseq_spcm_sim.setup import CardModel, Number, Refusal, Setup, refuse, trigger_delay_s
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """Samples that were played, with the set-up at that time.
+
+    Attributes:
+        stretch: The samples.
+        channels: The channels that were active, in the order of the columns.
+        sample_rate_hz: The sample rate.
+    """
+
+    stretch: Stretch
+    channels: Sequence[int]
+    sample_rate_hz: float
+
+    def span(self, channel: int) -> SampleSpan:
+        """The samples of one channel; the amplifier adds the voltage."""
+        column = self.stretch.samples[:, self.channels.index(channel)]
+        return SampleSpan(self.stretch.start_s, self.sample_rate_hz, column, 0, self.stretch.n_samples, 0.0)
+
 
 AMPLITUDES: Final = {r.SPC_AMP0: 0, r.SPC_AMP1: 1}
 OUTPUTS: Final = {r.SPC_ENABLEOUT0: 0, r.SPC_ENABLEOUT1: 1}
@@ -33,7 +49,8 @@ class Machine:
         self.amplifiers = (Amplifier(model), Amplifier(model))
         self.dds_values = DdsValues(model.n_dds_cores)
         self.dds = Dds(self.dds_values, model.dds_queue)
-        self.records = Records()
+        self.samples: list[Record] = []
+        self.tones: list[CoreOutputs] = []
         self.store = Store()
         self.n_stops = 0
         self._power_on()
@@ -41,8 +58,6 @@ class Machine:
     def _power_on(self) -> None:
         self.setup = Setup(self.model)
         self.memory = Memory(self.model.bus_bytes_per_s)
-        self.steps: dict[int, int] = {}
-        self.segment_sizes: dict[int, int] = {}
         self.buffer: Buffer | None = None
         self.fifo: Fifo | None = None
         self.run: Run | None = None
@@ -51,11 +66,6 @@ class Machine:
         self.trigger_enabled = False
         self.underrun = False
         self.n_triggers = 0
-
-    @property
-    def sample_rate_hz(self) -> int:
-        """The sample rate that is set."""
-        return self.setup[r.SPC_SAMPLERATE]
 
     def reset(self, now_s: float) -> None:
         """M2CMD_CARD_RESET: everything as after power-on, outputs off."""
@@ -83,11 +93,26 @@ class Machine:
                 self._end_run(now_s)
 
     def _end_run(self, now_s: float) -> None:
-        if self.run is not None:
-            self.records.keep(self.run.played(now_s), self.setup.channels, self.sample_rate_hz)
-        self.records.chords += self.dds.stop(now_s)
+        self.samples += self._run_samples(now_s)
+        self.tones += self.dds.stop(now_s)
         self.run = self.fifo = None
         self.running = self.trigger_enabled = False
+
+    def _run_samples(self, now_s: float) -> list[Record]:
+        stretches = self.run.played(now_s) if self.run is not None else []
+        return [Record(stretch, self.setup.channels, self.setup[r.SPC_SAMPLERATE]) for stretch in stretches]
+
+    def played(self, channel: int, now_s: float) -> list[Span]:
+        """What reached the connector of a channel up to now, in time's order."""
+        amplifier = self.amplifiers[channel]
+        parts: list[Span] = []
+        for record in self.samples + self._run_samples(now_s):
+            if channel in record.channels:
+                parts += amplifier.cut(record.span(channel))
+        for outputs in self.tones + self.dds.played(now_s):
+            for span in outputs.spans(channel):
+                parts += amplifier.cut(span)
+        return sorted(parts, key=lambda part: part.start_s)
 
     # Registers
 
@@ -102,10 +127,7 @@ class Machine:
         """
         if r.SPC_DDS_CORE0_FREQ <= register <= r.SPC_DDS_AVAIL_PHASE_STEP:
             return self.dds.write(register, value, now_s)
-        if 0 <= register - r.SPC_SEQMODE_STEPMEM0 < self.setup[r.SPC_SEQMODE_AVAILMAXSTEPS]:
-            Step.decode(int(value)).check(self.setup[r.SPC_SEQMODE_MAXSEGMENTS])
-            self.steps[register - r.SPC_SEQMODE_STEPMEM0] = int(value)
-        elif register == r.SPC_DATA_AVAIL_CARD_LEN:
+        if register == r.SPC_DATA_AVAIL_CARD_LEN:
             if self.fifo is None:
                 raise Refusal(r.ERR_SEQUENCE, "no FIFO buffer is defined")
             self.fifo.hand_over(int(value))
@@ -121,12 +143,6 @@ class Machine:
             self.amplifiers[AMPLITUDES[register]].set_amplitude(value, now_s)
         elif register in OUTPUTS:
             self.amplifiers[OUTPUTS[register]].enable(bool(value), now_s)
-        elif register == r.SPC_SEQMODE_SEGMENTSIZE:
-            self.segment_sizes[self.setup[r.SPC_SEQMODE_WRITESEGMENT]] = value
-        elif register == r.SPC_SEQMODE_MAXSEGMENTS:
-            self.memory.drop_segments()
-            self.segment_sizes.clear()
-            self.steps.clear()
 
     def read(self, register: int, now_s: float) -> Number:
         """Read a register.
@@ -136,15 +152,11 @@ class Machine:
         """
         if r.SPC_DDS_CORE0_FREQ <= register <= r.SPC_DDS_AVAIL_PHASE_STEP:
             return self.dds.read(register)
-        if 0 <= register - r.SPC_SEQMODE_STEPMEM0 < self.setup[r.SPC_SEQMODE_AVAILMAXSTEPS]:
-            return self.steps.get(register - r.SPC_SEQMODE_STEPMEM0, 0)
         if register == r.SPC_M2STATUS:
             return self.status(now_s)
         live = {
             r.SPC_CHCOUNT: len(self.setup.channels),
             r.SPC_TRIGGERCOUNTER: self.n_triggers,
-            r.SPC_SEQMODE_STATUS: self.run.step if isinstance(self.run, Sequence) else 0,
-            r.SPC_SEQMODE_SEGMENTSIZE: self.segment_sizes.get(self.setup[r.SPC_SEQMODE_WRITESEGMENT], 0),
             r.SPC_DATA_AVAIL_USER_LEN: self.fifo.user_bytes if self.fifo else 0,
             r.SPC_DATA_AVAIL_USER_POS: self.fifo.user_position if self.fifo else 0,
             r.SPC_FILLSIZEPROMILLE: self.fifo.fill_promille if self.fifo else 0,
@@ -169,29 +181,26 @@ class Machine:
     # Data
 
     def define_transfer(self, buffer: Buffer) -> None:
-        """Take note of a transfer buffer.
+        """Name the buffer of the next transfer.
 
         Raises:
-            Refusal: It is larger than the memory or segment that it is meant for.
+            Refusal: It is larger than the memory that is set up, or the FIFO is running.
         """
-        room = self._area_samples() * self.setup.frame_bytes
         self.fifo = None
         self.underrun = False
         if self.setup.mode == r.SPC_REP_FIFO_SINGLE:
             if self.running:
                 raise Refusal(r.ERR_RUNNING, "card is still running, access not possible")
-            outbuf, n_channels = self.setup[r.SPC_DATA_OUTBUFSIZE], len(self.setup.channels)
-            bus = self.model.bus_bytes_per_s
+            n_channels, bus = len(self.setup.channels), self.model.bus_bytes_per_s
+            rate_hz, outbuf = self.setup[r.SPC_SAMPLERATE], self.setup[r.SPC_DATA_OUTBUFSIZE]
             self.store.reserve(self.setup[r.SPC_LOOPS] * self.setup[r.SPC_SEGMENTSIZE] * n_channels)
-            self.fifo = Fifo(buffer, n_channels, self.sample_rate_hz, outbuf, bus, self.store)
-        elif buffer.offset + buffer.n_bytes > room:
-            raise refuse(buffer.offset + buffer.n_bytes, f"at most {room} bytes; set the memory size first")
+            self.fifo = Fifo(buffer, n_channels, rate_hz, outbuf, bus, self.store)
+        else:
+            room = self.setup[r.SPC_MEMSIZE] * self.setup.frame_bytes
+            if buffer.offset + buffer.n_bytes > room:
+                asked = buffer.offset + buffer.n_bytes
+                raise refuse(asked, f"at most {room} bytes; set the memory size first")
         self.buffer = buffer
-
-    def _area_samples(self) -> int:
-        if self.setup.mode == r.SPC_REP_STD_SEQUENCE:
-            return self.segment_sizes.get(self.setup[r.SPC_SEQMODE_WRITESEGMENT], 0)
-        return self.setup[r.SPC_MEMSIZE]
 
     def start_dma(self, now_s: float) -> None:
         """M2CMD_DATA_STARTDMA.
@@ -204,11 +213,8 @@ class Machine:
         if self.fifo is not None:
             self.fifo.start_dma(now_s)
             return
-        sequence = self.setup.mode == r.SPC_REP_STD_SEQUENCE
-        segment = self.setup[r.SPC_SEQMODE_WRITESEGMENT] if sequence else None
-        n_samples = self._area_samples() * len(self.setup.channels)
-        data = self.buffer.content()
-        self.memory.send(now_s, segment, n_samples, self.buffer.offset // 2, data)
+        n_samples = self.setup[r.SPC_MEMSIZE] * len(self.setup.channels)
+        self.memory.send(now_s, n_samples, self.buffer.offset // 2, self.buffer.content())
         self.buffer = None
 
     def stop_dma(self, now_s: float) -> None:
@@ -227,11 +233,24 @@ class Machine:
         """
         if self.running:
             raise Refusal(r.ERR_SEQUENCE, "the card runs already")
-        self.run = new_run(self.setup, self.memory, self.steps, self.segment_sizes, self.fifo)
+        self.run = self._new_run()
         if self.setup.mode == r.SPC_REP_STD_DDS:
             self.dds.start()
         self.running = True
         self.triggered = self.trigger_enabled = self.underrun = False
+
+    def _new_run(self) -> Run | None:
+        """The samples that are to be played; None in DDS mode."""
+        setup = self.setup
+        n_samples, n_channels, loops = setup[r.SPC_MEMSIZE], len(setup.channels), setup[r.SPC_LOOPS]
+        if setup.mode == r.SPC_REP_STD_DDS:
+            return None
+        if setup.mode == r.SPC_REP_STD_SINGLE:
+            return Replay(lambda: self.memory.read(n_samples, n_channels), setup[r.SPC_SAMPLERATE], loops)
+        if self.fifo is None:
+            raise Refusal(r.ERR_SEQUENCE, "no FIFO buffer is defined")
+        self.fifo.set_length(loops * setup[r.SPC_SEGMENTSIZE])
+        return self.fifo
 
     def stop(self, now_s: float) -> None:
         """M2CMD_CARD_STOP; no effect if it does not run."""
@@ -260,7 +279,7 @@ class Machine:
         if self.run is None:
             self.dds.trigger(now_s)
         else:
-            rate_hz = self.sample_rate_hz
+            rate_hz = self.setup[r.SPC_SAMPLERATE]
             self.run.trigger(now_s + trigger_delay_s(rate_hz) + self.setup[r.SPC_TRIG_DELAY] / rate_hz)
 
     def pulse(self, voltage_v: float, now_s: float) -> bool:
@@ -269,10 +288,16 @@ class Machine:
         Returns:
             Whether the card took it for a trigger.
         """
-        heard = self.trigger_enabled and crosses(self.setup, voltage_v)
-        if heard:
+        setup, level_v = self.setup, self.setup[r.SPC_TRIG_EXT0_LEVEL0] / 1000
+        accepted = (
+            self.trigger_enabled
+            and setup[r.SPC_TRIG_ORMASK] == r.SPC_TMASK_EXT0
+            and setup[r.SPC_TRIG_EXT0_MODE] != r.SPC_TM_NONE
+            and min(0.0, voltage_v) < level_v < max(0.0, voltage_v)
+        )
+        if accepted:
             self.fire(now_s)
-        return heard
+        return accepted
 
     def disable_trigger(self) -> None:
         """M2CMD_CARD_DISABLETRIGGER."""
@@ -290,7 +315,8 @@ class Machine:
 
     def forget(self, before_s: float) -> None:
         """Drop what was played before a time."""
-        self.records.forget(before_s)
+        self.samples = [record for record in self.samples if record.span(record.channels[0]).end_s > before_s]
+        self.tones = [outputs for outputs in self.tones if outputs.end_s > before_s]
         self.dds.forget(before_s)
         if self.fifo is not None:
             self.fifo.forget(before_s)

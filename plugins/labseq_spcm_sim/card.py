@@ -3,21 +3,74 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterable
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from labseq.plugin import Clock, LabseqError
-from labseq_spcm.simulator import registers as r
-from labseq_spcm.simulator.calls import list_writes, real_values
-from labseq_spcm.simulator.facts import M4I6631, CardModel
-from labseq_spcm.simulator.machine import Machine
-from labseq_spcm.simulator.memory import Buffer
-from labseq_spcm.simulator.output import Span
-from labseq_spcm.simulator.records import Log, Record
-from labseq_spcm.simulator.rules import ErrorInfo, Number, Refusal
+from labseq_spcm_sim import registers as r
+from labseq_spcm_sim.machine import Machine
+from labseq_spcm_sim.modes import Buffer
+from labseq_spcm_sim.output import Span
+from labseq_spcm_sim.setup import M4I6631, CardModel, ErrorInfo, Number, Refusal
+
+LIST_PARAM: Final = np.dtype([("register", "<i4"), ("type", "<i4"), ("value", "<i8")])
+"""One entry of a register list: 16 bytes, the value an integer or a double."""
+
+
+@dataclass(frozen=True, slots=True)
+class LogEntry:
+    """One write to a register, refused or not.
+
+    Attributes:
+        time_s: When, on the session's clock.
+        register: Its number.
+        value: What was written.
+    """
+
+    time_s: float
+    register: int
+    value: Number
+
+
+class Log:
+    """The writes of late, in order.
+
+    Those of one call are kept as they came, and told apart only when somebody looks.
+
+    Args:
+        size: How many writes are kept, about.
+    """
+
+    def __init__(self, size: int) -> None:
+        self._size = size
+        self._n = 0
+        self._calls: deque[tuple[float, Sequence[int], Sequence[Number]]] = deque()
+
+    def add(self, time_s: float, registers: Sequence[int], values: Sequence[Number]) -> None:
+        """Note the writes of one call."""
+        self._calls.append((time_s, registers, values))
+        self._n += len(registers)
+        while self._n - len(self._calls[0][1]) >= self._size:
+            self._n -= len(self._calls.popleft()[1])
+
+    def clear(self) -> None:
+        """Forget everything."""
+        self._calls.clear()
+        self._n = 0
+
+    def __len__(self) -> int:
+        return self._n
+
+    def __iter__(self) -> Iterator[LogEntry]:
+        for time_s, registers, values in self._calls:
+            for register, value in zip(registers, values, strict=True):
+                yield LogEntry(time_s, register, value)
+
 
 LOOK_S: Final = 0.05
 """How long a wait goes on before it looks again at what other threads have done."""
@@ -25,6 +78,22 @@ MIN_S: Final = 1e-9
 """Shortest wait, so that rounding cannot keep time from passing."""
 DRIVER_VERSION: Final = (7 << 24) | (9 << 16) | 22000
 """A version that ``spcm`` is content with; it is none of the vendor's."""
+
+
+def real_values(entries: NDArray[np.void]) -> NDArray[np.float64]:
+    """The values of a register list, float64 (n,), whether they are integers or real numbers."""
+    whole = entries["value"]
+    return np.where(entries["type"] == r.TYPE_DOUBLE, whole.copy().view(np.float64), whole)
+
+
+def list_writes(entries: NDArray[np.void]) -> Iterator[tuple[int, Number]]:
+    """The (register, value) of a register list."""
+    doubles: list[bool] = (entries["type"] == r.TYPE_DOUBLE).tolist()
+    whole: list[int] = entries["value"].tolist()
+    real: list[float] = entries["value"].copy().view(np.float64).tolist()
+    registers: list[int] = entries["register"].tolist()
+    for i, register in enumerate(registers):
+        yield register, real[i] if doubles[i] else whole[i]
 
 
 class SimulatedCard:
@@ -38,6 +107,7 @@ class SimulatedCard:
         model: What card it is.
         serial_number: Its serial number.
         log_size: How many register writes are remembered.
+        keep_history: Keep what was played until ``forget``; otherwise each start of the card drops it.
 
     Example:
         >>> from labseq.testing.fakes import FakeClock
@@ -55,11 +125,13 @@ class SimulatedCard:
         model: CardModel = M4I6631,
         serial_number: int = 12345,
         log_size: int = 100_000,
+        keep_history: bool = True,
     ) -> None:
         self.model = model
         self.serial_number = serial_number
         self.log = Log(log_size)
         self._clock = clock
+        self._keep_history = keep_history
         self._changed = threading.Condition(threading.RLock())
         self._machine = Machine(model)
         self._error = ErrorInfo()
@@ -87,21 +159,7 @@ class SimulatedCard:
     def played(self, channel: int) -> list[Span]:
         """What a channel has put out up to now, in time's order, with nothing between the spans."""
         with self._changed:
-            now_s, machine = self._advance(), self._machine
-            amplifier, channels = machine.amplifiers[channel], machine.setup.channels
-            records = list(machine.records.samples)
-            if machine.run is not None:
-                stretches = machine.run.played(now_s)
-                records += [Record(stretch, channels, machine.sample_rate_hz) for stretch in stretches]
-            chords = machine.records.chords + machine.dds.played(now_s)
-            parts: list[Span] = []
-            for record in records:
-                if channel in record.channels:
-                    parts += amplifier.cut(record.span(channel))
-            for chord in chords:
-                for span in chord.spans(channel):
-                    parts += amplifier.cut(span)
-            return sorted(parts, key=lambda part: part.start_s)
+            return self._machine.played(channel, self._advance())
 
     def forget(self, before_s: float) -> None:
         """Drop what was played before a time, to free memory in long runs."""
@@ -116,7 +174,7 @@ class SimulatedCard:
             self._advance()
             setup = self._machine.setup
             n_channels = len(setup.channels)
-            return self._machine.memory.read(None, setup[r.SPC_MEMSIZE], n_channels).copy()
+            return self._machine.memory.read(setup[r.SPC_MEMSIZE], n_channels).copy()
 
     @property
     def running(self) -> bool:
@@ -237,6 +295,8 @@ class SimulatedCard:
             raise Refusal(r.ERR_SEQUENCE, "the card and the transfer cannot be started together")
         if command & r.M2CMD_CARD_WRITESETUP and machine.running:
             raise Refusal(r.ERR_RUNNING, "card is still running, access not possible")
+        if command & r.M2CMD_CARD_START and not self._keep_history:
+            machine.forget(now_s)
         actions: dict[int, Callable[[], None]] = {
             r.M2CMD_CARD_RESET: lambda: machine.reset(now_s),
             r.M2CMD_CARD_STOP: lambda: machine.stop(now_s),

@@ -1,9 +1,9 @@
-"""From a tone program to the commands of the card's DDS.
+"""Kernels: the order of samples on the card, and the commands for its DDS.
 
-The card knows frequencies and amplitudes that change linearly. Each segment is cut into
-steps in which that is near enough: a ramp of the depth where the amplitude has made equal
-parts of its way, a transport that is not linear at equal times. At the start of each step
-one block of commands takes effect.
+The DDS knows frequencies and amplitudes that change linearly. Each segment of a tone program is
+cut into steps in which that is close enough: a depth ramp where the amplitude has covered equal
+parts of its change, a transport with another speed profile at equal times. At the start of each
+step one block of commands takes effect.
 """
 
 from __future__ import annotations
@@ -14,30 +14,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.plugin import const, kernel
-from labseq_spcm._kernels_dds_steps import (
-    COURSE_STEPS,
-    END_HZ,
-    MIN_TICKS,
-    START_HZ,
-    TICK_S,
-    TONES,
-    TURNS,
-    amplitude_at,
-    course_at,
-    cut,
-    widest_ramp,
-)
+from labseq_spcm.limits import DDS_MIN_TICKS, DDS_TICK_S
 
+Words = NDArray[np.uint16]
 Reals = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 Shorts = NDArray[np.int32]
 
+RAMP_STEPS: Final = 8
+"""Steps of a depth ramp: within 1 / (4 n^2), 0.4 % of the full depth, of a linear ramp."""
+COURSE_STEPS: Final = 16
+"""Steps of a transport: the frequency is within 0.3 % of its change."""
 MAX_CORES: Final = 20
 SAME_HZ: Final = 1.0
-"""A tone that goes on at its frequency, from one segment to the next, keeps its core."""
+"""A tone that starts within this of where another ended keeps that tone's core."""
 SAME_TURNS: Final = 1e-3
-"""And its phase, unless the program makes it jump by more than this."""
+"""The core keeps its phase too, unless the program's phase jumps by more than this."""
 
 FREQUENCY: Final = 603000
 FREQUENCY_SLOPE: Final = 604000
@@ -47,26 +40,90 @@ PHASE: Final = 607000
 SOURCE: Final = 608000
 TIMER: Final = 608001
 COMMAND: Final = 608003
+"""Registers of core 0, and of all cores together, as in the vendor's header files."""
 FROM_TIMER: Final = 1
 FROM_CARD: Final = 2
 AT_TRIGGER: Final = 2
 
-# Rows of what an axis' cores do.
+START_HZ, END_HZ, START, END, TURNS = 0, 1, 2, 3, 4
+"""Rows of an axis' tones: frequencies, amplitudes, phase in turns."""
 HZ, HZ_PER_S, AMP, AMP_PER_S = 0, 1, 2, 3
+"""Rows of the present state of an axis' cores."""
 
 TOO_SHORT: Final = -1
 TOO_MANY: Final = -2
 
+TONES: Final = const("float64", 2)
 OFFSETS: Final = const("int32", 1)
 CORES: Final = const("int64", 1)
 
 
+@kernel(f"void({const('uint16', 1)}, {const('uint16', 1)}, uint32[::1])")
+def interleave(first: Words, second: Words, out: NDArray[np.uint32]) -> None:
+    """Interleave the samples of both outputs, as the card stores them.
+
+    It writes whole frames of unsigned words, so that the processor can do many at a time.
+
+    Args:
+        first: uint16 (n,): the samples of output 0, their bits.
+        second: uint16 (n,): of output 1.
+        out: Result, uint32 (n,): the frames, output 0 in the low word.
+    """
+    for i in range(len(out)):
+        out[i] = np.uint32(first[i]) | (np.uint32(second[i]) << np.uint32(16))
+
+
+@kernel("float64(int64, float64)")
+def course_at(course: int, u: float) -> float:
+    """Part of its change that a frequency has covered; as :meth:`labseq.plugin.FrequencyCourse.fraction`."""
+    if course == 0:
+        return u
+    if course == 1:
+        return u * u * u * (10.0 - 15.0 * u + 6.0 * u * u)
+    v = min(u, 1.0 - u)
+    s = 16.0 / 3.0 * v**3 if v <= 0.25 else 1.0 / 6.0 - 2.0 * v + 8.0 * v * v - 16.0 / 3.0 * v**3
+    return s if u <= 0.5 else 1.0 - s
+
+
+@kernel(f"float64({TONES}, int64, float64)")
+def amplitude_at(tones: Reals, tone: int, u: float) -> float:
+    """Amplitude of a tone after a fraction u of its segment: its square changes linearly."""
+    start, end = tones[START, tone], tones[END, tone]
+    return np.sqrt(start * start + (end * end - start * start) * min(1.0, max(0.0, u)))
+
+
+@kernel(f"void({TONES}, int64, int64, float64[::1])")
+def widest_ramp(tones: Reals, first: int, last: int, widest: Reals) -> None:
+    """Put the start and end amplitude of the tone that changes most into ``widest``."""
+    for tone in range(first, last):
+        start, end = tones[START, tone], tones[END, tone]
+        if abs(end - start) > abs(widest[1] - widest[0]):
+            widest[0], widest[1] = start, end
+
+
+@kernel("int64(float64[::1], int64, float64, float64[::1])")
+def cut(widest: Reals, course: int, duration_s: float, knots: Reals) -> int:
+    """Cut a segment into steps: their ends as fractions of its duration; returns how many steps."""
+    start, end = widest[0], widest[1]
+    room = duration_s / ((DDS_MIN_TICKS + 1) * DDS_TICK_S)
+    if abs(end - start) > 0.05 * max(start, end):
+        n_steps = max(1, min(RAMP_STEPS, int(np.sqrt(room))))
+        for k in range(n_steps + 1):
+            a = start + (end - start) * k / n_steps
+            knots[k] = (a * a - start * start) / (end * end - start * start)
+        return n_steps
+    n_steps = 1 if course == 0 else max(1, min(COURSE_STEPS, int(room)))
+    for k in range(n_steps + 1):
+        knots[k] = k / n_steps
+    return n_steps
+
+
 @kernel(f"int64({OFFSETS}, {TONES}, int64, float64, {CORES}, int64[::1], bool_[::1], bool_[::1])")
 def assign(
-    offsets: Shorts, tones: Reals, segment: int, before_s: float, cores: Ints, core_of: Ints, fresh: Bools,
-    used: Bools,
+    offsets: Shorts, tones: Reals, segment: int, before_s: float, cores: Ints, core_of: Ints,
+    set_phase: Bools, used: Bools,
 ) -> int:  # fmt: skip
-    """Give each tone of a segment a core: the one that it had, or a free one.
+    """Assign a core to each tone of a segment: the one that it had, or a free one.
 
     Args:
         offsets: Where each segment's tones start.
@@ -74,8 +131,8 @@ def assign(
         segment: The segment.
         before_s: Duration of the segment before it.
         cores: The axis' cores.
-        core_of: For all tones, which of the cores they have (an index); filled in for the segment's.
-        fresh: For all tones, whether their phase must be set; likewise.
+        core_of: For each tone the index of its core; filled in for the segment's tones.
+        set_phase: For each tone whether its phase must be set; likewise.
         used: (2 MAX_CORES,): scratch.
 
     Returns:
@@ -85,7 +142,7 @@ def assign(
     used[:] = False
     for tone in range(first, last):
         core_of[tone] = -1
-        fresh[tone] = True
+        set_phase[tone] = True
         start = offsets[segment - 1] if segment > 0 else first
         for old in range(start, first):
             if abs(tones[END_HZ, old] - tones[START_HZ, tone]) < SAME_HZ and not used[core_of[old]]:
@@ -93,8 +150,8 @@ def assign(
                 used[core_of[old]] = True
                 turns = tones[TURNS, old] + 0.5 * before_s * (tones[START_HZ, old] + tones[END_HZ, old])
                 jump = tones[TURNS, tone] - turns
-                unheard = before_s == 0.0 and fresh[old]
-                fresh[tone] = unheard or abs(jump - np.rint(jump)) > SAME_TURNS
+                never_set = before_s == 0.0 and set_phase[old]
+                set_phase[tone] = never_set or abs(jump - np.rint(jump)) > SAME_TURNS
                 break
     free = 0
     for tone in range(first, last):
@@ -109,7 +166,7 @@ def assign(
 
 
 @kernel("int64(int32, float64, int32[::1], float64[::1], int64)")
-def put(register: int, value: float, registers: Shorts, values: Reals, n: int) -> int:
+def add_command(register: int, value: float, registers: Shorts, values: Reals, n: int) -> int:
     """Add a command."""
     registers[n] = register
     values[n] = value
@@ -124,15 +181,15 @@ def drive_core(
     core: int, hz: float, hz_per_s: float, amp: float, amp_per_s: float, now: Reals, at: int,
     registers: Shorts, values: Reals, n: int,
 ) -> int:  # fmt: skip
-    """Add the commands for what a core does from now on, where it is not what it does already."""
+    """Add the commands that bring a core from its present state into a new one."""
     if hz_per_s != 0.0 or now[HZ_PER_S, at] != 0.0 or hz != now[HZ, at]:
-        n = put(FREQUENCY + core, hz, registers, values, n)
+        n = add_command(FREQUENCY + core, hz, registers, values, n)
     if hz_per_s != now[HZ_PER_S, at]:
-        n = put(FREQUENCY_SLOPE + core, hz_per_s, registers, values, n)
+        n = add_command(FREQUENCY_SLOPE + core, hz_per_s, registers, values, n)
     if amp_per_s != 0.0 or now[AMP_PER_S, at] != 0.0 or amp != now[AMP, at]:
-        n = put(AMPLITUDE + core, amp, registers, values, n)
+        n = add_command(AMPLITUDE + core, amp, registers, values, n)
     if amp_per_s != now[AMP_PER_S, at]:
-        n = put(AMPLITUDE_SLOPE + core, amp_per_s, registers, values, n)
+        n = add_command(AMPLITUDE_SLOPE + core, amp_per_s, registers, values, n)
     now[HZ, at], now[HZ_PER_S, at], now[AMP, at], now[AMP_PER_S, at] = hz, hz_per_s, amp, amp_per_s
     return n
 
@@ -142,26 +199,26 @@ def drive_core(
     " float64, float64, float64[:, ::1], int32[::1], float64[::1], int64)"
 )
 def drive_axis(
-    offsets: Shorts, tones: Reals, segment: int, cores: Ints, core_of: Ints, fresh: Bools, course: int,
+    offsets: Shorts, tones: Reals, segment: int, cores: Ints, core_of: Ints, set_phase: Bools, course: int,
     begins: bool, u: float, until: float, step_s: float, late_s: float, now: Reals, registers: Shorts,
     values: Reals, n: int,
 ) -> int:  # fmt: skip
-    """Add the commands of one axis for one step of a segment, from fraction u of it until another.
+    """Add the commands of one axis for one step of a segment.
 
     Args:
         offsets: Where each segment's tones start.
         tones: The axis' tones.
         segment: The segment.
         cores: The axis' cores.
-        core_of: For all tones, which of the cores they have.
-        fresh: For all tones, whether their phase must be set.
+        core_of: For each tone the index of its core.
+        set_phase: For each tone whether its phase must be set.
         course: The segment's course.
-        begins: Whether it is the segment's first step.
-        u: Where the step starts on the card.
-        until: Where it ends on the card.
+        begins: Whether this is the segment's first step.
+        u: Fraction of the segment at which the step starts on the card.
+        until: Fraction at which it ends on the card.
         step_s: How long it takes on the card.
-        late_s: By how much it starts late there, because the card's times stand on a grid.
-        now: What the axis' cores do, (4, MAX_CORES).
+        late_s: How much later than in the program it starts, because the card rounds times to ticks.
+        now: Present state of the axis' cores, (4, MAX_CORES).
         registers: The commands' registers.
         values: Their values.
         n: How many commands there are.
@@ -185,9 +242,9 @@ def drive_axis(
         a0, a1 = amplitude_at(tones, tone, u), amplitude_at(tones, tone, until)
         hz_per_s, amp_per_s = way * (s1 - s0) / step_s, (a1 - a0) / step_s
         n = drive_core(cores[at], hz, hz_per_s, a0, amp_per_s, now, at, registers, values, n)
-        if begins and fresh[tone]:
+        if begins and set_phase[tone]:
             turns = tones[TURNS, tone] + hz * late_s + 0.25  # the card's tones are sines
-            n = put(PHASE + cores[at], 360.0 * (turns - np.floor(turns)), registers, values, n)
+            n = add_command(PHASE + cores[at], 360.0 * (turns - np.floor(turns)), registers, values, n)
     return n
 
 
@@ -199,10 +256,10 @@ def compile_program(
     duration_s: Reals, course: NDArray[np.int8], row_offsets: Shorts, row: Reals, row_cores: Ints,
     column_offsets: Shorts, column: Reals, column_cores: Ints, registers: Shorts, values: Reals, ends: Ints,
 ) -> int:  # fmt: skip
-    """Compile a program into blocks of commands.
+    """Compile a tone program into blocks of commands.
 
     The first block takes effect at the card's trigger, the others at ticks of the timer. The last
-    but one silences all; the last takes the timer away.
+    but one silences all tones; the last switches the timer off.
 
     Args:
         duration_s: Of each segment.
@@ -218,19 +275,21 @@ def compile_program(
         ends: Result: end of each block among the commands.
 
     Returns:
-        How many blocks; or TOO_SHORT or TOO_MANY, and ``ends[0]`` is the segment.
+        Number of blocks; or TOO_SHORT or TOO_MANY, and ``ends[0]`` is the segment.
     """
     row_now, column_now = np.zeros((4, MAX_CORES)), np.zeros((4, MAX_CORES))
     row_core, column_core = np.zeros(row.shape[1], np.int64), np.zeros(column.shape[1], np.int64)
-    row_fresh, column_fresh = np.ones(row.shape[1], np.bool_), np.ones(column.shape[1], np.bool_)
+    row_set_phase, column_set_phase = np.ones(row.shape[1], np.bool_), np.ones(column.shape[1], np.bool_)
     used, widest, knots = np.zeros(2 * MAX_CORES, np.bool_), np.zeros(2), np.zeros(COURSE_STEPS + 1)
-    n = put(SOURCE, FROM_TIMER, registers, values, 0)
+    n = add_command(SOURCE, FROM_TIMER, registers, values, 0)
     n_blocks, joint_s, before_s = 0, 0.0, 0.0
     for i in range(len(duration_s)):
-        fault = assign(row_offsets, row, i, before_s, row_cores, row_core, row_fresh, used)
-        fault += assign(column_offsets, column, i, before_s, column_cores, column_core, column_fresh, used)
+        status = assign(row_offsets, row, i, before_s, row_cores, row_core, row_set_phase, used)
+        status += assign(
+            column_offsets, column, i, before_s, column_cores, column_core, column_set_phase, used
+        )
         before_s = duration_s[i]
-        if fault < 0:
+        if status < 0:
             ends[0] = i
             return TOO_MANY
         if before_s == 0.0:
@@ -240,24 +299,24 @@ def compile_program(
         widest_ramp(column, column_offsets[i], column_offsets[i + 1], widest)
         n_steps = cut(widest, course[i], before_s, knots)
         for k in range(n_steps):
-            tick = np.rint((joint_s + knots[k] * before_s) / TICK_S)
-            n_ticks = np.rint((joint_s + knots[k + 1] * before_s) / TICK_S) - tick
-            if n_ticks < MIN_TICKS:
+            tick = np.rint((joint_s + knots[k] * before_s) / DDS_TICK_S)
+            n_ticks = np.rint((joint_s + knots[k + 1] * before_s) / DDS_TICK_S) - tick
+            if n_ticks < DDS_MIN_TICKS:
                 ends[0] = i
                 return TOO_SHORT
-            step_s, late_s = n_ticks * TICK_S, tick * TICK_S - (joint_s + knots[k] * before_s)
+            step_s, late_s = n_ticks * DDS_TICK_S, tick * DDS_TICK_S - (joint_s + knots[k] * before_s)
             u = knots[k] + late_s / before_s
             until = u + step_s / before_s
             n = drive_axis(
-                row_offsets, row, i, row_cores, row_core, row_fresh, course[i], k == 0, u, until, step_s,
+                row_offsets, row, i, row_cores, row_core, row_set_phase, course[i], k == 0, u, until, step_s,
                 late_s, row_now, registers, values, n,
             )  # fmt: skip
             n = drive_axis(
-                column_offsets, column, i, column_cores, column_core, column_fresh, course[i], k == 0, u,
+                column_offsets, column, i, column_cores, column_core, column_set_phase, course[i], k == 0, u,
                 until, step_s, late_s, column_now, registers, values, n,
             )  # fmt: skip
-            n = put(TIMER, step_s, registers, values, n)
-            n = put(COMMAND, AT_TRIGGER, registers, values, n)
+            n = add_command(TIMER, step_s, registers, values, n)
+            n = add_command(COMMAND, AT_TRIGGER, registers, values, n)
             ends[n_blocks] = n
             n_blocks += 1
         joint_s += before_s
@@ -267,10 +326,10 @@ def compile_program(
         n = drive_core(
             column_cores[at], column_now[HZ, at], 0.0, 0.0, 0.0, column_now, at, registers, values, n
         )
-    n = put(TIMER, 2 * MIN_TICKS * TICK_S, registers, values, n)
-    n = put(COMMAND, AT_TRIGGER, registers, values, n)
+    n = add_command(TIMER, 2 * DDS_MIN_TICKS * DDS_TICK_S, registers, values, n)
+    n = add_command(COMMAND, AT_TRIGGER, registers, values, n)
     ends[n_blocks] = n
-    n = put(SOURCE, FROM_CARD, registers, values, n)
-    n = put(COMMAND, AT_TRIGGER, registers, values, n)
+    n = add_command(SOURCE, FROM_CARD, registers, values, n)
+    n = add_command(COMMAND, AT_TRIGGER, registers, values, n)
     ends[n_blocks + 1] = n
     return n_blocks + 2

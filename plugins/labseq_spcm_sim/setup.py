@@ -1,4 +1,9 @@
-"""Which values the card takes: refused outside of the range, rounded where only the step is wrong.
+"""What the card can do, and which values its registers take.
+
+Source, where no other is named: Spectrum's manual "M4i.66xx/M4i.96xx", chapters on analog
+outputs, generation modes, trigger, sequence mode and DDS20; for the DDS steps and for
+manners that the manual does not tell, what ColdMatter (EDMSuite, ``HANDOFF.md``) measured
+on an M4i.9622-x8.
 
 A refused value leaves the old one in place, as the card does. What the simulator does not
 model is refused as well, with a text that says so, rather than taken without effect.
@@ -10,8 +15,87 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
-from labseq_spcm.simulator import facts, registers as r
-from labseq_spcm.simulator.facts import CardModel
+from labseq_spcm_sim import registers as r
+
+
+@dataclass(frozen=True, slots=True)
+class CardModel:
+    """One model of the M4i.66xx family with two channels.
+
+    Attributes:
+        name: Product name.
+        card_type: What the register SPC_PCITYP holds.
+        memory_samples: On-board memory in samples of 16 bit, shared by the active channels.
+        sample_rate_hz: Lowest and highest sample rate.
+        rate_gaps_hz: Sample rates that the clock cannot make: pairs (from, to).
+        rate_step_hz: Granularity of the sample rate.
+        amplitude_mv: Smallest and largest amplitude into 50 Ohm, in millivolts.
+        low_path_mv: The hysteresis between the amplifier's two paths: above the second the
+            low path is left, below the first the high one.
+        relay_s: How long the output is off when the path changes.
+        bus_bytes_per_s: Transfer from the PC; PCIe x8 Gen 2.
+        n_dds_cores: DDS cores on the chip; that a 6631 has 23 is not measured.
+        temperature_c: What its sensors read, in degrees Celsius (ours).
+        dds_queue: Commands that the DDS queue holds (an M4i.9622 reads 4098).
+    """
+
+    name: str = "M4i.6631-x8"
+    card_type: int = 0x76631
+    memory_samples: int = 2 * 1024**3
+    sample_rate_hz: tuple[float, float] = (50e6, 1.25e9)
+    rate_gaps_hz: tuple[tuple[float, float], ...] = ((750e6, 757e6), (1125e6, 1145e6))
+    rate_step_hz: int = 8
+    amplitude_mv: tuple[int, int] = (80, 2000)
+    low_path_mv: tuple[int, int] = (420, 480)
+    relay_s: float = 10e-3
+    bus_bytes_per_s: float = 2.8e9
+    n_dds_cores: int = 23
+    temperature_c: int = 45
+    dds_queue: int = 4096
+
+
+M4I6631: Final = CardModel()
+
+MEMORY_STEP: Final = 32
+"""Step and minimum of the memory size, in samples per channel."""
+MAX_LOOPS: Final = 2**32 - 1
+
+FAST_CLOCK_HZ: Final = 625e6
+"""Above this sample rate the trigger's way to the output takes twice as many clocks."""
+
+
+def trigger_delay_s(sample_rate_hz: float) -> float:
+    """From the trigger to the first sample: 476.5 clocks above 625 MS/s, else 238.5, and 16 ns."""
+    clocks = 476.5 if sample_rate_hz > FAST_CLOCK_HZ else 238.5
+    return clocks / sample_rate_hz + 16e-9
+
+
+DDS_RATE_HZ: Final = 1.25e9
+"""The DDS runs at the full sample rate."""
+DDS_TIMER_STEP_S: Final = 6.4e-9
+DDS_TIMER_S: Final = (83.2e-9, 27.487790730)
+DDS_FREQUENCY_STEP_HZ: Final = DDS_RATE_HZ / 2**32
+DDS_AMPLITUDE_STEP: Final = 1 / 32767
+DDS_PHASE_STEP_DEG: Final = 360 / 4096
+DDS_FREQUENCY_SLOPE_STEP: Final = 2775.5575615628914
+"""In Hz/s, with a ramp step size of 1."""
+DDS_FREQUENCY_SLOPE_MAX: Final = 1.90734863280903e14
+DDS_AMPLITUDE_SLOPE_STEP: Final = 298.03231910153505
+"""In 1/s, with a ramp step size of 1."""
+DDS_AMPLITUDE_SLOPE_MAX: Final = 305174.6170612535
+DDS_TRIGGER_DELAY_S: Final = 560e-9
+"""From a trigger to the change of the output."""
+DDS_RETRIGGER_S: Final = 72e-9
+"""Least time between two triggers."""
+DDS_SINGLE_PER_S: Final = 400e3
+"""Commands per second that reach the card one by one; the caller is kept waiting meanwhile."""
+DDS_DMA_PER_S: Final = 10e6
+"""Commands per second that reach the card by DMA, in the background."""
+DDS_DMA_LATENCY_S: Final = 20e-6
+"""What a block takes at least by DMA."""
+DDS_DMA_QUEUE: Final = 512 * 1024**2
+"""Commands that the on-board memory queues in DMA mode."""
+
 
 Number = int | float
 
@@ -165,17 +249,7 @@ def _sample_rate(setup: Setup, value: Number) -> Number:
 
 def _memory_size(setup: Setup, value: Number) -> Number:
     most = setup.model.memory_samples // len(setup.channels)
-    return within(facts.MEMORY_STEP, most, facts.MEMORY_STEP)(setup, value)
-
-
-def _segment_size(setup: Setup, value: Number) -> Number:
-    n_channels = len(setup.channels)
-    most = setup.model.memory_samples // n_channels // setup[r.SPC_SEQMODE_MAXSEGMENTS]
-    return within(facts.SEGMENT_MIN // n_channels, most, facts.MEMORY_STEP)(setup, value)
-
-
-def _segment(setup: Setup, value: Number) -> Number:
-    return within(0, setup[r.SPC_SEQMODE_MAXSEGMENTS] - 1)(setup, value)
+    return within(MEMORY_STEP, most, MEMORY_STEP)(setup, value)
 
 
 def _amplitude(setup: Setup, value: Number) -> Number:
@@ -186,9 +260,7 @@ _SWITCH: Final = one_of(0, 1)
 _STOP_LEVELS: Final = (r.SPCM_STOPLVL_ZERO, r.SPCM_STOPLVL_LOW, r.SPCM_STOPLVL_HIGH, r.SPCM_STOPLVL_HOLDLAST)
 _MODES: Final = (
     r.SPC_REP_STD_SINGLE,
-    r.SPC_REP_STD_SINGLERESTART,
     r.SPC_REP_FIFO_SINGLE,
-    r.SPC_REP_STD_SEQUENCE,
     r.SPC_REP_STD_DDS,
 )
 
@@ -198,7 +270,7 @@ _RULES: Final[dict[int, Rule]] = {
     r.SPC_CHENABLE: one_of(1, 2, 3),
     r.SPC_MEMSIZE: _memory_size,
     r.SPC_SEGMENTSIZE: within(16, 8 * 1024**3 - 16, 16),
-    r.SPC_LOOPS: within(0, facts.MAX_LOOPS),
+    r.SPC_LOOPS: within(0, MAX_LOOPS),
     r.SPC_SAMPLERATE: _sample_rate,
     r.SPC_CLOCKMODE: modelled(r.SPC_CM_INTPLL, r.SPC_CM_EXTREFCLOCK),
     r.SPC_REFERENCECLOCK: within(10e6, 1.25e9),
@@ -224,10 +296,6 @@ _RULES: Final[dict[int, Rule]] = {
     r.SPC_TRIG_EXT0_LEVEL0: within(-10_000, 10_000, 10, rounded=True),
     r.SPC_TRIG_DELAY: within(0, 8 * 1024**3 - 32, 32),
     r.SPC_DATA_OUTBUFSIZE: power_of_two(1024, 4 * 1024**3),
-    r.SPC_SEQMODE_MAXSEGMENTS: power_of_two(2, facts.MAX_SEGMENTS),
-    r.SPC_SEQMODE_WRITESEGMENT: _segment,
-    r.SPC_SEQMODE_SEGMENTSIZE: _segment_size,
-    r.SPC_SEQMODE_STARTSTEP: within(0, facts.MAX_STEPS - 1),
 }
 
 _WHILE_RUNNING: Final = {
@@ -236,8 +304,6 @@ _WHILE_RUNNING: Final = {
     r.SPC_AMP1,
     r.SPC_ENABLEOUT0,
     r.SPC_ENABLEOUT1,
-    r.SPC_SEQMODE_WRITESEGMENT,
-    r.SPC_SEQMODE_SEGMENTSIZE,
 }
 
 _DEFAULTS: Final[dict[int, Number]] = {
@@ -254,7 +320,6 @@ _DEFAULTS: Final[dict[int, Number]] = {
     r.SPC_CH0_STOPLEVEL: r.SPCM_STOPLVL_ZERO,
     r.SPC_CH1_STOPLEVEL: r.SPCM_STOPLVL_ZERO,
     r.SPC_DATA_OUTBUFSIZE: 4 * 1024**3,
-    r.SPC_SEQMODE_MAXSEGMENTS: 2,
 }
 
 
@@ -263,7 +328,7 @@ def _fixed(model: CardModel) -> dict[int, Number]:
         r.SPC_PCITYP: model.card_type,
         r.SPC_FNCTYPE: r.SPCM_TYPE_AO,
         r.SPC_PCIMEMSIZE: 2 * model.memory_samples,
-        r.SPC_PCIFEATURES: r.SPCM_FEAT_SEQUENCE,
+        r.SPC_PCIFEATURES: 0,
         r.SPC_PCIEXTFEATURES: r.SPCM_FEAT_EXTFW_DDS20 | r.SPCM_FEAT_EXTFW_AWG,
         r.SPC_MIINST_MODULES: 1,
         r.SPC_MIINST_CHPERMODULE: 2,
@@ -278,13 +343,10 @@ def _fixed(model: CardModel) -> dict[int, Number]:
         r.SPC_MON_TC_BASE_CTRL: model.temperature_c,
         r.SPC_MON_TC_MODULE_0: model.temperature_c,
         r.SPC_AVAILCARDMODES: sum(_MODES),
-        r.SPC_AVAILMEMSIZE_MIN: facts.MEMORY_STEP,
+        r.SPC_AVAILMEMSIZE_MIN: MEMORY_STEP,
         r.SPC_AVAILMEMSIZE_MAX: model.memory_samples,
-        r.SPC_AVAILMEMSIZE_STEP: facts.MEMORY_STEP,
+        r.SPC_AVAILMEMSIZE_STEP: MEMORY_STEP,
         r.SPC_TRIG_AVAILORMASK: r.SPC_TMASK_SOFTWARE | r.SPC_TMASK_EXT0,
         r.SPC_TRIG_AVAILDELAY: 8 * 1024**3 - 32,
         r.SPC_TRIG_AVAILDELAY_STEP: 32,
-        r.SPC_SEQMODE_AVAILMAXSEGMENT: facts.MAX_SEGMENTS,
-        r.SPC_SEQMODE_AVAILMAXSTEPS: facts.MAX_STEPS,
-        r.SPC_SEQMODE_AVAILMAXLOOP: r.SPCSEQ_LOOPMASK,
     }

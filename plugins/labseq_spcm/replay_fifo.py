@@ -1,0 +1,228 @@
+"""The modes that play rendered samples: ``replay`` from the card's memory, ``fifo`` as a stream."""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq.plugin import DeviceError, DeviceTimeoutError, LimitError, Renderer, ToneProgram, TransientError
+from labseq_spcm.card import POLL_S, TRANSFER_TIMEOUT_S, AwgCard, Buffer
+from labseq_spcm.limits import SAMPLE_STEP
+from labseq_spcm.settings import SpcmSettings
+
+CHUNK: Final = 1 << 18
+"""Samples rendered at a time, 0.4 ms at 625 MS/s: few enough to stay in the processor's cache."""
+RING_CHUNKS: Final = 4
+FRAME_BYTES: Final = 4
+"""Bytes of one sample of both outputs."""
+MIN_FILL: Final = 1 << 20
+"""Smallest part of the on-board memory that is used as a FIFO, in bytes."""
+
+
+class InterleavedRenderer:
+    """Renders a program as the card stores it: the samples of both outputs interleaved.
+
+    It renders in the caller's thread. A second thread would have to be waited for, and where other
+    programs keep the processor busy that takes longer than the rendering it would take over.
+
+    Args:
+        program: The program.
+        sample_rate_hz: The rate that the card's clock really makes.
+        row_channel: The output of the row axis, 0 or 1.
+
+    Attributes:
+        n_samples: Samples per channel, with silence up to the card's granularity.
+    """
+
+    def __init__(self, program: ToneProgram, sample_rate_hz: float, row_channel: int) -> None:
+        self._renderer = Renderer(program, sample_rate_hz)
+        self._channels = (row_channel, 1 - row_channel)
+        self._chunk = np.empty((2, CHUNK), np.int16)
+        self.n_samples = max(1, math.ceil(self._renderer.n_samples / SAMPLE_STEP)) * SAMPLE_STEP
+
+    def write(self, start: int, out: NDArray[np.int16]) -> None:
+        """Render some samples; after the end of the program there is silence.
+
+        Args:
+            start: Index of the first sample.
+            out: Result, int16 (n, 2): a column per output.
+        """
+        from labseq_spcm.kernels import interleave
+
+        frames = out.view(np.uint32)[:, 0]
+        for first in range(0, len(out), CHUNK):
+            chunk = self._chunk[:, : len(out) - first]
+            for axis, channel in enumerate(self._channels):
+                self._renderer.write(axis, start + first, chunk[channel])
+            first_words, second_words = chunk.view(np.uint16)
+            interleave(first_words, second_words, frames[first : first + CHUNK])
+
+
+class Replay:
+    """Mode ``replay``: uploads the whole program, then waits for its end. See ``PlayMode``.
+
+    Args:
+        card: The open card.
+        settings: The driver's settings.
+        sample_rate_hz: The rate that the card's clock really makes.
+    """
+
+    max_wait_s = math.inf
+    render_s = 0.0
+
+    def __init__(self, card: AwgCard, settings: SpcmSettings, sample_rate_hz: float) -> None:
+        self._card = card
+        self._row_channel = settings.row_channel
+        self._rate_hz = sample_rate_hz
+        self._buffer = Buffer()
+        spcm = card.spcm
+        card.set(spcm.SPC_CARDMODE, spcm.SPC_REP_STD_SINGLE, "card mode")
+        card.set(spcm.SPC_LOOPS, 1, "loops")
+        self._memory_samples = card.read(spcm.SPC_PCIMEMSIZE) // FRAME_BYTES
+
+    def prepare(self, program: ToneProgram) -> float:
+        """Render and upload a program; returns its playing time in seconds.
+
+        Raises:
+            LimitError: It does not fit into the card's memory.
+        """
+        start_s = time.perf_counter()
+        renderer = InterleavedRenderer(program, self._rate_hz, self._row_channel)
+        n_samples = renderer.n_samples
+        if n_samples > self._memory_samples:
+            what = f"{self._card.name}: length of the program"
+            length, most = (f"{n / self._rate_hz:.4g} s" for n in (n_samples, self._memory_samples))
+            hint = "use mode: fifo, or a lower sample_rate"
+            raise LimitError(what, length, f"{most}: the card's memory", hint)
+        frames = self._buffer.reserve(n_samples)
+        renderer.write(0, frames)
+        self.render_s = time.perf_counter() - start_s
+        self._card.set(self._card.spcm.SPC_MEMSIZE, n_samples, "memory size")
+        self._card.upload(frames)
+        return n_samples / self._rate_hz
+
+    def start(self, command: int) -> None:
+        """Start the card."""
+        self._card.command(command, "start")
+
+    def finished(self) -> bool:
+        """Whether the program has been played to its end."""
+        return not self._card.running
+
+    def abort(self) -> None:
+        """Nothing to do: the next program replaces this one."""
+
+
+class Fifo:
+    """Mode ``fifo``: streams a program while the rest is still being rendered. See ``PlayMode``.
+
+    Rendered chunks go into a ring in the computer, from there over the bus into the card's memory,
+    and from there to the outputs. Ring and memory are bounded, so a program is rendered about
+    ``fill`` ahead. Before the start both are filled, or hold the whole program. The card knows how
+    many samples to play: it ends by itself, and reports when it runs dry before.
+
+    Args:
+        card: The open card.
+        settings: The driver's settings.
+        sample_rate_hz: The rate that the card's clock really makes.
+    """
+
+    max_wait_s = 0.0
+    render_s = 0.0
+
+    def __init__(self, card: AwgCard, settings: SpcmSettings, sample_rate_hz: float) -> None:
+        self._card = card
+        self._row_channel = settings.row_channel
+        self._rate_hz = sample_rate_hz
+        self._ring = Buffer().reserve(RING_CHUNKS * CHUNK)
+        self._half_ring_s = RING_CHUNKS / 2 * CHUNK / sample_rate_hz
+        self._renderer: InterleavedRenderer | None = None
+        self._n_rendered = self._n_samples = 0
+        spcm = card.spcm
+        card.set(spcm.SPC_CARDMODE, spcm.SPC_REP_FIFO_SINGLE, "card mode")
+        card.set(spcm.SPC_LOOPS, 1, "loops")
+        ahead = int(settings.fill * sample_rate_hz) * FRAME_BYTES - self._ring.nbytes
+        self._fill = 1 << round(math.log2(max(MIN_FILL, ahead)))
+        card.set(spcm.SPC_DATA_OUTBUFSIZE, self._fill, "size of the card's FIFO in bytes")
+
+    def prepare(self, program: ToneProgram) -> float:
+        """Fill ring and card with the beginning of a program; returns its playing time in seconds.
+
+        Raises:
+            DeviceTimeoutError: The card does not fetch the data.
+        """
+        card, spcm = self._card, self._card.spcm
+        start_s = time.perf_counter()
+        self._renderer = InterleavedRenderer(program, self._rate_hz, self._row_channel)
+        self.render_s = time.perf_counter() - start_s
+        self._n_samples, self._n_rendered = self._renderer.n_samples, 0
+        card.set(spcm.SPC_SEGMENTSIZE, self._n_samples, "number of samples")
+        card.define_transfer(self._ring, CHUNK * FRAME_BYTES)
+        self._feed()
+        card.command(spcm.M2CMD_DATA_STARTDMA, "transfer")
+        deadline_s = card.clock.now() + TRANSFER_TIMEOUT_S
+        full = min(self._n_samples, (self._fill + self._ring.nbytes) // FRAME_BYTES)
+        while self._n_rendered < full:
+            if card.clock.now() > deadline_s:
+                text = f"the card fetched {self._n_rendered} of {full} samples"
+                raise DeviceTimeoutError(card.name, text, TRANSFER_TIMEOUT_S)
+            if not self._feed():
+                card.clock.sleep(POLL_S)
+        return self._n_samples / self._rate_hz
+
+    def start(self, command: int) -> None:
+        """Start the card."""
+        self._card.command(command, "start")
+
+    def finished(self) -> bool:
+        """Feed the card while it has room; whether it has played to the end.
+
+        Raises:
+            TransientError: The card ran out of data.
+        """
+        try:
+            is_full = self._feed() < RING_CHUNKS
+        except DeviceError:  # the card may have stopped just after it reported room
+            self._has_ended()
+            raise
+        self.max_wait_s = self._half_ring_s if is_full else 0.0
+        return self._has_ended()
+
+    def _has_ended(self) -> bool:
+        """Whether the card has played to the end.
+
+        Raises:
+            TransientError: It ran out of data.
+        """
+        spcm, status = self._card.spcm, self._card.status
+        ended = bool(status & spcm.M2STAT_CARD_READY)
+        if status & spcm.M2STAT_DATA_OVERRUN or (ended and self._n_rendered < self._n_samples):
+            share = f"{min(1.0, self._n_rendered / self._n_samples):.0%} of the program was rendered in time"
+            text = f"underrun: the card ran out of samples ({share}); raise `fill`, lower sample_rate, or use"
+            raise TransientError(f"{text} the mode replay", self._card.name)
+        return ended
+
+    def abort(self) -> None:
+        """Drop what was not rendered."""
+        self._renderer = None
+        self._n_rendered = self._n_samples
+
+    def _feed(self) -> int:
+        """Render into the ring while there is room, once around at most; returns how many chunks."""
+        card, spcm, renderer = self._card, self._card.spcm, self._renderer
+        for n_chunks in range(RING_CHUNKS):
+            if renderer is None or self._n_rendered >= self._n_samples:
+                return n_chunks
+            if card.read(spcm.SPC_DATA_AVAIL_USER_LEN) < CHUNK * FRAME_BYTES:
+                return n_chunks
+            first = self._n_rendered % len(self._ring)
+            start_s = time.perf_counter()
+            renderer.write(self._n_rendered, self._ring[first : first + CHUNK])
+            self.render_s += time.perf_counter() - start_s
+            card.write(spcm.SPC_DATA_AVAIL_CARD_LEN, CHUNK * FRAME_BYTES, "handing samples over")
+            self._n_rendered += CHUNK
+        return RING_CHUNKS

@@ -1,0 +1,33 @@
+"""A Spectrum M4i.6631-x8 simulated at its registers, for the real package ``spcm``.
+
+    card = SimulatedCard(clock)
+    with installed(card) as name, spcm.Card(name) as device:
+        ...
+    card.played(0)
+
+The driver ``labseq_spcm`` opens it as a :class:`SimulatedLibrary` where a profile says
+``card: simulated``. The README says what the simulator does and does not model.
+"""
+
+from labseq_spcm_sim.card import LogEntry, SimulatedCard
+from labseq_spcm_sim.library import CardOutputs, SimulatedLibrary, install, installed, vendor_library_found
+from labseq_spcm_sim.output import SampleSpan, Span, Tone, ToneSpan
+from labseq_spcm_sim.setup import M4I6631, CardModel, ErrorInfo, trigger_delay_s
+
+__all__ = [
+    "M4I6631",
+    "CardModel",
+    "CardOutputs",
+    "ErrorInfo",
+    "LogEntry",
+    "SampleSpan",
+    "SimulatedCard",
+    "SimulatedLibrary",
+    "Span",
+    "Tone",
+    "ToneSpan",
+    "install",
+    "installed",
+    "trigger_delay_s",
+    "vendor_library_found",
+]

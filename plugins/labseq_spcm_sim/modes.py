@@ -1,0 +1,445 @@
+"""The modes that play samples: STD_SINGLE from the on-board memory, FIFO_SINGLE as a stream."""
+
+from __future__ import annotations
+
+import ctypes
+import math
+import weakref
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq_spcm_sim import registers as r
+from labseq_spcm_sim.output import ROUNDING
+from labseq_spcm_sim.setup import Refusal, refuse
+
+Samples = NDArray[np.int16]
+
+PAGE = 4096
+SMALL_NOTIFY = (16, 32, 64, 128, 256, 512, 1024, 2048)
+
+
+@dataclass(frozen=True, slots=True)
+class Buffer:
+    """A transfer buffer in the memory of the PC.
+
+    Attributes:
+        address: Where it starts.
+        offset: Where its data shall go, in bytes from the start of the memory or segment.
+        n_bytes: Its length.
+        notify_bytes: How much must have been transferred until somebody is told; 0: all.
+    """
+
+    address: int
+    offset: int
+    n_bytes: int
+    notify_bytes: int
+
+    def check(self, buffer_type: int, direction: int) -> None:
+        """Refuse what the driver refuses, and a buffer that is not aligned to a page.
+
+        Raises:
+            Refusal: Wrong kind, direction, size or notify size, or not aligned.
+        """
+        if buffer_type != r.SPCM_BUF_DATA:
+            raise refuse(buffer_type, f"the buffer type {r.SPCM_BUF_DATA}")
+        if direction != r.SPCM_DIR_PCTOCARD:
+            raise Refusal(r.ERR_DIRMISMATCH, "a generator card takes data from the PC only")
+        if self.notify_bytes % PAGE and self.notify_bytes not in SMALL_NOTIFY:
+            raise Refusal(
+                r.ERR_NOTIFYSIZE, f"notify size {self.notify_bytes} is not a multiple of 4096 bytes"
+            )
+        if self.n_bytes <= 0 or self.n_bytes % 2 or self.offset % 2:
+            raise refuse(self.n_bytes, "a whole number of samples")
+        if not self.address or self.address % PAGE:
+            raise Refusal(r.ERR_INVALIDPARAM, "the buffer must be aligned to 4096 bytes")
+
+    def content(self) -> Samples:
+        """A copy of all of it, int16 (n_bytes / 2,)."""
+        out = np.empty(self.n_bytes // 2, np.int16)
+        self.fetch(0, out)
+        return out
+
+    def fetch(self, start: int, out: Samples) -> None:
+        """Copy some of its samples, which may go around its end, from byte ``start`` on."""
+        whole = (ctypes.c_char * self.n_bytes).from_address(self.address)
+        samples = np.frombuffer(memoryview(whole), np.int16)
+        first = start % self.n_bytes // 2
+        n = min(len(out), len(samples) - first)
+        out[:n] = samples[first : first + n]
+        out[n:] = samples[: len(out) - n]
+
+
+@dataclass(frozen=True, slots=True)
+class Upload:
+    """Data on their way to the memory.
+
+    Attributes:
+        done_s: When the last sample arrives.
+        n_samples: Size of the memory that is set up, all channels together.
+        first: Index of the first sample in it.
+        data: int16 (n,).
+    """
+
+    done_s: float
+    n_samples: int
+    first: int
+    data: Samples
+
+
+class Memory:
+    """The on-board memory and the bus to it.
+
+    Args:
+        bus_bytes_per_s: Speed of the bus.
+
+    Attributes:
+        uploads: Uploads that have not arrived yet, in order.
+        done_s: When the bus will be, or became, idle.
+    """
+
+    def __init__(self, bus_bytes_per_s: float) -> None:
+        self._bus_bytes_per_s = bus_bytes_per_s
+        self._samples: Samples = np.zeros(0, np.int16)
+        self.done_s = -math.inf
+        self.uploads: deque[Upload] = deque()
+
+    def send(self, now_s: float, n_samples: int, first: int, data: Samples) -> None:
+        """Put data on the bus."""
+        self.done_s = max(now_s, self.done_s) + data.nbytes / self._bus_bytes_per_s
+        self.uploads.append(Upload(self.done_s, n_samples, first, data))
+
+    def store(self, upload: Upload) -> None:
+        """Data arrive, in a new array: a replay that has begun keeps the old content."""
+        if len(upload.data) == upload.n_samples:
+            self._samples = upload.data
+            return
+        self._samples = self._resized(upload.n_samples).copy()
+        self._samples[upload.first : upload.first + len(upload.data)] = upload.data
+
+    def read(self, n_samples: int, n_channels: int) -> Samples:
+        """The content, int16 (n_samples, n_channels); zeros where nothing was ever written."""
+        return self._resized(n_samples * n_channels).reshape(n_samples, n_channels)
+
+    def _resized(self, n: int) -> Samples:
+        if len(self._samples) < n:
+            self._samples = np.concatenate([self._samples, np.zeros(n - len(self._samples), np.int16)])
+        return self._samples[:n]
+
+
+AREA: Final = 1 << 21
+"""Samples that are asked for at a time."""
+MAX_AHEAD: Final = 1 << 27
+"""Most samples that are asked for before they are needed."""
+
+
+class Store:
+    """Memory that is used again once nobody looks at what is in it any more.
+
+    To get fresh memory from the operating system, page by page, can take longer than to play what
+    is put there: a stream would run dry for a reason that no real card has.
+    """
+
+    def __init__(self) -> None:
+        self._free: list[Samples] = []
+        self._rest: Samples = np.empty(0, np.int16)
+
+    def reserve(self, n: int) -> None:
+        """See that there is memory for a number of samples, or for as many as are asked for ahead."""
+        while len(self._free) * AREA < min(n, MAX_AHEAD):
+            area = np.empty(AREA, np.int16)
+            area.fill(0)  # until then it is only promised
+            self._free.append(area)
+
+    def take(self, n: int) -> Samples:
+        """Memory for n samples, int16 (n,); it is free again when nothing refers to it any more."""
+        if n > AREA:
+            return np.empty(n, np.int16)
+        if len(self._rest) < n:
+            self.reserve(n)
+            area = self._free.pop()
+            self._rest = np.frombuffer(area.data, np.int16)  # all that is cut from it keeps it alive
+            weakref.finalize(self._rest, self._free.append, area)
+        taken, self._rest = self._rest[:n], self._rest[n:]
+        return taken
+
+
+@dataclass(frozen=True, slots=True)
+class Stretch:
+    """Samples of all active channels that were played in a row.
+
+    Attributes:
+        start_s: When the first one was at the output.
+        samples: int16 (n, n_channels); repeats.
+        n_samples: How many were played, per channel.
+    """
+
+    start_s: float
+    samples: Samples
+    n_samples: int
+
+
+class Run(Protocol):
+    """One run of the card in one of its modes, from its start to its stop."""
+
+    @property
+    def finished(self) -> bool:
+        """Whether it came to its end by itself."""
+        ...
+
+    @property
+    def failed(self) -> bool:
+        """Whether it broke off for want of data."""
+        ...
+
+    def advance(self, now_s: float) -> None:
+        """Let everything happen that is due."""
+        ...
+
+    def trigger(self, out_s: float) -> None:
+        """A trigger that reaches the output at ``out_s``."""
+        ...
+
+    def ends_s(self) -> float | None:
+        """When it will end, if that is known."""
+        ...
+
+    def played(self, now_s: float) -> list[Stretch]:
+        """What was played up to now."""
+        ...
+
+
+def cut(stretches: list[Stretch], sample_rate_hz: float, now_s: float) -> list[Stretch]:
+    """Only what has been played by now."""
+    parts: list[Stretch] = []
+    for stretch in stretches:
+        n_samples = min(stretch.n_samples, math.floor((now_s - stretch.start_s) * sample_rate_hz + ROUNDING))
+        if n_samples > 0:
+            parts.append(replace(stretch, n_samples=n_samples))
+    return parts
+
+
+class Replay:
+    """STD_SINGLE: plays the memory, after the first trigger.
+
+    Args:
+        content: Returns the memory, int16 (n, n_channels), as it is when the replay begins.
+        sample_rate_hz: Sample rate.
+        loops: How often the memory is played; 0: until the stop.
+    """
+
+    failed = False
+
+    def __init__(self, content: Callable[[], Samples], sample_rate_hz: float, loops: int) -> None:
+        self._content = content
+        self._rate = sample_rate_hz
+        self._loops = loops
+        self._end_s = math.inf
+        self._stretches: list[Stretch] = []
+        self.finished = False
+
+    def advance(self, now_s: float) -> None:
+        """End the replay when all loops were played."""
+        self.finished = now_s >= self._end_s
+
+    def trigger(self, out_s: float) -> None:
+        """Begin; later triggers have no effect."""
+        if not self._stretches:
+            samples = self._content()
+            n_samples = len(samples) * self._loops if self._loops else 2**62
+            self._end_s = out_s + n_samples / self._rate if self._loops else math.inf
+            self._stretches.append(Stretch(out_s, samples, n_samples))
+
+    def ends_s(self) -> float | None:
+        """Known once it plays, unless it plays until the stop."""
+        return self._end_s if math.isfinite(self._end_s) else None
+
+    def played(self, now_s: float) -> list[Stretch]:
+        """The samples played so far."""
+        return cut(self._stretches, self._rate, now_s)
+
+
+SMALL: float = 1e-3
+"""Bytes that are rounding of time."""
+
+
+class Fifo:
+    """A ring buffer in the PC, the bus, the on-board memory as a FIFO, and the output.
+
+    Bytes are handed over by the user, transferred by the bus while there is room on the
+    card, and consumed by the output from the trigger on. When the output finds none it
+    breaks off: an underrun.
+
+    Args:
+        buffer: The ring.
+        n_channels: Active channels.
+        sample_rate_hz: Sample rate.
+        room_bytes: How much of the on-board memory is used.
+        bus_bytes_per_s: Speed of the bus.
+        store: Memory for what was handed over.
+    """
+
+    def __init__(
+        self,
+        buffer: Buffer,
+        n_channels: int,
+        sample_rate_hz: float,
+        room_bytes: int,
+        bus_bytes_per_s: float,
+        store: Store,
+    ) -> None:
+        self._buffer = buffer
+        self._store = store
+        self._frame = 2 * n_channels
+        self._rate = sample_rate_hz
+        self._room = room_bytes
+        self._bus = bus_bytes_per_s
+        self._total = math.inf
+        self._handed = 0
+        self._transferred = 0.0
+        self._consumed = 0.0
+        self._now_s = -math.inf
+        self._play_s = math.inf
+        self._pieces: list[tuple[int, Stretch]] = []
+        self._dma = False
+        self.failed = False
+        self.finished = False
+
+    def set_length(self, n_samples: int) -> None:
+        """How many samples per channel shall be played; 0: until the stop."""
+        self._total = n_samples * self._frame if n_samples else math.inf
+
+    def hand_over(self, n_bytes: int) -> None:
+        """The user has filled bytes, which the card may now fetch.
+
+        Raises:
+            Refusal: More than were free, or not whole samples.
+        """
+        if not 0 <= n_bytes <= self._buffer.n_bytes - (self._handed - self._notified()):
+            raise refuse(n_bytes, f"0 to {self.user_bytes} bytes")
+        if n_bytes % self._frame:
+            raise refuse(n_bytes, f"a multiple of {self._frame} bytes")
+        if n_bytes:
+            data = self._store.take(n_bytes // 2)
+            self._buffer.fetch(self._handed, data)
+            data = data.reshape(-1, self._frame // 2)
+            self._pieces.append((self._handed // self._frame, Stretch(0.0, data, len(data))))
+            self._handed += n_bytes
+
+    def start_dma(self, now_s: float) -> None:
+        """The bus begins to fetch."""
+        self.advance(now_s)
+        self._dma = True
+
+    def stop_dma(self, now_s: float) -> None:
+        """The bus fetches no more."""
+        self.advance(now_s)
+        self._dma = False
+
+    def _notified(self) -> int:
+        done = math.floor(self._transferred + SMALL)
+        notify = self._buffer.notify_bytes
+        return done // notify * notify if notify else done
+
+    @property
+    def user_bytes(self) -> int:
+        """Bytes that are free for the user, in whole notify sizes."""
+        return self._buffer.n_bytes - (self._handed - self._notified())
+
+    @property
+    def user_position(self) -> int:
+        """Where in the ring the free bytes start."""
+        return self._handed % self._buffer.n_bytes
+
+    @property
+    def fill_promille(self) -> int:
+        """How full the on-board memory is, in sixteenths."""
+        sixteenths = math.floor(16 * (self._transferred - self._consumed) / self._room + SMALL)
+        return round(sixteenths * 62.5)
+
+    @property
+    def block_ready(self) -> bool:
+        """Whether a wait for the transfer would return."""
+        return self.user_bytes >= max(1, self._buffer.notify_bytes) or self._transferred >= self._handed
+
+    def block_s(self) -> float | None:
+        """When a wait for the transfer will return, at the present speed."""
+        speed = self._speed()
+        missing = max(1, self._buffer.notify_bytes) - self.user_bytes
+        return self._now_s + max(1.0, missing) / speed if speed > 0 else None
+
+    def _drain(self) -> float:
+        return self._rate * self._frame if self._now_s >= self._play_s and not self._over else 0.0
+
+    @property
+    def _over(self) -> bool:
+        return self.failed or self.finished
+
+    def _speed(self) -> float:
+        """What the bus carries now, in bytes per second."""
+        if not self._dma or self._over or self._transferred >= self._handed - SMALL:
+            return 0.0
+        full = self._transferred - self._consumed >= self._room - SMALL
+        return min(self._bus, self._drain()) if full else self._bus
+
+    def advance(self, now_s: float) -> None:
+        """Let bytes flow up to now."""
+        if self._now_s == -math.inf:
+            self._now_s = now_s
+        while self._now_s < now_s and not self._over:
+            self._flow(now_s)
+        self._now_s = max(self._now_s, now_s)
+
+    def _flow(self, now_s: float) -> None:
+        """Flow until something changes: the start, the end of the data, full, empty, or now."""
+        drain, speed = self._drain(), self._speed()
+        fill = self._transferred - self._consumed
+        if drain > speed and fill <= SMALL:
+            self.failed = True
+            return
+        spans = [now_s - self._now_s]
+        if self._now_s < self._play_s:
+            spans.append(self._play_s - self._now_s)
+        if speed:
+            spans.append((self._handed - self._transferred) / speed)
+        if speed > drain:
+            spans.append((self._room - fill) / (speed - drain))
+        if drain > speed:
+            spans.append(fill / (drain - speed))
+        if drain:
+            spans.append((self._total - self._consumed) / drain)
+        step_s = min(spans)
+        at_least_s = math.nextafter(self._now_s, math.inf)
+        self._now_s = now_s if step_s == spans[0] else max(self._now_s + step_s, at_least_s)
+        self._transferred = min(float(self._handed), self._transferred + speed * step_s)
+        self._consumed = min(self._transferred, self._consumed + drain * step_s)
+        self.finished = self._consumed >= self._total - SMALL
+
+    def trigger(self, out_s: float) -> None:
+        """The first trigger starts the output."""
+        self._play_s = min(self._play_s, out_s)
+
+    def ends_s(self) -> float | None:
+        """Known if the length is, and it plays."""
+        end_s = self._play_s + self._total / (self._rate * self._frame)
+        return end_s if end_s < math.inf else None
+
+    def played(self, now_s: float) -> list[Stretch]:
+        """What came out of the FIFO so far."""
+        n_samples = math.floor((self._consumed + SMALL) / self._frame)
+        stretches = [
+            Stretch(self._play_s + first / self._rate, piece.samples, min(piece.n_samples, n_samples - first))
+            for first, piece in self._pieces
+            if first < n_samples
+        ]
+        return cut(stretches, self._rate, now_s)
+
+    def forget(self, before_s: float) -> None:
+        """Drop the data that were played before a time."""
+        if self._play_s < before_s:
+            n_samples = (before_s - self._play_s) * self._rate
+            self._pieces = [piece for piece in self._pieces if piece[0] + piece[1].n_samples > n_samples]

@@ -1,0 +1,445 @@
+"""The driver of the Spectrum card, on the real package spcm and a simulated card: what is played."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+from hypothesis import given, strategies as st
+from hypothesis.extra.numpy import arrays
+from labseq_spcm.kernels import interleave
+from labseq_spcm.mobile_tweezers import HOT_C, TEST_SAMPLES, SpcmMobileTweezers
+from labseq_spcm.replay_fifo import CHUNK, InterleavedRenderer
+from labseq_spcm.settings import SpcmSettings
+from labseq_spcm_sim import M4I6631, SimulatedLibrary, Span, Tone, ToneSpan
+from numpy.typing import NDArray
+
+from labseq import (
+    ConfigError,
+    Context,
+    DeviceError,
+    HasSelfTest,
+    LimitError,
+    MotionSpec,
+    Plan,
+    RfSpec,
+    TransientError,
+)
+from labseq.motion import render, tone_program
+from labseq.testing import MobileTweezersContract
+from labseq.testing.fakes import FakeClock
+
+MODES = ["replay", "fifo", "dds"]
+
+
+class TestReplayContract(MobileTweezersContract):
+    @pytest.fixture
+    def factory(self) -> Callable[[Context], SpcmMobileTweezers]:
+        return partial(SpcmMobileTweezers, SpcmSettings(card="simulated"))
+
+
+class TestFifoContract(MobileTweezersContract):
+    @pytest.fixture
+    def factory(self) -> Callable[[Context], SpcmMobileTweezers]:
+        return partial(SpcmMobileTweezers, SpcmSettings(card="simulated", mode="fifo"))
+
+
+class TestDdsContract(MobileTweezersContract):
+    def context(self) -> Context:
+        motion = MotionSpec(max_row_tones=16, max_column_tones=5)
+        return replace(super().context(), motion=motion)
+
+    @pytest.fixture
+    def factory(self) -> Callable[[Context], SpcmMobileTweezers]:
+        return partial(SpcmMobileTweezers, SpcmSettings(card="simulated", mode="dds"))
+
+
+class TestSamples:
+    MODES: ClassVar = ["replay", "fifo"]
+
+    @pytest.mark.parametrize("mode", MODES)
+    def test_are_what_was_rendered_and_then_silence(self, driver: Any, mode: str) -> None:
+        with driver(mode) as lab:
+            program = lab.program(3)
+            rendered = render(program, lab.rate_hz).samples
+            lab.play(program)
+            for channel in (0, 1):
+                played = lab.samples(channel)
+                assert np.array_equal(played[: rendered.shape[1]], rendered[channel])
+                assert not played[rendered.shape[1] :].any()
+                assert len(played) - rendered.shape[1] < 32
+
+    @pytest.mark.parametrize("mode", MODES)
+    def test_come_from_the_channel_that_the_profile_names(self, driver: Any, mode: str) -> None:
+        with driver(mode, row_channel=1, column_channel=0) as lab:
+            program = lab.program()
+            rendered = render(program, lab.rate_hz).samples
+            lab.play(program)
+            assert np.array_equal(lab.samples(1)[: rendered.shape[1]], rendered[0])
+            assert np.array_equal(lab.samples(0)[: rendered.shape[1]], rendered[1])
+
+    @pytest.mark.parametrize("mode", MODES)
+    def test_of_one_program_leave_nothing_in_the_next(self, driver: Any, mode: str) -> None:
+        with driver(mode) as lab:
+            for n_batches in (5, 2):
+                program = lab.program(n_batches)
+                lab.card.forget(lab.clock.now() + 1.0)
+                lab.play(program)
+            rendered = render(program, lab.rate_hz).samples
+            played = lab.samples(0)
+            assert np.array_equal(played[: rendered.shape[1]], rendered[0])
+            assert not played[rendered.shape[1] :].any()
+
+    def test_are_rendered_for_the_rate_that_the_card_really_makes(self, driver: Any) -> None:
+        with driver(sample_rate=250e6 + 3) as lab:
+            assert lab.rate_hz == 250e6
+            program = lab.program()
+            lab.play(program)
+            rendered = render(program, lab.rate_hz).samples
+            assert np.array_equal(lab.samples(0)[: rendered.shape[1]], rendered[0])
+
+    def test_have_the_amplitude_of_the_profile(self, driver: Any) -> None:
+        with driver(motion=MotionSpec(rf=RfSpec(full_scale_v=0.2))) as lab:
+            lab.play(lab.program())
+            assert {span.amplitude_v for span in lab.card.played(0)} == {0.2}
+
+
+class TestPlaying:
+    @pytest.mark.parametrize("mode", MODES)
+    def test_needs_a_new_program_each_time(self, driver: Any, mode: str) -> None:
+        with driver(mode) as lab:
+            lab.play(lab.program())
+            with pytest.raises(DeviceError, match="without a prepared program"):
+                lab.tweezers.play()
+
+    @pytest.mark.parametrize("mode", MODES)
+    def test_starts_at_the_external_trigger(self, driver: Any, mode: str) -> None:
+        with driver(mode, trigger="external") as lab:
+            duration_s = lab.tweezers.prepare(lab.program())
+            assert not lab.card.trigger()  # too early: not armed yet
+            lab.tweezers.play()
+            lab.clock.sleep(2e-3)
+            assert not lab.card.played(0)
+            triggered_s = lab.clock.now()
+            assert lab.card.trigger()
+            lab.tweezers.wait(duration_s + 1e-3)
+            assert lab.card.played(0)[0].start_s >= triggered_s
+
+
+MOTION = MotionSpec(max_row_tones=16, max_column_tones=5)
+
+
+def _start_s(lab: Any) -> float:
+    """When the program began: its first tones come after the pause of the first batch."""
+    return lab.card.played(0)[0].start_s - lab.motion.overhead_per_batch_s
+
+
+def _tones_at(spans: list[Span], at_s: float) -> list[Tone]:
+    now = [span for span in spans if span.start_s <= at_s < span.end_s]
+    return [tone.after(at_s - s.start_s) for s in now if isinstance(s, ToneSpan) for tone in s.tones]
+
+
+def _apart(sine_rad: float, cosine_rad: float) -> float:
+    """The distance of the card's phase, of a sine, from the program's, of a cosine."""
+    return abs(math.remainder(sine_rad - np.pi / 2 - cosine_rad, 2 * np.pi))
+
+
+class TestTones:
+    def test_are_those_of_the_program(self, driver: Any) -> None:
+        with driver("dds") as lab:
+            program = lab.program(4)
+            lab.play(program)
+            start_s = _start_s(lab)
+            spans = [lab.card.played(channel) for channel in (0, 1)]
+            for at_s in np.linspace(0, program.total_duration_s, 997)[1:-1]:
+                if np.abs(program.joint_s - at_s).min() < 1e-6:
+                    continue
+                now = program.tones_at(at_s)
+                axes = (program.row, now.row), (program.column, now.column)
+                for channel, (axis, wanted) in enumerate(axes):
+                    most = axis.start_amplitude.max()
+                    tones = _tones_at(spans[channel], start_s + at_s)
+                    for hz, amplitude, phase_rad in zip(
+                        wanted.frequency_hz, wanted.amplitude, wanted.phase_rad, strict=True
+                    ):
+                        tone = min(tones, key=lambda tone: abs(tone.frequency_hz - hz))
+                        assert abs(tone.frequency_hz - hz) < 5
+                        assert abs(tone.amplitude**2 - amplitude**2) < 0.006 * most**2
+                        assert _apart(tone.phase_rad, phase_rad) < 0.01
+
+    @pytest.mark.parametrize("course", ["minimum_jerk", "constant_jerk"])
+    def test_follow_other_courses_of_speed(self, driver: Any, course: Any) -> None:
+        with driver("dds", motion=replace(MOTION, speed_profile=course)) as lab:
+            program = lab.program(1)
+            lab.play(program)
+            start_s = _start_s(lab)
+            transport = int(np.flatnonzero(program.kind == 2)[0])
+            spans = lab.card.played(1)
+            first_s, last_s = program.joint_s[transport], program.joint_s[transport + 1]
+            for at_s in np.linspace(first_s, last_s, 101)[1:-1]:
+                wanted = np.sort(program.tones_at(at_s).column.frequency_hz)
+                tones = np.sort([tone.frequency_hz for tone in _tones_at(spans, start_s + at_s)])
+                assert np.abs(tones - wanted).max() < 0.05 * 1.6e6
+
+    def test_are_silent_at_the_end(self, driver: Any) -> None:
+        with driver("dds") as lab:
+            program = lab.program()
+            lab.play(program)
+            ends = [span.end_s for channel in (0, 1) for span in lab.card.played(channel)]
+            assert max(ends) <= _start_s(lab) + program.total_duration_s + 1e-7
+            assert not lab.card.running
+
+    def test_of_a_program_larger_than_the_queue_are_sent_while_it_plays(self, driver: Any) -> None:
+        with driver("dds") as lab:
+            program = lab.program(100)
+            lab.tweezers.prepare(program)
+            assert lab.card.read(608006)[1] <= 4096
+            lab.tweezers.play()
+            lab.tweezers.wait(1.0)
+            last = lab.card.played(0)[-1]
+            assert last.end_s == pytest.approx(_start_s(lab) + program.total_duration_s, abs=1e-7)
+
+    def test_that_come_too_late_are_an_error(self, driver: Any) -> None:
+        with driver("dds") as lab:
+            lab.tweezers.prepare(lab.program(100))
+            lab.tweezers.play()
+            lab.clock.sleep(0.5)
+            with pytest.raises(TransientError, match="no commands in time"):
+                lab.tweezers.wait(1.0)
+            assert lab.card.outputs_on == (False, False)
+
+    def test_jump_in_phase_where_the_program_does(self, driver: Any) -> None:
+        with driver("dds") as lab:
+            program = lab.program(1)
+            phase_rad = program.row.phase_rad.copy()
+            phase_rad[int(program.row.offsets[2]) :] += 1.0
+            jumping = replace(program, row=replace(program.row, phase_rad=phase_rad))
+            lab.play(jumping)
+            at_s = program.joint_s[2] + 5e-6
+            (tone,) = _tones_at(lab.card.played(0), _start_s(lab) + at_s)
+            wanted = jumping.tones_at(at_s).row.phase_rad[0]
+            assert _apart(tone.phase_rad, wanted) < 0.05
+
+    def test_step_in_a_ramp_of_no_length(self, driver: Any) -> None:
+        with driver("dds", motion=replace(MOTION, pick_up_s=0.0)) as lab:
+            lab.play(lab.program(1))
+            assert lab.card.played(0)
+
+    def test_for_less_time_than_the_timer_can_do_are_refused(self, driver: Any) -> None:
+        with (
+            driver("dds", motion=replace(MOTION, pick_up_s=20e-9)) as lab,
+            pytest.raises(LimitError, match=r"83\.2 ns"),
+        ):
+            lab.tweezers.prepare(lab.program(1))
+
+
+class TestNumberOfTones:
+    @pytest.mark.parametrize(("rows", "columns"), [(20, 20), (17, 2), (1, 6), (21, 1)])
+    def test_profiles_with_more_tones_than_it_has_are_refused(
+        self, driver: Any, rows: int, columns: int
+    ) -> None:
+        settings = SpcmSettings(card="simulated", mode="dds")
+        motion = MotionSpec(max_row_tones=rows, max_column_tones=columns)
+        with pytest.raises(ConfigError, match=r"20 \+ 1 or 16 \+ 5"):
+            SpcmMobileTweezers(settings, Context(motion=motion))
+
+    @pytest.mark.parametrize(
+        ("rows", "columns", "row_channel"), [(20, 1, 0), (16, 5, 0), (5, 16, 1), (1, 20, 1)]
+    )
+    def test_profiles_within_its_tones_are_taken(
+        self, driver: Any, rows: int, columns: int, row_channel: int
+    ) -> None:
+        motion = MotionSpec(max_row_tones=rows, max_column_tones=columns)
+        with driver("dds", motion=motion, row_channel=row_channel, column_channel=1 - row_channel) as lab:
+            plan = Plan.from_batches([([(0, 0)], [(0, 3)])])
+            lab.play(tone_program(plan, motion=motion))
+            assert lab.card.played(0)
+            assert lab.card.played(1)
+
+    def test_of_programs_are_refused_beyond_those_it_has(self, driver: Any) -> None:
+        with driver("dds") as lab:
+            wide = [([(0, col) for col in range(6)], [(0, col + 1) for col in range(6)])]
+            program = tone_program(Plan.from_batches(wide))
+            with pytest.raises(LimitError, match="16 and 5"):
+                lab.tweezers.prepare(program)
+
+
+class CreepingClock(FakeClock):
+    """Some time passes with every look at it, as while samples are rendered."""
+
+    creep_s = 0.0
+
+    def now(self) -> float:
+        self._now_s += self.creep_s
+        return super().now()
+
+
+def test_programs_are_streamed_beyond_what_card_and_ring_hold(driver: Any) -> None:
+    with driver("fifo", fill=1e-3) as lab:
+        program = lab.program(16)
+        rendered = render(program, lab.rate_hz).samples
+        lab.tweezers.prepare(program)
+        filled_s = lab.card._machine.fifo._handed / 4 / lab.rate_hz
+        assert filled_s < 0.6 * program.total_duration_s
+        lab.tweezers.play()
+        lab.tweezers.wait(1.0)
+        assert np.array_equal(lab.samples(0)[: rendered.shape[1]], rendered[0])
+        assert np.array_equal(lab.samples(1)[: rendered.shape[1]], rendered[1])
+
+
+@pytest.mark.parametrize("fill_s", [1e-3, 8e-3, 20e-3])
+@pytest.mark.parametrize("share", [0.2, 0.7])
+def test_a_card_is_kept_supplied_when_that_takes_most_of_the_time(
+    driver: Any, fill_s: float, share: float
+) -> None:
+    """Each chunk takes two looks at the clock: for room, and to hand it over."""
+    clock = CreepingClock()
+    with driver("fifo", clock=clock, fill=fill_s) as lab:
+        program = lab.program(100)
+        lab.tweezers.prepare(program)
+        lab.tweezers.play()
+        clock.creep_s = share * 2**18 / lab.rate_hz / 2
+        lab.tweezers.wait(5.0)
+        clock.creep_s = 0.0
+        rendered = render(program, lab.rate_hz).samples
+        assert np.array_equal(lab.samples(0)[: rendered.shape[1]], rendered[0])
+
+
+def test_data_that_is_withheld_is_an_underrun_and_ends_in_the_safe_state(driver: Any) -> None:
+    with driver("fifo", fill=1e-3) as lab:
+        lab.tweezers.prepare(lab.program(16))
+        lab.tweezers.play()
+        lab.clock.sleep(0.1)  # nobody feeds the card
+        with pytest.raises(TransientError, match="underrun"):
+            lab.tweezers.wait(1.0)
+        assert lab.card.outputs_on == (False, False)
+        lab.play(lab.program(1))
+
+
+@pytest.mark.parametrize("creep_s", [1e-3, 3e-3, 10e-3])
+def test_an_underrun_in_the_middle_of_feeding_is_an_underrun(driver: Any, creep_s: float) -> None:
+    clock = CreepingClock()
+    with driver("fifo", clock=clock, fill=1e-3) as lab:
+        lab.tweezers.prepare(lab.program(40))
+        lab.tweezers.play()
+        clock.creep_s = creep_s
+        with pytest.raises(TransientError, match="underrun"):
+            lab.tweezers.wait(5.0)
+        clock.creep_s = 0.0
+        assert lab.card.outputs_on == (False, False)
+        assert not lab.card.running
+
+
+def test_what_an_underrun_cut_short_is_not_played_on(driver: Any) -> None:
+    with driver("fifo", fill=1e-3) as lab:
+        lab.tweezers.prepare(lab.program(16))
+        lab.tweezers.play()
+        lab.clock.sleep(0.1)
+        with pytest.raises(TransientError):
+            lab.tweezers.wait(1.0)
+        lab.card.forget(lab.clock.now() + 1.0)
+        lab.clock.sleep(0.1)
+        assert not lab.card.played(0)
+        program = lab.program(1)
+        rendered = render(program, lab.rate_hz).samples
+        lab.play(program)
+        assert np.array_equal(lab.samples(0)[: rendered.shape[1]], rendered[0])
+
+
+@given(st.integers(0, 100).flatmap(lambda n: arrays(np.int16, (2, n))))
+def test_interleaving_puts_the_samples_of_both_outputs_side_by_side(samples: NDArray[np.int16]) -> None:
+    first, second = samples.view(np.uint16)
+    frames = np.empty(samples.shape[1], np.uint32)
+    interleave(first, second, frames)
+    assert np.array_equal(frames.view(np.int16).reshape(-1, 2), samples.T)
+
+
+@pytest.mark.parametrize("row_channel", [0, 1])
+def test_any_stretch_of_a_program_is_rendered_as_in_the_whole(row_channel: int) -> None:
+    program = tone_program(Plan.from_batches([([(0, 0)], [(0, 3)]), ([(2, 1)], [(4, 1)])]))
+    whole = render(program, 625e6).samples
+    renderer = InterleavedRenderer(program, 625e6, row_channel)
+    assert 0 <= renderer.n_samples - whole.shape[1] < 32
+    wanted = np.zeros((renderer.n_samples + CHUNK, 2), np.int16)
+    wanted[: whole.shape[1]] = whole.T if row_channel == 0 else whole[::-1].T
+    for start, n_samples in [(0, len(wanted)), (0, 1), (12345, CHUNK), (CHUNK - 7, CHUNK + 100)]:
+        out = np.full((n_samples, 2), 99, np.int16)
+        renderer.write(start, out)
+        assert np.array_equal(out, wanted[start : start + n_samples])
+
+
+@pytest.mark.parametrize("mode", ["replay", "fifo", "dds"])
+def test_a_card_that_is_well_passes_and_stays_silent(driver: Any, mode: str) -> None:
+    with driver(mode) as lab:
+        assert isinstance(lab.tweezers, HasSelfTest)
+        lab.tweezers.self_test()
+        assert lab.card.outputs_on == (False, False)
+        assert not lab.card.running
+        lab.play(lab.program(1))
+
+
+def test_samples_are_sent_to_the_memory(driver: Any) -> None:
+    with driver("replay") as lab:
+        lab.tweezers.self_test()
+        assert lab.card.memory.shape == (TEST_SAMPLES, 2)
+        assert not lab.card.memory.any()
+
+
+def test_what_was_prepared_is_dropped(driver: Any) -> None:
+    with driver("replay") as lab:
+        lab.tweezers.prepare(lab.program(1))
+        lab.tweezers.self_test()
+        with pytest.raises(DeviceError, match="without a prepared program"):
+            lab.tweezers.play()
+
+
+@pytest.mark.parametrize(("above_c", "well"), [(0, True), (1, False)])
+def test_a_hot_card_is_reported(driver: Any, above_c: int, well: bool) -> None:
+    with driver(model=replace(M4I6631, temperature_c=HOT_C + above_c)) as lab:
+        if well:
+            lab.tweezers.self_test()
+            return
+        with pytest.raises(DeviceError, match="the base card has 81 degrees Celsius; expected at most 80"):
+            lab.tweezers.self_test()
+
+
+def test_a_clock_that_another_program_has_changed_is_reported(driver: Any) -> None:
+    with driver() as lab:
+        lab.card.write(20000, 100_000_000)
+        with pytest.raises(DeviceError, match="the sample rate is 100 MHz; expected 250 MHz"):
+            lab.tweezers.self_test()
+
+
+def test_a_closed_or_playing_card_is_not_tested(driver: Any) -> None:
+    with driver() as lab:
+        lab.tweezers.prepare(lab.program(1))
+        lab.tweezers.play()
+        with pytest.raises(DeviceError, match=r"self_test\(\) while a program plays"):
+            lab.tweezers.self_test()
+        lab.tweezers.close()
+        with pytest.raises(DeviceError, match="not open"):
+            lab.tweezers.self_test()
+
+
+def test_the_simulated_card_of_a_profile_keeps_only_the_last_program() -> None:
+    clock = FakeClock()
+    tweezers = SpcmMobileTweezers(SpcmSettings(card="simulated"), Context(clock=clock))
+    tweezers.open()
+    assert isinstance(tweezers.library, SimulatedLibrary)
+    card = tweezers.library.card
+    assert card is not None
+    program = tone_program(Plan.from_batches([([(0, 0)], [(0, 3)])]))
+    starts_s: list[float] = []
+    for _ in range(3):
+        tweezers.prepare(program)
+        starts_s.append(clock.now())
+        tweezers.play()
+        tweezers.wait(1.0)
+        assert [span.start_s > starts_s[-1] for span in card.played(0)] == [True]
+    tweezers.close()
+    assert tweezers.library.card is None

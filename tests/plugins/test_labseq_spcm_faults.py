@@ -1,0 +1,635 @@
+"""The Spectrum driver: wrong cards, settings and programs, safe state, and faults that it works around."""
+
+from __future__ import annotations
+
+import gc
+import json
+import subprocess
+import sys
+from contextlib import ExitStack, suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import settings, strategies as st
+from hypothesis.stateful import (
+    RuleBasedStateMachine,
+    invariant,
+    precondition,
+    rule,
+    run_state_machine_as_test,
+)
+from labseq_spcm.dds import ENTRY, TYPE_INT64
+from labseq_spcm.library import VendorLibrary, load_spcm
+from labseq_spcm.mobile_tweezers import SpcmMobileTweezers
+from labseq_spcm.settings import SpcmSettings
+from labseq_spcm_sim import M4I6631, vendor_library_found
+
+import labseq
+from labseq import (
+    Context,
+    DeviceError,
+    DeviceTimeoutError,
+    LabseqError,
+    LimitError,
+    MotionSpec,
+    Plan,
+    RfSpec,
+    ToneProgram,
+)
+from labseq.motion import tone_program
+from labseq.testing.fakes import FakeClock
+
+MODES = ["replay", "fifo", "dds"]
+
+
+def context(motion: MotionSpec | None = None) -> Context:
+    return Context("mobile_tweezers", clock=FakeClock(), motion=motion or MotionSpec())
+
+
+class TestCards:
+    def test_that_are_unknown_are_named_with_the_drivers_reason(self, driver: Any) -> None:
+        with driver():  # so that there is a driver library
+            tweezers = SpcmMobileTweezers(SpcmSettings(card="simulated-none"), context())
+            with pytest.raises(DeviceError, match=r"'simulated-none': .*no such card; see its name"):
+                tweezers.open()
+
+    def test_in_use_are_named_and_not_disturbed(self, driver: Any) -> None:
+        with driver() as lab:
+            other = SpcmMobileTweezers(lab.tweezers._settings, context())
+            with pytest.raises(DeviceError, match=r"in use; .*close what else uses it"):
+                other.open()
+            other.close()
+            lab.play(lab.program())
+
+    def test_of_another_family_are_refused(self, driver: Any) -> None:
+        digitizer = replace(M4I6631, name="M4i.4420-x8", card_type=0x74420)
+        text = r"is a M4i\.4420-x8 .* expected a Spectrum M4i\.66xx .*: name another one as `card`"
+        with pytest.raises(DeviceError, match=text), driver(model=digitizer):
+            pass
+
+    def test_with_another_serial_number_are_refused(self, driver: Any) -> None:
+        with pytest.raises(DeviceError, match="serial number 12345; expected 99"), driver(serial=99):
+            pass
+
+    def test_that_are_too_slow_are_refused(self, driver: Any) -> None:
+        slow = replace(M4I6631, name="M4i.6622-x8", sample_rate_hz=(50e6, 625e6))
+        text = r"the M4i\.6622-x8 makes at most 625 MS/s; lower sample_rate from 1000 MHz"
+        with pytest.raises(DeviceError, match=text), driver(model=slow, sample_rate=1e9):
+            pass
+
+    def test_that_were_refused_are_left_closed_with_their_outputs_off(self, driver: Any) -> None:
+        with driver() as lab:
+            name, card = lab.tweezers._settings.card, lab.card
+            lab.tweezers.close()
+            wrong = SpcmMobileTweezers(SpcmSettings(card=name, serial=99), context())
+            with pytest.raises(DeviceError):
+                wrong.open()
+            assert card.outputs_on == (False, False)
+            lab.tweezers.open()
+            lab.play(lab.program())
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("timeout_s", [0.0, 50e-3])
+def test_a_trigger_that_never_comes_times_out_into_the_safe_state(
+    driver: Any, mode: str, timeout_s: float
+) -> None:
+    with driver(mode, trigger="external") as lab:
+        lab.tweezers.prepare(lab.program())
+        lab.tweezers.play()
+        with pytest.raises(DeviceTimeoutError, match=r"no trigger came .* the cable at Ext0"):
+            lab.tweezers.wait(timeout_s)
+        assert not lab.card.running
+        assert lab.card.outputs_on == (False, False)
+        lab.tweezers.prepare(lab.program())
+
+
+class TestSettings:
+    @pytest.mark.parametrize("rate_hz", [751e6, 1.13e9])
+    def test_sample_rates_in_the_gaps_of_the_clock_are_refused(self, rate_hz: float) -> None:
+        with pytest.raises(ValueError, match=r"a gap from .*; expected a rate outside of it"):
+            SpcmSettings(sample_rate=rate_hz)
+
+    @pytest.mark.parametrize("rate_hz", [49e6, 1.26e9, float("nan")])
+    def test_sample_rates_beyond_the_clock_are_refused(self, rate_hz: float) -> None:
+        with pytest.raises(ValueError, match=r"expected 50 MHz to 1\.25 GHz|finite"):
+            SpcmSettings(sample_rate=rate_hz)
+
+    @pytest.mark.parametrize("mode", ["replay", "fifo"])
+    def test_sample_rates_that_mirror_tones_of_the_band_are_refused(self, mode: Any) -> None:
+        text = r"sample_rate is 236 MHz; the limit is above 236 MHz, twice the end of the AODs' band, 118 MHz"
+        with pytest.raises(LimitError, match=text):
+            SpcmMobileTweezers(SpcmSettings(card="simulated", mode=mode, sample_rate=236e6), context())
+
+    def test_rates_that_the_bus_cannot_carry_are_refused_for_fifo(self) -> None:
+        text = r"sample_rate is 1\.25 GHz, but the bus carries at most 700 MHz .* use mode: replay"
+        with pytest.raises(ValueError, match=text):
+            SpcmSettings(mode="fifo", sample_rate=1.25e9)
+
+    def test_both_axes_on_one_output_are_refused(self) -> None:
+        with pytest.raises(ValueError, match="both 0"):
+            SpcmSettings(column_channel=0)
+
+    @pytest.mark.parametrize(
+        ("full_scale_v", "max_peak_v", "text"),
+        [(2.1, 3.0, "2000 mV"), (0.05, 2.0, "80 mV"), (0.45, 2.0, "relay"), (1.0, 0.5, "max_peak")],
+    )
+    def test_amplitudes_that_card_or_amplifiers_cannot_do_are_refused(
+        self, full_scale_v: float, max_peak_v: float, text: str
+    ) -> None:
+        motion = MotionSpec(rf=RfSpec(full_scale_v=full_scale_v, max_peak_v=max_peak_v))
+        with pytest.raises(LimitError, match=text):
+            SpcmMobileTweezers(SpcmSettings(card="simulated"), context(motion))
+
+
+def with_row_tone(program: ToneProgram, name: str, value: float) -> ToneProgram:
+    """The program with another value of one of its row tones."""
+    values = getattr(program.row, name).copy()
+    values[3] = value
+    return replace(program, row=replace(program.row, **{name: values}))
+
+
+@pytest.mark.parametrize("mode", MODES)
+class TestPrograms:
+    @pytest.mark.parametrize(
+        ("name", "value", "text"),
+        [
+            ("start_hz", 81e6, r"frequency of a row tone in batch 0 is .* 82 to 118 MHz"),
+            ("end_hz", 119e6, r"frequency of a row tone in batch 0 is .* 82 to 118 MHz"),
+            ("start_hz", np.nan, "frequency of a row tone in batch 0 is nan"),
+            ("end_hz", np.inf, "frequency of a row tone in batch 0 is inf"),
+            ("start_amplitude", 1.5, r"amplitude of a row tone in batch 0 is 1\.5; .* 0 to 1 of full scale"),
+            ("end_amplitude", -0.1, r"amplitude of a row tone in batch 0 is -0\.1"),
+            ("end_amplitude", np.nan, "amplitude of a row tone in batch 0 is nan"),
+            ("phase_rad", np.nan, "phase of a row tone in batch 0 is nan"),
+        ],
+    )
+    def test_with_wrong_tones_are_refused_before_anything_is_uploaded(
+        self, driver: Any, mode: str, name: str, value: float, text: str
+    ) -> None:
+        with driver(mode) as lab:
+            lab.card.log.clear()
+            with pytest.raises(LimitError, match=text):
+                lab.tweezers.prepare(with_row_tone(lab.program(), name, value))
+            assert not list(lab.card.log)
+
+    def test_that_clip_only_together_are_refused(self, driver: Any, mode: str) -> None:
+        with driver(mode) as lab:
+            program = lab.program()
+            n_tones = int(np.diff(program.column.offsets).max())
+            loud = np.full_like(program.column.start_amplitude, 1.01 / n_tones)
+            column = replace(program.column, start_amplitude=loud)
+            with pytest.raises(LimitError, match=r"sum of the amplitudes.* of full scale; .* would clip"):
+                lab.tweezers.prepare(replace(program, column=column))
+
+    @pytest.mark.parametrize(
+        ("factor", "text"), [(0.0, "length"), (np.inf, "duration"), (np.nan, "duration"), (-1.0, "duration")]
+    )
+    def test_of_no_length_are_refused(self, driver: Any, mode: str, factor: float, text: str) -> None:
+        with driver(mode) as lab:
+            program = lab.program()
+            with pytest.raises(LimitError, match=text):
+                lab.tweezers.prepare(replace(program, duration_s=program.duration_s * factor))
+            with pytest.raises(DeviceError, match="without a prepared program"):
+                lab.tweezers.play()
+
+    def test_of_no_segments_are_refused(self, driver: Any, mode: str) -> None:
+        with driver(mode) as lab, pytest.raises(LimitError, match="length"):
+            lab.tweezers.prepare(lab.program(0))
+
+
+def test_a_program_longer_than_the_memory_is_refused(driver: Any) -> None:
+    small = replace(M4I6631, memory_samples=2 * 2**16)
+    with driver(model=small) as lab, pytest.raises(LimitError, match="the card's memory; use mode: fifo"):
+        lab.tweezers.prepare(lab.program())
+
+
+AMP0, TIMEOUT, TRIG_ORMASK = 30010, 295130, 40410
+DDS_CMD, CORES_ON_CH1, TRG_COUNT = 608003, 608041, 608013
+EXEC_AT_TRG, WRITE_TO_CARD = 2, 8
+
+
+@pytest.fixture
+def unraisable(monkeypatch: pytest.MonkeyPatch) -> list[object]:
+    """What finalizers raise."""
+    seen: list[object] = []
+    monkeypatch.setattr(sys, "unraisablehook", lambda raised: seen.append(raised.exc_value))
+    return seen
+
+
+class TestFaultsOfThePackage:
+    def test_a_closed_card_is_not_closed_again_by_the_garbage_collector(
+        self, driver: Any, unraisable: list[object]
+    ) -> None:
+        with driver("dds") as lab:
+            lab.card.write(AMP0, 9000)  # also with an error pending
+        gc.collect()
+        assert not unraisable
+
+    def test_a_card_that_was_not_found_is_forgotten_in_silence(
+        self, driver: Any, unraisable: list[object]
+    ) -> None:
+        with driver():
+            other = SpcmMobileTweezers(SpcmSettings(card="simulated-none"), context())
+            with pytest.raises(DeviceError):
+                other.open()
+        gc.collect()
+        assert not unraisable
+
+    def test_register_lists_longer_than_1024_entries_are_written_whole(self, driver: Any) -> None:
+        with driver("dds") as lab:
+            entries = np.zeros(3000, ENTRY)
+            entries["register"], entries["type"] = TIMEOUT, TYPE_INT64
+            entries["value"] = np.arange(3000)
+            lab.tweezers._card.write_list(entries, "many values")
+            assert lab.written(TIMEOUT)[-3000:] == list(range(3000))
+
+    def test_two_cards_in_one_process_keep_their_own_cores(self, driver: Any) -> None:
+        few = MotionSpec(max_row_tones=20, max_column_tones=1)
+        plan = Plan.from_batches([([(0, 0)], [(0, 3)])])
+        with driver("dds", motion=few) as first, driver("dds") as second:
+            for lab, core in ((first, 20), (second, 8)):
+                lab.play(tone_program(plan, motion=lab.motion))
+                (span, *_) = lab.card.played(1)
+                assert [tone.core for tone in span.tones] == [core]
+
+    def test_commands_are_sent_in_whole_blocks_and_never_more_than_the_queue_holds(self, driver: Any) -> None:
+        with driver("dds") as lab:
+            lab.tweezers.prepare(lab.program(200))
+            n_sent = sum(603000 <= entry.register < DDS_CMD for entry in lab.card.log)
+            assert 3000 < n_sent < 4100
+            lab.tweezers.play()
+            lab.tweezers.wait(1.0)
+            commands = [(entry.register, entry.value) for entry in lab.card.log if entry.register >= 603000]
+            assert len(commands) > 2 * n_sent
+            sent = [i for i, command in enumerate(commands) if command == (DDS_CMD, WRITE_TO_CARD)]
+            assert len(sent) > 5
+            assert all(commands[i - 1] == (DDS_CMD, EXEC_AT_TRG) for i in sent)
+
+    def test_it_is_imported_when_warming_and_prints_nothing(self) -> None:
+        code = """
+import sys
+from labseq import Context, MotionSpec
+from labseq_spcm.mobile_tweezers import SpcmMobileTweezers
+from labseq_spcm.settings import SpcmSettings
+motion = MotionSpec(max_row_tones=16, max_column_tones=4)
+tweezers = SpcmMobileTweezers(SpcmSettings(card="simulated", mode="dds"), Context(motion=motion))
+assert "spcm" not in sys.modules
+tweezers.warm()
+assert "spcm" in sys.modules
+tweezers.open()
+tweezers.close()
+"""
+        run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+        assert (run.returncode, run.stdout, run.stderr) == (0, "", "")
+
+
+class TestBehaviourOfTheCard:
+    def test_a_refused_value_is_an_error_and_the_next_call_works(self, driver: Any) -> None:
+        with driver() as lab:
+            card = lab.tweezers._card
+            with pytest.raises(DeviceError, match=r"amplitude = 9000: .*SPC_AMP0"):
+                card.write(AMP0, 9000, "amplitude")
+            assert card.set(AMP0, 1600, "amplitude") == 1600
+
+    def test_a_snapped_mask_is_noticed(self, driver: Any) -> None:
+        with driver("dds") as lab, pytest.raises(DeviceError, match="was set to 1, and the card reads"):
+            lab.tweezers._card.set(CORES_ON_CH1, 1, "cores of output 1")
+
+    @pytest.mark.parametrize("mode", MODES)
+    def test_the_cards_own_software_trigger_is_never_used(self, driver: Any, mode: str) -> None:
+        with driver(mode) as lab:
+            lab.play(lab.program(1))
+            assert set(lab.written(TRIG_ORMASK)) == {0}
+
+    def test_the_first_dds_block_is_not_lost_in_run_after_run(self, driver: Any) -> None:
+        with driver("dds") as lab:
+            program = tone_program(Plan.from_batches([([(0, 0)], [(0, 3)])]), motion=lab.motion)
+            for _ in range(3):
+                lab.card.forget(1e9)
+                lab.play(program)
+                spans = lab.card.played(1)
+                assert spans[-1].end_s - spans[0].start_s == pytest.approx(223.6e-6, abs=0.2e-6)
+
+    def test_the_end_is_not_taken_from_the_queue_that_empties_one_block_early(self, driver: Any) -> None:
+        with driver("dds") as lab:
+            lab.play(lab.program(1))
+            assert not [span for span in lab.card.played(1) if span.end_s > lab.clock.now()]
+            assert lab.card.read(TRG_COUNT)[1] > 0
+
+
+class TestWithoutTheLibrary:
+    def test_importing_the_plugin_imports_no_spcm(self) -> None:
+        code = (
+            "import sys, json, labseq_spcm, labseq_spcm.mobile_tweezers\n"
+            "from labseq.registry import Registry\n"
+            "labseq_spcm.labseq_register(Registry())\n"
+            "names = ('spcm', 'spcm_core', 'labseq_spcm_sim', 'numba', 'matplotlib')\n"
+            "print(json.dumps([name for name in names if name in sys.modules]))"
+        )
+        run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+        assert json.loads(run.stdout) == []
+
+    @pytest.mark.skipif(vendor_library_found(), reason="the vendor's library is installed here")
+    @pytest.mark.parametrize("after_a_simulated_card", [False, True])
+    def test_opening_names_the_package_and_the_simulated_card(self, after_a_simulated_card: bool) -> None:
+        code = (
+            "import sys\n"
+            "from labseq import Context, LabseqError\n"
+            "from labseq_spcm.mobile_tweezers import SpcmMobileTweezers\n"
+            "from labseq_spcm.settings import SpcmSettings\n"
+            "for card in sys.argv[1:]:\n"
+            "    tweezers = SpcmMobileTweezers(SpcmSettings(card=card), Context('mobile_tweezers'))\n"
+            "    try:\n"
+            "        tweezers.open()\n"
+            "    except LabseqError as error:\n"
+            "        print(error.exit_code, error)\n"
+            "    tweezers.close()\n"
+        )
+        cards = ["simulated"] if after_a_simulated_card else []
+        run = subprocess.run(
+            [sys.executable, "-c", code, *cards, "/dev/spcm0"], capture_output=True, text=True, check=True
+        )
+        assert run.stdout.startswith("3 mobile_tweezers: ")
+        for text in ("no driver library", "install Spectrum's driver", "`card: simulated`"):
+            assert text in run.stdout
+        assert not run.stderr
+
+
+def test_a_package_that_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "spcm", None)
+    with pytest.raises(
+        DeviceError, match=r"'spcm' cannot be imported .* `pip install spcm`; .* `card: simulated`"
+    ):
+        load_spcm("mobile_tweezers", VendorLibrary("/dev/spcm0"))
+
+
+def test_closing_goes_through_even_if_the_card_is_broken(driver: Any) -> None:
+    with driver() as lab:
+        lab.card.break_down("for this test")
+        lab.tweezers.close()
+        with pytest.raises(LabseqError, match="not open"):
+            lab.tweezers.play()
+
+
+PROFILE = """labseq: 1
+name: bench
+grid: {rows: 5, cols: 6, spacing: 4.49 um}
+camera: {use: virtual}
+static_tweezers: {use: virtual}
+mobile_tweezers: MOBILE
+detector: {use: threshold, frame: [128, 128], centre_px: [63.5, 63.5], pixel_size: 0.35 um}
+simulation: {use: virtual, image: {frame: [128, 128], centre_px: [63.5, 63.5]}}
+"""
+SEQUENCE = """labseq: 1
+name: small
+profile: p.yaml
+target: {pattern: compact, rows: 2, cols: 2}
+planner: {use: psca, degree_of_parallelism: 2}
+shot:
+  - load: {duration: 500 ms}
+  - image: {exposure: 45 ms}
+  - rearrange: {cycles: 1, window: 60 ms}
+  - image: {exposure: 45 ms}
+"""
+
+
+def run(folder: Path, mobile: str) -> labseq.Run:
+    (folder / "p.yaml").write_text(PROFILE.replace("MOBILE", mobile), encoding="utf-8")
+    (folder / "s.yaml").write_text(SEQUENCE, encoding="utf-8")
+    with labseq.Session.open(folder / "s.yaml", shots=1, seed=1, output=folder / "runs") as session:
+        return session.run()
+
+
+@pytest.mark.parametrize(
+    "mobile",
+    [
+        "{use: spcm, card: simulated, sample_rate: 250 MHz}",
+        "{use: spcm, card: simulated, mode: fifo, sample_rate: 250 MHz}",
+        "{use: spcm, card: simulated, mode: dds, max_row_tones: 16, max_column_tones: 5}",
+    ],
+)
+def test_a_simulated_card_plays_in_virtual_time(tmp_path: Path, mobile: str) -> None:
+    done = run(tmp_path, mobile)
+    assert (done.status, done.simulated, len(done.shots)) == ("complete", True, 1)
+
+
+@pytest.mark.parametrize(
+    ("mobile", "exit_code", "text"),
+    [
+        ("card: simulated, serial: 99", 3, "has the serial number 12345; expected 99: name another one"),
+        ("card: simulated, sample_rate: 755 MHz", 2, "p.yaml:6:60: sample_rate: the card's clock has a gap"),
+        ("card: simulated, sample_rate: 150 MHz", 2, "sample_rate is 150 MHz; the limit is above 236 MHz"),
+        ("card: simulated, sample_rate: .nan", 2, "p.yaml:6:60: sample_rate is .nan; expected a finite"),
+        ("card: simulated, mode: fifo, sample_rate: 1 GHz", 2, "the bus carries at most 700 MHz"),
+        ("card: simulated, mode: dds", 2, "set max_row_tones and max_column_tones to at most 16 and 5"),
+        ("card: simulated, rf: {full_scale: 3 V}", 2, "rf.full_scale is 3 V; the limit is the card's 80 mV"),
+        ("card: simulated, rf: {full_scale: 450 mV}", 2, "the card's output relay may switch, for 10 ms"),
+        ("card: simulated, row_channel: 1", 2, "row_channel and column_channel are both 1; expected 0 and 1"),
+        pytest.param(
+            *("card: /dev/spcm0", 3, "no driver library"),
+            marks=pytest.mark.skipif(vendor_library_found(), reason="the vendor's library is installed here"),
+        ),
+    ],
+)
+def test_mistakes_are_reported_with_what_is_expected(
+    tmp_path: Path, mobile: str, exit_code: int, text: str
+) -> None:
+    with pytest.raises(LabseqError) as raised:
+        run(tmp_path, f"{{use: spcm, {mobile}}}")
+    assert text in str(raised.value)
+    assert raised.value.exit_code == exit_code
+
+
+class TestSafeState:
+    @pytest.mark.parametrize("mode", MODES)
+    def test_ramps_down_stops_and_opens_the_output_relays(self, driver: Any, mode: str) -> None:
+        with driver(mode) as lab:
+            lab.tweezers.prepare(lab.program())
+            lab.tweezers.play()
+            lab.clock.sleep(0.6e-3)
+            lab.card.log.clear()
+            lab.tweezers.safe_state()
+            levels = lab.written(AMP0)
+            ramp = levels[:-1]  # then the amplitude is set again, with the output off
+            assert ramp == sorted(ramp, reverse=True)
+            assert len(ramp) > 10
+            assert min(ramp) == 481
+            assert levels[-1] == 1600
+            assert not lab.card.running
+            assert lab.card.outputs_on == (False, False)
+
+    def test_ramps_to_the_least_amplitude_where_no_relay_is_in_the_way(self, driver: Any) -> None:
+        with driver(motion=MotionSpec(rf=RfSpec(full_scale_v=0.3))) as lab:
+            lab.tweezers.prepare(lab.program())
+            lab.tweezers.play()
+            lab.tweezers.safe_state()
+            assert min(lab.written(AMP0)) == 80
+
+    def test_twice_ramps_only_once(self, driver: Any) -> None:
+        with driver() as lab:
+            lab.tweezers.prepare(lab.program())
+            lab.tweezers.play()
+            lab.tweezers.safe_state()
+            lab.card.log.clear()
+            lab.tweezers.safe_state()
+            assert set(lab.written(AMP0)) == {1600}
+            assert lab.card.outputs_on == (False, False)
+
+    def test_works_when_an_error_locks_the_driver(self, driver: Any) -> None:
+        with driver() as lab:
+            lab.tweezers.prepare(lab.program())
+            lab.tweezers.play()
+            assert lab.card.write(AMP0, 9000) == 0x101  # somebody else's mistake
+            lab.tweezers.safe_state()
+            assert not lab.card.running
+            assert lab.card.outputs_on == (False, False)
+
+    def test_the_output_path_is_never_switched_while_the_outputs_are_on(self, driver: Any) -> None:
+        with driver() as lab:
+            lab.play(lab.program())
+            lab.tweezers.prepare(lab.program())
+            lab.tweezers.play()
+            lab.tweezers.safe_state()
+            assert not [value for value in lab.written(AMP0) if value <= 480]
+
+    def test_an_output_that_cannot_be_switched_off_is_reported_and_the_other_one_is_off(
+        self, driver: Any, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        with driver() as lab:
+            lab.tweezers.prepare(lab.program())
+            lab.tweezers.play()
+            card = lab.tweezers._card
+            set_register = card.set
+
+            def broken(register: int, *arguments: Any) -> int:
+                if register == card.spcm.SPC_ENABLEOUT0:
+                    raise DeviceError("mobile_tweezers", "output 0 is broken")
+                return set_register(register, *arguments)
+
+            with monkeypatch.context() as patch:
+                patch.setattr(card, "set", broken)
+                with pytest.raises(DeviceError, match="output 0 is broken"):
+                    lab.tweezers.safe_state()
+            assert lab.card.outputs_on == (True, False)
+            assert not lab.card.running
+
+    def test_drops_what_was_prepared(self, driver: Any) -> None:
+        with driver() as lab:
+            lab.tweezers.prepare(lab.program())
+            lab.tweezers.safe_state()
+            with pytest.raises(DeviceError, match="without a prepared program"):
+                lab.tweezers.play()
+
+    @pytest.mark.parametrize("mode", MODES)
+    def test_nothing_of_the_old_program_is_played_after_it(self, driver: Any, mode: str) -> None:
+        with driver(mode) as lab:
+            lab.tweezers.prepare(lab.program(6))
+            lab.tweezers.play()
+            lab.clock.sleep(1e-3)
+            lab.tweezers.safe_state()
+            lab.card.forget(lab.clock.now() + 1.0)
+            lab.clock.sleep(0.1)
+            program = lab.program(1)
+            lab.play(program)
+            spans = lab.card.played(0)
+            assert spans[-1].end_s - spans[0].start_s <= program.total_duration_s + 1e-6
+
+
+class Calls(RuleBasedStateMachine):
+    """Calls of the driver in any order; what it refuses it refuses with an error of its own.
+
+    Args:
+        driver: Opens it on a simulated card.
+        mode: Its mode.
+        trigger: What starts a program.
+    """
+
+    def __init__(self, driver: Any, mode: str, trigger: str) -> None:
+        super().__init__()
+        self.stack = ExitStack()
+        self.lab = self.stack.enter_context(driver(mode, trigger=trigger, fill=1e-3))
+        self.is_open = self.safe = True
+
+    @rule(n_batches=st.sampled_from([1, 2, 24]))
+    def prepare(self, n_batches: int) -> None:
+        with suppress(LabseqError):
+            self.lab.tweezers.prepare(self.lab.program(n_batches))
+
+    @rule()
+    def play(self) -> None:
+        with suppress(LabseqError):
+            self.safe = False
+            self.lab.tweezers.play()
+
+    @rule(timeout_s=st.sampled_from([0.0, 0.3e-3, 5e-3, 1.0]))
+    def wait(self, timeout_s: float) -> None:
+        with suppress(LabseqError):
+            self.lab.tweezers.wait(timeout_s)
+
+    @rule(duration_s=st.sampled_from([1e-6, 0.3e-3, 3e-3, 0.1]))
+    def let_time_pass(self, duration_s: float) -> None:
+        self.lab.clock.sleep(duration_s)
+
+    @rule()
+    def trigger(self) -> None:
+        self.lab.card.trigger()
+
+    @precondition(lambda self: self.is_open)
+    @rule(write=st.sampled_from([(AMP0, 9000), (12345, 1), (100, 1 << 16)]))
+    def lock_the_driver(self, write: tuple[int, int]) -> None:
+        """By a value, a register, and a transfer that it refuses."""
+        self.lab.card.write(*write)
+
+    @rule(n_times=st.sampled_from([1, 2]))
+    def make_safe(self, n_times: int) -> None:
+        for _ in range(n_times):
+            self.lab.tweezers.safe_state()
+        self.safe = True
+
+    @rule()
+    def close(self) -> None:
+        self.lab.tweezers.close()
+        self.safe, self.is_open = True, False
+
+    @precondition(lambda self: self.safe)
+    @rule()
+    def open(self) -> None:
+        self.lab.tweezers.open()
+        self.is_open = True
+
+    @invariant()
+    def nothing_plays_in_the_safe_state(self) -> None:
+        if self.safe:
+            assert self.lab.card.outputs_on == (False, False)
+            assert not self.lab.card.running
+
+    @invariant()
+    def the_output_path_is_never_switched_while_an_output_is_on(self) -> None:
+        changes = self.lab.card._machine.amplifiers[0].changes
+        assert not [1 for _, volts in changes if volts and not 0.48 < volts <= 1.6]
+
+    def teardown(self) -> None:
+        try:
+            self.lab.tweezers.safe_state()
+            self.lab.tweezers.safe_state()
+            now_s = self.lab.clock.now()
+            self.safe = True
+            self.nothing_plays_in_the_safe_state()
+            self.lab.clock.sleep(1.0)
+            late = [
+                span for channel in (0, 1) for span in self.lab.card.played(channel) if span.end_s > now_s
+            ]
+            assert not late
+        finally:
+            self.stack.close()
+
+
+@pytest.mark.parametrize("trigger", ["software", "external"])
+@pytest.mark.parametrize("mode", MODES)
+def test_any_calls_end_in_silence(driver: Any, mode: str, trigger: str) -> None:
+    few = settings(max_examples=15, stateful_step_count=20)
+    run_state_machine_as_test(lambda: Calls(driver, mode, trigger), settings=few)  # type: ignore[no-untyped-call]
