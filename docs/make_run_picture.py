@@ -8,6 +8,7 @@ The run is the README's own, with a seed; what the computer took for each stage 
 from __future__ import annotations
 
 import io
+import re
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -26,18 +27,23 @@ AFTER = 14
 
 
 class Photographer(LiveView):
-    """The live view, on a screen that nobody sees; takes its picture in the shot after ``AFTER`` others."""
+    """The live view, without a screen; writes it as SVG after ``AFTER`` shots."""
 
     def __init__(self, picture: Path, after: int = AFTER) -> None:
         super().__init__(Console(file=io.StringIO(), width=110, height=27))
-        self._picture, self._left = picture, after
+        self._path, self._left = picture, after
 
     def event(self, name: str, values: Mapping[str, Any]) -> None:
         super().event(name, values)
         if name == "shot_finished":
             self._left -= 1
             if self._left == 0:
-                self.export_svg(self._picture)
+                screen = Console(
+                    file=io.StringIO(), width=110, height=27, record=True, color_system="truecolor"
+                )
+                screen.print(self.picture)
+                svg = screen.export_svg(title="labseq run")
+                self._path.write_text(re.sub(r"@font-face \{.*?\}\s*", "", svg, flags=re.DOTALL), "utf-8")
 
 
 def take(picture: Path = PICTURE, shots: int | None = None, after: int = AFTER) -> None:

@@ -21,6 +21,14 @@ Examples:
   labseq analyse data/2026-01-02/0001_compact-225
   labseq analyse data/2026-01-02/0001_compact-225 --use survival --set atoms=moved
 """
+PLOT_EXAMPLES = """\b
+Examples:
+  labseq plot
+  labseq plot data/2026-11-21/0004_scan-dop --what scan -o scan.pdf
+  labseq plot --shot 3
+  labseq plot --shot 3 --cycle 1 -o first_cycle.svg
+  labseq plot data/2026-11-21/0003_figure5 --figure 5 --compare data/2026-11-20/0007_figure5
+"""
 
 
 def replay(
@@ -28,15 +36,17 @@ def replay(
     planner: Annotated[
         str | None,
         typer.Option(
-            metavar="NAME", help="Another planner, with its default settings but for --dop and --set."
+            metavar="NAME", help="Another planner; its settings are the defaults except for --dop and --set."
         ),
     ] = None,
     dop: Annotated[
-        int | None, typer.Option(metavar="N", help="Another degree of parallelism of the planner.")
+        int | None, typer.Option(metavar="N", help="Another degree of parallelism for the planner.")
     ] = None,
     detector: Annotated[
         str | None,
-        typer.Option(metavar="NAME", help="Another detector, with its default settings but for --set."),
+        typer.Option(
+            metavar="NAME", help="Another detector; its settings are the defaults except for --set."
+        ),
     ] = None,
     overrides: Annotated[
         list[str] | None,
@@ -48,17 +58,20 @@ def replay(
     ] = None,
     shots: Annotated[
         str | None,
-        typer.Option(metavar="LIST", help="These shots only, counted from 1 as in `labseq show`: 3,5-9."),
+        typer.Option(metavar="LIST", help="Only these shots, counted from 1 as in `labseq show`: 3,5-9."),
     ] = None,
     as_json: Json = False,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", metavar="FILE", help="Also write everything as JSON, image by image."),
+        typer.Option(
+            "--output", "-o", metavar="FILE", help="Also write all results as JSON, image by image."
+        ),
     ] = None,
 ) -> None:
-    """Let a run's images go through another planner or detector, and compare with what was done.
+    """Pass a run's images to another planner or detector, and compare the results with the recorded ones.
 
-    Without either, the run's own must give what was recorded: exits with 1 if not.
+    Without another planner or detector, the run's own must reproduce what was recorded; the exit code is
+    1 if they do not.
     """
     from labseq.analysis.replay import ReplayRequest
     from labseq.analysis.terminal import replay_run
@@ -71,24 +84,73 @@ def analyse(
     run: RunFolder = None,
     use: Annotated[
         str | None,
-        typer.Option(metavar="NAME", help="One analysis; all those of the run's sequence by default."),
+        typer.Option(metavar="NAME", help="One analysis. Default: all that the run's sequence names."),
     ] = None,
     overrides: Annotated[
         list[str] | None,
         typer.Option(
             "--set",
             metavar="KEY=VALUE",
-            help="Change a setting of the analysis that --use names; may be given several times.",
+            help="Change a setting of the analysis given by --use; may be given several times.",
         ),
     ] = None,
-    anew: Annotated[
-        bool, typer.Option("--anew", help="Analyse all shots again, also those that have a result.")
+    again: Annotated[
+        bool, typer.Option("--again", help="Analyse all shots again, including those that have a result.")
     ] = False,
 ) -> None:
     """Analyse the shots of a run that have no result yet.
 
-    With other settings than those of the results that are there, all shots are analysed again.
+    If the settings differ from those of the existing results, all shots are analysed again.
     """
     from labseq.analysis.terminal import analyse_run
 
-    raise typer.Exit(analyse_run(run, use, overrides or (), anew=anew))
+    raise typer.Exit(analyse_run(run, use, overrides or (), again=again))
+
+
+def plot(
+    run: RunFolder = None,
+    what: Annotated[
+        str | None,
+        typer.Option(
+            metavar="PART",
+            help="Only one part of the picture: filling, success, survival, defects, timing, scan or losses.",
+        ),
+    ] = None,
+    shot: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N",
+            help="Draw one shot, counted from 1: its images, occupancies and the moves after them.",
+        ),
+    ] = None,
+    cycle: Annotated[
+        int | None,
+        typer.Option(
+            metavar="K", help="Only one cycle of that shot, counted from 1: the images before and after it."
+        ),
+    ] = None,
+    figure: Annotated[
+        str | None,
+        typer.Option(
+            metavar="4|5",
+            help="A figure of the paper. 4: filling against the degree of parallelism; 5: defect-free "
+            "probability against the number of cycles.",
+        ),
+    ] = None,
+    compare: Annotated[
+        Path | None, typer.Option(metavar="RUN2", help="Draw a second run into the same figure of the paper.")
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="FILE",
+            help="A PNG, SVG or PDF file. Default: overview.png, shot-3.png, ... in the current folder.",
+        ),
+    ] = None,
+) -> None:
+    """Draw a run, finished or not: an overview, one part of it, a shot, or a figure of the paper."""
+    from labseq.analysis.terminal import PlotRequest, plot_run
+
+    plot_run(run, PlotRequest(what, figure, compare, shot, cycle), output)

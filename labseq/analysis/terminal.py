@@ -16,20 +16,10 @@ from labseq.analysis.overview import CHOICES, overview, picture_of
 from labseq.analysis.paper import figure_4, figure_5, save_cycles, save_parallelism
 from labseq.analysis.replay import MeanCounts, Replay, ReplayedImages, ReplayedPlan, ReplayRequest, replay
 from labseq.analysis.shot import save_shot, shot_picture
-from labseq.cli.show import chosen_run
 from labseq.config import Document, split_overrides
-from labseq.console.output import (
-    as_line,
-    columns,
-    count_of,
-    json_writer,
-    percent,
-    plural,
-    report_compiling,
-    say,
-    settings_text,
-    stdout_to_stderr,
-)
+from labseq.console.output import as_line, json_writer, report_compiling, say, stdout_to_stderr
+from labseq.console.runs import chosen_run
+from labseq.console.text import columns, count_of, percent, plural, settings_text
 from labseq.errors import ConfigError, Problem, one_of
 from labseq.messages import clean
 from labseq.model.estimate import Estimate, mean
@@ -256,14 +246,14 @@ def _means_values(means: MeanCounts) -> dict[str, Any]:
     }
 
 
-def analyse_run(path: Path | None, use: str | None, overrides: Sequence[str], *, anew: bool) -> int:
+def analyse_run(path: Path | None, use: str | None, overrides: Sequence[str], *, again: bool) -> int:
     """Analyse the shots of a run that have no result yet, and say what came of it.
 
     Args:
         path: The run's folder or any file in it; None for the newest run.
         use: One analysis; None for those of the run's sequence.
         overrides: ``"key=value"`` strings: settings of that one.
-        anew: Whether to analyse all shots again.
+        again: Whether to analyse all shots again.
 
     Returns:
         The exit code: 1 if there is no result of a shot.
@@ -274,7 +264,7 @@ def analyse_run(path: Path | None, use: str | None, overrides: Sequence[str], *,
     run = chosen_run(path)
     failed = False
     for settings in _wanted(run, use, overrides):
-        done = analyse_missing(run, settings, anew=anew)
+        done = analyse_missing(run, settings, anew=again)
         _report(done)
         failed = failed or bool(done.failures)
     return int(failed)

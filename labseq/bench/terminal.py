@@ -30,15 +30,13 @@ from labseq.console.output import (
     as_line,
     check_different,
     check_writable,
-    columns,
     json_writer,
-    percent,
-    plural,
     report_compiling,
     say,
     stdout_to_stderr,
     write_text,
 )
+from labseq.console.text import columns, percent, plural
 from labseq.errors import PlanError
 from labseq.model.estimate import Estimate
 from labseq.pictures.plans import check_picture
@@ -336,8 +334,9 @@ def bench_latency_notes(report: LatencyReport) -> list[str]:
     load = "" if report.load is None else f", load {report.load:.2g}"
     playing, rate = format_quantity(report.playing_s, "time"), report.sample_rate_hz
     planner = f"{report.planner}, degree of parallelism {report.degree_of_parallelism}"
+    median, goal = (format_quantity(s, "time") for s in (report.total.median_s, GOAL_S))
     return [
-        f"frame to first chunk: {_bench_latency_time(report.total.median_s)}; the goal is {_bench_latency_time(GOAL_S)}",
+        f"frame to first chunk: {median}; the goal is {goal}",
         f"{plural(report.n_loadings, 'loading')}, seed {report.seed}; {plural(report.n_cores, 'core')}{load}",
         f"{planner}: {report.n_batches:g} batches, played in {playing}",
         f"profile {report.profile}: {device}; first chunk at {format_quantity(rate, 'frequency')}",

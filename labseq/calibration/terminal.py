@@ -18,7 +18,9 @@ from labseq.calibration.measure import METHODS, CalibrationRequest, Outcome, cal
 from labseq.calibration.store import DECIDING, Damaged, Store, Stored, figure_of, grid_text
 from labseq.config import CalibrationChoices
 from labseq.config.profile import OFF
-from labseq.console.output import LASTING, age_text, as_line, columns, event_text, say, stdout_to_stderr
+from labseq.console.events import LASTING, event_text
+from labseq.console.output import as_line, say, stdout_to_stderr
+from labseq.console.text import age_text, columns
 from labseq.errors import ConfigError, Problem
 from labseq.messages import clean, did_you_mean, listing
 from labseq.model import CALIBRATION_KINDS, CalibrationEntry, CalibrationKind, RunRecord

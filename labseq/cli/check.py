@@ -14,20 +14,10 @@ import numpy as np
 
 from labseq.calibration.terminal import age_s, quality_text
 from labseq.config import Axis, CheckSettings
-from labseq.console.errors import excerpt, lines_of
-from labseq.console.output import (
-    LogLines,
-    age_text,
-    as_line,
-    clock_time,
-    columns,
-    encodes,
-    plural,
-    say,
-    settings_text,
-    stdout_to_stderr,
-)
-from labseq.errors import ConfigError, Problem
+from labseq.console.errors import json_errors, warning_lines
+from labseq.console.events import LogLines
+from labseq.console.output import as_line, say, stdout_to_stderr
+from labseq.console.text import age_text, clock_time, columns, encodes, plural, settings_text, size_text
 from labseq.messages import clean
 from labseq.model import TimelineEntry
 from labseq.sequencer.policies import StepPolicy
@@ -165,18 +155,12 @@ def check_sequence(
         checked = check(session)
     except BaseException as error:
         if answer is not None:
-            answer(refusal(error))
+            answer(json_errors(error))
         raise
     if answer is not None:
         answer(as_line(_as_values(checked) | {"calibrations": _calibrations(session.assembly)}))
     else:
         _print(session.assembly, checked)
-
-
-def refusal(error: BaseException) -> str:
-    """What is wrong with a sequence, as one line of JSON."""
-    problems = error.problems if isinstance(error, ConfigError) else [Problem(t) for t in lines_of(error)]
-    return as_line({"problems": [asdict(problem) for problem in problems], "warnings": []})
 
 
 def _print(assembly: Assembly, checked: CheckReport) -> None:
@@ -192,8 +176,7 @@ def _print(assembly: Assembly, checked: CheckReport) -> None:
     )
     say("\n\n".join("\n".join(lines) for lines in parts if lines))
     for warning in checked.warnings:
-        notes = (f"      = {note}" for note in warning.notes)
-        say(f"warning: {warning}", *excerpt(warning), *notes, stream=sys.stderr)
+        say(*warning_lines(warning), stream=sys.stderr)
 
 
 def _as_values(checked: CheckReport) -> dict[str, Any]:
@@ -319,19 +302,6 @@ def _rehearsed(checked: CheckReport) -> list[tuple[str, str]]:
     median, p95 = (format_quantity(found[name], "time") for name in ("median", "p95"))
     text = f"{median} in the median, {p95} in 19 of 20, on {checked.rehearsal.n_loadings} random loadings"
     return [("first cycle", text)]
-
-
-def size_text(n_bytes: int) -> str:
-    """A size on disk for people.
-
-    Example:
-        >>> size_text(6_351_456), size_text(900)
-        ('6.4 MB', '0.9 kB')
-    """
-    for unit, factor in (("TB", 1e12), ("GB", 1e9), ("MB", 1e6)):
-        if n_bytes >= factor:
-            return f"{n_bytes / factor:.1f} {unit}"
-    return f"{n_bytes / 1e3:.1f} kB"
 
 
 def _limits(assembly: Assembly) -> list[tuple[str, str]]:

@@ -6,8 +6,9 @@ import sys
 from pathlib import Path
 from typing import Any, Final
 
-from labseq.cli.show import chosen_run
-from labseq.console.output import as_line, columns, plural, say
+from labseq.console.output import as_line, say
+from labseq.console.runs import chosen_run
+from labseq.console.text import columns, plural
 from labseq.errors import ConfigError, Problem, RecordingError
 from labseq.messages import visible
 from labseq.recording import Run, data_root

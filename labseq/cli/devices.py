@@ -7,10 +7,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from labseq.cli.check import refusal
 from labseq.config import load_profile, plugin_paths
-from labseq.console.errors import report
-from labseq.console.output import as_line, columns, report_compiling, say, stdout_to_stderr
+from labseq.console.errors import json_errors, report
+from labseq.console.output import as_line, report_compiling, say, stdout_to_stderr
+from labseq.console.text import columns
 from labseq.errors import ConfigError, DeviceError
 from labseq.kernel import announcing
 from labseq.messages import clean
@@ -48,7 +48,7 @@ def show_devices(profile: str, overrides: Sequence[str], dry_run: DryRun, *, as_
             report = check_devices(profile, overrides, dry_run)
     except BaseException as error:
         if answer is not None:
-            answer(refusal(error))
+            answer(json_errors(error))
         raise
     for warning in report.warnings:
         say(f"warning: {warning}", stream=sys.stderr)

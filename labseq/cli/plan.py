@@ -13,21 +13,9 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.text import Text
 
-from labseq.cli.live import DENSE, ROOMY, Scale, draw_array, kinds
-from labseq.console.output import (
-    STDOUT,
-    Glyphs,
-    check_different,
-    columns,
-    count_of,
-    encodes,
-    glyphs_for,
-    json_writer,
-    plural,
-    report_compiling,
-    say,
-    writing_to,
-)
+from labseq.cli.arrays import DENSE, ROOMY, Glyphs, Scale, draw_array, glyphs_for, site_kinds
+from labseq.console.output import STDOUT, check_different, json_writer, report_compiling, say, writing_to
+from labseq.console.text import columns, count_of, encodes, plural
 from labseq.kernel import interpret
 from labseq.model import Batch, Occupancy, TargetPattern
 from labseq.pictures.plans import occupancies, on_grid
@@ -181,12 +169,12 @@ class Canvas:
         """Explain the characters that occur in these arrays; empty if none does."""
         if self._arrangement[1] is None:
             return Text()
-        shown = {int(kind) for array in arrays for kind in np.unique(kinds(array, self.target))}
+        shown = {int(kind) for array in arrays for kind in np.unique(site_kinds(array, self.target))}
         parts: list[Text] = []
         for text, atom, fill, clear in _KEY:
             site = np.array([[atom]])
             target = TargetPattern(np.array([[fill]]), np.array([[clear]]))
-            if int(kinds(site, target)[0, 0]) in shown:
+            if int(site_kinds(site, target)[0, 0]) in shown:
                 parts.append(Text.assemble(draw_array(site, target, 0, DENSE, self.glyphs)[0], f" {text}"))
         return Text("   ").join(parts)
 

@@ -13,10 +13,12 @@ from pathlib import Path
 from typing import Any, Final
 
 from labseq.cli.live import observer_for
-from labseq.cli.show import existing, json_summary, summary_lines
+from labseq.cli.summary import json_summary, summary_lines
 from labseq.config import packaged_profiles_dir, packaged_sequences_dir
 from labseq.console.errors import lines_of
-from labseq.console.output import as_line, columns, plural, say, stdout_to_stderr
+from labseq.console.output import as_line, say, stdout_to_stderr
+from labseq.console.runs import existing_run
+from labseq.console.text import columns, plural
 from labseq.errors import ConfigError, LabseqError, Problem, RecordingError, StopRequested
 from labseq.messages import visible
 from labseq.queue.queue import Queue
@@ -59,7 +61,7 @@ def resume_run(path: Path, *, accept_changes: bool, realtime: bool, as_json: boo
 
     def resume(observer: RunObserver | None) -> Session:
         options = {"accept_changes": accept_changes, "realtime": realtime}
-        return Session.resume(existing(path), **options, observer=observer)
+        return Session.resume(existing_run(path), **options, observer=observer)
 
     run_session(resume, as_json=as_json)
 
@@ -92,10 +94,10 @@ def run_session(opening: Callable[[RunObserver | None], Session], *, as_json: bo
         if run is not None:
             _report(run)
         if answer is not None:
-            _answer(answer, outcome(session, run, failure), failure)
+            _answer(answer, json_result(session, run, failure), failure)
 
 
-def outcome(session: Session | None, run: Run | None, failure: BaseException | None) -> str:
+def json_result(session: Session | None, run: Run | None, failure: BaseException | None) -> str:
     """What came of a run, as one line of JSON.
 
     Args:
@@ -163,7 +165,7 @@ def stop_run(run: Path | None, profile: str | None, *, queue: bool, wait: bool) 
         say("the queue takes no further runs")
         if run is None and not running_here(profile):
             return
-    folder = find_running(None if run is None else existing(run), profile)
+    folder = find_running(None if run is None else existing_run(run), profile)
     ask_to_stop(folder)
     say(f"{folder} ({owner_text(folder)}) ends after the shot at hand")
     say(f"go on later with: labseq resume {folder}")

@@ -7,17 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from labseq.bench.waveform import AxisStatistics, PlannedWaveform, WaveformRequest, plan_waveform
-from labseq.cli.check import size_text
 from labseq.cli.plan import warnings, what
-from labseq.console.output import (
-    check_different,
-    columns,
-    json_writer,
-    percent,
-    plural,
-    report_compiling,
-    say,
-)
+from labseq.console.output import check_different, json_writer, report_compiling, say
+from labseq.console.text import columns, percent, plural, size_text
 from labseq.model import RfSpec
 from labseq.units import format_quantity
 

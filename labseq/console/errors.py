@@ -10,10 +10,12 @@ import sys
 import traceback
 import unicodedata
 from contextlib import suppress
+from dataclasses import asdict
 from pathlib import Path
 from typing import Final
 
-from labseq.console.output import plural, say
+from labseq.console.output import as_line, say
+from labseq.console.text import plural
 from labseq.errors import ConfigError, LabseqError, Problem, RecordingError, StopRequested
 
 _WIDEST: Final = 100
@@ -23,13 +25,11 @@ _WORD: Final = re.compile(rf"\"[^\"]*\"?|'[^']*'?|{_PLAIN}(?: (?!#){_PLAIN})*")
 
 
 def excerpt(problem: Problem) -> list[str]:
-    """Show the line as compilers do.
-
-    Args:
-        problem: A problem; without a line, or if its file cannot be read, nothing is shown.
+    """Show the line of a problem as compilers do.
 
     Returns:
-        The line with its number, and a line with carets below the word that is meant.
+        The line with its number, and a line with carets below the offending word; nothing if the problem
+        has no line, or its file cannot be read.
     """
     line = _line_of(problem)
     if line is None or not line.strip():
@@ -44,14 +44,14 @@ def excerpt(problem: Problem) -> list[str]:
     shown = line[shift : shift + widest].rstrip()
     while _width(shown) > widest:
         shown = shown[:-1]
-    # A tab takes as much room above as below.
+    # a tab is as wide in both lines
     pad = "".join("\t" if char == "\t" else " " * _width(char) for char in line[shift:start])
     carets = "^" * max(1, min(_width(line[start:end]), widest - _width(line[shift:start])))
     return [f"{problem.line:>5} | {shown}", " " * 5 + " | " + pad + carets]
 
 
 def _width(text: str) -> int:
-    """Columns of a terminal that a text takes."""
+    """Width of a text in a terminal, in columns."""
     narrow = len(text) - sum(unicodedata.combining(char) != 0 for char in text)
     return narrow + sum(unicodedata.east_asian_width(char) in "WF" for char in text)
 
@@ -78,11 +78,11 @@ EXIT_SIGNALLED: Final = 128
 EXIT_INTERRUPTED: Final = EXIT_SIGNALLED + 2
 EXIT_INTERNAL: Final = 1
 MAX_REPORTED: Final = 50
-"""Problems of a file that are told; a file with more of them is not what it was taken for."""
+"""Problems of a file that are printed; a file with more of them is probably not a file of labseq."""
 
 
 def report(error: BaseException, *, debug: bool = False) -> int:
-    """Say on stderr what went wrong.
+    """Print on stderr what went wrong.
 
     Args:
         error: What ended the command.
@@ -94,16 +94,13 @@ def report(error: BaseException, *, debug: bool = False) -> int:
     if debug:
         traceback.print_exception(error)
     lines = format_config_error(error) if isinstance(error, ConfigError) else lines_of(error)
-    with suppress(OSError, RecordingError):  # the exit code says it, too
+    with suppress(OSError, RecordingError):  # the exit code reports it, too
         say(*lines, stream=sys.stderr)
     return exit_code_of(error)
 
 
 def format_config_error(error: ConfigError) -> list[str]:
-    """Every problem with the line that it is in, and what else there is to look at.
-
-    Of very many problems only the first are told.
-    """
+    """Every problem with the line that it is in, and its notes; only the first of very many problems."""
     lines: list[str] = []
     for problem, text in zip(error.problems[:MAX_REPORTED], lines_of(error), strict=False):
         lines += [text, *excerpt(problem), *(f"      = {note}" for note in problem.notes)]
@@ -111,31 +108,42 @@ def format_config_error(error: ConfigError) -> list[str]:
     return [*lines, f"and {plural(n_more, 'more problem')}"] if n_more > 0 else lines
 
 
-def lines_of(error: BaseException) -> list[str]:
-    """The message for the user.
+def warning_lines(warning: Problem) -> list[str]:
+    """A warning about a place in a file, with the line that it is in."""
+    return [f"warning: {warning}", *excerpt(warning), *(f"      = {note}" for note in warning.notes)]
 
-    A problem in a file starts with its place, as compilers print it.
+
+def json_errors(error: BaseException) -> str:
+    """Why a file was refused, as one line of JSON."""
+    problems = error.problems if isinstance(error, ConfigError) else [Problem(t) for t in lines_of(error)]
+    return as_line({"problems": [asdict(problem) for problem in problems], "warnings": []})
+
+
+def lines_of(error: BaseException) -> list[str]:
+    """The message for the user; a problem in a file starts with its place, as compilers print it.
 
     Example:
         >>> lines_of(ConfigError("a session runs once"))
         ['error: a session runs once']
     """
-    if isinstance(error, ConfigError):
-        return [str(p) if p.source else f"error: {p}" for p in error.problems]
-    if isinstance(error, StopRequested):
-        return [str(error)]
-    if isinstance(error, LabseqError):
-        return [f"error: {error}"]
-    if isinstance(error, KeyboardInterrupt):
-        return ["stopped by Ctrl-C"]
-    if isinstance(error, OSError) and error.errno == errno.ENOSPC:
-        return [f"error: {error.filename or 'output'} cannot be written: {error.strerror}"]
-    text = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
-    return [f"internal error: {text}; please report it; run again with --debug to see where"]
+    match error:
+        case ConfigError():
+            return [str(p) if p.source else f"error: {p}" for p in error.problems]
+        case StopRequested():
+            return [str(error)]
+        case LabseqError():
+            return [f"error: {error}"]
+        case KeyboardInterrupt():
+            return ["stopped by Ctrl-C"]
+        case OSError(errno=errno.ENOSPC):
+            return [f"error: {error.filename or 'output'} cannot be written: {error.strerror}"]
+        case _:
+            text = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+            return [f"internal error: {text}; please report it; run again with --debug to see where"]
 
 
 def exit_code_of(error: BaseException) -> int:
-    """The exit code of a command that ended so.
+    """The exit code of a command that ended with an error.
 
     Example:
         >>> exit_code_of(StopRequested(15))

@@ -1,7 +1,7 @@
 """Options that several commands share, and their completion.
 
-A shell asks at every press of the tab key: nothing heavy is imported here, no plugin is loaded, and
-nothing that goes wrong is told.
+A shell runs the completion at every press of the tab key: nothing heavy is imported here, no plugin is
+loaded, and errors are ignored.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 from contextlib import suppress
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 import typer
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 _FILES: Final = ("sequence", "profile")
 _YAML: Final = (".yaml", ".yml")
 MAX_RUNS: Final = 20
-"""Most runs that are offered, the newest first."""
+"""Maximum number of runs that completion offers, the newest first."""
 
 
 def new_kinds(incomplete: str) -> list[str]:
@@ -41,7 +41,7 @@ def file_kinds(incomplete: str) -> list[str]:
 
 
 def profile_names(incomplete: str) -> list[str]:
-    """Profiles in ./hardware_profiles and those that come with labseq, by name."""
+    """Names of the profiles in ./hardware_profiles and of those that come with labseq."""
     found: set[str] = set()
     for folder in (Path(PROFILES), packaged_profiles_dir()):
         with suppress(OSError):
@@ -59,10 +59,15 @@ def run_folders(incomplete: str) -> list[str]:
 
 
 class DryRunKind(StrEnum):
-    """What ``--dry-run`` may be followed by."""
+    """The values of ``--dry-run``."""
 
     FULL = "full"
     FAST = "fast"
+
+
+def dry_run_mode(kind: DryRunKind | None) -> Literal["off", "full", "fast"]:
+    """The mode of a dry run; "off" without ``--dry-run``."""
+    return "off" if kind is None else kind.value  # pyright: ignore[reportReturnType]
 
 
 Profile = Annotated[
@@ -75,13 +80,23 @@ Profile = Annotated[
         autocompletion=profile_names,
     ),
 ]
+ProfileArgument = Annotated[
+    str,
+    typer.Argument(
+        metavar="PROFILE",
+        help="Name or file of the hardware profile.",
+        show_default=False,
+        autocompletion=profile_names,
+    ),
+]
 Overrides = Annotated[
     list[str] | None,
     typer.Option(
         "--set",
         metavar="ADDRESS=VALUE",
         help="Change one value, for example planner.degree_of_parallelism=2 or profile.mobile_tweezers.speed="
-        '"100 um/ms"; may be given several times.',
+        '"100 um/ms"; may be given several times. Steps are counted from 0: shot.2.rearrange.window is the '
+        "window of the third step.",
     ),
 ]
 DryRun = Annotated[
@@ -89,13 +104,21 @@ DryRun = Annotated[
     typer.Option(
         "--dry-run",
         metavar="[=fast]",
-        help="Open no hardware: every device is replaced by its driver's own simulation where it has one, "
-        "else by its virtual twin; with =fast by virtual twins only.",
+        help="Use no hardware: every device is replaced by its driver's own simulator if it has one, "
+        "else by its virtual twin; with =fast always by the virtual twin.",
         show_choices=False,
     ),
 ]
 Json = Annotated[
-    bool, typer.Option("--json", help="Print the outcome as one line of JSON on stdout, all else on stderr.")
+    bool,
+    typer.Option("--json", help="Print the result as one line of JSON on stdout, everything else on stderr."),
+]
+JsonFile = Annotated[
+    str | None,
+    typer.Option(
+        metavar="FILE|-",
+        help="Write the result as JSON; with '-' to stdout, and everything else to stderr.",
+    ),
 ]
 SequenceFile = Annotated[
     Path,
@@ -109,7 +132,8 @@ Shots = Annotated[
     int | None, typer.Option(metavar="N", help="Number of shots, instead of the sequence's own.")
 ]
 Seed = Annotated[
-    int | None, typer.Option(metavar="N", help="Seed of all random numbers: the same seed, the same run.")
+    int | None,
+    typer.Option(metavar="N", help="Seed of all random numbers; the same seed gives the same run."),
 ]
 Output = Annotated[
     Path | None, typer.Option(metavar="DIR", help="Folder for the data, instead of LABSEQ_DATA or ./data.")
@@ -119,7 +143,7 @@ RunFolder = Annotated[
     Path | None,
     typer.Argument(
         metavar="RUN",
-        help="A run's folder; the newest run by default.",
+        help="The run's folder, or any file in it; default: the newest run.",
         show_default=False,
         autocompletion=run_folders,
     ),
@@ -127,16 +151,16 @@ RunFolder = Annotated[
 
 
 def run_options(
-    *,
     profile: str | None,
     dry_run: DryRunKind | None,
     shots: int | None,
     seed: int | None,
     overrides: list[str] | None,
     output: Path | None,
+    *,
     realtime: bool,
 ) -> Options:
-    """What was chosen for a run, now or later."""
+    """The options of a run, now or in the queue."""
     from labseq.session import Options
 
     return Options(
@@ -145,6 +169,6 @@ def run_options(
         seed=seed,
         overrides=tuple(overrides or ()),
         output=output,
-        dry_run="off" if dry_run is None else dry_run.value,
+        dry_run=dry_run_mode(dry_run),
         realtime=realtime,
     )

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
-from labseq.cli.run import run_session
-from labseq.console.errors import excerpt, exit_code_of, report
-from labseq.console.output import columns, plural, say
+from labseq.console.errors import exit_code_of, report, warning_lines
+from labseq.console.output import say
+from labseq.console.text import columns, plural
 from labseq.messages import clean
 from labseq.plain import dumps
 from labseq.queue.queue import Entry, Opening, Queue, QueueRun
@@ -29,7 +29,7 @@ def add_entry(sequence: Path, options: Options) -> None:
     """
     entry, checked = Queue(data_root()).add(sequence, options)
     for warning in checked.warnings:
-        say(f"warning: {warning}", *excerpt(warning), stream=sys.stderr)
+        say(*warning_lines(warning), stream=sys.stderr)
     say(f"{entry.id}: {clean(str(sequence))}, {plural(checked.n_shots, 'shot')}, as it is written now")
 
 
@@ -68,14 +68,25 @@ def move_entry(number: int, before: int) -> None:
     Queue(data_root()).move(number, before)
 
 
-def run_entries(*, keep_going: bool, watch: bool) -> int:
-    """Run what is queued.
+class RunSession(Protocol):
+    """Opens a session, runs it and prints the result."""
+
+    def __call__(self, opening: Opening, *, as_json: bool) -> None: ...  # noqa: D102
+
+
+def run_entries(run_session: RunSession, *, keep_going: bool, watch: bool) -> int:
+    """Run the entries of the queue.
+
+    Args:
+        run_session: Runs the session of an entry and shows it.
+        keep_going: Whether to continue after an entry that failed.
+        watch: Whether to wait for new entries.
 
     Returns:
         The exit code: that of the first entry that failed, or 0.
 
     Raises:
-        LabseqError: Whatever ended a run; or somebody else runs the queue.
+        LabseqError: The error that ended a run; or another process runs the queue.
     """
 
     def take(opening: Opening) -> None:

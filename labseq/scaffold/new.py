@@ -11,7 +11,7 @@ import keyword
 import re
 import shutil
 import sys
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.resources import files
@@ -25,158 +25,25 @@ from labseq.config import find_profile, packaged_profiles_dir
 from labseq.errors import ConfigError, Problem
 from labseq.messages import clean, visible
 from labseq.plugins import PluginHost
-from labseq.scaffold.schemas import KINDS as FILE_KINDS, FileKind, refresh_schemas, schema_path, write_schema
+from labseq.scaffold.schemas import FileKind, refresh_schemas, schema_path, write_schema
 from labseq.session import load_plugins
 
 MAX_LENGTH: Final = 40
-
-_PLUGIN: Final = re.compile(r"[a-z][a-z0-9]*(_[a-z0-9]+)*")
-_FILE: Final = re.compile(r"[A-Za-z][A-Za-z0-9]*([_-][A-Za-z0-9]+)*")
-_YAML: Final = frozenset({"true", "false", "null"})
-_OURS: Final = frozenset({"labseq", "labseq_local", "plugins", "conftest"})
-_WINDOWS: Final = frozenset({"con", "prn", "aux", "nul"}) | {
-    f"{p}{n}" for p in ("com", "lpt") for n in range(10)
-}
-
-
-def check_plugin_name(kind: str, name: str, package: str, host: PluginHost) -> None:
-    """Refuse a name that a plugin cannot have, or that is taken.
-
-    Args:
-        kind: Kind of the plugin.
-        name: Its name.
-        package: Name of the Python package that it will be.
-        host: The plugins that there are.
-
-    Raises:
-        ConfigError: With what would be right.
-    """
-    if not _PLUGIN.fullmatch(name) or len(name) > MAX_LENGTH:
-        guess = re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_0123456789")[:MAX_LENGTH]
-        expected = (
-            f"a lower-case word of at most {MAX_LENGTH} letters, digits and '_' that begins with a letter"
-        )
-        raise _refused(
-            kind,
-            name,
-            "it is no name for a part of Python",
-            expected,
-            guess if _PLUGIN.fullmatch(guess) else "",
-        )
-    hint = f"my_{name}"
-    if keyword.iskeyword(name) or hasattr(builtins, name):
-        raise _refused(kind, name, "it is a word of Python itself", "another name", hint)
-    if name in sys.stdlib_module_names or name in _OURS:
-        raise _refused(kind, name, "a part of Python or labseq is called so", "another name", hint)
-    if name in _WINDOWS:
-        raise _refused(kind, name, "it is no name for a file on Windows", "another name", hint)
-    _check_is_free(kind, name, package, host)
-
-
-def _check_is_free(kind: str, name: str, package: str, host: PluginHost) -> None:
-    called, hint = kind.replace("_", " "), f"my_{name}"
-    entry = host.registry.find(kind, name)
-    if entry is not None:
-        what = f"the plugin '{entry.origin}' offers a {called} of that name"
-        raise _refused(kind, name, what, "another name", hint)
-    taken = next((info for info in host.infos if info.name == package), None)
-    if taken is not None:
-        what = f"there is a plugin '{package}' ({taken.origin})"
-        raise _refused(kind, name, what, "another name", hint)
-    if _is_installed(package):
-        what = f"there is a Python package '{package}', which the plugin would hide"
-        raise _refused(kind, name, what, "another name", hint)
-
-
-def check_file_name(kind: str, name: str, profiles: Path) -> None:
-    """Refuse a name that a sequence or profile cannot have.
-
-    Args:
-        kind: "sequence" or "profile".
-        name: Its name, without an ending.
-        profiles: Folder of the profiles that come with labseq.
-
-    Raises:
-        ConfigError: With what would be right.
-    """
-    if not _FILE.fullmatch(name) or len(name) > MAX_LENGTH:
-        guess = re.sub(r"\.ya?ml$", "", name, flags=re.IGNORECASE)
-        guess = re.sub(r"[^A-Za-z0-9]+", "_", guess).strip("_0123456789")[:MAX_LENGTH]
-        expected = f"at most {MAX_LENGTH} letters, digits, '-' and '_', from a letter on, without an ending"
-        raise _refused(
-            kind, name, "it is no name for a file", expected, guess if _FILE.fullmatch(guess) else ""
-        )
-    if name.lower() in _WINDOWS:
-        raise _refused(kind, name, "it is no name for a file on Windows", "another name", f"my_{name}")
-    if name.lower() in _YAML:
-        raise _refused(kind, name, "in YAML it is no text", "another name", f"my_{name}")
-    if kind == "profile" and (profiles / f"{name}.yaml").exists():
-        what = "a profile of that name comes with labseq, and yours would hide it"
-        raise _refused(kind, name, what, "another name", f"my_{name}")
-
-
-def _is_installed(package: str) -> bool:
-    """Whether Python finds such a package; a mere folder of that name in the way does not count."""
-    try:
-        spec = find_spec(package)
-    except (ImportError, ValueError):  # one that is loaded in an odd way
-        return True
-    return spec is not None and spec.origin is not None
-
-
-def _refused(kind: str, name: str, why: str, expected: str, guess: str) -> ConfigError:
-    called = kind.replace("_", " ")
-    what = f"{'an' if called[0] in 'aeiou' else 'a'} {called} cannot be called '{clean(name)}': {why}"
-    return ConfigError(Problem(what, expected=expected, hint=f"for example '{guess}'" if guess else ""))
-
-
-_FOLDER: Final = "templates"
-_SECTION: Final = re.compile(r"^==> (.+) <==\n", re.MULTILINE)
-
-
-def read_template(name: str) -> str:
-    """The text of a template.
-
-    Args:
-        name: Name of its file.
-    """
-    return (files("labseq.scaffolds") / _FOLDER / name).read_text(encoding="utf-8")
-
-
-def filled(text: str, values: Mapping[str, str]) -> str:
-    """A template with its words put in; a word that is missing is an error of ours.
-
-    Example:
-        >>> filled("class ${Name}Planner:", {"Name": "Spiral"})
-        'class SpiralPlanner:'
-    """
-    return Template(text).substitute(values)
-
-
-def plugin_sections(kind: str) -> dict[str, str]:
-    """The sections of a plugin's template, not filled in, by their names."""
-    _, *parts = _SECTION.split(read_template(f"{kind}.txt"))
-    return dict(zip(parts[::2], parts[1::2], strict=True))
-
-
-def class_prefix(name: str) -> str:
-    """What the names of a plugin's classes begin with.
-
-    Example:
-        >>> class_prefix("my_spiral_2")
-        'MySpiral2'
-    """
-    return "".join(word.capitalize() for word in name.split("_"))
-
-
+"""Maximum length of a name."""
 PLUGINS: Final = "plugins"
-"""Folder of the plugins, beside the sequences and profiles that name it."""
+"""Folder of the plugins, next to the sequences and profiles that name them."""
 FIRST: Final = "first"
-"""Name of the sequence that examples run."""
-ENTRY_POINTS: Final = "labseq_"
-"""What the names of plugins that are distributions of their own begin with."""
+"""Name of the sequence that the examples run."""
+PACKAGE_PREFIX: Final = "labseq_"
+"""How the names of plugins that are distributions of their own begin."""
 
-__all__ = ["FILE_KINDS", "CreatedFiles", "make_file", "make_plugin"]
+_PLUGIN_NAME: Final = re.compile(r"[a-z][a-z0-9]*(_[a-z0-9]+)*")
+_FILE_NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9]*([_-][A-Za-z0-9]+)*")
+_YAML_WORDS: Final = frozenset({"true", "false", "null"})
+_RESERVED: Final = frozenset({"labseq", "labseq_local", "plugins", "conftest"}) | sys.stdlib_module_names
+_WINDOWS: Final = frozenset(
+    {"con", "prn", "aux", "nul", *(f"{port}{n}" for port in ("com", "lpt") for n in range(10))}
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,7 +52,7 @@ class CreatedFiles:
 
     Attributes:
         path: The file, or the plugin's folder.
-        files: Every file of it, and further ones that were written for it.
+        files: All files that were written.
         commands: What to do next, one command line each.
     """
 
@@ -195,25 +62,24 @@ class CreatedFiles:
 
 
 def make_plugin(kind: str, name: str, folder: Path, *, package: bool = False) -> CreatedFiles:
-    """Make a plugin that runs at once: the plugin, its settings, tests of its promises, a README.
+    """Make a plugin that runs at once: the plugin, its settings, tests of its contract, a README.
 
     Args:
         kind: One of :data:`labseq.registry.KINDS`.
         name: Its name, for sequences and profiles.
         folder: Where sequences and profiles are; the plugin goes into ``plugins`` there.
-        package: Whether to make it a distribution of its own, beside them.
+        package: Whether to make it a distribution of its own, next to them.
 
     Raises:
-        ConfigError: The name cannot be or is taken, or something cannot be written.
+        ConfigError: The name is not allowed or taken, or something cannot be written.
     """
-    host = _plugins_of(folder)
-    module = name if not package or name.startswith(ENTRY_POINTS) else f"{ENTRY_POINTS}{name}"
-    check_plugin_name(kind, name, module, host)
+    module = name if not package or name.startswith(PACKAGE_PREFIX) else f"{PACKAGE_PREFIX}{name}"
+    check_plugin_name(kind, name, module, _plugins_of(folder))
     distribution = module.replace("_", "-")
     path = folder / distribution if package else folder / PLUGINS / name
+    where = path.relative_to(folder).as_posix()
     sections = plugin_sections(kind)
     source, tests = (f"src/{module}/", "tests/") if package else ("", "")
-    where = path.relative_to(folder).as_posix()
     words = {
         "name": name,
         "Name": class_prefix(name),
@@ -228,17 +94,23 @@ def make_plugin(kind: str, name: str, folder: Path, *, package: bool = False) ->
         "version": __version__,
         "sequence": f"{FIRST}.yaml",
     }
-    use = filled(sections.pop("use"), words).strip()
     install = [f"pip install -e {where}"] if package else []
-    commands = (*install, f"pytest {where}", f"labseq new sequence {FIRST}", use)
-    texts = {"README.md": read_template("README.md"), **_placed(sections, source, tests)}
+    use = fill(sections.pop("use"), words).strip()
+    commands = [*install, f"pytest {where}", f"labseq new sequence {FIRST}", use]
+    words["commands"] = "\n".join(commands)
+
+    texts = {"README.md": read_template("README.md")}
+    texts |= {f"{tests if f.startswith('test_') else source}{f}": text for f, text in sections.items()}
     if package:
         texts |= {"pyproject.toml": read_template("pyproject.txt"), f"{source}py.typed": ""}
-    words["commands"] = "\n".join(commands)
-    with _explained_errors(path):
-        made = _write_folder(path, {filled(file, words): filled(text, words) for file, text in texts.items()})
-        written = refresh_schemas(folder, _plugins_of(folder).registry)
-    return CreatedFiles(path, (*made, *written), (*_missing_for_tests(), *_still_to_do(commands, folder)))
+    with _reporting(path):
+        made = _write_folder(path, {fill(file, words): fill(text, words) for file, text in texts.items()})
+        schemas = refresh_schemas(folder, _plugins_of(folder).registry)
+    if (folder / f"{FIRST}.yaml").exists():
+        commands.remove(f"labseq new sequence {FIRST}")
+    if any(find_spec(module) is None for module in ("pytest", "hypothesis")):
+        commands.insert(0, 'pip install "labseq[testing]"')
+    return CreatedFiles(path, (*made, *schemas), tuple(commands))
 
 
 def make_file(kind: FileKind, name: str, folder: Path, *, profile: str = "virtual") -> CreatedFiles:
@@ -247,32 +119,28 @@ def make_file(kind: FileKind, name: str, folder: Path, *, profile: str = "virtua
     Args:
         kind: "sequence" or "profile".
         name: Its name; the file is ``NAME.yaml``.
-        folder: Where to.
+        folder: Where it goes.
         profile: Name of the profile that a sequence runs on.
 
     Raises:
-        ConfigError: The name cannot be or is taken, there is no such profile, or something cannot be
+        ConfigError: The name is not allowed or taken, there is no such profile, or something cannot be
             written.
     """
     host = _plugins_of(folder)
     check_file_name(kind, name, packaged_profiles_dir())
     find_profile(profile, folder)
-    path = folder / f"{name}.yaml"
-    text = filled(read_template(f"{kind}.yaml"), {"name": name, "profile": profile})
+    path, plugins, schema = folder / f"{name}.yaml", folder / PLUGINS, schema_path(kind, folder)
+    text = fill(read_template(f"{kind}.yaml"), {"name": name, "profile": profile})
     further: list[Path] = []
-    plugins, schema = folder / PLUGINS, schema_path(kind, folder)
-    with _explained_errors(path):
+    with _reporting(path):
         if path.exists():
             raise FileExistsError
-    with _explained_errors(plugins):
+    with _reporting(plugins):
         if not plugins.is_dir():
             further += _write_folder(plugins, {"README.md": read_template("plugins.md")})
-    with _explained_errors(schema):
+    with _reporting(schema):
         further.append(write_schema(kind, folder, host.registry))
-    with (
-        _explained_errors(path),
-        path.open("x", encoding="utf-8", newline="\n") as file,
-    ):  # last: with it all is there
+    with _reporting(path), path.open("x", encoding="utf-8", newline="\n") as file:
         file.write(text)
     commands = {
         "sequence": (f"labseq check {name}.yaml", f"labseq run {name}.yaml"),
@@ -281,8 +149,86 @@ def make_file(kind: FileKind, name: str, folder: Path, *, profile: str = "virtua
     return CreatedFiles(path, (path, *further), commands[kind])
 
 
+def check_plugin_name(kind: str, name: str, package: str, host: PluginHost) -> None:
+    """Refuse a name that a plugin cannot have, or that is taken.
+
+    Args:
+        kind: Kind of the plugin.
+        name: Its name.
+        package: Name of the Python package that it will be.
+        host: The plugins that exist.
+
+    Raises:
+        ConfigError: It is refused; the message suggests another name.
+    """
+    if not _PLUGIN_NAME.fullmatch(name) or len(name) > MAX_LENGTH:
+        guess = re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_0123456789")[:MAX_LENGTH]
+        allowed = f"a lower-case word of at most {MAX_LENGTH} letters, digits and '_'"
+        what = "it is not a valid name for a Python package"
+        expected = f"{allowed} that begins with a letter"
+        raise _refused(kind, name, what, expected, guess if _PLUGIN_NAME.fullmatch(guess) else "")
+    entry = host.registry.find(kind, name)
+    taken = next((info for info in host.infos if info.name == package), None)
+    reasons = (
+        (keyword.iskeyword(name) or hasattr(builtins, name), "Python itself uses this word"),
+        (name in _RESERVED, "a part of Python or labseq has this name"),
+        (name in _WINDOWS, "Windows allows no file of this name"),
+        (entry, f"the plugin '{entry and entry.origin}' offers a {kind.replace('_', ' ')} of that name"),
+        (taken, f"there is a plugin '{package}' ({taken and taken.origin})"),
+        (_is_installed(package), f"there is a Python package '{package}', which the plugin would hide"),
+    )
+    for is_refused, why in reasons:
+        if is_refused:
+            raise _refused(kind, name, why, "another name", f"my_{name}")
+
+
+def check_file_name(kind: str, name: str, profiles: Path) -> None:
+    """Refuse a name that a sequence or profile cannot have.
+
+    Args:
+        kind: "sequence" or "profile".
+        name: Its name, without an ending.
+        profiles: Folder of the profiles that come with labseq.
+
+    Raises:
+        ConfigError: It is refused; the message suggests another name.
+    """
+    if not _FILE_NAME.fullmatch(name) or len(name) > MAX_LENGTH:
+        guess = re.sub(r"\.ya?ml$", "", name, flags=re.IGNORECASE)
+        guess = re.sub(r"[^A-Za-z0-9]+", "_", guess).strip("_0123456789")[:MAX_LENGTH]
+        expected = f"at most {MAX_LENGTH} letters, digits, '-' and '_', beginning with a letter, no ending"
+        what = "it is not a valid file name"
+        raise _refused(kind, name, what, expected, guess if _FILE_NAME.fullmatch(guess) else "")
+    reasons = (
+        (name.lower() in _WINDOWS, "Windows allows no file of this name"),
+        (name.lower() in _YAML_WORDS, "YAML does not read it as text"),
+        (
+            kind == "profile" and (profiles / f"{name}.yaml").exists(),
+            "a profile of that name comes with labseq, and yours would hide it",
+        ),
+    )
+    for is_refused, why in reasons:
+        if is_refused:
+            raise _refused(kind, name, why, "another name", f"my_{name}")
+
+
+def _refused(kind: str, name: str, why: str, expected: str, guess: str) -> ConfigError:
+    called = kind.replace("_", " ")
+    what = f"{'an' if called[0] in 'aeiou' else 'a'} {called} cannot be called '{clean(name)}': {why}"
+    return ConfigError(Problem(what, expected=expected, hint=f"for example '{guess}'" if guess else ""))
+
+
+def _is_installed(package: str) -> bool:
+    """Whether Python finds such a package; a plain folder of that name does not count."""
+    try:
+        spec = find_spec(package)
+    except (ImportError, ValueError):  # it is loaded, but by other means than the import system
+        return True
+    return spec is not None and spec.origin is not None
+
+
 def _plugins_of(folder: Path) -> PluginHost:
-    """The plugins that the files of a folder find.
+    """The plugins that the files of a folder can name.
 
     Raises:
         ConfigError: There is no such folder.
@@ -293,32 +239,46 @@ def _plugins_of(folder: Path) -> PluginHost:
     return load_plugins([own] if own.is_dir() else [])
 
 
-def _missing_for_tests() -> list[str]:
-    """The command that installs what the tests of a plugin need, if it is not there."""
-    is_there = all(find_spec(module) is not None for module in ("pytest", "hypothesis"))
-    return [] if is_there else ['pip install "labseq[testing]"']
+def read_template(name: str) -> str:
+    """The text of a template."""
+    return (files("labseq.scaffold") / "templates" / name).read_text(encoding="utf-8")
 
 
-def _still_to_do(commands: Sequence[str], folder: Path) -> list[str]:
-    """The commands without the one that makes the sequence of the examples, if there is one."""
-    done = {f"labseq new sequence {FIRST}"} if (folder / f"{FIRST}.yaml").exists() else set[str]()
-    return [command for command in commands if command not in done]
+def plugin_sections(kind: str) -> dict[str, str]:
+    """The sections of a plugin's template by name, before their words are filled in."""
+    _, *parts = re.split(r"^==> (.+) <==\n", read_template(f"{kind}.txt"), flags=re.MULTILINE)
+    return dict(zip(parts[::2], parts[1::2], strict=True))
 
 
-def _placed(sections: Mapping[str, str], source: str, tests: str) -> dict[str, str]:
-    """The files of a plugin, each in its place."""
-    return {f"{tests if file.startswith('test_') else source}{file}": text for file, text in sections.items()}
+def fill(text: str, words: Mapping[str, str]) -> str:
+    """Fill words into a template.
+
+    Example:
+        >>> fill("class ${Name}Planner:", {"Name": "Spiral"})
+        'class SpiralPlanner:'
+    """
+    return Template(text).substitute(words)
 
 
-def _write_folder(path: Path, texts: Mapping[str, str]) -> list[Path]:
-    """Write a folder that is there whole or not at all.
+def class_prefix(name: str) -> str:
+    """How the names of a plugin's classes begin.
+
+    Example:
+        >>> class_prefix("my_spiral_2")
+        'MySpiral2'
+    """
+    return "".join(word.capitalize() for word in name.split("_"))
+
+
+def _write_folder(path: Path, texts: Mapping[str, str]) -> Iterable[Path]:
+    """Write a folder completely or not at all.
 
     Args:
         path: The folder.
         texts: Path of each file in it, with '/', and its text.
 
     Raises:
-        OSError: Something is there already, or it cannot be written; nothing is left of it.
+        OSError: It exists already, or it cannot be written.
     """
     if path.exists() or path.is_symlink():
         raise FileExistsError
@@ -336,8 +296,8 @@ def _write_folder(path: Path, texts: Mapping[str, str]) -> list[Path]:
 
 
 @contextmanager
-def _explained_errors(path: Path) -> Generator[None]:
-    """Say of what the system refuses why."""
+def _reporting(path: Path) -> Generator[None]:
+    """Report what the operating system refuses as an error about a path."""
     try:
         yield
     except FileExistsError:

@@ -1,4 +1,4 @@
-"""What `labseq new` and `labseq schema` print."""
+"""`labseq new` and `labseq schema`: check the arguments, make the files, print what was made."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ from labseq.console.output import say, write_text
 from labseq.errors import ConfigError, Problem
 from labseq.messages import clean, did_you_mean, listing
 from labseq.registry import KINDS
-from labseq.scaffold.new import FILE_KINDS, PLUGINS, CreatedFiles, make_file, make_plugin
-from labseq.scaffold.schemas import SCHEMA_FOLDER, schema_text
+from labseq.scaffold.new import PLUGINS, CreatedFiles, make_file, make_plugin
+from labseq.scaffold.schemas import KINDS as FILE_KINDS, SCHEMA_FOLDER, schema_text
 from labseq.session import load_plugins
 
 
 def make_new(kind: str, name: str, folder: Path, *, package: bool, profile: str | None) -> None:
-    """Make it and say so.
+    """Make a plugin, a sequence or a profile, and print its files and what to do next.
 
     Args:
         kind: A kind of plugin, "sequence" or "profile".
         name: Its name.
         folder: Folder of the sequences and profiles.
-        package: Whether a plugin shall be a distribution of its own.
+        package: Whether a plugin becomes a distribution of its own.
         profile: Profile that a sequence runs on.
 
     Raises:
-        ConfigError: The name cannot be or is taken, an option does not go with the kind, or something
+        ConfigError: The name is not allowed or taken, an option does not apply to the kind, or something
             cannot be written.
     """
     if kind not in (*KINDS, *FILE_KINDS):
@@ -34,9 +34,9 @@ def make_new(kind: str, name: str, folder: Path, *, package: bool, profile: str 
         what = f"there is no kind '{clean(kind)}'"
         raise ConfigError(Problem(what, expected=listing(known), hint=did_you_mean(kind, known)))
     if package and kind in FILE_KINDS:
-        raise ConfigError(Problem(f"--package does not go with a {kind}", hint="leave it out"))
+        raise ConfigError(Problem(f"--package does not apply to a {kind}", hint="leave it out"))
     if profile is not None and kind != "sequence":
-        raise ConfigError(Problem(f"--profile does not go with a {_called(kind)}", hint="leave it out"))
+        raise ConfigError(Problem(f"--profile does not apply to a {_called(kind)}", hint="leave it out"))
     if kind in KINDS:
         made = make_plugin(kind, name, folder, package=package)
     else:
@@ -45,14 +45,14 @@ def make_new(kind: str, name: str, folder: Path, *, package: bool, profile: str 
 
 
 def lines_of(kind: str, name: str, made: CreatedFiles) -> list[str]:
-    """What is printed.
+    """What is printed about the new files.
 
     Example:
-        >>> lines_of("sequence", "a", Made(Path("a.yaml"), (Path("a.yaml"),), ("labseq run a.yaml",)))
-        ['made the sequence a:', '  a.yaml', '', 'go on with', '  labseq run a.yaml']
+        >>> lines_of("sequence", "a", CreatedFiles(Path("a.yaml"), (Path("a.yaml"),), ("labseq run a.yaml",)))
+        ['made the sequence a:', '  a.yaml', '', 'next:', '  labseq run a.yaml']
     """
     files = [f"  {path}" for path in made.files]
-    return [f"made the {_called(kind)} {name}:", *files, "", "go on with", *(f"  {c}" for c in made.commands)]
+    return [f"made the {_called(kind)} {name}:", *files, "", "next:", *(f"  {c}" for c in made.commands)]
 
 
 def _called(kind: str) -> str:
@@ -79,8 +79,8 @@ def write_schema(kind: str, output: Path | None, plugins: Sequence[Path] | None)
     if output is None:
         say(text.rstrip())
         return
-    if output.parent.name == SCHEMA_FOLDER:  # where new files look for it
-        with suppress(OSError):  # the writing tells of it
+    if output.parent.name == SCHEMA_FOLDER:  # where new files refer to it
+        with suppress(OSError):  # writing reports the error
             output.parent.mkdir(exist_ok=True)
     write_text(output, text)
     say(f"wrote {output}")

@@ -8,11 +8,15 @@ import json
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
 import labseq
-from labseq.cli.live import Follower, Tally, draw, draw_scan
+from labseq.cli.arrays import UNICODE
+from labseq.cli.live import Picture, draw_scan
 from labseq.cli.show import Tables, show_run
-from labseq.console.output import UNICODE, LogLines, tell
+from labseq.cli.tally import Tally
+from labseq.cli.watch import EventReader
+from labseq.console.events import LogLines, event_text
 from labseq.recording.export import export_run
 from tests.session.small_runs import PROFILE
 
@@ -74,11 +78,11 @@ def test_the_table_has_the_points_in_the_order_in_which_they_were_chosen(
 
 
 def test_a_view_in_another_process_learns_the_points_and_the_best(told: tuple[labseq.Run, list[str]]) -> None:
-    follower = Follower(told[0])
-    tally, lines = Tally(follower.now), list[str]()
-    for name, values in follower.read():
-        tally.note(name, values)
-        lines.append(tell(name, values, tally.record))
+    reader = EventReader(told[0])
+    tally, lines = Tally(reader.now), list[str]()
+    for name, values in reader.read():
+        tally.add(name, values)
+        lines.append(event_text(name, values, tally.record))
     assert [line for line in lines if line.startswith("point ")] == [
         line for line in told[1] if line.startswith("point ")
     ]
@@ -87,7 +91,10 @@ def test_a_view_in_another_process_learns_the_points_and_the_best(told: tuple[la
     assert [point.n_shots for _, point in points] == [2] * 5
     assert points[0][0] == "2, 60 ms"
     assert draw_scan(tally.scan, 48, 8, UNICODE)
-    assert f"best so far       {tally.best}" in draw(tally, [], 110, 40, UNICODE).plain
+    console = Console(file=io.StringIO(), width=110, height=40)
+    with console.capture() as shown:
+        console.print(Picture(tally, [], UNICODE))
+    assert f"best so far       {tally.best}" in shown.get()
     assert ", point " in tally.best
 
 

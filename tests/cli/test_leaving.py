@@ -37,7 +37,7 @@ def leave(tmp_path: Path, command: str, **plugin: object) -> subprocess.Complete
 def test_a_thread_that_never_ends_does_not_keep_the_process(tmp_path: Path, command: str, code: int) -> None:
     done = leave(tmp_path, command, target="threading.Event().wait", daemon=False)
     assert done.returncode == code
-    assert "a thread of a plugin would not end: labseq test poller; " in done.stderr
+    assert "a thread of a plugin did not end: labseq test poller; " in done.stderr
     assert "still in the buffer" in done.stdout
 
 

@@ -2,15 +2,19 @@ from __future__ import annotations
 
 import io
 import sys
-from pathlib import Path
+from dataclasses import replace
+from itertools import pairwise
 from typing import Any
-from xml.etree import ElementTree as ET
 
 import pytest
+from hypothesis import given, strategies as st
 from rich.console import Console
 
-from labseq.cli.live import REDRAW_S, LiveView, observer_for
-from labseq.console.output import LogLines
+from labseq.cli.arrays import ASCII, UNICODE
+from labseq.cli.live import REDRAW_S, LiveView, Picture, draw_scan, observer_for
+from labseq.cli.tally import ScanTally, Tally
+from labseq.console.events import LogLines
+from labseq.model import ShotRecord
 
 
 class Screen(io.TextIOWrapper):
@@ -29,7 +33,7 @@ class Screen(io.TextIOWrapper):
         return raw.getvalue().decode(self.encoding)
 
 
-class ResolvedProfile:
+class Terminal:
     """A live view on a screen, with a clock that is set by hand."""
 
     def __init__(self, encoding: str = "utf-8", size: tuple[int, int] = (110, 26)) -> None:
@@ -56,84 +60,75 @@ class ResolvedProfile:
 @pytest.mark.parametrize("encoding", ["utf-8", "cp1252", "ascii", "cp437"])
 @pytest.mark.parametrize("size", [(110, 26), (80, 24), (40, 8)])
 def test_a_run_is_shown_on_any_screen(fake: Any, encoding: str, size: tuple[int, int]) -> None:
-    bench = ResolvedProfile(encoding, size)
-    bench.play(fake.script(fake.run()))
-    text = bench.screen.text
+    terminal = Terminal(encoding, size)
+    terminal.play(fake.script(fake.run()))
+    text = terminal.screen.text
     assert "data/2026-01-02/0001_compact-225" in text
     assert "2/20 shots" in text
     assert text.endswith("\x1b[?25h"), "the cursor is back"
-    assert ("±" in text) is (encoding == "utf-8")
+    assert ("●" in text) is (encoding == "utf-8" and size[0] > 40)
 
 
 def test_stdout_is_given_back(fake: Any) -> None:
     before = sys.stdout, sys.stderr
-    bench = ResolvedProfile()
+    terminal = Terminal()
     events = iter(fake.script(fake.run()))
     for name, values in events:
-        bench.view.event(name, values)
+        terminal.view.event(name, values)
         if name == "shot_started":
             break
     assert sys.stdout is not before[0]
-    bench.view.close()
-    bench.view.close()
+    terminal.view.close()
+    terminal.view.close()
     assert (sys.stdout, sys.stderr) == before
 
 
-def test_it_is_drawn_at_most_four_times_a_second(fake: Any) -> None:
-    bench = ResolvedProfile()
+def test_the_view_is_drawn_at_most_four_times_a_second(fake: Any) -> None:
+    terminal = Terminal()
     run = fake.run()
-    bench.play([("run_starting", {"record": run, "run_dir": "x"})])
+    terminal.play([("run_starting", {"record": run, "run_dir": "x"})])
     image = {"image": fake.image(run.target.fill, 1), "filling_fraction": 1.0}
-    assert bench.drawings("image", image) == 1
-    assert bench.drawings("image", image, after_s=0.9 * REDRAW_S) == 0
-    assert bench.drawings("image", image, after_s=0.1 * REDRAW_S) == 1
+    assert terminal.drawings("image", image) == 1
+    assert terminal.drawings("image", image, after_s=0.9 * REDRAW_S) == 0
+    assert terminal.drawings("image", image, after_s=0.1 * REDRAW_S) == 1
 
 
 def test_with_real_hardware_it_is_drawn_between_shots_only(fake: Any) -> None:
-    bench = ResolvedProfile()
+    terminal = Terminal()
     run = fake.run(simulated=False)
-    bench.play([("run_starting", {"record": run, "run_dir": "x"})])
+    terminal.play([("run_starting", {"record": run, "run_dir": "x"})])
     image = {"image": fake.image(run.target.fill, 1), "filling_fraction": 1.0}
-    assert bench.drawings("image", image) == 0
-    assert bench.drawings("state", {"state": "making safe"}) == 0
-    assert bench.drawings("shot_finished", {"shot": fake.shot()}) == 1
+    assert terminal.drawings("image", image) == 0
+    assert terminal.drawings("state", {"state": "making safe"}) == 0
+    assert terminal.drawings("shot_finished", {"shot": fake.shot()}) == 1
 
 
-def test_what_must_be_seen_stays_on_the_screen(fake: Any) -> None:
-    bench = ResolvedProfile()
-    bench.play([("run_starting", {"record": fake.run(), "run_dir": "x"})])
-    bench.play([("warning", {"text": "the [laser] is warm"})])
-    bench.play([("safe_state", {"device": "camera", "ok": False, "error": "camera: mute"})])
-    bench.view.close()
-    assert bench.screen.text.count("warning: the [laser] is warm") == 1
+def test_warnings_stay_on_the_screen(fake: Any) -> None:
+    terminal = Terminal()
+    terminal.play([("run_starting", {"record": fake.run(), "run_dir": "x"})])
+    terminal.play([("warning", {"text": "the [laser] is warm"})])
+    terminal.play([("safe_state", {"device": "camera", "ok": False, "error": "camera: mute"})])
+    terminal.view.close()
+    assert terminal.screen.text.count("warning: the [laser] is warm") == 1
     assert (
-        bench.screen.text.count("warning: camera could not be brought to its safe state: camera: mute") == 1
+        terminal.screen.text.count("warning: camera could not be brought to its safe state: camera: mute")
+        == 1
     )
 
 
 def test_the_screen_is_given_back_even_if_drawing_fails(fake: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    bench = ResolvedProfile()
-    bench.play([("run_starting", {"record": fake.run(), "run_dir": "x"})])
+    terminal = Terminal()
+    terminal.play([("run_starting", {"record": fake.run(), "run_dir": "x"})])
     before = sys.stdout
 
     def fail(*_: Any) -> Any:
         raise ValueError("broken")
 
-    monkeypatch.setattr("labseq.cli.live.draw", fail)
+    monkeypatch.setattr("labseq.cli.live._progress", fail)
     with pytest.raises(ValueError, match="broken"):
-        bench.view.close()
+        terminal.view.close()
     assert sys.stdout is not before
-    assert bench.screen.text.endswith("\x1b[?25h")
-
-
-def test_export_svg_needs_nothing_from_elsewhere(fake: Any, tmp_path: Path) -> None:
-    bench = ResolvedProfile("ascii")
-    bench.play(fake.script(fake.run()))
-    bench.view.export_svg(tmp_path / "run.svg")
-    text = (tmp_path / "run.svg").read_text("utf-8")
-    ET.fromstring(text)
-    assert "url(http" not in text.replace('"', "")
-    assert text.count("●") >= 225
+    assert terminal.screen.text.endswith("\x1b[?25h")
 
 
 @pytest.mark.parametrize(
@@ -145,3 +140,186 @@ def test_the_view_is_for_terminals(tty: bool, term: str, live: bool, monkeypatch
     monkeypatch.setenv("FORCE_COLOR", "1")
     observer = observer_for(Screen(tty=tty))
     assert isinstance(observer, LiveView if live else LogLines)
+
+
+RECENT = ["first", "second", "third"]
+
+
+def tally_of(fake: Any, run: Any, n_shots: int = 2) -> Tally:
+    tally = Tally(lambda: 0.0)
+    for name, values in fake.script(run, n_shots=n_shots):
+        if name != "run_finished":
+            tally.add(name, values)
+    return tally
+
+
+def picture(tally: Tally, width: int, height: int, glyphs: Any = UNICODE, recent: Any = RECENT) -> list[str]:
+    console = Console(file=io.StringIO(), width=width, height=height, color_system=None)
+    console.print(Picture(tally, recent, glyphs))
+    return [line.rstrip() for line in console.file.getvalue().splitlines()]  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(
+    "size", [(200, 60), (110, 26), (107, 24), (80, 24), (80, 20), (60, 24), (40, 10), (20, 5), (8, 2)]
+)
+@pytest.mark.parametrize("glyphs", [UNICODE, ASCII])
+@pytest.mark.parametrize("n", [20, 60])
+def test_a_picture_never_exceeds_the_terminal(fake: Any, size: tuple[int, int], glyphs: Any, n: int) -> None:
+    lines = picture(tally_of(fake, fake.run(target=fake.target(n))), *size, glyphs)
+    assert len(lines) < size[1]
+    assert max(map(len, lines)) <= size[0]
+
+
+def test_a_wide_terminal_shows_everything(fake: Any) -> None:
+    lines = picture(tally_of(fake, fake.run()), 120, 30)
+    text = "\n".join(lines)
+    assert lines[0].startswith("compact-225  ━━━━━━")
+    assert "2/20 shots" in lines[0]
+    assert "defect-free       2 of 2 (100.0 %), 65-100 %" in text
+    assert "filling           100 %" in text
+    assert text.count("● " * 14 + "●") == 15
+    assert "shot 2, image of cycle 2:" in text
+    assert lines[-3:] == RECENT
+
+
+def test_rows_are_sheared_as_on_the_array(fake: Any) -> None:
+    def left_edges(**grid: Any) -> list[int]:
+        lines = picture(tally_of(fake, fake.run(**grid)), 120, 30)
+        return [line.index("● ● ● ●") for line in lines if "● " * 14 + "●" in line]
+
+    right, left, square = left_edges(), left_edges(shear=-1), left_edges(lattice="square")
+    assert [b - a for a, b in pairwise(right)] == [1] * 14
+    assert [b - a for a, b in pairwise(left)] == [-1] * 14
+    assert len(set(square)) == 1
+
+
+@pytest.mark.parametrize(
+    ("size", "drawn"),
+    [((120, 30), "● ● ●"), ((80, 24), "●●●"), ((80, 16), "███"), ((70, 24), None)],
+)
+def test_the_array_shrinks_before_it_goes(fake: Any, size: tuple[int, int], drawn: str | None) -> None:
+    text = "\n".join(picture(tally_of(fake, fake.run()), *size))
+    sizes = [candidate for candidate in ("● ● ●", "●●●", "███") if candidate in text]
+    assert sizes == ([drawn] if drawn else [])
+    assert "defect-free" in text
+
+
+def test_on_real_hardware_there_is_one_clock(fake: Any) -> None:
+    for simulated, heads in (
+        (True, "stage host p99 modelled budget over"),
+        (False, "stage p50 p99 budget over"),
+    ):
+        lines = picture(tally_of(fake, fake.run(simulated=simulated)), 120, 30)
+        assert [line for line in lines if heads in " ".join(line.split())]
+
+
+def test_stage_table_shows_budgets(fake: Any) -> None:
+    rows = {
+        line.split()[0]: line.split()[1:]
+        for line in picture(tally_of(fake, fake.run(lattice="square")), 60, 30)
+        if line[:5] in {"plan ", "move "}
+    }
+    times = ["800", "us", "800", "us", "7.5", "ms"]
+    assert rows == {"plan": [*times, "-"], "move": [*times, "60", "ms"]}
+
+
+def test_before_the_first_image_there_is_no_array(fake: Any) -> None:
+    tally = Tally(lambda: 0.0)
+    tally.add("run_starting", {"record": fake.run(), "run_dir": "x"})
+    text = "\n".join(picture(tally, 120, 30, recent=[]))
+    assert "0/20 shots" in text
+    assert "●" not in text
+
+
+def test_a_defect_and_a_surplus_atom_are_counted(fake: Any) -> None:
+    run = fake.run()
+    tally = tally_of(fake, run)
+    occupancy = run.target.fill.copy()
+    occupancy[5, 5] = False
+    tally.add("image", {"image": fake.image(occupancy, cycle=3)})
+    lines = picture(tally, 120, 30)
+    assert any(line.rstrip().endswith("224 atoms, 1 defect") for line in lines)
+    assert "○" in "\n".join(lines)
+
+
+def test_the_status_takes_the_place_of_the_time_left(fake: Any) -> None:
+    tally = tally_of(fake, fake.run(), n_shots=20)
+    assert picture(tally, 80, 24)[0].endswith("20/20 shots  0:00 left")
+    tally.add("run_finished", {"record": fake.run(), "status": "stopped", "error": ""})
+    assert picture(tally, 80, 24)[0].endswith("20/20 shots  stopped")
+
+
+def test_a_scan_is_drawn_where_there_is_room(fake: Any) -> None:
+    scan = {
+        "addresses": ["dop"],
+        "points": [[3], [7]],
+        "written": [["3"], ["7"]],
+        "point_of_shot": [0, 1] * 10,
+    }
+    run = replace(fake.run(), scan=scan)
+    tally = tally_of(fake, run)
+    assert any("defect-free by dop" in line for line in picture(tally, 120, 36))
+    assert not any("defect-free by dop" in line for line in picture(tally, 120, 18))
+
+
+def scan(values: list[Any], *, repeats: int = 1) -> dict[str, Any]:
+    return {
+        "addresses": ["planner.dop"],
+        "points": [[value] for value in values],
+        "written": [[str(value)] for value in values],
+        "point_of_shot": [i for i in range(len(values)) for _ in range(repeats)],
+    }
+
+
+def scan_tally(values: list[Any], shots: list[tuple[int, bool, float]]) -> ScanTally:
+    tally = ScanTally(scan(values))
+    for index, success, filling in shots:
+        tally.add(ShotRecord(index, 0, 1, "", success=success, filling_fraction=filling))
+    return tally
+
+
+def plot(tally: ScanTally, width: int = 40, height: int = 6, glyphs: Any = UNICODE) -> list[str]:
+    return [line.plain for line in draw_scan(tally, width, height, glyphs)]
+
+
+def test_points_stand_in_the_order_of_their_values() -> None:
+    tally = scan_tally([7, 3, 15], [(0, True, 1.0), (1, False, 0.9), (2, True, 1.0), (2, False, 0.9)])
+    assert plot(tally) == [
+        "defect-free by planner.dop",
+        " 100 %      ████      ",
+        "            ████      ",
+        "            ████ ████ ",
+        "   0 % ▁▁▁▁ ████ ████ ",
+        "       3            15",
+    ]
+
+
+def test_without_a_defect_free_shot_the_filling_is_drawn() -> None:
+    drawn = plot(scan_tally([1, 2, 3], [(0, False, 0.98), (2, False, 0.99)]), glyphs=ASCII)
+    assert drawn[0] == "filling by planner.dop"
+    assert (drawn[1][:7], drawn[-2][:7]) == ("  99 % ", "  98 % ")
+    assert drawn[-2][7:] == "....      #### "
+
+
+@pytest.mark.parametrize(("width", "height"), [(15, 6), (40, 3)])
+def test_where_there_is_no_room_there_is_no_plot(width: int, height: int) -> None:
+    assert plot(scan_tally([1], [(0, True, 1.0)]), width, height) == []
+
+
+def test_before_the_first_shot_there_is_no_plot() -> None:
+    assert plot(scan_tally([1, 2], [(0, False, float("nan")), (99, True, 1.0)])) == []
+
+
+@given(
+    st.lists(st.integers(0, 500), min_size=1, max_size=120, unique=True),
+    st.lists(st.tuples(st.integers(0, 120), st.booleans(), st.floats(0, 1)), max_size=60),
+    st.integers(16, 60),
+    st.integers(4, 12),
+    st.sampled_from([UNICODE, ASCII]),
+)
+def test_a_plot_never_exceeds_its_room(
+    values: list[int], shots: list[tuple[int, bool, float]], width: int, height: int, glyphs: Any
+) -> None:
+    drawn = plot(scan_tally(values, shots), width, height, glyphs)
+    assert len(drawn) in (0, height)
+    assert all(len(line) <= max(width, len("defect-free by planner.dop")) for line in drawn)

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from labseq.console.output import LogLines, event_text
+from labseq.console.events import LogLines, event_text
 
 
 def lines_of(events: Any) -> list[str]:
@@ -41,7 +41,7 @@ def test_what_goes_wrong_is_told(fake: Any) -> None:
     ]
     assert lines_of(events) == [
         "warning: the laser is warm",
-        "shot 1: attempt 2 failed, once more: TransientError: no light",
+        "shot 1: attempt 2 failed, trying again: TransientError: no light",
         "shot 1  failed: TransientError: no light",
         "warning: camera could not be brought to its safe state: camera: mute",
         "warning: shutter could not be closed: shutter: jammed",

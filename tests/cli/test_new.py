@@ -34,7 +34,7 @@ def test_a_planner_from_an_empty_folder(capsys: pytest.CaptureFixture[str]) -> N
         "  plugins/spiral/planner.py\n"
         "  plugins/spiral/test_spiral.py\n"
         "\n"
-        "go on with\n"
+        "next:\n"
         "  pytest plugins/spiral\n"
         "  labseq new sequence first\n"
         "  labseq run first.yaml --set planner.use=spiral\n"
@@ -62,8 +62,8 @@ def test_a_package(capsys: pytest.CaptureFixture[str]) -> None:
             "there is no kind 'planer'; expected one of planner, camera, .*did you mean 'planner'",
         ),
         (["planner", "my-planner"], "a planner cannot be called 'my-planner'.*for example 'my_planner'"),
-        (["sequence", "a", "--package"], "--package does not go with a sequence; leave it out"),
-        (["static_tweezers", "a", "--profile", "lab"], "--profile does not go with a static tweezers"),
+        (["sequence", "a", "--package"], "--package does not apply to a sequence; leave it out"),
+        (["static_tweezers", "a", "--profile", "lab"], "--profile does not apply to a static tweezers"),
         (["planner", "a", "--folder", "nowhere"], "nowhere: there is no such folder"),
         (["planner"], "NAME"),
     ],

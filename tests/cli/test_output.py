@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 from hypothesis import given, strategies as st
 
-from labseq.console.output import columns, discard_unwritten, say
+from labseq.console.output import discard_unwritten, say
+from labseq.console.text import columns
 from labseq.errors import RecordingError
 
 FULL = Path("/dev/full")

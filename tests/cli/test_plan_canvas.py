@@ -5,8 +5,8 @@ import pytest
 from hypothesis import example, given, settings, strategies as st
 from rich.text import Text
 
+from labseq.cli.arrays import ASCII, UNICODE, Glyphs
 from labseq.cli.plan import Canvas
-from labseq.console.output import ASCII, UNICODE, Glyphs
 from labseq.model import Occupancy, TargetPattern
 from labseq.testing.strategies import cases
 

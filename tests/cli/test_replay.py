@@ -110,15 +110,15 @@ def test_everything_is_written_as_json(run, tmp_path, capsys):
 
 
 def test_an_analysis_is_made_up_and_told(run, capsys):
-    assert analyse_run(run.path, "survival", ["atoms=moved"], anew=False) == 0
+    assert analyse_run(run.path, "survival", ["atoms=moved"], again=False) == 0
     path = run.path / "analysis" / "survival.jsonl"
     assert capsys.readouterr().out == f"survival: 2 shots analysed; see {path}\n"
-    assert analyse_run(run.path, "survival", ["atoms=moved"], anew=False) == 0
+    assert analyse_run(run.path, "survival", ["atoms=moved"], again=False) == 0
     assert "0 shots analysed, 2 had a result already" in capsys.readouterr().out
 
 
 def test_an_analysis_that_fails_exits_with_1(run, capsys):
-    assert analyse_run(run.path, "wrong", [], anew=False) == 1
+    assert analyse_run(run.path, "wrong", [], again=False) == 1
     assert capsys.readouterr().err.splitlines() == [
         f"wrong: shot {i} failed: ValueError: too dark" for i in (1, 2)
     ]
@@ -138,4 +138,4 @@ def test_an_analysis_that_fails_exits_with_1(run, capsys):
 )
 def test_what_cannot_be_analysed_is_refused(run, use, overrides, expected):
     with pytest.raises((ConfigError, labseq.UnknownPluginError), match=expected):
-        analyse_run(run.path, use, overrides, anew=False)
+        analyse_run(run.path, use, overrides, again=False)

@@ -1,19 +1,18 @@
 from __future__ import annotations
 
 import math
-import statistics
 from typing import Any
 
 import pytest
-from hypothesis import given, strategies as st
 
-from labseq.cli.live import StageTally, Tally
-from labseq.model import ShotRecord, StageTiming
+from labseq.cli.tally import StageTally, Tally
+from labseq.model import StageTiming
+from labseq.model.estimate import Estimate
 
 
 def played(tally: Tally, events: Any) -> Tally:
     for name, values in events:
-        tally.note(name, values)
+        tally.add(name, values)
     return tally
 
 
@@ -21,7 +20,7 @@ def test_a_run_is_summed_up(fake: Any) -> None:
     tally = played(Tally(lambda: 0.0), fake.script(fake.run(), n_shots=3))
     assert (tally.n_done, tally.n_defect_free, tally.n_seen) == (3, 3, 3)
     assert tally.n_shots == 20
-    assert tally.filling() == (1.0, 0.0)
+    assert tally.filling == Estimate(1.0, 0.0)
     assert (tally.image_shot, tally.image.cycle if tally.image else None) == (2, 2)
     assert len(tally.stages["plan"].host_s) == 6
     assert tally.stages["plan"].medians_s() == (0.8e-3, 7.5e-3)
@@ -37,24 +36,23 @@ def test_only_complete_shots_count(fake: Any) -> None:
         fake.shot(3, success=False, seen=0, filling=math.nan),
     ]
     for shot in shots:
-        tally.note("shot_finished", {"shot": shot})
-    assert (tally.n_done, tally.n_defect_free, tally.n_seen, tally.n_filled) == (2, 0, 1, 1)
-    mean, error = tally.filling()
-    assert mean == 0.99
-    assert math.isnan(error)
+        tally.add("shot_finished", {"shot": shot})
+    assert (tally.n_done, tally.n_defect_free, tally.n_seen) == (2, 0, 1)
+    assert tally.filling.value == 0.99
+    assert math.isnan(tally.filling.error)
 
 
 def test_unknown_events_and_stages_are_ignored() -> None:
     tally = Tally(lambda: 0.0)
-    tally.note("something_new", {"a": 1})
-    tally.note("stage", {"timing": StageTiming("step 0 load", 0, 0, 0.0, 0.5, 0.5)})
+    tally.add("something_new", {"a": 1})
+    tally.add("stage", {"timing": StageTiming("step 0 load", 0, 0, 0.0, 0.5, 0.5)})
     assert not any(stage.host_s for stage in tally.stages.values())
 
 
 def test_over_budget_is_counted() -> None:
     tally = Tally(lambda: 0.0)
     for duration_s in (59e-3, 60e-3, 62e-3):
-        tally.note("stage", {"timing": StageTiming("move", 2, 1, 0.0, duration_s, 1e-3, 60e-3)})
+        tally.add("stage", {"timing": StageTiming("move", 2, 1, 0.0, duration_s, 1e-3, 60e-3)})
     assert tally.stages["move"].n_over == 1
 
 
@@ -68,22 +66,11 @@ def test_the_99th_percentile_is_nearly_the_longest() -> None:
 def test_time_left_follows_the_pace_so_far(fake: Any) -> None:
     now = 100.0
     tally = Tally(lambda: now)
-    tally.note("run_starting", {"record": fake.run(n_shots=10), "run_dir": "x"})
+    tally.add("run_starting", {"record": fake.run(n_shots=10), "run_dir": "x"})
     now = 107.0  # compiling and opening are no shots
-    tally.note("shot_started", {"shot": 0, "attempt": 0})
-    assert math.isnan(tally.time_left_s())
+    tally.add("shot_started", {"shot": 0, "attempt": 0})
+    assert math.isnan(tally.time_left_s)
     for i in range(2):
         now += 3.0
-        tally.note("shot_finished", {"shot": fake.shot(i)})
-    assert tally.time_left_s() == pytest.approx(24.0)
-
-
-@given(st.lists(st.floats(0, 1), min_size=2, max_size=50))
-def test_filling_is_mean_and_standard_error(values: list[float]) -> None:
-    tally = Tally(lambda: 0.0)
-    for value in values:
-        shot = ShotRecord(0, 0, 1, "", status="complete", filling_fraction=value)
-        tally.note("shot_finished", {"shot": shot})
-    mean, error = tally.filling()
-    assert mean == pytest.approx(statistics.fmean(values))
-    assert error == pytest.approx(statistics.stdev(values) / math.sqrt(len(values)), abs=1e-9)
+        tally.add("shot_finished", {"shot": fake.shot(i)})
+    assert tally.time_left_s == pytest.approx(24.0)

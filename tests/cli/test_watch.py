@@ -10,7 +10,8 @@ from typing import Any
 
 import pytest
 
-from labseq.cli.live import POLL_S, Follower, Tail, Tally, record_of, watch_run
+from labseq.cli.tally import Tally
+from labseq.cli.watch import POLL_S, EventReader, NewLines, record_of, watch_run
 from labseq.errors import ConfigError
 from labseq.recording import RunWriter, open_run
 
@@ -62,7 +63,7 @@ def test_a_run_is_watched_to_its_end(bench: ResolvedProfile) -> None:
     assert lines[0].endswith("3 shots, seed 1, profile virtual, simulated")
     assert lines[1:4] == [
         "shot 1/3  defect-free in cycle 2  filling 100.0 %  1.9 s",
-        "shot 2: attempt 1 failed, once more: TransientError: no light",
+        "shot 2: attempt 1 failed, trying again: TransientError: no light",
         "shot 2/3  defect-free in cycle 2  filling 100.0 %  1.9 s",
     ]
     assert "shots             2 of 3, 1 attempt kept that did not complete" in lines
@@ -79,20 +80,20 @@ def test_ctrl_c_leaves_the_run_alone(bench: ResolvedProfile) -> None:
         raise KeyboardInterrupt
 
     lines = bench.watch(interrupt)
-    assert lines[-1] == f"no longer watched; {bench.writer.run_dir} goes on"
+    assert lines[-1] == f"no longer watched; the run {bench.writer.run_dir} continues"
     assert open_run(bench.writer.run_dir).status == "running"
 
 
 def test_the_view_learns_what_the_runs_own_view_does(bench: ResolvedProfile) -> None:
     bench.take(0)
-    follower = Follower(open_run(bench.writer.run_dir), lambda: 1e10)
-    tally = Tally(follower.now)
-    for name, values in follower.read():
-        tally.note(name, values)
+    reader = EventReader(open_run(bench.writer.run_dir), lambda: 1e10)
+    tally = Tally(reader.now)
+    for name, values in reader.read():
+        tally.add(name, values)
     assert (tally.n_done, tally.n_defect_free, tally.n_seen, tally.n_shots) == (1, 1, 1, 3)
-    assert follower.now() == 1e10
-    assert not follower.is_over()
-    assert [*follower.read()] == []
+    assert reader.now() == 1e10
+    assert not reader.is_over()
+    assert [*reader.read()] == []
 
 
 def test_lines_of_another_version_and_damaged_ones_are_passed_over(bench: ResolvedProfile) -> None:
@@ -118,7 +119,7 @@ def test_a_shot_whose_file_is_gone_is_still_told(bench: ResolvedProfile) -> None
 
 
 def test_only_whole_lines_are_read_and_each_once(tmp_path: Path) -> None:
-    tail = Tail(tmp_path / "log")
+    tail = NewLines(tmp_path / "log")
     assert tail.read() == []
     (tmp_path / "log").write_text('{"a": 1}\n{"a"')
     assert tail.read() == [{"a": 1}]

@@ -14,7 +14,7 @@ from markdown_it import MarkdownIt
 
 import labseq
 from labseq.cli.app import app
-from labseq.cli.main import arrange
+from labseq.cli.entry import arrange
 from labseq.config import ProfileSpec, SequenceSpec
 from labseq.config.yaml_nodes import compose
 from labseq.console.errors import told

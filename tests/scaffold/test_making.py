@@ -32,7 +32,7 @@ def test_every_kind_has_a_template(kind: str) -> None:
 @pytest.mark.parametrize(
     ("name", "why"),
     [
-        ("my-planner", "no name for a part of Python; expected .* for example 'my_planner'"),
+        ("my-planner", "not a valid name for a Python package; expected .* for example 'my_planner'"),
         ("Spiral", "for example 'spiral'"),
         ("2spiral", "a lower-case word"),
         ("", "a lower-case word"),
@@ -40,11 +40,11 @@ def test_every_kind_has_a_template(kind: str) -> None:
         ("ü", "a lower-case word"),
         ("x" * 41, "at most 40 letters"),
         ("../spiral", "for example 'spiral'"),
-        ("class", "a word of Python itself; .*'my_class'"),
-        ("print", "a word of Python itself"),
+        ("class", "Python itself uses this word; .*'my_class'"),
+        ("print", "Python itself uses this word"),
         ("json", "a part of Python or labseq"),
         ("labseq", "a part of Python or labseq"),
-        ("nul", "no name for a file on Windows"),
+        ("nul", "Windows allows no file of this name"),
         ("psca", "the plugin 'labseq_psca' offers a planner of that name"),
         ("labseq_psca", "there is a plugin 'labseq_psca'"),
         ("pydantic", "there is a Python package 'pydantic'"),
@@ -59,12 +59,12 @@ def test_names_that_a_plugin_cannot_have(name: str, why: str, tmp_path: Path) ->
 @pytest.mark.parametrize(
     ("kind", "name", "why"),
     [
-        ("sequence", "a.yaml", "without an ending; for example 'a'"),
+        ("sequence", "a.yaml", "no ending; for example 'a'"),
         ("sequence", "a/b", "for example 'a_b'"),
         ("sequence", "-a", "for example 'a'"),
         ("sequence", "", "letters, digits"),
-        ("sequence", "Con", "no name for a file on Windows"),
-        ("sequence", "True", "in YAML it is no text"),
+        ("sequence", "Con", "Windows allows no file of this name"),
+        ("sequence", "True", "YAML does not read it as text"),
         ("profile", "virtual", "yours would hide it"),
     ],
 )

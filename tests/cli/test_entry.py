@@ -1,7 +1,7 @@
 import pytest
 from hypothesis import given, strategies as st
 
-from labseq.cli.main import arrange
+from labseq.cli.entry import arrange
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from labseq.analysis.statistics import CycleStatistics, Rate, Statistics
-from labseq.cli.show import NOT_JUDGED, cycle_table, statistics_rows
+from labseq.cli.summary import NOT_JUDGED, cycle_table, statistics_rows
 from labseq.model.estimate import Estimate
 
 UNKNOWN = Estimate(math.nan, math.nan)

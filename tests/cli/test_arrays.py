@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
-from labseq.cli.live import (
+from labseq.cli.arrays import (
+    ASCII,
     ATOM,
     DEFECT,
     DENSE,
@@ -15,17 +16,17 @@ from labseq.cli.live import (
     RESERVOIR,
     ROOMY,
     SURPLUS,
+    UNICODE,
     draw_array,
-    kinds,
     scales,
+    site_kinds,
 )
-from labseq.console.output import ASCII, UNICODE
 from labseq.model import TargetPattern
 
 FILL = np.array([[0, 1, 1], [0, 0, 0]], np.bool_)
 CLEAR = np.array([[0, 0, 0], [0, 1, 1]], np.bool_)
 TARGET = TargetPattern(FILL, CLEAR)
-X = UNICODE.surplus
+X = UNICODE.sites[SURPLUS]
 OCCUPANCY = np.array([[1, 1, 0], [0, 1, 0]], np.bool_)
 
 
@@ -33,8 +34,8 @@ def plain(lines: Any) -> list[str]:
     return [line.plain.rstrip() for line in lines]
 
 
-def test_kinds() -> None:
-    assert kinds(OCCUPANCY, TARGET).tolist() == [[RESERVOIR, ATOM, DEFECT], [EMPTY, SURPLUS, EMPTY]]
+def test_site_kinds() -> None:
+    assert site_kinds(OCCUPANCY, TARGET).tolist() == [[RESERVOIR, ATOM, DEFECT], [EMPTY, SURPLUS, EMPTY]]
 
 
 @pytest.mark.parametrize(
@@ -77,7 +78,7 @@ def test_half_blocks_tell_upper_from_lower() -> None:
 def test_a_drawing_has_the_size_that_was_promised(n_rows: int, n_cols: int, shear: int, scale: Any) -> None:
     sites = np.ones((n_rows, n_cols), np.bool_)
     lines = draw_array(sites, TargetPattern(sites, ~sites), shear, scale, UNICODE)
-    width, height = scale.size(n_rows, n_cols, shear != 0)
+    width, height = scale.size(n_rows, n_cols, shear)
     assert len(lines) == height
     assert max(line.cell_len for line in lines) <= width
 

@@ -1,0 +1,127 @@
+"""The entry point of the command line: arguments, usage errors, and leaving with the right exit code."""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from typing import Any, Final, NoReturn
+
+from labseq.console.output import discard_unwritten, replace_unencodable, say
+from labseq.errors import ConfigError, RecordingError
+
+MAX_WAIT_S: Final = 1.0
+"""How long the threads of plugins may take to end."""
+_PLAIN_DRY_RUN: Final = frozenset({"doctor"})
+"""Commands whose ``--dry-run`` has no value."""
+
+
+def main(arguments: Sequence[str] | None = None) -> NoReturn:
+    """Run the command line; the console entry point.
+
+    Args:
+        arguments: Without the program's name; those of the process by default.
+
+    Raises:
+        SystemExit: Always, with the exit code.
+    """
+    import typer
+
+    from labseq.cli.app import app
+    from labseq.console.errors import report
+
+    arranged = arrange(sys.argv[1:] if arguments is None else arguments)
+    usage_error: type[Exception] = typer.BadParameter.__mro__[1]  # it has no public name
+    replace_unencodable()
+    try:
+        code = app(args=arranged, prog_name="labseq", standalone_mode=False) or 0
+    except SystemExit as leaving:
+        code = leaving.code
+    except usage_error as error:
+        code = _report_usage(error, arranged)
+    except BaseException as error:  # noqa: BLE001 - the one place where an error becomes an exit code
+        code = report(error, debug="--debug" in arranged[:1])
+    discard_unwritten()
+    if arguments is None:
+        _end_process(code)
+    sys.exit(code)
+
+
+def arrange(arguments: Sequence[str]) -> list[str]:
+    """Give ``--dry-run`` its value and move ``--debug`` to the front.
+
+    typer knows no options whose value may be left out, and takes global options only before
+    the command. What follows ``--`` is left alone.
+
+    Example:
+        >>> arrange(["run", "--dry-run", "a.yaml", "--debug"])
+        ['--debug', 'run', '--dry-run=full', 'a.yaml']
+    """
+    end = arguments.index("--") if "--" in arguments else len(arguments)
+    options, rest = arguments[:end], arguments[end:]
+    debug = ["--debug"] if "--debug" in options else []
+    command = next((option for option in options if not option.startswith("-")), "")
+    values = {} if command in _PLAIN_DRY_RUN else {"--dry-run": "--dry-run=full"}
+    return [*debug, *(values.get(option, option) for option in options if option != "--debug"), *rest]
+
+
+def _report_usage(error: Any, arguments: Sequence[str]) -> int:
+    """Print a usage error on stderr, and as the command's JSON if ``--json`` is among the arguments.
+
+    Returns:
+        The exit code.
+    """
+    with suppress(OSError, RecordingError):  # the exit code reports it, too
+        error.show()
+        options = arguments[: arguments.index("--")] if "--" in arguments else arguments
+        line = _usage_json(error) if "--json" in options else ""
+        if line:
+            say(line)
+    return int(error.exit_code)
+
+
+def _usage_json(error: Any) -> str:
+    """A usage error as the command's JSON; "" for commands whose ``--json`` names a file."""
+    problem = ConfigError(" ".join(str(error.format_message()).split()))
+    command = error.ctx.info_name if error.ctx is not None else ""
+    if command == "check":
+        from labseq.cli.check import json_errors
+
+        return json_errors(problem)
+    if command in ("run", "show"):
+        from labseq.cli.run import json_result
+
+        return json_result(None, None, problem)
+    return ""
+
+
+def _end_process(code: Any) -> NoReturn:
+    """Leave with an exit code, even if a plugin left a thread that Python would wait for.
+
+    All data are on disk by now and every device is safe, so nothing is lost with such a thread.
+
+    Args:
+        code: As for ``sys.exit``.
+    """
+    deadline = time.monotonic() + MAX_WAIT_S
+    with suppress(KeyboardInterrupt):  # Ctrl-C: wait no longer
+        for thread in _plugin_threads():
+            thread.join(max(0.0, deadline - time.monotonic()))
+    names = sorted(thread.name for thread in _plugin_threads())
+    if not names:
+        sys.exit(code)
+    with suppress(RecordingError):
+        threads = "a thread" if len(names) == 1 else f"{len(names)} threads"
+        text = f"warning: {threads} of a plugin did not end: {', '.join(names)}; ended with the process"
+        say(text, stream=sys.stderr)
+    discard_unwritten()
+    os._exit(code if isinstance(code, int) else int(code is not None))
+
+
+def _plugin_threads() -> list[threading.Thread]:
+    """The threads that keep the process from ending."""
+    this = threading.current_thread()
+    return [thread for thread in threading.enumerate() if thread is not this and not thread.daemon]

@@ -1,0 +1,181 @@
+"""The options of `labseq plan` and `labseq waveform`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Final
+
+import typer
+
+from labseq.console.options import JsonFile
+
+if TYPE_CHECKING:
+    from labseq.session import PlanRequest
+
+PLAN_EXAMPLES: Final = """\b
+Examples:
+  labseq plan random:20x20@0.75 --seed 1 --target kagome:15x15 --dop 7
+  labseq plan random:20x20@0.75 --seed 1 --target sierpinski:16x16 --step
+  labseq plan data/2026-11-20/0001_compact-225/shots/shot_000003.h5#2 --png second_cycle.png
+  labseq plan occupancy.npy --target ring:radius=4 --origin 2,3 --json - | jq .n_batches
+"""
+WAVEFORM_EXAMPLES: Final = """\b
+Examples:
+  labseq waveform random:20x20@0.75 --seed 1 --target kagome:15x15 --png waveform.png
+  labseq waveform plan.json --profile lab --batches 1-3 --png begin.png --npz begin.npz
+  labseq plan occupancy.npy --target ring:radius=4 --json - | labseq waveform - --json - | jq .row.peak_v
+"""
+
+Target = Annotated[
+    str | None,
+    typer.Option(
+        metavar="PATTERN:ROWSxCOLS",
+        help="The target, for example kagome:15x15 or ring:radius=4,width=2, or a sequence file whose "
+        "target is used. Default: the target that the shot was taken with.",
+    ),
+]
+Planner = Annotated[str, typer.Option(metavar="NAME", help="The planner.")]
+Dop = Annotated[
+    int | None,
+    typer.Option(
+        metavar="N",
+        help="Degree of parallelism: maximum number of mobile tweezers on at once. Default: the planner's.",
+    ),
+]
+Seed = Annotated[
+    int | None,
+    typer.Option(metavar="N", min=0, help="Seed of 'random:'. Default: a new one, which is printed."),
+]
+Origin = Annotated[
+    str | None,
+    typer.Option(metavar="R,C", help="Row and column of the target's top left site, from 0, as in 2,3."),
+]
+Profile = Annotated[
+    str | None,
+    typer.Option(
+        "--profile",
+        "-p",
+        metavar="NAME|FILE",
+        help="Hardware profile with the grid, the motion and the plugin folders. Default: those of the "
+        "shot file, else the paper's spacing and motion.",
+    ),
+]
+Overrides = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="Change a setting of the planner, or with profile.mobile_tweezers.speed=... a value of the "
+        "profile; may be given several times.",
+    ),
+]
+
+
+def plan(
+    occupancy: Annotated[
+        str,
+        typer.Argument(
+            metavar="OCCUPANCY",
+            help="A .npy file; a text file of 0 and 1, or '-' for such a text on standard input; the shot "
+            "file run/shots/shot_000003.h5#2 (the image that cycle 2 was planned on; default: cycle 1); or "
+            "random:20x20@0.75 (each site filled with that probability).",
+            show_default=False,
+        ),
+    ],
+    target: Target = None,
+    planner: Planner = "psca",
+    dop: Dop = None,
+    seed: Seed = None,
+    origin: Origin = None,
+    profile: Profile = None,
+    overrides: Overrides = None,
+    step: Annotated[
+        bool, typer.Option("--step", help="Show batch by batch; in a terminal, wait for Enter after each.")
+    ] = False,
+    json: JsonFile = None,
+    png: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Draw the plan, with an arrow for each atom move.")
+    ] = None,
+) -> None:
+    """Plan the moves for one occupancy, check the plan as a run does, and print or draw it.
+
+    Batches and cycles are counted from 1, rows and columns from 0.
+    """
+    from labseq.cli.plan import PlanOutput, plan_once
+
+    request = _request(occupancy, target, planner, dop, seed, origin, profile, overrides)
+    plan_once(request, PlanOutput(step=step, json=json, png=png))
+
+
+def waveform(
+    plan: Annotated[
+        str,
+        typer.Argument(
+            metavar="PLAN|OCCUPANCY",
+            help="What 'labseq plan --json' wrote: a file that ends in .json, or '-' for standard input; or "
+            "any OCCUPANCY of 'labseq plan', which is then planned.",
+            show_default=False,
+        ),
+    ],
+    target: Target = None,
+    planner: Planner = "psca",
+    dop: Dop = None,
+    seed: Seed = None,
+    origin: Origin = None,
+    profile: Profile = None,
+    overrides: Overrides = None,
+    batches: Annotated[
+        str | None, typer.Option(metavar="N|M-N", help="Only these batches, counted from 1. Default: all.")
+    ] = None,
+    sample_rate: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FREQUENCY",
+            help='Samples per second, as in "625 MHz". Default: the setting sample_rate of the mobile '
+            "tweezers in the profile, else 625 MHz.",
+        ),
+    ] = None,
+    json: JsonFile = None,
+    png: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Draw spectrogram and envelope of the samples with the intended tones on top.",
+        ),
+    ] = None,
+    npz: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Write the samples and the starts of the batches for numpy."),
+    ] = None,
+) -> None:
+    """Show what the AWG would play for a plan: voltages, powers, spectrogram, samples."""
+    from labseq.bench.waveform import WaveformRequest
+    from labseq.cli.waveform import WaveformOutput, show_waveform
+
+    request = _request(plan, target, planner, dop, seed, origin, profile, overrides)
+    output = WaveformOutput(json=json, png=png, npz=npz)
+    show_waveform(WaveformRequest(request, batches, sample_rate), output)
+
+
+def _request(
+    occupancy: str,
+    target: str | None,
+    planner: str,
+    dop: int | None,
+    seed: int | None,
+    origin: str | None,
+    profile: str | None,
+    overrides: list[str] | None,
+) -> PlanRequest:
+    from labseq.session import PlanRequest
+
+    return PlanRequest(
+        occupancy=occupancy,
+        target=target,
+        planner=planner,
+        degree_of_parallelism=dop,
+        overrides=tuple(overrides or ()),
+        seed=seed,
+        origin=origin,
+        profile=profile,
+    )

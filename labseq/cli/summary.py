@@ -1,0 +1,239 @@
+"""The summary of a run: its points or cycles in a table, and all of it in a few lines."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from datetime import datetime
+from typing import Any, Final
+
+from labseq.analysis.statistics import CycleStatistics, Rate, Statistics, statistics_of
+from labseq.console.text import columns, count_of, plural
+from labseq.messages import clean
+from labseq.model.estimate import Estimate
+from labseq.plain import to_plain
+from labseq.recording import Run
+from labseq.recording.reader import scan_points
+from labseq.units import format_quantity
+
+MAX_ROWS: Final = 40
+"""Rows of a table; of a longer one the first and the last are shown."""
+MAX_LISTED: Final = 5
+"""Reasons, and shots of each, that are listed one by one."""
+MAX_DEFECTS: Final = 6
+"""Shots with at least this many defects are counted together."""
+NOT_JUDGED: Final = "not judged: no image step after the last rearrangement"
+
+
+def summary_lines(run: Run) -> list[str]:
+    """A table of the run's points or cycles, and its statistics. Shots and cycles are counted from 1."""
+    statistics = statistics_of(run.shots, run.target)
+    table = shortened(point_table(run)) or cycle_table(statistics)
+    skipped = f", {len(run.skipped)} skipped" if run.skipped else ""
+    kept = f", {plural(len(run.attempts), 'attempt')} kept that did not complete" if run.attempts else ""
+    rows = [
+        ("run", str(run.path)),
+        ("status", f"{run.status}: {run.error}" if run.status == "failed" else run.status),
+        ("shots", f"{len(run.shots)} of {run.n_shots}{skipped}{kept}"),
+        *_skipped_rows(run),
+        *statistics_rows(statistics),
+        ("duration", _duration(run)),
+    ]
+    if run.n_damaged_lines:
+        rows.append(("warning", f"{plural(run.n_damaged_lines, 'line')} of the index cannot be read"))
+    return [*table, *([""] if table else []), *columns(rows)]
+
+
+def json_summary(run: Run | None) -> dict[str, Any]:
+    """The summary as ``--json`` prints it, with shots counted from 0; None for a run that never started."""
+    if run is None:
+        nothing = {"defect_free": None, "filling_fraction": None}
+        return {"run_dir": None, "shots": 0, **nothing, "status": "failed"}
+    values = run.summary() | {"statistics": statistics_of(run.shots, run.target).as_dict()}
+    if points := json_points(run):
+        values["points"] = points
+    if run.skipped:
+        values["skipped_shots"] = [{"shots": shots, "why": why} for why, shots in _by_reason(run)]
+    return values | ({"error": run.error} if run.error else {})
+
+
+def json_points(run: Run) -> list[dict[str, Any]]:
+    """The points of a scan as ``--json`` prints them."""
+    points = [(point, statistics_of(point.shots, run.target)) for point in scan_points(run)]
+    return [
+        {
+            "parameters": dict(point.parameters),
+            "shots": len(point.shots),
+            "defect_free": to_plain(statistics.defect_free.value),
+            "filling_fraction": to_plain(statistics.filling.value),
+            "statistics": statistics.as_dict(),
+        }
+        for point, statistics in points
+    ]
+
+
+def shortened(table: list[str]) -> list[str]:
+    """The header, the first and the last rows of a long table."""
+    if len(table) - 1 <= MAX_ROWS:
+        return table
+    half = MAX_ROWS // 2
+    return [*table[: half + 1], "...", *table[-half:]]
+
+
+def point_table(run: Run) -> list[str]:
+    """A row per point of the scan; nothing without a scan.
+
+    If no shot is judged, the images that ended the last cycles are.
+    """
+    points = [(point, statistics_of(point.shots, run.target)) for point in scan_points(run)]
+    if not points:
+        return []
+    is_judged = any(statistics.defect_free.n_trials for _, statistics in points)
+    rows: list[tuple[str, ...]] = []
+    for point, statistics in points:
+        shown = statistics if is_judged or not statistics.cycles else statistics.cycles[-1]
+        values = map(clean, point.written.values())
+        rows.append(
+            (*values, str(len(point.shots)), share_text(shown.filling), counted_text(shown.defect_free))
+        )
+    after = "" if is_judged else ", last cycle"
+    header = (*map(clean, points[0][0].written), "shots", f"filling{after}", f"defect-free{after}")
+    return columns([header, *rows], right=range(len(header) - 1))
+
+
+def cycle_table(statistics: Statistics) -> list[str]:
+    """A row per cycle, judged on the image that ended it; nothing without cycles."""
+    if not statistics.cycles:
+        return []
+    header = ("cycle", "shots", "defect-free", "filling", "atom moves", "batches", "left out")
+    lines = columns([header, *map(_cycle_row, statistics.cycles)], right=range(len(header)))
+    if statistics.cycles[-1].n_shots < statistics.cycles[0].n_shots:
+        return [*lines, "each cycle on its own image, without the shots that had ended before it"]
+    return [*lines, "each cycle on its own image"]
+
+
+def _cycle_row(cycle: CycleStatistics) -> tuple[str, ...]:
+    return (
+        str(cycle.cycle),
+        str(cycle.n_shots),
+        rate_text(cycle.defect_free),
+        share_text(cycle.filling),
+        str(cycle.n_atom_moves),
+        str(cycle.n_batches),
+        str(cycle.n_left_out),
+    )
+
+
+def statistics_rows(statistics: Statistics) -> list[tuple[str, str]]:
+    """The results of the shots: name and value of each line."""
+    one = statistics
+    is_judged = bool(one.defect_free.n_trials)
+    rows = [
+        ("defect-free", counted_text(one.defect_free) if is_judged or not one.n_shots else NOT_JUDGED),
+        ("seen defect-free", count_of(one.seen.n, one.seen.n_trials)),
+        ("filling", share_text(one.filling)),
+    ]
+    if one.defects:
+        rows.append(("defects", histogram_text(one.defects)))
+    elif one.cycles and not is_judged:
+        rows.append(("defects", f"{histogram_text(one.cycles[-1].defects)}, after cycle {len(one.cycles)}"))
+    if one.too_short.n:
+        rows.append(("window", f"too short in {count_of(one.too_short.n, one.too_short.n_trials)}"))
+    if one.losses:
+        causes = [f"{cause.replace('_', ' ')} {loss}" for cause, loss in one.losses.items() if loss.value]
+        rows.append(("lost in a shot", ", ".join(causes) or "no atoms"))
+    if not math.isnan(one.defects_true.value):
+        rows.append(("true defects", f"{one.defects_true} in a shot, {one.defects_seen} on its last image"))
+    if one.unreadable:
+        are = "is" if len(one.unreadable) == 1 else "are"
+        damaged = f"{plural(len(one.unreadable), 'shot')} cannot be read and {are} left out"
+        rows.append(("warning", f"{damaged} of cycles and defects: {_numbers(one.unreadable)}"))
+    return rows
+
+
+def rate_text(rate: Rate) -> str:
+    """A rate in per cent, with its interval.
+
+    Example:
+        >>> rate_text(Rate(7, 20)), rate_text(Rate(0, 0))
+        ('35.0 % (25.3 to 46.2)', '-')
+    """
+    if not rate.n_trials:
+        return "-"
+    low, high = rate.interval
+    return f"{100 * rate.value:.1f} % ({100 * low:.1f} to {100 * high:.1f})"
+
+
+def counted_text(rate: Rate) -> str:
+    """A count, its total and its rate, with its interval.
+
+    Example:
+        >>> counted_text(Rate(7, 20)), counted_text(Rate(0, 0))
+        ('7 of 20 (35.0 %), 25.3 to 46.2 %', '0 of 0')
+    """
+    if not rate.n_trials:
+        return count_of(0, 0)
+    low, high = rate.interval
+    return f"{count_of(rate.n, rate.n_trials)}, {100 * low:.1f} to {100 * high:.1f} %"
+
+
+def share_text(fraction: Estimate) -> str:
+    """A mean fraction in per cent.
+
+    Example:
+        >>> share_text(Estimate(0.97664, 0.0004))
+        '97.66(4) %'
+    """
+    text = str(fraction.scaled(100.0))
+    return text if text == "-" else f"{text} %"
+
+
+def histogram_text(counts: Sequence[int]) -> str:
+    """How many shots have how many defects; the highest numbers together if there are many.
+
+    Example:
+        >>> histogram_text((7, 5, 0, 2))
+        'none in 7, 1 in 5, 3 in 2 shots'
+        >>> histogram_text((1,) * 12)
+        'none in 1, 1 in 1, 2 in 1, 3 in 1, 4 in 1, 5 in 1, 6 or more in 6 shots'
+    """
+    apart = len(counts) if len(counts) <= MAX_DEFECTS + 1 else MAX_DEFECTS
+    parts = [f"{n or 'none'} in {count}" for n, count in enumerate(counts[:apart]) if count]
+    if rest := sum(counts[apart:]):
+        parts.append(f"{apart} or more in {rest}")
+    return f"{', '.join(parts)} shots"
+
+
+def _skipped_rows(run: Run) -> list[tuple[str, str]]:
+    """A row for each reason why shots were skipped, with the shots."""
+    groups = _by_reason(run)
+    rows = [
+        ("skipped", f"{'shot' if len(shots) == 1 else 'shots'} {_numbers(shots)}: {clean(why)}")
+        for why, shots in groups[:MAX_LISTED]
+    ]
+    n_more = len(groups) - MAX_LISTED
+    return rows if n_more <= 0 else [*rows, ("", f"and for {plural(n_more, 'other reason')}")]
+
+
+def _by_reason(run: Run) -> list[tuple[str, list[int]]]:
+    """The reasons why shots were skipped, each with its shots counted from 0."""
+    found: dict[str, list[int]] = {}
+    for shot, why in sorted(run.skipped.items()):
+        found.setdefault(why, []).append(shot)
+    return [*found.items()]
+
+
+def _numbers(shots: Sequence[int]) -> str:
+    """The numbers of the first shots, counted from 1."""
+    return ", ".join(str(shot + 1) for shot in shots[:MAX_LISTED]) + (", ..." * (len(shots) > MAX_LISTED))
+
+
+def _duration(run: Run) -> str:
+    """Wall time from the start of the run to the end of its last shot."""
+    ends = [str(shot.row.get("t_end_utc") or "") for shot in (*run.shots, *run.attempts)]
+    try:
+        start = datetime.fromisoformat(str(run.record["t_start_utc"]))
+        duration = max(datetime.fromisoformat(text) for text in ends if text) - start
+    except (KeyError, ValueError, TypeError):  # no shots, or a damaged index
+        return "-"
+    return format_quantity(duration.total_seconds(), "time")

@@ -1,0 +1,167 @@
+"""What happens in a run, as lines of text."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final, TextIO
+
+from labseq.console.output import say
+from labseq.console.text import percent, plural
+from labseq.model import RunRecord, ShotRecord
+from labseq.units import format_quantity
+
+LASTING: Final = frozenset(
+    {"settling", "compiling", "compiled", "warning", "run_starting", "shot_repeated", "safe_state", "closed"}
+)
+"""Events that must stay on the screen above the live view."""
+_LOGGED: Final = LASTING | {"shot_finished", "scan_point", "scan_ended"}
+
+
+class LogLines:
+    """Implements ``RunObserver`` by printing a line per event.
+
+    Args:
+        stream: Where the lines are printed.
+        events: Names of the events that are printed.
+    """
+
+    def __init__(self, stream: TextIO, events: frozenset[str] = _LOGGED) -> None:
+        self._stream = stream
+        self._events = events
+        self._run: RunRecord | None = None
+
+    def event(self, name: str, values: Mapping[str, Any]) -> None:
+        """Print the line of an event, if it has one."""
+        if name == "run_starting":
+            self._run = values["record"]
+        text = event_text(name, values, self._run) if name in self._events else ""
+        if text:
+            say(text, stream=self._stream)
+
+    def refresh(self) -> None:
+        """Do nothing: every line was printed at once."""
+
+    def close(self) -> None:
+        """Do nothing: the terminal was not changed."""
+
+
+def event_text(name: str, values: Mapping[str, Any], run: RunRecord | None) -> str:
+    """Describe an event on one line. Shots, attempts and points are counted from 1.
+
+    Args:
+        name: Name of the event.
+        values: Its values.
+        run: The run, once it is known.
+
+    Returns:
+        "" for an event that is not printed.
+    """
+    match name:
+        case "run_starting":
+            return run_text(values["record"], values["run_dir"], values.get("n_before", 0))
+        case "shot_finished":
+            return shot_text(values["shot"], run)
+        case "shot_repeated":
+            shot: ShotRecord = values["shot"]
+            return (
+                f"shot {shot.shot_index + 1}: attempt {shot.attempt + 1} failed, trying again: {shot.error}"
+            )
+        case "safe_state" | "closed" if not values["ok"]:
+            task = "brought to its safe state" if name == "safe_state" else "closed"
+            return f"warning: {values['device']} could not be {task}: {values['error']}"
+        case "settling":
+            longest = format_quantity(values["timeout_s"], "time")
+            return f"waiting for {values['device']} to settle, at most {longest}"
+        case "compiling":
+            return f"compiling {values['module']}; later runs find it in the cache"
+        case "compiled":
+            return f"compiled in {format_quantity(values['duration_s'], 'time')}"
+        case "warning":
+            return f"warning: {values['text']}"
+        case "window_too_short":
+            where = f"shot {values['shot'] + 1}, cycle {values['cycle']}"
+            return f"{where}: {values['n_batches_played']} of {values['n_batches']} batches fit the window"
+        case "leader_awaited":
+            longest = format_quantity(values["timeout_s"], "time")
+            who, signal = values["device"], values["signal"]
+            return f"shot {values['shot'] + 1}: waiting for '{signal}' from {who}, at most {longest}"
+        case "scan_point":
+            return point_text(values)
+        case "scan_ended":
+            return f"{values['scanner']} needs no more points"
+        case "device_command":
+            return f"shot {values['shot'] + 1}: {values['device']}: {values['command']}"
+        case _:
+            return ""
+
+
+def run_text(run: RunRecord, run_dir: str, n_before: int = 0) -> str:
+    """A line about a run that starts, or resumes after ``n_before`` shots."""
+    simulated = ", simulated" if run.simulated else ""
+    profile = Path(run.profile_path).stem
+    before = f", {n_before} of them taken before" if n_before else ""
+    return f"{run_dir}: {plural(run.n_shots, 'shot')}{before}, seed {run.seed}, profile {profile}{simulated}"
+
+
+def shot_text(shot: ShotRecord, run: RunRecord | None) -> str:
+    """A line about a shot that is over."""
+    of = f"{shot.shot_index + 1}/{run.n_shots}" if run is not None else f"{shot.shot_index + 1}"
+    if shot.status != "complete":
+        return f"shot {of}  {shot.status}" + (f": {shot.error}" if shot.status == "failed" else "")
+    n_atoms = run.target.n_atoms if run is not None else 0
+    parts = [f"shot {of}", outcome(shot.success, shot.seen_defect_free_cycle, shot.filling_fraction, n_atoms)]
+    if not math.isnan(shot.filling_fraction):
+        parts.append(f"filling {percent(shot.filling_fraction)}")
+    if shot.n_missing_atoms:
+        parts.append(f"{plural(shot.n_missing_atoms, 'atom')} too few loaded")
+    duration_s = max((timing.t_start_s + timing.duration_s for timing in shot.timing), default=0.0)
+    return "  ".join([*parts, format_quantity(duration_s, "time")])
+
+
+def outcome(success: bool, seen_cycle: int, filling_fraction: float, n_atoms: int) -> str:
+    """How a shot ended. Cycles are counted from 1.
+
+    Args:
+        success: Whether its last image met the target.
+        seen_cycle: The first cycle whose image met it; 0 for none.
+        filling_fraction: Share of target sites with an atom; nan without an image.
+        n_atoms: Number of target sites.
+
+    Example:
+        >>> outcome(True, 2, 1.0, 225)
+        'defect-free in cycle 2'
+        >>> outcome(False, 3, 0.9955555, 225)
+        '1 defect (defect-free in cycle 3)'
+    """
+    seen = f"defect-free in cycle {seen_cycle}" if seen_cycle else ""
+    if success:
+        return seen or "defect-free"
+    if math.isnan(filling_fraction):
+        return "not judged: no image"
+    n_defects = round((1.0 - filling_fraction) * n_atoms)
+    found = plural(n_defects, "defect") if n_defects else "surplus atoms"
+    return f"{found} ({seen})" if seen else found
+
+
+def point_text(values: Mapping[str, Any]) -> str:
+    """A line about a point of an adaptive scan, and the best one so far."""
+    best = values["best"]
+    at = ", ".join(f"{address} {text}" for address, text in values["written"].items())
+    this = f"point {values['point'] + 1} ({at}): {values['figure']} {_figure(values['value'])}"
+    if best is None:
+        return this
+    return f"{this}; best so far " + ("this" if best["point"] == values["point"] else best_text(values))
+
+
+def best_text(values: Mapping[str, Any]) -> str:
+    """The best point of an adaptive scan so far, without its addresses; "" if there is none."""
+    best = values["best"]
+    if best is None:
+        return ""
+    return f"{_figure(best['value'])}, point {best['point'] + 1} ({', '.join(best['written'].values())})"
+
+
+def _figure(value: float | None) -> str:
+    return "unknown" if value is None else f"{value:.5g}"
