@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any, Final, NamedTuple, NoReturn, TypeAlias, cast
@@ -84,6 +84,15 @@ class Node:
             return [child.plain() for child in self.value]
         return self.value
 
+    def leaves(self, loc: Loc = ()) -> Iterator[tuple[Loc, Node]]:
+        """All scalars in it, each with its location."""
+        if isinstance(self.value, dict | list):
+            steps = self.value.items() if isinstance(self.value, dict) else enumerate(self.value)
+            for step, child in steps:
+                yield from child.leaves((*loc, step))
+        else:
+            yield loc, self
+
     def child(self, step: str | int) -> Node | None:
         """The value of a key or of a list index; None if it is missing."""
         if isinstance(self.value, dict):
@@ -111,25 +120,30 @@ class Node:
             node = child
         return node.mark
 
-    def replaced(self, loc: Loc, new: Node) -> Node:
+    def replaced(self, loc: Loc, new: Node, *, same_key: bool = False) -> Node:
         """A copy with the value at ``loc`` replaced, or added to a mapping.
 
         The parents must exist; an empty parent becomes a mapping.
+
+        Args:
+            loc: Where.
+            new: The new value.
+            same_key: Whether problems of its key still belong to the place where the key is; otherwise they
+                belong to the new value's place: an option that replaces a value gives its key too.
         """
         if not loc:
             return new
         step, rest = loc[0], loc[1:]
         child = self.child(step)
-        inner = (child or Node({}, new.mark)).replaced(rest, new)
+        inner = (child or Node({}, new.mark)).replaced(rest, new, same_key=same_key)
         if isinstance(step, int):
             items = list(self.value) if isinstance(self.value, list) else []
             items[step] = inner
             return Node(items, self.mark)
         values = dict(self.value) if isinstance(self.value, dict) else {}
         values[step] = inner
-        # Where an option replaces or adds a whole value, problems of the key belong to the option too.
-        keys = dict(self.keys) if rest and child is not None else {**self.keys, step: new.mark}
-        return Node(values, self.mark, keys)
+        keeps_key = child is not None and (rest or same_key)
+        return Node(values, self.mark, self.keys if keeps_key else {**self.keys, step: new.mark})
 
 
 @lru_cache(maxsize=8)  # nodes are immutable, and most sessions of a process read the same profile

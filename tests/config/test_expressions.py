@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, strategies as st
 
 from labseq.config import Document, load_sequence
-from labseq.config.expressions import MAX_DEPTH, MAX_LENGTH, POWERS
+from labseq.config.expressions import MAX_LENGTH, MAX_PARTS, POWERS
 from labseq.errors import ConfigError
 from labseq.units import UNITS, parse_any
 
@@ -82,10 +82,10 @@ def test_what_comes_out(text: str, expected: Any) -> None:
 @pytest.mark.parametrize(
     ("text", "told"),
     [
-        ("= 2 * (3 + 4", "16: the expression ends too early; expected an operator or ')'"),
-        ("=", "5: the expression ends too early; expected a number, a name or '('"),
+        ("= 2 * (3 + 4", "11: the '(' that opens here is never closed; expected ')'"),
+        ("=", "5: the expression ends too early; expected a number, an address or '('"),
         ("= 2 *", "9: the expression ends too early"),
-        ("= 2 3", "9: '3' cannot stand here; expected an operator such as '+' or '*'"),
+        ("= 2 3", "9: '3' cannot stand here; expected numbers, addresses, functions, brackets and + - * / **"),
         ("= 2 ms 3", "12: '3' cannot stand here"),
         ("= 2 + 3)", "12: ')' cannot stand here"),
         ("= variables.hold + 5", "22: a time and a number cannot be added; give the number its unit"),
@@ -114,7 +114,7 @@ def test_what_comes_out(text: str, expected: Any) -> None:
         ("= sin(1, 2)", "sin() takes 1 value, not 2"),
         ("= min(1)", "7: min() takes 2 values or more, not 1"),
         ("= sni(1)", "7: there is no function 'sni'; expected one of"),
-        ("= __import__('os')", "7: there is no function '__import__'"),
+        ("= __import__('os')", "18: ''' cannot stand here"),
         ("= variables.n.real", "has no 'real' in it"),
         ("= variables.n.__class__", "has no '__class__' in it"),
         ("= 1 s * 1 s", "5: the result is in s^2, which is no unit of any setting"),
@@ -123,8 +123,8 @@ def test_what_comes_out(text: str, expected: Any) -> None:
         ("= 2 if 1 else 3", "9: 'i' cannot stand here"),
         ("= [1, 2]", "7: '[' cannot stand here"),
         ("= 1; 2", "8: ';' cannot stand here"),
-        (f"= {'(' * 40}1{')' * 40}", f"this is nested more than {MAX_DEPTH} deep"),
-        (f"= {'-' * 100}1", f"this is nested more than {MAX_DEPTH} deep"),
+        (f"= {'-' * 300}1", f"the expression has more than {MAX_PARTS} parts"),
+        (f"= {'(' * 240}1{')' * 240}", "'(' cannot stand here"),
         (f"= {'1 + ' * 200}1", f"the expression has 803 characters; expected at most {MAX_LENGTH}"),
         ("= " + "9" * 400, "this is too large a number"),
     ],
@@ -149,7 +149,7 @@ def test_a_long_chain_ends() -> None:
     chain = "".join(f"v{i}: = v{i + 1}\n" for i in range(40)) + "v40: 7\n"
     assert value("= v0", chain) == 7
     chain = "".join(f"v{i}: = v{i + 1}\n" for i in range(3000)) + "v3000: 7\n"
-    assert "more than 50 expressions refer to each other in a row" in refused("= v0", chain)
+    assert value("= v0", chain) == 7
 
 
 def test_the_place_in_an_option_is_told_by_its_character() -> None:
