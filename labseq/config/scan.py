@@ -100,6 +100,11 @@ class Scan:
         """All axes, in the order written."""
         return tuple(axis for group in self.groups for axis in group)
 
+    def groups_in(self, in_profile: bool) -> list[int]:
+        """Indices of the groups that change values of the profile, or of the sequence."""
+        groups = enumerate(self.groups)
+        return [i for i, group in groups if any(axis.of_profile == in_profile for axis in group)]
+
     def positions(self, point: int) -> tuple[int, ...]:
         """The position in each group that makes a point, counted from 0."""
         return tuple(int(i) for i in np.unravel_index(point, self.shape)) if self.groups else ()

@@ -346,13 +346,14 @@ def resolve(text: str) -> Scalar:
     """
     if text in _WORDS:
         return _WORDS[text]
-    rules = ((_INT, int), (_FLOAT, float), (_OCTAL_OR_HEX, lambda digits: int(digits, 0)))
-    for pattern, convert in rules:
-        if pattern.fullmatch(text):
-            if len(text) > MAX_DIGITS:
-                raise ValueError(f"a number of {len(text)} characters is too long")
-            return convert(text)
-    return text
+    is_int, is_coded = _INT.fullmatch(text), _OCTAL_OR_HEX.fullmatch(text)
+    if not (is_int or is_coded or _FLOAT.fullmatch(text)):
+        return text
+    if len(text) > MAX_DIGITS:
+        raise ValueError(f"a number of {len(text)} characters is too long")
+    if is_coded:
+        return int(text, 0)
+    return int(text, 10) if is_int else float(text)
 
 
 # U+0085, U+2028 and U+2029 are line breaks for PyYAML but for few editors, so

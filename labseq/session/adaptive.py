@@ -22,7 +22,7 @@ from labseq.roles import Scanner, Step
 from labseq.session.construct import construct_one
 from labseq.session.policies import check_figure, missing_figure
 from labseq.session.profile import ChosenPlugin, resolve
-from labseq.session.scan import Point, Scanned
+from labseq.session.scan import Point, ScanPoints
 from labseq.units import written
 
 CLIMBED: Final = "to climb on"
@@ -42,7 +42,7 @@ class Search:
         ranges: What it may choose from.
     """
 
-    scanned: Scanned
+    scanned: ScanPoints
     adaptive: Adaptive
     chosen: ChosenPlugin
     ranges: tuple[ScanRange, ...]
@@ -61,23 +61,16 @@ class Search:
         """What the scanner is constructed with."""
         return ScanSpace(self.ranges, self.adaptive.n_points, self.scanned.scan.repeats, seed)
 
-    def at(
-        self, values: Mapping[str, float], planner: ChosenPlugin, steps: tuple[tuple[str, Step], ...]
-    ) -> Point:
-        """The settings of a point.
-
-        Args:
-            values: Address -> value, SI.
-            planner: The planner where the scan does not change it.
-            steps: The steps where it does not change them.
+    def at(self, values: Mapping[str, float]) -> Point:
+        """The settings of a point, from address -> value, SI.
 
         Raises:
-            ConfigError: What it changes does not take these values.
+            ConfigError: A plugin refuses these values.
         """
         chosen = [values[one.address] for one in self.ranges]
         alone = self.scanned.of(self.scanned.scan.at(chosen))
         try:
-            return alone.at(0, planner, steps)
+            return alone.at(0)
         except ConfigError as error:
             raise alone.scan.explained(error) from None
 
@@ -100,17 +93,14 @@ class Search:
         }
 
 
-def make_search(
-    scanned: Scanned, planner: ChosenPlugin, steps: Steps, found: ProblemCollector
-) -> Search | None:
+def make_search(scanned: ScanPoints, steps: Steps, found: ProblemCollector) -> Search | None:
     """Check what chooses a scan's points; None if nothing does, or something is wrong.
 
     The scanner is constructed once, to see whether it can be.
 
     Args:
         scanned: The scan, its ends checked.
-        planner: The planner where the scan does not change it.
-        steps: Likewise the steps.
+        steps: Name and step, in order.
         found: Where the problems go.
     """
     adaptive = scanned.scan.adaptive
@@ -122,8 +112,8 @@ def make_search(
     chosen: ChosenPlugin | None = None
     with found:
         chosen = resolve(scanned.bench.host, document, "scanner", adaptive.choice, SCANNER_KEYS)
-    low = scanned.at(0, planner, tuple(steps)).parameters
-    high = scanned.at(math.prod(scanned.scan.shape) - 1, planner, tuple(steps)).parameters
+    low = scanned.at(0).parameters
+    high = scanned.at(math.prod(scanned.scan.shape) - 1).parameters
     ranges: list[ScanRange] = []
     for axis, ends in zip(scanned.scan.axes, adaptive.ends, strict=True):
         with found:

@@ -42,7 +42,7 @@ from labseq.session.profile import (
     resolve_profile,
     validate,
 )
-from labseq.session.scan import Point, Scanned
+from labseq.session.scan import Point, ScanPoints
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +72,7 @@ class Assembly:
     steps: tuple[tuple[str, Step], ...]
     dry_run: DryRun
     resolved: Mapping[str, Any]
-    scanned: Scanned | None = None
+    scanned: ScanPoints | None = None
     policy: RunPolicy = field(default_factory=RunPolicy)
     search: Search | None = None
 
@@ -97,7 +97,7 @@ class Assembly:
         """The settings of a point of the scan."""
         if self.scanned is None:
             return Point(self.planner, self.steps, self.bench, {})
-        return self.scanned.at(point, self.planner, self.steps)
+        return self.scanned.at(point)
 
 
 def assemble(
@@ -175,14 +175,15 @@ def _put_together(
     steps, step_dumps = make_steps(bench, document, sequence, found)
     policy = make_policy(document, sequence, steps, found)
     analyses = make_analyses(bench, document, sequence, found)
-    scanned: Scanned | None = None
+    scanned: ScanPoints | None = None
     search: Search | None = None
     try:
         if scan is not None and is_whole:
-            scanned = Scanned(bind_scan(scan, bench.document), document, sequence, bench, dry_run)
+            bound, planner = bind_scan(scan, bench.document), made.get("planner")
+            scanned = ScanPoints(bound, document, sequence, bench, dry_run, planner, tuple(steps))
             scanned.check(found)
             if not found.problems:
-                search = make_search(scanned, made["planner"], steps, found)
+                search = make_search(scanned, steps, found)
         found.raise_any()
     except ConfigError as error:
         raise _explained(error, scan) from None

@@ -296,7 +296,7 @@ class AdaptiveScanRun(ScanRun):
                 values = self._asker.ask(self._results.before(visit))
             point = None
             if values is not None:
-                point = self._search.at(values, self.assembly.planner, self.assembly.steps)
+                point = self._search.at(values)
             self._at = visit, point
         return self._at[1]
 
@@ -323,4 +323,4 @@ def point_of(assembly: Assembly, shot: Shot, course: ScanRun) -> Point:
     if assembly.search is None:
         return assembly.at(course.points[shot.index])
     values = {one.address: shot.row["parameters"][one.address] for one in assembly.search.ranges}
-    return assembly.search.at(values, assembly.planner, assembly.steps)
+    return assembly.search.at(values)

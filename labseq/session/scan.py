@@ -1,16 +1,14 @@
-"""A scan: what each point changes, checked and put together before anything is opened; running it point by point.
+"""The points of a scan: each is a set of overrides, assembled by the same functions as the files.
 
-The points of a scan are many, what they are made of is little: a *part* is the settings
-of one plugin (the planner, a step, a role or device of the profile). A part is validated for
-every combination of the values that go into it, and for no others: what goes into different
-parts cannot contradict each other in a file. Not checked here, but before the run opens
-anything (and by ``labseq check``): whether the constructors accept their settings.
+A scan has many points, but few different settings: a *part* is the settings of one plugin (the planner,
+a step, a role or a device of the profile). A part is validated once for each content that the points
+give it. Constructors are called later, when the run opens or ``labseq check`` asks them.
 """
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Iterator, Mapping
+import json
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
@@ -30,20 +28,20 @@ from labseq.settings import Choice
 from labseq.units import parse_any
 
 MAX_PROBLEMS: Final = 20
-"""Wrong values after which no more are looked for."""
+"""The check of a scan stops after this number of wrong values."""
 
 Part = tuple[bool, Loc]
-"""Whether it is the profile's, and where its settings are."""
+"""Whether the part is in the profile, and where its settings are."""
 
 
 @dataclass(frozen=True, slots=True)
 class PartSettings:
-    """A part with the settings of some of the points.
+    """A part with the values of a point.
 
     Attributes:
         chosen: The plugin; None for a step.
         step: The step; None for everything else.
-        choice: What the profile says of a role.
+        choice: What the profile says of a role; None for planner and steps.
         dump: The settings after defaults, SI, JSON-ready.
     """
 
@@ -71,15 +69,17 @@ class Point:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Scanned:
+class ScanPoints:
     """The points of a run.
 
     Attributes:
         scan: The scan, its axes bound to the profile.
         document: The sequence's file.
-        sequence: What it says.
+        sequence: Its content.
         bench: The profile.
         dry_run: "off", "full" or "fast".
+        planner: The planner if no axis changes it; None if it is wrong.
+        steps: Name and step, in order, if no axis changes them.
     """
 
     scan: Scan
@@ -87,159 +87,133 @@ class Scanned:
     sequence: SequenceSpec
     bench: ResolvedProfile
     dry_run: DryRun
-    _made: dict[tuple[Part, tuple[int, ...]], PartSettings] = field(
-        default_factory=dict[Any, PartSettings], repr=False
-    )
-    _benches: dict[tuple[int, ...], ResolvedProfile] = field(
-        default_factory=dict[Any, ResolvedProfile], repr=False
-    )
+    planner: ChosenPlugin | None
+    steps: tuple[tuple[str, Step], ...]
+    _documents: dict[Any, Document] = field(default_factory=dict[Any, Document], repr=False)
+    _made: dict[Any, PartSettings] = field(default_factory=dict[Any, PartSettings], repr=False)
+    _benches: dict[Any, ResolvedProfile] = field(default_factory=dict[Any, ResolvedProfile], repr=False)
 
     def check(self, found: ProblemCollector) -> None:
-        """Validate every part with every combination of the values that go into it.
+        """Validate the parts with the values of every point.
 
         Args:
-            found: Where the problems go, those of the first :data:`MAX_PROBLEMS` wrong values.
+            found: Receives the problems, those of the first :data:`MAX_PROBLEMS` wrong values.
         """
         try:
-            self._check_following()
+            self._check_dependents()
         except ConfigError as error:
             found.add(error)
             return
-        known, n_wrong = {*self.scan.explained(ConfigError(found.problems)).problems}, 0
-        for part in self._parts():
-            for point in self._points_of(part):
+        known, n_wrong = set(self.scan.explained(ConfigError(found.problems)).problems), 0
+        for in_profile, point in [(side, point) for side in (False, True) for point in self._points(side)]:
+            for part in self._parts():
+                if part[0] != in_profile:
+                    continue
                 try:
                     self._part(part, point)
                 except ConfigError as error:
-                    new = [problem for problem in self.scan.explained(error).problems if problem not in known]
+                    new = [one for one in self.scan.explained(error).problems if one not in known]
                     known.update(new)
                     n_wrong += bool(new)
-                    if new:
-                        found.add(ConfigError(new))
+                    found.problems += new
                 if n_wrong == MAX_PROBLEMS:
                     return
 
-    def at(self, point: int, planner: ChosenPlugin, steps: tuple[tuple[str, Step], ...]) -> Point:
+    def at(self, point: int) -> Point:
         """The settings of a point.
 
-        Args:
-            point: Its index.
-            planner: The planner where the scan does not change it.
-            steps: The steps where it does not change them.
+        Raises:
+            ConfigError: A plugin refuses the values.
         """
         parts = {part: self._part(part, point) for part in self._parts()}
-        changed = list(steps)
-        for (of_profile, loc), made in parts.items():
-            if not of_profile and loc == ("planner",):
-                assert made.chosen is not None
+        planner, steps = self.planner, list(self.steps)
+        for (in_profile, loc), made in parts.items():
+            if not in_profile and made.step is None:
                 planner = made.chosen
-            elif not of_profile:
-                assert made.step is not None
-                number = int(loc[1])
-                changed[number] = (steps[number][0], made.step)
-        parameters = {axis.address: _resolved(axis, node, parts) for axis, node in self.scan.values(point)}
+            elif not in_profile and made.step is not None:
+                steps[int(loc[1])] = (steps[int(loc[1])][0], made.step)
+        assert planner is not None
+        parameters = {axis.address: _value_of(axis, node, parts) for axis, node in self.scan.values(point)}
         for axis in self.scan.axes:
-            for loc in self._following(axis):
+            for loc in self._dependents(axis):
                 part = _part_of(axis.of_profile, loc)
                 parameters[_address(axis.of_profile, loc)] = _value_in(parts[part], part, loc)
-        return Point(planner, tuple(changed), self._bench_at(point, parts), parameters)
+        return Point(planner, tuple(steps), self._bench_at(parts), parameters)
 
-    def of(self, scan: Scan) -> Scanned:
-        """The same with other points."""
-        return Scanned(scan, self.document, self.sequence, self.bench, self.dry_run)
+    def of(self, scan: Scan) -> ScanPoints:
+        """The points of another scan of the same run."""
+        return replace(self, scan=scan, _documents={})
 
     def present(self, axis: Axis) -> Any:
-        """What the files have in the place of an axis, SI; None if that is nothing, or wrong."""
-        base, alone = self.bench.document if axis.of_profile else self.document, replace(self.scan, groups=())
+        """The value of an axis in the files, SI; None if there is none, or it is wrong."""
+        document = self.bench.document if axis.of_profile else self.document
         if axis.loc[0] == VARIABLES:
-            return _si(base.get(axis.loc))
+            return _si(document.get(axis.loc))
         part = _part_of(axis.of_profile, axis.loc)
         try:
-            return _value_in(self.of(alone)._make(part, 0), part, axis.loc)
+            return _value_in(self._make(part, document), part, axis.loc)
         except ConfigError:
             return None
 
-    def _bench_at(self, point: int, parts: Mapping[Part, PartSettings]) -> ResolvedProfile:
-        """The profile at a point; the same object wherever it is the same."""
-        positions = self.scan.positions(point)
-        touched = {g for (of_profile, loc) in parts if of_profile for g in self._groups_of((True, loc))}
+    def _points(self, in_profile: bool) -> list[int]:
+        """A point for each combination of the values that go into one of the two files."""
+        shape, touched = self.scan.shape, self.scan.groups_in(in_profile)
         if not touched:
-            return self.bench
-        key = tuple(positions[g] for g in sorted(touched))
-        if key not in self._benches:
-            chosen, profile = dict(self.bench.chosen), self.bench.profile
-            for (of_profile, loc), made in parts.items():
-                if of_profile:
-                    assert made.chosen is not None
-                    chosen[str(loc[-1])] = made.chosen
-                    if isinstance(made.choice, MobileTweezersChoice):
-                        profile = profile.model_copy(update={"mobile_tweezers": made.choice})
-            self._benches[key] = replace(self.bench, profile=profile, chosen=chosen)
-        return self._benches[key]
+            return []
+        sizes = [n if i in touched else 1 for i, n in enumerate(shape)]
+        return [int(np.ravel_multi_index(positions, shape)) for positions in np.ndindex(*sizes)]
 
     def _parts(self) -> list[Part]:
-        return list(dict.fromkeys(part for axis in self.scan.axes for part in self._parts_of(axis)))
+        """The parts that the scan changes: those of its axes, and of expressions that depend on them."""
+        places = [
+            (axis.of_profile, loc) for axis in self.scan.axes for loc in (axis.loc, *self._dependents(axis))
+        ]
+        return list(dict.fromkeys(_part_of(*place) for place in places if place[1][0] != VARIABLES))
 
-    def _parts_of(self, axis: Axis) -> list[Part]:
-        """What a value goes into: its own part, and those with an expression that follows from it."""
-        own = [] if axis.loc[0] == VARIABLES else [_part_of(axis.of_profile, axis.loc)]
-        following = (_part_of(axis.of_profile, loc) for loc in self._following(axis))
-        return list(dict.fromkeys([*own, *following]))
-
-    def _following(self, axis: Axis) -> list[Loc]:
-        """The settings whose values follow from that of an axis."""
+    def _dependents(self, axis: Axis) -> list[Loc]:
+        """The settings with an expression that depends on an axis."""
         expressions = (self.bench.document if axis.of_profile else self.document).expressions
         found = [] if expressions is None else expressions.following(axis.loc)
         return [loc for loc in found if loc[0] != VARIABLES]
 
-    def _check_following(self) -> None:
-        """Refuse an axis from which nothing follows, or something of which a run has only one."""
+    def _check_dependents(self) -> None:
+        """Refuse an axis on which no setting depends, or a setting that a run has only one of."""
         for axis in self.scan.axes:
-            following, own, name = self._following(axis), clean(axis.address), self.scan.name
-            if axis.loc[0] == VARIABLES and not following:
-                hint = f"write '= {own.removeprefix(PROFILE)}' where it shall count"
+            dependents, own, name = self._dependents(axis), clean(axis.address), self.scan.name
+            if axis.loc[0] == VARIABLES and not dependents:
+                hint = f"write '= {own.removeprefix(PROFILE)}' in the setting that is to follow it"
                 what = f"nothing follows from '{own}'"
                 raise ConfigError(axis.key.problem(name, what, "an expression with it", hint))
-            for loc in following:
+            for loc in dependents:
                 if not _is_part(axis.of_profile, loc):
                     other = clean(_address(axis.of_profile, loc))
                     what = f"'{other}' follows from '{own}', and a scan cannot change it"
                     raise ConfigError(axis.key.problem(name, what, "one value of it for the whole run"))
 
-    def _groups_of(self, part: Part) -> list[int]:
-        """The groups whose values go into a part."""
-        return [
-            g
-            for g, group in enumerate(self.scan.groups)
-            if any(part in self._parts_of(axis) for axis in group)
-        ]
-
-    def _points_of(self, part: Part) -> Iterator[int]:
-        """A point for each combination of what goes into a part; all else as at the first point."""
-        shape, groups = self.scan.shape, self._groups_of(part)
-        for positions in itertools.product(*(range(shape[g]) for g in groups)):
-            whole = [0] * len(shape)
-            for g, position in zip(groups, positions, strict=True):
-                whole[g] = position
-            yield int(np.ravel_multi_index(whole, shape))
+    def _document_at(self, in_profile: bool, point: int) -> Document:
+        """The sequence or the profile with the values of a point."""
+        positions = self.scan.positions(point)
+        key = in_profile, tuple(positions[group] for group in self.scan.groups_in(in_profile))
+        if key not in self._documents:
+            document = self.bench.document if in_profile else self.document
+            self._documents[key] = self.scan.put(document, point, profile=in_profile)
+        return self._documents[key]
 
     def _part(self, part: Part, point: int) -> PartSettings:
-        positions = self.scan.positions(point)
-        key = (part, tuple(positions[g] for g in self._groups_of(part)))
+        document = self._document_at(part[0], point)
+        key = part, json.dumps(document.get(part[1]))
         if key not in self._made:
-            self._made[key] = self._make(part, point)
+            self._made[key] = self._make(part, document)
         return self._made[key]
 
-    def _make(self, part: Part, point: int) -> PartSettings:
-        of_profile, loc = part
-        base = self.bench.document if of_profile else self.document
-        document = self.scan.put(base, point, profile=of_profile)
-        if of_profile:
+    def _make(self, part: Part, document: Document) -> PartSettings:
+        in_profile, loc = part
+        if in_profile:
             return self._make_role(document, loc)
         if loc == ("planner",):
             choice = document.validate(Choice, loc).placed("planner")
             chosen = resolve(self.bench.host, document, "planner", choice)
-            return PartSettings(chosen, None, choice, chosen.dump())
+            return PartSettings(chosen, None, None, chosen.dump())
         step, dumped = make_step(self.bench, document, self.sequence.shot[int(loc[1])])
         return PartSettings(None, step, None, dumped)
 
@@ -260,25 +234,40 @@ class Scanned:
             dumped |= choice.model_dump(mode="json", exclude={"use"})
         return PartSettings(chosen, None, choice, dumped)
 
+    def _bench_at(self, parts: Mapping[Part, PartSettings]) -> ResolvedProfile:
+        """The profile at a point; the same object wherever its parts are the same."""
+        changed = {str(loc[-1]): made for (in_profile, loc), made in parts.items() if in_profile}
+        key = tuple(map(id, changed.values()))
+        if key not in self._benches:
+            chosen, profile = dict(self.bench.chosen), self.bench.profile
+            for name, made in changed.items():
+                assert made.chosen is not None
+                chosen[name] = made.chosen
+                if isinstance(made.choice, MobileTweezersChoice):
+                    profile = profile.model_copy(update={"mobile_tweezers": made.choice})
+            bench = replace(self.bench, profile=profile, chosen=chosen) if changed else self.bench
+            self._benches[key] = bench
+        return self._benches[key]
 
-def _part_of(of_profile: bool, loc: Loc) -> Part:
-    if not of_profile:
+
+def _part_of(in_profile: bool, loc: Loc) -> Part:
+    if not in_profile:
         return False, loc[:1] if loc[0] == "planner" else loc[:3]
     return True, loc[:2] if loc[0] == "devices" else loc[:1]
 
 
-def _is_part(of_profile: bool, loc: Loc) -> bool:
+def _is_part(in_profile: bool, loc: Loc) -> bool:
     """Whether a scan may change a setting."""
-    if of_profile:
+    if in_profile:
         return loc[0] in ROLES or (loc[0] == "devices" and len(loc) > 2)
     return loc[0] == "planner" or (loc[0] == "shot" and len(loc) > 3)
 
 
-def _address(of_profile: bool, loc: Loc) -> str:
-    return ".".join([*((PROFILE.rstrip("."),) if of_profile else ()), *map(str, loc)])
+def _address(in_profile: bool, loc: Loc) -> str:
+    return (PROFILE if in_profile else "") + ".".join(map(str, loc))
 
 
-def _resolved(axis: Axis, node: Node, parts: Mapping[Part, PartSettings]) -> Any:
+def _value_of(axis: Axis, node: Node, parts: Mapping[Part, PartSettings]) -> Any:
     """A scanned value as the plugin understood it, in SI; a mapping as it is written."""
     if axis.loc[0] == VARIABLES:
         return _si(node.plain())
@@ -291,10 +280,10 @@ def _value_in(made: PartSettings, part: Part, loc: Loc) -> Any:
     """A value among the settings of its part; None if there is none."""
     value: Any = made.dump
     for step in loc[len(part[1]) :]:
-        if isinstance(value, list):
-            value = value[step] if isinstance(step, int) and step < len(value) else None  # pyright: ignore[reportUnknownVariableType]
-        else:
-            value = value.get(step) if isinstance(value, dict) else None
+        try:
+            value = value[step]
+        except (KeyError, IndexError, TypeError):
+            return None
     return value
 
 
