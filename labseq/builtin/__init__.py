@@ -14,7 +14,6 @@ LABSEQ_API: Final = _API
 def labseq_register(registry: Registry) -> None:
     """Offer the built-in steps, patterns, detectors and analyses."""
     from labseq.builtin.analyses import SurvivalAnalysis, SurvivalSettings
-    from labseq.builtin.detectors import ThresholdSettings, WeightedSettings
     from labseq.builtin.equalise import EqualiseStep
     from labseq.builtin.patterns import BitmapSettings, CompactSettings
     from labseq.builtin.probes import CheckOverlayStep, CheckSitesStep, ProbeStep
@@ -36,8 +35,8 @@ def labseq_register(registry: Registry) -> None:
         WaitSettings,
         wait_step,
     )
-    from labseq.detection.threshold import BlindDetector, ThresholdDetector
-    from labseq.detection.weighted import WeightedDetector
+    from labseq.detection.threshold import BlindDetector, ThresholdDetector, ThresholdSettings
+    from labseq.detection.weighted import WeightedDetector, WeightedSettings
     from labseq.geometry import bitmap, compact
 
     registry.step("load", LoadStep, LoadSettings)

@@ -30,7 +30,7 @@ Floats = NDArray[np.float64]
 ROUNDS: Final = 30
 SETTLED_M: Final = 0.1e-9
 KNOWN_BEFORE_M: Final = 0.5e-6
-"""How far a row or column may stand from the centre of all, 1 sigma, before anything is measured."""
+"""Expected distance of a row or column from the common centre, 1 sigma, before the measurement."""
 WORST_ERROR_M: Final = 50e-9
 SLOPE_STEP_M: Final = 1e-9
 
@@ -42,7 +42,7 @@ class FrequenciesFit:
     Attributes:
         row_hz: float64 (n_rows,), frequency of each row's tone.
         column_hz: float64 (n_cols,), of each column's.
-        row_offset_m: float64 (n_rows,), how far each row's tweezers stood beside their sites, along a2.
+        row_offset_m: float64 (n_rows,), distance of each row's tweezers from their sites, along a2.
         column_offset_m: float64 (n_cols,), the same for the columns, along a1.
         row_error_m: float64 (n_rows,), standard errors.
         column_error_m: float64 (n_cols,), standard errors.
@@ -71,14 +71,14 @@ def fit_frequencies(
     motion: MotionSpec,
     worst_error_m: float = WORST_ERROR_M,
 ) -> FrequenciesFit:
-    """Find where each row's and each column's tone puts its tweezers, and the tones that put them right.
+    """Find the position of each row's and column's tweezers, and the tones that put them onto the sites.
 
-    The bump of survival is that of all sites (:func:`labseq.motion.fit_overlay`). Its centre on the
+    All sites have the same survival peak (:func:`labseq.motion.fit_overlay`). Its centre on the
     site (i, j) is that of column j along a1 and of row i along a2; all are fitted together by maximum
-    likelihood. Each is then drawn to a parabola through the others of its axis, as much as
-    its own error and the scatter of all about the parabola ask for: one with few atoms takes that
-    of its neighbours. What comes out is where the tones stand altogether, the common part included:
-    an overlay that was made up for in the measurement is no longer needed.
+    likelihood. Each is then shrunk towards a parabola through the others of its axis, by as much as
+    its error and the scatter of all about the parabola require: one with few atoms takes the value
+    of its neighbours. The tones include the common shift, so that the overlay that was corrected
+    in the measurement is no longer needed.
 
     Args:
         offset_m: float64 (n_points, 2), commanded offsets along a1 and a2.
@@ -86,7 +86,7 @@ def fit_frequencies(
         n_survived: int, of the same shape: how many of them were seen afterwards.
         grid: The grid of sites, with the tones that were played.
         motion: How the tweezers move.
-        worst_error_m: Refuse rows and columns that are known less well, on average.
+        worst_error_m: Maximum r.m.s. error of rows and columns.
 
     Raises:
         DeviceError: As :func:`labseq.motion.fit_overlay`, or there are too few atoms for a fit by rows.
@@ -113,12 +113,12 @@ def fit_frequencies(
 
 
 def smoothed(values: Floats, errors: Floats) -> tuple[Floats, Floats]:
-    """Draw measured values to the parabola through all of them, as far as their errors ask for it.
+    """Shrink measured values towards the parabola through all of them, according to their errors.
 
     The scatter about the parabola beyond the errors is found so that chi squared equals its degrees of
-    freedom (Paule and Mandel, J. Res. Natl. Bur. Stand. 87, 377, 1982). A value takes the mean of its own
-    and the parabola's, weighted by the inverse of its error and of that scatter, squared. One that is
-    further than three times both from the parabola stays as it was measured.
+    freedom (Paule and Mandel, J. Res. Natl. Bur. Stand. 87, 377, 1982). Each value becomes the mean of itself
+    and the parabola, weighted by the inverse of its error and of that scatter, squared. One that is
+    further than three times both from the parabola is not changed.
 
     Args:
         values: float64 (n,), in the order of rows or columns.
@@ -149,7 +149,7 @@ def smoothed(values: Floats, errors: Floats) -> tuple[Floats, Floats]:
 
 
 def _through(basis: Floats, values: Floats, variance: Floats) -> tuple[Floats, Floats]:
-    """The curve of least squares at each place, and its variance there."""
+    """The least-squares curve at each place, and its variance there."""
     covariance = np.linalg.inv((basis.T / variance) @ basis)
     curve = basis @ (covariance @ (basis.T @ (values / variance)))
     return curve, ((basis @ covariance) * basis).sum(axis=1)
@@ -158,7 +158,7 @@ def _through(basis: Floats, values: Floats, variance: Floats) -> tuple[Floats, F
 def _centres(
     offset: Floats, n: Floats, k: Floats, overlay: OverlayFit, grid: SiteGrid
 ) -> tuple[Floats, Floats, Floats]:
-    """The centres of columns and rows of greatest likelihood, by Fisher's scoring, and their covariance."""
+    """The most likely centres of columns and rows, by Fisher scoring, and their covariance."""
     common = np.concatenate([np.full(m, c) for m, c in zip(grid.shape[::-1], overlay.centre_m, strict=True)])
     centres, n_cols = common.copy(), grid.n_cols
     spread: Floats = np.zeros((len(centres), len(centres)))

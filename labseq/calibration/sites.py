@@ -10,7 +10,7 @@ import numpy as np
 from labseq.calibration.lattice import FoundLattice, find_lattice
 from labseq.calibration.method import AnalysisResult, CalibrationData
 from labseq.calibration.pictures import draw_sites
-from labseq.detection.drift import FrameAverage
+from labseq.calibration.spots import FrameAverage
 from labseq.detection.sites import read_sites
 from labseq.errors import ConfigError, Problem
 from labseq.session.profile import ResolvedProfile

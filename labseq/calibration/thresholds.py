@@ -1,4 +1,4 @@
-"""Thresholds of the detector: the two peaks of each site's signals."""
+"""Thresholds of the detector, from the two peaks of each site's signals."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Floats = NDArray[np.float64]
 
 N_BINS: Final = 1000
 OUTER: Final = 0.5
-"""Widths from the middle of a peak, on its outer side, beyond which signals are only counted."""
+"""Distance from a peak, on its outer side, beyond which signals are only counted; in its widths."""
 
 FLATTEST: Final = 1e-5
 """Skewness below which a peak is a Gaussian."""
@@ -25,10 +25,11 @@ FLATTEST: Final = 1e-5
 
 @dataclass(frozen=True, slots=True)
 class Peak:
-    """A Pearson type III law: a gamma law moved, scaled, and mirrored if its skewness is below 0.
+    """Pearson type III distribution: a shifted and scaled gamma distribution, mirrored for negative skewness.
 
-    The counts of k photoelectrons behind an EM register follow a gamma law, and those
+    The counts of k photoelectrons after an EM register follow a gamma distribution, and those
     of a Poisson number of them have its skewness and, within an eighth, its excess kurtosis.
+    ``scipy.stats.pearson3`` is ten times slower and less exact where the skewness is small.
 
     Attributes:
         mean: Mean.
@@ -41,14 +42,16 @@ class Peak:
     skewness: float
 
     def log_density(self, at: Floats) -> Floats:
-        """Logarithm of the density; -700 where there is none."""
+        """Logarithm of the density; -700 where the density is 0."""
         from scipy.special import gammaln
 
         z = (at - self.mean) / self.width
         if abs(self.skewness) < FLATTEST:
             return -0.5 * z**2 - np.log(self.width * np.sqrt(2 * np.pi))
         order = 4 / self.skewness**2
-        part = z * np.sign(self.skewness) / np.sqrt(order)  # of the gamma law's mean, from there on
+        part = (
+            z * np.sign(self.skewness) / np.sqrt(order)
+        )  # distance from the mean, in units of the gamma distribution's mean
         inside = np.maximum(part, -1 + 1e-12)
         norm = (order - 0.5) * np.log(order) - order - gammaln(order)
         if order > 1e4:
@@ -57,7 +60,7 @@ class Peak:
         return np.where(part > -1, np.maximum(log_p, -700.0), -700.0)
 
     def below(self, at: Floats) -> Floats:
-        """Probability of less."""
+        """Probability of a smaller signal."""
         from scipy.special import gammainc, gammaincc, ndtr
 
         z = (at - self.mean) / self.width
@@ -68,22 +71,22 @@ class Peak:
         return gammainc(order, rising) if self.skewness > 0 else gammaincc(order, rising)
 
     def above(self, at: Floats) -> Floats:
-        """Probability of more."""
+        """Probability of a larger signal."""
         return Peak(-self.mean, self.width, -self.skewness).below(-at)
 
     def widened(self, factor: float) -> Peak:
-        """The same with another width."""
+        """The same peak with another width."""
         return Peak(self.mean, self.width * factor, self.skewness)
 
 
 @dataclass(frozen=True, slots=True)
 class Shapes:
-    """The law of signals that are 0 in the middle of a site's lower peak and 1 in that of its upper.
+    """The distribution of signals scaled to 0 at a site's lower peak and 1 at its upper peak.
 
     Attributes:
         empty: The lower peak.
         full: The upper peak.
-        between: Fraction of the signals that lie anywhere between: atoms lost during the exposure.
+        between: Fraction of the signals spread evenly between the peaks: atoms lost during the exposure.
     """
 
     empty: Peak
@@ -92,14 +95,14 @@ class Shapes:
 
 
 def fit_shapes(signals: Floats, loading: float, width_empty: float, width_full: float) -> Shapes:
-    """Fit two peaks and a floor between them by maximum likelihood.
+    """Fit two peaks and a constant between them by maximum likelihood.
 
-    The floor keeps the atoms that are lost during the exposure, which shine for a
-    part of it, from making the tails of the peaks too long. On the outer side of each
-    peak signals are only counted, for it is the inner sides that must be right.
+    Atoms lost during the exposure shine for a part of it. The constant describes them;
+    without it they would lengthen the tails of the peaks. On the outer side of each
+    peak signals are only counted, because the errors depend on the inner sides.
 
     Args:
-        signals: float64 (n,), 0 and 1 in the middle of the peaks.
+        signals: float64 (n,), scaled to 0 and 1 at the peaks.
         loading: Fraction in the upper peak, roughly.
         width_empty: Width of the lower peak, roughly.
         width_full: Width of the upper peak, roughly.
@@ -163,28 +166,28 @@ Bools = NDArray[np.bool_]
 MIN_FRAMES: Final = 30
 MIN_IN_PEAK: Final = 5
 APART: Final = 3.0
-"""Least distance of two peaks, in their joint widths; a single peak cut in two has 2."""
+"""Minimum distance of two peaks, in their combined widths; a single peak cut in two has 2."""
 
 FAINT: Final = 0.4
-"""Least distance of a site's peaks, of the usual."""
+"""Minimum distance of a site's peaks, relative to the usual distance."""
 
 MAX_ONE_PEAK: Final = 0.2
-"""Most sites with one peak, of all."""
+"""Maximum fraction of sites with one peak."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FittedThresholds:
-    """Thresholds of the sites, and what is expected of them.
+    """Thresholds of the sites, and their expected errors.
 
     Attributes:
         thresholds: float64 (n_rows, n_cols), in the unit of the signals.
         false_negative: float64 (n_rows, n_cols), probability that an atom is missed.
         false_positive: float64 (n_rows, n_cols), probability that an empty site is taken for full.
         loading: float64 (n_rows, n_cols), fraction of the frames above the threshold.
-        never_loaded: bool (n_rows, n_cols), sites with the lower peak alone; their threshold has
+        never_loaded: bool (n_rows, n_cols), sites with the lower peak only; their threshold has
             the usual distance from it.
-        always_loaded: bool (n_rows, n_cols), sites with the upper peak alone; theirs stands
-            between the usual lower peak and their upper.
+        always_loaded: bool (n_rows, n_cols), sites with the upper peak only; their threshold is
+            between the usual lower peak and their upper one.
         lost: Fraction of the signals between the peaks: atoms lost during the exposure.
     """
 
@@ -204,7 +207,7 @@ class FittedThresholds:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _SitePeaks:
-    """Where the peaks of each site are; float64 (n_sites,) but for ``two``."""
+    """The peaks of each site, float64 (n_sites,); ``two``: whether it has both, bool (n_sites,)."""
 
     empty: Floats
     full: Floats
@@ -218,22 +221,21 @@ class _SitePeaks:
 def fit_thresholds(signals: Floats, miss_cost: float = 3.0, detector: str = "detector") -> FittedThresholds:
     """Fit the two peaks of each site and put the threshold where errors cost least.
 
-    All sites share the shape of the peaks, for the errors are in tails that a site
-    shows once in thousands of frames. Places and widths are each site's own, drawn
-    towards those of all by as much as chance explains (James and Stein, Proc. 4th
+    All sites share the shape of the peaks, because the errors are in tails that a site
+    shows once in thousands of frames. Each site has its own positions and widths, shrunk
+    towards the mean of all sites by as much as chance explains (James and Stein, Proc. 4th
     Berkeley Symp. 1, 361, 1961).
 
     Args:
         signals: float64 (n_frames, n_rows, n_cols), what the detector compares, from
             frames of randomly loaded atoms.
-        miss_cost: What a missed atom costs, in imagined ones. A second atom is sent onto a
-            missed one and both are lost, which leaves a site empty; an imagined atom
-            leaves one empty.
+        miss_cost: Cost of a missed atom, relative to an imagined one. A second atom is moved onto
+            a missed one and both are lost; an imagined atom leaves its site empty.
         detector: Its name, for messages.
 
     Raises:
         LimitError: Fewer than 30 frames, or a cost that is not above 0.
-        DeviceError: More than 20 % of the sites show one peak only.
+        DeviceError: A signal is not finite, or more than 20 % of the sites show one peak only.
     """
     n_frames, *shape = signals.shape
     if n_frames < MIN_FRAMES:
@@ -265,14 +267,14 @@ def fit_thresholds(signals: Floats, miss_cost: float = 3.0, detector: str = "det
 
 
 def _site_peaks(by_site: Floats) -> _SitePeaks:
-    """Cut each site's signals in two, again and again in the middle of the two parts' middles."""
+    """Divide each site's signals in two; repeatedly, midway between the medians of both parts."""
     low, high = np.quantile(by_site, [0.02, 0.98], axis=1)
     cut = (low + high) / 2
     for _ in range(12):
         empty = _middle(by_site, by_site <= cut[:, None])
         full = _middle(by_site, by_site > cut[:, None])
         cut = np.where(np.isfinite(empty + full), (empty + full) / 2, cut)
-    parts = [_described(by_site, part) for part in (by_site <= cut[:, None], by_site > cut[:, None])]
+    parts = [_moments(by_site, part) for part in (by_site <= cut[:, None], by_site > cut[:, None])]
     (empty, width_empty, n_empty), (full, width_full, n_full) = parts
     apart = (full - empty) / np.maximum(np.hypot(width_empty, width_full), 1e-300)
     few = np.minimum(n_empty, n_full) < max(MIN_IN_PEAK, 0.02 * by_site.shape[1])
@@ -289,8 +291,8 @@ def _middle(by_site: Floats, part: Bools) -> Floats:
     return np.where(counts > 0, middle, np.nan)
 
 
-def _described(by_site: Floats, part: Bools) -> tuple[Floats, Floats, Floats]:
-    """Mean and standard deviation without what is far off, and how many there are."""
+def _moments(by_site: Floats, part: Bools) -> tuple[Floats, Floats, Floats]:
+    """Mean and standard deviation without outliers, and the number of signals."""
     middle = _middle(by_site, part)
     off = np.abs(by_site - middle[:, None])
     near = part & (off < 4 * 1.4826 * _middle(off, part)[:, None] + 1e-12)
@@ -313,14 +315,15 @@ def _check_enough(two: Bools, by_site: Floats, detector: str) -> None:
 
 
 def _with_single_peaks(peaks: _SitePeaks, by_site: Floats) -> tuple[_SitePeaks, Bools, Bools]:
-    """Peaks drawn towards those of all; a site with one peak gets the other from all."""
+    """Shrink the peaks towards the mean of all; a site with one peak gets the other from all."""
     two = peaks.two
-    empty = _drawn(peaks.empty, peaks.width_empty / np.sqrt(np.maximum(peaks.n_empty, 1)), two)
-    full = _drawn(peaks.full, peaks.width_full / np.sqrt(np.maximum(peaks.n_full, 1)), two)
-    width_empty = _drawn(
-        peaks.width_empty, peaks.width_empty * 0.85 / np.sqrt(np.maximum(peaks.n_empty, 1)), two
+    error_empty, error_full = (
+        width / np.sqrt(np.maximum(n, 1))
+        for width, n in ((peaks.width_empty, peaks.n_empty), (peaks.width_full, peaks.n_full))
     )
-    width_full = _drawn(peaks.width_full, peaks.width_full * 0.85 / np.sqrt(np.maximum(peaks.n_full, 1)), two)
+    empty, full = _shrunk(peaks.empty, error_empty, two), _shrunk(peaks.full, error_full, two)
+    width_empty = _shrunk(peaks.width_empty, 0.85 * error_empty, two)
+    width_full = _shrunk(peaks.width_full, 0.85 * error_full, two)
     usual_empty, usual_full = np.median(peaks.empty[two]), np.median(peaks.full[two])
     middle = np.median(by_site, axis=1)
     always = ~two & (np.abs(middle - usual_full) < np.abs(middle - usual_empty))
@@ -330,13 +333,13 @@ def _with_single_peaks(peaks: _SitePeaks, by_site: Floats) -> tuple[_SitePeaks, 
     return _SitePeaks(empty, full, width_empty, width_full, peaks.n_empty, peaks.n_full, two), never, always
 
 
-def _drawn(values: Floats, chance: Floats, known: Bools) -> Floats:
-    """Values drawn towards their mean by as much as chance explains, at most by its standard deviation."""
+def _shrunk(values: Floats, chance: Floats, known: Bools) -> Floats:
+    """Shrink values towards their median by as much as chance explains, by 1.5 standard errors at most."""
     mean = float(np.median(values[known]))
     spread = 1.4826 * float(np.median(np.abs(values[known] - mean)))
     real = max(0.0, spread**2 - float(np.median(chance[known] ** 2)))
-    drawn = mean + (values - mean) * real / np.maximum(real + chance**2, 1e-300)
-    return np.where(known, np.clip(drawn, values - 1.5 * chance, values + 1.5 * chance), mean)
+    shrunk = mean + (values - mean) * real / np.maximum(real + chance**2, 1e-300)
+    return np.where(known, np.clip(shrunk, values - 1.5 * chance, values + 1.5 * chance), mean)
 
 
 def _common_shapes(by_site: Floats, places: _SitePeaks, two: Bools) -> Shapes:
@@ -349,7 +352,7 @@ def _common_shapes(by_site: Floats, places: _SitePeaks, two: Bools) -> Shapes:
 def _cheapest(
     shapes: Shapes, ratio_empty: Floats, ratio_full: Floats, miss_cost: float
 ) -> tuple[Floats, Floats, Floats]:
-    """Threshold of each site between 0 and 1, and both probabilities of error there."""
+    """Threshold of each site between 0 and 1, and the probabilities of a missed and of an imagined atom."""
     at = np.linspace(0.02, 0.98, 1921)
     steps = np.exp(np.linspace(np.log(0.5), np.log(2.0), 57))
     imagined = np.stack([shapes.empty.widened(step).above(at) for step in steps])

@@ -7,9 +7,6 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.errors import DeviceError
-from labseq.model import Frame
-
 Floats = NDArray[np.float64]
 
 FURTHEST_PX: Final = 3.0
@@ -31,11 +28,11 @@ class Shift(NamedTuple):
 
 
 def measure_shift(image: NDArray[Any], positions_px: Floats, spot_px: float) -> Shift:
-    """Measure how far the spots stand beside their calibrated places, all together.
+    """Measure the common shift of the spots from their calibrated positions.
 
-    The light around each site is weighed by a Gaussian as wide as the spot; the
-    weight's middle, the same for all sites, is moved until the mean moment about
-    it is 0. There a background counts for nothing. Sites that are dark, or three
+    The light around each site is weighted by a Gaussian as wide as the spot. The
+    centre of the weights, the same for all sites, is moved until the mean moment about
+    it is 0. A uniform background does not contribute there. Dark sites, and those three
     times as bright as the others, are left out.
 
     Args:
@@ -44,7 +41,7 @@ def measure_shift(image: NDArray[Any], positions_px: Floats, spot_px: float) -> 
         spot_px: Width of the spots (1 sigma).
 
     Returns:
-        The shift, good for 2 pixels, and 3 at most.
+        The shift: accurate up to 2 pixels, 3 pixels at most.
     """
     sites = positions_px.reshape(-1, 2)
     half = int(np.ceil(FURTHEST_PX + 2.5 * spot_px))
@@ -61,7 +58,7 @@ def measure_shift(image: NDArray[Any], positions_px: Floats, spot_px: float) -> 
         total = light[lit].sum()
         if not total > 0:
             return Shift(0.0, 0.0, float("inf"))
-        step = 2 * moments[lit].sum(axis=0) / total  # a weight as wide as the spot goes half way
+        step = 2 * moments[lit].sum(axis=0) / total  # a weight as wide as the spot gives half of the shift
         error = 2 * float(np.sqrt((moments[lit] ** 2).sum() / 2)) / total
         shift = np.clip(shift + np.clip(step, -1.0, 1.0), -FURTHEST_PX, FURTHEST_PX)
         if np.abs(step).max() < 1e-3:
@@ -84,52 +81,3 @@ def _lit(light: Floats) -> NDArray[np.bool_]:
     dark, bright = np.quantile(light, [0.02, 0.97])
     lit = light > (dark + bright) / 2
     return lit & (light < 3 * np.median(light[lit])) if lit.any() else lit
-
-
-class FrameAverage:
-    """Adds frames up.
-
-    Args:
-        camera: Name of the camera, for messages.
-
-    Example:
-        >>> import numpy as np
-        >>> average = FrameAverage()
-        >>> for counts in (100, 200):
-        ...     average.add(Frame(np.full((2, 3), counts, np.uint16), 0.045, 0.0))
-        >>> average.n_frames, average.image[0].tolist()
-        (2, [150.0, 150.0, 150.0])
-    """
-
-    def __init__(self, camera: str = "camera") -> None:
-        self._camera = camera
-        self._sum: NDArray[np.float64] | None = None
-        self.n_frames = 0
-
-    @property
-    def image(self) -> NDArray[np.float64]:
-        """Mean counts, float64 (height, width).
-
-        Raises:
-            DeviceError: There is no frame yet.
-        """
-        if self._sum is None:
-            raise DeviceError(self._camera, "no frame was taken, so that there is no average")
-        return self._sum / self.n_frames
-
-    def add(self, frame: Frame) -> None:
-        """Add a frame.
-
-        Raises:
-            DeviceError: It is of another size than those before.
-        """
-        if self._sum is None:
-            self._sum = np.zeros(frame.image.shape)
-        if frame.image.shape != self._sum.shape:
-            raise DeviceError(
-                self._camera,
-                f"frame {self.n_frames} has {frame.image.shape} pixels, those before {self._sum.shape}; "
-                "leave the camera's crop as it is during a calibration",
-            )
-        self._sum += frame.image
-        self.n_frames += 1

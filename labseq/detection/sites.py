@@ -1,20 +1,66 @@
-"""Site positions on the camera, regions around them, and the light they collect."""
+"""Positions of the sites on the camera, and the light in a region around each."""
 
 from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Annotated, Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field, PositiveInt, field_validator
 
 from labseq.errors import ConfigError, DeviceError, LimitError
-from labseq.model import CalibrationEntry, Frame, SiteGrid
+from labseq.model import Frame, SiteGrid
 from labseq.model.arrays import read_only
+from labseq.roles import Context
+from labseq.settings import Angle, FilePath, Length, Settings
+
+Floats = NDArray[np.float64]
+
+PositiveLength = Annotated[Length, Field(gt=0)]
+Thresholds: TypeAlias = float | FilePath | tuple[tuple[float, ...], ...]
+"""One number for all sites, one for each, or the path of a .npy file with one for each."""
+
+COLUMNS: Final = ("row", "col", "y", "x")
+
+
+class RegionSettings(Settings):
+    """Where the sites are on the frames.
+
+    The file in `sites` takes precedence over the calibration of sites in use, and that
+    over the geometry set here.
+    """
+
+    sites: FilePath | None = Field(
+        default=None,
+        description="file with the place of each site, for an irregular array: .npy of (y, x), shape "
+        "[rows, cols, 2], or .csv with the columns row, col, y, x; in pixels",
+    )
+    frame: tuple[PositiveInt, PositiveInt] = Field(
+        default=(512, 512),
+        description="[height, width] in pixels of the frames that `sites` and `centre_px` belong to",
+    )
+    centre_px: tuple[float, float] = Field(
+        default=(255.5, 255.5),
+        description="[y, x] of the grid's centre in pixels; whole numbers are the middles of pixels",
+    )
+    pixel_size: PositiveLength = Field(
+        default=0.35e-6, description="size of a camera pixel in the atom plane"
+    )
+    angle: Angle = Field(default=0.0, description="rotation of the grid on the frame, clockwise")
+    region: PositiveInt = Field(
+        default=5, description="width of the region of interest around each site, in pixels; odd"
+    )
+
+    @field_validator("region")
+    @classmethod
+    def _region_is_odd(cls, region: int) -> int:
+        if region % 2 == 0:
+            raise ValueError(f"{region} is even; a region has a pixel in its middle: choose {region + 1}")
+        return region
 
 
 def site_pixels(
@@ -45,59 +91,6 @@ def site_pixels(
     return np.stack([y_px, x_px], axis=-1)
 
 
-Floats = NDArray[np.float64]
-
-COLUMNS: Final = ("row", "col", "y", "x")
-
-
-class ContextLike(Protocol):
-    """What a detector needs of a ``labseq.Context``."""
-
-    @property
-    def name(self) -> str:
-        """Role in the profile."""
-        ...
-
-    @property
-    def grid(self) -> SiteGrid:
-        """The grid of sites."""
-        ...
-
-    @property
-    def calibrations(self) -> Mapping[str, CalibrationEntry]:
-        """Calibrations in use: kind -> entry."""
-        ...
-
-
-class GeometryLike(Protocol):
-    """Where the sites are on the frames; SI and pixels."""
-
-    @property
-    def sites(self) -> Path | None:
-        """File with the place of each site; None for none."""
-        ...
-
-    @property
-    def frame(self) -> tuple[int, int]:
-        """(height, width) of the frames that file and geometry belong to."""
-        ...
-
-    @property
-    def centre_px(self) -> tuple[float, float]:
-        """(y, x) of the grid's centre."""
-        ...
-
-    @property
-    def pixel_size(self) -> float:
-        """Size of a pixel in the atom plane, in metres."""
-        ...
-
-    @property
-    def angle(self) -> float:
-        """Rotation of the grid, in radians, clockwise on the screen."""
-        ...
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class KnownSites:
     """Where the sites are.
@@ -105,8 +98,8 @@ class KnownSites:
     Attributes:
         positions_px: float64 (n_rows, n_cols, 2), (y, x) of each site in pixels; read-only.
         frame: (height, width) of the frames that they belong to.
-        source: Who says so, in words: "the calibration of sites a1b2c3d4e5f6".
-        mend: What to do if they do not fit.
+        source: Where they come from, for messages: "the calibration of sites a1b2c3d4e5f6".
+        remedy: What to do if they do not match the frames.
     """
 
     positions_px: Floats
@@ -119,15 +112,15 @@ class KnownSites:
         object.__setattr__(self, "positions_px", positions)
 
 
-def known_sites(settings: GeometryLike, context: ContextLike) -> KnownSites:
-    """Where the sites are: by the file in ``sites``, else by the calibration in use, else by the geometry.
+def known_sites(settings: RegionSettings, context: Context) -> KnownSites:
+    """The sites from the file in ``sites``, else from the calibration in use, else from the geometry.
 
     Args:
-        settings: See :class:`GeometryLike`.
+        settings: Settings of the detector.
         context: Grid and calibrations.
 
     Raises:
-        ConfigError: The file cannot be read, or has not one place for each site.
+        ConfigError: The file cannot be read, or does not have one position for each site.
     """
     if settings.sites is not None:
         return KnownSites(
@@ -154,19 +147,19 @@ def known_sites(settings: GeometryLike, context: ContextLike) -> KnownSites:
 
 
 def read_sites(path: Path, shape: tuple[int, int]) -> Floats:
-    """Read the places of the sites of an irregular array.
+    """Read the positions of the sites of an irregular array.
 
     Args:
         path: A .npy file of floats (n_rows, n_cols, 2) with (y, x) in pixels, or a
-            table in text with the columns row, col, y and x, named in its first
-            line and separated by commas, and a line for each site.
+            text file with the columns row, col, y and x, named in its first line
+            and separated by commas, and one line for each site.
         shape: (n_rows, n_cols) of the grid.
 
     Returns:
         float64 (n_rows, n_cols, 2).
 
     Raises:
-        ConfigError: It cannot be read, or has not one place for each site.
+        ConfigError: It cannot be read, or does not have one position for each site.
     """
     try:
         positions = _array(path) if path.suffix == ".npy" else _table(path, shape)
@@ -202,29 +195,18 @@ def _table(path: Path, shape: tuple[int, int]) -> Floats:
                 row, col = int(line["row"]), int(line["col"])
                 place = float(line["y"]), float(line["x"])
             except (TypeError, ValueError):
-                raise ValueError(f"line {table.line_num} has not four numbers") from None
+                raise ValueError(f"line {table.line_num} does not have four numbers") from None
             if not (0 <= row < shape[0] and 0 <= col < shape[1]):
                 raise ValueError(
                     f"line {table.line_num} is of site ({row}, {col}), which the grid does not have"
                 )
             if not np.isnan(positions[row, col, 0]):
-                raise ValueError(
-                    f"line {table.line_num} is of site ({row}, {col}), which stands above already"
-                )
+                raise ValueError(f"line {table.line_num} is of site ({row}, {col}), like an earlier line")
             positions[row, col] = place
     left = np.argwhere(np.isnan(positions[..., 0]))
     if len(left):
         raise ValueError(f"{len(left)} sites are missing, ({left[0, 0]}, {left[0, 1]}) among them")
     return positions
-
-
-class RegionsLike(GeometryLike, Protocol):
-    """Where the sites are on the frames, and how wide a square of pixels each has; SI and pixels."""
-
-    @property
-    def region(self) -> int:
-        """Width of the square of pixels, odd."""
-        ...
 
 
 def region_corners(known: KnownSites, region: int) -> NDArray[np.int64]:
@@ -248,7 +230,7 @@ def region_corners(known: KnownSites, region: int) -> NDArray[np.int64]:
         y, x = corners[first]
         last = region - 1
         raise LimitError(
-            f"the region of interest of site ({row}, {col}), by {known.source},",
+            f"the region of interest of site ({row}, {col}), according to {known.source},",
             f"rows {y} to {y + last} and columns {x} to {x + last} of the frame",
             f"a frame of {height} x {width} pixels",
             f"{known.remedy}; or take a smaller `region`",
@@ -267,8 +249,8 @@ def checked_image(frame: Frame, known: KnownSites, name: str) -> NDArray[np.uint
         height, width = known.frame
         raise DeviceError(
             name,
-            f"the frame is {image.dtype} {image.shape}; by {known.source} the sites are on uint16 frames of "
-            f"({height}, {width}); {known.remedy}",
+            f"the frame is {image.dtype} {image.shape}; according to {known.source}, the sites are on "
+            f"uint16 frames of ({height}, {width}); {known.remedy}",
         )
     return image
 
@@ -300,7 +282,7 @@ def spot_light(
 
 
 def pairs_within(positions: NDArray[np.float64], distance: float) -> NDArray[np.int64]:
-    """Ordered pairs of different points within a distance, int64 (n_pairs, 2), by the first.
+    """Ordered pairs of different points within a distance, int64 (n_pairs, 2), sorted by the first.
 
     Args:
         positions: float64 (n, 2).

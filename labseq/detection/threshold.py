@@ -1,51 +1,86 @@
-"""The threshold detector."""
+"""The threshold detector, and the base of detectors that compare a signal with a threshold."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
-from typing import ClassVar, Literal, Protocol, TypeAlias
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field, PositiveFloat
 
-from labseq.detection.sites import (
-    ContextLike,
-    KnownSites,
-    RegionsLike,
-    checked_image,
-    known_sites,
-    region_corners,
-)
+from labseq.detection.sites import RegionSettings, Thresholds, checked_image, known_sites, region_corners
 from labseq.errors import ConfigError, LimitError
 from labseq.model import Frame, Occupancy
-
-PerSite: TypeAlias = float | str | Path | Sequence[Sequence[float]]
-"""One number for all sites, one for each, or the path of a .npy file with one for each."""
+from labseq.roles import Context
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class KnownThresholds:
-    """The thresholds.
+class ComparingDetector(ABC):
+    """Base of detectors: there is an atom where the signal exceeds the site's threshold.
 
-    Attributes:
-        values: float64 (n_rows, n_cols), in the detector's unit.
-        source: Who says so, in words.
+    Args:
+        settings: Where the sites are.
+        threshold: Threshold of each site, unless a calibration of thresholds is in use.
+        width: Distance from the threshold at which the confidence is tanh(1) = 0.76.
+        context: Grid, calibrations and name.
+
+    Raises:
+        LimitError: A region extends over the edge of the frame, or the thresholds do
+            not have one value per site.
+        ConfigError: A file cannot be read, or the calibrated thresholds are of another unit.
     """
 
-    values: NDArray[np.float64]
-    source: str
+    signal_unit: ClassVar[str]
+
+    def __init__(
+        self, settings: RegionSettings, threshold: Thresholds, width: float, context: Context
+    ) -> None:
+        self._name = context.name or "detector"
+        self._width = width
+        self._known = known_sites(settings, context)
+        self._corners = region_corners(self._known, settings.region)
+        self._thresholds, self._thresholds_source = known_thresholds(threshold, self.signal_unit, context)
+
+    @property
+    def sites_px(self) -> NDArray[np.float64]:
+        """(y, x) of each site in pixels, float64 (n_rows, n_cols, 2)."""
+        return self._known.positions_px
+
+    def describe(self) -> Mapping[str, str]:
+        """Where its sites and thresholds come from."""
+        return {"sites": self._known.source, "thresholds": self._thresholds_source}
+
+    def detect(self, frame: Frame) -> tuple[Occupancy, NDArray[np.float32]]:
+        """Find the atoms.
+
+        Returns:
+            The occupancy, bool (n_rows, n_cols), and the confidence per site,
+            float32 (n_rows, n_cols), 0 at the threshold and 1 for certainty.
+
+        Raises:
+            DeviceError: The frame is not of the size that the sites belong to.
+        """
+        distance = self.signals(frame) - self._thresholds
+        confidence = np.tanh(np.abs(distance) / self._width).astype(np.float32)
+        return distance > 0.0, confidence
+
+    @abstractmethod
+    def signals(self, frame: Frame) -> NDArray[np.float64]:
+        """The signals that are compared with the thresholds, float64 (n_rows, n_cols)."""
 
 
-def known_thresholds(threshold: PerSite, unit: str, context: ContextLike) -> KnownThresholds:
-    """The thresholds by the calibration in use, else by the settings.
+def known_thresholds(threshold: Thresholds, unit: str, context: Context) -> tuple[NDArray[np.float64], str]:
+    """The thresholds of the calibration in use, else of the settings.
 
     Args:
         threshold: The setting.
         unit: What the detector compares: "counts" or "log-odds".
         context: Grid and calibrations.
+
+    Returns:
+        float64 (n_rows, n_cols), in the detector's unit, and where they come from, for messages.
 
     Raises:
         LimitError: Not one finite value per site.
@@ -54,17 +89,17 @@ def known_thresholds(threshold: PerSite, unit: str, context: ContextLike) -> Kno
     entry = context.calibrations.get("thresholds")
     if entry is None:
         source = "the detector's settings" if not isinstance(threshold, str | Path) else str(threshold)
-        return KnownThresholds(site_thresholds(threshold, context.grid.shape), source)
+        return site_thresholds(threshold, context.grid.shape), source
     theirs = entry.origin.get("unit", unit)
     if theirs != unit:
         raise ConfigError(
-            f"the calibration of thresholds {entry.id} is in {theirs}, and the detector compares {unit}; "
+            f"the calibration of thresholds {entry.id} is in {theirs}, but the detector compares {unit}; "
             "calibrate the thresholds with this detector, or take another calibration, or `off`"
         )
-    return KnownThresholds(entry.values["thresholds"], f"the calibration of thresholds {entry.id}")
+    return entry.values["thresholds"], f"the calibration of thresholds {entry.id}"
 
 
-def site_thresholds(threshold: PerSite, shape: tuple[int, int]) -> NDArray[np.float64]:
+def site_thresholds(threshold: Thresholds, shape: tuple[int, int]) -> NDArray[np.float64]:
     """One threshold per site, float64 (n_rows, n_cols).
 
     Raises:
@@ -102,83 +137,25 @@ def _load(path: Path) -> NDArray[np.float64]:
         ) from error
 
 
-class ComparingLike(RegionsLike, Protocol):
-    """Settings of :class:`ComparingDetector`."""
+class ThresholdSettings(RegionSettings):
+    """A region of interest and a threshold per site.
 
-    @property
-    def threshold(self) -> PerSite:
-        """Signal above which there is an atom."""
-        ...
-
-    @property
-    def width(self) -> float:
-        """Distance from the threshold at which the confidence is tanh(1) = 0.76."""
-        ...
-
-
-class ComparingDetector(ABC):
-    """Base of detectors: there is an atom where the signal exceeds the site's threshold.
-
-    Args:
-        settings: See :class:`ComparingLike`.
-        context: Grid, calibrations and name; a ``labseq.Context``.
-
-    Raises:
-        LimitError: A region reaches over the edge of the frame, or the thresholds do
-            not have one value per site.
-        ConfigError: A file cannot be read, or the calibrated thresholds are of another unit.
+    The defaults fit the virtual lab: they give the paper's mean detection
+    fidelity of 99.946 % on its frames.
     """
 
-    signal_unit: ClassVar[str]
-
-    def __init__(self, settings: ComparingLike, context: ContextLike) -> None:
-        self._name = context.name or "detector"
-        self._width = settings.width
-        self._known = known_sites(settings, context)
-        self._corners = region_corners(self._known, settings.region)
-        thresholds = known_thresholds(settings.threshold, self.signal_unit, context)
-        self._thresholds, self._thresholds_source = thresholds.values, thresholds.source
-
-    @property
-    def sites_px(self) -> NDArray[np.float64]:
-        """(y, x) of each site in pixels, float64 (n_rows, n_cols, 2)."""
-        return self._known.positions_px
-
-    def describe(self) -> Mapping[str, str]:
-        """Where its sites and thresholds come from."""
-        return {"sites": self._known.source, "thresholds": self._thresholds_source}
-
-    def detect(self, frame: Frame) -> tuple[Occupancy, NDArray[np.float32]]:
-        """Find the atoms.
-
-        Returns:
-            The occupancy, bool (n_rows, n_cols), and the confidence per site,
-            float32 (n_rows, n_cols), 0 at the threshold and 1 for certainty.
-
-        Raises:
-            DeviceError: The frame is not of the size that the sites belong to.
-        """
-        distance = self.signals(frame) - self._thresholds
-        confidence = np.tanh(np.abs(distance) / self._width).astype(np.float32)
-        return distance > 0.0, confidence
-
-    @abstractmethod
-    def signals(self, frame: Frame) -> NDArray[np.float64]:
-        """What is compared, float64 (n_rows, n_cols)."""
-
-
-class ThresholdLike(ComparingLike, Protocol):
-    """Settings of :class:`ThresholdDetector`; SI and pixels."""
-
-    @property
-    def shape(self) -> Literal["square", "disc"]:
-        """Shape of the region of interest."""
-        ...
-
-    @property
-    def offset(self) -> float:
-        """Counts of a dark pixel."""
-        ...
+    shape: Literal["square", "disc"] = Field(default="square", description="shape of the region of interest")
+    offset: float = Field(default=500.0, description="counts of a dark pixel")
+    threshold: Thresholds = Field(
+        default=1630.0,
+        description="counts over the offset, summed over the region, above which there is an atom, "
+        "unless a calibration of thresholds is in use: one number, one for each site (rows of numbers), or "
+        "the path of a .npy file with one for each site",
+    )
+    width: PositiveFloat = Field(
+        default=130.0,
+        description="distance of the counts from the threshold at which the confidence reaches 0.76",
+    )
 
 
 class ThresholdDetector(ComparingDetector):
@@ -189,26 +166,26 @@ class ThresholdDetector(ComparingDetector):
     ``tanh(|counts - T_ij| / width)``: for two classes whose log-odds grow linearly
     with the counts, that is the probability of being right, scaled to 0..1.
 
-    Where the sites are is said by the file in ``sites``, else by the calibration of
-    sites in use, else by the geometry in the settings; the thresholds by the
-    calibration of thresholds in use, else by the settings.
+    The sites come from the file in ``sites``, else from the calibration of sites in
+    use, else from the geometry in the settings; the thresholds from the calibration of
+    thresholds in use, else from the settings.
 
     Args:
-        settings: See :class:`ThresholdLike`. A threshold given as text is the path
+        settings: A threshold given as text is the path
             of a .npy file of floats (n_rows, n_cols), read here.
-        context: Grid, calibrations and name; a ``labseq.Context``.
+        context: Grid, calibrations and name.
 
     Raises:
-        LimitError: A region of interest reaches over the edge of the frame, or the
+        LimitError: A region of interest extends over the edge of the frame, or the
             thresholds do not have one value per site.
-        ConfigError: A file cannot be read, or the calibrated thresholds are no counts.
+        ConfigError: A file cannot be read, or the calibrated thresholds are not in counts.
     """
 
     signal_unit = "counts"
 
-    def __init__(self, settings: ThresholdLike, context: ContextLike) -> None:
-        super().__init__(settings, context)
-        self._pixels = _region_pixels(settings, self._known, self._corners)
+    def __init__(self, settings: ThresholdSettings, context: Context) -> None:
+        super().__init__(settings, settings.threshold, settings.width, context)
+        self._pixels = self._region_pixels(settings)
         self._dark = len(self._pixels) * settings.offset
 
     def signals(self, frame: Frame) -> NDArray[np.float64]:
@@ -221,33 +198,30 @@ class ThresholdDetector(ComparingDetector):
         counts = image.take(self._pixels).sum(axis=0, dtype=np.uint32)
         return counts.reshape(self._thresholds.shape) - self._dark
 
-
-def _region_pixels(
-    settings: ThresholdLike, known: KnownSites, corners: NDArray[np.int64]
-) -> NDArray[np.int64]:
-    """Flat indices of the regions' pixels, (pixels of a region, n_sites): summed along rows of memory."""
-    dy, dx = np.indices((settings.region, settings.region)).reshape(2, -1, 1)
-    if settings.shape == "disc":
-        half = settings.region // 2
-        inside = (dy - half) ** 2 + (dx - half) ** 2 <= (settings.region / 2) ** 2
-        dy, dx = dy[inside, None], dx[inside, None]
-    return (corners[:, 0] + dy) * known.frame[1] + corners[:, 1] + dx
+    def _region_pixels(self, settings: ThresholdSettings) -> NDArray[np.int64]:
+        """Flat indices of the regions' pixels, int64 (pixels of a region, n_sites)."""
+        dy, dx = np.indices((settings.region, settings.region)).reshape(2, -1, 1)
+        if settings.shape == "disc":
+            half = settings.region // 2
+            inside = (dy - half) ** 2 + (dx - half) ** 2 <= (settings.region / 2) ** 2
+            dy, dx = dy[inside, None], dx[inside, None]
+        return (self._corners[:, 0] + dy) * self._known.frame[1] + self._corners[:, 1] + dx
 
 
 class BlindDetector:
-    """Takes any frame and sees no atoms: it needs to know neither the sites nor the camera.
+    """Accepts any frame and detects no atoms; for runs that calibrate the sites.
 
     Args:
         settings: None.
         context: The grid.
     """
 
-    def __init__(self, settings: object, context: ContextLike) -> None:
+    def __init__(self, settings: object, context: Context) -> None:
         del settings
         self._shape = context.grid.shape
 
     def detect(self, frame: Frame) -> tuple[Occupancy, NDArray[np.float32]]:
-        """See nothing.
+        """Detect nothing.
 
         Returns:
             An empty occupancy, bool (n_rows, n_cols), and no confidence, float32 (n_rows, n_cols).

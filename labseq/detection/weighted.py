@@ -1,52 +1,229 @@
-"""The weighted detector: the light of each site fitted with its neighbours'."""
+"""The weighted detector: the log-odds of an atom, with the light of its neighbours corrected."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Final, Protocol
+from typing import Annotated, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
-from labseq.detection.sites import ContextLike, KnownSites, checked_image, pairs_within, spot_light
-from labseq.detection.threshold import ComparingDetector, ComparingLike
+from labseq.detection.sites import (
+    KnownSites,
+    PositiveLength,
+    RegionSettings,
+    Thresholds,
+    checked_image,
+    pairs_within,
+    spot_light,
+)
+from labseq.detection.threshold import ComparingDetector
 from labseq.model import Frame
+from labseq.roles import Context
+from labseq.settings import Fraction
 
 Floats = NDArray[np.float64]
 
 N_LIGHTS: Final = 64
 N_COUNTS: Final = 65_536
+SPOT_REACH: Final = 4.0
+"""Distance up to which a spot's light is included, in widths of the spot."""
 
 
-class SensorLike(Protocol):
-    """What is known of the camera."""
+class WeightedSettings(RegionSettings):
+    """The likelihood of an atom from spot-shaped weights, corrected for the neighbours' light.
 
-    @property
-    def em_register(self) -> bool:
-        """Whether photoelectrons are multiplied with the excess noise of an EM register."""
-        ...
+    Fewer errors than with `threshold`, for more to be known of the camera. The
+    defaults fit the virtual lab.
+    """
 
-    @property
-    def offset(self) -> float:
-        """Counts of a dark pixel."""
-        ...
+    region: PositiveInt = Field(
+        default=9,
+        description="width of the square of pixels that is weighed around each site; odd, and at least "
+        "six times the width of the spot",
+    )
+    spot: PositiveLength = Field(
+        default=0.42e-6, description="width (1 sigma of a Gaussian) of an atom's image in the atom plane"
+    )
+    photoelectrons: Annotated[float, Field(gt=0, le=5000)] = Field(
+        default=60.0, description="mean photoelectrons of an atom in an exposure"
+    )
+    background: Annotated[float, Field(ge=1e-4, le=1000)] = Field(
+        default=0.375,
+        description="mean photoelectrons of a pixel without atoms: stray light, dark current, clock-induced "
+        "charge",
+    )
+    filling: Fraction = Field(
+        default=0.75,
+        description="fraction of the sites that hold atoms: how much light neighbours are expected to give",
+    )
+    offset: float = Field(default=500.0, description="counts of a dark pixel")
+    counts_per_photoelectron: PositiveFloat = Field(
+        default=60.0, description="mean counts of one photoelectron: the EM gain over the electrons per count"
+    )
+    read_noise: NonNegativeFloat = Field(
+        default=16.0, description="read noise in counts r.m.s.; rounding to whole counts is added"
+    )
+    em_register: bool = Field(
+        default=True,
+        description="whether photoelectrons are multiplied with the excess noise of an EM register (true for "
+        "an EMCCD with a high gain, false for a CMOS camera or a gain that is off)",
+    )
+    threshold: Thresholds = Field(
+        default=0.0,
+        description="log-odds above which there is an atom; lower misses fewer atoms and imagines more; used "
+        "unless a calibration of thresholds is in use: one number, one for each site (rows of numbers), or "
+        "the path of a .npy file with one for each site",
+    )
+    width: PositiveFloat = Field(
+        default=2.0,
+        description="distance of the log-odds from the threshold at which the confidence reaches 0.76; "
+        "with 2 the confidence is that of the likelihood",
+    )
 
-    @property
-    def counts_per_photoelectron(self) -> float:
-        """Mean counts of one photoelectron."""
-        ...
 
-    @property
-    def read_noise(self) -> float:
-        """Read noise, counts r.m.s."""
-        ...
+@dataclass(frozen=True, slots=True, eq=False)
+class Weights:
+    """Values computed once for a detector.
+
+    Attributes:
+        pixels: float32 (n_sites, region, region), weight of each pixel.
+        curve: float32 (65536,), value of counts in photoelectrons.
+        constant: float64 (n_sites,), log-odds of a site whose pixels are at the offset
+            and whose neighbours have their mean light.
+        starts: int64 (n_sites + 1,), where a site's neighbours start in the lists.
+        neighbours: int64 (n,), sites whose light reaches it.
+        effects: float64 (n,), log-odds added by an atom there.
+        expected: float64 (n_sites,), mean log-odds added by its neighbours.
+    """
+
+    pixels: NDArray[np.float32]
+    curve: NDArray[np.float32]
+    constant: Floats
+    starts: NDArray[np.int64]
+    neighbours: NDArray[np.int64]
+    effects: Floats
+    expected: Floats
+
+
+class WeightedDetector(ComparingDetector):
+    """Adds up the log-odds of an atom, pixel by pixel, and compares with a threshold.
+
+    The optimum is that of Neyman and Pearson (Phil. Trans. R. Soc. A 231, 289, 1933):
+    among all detectors with the same rate of false positives, the likelihood ratio misses
+    the fewest atoms. A curve converts the counts of a pixel: linear for a few photoelectrons,
+    flatter for many, because the EM register makes large counts less informative. Each pixel
+    of a site has a weight: the difference of the log-likelihoods of the pixel's light with
+    and without the site's atom, at the site's true position between the pixels (see
+    :func:`labseq.detection.weighted.evidence`).
+
+    Both cases contain the mean light of the neighbours, so that a pixel in their light
+    weighs less. A second pass corrects for the neighbours found in the first: it subtracts
+    the mean effect of each, as in the detection of many senders on one channel (Verdu,
+    Multiuser Detection, 1998, chapter 7). Neighbours are those within the reach of spot and
+    region, on any lattice.
+
+    The confidence is ``tanh(|log-odds - T_ij| / width)``; at T = 0 and the width of 2 it is the
+    probability of being right, scaled to 0..1, if half of the sites hold atoms.
+
+    The sites come from the file in ``sites``, else from the calibration of sites in
+    use, else from the geometry in the settings; the thresholds from the calibration of
+    thresholds in use, else from the settings.
+
+    Args:
+        settings: A threshold given as text is the path
+            of a .npy file of floats (n_rows, n_cols), read here.
+        context: Grid, calibrations and name.
+
+    Raises:
+        LimitError: A region extends over the edge of the frame, or the thresholds do
+            not have one value per site.
+        ConfigError: A file cannot be read, or the calibrated thresholds are not log-odds.
+    """
+
+    signal_unit = "log-odds"
+
+    def __init__(self, settings: WeightedSettings, context: Context) -> None:
+        super().__init__(settings, settings.threshold, settings.width, context)
+        self._settings, self._grid = settings, context.grid
+        self._weights: Weights | None = None
+        self._kernels: Any = None
+
+    def warm(self) -> None:
+        """Compute the weights; compile the kernels, or load them from the cache."""
+        self._ready()
+
+    def signals(self, frame: Frame) -> Floats:
+        """Log-odds of an atom against none, float64 (n_rows, n_cols).
+
+        Raises:
+            DeviceError: The frame is not of the size that the sites belong to.
+        """
+        image = checked_image(frame, self._known, self._name)
+        weights = self._ready()
+        odds = np.empty(len(self._corners))
+        self._kernels.weigh_sites(image, self._corners, weights.pixels, weights.curve, weights.constant, odds)
+        if len(weights.neighbours):
+            first, odds = odds, np.empty_like(odds)
+            self._kernels.undo_neighbours(weights.starts, weights.neighbours, weights.effects, first, odds)
+            odds += weights.expected
+        return odds.reshape(self._grid.shape)
+
+    def _ready(self) -> Weights:
+        if self._weights is None:
+            from labseq.detection import kernels as weigh_sites
+
+            self._kernels = weigh_sites
+            self._weights = site_weights(self._settings, self._known, self._corners)
+        return self._weights
+
+
+def site_weights(settings: WeightedSettings, known: KnownSites, corners: NDArray[np.int64]) -> Weights:
+    """Compute the weights of all sites.
+
+    Args:
+        settings: Settings of the detector.
+        known: Where the sites are.
+        corners: int64 (n_sites, 2), (y, x) of the first pixel of each region.
+    """
+    sites = known.positions_px.reshape(-1, 2)
+    spot_px, region, filling = settings.spot / settings.pixel_size, settings.region, settings.filling
+    own = settings.photoelectrons * spot_light(sites, corners, region, spot_px)
+    pairs = pairs_within(sites, (region / 2 + SPOT_REACH * spot_px) * np.sqrt(2))
+    lit = settings.photoelectrons * spot_light(sites[pairs[:, 1]], corners[pairs[:, 0]], region, spot_px)
+    dark = np.full_like(own, settings.background)
+    np.add.at(dark, pairs[:, 0], filling * lit)
+    likelihood = evidence(settings, settings.background, float((dark + own).max() + lit.max(initial=0.0)))
+
+    def gained(values: Floats, before: Floats, light: Floats) -> Floats:
+        return np.interp(before + light, likelihood.light, values) - np.interp(
+            before, likelihood.light, values
+        )
+
+    pixels = gained(likelihood.weight, dark, own)
+    effects = np.zeros(len(pairs))
+    without = dark[pairs[:, 0]] - filling * lit
+    for before in (without, without + own[pairs[:, 0]]):  # whether the site holds an atom or not
+        effects += (pixels[pairs[:, 0]] * gained(likelihood.mean, before, lit)).sum(axis=(1, 2)) / 2
+    felt = effects > 1e-3
+    pairs, effects = pairs[felt], effects[felt]
+    return Weights(
+        pixels=pixels.astype(np.float32),
+        curve=likelihood.curve,
+        constant=gained(likelihood.constant, dark, own).sum(axis=(1, 2)),
+        starts=np.searchsorted(pairs[:, 0], np.arange(len(sites) + 1)),
+        neighbours=np.ascontiguousarray(pairs[:, 1]),
+        effects=effects,
+        expected=np.asarray(filling * np.bincount(pairs[:, 0], effects, len(sites)), np.float64),
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LightLikelihood:
     """The log-likelihood of counts x under light lam, as ``weight(lam) * curve(x) + constant(lam)``.
 
-    A term that depends on x alone is left out: it says nothing about the light.
+    Terms that depend on x alone are left out: they do not depend on the light.
 
     Attributes:
         light: float64 (n,), mean photoelectrons of a pixel, rising.
@@ -63,21 +240,21 @@ class LightLikelihood:
     curve: NDArray[np.float32]
 
 
-def evidence(sensor: SensorLike, darkest: float, brightest: float) -> LightLikelihood:
-    """Work out what counts say about light between two limits.
+def evidence(sensor: WeightedSettings, darkest: float, brightest: float) -> LightLikelihood:
+    """Compute the log-likelihood of light between two limits, for all counts.
 
     The number of photoelectrons is Poisson; with an EM register of high gain each
-    is multiplied by an exponential law, so that k of them follow a gamma law of
-    order k (Basden, Haniff, Mackay, MNRAS 345, 985, 2003); read noise is Gaussian.
-    The log-likelihood over that of the darkest light is a function of light and
-    counts; its best approximation by one product and a constant is the first term
+    is multiplied by an exponentially distributed gain, so that k of them follow a gamma
+    distribution of order k (Basden, Haniff, Mackay, MNRAS 345, 985, 2003); read noise is Gaussian.
+    The ratio of the likelihood to that of the darkest light is a function of light and
+    counts. The best approximation of its logarithm by one product and a constant is the first term
     of its singular value decomposition, counts weighted by how often they occur.
     Without EM register and read noise it is exact: the product is k log(light).
 
     Args:
-        sensor: See :class:`SensorLike`.
-        darkest: Least mean photoelectrons of a pixel, more than 0.
-        brightest: Most.
+        sensor: Settings of the detector, of which those of the camera are used.
+        darkest: Minimum mean photoelectrons of a pixel, more than 0.
+        brightest: Maximum.
     """
     light = np.concatenate(
         [[darkest], darkest + np.geomspace(1e-3, 1.0, N_LIGHTS - 1) * (brightest - darkest)]
@@ -104,7 +281,7 @@ def evidence(sensor: SensorLike, darkest: float, brightest: float) -> LightLikel
 
 
 def _signals(em_register: bool, noise: float, n_most: int) -> Floats:
-    """Signals to work with, in photoelectrons: fine where read noise matters, up to any that occurs."""
+    """Signals in photoelectrons: finely spaced where read noise matters, up to the largest that occurs."""
     low = 5 * noise
     if em_register:
         high = n_most + 6 * np.sqrt(2 * n_most) + low
@@ -148,165 +325,3 @@ def _log_normal(distance: Floats, width: float) -> Floats:
 def _log_sum(log_terms: Floats, axis: int) -> Floats:
     highest = log_terms.max(axis=axis)
     return highest + np.log(np.exp(log_terms - highest).sum(axis=axis))
-
-
-SPOT_REACH: Final = 4.0
-"""Widths of a spot beyond which its light is not looked for."""
-
-
-class WeightedLike(ComparingLike, SensorLike, Protocol):
-    """Settings of :class:`WeightedDetector`; SI and pixels."""
-
-    @property
-    def spot(self) -> float:
-        """Width of a spot (1 sigma) in the atom plane, in metres."""
-        ...
-
-    @property
-    def photoelectrons(self) -> float:
-        """Mean photoelectrons of an atom."""
-        ...
-
-    @property
-    def background(self) -> float:
-        """Mean photoelectrons of a pixel without atoms, more than 0."""
-        ...
-
-    @property
-    def filling(self) -> float:
-        """Fraction of the sites that hold atoms."""
-        ...
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Weights:
-    """What is worked out once.
-
-    Attributes:
-        pixels: float32 (n_sites, region, region), weight of each pixel.
-        curve: float32 (65536,), worth of counts in photoelectrons.
-        constant: float64 (n_sites,), log-odds of a site whose pixels are at the offset
-            and whose neighbours have their mean light.
-        starts: int64 (n_sites + 1,), where a site's neighbours start in the lists.
-        neighbours: int64 (n,), sites whose light reaches it.
-        effects: float64 (n,), log-odds that an atom there adds.
-        expected: float64 (n_sites,), log-odds that its neighbours add on average.
-    """
-
-    pixels: NDArray[np.float32]
-    curve: NDArray[np.float32]
-    constant: Floats
-    starts: NDArray[np.int64]
-    neighbours: NDArray[np.int64]
-    effects: Floats
-    expected: Floats
-
-
-class WeightedDetector(ComparingDetector):
-    """Adds up the log-odds of an atom, pixel by pixel, and compares with a threshold.
-
-    The optimum is that of Neyman and Pearson (Phil. Trans. R. Soc. A 231, 289, 1933):
-    among all detectors with as many false positives, the likelihood ratio misses the
-    fewest atoms. The counts of a pixel are turned by a curve into what they are worth:
-    linear for a few photoelectrons, flatter for many, because the EM register makes
-    large counts say less. A weight per site and pixel multiplies that: the difference
-    of the log-likelihoods of the pixel's light with and without the site's atom, at the
-    site's true place between the pixels (see :func:`labseq.detection.weighted.evidence`).
-
-    Neighbours' light is part of both cases with its mean, so that a pixel in their light
-    weighs less. Then what they add beyond the mean is undone: with the neighbours as found
-    in the first pass, the mean effect of each is taken off, as in the detection of many
-    senders on one channel (Verdu, Multiuser Detection, 1998, chapter 7). Neighbours are
-    those within the reach of spot and region, on any lattice.
-
-    The confidence is ``tanh(|log-odds - T_ij| / width)``; at T = 0 and the width of 2 it is the
-    probability of being right, scaled to 0..1, if half of the sites hold atoms.
-
-    Where the sites are is said by the file in ``sites``, else by the calibration of
-    sites in use, else by the geometry in the settings; the thresholds by the
-    calibration of thresholds in use, else by the settings.
-
-    Args:
-        settings: See :class:`WeightedLike`. A threshold given as text is the path
-            of a .npy file of floats (n_rows, n_cols), read here.
-        context: Grid, calibrations and name; a ``labseq.Context``.
-
-    Raises:
-        LimitError: A region reaches over the edge of the frame, or the thresholds do
-            not have one value per site.
-        ConfigError: A file cannot be read, or the calibrated thresholds are no log-odds.
-    """
-
-    signal_unit = "log-odds"
-
-    def __init__(self, settings: WeightedLike, context: ContextLike) -> None:
-        super().__init__(settings, context)
-        self._settings, self._grid = settings, context.grid
-        self._weights: Weights | None = None
-        self._kernels: Any = None
-
-    def warm(self) -> None:
-        """Work out the weights; compile the kernels, or load them from the cache."""
-        self._ready()
-
-    def signals(self, frame: Frame) -> Floats:
-        """Log-odds of an atom against none, float64 (n_rows, n_cols).
-
-        Raises:
-            DeviceError: The frame is not of the size that the sites belong to.
-        """
-        image = checked_image(frame, self._known, self._name)
-        weights = self._ready()
-        odds = np.empty(len(self._corners))
-        self._kernels.weigh_sites(image, self._corners, weights.pixels, weights.curve, weights.constant, odds)
-        if len(weights.neighbours):
-            first, odds = odds, np.empty_like(odds)
-            self._kernels.undo_neighbours(weights.starts, weights.neighbours, weights.effects, first, odds)
-            odds += weights.expected
-        return odds.reshape(self._grid.shape)
-
-    def _ready(self) -> Weights:
-        if self._weights is None:
-            from labseq.detection import kernels as weigh_sites
-
-            self._kernels = weigh_sites
-            self._weights = site_weights(self._settings, self._known, self._corners)
-        return self._weights
-
-
-def site_weights(settings: WeightedLike, known: KnownSites, corners: NDArray[np.int64]) -> Weights:
-    """Work out the weights of all sites.
-
-    Args:
-        settings: See :class:`WeightedLike`.
-        known: Where the sites are.
-        corners: int64 (n_sites, 2), (y, x) of the first pixel of each region.
-    """
-    sites = known.positions_px.reshape(-1, 2)
-    spot_px, region, filling = settings.spot / settings.pixel_size, settings.region, settings.filling
-    own = settings.photoelectrons * spot_light(sites, corners, region, spot_px)
-    pairs = pairs_within(sites, (region / 2 + SPOT_REACH * spot_px) * np.sqrt(2))
-    lit = settings.photoelectrons * spot_light(sites[pairs[:, 1]], corners[pairs[:, 0]], region, spot_px)
-    dark = np.full_like(own, settings.background)
-    np.add.at(dark, pairs[:, 0], filling * lit)
-    law = evidence(settings, settings.background, float((dark + own).max() + lit.max(initial=0.0)))
-
-    def gained(values: Floats, before: Floats, light: Floats) -> Floats:
-        return np.interp(before + light, law.light, values) - np.interp(before, law.light, values)
-
-    pixels = gained(law.weight, dark, own)
-    effects = np.zeros(len(pairs))
-    without = dark[pairs[:, 0]] - filling * lit
-    for before in (without, without + own[pairs[:, 0]]):  # whether the site holds an atom or not
-        effects += (pixels[pairs[:, 0]] * gained(law.mean, before, lit)).sum(axis=(1, 2)) / 2
-    felt = effects > 1e-3
-    pairs, effects = pairs[felt], effects[felt]
-    return Weights(
-        pixels=pixels.astype(np.float32),
-        curve=law.curve,
-        constant=gained(law.constant, dark, own).sum(axis=(1, 2)),
-        starts=np.searchsorted(pairs[:, 0], np.arange(len(sites) + 1)),
-        neighbours=np.ascontiguousarray(pairs[:, 1]),
-        effects=effects,
-        expected=np.asarray(filling * np.bincount(pairs[:, 0], effects, len(sites)), np.float64),
-    )

@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 
 from labseq import Context, Frame, SiteGrid
-from labseq.builtin.detectors import ThresholdSettings, WeightedSettings
-from labseq.detection.threshold import ThresholdDetector
-from labseq.detection.weighted import WeightedDetector
+from labseq.detection.threshold import ThresholdDetector, ThresholdSettings
+from labseq.detection.weighted import WeightedDetector, WeightedSettings
 
 
 @pytest.fixture

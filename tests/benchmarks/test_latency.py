@@ -18,8 +18,7 @@ from labseq_virtual.world import World
 
 from labseq import Context, DepthRamp, Frame, MotionSpec, RandomStream, SiteGrid, TargetPattern
 from labseq.bench.latency import CHUNK
-from labseq.builtin.detectors import ThresholdSettings
-from labseq.detection.threshold import ThresholdDetector
+from labseq.detection.threshold import ThresholdDetector, ThresholdSettings
 from labseq.model import ToneProgram
 from labseq.motion import Renderer, check_plan, comb_sample_rate, render_chunks, tone_program
 

@@ -12,8 +12,7 @@ from labseq_virtual.transport import Transport
 from labseq_virtual.world import World
 
 from labseq import Context, DepthRamp, MotionSpec, Plan, RandomStream, SiteGrid, tone_program
-from labseq.builtin.detectors import ThresholdSettings
-from labseq.detection.threshold import ThresholdDetector
+from labseq.detection.threshold import ThresholdDetector, ThresholdSettings
 
 GRID = SiteGrid()
 

@@ -171,7 +171,9 @@ def test_an_analysis_that_fails_says_why_and_keeps_what_is_in_use(
     assert lab.store.active()["sites"].id == old.entry.id
     assert len(lab.store.entries()) == 1
     (warning,) = (values["text"] for name, values in lab.observer.events if name == "warning")
-    assert warning.startswith("the calibration failed, and the one in use is unchanged; analyse the run again")
+    assert warning.startswith(
+        "the calibration failed, and the one in use is unchanged; analyse the run again"
+    )
 
 
 def test_too_few_frames_for_thresholds(lab: Lab) -> None:

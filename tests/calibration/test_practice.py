@@ -14,18 +14,17 @@ from numpy.typing import NDArray
 
 import labseq
 from labseq import Context, DepthRamp, RandomStream, Run, TweezerAmplitudes
-from labseq.builtin.detectors import ThresholdSettings
 from labseq.builtin.equalise import factors
 from labseq.calibration.measure import METHODS, CalibrationRequest, calibrate
 from labseq.config import load_profile
 from labseq.detection.sites import known_sites, region_corners, spot_light
-from labseq.detection.threshold import ThresholdDetector
+from labseq.detection.threshold import ThresholdDetector, ThresholdSettings
 from labseq.model import CalibrationEntry
 from labseq.motion import standing_on_sites
 
 Floats = NDArray[np.float64]
 
-ROOT = Path(__file__).parents[3]
+ROOT = Path(__file__).parents[2]
 SHOTS = {"tweezers": 1, "sites": 25, "thresholds": 120, "frequencies": 58, "overlay": 29}
 """Kinds in the order of the morning, and half of the usual shots or more."""
 N_FRESH = 150

@@ -20,10 +20,9 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from labseq import Context, DepthRamp, Frame, RandomStream, SiteGrid
-from labseq.builtin.detectors import ThresholdSettings, WeightedSettings
 from labseq.detection.sites import known_sites, region_corners, spot_light
-from labseq.detection.threshold import ThresholdDetector
-from labseq.detection.weighted import WeightedDetector
+from labseq.detection.threshold import ThresholdDetector, ThresholdSettings
+from labseq.detection.weighted import WeightedDetector, WeightedSettings
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

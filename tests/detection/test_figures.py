@@ -14,7 +14,8 @@ from labseq_virtual.world import World
 
 from labseq import Context, DepthRamp, RandomStream, SiteGrid
 from labseq.calibration.lattice import find_lattice
-from labseq.detection.drift import FrameAverage, measure_shift
+from labseq.calibration.spots import FrameAverage
+from labseq.detection.drift import measure_shift
 
 from .drawn import drawn, seen_sites
 

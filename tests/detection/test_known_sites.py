@@ -11,10 +11,9 @@ import pytest
 from hypothesis import given, strategies as st
 from numpy.typing import NDArray
 
-from labseq.builtin.detectors import ThresholdSettings, WeightedSettings
 from labseq.detection.sites import known_sites, read_sites, site_pixels
-from labseq.detection.threshold import ThresholdDetector
-from labseq.detection.weighted import WeightedDetector
+from labseq.detection.threshold import ThresholdDetector, ThresholdSettings
+from labseq.detection.weighted import WeightedDetector, WeightedSettings
 from labseq.errors import ConfigError, DeviceError, LimitError
 from labseq.model import CalibrationEntry, Frame, SiteGrid
 from labseq.roles import Context, ReportsSignals
@@ -154,11 +153,11 @@ def test_a_table_is_read_in_any_order_of_lines(
     [
         ("", "no column 'row'"),
         ("row,col,y\n0,0,1\n", "no column 'x'"),
-        (as_table(PLACES).replace("0,1,", "0,0,"), r"line 3 is of site \(0, 0\), which stands above"),
+        (as_table(PLACES).replace("0,1,", "0,0,"), r"line 3 is of site \(0, 0\), like an earlier line"),
         (as_table(PLACES) + "3,0,1,1\n", r"line 14 is of site \(3, 0\), which the grid does not have"),
         ("\n".join(as_table(PLACES).splitlines()[:-2]), r"2 sites are missing, \(2, 2\) among them"),
-        ("row,col,y,x\n0,0,1\n", "line 2 has not four numbers"),
-        ("row,col,y,x\n0,0,one,2\n", "line 2 has not four numbers"),
+        ("row,col,y,x\n0,0,1\n", "line 2 does not have four numbers"),
+        ("row,col,y,x\n0,0,one,2\n", "line 2 does not have four numbers"),
         (as_table(np.where(PLACES[1, 1] == PLACES, np.inf, PLACES)), "not all finite"),
     ],
 )

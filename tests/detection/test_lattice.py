@@ -10,7 +10,7 @@ from hypothesis import given, settings, strategies as st
 from numpy.typing import NDArray
 
 from labseq.calibration.lattice import FoundLattice, find_lattice
-from labseq.detection.drift import FrameAverage
+from labseq.calibration.spots import FrameAverage
 from labseq.errors import DeviceError
 from labseq.model import Frame, SiteGrid
 
@@ -161,7 +161,7 @@ def test_a_dark_row_inside_is_no_matter_and_a_dark_outer_row_is_ambiguous() -> N
     rng = np.random.default_rng(5)
     inside = find_lattice(drawn(np.delete(sites, 4, axis=0), (140, 160), 1.2, rng), SMALL)
     assert furthest(inside, sites) < 0.15
-    with pytest.raises(DeviceError, match=r"8 x 8 rows and columns .* leaves open which one"):
+    with pytest.raises(DeviceError, match=r"8 x 8 rows and columns .* is ambiguous"):
         find_lattice(drawn(sites[1:], (140, 160), 1.2, rng), SMALL)
 
 
@@ -182,7 +182,7 @@ def test_spots_that_stand_on_no_lattice_are_refused(jitter: float) -> None:
 def test_sites_beside_the_frame_are_told() -> None:
     sites = seen_sites(SMALL, 10.0, centre=(70.0, 80.0))
     image = drawn(sites, (140, 160), 1.2, np.random.default_rng(7))
-    with pytest.raises(DeviceError, match=r"beside the frame|rows and columns"):
+    with pytest.raises(DeviceError, match=r"outside of the frame|rows and columns"):
         find_lattice(image[:, 30:], SMALL)
 
 
@@ -194,7 +194,7 @@ def test_one_row_is_no_lattice() -> None:
 def test_an_average_is_the_mean_and_refuses_another_size() -> None:
     frames = np.random.default_rng(8).integers(0, 65536, (5, 4, 6), np.uint16)
     average = FrameAverage("andor")
-    with pytest.raises(DeviceError, match="andor: no frame"):
+    with pytest.raises(DeviceError, match="andor: there is no average"):
         _ = average.image
     for image in frames:
         average.add(Frame(image, 0.045, 0.0))

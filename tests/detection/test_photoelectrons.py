@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from numpy.typing import NDArray
 
-from labseq.builtin.detectors import WeightedSettings
-from labseq.detection.weighted import LightLikelihood, evidence
+from labseq.detection.weighted import LightLikelihood, WeightedSettings, evidence
 
 Floats = NDArray[np.float64]
 N = 8192

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
-from labseq.builtin.detectors import ThresholdSettings
 from labseq.detection.sites import KnownSites, known_sites, region_corners
+from labseq.detection.threshold import ThresholdSettings
 from labseq.errors import LimitError
 from labseq.model import SiteGrid
 from labseq.roles import Context

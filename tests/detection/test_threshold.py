@@ -12,9 +12,8 @@ import pytest
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from labseq.builtin.detectors import ThresholdSettings
 from labseq.detection.sites import site_pixels
-from labseq.detection.threshold import ThresholdDetector
+from labseq.detection.threshold import ThresholdDetector, ThresholdSettings
 from labseq.errors import ConfigError, DeviceError, LimitError
 from labseq.model import Frame, SiteGrid
 from labseq.roles import Context

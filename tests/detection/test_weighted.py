@@ -13,10 +13,9 @@ from hypothesis import given, settings, strategies as st
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from labseq.builtin.detectors import WeightedSettings
 from labseq.config import load_profile
 from labseq.detection.sites import site_pixels
-from labseq.detection.weighted import WeightedDetector
+from labseq.detection.weighted import WeightedDetector, WeightedSettings
 from labseq.errors import ConfigError, DeviceError, LimitError
 from labseq.model import Frame, SiteGrid
 from labseq.roles import Context, NeedsWarmUp

@@ -13,8 +13,7 @@ from labseq_virtual.world import World
 from numpy.typing import NDArray
 
 from labseq import Context, DepthRamp, RandomStream
-from labseq.builtin.detectors import ThresholdSettings
-from labseq.detection.threshold import ThresholdDetector
+from labseq.detection.threshold import ThresholdDetector, ThresholdSettings
 
 EXPOSURE_S = 45e-3
 NOWHERE = np.empty((0, 2))

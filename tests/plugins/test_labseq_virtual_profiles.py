@@ -19,9 +19,9 @@ from labseq_virtual.settings import (
 )
 
 from labseq import MotionSpec, Registry, RfSpec, Settings, SiteGrid
-from labseq.builtin.detectors import ThresholdSettings
 from labseq.builtin.patterns import BitmapSettings, CompactSettings
 from labseq.config import MOTION_KEYS, load_profile
+from labseq.detection.threshold import ThresholdSettings
 
 MODELS: Mapping[str, type[Settings]] = {
     "camera": CameraSettings,

@@ -12,9 +12,8 @@ from labseq_virtual.world import World
 from numpy.typing import NDArray
 
 from labseq import Context, DepthRamp, RandomStream, SensorMode
-from labseq.builtin.detectors import ThresholdSettings, WeightedSettings
-from labseq.detection.threshold import ThresholdDetector
-from labseq.detection.weighted import WeightedDetector
+from labseq.detection.threshold import ThresholdDetector, ThresholdSettings
+from labseq.detection.weighted import WeightedDetector, WeightedSettings
 from labseq.roles import WHOLE_SENSOR
 
 Floats = NDArray[np.float64]

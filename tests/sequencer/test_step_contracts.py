@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from labseq import Context
-from labseq.builtin.detectors import ThresholdSettings
 from labseq.builtin.equalise import EqualiseStep
 from labseq.builtin.probes import CheckOverlayStep, CheckSitesStep, ProbeStep
 from labseq.builtin.steps import (
@@ -29,7 +28,7 @@ from labseq.builtin.steps import (
     WaitSettings,
     WaitStep,
 )
-from labseq.detection.threshold import ThresholdDetector
+from labseq.detection.threshold import ThresholdDetector, ThresholdSettings
 from labseq.model import SiteGrid
 from labseq.testing import (
     StepContract,

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from labseq.builtin.detectors import ThresholdSettings
 from labseq.builtin.probes import CheckOverlayStep, CheckSitesStep
 from labseq.builtin.steps import CheckOverlaySettings, CheckSitesSettings, ImageSettings, ImageStep
-from labseq.detection.threshold import ThresholdDetector
+from labseq.detection.threshold import ThresholdDetector, ThresholdSettings
 from labseq.errors import ConfigError, DeviceError
 from labseq.model import CalibrationEntry, Frame, SegmentKind, ShotRecord, SiteGrid
 from labseq.model.calibration import grid_facts

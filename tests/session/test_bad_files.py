@@ -188,7 +188,7 @@ def test_overrides_of_the_wrong_type_are_refused(overrides: Any) -> None:
         (
             "spacing: 4.49 um",
             "spacing: 4.49",
-            "the region of interest of site (0, 0), by the detector's settings, is rows ",
+            "the region of interest of site (0, 0), according to the detector's settings, is rows ",
         ),
         ("threshold: 1630", "threshold: gone.npy", "thresholds cannot be read from 'gone.npy': No such file"),
         ("threshold: 1630", "threshold: [[1, 2]]", "the shape of the detector's thresholds is (1, 2)"),
