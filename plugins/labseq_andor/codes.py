@@ -1,12 +1,13 @@
-"""Numbers of Andor's SDK2, by their names in its header ``atmcd32d.h``."""
+"""Numbers of Andor's SDK2, with their names in its header ``atmcd32d.h``, and what return codes mean."""
 
 from __future__ import annotations
 
 from enum import IntEnum, IntFlag
+from typing import Final
 
 
 class Code(IntEnum):
-    """What a function of the SDK returns."""
+    """Return code of an SDK function."""
 
     ERROR_CODES = 20001
     SUCCESS = 20002
@@ -14,8 +15,6 @@ class Code(IntEnum):
     ERROR_ACK = 20013
     ACQ_BUFFER = 20018
     ACQ_DOWNFIFO_FULL = 20019
-    KINETIC_TIME_NOT_MET = 20022
-    ACCUM_TIME_NOT_MET = 20023
     NO_NEW_DATA = 20024
     SPOOLERROR = 20026
     TEMP_OFF = 20034
@@ -34,9 +33,7 @@ class Code(IntEnum):
     P5INVALID = 20076
     P6INVALID = 20077
     INVALID_MODE = 20078
-    P7INVALID = 20083
     USBERROR = 20089
-    BINNING_ERROR = 20099
     ERROR_NOCAMERA = 20990
     NOT_SUPPORTED = 20991
     NOT_AVAILABLE = 20992
@@ -58,8 +55,6 @@ class Triggers(IntFlag):
     INTERNAL = 1
     EXTERNAL = 2
     CONTINUOUS = 8
-    EXTERNALSTART = 16
-    EXTERNALEXPOSURE = 32
     INVERTED = 64
 
 
@@ -78,7 +73,7 @@ class SetFunctions(IntFlag):
 
 
 class GetFunctions(IntFlag):
-    """What can be asked for (``ulGetFunctions``)."""
+    """What can be read (``ulGetFunctions``)."""
 
     TEMPERATURE = 0x01
     TEMPERATURERANGE = 0x04
@@ -88,7 +83,7 @@ class GetFunctions(IntFlag):
 
 
 class Features(IntFlag):
-    """What else a camera can do (``ulFeatures``)."""
+    """Other features of a camera (``ulFeatures``)."""
 
     POLLING = 1
     SHUTTER = 8
@@ -96,14 +91,39 @@ class Features(IntFlag):
     METADATA = 0x8000
 
 
-EM_GAIN_REAL = 8
-"""Flag of ``ulEMGainCapability``: the gain can be set as the factor that it is."""
+EM_GAIN_REAL: Final = 8
+"""Flag of ``ulEMGainCapability``: the gain can be set as a factor."""
+REAL_GAIN_MODE: Final = 3
+"""Mode of ``SetEMGainMode`` in which the gain is a factor."""
+FULL_IMAGE: Final = 4
+"""Mode of ``SetReadMode`` that reads images."""
+SHUTTER_AUTO, SHUTTER_OPEN, SHUTTER_CLOSED = 0, 1, 2
+"""Modes of ``SetShutter``."""
 
-REAL_GAIN_MODE = 3
-"""Mode of ``SetEMGainMode`` for that."""
+GONE: Final = frozenset({Code.ERROR_ACK, Code.USBERROR, Code.ERROR_NOCAMERA, Code.NOT_INITIALIZED})
+"""Codes of a camera that no longer answers."""
+OVERRUN: Final = frozenset({Code.ACQ_BUFFER, Code.ACQ_DOWNFIFO_FULL, Code.SPOOLERROR})
+"""Codes of an acquisition that ended because the computer did not take the data in time."""
 
-SOFTWARE_TRIGGER = 10
-"""Mode of ``SetTriggerMode``."""
+_UNPLUGGED: Final = "the camera does not answer any more; look at its power and its cable, then start again"
+_IN_USE: Final = (
+    "the camera is there but cannot be used; close Solis and every other program that uses it, and if none "
+    "does, switch the camera off and on"
+)
+_MEANINGS: Final = {
+    Code.ERROR_ACK: _UNPLUGGED,
+    Code.USBERROR: _UNPLUGGED,
+    Code.NOT_INITIALIZED: _UNPLUGGED,
+    Code.ERROR_NOCAMERA: _IN_USE,
+    Code.VXDNOTINSTALLED: _IN_USE,
+    Code.NOT_AVAILABLE: _IN_USE,
+    Code.ACQUIRING: "the camera cannot do this while it acquires",
+    Code.NOT_SUPPORTED: "this camera cannot do that",
+    Code.INVALID_MODE: "this camera cannot do that with the other settings",
+}
 
-EXTERNAL_TRIGGER = 1
-"""Mode of ``SetTriggerMode``: an edge at the trigger input starts each exposure."""
+
+def explain(function: str, code: int, code_name: str = "") -> str:
+    """What a return code means for a user, with the function and the code at the end."""
+    meaning = next((text for known, text in _MEANINGS.items() if known == code), "Andor's SDK refuses")
+    return f"{meaning} ({function} gave {f'{code}, {code_name}' if code_name else code})"

@@ -1,4 +1,4 @@
-"""What is known of some cameras before they are opened, and how long a read-out takes."""
+"""What is known about some camera heads before they are opened, and how long a read-out takes."""
 
 from __future__ import annotations
 
@@ -8,24 +8,24 @@ from typing import Final
 from labseq.plugin import SensorMode
 
 ROW_OVERHEAD_S: Final = 3e-6
-"""Time that a row takes beyond its pixels, in seconds (ours)."""
+"""Time per row in addition to reading its pixels, in seconds (our estimate)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Head:
     """A camera head.
 
-    The figures are those of cameras of this name as far as they are known; heads differ from one to the
-    next, and the camera itself tells what it has when it is opened.
+    The values are typical of cameras of this name. Individual heads differ; once a camera is open, the driver
+    uses what the camera reports.
 
     Attributes:
-        model: What it calls itself.
+        model: Name that the camera reports.
         sensor_shape: (height, width) in pixels.
         pixel_m: Side of a pixel, in metres.
         em_rates_hz: Read-out rates of the amplifier behind the EM register, fastest first.
-        conventional_rates_hz: Those of the other one.
+        conventional_rates_hz: Read-out rates of the conventional amplifier.
         shifts_s: Times to shift all rows by one, fastest first.
-        recommended_shift: Index of the fastest that the maker recommends.
+        recommended_shift: Index of the fastest shift that Andor recommends.
         preamp_gains: Gains of the pre-amplifier.
     """
 
@@ -37,6 +37,10 @@ class Head:
     shifts_s: tuple[float, ...]
     recommended_shift: int
     preamp_gains: tuple[float, ...]
+
+    def rates_hz(self, amplifier: str) -> tuple[float, ...]:
+        """Read-out rates of the amplifier "em" or "conventional", fastest first."""
+        return self.em_rates_hz if amplifier == "em" else self.conventional_rates_hz
 
 
 IXON_897: Final = Head(
@@ -63,35 +67,29 @@ HEADS: Final = (IXON_897, IXON_888)
 
 
 def known_head(model: str) -> Head | None:
-    """The head of this name, or whose name begins or is begun by it; None if it is not known."""
+    """The head with this name, or with a longer or shorter form of it; None if it is not known."""
     for head in HEADS:
         if model and (model.upper().startswith(head.model) or head.model.startswith(model.upper())):
             return head
     return None
 
 
-@dataclass(frozen=True, slots=True)
-class ReadOut:
-    """How a sensor is read.
+def readout_s(
+    rate_hz: float, shift_s: float, sensor_shape: tuple[int, int], mode: SensorMode, *, isolated_crop: bool
+) -> float:
+    """Time from the end of an exposure until the last pixel is read, in seconds.
 
-    Attributes:
+    All rows are shifted under the mask. Then each row of the region is shifted into the register and read;
+    the other rows are discarded. A row is read to its full width, except in isolated crop. The formula is
+    ours: once the camera is open, the SDK reports the true time.
+
+    Args:
         rate_hz: Pixels per second.
         shift_s: Time to shift all rows by one, in seconds.
-        isolated_crop: Whether the region is all that the camera knows of the sensor.
+        sensor_shape: (height, width) of the sensor.
+        mode: Region and binning.
+        isolated_crop: Whether the camera ignores the sensor outside the region.
     """
-
-    rate_hz: float
-    shift_s: float
-    isolated_crop: bool = False
-
-    def duration_s(self, sensor_shape: tuple[int, int], mode: SensorMode) -> float:
-        """Time from the end of an exposure until the last pixel is read, in seconds.
-
-        All rows are shifted under the mask; then each row of the region is shifted into the register and
-        read, and the other rows are thrown away. A row is read to its full width, except in isolated
-        crop. The formula is ours: the SDK tells the true time once the camera is open.
-        """
-        _, _, height, width = mode.region or (0, 0, *sensor_shape)
-        n_rows, n_columns = (height, width) if self.isolated_crop else sensor_shape
-        n_read = height // mode.binning
-        return 2 * n_rows * self.shift_s + n_read * (n_columns / self.rate_hz + ROW_OVERHEAD_S)
+    _, _, height, width = mode.region or (0, 0, *sensor_shape)
+    n_rows, n_columns = (height, width) if isolated_crop else sensor_shape
+    return 2 * n_rows * shift_s + height // mode.binning * (n_columns / rate_hz + ROW_OVERHEAD_S)

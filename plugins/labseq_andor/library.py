@@ -1,21 +1,96 @@
-"""pylablib and Andor's library, imported and loaded only when a camera is opened."""
+"""pylablib and the library that it calls: Andor's, or a simulated one."""
 
 from __future__ import annotations
 
 import ctypes
 import importlib
 import sys
+from collections.abc import Callable
 from functools import lru_cache, partial
 from types import SimpleNamespace
 from typing import Any, Final
 
-from labseq.plugin import DeviceError
-from labseq_andor.counterpart import SimulatedCamera, SimulatedSdk, simulated_sdk
+from labseq.plugin import Context, DeviceError, ExposureResult, wait_for
+from labseq_andor.settings import SIMULATED, AndorSettings
 
 OTHERWISE: Final = "to try things without a camera, set `camera: simulated`"
-INSTALL: Final = 'install it with `pip install "labseq[andor]"`'
-STAND_IN: Final = "stand-in"
 LINUX_LIBRARY: Final = "libandor.so"
+LINUX_FOLDER: Final = "/usr/local/etc/andor"
+"""Where Andor's installer for Linux puts the files that Initialize reads."""
+
+
+class AndorLibrary:
+    """Andor's library as the driver uses it; the simulated library overrides all of it.
+
+    Args:
+        settings: Settings of the driver.
+        context: Name of the device, and clock.
+
+    Attributes:
+        head: Head of the camera if it is known before the camera is opened.
+        sensor_shape: (height, width) of its sensor, likewise.
+        folder: Folder for the SDK's function Initialize.
+    """
+
+    def __init__(self, settings: AndorSettings, context: Context) -> None:
+        self.head = settings.head
+        self.sensor_shape = None if self.head is None else self.head.sensor_shape
+        self.folder = "" if sys.platform == "win32" else LINUX_FOLDER
+        self._path = settings.sdk
+        self._name = context.name or "camera"
+        self._clock = context.clock
+
+    def warm(self, em_gain: float) -> None:
+        """Do slow work that can be done before the camera is opened."""
+
+    def connect(self, andor: Any) -> tuple[int, ...] | None:
+        """Load the library and make pylablib call it.
+
+        Args:
+            andor: pylablib's module for SDK2.
+
+        Returns:
+            Places of the usable cameras in the SDK's list; None for all.
+
+        Raises:
+            DeviceError: The library is missing, or cameras of another library are open in this process.
+        """
+        path, library = self._path, None
+        if not path and sys.platform != "win32":
+            path = LINUX_LIBRARY
+        try:
+            if path:
+                library = load_file(path)
+            bind(self._name, andor, path, library)
+        except OSError as error:
+            which = f"'{path or 'atmcd64d.dll'}' cannot be loaded ({str(error).splitlines()[0]})"
+            what = "install Andor SDK2 or Solis for this system, or give the library's file as `sdk`"
+            raise DeviceError(self._name, f"Andor's library {which}; {what}; {OTHERWISE}") from error
+
+    def disconnect(self) -> None:
+        """Release what ``connect`` took; legal in any state. Andor's library stays loaded."""
+
+    def wait(self, look: Callable[[float], ExposureResult | None], timeout_s: float) -> ExposureResult | None:
+        """Wait for a frame.
+
+        Args:
+            look: Waits for a frame for at most the given seconds of real time.
+            timeout_s: How long to wait in all, in seconds.
+        """
+        return wait_for(look, timeout_s, self._clock)
+
+
+def library_for(settings: AndorSettings, context: Context) -> AndorLibrary:
+    """The library that the settings choose.
+
+    Raises:
+        ConfigError: The simulated camera is chosen, but the profile has no simulation.
+    """
+    if settings.camera == SIMULATED:
+        from labseq_andor_sim import SimulatedAndorLibrary
+
+        return SimulatedAndorLibrary(settings, context)
+    return AndorLibrary(settings, context)
 
 
 def load_pylablib(name: str) -> Any:
@@ -30,49 +105,30 @@ def load_pylablib(name: str) -> Any:
     try:
         return importlib.import_module("pylablib.devices.Andor.AndorSDK2")
     except ModuleNotFoundError as error:
-        text = f"the Python package 'pylablib' cannot be imported ({error}); {INSTALL}"
-        raise DeviceError(name, f"{text}; {OTHERWISE}") from error
+        text = f"the Python package 'pylablib' cannot be imported ({error})"
+        install = 'install it with `pip install "labseq[andor]"`'
+        raise DeviceError(name, f"{text}; {install}; {OTHERWISE}") from error
 
 
-def bind_sdk(name: str, andor: Any, path: str) -> None:
-    """Let pylablib call Andor's library.
+@lru_cache(maxsize=8)
+def load_file(path: str) -> Any:
+    """Load a C library from a file."""
+    return getattr(ctypes, "WinDLL", ctypes.CDLL)(path)
+
+
+def bind(name: str, andor: Any, key: str, library: Any) -> None:
+    """Make pylablib call a library.
+
+    pylablib has no option for this, but it uses whatever its loader returns.
 
     Args:
         name: Name of the device, for the message.
-        andor: What :func:`load_pylablib` gave.
-        path: File of the library; "" for where Andor's installer puts it.
+        andor: pylablib's module for SDK2.
+        key: Identifies the library.
+        library: The library; None: pylablib looks for Andor's itself.
 
     Raises:
-        DeviceError: It is not there, or a simulated camera is open in this process.
-    """
-    library = None
-    if path or sys.platform != "win32":
-        try:
-            library = _load(path or LINUX_LIBRARY)
-        except OSError as error:
-            raise _missing(name, path or LINUX_LIBRARY, error) from error
-    try:
-        _bind(name, andor, path, library)
-    except OSError as error:
-        raise _missing(name, "atmcd64d.dll", error) from error
-
-
-def bind_simulator(name: str, andor: Any, *cameras: SimulatedCamera) -> SimulatedSdk:
-    """Let pylablib call the stand-in, with cameras attached.
-
-    Raises:
-        DeviceError: A real camera is open in this process.
-    """
-    sdk = simulated_sdk(andor.atmcd32d_lib.define_functions)
-    _bind(name, andor, STAND_IN, sdk)
-    sdk.attach(*cameras)
-    return sdk
-
-
-def _bind(name: str, andor: Any, key: str, library: Any) -> None:
-    """Give pylablib a library; None: let it look for Andor's itself.
-
-    pylablib offers no way to do that, but takes whatever its loader returns.
+        DeviceError: Cameras of another library are open in this process.
     """
     control, declarations = andor.libctl, andor.atmcd32d_lib
     with control.lock:
@@ -81,11 +137,10 @@ def _bind(name: str, andor: Any, key: str, library: Any) -> None:
         if control.get_opened_num():
             text = "another Andor camera is open in this process, by another library"
             raise DeviceError(name, f"{text}; real and simulated ones cannot be used at the same time")
-        loader = declarations.load_lib
-        fresh = declarations.AndorSDK2Lib()
+        loader, fresh = declarations.load_lib, declarations.AndorSDK2Lib()
         if library is not None:
             declarations.load_lib = SimpleNamespace(
-                load_lib=partial(_give, library),
+                load_lib=partial(_return_library, library),
                 get_program_files_folder=loader.get_program_files_folder,
                 par_error_message="",
             )
@@ -98,17 +153,5 @@ def _bind(name: str, andor: Any, key: str, library: Any) -> None:
         control.initialized = True
 
 
-def _give(library: Any, *_names: Any, **_options: Any) -> Any:
+def _return_library(library: Any, *_names: Any, **_options: Any) -> Any:
     return library
-
-
-@lru_cache(maxsize=8)
-def _load(path: str) -> Any:
-    kind = getattr(ctypes, "WinDLL", ctypes.CDLL)
-    return kind(path)
-
-
-def _missing(name: str, path: str, error: OSError) -> DeviceError:
-    text = f"Andor's library '{path}' cannot be loaded ({str(error).splitlines()[0]})"
-    what = "install Andor SDK2 or Solis for this system, or give the library's file as `sdk`"
-    return DeviceError(name, f"{text}; {what}; {OTHERWISE}")

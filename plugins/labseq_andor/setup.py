@@ -1,4 +1,4 @@
-"""What is set once, when a camera is opened: read-out, region, cooling."""
+"""What is set once, when a camera is opened: amplifier and speeds, cooler, region, EM gain."""
 
 from __future__ import annotations
 
@@ -6,23 +6,22 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 from labseq.plugin import ZERO_CELSIUS_K, ConfigError, DeviceError, format_quantity, one_of
-from labseq_andor.codes import EM_GAIN_REAL, REAL_GAIN_MODE, AcqModes, Features, SetFunctions
+from labseq_andor.codes import EM_GAIN_REAL, FULL_IMAGE, REAL_GAIN_MODE, AcqModes, Features, SetFunctions
 from labseq_andor.sdk import Sdk
 from labseq_andor.settings import HIGH_GAIN, AndorSettings
 
-FULL_IMAGE: Final = 4
 NEAR: Final = 0.02
-"""How near a speed must come to the one asked for, relatively: the SDK gives them as float32."""
+"""Largest relative difference between a speed and the setting for it: the SDK gives speeds as float32."""
 
 
 def set_up(sdk: Sdk, settings: AndorSettings, name: str) -> dict[str, Any]:
-    """Set what stays the same, with the shutter closed and without EM gain.
+    """Set what stays the same in all series, with the shutter closed and without EM gain.
 
     Returns:
-        What the camera says of itself: JSON-ready values.
+        What the camera reports about itself: JSON-ready values.
 
     Raises:
-        DeviceError: Another model than the settings say, or a setting that it does not have.
+        DeviceError: Another model than the settings say, or a setting that the camera does not have.
         ConfigError: The region does not fit the sensor.
     """
     info = sdk.camera.device_info
@@ -33,8 +32,8 @@ def set_up(sdk: Sdk, settings: AndorSettings, name: str) -> dict[str, Any]:
     with sdk.selected() as lib:
         width, height = sdk.camera.get_detector_size()
         *_, version, build = lib.GetHardwareVersion()
-    if setting_error := settings.sensor_conflict((height, width)):
-        raise ConfigError(f"{name}: {setting_error}")
+    if conflict := settings.sensor_conflict((height, width)):
+        raise ConfigError(f"{name}: {conflict}")
     facts: dict[str, Any] = {
         "model": model,
         "serial_number": str(info.serial_number),
@@ -42,36 +41,37 @@ def set_up(sdk: Sdk, settings: AndorSettings, name: str) -> dict[str, Any]:
         "sdk_version": sdk.version(),
         "sensor_shape": [height, width],
     }
-    facts |= _amplifiers(sdk, settings, name)
-    facts |= _cooler(sdk, settings, name)
-    _others(sdk, settings, name)
-    _image(sdk, settings, (height, width), name)
-    facts["em_gain_range"] = _gain_range(sdk, settings, name)
+    with sdk.selected() as lib:
+        facts |= _set_amplifier(sdk.camera, settings, name)
+        facts |= _set_cooler(sdk, settings, name)
+        _set_options(sdk, lib, settings, name)
+        _set_region(sdk, lib, settings, (height, width), name)
+        facts["em_gain_range"] = _set_gain_mode(sdk, lib, settings, name)
     return facts
 
 
-def _amplifiers(sdk: Sdk, settings: AndorSettings, name: str) -> dict[str, Any]:
+def _set_amplifier(camera: Any, settings: AndorSettings, name: str) -> dict[str, Any]:
+    """Choose amplifier, read-out rate, pre-amplifier gain and shift speed."""
     kind = "conventional" if settings.amplifier == "conventional" else "multiplying"
-    with sdk.selected():
-        every = sdk.camera.get_all_amp_modes()
-        shifts_us = [float(speed) for speed in sdk.camera.get_all_vsspeeds()]
-        modes = [mode for mode in every if kind in str(mode.oamp_kind).lower()]
-        if not modes:
-            kinds = one_of(sorted({str(mode.oamp_kind) for mode in every}))
-            raise DeviceError(name, f"this camera has no amplifier of that kind; it has {kinds}")
-        rates_hz = [float(mode.hsspeed_MHz) * 1e6 for mode in modes]
-        wanted_hz = settings.readout_rate or max(rates_hz)
-        rate_hz = _nearest(rates_hz, wanted_hz, "readout_rate", "frequency", name)
-        modes = [mode for mode, its_hz in zip(modes, rates_hz, strict=True) if its_hz == rate_hz]
-        gains = [float(mode.preamp_gain) for mode in modes]
-        gain = _nearest(gains, settings.preamp_gain or gains[0], "preamp_gain", "", name)
-        mode = modes[gains.index(gain)]
-        sdk.camera.set_amp_mode(mode.channel, mode.oamp, mode.hsspeed, mode.preamp)
-        index = sdk.camera.get_max_vsspeed()
-        if settings.vertical_shift_speed is not None:
-            wanted_us = settings.vertical_shift_speed * 1e6
-            index = shifts_us.index(_nearest(shifts_us, wanted_us, "vertical_shift_speed", "us", name))
-        sdk.camera.set_vsspeed(index)
+    all_modes = camera.get_all_amp_modes()
+    modes = [mode for mode in all_modes if kind in str(mode.oamp_kind).lower()]
+    if not modes:
+        kinds = one_of(sorted({str(mode.oamp_kind) for mode in all_modes}))
+        raise DeviceError(name, f"this camera has no amplifier of that kind; it has {kinds}")
+    rates_hz = [float(mode.hsspeed_MHz) * 1e6 for mode in modes]
+    wanted_hz = settings.readout_rate or max(rates_hz)
+    rate_hz = _nearest(rates_hz, wanted_hz, "readout_rate", "frequency", name)
+    modes = [mode for mode, its_hz in zip(modes, rates_hz, strict=True) if its_hz == rate_hz]
+    gains = [float(mode.preamp_gain) for mode in modes]
+    gain = _nearest(gains, settings.preamp_gain or gains[0], "preamp_gain", "", name)
+    mode = modes[gains.index(gain)]
+    camera.set_amp_mode(mode.channel, mode.oamp, mode.hsspeed, mode.preamp)
+    shifts_us = [float(speed) for speed in camera.get_all_vsspeeds()]
+    index = camera.get_max_vsspeed()
+    if settings.vertical_shift_speed is not None:
+        wanted_us = settings.vertical_shift_speed * 1e6
+        index = shifts_us.index(_nearest(shifts_us, wanted_us, "vertical_shift_speed", "us", name))
+    camera.set_vsspeed(index)
     return {
         "amplifier": str(mode.oamp_kind),
         "bit_depth": int(mode.channel_bitdepth),
@@ -81,83 +81,82 @@ def _amplifiers(sdk: Sdk, settings: AndorSettings, name: str) -> dict[str, Any]:
     }
 
 
-def _nearest(values: Sequence[float], wanted: float, setting: str, dimension: str, name: str) -> float:
+def _nearest(values: Sequence[float], wanted: float, setting: str, unit: str, name: str) -> float:
     best = min(values, key=lambda value: abs(value - wanted))
     if abs(best - wanted) <= NEAR * wanted:
         return best
 
-    def told(value: float) -> str:
-        if dimension == "frequency":
-            return format_quantity(float(f"{value:.3g}"), dimension)
-        return f"{value:.3g} {dimension}".strip()
+    def format_value(value: float) -> str:
+        if unit == "frequency":
+            return format_quantity(float(f"{value:.3g}"), unit)
+        return f"{value:.3g} {unit}".strip()
 
-    there = one_of(list(dict.fromkeys(told(value) for value in values)))
-    raise DeviceError(name, f"`{setting}` is {told(wanted)}, which this camera does not have; it has {there}")
+    offered = one_of(list(dict.fromkeys(format_value(value) for value in values)))
+    text = f"`{setting}` is {format_value(wanted)}, which this camera does not have; it has {offered}"
+    raise DeviceError(name, text)
 
 
-def _cooler(sdk: Sdk, settings: AndorSettings, name: str) -> dict[str, Any]:
-    cooling = settings.cooling
-    if cooling is None:
+def _set_cooler(sdk: Sdk, settings: AndorSettings, name: str) -> dict[str, Any]:
+    if settings.cooling is None:
         return {}
-    with sdk.selected():
-        if not sdk.capabilities.ulSetFunctions & SetFunctions.TEMPERATURE:
-            raise DeviceError(name, "this camera has no cooler; leave `cooling` out")
-        wanted_c = round(cooling.temperature - ZERO_CELSIUS_K)
-        low_c, high_c = sdk.camera.get_temperature_range()
-        if not low_c <= wanted_c <= high_c:
-            text = f"cooling: temperature is {wanted_c} degC; this camera takes {low_c} to {high_c} degC"
-            raise DeviceError(name, text)
-        sdk.camera.set_temperature(wanted_c, enable_cooler=True)
+    if not sdk.capabilities.ulSetFunctions & SetFunctions.TEMPERATURE:
+        raise DeviceError(name, "this camera has no cooler; leave `cooling` out")
+    wanted_c = round(settings.cooling.temperature - ZERO_CELSIUS_K)
+    low_c, high_c = sdk.camera.get_temperature_range()
+    if not low_c <= wanted_c <= high_c:
+        text = f"cooling: temperature is {wanted_c} degC; this camera takes {low_c} to {high_c} degC"
+        raise DeviceError(name, text)
+    sdk.camera.set_temperature(wanted_c, enable_cooler=True)
     return {"setpoint_k": wanted_c + ZERO_CELSIUS_K}
 
 
-def _others(sdk: Sdk, settings: AndorSettings, name: str) -> None:
+def _set_options(sdk: Sdk, lib: Any, settings: AndorSettings, name: str) -> None:
     capabilities = sdk.capabilities
-    with sdk.selected() as lib:
-        if capabilities.ulSetFunctions & SetFunctions.BASELINECLAMP:
-            lib.SetBaselineClamp(int(settings.baseline_clamp))
-        if capabilities.ulFeatures & Features.METADATA:
-            lib.SetMetaData(1)
-        if settings.frame_transfer and not capabilities.ulAcqModes & AcqModes.FRAMETRANSFER:
-            raise DeviceError(name, "this camera has no frame transfer; leave `frame_transfer` out")
-        if capabilities.ulAcqModes & AcqModes.FRAMETRANSFER:
-            sdk.camera.enable_frame_transfer_mode(settings.frame_transfer)
-        sdk.camera.setup_ext_trigger(invert=settings.trigger_edge == "falling")
-        if settings.fast_trigger:
-            lib.SetFastExtTrigger(1)
+    if capabilities.ulSetFunctions & SetFunctions.BASELINECLAMP:
+        lib.SetBaselineClamp(int(settings.baseline_clamp))
+    if capabilities.ulFeatures & Features.METADATA:
+        lib.SetMetaData(1)
+    if capabilities.ulAcqModes & AcqModes.FRAMETRANSFER:
+        sdk.camera.enable_frame_transfer_mode(settings.frame_transfer)
+    elif settings.frame_transfer:
+        raise DeviceError(name, "this camera has no frame transfer; leave `frame_transfer` out")
+    sdk.camera.setup_ext_trigger(invert=settings.trigger_edge == "falling")
+    if settings.fast_trigger:
+        lib.SetFastExtTrigger(1)
 
 
-def _image(sdk: Sdk, settings: AndorSettings, sensor_shape: tuple[int, int], name: str) -> None:
+def _set_region(
+    sdk: Sdk, lib: Any, settings: AndorSettings, sensor_shape: tuple[int, int], name: str
+) -> None:
+    """Set region and binning; after frame transfer, which isolated crop needs."""
     y, x, height, width = settings.mode.region or (0, 0, *sensor_shape)
     binning = settings.binning
-    with sdk.selected() as lib:
-        lib.SetReadMode(FULL_IMAGE)
-        lib.SetImage(binning, binning, x + 1, x + width, y + 1, y + height)
-        if not settings.isolated_crop:
-            return
-        functions = sdk.capabilities.ulSetFunctions
-        if functions & SetFunctions.EXTENDED_CROP_MODE:
-            sdk.raw("SetIsolatedCropModeEx", 1, height, width, binning, binning, x + 1, y + 1)
-        elif functions & SetFunctions.CROPMODE and (y, x) == (0, 0):
-            sdk.raw("SetIsolatedCropMode", 1, height, width, binning, binning)
-        else:
-            text = "this camera cannot crop this region; with `isolated_crop` it must begin at y: 0, x: 0"
-            raise DeviceError(name, f"{text}, if the camera can do it at all")
+    lib.SetReadMode(FULL_IMAGE)
+    lib.SetImage(binning, binning, x + 1, x + width, y + 1, y + height)
+    if not settings.isolated_crop:
+        return
+    functions = sdk.capabilities.ulSetFunctions
+    if functions & SetFunctions.EXTENDED_CROP_MODE:
+        sdk.raw("SetIsolatedCropModeEx", 1, height, width, binning, binning, x + 1, y + 1)
+    elif functions & SetFunctions.CROPMODE and (y, x) == (0, 0):
+        sdk.raw("SetIsolatedCropMode", 1, height, width, binning, binning)
+    else:
+        text = "this camera cannot crop this region; with `isolated_crop` it must begin at y: 0, x: 0"
+        raise DeviceError(name, f"{text}, if the camera has isolated crop at all")
 
 
-def _gain_range(sdk: Sdk, settings: AndorSettings, name: str) -> list[int] | None:
-    """Choose real gain, which is the factor that it says; None for a camera or an amplifier without."""
+def _set_gain_mode(sdk: Sdk, lib: Any, settings: AndorSettings, name: str) -> list[int] | None:
+    """Choose the mode in which the EM gain is a factor; None for a camera or an amplifier without it."""
     capabilities = sdk.capabilities
-    with sdk.selected() as lib:
-        if settings.amplifier == "em" and capabilities.ulEMGainCapability & EM_GAIN_REAL:
-            lib.SetEMGainMode(REAL_GAIN_MODE)
-            if settings.em_gain > HIGH_GAIN and capabilities.ulSetFunctions & SetFunctions.EMADVANCED:
-                lib.SetEMAdvanced(1)
-            low, high = (int(value) for value in lib.GetEMGainRange())
-            if settings.em_gain != 1 and not low <= settings.em_gain <= high:
-                text = f"`em_gain` is {settings.em_gain}; this camera takes 1 (off) and {low} to {high}"
-                raise DeviceError(name, text)
-            return [low, high]
+    if settings.amplifier == "em" and capabilities.ulEMGainCapability & EM_GAIN_REAL:
+        lib.SetEMGainMode(REAL_GAIN_MODE)
+        if settings.em_gain > HIGH_GAIN and capabilities.ulSetFunctions & SetFunctions.EMADVANCED:
+            lib.SetEMAdvanced(1)
+        low, high = (int(value) for value in lib.GetEMGainRange())
+        if settings.em_gain != 1 and not low <= settings.em_gain <= high:
+            text = f"`em_gain` is {settings.em_gain}; this camera takes 1 (off) and {low} to {high}"
+            raise DeviceError(name, text)
+        return [low, high]
     if settings.em_gain > 1:
         raise DeviceError(name, "this camera has no EM gain that is set as a factor; leave `em_gain` out")
     return None

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 from labseq_andor.camera import AndorCamera
-from labseq_andor.counterpart import SimulatedCamera
 from labseq_andor.settings import AndorSettings
+from labseq_andor_sim import SimulatedAndorLibrary, SimulatedCamera
 from numpy.typing import NDArray
 
 from labseq import Clock, Context, Frame, SensorMode
@@ -60,8 +60,9 @@ class Rig:
         self.context = Context("camera", SiteGrid(), clock=self.clock, simulation=self.world)
         given = {"camera": "simulated", **settings}
         self.camera = AndorCamera(AndorSettings.model_validate(given), self.context)
-        assert self.camera.simulated is not None
-        self.sim: SimulatedCamera = self.camera.simulated
+        assert isinstance(self.camera.library, SimulatedAndorLibrary)
+        self.library = self.camera.library
+        self.sim: SimulatedCamera = self.library.camera
 
     def take(self, n_frames: int, exposure_s: float = 0.01, trigger: Trigger = "software") -> list[Frame]:
         """Trigger and read, one frame after the other."""

@@ -1,25 +1,31 @@
-"""The Andor camera, on the stand-in of the SDK below the real pylablib."""
+"""The Andor driver with the real pylablib, on the simulator of the SDK: series, cooling, whole runs."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
 import pytest
+import yaml
 from hypothesis import given, settings, strategies as st
 from labseq_andor.camera import AndorCamera
+from labseq_andor.codes import Code
 from labseq_andor.library import load_pylablib
 from labseq_andor.settings import AndorSettings
 
-from labseq import Context, LimitError
+from labseq import Context, DeviceError, DeviceTimeoutError, LimitError, NeedsSettling, Run, Session
 from labseq.roles import NeverStopped, Trigger
 from labseq.testing import CameraContract
 
 from .labseq_andor_rig import Rig, rig
 from .needs import need_library
+
+COLD: Final[dict[str, Any]] = {"temperature": "-70 degC"}
+ROOT: Final = Path(__file__).parents[2]
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -109,11 +115,11 @@ def test_a_known_model_tells_sensor_and_read_out_before_it_is_opened() -> None:
 def test_em_gain_is_on_in_a_series_only() -> None:
     with rig(em_gain=250) as lab:
         assert lab.camera.facts.em_gain == 250
-        assert lab.sim.register.gain == 0
+        assert lab.sim.amplifiers.em_gain == 0
         lab.take(1)
         assert lab.world.modes[-1].em_gain == 250
         lab.camera.safe_state()
-        assert lab.sim.register.gain == 0
+        assert lab.sim.amplifiers.em_gain == 0
         lab.camera.self_test()
         assert lab.world.modes[-1].em_gain == 1
 
@@ -235,3 +241,140 @@ def test_two_simulated_cameras_work_side_by_side() -> None:
             assert one.take(1)[0].image.shape == (96, 128)
             assert other.take(1)[0].image.shape == (64, 64)
         assert (one.camera.describe()["model"], other.camera.describe()["model"]) == ("DU-897", "DU-888")
+
+
+# cooling
+
+
+def status(lab: Rig) -> int:
+    return lab.sim.cooler.status
+
+
+def test_it_waits_until_the_sensor_is_cold_and_the_camera_calls_it_stabilized() -> None:
+    with rig(cooling=COLD) as lab:
+        assert isinstance(lab.camera, NeedsSettling)
+        assert lab.camera.settling_timeout_s == 900.0
+        assert status(lab) == Code.TEMP_NOT_REACHED
+        lab.camera.settle()
+        assert status(lab) == Code.TEMP_STABILIZED
+        assert lab.camera.describe()["temperature_k"] == pytest.approx(203.15, abs=1.0)
+        assert 200.0 < lab.clock.now() < 600.0
+
+
+def test_without_cooling_the_cooler_is_left_alone() -> None:
+    with rig() as lab:
+        assert lab.camera.settling_timeout_s == 0.0
+        lab.camera.settle()
+        assert (lab.clock.now(), lab.sim.cooler.is_on) == (0.0, False)
+
+
+def test_a_cooler_that_never_gets_cold() -> None:
+    with rig(cooling={"temperature": "-80 degC", "timeout": "10 min"}) as lab:
+        lab.sim.faults.coldest_c = -60.0
+        with pytest.raises(
+            DeviceTimeoutError, match=r"sensor is at -60.0 degC after 600 s.*-80.0 degC.*water"
+        ):
+            lab.camera.settle()
+        assert lab.clock.now() == pytest.approx(600.0, abs=1.5)
+
+
+def test_a_camera_that_never_calls_itself_stabilized() -> None:
+    with rig(cooling={"temperature": "-80 degC", "tolerance": 20, "timeout": "5 min"}) as lab:
+        lab.sim.faults.coldest_c = -70.0
+        with pytest.raises(DeviceTimeoutError, match=r"does not report a stabilized temperature after 300 s"):
+            lab.camera.settle()
+
+
+def test_a_drift_is_waited_for_too() -> None:
+    with rig(cooling={**COLD, "timeout": "10 min"}) as lab:
+        lab.camera.settle()
+        lab.sim.faults.drift_k = 5.0
+        assert status(lab) == Code.TEMP_DRIFT
+        with pytest.raises(DeviceTimeoutError, match=r"sensor is at -6\d"):
+            lab.camera.settle()
+
+
+def test_the_safe_state_keeps_the_cooler_on() -> None:
+    with rig(cooling=COLD) as lab:
+        lab.camera.settle()
+        lab.camera.safe_state()
+        assert lab.sim.cooler.is_on
+        assert status(lab) == Code.TEMP_STABILIZED
+
+
+@pytest.mark.parametrize(("after", "is_on"), [("keep", True), ("off", False)])
+def test_closing_leaves_the_cooler_as_the_settings_say(after: str, is_on: bool) -> None:
+    with rig(cooling=COLD, cooler_after_close=after) as lab:
+        lab.camera.settle()
+    assert lab.sim.cooler.is_on == is_on
+    lab.clock.sleep(600.0)
+    assert lab.sim.cooler.temperature_c == pytest.approx(-70.0 if is_on else 20.0, abs=0.1)
+
+
+def test_a_camera_that_stayed_cold_is_ready_at_once_when_it_is_opened_again() -> None:
+    with rig(cooling=COLD) as lab:
+        lab.camera.settle()
+    lab.camera.open()
+    start_s = lab.clock.now()
+    lab.camera.settle()
+    assert lab.clock.now() - start_s < 10.0
+    lab.camera.close()
+
+
+def test_a_closed_camera_does_not_settle() -> None:
+    with pytest.raises(DeviceError, match="not open"):
+        Rig(cooling=COLD).camera.settle()
+
+
+def test_looking_for_a_serial_number_leaves_other_cameras_cold() -> None:
+    lab = Rig(serial=4711)
+    lab.sim.cooler.set_temperature(-70)
+    lab.sim.cooler.switch_on()
+    with pytest.raises(DeviceError, match="expected 4711"):
+        lab.camera.open()
+    assert lab.sim.cooler.is_on
+
+
+# whole runs
+
+
+def profile(folder: Path, **camera: Any) -> str:
+    """``virtual`` with another camera."""
+    parts = yaml.safe_load((ROOT / "hardware_profiles" / "virtual.yaml").read_text())
+    parts["camera"] = {"use": "andor", "em_gain": 300, **camera}
+    path = folder / "bench_andor.yaml"
+    path.write_text(yaml.safe_dump(parts))
+    return str(path)
+
+
+def run(output: Path, profile: str, *overrides: str, dry_run: Any = "off") -> Run:
+    with Session.open(
+        ROOT / "sequences" / "compact_225.yaml",
+        profile=profile,
+        shots=2,
+        seed=1,
+        output=output,
+        overrides=overrides,
+        dry_run=dry_run,
+    ) as session:
+        return session.run()
+
+
+def assert_equal(one: Run, other: Run) -> None:
+    for a, b in zip(one.shots, other.shots, strict=True):
+        np.testing.assert_array_equal(a.occupancies, b.occupancies)
+
+
+def test_the_whole_experiment_sees_what_the_virtual_camera_sees(tmp_path: Path) -> None:
+    readout_s = AndorSettings().readout_s(None, (512, 512))
+    andor = run(tmp_path, profile(tmp_path, camera="simulated"))
+    assert andor.simulated
+    assert_equal(andor, run(tmp_path, "virtual", f"profile.camera.readout={readout_s}"))
+
+
+def test_a_dry_run_with_a_real_cameras_profile_takes_the_simulated_one(tmp_path: Path) -> None:
+    real = profile(tmp_path, serial=4711, model="DU-897", cooling={"temperature": "-70 degC"})
+    done = run(tmp_path, real, dry_run="full")
+    assert done.simulated
+    described = done.record["devices"]["camera"]
+    assert (described["serial_number"], described["setpoint_k"]) == ("10001", pytest.approx(203.15))

@@ -9,11 +9,11 @@ from typing import Any
 
 import pytest
 from labseq_andor.camera import AndorCamera
-from labseq_andor.counterpart import SimulatedCamera
-from labseq_andor.counterpart.optics import CLOSED
+from labseq_andor.codes import SHUTTER_CLOSED
 from labseq_andor.heads import IXON_888, IXON_897
 from labseq_andor.library import load_pylablib
 from labseq_andor.settings import AndorSettings
+from labseq_andor_sim import SimulatedCamera
 
 from labseq import ConfigError, Context, DeviceError, DeviceTimeoutError, TransientError
 from labseq.errors import StopRequested
@@ -54,7 +54,7 @@ def test_another_program_holds_the_camera() -> None:
 
 def test_another_model_answers() -> None:
     lab = Rig(model="DU-888")
-    lab.sim.identity._head = IXON_897
+    lab.sim.head = IXON_897
     assert "connected camera is a DU-897; expected a model that begins with DU-888" in refusal(lab)
 
 
@@ -65,13 +65,13 @@ def test_another_serial_number_answers() -> None:
 def two_cameras(**settings: Any) -> tuple[Rig, SimulatedCamera]:
     lab = Rig(**settings)
     other = SimulatedCamera(lab.world, lab.clock, IXON_888, (96, 128), serial=10002)
-    lab.camera.beside.append(other)
+    lab.library.others.append(other)
     return lab, other
 
 
 def test_with_two_cameras_the_serial_number_decides() -> None:
     lab, _ = two_cameras()
-    assert "2 Andor cameras are connected; say which by `serial`" in refusal(lab)
+    assert "2 Andor cameras are connected; choose one by `serial`" in refusal(lab)
     lab, _ = two_cameras(serial=4711)
     assert "10001 and 10002; expected 4711" in refusal(lab)
     lab, _ = two_cameras(serial=10002)
@@ -81,7 +81,7 @@ def test_with_two_cameras_the_serial_number_decides() -> None:
 
 
 def test_a_camera_that_pylablib_cannot_open(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("labseq_andor.counterpart.identity.READ_MODES", 3)
+    monkeypatch.setattr("labseq_andor_sim.camera.READ_MODES", 3)
     assert "pylablib cannot open this camera: invalid value None for the read_mode" in refusal(Rig())
 
 
@@ -253,8 +253,8 @@ def test_the_safe_state_comes_through_while_a_call_hangs() -> None:
         reader.start()
         assert lab.sim.acquisition.hangs.wait(10.0)
         lab.camera.safe_state()
-        assert lab.sim.optics.shutter == CLOSED
-        assert (lab.sim.register.gain, lab.sim.acquisition.is_acquiring) == (0, False)
+        assert lab.sim.optics.shutter == SHUTTER_CLOSED
+        assert (lab.sim.amplifiers.em_gain, lab.sim.acquisition.is_acquiring) == (0, False)
         lab.sim.faults.hang.set()
         reader.join(10.0)
         assert not reader.is_alive()
@@ -284,7 +284,7 @@ def test_without_andors_library_the_error_says_what_to_install() -> None:
 def test_a_real_camera_does_not_take_the_place_of_an_open_simulated_one(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("labseq_andor.library._load", lambda path: builtins.object())
+    monkeypatch.setattr("labseq_andor.library.load_file", lambda path: builtins.object())
     with rig() as lab:
         camera = AndorCamera(AndorSettings(sdk="libandor.so"), Context("camera_2"))
         with pytest.raises(DeviceError, match="camera_2: another Andor camera is open in this process"):

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 from labseq_andor.codes import Code
-from labseq_andor.counterpart import SimulatedCamera, SimulatedSdk
-from labseq_andor.counterpart.camera import FUNCTIONS
 from labseq_andor.heads import HEADS, IXON_897
 from labseq_andor.library import load_pylablib
+from labseq_andor_sim import SimulatedCamera, SimulatedSdk
+from labseq_andor_sim.library import FUNCTIONS
 
 from labseq.testing.fakes import Calls, FakeClock
 

@@ -1,0 +1,278 @@
+"""How the simulated camera acquires series of frames, and the ring buffer that keeps them."""
+
+from __future__ import annotations
+
+import ctypes
+import threading
+import time
+from collections import OrderedDict, deque
+from dataclasses import dataclass
+from typing import Any, Final, Literal
+
+import numpy as np
+from labseq_andor.codes import Code
+
+from labseq.plugin import Clock, Frame, Series, SimulatedSensor
+from labseq_andor_sim.configuration import EXTERNAL, INTERNAL, SOFTWARE, Timing
+from labseq_andor_sim.functions import implements
+
+ROUNDING_S: Final = 1e-9
+BUFFER_BYTES: Final = 48 * 2**20
+"""Size of the ring buffer (ours)."""
+KINDS: Final[dict[int, Literal["software", "internal", "external"]]] = {
+    INTERNAL: "internal",
+    EXTERNAL: "external",
+    SOFTWARE: "software",
+}
+COLDEST_C: Final = -100.0
+"""Lowest temperature that the cooler reaches, in degrees Celsius (ours)."""
+
+
+@dataclass(slots=True)
+class Faults:
+    """Failures to simulate; may be changed at any time.
+
+    Attributes:
+        not_connected: The camera is not there.
+        held: Another program uses it.
+        unplugged: It answers no call any more.
+        unplugged_at: Number of the frame, from 1, at which it is unplugged; 0: never.
+        missed_triggers: How many of the next triggers the camera does not see.
+        late_s: Delay of each frame, in seconds.
+        buffer_error_at: Number of the frame, from 1, that the computer fails to take over; 0: none.
+        buffer_frames: Frames that the ring buffer holds; 0: as many as fit into 48 MiB (ours).
+        coldest_c: Lowest temperature that the cooler reaches, in degrees Celsius.
+        drift_k: How far the sensor has drifted from its temperature, in kelvins.
+        hang: Fetching a frame does not return until this is set; None: it returns.
+    """
+
+    not_connected: bool = False
+    held: bool = False
+    unplugged: bool = False
+    unplugged_at: int = 0
+    missed_triggers: int = 0
+    late_s: float = 0.0
+    buffer_error_at: int = 0
+    buffer_frames: int = 0
+    coldest_c: float = COLDEST_C
+    drift_k: float = 0.0
+    hang: threading.Event | None = None
+
+
+class Acquisition:
+    """Starts exposures, and moves each frame into the ring buffer when it has been read.
+
+    Frames in the ring buffer are numbered from 1; the oldest is overwritten when the buffer is full.
+
+    Args:
+        sensor: Source of the pixels.
+        timing: Exposure, cycle times and trigger.
+        clock: The session's clock.
+        faults: Failures to simulate.
+
+    Attributes:
+        is_acquiring: Whether a series is running.
+        n_fetched: Number of the last frame that was fetched.
+        hangs: Set when fetching a frame hangs.
+    """
+
+    def __init__(self, sensor: SimulatedSensor, timing: Timing, clock: Clock, faults: Faults) -> None:
+        self._sensor, self._timing = sensor, timing
+        self._clock, self._faults = clock, faults
+        self._arrived = threading.Condition()
+        self.hangs = threading.Event()
+        self.reset()
+
+    def reset(self) -> None:
+        """End any series, as Initialize does."""
+        self.is_acquiring = False
+        self._fault: Code = Code.SUCCESS
+        self._n_left = 0
+        self._is_cancelled = False
+        self._coming: deque[tuple[float, Frame]] = deque()
+        self._busy_until_s = self._started_s = 0.0
+        self._sensor.clear()
+        self._empty_buffer()
+
+    @implements("PrepareAcquisition", "FreeInternalMemory", only_idle=True)
+    def _empty_buffer(self) -> Code:
+        self._buffer: OrderedDict[int, Frame] = OrderedDict()
+        self._n_arrived = self.n_fetched = 0
+        return Code.SUCCESS
+
+    @implements("GetSizeOfCircularBuffer", outputs=1)
+    def _get_buffer_size(self) -> tuple[int]:
+        height, width = self._timing.optics.frame_shape
+        return (self._faults.buffer_frames or max(2, BUFFER_BYTES // (2 * height * width)),)
+
+    @implements("StartAcquisition", only_idle=True)
+    def _start(self) -> Code:
+        """Arm the sensor; with the internal trigger the first exposure begins."""
+        timing, mode = self._timing, self._timing.sensor_mode
+        if not timing.optics.reads_images:
+            return Code.INVALID_MODE
+        self._empty_buffer()
+        series = Series(timing.n_frames, timing.exposure_s, KINDS[timing.trigger], mode.em_gain or 1.0)
+        self._sensor.arm(series, mode, timing.readout_s, timing.kinetic_s)
+        self._n_left = timing.n_frames
+        self.is_acquiring, self._fault, self._is_cancelled = True, Code.SUCCESS, False
+        self._started_s = self._busy_until_s = self._clock.now()
+        self._coming.clear()
+        self.proceed()
+        return Code.SUCCESS
+
+    @implements("AbortAcquisition")
+    def abort(self) -> Code:
+        """Stop; frames that were not read out are lost."""
+        if not self.is_acquiring:
+            return Code.IDLE
+        self._finish()
+        self._sensor.clear()
+        return Code.SUCCESS
+
+    @implements("SendSoftwareTrigger")
+    def _trigger(self) -> Code:
+        """Expose; refused during an exposure, or a read-out that cannot overlap with the next exposure."""
+        if self._timing.trigger != SOFTWARE or not self._timing.runs_till_abort:
+            return Code.INVALID_MODE
+        if not self.is_acquiring:
+            return Code.IDLE
+        if self._is_busy:
+            return Code.ERROR_CODES
+        self._expose()
+        return Code.SUCCESS
+
+    def pulse(self) -> bool:
+        """An edge at the trigger input, now; False if it started no exposure, since it came too soon."""
+        is_armed = self.is_acquiring and self._timing.trigger == EXTERNAL and self._n_left > 0
+        if not is_armed or self._is_busy:
+            return False
+        self._expose()
+        return True
+
+    @implements("GetStatus", outputs=1)
+    def _get_status(self) -> tuple[int]:
+        """Idle, acquiring, or why the acquisition ended early."""
+        self.proceed()
+        idle = self._fault if self._fault != Code.SUCCESS else Code.IDLE
+        return (Code.ACQUIRING if self.is_acquiring else idle,)
+
+    @implements("GetAcquisitionProgress", outputs=2)
+    def _get_progress(self) -> tuple[int, int]:
+        """Accumulated exposures, and frames so far."""
+        self.proceed()
+        return 0, self._n_arrived
+
+    @implements("GetNumberNewImages", outputs=2)
+    def _get_new(self) -> Code | tuple[int, int]:
+        """Numbers of the first and the last frame that were not fetched."""
+        self.proceed()
+        new = [number for number in self._buffer if number > self.n_fetched]
+        return (new[0], new[-1]) if new else Code.NO_NEW_DATA
+
+    @implements("GetImages16", outputs=2, waits=True)
+    def _get_images(self, first: int, last: int, pixels: Any, size: int) -> Code | tuple[int, int]:
+        """Copy frames into an array of ``size`` pixels."""
+        if self._faults.hang is not None:
+            self.hangs.set()
+            self._faults.hang.wait()
+        if first not in self._buffer:
+            return Code.P1INVALID
+        if last not in self._buffer or last < first:
+            return Code.P2INVALID
+        images = [np.ascontiguousarray(self._buffer[number].image) for number in range(first, last + 1)]
+        if size != sum(image.size for image in images):
+            return Code.P4INVALID
+        address = ctypes.addressof(pixels.contents)
+        for image in images:
+            ctypes.memmove(address, image.ctypes.data, image.nbytes)
+            address += image.nbytes
+        self.n_fetched = max(self.n_fetched, last)
+        return first, last
+
+    @implements("SetMetaData", only_idle=True)
+    def _set_metadata(self, state: int) -> Code:
+        """No effect: there are always time stamps."""
+        return Code.SUCCESS if state in (0, 1) else Code.P1INVALID
+
+    @implements("GetMetaDataInfo")
+    def _get_time_stamp(self, _start: int | None, since_start_ms: Any, index: int) -> Code:
+        """Milliseconds from the start of the series to that of a frame counted from 0."""
+        frame = self._buffer.get(index + 1)
+        if frame is None:
+            return Code.P2INVALID
+        since_start_ms[0] = (frame.t_start_s - self._started_s) * 1e3
+        return Code.SUCCESS
+
+    @implements("WaitForAcquisitionByHandleTimeOut", waits=True)
+    def _wait(self, _handle: int, timeout_ms: int) -> Code:
+        """Wait in real time for a frame; on a virtual clock it is there already, or does not come."""
+        deadline_s = time.monotonic() + timeout_ms / 1e3
+        with self._arrived:
+            while True:
+                self.proceed()
+                if self._n_arrived > self.n_fetched:
+                    return Code.SUCCESS
+                left_s = deadline_s - time.monotonic()
+                if self._is_cancelled or left_s <= 0:
+                    self._is_cancelled = False
+                    return Code.NO_NEW_DATA
+                next_s = 1.0
+                if self._coming and not self._clock.virtual:
+                    next_s = max(self._coming[0][0] - self._clock.now(), 1e-4)
+                self._arrived.wait(min(left_s, next_s))
+
+    @implements("CancelWait")
+    def _cancel_wait(self) -> Code:
+        with self._arrived:
+            self._is_cancelled = True
+            self._arrived.notify_all()
+        return Code.SUCCESS
+
+    def proceed(self) -> None:
+        """Do what is due by now: frames arrive; with the internal trigger the next exposure begins."""
+        now_s = self._clock.now() + ROUNDING_S
+        while self.is_acquiring:
+            if not self._coming and self._timing.trigger == INTERNAL:
+                self._expose()
+            if not self._coming or self._coming[0][0] > now_s:
+                return
+            self._arrive(self._coming.popleft()[1])
+
+    @property
+    def _is_busy(self) -> bool:
+        return self._clock.now() < self._busy_until_s - ROUNDING_S
+
+    def _expose(self) -> None:
+        self._n_left -= 1
+        if self._faults.missed_triggers > 0:
+            self._faults.missed_triggers -= 1
+            self._sensor.skip()
+            return
+        frame = self._sensor.expose(self._faults.late_s)
+        if frame is None:
+            return
+        end_s, readout_s = frame.t_start_s + self._timing.exposure_s, self._timing.readout_s
+        self._busy_until_s = end_s if self._timing.optics.frame_transfer else end_s + readout_s
+        with self._arrived:
+            self._coming.append((end_s + readout_s + self._faults.late_s, frame))
+            self._arrived.notify_all()
+
+    def _arrive(self, frame: Frame) -> None:
+        number = self._n_arrived + 1
+        if number == self._faults.unplugged_at:
+            self._faults.unplugged = True
+        if number == self._faults.buffer_error_at:
+            self._fault = Code.ACQ_BUFFER
+            self._finish()
+            return
+        self._n_arrived = number
+        self._buffer[number] = frame
+        if len(self._buffer) > self._get_buffer_size()[0]:
+            self._buffer.popitem(last=False)
+        if not self._n_left and not self._coming:
+            self._finish()
+
+    def _finish(self) -> None:
+        self.is_acquiring = False
+        self._coming.clear()
