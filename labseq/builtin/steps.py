@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 from labseq.errors import DeviceError, PlanError
 from labseq.model import CycleRecord, Plan, PlanReport, TimelineEntry, ToneProgram
 from labseq.motion import check_plan, fitting_batches, tone_program
-from labseq.roles import ReportsTimings, Shot, StepContext
+from labseq.roles import Shot, StepContext, offers
 from labseq.sequencer.lines import margin_s
 from labseq.settings import Duration, Fraction, Length, Settings, Text, empty_is, setting_error
 from labseq.units import format_quantity
@@ -215,7 +215,7 @@ def play(shot: Shot, build: Callable[[], ToneProgram], start_s: float, cycle: in
         with shot.stage("tones", cycle=cycle):
             program = build()
         duration_s = _duration(shot.call("mobile_tweezers", limit_s, mobile.prepare, program))
-        if isinstance(mobile, ReportsTimings):
+        if offers(mobile, "timings"):
             for part, host_s in shot.call("mobile_tweezers", limit_s, mobile.timings).items():
                 shot.stage_done(part, 0.0 if shot.clock.virtual else host_s, host_s, cycle=cycle)
         if shot.clock.virtual:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from labseq.errors import DeviceError, DeviceTimeoutError, LimitError, TransientError, one_of
 from labseq.model import CameraFacts, Frame, SensorMode
-from labseq.roles import Clock, Context, Simulation, Trigger
+from labseq.roles import Camera, Clock, Context, Simulation, Trigger
 from labseq.units import ZERO_CELSIUS_K, format_quantity
 
 
@@ -61,7 +61,7 @@ class ExposureResult:
 TEST_EXPOSURE_S: Final = 10e-3
 
 
-class CameraDriver(ABC):
+class CameraDriver(Camera):
     """Base of camera drivers: plays the role, and asks a subclass only for what its camera does.
 
     It refuses what the camera cannot do before it is asked to, keeps to as many frames as were

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Protocol, Self, cast
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, NonNegativeInt, PositiveInt, model_validator
 
 from labseq.drivers import Cooling
 from labseq.errors import ConfigError
 from labseq.model import SensorMode
-from labseq.roles import Context, ReportsSensor, Simulation
+from labseq.roles import Context, Simulation, offers
 from labseq.settings import Duration, Settings, Temperature
 from labseq.units import ZERO_CELSIUS_K, format_quantity
-
-
-class SimulationWithSensor(Simulation, ReportsSensor, Protocol):
-    """A simulated world that tells of its sensor."""
 
 
 class RegionSettings(Settings):
@@ -54,19 +50,19 @@ class CameraSettings(Settings):
             return f"{ends}, beyond the sensor of {rows} x {cols} pixels; choose a smaller or another one"
         return _unbinnable(height, width, self.binning)
 
-    def simulated_world(self, context: Context) -> SimulationWithSensor:
-        """The simulated world that the simulated counterpart of a camera shows.
+    def simulated_world(self, context: Context) -> Simulation:
+        """The simulation whose frames a simulated camera takes.
 
         Raises:
-            ConfigError: There is none, it does not know its sensor, or the region is beyond that.
+            ConfigError: There is none, it does not describe its sensor, or the region is beyond it.
         """
         world = context.simulation
-        if world is None or not isinstance(world, ReportsSensor):
-            text = "a simulated camera needs a simulated world that tells of its sensor"
+        if world is None or not offers(world, "sensor_shape"):
+            text = "a simulated camera needs a simulation that describes its sensor"
             raise ConfigError(f"{text}; add `simulation: {{use: virtual}}` to the profile")
         if setting_error := self.sensor_conflict(world.sensor_shape):
             raise ConfigError(setting_error)
-        return cast("SimulationWithSensor", world)
+        return world
 
     @model_validator(mode="after")
     def _region_can_be_binned(self) -> Self:

@@ -1,13 +1,15 @@
-"""The roles that plugins play, as Protocols, and what they are given to play them.
+"""The roles that plugins play, and what they work with.
 
 Roles are synchronous. A constructor does no I/O; ``open()`` does. Hardware roles
 share ``open``, ``close``, ``safe_state`` (legal in any state, also before
-``open``, and any number of times) and ``describe``. Optional capabilities are
-small extra Protocols that the core looks for with ``isinstance``.
+``open``, and any number of times) and ``describe``. Optional abilities are methods
+with a default on the role's base class. The few Protocols that remain
+(``LeaderLink``, ``NeedsWarmUp``, ``ReportsSignals``, ``ReceivesOutput``)
+change what the core does where a plugin has them.
 
 Failures: a device raises ``DeviceError`` (or ``DeviceTimeoutError``),
-``LimitError`` before anything moves when it is asked for too much, and
-``TransientError`` when a repetition of the shot may help.
+``LimitError`` before anything moves when the request is out of range, and
+``TransientError`` when repeating the shot may help.
 """
 
 from labseq.roles.deciding import (
@@ -21,36 +23,23 @@ from labseq.roles.deciding import (
 )
 from labseq.roles.hardware import (
     Camera,
-    ChecksCommands,
     Device,
     Hardware,
-    HasReadings,
-    HasSelfTest,
-    Interlocked,
     LeaderLink,
     Lines,
     MobileTweezers,
-    NeedsSettling,
-    ReportsCameraFacts,
-    ReportsLinesFacts,
-    ReportsTimings,
     StaticTweezers,
     Trigger,
+    offers,
 )
-from labseq.roles.shot import Clock, Context, NeverStopped, Repeatable, RunObserver, Shot, Step, StepContext
+from labseq.roles.shot import Clock, Context, NeverStopped, RunObserver, Shot, Step, StepContext
 from labseq.roles.simulation import (
     WHOLE_SENSOR,
     ReceivesOutput,
-    ReportsEvents,
-    ReportsLoading,
-    ReportsLosses,
-    ReportsSensor,
-    ReportsTruth,
     RfSource,
     Signal,
     Simulation,
     ToneSource,
-    WiresTriggers,
 )
 
 __all__ = [
@@ -62,27 +51,16 @@ __all__ = [
     "Detector",
     "Device",
     "Hardware",
-    "Interlocked",
-    "ReportsCameraFacts",
-    "ChecksCommands",
-    "ReportsLinesFacts",
-    "ReportsLoading",
-    "ReportsSensor",
     "LeaderLink",
     "Lines",
     "ReceivesOutput",
-    "ReportsLosses",
     "MobileTweezers",
     "NeverStopped",
     "Planner",
-    "HasReadings",
     "RecordedShot",
-    "Repeatable",
     "RfSource",
     "RunObserver",
     "Scanner",
-    "HasSelfTest",
-    "NeedsSettling",
     "Shot",
     "Signal",
     "ReportsSignals",
@@ -90,11 +68,8 @@ __all__ = [
     "StaticTweezers",
     "Step",
     "StepContext",
-    "ReportsEvents",
-    "ReportsTimings",
     "ToneSource",
     "Trigger",
-    "ReportsTruth",
     "NeedsWarmUp",
-    "WiresTriggers",
+    "offers",
 ]

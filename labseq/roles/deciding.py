@@ -1,4 +1,8 @@
-"""The roles that decide, and those that look at what came of it: planner, detector, scanner, analysis."""
+"""The roles that decide, and those that analyse the result: planner, detector, scanner, analysis.
+
+All are pure functions of their inputs, so a class with the methods of the role plays it; it need not be
+derived from it.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +25,7 @@ from labseq.model import (
 
 
 class Planner(Protocol):
-    """Decides the moves. Pure: deterministic, no I/O, the input left untouched."""
+    """Decides the moves. Pure: deterministic, no I/O, the input left unchanged."""
 
     def plan(self, occupancy: Occupancy, target: TargetPattern) -> Plan:
         """Plan the moves that fill the target.
@@ -31,7 +35,7 @@ class Planner(Protocol):
         Args:
             occupancy: bool (n_rows, n_cols), as detected; of any memory layout, and
                 perhaps read-only.
-            target: What to end with.
+            target: The pattern to end with.
         """
         ...
 
@@ -52,9 +56,9 @@ class Detector(Protocol):
 class Scanner(Protocol):
     """Chooses the points of an adaptive scan, one after another.
 
-    Pure: what it chooses follows from its settings, the space (its seed included) and the points
-    visited so far, and from nothing else; it does no I/O. So a run that is resumed goes on as it
-    would have. It may keep what it has worked out, as long as nobody can tell.
+    Pure: the choice follows from its settings, the space (its seed included) and the points visited so
+    far, and from nothing else; it does no I/O. So a resumed run continues as it would have. It may cache
+    results as long as they change no choice.
     """
 
     def next_point(self, visited: Sequence[VisitedPoint]) -> Mapping[str, float] | None:
@@ -62,17 +66,17 @@ class Scanner(Protocol):
 
         Args:
             visited: The points so far with their scores, in order; none at the first call. A point
-                may stand in it more than once.
+                may occur more than once.
 
         Returns:
-            A value for each address, SI, within its range (:meth:`labseq.ScanRange.at` gives such
+            A value for each address, SI, within its range (:meth:`labseq.plugin.ScanRange.at` gives such
             values); or None if there is nothing more to find out: the run ends then.
         """
         ...
 
 
 class RecordedShot(Protocol):
-    """A shot that was taken, read back from disk: a ``Shot`` of ``labseq.open_run``, which tells more."""
+    """A shot read back from disk. The ``Shot`` of ``labseq.open_run`` has more."""
 
     @property
     def index(self) -> int:
@@ -81,7 +85,7 @@ class RecordedShot(Protocol):
 
     @property
     def target(self) -> TargetPattern:
-        """What the array was to look like."""
+        """The target pattern."""
         ...
 
     @property
@@ -111,7 +115,7 @@ class RecordedShot(Protocol):
 
     @property
     def frames(self) -> NDArray[np.uint16]:
-        """The frames that were kept, uint16 (n_frames, height, width)."""
+        """The recorded frames, uint16 (n_frames, height, width)."""
         ...
 
     @property
@@ -126,7 +130,7 @@ class RecordedShot(Protocol):
 
     @property
     def readings(self) -> Mapping[str, Any]:
-        """Values read from devices, and noted by steps."""
+        """Values read from devices or recorded by steps."""
         ...
 
     @property
@@ -136,33 +140,33 @@ class RecordedShot(Protocol):
 
 
 class Analysis(Protocol):
-    """Works something out of each shot, in a process of its own beside the run."""
+    """Computes results from each shot, in a process of its own next to the run."""
 
     def shot(self, shot: RecordedShot) -> Mapping[str, Any]:
         """Analyse a shot.
 
         Args:
-            shot: The shot, whole and on disk; shots come in the order they were taken.
+            shot: The shot, complete and on disk; shots come in the order they were taken.
 
         Returns:
-            Name -> number, text, array, or lists and mappings of them: what the shot's line of
-            the results says. "shot" and "error" are no names of results.
+            Name -> number, text, array, or lists and mappings of them: the shot's line in the results.
+            "shot" and "error" cannot be names of results.
         """
         ...
 
 
 @runtime_checkable
 class NeedsWarmUp(Protocol):
-    """A planner, detector or driver with kernels to compile before the first shot."""
+    """A planner or detector with kernels to compile before the first shot."""
 
     def warm(self) -> None:
-        """Compile (or load from the cache) every kernel that a shot will need."""
+        """Compile, or load from the cache, every kernel that a shot will need."""
         ...
 
 
 @runtime_checkable
 class ReportsSignals(Protocol):
-    """A detector that tells what it compares with its thresholds, so that they can be calibrated."""
+    """A detector that reports the values it compares with its thresholds, so that they can be calibrated."""
 
     @property
     def signal_unit(self) -> str:
@@ -175,5 +179,5 @@ class ReportsSignals(Protocol):
         ...
 
     def signals(self, frame: Frame) -> NDArray[np.float64]:
-        """What is compared with the threshold of each site, float64 (n_rows, n_cols)."""
+        """The value that is compared with the threshold of each site, float64 (n_rows, n_cols)."""
         ...

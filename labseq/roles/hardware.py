@@ -1,7 +1,12 @@
-"""The roles of hardware."""
+"""The roles of hardware: base classes of drivers.
+
+An abstract method is what every driver must do. The others are optional abilities: their defaults do
+nothing, and the core calls them only where a driver has its own version (see :func:`labseq.roles.offers`).
+"""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal, Protocol, runtime_checkable
 
@@ -11,204 +16,117 @@ from numpy.typing import NDArray
 from labseq.model import CameraFacts, Frame, LineProgram, LinesFacts, ToneProgram
 
 Trigger = Literal["software", "internal", "external"]
+"""What starts an exposure."""
 
 
-class Hardware(Protocol):
+class Hardware(ABC):
     """What all hardware roles share."""
 
+    @abstractmethod
     def open(self) -> None:
         """Connect and initialise; the first call that may do I/O."""
-        ...
 
+    @abstractmethod
     def close(self) -> None:
         """Disconnect; legal in any state."""
-        ...
 
+    @abstractmethod
     def safe_state(self) -> None:
         """Make all outputs harmless; idempotent and legal in any state."""
-        ...
 
+    @abstractmethod
     def describe(self) -> Mapping[str, Any]:
-        """Model, serial number, firmware, settings in force: JSON-ready values."""
-        ...
+        """Model, serial number, firmware, current settings: JSON-ready values."""
 
+    def warm(self) -> None:
+        """Compile, or load from the cache, every kernel that a shot will need; called before ``open()``."""
 
-@runtime_checkable
-class HasSelfTest(Protocol):
-    """A device that can tell whether it works, for ``labseq devices``."""
+    @property
+    def settling_timeout_s(self) -> float:
+        """Longest time that :meth:`settle` may take, in seconds; 0 if there is nothing to wait for."""
+        return 0.0
+
+    def settle(self) -> None:
+        """Wait until the device is ready, for example until a camera is cold; all devices are open.
+
+        Raises:
+            DeviceTimeoutError: It is not ready after ``settling_timeout_s`` on the session's clock.
+        """
 
     def self_test(self) -> None:
-        """Check what can be checked without harm: no light, nothing that moves; the device is open.
+        """Check the open device without light and without moving anything; for ``labseq devices``.
 
         Raises:
             DeviceError: With what is wrong.
         """
-        ...
-
-
-@runtime_checkable
-class NeedsSettling(Protocol):
-    """A device that needs time after ``open()`` until it works as it shall: a camera that cools."""
-
-    @property
-    def settling_timeout_s(self) -> float:
-        """How long that may take, in seconds; 0 if there is nothing to wait for."""
-        ...
-
-    def settle(self) -> None:
-        """Wait for it on the session's clock; all devices are open.
-
-        Raises:
-            DeviceTimeoutError: It takes longer than it may.
-        """
-        ...
-
-
-@runtime_checkable
-class HasReadings(Protocol):
-    """A device some of whose values are read at the start of each shot and kept with it."""
 
     def poll(self) -> Mapping[str, bool | int | float | str]:
-        """Name -> value; they stand among the shot's readings as "device.name"."""
-        ...
-
-
-@runtime_checkable
-class Interlocked(Protocol):
-    """A device that tells when something is so far off that no atom may be picked up."""
+        """Values to record with each shot, read at its start; each becomes the reading "device.name"."""
+        return {}
 
     def check_interlocks(self) -> None:
-        """Read what is watched; asked at the start of each shot and before each pick-up.
+        """Read the watched values; called at the start of each shot and before each pick-up of atoms.
 
         Raises:
             DeviceError: A value is past its limit; the run ends safely.
         """
-        ...
 
 
-@runtime_checkable
-class LeaderLink(Protocol):
-    """A device through which another control system leads: it says `go`, and is told what came of it.
-
-    For each `go` it gets exactly one answer, `ready` or `failed`, within the device's deadline, whatever
-    becomes of the shot: the device answers by itself where labseq does not in time.
-    """
-
-    @property
-    def deadline_s(self) -> float:
-        """Longest time from a signal to its answer, in seconds."""
-        ...
-
-    def wait_for(self, signal: str, timeout_s: float) -> str:
-        """Wait for a signal on the session's clock, and tell the leader that labseq is busy from now on.
-
-        A signal that came since the last answer counts. Looks for a stop request at least every 50 ms.
-
-        Args:
-            signal: "go".
-            timeout_s: How long to wait, in seconds.
-
-        Returns:
-            What the leader said with it; "" if nothing.
-
-        Raises:
-            DeviceTimeoutError: It did not come in time.
-            StopRequested: The operator asked the run to stop.
-        """
-        ...
-
-    def report(self, state: Literal["ready", "failed"], about: Mapping[str, bool | int | float | str]) -> str:
-        """Answer the signal that was waited for; without one, nothing is said.
-
-        Args:
-            state: What came of it.
-            about: "shot"; of one that is ready and was judged, "success" and "filling" (of the target, 0 to
-                1); of a failure its "reason".
-
-        Returns:
-            What the leader was told: "ready", "failed"; "late" if it was told of a failure when the deadline
-            passed; "gone" if it is not there any more; "" if it is owed nothing.
-        """
-        ...
-
-    def new_events(self) -> Sequence[str]:
-        """What happened since the last call, for the log: who came and went, what was not understood."""
-        ...
-
-
-@runtime_checkable
-class ChecksCommands(Protocol):
-    """A device that knows its commands before it is opened, for ``labseq check`` and the start of a run."""
-
-    def check_command(self, name: str, **arguments: Any) -> None:
-        """Check a command and its arguments; nothing is sent.
-
-        Raises:
-            DeviceError: It has no such command, or other arguments.
-            LimitError: An argument is past its limit.
-        """
-        ...
-
-
-class Camera(Hardware, Protocol):
+class Camera(Hardware):
     """Takes frames, in series.
 
     Its ``safe_state`` ends the acquisition, closes the shutter and sets the EM gain to 1.
     """
 
+    @property
+    def facts(self) -> CameraFacts:
+        """Read-out time, longest exposure, frame shape, EM gain and triggers; also before ``open()``."""
+        return CameraFacts()
+
+    @abstractmethod
     def arm(self, n_frames: int, exposure_s: float, trigger: Trigger) -> None:
         """Get ready for a series of ``n_frames`` exposures; the internal trigger starts them at once."""
-        ...
 
+    @abstractmethod
     def trigger(self) -> None:
         """Start the next exposure of the series (software trigger); returns at once."""
-        ...
 
+    @abstractmethod
     def read(self, timeout_s: float) -> Frame:
-        """Wait for the oldest frame not yet read.
+        """Wait for the oldest frame that has not been read yet.
 
         Raises:
             DeviceTimeoutError: No frame came within ``timeout_s``.
-            TransientError: A frame of the series was lost; a repeated shot may mend it.
+            TransientError: A frame of the series was lost; repeating the shot may help.
         """
-        ...
 
 
-@runtime_checkable
-class ReportsCameraFacts(Protocol):
-    """A camera that tells its limits before it is opened, for ``labseq check`` and budgets."""
-
-    @property
-    def facts(self) -> CameraFacts:
-        """Read-out time, longest exposure, shape of its frames, EM gain, triggers."""
-        ...
-
-
-class StaticTweezers(Hardware, Protocol):
+class StaticTweezers(Hardware):
     """The static array."""
 
+    @abstractmethod
     def load(self, amplitudes: tuple[NDArray[np.float64], NDArray[np.float64]] | None) -> None:
         """Set the tone amplitudes of the rows (n_rows,) and columns (n_cols,).
 
-        Fractions of full scale; None stands for the calibrated ones.
+        Fractions of full scale; None means the calibrated ones.
         """
-        ...
 
+    @abstractmethod
     def start(self) -> None:
         """Bring the array to its nominal depth, from off or after a ramp; no effect if it is there.
 
         Each shot begins with it.
         """
-        ...
 
+    @abstractmethod
     def ramp(self, depth: float, duration_s: float) -> None:
         """Change the depth linearly, to a fraction of the nominal depth."""
-        ...
 
 
-class MobileTweezers(Hardware, Protocol):
+class MobileTweezers(Hardware):
     """The moving tweezers."""
 
+    @abstractmethod
     def prepare(self, program: ToneProgram) -> float:
         """Render and upload a program without playing it.
 
@@ -218,65 +136,76 @@ class MobileTweezers(Hardware, Protocol):
         Raises:
             LimitError: The program asks for more than the device can do.
         """
-        ...
 
+    @abstractmethod
     def play(self) -> None:
-        """Start playing what was prepared; returns at once."""
-        ...
+        """Start playing the prepared program; returns at once."""
 
+    @abstractmethod
     def wait(self, timeout_s: float) -> None:
         """Wait until the program has been played to its end.
 
         Raises:
             DeviceTimeoutError: It did not end within ``timeout_s``.
         """
-        ...
-
-
-@runtime_checkable
-class ReportsTimings(Protocol):
-    """Mobile tweezers that tell how long the parts of their last ``prepare()`` took."""
 
     def timings(self) -> Mapping[str, float]:
-        """Name of a part ("render", "upload") -> seconds on this computer's clock; no I/O."""
-        ...
+        """Parts of the last ``prepare()``, such as "render" or "upload" -> seconds on this computer's clock.
+
+        No I/O.
+        """
+        return {}
 
 
-class Device(Hardware, Protocol):
+class Device(Hardware):
     """Any other instrument: a shutter, a laser controller, a synthesizer."""
 
+    @abstractmethod
     def command(self, name: str, **arguments: Any) -> None:
         """Carry out one of the commands that the device declares."""
-        ...
 
+    @abstractmethod
     def read(self, name: str) -> Any:
         """Read one of the values that the device declares."""
-        ...
+
+    def check_command(self, name: str, **arguments: Any) -> None:
+        """Check a command and its arguments before the device is opened; nothing is sent.
+
+        Raises:
+            DeviceError: It has no such command, or other arguments.
+            LimitError: An argument is past its limit.
+        """
 
 
-class Lines(Hardware, Protocol):
-    """The timing box that switches light and sends triggers; ``context.lines`` says what is wired to it.
+class Lines(Hardware):
+    """The timing box that switches light and sends triggers; ``context.lines`` names its wired channels.
 
     Between steps the lines are idle: on where :data:`labseq.model.lines.IDLE` says so. ``open()``
     puts them there, ``safe_state`` turns all of them off.
     """
 
+    @property
+    def lines_facts(self) -> LinesFacts:
+        """Channels, number of edges and resolution; also before ``open()``."""
+        return LinesFacts(())
+
+    @abstractmethod
     def compile(self, program: LineProgram) -> None:
-        """Take a program for the next firing; one that it knows already costs no time.
+        """Take a program for the next firing; a program that was compiled before costs no time.
 
         Raises:
-            LimitError: More edges, or nearer to one another, than the box can make.
+            LimitError: The program has more edges, or edges closer together, than the box can make.
         """
-        ...
 
+    @abstractmethod
     def arm(self) -> None:
-        """Get ready to fire what was compiled last."""
-        ...
+        """Get ready to fire the program compiled last."""
 
+    @abstractmethod
     def fire(self) -> None:
         """Start the program; returns at once."""
-        ...
 
+    @abstractmethod
     def wait(self, timeout_s: float) -> None:
         """Wait for its end.
 
@@ -284,14 +213,64 @@ class Lines(Hardware, Protocol):
             DeviceTimeoutError: It did not end within ``timeout_s``.
             DeviceError: The box did something else, for example a reset.
         """
-        ...
 
 
 @runtime_checkable
-class ReportsLinesFacts(Protocol):
-    """A timing box that tells its limits before it is opened, for ``labseq check``."""
+class LeaderLink(Protocol):
+    """A device or timing box through which another control system starts the shots of this run.
+
+    The other system sends the signal `go` and gets exactly one answer to it, `ready` or `failed`, within
+    the device's deadline. The device answers by itself if labseq does not in time.
+    """
 
     @property
-    def lines_facts(self) -> LinesFacts:
-        """Channels, edges, resolution."""
+    def deadline_s(self) -> float:
+        """Longest time from a signal to its answer, in seconds."""
         ...
+
+    def wait_for(self, signal: str, timeout_s: float) -> str:
+        """Wait for a signal on the session's clock, then report to the other system that labseq is busy.
+
+        A signal that came since the last answer counts. Checks for a stop request at least every 50 ms.
+
+        Args:
+            signal: "go".
+            timeout_s: How long to wait, in seconds.
+
+        Returns:
+            The text that came with the signal; "" if none.
+
+        Raises:
+            DeviceTimeoutError: It did not come in time.
+            StopRequested: The operator asked the run to stop.
+        """
+        ...
+
+    def report(self, state: Literal["ready", "failed"], about: Mapping[str, bool | int | float | str]) -> str:
+        """Answer the signal that was waited for; without one, nothing is sent.
+
+        Args:
+            state: The outcome.
+            about: "shot"; for a shot that is ready and was judged, "success" and "filling" (of the target,
+                0 to 1); for a failure its "reason".
+
+        Returns:
+            The answer that the other system got: "ready", "failed"; "late" if a failure was reported when
+            the deadline passed; "gone" if it has disconnected; "" if no answer was due.
+        """
+        ...
+
+    def new_events(self) -> Sequence[str]:
+        """Messages for the log since the last call: connections, and texts that were not understood."""
+        ...
+
+
+def offers(part: object, ability: str) -> bool:
+    """Whether a driver or simulation has its own version of an optional ability.
+
+    Args:
+        part: The driver or simulation; it need not be derived from its role's base class.
+        ability: Name of the method or property, for example "self_test".
+    """
+    owner = next((cls for cls in type(part).__mro__ if ability in vars(cls)), None)
+    return owner is not None and not owner.__module__.startswith("labseq.roles.")

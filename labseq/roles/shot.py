@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
-from typing import Any, ParamSpec, Protocol, TypeVar, runtime_checkable
+from typing import Any, ParamSpec, Protocol, TypeVar
 
 from labseq.model import (
     CalibrationEntry,
@@ -34,11 +35,11 @@ class Clock(Protocol):
         ...
 
     def now(self) -> float:
-        """Monotonic time in seconds; its zero is arbitrary."""
+        """Monotonic time in seconds, from an arbitrary zero."""
         ...
 
     def sleep(self, duration_s: float) -> None:
-        """Wait. Looks for a stop request at least every 50 ms.
+        """Wait. Checks for a stop request at least every 50 ms.
 
         Raises:
             StopRequested: The operator asked the run to stop.
@@ -51,7 +52,7 @@ class Clock(Protocol):
 
 
 class NeverStopped:
-    """A real clock that nobody stops; for plugins used outside of a run."""
+    """A real clock without stop requests; for plugins used outside of a run."""
 
     virtual = False
 
@@ -68,7 +69,7 @@ class NeverStopped:
         threading.Event().wait(max(0.0, duration_s))
 
     def check(self) -> None:
-        """Nothing to look for."""
+        """No effect."""
 
 
 P = ParamSpec("P")
@@ -77,7 +78,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class Context:
-    """What a plugin's factory is given besides its settings.
+    """What a plugin's factory receives besides its settings.
 
     Attributes:
         name: Role or device name in the profile: "camera", "planner", "shutter".
@@ -86,8 +87,8 @@ class Context:
         clock: The session's time; drivers wait by ``clock.sleep``.
         random: The plugin's own random numbers.
         calibrations: Calibrations in use: kind -> entry.
-        simulation: The world, in every context; None where the profile has none.
-        lines: What is wired to the timing box.
+        simulation: The simulation; None if the profile has none.
+        lines: The lines of the timing box.
     """
 
     name: str = ""
@@ -101,7 +102,7 @@ class Context:
 
 
 class Shot(Protocol):
-    """What a step works with: the devices, guarded, and the shot's state."""
+    """What a step works with: the devices and the state of the shot."""
 
     @property
     def index(self) -> int:
@@ -120,7 +121,7 @@ class Shot(Protocol):
 
     @property
     def target(self) -> TargetPattern:
-        """What the array shall look like."""
+        """The target pattern."""
         ...
 
     @property
@@ -130,7 +131,7 @@ class Shot(Protocol):
 
     @property
     def simulation(self) -> Simulation | None:
-        """The simulated world, if there is one."""
+        """The simulation, if there is one."""
         ...
 
     @property
@@ -175,7 +176,7 @@ class Shot(Protocol):
 
     @property
     def degree_of_parallelism(self) -> int:
-        """Most mobile tweezers that a batch of this run may use."""
+        """Maximum number of mobile tweezers in a batch of this run."""
         ...
 
     @property
@@ -203,13 +204,13 @@ class Shot(Protocol):
         ...
 
     def judge(self) -> None:
-        """Judge the shot's success on the image just taken."""
+        """Decide on the image just taken whether the shot succeeded."""
         ...
 
     def call(
         self, owner: str, timeout_s: float, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs
     ) -> T:
-        """Call a device or plugin so that neither a hang nor a stop request is lost.
+        """Call a device or plugin with a time limit, and obey stop requests meanwhile.
 
         Args:
             owner: Role or device name, for the error message.
@@ -226,7 +227,7 @@ class Shot(Protocol):
         ...
 
     def check_interlocks(self) -> None:
-        """Ask every device that watches something; before atoms are picked up.
+        """Check the interlocks of every device; before atoms are picked up.
 
         Raises:
             DeviceError: A value is past its limit.
@@ -234,14 +235,14 @@ class Shot(Protocol):
         ...
 
     def follow(self, signal: str, timeout_s: float, device: str = "") -> None:
-        """Wait until another control system says to go on; it is told what becomes of this shot.
+        """Wait for the start signal of another control system, which will receive the outcome of this shot.
 
-        At a second wait in a shot it is told first that labseq is ready.
+        At a second wait in a shot, labseq first reports that it is ready.
 
         Args:
             signal: "go".
             timeout_s: How long to wait, in seconds.
-            device: Name of the device through which it leads; "" for the only one that there is.
+            device: Name of the device that it uses; "" for the only one there is.
 
         Raises:
             ConfigError: There is no such device.
@@ -255,7 +256,7 @@ class Shot(Protocol):
         ...
 
     def lines_on(self, kind: str, duration_s: float) -> AbstractContextManager[None]:
-        """Context manager around what a step does: its lines go on before it and off after it.
+        """Context manager for the work of a step: its lines switch on before it and off after it.
 
         Args:
             kind: Kind of the step, as the profile's lines name it: "image".
@@ -270,13 +271,13 @@ class Shot(Protocol):
     def stage_done(
         self, name: str, duration_s: float, host_s: float, budget_s: float = ..., cycle: int = 0
     ) -> None:
-        """Keep the time of a stage that has just ended, where no ``with`` can stand around it.
+        """Record a stage that has just ended, where :meth:`stage` cannot be used.
 
         Args:
             name: Of the stage.
             duration_s: Its duration on the session's clock, in seconds.
             host_s: The same on this computer's clock.
-            budget_s: What it may take; by default what the profile's ``budgets`` say.
+            budget_s: Its budget; by default that of the profile's ``budgets``.
             cycle: Rearrangement cycle, counted from 1; 0 outside of one.
         """
         ...
@@ -290,7 +291,7 @@ class Shot(Protocol):
         ...
 
     def note(self, name: str, value: float | Sequence[Any]) -> None:
-        """Keep a value, or lists of them, with the shot, among its readings: "overlay.error_m"."""
+        """Record a value, or lists of values, among the shot's readings: "overlay.error_m"."""
         ...
 
     def log(self, event: str, **values: Any) -> None:
@@ -300,14 +301,14 @@ class Shot(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class StepContext:
-    """What a step needs to know to lay out its timeline before anything is opened.
+    """What a step lays out its timeline with, before anything is opened.
 
     Attributes:
         grid: The grid of sites.
         motion: How the mobile tweezers move.
-        target: What the array shall look like.
+        target: The target pattern.
         camera: What the camera says of itself before it is opened.
-        lines: What is wired to the timing box.
+        lines: The lines of the timing box.
     """
 
     grid: SiteGrid
@@ -317,40 +318,32 @@ class StepContext:
     lines: tuple[LineSpec, ...] = ()
 
 
-class Step(Protocol):
+class Step(ABC):
     """One step of a shot.
 
     Attributes:
         needs_image: Whether an image must have been taken before it in the shot.
-        takes_image: Whether later steps find an image of it.
+        takes_image: Whether it leaves an image to the steps after it.
+        repeatable: Whether it may be retried in the same shot when it fails, because it leaves the atoms
+            where they are; other steps are only repeated with the whole shot.
     """
 
-    needs_image: bool
-    takes_image: bool
+    needs_image: bool = False
+    takes_image: bool = False
+    repeatable = False
 
+    @abstractmethod
     def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:
-        """What the step will do, at most, for ``labseq check``."""
-        ...
+        """What the step will do, and how long each part takes at most; for ``labseq check`` and budgets."""
 
+    @abstractmethod
     def run(self, shot: Shot) -> None:
         """Do it."""
-        ...
-
-
-@runtime_checkable
-class Repeatable(Protocol):
-    """A step that may be tried again in the same shot when it fails: it leaves the atoms where they are.
-
-    Attributes:
-        repeatable: Whether it may; others can only be repeated with the whole shot.
-    """
-
-    repeatable: bool
 
 
 class RunObserver(Protocol):
-    """Somebody who watches a run: the live view, a log. Failures never stop the run."""
+    """Receives the events of a run: the live view, a log. Its failures never stop the run."""
 
     def event(self, name: str, values: Mapping[str, Any]) -> None:
-        """Something happened: "run_started", "shot_started", "stage", "image", ..."""
+        """Receive an event: "run_started", "shot_started", "stage", "image", ..."""
         ...

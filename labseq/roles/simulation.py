@@ -1,7 +1,8 @@
-"""The role of the simulated world, and what it may offer beyond it."""
+"""The role of the simulation that virtual drivers and simulated devices act on."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, Protocol, TypeAlias, runtime_checkable
 
@@ -19,42 +20,46 @@ from labseq.model import (
 )
 
 Signal: TypeAlias = ToneProgram | DepthRamp | TweezerAmplitudes | LineProgram
-"""What devices play on a simulated world."""
+"""What a device plays in a simulation."""
 
 WHOLE_SENSOR: Final = SensorMode()
-"""What a camera does that sets nothing: the whole sensor, the simulation's own gain."""
+"""The whole sensor with the simulation's own gain, for a camera that sets nothing."""
 
 
-class Simulation(Protocol):
-    """The world that virtual drivers act on; one per run, opened before them."""
+class Simulation(ABC):
+    """The atoms, tweezers and light of a simulated lab; one per run, opened before the devices.
 
+    Methods with a default are optional, as in :mod:`labseq.roles.hardware`.
+    """
+
+    @abstractmethod
     def open(self) -> None:
         """Draw the machine's own disorder."""
-        ...
 
+    @abstractmethod
     def close(self) -> None:
         """Forget everything."""
-        ...
 
+    @abstractmethod
     def begin_shot(self) -> None:
         """Remove all atoms; called after the random stream was set to the shot."""
-        ...
 
+    @abstractmethod
     def load(self, t_start_s: float, duration_s: float) -> None:
-        """The atom source is on: loads every site whose static tweezer is on."""
-        ...
+        """The atom source is on: load every site whose static tweezer is on."""
 
+    @abstractmethod
     def play(self, role: str, signal: Signal, t_start_s: float) -> None:
-        """A device's output, from ``t_start_s`` on.
+        """Take a device's output, from ``t_start_s`` on.
 
         Args:
             role: "mobile_tweezers", which plays a ``ToneProgram``; "static_tweezers": ``DepthRamp`` or
                 ``TweezerAmplitudes``; "lines": ``LineProgram``.
-            signal: What it plays.
+            signal: The output.
             t_start_s: When it begins, on the session's clock.
         """
-        ...
 
+    @abstractmethod
     def expose(self, t_start_s: float, exposure_s: float, mode: SensorMode = WHOLE_SENSOR) -> Frame:
         """The frame that a camera sees; imaging light is on.
 
@@ -63,93 +68,63 @@ class Simulation(Protocol):
             exposure_s: Exposure time.
             mode: How the camera exposes and reads its sensor.
         """
-        ...
 
+    @abstractmethod
     def describe(self) -> Mapping[str, Any]:
         """Every constant of the model: JSON-ready values."""
-        ...
-
-
-@runtime_checkable
-class ReportsSensor(Protocol):
-    """A simulation that tells of the sensor that its frames come from, before anything is opened."""
 
     @property
     def sensor_shape(self) -> tuple[int, int]:
-        """(height, width) in pixels of the sensor."""
-        ...
+        """(height, width) in pixels of the sensor that frames come from; also before ``open()``."""
+        raise NotImplementedError("this simulation does not describe its sensor")
 
     def readout_fraction(self, mode: SensorMode) -> float:
         """Time to read a frame, relative to that of the whole sensor without binning."""
-        ...
+        del mode
+        return 1.0
 
     def prepare_sensor(self, mode: SensorMode) -> None:
-        """Work out what all frames of a mode have in common, before a run."""
-        ...
-
-
-@runtime_checkable
-class WiresTriggers(Protocol):
-    """A simulation in which an edge of a line reaches the trigger input that it is wired to."""
+        """Compute, before a run, what all frames of a mode have in common."""
 
     def wire(self, role: str, on_edge: Callable[[float], object]) -> None:
-        """Tell a device of the edges of the line that triggers its role, from now on.
+        """Pass the edges of the line that triggers a role to its simulated device, from now on.
 
         Args:
             role: "camera".
-            on_edge: Called with the time of the edge on the session's clock, by whoever fires the lines.
+            on_edge: Called with the time of the edge on the session's clock, by the device that fires the
+                lines.
         """
-        ...
-
-
-@runtime_checkable
-class ReportsLoading(Protocol):
-    """A simulation that tells how well it loads, for estimates before a run."""
 
     @property
-    def loading_probability(self) -> float:
-        """Probability that a site holds an atom after loading."""
-        ...
+    def loading_probability(self) -> float | None:
+        """Probability that a site holds an atom after loading, for estimates before a run; None if unknown."""
+        return None
 
-
-@runtime_checkable
-class ReportsTruth(Protocol):
-    """A simulation that knows, and tells for the record, where the atoms really are."""
-
-    def truth(self) -> Occupancy:
-        """The true occupancy now, bool (n_rows, n_cols)."""
-        ...
-
-
-@runtime_checkable
-class ReportsLosses(Protocol):
-    """A simulation that knows, and tells for the record, what atoms were lost by."""
+    def truth(self) -> Occupancy | None:
+        """The true occupancy now, bool (n_rows, n_cols), for the record; None if unknown."""
+        return None
 
     def losses(self) -> Mapping[str, int]:
-        """Atoms lost since the shot began: cause -> number."""
-        ...
-
-
-@runtime_checkable
-class ReportsEvents(Protocol):
-    """A simulation that tells, for the record, what happened to the atoms."""
+        """Atoms lost since the shot began, for the record: cause -> number."""
+        return {}
 
     def atom_events(self, since_s: float) -> Mapping[str, NDArray[Any]]:
-        """What happened since the shot began: name -> structured array, with a field for each column.
+        """Events of the shot, for the record: name -> structured array with a field for each column.
 
         A dtype with ``metadata={"descriptions": {column: text}}`` takes its texts into the shot's file.
 
         Args:
             since_s: Time on the session's clock from which times are counted.
         """
-        ...
+        del since_s
+        return {}
 
 
 class RfSource(Protocol):
     """The two outputs of a simulated device that drives the mobile tweezers."""
 
     def played(self, until_s: float) -> tuple[Sequence[RfSpan], Sequence[RfSpan]]:
-        """What the row output and the column output played since the last call, in time's order.
+        """The signals of the row output and the column output since the last call, in order of time.
 
         Args:
             until_s: Time on the session's clock at which to stop for now.
@@ -161,7 +136,7 @@ class ToneSource(Protocol):
     """The two outputs of a simulated device that drives the static tweezers."""
 
     def played(self, until_s: float) -> Sequence[TweezerAmplitudes]:
-        """What the amplitudes of the tones were since the last call, in time's order; nothing if unchanged.
+        """The amplitudes of the tones since the last call, in order of time; empty if unchanged.
 
         A depth is part of them: at half the depth the amplitudes of rows and columns are lower. They are 0
         before the first call.
@@ -174,14 +149,14 @@ class ToneSource(Protocol):
 
 @runtime_checkable
 class ReceivesOutput(Protocol):
-    """A simulation that acts on what a device's outputs really play, rather than on what it is told."""
+    """A simulation that acts on the samples that a device outputs, rather than on the program it was given."""
 
     def warm(self) -> None:
-        """Compile the kernels for that; a driver that will be listened to calls it in its own ``warm``."""
+        """Compile the kernels for that; a driver with such outputs calls it in its own ``warm``."""
         ...
 
     def connect_outputs(self, role: str, source: RfSource | ToneSource) -> None:
-        """From now on listen to these outputs of a role, in the place of earlier ones.
+        """Receive these outputs of a role from now on, in place of earlier ones.
 
         Args:
             role: "mobile_tweezers", with an ``RfSource``, or "static_tweezers", with a ``ToneSource``.

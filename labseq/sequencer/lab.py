@@ -26,10 +26,10 @@ from labseq.roles import (
     Lines,
     MobileTweezers,
     Planner,
-    ReportsCameraFacts,
     Simulation,
     StaticTweezers,
     StepContext,
+    offers,
 )
 from labseq.sequencer.lines import blinding_lines
 
@@ -120,7 +120,7 @@ class Lab:
     @property
     def step_context(self) -> StepContext:
         """What steps need to lay out their timelines."""
-        facts = self.camera.facts if isinstance(self.camera, ReportsCameraFacts) else CameraFacts()
+        facts = self.camera.facts if offers(self.camera, "facts") else CameraFacts()
         return StepContext(self.grid, self.motion, self.target, facts, self.line_specs)
 
     def hardware(self) -> Iterator[tuple[str, Hardware]]:

@@ -17,7 +17,7 @@ from labseq.errors import LabseqError, StopRequested
 from labseq.guard import DRIVER_MARGIN_S, Guard, StopFlag
 from labseq.model import ShotRecord, TimelineEntry
 from labseq.model.records import ShotStatus
-from labseq.roles import NeedsSettling, RunObserver, Step, StepContext
+from labseq.roles import RunObserver, Step, StepContext, offers
 from labseq.sequencer.lab import Lab, Outcome, close_all, make_safe
 from labseq.sequencer.leading import Emit, LeaderHandshakes
 from labseq.sequencer.policies import RunPolicy, StepPolicy, Then, may_be_retried
@@ -96,11 +96,7 @@ def open_devices(lab: Lab, guard: Guard, stop: StopFlag, emit: Emit, names: Coll
         guard.call("static_tweezers", timeout_s, lab.static_tweezers.load, None)
         guard.call("static_tweezers", timeout_s, lab.static_tweezers.start)
     for name, device in lab.hardware():
-        if (
-            name in names
-            and isinstance(device, NeedsSettling)
-            and (longest_s := device.settling_timeout_s) > 0
-        ):
+        if name in names and offers(device, "settle") and (longest_s := device.settling_timeout_s) > 0:
             emit("settling", {"device": name, "timeout_s": longest_s})
             guard.call(name, longest_s + DRIVER_MARGIN_S, device.settle)
 
@@ -139,7 +135,10 @@ def lay_out(
 
     def entries(number: int, name: str, step: Step) -> list[TimelineEntry]:
         with _named(number, name):
-            return list(step.plan_timeline(context))
+            found = list(step.plan_timeline(context))
+            if other := [one for one in found if not isinstance(one, TimelineEntry)]:  # pyright: ignore[reportUnnecessaryIsInstance]
+                raise TypeError(f"plan_timeline() gave {other[0]!r}; expected TimelineEntry objects")
+            return found
 
     return [
         guard.call("step", lab.timeouts.call_s, entries, number, name, step)

@@ -14,7 +14,7 @@ from labseq.errors import ConfigError, DeviceError, InterlockError, OverBudgetEr
 from labseq.guard import DRIVER_MARGIN_S, Guard
 from labseq.model import CycleRecord, Frame, ImageRecord, Occupancy, ShotRecord, StageTiming
 from labseq.model.records import OVERSHOOT_S
-from labseq.roles import Device, HasReadings, Interlocked, ReportsEvents, ReportsLosses, ReportsTruth
+from labseq.roles import Device, offers
 from labseq.sequencer.lab import Lab, check_blinding
 from labseq.sequencer.leading import Emit, LeaderHandshakes
 from labseq.sequencer.lines import line_program, margin_s, trigger_line
@@ -201,14 +201,14 @@ class RunningShot:
     def poll(self) -> None:
         """Keep with the shot what devices are read for at its start."""
         for name, device in self.lab.hardware():
-            if isinstance(device, HasReadings):
+            if offers(device, "poll"):
                 values = self.call(name, self.call_timeout_s, device.poll)
                 self.record.readings.update({f"{name}.{value}": read for value, read in values.items()})
 
     def check_interlocks(self) -> None:
         """Ask every device that watches something; see ``labseq.roles.Shot``."""
         for name, device in self.lab.hardware():
-            if isinstance(device, Interlocked):
+            if offers(device, "check_interlocks"):
                 try:
                     self.call(name, self.call_timeout_s, device.check_interlocks)
                 except DeviceError as error:
@@ -318,19 +318,21 @@ class RunningShot:
         self._emit(event, {"shot": self.index, **values})
 
     def record_truth(self) -> None:
-        """Keep the true occupancy, where the simulation tells it."""
-        if isinstance(self.simulation, ReportsTruth):
-            truth = self.call("simulation", self.call_timeout_s, self.simulation.truth)
-            self.record.readings["simulation.n_atoms_true"] = int(np.count_nonzero(truth))
-            self.record.readings["simulation.n_defects_true"] = self.target.n_defects(truth)
-        if isinstance(self.simulation, ReportsLosses):
-            losses = self.call("simulation", self.call_timeout_s, self.simulation.losses)
-            self.record.readings.update({f"simulation.lost.{cause}": n for cause, n in losses.items()})
-        if isinstance(self.simulation, ReportsEvents):
-            atom_events = self.call(
-                "simulation", self.call_timeout_s, self.simulation.atom_events, self.start_s
-            )
-            self.record.atom_events.update(atom_events)
+        """Record what the simulation knows: the true occupancy, the losses, the events of the atoms."""
+        simulation, readings, timeout_s = self.simulation, self.record.readings, self.call_timeout_s
+        if simulation is None:
+            return
+        if offers(simulation, "truth"):
+            truth = self.call("simulation", timeout_s, simulation.truth)
+            if truth is not None:
+                readings["simulation.n_atoms_true"] = int(np.count_nonzero(truth))
+                readings["simulation.n_defects_true"] = self.target.n_defects(truth)
+        if offers(simulation, "losses"):
+            losses = self.call("simulation", timeout_s, simulation.losses)
+            readings.update({f"simulation.lost.{cause}": n for cause, n in losses.items()})
+        if offers(simulation, "atom_events"):
+            events = self.call("simulation", timeout_s, simulation.atom_events, self.start_s)
+            self.record.atom_events.update(events)
 
     def _detected(self, answer: Any) -> tuple[Occupancy, Any]:
         shape = self.grid.shape

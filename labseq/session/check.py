@@ -16,7 +16,7 @@ from labseq.errors import LabseqError, Problem
 from labseq.guard import Guard
 from labseq.model import TimelineEntry
 from labseq.motion import check_plan
-from labseq.roles import ReportsLoading, Step
+from labseq.roles import Step, offers
 from labseq.sequencer.lab import Lab
 from labseq.sequencer.leading import find_leader
 from labseq.sequencer.lines import spans_on
@@ -192,9 +192,11 @@ def _windows(steps: Sequence[tuple[str, Step]]) -> list[tuple[int, list[float]]]
 
 def _rehearse(lab: Lab) -> tuple[Rehearsal | None, str]:
     """Plan for random loadings; what the planner does wrong is told, not raised."""
-    loading = (
-        lab.simulation.loading_probability if isinstance(lab.simulation, ReportsLoading) else PAPERS_LOADING
-    )
+    loading = None
+    if lab.simulation is not None and offers(lab.simulation, "loading_probability"):
+        loading = lab.simulation.loading_probability
+    if loading is None:
+        loading = PAPERS_LOADING
     rng, guard = np.random.default_rng(0), Guard()
     durations, firsts, n_filled = list[float](), list[float](), 0
     deadline = time.monotonic() + MAX_WAIT_S

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, Final
@@ -182,10 +183,15 @@ def check_role(entry: Entry, made: object) -> None:
         PluginLoadError: With what is missing.
     """
     role = _ROLES[entry.kind]
-    called, see = f"{entry.kind} '{entry.name}'", f"see labseq.{role.__name__}"
+    called, see = f"{entry.kind} '{entry.name}'", f"see labseq.plugin.{role.__name__}"
     if made is None or isinstance(made, type):
         raise entry.owner.fault(f"the factory of {called} made {_called(made)}; expected an object; {see}")
-    names = [name for name in [*role.__annotations__, *dir(role)] if not name.startswith("_")]
+    names = (
+        [*role.__annotations__, *getattr(role, "__abstractmethods__", ())]
+        if issubclass(role, ABC)
+        else dir(role)
+    )
+    names = sorted(name for name in names if not name.startswith("_"))
     missing = [name for name in names if not hasattr(made, name)]
     if missing:
         raise entry.owner.fault(f"{called} has no {', '.join(missing)}; {see}")

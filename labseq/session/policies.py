@@ -22,7 +22,7 @@ from labseq.errors import CheckFailedError, Loc
 from labseq.messages import clean, did_you_mean, listing
 from labseq.recording import figures_in
 from labseq.recording.columns import FIGURES
-from labseq.roles import Repeatable, Step
+from labseq.roles import Step
 from labseq.sequencer.policies import RunPolicy, StepPolicy
 
 _JUDGED: Final = frozenset(
@@ -141,7 +141,7 @@ def _step_policy(document: Document, spec: StepSpec, otherwise: StepPolicy) -> S
 
 
 def _is_repeatable(step: Step) -> bool:
-    return isinstance(step, Repeatable) and step.repeatable
+    return bool(getattr(step, "repeatable", False))
 
 
 class Checks:

@@ -28,7 +28,7 @@ from labseq.model import CalibrationEntry, SiteGrid
 from labseq.model.lines import IDLE
 from labseq.plugins import PluginHost, call_plugin
 from labseq.registry import LOAD_S, VIRTUAL_TWIN, Entry
-from labseq.roles import ReportsLinesFacts
+from labseq.roles import offers
 from labseq.sequencer.lab import Lab
 from labseq.sequencer.lines import blinding_lines, trigger_line
 from labseq.session.calibrations import ActiveCalibrations, calibrated
@@ -292,7 +292,7 @@ def wiring_problems(document: Document, lab: Lab) -> list[Problem]:
     """
     problems: list[Problem] = []
     camera = lab.step_context.camera
-    if isinstance(lab.lines, ReportsLinesFacts):
+    if lab.lines is not None and offers(lab.lines, "lines_facts"):
         channels = lab.lines.lines_facts.channels
         for spec in lab.line_specs:
             if spec.channel not in channels:

@@ -15,7 +15,7 @@ from labseq.errors import ConfigError, DeviceError, LabseqError, RecordingError,
 from labseq.files import Holder, Lock, knows_no_locks
 from labseq.guard import Guard, StopFlag
 from labseq.recording import clear_active, data_root, died, lock_files, marker_roots
-from labseq.roles import Clock, Hardware, HasSelfTest, NeedsWarmUp, ReceivesOutput, RunObserver, Simulation
+from labseq.roles import Clock, Hardware, RunObserver, Simulation, offers
 from labseq.sequencer import RealClock, VirtualClock
 from labseq.sequencer.lab import Timeouts, in_safe_order
 from labseq.session.construct import construct_each
@@ -434,11 +434,11 @@ def check_each_device(
     return tried
 
 
-def _examined(guard: Guard, name: str, device: Hardware | Simulation, timeouts: Timeouts) -> CheckedDevice:
+def _examined(guard: Guard, name: str, device: Any, timeouts: Timeouts) -> CheckedDevice:
     """Open, identify and test a device, as far as it goes."""
     found = CheckedDevice(name)
     try:
-        if isinstance(device, NeedsWarmUp) and not isinstance(device, ReceivesOutput):
+        if name != "simulation" and offers(device, "warm"):
             guard.call(name, WARM_S, device.warm)  # else a self test might have to compile within its timeout
         guard.call_to_the_end(name, timeouts.call_s, device.open)
         described: Any = guard.call(name, timeouts.call_s, device.describe)
@@ -446,7 +446,7 @@ def _examined(guard: Guard, name: str, device: Hardware | Simulation, timeouts: 
             text = f"describe() gave a {type(described).__name__}; expected a mapping"
             raise DeviceError(name, text)
         found = replace(found, described=described)
-        if isinstance(device, HasSelfTest):
+        if offers(device, "self_test"):
             guard.call(name, timeouts.call_s, device.self_test)
             found = replace(found, tested=True)
         readings_s = [_reading_s(guard, name, device, timeouts.call_s) for _ in range(N_READINGS)]

@@ -16,7 +16,7 @@ from labseq.errors import ConfigError, DeviceError, LabseqError, Loc, Problem
 from labseq.guard import Guard, StopFlag
 from labseq.model import RunRecord, TimelineEntry
 from labseq.recording import Run, RunWriter, clear_active, data_root, mark_active, marker_roots, open_run
-from labseq.roles import ChecksCommands, RunObserver
+from labseq.roles import RunObserver, offers
 from labseq.sequencer import Sequencer
 from labseq.sequencer.lab import Lab, describe
 from labseq.sequencer.leading import find_leader, leaders
@@ -71,7 +71,7 @@ def check_commands(assembly: Assembly, points: Iterable[Point], build: Callable[
 
 def _failure(guard: Guard, lab: Lab, step: DeviceStep) -> LabseqError | None:
     device = lab.devices.get(step.device)
-    if not isinstance(device, ChecksCommands):
+    if device is None or not offers(device, "check_command"):
         return None
     check, timeout_s = device.check_command, lab.timeouts.call_s
     try:

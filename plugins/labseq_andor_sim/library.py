@@ -20,8 +20,8 @@ from labseq.plugin import (
     Context,
     ExposureResult,
     LabseqError,
-    ReportsSensor,
     SensorMode,
+    offers,
     wait_for,
 )
 from labseq_andor_sim.acquisition import Acquisition
@@ -56,7 +56,7 @@ class SimulatedAndorLibrary(AndorLibrary):
         if world is None:
             text = "the simulated camera needs a simulation; add `simulation: {use: virtual}`"
             raise ConfigError(f"{text} to the profile")
-        shape = world.sensor_shape if isinstance(world, ReportsSensor) else IXON_897.sensor_shape
+        shape = world.sensor_shape if offers(world, "sensor_shape") else IXON_897.sensor_shape
         self.head: Head = simulated_head(settings, shape)
         self.sensor_shape = shape
         self.folder = ""
@@ -68,7 +68,7 @@ class SimulatedAndorLibrary(AndorLibrary):
 
     def warm(self, em_gain: float) -> None:
         """Compute what all simulated frames have in common."""
-        if isinstance(self._world, ReportsSensor):
+        if offers(self._world, "sensor_shape"):
             region = self._settings.mode.region
             is_whole = region == (0, 0, *self._world.sensor_shape)
             mode = SensorMode(None if is_whole else region, self._settings.binning, em_gain)

@@ -10,9 +10,9 @@ from typing import Any, Final
 from labseq.plugin import (
     ConfigError,
     Context,
+    Device,
     DeviceError,
     DeviceTimeoutError,
-    ReportsTruth,
     format_quantity,
     one_of,
     wait_for,
@@ -40,7 +40,7 @@ def serial_leader(settings: SerialLeaderSettings, context: Context) -> LeaderDev
     return LeaderDevice(settings, context, None if is_simulated else SerialLink(settings, context.name))
 
 
-class LeaderDevice:
+class LeaderDevice(Device):
     """Lets another control system lead; implements ``labseq.LeaderLink``.
 
     A thread of its own listens, and keeps the deadline while a shot goes on. It knows no commands; its
@@ -264,7 +264,7 @@ class LeaderDevice:
         start_s = self._clock.now()
         self._clock.sleep(duration_s)
         world = self._world
-        if world is not None and not (isinstance(world, ReportsTruth) and world.truth().any()):
+        if world is not None and ((truth := world.truth()) is None or not truth.any()):
             world.load(start_s, duration_s)
 
     def _say(self, lines: Sequence[str]) -> bool:

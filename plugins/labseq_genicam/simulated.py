@@ -9,7 +9,14 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.plugin import Context, DeviceError, Frame, Series, SimulatedSensor, WiresTriggers, trigger_line
+from labseq.plugin import (
+    Context,
+    DeviceError,
+    Frame,
+    Series,
+    SimulatedSensor,
+    trigger_line,
+)
 from labseq_genicam.acquisition import Acquisition, Start
 from labseq_genicam.counterpart.fake import FakeCamera
 from labseq_genicam.counterpart.faults import Faults
@@ -101,7 +108,7 @@ class SimulatedCamera:
         self.clear()
         self._series, self._acquisition = series, acquisition
         self._sensor.arm(series, self._mode, self._readout_s, None if math.isnan(period_s) else period_s)
-        if series.trigger == "external" and isinstance(self._world, WiresTriggers):
+        if series.trigger == "external":
             self._world.wire("camera", self._on_edge)
 
     def fire(self) -> None:

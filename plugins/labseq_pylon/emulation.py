@@ -22,7 +22,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.plugin import Context, DeviceError, Frame, ReportsSensor, Series, SimulatedSensor, Trigger
+from labseq.plugin import Context, DeviceError, Frame, Series, SimulatedSensor, Trigger
 from labseq_pylon.finding import EMULATION
 from labseq_pylon.library import Sdk
 from labseq_pylon.nodes import Nodes
@@ -45,7 +45,7 @@ class EmulatedCamera:
 
     def __init__(self, settings: PylonSettings, context: Context) -> None:
         world = settings.simulated_world(context)
-        self._world: ReportsSensor = world
+        self._world = world
         self._sensor = SimulatedSensor(world, context.clock)
         self._clock = context.clock
         self._mode = settings.mode

@@ -6,7 +6,15 @@ import threading
 from collections.abc import Mapping
 from typing import Any
 
-from labseq.plugin import Context, DeviceError, LabseqError, LimitError, TransientError, clean
+from labseq.plugin import (
+    Context,
+    Device,
+    DeviceError,
+    LabseqError,
+    LimitError,
+    TransientError,
+    clean,
+)
 from labseq_serial.arguments import Scalar
 from labseq_serial.instrument import Instrument
 from labseq_serial.line import Line
@@ -15,7 +23,7 @@ from labseq_serial.settings import SIMULATED, SerialSettings, known
 from labseq_serial.simulated import SimulatedPort
 
 
-class SerialDevice:
+class SerialDevice(Device):
     """An instrument on a serial line, described in the profile.
 
     A line that breaks in a shot fails the shot with ``TransientError``. The next call opens the port once

@@ -11,7 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from labseq.plugin import Context, DeviceError, LimitError, TransientError
+from labseq.plugin import (
+    Context,
+    DeviceError,
+    LimitError,
+    StaticTweezers,
+    TransientError,
+)
 from labseq_soapy.alone import end_stale_process, marker_of, place
 from labseq_soapy.array_tones import Amplitudes, ArrayTones
 from labseq_soapy.capture import built
@@ -23,7 +29,7 @@ from labseq_soapy.settings import SoapySettings
 from labseq_soapy.simulated import SimulatedRadio
 
 
-class SoapyStaticTweezers:
+class SoapyStaticTweezers(StaticTweezers):
     """Plays a loop of tones for each AOD on two outputs of a radio.
 
     A process of its own keeps the radio supplied. It ramps the light down if labseq is killed or hangs,

@@ -19,6 +19,7 @@ from labseq.plugin import (
     DeviceError,
     DeviceTimeoutError,
     LabseqError,
+    MobileTweezers,
     ToneProgram,
     TransientError,
     format_quantity,
@@ -69,7 +70,7 @@ class PlayMode(Protocol):
         ...
 
 
-class SpcmMobileTweezers:
+class SpcmMobileTweezers(MobileTweezers):
     """Plays tone programs on two outputs of an arbitrary waveform generator.
 
     A program is refused before anything is uploaded if it leaves an AOD's band or would clip.

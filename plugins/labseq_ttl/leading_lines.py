@@ -6,7 +6,13 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
-from labseq.plugin import ConfigError, Context, DeviceError, DeviceTimeoutError, ReportsTruth, format_quantity
+from labseq.plugin import (
+    ConfigError,
+    Context,
+    DeviceError,
+    DeviceTimeoutError,
+    format_quantity,
+)
 from labseq_ttl.box import Box
 from labseq_ttl.connection import SIMULATED_MAX_WAIT_S
 from labseq_ttl.leader import HIGH, MORE, LeaderPins
@@ -153,7 +159,7 @@ class LeadingLines(TtlLines):
             raise DeviceTimeoutError(self._name, f"{what}; see 'simulated_go_delay'", timeout_s)
         start_s, world = self._clock.now(), self._world
         self._clock.sleep(after_s)
-        if world is not None and not (isinstance(world, ReportsTruth) and world.truth().any()):
+        if world is not None and ((truth := world.truth()) is None or not truth.any()):
             world.load(start_s, after_s)
         counterpart.start()
         if self._opened().box.line.new_events(SIMULATED_MAX_WAIT_S) is None:

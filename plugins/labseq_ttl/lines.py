@@ -13,6 +13,7 @@ from labseq.plugin import (
     DeviceError,
     DeviceTimeoutError,
     LineProgram,
+    Lines,
     LinesFacts,
     idle_program,
     off_program,
@@ -34,7 +35,7 @@ LATENCY_S: Final = 0.4e-3
 ROUNDING_S: Final = 1e-9
 
 
-class TtlLines:
+class TtlLines(Lines):
     """A timing box with labseq's firmware.
 
     Args:

@@ -15,11 +15,10 @@ from labseq.plugin import (
     ConfigError,
     Context,
     ExposureResult,
-    ReportsSensor,
     SensorMode,
     Series,
     SimulatedSensor,
-    WiresTriggers,
+    offers,
     settle,
     trigger_line,
 )
@@ -96,7 +95,7 @@ class VirtualCamera(CameraDriver):
         )
         self._in_force = self._idle
         self._readout_s, self._frame_shape = settings.readout, None
-        if isinstance(self._world, ReportsSensor):
+        if offers(self._world, "sensor_shape"):
             if setting_error := settings.sensor_conflict(self._world.sensor_shape):
                 raise ConfigError(setting_error)
             self._readout_s *= self._world.readout_fraction(self._mode)
@@ -118,7 +117,7 @@ class VirtualCamera(CameraDriver):
 
     def warm(self) -> None:
         """Work out what all frames have in common, and compile their kernels or load them."""
-        if isinstance(self._world, ReportsSensor):
+        if offers(self._world, "sensor_shape"):
             self._world.prepare_sensor(self._mode)
 
     @property
@@ -163,7 +162,7 @@ class VirtualCamera(CameraDriver):
         self._is_internal = series.trigger == "internal"
         self._coming.clear()
         self._n_seen = 0
-        if series.trigger == "external" and isinstance(self._world, WiresTriggers):
+        if series.trigger == "external":
             self._world.wire("camera", self._expose)
 
     def _fire(self) -> None:

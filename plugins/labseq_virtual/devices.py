@@ -10,10 +10,12 @@ from numpy.typing import NDArray
 
 from labseq.plugin import (
     Context,
+    Device,
     DeviceError,
     DeviceTimeoutError,
     LimitError,
     LineProgram,
+    Lines,
     LinesFacts,
     format_quantity,
     idle_program,
@@ -27,7 +29,7 @@ ROUNDING_S = 1e-9
 """How far from its limit a time may be because sums were rounded."""
 
 
-class VirtualLines(VirtualDriver):
+class VirtualLines(VirtualDriver, Lines):
     """Ideal lines: the simulated world feels exactly what was compiled.
 
     A firing needs a compiled program and an ``arm`` of its own, so that nothing is ever
@@ -135,7 +137,7 @@ class VirtualLines(VirtualDriver):
         self._world.play("lines", program, self._clock.now())
 
 
-class VirtualDevice:
+class VirtualDevice(Device):
     """Remembers what it was told.
 
     The value ``state`` is the last command ("closed" before ``open``, "ready"
@@ -203,7 +205,7 @@ class VirtualDevice:
 VALUE = "spot_powers"
 
 
-class VirtualSpotMeter(VirtualDriver):
+class VirtualSpotMeter(VirtualDriver, Device):
     """Measures the power of each static tweezer, with noise.
 
     Its only value is ``spot_powers``, float64 (n_rows, n_cols), over the nominal power.

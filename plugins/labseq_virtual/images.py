@@ -167,7 +167,7 @@ class Images:
 
 
 class SensorMixin:
-    """The part of a world that tells of its sensor; implements ``labseq.ReportsSensor``."""
+    """The part of the simulation that describes its sensor."""
 
     _exposure: Exposure
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Mapping
 from typing import Any, Final
 
@@ -17,8 +17,11 @@ from labseq.plugin import (
     DepthRamp,
     DeviceError,
     DeviceTimeoutError,
+    Hardware,
     LimitError,
+    MobileTweezers,
     Simulation,
+    StaticTweezers,
     ToneProgram,
     TweezerAmplitudes,
     format_quantity,
@@ -26,7 +29,7 @@ from labseq.plugin import (
 from labseq_virtual.settings import MobileTweezersSettings, StaticTweezersSettings
 
 
-class VirtualDriver(ABC):
+class VirtualDriver(Hardware):
     """Base of the virtual drivers that act on the simulated world.
 
     Args:
@@ -83,7 +86,7 @@ ROUNDING: Final = 1e-9
 """How far a sum of amplitudes may exceed its limit by rounding."""
 
 
-class VirtualMobileTweezers(VirtualDriver):
+class VirtualMobileTweezers(VirtualDriver, MobileTweezers):
     """Ideal mobile tweezers: what a tone program says is what the atoms feel.
 
     A program is refused before it plays if it leaves the AOD's band or would clip.
@@ -253,7 +256,7 @@ def _where(axis: str, tones: AxisTones, program: ToneProgram, tone: int) -> str:
 Amplitudes = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
-class VirtualStaticTweezers(VirtualDriver):
+class VirtualStaticTweezers(VirtualDriver, StaticTweezers):
     """The static array of the simulated world.
 
     The world's depths follow the tones' amplitudes, ``start`` and ``ramp``.

@@ -27,6 +27,7 @@ from labseq.plugin import (
     RfSource,
     SensorMode,
     Signal,
+    Simulation,
     SiteGrid,
     ToneProgram,
     ToneSource,
@@ -204,11 +205,10 @@ ROUNDING_S: Final = 1e-6
 """How far into the past an event may lie because sums of times were rounded."""
 
 
-class World(SensorMixin):
+class World(SensorMixin, Simulation):
     """Atoms in static tweezers, what light does to them, and what a camera sees of it.
 
-    Implements ``labseq.Simulation``, ``labseq.ReportsSensor``, ``labseq.ReportsTruth``,
-    ``labseq.ReportsLosses``, ``labseq.ReceivesOutput`` and ``labseq.ReportsEvents``.
+    Implements ``labseq.plugin.ReceivesOutput`` too.
     Events come in the order of time. A program of the mobile tweezers is carried out when it has ended, or as far as it came when another program takes
     its place: playing a program without segments cuts it short, and atoms in flight are lost. A
     ramp of the static tweezers that comes during a program or an exposure acts at its end.

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 from hypothesis import given, strategies as st
 
-from labseq import CameraFacts, Context, DeviceError, DeviceTimeoutError, Frame, HasSelfTest, LimitError
-from labseq.roles import Trigger
+from labseq import CameraFacts, Context, DeviceError, DeviceTimeoutError, Frame, LimitError
+from labseq.roles import Trigger, offers
 from labseq.testing import CameraContract
 
 from .cameras import SHAPE, ResolvedProfile, TinyCamera
@@ -268,7 +268,7 @@ def test_the_em_gain_is_on_in_a_series_and_1_in_the_self_test() -> None:
 )
 def test_the_self_test_takes_a_short_frame(facts: Mapping[str, Any], exposure_s: float) -> None:
     bench = ResolvedProfile(**facts)
-    assert isinstance(bench.camera, HasSelfTest)
+    assert offers(bench.camera, "self_test")
     bench.camera.self_test()
     assert bench.camera.log == ["start", "fire", "take"]
     assert bench.camera.series[0].exposure_s == exposure_s

@@ -17,8 +17,8 @@ from labseq_andor.codes import Code
 from labseq_andor.library import load_pylablib
 from labseq_andor.settings import AndorSettings
 
-from labseq import Context, DeviceError, DeviceTimeoutError, LimitError, NeedsSettling, Run, Session
-from labseq.roles import NeverStopped, Trigger
+from labseq import Context, DeviceError, DeviceTimeoutError, LimitError, Run, Session
+from labseq.roles import NeverStopped, Trigger, offers
 from labseq.testing import CameraContract
 
 from .labseq_andor_rig import Rig, rig
@@ -252,7 +252,7 @@ def status(lab: Rig) -> int:
 
 def test_it_waits_until_the_sensor_is_cold_and_the_camera_calls_it_stabilized() -> None:
     with rig(cooling=COLD) as lab:
-        assert isinstance(lab.camera, NeedsSettling)
+        assert offers(lab.camera, "settle")
         assert lab.camera.settling_timeout_s == 900.0
         assert status(lab) == Code.TEMP_NOT_REACHED
         lab.camera.settle()

@@ -18,7 +18,7 @@ from labseq_follow.settings import SerialLeaderSettings, TcpLeaderSettings
 from labseq import ConfigError, Context, Device, DeviceError, DeviceTimeoutError, StopRequested
 from labseq.config import Document
 from labseq.guard import StopFlag
-from labseq.roles import ChecksCommands, LeaderLink
+from labseq.roles import LeaderLink, offers
 from labseq.sequencer import RealClock
 from labseq.testing import DeviceContract
 from labseq.testing.contracts.hardware import Factory, Wait
@@ -66,7 +66,7 @@ def test_both_lead_and_know_that_they_have_no_commands() -> None:
         serial_leader(SerialLeaderSettings(port="COM7"), Context("leader")),
     ):
         assert isinstance(leader, LeaderLink)
-        assert isinstance(leader, ChecksCommands)
+        assert offers(leader, "check_command")
         with pytest.raises(DeviceError, match="unknown command 'go'; it has none"):
             leader.check_command("go")
 

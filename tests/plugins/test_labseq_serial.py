@@ -10,7 +10,8 @@ from typing import Any, ClassVar
 import pytest
 from labseq_serial.device import SerialDevice
 
-from labseq import ChecksCommands, Context, DeviceError, HasReadings, HasSelfTest, Interlocked, LimitError
+from labseq import Context, DeviceError, LimitError
+from labseq.roles import offers
 from labseq.testing import DeviceContract
 from labseq.testing.fakes import FakeClock
 
@@ -157,8 +158,8 @@ def test_an_interlock_that_cannot_be_read_stops_everything(counterpart: Counterp
 
 def test_it_can_do_what_labseq_asks_of_such_devices() -> None:
     device = SerialDevice(settings(port="simulated"), Context("synth"))
-    for capability in (HasSelfTest, HasReadings, Interlocked, ChecksCommands):
-        assert isinstance(device, capability)
+    for ability in ("self_test", "poll", "check_interlocks", "check_command"):
+        assert offers(device, ability)
 
 
 @on_a_pty

@@ -12,7 +12,7 @@ from labseq_soapy.settings import SoapySettings
 from labseq_soapy.static_tweezers import SoapyStaticTweezers
 
 from labseq import Context, LimitError
-from labseq.roles import HasSelfTest, Interlocked
+from labseq.roles import offers
 from labseq.testing import StaticTweezersContract
 
 from .labseq_soapy_rig import GRID, SMALL, made, need_radio, opened
@@ -33,7 +33,7 @@ class TestSoapyStaticTweezers(StaticTweezersContract):
 
 def test_it_tests_itself_in_the_dark() -> None:
     with opened() as rig:
-        assert isinstance(rig.tweezers, HasSelfTest | Interlocked)
+        assert offers(rig.tweezers, "self_test")
         rig.tweezers.self_test()
         rig.tweezers.check_interlocks()
         assert not rig.ring.latest(1000).any()

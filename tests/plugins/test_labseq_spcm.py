@@ -23,7 +23,6 @@ from labseq import (
     ConfigError,
     Context,
     DeviceError,
-    HasSelfTest,
     LimitError,
     MotionSpec,
     Plan,
@@ -31,6 +30,7 @@ from labseq import (
     TransientError,
 )
 from labseq.motion import render, tone_program
+from labseq.roles import offers
 from labseq.testing import MobileTweezersContract
 from labseq.testing.fakes import FakeClock
 
@@ -376,7 +376,7 @@ def test_any_stretch_of_a_program_is_rendered_as_in_the_whole(row_channel: int) 
 @pytest.mark.parametrize("mode", ["replay", "fifo", "dds"])
 def test_a_card_that_is_well_passes_and_stays_silent(driver: Any, mode: str) -> None:
     with driver(mode) as lab:
-        assert isinstance(lab.tweezers, HasSelfTest)
+        assert offers(lab.tweezers, "self_test")
         lab.tweezers.self_test()
         assert lab.card.outputs_on == (False, False)
         assert not lab.card.running

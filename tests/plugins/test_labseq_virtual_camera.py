@@ -12,11 +12,11 @@ from labseq import (
     Context,
     DeviceError,
     DeviceTimeoutError,
-    HasSelfTest,
     LimitError,
     RandomStream,
     TransientError,
 )
+from labseq.roles import offers
 from labseq.testing.fakes import FakeClock, RecordingSimulation
 
 
@@ -207,7 +207,7 @@ def test_a_late_frame_comes_when_it_comes() -> None:
 
 
 def test_the_self_test_takes_a_frame_and_leaves_none(lab: Lab) -> None:
-    assert isinstance(lab.camera, HasSelfTest)
+    assert offers(lab.camera, "self_test")
     lab.camera.self_test()
     assert lab.clock.now() == pytest.approx(15e-3)
     lab.camera.arm(1, 10e-3, "software")

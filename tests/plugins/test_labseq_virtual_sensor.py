@@ -20,12 +20,11 @@ from labseq import (
     DeviceError,
     DeviceTimeoutError,
     LimitError,
-    NeedsSettling,
     RandomStream,
-    ReportsSensor,
     SensorMode,
     SiteGrid,
 )
+from labseq.roles import offers
 from labseq.testing.fakes import FakeClock
 
 EXPOSURE_S = 45e-3
@@ -86,7 +85,7 @@ def run(folder: Path) -> None:
 
 def test_the_world_tells_of_its_sensor() -> None:
     lab = Lab()
-    assert isinstance(lab.world, ReportsSensor)
+    assert offers(lab.world, "sensor_shape")
     assert lab.world.sensor_shape == (120, 120)
     assert lab.world.readout_fraction(SensorMode((0, 0, 60, 60), 2)) == pytest.approx(1 / 16)
 
@@ -217,7 +216,7 @@ def test_a_sensor_cools_from_room_temperature_past_its_set_point_and_back() -> N
 
 def test_the_camera_waits_until_it_is_cold() -> None:
     lab = Lab(cooling=COLD)
-    assert isinstance(lab.camera, NeedsSettling)
+    assert offers(lab.camera, "settle")
     assert lab.camera.settling_timeout_s == 900.0
     assert lab.said("temperature_k") == ROOM_K
     start_s = lab.clock.now()

@@ -17,11 +17,11 @@ from labseq import (
     DeviceError,
     LimitError,
     RandomStream,
-    ReportsTruth,
     SiteGrid,
     ToneProgram,
 )
 from labseq.model import AxisTones
+from labseq.roles import offers
 
 GRID = SiteGrid(20, 20)
 TINY_IMAGE = {"frame": (2, 2), "background": 0.0}
@@ -281,7 +281,7 @@ def test_the_same_seed_gives_the_same_shot_whatever_came_before() -> None:
 
 def test_the_world_tells_the_truth_and_keeps_it() -> None:
     world = new_world(loading=1.0)
-    assert isinstance(world, ReportsTruth)
+    assert offers(world, "truth")
     world.load(0.0, 0.5)
     world.truth()[...] = False
     assert n_atoms(world) == 400

@@ -196,13 +196,13 @@ def test_a_leader_that_is_told_by_a_driver_which_waits_is_told_of_a_stop() -> No
 
     made = rig(FOLLOW, ("stop", Stopping(given(duration=1.0))), IMAGE)
     leader = leader_of(made)
-    tell = leader.tell
+    tell = leader.report
 
     def waits(state: Any, about: Any) -> str:
         made.lab.clock.check()  # as every driver does that waits for its device
         return tell(state, about)
 
-    vars(leader)["tell"] = waits
+    vars(leader)["report"] = waits
     with pytest.raises(StopRequested):
         made.run()
     assert states(made) == ["failed"]
@@ -234,14 +234,14 @@ def test_a_go_that_never_comes_ends_the_run_safely() -> None:
 
 def test_one_that_cannot_be_told_is_a_warning_and_hides_nothing() -> None:
     made = rig(fail_on={"camera.read": OSError("cable")})
-    leader, tell = leader_of(made), leader_of(made).tell
+    leader, tell = leader_of(made), leader_of(made).report
 
     def unplugged(state: Any, about: Any) -> str:
         if state == "failed":
             raise OSError("unplugged")
         return tell(state, about)
 
-    vars(leader)["tell"] = unplugged
+    vars(leader)["report"] = unplugged
     with pytest.raises(DeviceError, match="cable"):
         made.run()
     (warning,) = made.observer.of("warning")

@@ -97,8 +97,11 @@ def test_a_line_that_triggers_the_camera_takes_the_place_of_the_software() -> No
 
 def test_a_blinding_line_refuses_an_exposure_with_em_gain() -> None:
     blinding = LineSpec("mot", 3, frozenset({"load", "image"}), blinding=True)
-    camera = RecordingCamera()
-    vars(camera)["facts"] = CameraFacts(em_gain=300.0)
+
+    class Multiplying(RecordingCamera):
+        facts = CameraFacts(em_gain=300.0)
+
+    camera = Multiplying()
     made = with_camera(Rig((LOAD, IMAGE), line_specs=[blinding]), camera)
     with pytest.raises(DeviceError, match="the line 'mot' is on during `image`"):
         made.run()

@@ -94,7 +94,7 @@ def test_the_run_speaks_for_what_is_outside_of_steps() -> None:
     lost = DeviceError("shutter", "no answer")
     again = RunPolicy(otherwise=StepPolicy(on_failure="repeat_shot"))
 
-    class HasReadings(RecordingDevice):
+    class Polled(RecordingDevice):
         polls = 0
 
         def poll(self) -> dict[str, float]:
@@ -104,7 +104,7 @@ def test_the_run_speaks_for_what_is_outside_of_steps() -> None:
             return {"power_w": 1.0}
 
     made = Rig(policy=again)
-    made.lab.devices["shutter"].__class__ = HasReadings  # fakes are made by their role, with its methods
+    made.lab.devices["shutter"].__class__ = Polled  # fakes are made by their role, with its methods
     made.run()
     assert [shot.status for shot in made.sink.shots] == ["failed", "complete"]
 

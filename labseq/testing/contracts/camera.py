@@ -11,7 +11,7 @@ import numpy as np
 
 from labseq.errors import DeviceError
 from labseq.model import Frame
-from labseq.roles import Camera, ReportsCameraFacts, Trigger
+from labseq.roles import Camera, Trigger, offers
 from labseq.testing.contracts.hardware import Action, Factory, HardwareContract, Wait
 from labseq.testing.contracts.promises import promise, refusal
 
@@ -200,4 +200,4 @@ class CameraContract(HardwareContract[Camera]):
 
 def triggers_of(camera: Camera) -> tuple[str, ...]:
     """What may start its exposures: what it tells, or software triggers."""
-    return camera.facts.triggers if isinstance(camera, ReportsCameraFacts) else ("software",)
+    return camera.facts.triggers if offers(camera, "facts") else ("software",)

@@ -13,7 +13,7 @@ import numpy as np
 from labseq.errors import DeviceError, LimitError
 from labseq.model import Plan, ToneProgram
 from labseq.motion import tone_program
-from labseq.roles import MobileTweezers, ReportsTimings
+from labseq.roles import MobileTweezers, offers
 from labseq.testing.contracts.hardware import Action, Factory, HardwareContract, Wait
 from labseq.testing.contracts.process import quietly
 from labseq.testing.contracts.promises import doing, promise, refusal
@@ -138,7 +138,7 @@ class MobileTweezersContract(HardwareContract[MobileTweezers]):
     def test_tells_its_timings(self, factory: Factory[MobileTweezers]) -> None:
         """They are recorded for every cycle, in the middle of a shot."""
         with self.opened(factory) as (tweezers, _):
-            if not isinstance(tweezers, ReportsTimings):
+            if not offers(tweezers, "timings"):
                 return
             start_s = perf_counter()
             tweezers.prepare(self.program())

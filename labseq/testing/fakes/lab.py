@@ -24,7 +24,7 @@ from labseq.model import (
     VisitedPoint,
     as_occupancy,
 )
-from labseq.roles import WHOLE_SENSOR, Clock, Context, Signal
+from labseq.roles import WHOLE_SENSOR, Clock, Context, Signal, Simulation
 from labseq.sequencer.lab import Lab, Timeouts
 from labseq.testing.fakes.devices import (
     Calls,
@@ -129,7 +129,7 @@ class ScriptedScanner:
         return point
 
 
-class RecordingSimulation:
+class RecordingSimulation(Simulation):
     """A world without atoms that notes what devices do to it; it exposes black frames.
 
     Args:
