@@ -181,7 +181,7 @@ def test_a_broken_screen_does_not_hide_the_outcome(perform: Any, monkeypatch: py
     def fail(_: object) -> None:
         raise OSError("no screen")
 
-    monkeypatch.setattr("labseq.console.output.LogLines.close", fail)
+    monkeypatch.setattr("labseq.console.events.LogLines.close", fail)
     _, out, _, caught = perform()
     assert caught is None
     assert json.loads(out)["status"] == "complete"
@@ -194,7 +194,7 @@ FULL = Path("/dev/full")
 def test_a_full_disk_behind_stdout_takes_nothing_from_the_run(perform: Any) -> None:
     with FULL.open("w", encoding="utf-8") as full, pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "stdout", full)
-        patch.setattr("labseq.console.output.LogLines.event", lambda *_: None)  # a session gives it up
+        patch.setattr("labseq.console.events.LogLines.event", lambda *_: None)  # a session gives it up
         session, _, err, caught = perform(as_json=False)
         discard_unwritten()
     assert caught is None
