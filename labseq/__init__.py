@@ -113,7 +113,7 @@ _HOMES: Final = {
 }
 _HOME_OF: Final = {name: home for home, names in _HOMES.items() for name in names}
 
-__version__: Final = "0.1.0"
+__version__: Final = "0.2.0"
 
 
 def __getattr__(name: str) -> Any:

@@ -326,7 +326,7 @@ _SAME_START_S: Final = 2.0
 
 
 def _start_time(pid: int) -> float | None:
-    """When a process started, in seconds since 1970; None if there is no such process, 0 if that is hidden."""
+    """When a process started, in seconds since 1970; None without such a process, 0 if hidden."""
     import psutil  # takes 0.03 s to import
 
     try:

@@ -15,7 +15,7 @@ from labseq.errors import ConfigError, DeviceError, Problem
 from labseq.guard import StopFlag
 from labseq.model import CalibrationKind, Frame, MotionSpec, SiteGrid
 from labseq.recording import Run
-from labseq.recording.shot import read_frames
+from labseq.recording.shot_file import read_frames
 from labseq.roles import Detector
 from labseq.sequencer import VirtualClock
 from labseq.session.construct import construct

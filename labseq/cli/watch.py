@@ -23,7 +23,6 @@ from labseq.plain import parse_object
 from labseq.recording import Run, Shot, open_run
 from labseq.recording.folders import EVENTS_FILE, INDEX_FILE
 from labseq.recording.run_file import is_index_row, read_state
-from labseq.recording.shot import load_content
 from labseq.roles import RunObserver
 
 POLL_S: Final = 0.5
@@ -111,7 +110,7 @@ class EventReader:
         """
         lines = self._events.read()
         for row in filter(is_index_row, self._index.read()):  # a shot is in the index before its event
-            self._shots[row["shot"], row["attempt"]] = Shot(self._folder / row["file"], row, load_content)
+            self._shots[row["shot"], row["attempt"]] = Shot(self._folder / row["file"], row)
         finished = [i for i, line in enumerate(lines) if line.get("event") in _OF_SHOTS]
         to_open = frozenset(finished[-_MAX_OPENED:])
         for i, line in enumerate(lines):

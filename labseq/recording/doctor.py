@@ -20,7 +20,7 @@ from labseq.recording import folders
 from labseq.recording.folders import Marker, markers_in
 from labseq.recording.run_file import (
     STATUSES,
-    NewerFormatError,
+    OtherFormatError,
     encode_state,
     index_row,
     is_index_row,
@@ -355,7 +355,7 @@ def _check_stray(run_dir: Path, path: Path, run_id: str, index: LineFile, counte
 
     Of a shot that has another line, that goes on to count: the last one does.
     """
-    from labseq.recording.shot import read_content, read_frames
+    from labseq.recording.shot_file import read_content, read_frames
 
     try:
         data = path.read_bytes()
@@ -364,14 +364,14 @@ def _check_stray(run_dir: Path, path: Path, run_id: str, index: LineFile, counte
     try:
         content = read_content(path)
         read_frames(path)
-    except NewerFormatError as error:
+    except OtherFormatError as error:
         return Damage("no line in the index", path, f"left: {_reason(error)}")
     except RecordingError as error:
         return quarantined(f"no line in the index, and {_reason(error).partition('; ')[0]}", path, run_dir)
     record, file = content.record, path.relative_to(run_dir).as_posix()
     counts = record.status == "complete"
     if content.run_id != run_id:
-        return quarantined(f"a shot of another run, {content.run_id}", path, run_dir)
+        return quarantined(f"a shot of another run, {content.run['run_id']}", path, run_dir)
     if not _is_name_of(file, record.shot_index, record.attempt, counts=counts):
         return quarantined("a shot under a name that is not its own", path, run_dir)
     sha256 = hashlib.sha256(data).hexdigest()

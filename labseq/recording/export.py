@@ -35,9 +35,9 @@ from labseq.plain import dumps, plain_text
 from labseq.recording import folders, schema as layout
 from labseq.recording.columns import Column, columns_of
 from labseq.recording.folders import RUN_FILE
+from labseq.recording.hdf5 import link_name, load_filter, set_attributes
 from labseq.recording.reader import Run
-from labseq.recording.schema import link_name, set_attributes
-from labseq.recording.shot import Shot, allow_filter
+from labseq.recording.shot import Shot
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -211,7 +211,7 @@ def dataset_of(run: Run, *, occupancies: bool = True) -> xr.Dataset:
 
 
 def _occupancies(run: Run, axes: Axes) -> NDArray[np.int8]:
-    from labseq.recording.shot import read_occupancies
+    from labseq.recording.shot_file import read_occupancies
 
     found = [read_occupancies(shot.file) for shot in run.shots]
     n_images = max(map(len, found), default=0)
@@ -354,9 +354,9 @@ def _write_netcdf(run: Run, path: Path) -> None:
 
 
 FORMAT: Final = "labseq-archive"
-FORMAT_VERSION: Final = "1.0"
+FORMAT_VERSION: Final = "2.0"
 
-_COMMON: Final = ("target", "devices", "provenance")
+_COMMON: Final = ("target", "run")
 _WORTH_PACKING: Final = 1024
 """Bytes from which compressing an array makes it smaller."""
 _PACKED: Final = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
@@ -379,14 +379,8 @@ def write_archive(run: Run, path: Path, *, frames: bool) -> list[str]:
     """
     left_out: list[str] = []
     with whole_file(path) as part, h5py.File(Path(part.name), "w", libver=layout.LIBRARY_VERSIONS) as file:
-        set_attributes(
-            file,
-            **facts_of(run),
-            format=FORMAT,
-            format_version=FORMAT_VERSION,
-            NX_class="NXroot",
-            default="table",
-        )
+        formats = {"format": FORMAT, "format_version": FORMAT_VERSION}
+        set_attributes(file, {**facts_of(run), **formats, "NX_class": "NXroot", "default": "table"})
         file.attrs["archived_by"] = f"labseq {labseq.__version__}"
         _write_table(file.create_group("table"), run)
         _write_files(file.create_group("run"), run.path)
@@ -401,7 +395,7 @@ def write_archive(run: Run, path: Path, *, frames: bool) -> list[str]:
 
 
 def _write_table(group: h5py.Group, run: Run) -> None:
-    set_attributes(group, NX_class="NXdata", signal="filling_fraction")
+    set_attributes(group, {"NX_class": "NXdata", "signal": "filling_fraction"})
     group.attrs["axes"] = ["shot"]
     names: list[str] = []
     for column in columns_of(run):
@@ -410,7 +404,7 @@ def _write_table(group: h5py.Group, run: Run) -> None:
         if dtype.kind == "O":
             values, dtype = list(map(plain_text, values)), h5py.string_dtype()
         dataset = group.create_dataset(names[-1], data=values, dtype=dtype)
-        set_attributes(dataset, units=column.units, description=column.description)
+        set_attributes(dataset, {"units": column.units, "description": column.description})
 
 
 def _write_files(group: h5py.Group, run_dir: Path) -> None:
@@ -427,7 +421,7 @@ def _write_file(group: h5py.Group, name: str, data: bytes) -> None:
         dataset = group.create_dataset(name, data=data.decode(), dtype=h5py.string_dtype())
     else:
         dataset = group.create_dataset(name, data=np.frombuffer(data, np.uint8))
-    set_attributes(dataset, units="", description="this file of the run's folder")
+    set_attributes(dataset, {"units": "", "description": "this file of the run's folder"})
 
 
 def _is_text(data: bytes) -> bool:
@@ -455,7 +449,7 @@ class _Shots:
             entry: Any = source["entry"]
             if self._frames:
                 for camera in entry["camera"].values() if "camera" in entry else ():
-                    allow_filter(shot.file, camera["images"])
+                    load_filter(shot.file, camera["images"])
             made = self._group.create_group(shot.file.stem)
             _copy_attributes(entry, made)
             for name in entry:

@@ -339,7 +339,7 @@ class Follower:
                     self._offset += len(line)
                     row = parse_object(line)
                     if row is not None and is_index_row(row) and row["counts"]:
-                        yield Shot(self._run_dir / row["file"], row, load_content)
+                        yield Shot(self._run_dir / row["file"], row)
         except FileNotFoundError:
             return
         except OSError as error:

@@ -1,7 +1,7 @@
-"""The files of a run's folder: run.json, the index of shots, the log.
+"""run.json, STATE and the lines of a run's index: what they hold, written and read back.
 
-They stand in the shot's line of the index, so that a run of many thousand shots is summed
-up without opening their files.
+A shot's line in the index also sums up its images and cycles, so that a run of many thousand shots is
+evaluated without opening their files.
 """
 
 from __future__ import annotations
@@ -11,26 +11,159 @@ from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, fields
 from numbers import Real
 from pathlib import Path
-from types import UnionType
-from typing import Any, Final, cast
+from typing import Any, Final, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 import labseq
 from labseq.errors import RecordingError
-from labseq.files import Process
+from labseq.files import Process, read_file
 from labseq.model import RunRecord, ShotRecord, TargetPattern
 from labseq.model.records import RunStatus
 from labseq.plain import dumps, parse_object, to_plain
-from labseq.recording import schema as layout
+from labseq.recording import schema
 from labseq.recording.folders import PROFILE_FILE, RUN_FILE, SEQUENCE_FILE, STATE_FILE
 
 SIMULATION: Final = "simulation."
-"""What the names of readings begin with that only a simulation can know."""
+"""Prefix of the names of readings that only a simulation can know."""
 
+STATUSES: Final = ("running", "complete", "stopped", "failed")
+
+_LAST_VERSION_OF_FORMAT_1: Final = "0.1.0"
 _MAX_TEXT: Final = 80
 _MAX_DEPTH: Final = 4
+
+
+class OtherFormatError(RecordingError):
+    """A file was written by a labseq with another format than this one's."""
+
+
+def check_version(path: Path, found: str, known: str) -> None:
+    """Refuse files of another major version of the format.
+
+    Args:
+        path: The file.
+        found: Its format version.
+        known: The format version of this labseq.
+
+    Raises:
+        OtherFormatError: The major version is another one.
+        RecordingError: There is no version.
+    """
+    major = found.partition(".")[0]
+    if not major.isdecimal():
+        raise RecordingError(
+            path, f"has the format version '{found}'; expected one like {known}; it is damaged"
+        )
+    if major != known.partition(".")[0]:
+        older = int(major) < int(known.partition(".")[0])
+        advice = f"use labseq {_LAST_VERSION_OF_FORMAT_1} to read it" if older else "update labseq"
+        raise OtherFormatError(path, f"has format version {found}, this labseq reads {known}; {advice}")
+
+
+_IN_RUN: Final = {"name": str, "n_shots": int, "seed": int, "simulated": bool, "target": dict}
+
+
+def sha256_of_text(text: str) -> str:
+    """SHA-256 of a text's bytes, in hexadecimal."""
+    return hashlib.sha256(encode_text(text)).hexdigest()
+
+
+def encode_text(text: str) -> bytes:
+    """The exact bytes that a text was decoded from."""
+    return text.encode("utf-8", "surrogateescape")
+
+
+def encode_run(run: RunRecord, run_id: str) -> bytes:
+    """The content of run.json."""
+    values = {
+        "format": schema.RUN_FORMAT,
+        "format_version": schema.RUN_FORMAT_VERSION,
+        "creator": f"labseq {labseq.__version__}",
+        "run_id": run_id,
+        **{field.name: getattr(run, field.name) for field in fields(run)},
+        "target": {"name": run.target.name, "fill": _rows(run.target.fill), "clear": _rows(run.target.clear)},
+        "sequence_file": SEQUENCE_FILE,
+        "sequence_sha256": sha256_of_text(run.sequence_text),
+        "profile_file": PROFILE_FILE,
+        "profile_sha256": sha256_of_text(run.profile_text),
+    }
+    return dumps(values, indent=1).encode() + b"\n"
+
+
+def read_run(folder: Path) -> dict[str, Any]:
+    """Read run.json.
+
+    Raises:
+        RecordingError: It is damaged, or of another format.
+    """
+    path = folder / RUN_FILE
+    record = parse_object(read_file(path))
+    if record is None or record.get("format") != schema.RUN_FORMAT:
+        raise RecordingError(path, "is damaged, or not labseq's; take it from a backup")
+    check_version(path, str(record.get("format_version")), schema.RUN_FORMAT_VERSION)
+    wrong = [name for name, kind in _IN_RUN.items() if not isinstance(record.get(name), kind)]
+    if wrong:
+        raise RecordingError(path, f"is damaged: it has no valid '{wrong[0]}'; take it from a backup")
+    return record
+
+
+def target_of(path: Path, record: Mapping[str, Any]) -> TargetPattern:
+    """The target in run.json.
+
+    Raises:
+        RecordingError: It is damaged.
+    """
+    try:
+        target = record["target"]
+        return TargetPattern(_grid(target["fill"]), _grid(target["clear"]), str(target["name"]))
+    except (KeyError, TypeError, ValueError) as error:
+        raise RecordingError(path, f"has a damaged target: {error!r}; take it from a backup") from error
+
+
+def _rows(sites: NDArray[np.bool_]) -> list[str]:
+    return ["".join("1" if site else "0" for site in row) for row in sites]
+
+
+def _grid(rows: list[str]) -> NDArray[np.bool_]:
+    return np.array([[site == "1" for site in row] for row in rows], np.bool_).reshape(len(rows), -1)
+
+
+def encode_state(status: RunStatus, error: str = "") -> bytes:
+    """The content of STATE: one line, with the process that the run belongs to."""
+    return dumps({"state": status, **asdict(Process.current()), "error": error}).encode() + b"\n"
+
+
+def read_state_file(folder: Path) -> dict[str, Any]:
+    """The content of STATE as it is; empty if it is missing or damaged."""
+    try:
+        return parse_object((folder / STATE_FILE).read_bytes()) or {}
+    except OSError:
+        return {}
+
+
+def read_state(folder: Path) -> tuple[RunStatus, str]:
+    """Status of a run, and the error that ended it.
+
+    A run that is "running" while its process is gone has failed. A run on another computer is believed,
+    because its process cannot be looked up.
+    """
+    state = read_state_file(folder)
+    if state.get("state") not in STATUSES:
+        return "failed", f"{STATE_FILE} is missing or damaged"
+    status = cast("RunStatus", state["state"])
+    if status != "running":
+        return status, str(state.get("error") or "")
+    process = Process.from_plain(state)
+    if process is None or (process.is_here and not process.is_running):
+        return "failed", "the process that ran it is gone"
+    return "running", ""
+
+
+def read_owner(folder: Path) -> Process | None:
+    """The process that runs or ran a run; None if that is not known."""
+    return Process.from_plain(read_state_file(folder))
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,12 +208,12 @@ class Cycles:
 
 @dataclass(frozen=True, slots=True)
 class ShotSummary:
-    """A shot in a few numbers.
+    """A shot in a few numbers, as its line in the index has them.
 
     Attributes:
         images: Its images.
         cycles: Its cycles.
-        simulation: Truths that a simulation told, such as "lost.vacuum"; empty on real hardware.
+        simulation: True values that a simulation reported, such as "lost.vacuum"; empty on real hardware.
     """
 
     images: Images
@@ -91,10 +224,6 @@ class ShotSummary:
     def is_judged(self) -> bool:
         """Whether no cycle ended with the last image: that one may have been chosen for being good."""
         return not any(self.images.cycle[-1:])
-
-    def as_row(self) -> dict[str, Any]:
-        """What goes into the index, JSON-ready; :func:`summary_in` reads it."""
-        return asdict(self)
 
 
 def summarise(shot: ShotRecord, target: TargetPattern) -> ShotSummary:
@@ -115,25 +244,70 @@ def summarise(shot: ShotRecord, target: TargetPattern) -> ShotSummary:
     cycles = Cycles(
         n_batches=tuple(cycle.plan.n_batches for cycle in shot.cycles),
         n_batches_played=tuple(cycle.n_batches_played for cycle in shot.cycles),
-        n_atom_moves=tuple(int(cycle.plan.batch_offsets[cycle.n_batches_played]) for cycle in shot.cycles),
+        n_atom_moves=tuple(cycle.n_atom_moves_played for cycle in shot.cycles),
     )
-    told = {
+    simulation = {
         name.removeprefix(SIMULATION): float(value)
         for name, value in shot.readings.items()
         if name.startswith(SIMULATION) and isinstance(value, Real)
     }
-    return ShotSummary(images, cycles, told)
+    return ShotSummary(images, cycles, simulation)
+
+
+def summary_of(row: Mapping[str, Any]) -> ShotSummary:
+    """The summary in a line of the index.
+
+    Raises:
+        RecordingError: The line is damaged.
+    """
+    try:
+        simulation = {str(name): float(value) for name, value in row["simulation"].items()}
+        return ShotSummary(_columns(Images, row["images"]), _columns(Cycles, row["cycles"]), simulation)
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
+        reason = f"has a damaged line for shot {row.get('shot')}; 'labseq doctor' moves it away"
+        raise RecordingError("index.jsonl", reason) from error
+
+
+_T = TypeVar("_T", Images, Cycles)
+
+
+def _columns(kind: type[_T], table: Mapping[str, Any]) -> _T:
+    columns = [tuple(table[field.name]) for field in fields(kind)]
+    if len({*map(len, columns)}) > 1 or not {type(value) for one in columns for value in one} <= {int, float}:
+        raise ValueError(kind.__name__)
+    return kind(*columns)
+
+
+def index_row(
+    shot: ShotRecord, target: TargetPattern, *, file: str, sha256: str, n_bytes: int
+) -> dict[str, Any]:
+    """A shot's line in the index."""
+    stage_s: dict[str, float] = {}
+    for timing in shot.timing:
+        stage_s[timing.stage] = stage_s.get(timing.stage, 0.0) + timing.duration_s
+    return {
+        **{field.name: field.value(shot) for field in schema.SHOT if field.in_index},
+        "counts": shot.status == "complete",
+        "stage_s": stage_s,
+        "parameters": to_plain(shot.parameters),
+        "readings": flat_readings(shot.readings),
+        "calibrations": to_plain(shot.calibrations),
+        **asdict(summarise(shot, target)),
+        "file": file,
+        "sha256": sha256,
+        "bytes": n_bytes,
+    }
 
 
 def flat_readings(readings: Mapping[str, Any]) -> dict[str, Any]:
-    """The readings that are single values, by dotted names; those of a simulation stand in its summary.
+    """The readings that are single values, by dotted names, without those of a simulation.
 
     Example:
         >>> flat_readings({"laser": {"power_w": 0.1, "trace": [1, 2]}, "simulation.lost.vacuum": 2.0})
         {'laser.power_w': 0.1}
     """
-    told = {name: value for name, value in readings.items() if not name.startswith(SIMULATION)}
-    return dict(_flat("", to_plain(told), _MAX_DEPTH))
+    real = {name: value for name, value in readings.items() if not name.startswith(SIMULATION)}
+    return dict(_flat("", to_plain(real), _MAX_DEPTH))
 
 
 def _flat(prefix: str, values: Mapping[str, Any], depth: int) -> Iterator[tuple[str, Any]]:
@@ -144,210 +318,25 @@ def _flat(prefix: str, values: Mapping[str, Any], depth: int) -> Iterator[tuple[
             yield f"{prefix}{name}", value
 
 
-def summary_in(row: Mapping[str, Any]) -> ShotSummary | None:
-    """The summary in a line of the index; None if there is none, as before version 1.1, or it is damaged."""
-    try:
-        images, cycles = (
-            _columns(kind, row[name]) for kind, name in ((Images, "images"), (Cycles, "cycles"))
-        )
-        told = {str(name): float(value) for name, value in row["simulation"].items() if _is_number(value)}
-    except (KeyError, TypeError, AttributeError, ValueError):
-        return None
-    return ShotSummary(cast("Images", images), cast("Cycles", cycles), told)
-
-
-def _columns(kind: type[Images | Cycles], table: Mapping[str, Any]) -> Images | Cycles:
-    """A table of numbers.
-
-    Raises:
-        ValueError: Its columns differ in length, or hold something else.
-    """
-    columns = [tuple(table[field.name]) for field in fields(kind)]
-    if len({*map(len, columns)}) > 1 or not all(_is_number(value) for one in columns for value in one):
-        raise ValueError(kind.__name__)
-    return kind(*columns)
-
-
-def _is_number(value: object) -> bool:
-    return type(value) in (int, float)
-
-
-_IN_RUN: Final = {"name": str, "n_shots": int, "seed": int, "simulated": bool, "target": dict}
-_IN_INDEX: Final[Mapping[str, type | UnionType]] = {
-    "shot": int,
-    "attempt": int,
-    "counts": bool,
-    "file": str,
-    "status": str,
-    "success": bool,
-    "filling_fraction": float | int | None,
-    "seen_defect_free_cycle": int,
-}
-STATUSES: Final = ("running", "complete", "stopped", "failed")
-
-
-class NewerFormatError(RecordingError):
-    """A file was written by a newer labseq than this one."""
-
-
-def encode_text(text: str) -> bytes:
-    """The exact bytes that a text was decoded from."""
-    return text.encode("utf-8", "surrogateescape")
-
-
-def sha256_of_text(text: str) -> str:
-    """SHA-256 of a text's bytes, in hexadecimal."""
-    return hashlib.sha256(encode_text(text)).hexdigest()
-
-
-def encode_run(run: RunRecord, run_id: str) -> bytes:
-    """The content of run.json."""
-    fields = {name: getattr(run, name) for name in RunRecord.__slots__}
-    target = {"name": run.target.name, "fill": _rows(run.target.fill), "clear": _rows(run.target.clear)}
-    values = {
-        "format": layout.RUN_FORMAT,
-        "format_version": layout.RUN_FORMAT_VERSION,
-        "creator": f"labseq {labseq.__version__}",
-        "run_id": run_id,
-        **fields,
-        "target": target,
-        "sequence_file": SEQUENCE_FILE,
-        "sequence_sha256": sha256_of_text(run.sequence_text),
-        "profile_file": PROFILE_FILE,
-        "profile_sha256": sha256_of_text(run.profile_text),
-    }
-    return dumps(values, indent=1).encode() + b"\n"
-
-
-def read_run(folder: Path) -> dict[str, Any]:
-    """Read run.json.
-
-    Raises:
-        RecordingError: It is damaged, or of a newer labseq.
-    """
-    path = folder / RUN_FILE
-    try:
-        record = parse_object(path.read_bytes())
-    except OSError as error:
-        raise RecordingError(path, f"cannot be read: {error.strerror}; check the disk") from error
-    if record is None or record.get("format") != layout.RUN_FORMAT:
-        raise RecordingError(path, "is damaged, or not labseq's; take it from a backup")
-    check_version(path, str(record.get("format_version")), layout.RUN_FORMAT_VERSION)
-    wrong = [name for name, kind in _IN_RUN.items() if not isinstance(record.get(name), kind)]
-    if wrong:
-        raise RecordingError(path, f"is damaged: it has no valid '{wrong[0]}'; take it from a backup")
-    return record
-
-
-def check_version(path: Path, came: str, known: str) -> None:
-    """Refuse files of a newer major version than this labseq knows.
-
-    Raises:
-        RecordingError: The version is newer, or none at all.
-    """
-    major = came.partition(".")[0]
-    if not major.isdecimal():
-        raise RecordingError(
-            path, f"has the format version '{came}'; expected one like {known}; it is damaged"
-        )
-    if int(major) > int(known.partition(".")[0]):
-        reason = f"has format version {came}, this labseq reads {known}; update labseq"
-        raise NewerFormatError(path, reason)
-
-
-def target_of(path: Path, record: Mapping[str, Any]) -> TargetPattern:
-    """The target in run.json.
-
-    Raises:
-        RecordingError: There is none, or it is damaged.
-    """
-    try:
-        target = record["target"]
-        return TargetPattern(_grid(target["fill"]), _grid(target["clear"]), str(target["name"]))
-    except (KeyError, TypeError, ValueError) as error:
-        raise RecordingError(path, f"has a damaged target: {error!r}; take it from a backup") from error
-
-
-def _rows(sites: NDArray[np.bool_]) -> list[str]:
-    return ["".join("1" if site else "0" for site in row) for row in sites]
-
-
-def _grid(rows: list[str]) -> NDArray[np.bool_]:
-    return np.array([[site == "1" for site in row] for row in rows], np.bool_).reshape(len(rows), -1)
-
-
-def encode_state(status: RunStatus, error: str = "") -> bytes:
-    """The content of STATE: one line, with the process that the run belongs to."""
-    return dumps({"state": status, **asdict(Process.current()), "error": error}).encode() + b"\n"
-
-
-def read_state(folder: Path) -> tuple[RunStatus, str]:
-    """Status of a run, and the error that ended it.
-
-    A run that is "running" while its process is gone has failed. On another
-    computer that cannot be known, and the run is believed.
-    """
-    try:
-        state = parse_object((folder / STATE_FILE).read_bytes())
-    except OSError:
-        state = None
-    if state is None or state.get("state") not in STATUSES:
-        return "failed", f"{STATE_FILE} is missing or damaged"
-    status = cast("RunStatus", state["state"])
-    if status != "running":
-        return status, str(state.get("error") or "")
-    owner = Process.from_plain(state)
-    if owner is None or (owner.is_here and not owner.is_running):
-        return "failed", "the process that ran it is gone"
-    return "running", ""
-
-
-def read_owner(folder: Path) -> Process | None:
-    """The process that a run belongs to, or belonged to; None if that is not known."""
-    try:
-        return Process.from_plain(parse_object((folder / STATE_FILE).read_bytes()) or {})
-    except OSError:
-        return None
-
-
-def index_row(
-    shot: ShotRecord, target: TargetPattern, *, file: str, sha256: str, n_bytes: int
-) -> dict[str, Any]:
-    """A shot's line in the index. ``n_batches`` and ``n_atom_moves`` count what was played."""
-    stage_s: dict[str, float] = {}
-    for timing in shot.timing:
-        stage_s[timing.stage] = stage_s.get(timing.stage, 0.0) + timing.duration_s
-    played = [(cycle.n_batches_played, cycle.plan.batch_offsets) for cycle in shot.cycles]
-    return {
-        "shot": shot.shot_index,
-        "attempt": shot.attempt,
-        "counts": shot.status == "complete",
-        "file": file,
-        "status": shot.status,
-        "error": shot.error,
-        "t_start_utc": shot.t_start_utc,
-        "t_end_utc": shot.t_end_utc,
-        "success": shot.success,
-        "filling_fraction": shot.filling_fraction,
-        "seen_defect_free_cycle": shot.seen_defect_free_cycle,
-        "n_cycles": len(shot.cycles),
-        "n_images": len(shot.images),
-        "n_batches": sum(n for n, _ in played),
-        "n_atom_moves": sum(int(offsets[n]) for n, offsets in played),
-        "n_missing_atoms": shot.n_missing_atoms,
-        "stage_s": stage_s,
-        "parameters": to_plain(shot.parameters),
-        "readings": flat_readings(shot.readings),
-        "calibrations": to_plain(shot.calibrations),
-        **summarise(shot, target).as_row(),
-        "sha256": sha256,
-        "bytes": n_bytes,
-    }
+_KINDS: Final = {"int64": int, "bool": bool, "text": str, "float64": float | int | None}
+_IN_INDEX: Final = (
+    *((field.name, _KINDS[field.dtype]) for field in schema.SHOT if field.in_index),
+    *dict.fromkeys(("stage_s", "parameters", "readings", "calibrations"), dict).items(),
+    *dict.fromkeys(("images", "cycles", "simulation"), dict).items(),
+    *{"counts": bool, "file": str, "sha256": str, "bytes": int}.items(),
+)
+_NOTHING: Final = object()
 
 
 def is_index_row(row: Mapping[str, Any]) -> bool:
-    """Whether a line of the index holds what a run cannot be shown without; other values may be missing."""
-    return all(name in row and isinstance(row[name], kind) for name, kind in _IN_INDEX.items())
+    """Whether a line of the index has all that :func:`index_row` wrote."""
+    if not all(isinstance(row.get(name, _NOTHING), kind) for name, kind in _IN_INDEX):
+        return False
+    try:
+        summary_of(row)
+    except RecordingError:
+        return False
+    return all(type(seconds) in (int, float, type(None)) for seconds in row["stage_s"].values())
 
 
 def is_skip_row(row: Mapping[str, Any], n_shots: int) -> bool:

@@ -16,7 +16,7 @@ from labseq.messages import clean
 from labseq.model import ScanRange, ScanSpace, VisitedPoint
 from labseq.plain import dumps
 from labseq.recording import Shot
-from labseq.recording.columns import figures_of
+from labseq.recording.columns import figures_in
 from labseq.recording.reader import SCANNER
 from labseq.roles import Scanner, Step
 from labseq.session.construct import construct_one
@@ -217,7 +217,7 @@ class Results:
 
     def missing_figure(self, shot: int) -> str:
         """What to say, once, of a shot that has not what the scan climbs on; "" if it has."""
-        figure, figures = self.search.adaptive.figure, figures_of(self.shots[shot])
+        figure, figures = self.search.adaptive.figure, figures_in(self.shots[shot].row)
         if self._warned or figure in figures:
             return ""
         self._warned = True
@@ -257,7 +257,7 @@ class Results:
         return [self.shots[index] for index in indices if index in self.shots]
 
     def _visit(self, visit: int) -> VisitedPoint:
-        figures = [MappingProxyType(figures_of(shot)) for shot in self._shots_of(visit)]
+        figures = [MappingProxyType(figures_in(shot.row)) for shot in self._shots_of(visit)]
         name, sign = self.search.adaptive.figure, 1.0 if self.search.adaptive.maximise else -1.0
         known = [sign * one[name] for one in figures if name in one]
         score = math.fsum(known) / len(known) if known else math.nan

@@ -13,7 +13,6 @@ from labseq.errors import DeviceError
 from labseq.guard import StopFlag
 from labseq.plain import dumps
 from labseq.recording import Run, RunWriter, Shot
-from labseq.recording.shot import load_content
 from labseq.roles import RunObserver
 from labseq.sequencer import Sequencer
 from labseq.sequencer.lab import Lab
@@ -307,7 +306,7 @@ class AdaptiveScanRun(ScanRun):
         if not row["counts"]:
             self._results.give_up(shot, row["parameters"])
             return
-        self._results.add(Shot(self._writer.run_dir / row["file"], json.loads(dumps(row)), load_content))
+        self._results.add(Shot(self._writer.run_dir / row["file"], json.loads(dumps(row))))
         if warning := self._results.missing_figure(shot):
             self._log_event("warning", {"text": warning})
 

@@ -181,7 +181,7 @@ def _checked(array: NDArray[Any], name: str) -> Occupancy:
 
 
 def _shot(path: Path, cycle: str | None) -> Source:
-    from labseq.recording.shot import read_content
+    from labseq.recording.shot_file import read_content
 
     name = visible(str(path))
     try:

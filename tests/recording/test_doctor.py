@@ -169,7 +169,7 @@ def test_an_earlier_take_of_a_shot_does_not_replace_the_later(
     assert later.name == "shot_000001.take_2.h5"
     with h5py.File(later, "r+") as file:
         run_id = json.loads((run_dir / "run.json").read_text("utf-8"))["run_id"]
-        file["entry"].attrs["run_id"] = run_id
+        file["entry/run"].attrs["run_id"] = run_id
     rows = [json.loads(line) for line in (run_dir / "index.jsonl").read_bytes().splitlines()]
     rows[-1]["sha256"] = hashlib.sha256(later.read_bytes()).hexdigest()
     (run_dir / "index.jsonl").write_text("".join(f"{json.dumps(row)}\n" for row in rows), "utf-8")

@@ -55,7 +55,7 @@ def test_csv_is_a_table_with_a_line_of_names_and_a_table_of_units(run: Run, tmp_
     for shot, row in zip(run.shots, rows, strict=True):
         with h5py.File(run.path / row["file"]) as file:
             entry: Any = file["entry"]
-            assert int(row["shot"]) == entry.attrs["shot_index"] == shot.index
+            assert int(row["shot"]) == entry.attrs["shot"] == shot.index
             assert float(row["filling_fraction"]) == entry.attrs["filling_fraction"]
             assert row["success"] == ("true" if entry.attrs["success"] else "false")
             assert float(row[ADDRESSES[1]]) == json.loads(entry["parameters"][()])[ADDRESSES[1]]
@@ -135,7 +135,7 @@ def test_an_archive_holds_what_the_files_hold(run: Run, tmp_path: Path, frames: 
                 for name, dataset in found.items():
                     assert values_in(dataset) == values_in(expected[name]), name
                     assert {*dataset.attrs} == {*expected[name].attrs}, name
-                assert copy.attrs["shot_index"] == entry.attrs["shot_index"]
+                assert copy.attrs["shot"] == entry.attrs["shot"]
                 if frames:
                     np.testing.assert_array_equal(copy["images_view/images"], entry["images_view/images"])
                 else:
@@ -185,7 +185,7 @@ def test_what_is_the_same_in_all_shots_stands_in_an_archive_once(run: Run, tmp_p
     path = exported(run, "archive", tmp_path)
     assert path.stat().st_size < 0.7 * sum(shot.file.stat().st_size for shot in run.shots)
     with h5py.File(path) as archive:
-        first, last = (archive[f"shots/shot_{i:06d}/provenance"] for i in (0, 11))
+        first, last = (archive[f"shots/shot_{i:06d}/run"] for i in (0, 11))
         assert first == last
 
 

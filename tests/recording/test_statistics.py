@@ -6,6 +6,7 @@ import json
 import math
 import statistics as by_hand
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +14,10 @@ import numpy as np
 import pytest
 
 from labseq.analysis.statistics import Rate, statistics_of
+from labseq.errors import RecordingError
 from labseq.model import CycleRecord, ImageRecord, Plan, PlanReport, RunRecord, ShotRecord
 from labseq.recording import Run, RunWriter, open_run
-from labseq.recording.run_file import summarise, summary_in
+from labseq.recording.run_file import summarise, summary_of
 
 MakeRun = Callable[..., RunRecord]
 MakeShot = Callable[..., ShotRecord]
@@ -71,15 +73,6 @@ def recorded(tmp_path: Path, make_run: MakeRun) -> Callable[..., Run]:
         return open_run(writer.run_dir)
 
     return record
-
-
-def without_summaries(run: Run) -> Run:
-    """The run as labseq recorded it before format 1.1."""
-    index = run.path / "index.jsonl"
-    rows = [json.loads(line) for line in index.read_text("utf-8").splitlines()]
-    kept = [{k: v for k, v in row.items() if k not in ("images", "cycles", "simulation")} for row in rows]
-    index.write_text("".join(f"{json.dumps(row)}\n" for row in kept), "utf-8")
-    return open_run(run.path)
 
 
 def test_each_cycle_is_judged_on_its_own_image(of_defects: Any, recorded: Any) -> None:
@@ -141,22 +134,13 @@ def test_the_truth_of_a_simulation_is_told_where_it_is_known(of_defects: Any, re
     assert (found.defects_true.value, found.defects_seen.value) == (2.0, 1.5)
 
 
-def test_runs_of_before_tell_the_same_from_their_files(of_defects: Any, recorded: Any) -> None:
-    new = recorded(of_defects(0, (2, 0), last=0, lost__vacuum=3), of_defects(1, (None, 1), last=2))
-    told = statistics_of(new.shots, new.target)
-    old = without_summaries(new)
-    assert summary_in(old.shots[0].row) is None
-    assert statistics_of(old.shots, old.target).as_dict() == told.as_dict()
-
-
-def test_a_shot_that_cannot_be_read_is_left_out_and_told(of_defects: Any, recorded: Any) -> None:
-    run = without_summaries(recorded(*(of_defects(i, (1, 0), last=0) for i in range(3))))
-    run.shots[1].file.unlink()
-    run.shots[2].file.write_bytes(b"no HDF5")
+def test_a_shot_with_a_damaged_line_is_left_out_and_named(of_defects: Any, recorded: Any) -> None:
+    run = recorded(*(of_defects(i, (1, 0), last=0) for i in range(3)))
+    run.shots[1].row["images"] = {"cycle": [0, 1]}
     found = statistics_of(run.shots, run.target)
-    assert found.unreadable == (1, 2)
-    assert found.cycles[0].n_shots == 1
-    assert found.defect_free == Rate(3, 3)  # the index knows
+    assert found.unreadable == (1,)
+    assert found.cycles[0].n_shots == 2
+    assert found.defect_free == Rate(3, 3)
 
 
 @pytest.mark.parametrize(
@@ -169,10 +153,10 @@ def test_a_shot_that_cannot_be_read_is_left_out_and_told(of_defects: Any, record
         {"cycles": {"n_batches": ["1"], "n_batches_played": [1], "n_atom_moves": [1]}},
     ],
 )
-def test_a_damaged_summary_is_none(of_defects: Any, recorded: Any, damage: dict[str, Any]) -> None:
+def test_a_damaged_summary_is_an_error(of_defects: Any, recorded: Any, damage: dict[str, Any]) -> None:
     (shot,) = recorded(of_defects(0, (1, 0))).shots
-    assert summary_in(shot.row) == shot.summary
-    assert summary_in({**shot.row, **damage}) is None
+    with pytest.raises(RecordingError, match=r"damaged line for shot 0; 'labseq doctor'"):
+        summary_of({**shot.row, **damage})
 
 
 def test_an_empty_run_has_nothing_to_tell(recorded: Any) -> None:
@@ -201,4 +185,4 @@ def test_many_shots_are_summed_up_from_the_index_alone(of_defects: Any, recorded
 
 def test_a_summary_survives_the_index(of_defects: Any, make_run: MakeRun) -> None:
     summary = summarise(of_defects(0, (2, None, 0), last=1, lost__vacuum=3), make_run().target)
-    assert summary_in(json.loads(json.dumps(summary.as_row()))) == summary
+    assert summary_of(json.loads(json.dumps(asdict(summary)))) == summary

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import errno
 import hashlib
 import json
@@ -106,7 +107,7 @@ def test_the_index_tells_each_shot_in_a_line(tmp_path: Path, make_run: MakeRun, 
         "parameters": {"shot.2.rearrange.window": 0.06, "ümlaut": [1, None]},
         "readings": {"laser.power_w": 0.1, "laser.locked": True},
         "calibrations": {"sites": "f102b3cd999c", "overlay": "a18d1601661e"},
-        **json.loads(json.dumps(summarise(make_shot(), make_run().target).as_row())),
+        **json.loads(json.dumps(dataclasses.asdict(summarise(make_shot(), make_run().target)))),
         "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
         "bytes": path.stat().st_size,
     }

@@ -8,7 +8,7 @@ Each makes Markdown, which the page's own parser then reads:
 - ``{registered} planner``: everything that is registered for a role, with its keys
 - ``{quantities}``: the quantities and their units
 - ``{command} run``, ``{command} bench planners``: one command; without a name, the options of all
-- ``{shot-file} datasets``, ``{shot-file} columns``, ``{shot-file} attributes``: what stands in a shot's file
+- ``{shot-file} datasets``, ``columns``, ``attributes``, ``index``: what a shot's file and the index hold
 - ``{registry}``, ``{scripts}``, ``{names}``: how plugins offer things, what scripts call, all public names
 - ``{contract} camera``, ``{strategies}``, ``{fakes}``: what ``labseq.testing`` has for plugins
 - ``{hooks}``, ``{role} Camera``, ``{errors}``, ``{error-tree}``, ``{plan-rules}``

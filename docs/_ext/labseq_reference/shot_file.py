@@ -1,13 +1,10 @@
-"""What stands in a shot's file, as Markdown tables."""
+"""What a shot's file holds, as Markdown tables built from the schema."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Final
 
-import numpy as np
-
-from labseq.recording.schema import ATTRIBUTES, COLUMNS, DATASETS, EVERYWHERE, TABLES, units_of
+from labseq.recording import schema
 from labseq_reference.known import UnknownNameError
 from labseq_reference.tables import table
 
@@ -15,42 +12,39 @@ from labseq_reference.tables import table
 def datasets() -> list[str]:
     """A row per dataset."""
     rows = [
-        (f"`/entry/{path}`", what.dtype, what.shape, what.units, what.meaning, what.since_version)
-        for path, what in DATASETS.items()
+        (f"`/entry/{one.path}`", one.dtype, one.axes, one.units, one.description) for one in schema.datasets()
     ]
-    return table(
-        ("path", "type", "axes", "unit", "meaning", "since_version"), rows, ("shot-file", "datasets")
-    )
+    return table(("path", "type", "axes", "unit", "description"), rows, ("shot-file", "datasets"))
 
 
 def columns() -> list[str]:
     """A table for each table of the file, with a row per column."""
     lines: list[str] = []
-    for path, meanings in COLUMNS.items():
-        units = dict(zip(meanings, units_of(TABLES[path]), strict=True))
+    for one in schema.TABLES:
         rows = [
-            (f"`{name}`", _named(TABLES[path][name]), units[name], meaning)
-            for name, meaning in meanings.items()
+            (f"`{of.name}`", _TYPES.get(of.dtype, of.dtype), of.units, of.description) for of in one.columns
         ]
-        lines += [f"`/entry/{path}`: {DATASETS[path].meaning}.", ""]
-        lines += [*table(("column", "type", "unit", "meaning"), rows, ("shot-file", "columns")), ""]
+        lines += [f"`/entry/{one.path}`: {one.description}.", ""]
+        lines += [*table(("column", "type", "unit", "description"), rows, ("shot-file", "columns")), ""]
     return lines
 
 
 def attributes() -> list[str]:
     """A row per attribute: those of every dataset first."""
-    rows = [("every dataset", f"`{name}`", "text", meaning) for name, meaning in EVERYWHERE.items()]
-    for path, found in ATTRIBUTES.items():
-        rows += [(f"`{path}`", f"`{name}`", kind, meaning) for name, (kind, meaning) in found.items()]
-    return table(("of", "attribute", "type", "meaning"), rows, ("shot-file", "attributes"))
+    rows = [("every dataset", f"`{name}`", "text", about) for name, about in schema.EVERYWHERE.items()]
+    for path, found in schema.attributes().items():
+        rows += [(f"`{path}`", f"`{name}`", kind, about) for name, (kind, about) in found.items()]
+    return table(("of", "attribute", "type", "description"), rows, ("shot-file", "attributes"))
 
 
-def _named(dtype: np.dtype[np.generic]) -> str:
-    names: Mapping[str, str] = {"S": f"ascii, {dtype.itemsize} bytes", "O": "text"}
-    return names.get(dtype.kind, dtype.name)
+def index() -> list[str]:
+    """A row per value that a shot's line in the index has of the shot's record."""
+    rows = [(f"`{field.name}`", field.dtype, field.description) for field in schema.SHOT if field.in_index]
+    return table(("key", "type", "description"), rows, ("shot-file", "index"))
 
 
-_PARTS: Final = {"datasets": datasets, "columns": columns, "attributes": attributes}
+_TYPES: Final = {"i2": "int16", "i4": "int32", "f8": "float64", "?": "bool"}
+_PARTS: Final = {"datasets": datasets, "columns": columns, "attributes": attributes, "index": index}
 
 
 def part(name: str) -> list[str]:

@@ -1,0 +1,144 @@
+"""Writing HDF5: attributes, arrays, tables and texts that say what they are and in what unit."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Container, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import h5py
+import numpy as np
+from h5py import h5a, h5s, h5t  # pyright: ignore[reportAttributeAccessIssue] - h5py ships no types
+from numpy.typing import NDArray
+
+from labseq.errors import RecordingError
+from labseq.plain import dumps, plain_text
+from labseq.recording.schema import ARRAYS, Dataset, Field, Table, describe_columns
+
+_STRING: Final = h5py.string_dtype()
+_STRING_TYPE: Final = h5t.py_create(_STRING, logical=True)
+_SCALAR: Final = h5s.create(h5s.SCALAR)
+
+
+def set_attributes(node: Any, values: Mapping[str, Any]) -> None:
+    """Add attributes to a group or dataset that has none of these names; text is made fit for HDF5."""
+    for name, value in values.items():
+        if isinstance(value, str):
+            _add_text(node, name, np.array(plain_text(value), _STRING), _SCALAR)
+        else:
+            node.attrs[name] = value
+
+
+def _add_text(node: Any, name: str, text: Any, space: Any) -> None:
+    h5a.create(node.id, name.encode(), _STRING_TYPE, space).write(text)  # attrs[...] takes twice the time
+
+
+def write_fields(node: Any, fields: Sequence[Field], record: Any) -> None:
+    """Add attributes, one for each field of a record."""
+    set_attributes(node, {field.name: _attribute(field, field.value(record)) for field in fields})
+
+
+def _attribute(field: Field, value: Any) -> Any:
+    if field.dtype == "integer":
+        return value if -(2**63) <= value < 2**63 else str(value)
+    return value if field.dtype == "text" else np.dtype(field.dtype).type(value)
+
+
+def read_fields(node: Any, fields: Sequence[Field]) -> dict[str, Any]:
+    """Attributes as plain values: attribute of the record -> value."""
+    found: dict[str, Any] = {}
+    for field in fields:
+        value = node.attrs[field.name]
+        value = value.item() if isinstance(value, np.generic) else value
+        found[field.attribute] = int(value) if field.dtype == "integer" else value
+    return found
+
+
+def write_texts(group: Any, fields: Sequence[Field], record: Any) -> None:
+    """Add a dataset of text or JSON for each field of a record."""
+    for field in fields:
+        value = field.value(record)
+        text = dumps(value) if field.dtype == "json" else plain_text(value)
+        dataset = group.create_dataset(field.name, data=text, dtype=_STRING)
+        kind = "application/json" if field.dtype == "json" else "text/plain"
+        set_attributes(dataset, {"content_type": kind, "units": "", "description": field.description})
+
+
+def read_texts(group: Any, fields: Sequence[Field]) -> dict[str, Any]:
+    """Texts and JSON values: attribute of the record -> value."""
+    texts = {field: group[field.name][()].decode() for field in fields}
+    return {
+        field.attribute: json.loads(text) if field.dtype == "json" else text for field, text in texts.items()
+    }
+
+
+def write_array(group: Any, path: str, values: Any) -> Any:
+    """Add an array of :data:`ARRAYS` under the last part of its path."""
+    what = ARRAYS[path]
+    dataset = group.create_dataset(path.rpartition("/")[2], data=np.asarray(values, what.dtype))
+    describe(dataset, what)
+    return dataset
+
+
+def describe(dataset: Any, what: Dataset) -> None:
+    """Say in its attributes what a dataset is, and in what unit."""
+    set_attributes(dataset, {"units": what.units, "description": what.description})
+
+
+def write_table(group: Any, table: Table, rows: NDArray[Any], name: str = "") -> None:
+    """Add a table of the schema under ``name``, else the last part of its path."""
+    dataset = group.create_dataset(name or table.path.rpartition("/")[2], data=rows)
+    units, descriptions = describe_columns(rows.dtype, table)
+    space = h5s.create_simple((len(units),))
+    for key, texts in (("units", units), ("descriptions", descriptions)):
+        _add_text(dataset, key, np.array(list(map(plain_text, texts)), _STRING), space)
+    set_attributes(dataset, {"description": table.description})
+
+
+def link_name(name: str, taken: Container[str]) -> str:
+    """A name that HDF5 accepts and that is not taken yet.
+
+    Example:
+        >>> link_name("laser/780", ()), link_name(".", {"_"})
+        ('laser_780', '__2')
+    """
+    clean = plain_text(name).replace("/", "_")
+    if not clean.strip("."):
+        clean = "_"
+    free, n = clean, 1
+    while free in taken:
+        n += 1
+        free = f"{clean}_{n}"
+    return free
+
+
+def load_filter(path: Path, dataset: Any) -> None:
+    """Load what is needed to read a dataset that may be compressed.
+
+    Raises:
+        RecordingError: It is compressed, and the package for it is missing.
+    """
+    if dataset.id.get_create_plist().get_nfilters() == 0:
+        return
+    try:
+        import hdf5plugin  # noqa: F401  # pyright: ignore[reportUnusedImport] - importing it registers the filter
+    except ImportError as error:
+        text = (
+            "holds compressed frames, and to read them hdf5plugin is needed; pip install 'labseq[compress]'"
+        )
+        raise RecordingError(path, text) from error
+
+
+def bitshuffle() -> Mapping[str, Any]:
+    """Options of a dataset that is compressed with bitshuffle and LZ4.
+
+    Raises:
+        RecordingError: The package for it is missing.
+    """
+    try:
+        import hdf5plugin
+    except ImportError as error:
+        missing = "compressed frames need hdf5plugin, which is not installed"
+        raise RecordingError(Path("compress"), f"{missing}; pip install 'labseq[compress]'") from error
+    return hdf5plugin.Bitshuffle(cname="lz4")
