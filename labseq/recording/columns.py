@@ -21,13 +21,19 @@ from labseq.units import si_unit_of
 _Row: TypeAlias = Mapping[str, Any]
 
 _DERIVED: Final[Mapping[str, tuple[str, Callable[[_Row], Any]]]] = {
-    "n_defects": ("empty target sites on the last image", lambda row: _last(row["images"]["n_defects"])),
+    "n_defects": (
+        "empty target sites on the last image",
+        lambda row: _last(row.get("images", {}).get("n_defects")),
+    ),
     "n_surplus": (
         "atoms on the last image on sites that must be empty",
-        lambda row: _last(row["images"]["n_surplus"]),
+        lambda row: _last(row.get("images", {}).get("n_surplus")),
     ),
-    "duration_s": ("sum of the steps on the session's clock", lambda row: _duration_s(row["stage_s"])),
-    "file": ("the shot's file, from the run's folder", lambda row: row["file"]),
+    "duration_s": (
+        "sum of the steps on the session's clock",
+        lambda row: _duration_s(row.get("stage_s", {})),
+    ),
+    "file": ("the shot's file, from the run's folder", lambda row: row.get("file")),
 }
 """Columns that are worked out from a line of the index: description, value."""
 
@@ -42,12 +48,13 @@ FIGURES: Final = tuple(name for name in _DESCRIPTIONS if name not in {*_TEXTS, "
 
 
 def _readings(row: _Row) -> dict[str, Any]:
-    return {**row["readings"], **{f"{SIMULATION}{name}": value for name, value in row["simulation"].items()}}
+    simulated = {f"{SIMULATION}{name}": value for name, value in row.get("simulation", {}).items()}
+    return {**row.get("readings", {}), **simulated}
 
 
 _GROUPS: Final[Mapping[str, Callable[[_Row], Mapping[str, Any]]]] = {
     "": lambda row: row["parameters"],
-    "stage.": lambda row: {f"{name}_s": seconds for name, seconds in row["stage_s"].items()},
+    "stage.": lambda row: {f"{name}_s": seconds for name, seconds in row.get("stage_s", {}).items()},
     "reading.": _readings,
     "calibration.": lambda row: row["calibrations"],
 }
@@ -132,11 +139,11 @@ def figures_in(row: Mapping[str, Any]) -> dict[str, float]:
 
 def _fixed(row: _Row) -> dict[str, Any]:
     """The values that every run has."""
-    found = {field.name: row[field.name] for field in _FIELDS}
+    found = {field.name: row.get(field.name) for field in _FIELDS}
     return found | {name: value(row) for name, (_, value) in _DERIVED.items()}
 
 
-def _last(values: Sequence[Any]) -> Any:
+def _last(values: Sequence[Any] | None) -> Any:
     return values[-1] if values else None
 
 

@@ -129,17 +129,6 @@ def test_damaged_lines_are_told(fake: Any, tmp_path: Path) -> None:
     assert "warning           1 line of the index cannot be read" in summary_lines(open_run(folder))
 
 
-@pytest.mark.parametrize("value", [None, "x", [], {"step 0 load": "x"}])
-def test_stage_times_that_are_none_are_left_out(fake: Any, tmp_path: Path, value: object) -> None:
-    folder = write_run(tmp_path, fake, [fake.shot(0)])
-    index = folder / "index.jsonl"
-    row = {**json.loads(index.read_text("utf-8")), "stage_s": value, "t_end_utc": "2026-11-21T12:00:00"}
-    index.write_text(json.dumps(row) + "\n", "utf-8")
-    run = open_run(folder)
-    assert shot_table(run)[1].endswith("-")
-    assert "duration          -" in summary_lines(run)
-
-
 SKIPPED_SCAN = {
     "addresses": ["planner.degree_of_parallelism"],
     "points": [[1], [4]],
