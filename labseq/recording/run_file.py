@@ -7,6 +7,7 @@ evaluated without opening their files.
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, fields
 from numbers import Real
@@ -261,7 +262,7 @@ def summary_of(row: Mapping[str, Any]) -> ShotSummary:
         RecordingError: The line is damaged.
     """
     try:
-        simulation = {str(name): float(value) for name, value in row["simulation"].items()}
+        simulation = {str(name): _number(value) for name, value in row["simulation"].items()}
         return ShotSummary(_columns(Images, row["images"]), _columns(Cycles, row["cycles"]), simulation)
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         reason = f"has a damaged line for shot {row.get('shot')}; 'labseq doctor' moves it away"
@@ -272,10 +273,19 @@ _T = TypeVar("_T", Images, Cycles)
 
 
 def _columns(kind: type[_T], table: Mapping[str, Any]) -> _T:
-    columns = [tuple(table[field.name]) for field in fields(kind)]
-    if len({*map(len, columns)}) > 1 or not {type(value) for one in columns for value in one} <= {int, float}:
+    columns = [tuple(map(_number, table[field.name])) for field in fields(kind)]
+    if len({*map(len, columns)}) > 1:
         raise ValueError(kind.__name__)
     return kind(*columns)
+
+
+def _number(value: Any) -> Any:
+    """A number of the index; JSON has null for nan and infinities."""
+    if value is None:
+        return math.nan
+    if type(value) not in (int, float):
+        raise TypeError(value)
+    return value
 
 
 def index_row(
