@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from types import TracebackType
 from typing import ClassVar, Literal, TypeAlias
 
 Loc: TypeAlias = tuple[str | int, ...]
@@ -72,6 +73,59 @@ class ConfigError(LabseqError, ValueError):
             problems = (problems,)
         self.problems: tuple[Problem, ...] = tuple(problems)
         super().__init__("\n".join(str(problem) for problem in self.problems))
+
+
+class ProblemCollector:
+    """Collects the problems of several checks, so that the user sees them all at once.
+
+    Example:
+        >>> found = ProblemCollector()
+        >>> with found:
+        ...     raise ConfigError("shots is 0")
+        >>> with found:
+        ...     raise ConfigError("name is missing")
+        >>> found.raise_any()
+        Traceback (most recent call last):
+        ...
+        labseq.errors.ConfigError: shots is 0
+        name is missing
+    """
+
+    def __init__(self) -> None:
+        self.problems: list[Problem] = []
+
+    def __enter__(self) -> ProblemCollector:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> bool:
+        if not isinstance(error, ConfigError):
+            return False
+        self.add(error)
+        return True
+
+    def add(self, error: ConfigError) -> None:
+        """Collect the problems of an error."""
+        self.problems += error.problems
+
+    def stop(self, error: ConfigError) -> ConfigError:
+        """An error after which nothing else can be checked, together with all collected problems."""
+        self.add(error)
+        return self._joined()
+
+    def raise_any(self) -> None:
+        """Raise the collected problems, those of each file in its order.
+
+        Raises:
+            ConfigError: There are any.
+        """
+        if self.problems:
+            raise self._joined()
+
+    def _joined(self) -> ConfigError:
+        sources = list(dict.fromkeys(problem.source for problem in self.problems))
+        return ConfigError(sorted(self.problems, key=lambda p: (sources.index(p.source), p.line, p.column)))
 
 
 class PluginLoadError(LabseqError):

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
+import unicodedata
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Final, Self, TypeAlias, TypeVar, cast
+from typing import Annotated, Any, ClassVar, Final, Literal, Self, TypeAlias, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,10 +25,10 @@ from pydantic import (
 from pydantic_core import PydanticCustomError
 
 from labseq.errors import Loc
-from labseq.messages import clean
+from labseq.messages import clean, shown
 from labseq.model.grid import centred_comb
 from labseq.text_files import beside
-from labseq.units import expected, parse_quantity
+from labseq.units import expected, parse_any, parse_quantity
 
 FOLDER: Final = "folder"
 """Key of pydantic's validation context: the folder of the file that the settings are in."""
@@ -199,6 +201,63 @@ def _placed_by_field(choice: _C, info: ValidationInfo) -> _C:
 
 placed_by_field: Final = AfterValidator(_placed_by_field)
 """For a field that is a :class:`Choice`: its location is the field's name."""
+
+
+FORMAT: Final = 1
+"""Version of the file format that this labseq reads."""
+
+_VARIABLE: Final = re.compile(r"[^\W\d]\w*")
+
+
+def _is_version(value: Any) -> Any:
+    if type(value) is not int or value != FORMAT:  # neither true nor 1.0 is a version
+        raise setting_error(f"labseq is {shown(value)}", "1, the version of the file format")
+    return FORMAT
+
+
+def _is_name(name: str) -> str:
+    name = unicodedata.normalize("NFC", name)
+    # Letters, marks on letters, and digits of any script.
+    odd = next((c for c in name if unicodedata.category(c)[0] not in "LMN" and c not in " -_."), None)
+    expected = "letters, digits, spaces, '-', '_' and '.'"
+    if odd is not None:
+        raise setting_error(f"name is '{clean(name)}', with '{clean(odd)}' in it", expected)
+    if not any(char.isalnum() for char in name):
+        raise setting_error(f"name is '{clean(name)}'", "at least one letter or digit")
+    if name != name.strip():
+        raise setting_error(f"name is '{clean(name)}'", "no space at either end")
+    return name
+
+
+def si_of(value: Any) -> Any:
+    """The value of a variable, SI, from what is written."""
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        return value
+    try:
+        return parse_any(value if isinstance(value, str) else "")[0]
+    except ValueError:
+        what = f"a variable is {shown(value)}"
+        raise setting_error(what, "a number, or a number with a unit such as '20 ms'") from None
+
+
+def _named_well(variables: dict[str, int | float]) -> dict[str, int | float]:
+    for name in variables:
+        if not _VARIABLE.fullmatch(name):
+            what = f"a variable is called '{clean(name)}'"
+            raise setting_error(what, "letters, digits and '_', a letter first", at=(name,), key=True)
+    return variables
+
+
+FormatVersion: TypeAlias = Annotated[Literal[1], BeforeValidator(_is_version)]
+"""1."""
+Name: TypeAlias = Annotated[str, Field(min_length=1, max_length=80), AfterValidator(_is_name)]
+"""A name that can be part of the name of a folder."""
+Folders: TypeAlias = Annotated[list[Text], empty_is([])]
+"""Folders, relative to the file that names them."""
+Variables: TypeAlias = Annotated[
+    dict[str, Annotated[int | float, BeforeValidator(si_of)]], AfterValidator(_named_well), empty_is({})
+]
+"""Name -> value, SI."""
 
 
 class FrequencyComb(Settings):

@@ -13,8 +13,8 @@ from typing import Any, Final, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.config import Document, MotionSettings, Override, ProblemCollector
-from labseq.errors import ConfigError, LimitError, PlanError, Problem
+from labseq.config import Document, MotionSettings, Override
+from labseq.errors import ConfigError, LimitError, PlanError, Problem, ProblemCollector
 from labseq.messages import clean
 from labseq.model import MotionSpec, Occupancy, Plan, SiteGrid, TargetPattern
 from labseq.motion import check_plan

@@ -1,10 +1,8 @@
 """YAML to frozen, validated specs, with errors that name file, line and column."""
 
-from labseq.config.addresses import Override, profile_overrides, split_overrides
-from labseq.config.document import Document, StoredText
-from labseq.config.fields import ROLES, plugin_paths
+from labseq.config.addresses import ROLES, Override, profile_overrides, split_overrides
+from labseq.config.document import Document, StoredText, plugin_paths
 from labseq.config.find import find_profile, find_sequence
-from labseq.config.messages import ProblemCollector
 from labseq.config.profile import (
     DEVICE_KEYS,
     LINES_KEYS,
@@ -33,7 +31,6 @@ __all__ = [
     "Document",
     "MotionSettings",
     "Override",
-    "ProblemCollector",
     "ProfileSpec",
     "Scan",
     "SequenceSpec",

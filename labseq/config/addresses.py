@@ -9,7 +9,22 @@ from labseq.config.yaml_nodes import Node
 from labseq.errors import ConfigError, Loc, Problem
 from labseq.messages import clean, did_you_mean, listing, shown, visible
 
-_PROFILE: Final = "profile."
+PROFILE: Final = "profile."
+"""Prefix of the addresses of profile values."""
+VARIABLES: Final = "variables"
+"""Key of the values that only expressions use."""
+ROLES: Final = ("camera", "static_tweezers", "mobile_tweezers", "detector", "lines", "simulation")
+"""The roles of a profile that are one plugin each."""
+MAY_ADD: Final = (
+    "timeouts",
+    "budgets",
+    "grid.row_frequency",
+    "grid.column_frequency",
+    "mobile_tweezers.rf",
+    "calibrations",
+    "calibrations.use",
+)
+"""Addresses of profile mappings that an override may add."""
 _SHOWN: Final = 80
 
 
@@ -63,8 +78,8 @@ def split_overrides(options: Sequence[str]) -> tuple[list[Override], list[Overri
             what = "this is not of the form address=value"
             example = "for example --set planner.degree_of_parallelism=5"
             problems.append(Problem(what, clean(origin), expected=example))
-        elif address.startswith(_PROFILE):
-            profile.append(Override(address.removeprefix(_PROFILE), value, origin))
+        elif address.startswith(PROFILE):
+            profile.append(Override(address.removeprefix(PROFILE), value, origin))
         else:
             sequence.append(Override(address, value, origin))
     if problems:

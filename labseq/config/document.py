@@ -2,28 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final, NamedTuple, TypeVar, cast, overload
+from typing import Any, Final, Literal, NamedTuple, TypeVar, cast, overload
 
 from pydantic import BaseModel
 
 from labseq.config.addresses import Override, find
 from labseq.config.expressions import Expressions, evaluate
-from labseq.config.messages import ProblemCollector
-from labseq.config.validation import ValidationContext, node_of, validate
+from labseq.config.validation import ValidationContext, check, node_of, validate
 from labseq.config.yaml_nodes import Mark, Node, compose
-from labseq.errors import ConfigError, Loc, Problem
-from labseq.messages import shown, visible
-from labseq.settings import NoSettings
-from labseq.text_files import decode, read_bytes
+from labseq.errors import ConfigError, Loc, Problem, ProblemCollector
+from labseq.messages import clean, shown, visible
+from labseq.settings import FORMAT, NoSettings
+from labseq.text_files import beside, decode, is_folder, read_bytes
 
 M = TypeVar("M", bound=BaseModel)
 
+FileKind = Literal["sequence", "hardware profile"]
+_KINDS: Final[Mapping[FileKind, str]] = {"sequence": "shot", "hardware profile": "grid"}
+"""Kind of file -> a key that only this kind has."""
+
 
 class StoredText(NamedTuple):
-    """The text of a file as it was at another time; paths in it stay relative to the file.
+    """The text that a file had when a run began; paths in it stay relative to the file.
 
     Attributes:
         text: The text.
@@ -36,7 +39,7 @@ class StoredText(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Document:
-    r"""A sequence or a profile as it was written. Immutable: do not change ``data``.
+    r"""A sequence or a profile as it was written, with its overrides. Immutable.
 
     Example:
         >>> document = Document.parse("shots: 20\nshot:\n  - load: {}\n", "mine.yaml")
@@ -48,21 +51,16 @@ class Document:
     Attributes:
         path: The file.
         name: The file's name as the user gave it, for messages.
-        text: The file's text, exactly, but for a byte order mark.
-        root: The top mapping.
-        data: The same as plain dicts, lists and scalars, overrides included.
-        expressions: What of it was worked out; None before :meth:`evaluated`.
+        text: The file's text, without a byte order mark.
+        root: The top mapping, with the results of the expressions once they are computed.
+        expressions: The expressions; None before :meth:`evaluated`.
     """
 
     path: Path
     name: str
     text: str
     root: Node
-    data: dict[str, Any] = field(init=False)
     expressions: Expressions | None = None
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "data", self.root.plain())
 
     @classmethod
     def read(cls, path: Path, kept: StoredText | None = None) -> Document:
@@ -70,7 +68,7 @@ class Document:
 
         Args:
             path: The file.
-            kept: What it says, in place of what it says today; it need not exist then.
+            kept: The text to use in place of the file's, which need not exist then.
 
         Raises:
             ConfigError: It cannot be read, or is no strict YAML 1.2 with a mapping at the top.
@@ -96,30 +94,23 @@ class Document:
         return cls(Path(name), name, decoded, root)
 
     @property
+    def data(self) -> dict[str, Any]:
+        """The content as plain dicts, lists and scalars."""
+        return self.root.plain()
+
+    @property
     def written(self) -> Node:
-        """The top mapping with its expressions, whether or not they were worked out."""
+        """The top mapping with its expressions, whether or not they are computed."""
         return self.root if self.expressions is None else self.expressions.written
 
     def evaluated(self) -> Document:
-        """A copy with the values of its expressions in their places.
+        """A copy with the results of its expressions.
 
         Raises:
             ConfigError: Everything that is wrong with them.
         """
         expressions = evaluate(self.written, self.name, self.text)
         return replace(self, root=expressions.root, expressions=expressions)
-
-    def replaced(self, root: Node) -> Document:
-        """A copy with another tree; its expressions are worked out anew if those of this one were.
-
-        Args:
-            root: The tree, with its expressions.
-
-        Raises:
-            ConfigError: What is wrong with them.
-        """
-        document = replace(self, root=root, expressions=None)
-        return document if self.expressions is None else document.evaluated()
 
     def get(self, loc: Loc, default: Any = None) -> Any:
         """The plain value at a location, or the default."""
@@ -129,14 +120,13 @@ class Document:
     def locate(self, loc: Loc, key: bool = False) -> tuple[int, int]:
         """Line and column, from 1, of the value at a location, or of its key.
 
-        For what does not exist, those of the nearest parent that does; (0, 0)
-        for what came from an option.
+        If it does not exist, those of its nearest parent; (0, 0) for the value of an option.
         """
         mark = self.root.mark_at(loc, key)
         return mark.line, mark.column
 
     def problem(self, loc: Loc, what: str, expected: str = "", hint: str = "", key: bool = False) -> Problem:
-        """Say that something is wrong at a location: in the file, or in the option it came from."""
+        """A problem at a location: in the file, or in the option that set the value."""
         return self.root.mark_at(loc, key).problem(self.name, what, expected, hint)
 
     def error(
@@ -144,6 +134,18 @@ class Document:
     ) -> ConfigError:
         """The same as an error to raise."""
         return ConfigError(self.problem(loc, what, expected, hint, key))
+
+    def with_values(self, values: Iterable[tuple[Loc, Node]]) -> Document:
+        """A copy with other values at some locations, and its expressions computed again.
+
+        Raises:
+            ConfigError: An expression has no value any more.
+        """
+        root = self.written
+        for loc, node in values:
+            root = root.replaced(loc, node)
+        document = replace(self, root=root, expressions=None)
+        return document if self.expressions is None else document.evaluated()
 
     def override(self, address: str, value: str, origin: str, *, may_add: Collection[str] = ()) -> Document:
         """A copy with one value replaced, or added to a mapping.
@@ -153,14 +155,13 @@ class Document:
                 or "shot.sort.window".
             value: YAML for one value: ``5``, ``45 ms``, ``[60 ms, 40 ms]``, ``{use: psca}``.
             origin: The option, named as the place of anything wrong with the value.
-            may_add: Addresses of mappings that are made if the file has none.
+            may_add: Addresses of mappings that are added if the file has none.
 
         Raises:
             ConfigError: The address leads nowhere, or the value is no YAML.
         """
         loc = find(self.root, address, self.name, origin, may_add)
-        node = compose(value, self.name, origin) or Node(None, Mark(0, 0, origin))
-        return self.replaced(self.written.replaced(loc, node))
+        return self.with_values([(loc, compose(value, self.name, origin) or Node(None, Mark(0, 0, origin)))])
 
     def override_all(
         self,
@@ -173,8 +174,8 @@ class Document:
 
         Args:
             overrides: Address and value of each.
-            may_add: Addresses of mappings that are made if the file has none.
-            found: Where the problems go; without it they are raised.
+            may_add: Addresses of mappings that are added if the file has none.
+            found: Receives the problems; without it they are raised.
 
         Raises:
             ConfigError: All the overrides that cannot be applied.
@@ -223,9 +224,9 @@ class Document:
         """Make settings of the mapping at a location; an empty or missing one counts as {}.
 
         Args:
-            model: The settings model; None for what takes no settings.
+            model: The settings model; None for a plugin that takes no settings.
             loc: Where the mapping is.
-            drop: Keys that are somebody else's and left out.
+            drop: Keys that belong to another model and are left out.
             other_keys: Keys to name as known when one is misspelt.
             called: What messages call the mapping: "camera 'andor'"; "" for its key.
 
@@ -233,27 +234,61 @@ class Document:
             ConfigError: Everything that is wrong in the mapping, in file order.
         """
         name = next((step for step in reversed(loc) if isinstance(step, str)), "")
-        asked = ValidationContext(name, called, drop, other_keys, self.path.parent)
-        result = validate(model or NoSettings, self.root.at(loc), asked)
-        if not isinstance(result, list):
-            return None if model is None else cast("M", result)
-        placed = [(self.root.mark_at(loc + found.loc, found.key), found.words) for found in result]
-        placed.sort(key=lambda pair: pair[0].order)
-        problems = [mark.problem(self.name, w.what, w.expected, w.hint) for mark, w in placed]
+        context = ValidationContext(name, called, drop, other_keys, self.path.parent)
+        node = self.root.at(loc) or Node({}, self.root.mark_at(loc))
+        made = validate(model or NoSettings, node, context, self.name)
+        return None if model is None else cast("M", made)
+
+
+def check_kind(document: Document, kind: FileKind) -> None:
+    """Refuse a file of another kind, or of a newer format, before any other check.
+
+    Raises:
+        ConfigError: It is for a newer labseq, or it is not a sequence or a profile.
+    """
+    version, keys = document.get(("labseq",)), cast("dict[str, Node]", document.root.value)
+    if isinstance(version, int) and version > FORMAT:
+        what = f"this file is written for a newer labseq: its format is {version}, this labseq reads {FORMAT}"
+        raise document.error(("labseq",), what, "", "update labseq")
+    for other, key in _KINDS.items():
+        if other != kind and key in keys and _KINDS[kind] not in keys:
+            what = f"this is a {other} (it has the key '{key}')"
+            raise document.error((key,), what, f"a {kind}", key=True)
+
+
+def plugin_paths(document: Document, folders: Sequence[str]) -> list[Path]:
+    """The folders of ``plugin_folders``, relative to the file that names them.
+
+    Raises:
+        ConfigError: One does not exist.
+    """
+    paths = [beside(document.path.parent, folder) for folder in folders]
+    problems = [
+        document.problem(
+            ("plugin_folders", i),
+            f"there is no plugin folder '{clean(folder)}'",
+            f"a folder at {visible(str(path))}",
+        )
+        for i, (folder, path) in enumerate(zip(folders, paths, strict=True))
+        if not is_folder(path)
+    ]
+    if problems:
         raise ConfigError(problems)
+    return paths
 
 
-# Without these, plugins would count as unknown that are not, and a target would meet another grid.
+# Without these, known plugins would count as unknown, and a target would meet another grid.
 _NEEDED: Final = ("plugin_folders", "profile")
+_MAX_PASSES: Final = 5
 
 
 @dataclass(frozen=True, slots=True)
 class FallbackValues:
-    """What takes the place of wrong values; it must never give rise to errors of its own.
+    """Valid values that replace wrong ones, so that the rest of a file can still be checked.
 
     Attributes:
-        values: Every key that a file must have -> a right value.
-        items: Key of a list or mapping -> a right item of it.
+        values: Every key that a file must have -> a value.
+        items: Key of a list or mapping -> an item of it.
     """
 
     values: Mapping[str, Any]
@@ -263,70 +298,48 @@ class FallbackValues:
 def load_checked(
     document: Document, model: type[M], called: str, fallbacks: FallbackValues, found: ProblemCollector | None
 ) -> tuple[Document, M]:
-    """Validate a whole file; gather its problems, if asked to, and go on with stand-ins.
+    """Validate a whole file; if problems are collected, continue with fallbacks for wrong values.
 
     Args:
         document: The file.
         model: The settings model of the whole file.
-        called: What to call it in messages.
-        stand_ins: What takes the place of wrong values.
-        found: Where the problems go; without it they are raised.
+        called: What messages call it.
+        fallbacks: Replace the wrong values.
+        found: Receives the problems; without it they are raised.
 
     Raises:
-        ConfigError: The file is wrong, and nothing else can be said of it.
+        ConfigError: The file is wrong, and its other values cannot be checked.
     """
     try:
         return document, document.validate(model, called=called)
     except ConfigError as error:
         if found is None:
             raise
-        mended = replace_invalid(document, model, fallbacks)
-        if any(mended.get((key,)) != document.get((key,)) for key in _NEEDED):
+        repaired = _without_wrong_values(document, model, fallbacks)
+        if any(repaired.get((key,)) != document.get((key,)) for key in _NEEDED):
             raise
-        spec = mended.validate(model, called=called)
+        spec = repaired.validate(model, called=called)
         found.add(error)
-        return mended, spec
+        return repaired, spec
 
 
-def replace_invalid(document: Document, model: type[BaseModel], fallbacks: FallbackValues) -> Document:
-    """Replace or leave out every top-level value that the model refuses.
-
-    Args:
-        document: A wrong file.
-        model: The settings model of the whole file.
-        stand_ins: What takes the place of wrong values.
-
-    Returns:
-        A copy that the model accepts, unless its values do not go together.
-    """
-    root = document.root
-    assert isinstance(root.value, dict)
-    right = {key: node_of(value, root.mark) for key, value in fallbacks.values.items()}
-
-    def accepts(key: str, node: Node) -> bool:
-        return not isinstance(
-            validate(model, Node({**right, key: node}, root.mark), ValidationContext("")), list
-        )
-
-    def mended_items(key: str, node: Node) -> Node:
-        other = node_of(fallbacks.items[key], node.mark)
-        if isinstance(node.value, list):
-            kept = [item if accepts(key, Node([item], node.mark)) else other for item in node.value]
-            return Node(kept, node.mark)
-        if isinstance(node.value, dict):
-            named = {
-                name: item if accepts(key, Node({name: item}, node.mark)) else other
-                for name, item in node.value.items()
-            }
-            return Node(named, node.mark, node.keys)
-        return node
-
-    kept: dict[str, Node] = {}
-    for key in model.model_fields.keys() & root.value.keys():
-        node = root.value[key]
-        if not accepts(key, node) and key in fallbacks.items:
-            node = mended_items(key, node)
-        if accepts(key, node):
-            kept[key] = node
-    keys = {key: root.keys.get(key, root.mark) for key in {**right, **kept}}
-    return Document(document.path, document.name, document.text, Node({**right, **kept}, root.mark, keys))
+def _without_wrong_values(document: Document, model: type[BaseModel], fallbacks: FallbackValues) -> Document:
+    """A copy whose wrong values are replaced by fallbacks, or removed if they have none."""
+    root, seen = document.root, set[Loc]()
+    for _ in range(_MAX_PASSES):  # validators of a whole list run once all its items are right
+        found = check(model, root, ValidationContext(""))
+        if not isinstance(found, list):
+            break
+        values = dict(cast("dict[str, Node]", root.value))
+        for loc in dict.fromkeys(finding.loc[:2] for finding in found if finding.loc):
+            key, around = str(loc[0]), values.get(str(loc[0]))
+            if len(loc) > 1 and key in fallbacks.items and around and around.at(loc[1:]) and loc not in seen:
+                item = node_of(fallbacks.items[key], around.mark)
+                values[key] = around.replaced(loc[1:], item, same_key=True)
+            elif key in fallbacks.values:
+                values[key] = node_of(fallbacks.values[key], root.mark)
+            else:
+                values.pop(key, None)
+            seen.add(loc)
+        root = Node(values, root.mark, {key: root.keys.get(key, root.mark) for key in values})
+    return Document(document.path, document.name, document.text, root)

@@ -11,13 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, model_validator
 
-from labseq.config.fields import Name
 from labseq.config.profile import Sites
 from labseq.config.validation import validate_values
 from labseq.errors import ConfigError, Problem
 from labseq.messages import shown
 from labseq.model import Batch, Occupancy, Plan, SiteGrid, TargetPattern
-from labseq.settings import Settings, setting_error
+from labseq.settings import Name, Settings, setting_error
 from labseq.text_files import decode
 
 MAX_BYTES: Final = 4 << 20

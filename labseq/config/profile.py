@@ -10,29 +10,33 @@ from typing import Annotated, Any, Final, Literal, Self, TypeAlias, cast
 
 from pydantic import AfterValidator, Field, NonNegativeInt, model_validator
 
-from labseq.config.addresses import Override
-from labseq.config.document import Document, FallbackValues, StoredText, load_checked
-from labseq.config.fields import FORMAT, MAY_ADD, ROLES, Folders, FormatVersion, Name, Variables, check_kind
+from labseq.config.addresses import MAY_ADD, ROLES, Override
+from labseq.config.document import Document, FallbackValues, StoredText, check_kind, load_checked
 from labseq.config.find import find_profile
-from labseq.config.messages import ProblemCollector
 from labseq.config.scan import Scan, bind_scan
 from labseq.config.sequence import BudgetSettings
+from labseq.errors import ProblemCollector
 from labseq.messages import clean
 from labseq.model import CALIBRATION_KINDS, MotionSpec, RfSpec, SiteGrid
 from labseq.model.lines import LineSpec
 from labseq.model.motion import PhaseChoice, SpeedProfile
 from labseq.settings import (
+    FORMAT,
     Choice,
     Duration,
     FilePath,
+    Folders,
+    FormatVersion,
     Fraction,
     Frequency,
     FrequencyComb,
     Length,
+    Name,
     Power,
     Settings,
     Speed,
     Text,
+    Variables,
     Voltage,
     empty_is,
     placed_by_field,

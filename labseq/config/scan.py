@@ -20,20 +20,16 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, WithJsonSchema, model_validator
 
-from labseq.config.addresses import Override, find
+from labseq.config.addresses import MAY_ADD, PROFILE, ROLES, VARIABLES, Override, find
 from labseq.config.document import Document
-from labseq.config.fields import MAY_ADD, ROLES, VARIABLES
-from labseq.config.messages import ProblemCollector
 from labseq.config.yaml_nodes import Mark, Node
-from labseq.errors import ConfigError, Loc, Problem
+from labseq.errors import ConfigError, Loc, Problem, ProblemCollector
 from labseq.messages import clean, did_you_mean, listing, shown
 from labseq.settings import Choice, Settings, Text, setting_error
 from labseq.units import UNITS, factor_of, scaled, written
 
 ScanOrder = Literal["sequential", "shuffled"]
 
-PROFILE: Final = "profile."
-"""What the addresses of profile values begin with."""
 
 _ORDER_KEY: Final = 0x5CA4  # apart from every shot's own random numbers, whose keys have two parts
 
@@ -148,11 +144,8 @@ class Scan:
 
     def put(self, document: Document, point: int, *, profile: bool) -> Document:
         """A copy of the sequence or of the profile with the values of a point."""
-        root = document.written
-        for axis, node in self.values(point):
-            if axis.of_profile == profile:
-                root = root.replaced(axis.loc, node)
-        return document.replaced(root)
+        pairs = self.values(point)
+        return document.with_values((axis.loc, node) for axis, node in pairs if axis.of_profile == profile)
 
     def explained(self, error: ConfigError) -> ConfigError:
         """An error that says of each wrong value which address the scan puts it into."""

@@ -11,18 +11,21 @@ from typing import Annotated, Any, Final, Literal, Self, TypeAlias, cast
 from pydantic import AfterValidator, Field, PlainValidator, model_validator
 
 from labseq.config.addresses import Override
-from labseq.config.document import Document, FallbackValues, StoredText, load_checked
-from labseq.config.fields import FORMAT, Folders, FormatVersion, Name, Variables, check_kind
-from labseq.config.messages import ProblemCollector
+from labseq.config.document import Document, FallbackValues, StoredText, check_kind, load_checked
 from labseq.config.scan import Scan, ScanOrder, read_scan
-from labseq.errors import Loc
+from labseq.errors import Loc, ProblemCollector
 from labseq.messages import clean, shown
 from labseq.settings import (
+    FORMAT,
     Choice,
     Duration,
+    Folders,
+    FormatVersion,
+    Name,
     PatternChoice,
     Settings,
     Text,
+    Variables,
     empty_is,
     placed_by_field,
     setting_error,

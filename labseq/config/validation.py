@@ -1,8 +1,9 @@
-"""Values checked against a settings model; each error names its place."""
+"""Values checked against a settings model: pydantic's errors become problems with line and column."""
 
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from enum import Enum
@@ -13,106 +14,42 @@ import numpy as np
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
-from labseq.config.messages import EXPECTED_TYPES, ErrorText, explain_validation_error
-from labseq.config.yaml_nodes import Mark, Node, comma_hint
-from labseq.errors import ConfigError, Loc
-from labseq.messages import clean, closest, listing, shown
+from labseq.config.yaml_nodes import Mark, Node, comma_hint, resolve
+from labseq.errors import ConfigError, Loc, Problem
+from labseq.messages import clean, closest, did_you_mean, listing, shown
 from labseq.settings import FOLDER, NoSettings
-
-
-def models_at(model: type[BaseModel], loc: Loc) -> list[type[BaseModel]]:
-    """The settings models that can stand at a location below a model: several in a union."""
-    models = [model]
-    for step in loc:
-        # A step that is no field is a list index or the key of a dict of models.
-        fields = [found for one in models if (found := field_of(one, step)) is not None]
-        if fields:
-            models = [inner for found in fields for inner in _models_in(found.annotation)]
-    return models
-
-
-def field_of(model: type[BaseModel], key: str | int) -> FieldInfo | None:
-    """The field that a key of the file sets."""
-    return next((field for name, field in model.model_fields.items() if key == _key(name, field)), None)
-
-
-def keys_of(models: list[type[BaseModel]]) -> list[str]:
-    """The keys that the models know, in order."""
-    keys = [_key(name, field) for model in models for name, field in model.model_fields.items()]
-    return list(dict.fromkeys(keys))
-
-
-def description_of(models: list[type[BaseModel]], key: str) -> str:
-    """First sentence of what a key's field says about itself, or ""."""
-    for model in models:
-        field = field_of(model, key)
-        if field is not None and field.description:
-            sentence = field.description.split(". ")[0].rstrip(".")
-            return sentence[0].lower() + sentence[1:] if sentence[1:2].islower() else sentence
-    return ""
-
-
-def _key(name: str, field: FieldInfo) -> str:
-    """What a field is called in the file."""
-    return field.validation_alias if isinstance(field.validation_alias, str) else name
-
-
-def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
-    """The models that an annotation names, inside of unions, lists, dicts and Annotated."""
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        yield annotation
-        return
-    for inner in get_args(annotation):
-        yield from _models_in(inner)
-
 
 M = TypeVar("M", bound=BaseModel)
 
 MAX_HINTS: Final = 50
-"""Unknown keys of a mapping that known ones are compared with: a file with more is not what it was
-taken for, and comparing takes time."""
+"""Number of unknown keys of a mapping that are compared with the known ones, which takes time. A file with
+more of them is probably not what it was taken for."""
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """Something wrong at a location below the mapping, or (``key``) with the key there."""
+    """A problem, still without its place in the file.
+
+    Attributes:
+        loc: The location, from the mapping that is validated.
+        problem: What is wrong.
+        key: Whether the problem is about the key at that location, not its value.
+    """
 
     loc: Loc
-    words: ErrorText
+    problem: Problem
     key: bool = False
 
 
 @dataclass(frozen=True, slots=True)
-class _Placed:
-    """An error of pydantic with the location in the file that it is about.
-
-    Attributes:
-        error: pydantic's error.
-        loc: Location below the mapping; it may end with a missing key.
-        union: Location of the union that it comes out of, or None.
-        branch: Which branch of the union.
-    """
-
-    error: Mapping[str, Any]
-    loc: Loc
-    union: Loc | None
-    branch: str
-
-    @property
-    def is_wrong_type(self) -> bool:
-        """Whether it only says that the value is of another type."""
-        return self.error["type"] in EXPECTED_TYPES and self.loc == self.union
-
-
-@dataclass(frozen=True, slots=True)
 class ValidationContext:
-    """What a mapping is validated for.
+    """What messages about a mapping need to know.
 
     Attributes:
         name: Name of the mapping in messages; "" at the top of a file.
-        called: What to call it in messages; "" for its name.
+        called: What messages call it; "" for its name.
         drop: Keys that are left out.
-        other_keys: Keys that belong to somebody else: named, but not validated.
+        other_keys: Keys that belong to another model: messages list them as known.
         folder: Folder that the paths in it are relative to.
     """
 
@@ -122,22 +59,60 @@ class ValidationContext:
     other_keys: Collection[str] = ()
     folder: Path = Path()
 
+    def known_keys(self, model: type[BaseModel], loc: Loc) -> list[str]:
+        """The keys of the mapping at a location."""
+        keys = [
+            _key(name, field) for one in _models_at(model, loc) for name, field in one.model_fields.items()
+        ]
+        own = keys if loc else [*(key for key in keys if key not in self.drop), *self.other_keys]
+        return list(dict.fromkeys(own))
 
-def validate(model: type[M], node: Node | None, asked: ValidationContext) -> M | list[Finding]:
-    """Make settings of a mapping, or say everything that is wrong with it."""
-    data = {} if node is None or node.value is None else node.plain()
+    def mapping(self, loc: Loc) -> str:
+        """What messages call the mapping at a location."""
+        if loc:
+            return f"'{self.value(loc)}'"
+        return self.called or (f"'{self.name}'" if self.name else "this file")
+
+    def value(self, loc: Loc) -> str:
+        """What messages call the value at a location: its key, and the list indices after it."""
+        last = next((i for i in reversed(range(len(loc))) if isinstance(loc[i], str)), 0)
+        return ".".join(map(str, loc[last:])) if loc else self.name
+
+
+def validate(model: type[M], node: Node, context: ValidationContext, file: str) -> M:
+    """Make settings of a mapping; an empty value counts as {}.
+
+    Args:
+        model: The settings model.
+        node: The mapping.
+        context: How messages call it.
+        file: Name of the file for the messages.
+
+    Raises:
+        ConfigError: Everything that is wrong in the mapping, in file order.
+    """
+    result = check(model, node, context)
+    if not isinstance(result, list):
+        return result
+    placed = [(node.mark_at(found.loc, found.key), found.problem) for found in result]
+    placed.sort(key=lambda pair: pair[0].order)
+    raise ConfigError([mark.problem(file, p.what, p.expected, p.hint) for mark, p in placed])
+
+
+def check(model: type[M], node: Node, context: ValidationContext) -> M | list[Finding]:
+    """Make settings of a mapping, or list everything that is wrong with it."""
+    data = {} if node.value is None else node.plain()
     if not isinstance(data, dict):
-        raw = node.raw if node else ""
-        words = ErrorText(f"{asked.name} is {shown(data, raw)}", "a mapping of settings such as {key: value}")
-        return [Finding((), words)]
-    kept = {key: value for key, value in cast("dict[str, Any]", data).items() if key not in asked.drop}
+        what = f"{context.name} is {shown(data, node.raw)}"
+        return [Finding((), Problem(what, expected="a mapping of settings such as {key: value}"))]
+    kept = {key: value for key, value in cast("dict[str, Any]", data).items() if key not in context.drop}
     try:
-        return _validated(model, json.dumps(kept), {FOLDER: asked.folder})
+        return _validated(model, json.dumps(kept), {FOLDER: context.folder})
     except ValidationError as error:
-        return _findings(error, model, node or Node({}, Mark(1, 1)), asked)
+        return _findings(error, model, node, context)
     except Exception as error:  # noqa: BLE001 - a plugin's own validator may raise anything
         reason = " ".join(f"{type(error).__name__}: {error}".split())
-        return [Finding((), ErrorText(f"these settings make the plugin's check fail: {reason}"))]
+        return [Finding((), Problem(f"these settings make the plugin's check fail: {reason}"))]
 
 
 def _validated(model: type[M], text: str, context: Mapping[str, Any]) -> M:
@@ -160,11 +135,38 @@ def _is_long_enough(error: Mapping[str, Any]) -> bool:
     return error["type"] == "too_short" and len(error["input"]) >= error["ctx"]["min_length"]
 
 
+@dataclass(frozen=True, slots=True)
+class _Placed:
+    """An error of pydantic with the location in the file that it is about.
+
+    Attributes:
+        error: pydantic's error.
+        loc: Location below the mapping; it may end with a missing key.
+        union: Location of the union that it comes out of, or None.
+        branch: Which branch of the union.
+    """
+
+    error: Mapping[str, Any]
+    loc: Loc
+    union: Loc | None
+    branch: str
+
+    @property
+    def kind(self) -> str:
+        """The error's name in pydantic."""
+        return str(self.error["type"])
+
+    @property
+    def is_wrong_type(self) -> bool:
+        """Whether it only says that the value is of another type."""
+        return self.kind in _TYPES and self.loc == self.union
+
+
 def _findings(
-    error: ValidationError, model: type[BaseModel], top: Node, asked: ValidationContext
+    error: ValidationError, model: type[BaseModel], top: Node, context: ValidationContext
 ) -> list[Finding]:
-    found = cast("list[Mapping[str, Any]]", error.errors(include_url=False))
-    errors = [_place(one, top) for one in found if not (_is_list_for_tuple(one) or _is_long_enough(one))]
+    raised = cast("list[Mapping[str, Any]]", error.errors(include_url=False))
+    errors = [_place(one, top) for one in raised if not (_is_list_for_tuple(one) or _is_long_enough(one))]
     chosen = [one for one in errors if one.union is None]
     unions: dict[Loc, list[_Placed]] = {}
     for one in errors:
@@ -173,23 +175,23 @@ def _findings(
     findings: list[Finding] = []
     for union in unions.values():
         if all(one.is_wrong_type for one in union):
-            findings.append(_no_type_fits(union, top, asked))
+            findings.append(_no_type_fits(union, top, context))
         else:
             chosen += _best_branch(union)
-    missing = {one.loc for one in chosen if one.error["type"] == "missing"}
-    unknown = [one for one in chosen if one.error["type"] == "extra_forbidden"]
-    meant = {one.loc: _meant_key(one, model, asked) for one in unknown[:MAX_HINTS]}
+    missing = {one.loc for one in chosen if one.kind == "missing"}
+    unknown = [one for one in chosen if one.kind == "extra_forbidden"][:MAX_HINTS]
+    meant = {one.loc: closest(str(one.loc[-1]), context.known_keys(model, one.loc[:-1])) for one in unknown}
     misspelt = {(*loc[:-1], key) for loc, key in meant.items()}
     for one in chosen:
-        if one.error["type"] == "extra_forbidden":
-            findings.append(_unknown_key(one, meant.get(one.loc, ""), model, top, asked))
-        elif one.error["type"] != "missing":
-            findings.append(_wrong_value(one, top, asked))
+        if one.kind == "extra_forbidden":
+            findings.append(_unknown_key(one.loc, meant.get(one.loc, ""), model, top, context))
+        elif one.kind != "missing":
+            findings.append(_wrong_value(one, top, context))
         elif isinstance(index := one.loc[-1], int):
             if (*one.loc[:-1], index + 1) not in missing:
-                findings.append(_missing_item(one, index, top, asked))
+                findings.append(_missing_item(one.loc[:-1], index, top, context))
         elif one.loc not in misspelt:  # a misspelt key is not missing as well
-            findings.append(_missing_key(one, model, top, asked))
+            findings.append(_missing_key(one.loc, model, top, context))
     return findings
 
 
@@ -224,85 +226,200 @@ def _best_branch(union: list[_Placed]) -> list[_Placed]:
     return max(branches.values(), key=fit)
 
 
-def _no_type_fits(union: list[_Placed], top: Node, asked: ValidationContext) -> Finding:
+def _no_type_fits(union: list[_Placed], top: Node, context: ValidationContext) -> Finding:
     loc = union[0].loc
-    expected = dict.fromkeys(EXPECTED_TYPES[one.error["type"]] for one in union)
     node = top.at(loc) or top
-    *others, last = expected
-    either = f"{', '.join(others)} or {last}" if others else last
-    return Finding(loc, ErrorText(f"{_name(loc, asked)} is {shown(node.plain(), node.raw)}", either))
-
-
-def _wrong_value(one: _Placed, top: Node, asked: ValidationContext) -> Finding:
-    context = one.error.get("ctx", {})
-    at = (context["discriminator"].strip("'"),) if one.error["type"] == "union_tag_invalid" else ()
-    loc = one.loc + tuple(context.get("at", at))
-    node = top.at(one.loc) or top
-    name = _name(one.loc, asked)
-    if "[key]" in one.error["loc"]:
-        words = explain_validation_error(one.error, f"the key '{clean(str(one.loc[-1]))}'", one.loc[-1], "")
-        return Finding(loc, words, key=True)
+    *others, last = dict.fromkeys(_TYPES[one.kind] for one in union)
+    expected = f"{', '.join(others)} or {last}" if others else last
     return Finding(
-        loc, explain_validation_error(one.error, name, node.plain(), node.raw), bool(context.get("key"))
+        loc, Problem(f"{context.value(loc)} is {shown(node.plain(), node.raw)}", expected=expected)
     )
 
 
+def _wrong_value(one: _Placed, top: Node, context: ValidationContext) -> Finding:
+    details = one.error.get("ctx", {})
+    at = (details["discriminator"].strip("'"),) if one.kind == "union_tag_invalid" else ()
+    loc = one.loc + tuple(details.get("at", at))
+    if "[key]" in one.error["loc"]:
+        name = f"the key '{clean(str(one.loc[-1]))}'"
+        return Finding(loc, explain(one.error, name, one.loc[-1], ""), key=True)
+    node = top.at(one.loc) or top
+    problem = explain(one.error, context.value(one.loc), node.plain(), node.raw)
+    return Finding(loc, problem, bool(details.get("key")))
+
+
 def _unknown_key(
-    one: _Placed, meant: str, model: type[BaseModel], top: Node, asked: ValidationContext
+    loc: Loc, meant: str, model: type[BaseModel], top: Node, context: ValidationContext
 ) -> Finding:
-    loc, key = one.loc, clean(str(one.loc[-1]))
-    node = top.at(loc)
+    key, node = clean(str(loc[-1])), top.at(loc)
     comma = comma_hint(key, node.value) if node is not None else ""
-    known = _known_keys(loc[:-1], model, asked)
-    owner = _called(loc[:-1], asked)
+    known, owner = context.known_keys(model, loc[:-1]), context.mapping(loc[:-1])
     if not known:
-        words = ErrorText(f"{owner} takes no settings, but '{key}' is given", "", comma or "remove it")
-        return Finding(loc, words, key=True)
+        what = f"{owner} takes no settings, but '{key}' is given"
+        return Finding(loc, Problem(what, hint=comma or "remove it"), key=True)
     hint = "put a space after the ':'" if ":" in key else f"did you mean '{meant}'?" if meant else ""
-    words = ErrorText(f"'{key}' is not a setting of {owner}", listing(known), comma or hint)
-    return Finding(loc, words, key=True)
+    what = f"'{key}' is not a setting of {owner}"
+    return Finding(loc, Problem(what, expected=listing(known), hint=comma or hint), key=True)
 
 
-def _missing_key(one: _Placed, model: type[BaseModel], top: Node, asked: ValidationContext) -> Finding:
-    loc, key = one.loc, str(one.loc[-1])
-    parent = top.at(loc[:-1])
-    about = description_of(models_at(model, loc[:-1]), key)
-    where = f" from {_called(loc[:-1], asked)}" if asked.name or len(loc) > 1 else ""
+def _missing_key(loc: Loc, model: type[BaseModel], top: Node, context: ValidationContext) -> Finding:
+    parent, key, around = top.at(loc[:-1]), str(loc[-1]), loc[:-1]
+    about = _description(_models_at(model, around), key)
+    where = f" from {context.mapping(around)}" if context.name or around else ""
     what = f"'{key}' is missing{where}" + (f" ({about})" if about else "")
-    known = _known_keys(loc[:-1], model, asked)
+    known = context.known_keys(model, around)
     others = [k for k in parent.value if k not in known] if parent and isinstance(parent.value, dict) else []
     alike = closest(key, others)
-    return Finding(loc, ErrorText(what, "", f"did you write '{clean(alike)}' for it?" if alike else ""))
+    return Finding(loc, Problem(what, hint=f"did you write '{clean(alike)}' for it?" if alike else ""))
 
 
-def _missing_item(one: _Placed, index: int, top: Node, asked: ValidationContext) -> Finding:
-    loc = one.loc[:-1]
+def _missing_item(loc: Loc, index: int, top: Node, context: ValidationContext) -> Finding:
     node = top.at(loc)
     n = len(node.value) if node and isinstance(node.value, list) else 0
-    what = f"{_name(loc, asked)} has {n} {'entry' if n == 1 else 'entries'}"
-    return Finding(loc, ErrorText(what, f"at least {index + 1}"))
+    what = f"{context.value(loc)} has {n} {'entry' if n == 1 else 'entries'}"
+    return Finding(loc, Problem(what, expected=f"at least {index + 1}"))
 
 
-def _known_keys(loc: Loc, model: type[BaseModel], asked: ValidationContext) -> list[str]:
-    known = [key for key in keys_of(models_at(model, loc)) if loc or key not in asked.drop]
-    return known if loc else [*known, *(key for key in asked.other_keys if key not in known)]
+def _key(name: str, field: FieldInfo) -> str:
+    """What a field is called in the file."""
+    return field.validation_alias if isinstance(field.validation_alias, str) else name
 
 
-def _meant_key(one: _Placed, model: type[BaseModel], asked: ValidationContext) -> str:
-    return closest(str(one.loc[-1]), _known_keys(one.loc[:-1], model, asked))
+def _field(model: type[BaseModel], key: str | int) -> FieldInfo | None:
+    return next((field for name, field in model.model_fields.items() if key == _key(name, field)), None)
 
 
-def _called(loc: Loc, asked: ValidationContext) -> str:
-    """What to call a mapping."""
-    if loc:
-        return f"'{_name(loc, asked)}'"
-    return asked.called or (f"'{asked.name}'" if asked.name else "this file")
+def _models_at(model: type[BaseModel], loc: Loc) -> list[type[BaseModel]]:
+    """The settings models of a location below a model: several in a union."""
+    models = [model]
+    for step in loc:
+        # A step that is no field is a list index or the key of a dict of models.
+        fields = [found for one in models if (found := _field(one, step)) is not None]
+        if fields:
+            models = [inner for found in fields for inner in _models_in(found.annotation)]
+    return models
 
 
-def _name(loc: Loc, asked: ValidationContext) -> str:
-    """Name of a value: its key, and the indices of the lists within."""
-    last = next((i for i in reversed(range(len(loc))) if isinstance(loc[i], str)), 0)
-    return ".".join(str(step) for step in loc[last:]) if loc else asked.name
+def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
+    """The models that an annotation names, inside of unions, lists, dicts and Annotated."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+        return
+    for inner in get_args(annotation):
+        yield from _models_in(inner)
+
+
+def _description(models: list[type[BaseModel]], key: str) -> str:
+    """First sentence of the description of a key's field, or ""."""
+    for model in models:
+        field = _field(model, key)
+        if field is not None and field.description:
+            sentence = field.description.split(". ")[0].rstrip(".")
+            return sentence[0].lower() + sentence[1:] if sentence[1:2].islower() else sentence
+    return ""
+
+
+_MAPPING: Final = "a mapping (key: value)"
+_LIST: Final = "a list ([a, b], or lines that begin with '- ')"
+_TYPES: Final[Mapping[str, str]] = {
+    **dict.fromkeys(("bool_type", "bool_parsing"), "true or false"),
+    **dict.fromkeys(("int_type", "int_parsing", "int_from_float", "int_parsing_size"), "a whole number"),
+    **dict.fromkeys(("float_type", "float_parsing", "decimal_type", "decimal_parsing"), "a number"),
+    **dict.fromkeys(("string_type", "string_sub_type", "path_type"), "text"),
+    **dict.fromkeys(("list_type", "tuple_type", "set_type", "frozen_set_type", "iterable_type"), _LIST),
+    **dict.fromkeys(("dict_type", "mapping_type", "model_type", "dataclass_type"), _MAPPING),
+    "model_attributes_type": _MAPPING,
+    "none_required": "nothing",
+}
+"""pydantic's errors that mean "this is the wrong type" -> the right type."""
+
+_LIMITS: Final[Mapping[str, tuple[str, str]]] = {
+    "greater_than": ("more than", "gt"),
+    "greater_than_equal": ("at least", "ge"),
+    "less_than": ("less than", "lt"),
+    "less_than_equal": ("at most", "le"),
+    "multiple_of": ("a multiple of", "multiple_of"),
+}
+_LENGTHS: Final[Mapping[str, tuple[str, str, str, str]]] = {
+    "too_short": ("at least", "min_length", "entry", "entries"),
+    "too_long": ("at most", "max_length", "entry", "entries"),
+    "string_too_short": ("at least", "min_length", "character", "characters"),
+    "string_too_long": ("at most", "max_length", "character", "characters"),
+}
+
+
+def explain(error: Mapping[str, Any], name: str, value: Any, raw: str) -> Problem:
+    """Explain an error of pydantic to a physicist.
+
+    Args:
+        error: One of ``ValidationError.errors()``, neither "missing" nor "extra_forbidden".
+        name: Name of the setting.
+        value: Its value in the file.
+        raw: Its value as it is written, or "".
+    """
+    kind, details = str(error["type"]), error.get("ctx", {})
+    what = f"{name} is {shown(value, raw)}" if name else f"this is {shown(value, raw)}"
+    if kind == "setting_error":
+        return Problem(details["what"], expected=details["expected"], hint=details["hint"])
+    if kind in ("value_error", "assertion_error"):
+        return _of_validator(str(details.get("error", error["msg"])), name, what)
+    if kind in _TYPES:
+        return Problem(what, expected=_TYPES[kind], hint=_type_hint(kind, value))
+    if kind in _LIMITS:
+        words, key = _LIMITS[kind]
+        limit = f"{details[key]:g}" if isinstance(details[key], float) else str(details[key])
+        si = " (in SI units)" if isinstance(value, str) and details[key] != 0 else ""
+        return Problem(what, expected=f"{words} {limit}{si}")
+    if kind in _LENGTHS:
+        words, key, one, many = _LENGTHS[kind]
+        n = len(value)
+        return Problem(f"{name} has {n} {one if n == 1 else many}", expected=f"{words} {details[key]}")
+    if kind == "finite_number":
+        return Problem(what, expected="a finite number")
+    if kind in ("literal_error", "enum"):
+        choices = re.findall(r"'([^']*)'", details["expected"])
+        hint = did_you_mean(str(value), choices) if len(choices) > 1 else ""
+        return Problem(what, expected=details["expected"], hint=hint)
+    if kind == "union_tag_invalid":
+        tags = details["expected_tags"]
+        hint = did_you_mean(str(details["tag"]), re.findall(r"'([^']*)'", tags))
+        setting = details["discriminator"].strip("'")
+        return Problem(f"{setting} is {shown(details['tag'])}", expected=tags, hint=hint)
+    if kind == "union_tag_not_found":
+        return Problem(f"{details['discriminator']} is missing from '{name}'")
+    message = str(error["msg"])
+    expected = message.removeprefix("Input should be ")
+    return Problem(what, expected=expected) if expected != message else Problem(f"{name}: {message}")
+
+
+def _of_validator(text: str, name: str, plain: str) -> Problem:
+    """The message of a validator's ValueError, on one line and split at "; expected"."""
+    text = " ".join(text.split())
+    if text.startswith("expected "):
+        return Problem(plain, expected=text.removeprefix("expected "))
+    what, _, rest = text.partition("; expected ")
+    expected, _, hint = rest.partition("; ")
+    return Problem(f"{name}: {what}" if name else what, expected=expected, hint=hint)
+
+
+def _type_hint(kind: str, value: Any) -> str:
+    """What the writer probably meant by a text in the place of a number or a switch, or vice versa."""
+    if not isinstance(value, str):
+        is_word = isinstance(value, bool | int | float) and kind == "string_type"
+        return "put it in quotes" if is_word else ""
+    if kind.startswith("bool"):
+        word = value.lower()
+        meant = "true" if word in ("yes", "on") else "false" if word in ("no", "off") else ""
+        return f"did you mean {meant}?" if meant else ""
+    if kind.startswith(("int", "float")):
+        try:
+            number = resolve(value.replace("_", ""))
+        except ValueError:
+            return ""
+        is_right = type(number) is int or (type(number) is float and kind.startswith("float"))
+        hint = f"did you mean {number}?" if "_" in value else f"write {number} without quotes"
+        return hint if is_right else ""
+    return ""
 
 
 @overload
@@ -313,7 +430,7 @@ def validate_values(model: type[M] | None, values: Mapping[str, Any], called: st
     """Make settings of Python values, by the same rules as those of a file.
 
     Args:
-        model: The settings model; None for what takes no settings.
+        model: The settings model; None for a plugin that takes no settings.
         values: Setting -> value; numpy's numbers and arrays count as plain ones.
         called: What the settings belong to, for messages: "planner 'psca'".
 
@@ -321,16 +438,12 @@ def validate_values(model: type[M] | None, values: Mapping[str, Any], called: st
         ConfigError: Everything that is wrong with them.
     """
     root = node_of(dict(values), Mark(0, 0, called))
-    result = validate(model or NoSettings, root, ValidationContext("", "it"))
-    if isinstance(result, list):
-        raise ConfigError(
-            [root.mark.problem("", w.what, w.expected, w.hint) for w in (found.words for found in result)]
-        )
-    return None if model is None else cast("M", result)
+    made = validate(model or NoSettings, root, ValidationContext("", "it"), "")
+    return None if model is None else cast("M", made)
 
 
 def node_of(value: Any, mark: Mark) -> Node:
-    """Plain values as nodes that all stand at one place.
+    """Plain values as nodes with one common place.
 
     Raises:
         ConfigError: A value that no file could hold.
@@ -351,6 +464,5 @@ def node_of(value: Any, mark: Mark) -> Node:
     if value is None or isinstance(value, str | int | float):
         return Node(value, mark)
     kind = type(cast("object", value)).__name__
-    raise ConfigError(
-        mark.problem("", f"a value of type {kind} is no setting", "a number, text, list or dict")
-    )
+    expected = "a number, text, list or dict"
+    raise ConfigError(mark.problem("", f"a value of type {kind} is no setting", expected))

@@ -18,13 +18,12 @@ from pydantic import BaseModel
 from pydantic.json_schema import GenerateJsonSchema
 from pydantic_core import core_schema
 
-from labseq.config.fields import si_of
 from labseq.config.profile import DeviceChoice, LinesChoice, MobileTweezersChoice, ProfileSpec
 from labseq.config.scan import AdaptiveChoice
 from labseq.config.sequence import AnalysisChoice, SequenceSpec, StepPolicySettings
 from labseq.files import whole_file
 from labseq.registry import Entry, Registry
-from labseq.settings import Choice, DefaultIfEmpty, PatternChoice, Quantity, Settings
+from labseq.settings import Choice, DefaultIfEmpty, PatternChoice, Quantity, Settings, si_of
 from labseq.units import EXAMPLES, UNITS, expected, format_quantity, parse_quantity
 
 JsonSchema: TypeAlias = dict[str, Any]

@@ -8,9 +8,8 @@ from dataclasses import asdict, dataclass, field
 from types import MappingProxyType
 from typing import Any, Final, cast
 
-from labseq.config import ProblemCollector
 from labseq.config.scan import SCANNER_KEYS, Adaptive, Axis, Ends
-from labseq.errors import ConfigError, DeviceError
+from labseq.errors import ConfigError, DeviceError, ProblemCollector
 from labseq.guard import Guard, StopFlag
 from labseq.messages import clean
 from labseq.model import ScanRange, ScanSpace, VisitedPoint

@@ -12,7 +12,6 @@ from labseq.config import (
     ROLES,
     Document,
     Override,
-    ProblemCollector,
     Scan,
     SequenceSpec,
     StoredText,
@@ -23,7 +22,7 @@ from labseq.config import (
     read_scan,
     split_overrides,
 )
-from labseq.errors import ConfigError
+from labseq.errors import ConfigError, ProblemCollector
 from labseq.model import TargetPattern
 from labseq.plugins import PluginHost
 from labseq.roles import Step

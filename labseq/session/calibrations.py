@@ -9,9 +9,9 @@ from shlex import quote
 from typing import Any, Final, Literal
 
 from labseq.calibration.store import Store, Stored, check_grid
-from labseq.config import Document, ProblemCollector, ProfileSpec, load_profile, profile_dir
+from labseq.config import Document, ProfileSpec, load_profile, profile_dir
 from labseq.config.profile import OFF
-from labseq.errors import ConfigError, LimitError
+from labseq.errors import ConfigError, LimitError, ProblemCollector
 from labseq.model import CALIBRATION_KINDS, CalibrationEntry, CalibrationKind, SiteGrid
 from labseq.motion import standing_on_sites
 from labseq.registry import VIRTUAL_TWIN

@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, Final
 
-from labseq.config import Document, ProblemCollector, SequenceSpec, StepSpec
+from labseq.config import Document, SequenceSpec, StepSpec
 from labseq.config.sequence import ANALYSIS_KEYS
-from labseq.errors import ConfigError, LabseqError, LimitError, PluginLoadError, one_of
+from labseq.errors import ConfigError, LabseqError, LimitError, PluginLoadError, ProblemCollector, one_of
 from labseq.model import (
     CalibrationEntry,
     LineSpec,

@@ -10,15 +10,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from labseq.config import (
-    CheckSettings,
-    Document,
-    ProblemCollector,
-    SequenceSpec,
-    StepPolicySettings,
-    StepSpec,
-)
-from labseq.errors import CheckFailedError, Loc
+from labseq.config import CheckSettings, Document, SequenceSpec, StepPolicySettings, StepSpec
+from labseq.errors import CheckFailedError, Loc, ProblemCollector
 from labseq.messages import clean, did_you_mean, listing
 from labseq.recording import figures_in
 from labseq.recording.columns import FIGURES

@@ -15,14 +15,22 @@ from labseq.config import (
     ROLES,
     Document,
     Override,
-    ProblemCollector,
     ProfileSpec,
     Scan,
     StoredText,
     load_profile,
     plugin_paths,
 )
-from labseq.errors import ConfigError, LabseqError, Loc, PluginLoadError, Problem, UnknownPluginError, one_of
+from labseq.errors import (
+    ConfigError,
+    LabseqError,
+    Loc,
+    PluginLoadError,
+    Problem,
+    ProblemCollector,
+    UnknownPluginError,
+    one_of,
+)
 from labseq.messages import clean, did_you_mean
 from labseq.model import CalibrationEntry, SiteGrid
 from labseq.model.lines import IDLE

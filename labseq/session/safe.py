@@ -10,8 +10,15 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
-from labseq.config import ProblemCollector, load_profile, plugin_paths, profile_overrides
-from labseq.errors import ConfigError, DeviceError, LabseqError, RecordingError, StopRequested
+from labseq.config import load_profile, plugin_paths, profile_overrides
+from labseq.errors import (
+    ConfigError,
+    DeviceError,
+    LabseqError,
+    ProblemCollector,
+    RecordingError,
+    StopRequested,
+)
 from labseq.files import Holder, Lock, knows_no_locks
 from labseq.guard import Guard, StopFlag
 from labseq.recording import clear_active, data_root, died, lock_files, marker_roots

@@ -14,12 +14,11 @@ from typing import Any, Final
 
 import numpy as np
 
-from labseq.config import ROLES, Axis, Document, ProblemCollector, Scan, SequenceSpec
-from labseq.config.fields import VARIABLES
+from labseq.config import ROLES, Axis, Document, Scan, SequenceSpec
+from labseq.config.addresses import PROFILE, VARIABLES
 from labseq.config.profile import MobileTweezersChoice
-from labseq.config.scan import PROFILE
 from labseq.config.yaml_nodes import Node
-from labseq.errors import ConfigError, Loc
+from labseq.errors import ConfigError, Loc, ProblemCollector
 from labseq.messages import clean
 from labseq.roles import Step
 from labseq.session.construct import make_step

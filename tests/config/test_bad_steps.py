@@ -19,8 +19,8 @@ from labseq.builtin.steps import (
     RearrangeSettings,
     WaitSettings,
 )
-from labseq.config import ProblemCollector, load_sequence
-from labseq.errors import ConfigError
+from labseq.config import load_sequence
+from labseq.errors import ConfigError, ProblemCollector
 from labseq.settings import Settings
 
 GOOD = (Path(__file__).parent / "data" / "sequence.yaml").read_text(encoding="utf-8")

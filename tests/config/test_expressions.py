@@ -85,7 +85,10 @@ def test_what_comes_out(text: str, expected: Any) -> None:
         ("= 2 * (3 + 4", "11: the '(' that opens here is never closed; expected ')'"),
         ("=", "5: the expression ends too early; expected a number, an address or '('"),
         ("= 2 *", "9: the expression ends too early"),
-        ("= 2 3", "9: '3' cannot stand here; expected numbers, addresses, functions, brackets and + - * / **"),
+        (
+            "= 2 3",
+            "9: '3' cannot stand here; expected numbers, addresses, functions, brackets and + - * / **",
+        ),
         ("= 2 ms 3", "12: '3' cannot stand here"),
         ("= 2 + 3)", "12: ')' cannot stand here"),
         ("= variables.hold + 5", "22: a time and a number cannot be added; give the number its unit"),

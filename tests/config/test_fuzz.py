@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from labseq.builtin.steps import DeviceSettings, ImageSettings, LoadSettings, RearrangeSettings, WaitSettings
-from labseq.config import Override, ProblemCollector, load_profile, load_sequence, split_overrides
-from labseq.errors import ConfigError
+from labseq.config import Override, load_profile, load_sequence, split_overrides
+from labseq.errors import ConfigError, ProblemCollector
 from labseq.settings import Settings
 
 DATA = Path(__file__).parent / "data"

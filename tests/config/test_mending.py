@@ -5,9 +5,10 @@ from typing import Any
 
 from hypothesis import given, settings, strategies as st
 
-from labseq.config import Document, ProblemCollector, SequenceSpec, load_sequence
+from labseq.config import Document, SequenceSpec, load_sequence
 from labseq.config.document import FallbackValues, load_checked
 from labseq.config.validation import node_of
+from labseq.errors import ProblemCollector
 
 STAND_INS = FallbackValues(
     values={
