@@ -1,4 +1,4 @@
-"""labseq's end of the streaming process: starts it, tells it what to do, and knows how it is."""
+"""The connection to the streaming process: start, commands, supervision, end."""
 
 from __future__ import annotations
 
@@ -8,26 +8,26 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
 from labseq.plugin import Clock, DeviceError, wait_for
-from labseq_soapy.messages import Setup, received, send
+from labseq_soapy.messages import Facts, Setup, received, send
 from labseq_soapy.output import Samples
-from labseq_soapy.radio import Facts
 
 OPEN_S: Final = 60.0
 """How long a radio may take to open: some load their firmware."""
 SILENT_S: Final = 6.0
-"""A streaming process that says nothing for so long, once the radio is open, hangs.
+"""A streaming process that sends nothing for so long, once the radio is open, hangs.
 
-It is less than labseq waits for any call, so that it is told what hangs.
+It is less than labseq waits for any call, so that the error names the process.
 """
 END_S: Final = 3.0
-"""How long it may take to end beside its ramp."""
+"""How long the process may take to end in addition to its ramp."""
 
 
 class Link:
@@ -36,9 +36,13 @@ class Link:
     Args:
         name: Name of the device, for messages.
         clock: The session's clock.
-        setup: What the process is told first.
-        log: File for what the radio's module prints.
+        setup: The first message to the process.
+        log: File for the output of the radio's module.
         environment: Environment of the process.
+
+    Attributes:
+        pid: Number of the process.
+        facts: What the radio reported; None until it is open.
     """
 
     def __init__(
@@ -47,12 +51,12 @@ class Link:
         self._name, self._clock, self._setup, self._log = name, clock, setup, log
         self._news = threading.Condition()
         self._sending = threading.Lock()
-        self._facts: Facts | None = None
         self._ended = ""
-        self._done = self._asked = 0
+        self._n_done = self._n_tasks = 0
         self._status = {"underflows": 0, "dark": 0}
-        self._heard_s = time.monotonic()
+        self._received_s = time.monotonic()
         self._closing = threading.Event()
+        self.facts: Facts | None = None
         with log.open("wb") as file:
             self._process = subprocess.Popen(
                 [sys.executable, "-P", "-m", "labseq_soapy.streamer"],
@@ -61,8 +65,9 @@ class Link:
                 stderr=file,
                 bufsize=0,
                 env=dict(environment),
-                start_new_session=True,  # what ends a terminal's programs does not end it before labseq
+                start_new_session=True,  # so that Ctrl-C in a terminal does not end it before labseq
             )
+        self.pid = self._process.pid
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         self._in, self._out = self._process.stdin, self._process.stdout
@@ -70,15 +75,10 @@ class Link:
             threading.Thread(target=work, name=f"{name} {work.__name__}", daemon=True)
             for work in (self._listen, self._beat)
         ]
-        with contextlib.suppress(OSError):  # it has ended already; why is told below
-            self._say(setup.as_message())
+        with contextlib.suppress(OSError):  # it has ended already; wait_open() reports why
+            self._send(asdict(setup))
         for thread in self._threads:
             thread.start()
-
-    @property
-    def pid(self) -> int:
-        """Number of the process."""
-        return self._process.pid
 
     @property
     def underflows(self) -> int:
@@ -92,26 +92,26 @@ class Link:
 
     @property
     def hangs(self) -> bool:
-        """Whether the process is there, but silent; while the radio is opened it always is."""
-        is_open = self._facts is not None and not self._ended
-        return is_open and time.monotonic() - self._heard_s > SILENT_S
+        """Whether the process runs but is silent; while the radio is being opened it always is."""
+        is_open = self.facts is not None and not self._ended
+        return is_open and time.monotonic() - self._received_s > SILENT_S
 
-    def facts(self) -> Facts:
-        """Wait until the radio is open and streams silence; what it says of itself.
+    def wait_open(self) -> Facts:
+        """Wait until the radio is open and streams silence; returns what it reports.
 
         Raises:
             DeviceError: It cannot be opened or set up.
         """
-        self._wait(lambda: self._facts is not None, OPEN_S, "open the radio")
-        assert self._facts is not None
-        return self._facts
+        self._wait(lambda: self.facts is not None, OPEN_S, "open the radio")
+        assert self.facts is not None
+        return self.facts
 
     def load(self, loop: Samples, fade_s: float) -> None:
         """Play another loop, and wait until it is at the connectors.
 
         Args:
             loop: float32 (2, 2 n), I and Q in turn, by the channels' numbers.
-            fade_s: Time in which it takes the place of the one before.
+            fade_s: Duration of the transition from the loop before.
 
         Raises:
             DeviceError: The stream is dead.
@@ -122,7 +122,7 @@ class Link:
             self._do("loop", file=str(file), fade_s=fade_s)
 
     def ramp(self, depth: float, duration_s: float) -> None:
-        """Change the depth, and wait until its end is at the connectors.
+        """Change the depth, and wait until the end of the ramp is at the connectors.
 
         Raises:
             DeviceError: The stream is dead.
@@ -130,23 +130,23 @@ class Link:
         self._do("ramp", depth=depth, duration_s=duration_s)
 
     def check(self) -> None:
-        """Refuse to go on with a stream that is dead.
+        """Check that the stream is alive.
 
         Raises:
-            DeviceError: With what is known of its end.
+            DeviceError: It is dead, with the known reason.
         """
         if self._ended:
-            dark = "" if self._facts is None else "; the array is dark"
+            dark = "" if self.facts is None else "; the array is dark"
             raise DeviceError(self._name, f"{self._ended}{dark}")
         if self.hangs:
-            text = f"its streaming process (number {self.pid}) hangs: it said nothing for {SILENT_S:g} s"
+            text = f"its streaming process (number {self.pid}) hangs: it sent nothing for {SILENT_S:g} s"
             raise DeviceError(self._name, text)
 
     def close(self) -> None:
         """Let the process ramp down and end; one that does not is killed. Legal in any state."""
         self._closing.set()
         with contextlib.suppress(OSError):
-            self._say({"do": "end"})
+            self._send({"do": "end"})
         try:
             self._process.wait(END_S + self._setup.ramp_s)
         except subprocess.TimeoutExpired:
@@ -160,16 +160,16 @@ class Link:
 
     def _do(self, what: str, **values: Any) -> None:
         self.check()
-        self._asked += 1
-        task = self._asked
+        self._n_tasks += 1
+        task = self._n_tasks
         try:
-            self._say({"do": what, "id": task, **values})
+            self._send({"do": what, "id": task, **values})
         except OSError:
-            self._wait(lambda: False, END_S, "say why it has ended")
-        self._wait(lambda: self._done >= task, float("inf"), what)
+            self._wait(lambda: False, END_S, "report why it has ended")
+        self._wait(lambda: self._n_done >= task, float("inf"), what)
 
-    def _wait(self, come: Any, timeout_s: float, what: str) -> None:
-        """Wait for something as long as the process lives.
+    def _wait(self, is_done: Callable[[], bool], timeout_s: float, what: str) -> None:
+        """Wait for something while the process lives.
 
         Raises:
             DeviceError: It has ended, or hangs, or it takes too long.
@@ -177,8 +177,8 @@ class Link:
 
         def poll(longest_s: float) -> bool | None:
             with self._news:
-                self._news.wait_for(lambda: come() or self._ended, longest_s)
-                if come():
+                self._news.wait_for(lambda: is_done() or self._ended, longest_s)
+                if is_done():
                     return True
             self.check()
             return None
@@ -190,32 +190,32 @@ class Link:
         why = ""
         for message in received(self._out.fileno()):
             with self._news:
-                self._heard_s = time.monotonic()
+                self._received_s = time.monotonic()
                 if facts := message.get("facts"):
-                    self._facts = Facts.from_message(facts)
+                    self.facts = Facts(**facts)
                 self._status = message.get("status", self._status)
-                self._done = max(self._done, message.get("done", 0))
+                self._n_done = max(self._n_done, message.get("done", 0))
                 why = message.get("failed") or message.get("ended") or why
                 self._news.notify_all()
         code = self._process.wait()
         with self._news:
-            self._ended = why or f"its streaming process ended with code {code}{self._last_words()}"
+            self._ended = why or f"its streaming process ended with code {code}{self._last_line()}"
             self._news.notify_all()
 
-    def _last_words(self) -> str:
+    def _last_line(self) -> str:
         with contextlib.suppress(OSError):
-            lines = self._log.read_text("utf-8", "replace").split("\n")
-            words = [line.strip() for line in lines if line.strip()]
-            return f", with the last words: {words[-1][:200]}" if words else ""
+            lines = [line.strip() for line in self._log.read_text("utf-8", "replace").split("\n")]
+            lines = [line for line in lines if line]
+            return f", its last message: {lines[-1][:200]}" if lines else ""
         return ""
 
     def _beat(self) -> None:
         while not self._closing.wait(self._setup.max_wait_s / 8):
             try:
-                self._say({"do": "beat"})
+                self._send({"do": "beat"})
             except OSError:
                 return
 
-    def _say(self, message: Mapping[str, Any]) -> None:
+    def _send(self, message: Mapping[str, Any]) -> None:
         with self._sending:
             send(self._in.fileno(), message)

@@ -1,4 +1,4 @@
-"""What labseq and the streaming process tell each other: lines of JSON through two pipes.
+"""The messages between labseq and the streaming process: lines of JSON through two pipes.
 
 labseq's first line is a :class:`Setup`; then come commands, each with a key ``do``:
 
@@ -7,26 +7,26 @@ labseq's first line is a :class:`Setup`; then come commands, each with a key ``d
 ==========  =====================================  ==============================================
 ``loop``    ``id``, ``file``, ``fade_s``           ``{"done": id}`` when it is at the connectors
 ``ramp``    ``id``, ``depth``, ``duration_s``      the same
-``end``     none                                   none: it ramps down, lets the radio go and ends
-``beat``    none                                   none: labseq lives
+``end``     none                                   none: it ramps down, closes the radio and ends
+``beat``    none                                   none: shows that labseq is alive
 ==========  =====================================  ==============================================
 
-The process says ``{"facts": ...}`` or ``{"failed": text}`` once, then ``{"status": ...}`` again and
-again, and ``{"ended": text}`` if it ends for another reason than ``end``.
+The process sends ``{"facts": ...}`` or ``{"failed": text}`` once, then ``{"status": ...}`` regularly,
+and ``{"ended": text}`` if it ends for another reason than ``end``.
 """
 
 from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 
 @dataclass(frozen=True, slots=True)
 class Setup:
-    """What the streaming process is told first.
+    """What the streaming process needs to know first.
 
     Attributes:
         device: Arguments that open the radio.
@@ -38,19 +38,19 @@ class Setup:
         gain_db: Gain of each axis; None: the lowest.
         antenna: Name of the connector; "": as the radio chooses.
         clock_source: Reference of its clocks; "": as the radio chooses.
-        ramp_s: Duration of its own ramp to nothing.
+        ramp_s: Duration of the ramp to zero at its end.
         max_wait_s: How long labseq may be silent.
-        hold: Whether to go on without labseq.
-        marker: File that says that it goes on without labseq; who deletes it ends it.
+        hold: Whether to continue without labseq.
+        marker: File that the process writes when it continues without labseq; deleting it ends the process.
     """
 
     device: str
     stream: str
-    channels: tuple[int, int]
+    channels: Sequence[int]
     rate_hz: float
     oscillator_hz: float
     bandwidth_hz: float | None
-    gain_db: tuple[float | None, float | None]
+    gain_db: Sequence[float | None]
     antenna: str
     clock_source: str
     ramp_s: float
@@ -58,25 +58,31 @@ class Setup:
     hold: bool
     marker: str
 
-    def as_message(self) -> Mapping[str, Any]:
-        """The same, for JSON."""
-        return asdict(self)
 
-    @classmethod
-    def from_message(cls, values: Mapping[str, Any]) -> Setup:
-        """Read back what ``as_message`` made."""
-        rows, columns = values["channels"]
-        row_gain, column_gain = values["gain_db"]
-        pairs: dict[str, Any] = {"channels": (rows, columns), "gain_db": (row_gain, column_gain)}
-        told: dict[str, Any] = {**values, **pairs}
-        return cls(**told)
+@dataclass(frozen=True, slots=True)
+class Facts:
+    """What the radio reports after it was set up.
+
+    Attributes:
+        radio: Driver, hardware, serial number and the like.
+        rate_hz: Sample rate.
+        oscillator_hz: Local oscillator of the row and the column channel.
+        gain_db: Gain of the row and the column channel.
+        buffered: Number of samples in its buffer when it takes no more.
+    """
+
+    radio: Mapping[str, str]
+    rate_hz: float
+    oscillator_hz: Sequence[float]
+    gain_db: Sequence[float]
+    buffered: int = 0
 
 
 def send(pipe: int, message: Mapping[str, Any]) -> None:
-    """Write a message whole.
+    """Write a message.
 
     Raises:
-        OSError: Nobody is at the other end.
+        OSError: The other end is closed.
     """
     data = json.dumps(message).encode() + b"\n"
     while data:

@@ -1,4 +1,4 @@
-"""What is sent to the radio, block by block: a loop, its depth, and the fades from one loop to the next."""
+"""The samples for the radio, block by block: a loop, its depth, and the fades from one loop to the next."""
 
 from __future__ import annotations
 
@@ -10,16 +10,15 @@ from numpy.typing import NDArray
 Samples = NDArray[np.float32]
 
 BLOCK: Final = 1 << 15
-"""Most samples that are made at once: below a millisecond at any rate that 20 tones need."""
+"""Most samples per block: less than a millisecond at any rate that 20 tones need."""
 
 
 class Output:
     """The signal of both channels.
 
     At full depth the samples are those of the loop itself, at depth 0 of a buffer of zeros; only ramps
-    and fades cost work. The depth of a tweezer goes as the product of the powers of its row's and its
-    column's tone, so that both amplitudes go as its fourth root. The loop runs on whatever happens, so no
-    phase ever jumps.
+    and fades cost work. Both amplitudes of a tweezer scale with the fourth root of its depth. The loop is
+    never interrupted, so no phase ever jumps.
 
     Attributes:
         depth: Depth at the end of the last block, as a fraction of the nominal depth.
@@ -31,14 +30,14 @@ class Output:
         self._loop = self._silence
         self._next: Samples | None = None
         self._n_fade = self._n_faded = 0
-        self._ramp = _Course(0.0, 0.0, 0)
+        self._ramp = _LinearChange(0.0, 0.0, 0)
         self._at = 0
         self._steps = np.arange(1, BLOCK + 1, dtype=np.float32).repeat(2)
         self._factor = np.empty(2 * BLOCK, np.float32)
         self._made = np.empty((2, 2 * BLOCK), np.float32)
 
     def load(self, loop: Samples, n_fade: int) -> None:
-        """Play another loop: at once where nothing is on, else faded in.
+        """Play another loop: at once if nothing is on, otherwise faded in.
 
         Args:
             loop: float32 (2, 2 n), I and Q in turn; each loop as long as the first.
@@ -49,13 +48,13 @@ class Output:
         elif self.depth == 0.0 and not self._ramp.left:
             self._loop, self._next = loop, None
         else:
-            if self._next is not None:  # the fade before is cut short where it is
+            if self._next is not None:  # the earlier fade stops where it is
                 self._loop = self._mixed_loop(self._next)
             self._next, self._n_fade, self._n_faded = loop, max(1, n_fade), 0
 
     def ramp(self, depth: float, n_samples: int) -> None:
-        """Change the depth linearly, from where it is; the last sample has the new depth."""
-        self._ramp = _Course(self.depth, depth, max(1, n_samples))
+        """Change the depth linearly from its present value; the last sample has the new depth."""
+        self._ramp = _LinearChange(self.depth, depth, max(1, n_samples))
 
     @property
     def steady(self) -> bool:
@@ -112,8 +111,8 @@ class Output:
         return (self._loop + weight * (coming - self._loop)).astype(np.float32, copy=False)
 
 
-class _Course:
-    """A linear course of the depth, sample by sample."""
+class _LinearChange:
+    """A linear change of the depth, sample by sample."""
 
     def __init__(self, start: float, end: float, n_samples: int) -> None:
         self._start, self._end, self._n_samples = start, end, n_samples
@@ -129,6 +128,6 @@ class _Course:
         return (self._end - self._start) / max(1, self._n_samples)
 
     def advance(self, n: int) -> float:
-        """Go on by n samples; the depth there."""
+        """Continue by n samples; returns the depth there."""
         self.left -= n
         return self.now if self.left else self._end

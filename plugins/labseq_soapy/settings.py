@@ -2,27 +2,11 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
-from typing import Annotated, Final, Literal, Self, TypeAlias
+from typing import Annotated, Literal, Self, TypeAlias
 
 from pydantic import Field, model_validator
 
-from labseq.plugin import Duration, Frequency, FrequencyComb, Settings, clean, closest, one_of, setting_error
-
-SIMULATED = "simulated"
-"""The device that needs no radio."""
-LEAST: Final[Mapping[str, float]] = {
-    "speed": 1e-4,
-    "buffer": 1e-4,
-    "patience": 0.0,
-    "record": 0.0,
-    "channels": 1.0,
-    "coerce_rate": 0.0,
-}
-"""Arguments of the simulated radio that are numbers, and the least that they may be."""
-WORDS: Final[Mapping[str, tuple[str, ...]]] = {"fault": ("absent",), "folder": ()}
-"""Those that are not, and what they may be; none: anything."""
+from labseq.plugin import Duration, Frequency, FrequencyComb, Settings
 
 Channel: TypeAlias = Annotated[int, Field(ge=0, le=15)]
 Rate: TypeAlias = Annotated[Frequency, Field(gt=0)]
@@ -52,13 +36,13 @@ class SoapySettings(Settings):
     )
     local_oscillator: Rate | None = Field(
         default=None,
-        description="centre of the radio's band, for both outputs; none: a third of a site beside the tone "
+        description="centre of the radio's band, for both outputs; none: a third of a site from the tone "
         "in the middle, so that its leakage and the tones' images fall between the tweezers",
     )
     row_frequency: FrequencyComb = Field(default=FrequencyComb(), description="tones of the rows")
     column_frequency: FrequencyComb = Field(default=FrequencyComb(), description="tones of the columns")
     tone_tolerance: Annotated[Frequency, Field(gt=0, le=1e3)] = Field(
-        default=1.0, description="how far a tone may be from the one that was asked for"
+        default=1.0, description="how far a tone may be from its exact frequency"
     )
     row_gain: float | None = Field(
         default=None, description="gain of the row output in dB; none: the lowest that it has"
@@ -73,16 +57,16 @@ class SoapySettings(Settings):
     )
     fade: Annotated[Duration, Field(le=1.0)] = Field(
         default=1e-3,
-        description="time in which new amplitudes take the place of the old while the array is on",
+        description="time in which new amplitudes replace the old ones while the array is on",
     )
     switch: Annotated[Duration, Field(le=1.0)] = Field(
         default=10e-3,
-        description="time of the ramps by which the array is turned on, and off when all is made safe",
+        description="duration of the ramps that turn the array on, and off in the safe state",
     )
     on_exit: Literal["ramp_down", "hold"] = Field(
         default="ramp_down",
-        description="what becomes of the light when labseq is killed or hangs: ramped down, or held until "
-        "labseq opens the radio anew",
+        description="the light when labseq is killed or hangs: ramped down, or held until labseq opens "
+        "the radio again",
     )
     patience: Annotated[Duration, Field(ge=0.2, le=3600)] = Field(
         default=5.0, description="with `ramp_down`: how long labseq may be silent before it counts as hung"
@@ -90,41 +74,16 @@ class SoapySettings(Settings):
 
     @property
     def is_simulated(self) -> bool:
-        """Whether there is no radio; arguments of the simulated one may follow the name, after a comma."""
-        return self.device.partition(",")[0] == SIMULATED
-
-    @property
-    def simulated_arguments(self) -> dict[str, str]:
-        """What stands behind the name of a simulated radio."""
-        pairs = (pair.partition("=") for pair in self.device.split(",")[1:])
-        return {key.strip(): value.strip() for key, _, value in pairs}
+        """Whether the radio is a simulated one; its arguments may follow after a comma."""
+        return self.device.partition(",")[0] == "simulated"
 
     @model_validator(mode="after")
-    def _simulated_radio_knows_its_arguments(self) -> Self:
+    def _check_simulated_radio(self) -> Self:
         if self.is_simulated:
-            for key, value in self.simulated_arguments.items():
-                self._check_argument(key, value)
-        return self
+            from labseq_soapy_sim import read_arguments
 
-    def _check_argument(self, key: str, value: str) -> None:
-        known = (*LEAST, *WORDS)
-        if key not in known:
-            meant = closest(key, known)
-            hint = f"did you mean '{meant}'?" if meant else ""
-            raise setting_error(
-                f"the simulated radio has no argument '{clean(key)}'", one_of(known), hint, at=("device",)
-            )
-        came = f"{key} of the simulated radio is '{clean(value)}'"
-        if (words := WORDS.get(key)) is not None:
-            if not value or (words and value not in words):
-                raise setting_error(came, one_of(words) if words else "a folder", at=("device",))
-            return
-        try:
-            number = float(value)
-        except ValueError:
-            number = math.nan
-        if not LEAST[key] <= number < math.inf:
-            raise setting_error(came, f"a number, at least {LEAST[key]:g}", at=("device",))
+            read_arguments(self.device)
+        return self
 
     @model_validator(mode="after")
     def _two_outputs(self) -> Self:

@@ -3,45 +3,33 @@
 from __future__ import annotations
 
 import math
-import os
-from collections.abc import Generator, Mapping
-from contextlib import contextmanager
-from pathlib import Path
+from collections.abc import Mapping
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
-from labseq.plugin import (
-    Context,
-    DeviceError,
-    LimitError,
-    StaticTweezers,
-    TransientError,
-)
-from labseq_soapy.alone import end_stale_process, marker_of, place
-from labseq_soapy.array_tones import Amplitudes, ArrayTones
-from labseq_soapy.capture import built
-from labseq_soapy.library import SoapyError
+from labseq.plugin import Context, DeviceError, LimitError, StaticTweezers, TransientError
+from labseq_soapy.access import choose_radio, end_stale_process, marker_of
 from labseq_soapy.link import Link
-from labseq_soapy.messages import Setup
-from labseq_soapy.radio import Facts
+from labseq_soapy.messages import Facts, Setup
 from labseq_soapy.settings import SoapySettings
-from labseq_soapy.simulated import SimulatedRadio
+from labseq_soapy.tones import Amplitudes, ArrayTones
 
 
 class SoapyStaticTweezers(StaticTweezers):
     """Plays a loop of tones for each AOD on two outputs of a radio.
 
-    A process of its own keeps the radio supplied. It ramps the light down if labseq is killed or hangs,
-    unless the profile says otherwise. The depth of a tweezer is taken to go as the product of the powers of
-    its two tones, so that both amplitudes go as its fourth root.
+    A separate process streams samples to the radio. It ramps the light down if labseq is killed or hangs,
+    unless the profile says otherwise. The depth of a tweezer is proportional to the product of the powers
+    of its two tones, so both amplitudes scale with the fourth root of the depth.
 
     Args:
         settings: The radio, and how it is used.
-        context: Name, grid, clock, calibrated amplitudes.
+        context: Name, grid, clock, simulation, calibrated amplitudes.
 
     Attributes:
-        simulated_radio: The simulated radio, while it is open; None for a real one.
+        radio: How the streaming process gets to the radio.
 
     Raises:
         LimitError: The tones span more than 80 % of the sample rate, or no loop holds them all.
@@ -51,48 +39,44 @@ class SoapyStaticTweezers(StaticTweezers):
         self._name = context.name or "static_tweezers"
         self._settings = settings
         self._clock = context.clock
-        self._world = context.simulation
         self._tones = ArrayTones(self._name, settings, context.grid.shape)
         self._calibrated = _calibrated(context)
         self._amplitudes: Amplitudes | None = None
-        self._depth: float | None = 0.0  # None: a ramp was broken off
+        self._depth: float | None = 0.0  # None: a ramp was interrupted
         self._dark = 0
         self._link: Link | None = None
         self._facts: Facts | None = None
         self._is_loaded = False
-        self.simulated_radio: SimulatedRadio | None = None
+        self.radio = choose_radio(self._name, settings, context)
 
     def warm(self) -> None:
-        """Compile the simulated radio, if that is what there is.
+        """Do what takes long before the first shot.
 
         Raises:
-            DeviceError: It cannot be compiled.
+            DeviceError: It failed.
         """
-        if self._settings.is_simulated:
-            with self._in_words():
-                built()
+        self.radio.warm()
 
     def open(self) -> None:
-        """Open the radio and let it play silence; no effect if it is open.
+        """Open the radio and stream silence; no effect if it is open.
 
         Raises:
-            DeviceError: No library, no such radio, another program has it, or it refuses a setting.
+            DeviceError: No library, no such radio, another program uses it, or it refuses a setting.
             LimitError: The calibrated amplitudes are too much.
         """
         if self._link is not None:
             return
         try:
             self._link = self._connect()
-            self._facts = self._link.facts()
+            self._facts = self._link.wait_open()
             self._tones.tune(self._facts)
-            if self.simulated_radio is not None:
-                self.simulated_radio.connect_outputs(self._tones.tones_hz)
+            self.radio.started(self._tones.tones_hz)
         except BaseException:
             self._disconnect()
             raise
 
     def close(self) -> None:
-        """Ramp down and let the radio go; legal in any state."""
+        """Ramp down and close the radio; legal in any state."""
         self._disconnect()
 
     def load(self, amplitudes: Amplitudes | None) -> None:
@@ -142,10 +126,10 @@ class SoapyStaticTweezers(StaticTweezers):
         self._ramp(depth, duration_s)
 
     def safe_state(self) -> None:
-        """Ramp the array down; a stream that is dead is dark already.
+        """Ramp the array down; a dead stream is dark already.
 
         Raises:
-            DeviceError: The process hangs; it was killed, which ends the light too.
+            DeviceError: The process hangs; it was killed, which turns the light off too.
         """
         link = self._link
         if link is None or self._depth == 0.0:
@@ -159,7 +143,7 @@ class SoapyStaticTweezers(StaticTweezers):
             self._depth = 0.0
 
     def check_interlocks(self) -> None:
-        """See whether the stream lives; asked at the start of each shot and before each pick-up.
+        """Check that the stream is alive; called at the start of each shot and before each pick-up.
 
         Raises:
             TransientError: The radio ran out of samples since the last call, while the array was on.
@@ -168,7 +152,7 @@ class SoapyStaticTweezers(StaticTweezers):
         self._checked()
 
     def self_test(self) -> None:
-        """See whether the stream runs and takes the calibrated amplitudes; no light goes on.
+        """Check that the stream runs and that the calibrated amplitudes are possible; the light stays off.
 
         Raises:
             DeviceError: Not open, or something is wrong.
@@ -177,7 +161,7 @@ class SoapyStaticTweezers(StaticTweezers):
         try:
             self._tones.samples(self._calibrated)
         except LimitError as error:
-            raise DeviceError(self._name, f"it cannot have the calibrated amplitudes: {error}") from error
+            raise DeviceError(self._name, f"it cannot play the calibrated amplitudes: {error}") from error
 
     def describe(self) -> Mapping[str, Any]:
         """Settings, depth, amplitudes; once opened, also the radio, the loop and underflows."""
@@ -185,13 +169,13 @@ class SoapyStaticTweezers(StaticTweezers):
         amplitudes = (
             "calibrated" if given is None else {"row": given[0].tolist(), "column": given[1].tolist()}
         )
-        told = {**self._settings.model_dump(mode="json"), "local_oscillator": self._tones.oscillator_hz}
-        common = {"model": "SoapySDR", **told, "depth": self._depth, "amplitudes": amplitudes}
+        settings = {**self._settings.model_dump(mode="json"), "local_oscillator": self._tones.oscillator_hz}
+        common = {"model": "SoapySDR", **settings, "depth": self._depth, "amplitudes": amplitudes}
         if self._facts is None or self._link is None:
             return common
         return {
             **common,
-            **self._facts.as_message(),
+            **asdict(self._facts),
             "model": f"SoapySDR {self._facts.radio['hardware']}",
             "serial_number": self._facts.radio.get("serial", ""),
             "loop_samples": self._tones.loops[0].n_samples,
@@ -200,38 +184,26 @@ class SoapyStaticTweezers(StaticTweezers):
         }
 
     def _connect(self) -> Link:
-        setup, device, environment, folder = self._settings, self._settings.device, dict(os.environ), place()
-        if setup.is_simulated:
-            with self._in_words():
-                self.simulated_radio = radio = SimulatedRadio(setup, self._world)
-            device, environment, folder = radio.device, radio.environment, radio.folder
-        marker = marker_of(setup.device)  # a simulated radio's own folder is another each time
+        settings = self._settings
+        marker = marker_of(settings.device)
         end_stale_process(self._name, marker, self._clock)
-        told = Setup(
+        device, environment, folder = self.radio.connect()
+        setup = Setup(
             device=device,
-            stream=setup.stream,
-            channels=(setup.row_channel, setup.column_channel),
-            rate_hz=setup.sample_rate,
+            stream=settings.stream,
+            channels=(settings.row_channel, settings.column_channel),
+            rate_hz=settings.sample_rate,
             oscillator_hz=self._tones.oscillator_hz,
-            bandwidth_hz=setup.bandwidth,
-            gain_db=(setup.row_gain, setup.column_gain),
-            antenna=setup.antenna,
-            clock_source=setup.clock_source,
-            ramp_s=setup.switch,
-            max_wait_s=setup.patience,
-            hold=setup.on_exit == "hold",
+            bandwidth_hz=settings.bandwidth,
+            gain_db=(settings.row_gain, settings.column_gain),
+            antenna=settings.antenna,
+            clock_source=settings.clock_source,
+            ramp_s=settings.switch,
+            max_wait_s=settings.patience,
+            hold=settings.on_exit == "hold",
             marker=str(marker),
         )
-        log = Path(folder) / f"{marker.stem}.log"
-        return Link(self._name, self._clock, told, log, environment)
-
-    @contextmanager
-    def _in_words(self) -> Generator[None]:
-        """What a simulated radio lacks is the device's failure."""
-        try:
-            yield
-        except SoapyError as error:
-            raise DeviceError(self._name, str(error)) from error
+        return Link(self._name, self._clock, setup, folder / f"{marker.stem}.log", environment)
 
     def _load(self, amplitudes: Amplitudes | None) -> None:
         loop = self._tones.samples(self._calibrated if amplitudes is None else amplitudes)
@@ -239,7 +211,7 @@ class SoapyStaticTweezers(StaticTweezers):
         self._opened().load(loop, self._settings.fade)
         if self._depth != 0.0 and self._clock.virtual:
             self._clock.sleep(self._settings.fade)
-        self._look()
+        self.radio.changed()
 
     def _ramp(self, depth: float, duration_s: float) -> None:
         link, self._depth = self._opened(), None
@@ -247,11 +219,7 @@ class SoapyStaticTweezers(StaticTweezers):
         self._depth = depth
         if self._clock.virtual:
             self._clock.sleep(duration_s)
-        self._look()
-
-    def _look(self) -> None:
-        if self.simulated_radio is not None:
-            self.simulated_radio.look()
+        self.radio.changed()
 
     def _opened(self) -> Link:
         if self._link is None:
@@ -259,7 +227,7 @@ class SoapyStaticTweezers(StaticTweezers):
         return self._link
 
     def _checked(self) -> Link:
-        """The link, if its stream lives and has not failed since the last call."""
+        """The link, if its stream is alive and did not run dry since the last call."""
         link = self._opened()
         link.check()
         dark, self._dark = link.dark - self._dark, link.dark
@@ -273,13 +241,11 @@ class SoapyStaticTweezers(StaticTweezers):
         self._depth, self._dark, self._is_loaded, self._amplitudes = 0.0, 0, False, None
         if link is not None:
             link.close()
-        if self.simulated_radio is not None:
-            self.simulated_radio.close()
-            self.simulated_radio = None
+        self.radio.disconnect()
 
 
 def _calibrated(context: Context) -> Amplitudes:
-    """The amplitudes of the calibration in use; without one all equal, full scale together."""
+    """The amplitudes of the active calibration; without one all are equal and add up to full scale."""
     found = context.calibrations.get("tweezers")
     if found is None:
         n_rows, n_cols = context.grid.shape

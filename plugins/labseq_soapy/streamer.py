@@ -1,7 +1,7 @@
 """The process that keeps the radio supplied: ``python -m labseq_soapy.streamer``.
 
-It is a process of its own so that nothing that labseq does can make the stream run dry, and so that the light
-is ramped down when labseq is killed or hangs. It speaks with labseq as :mod:`labseq_soapy.messages` tells.
+It is a separate process so that nothing that labseq does can make the stream run dry, and so that the light
+is ramped down when labseq is killed or hangs. :mod:`labseq_soapy.messages` describes what the two exchange.
 """
 
 from __future__ import annotations
@@ -15,32 +15,32 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from labseq_soapy.library import SoapyError, Stream
 from labseq_soapy.messages import Setup, received, send
 from labseq_soapy.output import BLOCK, Output, Samples
-from labseq_soapy.radio import Facts, open_radio, set_up
+from labseq_soapy.soapysdr import SoapyError, Stream, open_radio, set_up
 
 STALL_S: Final = 2.0
-"""A radio that takes no samples for so long is given up."""
+"""A stream that takes no samples for so long is dead."""
 STATUS_S: Final = 0.2
 WRITE_S: Final = 0.1
 MARKER_S: Final = 0.1
 
 
 class CommandReader:
-    """Reads what labseq says, in a thread, and the loops that it names from their files."""
+    """Reads labseq's commands, and the files of the loops that they name, in a thread."""
 
     def __init__(self, pipe: int) -> None:
         self.inbox: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
         self.last_s = time.monotonic()
         self.closed = False
         self._messages = received(pipe)
-        self.setup = Setup.from_message(next(self._messages))
+        self.setup = Setup(**next(self._messages))
         threading.Thread(target=self._listen, daemon=True).start()
 
     def _listen(self) -> None:
@@ -56,27 +56,27 @@ class CommandReader:
 
 
 class StatusWriter:
-    """Tells labseq things, in a thread: a labseq that hangs must not hold up the stream."""
+    """Sends messages to labseq in a thread: a labseq that hangs must not block the stream."""
 
     def __init__(self, pipe: int) -> None:
         self._pipe = pipe
-        self._said: queue.SimpleQueue[Mapping[str, Any] | threading.Event] = queue.SimpleQueue()
-        threading.Thread(target=self._talk, daemon=True).start()
+        self._outbox: queue.SimpleQueue[Mapping[str, Any] | threading.Event] = queue.SimpleQueue()
+        threading.Thread(target=self._write, daemon=True).start()
 
     def post(self, message: Mapping[str, Any]) -> None:
-        """Say something, soon."""
-        self._said.put(message)
+        """Send a message soon."""
+        self._outbox.put(message)
 
     def finish(self) -> None:
-        """Wait until all was said, if anybody listens."""
-        said = threading.Event()
-        self._said.put(said)
-        said.wait(1.0)
+        """Wait until all messages were sent; not long, for labseq may be gone."""
+        sent = threading.Event()
+        self._outbox.put(sent)
+        sent.wait(1.0)
 
-    def _talk(self) -> None:
+    def _write(self) -> None:
         with contextlib.suppress(OSError):
             while True:
-                message = self._said.get()
+                message = self._outbox.get()
                 if isinstance(message, threading.Event):
                     message.set()
                 else:
@@ -84,49 +84,49 @@ class StatusWriter:
 
 
 class Streamer:
-    """Keeps a stream supplied until it is told to end, or labseq is gone.
+    """Keeps a stream supplied until labseq ends it or is gone.
 
     Args:
         stream: The stream, active.
-        setup: How labseq wants it.
+        setup: labseq's first message.
         rate_hz: Samples per second.
-        ear: What labseq says.
-        say: Tells labseq something.
+        commands: labseq's commands.
+        post: Sends a message to labseq.
     """
 
     def __init__(
-        self, stream: Stream, setup: Setup, rate_hz: float, ear: CommandReader, post: Callable[[Any], None]
+        self,
+        stream: Stream,
+        setup: Setup,
+        rate_hz: float,
+        commands: CommandReader,
+        post: Callable[[Mapping[str, Any]], None],
     ) -> None:
-        self._stream, self._setup, self._rate_hz, self._commands, self._say = (
-            stream,
-            setup,
-            rate_hz,
-            ear,
-            post,
-        )
+        self._stream, self._setup, self._rate_hz = stream, setup, rate_hz
+        self._commands, self._post = commands, post
         self._output = Output()
         self._written = self._buffered = self._due = 0
         self._task: int | None = None
         self._settling = False
         self._underflows = self._dark = 0
-        self._told_s = self._looked_s = 0.0
+        self._status_s = self._marker_s = 0.0
         self._alone = self._leaving = False
         self._terminated = False
 
     def fill(self) -> int:
-        """Fill the radio's buffer with silence; how many samples it holds."""
+        """Fill the radio's buffer with silence; returns how many samples it holds."""
         silence, first = self._output.block(), 0
         while self._written < self._rate_hz:
             taken = self._stream.write(silence, 0, 0.0)
             self._written += taken
             first = first or taken
-            if 2 * taken <= first:  # full, but for what it has played meanwhile
+            if 2 * taken <= first:  # full, except for what it has played meanwhile
                 break
         self._buffered = self._written
         return self._buffered
 
     def run(self) -> None:
-        """Stream until the end; the light is then off.
+        """Stream until the end, when the light is off.
 
         Raises:
             SoapyError: The stream is broken.
@@ -135,14 +135,14 @@ class Streamer:
             while not self._commands.inbox.empty():
                 self._execute(self._commands.inbox.get())
             self._write(self._output.block())
-            self._look()
+            self._check()
 
     def terminate(self, *_: object) -> None:
-        """Ramp down and end; a signal's handler."""
+        """Ramp down and end; handler of a signal."""
         self._terminated = True
 
     def _execute(self, message: dict[str, Any]) -> None:
-        if self._leaving:  # too late
+        if self._leaving:  # it comes too late
             return
         match message["do"]:
             case "loop":
@@ -173,31 +173,31 @@ class Streamer:
         if self._settling and self._output.steady:
             self._settling, self._due = False, self._written + self._buffered
         if self._task is not None and not self._settling and self._written >= self._due:
-            self._say({"done": self._task})
+            self._post({"done": self._task})
             self._task = None
 
-    def _look(self) -> None:
+    def _check(self) -> None:
         found = self._stream.underflows()
         if found:
             self._underflows += found
             self._dark += found if self._output.depth > 0.0 else 0
         now_s = time.monotonic()
-        if found or now_s - self._told_s > STATUS_S:
-            self._told_s = now_s
+        if found or now_s - self._status_s > STATUS_S:
+            self._status_s = now_s
             if not self._alone:
-                self._say({"status": {"underflows": self._underflows, "dark": self._dark}})
+                self._post({"status": {"underflows": self._underflows, "dark": self._dark}})
         if self._leaving:
             return
         if self._terminated:
             self._leave("it was asked to end by a signal")
         elif self._alone:
-            self._look_at_marker(now_s)
+            self._check_marker(now_s)
         elif self._commands.closed:
-            self._part("labseq is gone")
+            self._continue_alone("labseq is gone")
         elif not self._setup.hold and now_s - self._commands.last_s > self._setup.max_wait_s:
-            self._part(f"labseq said nothing for {self._setup.max_wait_s:g} s")
+            self._continue_alone(f"labseq sent nothing for {self._setup.max_wait_s:g} s")
 
-    def _part(self, why: str) -> None:
+    def _continue_alone(self, why: str) -> None:
         self._alone = True
         marker = Path(self._setup.marker)
         with contextlib.suppress(OSError):
@@ -206,47 +206,46 @@ class Streamer:
         if not self._setup.hold:
             self._leave(why)
 
-    def _look_at_marker(self, now_s: float) -> None:
-        if now_s - self._looked_s > MARKER_S:
-            self._looked_s = now_s
+    def _check_marker(self, now_s: float) -> None:
+        if now_s - self._marker_s > MARKER_S:
+            self._marker_s = now_s
             if not Path(self._setup.marker).exists():
                 self._leave("")
 
     def _leave(self, why: str) -> None:
         self._leaving = True
         if why:
-            self._say({"ended": why})
+            self._post({"ended": why})
         self._output.ramp(0.0, round(self._setup.ramp_s * self._rate_hz))
         self._begin(0)
 
 
 def repeated(loop: Samples) -> Samples:
-    """A loop as often as makes a block or more, float32 (2, 2 n)."""
+    """A loop repeated to fill a block or more, float32 (2, 2 n)."""
     n = loop.shape[1] // 2
     return np.tile(loop, (1, -(-BLOCK // n)))
 
 
-def stream_to(ear: CommandReader, mouth: StatusWriter) -> None:
+def stream(commands: CommandReader, messages: StatusWriter) -> None:
     """Open the radio, stream, close it.
 
     Raises:
-        SoapyError: It cannot be opened or set up, or the stream broke; labseq was not told.
+        SoapyError: It cannot be opened or set up, or the stream broke.
     """
-    setup = ear.setup
+    setup = commands.setup
     radio = open_radio(setup)
     try:
         facts = set_up(radio, setup)
-        stream = radio.stream(sorted(setup.channels), setup.stream)
-        stream.activate()
-        streamer = Streamer(stream, setup, facts.rate_hz, ear, mouth.post)
+        samples = radio.stream(sorted(setup.channels), setup.stream)
+        samples.activate()
+        streamer = Streamer(samples, setup, facts.rate_hz, commands, messages.post)
         signal.signal(signal.SIGTERM, streamer.terminate)
-        told = Facts(facts.radio, facts.rate_hz, facts.oscillator_hz, facts.gain_db, streamer.fill())
-        mouth.post({"facts": told.as_message()})
+        messages.post({"facts": asdict(replace(facts, buffered=streamer.fill()))})
         try:
             streamer.run()
         finally:
-            with contextlib.suppress(SoapyError):  # what broke it is told
-                stream.close()
+            with contextlib.suppress(SoapyError):  # the first error is reported
+                samples.close()
     finally:
         with contextlib.suppress(SoapyError):
             radio.close()
@@ -257,19 +256,19 @@ def stream_to(ear: CommandReader, mouth: StatusWriter) -> None:
 
 
 def main() -> int:
-    """Run the process; its exit code."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for labseq, which then ramps down
+    """Run the process; returns its exit code."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to labseq, which ramps down
     pipe = os.dup(1)
-    os.dup2(2, 1)  # whatever a radio's module prints goes to the log
-    ear, mouth = CommandReader(0), StatusWriter(pipe)
-    gc.disable()  # nothing here makes cycles
+    os.dup2(2, 1)  # the output of the radio's module goes to the log
+    commands, messages = CommandReader(0), StatusWriter(pipe)
+    gc.disable()  # nothing here creates reference cycles
     try:
-        stream_to(ear, mouth)
+        stream(commands, messages)
     except SoapyError as error:
-        mouth.post({"failed": str(error)})
-        mouth.finish()
+        messages.post({"failed": str(error)})
+        messages.finish()
         return 3
-    mouth.finish()
+    messages.finish()
     return 0
 
 

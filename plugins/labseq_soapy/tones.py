@@ -1,7 +1,7 @@
-"""Which tones are played: local oscillator, length of the loop, phases, and the loop itself.
+"""The tones of the array: local oscillator, length of the loop, phases, and the samples of the loop.
 
-All pure. Tones are complex: at baseband each is ``a exp(i (2 pi f t + phase))``, f from its distance to
-the local oscillator.
+Tones are complex: at baseband each is ``a exp(i (2 pi f t + phase))``, where f is its distance from the
+local oscillator. The functions are pure; :class:`ArrayTones` applies them to both axes of one radio.
 """
 
 from __future__ import annotations
@@ -13,12 +13,21 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.plugin import LimitError, format_quantity
+from labseq.plugin import DeviceError, LimitError, format_quantity
+from labseq_soapy.messages import Facts
+from labseq_soapy.output import Samples
+from labseq_soapy.settings import SoapySettings
 
 Floats = NDArray[np.float64]
+Amplitudes = tuple[Floats, Floats]
+
+RATE_ERROR: Final = 1e-6
+"""How far the sample rate may be from the requested one, as a fraction."""
+TUNING_ERROR: Final = 0.01
+"""How far the local oscillators may be from the requested frequency, as a fraction of the sample rate."""
 
 USABLE: Final = 0.8
-"""Part of the sample rate that tones may span: beyond it the radio's filters cut."""
+"""Part of the sample rate that tones may span: the radio's filters attenuate the rest."""
 
 LONGEST: Final = 1 << 23
 """Longest loop in samples: 128 MiB for both channels."""
@@ -54,10 +63,10 @@ class AxisLoop:
 
 
 def local_oscillator(axes: Sequence[Floats]) -> float:
-    """Frequency whose leakage, and the images of the tones in it, stay farthest from all tones.
+    """Frequency for which its leakage and the tones' images are farthest from all tones.
 
-    Near the middle of the tones. A third of the spacing beside a tone is best on a comb: leakage and images
-    are then a third of the spacing from the nearest tone. Half of it would put each image onto another tone.
+    It is near the middle of the tones. On a comb, a third of the spacing from a tone is best: leakage and
+    images are then a third of the spacing from the nearest tone. At half of it each image would be on a tone.
 
     Args:
         axes: Tones of each axis, in Hz.
@@ -79,7 +88,7 @@ def local_oscillator(axes: Sequence[Floats]) -> float:
 
 
 def clearance(tones_hz: Floats, oscillator_hz: float) -> float:
-    """Distance from any tone of an axis to the leakage or an image of a tone, the least one, in Hz."""
+    """Smallest distance of a tone of an axis from the leakage or an image of a tone, in Hz."""
     spots = np.append(2 * oscillator_hz - tones_hz, oscillator_hz)
     return float(np.abs(spots[:, None] - tones_hz).min())
 
@@ -88,7 +97,7 @@ def check_span(what: str, tones_hz: Floats, oscillator_hz: float, rate_hz: float
     """Refuse tones that are too far from the local oscillator for the sample rate.
 
     Raises:
-        LimitError: With both.
+        LimitError: They are.
     """
     farthest = float(np.abs(tones_hz - oscillator_hz).max())
     limit_hz = USABLE * rate_hz / 2
@@ -106,7 +115,7 @@ def shortest_loop(what: str, offsets_hz: Floats, rate_hz: float, tolerance_hz: f
         what: Name of the device, for the message.
         offsets_hz: Tones of all axes, relative to the local oscillator.
         rate_hz: Samples per second.
-        tolerance_hz: How far a tone may be from the one that was asked for.
+        tolerance_hz: How far a tone may be from its exact frequency.
 
     Returns:
         The length in samples.
@@ -120,7 +129,7 @@ def shortest_loop(what: str, offsets_hz: Floats, rate_hz: float, tolerance_hz: f
     """
     for start in range(1, LONGEST + 1, _CHUNK):
         lengths = np.arange(start, min(start + _CHUNK, LONGEST + 1), dtype=np.float64)
-        for offset_hz in offsets_hz:  # each tone leaves fewer
+        for offset_hz in offsets_hz:  # keep the lengths that suit this tone too
             cycles = offset_hz * lengths / rate_hz
             lengths = lengths[np.abs(cycles - np.rint(cycles)) * rate_hz < tolerance_hz * lengths]
         if len(lengths):
@@ -141,11 +150,10 @@ def axis_loop(offsets_hz: Floats, n_samples: int, rate_hz: float) -> AxisLoop:
 
 
 def low_crest_phases(frequency_hz: Floats) -> Floats:
-    """Phases of equal tones for a low crest factor of their complex sum; always the same for the same tones.
+    """Phases of equal tones for a low crest factor of their complex sum; the same for the same tones.
 
-    They start from Schroeder's (IEEE Trans. Inf. Theory 16, 85, 1970). Then the sum is clipped again and
-    again, and the phases of what remains are taken (van der Ouderaa et al., IEEE Trans. Instrum. Meas. 37,
-    145, 1988).
+    Start from Schroeder's phases (IEEE Trans. Inf. Theory 16, 85, 1970); then repeatedly clip the sum and
+    take the phases of the result (van der Ouderaa et al., IEEE Trans. Instrum. Meas. 37, 145, 1988).
 
     Args:
         frequency_hz: float64 (n_tones,).
@@ -172,14 +180,14 @@ def low_crest_phases(frequency_hz: Floats) -> Floats:
 
 
 def crest_factor(samples: NDArray[np.complex64]) -> float:
-    """Highest magnitude over the r.m.s. one; 0 for silence."""
+    """Ratio of the highest to the r.m.s. magnitude; 0 for silence."""
     size = np.abs(samples)
     rms = float(np.sqrt(np.mean(np.square(size, dtype=np.float64))))
     return float(size.max()) / rms if rms > 0.0 else 0.0
 
 
 def _times_s(frequency_hz: Floats) -> Floats:
-    """When to look for peaks: over a period of a comb, or many beats of other tones."""
+    """Times at which peaks are looked for: one period of a comb, or four beats of other tones."""
     spacings = np.diff(np.sort(frequency_hz))
     is_comb = np.ptp(spacings) < 1e-3 * spacings.min()
     n_beats = 1 if is_comb else 4
@@ -198,3 +206,90 @@ def _mhz(value: float) -> str:
 
 def _hz(value: float) -> str:
     return format_quantity(value, "frequency")
+
+
+class ArrayTones:
+    """Tones, local oscillator and loops of the array.
+
+    Args:
+        name: Name of the device, for messages.
+        settings: Of the driver.
+        shape: (n_rows, n_cols).
+
+    Attributes:
+        tones_hz: Tones of the rows and of the columns.
+        oscillator_hz: Frequency requested for the local oscillators.
+        crest_factor: Of the complex sums of the rows' and the columns' tones, in the last loop.
+        loops: The tones on the grid of the loop; none before :meth:`tune`.
+
+    Raises:
+        LimitError: The tones span more than 80 % of the sample rate, or no loop holds them all.
+    """
+
+    def __init__(self, name: str, settings: SoapySettings, shape: tuple[int, int]) -> None:
+        self._name, self._settings = name, settings
+        n_rows, n_cols = shape
+        self.tones_hz = settings.row_frequency.tones(n_rows), settings.column_frequency.tones(n_cols)
+        chosen = settings.local_oscillator
+        self.oscillator_hz = local_oscillator(self.tones_hz) if chosen is None else chosen
+        self.crest_factor: tuple[float, ...] = ()
+        self.loops: tuple[AxisLoop, ...] = ()
+        self._n_samples(settings.sample_rate, (self.oscillator_hz, self.oscillator_hz))
+
+    def tune(self, facts: Facts) -> None:
+        """Fit the loops to the sample rate and local oscillators that the radio really has.
+
+        Raises:
+            DeviceError: They are not the requested ones.
+            LimitError: No loop holds all tones.
+        """
+        wanted_hz = self._settings.sample_rate
+        if abs(facts.rate_hz - wanted_hz) > RATE_ERROR * wanted_hz:
+            text = f"the radio makes {facts.rate_hz:.10g} samples per second; expected {wanted_hz:.10g}"
+            raise DeviceError(self._name, f"{text}: choose a sample_rate that it has")
+        for found_hz in facts.oscillator_hz:
+            if abs(found_hz - self.oscillator_hz) > TUNING_ERROR * wanted_hz:
+                text = f"the radio tuned its local oscillator to {found_hz:.10g} Hz"
+                raise DeviceError(self._name, f"{text}; expected {self.oscillator_hz:.10g} Hz: see its range")
+        n_samples = self._n_samples(facts.rate_hz, facts.oscillator_hz)
+        self.loops = tuple(
+            axis_loop(tones_hz - oscillator_hz, n_samples, facts.rate_hz)
+            for tones_hz, oscillator_hz in zip(self.tones_hz, facts.oscillator_hz, strict=True)
+        )
+
+    def samples(self, amplitudes: Amplitudes) -> Samples:
+        """One loop of both axes, in the order of their channels, float32 (2, 2 n), I and Q in turn.
+
+        Args:
+            amplitudes: Of the rows (n_rows,) and columns (n_cols,), fractions of full scale.
+
+        Raises:
+            LimitError: Not one amplitude for each tone, a bad one, or their sum exceeds full scale.
+        """
+        made: list[NDArray[np.complex64]] = []
+        for axis, values, loop in zip(("row", "column"), amplitudes, self.loops, strict=True):
+            what, shape = f"{self._name}: shape of the {axis} amplitudes", loop.cycles.shape
+            if values.shape != shape:
+                raise LimitError(what, values.shape, shape)
+            if not (np.isfinite(values).all() and (values >= 0).all()):
+                raise LimitError(f"{self._name}: a {axis} amplitude", "negative or not finite", "0 or more")
+            made.append(loop.samples(values))
+            peak = float(np.abs(made[-1]).max()) * max(1.0, self._settings.max_depth) ** 0.25
+            if peak > 1.0 + 1e-6:
+                hint = "lower the amplitudes, or max_depth, and raise the gain"
+                raise LimitError(
+                    f"{self._name}: peak of the {axis} tones", f"{peak:.3g} of full scale", "1", hint
+                )
+        self.crest_factor = tuple(crest_factor(axis) for axis in made)
+        order = np.argsort([self._settings.row_channel, self._settings.column_channel])
+        return np.stack([made[axis].view(np.float32) for axis in order])
+
+    def _n_samples(self, rate_hz: float, oscillators_hz: Sequence[float]) -> int:
+        offsets_hz: list[Floats] = []
+        for axis, tones_hz, oscillator_hz in zip(
+            ("row", "column"), self.tones_hz, oscillators_hz, strict=True
+        ):
+            check_span(f"{self._name}: {axis} tones", tones_hz, oscillator_hz, rate_hz)
+            offsets_hz.append(tones_hz - oscillator_hz)
+        all_hz = np.unique(np.concatenate(offsets_hz))
+        return shortest_loop(self._name, all_hz, rate_hz, self._settings.tone_tolerance)

@@ -12,7 +12,7 @@ from typing import Any, Final
 
 import numpy as np
 from labseq_genicam.aravis.library import library
-from labseq_soapy.capture import built
+from labseq_soapy_sim import build_module
 from labseq_ttl.counterpart.build import runner
 from labseq_virtual.settings import WorldSettings
 from labseq_virtual.world import World
@@ -31,8 +31,8 @@ REAL_LAB: Final = ("docs/how-to/rehearse.md",)
 """Pages that mean the profile ``lab`` as it is; on all others it is the virtual lab, to be run."""
 
 NEEDED: Final[dict[str, tuple[Callable[[], object], ...]]] = {
-    "docs/how-to/cameras-genicam.md": (library, built, lambda: runner("lines")),
-    "docs/how-to/rehearse.md": (built,),
+    "docs/how-to/cameras-genicam.md": (library, build_module, lambda: runner("lines")),
+    "docs/how-to/rehearse.md": (build_module,),
 }
 """Page -> what loads the libraries of the system that its simulated counterparts need."""
 SHOTS: Final = {

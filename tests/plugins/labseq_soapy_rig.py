@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from labseq_soapy.capture import Ring, built
 from labseq_soapy.settings import SoapySettings
 from labseq_soapy.static_tweezers import SoapyStaticTweezers
+from labseq_soapy_sim import Ring, SimulatedRadio, build_module
 from numpy.typing import NDArray
 
 from labseq import Clock, Context, Simulation, SiteGrid, wait_for
@@ -38,7 +38,7 @@ WAIT_S = 20.0
 
 def need_radio() -> None:
     """Skip without the library, the compiler or the headers."""
-    need_library(built)
+    need_library(build_module)
 
 
 @dataclass
@@ -50,8 +50,8 @@ class Rig:
 
     @property
     def ring(self) -> Ring:
-        radio = self.tweezers.simulated_radio
-        assert radio is not None
+        radio = self.tweezers.radio
+        assert isinstance(radio, SimulatedRadio)
         return radio.ring
 
     def described(self, name: str) -> Any:
@@ -60,7 +60,7 @@ class Rig:
 
 def made(
     grid: SiteGrid = GRID,
-    world: Simulation | None = None,
+    simulation: Simulation | None = None,
     clock: FakeClock | None = None,
     arguments: str = "",
     **settings: Any,
@@ -70,7 +70,7 @@ def made(
     clock = clock or FakeClock()
     chosen = {**SMALL, **settings}
     chosen["device"] += f",{arguments}" if arguments else ""
-    context = Context("static_tweezers", grid, clock=clock, simulation=world)
+    context = Context("static_tweezers", grid, clock=clock, simulation=simulation)
     return Rig(SoapyStaticTweezers(SoapySettings.model_validate(chosen), context), clock)
 
 

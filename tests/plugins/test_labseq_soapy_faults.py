@@ -12,10 +12,10 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from labseq_soapy import library, link
-from labseq_soapy.capture import Fault, Ring
-from labseq_soapy.library import SoapyError, stream_error
+from labseq_soapy import link, soapysdr
+from labseq_soapy.soapysdr import SoapyError
 from labseq_soapy.streamer import Streamer, repeated
+from labseq_soapy_sim import Fault, Ring
 
 from labseq import DeviceError, TransientError
 from labseq.errors import StopRequested
@@ -40,7 +40,10 @@ class TestOpening:
     @pytest.mark.parametrize(
         ("arguments", "text"),
         [
-            ("fault=absent", r"cannot be opened: .*no such radio; `SoapySDRUtil --find` lists what is there"),
+            (
+                "fault=absent",
+                "cannot be opened: .*no such radio; `SoapySDRUtil --find` lists the radios",
+            ),
             ("channels=1", r"it has 1 channel\(s\) that transmit; expected 2, one for each AOD"),
             (
                 "coerce_rate=1000000",
@@ -63,12 +66,13 @@ class TestOpening:
         with pytest.raises(DeviceError, match="a gain of 70 dB; channel 1 has 0 to 60 dB"):
             made(column_gain=70.0).tweezers.open()
 
-    def test_without_the_library_tells_how_to_install_it(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        rig = made()
-        monkeypatch.setattr(library, "_NAMES", {"linux": ("libNoSuchRadio.so",)})
-        library.library.cache_clear()
-        with pytest.raises(DeviceError, match=r"the library SoapySDR cannot be loaded .*libsoapysdr0.8"):
-            rig.tweezers.open()
+    def test_without_the_library_the_error_says_how_to_install_it(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(soapysdr, "_NAMES", {"linux": ("libNoSuchRadio.so",)})
+        soapysdr.library.cache_clear()
+        with pytest.raises(SoapyError, match=r"the library SoapySDR cannot be loaded .*libsoapysdr0.8"):
+            soapysdr.library()
 
     def test_without_a_compiler_tells_what_to_install(
         self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
@@ -235,40 +239,35 @@ class Sink:
 
 
 def test_a_command_that_comes_while_the_light_is_ramped_down_does_not_turn_it_on() -> None:
-    sink, heard = Sink(), queue.SimpleQueue[dict[str, Any]]()
+    sink, inbox = Sink(), queue.SimpleQueue[dict[str, Any]]()
     loop = repeated(np.ones((2, 160), np.float32))
-    heard.put({"do": "loop", "id": 1, "loop": loop, "fade_s": 0.0})
-    heard.put({"do": "ramp", "id": 2, "depth": 1.0, "duration_s": 0.0})
-    heard.put({"do": "end"})
-    heard.put({"do": "ramp", "id": 3, "depth": 1.0, "duration_s": 0.0})
-    ear = SimpleNamespace(heard=heard, closed=False, last_s=float("inf"))
+    inbox.put({"do": "loop", "id": 1, "loop": loop, "fade_s": 0.0})
+    inbox.put({"do": "ramp", "id": 2, "depth": 1.0, "duration_s": 0.0})
+    inbox.put({"do": "end"})
+    inbox.put({"do": "ramp", "id": 3, "depth": 1.0, "duration_s": 0.0})
+    commands = SimpleNamespace(inbox=inbox, closed=False, last_s=float("inf"))
     setup = SimpleNamespace(ramp_s=0.1, hold=False, max_wait_s=5.0)
-    said: list[Any] = []
-    streamer = Streamer(cast("Any", sink), cast("Any", setup), 1.2e6, cast("Any", ear), said.append)
+    posted: list[Any] = []
+    streamer = Streamer(cast("Any", sink), cast("Any", setup), 1.2e6, cast("Any", commands), posted.append)
     streamer.run()
     assert not sink.latest[:, -2:].any()
-    assert {"done": 3} not in said
+    assert {"done": 3} not in posted
 
 
 def test_a_loop_that_cannot_be_read_ends_the_stream_by_a_ramp() -> None:
     with opened() as rig:
         rig.tweezers.start()
         assert rig.tweezers._link is not None
-        rig.tweezers._link._say({"do": "loop", "id": 99, "file": "none.npy", "fade_s": 0.0})
+        rig.tweezers._link._send({"do": "loop", "id": 99, "file": "none.npy", "fade_s": 0.0})
         until(raised(DeviceError, rig.tweezers.check_interlocks))
         with pytest.raises(DeviceError, match=r"a loop cannot be read: .*none\.npy.*; the array is dark"):
             rig.tweezers.check_interlocks()
 
 
-def test_errors_of_streams_are_told_in_words() -> None:
-    assert stream_error(-7) == "it ran out of samples (-7)"
-    assert stream_error(-99) == "an unknown error (-99)"
-
-
 def test_a_radio_that_is_not_there_is_refused_by_the_library() -> None:
     made()
     with pytest.raises(SoapyError, match="no match"):
-        library.Radio("driver=capture,serial=none")
+        soapysdr.Radio("driver=capture,serial=none")
 
 
 def assert_ramped_down(folder: Path) -> None:

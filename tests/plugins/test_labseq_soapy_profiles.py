@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from labseq_soapy import labseq_register
-from labseq_soapy.capture import build
+from labseq_soapy_sim import build
 
 import labseq
 from labseq.errors import LabseqError
@@ -83,7 +83,9 @@ def test_a_simulated_radio_gives_the_same_atoms_as_the_virtual_tweezers(tmp_path
         ("{use: soapy, device: 'driver=none'}", 3, "'driver=none' cannot be opened"),
     ],
 )
-def test_mistakes_are_told_with_their_place(tmp_path: Path, static: str, exit_code: int, text: str) -> None:
+def test_mistakes_are_reported_with_their_place(
+    tmp_path: Path, static: str, exit_code: int, text: str
+) -> None:
     need_radio()
     with pytest.raises(LabseqError) as caught:
         run(tmp_path, static)

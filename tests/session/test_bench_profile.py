@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from labseq_genicam.aravis.library import library
-from labseq_soapy.capture import built
+from labseq_soapy_sim import build_module
 from labseq_ttl.counterpart.build import runner
 
 from labseq import Run, Session
@@ -20,7 +20,7 @@ SEQUENCE = Path(__file__).parents[2] / "sequences" / "compact_225.yaml"
 
 @pytest.fixture(autouse=True, scope="module")
 def installed() -> None:
-    for load in (library, built, lambda: runner("lines")):
+    for load in (library, build_module, lambda: runner("lines")):
         need_library(load)
 
 

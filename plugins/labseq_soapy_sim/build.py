@@ -1,4 +1,4 @@
-"""Compiling the capture module, once for each version of it."""
+"""Compiling the SoapySDR module of the simulated radio, once for each version of its source."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ import tempfile
 from pathlib import Path
 from typing import Final
 
-from labseq.plugin import cache_root
-from labseq_soapy.library import SoapyError, library
+from labseq.plugin import DeviceError, cache_root
 
 SOURCE: Final = Path(__file__).with_name("capture.cpp")
 NEEDS: Final = "install them with `apt-get install g++ libsoapysdr-dev`"
@@ -21,30 +20,33 @@ _INCLUDES: Final = ("/usr/include", "/usr/local/include", "/opt/homebrew/include
 
 
 def can_build() -> bool:
-    """Whether a compiler and the headers are there, at a glance."""
+    """Whether a compiler and the headers of SoapySDR are installed; a quick check."""
     return _compiler() is not None and _include() is not None
 
 
-def built() -> Path:
-    """Folder that holds the compiled module, and nothing else; compiled into labseq's cache if need be.
+def build_module(name: str = "static_tweezers") -> Path:
+    """Compile the module into labseq's cache, unless it is there; returns its folder.
+
+    Args:
+        name: Name of the device, for messages.
 
     Raises:
-        SoapyError: The library, the compiler or the headers are missing, or it does not compile.
+        DeviceError: The compiler or the headers are missing, or it does not compile.
     """
-    library()
     source = SOURCE.read_bytes()
     digest = hashlib.sha256(source + platform.platform().encode()).hexdigest()[:16]
     folder = cache_root() / "soapy" / digest
     if not folder.exists():
-        _compile(folder)
+        _compile(name, folder)
     return folder
 
 
-def _compile(folder: Path) -> None:
+def _compile(name: str, folder: Path) -> None:
     compiler, include = _compiler(), _include()
     if compiler is None or include is None:
         missing = "no C++ compiler" if compiler is None else "no headers of SoapySDR"
-        raise SoapyError(f"the simulated radio must be compiled, but there are {missing} here; {NEEDS}")
+        text = f"the simulated radio must be compiled, but there are {missing} here; {NEEDS}"
+        raise DeviceError(name, text)
     folder.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=folder.parent) as work:
         part = Path(work) / folder.name
@@ -54,7 +56,8 @@ def _compile(folder: Path) -> None:
         command = [compiler, *flags, "-o", str(output), str(SOURCE), "-lSoapySDR"]
         done = subprocess.run(command, capture_output=True, text=True, errors="replace", check=False)  # noqa: S603
         if done.returncode != 0:
-            raise SoapyError(f"the simulated radio does not compile: {_first_error(done.stderr)}; {NEEDS}")
+            text = f"the simulated radio does not compile: {_first_error(done.stderr)}; {NEEDS}"
+            raise DeviceError(name, text)
         try:
             part.rename(folder)
         except OSError:  # another process was first

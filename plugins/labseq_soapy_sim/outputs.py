@@ -1,4 +1,4 @@
-"""What the simulated radio plays, for a simulated world that listens."""
+"""The amplitudes of the tones that the simulated radio plays, for a simulation that receives them."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.plugin import TweezerAmplitudes
-from labseq_soapy.capture.ring import Ring
+from labseq_soapy_sim.ring import Ring
 
 DECIMALS: Final = 6
-"""To which amplitudes are heard: far above the rounding of float32, far below what an atom feels."""
+"""Decimals of the amplitudes: far above the rounding of float32, far below what matters to an atom."""
 
 Floats = NDArray[np.float64]
 
@@ -20,11 +20,12 @@ Floats = NDArray[np.float64]
 class CapturedOutputs:
     """The two connectors of a simulated radio.
 
-    Implements ``labseq.ToneSource``. It looks for the tones where they should be: what is played at
-    another frequency, because the local oscillator or the sample rate is wrong, makes no tweezers.
+    Implements ``labseq.plugin.ToneSource``. Amplitudes are measured at the frequencies where the tones
+    should be: a signal at another frequency, because the local oscillator or the sample rate is wrong,
+    makes no tweezers.
 
     Args:
-        ring: What the radio was sent.
+        ring: The samples that the radio received.
         tones_hz: Tones of the rows and of the columns.
         channels: Channel of the rows and of the columns.
     """
@@ -32,30 +33,30 @@ class CapturedOutputs:
     def __init__(self, ring: Ring, tones_hz: tuple[Floats, Floats], channels: tuple[int, int]) -> None:
         self._ring = ring
         self._axes = tuple(zip(tones_hz, channels, strict=True))
-        self._heard: list[TweezerAmplitudes] = []
+        self._changes: list[TweezerAmplitudes] = []
         self._last = tuple(np.zeros(len(tones)) for tones in tones_hz)
         self._underflows = int(ring["underflows"])
         self._filters: dict[tuple[int, float, float], NDArray[np.complex128]] = {}
 
-    def look(self) -> None:
-        """Note the amplitudes if they have changed; the driver calls it whenever it has changed them."""
+    def measure(self) -> None:
+        """Record the amplitudes if they have changed; an underflow is recorded as darkness in between."""
         underflows = int(self._ring["underflows"])
         if underflows != self._underflows:
             self._underflows = underflows
-            self._note(tuple(np.zeros_like(values) for values in self._last))
-        self._note(self._now())
+            self._record(tuple(np.zeros_like(values) for values in self._last))
+        self._record(self._now())
 
-    def played(self, until_s: float) -> Sequence[TweezerAmplitudes]:  # noqa: ARG002 - they lag behind nothing
-        """What the tones' amplitudes were since the last call, in time's order; nothing if unchanged."""
-        self.look()
-        heard, self._heard = self._heard, []
-        return heard
+    def played(self, until_s: float) -> Sequence[TweezerAmplitudes]:  # noqa: ARG002 - all changes are in the past
+        """The amplitudes since the last call, in time's order; empty if unchanged."""
+        self.measure()
+        changes, self._changes = self._changes, []
+        return changes
 
-    def _note(self, amplitudes: tuple[Floats, ...]) -> None:
+    def _record(self, amplitudes: tuple[Floats, ...]) -> None:
         if all(np.array_equal(now, last) for now, last in zip(amplitudes, self._last, strict=True)):
             return
         self._last = amplitudes
-        self._heard.append(TweezerAmplitudes(*amplitudes))
+        self._changes.append(TweezerAmplitudes(*amplitudes))
 
     def _now(self) -> tuple[Floats, ...]:
         if not self._ring.is_playing:
@@ -72,12 +73,12 @@ class CapturedOutputs:
         samples = self._ring.latest(n)[channel]
         if len(samples) < n:
             return np.zeros(len(tones_hz))
-        heard = np.einsum("ij,j", self._filters[key], samples)  # BLAS would wake its threads for this
-        return np.round(np.abs(heard), DECIMALS)
+        found = np.einsum("ij,j", self._filters[key], samples)  # BLAS would wake its threads for this
+        return np.round(np.abs(found), DECIMALS)
 
 
 def _least_squares(offsets_hz: Floats, n: int, rate_hz: float) -> NDArray[np.complex128]:
-    """What samples are multiplied by to find the amplitudes of tones in them, complex128 (n_tones, n)."""
+    """Matrix that gives the tones' complex amplitudes from samples, complex128 (n_tones, n)."""
     waves = np.exp(-2j * np.pi * np.outer(offsets_hz, np.arange(n) / rate_hz))
     overlaps = np.einsum("it,jt", waves, waves.conj())
     return np.einsum("ij,jt", np.linalg.inv(overlaps), waves)

@@ -1,4 +1,4 @@
-"""The C interface of SoapySDR 0.8, as far as it is needed to transmit; loaded on first use."""
+"""A radio that transmits, through the C interface of SoapySDR 0.8 (loaded on first use)."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
+
+from labseq_soapy.messages import Facts, Setup
 
 TX: Final = 0
 FORMAT: Final = b"CF32"
@@ -48,7 +50,7 @@ _NAMES: Final = {
 
 
 class SoapyError(Exception):
-    """The library, the radio's module or the radio refused something; the text says what."""
+    """The library, the radio's module or the radio refused something; the text names it."""
 
 
 class _Range(ctypes.Structure):
@@ -108,7 +110,7 @@ def library() -> Any:
     """The library, its functions with their signatures.
 
     Raises:
-        SoapyError: It cannot be found; says how to install it.
+        SoapyError: It cannot be found; the text says how to install it.
     """
     reason = ""
     for name in _NAMES.get(sys.platform, _NAMES["linux"]):
@@ -126,7 +128,7 @@ def library() -> Any:
 
 
 class Radio:
-    """One open device; all its calls come from one thread.
+    """One open radio; all calls come from one thread.
 
     Args:
         arguments: What opens it, for example "driver=uhd,serial=30AD123".
@@ -139,14 +141,14 @@ class Radio:
         self._library = library()
         self._device = self._call("makeStrArgs", arguments.encode())
         if not self._device:
-            raise SoapyError(f"no device answers to '{arguments}'")
+            raise SoapyError(f"there is no radio '{arguments}'")
 
     def identify(self) -> dict[str, str]:
-        """Driver, hardware, and what else the device tells of itself."""
+        """Driver, hardware, serial number and the like."""
         info = self._call("getHardwareInfo", self._device)
-        told = {info.keys[i].decode(): info.vals[i].decode() for i in range(info.size)}
+        details = {info.keys[i].decode(): info.vals[i].decode() for i in range(info.size)}
         self._library.SoapySDRKwargs_clear(byref(info))
-        return {"driver": self._text("getDriverKey"), "hardware": self._text("getHardwareKey"), **told}
+        return {"driver": self._text("getDriverKey"), "hardware": self._text("getHardwareKey"), **details}
 
     @property
     def n_channels(self) -> int:
@@ -191,7 +193,7 @@ class Radio:
         return Stream(self._library, self._device, handle, len(channels))
 
     def close(self) -> None:
-        """Let the device go."""
+        """Close the radio."""
         self._call("unmake", self._device)
 
     def _text(self, getter: str) -> str:
@@ -218,15 +220,15 @@ class Stream:
         call(self._library, "activateStream", self._device, self._handle, 0, 0, 0)
 
     def write(self, samples: NDArray[np.float32], start: int, timeout_s: float) -> int:
-        """Hand over samples.
+        """Write samples to the stream.
 
         Args:
             samples: float32 (n_channels, 2 n), I and Q in turn; each row in one piece.
-            start: Index of the first sample to hand over.
+            start: Index of the first sample to write.
             timeout_s: How long to wait for room.
 
         Returns:
-            How many samples were taken; 0 if there was no room in time.
+            Number of samples that the radio took; 0 if there was no room in time.
 
         Raises:
             SoapyError: The stream is broken.
@@ -249,7 +251,7 @@ class Stream:
         raise SoapyError(f"writing to the stream: {stream_error(n_taken)}")
 
     def underflows(self) -> int:
-        """How often the device ran out of samples since the last call, as far as it tells.
+        """How often the radio reported since the last call that it ran out of samples.
 
         Raises:
             SoapyError: The stream is broken.
@@ -270,29 +272,81 @@ class Stream:
         return count
 
     def close(self) -> None:
-        """Stop playing and give the stream back."""
+        """Stop playing and close the stream."""
         call(self._library, "deactivateStream", self._device, self._handle, 0, 0)
         call(self._library, "closeStream", self._device, self._handle)
 
 
 def call(found: Any, name: str, *arguments: Any) -> Any:
-    """Call a function of a device.
+    """Call a function of a radio.
 
     Raises:
-        SoapyError: It failed, with what the library says of it.
+        SoapyError: It failed, with the library's message.
     """
     result = getattr(found, f"SoapySDRDevice_{name}")(*arguments)
     if found.SoapySDRDevice_lastStatus() != 0:
         text = (found.SoapySDRDevice_lastError() or b"").decode(errors="replace")
-        raise SoapyError(f"{name}: {text or 'it failed and does not say why'}")
+        raise SoapyError(f"{name}: {text or 'it failed without a message'}")
     return result
 
 
 def stream_error(code: int) -> str:
-    """What a negative result of a stream means.
+    """The meaning of a negative result of a stream.
 
     Example:
         >>> stream_error(-7)
         'it ran out of samples (-7)'
     """
     return f"{STREAM_ERRORS.get(code, 'an unknown error')} ({code})"
+
+
+def open_radio(setup: Setup) -> Radio:
+    """Open the radio.
+
+    Raises:
+        SoapyError: There is none, another program has it, or it has too few channels.
+    """
+    try:
+        radio = Radio(setup.device)
+    except SoapyError as error:
+        text = f"'{setup.device}' cannot be opened: {error}"
+        hint = "`SoapySDRUtil --find` lists the radios that are connected"
+        raise SoapyError(text if "library" in str(error) else f"{text}; {hint}") from error
+    needed = max(setup.channels) + 1
+    if radio.n_channels < needed:
+        n_channels = radio.n_channels
+        radio.close()
+        text = f"it has {n_channels} channel(s) that transmit; expected {needed}, one for each AOD"
+        raise SoapyError(text)
+    return radio
+
+
+def set_up(radio: Radio, setup: Setup) -> Facts:
+    """Set up both channels, and read the values back.
+
+    Raises:
+        SoapyError: The radio refuses something, or its channels have different rates.
+    """
+    if setup.clock_source:
+        radio.set_clock_source(setup.clock_source)
+    for channel, gain_db in zip(setup.channels, setup.gain_db, strict=True):
+        radio.set("SampleRate", channel, setup.rate_hz)
+        if setup.bandwidth_hz is not None:
+            radio.set("Bandwidth", channel, setup.bandwidth_hz)
+        if setup.antenna:
+            radio.set("Antenna", channel, setup.antenna)
+        radio.set("Frequency", channel, setup.oscillator_hz)
+        lowest, highest = radio.gain_range(channel)
+        if gain_db is not None and not lowest <= gain_db <= highest:
+            text = f"a gain of {gain_db:g} dB; channel {channel} has {lowest:g} to {highest:g} dB"
+            raise SoapyError(text)
+        radio.set("Gain", channel, lowest if gain_db is None else gain_db)
+    rates = [radio.get("SampleRate", channel) for channel in setup.channels]
+    if rates[0] != rates[1]:
+        raise SoapyError(f"its channels have different sample rates: {rates[0]:.10g} and {rates[1]:.10g} Hz")
+    return Facts(
+        radio=radio.identify(),
+        rate_hz=rates[0],
+        oscillator_hz=[radio.get("Frequency", channel) for channel in setup.channels],
+        gain_db=[radio.get("Gain", channel) for channel in setup.channels],
+    )

@@ -1,4 +1,4 @@
-"""What the capture module was sent, as it stands in the file that it shares."""
+"""The samples that the simulated radio received, in the file that it shares."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _HEADER: Final = np.dtype(
 
 
 class Fault(enum.IntFlag):
-    """What goes wrong with the radio while it is set; of the first, once."""
+    """Faults of the radio while they are set; the underflow happens once."""
 
     NONE = 0
     UNDERFLOW = 1
@@ -37,7 +37,7 @@ class Ring:
     """The latest samples of both channels.
 
     Args:
-        folder: Folder of the capture module's files.
+        folder: Folder of the radio's files.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -45,7 +45,7 @@ class Ring:
         memory = np.memmap(self._path, np.uint8, "r+")
         self._header: Any = memory[: _HEADER.itemsize].view(_HEADER)[0]
         if self._header["magic"] != MAGIC:
-            raise ValueError(f"{self._path} is not of this version of the capture module")
+            raise ValueError(f"{self._path} was written by another version of labseq_soapy_sim")
         samples = memory[_HEADER.itemsize :].view(np.complex64)
         self._samples: NDArray[np.complex64] = samples.reshape(CHANNELS, int(self._header["ring"]))
 
@@ -54,12 +54,12 @@ class Ring:
         return self._header[name]
 
     def set_fault(self, fault: Fault) -> None:
-        """Let something go wrong from now on."""
+        """Set the radio's faults from now on."""
         self._header["fault"] = int(fault)
 
     @property
     def is_playing(self) -> bool:
-        """Whether anything comes out: somebody has the radio open, and its buffer has not run dry."""
+        """Whether the radio plays: a process has it open, and its buffer has not run dry."""
         header = self._header
         if not header["is_active"] or not self._is_held():
             return False
@@ -67,13 +67,13 @@ class Ring:
         return bool(late_s <= header["max_wait_s"])
 
     def latest(self, n: int) -> NDArray[np.complex64]:
-        """The latest samples that it was sent, complex64 (2, n); fewer if there were fewer."""
+        """The latest samples that it received, complex64 (2, n); fewer if there were fewer."""
         size = self._samples.shape[1]
         while True:
             end = int(self._header["sent"])
             places = np.arange(max(0, end - n), end) % size
             found = self._samples[:, places]
-            if int(self._header["sent"]) - end < size - n - (1 << 16):  # not written over meanwhile
+            if int(self._header["sent"]) - end < size - n - (1 << 16):  # not overwritten meanwhile
                 return found
 
     def _is_held(self) -> bool:

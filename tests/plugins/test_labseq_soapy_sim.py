@@ -1,4 +1,4 @@
-"""What the simulated radio plays, as the simulated world hears it."""
+"""The amplitudes that the simulated radio plays, as the simulation receives them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import cast
 
 import numpy as np
 import pytest
-from labseq_soapy.capture import Fault
+from labseq_soapy_sim import Fault
 from labseq_virtual.settings import WorldSettings
 from labseq_virtual.world import World
 
@@ -22,8 +22,8 @@ from .labseq_soapy_rig import GRID, Rig, opened, until
 ROWS, COLUMNS = np.array([0.1, 0.2, 0.15]), np.array([0.1, 0.05, 0.2, 0.1])
 
 
-class ListeningWorld(RecordingSimulation):
-    """Keeps what it hears."""
+class ReceivingSimulation(RecordingSimulation):
+    """Keeps the outputs that are connected to it."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -36,53 +36,53 @@ class ListeningWorld(RecordingSimulation):
         assert role == "static_tweezers"
         self.source = cast("ToneSource", source)
 
-    def hears(self) -> list[TweezerAmplitudes]:
+    def changes(self) -> list[TweezerAmplitudes]:
         assert self.source is not None
         return list(self.source.played(0.0))
 
 
-def depths(heard: list[TweezerAmplitudes]) -> list[float]:
+def depths(found: list[TweezerAmplitudes]) -> list[float]:
     """Depth of the first tweezer over that with the amplitudes of ROWS and COLUMNS."""
     nominal = (ROWS[0] * COLUMNS[0]) ** 2
-    return [float((one.row[0] * one.column[0]) ** 2 / nominal) for one in heard]
+    return [float((one.row[0] * one.column[0]) ** 2 / nominal) for one in found]
 
 
-def test_it_hears_each_change_of_the_amplitudes_once() -> None:
-    world = ListeningWorld()
-    with opened(world=world) as rig:
-        assert world.hears() == []
+def test_each_change_of_the_amplitudes_is_reported_once() -> None:
+    simulation = ReceivingSimulation()
+    with opened(simulation=simulation) as rig:
+        assert simulation.changes() == []
         rig.tweezers.load((ROWS, COLUMNS))
-        assert world.hears() == []
+        assert simulation.changes() == []
         rig.tweezers.start()
-        (heard,) = world.hears()
-        assert heard.row == pytest.approx(ROWS, abs=1e-6)
-        assert heard.column == pytest.approx(COLUMNS, abs=1e-6)
-        assert world.hears() == []
+        (found,) = simulation.changes()
+        assert found.row == pytest.approx(ROWS, abs=1e-6)
+        assert found.column == pytest.approx(COLUMNS, abs=1e-6)
+        assert simulation.changes() == []
         rig.tweezers.load((ROWS / 2, COLUMNS))
-        assert world.hears()[0].row == pytest.approx(ROWS / 2, abs=1e-6)
+        assert simulation.changes()[0].row == pytest.approx(ROWS / 2, abs=1e-6)
 
 
-def test_it_hears_a_dip_that_was_over_before_it_listened() -> None:
-    world = ListeningWorld()
-    with opened(world=world) as rig:
+def test_a_dip_that_was_over_before_the_simulation_asks_is_reported() -> None:
+    simulation = ReceivingSimulation()
+    with opened(simulation=simulation) as rig:
         rig.tweezers.load((ROWS, COLUMNS))
         rig.tweezers.start()
         rig.tweezers.ramp(0.25, 0.001)
         rig.tweezers.ramp(1.0, 0.001)
-        assert depths(world.hears()) == pytest.approx([1.0, 0.25, 1.0], abs=1e-4)
+        assert depths(simulation.changes()) == pytest.approx([1.0, 0.25, 1.0], abs=1e-4)
 
 
-def test_equal_runs_are_heard_equal_to_the_last_digit() -> None:
-    heard: list[list[tuple[bytes, bytes]]] = []
+def test_equal_runs_are_equal_to_the_last_digit() -> None:
+    found: list[list[tuple[bytes, bytes]]] = []
     for _ in range(2):
-        world = ListeningWorld()
-        with opened(world=world) as rig:
+        simulation = ReceivingSimulation()
+        with opened(simulation=simulation) as rig:
             rig.tweezers.start()
             for depth in (0.3, 0.7, 1.0):
                 rig.tweezers.ramp(depth, 0.001)
-            heard.append([(one.row.tobytes(), one.column.tobytes()) for one in world.hears()])
-    assert heard[0] == heard[1]
-    assert len(heard[0]) == 4
+            found.append([(one.row.tobytes(), one.column.tobytes()) for one in simulation.changes()])
+    assert found[0] == found[1]
+    assert len(found[0]) == 4
 
 
 def kill(rig: Rig) -> None:
@@ -104,39 +104,39 @@ def tune_away(rig: Rig) -> None:
     ],
     ids=["the process is killed", "rows mute", "columns mute", "oscillator off"],
 )
-def test_it_hears_no_tweezers_from_a_radio_that_fails(fail: Callable[[Rig], None]) -> None:
-    world = ListeningWorld()
-    with opened(world=world) as rig:
+def test_a_radio_that_fails_makes_no_tweezers(fail: Callable[[Rig], None]) -> None:
+    simulation = ReceivingSimulation()
+    with opened(simulation=simulation) as rig:
         rig.tweezers.start()
-        assert depths(world.hears())[0] > 0.0
+        assert depths(simulation.changes())[0] > 0.0
         fail(rig)
 
         def is_dark() -> bool:
-            heard = world.hears()
-            return bool(heard) and (heard[-1].row.max() < 0.01 or heard[-1].column.max() < 0.01)
+            found = simulation.changes()
+            return bool(found) and (found[-1].row.max() < 0.01 or found[-1].column.max() < 0.01)
 
         until(is_dark)
 
 
-def test_it_hears_the_dark_moment_of_an_underflow_and_then_the_light_again() -> None:
-    world = ListeningWorld()
-    with opened(world=world) as rig:
+def test_an_underflow_is_a_dark_moment_and_then_light_again() -> None:
+    simulation = ReceivingSimulation()
+    with opened(simulation=simulation) as rig:
         rig.tweezers.start()
-        before = world.hears()[-1]
+        before = simulation.changes()[-1]
         rig.ring.set_fault(Fault.UNDERFLOW)
         until(lambda: int(rig.ring["underflows"]) == 1)
-        dark, light = world.hears()
+        dark, light = simulation.changes()
         assert not dark.row.any()
         assert np.array_equal(light.row, before.row)
 
 
-def test_a_ramp_on_a_dead_stream_is_no_light_for_the_world() -> None:
-    world = ListeningWorld()
-    with opened(world=world) as rig:
+def test_a_ramp_on_a_dead_stream_is_no_light() -> None:
+    simulation = ReceivingSimulation()
+    with opened(simulation=simulation) as rig:
         kill(rig)
         with pytest.raises(DeviceError):
             rig.tweezers.start()
-        assert world.hears() == []
+        assert simulation.changes() == []
 
 
 class Lab:
@@ -163,14 +163,14 @@ class Lab:
 class TestAtoms:
     def test_are_loaded_only_where_the_radio_makes_tweezers(self) -> None:
         lab = Lab()
-        with opened(world=lab.world, clock=lab.clock) as rig:
+        with opened(simulation=lab.world, clock=lab.clock) as rig:
             rig.tweezers.load((np.array([1.0, 0.0, 1.0]) / 3, np.full(4, 1 / 4)))
             lab.load(rig)
             assert lab.world.truth().any(axis=1).tolist() == [True, False, True]
 
     def test_stay_in_a_ramp_that_holds_them_and_are_lost_in_one_that_does_not(self) -> None:
         lab = Lab()
-        with opened(world=lab.world, clock=lab.clock) as rig:
+        with opened(simulation=lab.world, clock=lab.clock) as rig:
             lab.load(rig)
             rig.tweezers.ramp(0.5, 0.001)
             assert lab.n_atoms == GRID.n_rows * GRID.n_cols
@@ -182,14 +182,14 @@ class TestAtoms:
 
     def test_are_lost_when_the_streaming_process_is_killed(self) -> None:
         lab = Lab()
-        with opened(world=lab.world, clock=lab.clock) as rig:
+        with opened(simulation=lab.world, clock=lab.clock) as rig:
             lab.load(rig)
             kill(rig)
             assert lab.n_atoms == 0
 
     def test_are_lost_in_an_underflow_which_asks_for_the_shot_again(self) -> None:
         lab = Lab()
-        with opened(world=lab.world, clock=lab.clock) as rig:
+        with opened(simulation=lab.world, clock=lab.clock) as rig:
             lab.load(rig)
             rig.ring.set_fault(Fault.UNDERFLOW)
             until(lambda: rig.described("underflows") == 1)
@@ -204,7 +204,7 @@ class TestAtoms:
         runs: list[bytes] = []
         for _ in range(2):
             lab = Lab(loading=0.6, depth_disorder=0.3, lifetime=1.0)
-            with opened(world=lab.world, clock=lab.clock) as rig:
+            with opened(simulation=lab.world, clock=lab.clock) as rig:
                 lab.load(rig)
                 rig.tweezers.ramp(0.3, 0.002)
                 runs.append(lab.world.truth().tobytes())

@@ -1,0 +1,131 @@
+"""The radio that a profile names, and a streaming process that an earlier labseq left with it."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+import threading
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq.plugin import Clock, Context, DeviceError, Process, state_root, wait_for
+from labseq_soapy.settings import SoapySettings
+
+END_S: Final = 10.0
+"""How long a process that was left behind may take to ramp down and close its radio."""
+
+
+class RadioAccess(Protocol):
+    """How the streaming process gets to a radio."""
+
+    def warm(self) -> None:
+        """Do what takes long before the first shot."""
+        ...
+
+    def connect(self) -> tuple[str, Mapping[str, str], Path]:
+        """Make the radio available.
+
+        Returns:
+            The arguments that open it, the environment of the streaming process, and a folder for logs.
+        """
+        ...
+
+    def started(self, tones_hz: tuple[NDArray[np.float64], NDArray[np.float64]]) -> None:
+        """The radio streams; its amplitudes are those of these tones of rows and columns."""
+        ...
+
+    def changed(self) -> None:
+        """The amplitudes of the tones have changed."""
+        ...
+
+    def disconnect(self) -> None:
+        """The radio was closed; no effect if it is not connected."""
+        ...
+
+
+class RealRadio:
+    """A radio that is connected to the computer.
+
+    Args:
+        device: Arguments that open it.
+    """
+
+    def __init__(self, device: str) -> None:
+        self._device = device
+
+    def warm(self) -> None:
+        """Nothing to do."""
+
+    def connect(self) -> tuple[str, Mapping[str, str], Path]:
+        """The radio is always available."""
+        return self._device, os.environ, state_folder()
+
+    def started(self, tones_hz: tuple[NDArray[np.float64], NDArray[np.float64]]) -> None:
+        """Nothing to do."""
+
+    def changed(self) -> None:
+        """Nothing to do."""
+
+    def disconnect(self) -> None:
+        """Nothing to do."""
+
+
+def choose_radio(name: str, settings: SoapySettings, context: Context) -> RadioAccess:
+    """The radio that the setting ``device`` names."""
+    if not settings.is_simulated:
+        return RealRadio(settings.device)
+    from labseq_soapy_sim import SimulatedRadio
+
+    channels = settings.row_channel, settings.column_channel
+    return SimulatedRadio(name, settings.device, channels, context.simulation)
+
+
+def state_folder() -> Path:
+    """Folder of markers and logs, in the user's state folder if there is one."""
+    root = state_root()
+    with suppress(OSError):
+        if root is not None:
+            folder = root / "soapy"
+            folder.mkdir(parents=True, exist_ok=True)
+            return folder
+    return Path(tempfile.gettempdir())
+
+
+def marker_of(device: str) -> Path:
+    """File for the number of a process that runs this radio without labseq; deleting it ends the process."""
+    return state_folder() / f"soapy-{hashlib.sha256(device.encode()).hexdigest()[:16]}.alone"
+
+
+def end_stale_process(name: str, marker: Path, clock: Clock) -> None:
+    """End the process that an earlier labseq left behind with this radio, if there is one; it ramps down.
+
+    Args:
+        name: Name of the device, for the message.
+        marker: See :func:`marker_of`.
+        clock: The session's clock.
+
+    Raises:
+        DeviceError: It does not end.
+    """
+    try:
+        number = int(marker.read_text("ascii"))
+        marker.unlink()
+    except (OSError, ValueError):
+        return
+    process = Process(number, 0.0, Process.current().host)
+
+    def poll(longest_s: float) -> bool | None:
+        if not process.is_running:
+            return True
+        threading.Event().wait(longest_s)
+        return None
+
+    if not wait_for(poll, END_S, clock):
+        text = f"process {number}, left behind with this radio, does not end within {END_S:g} s"
+        raise DeviceError(name, f"{text}; end it yourself")

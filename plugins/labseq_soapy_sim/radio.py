@@ -1,0 +1,138 @@
+"""``device: simulated``: the driver streams to a radio that exists only in software."""
+
+from __future__ import annotations
+
+import math
+import os
+import shutil
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq.plugin import ReceivesOutput, Simulation, clean, closest, one_of, setting_error
+from labseq_soapy_sim.build import build_module
+from labseq_soapy_sim.outputs import CapturedOutputs
+from labseq_soapy_sim.ring import Ring
+
+DEFAULTS: Final[Mapping[str, str]] = {"speed": "0.1", "buffer": "0.002", "patience": "60"}
+"""A tenth of real time costs a tenth of the work. On a busy computer samples sometimes come late: the
+radio's clock then waits for them, so that equal runs give equal atoms."""
+LEAST: Final[Mapping[str, float]] = {
+    "speed": 1e-4,
+    "buffer": 1e-4,
+    "patience": 0.0,
+    "record": 0.0,
+    "channels": 1.0,
+    "coerce_rate": 0.0,
+}
+"""Arguments that are numbers, and their lowest values."""
+WORDS: Final[Mapping[str, tuple[str, ...]]] = {"fault": ("absent",), "folder": ()}
+"""Arguments that are texts, and their allowed values; none: any."""
+
+
+def read_arguments(device: str) -> dict[str, str]:
+    """The arguments of a device such as ``simulated,speed=1,buffer=0.05``.
+
+    Raises:
+        SettingError: There is no such argument, or it is out of range; at the key ``device``.
+    """
+    pairs = (pair.partition("=") for pair in device.split(",")[1:])
+    arguments = {key.strip(): value.strip() for key, _, value in pairs}
+    for key, value in arguments.items():
+        _check_argument(key, value)
+    return arguments
+
+
+def _check_argument(key: str, value: str) -> None:
+    known = (*LEAST, *WORDS)
+    if key not in known:
+        nearest = closest(key, known)
+        hint = f"did you mean '{nearest}'?" if nearest else ""
+        text = f"the simulated radio has no argument '{clean(key)}'"
+        raise setting_error(text, one_of(known), hint, at=("device",))
+    came = f"{key} of the simulated radio is '{clean(value)}'"
+    if (words := WORDS.get(key)) is not None:
+        if not value or (words and value not in words):
+            raise setting_error(came, one_of(words) if words else "a folder", at=("device",))
+        return
+    try:
+        number = float(value)
+    except ValueError:
+        number = math.nan
+    if not LEAST[key] <= number < math.inf:
+        raise setting_error(came, f"a number, at least {LEAST[key]:g}", at=("device",))
+
+
+class SimulatedRadio:
+    """One simulated radio and its files; the driver opens it instead of a real one.
+
+    Args:
+        name: Name of the device, for messages.
+        device: ``simulated``, with arguments of the radio after a comma.
+        channels: Channel of the rows and of the columns.
+        simulation: Receives the tones' amplitudes, if it implements ``ReceivesOutput``.
+
+    Attributes:
+        folder: Folder of the radio's files, while it is open.
+    """
+
+    def __init__(
+        self, name: str, device: str, channels: tuple[int, int], simulation: Simulation | None
+    ) -> None:
+        self._name = name
+        self._arguments = read_arguments(device)
+        self._channels = channels
+        self._simulation = simulation
+        self._outputs: CapturedOutputs | None = None
+        self._given = "folder" in self._arguments
+        self.folder: Path | None = None
+
+    @property
+    def ring(self) -> Ring:
+        """The samples that it received; it must be open."""
+        assert self.folder is not None
+        return Ring(self.folder)
+
+    def warm(self) -> None:
+        """Compile it.
+
+        Raises:
+            DeviceError: It cannot be compiled.
+        """
+        build_module(self._name)
+
+    def connect(self) -> tuple[str, Mapping[str, str], Path]:
+        """Make the radio available.
+
+        Returns:
+            The arguments that open it, the environment in which SoapySDR finds it, and a folder for logs.
+
+        Raises:
+            DeviceError: It cannot be compiled.
+        """
+        environment = {**os.environ, "SOAPY_SDR_PLUGIN_PATH": str(build_module(self._name))}
+        self.folder = Path(self._arguments["folder"] if self._given else tempfile.mkdtemp(prefix="labseq-"))
+        arguments = {"driver": "capture", **DEFAULTS, **self._arguments, "folder": str(self.folder)}
+        return ",".join(f"{key}={value}" for key, value in arguments.items()), environment, self.folder
+
+    def started(self, tones_hz: tuple[NDArray[np.float64], NDArray[np.float64]]) -> None:
+        """The radio streams: let the simulation receive these tones of rows and columns from now on."""
+        if isinstance(self._simulation, ReceivesOutput):
+            self._outputs = CapturedOutputs(self.ring, tones_hz, self._channels)
+            self._simulation.connect_outputs("static_tweezers", self._outputs)
+
+    def changed(self) -> None:
+        """The driver has changed the amplitudes: measure them."""
+        if self._outputs is not None:
+            self._outputs.measure()
+
+    def disconnect(self) -> None:
+        """Remove its files, unless the profile names their folder; no effect if it is not connected."""
+        self._outputs = None
+        if self.folder is not None and not self._given:
+            shutil.rmtree(self.folder, ignore_errors=True)
+        self.folder = None
