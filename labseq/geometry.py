@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal, Protocol, TypeAlias
+from typing import Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -200,44 +200,6 @@ Clear: TypeAlias = Literal["bounding_box", "none"]
 """Which sites must be empty: every other site of the pattern's block, or none."""
 
 
-class CompactLike(Protocol):
-    """Settings of :func:`compact`."""
-
-    @property
-    def rows(self) -> int:
-        """Rows of the block."""
-        ...
-
-    @property
-    def cols(self) -> int:
-        """Columns of the block."""
-        ...
-
-    @property
-    def origin(self) -> Origin:
-        """Where it sits."""
-        ...
-
-
-class BitmapLike(Protocol):
-    """Settings of :func:`bitmap`."""
-
-    @property
-    def mask(self) -> NDArray[np.bool_]:
-        """What is drawn: bool (rows, cols), True where an atom must be."""
-        ...
-
-    @property
-    def origin(self) -> Origin:
-        """Where it sits."""
-        ...
-
-    @property
-    def clear(self) -> Clear:
-        """Which sites must be empty."""
-        ...
-
-
 def pattern(
     mask: NDArray[np.bool_],
     grid: SiteGrid,
@@ -270,26 +232,3 @@ def pattern(
     fill = place(mask, grid.shape, origin)
     empty = ~mask if clear == "bounding_box" else np.zeros_like(mask)
     return TargetPattern(fill, place(empty, grid.shape, origin), name)
-
-
-def compact(settings: CompactLike, grid: SiteGrid) -> TargetPattern:
-    """A full block of sites, for example the paper's 15 x 15 out of 20 x 20.
-
-    Raises:
-        LimitError: It is larger than the grid or sticks out of it.
-    """
-    check_size((settings.rows, settings.cols), grid.shape)
-    mask = np.ones((settings.rows, settings.cols), np.bool_)
-    name = f"compact {settings.rows} x {settings.cols}"
-    return pattern(mask, grid, origin=settings.origin, name=name)
-
-
-def bitmap(settings: BitmapLike, grid: SiteGrid) -> TargetPattern:
-    """Sites as they are drawn; the bounding box is the whole drawing, margins included.
-
-    Raises:
-        LimitError: It is larger than the grid or sticks out of it.
-    """
-    mask = settings.mask
-    name = f"bitmap {mask.shape[0]} x {mask.shape[1]}"
-    return pattern(mask, grid, origin=settings.origin, clear=settings.clear, name=name)

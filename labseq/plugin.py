@@ -43,9 +43,11 @@ from labseq.model import (
     Batch,
     CalibrationEntry,
     CameraFacts,
+    CycleRecord,
     DepthRamp,
     Frame,
     FrequencyCourse,
+    ImageRecord,
     LineProgram,
     LinesFacts,
     LineSpec,
@@ -72,7 +74,14 @@ from labseq.model import (
     Waveform,
     as_occupancy,
 )
-from labseq.motion import Renderer, check_plan, render, warm_rendering
+from labseq.motion import (
+    Renderer,
+    check_plan,
+    fitting_batches,
+    render,
+    tone_program,
+    warm_rendering,
+)
 from labseq.motion.tones import site_time_s
 from labseq.recording import Run, open_run
 from labseq.registry import Registry
@@ -121,6 +130,7 @@ from labseq.settings import (
     Temperature,
     Text,
     Voltage,
+    empty_is,
     setting_error,
 )
 from labseq.units import UNITS, ZERO_CELSIUS_K, expected, format_quantity, parse_quantity, scaled
@@ -141,6 +151,7 @@ __all__ = [
     "Context",
     "Cooling",
     "CoolingSettings",
+    "CycleRecord",
     "DepthRamp",
     "Detector",
     "Device",
@@ -155,6 +166,7 @@ __all__ = [
     "FrequencyComb",
     "FrequencyCourse",
     "Hardware",
+    "ImageRecord",
     "IndustrialCameraSettings",
     "InvalidPlanError",
     "LABSEQ_API",
@@ -171,7 +183,6 @@ __all__ = [
     "NeedsWarmUp",
     "NeverStopped",
     "Occupancy",
-    "Process",
     "Plan",
     "PlanError",
     "PlanReport",
@@ -180,6 +191,7 @@ __all__ = [
     "Port",
     "Power",
     "Problem",
+    "Process",
     "RandomStream",
     "ReceivesOutput",
     "RecordedShot",
@@ -235,7 +247,9 @@ __all__ = [
     "clean",
     "closest",
     "const",
+    "empty_is",
     "expected",
+    "fitting_batches",
     "format_quantity",
     "from_the_centre",
     "hookimpl",
@@ -260,6 +274,7 @@ __all__ = [
     "settle",
     "site_time_s",
     "state_root",
+    "tone_program",
     "trigger_line",
     "visible",
     "wait_for",

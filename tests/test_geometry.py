@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, strategies as st
 from pydantic import ValidationError
 
-from labseq.builtin.patterns import BitmapSettings, CompactSettings
+from labseq.builtin.patterns import BitmapSettings, CompactSettings, bitmap, compact
 from labseq.errors import LimitError
-from labseq.geometry import bitmap, compact, pattern, place, read_bitmap
+from labseq.geometry import pattern, place, read_bitmap
 from labseq.model import SiteGrid
 
 SIZES = st.integers(1, 12)

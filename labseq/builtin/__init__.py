@@ -14,30 +14,31 @@ LABSEQ_API: Final = _API
 def labseq_register(registry: Registry) -> None:
     """Offer the built-in steps, patterns, detectors and analyses."""
     from labseq.builtin.analyses import SurvivalAnalysis, SurvivalSettings
-    from labseq.builtin.equalise import EqualiseStep
-    from labseq.builtin.patterns import BitmapSettings, CompactSettings
-    from labseq.builtin.probes import CheckOverlayStep, CheckSitesStep, ProbeStep
-    from labseq.builtin.steps import (
+    from labseq.builtin.equalise import EqualiseSettings, EqualiseStep
+    from labseq.builtin.patterns import BitmapSettings, CompactSettings, bitmap, compact
+    from labseq.builtin.probes import (
         CheckOverlaySettings,
+        CheckOverlayStep,
         CheckSitesSettings,
+        CheckSitesStep,
+        ProbeSettings,
+        ProbeStep,
+    )
+    from labseq.builtin.rearrange import RearrangeSettings, RearrangeStep
+    from labseq.builtin.steps import (
         DeviceSettings,
         DeviceStep,
-        EqualiseSettings,
         ImageSettings,
         ImageStep,
         LoadSettings,
         LoadStep,
-        ProbeSettings,
         RampSettings,
         RampStep,
-        RearrangeSettings,
-        RearrangeStep,
         WaitSettings,
         wait_step,
     )
     from labseq.detection.threshold import BlindDetector, ThresholdDetector, ThresholdSettings
     from labseq.detection.weighted import WeightedDetector, WeightedSettings
-    from labseq.geometry import bitmap, compact
 
     registry.step("load", LoadStep, LoadSettings)
     registry.step("image", ImageStep, ImageSettings)

@@ -4,25 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import Field
 
-from labseq.model import CycleRecord, ImageRecord, Occupancy, Plan
-from labseq.settings import Settings
+from labseq.plugin import Context, CycleRecord, ImageRecord, Occupancy, Plan, RecordedShot, Settings
 
 
-class _Settings(Protocol):
-    @property
-    def atoms(self) -> str: ...
+class SurvivalSettings(Settings):
+    """How many atoms are there on the next image, site by site."""
 
-
-class _Shot(Protocol):
-    @property
-    def images(self) -> Sequence[ImageRecord]: ...
-    @property
-    def cycles(self) -> Sequence[CycleRecord]: ...
+    atoms: Literal["all", "moved", "held"] = Field(
+        default="all",
+        description="which atoms count: all, those that were moved in between, or those that were not",
+    )
 
 
 class SurvivalAnalysis:
@@ -33,10 +29,10 @@ class SurvivalAnalysis:
     detection gets wrong is part of it.
     """
 
-    def __init__(self, settings: _Settings, context: object) -> None:  # noqa: ARG002 - as every factory
+    def __init__(self, settings: SurvivalSettings, context: Context) -> None:  # noqa: ARG002 - as every factory
         self.atoms = settings.atoms
 
-    def shot(self, shot: _Shot) -> dict[str, Any]:
+    def shot(self, shot: RecordedShot) -> dict[str, Any]:
         """Count the atoms of a shot.
 
         Returns:
@@ -101,12 +97,3 @@ def after_moves(held: Occupancy, moved: Occupancy, plan: Plan) -> tuple[Occupanc
 def _place(record: ImageRecord | CycleRecord) -> tuple[int, int]:
     """Where it stands in the shot: the image that ends a cycle has the cycle's own place."""
     return record.step, record.cycle
-
-
-class SurvivalSettings(Settings):
-    """How many atoms are there on the next image, site by site."""
-
-    atoms: Literal["all", "moved", "held"] = Field(
-        default="all",
-        description="which atoms count: all, those that were moved in between, or those that were not",
-    )

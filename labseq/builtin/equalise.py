@@ -1,9 +1,8 @@
 """The step that equalises the static tweezers in a closed loop.
 
-The spot (i, j) has a power that goes with the tone of row i and the tone of column j:
+The power of the spot (i, j) depends on the tone of row i and the tone of column j:
 ``P_ij = P f_i g_j (1 + e_ij)``. The factors f and g are the *separable* part, which the tones can
-make even; e is the rest, which they cannot, and which is left alone. A light shift serves as
-well as a power.
+make even; e is the rest, which they cannot change. Light shifts may be used instead of powers.
 """
 
 from __future__ import annotations
@@ -11,19 +10,18 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Final, NoReturn, Protocol
+from typing import Annotated, Final, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
-from labseq.errors import DeviceError
-from labseq.model import TimelineEntry
-from labseq.roles import Device, Shot, StepContext
+from labseq.plugin import Device, DeviceError, Settings, Shot, Step, StepContext, Text, TimelineEntry
 
 Floats = NDArray[np.float64]
 
 DEAD: Final = 0.05
-"""Light of a row or column, over that of the others, below which its tone is taken to be off."""
+"""Light of a row or column, relative to the median, below which its tone is taken to be off."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,7 +60,7 @@ class Equalised:
         row_amplitudes: float64 (n_rows,), fractions of full scale.
         column_amplitudes: float64 (n_cols,), likewise.
         separable_spread: The rms of the separable part that was measured, relative.
-        residual_spread: The standard deviation of what the tones cannot change, relative.
+        residual_spread: The standard deviation of the part that the tones cannot change, relative.
     """
 
     row_amplitudes: Floats
@@ -72,11 +70,11 @@ class Equalised:
 
 
 def factors(power: Floats) -> Factors:
-    """Part powers into factors of rows and columns: a two-way analysis of variance of their logarithms.
+    """Separate powers into factors of rows and columns: a two-way analysis of variance of their logarithms.
 
     Args:
-        power: float64 (n_rows, n_cols), in any unit; nan where nothing was measured. What is not
-            above 0 counts as not measured.
+        power: float64 (n_rows, n_cols), in any unit; nan where nothing was measured. Values
+            of 0 or less count as not measured.
 
     Raises:
         DeviceError: A row or column has no light.
@@ -109,7 +107,7 @@ def equalise(
     gain: float = 1.0,
     max_sum: float = 1.0,
 ) -> Equalised:
-    """Take the separable part out of the powers; they are taken to go as the amplitude squared.
+    """Take the separable part out of the powers, which are taken as proportional to the amplitude squared.
 
     The sum of an axis' amplitudes stays what it was, or comes down to ``max_sum``.
 
@@ -117,12 +115,12 @@ def equalise(
         power: float64 (n_rows, n_cols), nan where nothing was measured.
         row_amplitudes: float64 (n_rows,), those that the powers were measured at.
         column_amplitudes: float64 (n_cols,), likewise.
-        gain: How much of the separable part to take out; below 1 a loop is patient with noise.
-        max_sum: Most that the amplitudes of an axis may add up to, as a fraction of full scale.
+        gain: Fraction of the separable part to take out; below 1 a loop averages over noise.
+        max_sum: Largest sum of the amplitudes of an axis, as a fraction of full scale.
 
     Raises:
         DeviceError: A row or column has no light.
-        ValueError: Shapes do not belong together, or an amplitude is not above 0.
+        ValueError: Shapes do not match, or an amplitude is not above 0.
     """
     shape = (len(row_amplitudes), len(column_amplitudes))
     if np.shape(power) != shape:
@@ -159,41 +157,46 @@ def _refuse_dead(power: Floats, known: NDArray[np.bool_]) -> None:
 
 
 QUIET: Final = 1 / 3
-"""Noise of the separable part, over the spread that is aimed at, at which averaging ends."""
+"""Noise of the separable part, relative to the target spread, at which averaging ends."""
 ROUGH: Final = 0.3
-"""What a round is expected to leave of the spread."""
+"""Fraction of the spread that is expected to remain after a round."""
 MIN_PROGRESS: Final = 0.9
-"""By what factor the spread must fall in :data:`PATIENCE` rounds."""
+"""Factor by which the spread must fall in :data:`PATIENCE` rounds."""
 PATIENCE: Final = 4
 
 
-@dataclass(frozen=True, slots=True)
-class LoopLimits:
-    """When the loop ends.
+class EqualiseSettings(Settings):
+    """``equalise``: make the static tweezers even, in a closed loop."""
 
-    Attributes:
-        spread: The rms of the separable part that is aimed at, relative.
-        gain: How much of it a round takes out.
-        max_sum: Most that an axis' amplitudes may add up to.
-        max_averages: Most measurements that a round averages.
-        max_rounds: Most rounds.
-    """
-
-    spread: float = 0.005
-    gain: float = 0.8
-    max_sum: float = 1.0
-    max_averages: int = 100
-    max_rounds: int = 25
+    device: Text = Field(
+        default="trap_camera", description="device of the profile that measures the power of each tweezer"
+    )
+    value: Text = Field(
+        default="spot_powers", description="its value with the powers, an array of rows and columns"
+    )
+    spread: Annotated[float, Field(gt=0, lt=1)] = Field(
+        default=0.005, description="target rms of the part that rows and columns can even out"
+    )
+    gain: Annotated[float, Field(gt=0, le=1)] = Field(
+        default=0.8, description="fraction of it that a round takes out"
+    )
+    max_sum: Annotated[float, Field(gt=0)] = Field(
+        default=1.0, description="largest sum of the amplitudes of an axis, as a fraction of full scale"
+    )
+    max_averages: int = Field(
+        default=100, ge=2, description="maximum number of measurements that a round averages"
+    )
+    max_rounds: int = Field(default=25, ge=1, description="maximum number of rounds")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoopResult:
-    """Where the loop arrived.
+    """The result of the loop.
 
     Attributes:
-        equalised: The amplitudes in force, and the spreads that were measured at them; the noise
-            of the measurement is still in both.
-        noise: Its part of the separable spread.
+        equalised: The amplitudes now in use, and the spreads measured at them; both spreads include
+            the noise of the measurement.
+        noise: The noise in the separable spread.
         spreads: Separable spread of each round, the last one included.
         n_measured: Measurements in all.
     """
@@ -209,26 +212,25 @@ def equalise_loop(
     apply: Callable[[Floats, Floats], None],
     row_amplitudes: Floats,
     column_amplitudes: Floats,
-    limits: LoopLimits | None = None,
+    limits: EqualiseSettings | None = None,
 ) -> LoopResult:
     """Measure and correct until the separable part of the powers is even.
 
-    Each round averages measurements until their noise, worked out from their own scatter, is a third
-    of the spread that is aimed at, or of what the round is about to leave. The part that the tones
-    cannot change is left alone.
+    Each round averages measurements until their noise, estimated from their own scatter, is a third
+    of the target spread, or of the spread that the round is expected to leave.
 
     Args:
         measure: Measures the power of each spot once, float64 (n_rows, n_cols), nan where it cannot.
         apply: Plays amplitudes of rows and columns.
         row_amplitudes: float64 (n_rows,), where to begin.
         column_amplitudes: float64 (n_cols,), likewise.
-        limits: When to end.
+        limits: Target spread, gain, and when to end.
 
     Raises:
-        DeviceError: It does not arrive; it says why: a tone without light, too much
+        DeviceError: The loop does not converge, and why: a tone without light, too much
             noise and how many averages it would take, or a spread that does not fall.
     """
-    limits = limits or LoopLimits()
+    limits = limits or EqualiseSettings()
     rows, cols = (np.array(each, np.float64) for each in (row_amplitudes, column_amplitudes))
     spreads: list[float] = []
     n_measured = 0
@@ -268,11 +270,11 @@ def _average(measure: Callable[[], Floats], wanted: float, max_averages: int) ->
 
 
 def _noise(mean: Floats, variance: Floats) -> float:
-    """The rms that noise alone gives the separable part of powers of some variance."""
+    """The rms of the separable part of powers of some variance that is due to noise alone."""
     known = np.isfinite(mean) & (mean > 0)
     n_rows, n_cols = mean.shape
     if not known.any():
-        return 0.0  # there is nothing to average; what that means is said by others
+        return 0.0  # nothing to average; `factors` refuses it
     relative = float((variance[known] / mean[known] ** 2).mean())
     return math.sqrt(relative * (1 / n_rows + 1 / n_cols))
 
@@ -297,55 +299,32 @@ def _refuse(why: str) -> NoReturn:
 
 
 READINGS: Final = "equalise."
-"""What the names of the readings begin with that the step leaves."""
+"""Prefix of the names of the readings that the step records."""
 
 
-class _Settings(Protocol):
-    @property
-    def device(self) -> str: ...
-    @property
-    def value(self) -> str: ...
-    @property
-    def spread(self) -> float: ...
-    @property
-    def gain(self) -> float: ...
-    @property
-    def max_sum(self) -> float: ...
-    @property
-    def max_averages(self) -> int: ...
-    @property
-    def max_rounds(self) -> int: ...
-
-
-class EqualiseStep:
+class EqualiseStep(Step):
     """Measures the power of each static tweezer, and corrects the rows' and columns' tones until it is even.
 
     A device of the profile measures: its value is an array (n_rows, n_cols) of spot powers on a camera, light
-    shifts, or anything else that goes with the depth; nan where it cannot tell.
+    shifts, or anything else proportional to the depth; nan where it has no value.
     """
 
-    needs_image = False
-    takes_image = False
-
-    def __init__(self, settings: _Settings) -> None:
+    def __init__(self, settings: EqualiseSettings) -> None:
         self.settings = settings
 
-    def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:  # noqa: ARG002 - Protocol
-        """One bar without a known length."""
+    def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:  # noqa: ARG002 - of the role
+        """One entry without a known length."""
         return [TimelineEntry(f"equalise by {self.settings.device}", 0.0, 0.0)]
 
     def run(self, shot: Shot) -> None:
-        """Turn the array on and run the loop; what it found stays in force, and among the shot's readings.
+        """Turn the array on and run the loop; its result stays in use and is recorded in the shot's readings.
 
         Raises:
-            DeviceError: The loop does not arrive; it says why. Or the device's value is no such array.
+            DeviceError: The loop does not converge, and why; or the device's value is not such an array.
         """
         settings, tweezers = self.settings, shot.static_tweezers
         limit_s, device = shot.call_timeout_s, shot.device(settings.device)
         shot.call("static_tweezers", limit_s, tweezers.start)
-        limits = LoopLimits(
-            settings.spread, settings.gain, settings.max_sum, settings.max_averages, settings.max_rounds
-        )
 
         def apply(rows: Floats, cols: Floats) -> None:
             shot.call("static_tweezers", limit_s, tweezers.load, (rows, cols))
@@ -359,7 +338,7 @@ class EqualiseStep:
 
         rows, cols = _in_force(shot)
         with shot.stage("equalise"):
-            found = equalise_loop(measure, apply, rows, cols, limits)
+            found = equalise_loop(measure, apply, rows, cols, settings)
             after = self._measure(shot, device)
         equalised = found.equalised
         shot.note(READINGS + "row_amplitudes", equalised.row_amplitudes.tolist())
@@ -388,7 +367,7 @@ class EqualiseStep:
 
 
 def _in_force(shot: Shot) -> tuple[Floats, Floats]:
-    """Where to begin: the calibration in use; without one all equal, full scale together."""
+    """The amplitudes to begin with: those of the calibration; without one all equal, adding up to full scale."""
     entry = shot.calibrations.get("tweezers")
     if entry is not None:
         return entry.values["row_amplitudes"], entry.values["column_amplitudes"]

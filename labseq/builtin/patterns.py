@@ -1,4 +1,4 @@
-"""Settings of the built-in target patterns."""
+"""The built-in target patterns, and drawings in text and PNG files."""
 
 from __future__ import annotations
 
@@ -10,10 +10,19 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr, model_validator
 
-from labseq.errors import ConfigError, Problem
 from labseq.geometry import DrawingError, read_bitmap
-from labseq.messages import visible
-from labseq.settings import FilePath, Settings, setting_error
+from labseq.plugin import (
+    ConfigError,
+    FilePath,
+    Problem,
+    Settings,
+    SiteGrid,
+    TargetPattern,
+    check_size,
+    pattern,
+    setting_error,
+    visible,
+)
 from labseq.text_files import decode, read_bytes
 
 MAX_PIXELS: Final = 1024
@@ -96,6 +105,18 @@ class CompactSettings(Settings):
     )
 
 
+def compact(settings: CompactSettings, grid: SiteGrid) -> TargetPattern:
+    """A full block of sites, for example the paper's 15 x 15 out of 20 x 20.
+
+    Raises:
+        LimitError: It is larger than the grid or sticks out of it.
+    """
+    check_size((settings.rows, settings.cols), grid.shape)
+    mask = np.ones((settings.rows, settings.cols), np.bool_)
+    name = f"compact {settings.rows} x {settings.cols}"
+    return pattern(mask, grid, origin=settings.origin, name=name)
+
+
 class BitmapSettings(Settings):
     r"""Sites as they are drawn, in the sequence or in a file.
 
@@ -147,3 +168,14 @@ class BitmapSettings(Settings):
         else:
             raise setting_error("a bitmap needs a drawing", "'sites' or 'file'")
         return self
+
+
+def bitmap(settings: BitmapSettings, grid: SiteGrid) -> TargetPattern:
+    """Sites as they are drawn; the bounding box is the whole drawing, margins included.
+
+    Raises:
+        LimitError: It is larger than the grid or sticks out of it.
+    """
+    mask = settings.mask
+    name = f"bitmap {mask.shape[0]} x {mask.shape[1]}"
+    return pattern(mask, grid, origin=settings.origin, clear=settings.clear, name=name)

@@ -1,18 +1,18 @@
-"""Steps that probe the overlay and watch for drifts."""
+"""Steps that hold atoms displaced from their sites, and steps that watch for drifts."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Final, Literal, Protocol
+from typing import Annotated, Final, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
-from labseq.builtin.steps import play
+from labseq.builtin.rearrange import play
+from labseq.builtin.steps import PositiveDuration
 from labseq.detection.drift import measure_shift
-from labseq.errors import ConfigError, DeviceError
-from labseq.model import Occupancy, SiteGrid, TimelineEntry
 from labseq.motion import (
     FastOffset,
     SurvivalShape,
@@ -22,49 +22,60 @@ from labseq.motion import (
     hold_program,
     hold_time_s,
 )
-from labseq.roles import ReportsSignals, Shot, StepContext
-from labseq.units import format_quantity
+from labseq.plugin import (
+    ConfigError,
+    DeviceError,
+    Duration,
+    Length,
+    Occupancy,
+    ReportsSignals,
+    Settings,
+    Shot,
+    SiteGrid,
+    Step,
+    StepContext,
+    TimelineEntry,
+    format_quantity,
+)
 
-Pattern = Literal["same", "cross"]
-
-
-class HoldSettings(Protocol):
-    """How atoms are held, from the settings of a step."""
-
-    @property
-    def hold(self) -> float:
-        """Time between the ramps, in seconds."""
-        ...
-
-    @property
-    def drop_off(self) -> float:
-        """Duration of the drop-off, in seconds."""
-        ...
-
-
-class _Settings(HoldSettings, Protocol):
-    @property
-    def offset(self) -> tuple[float, float]: ...
-    @property
-    def pattern(self) -> Pattern: ...
-    @property
-    def sites(self) -> Literal["seen", "all"]: ...
+PositiveLength: TypeAlias = Annotated[Length, Field(gt=0)]
+"""Metres, more than 0; "0.9 um"."""
 
 
-class ProbeStep:
-    """Picks atoms up, holds them and sets them down, beside their sites by an offset.
+class ProbeSettings(Settings):
+    """``probe``: pick atoms up, hold them and set them down, displaced from their sites."""
 
-    Who survives tells where the mobile tweezers stand; an image after it shows that.
+    offset: tuple[Length, Length] = Field(
+        default=(0.0, 0.0),
+        description="[along a row, from row to row]: displacement of the tweezers from the sites",
+    )
+    hold: Duration = Field(default=0.2e-3, description="time between pick-up and drop-off")
+    drop_off: Duration = Field(
+        default=5e-6, description="duration of the drop-off; a slow one leads atoms back to their sites"
+    )
+    pattern: Literal["same", "cross"] = Field(
+        default="same",
+        description="the offset of each site: the same for all, or in four groups of sites forwards and "
+        "backwards along a row, forwards and backwards from row to row",
+    )
+    sites: Literal["seen", "all"] = Field(
+        default="seen", description="which sites are probed: where the last image saw an atom, or all"
+    )
+
+
+class ProbeStep(Step):
+    """Picks atoms up, holds them and sets them down, displaced from their sites by an offset.
+
+    The survival, seen on an image after it, depends on where the mobile tweezers are.
     """
 
     needs_image = True
-    takes_image = False
 
-    def __init__(self, settings: _Settings) -> None:
+    def __init__(self, settings: ProbeSettings) -> None:
         self.settings = settings
 
     def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:
-        """One bar, with all sites held.
+        """One entry, with all sites held.
 
         Raises:
             LimitError: At this offset, tones of the grid break a limit.
@@ -74,7 +85,7 @@ class ProbeStep:
         return [TimelineEntry("probe", duration_s, duration_s if settings.sites == "all" else 0.0)]
 
     def run(self, shot: Shot) -> None:
-        """Hold the atoms that the last image saw, or those of all sites."""
+        """Hold the atoms that were seen on the last image, or those of all sites."""
         seen = shot.occupancy
         if seen is None:
             raise ConfigError("probe needs an image before it in the shot")
@@ -88,86 +99,77 @@ class ProbeStep:
         return np.broadcast_to(np.asarray(offset_m, np.float64), (*grid.shape, 2))
 
 
-def hold(shot: Shot, sites: Occupancy, offsets_m: NDArray[np.float64], hold_settings: HoldSettings) -> None:
-    """Pick up, hold and drop the atoms of some sites, each beside its site by an offset.
+def hold(
+    shot: Shot,
+    sites: Occupancy,
+    offsets_m: NDArray[np.float64],
+    settings: ProbeSettings | CheckOverlaySettings,
+) -> None:
+    """Pick up, hold and drop the atoms of some sites, each displaced from its site by an offset.
 
     Args:
         shot: The running shot.
         sites: bool (n_rows, n_cols); without any, nothing is played.
         offsets_m: float64 (n_rows, n_cols, 2), along a1 and a2.
-        holding: How long.
+        settings: For how long.
     """
     if sites.any():
         start_s = shot.clock.now()
-        times_s = hold_settings.hold, hold_settings.drop_off
+        times_s = settings.hold, settings.drop_off
         play(shot, lambda: hold_program(shot.grid, shot.motion, sites, offsets_m, *times_s), start_s)
 
 
-def longest_s(context: StepContext, offsets_m: NDArray[np.float64], hold_settings: HoldSettings) -> float:
+def longest_s(
+    context: StepContext, offsets_m: NDArray[np.float64], settings: ProbeSettings | CheckOverlaySettings
+) -> float:
     """How long :func:`hold` takes if every site holds an atom.
 
     Raises:
         LimitError: The tone of a site leaves its band.
     """
-    time_s = hold_time_s(context.grid, context.motion, offsets_m, hold_settings.hold, hold_settings.drop_off)
+    time_s = hold_time_s(context.grid, context.motion, offsets_m, settings.hold, settings.drop_off)
     return context.motion.overhead_per_cycle_s + time_s
 
 
 Exceeded = Literal["warn", "stop"]
 
 MIN_ATOMS: Final = 10
-"""With fewer, noise may pass for atoms that stand elsewhere."""
+"""With fewer, noise may be taken for displaced atoms."""
 SURE: Final = 1.0
 """A shift counts as too large if it exceeds the limit by this many of its errors."""
 
 
-class _SitesSettings(Protocol):
-    @property
-    def every(self) -> int: ...
-    @property
-    def limit_px(self) -> float: ...
-    @property
-    def spot_px(self) -> float: ...
-    @property
-    def exceeded(self) -> Exceeded: ...
+class CheckSitesSettings(Settings):
+    """``check_sites``: check on the last image whether the sites have moved on the camera."""
+
+    every: int = Field(default=1, ge=1, description="check one in this many shots, from the first")
+    limit_px: float = Field(default=0.5, gt=0, description="largest shift that is accepted, in pixels")
+    spot_px: float = Field(
+        default=1.2, gt=0, description="width (1 sigma of a Gaussian) of an atom's image, in pixels"
+    )
+    exceeded: Literal["warn", "stop"] = Field(
+        default="warn", description="whether a larger shift is a warning or stops the run"
+    )
 
 
-class _OverlaySettings(HoldSettings, Protocol):
-    @property
-    def every(self) -> int: ...
-    @property
-    def offset(self) -> float: ...
-    @property
-    def exposure(self) -> float: ...
-    @property
-    def limit(self) -> float: ...
-    @property
-    def exceeded(self) -> Exceeded: ...
-    @property
-    def half_width(self) -> float: ...
-    @property
-    def edge(self) -> float: ...
-
-
-class CheckSitesStep:
-    """Sees on the last image whether the atoms still stand where the detector looks for them."""
+class CheckSitesStep(Step):
+    """Checks on the last image whether the atoms are still where the detector looks for them."""
 
     needs_image = True
-    takes_image = False
     repeatable = True
 
-    def __init__(self, settings: _SitesSettings) -> None:
+    def __init__(self, settings: CheckSitesSettings) -> None:
         self.settings = settings
 
-    def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:  # noqa: ARG002 - Protocol
-        """One bar without a length: it takes some milliseconds of the computer's time."""
+    def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:  # noqa: ARG002 - of the role
+        """One entry without a length: it takes some milliseconds of the computer's time."""
         return [TimelineEntry("check sites", 0.0, 0.0)]
 
     def run(self, shot: Shot) -> None:
-        """Measure the common shift, note it, and warn or stop if it is too large.
+        """Measure the common shift, record it, and warn or stop if it is too large.
 
         Raises:
-            ConfigError: The detector does not tell where it looks for the atoms.
+            ConfigError: The detector does not report where it looks for the atoms.
             DeviceError: The shift is too large, and ``exceeded`` is "stop".
         """
         settings, detector = self.settings, shot.detector
@@ -177,7 +179,7 @@ class CheckSitesStep:
             raise ConfigError("check_sites needs an image before it in the shot")
         if not isinstance(detector, ReportsSignals):
             raise ConfigError(
-                "check_sites needs a detector that tells where it looks for the atoms; "
+                "check_sites needs a detector that reports where it looks for the atoms; "
                 "'threshold' and 'weighted' do"
             )
         image, sites_px = shot.frame.image, detector.sites_px[shot.occupancy]
@@ -191,7 +193,7 @@ class CheckSitesStep:
         if not error <= settings.limit_px:
             _warn(
                 shot,
-                f"check_sites cannot tell where the sites are with {len(sites_px)} atoms seen on them: "
+                f"check_sites cannot locate the sites with {len(sites_px)} atoms seen on them: "
                 "few were loaded, or the sites are far from where the detector looks",
             )
             return
@@ -207,16 +209,41 @@ class CheckSitesStep:
             )
 
 
-class CheckOverlayStep:
-    """Sees by a probe of four groups of sites whether the mobile tweezers still stand on the sites.
+class CheckOverlaySettings(Settings):
+    """``check_overlay``: check by a probe whether the mobile tweezers are still centred on the sites."""
 
-    It costs the atoms of a shot that are probed, so it comes after everything else, every so many shots.
+    every: int = Field(default=20, ge=1, description="check one in this many shots, from the first")
+    offset: PositiveLength = Field(
+        default=0.9e-6,
+        description="offset of the probe in each of four directions: on the edge of the survival peak",
+    )
+    hold: Duration = Field(default=0.2e-3, description="time between pick-up and drop-off")
+    drop_off: Duration = Field(
+        default=5e-6, description="duration of the drop-off; a slow one leads atoms back to their sites"
+    )
+    exposure: PositiveDuration = Field(default=45e-3, description="exposure time of the image after it")
+    limit: PositiveLength = Field(default=100e-9, description="largest offset that is accepted, on each axis")
+    exceeded: Literal["warn", "stop"] = Field(
+        default="warn", description="whether a larger offset is a warning or stops the run"
+    )
+    half_width: PositiveLength = Field(
+        default=0.93e-6,
+        description="distance at which half of the probed atoms survive, without a calibration",
+    )
+    edge: PositiveLength = Field(
+        default=0.23e-6, description="width (1 sigma) of the survival peak's edge, without a calibration"
+    )
+
+
+class CheckOverlayStep(Step):
+    """Checks by probing four groups of sites whether the mobile tweezers are still centred on the sites.
+
+    It loses the probed atoms, so it comes after everything else, in one of `every` shots.
     """
 
     needs_image = True
-    takes_image = False
 
-    def __init__(self, settings: _OverlaySettings) -> None:
+    def __init__(self, settings: CheckOverlaySettings) -> None:
         self.settings = settings
 
     def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:
@@ -237,7 +264,7 @@ class CheckOverlayStep:
         ]
 
     def run(self, shot: Shot) -> None:
-        """Probe, take an image, note the offset, and warn or stop if it is too large.
+        """Probe, take an image, record the offset, and warn or stop if it is too large.
 
         Raises:
             DeviceError: The offset is too large, and ``exceeded`` is "stop".
@@ -273,18 +300,18 @@ class CheckOverlayStep:
         )
         limit = format_quantity(settings.limit, "length")
         if not found.fits:
-            text = "the survival of the probed atoms goes with no small offset of the mobile tweezers"
+            text = "the survival of the probed atoms fits no small offset of the mobile tweezers"
             _handle_exceeded(
                 shot, settings.exceeded, "mobile_tweezers", f"{text}: run `labseq calibrate overlay`"
             )
         elif (offset_m > settings.limit + SURE * error_m).any():
-            text = f"the mobile tweezers stand {parts} beside the sites; the limit is {limit}"
+            text = f"the mobile tweezers are {parts} from the sites; the limit is {limit}"
             _handle_exceeded(
                 shot, settings.exceeded, "mobile_tweezers", f"{text}: run `labseq calibrate overlay`"
             )
         elif not (error_m <= settings.limit).all():
             n_atoms = "1 atom" if found.n_atoms == 1 else f"{found.n_atoms} atoms"
-            _warn(shot, f"check_overlay cannot tell the overlay to {limit} with {n_atoms} on this shot")
+            _warn(shot, f"check_overlay cannot measure the overlay to {limit} with {n_atoms} in this shot")
 
     def _offsets_m(self, shape: tuple[int, int]) -> NDArray[np.float64]:
         return cross_offsets_m(shape, (self.settings.offset, self.settings.offset))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final
 
@@ -40,6 +41,18 @@ class LineSpec:
     triggers: str = ""
     blinding: bool = False
     active_low: bool = False
+
+
+def lines_of(specs: Iterable[LineSpec], kind: str) -> list[LineSpec]:
+    """The lines that a kind of step turns on; none for idle, which has no leads and lags."""
+    return [spec for spec in specs if kind in spec.on and kind != IDLE]
+
+
+def margin_s(specs: Iterable[LineSpec], kind: str) -> float:
+    """How much longer a step takes for the leads and lags of its lines, in seconds."""
+    taking_part = lines_of(specs, kind)
+    lead_s = max((spec.lead_s for spec in taking_part), default=0.0)
+    return lead_s + max((spec.lag_s for spec in taking_part if not spec.pulse_s), default=0.0)
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,6 +21,7 @@ from labseq.model import (
     TargetPattern,
     TimelineEntry,
 )
+from labseq.model.lines import margin_s
 from labseq.roles.deciding import Detector, Planner
 from labseq.roles.hardware import Device, MobileTweezers, StaticTweezers
 from labseq.roles.simulation import Simulation
@@ -316,6 +317,10 @@ class StepContext:
     target: TargetPattern
     camera: CameraFacts = field(default_factory=CameraFacts)
     lines: tuple[LineSpec, ...] = ()
+
+    def margin_s(self, kind: str) -> float:
+        """How much longer a kind of step takes for the leads and lags of its lines, in seconds."""
+        return margin_s(self.lines, kind)
 
 
 class Step(ABC):

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 
 from labseq.model import TimelineEntry
-from labseq.model.lines import IDLE, LineProgram, LineSpec
+from labseq.model.lines import IDLE, LineProgram, LineSpec, lines_of, margin_s
 
 TIMES_APART_S = 1e-9
 """Edges nearer to one another than this are one edge."""
@@ -30,7 +30,7 @@ def line_program(specs: Sequence[LineSpec], kind: str, duration_s: float) -> Lin
         >>> program.t_s.tolist(), program.on[:, 0].tolist(), program.begin_s
         ([0.0, 0.048], [True, False], 0.001)
     """
-    taking_part = _taking_part(specs, kind)
+    taking_part = lines_of(specs, kind)
     begin_s = max((spec.lead_s for spec in taking_part), default=0.0)
     end_s = begin_s + duration_s
     over_s = end_s + max((spec.lag_s for spec in taking_part if not spec.pulse_s), default=0.0)
@@ -53,13 +53,6 @@ def off_program(specs: Sequence[LineSpec]) -> LineProgram:
     """All lines off, at once."""
     names = tuple(spec.name for spec in specs)
     return LineProgram("off", names, np.zeros(1), np.zeros((1, len(specs)), np.bool_), 0.0, 0.0)
-
-
-def margin_s(specs: Iterable[LineSpec], kind: str) -> float:
-    """How much longer a step takes for the leads and lags of its lines, in seconds."""
-    taking_part = _taking_part(specs, kind)
-    lead_s = max((spec.lead_s for spec in taking_part), default=0.0)
-    return lead_s + max((spec.lag_s for spec in taking_part if not spec.pulse_s), default=0.0)
 
 
 def spans_on(
@@ -96,11 +89,6 @@ def trigger_line(specs: Iterable[LineSpec], role: str) -> LineSpec | None:
 def blinding_lines(specs: Iterable[LineSpec], kind: str) -> list[str]:
     """Names of the lines whose light would harm a camera with EM gain in such a step."""
     return [spec.name for spec in specs if spec.blinding and kind in spec.on]
-
-
-def _taking_part(specs: Iterable[LineSpec], kind: str) -> list[LineSpec]:
-    """The lines that a step turns on; idle is no step, and nothing leads or lags it."""
-    return [spec for spec in specs if kind in spec.on and kind != IDLE]
 
 
 def _join(spans: list[tuple[float, float]], more: Iterable[tuple[float, float]]) -> None:

@@ -70,12 +70,12 @@ def check_commands(assembly: Assembly, points: Iterable[Point], build: Callable[
 
 
 def _failure(guard: Guard, lab: Lab, step: DeviceStep) -> LabseqError | None:
-    device = lab.devices.get(step.device)
+    device = lab.devices.get(step.settings.name)
     if device is None or not offers(device, "check_command"):
         return None
     check, timeout_s = device.check_command, lab.timeouts.call_s
     try:
-        guard.call(step.device, timeout_s, check, step.command, **step.arguments)
+        guard.call(step.settings.name, timeout_s, check, step.settings.do, **step.settings.arguments)
     except LabseqError as failure:
         return failure
     return None

@@ -8,17 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from labseq.builtin.steps import (
-    CheckOverlaySettings,
-    CheckSitesSettings,
-    DeviceSettings,
-    ImageSettings,
-    LoadSettings,
-    ProbeSettings,
-    RampSettings,
-    RearrangeSettings,
-    WaitSettings,
-)
+from labseq.builtin.probes import CheckOverlaySettings, CheckSitesSettings, ProbeSettings
+from labseq.builtin.rearrange import RearrangeSettings
+from labseq.builtin.steps import DeviceSettings, ImageSettings, LoadSettings, RampSettings, WaitSettings
 from labseq.config import load_sequence
 from labseq.errors import ConfigError, ProblemCollector
 from labseq.settings import Settings
@@ -291,25 +283,25 @@ CASES = [
         "required setting missing in an empty step",
         "wait: {duration: 1 ms}",
         "wait:",
-        "s.yaml:26:10: a wait says neither how long nor for what; expected 'duration', or 'for' and 'timeout'",
+        "s.yaml:26:10: a wait needs a time or a signal; expected 'duration', or 'for' and 'timeout'",
     ),
     (
         "wait for a time and for a signal",
         "wait: {duration: 1 ms}",
         "wait: {duration: 1 ms, for: go, timeout: 1 s}",
-        "s.yaml:26:12: 'duration' and 'for' stand together; expected one of them",
+        "s.yaml:26:12: 'duration' excludes 'for'; expected one of them",
     ),
     (
         "wait for a signal without end",
         "wait: {duration: 1 ms}",
         "wait: {for: go}",
-        "s.yaml:26:12: a wait for 'go' has no 'timeout'; expected how long it may take",
+        "s.yaml:26:12: a wait for 'go' has no 'timeout'; expected the longest wait",
     ),
     (
         "timeout of a wait for a time",
         "wait: {duration: 1 ms}",
         "wait: {duration: 1 ms, timeout: 1 s}",
-        "s.yaml:26:28: 'timeout' stands here without 'for'; expected 'for: go' beside it",
+        "s.yaml:26:28: 'timeout' needs 'for'; expected 'for: go' next to it",
     ),
     (
         "wait for an unknown signal",

@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from labseq.builtin.steps import DeviceSettings, ImageSettings, LoadSettings, RearrangeSettings, WaitSettings
+from labseq.builtin.rearrange import RearrangeSettings
+from labseq.builtin.steps import DeviceSettings, ImageSettings, LoadSettings, WaitSettings
 from labseq.config import Override, load_profile, load_sequence, split_overrides
 from labseq.errors import ConfigError, ProblemCollector
 from labseq.settings import Settings

@@ -3,17 +3,9 @@ from __future__ import annotations
 import pytest
 from pydantic import BaseModel
 
-from labseq.builtin.steps import (
-    CheckOverlaySettings,
-    CheckSitesSettings,
-    DeviceSettings,
-    ImageSettings,
-    LoadSettings,
-    ProbeSettings,
-    RampSettings,
-    RearrangeSettings,
-    WaitSettings,
-)
+from labseq.builtin.probes import CheckOverlaySettings, CheckSitesSettings, ProbeSettings
+from labseq.builtin.rearrange import RearrangeSettings
+from labseq.builtin.steps import DeviceSettings, ImageSettings, LoadSettings, RampSettings, WaitSettings
 from labseq.config import Document
 
 STEPS: list[type[BaseModel]] = [

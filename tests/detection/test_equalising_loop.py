@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from labseq.builtin.equalise import LoopLimits, LoopResult, equalise_loop, factors
+from labseq.builtin.equalise import EqualiseSettings, LoopResult, equalise_loop, factors
 from labseq.errors import DeviceError
 
 
@@ -41,7 +41,7 @@ class Array:
         return [np.full(n, 1 / n) for n in self.shape]
 
 
-def begin(array: Array, limits: LoopLimits | None = None) -> LoopResult:
+def begin(array: Array, limits: EqualiseSettings | None = None) -> LoopResult:
     rows, cols = array.start()
     return equalise_loop(array.measure, array.apply, rows, cols, limits)
 
@@ -94,13 +94,13 @@ def test_too_much_noise_says_how_many_averages_it_takes() -> None:
     with pytest.raises(
         DeviceError, match=r"too much noise: 20 averages leave .*; about \d+ averages"
     ) as told:
-        begin(array, LoopLimits(max_averages=20))
+        begin(array, EqualiseSettings(max_averages=20))
     needed = int(str(told.value).split("about ")[1].split()[0])
     again = Array(6, noise=0.1)
     with pytest.raises(DeviceError, match="too much noise"):
-        begin(again, LoopLimits(max_averages=needed // 2))
+        begin(again, EqualiseSettings(max_averages=needed // 2))
     again = Array(6, noise=0.1)
-    assert begin(again, LoopLimits(max_averages=1000)).noise <= 0.005 / 3
+    assert begin(again, EqualiseSettings(max_averages=1000)).noise <= 0.005 / 3
 
 
 def test_a_dead_row_is_named() -> None:
@@ -122,7 +122,7 @@ def test_amplitudes_beyond_full_scale_bring_the_others_down() -> None:
     array = Array(9, shape=(2, 3), noise=0.001, disorder=0.0)
     array.bias[0][:] = 1.0, 0.1
     array.apply = lambda rows, cols: setattr(array, "amplitudes", [rows, cols])
-    limits = LoopLimits(max_sum=2.0)
+    limits = EqualiseSettings(max_sum=2.0)
     result = equalise_loop(array.measure, array.apply, np.ones(2), np.full(3, 1 / 3), limits)
     assert result.equalised.row_amplitudes == pytest.approx([0.1**0.5, 1.0], rel=0.02)
 
@@ -130,4 +130,4 @@ def test_amplitudes_beyond_full_scale_bring_the_others_down() -> None:
 def test_slow_progress_ends_after_all_rounds() -> None:
     array = Array(10)
     with pytest.raises(DeviceError, match="after 3 rounds"):
-        begin(array, LoopLimits(gain=0.1, max_rounds=3))
+        begin(array, EqualiseSettings(gain=0.1, max_rounds=3))

@@ -18,8 +18,7 @@ from labseq_patterns import (
 from labseq_scans.pattern import InterleavedSettings, interleaved
 
 from labseq import SiteGrid, TargetPattern
-from labseq.builtin.patterns import BitmapSettings, CompactSettings
-from labseq.geometry import bitmap, compact
+from labseq.builtin.patterns import BitmapSettings, CompactSettings, bitmap, compact
 from labseq.testing import PatternContract
 
 BLOCK = settings.BlockSettings(rows=7, cols=8)

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from labseq.builtin.equalise import READINGS, EqualiseStep, factors
-from labseq.builtin.steps import EqualiseSettings
+from labseq.builtin.equalise import READINGS, EqualiseSettings, EqualiseStep, factors
 from labseq.errors import ConfigError, DeviceError, StopRequested
 from labseq.model import CalibrationEntry, ShotRecord, SiteGrid
 from labseq.sequencer import Sequencer

@@ -5,7 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from labseq.builtin.steps import DeviceStep, RearrangeStep
+from labseq.builtin.rearrange import RearrangeStep
+from labseq.builtin.steps import DeviceStep
 from labseq.errors import DeviceError, DeviceTimeoutError, StopRequested
 from labseq.model import CameraFacts, SiteGrid, TargetPattern
 from labseq.roles import Context

@@ -5,7 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from labseq.builtin.steps import RearrangeStep, WaitStep
+from labseq.builtin.rearrange import RearrangeStep
+from labseq.builtin.steps import WaitStep
 from labseq.errors import DeviceError, DeviceTimeoutError
 from labseq.model import CameraFacts, LineSpec
 from labseq.testing.fakes import RecordingCamera, RecordingLines

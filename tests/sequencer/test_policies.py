@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from labseq.builtin.steps import RearrangeStep
+from labseq.builtin.rearrange import RearrangeStep
 from labseq.errors import (
     DeviceError,
     DeviceHungError,

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from labseq.builtin.probes import ProbeStep
-from labseq.builtin.steps import ImageStep, ProbeSettings
+from labseq.builtin.probes import ProbeSettings, ProbeStep
+from labseq.builtin.steps import ImageStep
 from labseq.errors import ConfigError, DeviceError, LimitError
 from labseq.model import MotionSpec, SegmentKind, SiteGrid, ToneProgram
 from labseq.roles import StepContext

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from labseq.builtin.steps import RearrangeStep
+from labseq.builtin.rearrange import RearrangeStep
 from labseq.errors import DeviceError, InvalidPlanError, PlanError
 from labseq.model import Plan
 from labseq.sequencer.lab import Timeouts

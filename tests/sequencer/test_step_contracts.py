@@ -8,23 +8,25 @@ import numpy as np
 import pytest
 
 from labseq import Context
-from labseq.builtin.equalise import EqualiseStep
-from labseq.builtin.probes import CheckOverlayStep, CheckSitesStep, ProbeStep
-from labseq.builtin.steps import (
+from labseq.builtin.equalise import EqualiseSettings, EqualiseStep
+from labseq.builtin.probes import (
     CheckOverlaySettings,
+    CheckOverlayStep,
     CheckSitesSettings,
+    CheckSitesStep,
+    ProbeSettings,
+    ProbeStep,
+)
+from labseq.builtin.rearrange import RearrangeSettings, RearrangeStep
+from labseq.builtin.steps import (
     DeviceSettings as DeviceStepSettings,
     DeviceStep,
-    EqualiseSettings,
     ImageSettings,
     ImageStep,
     LoadSettings,
     LoadStep,
-    ProbeSettings,
     RampSettings,
     RampStep,
-    RearrangeSettings,
-    RearrangeStep,
     WaitSettings,
     WaitStep,
 )

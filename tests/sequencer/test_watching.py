@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from labseq.builtin.probes import CheckOverlayStep, CheckSitesStep
-from labseq.builtin.steps import CheckOverlaySettings, CheckSitesSettings, ImageSettings, ImageStep
+from labseq.builtin.probes import CheckOverlaySettings, CheckOverlayStep, CheckSitesSettings, CheckSitesStep
+from labseq.builtin.steps import ImageSettings, ImageStep
 from labseq.detection.threshold import ThresholdDetector, ThresholdSettings
 from labseq.errors import ConfigError, DeviceError
 from labseq.model import CalibrationEntry, Frame, SegmentKind, ShotRecord, SiteGrid
@@ -95,9 +95,9 @@ def test_an_overlay_that_has_drifted_is_a_warning_with_the_shift() -> None:
     shots, observer = run(overlay_lab(Drifting((0.25e-6, 0.0))), check_overlay())
     assert shots[0].status == "complete"
     (warning,) = observer.of("warning")
-    assert warning["text"].startswith("shot 1: the mobile tweezers stand 2")
+    assert warning["text"].startswith("shot 1: the mobile tweezers are 2")
     assert "from row to row" in warning["text"]
-    assert warning["text"].endswith("beside the sites; the limit is 100 nm: run `labseq calibrate overlay`")
+    assert warning["text"].endswith("from the sites; the limit is 100 nm: run `labseq calibrate overlay`")
 
 
 def test_or_it_stops_the_run() -> None:
@@ -112,7 +112,7 @@ def test_losses_that_no_offset_explains_are_told_too() -> None:
         def _probe(self, seen: NDArray[np.bool_], program: Any) -> None:
             seen[1::2] = False  # both groups that went along one axis, and none of those along the other
 
-    with pytest.raises(DeviceError, match="goes with no small offset of the mobile tweezers: run `labseq"):
+    with pytest.raises(DeviceError, match="fits no small offset of the mobile tweezers: run `labseq"):
         run(overlay_lab(Uneven((0.0, 0.0))), check_overlay(exceeded="stop"))
 
 
@@ -148,14 +148,14 @@ def test_too_few_atoms_are_said() -> None:
     _, observer = run(fake_lab([few], grid=GRID), check_overlay())
     (warning,) = observer.of("warning")
     assert (
-        warning["text"] == "shot 1: check_overlay cannot tell the overlay to 100 nm with 3 atoms on this shot"
+        warning["text"] == "shot 1: check_overlay cannot measure the overlay to 100 nm with 3 atoms in this shot"
     )
 
 
 def test_no_atoms_are_no_error() -> None:
     shots, observer = run(fake_lab([~FULL], grid=GRID), check_overlay(exceeded="stop"))
     assert "overlay.along_row_m" not in shots[0].readings
-    assert observer.of("warning")[0]["text"].endswith("with 0 atoms on this shot")
+    assert observer.of("warning")[0]["text"].endswith("with 0 atoms in this shot")
 
 
 def test_its_timeline_may_be_left_out() -> None:
@@ -228,7 +228,7 @@ def test_too_few_atoms_are_no_drift(n_atoms: int) -> None:
     shots, observer = sites_run((0.9, 0.0), occupied, exceeded="stop")
     (warning,) = observer.of("warning")
     assert warning["text"] == (
-        f"shot 1: check_sites cannot tell where the sites are with {n_atoms} atoms seen on them: "
+        f"shot 1: check_sites cannot locate the sites with {n_atoms} atoms seen on them: "
         "few were loaded, or the sites are far from where the detector looks"
     )
     assert "sites.shift_y_px" not in shots[0].readings
@@ -242,5 +242,5 @@ def test_some_atoms_are_enough() -> None:
 
 
 def test_a_detector_that_tells_no_sites_is_refused() -> None:
-    with pytest.raises(ConfigError, match="needs a detector that tells where it looks"):
+    with pytest.raises(ConfigError, match="needs a detector that reports where it looks"):
         run(fake_lab(grid=GRID), [("check", CheckSitesStep(CheckSitesSettings()))])

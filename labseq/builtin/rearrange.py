@@ -1,0 +1,214 @@
+"""The step ``rearrange``: plan, check, move and image, in cycles."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from numbers import Real
+from typing import Literal, Self
+
+from pydantic import Field, model_validator
+
+from labseq.builtin.steps import PositiveDuration
+from labseq.plugin import (
+    CycleRecord,
+    DeviceError,
+    Duration,
+    Plan,
+    PlanError,
+    PlanReport,
+    Settings,
+    Shot,
+    Step,
+    StepContext,
+    TimelineEntry,
+    ToneProgram,
+    check_plan,
+    fitting_batches,
+    offers,
+    setting_error,
+    tone_program,
+)
+
+
+class RearrangeSettings(Settings):
+    """``rearrange``: plan, check, move and image, in cycles."""
+
+    cycles: int = Field(default=1, ge=1, le=100, description="maximum number of cycles of plan, move, image")
+    window: Duration | tuple[Duration, ...] = Field(
+        default=60e-3,
+        description="longest time for the moves of one cycle, overheads included; a list gives one per cycle",
+    )
+    exposure: PositiveDuration = Field(
+        default=45e-3, description="exposure time of the image that ends a cycle"
+    )
+    stop_when: Literal["defect_free", "never"] = Field(
+        default="defect_free", description="whether to leave out further cycles once the target is met"
+    )
+    window_mode: Literal["early", "fixed"] = Field(
+        default="early", description="whether the image follows the last batch, or the end of the window"
+    )
+
+    @model_validator(mode="after")
+    def _one_window_per_cycle(self) -> Self:
+        if isinstance(self.window, tuple) and len(self.window) != self.cycles:
+            entries = "1 entry" if len(self.window) == 1 else f"{len(self.window)} entries"
+            default = "" if "cycles" in self.model_fields_set else ", its default"
+            what = f"the list has {entries}, but cycles is {self.cycles}{default}"
+            raise setting_error(what, f"{self.cycles}, one per cycle", at=("window",))
+        return self
+
+    def window_of(self, cycle: int) -> float:
+        """The window of a cycle, in seconds.
+
+        Args:
+            cycle: Counted from 1.
+        """
+        return self.window[cycle - 1] if isinstance(self.window, tuple) else self.window
+
+
+class RearrangeStep(Step):
+    """Rearranges in cycles; cycle k is plan, check, move, image.
+
+    A batch that would end after the cycle's window is not started. With
+    ``window_mode: early`` the image follows the last batch; with ``fixed`` the
+    step waits for the end of the window.
+    """
+
+    needs_image = True
+    takes_image = True
+
+    def __init__(self, settings: RearrangeSettings) -> None:
+        self.settings = settings
+
+    def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:
+        """Two entries per cycle, the moves at their window."""
+        exposure_s = self.settings.exposure
+        image_s = exposure_s + context.camera.readout_s + context.margin_s("image")
+        all_made = self.settings.stop_when == "never"
+        waited_out = all_made and self.settings.window_mode == "fixed"
+        entries: list[TimelineEntry] = []
+        for cycle in range(1, self.settings.cycles + 1):
+            window_s = self.settings.window_of(cycle)
+            min_duration_s, min_image_s = window_s if waited_out else 0.0, image_s if all_made else 0.0
+            moves = TimelineEntry(f"cycle {cycle}: move", window_s, min_duration_s, kind="rearrange")
+            image = TimelineEntry(f"cycle {cycle}: image", image_s, min_image_s, 1, exposure_s, "image")
+            entries += [moves, image]
+        return entries
+
+    def run(self, shot: Shot) -> None:
+        """Run cycles until the target is met (``stop_when: defect_free``) or all are done."""
+        for cycle in range(1, self.settings.cycles + 1):
+            if shot.occupancy is None:
+                raise PlanError("rearrange needs an image before it in the shot")
+            if self.settings.stop_when == "defect_free" and shot.target.is_met_by(shot.occupancy):
+                return
+            self._move(shot, cycle)
+            shot.take_image(self.settings.exposure, cycle)
+
+    def _move(self, shot: Shot, cycle: int) -> None:
+        window_s = self.settings.window_of(cycle)
+        start_s = shot.clock.now()
+        with shot.stage("move", window_s, cycle):
+            plan, report = checked_plan(shot, cycle)
+            n_played = self._play(shot, plan, report, cycle, start_s)
+            left_s = window_s - (shot.clock.now() - start_s)
+            if self.settings.window_mode == "fixed" and left_s > 0:
+                shot.clock.sleep(left_s)
+        moves_s = float(report.batch_end_s[n_played - 1]) if n_played else 0.0
+        shot.record_cycle(
+            CycleRecord(shot.step, cycle, plan, report, n_played, window_s, start_s - shot.start_s, moves_s)
+        )
+
+    def _play(self, shot: Shot, plan: Plan, report: PlanReport, cycle: int, start_s: float) -> int:
+        """Play the batches that fit into the window; returns their number.
+
+        The modelled overhead of the cycle (planning, rendering, upload) counts in
+        full; only the time that they really took beyond it shortens the window.
+        """
+        if plan.n_batches == 0:
+            return 0
+        overhead_s = shot.motion.overhead_per_cycle_s
+        late_s = max(0.0, shot.clock.now() - start_s - overhead_s) + shot.margin_s("rearrange")
+        n_played = fitting_batches(report, plan, self.settings.window_of(cycle) - late_s)
+        if n_played < plan.n_batches:
+            shot.log("window_too_short", cycle=cycle, n_batches=plan.n_batches, n_batches_played=n_played)
+        if n_played > 0:
+            play(
+                shot,
+                lambda: tone_program(plan, grid=shot.grid, motion=shot.motion, n_batches=n_played),
+                start_s,
+                cycle,
+            )
+        return n_played
+
+
+def checked_plan(shot: Shot, cycle: int) -> tuple[Plan, PlanReport]:
+    """Plan for the last image of a shot, and check the plan.
+
+    Raises:
+        PlanError: The planner fails, or its plan breaks a rule.
+    """
+    occupancy = shot.occupancy
+    assert occupancy is not None
+    with shot.stage("plan", cycle=cycle):
+        copy = occupancy.copy()  # for a planner that writes into its input
+        try:
+            plan = shot.call("planner", shot.plan_timeout_s, shot.planner.plan, copy, shot.target)
+        except PlanError as error:
+            raise error if error.planner else PlanError(str(error), shot.planner_name) from error
+    if not isinstance(plan, Plan):  # pyright: ignore[reportUnnecessaryIsInstance]
+        raise PlanError(f"plan() returned {type(plan).__name__}; expected a Plan", shot.planner_name)
+    limit = shot.degree_of_parallelism
+    with shot.stage("check", cycle=cycle):
+        report = check_plan(
+            plan,
+            occupancy,
+            shot.target,
+            limit,
+            grid=shot.grid,
+            motion=shot.motion,
+            planner=shot.planner_name,
+        )
+    return plan, report
+
+
+def play(shot: Shot, build: Callable[[], ToneProgram], start_s: float, cycle: int = 0) -> None:
+    """Build a tone program, play it and wait for its end.
+
+    On a virtual clock it takes at least the modelled overhead of a cycle, as on real hardware.
+
+    Args:
+        shot: The running shot.
+        build: Makes the program.
+        start_s: Start of the cycle on the session's clock; its overhead counts from there.
+        cycle: Rearrangement cycle, counted from 1; 0 outside of one.
+
+    Raises:
+        LimitError: The program breaks a limit.
+        DeviceError: The mobile tweezers fail, or a watched value is past its limit.
+    """
+    overhead_s = shot.motion.overhead_per_cycle_s
+    mobile, limit_s = shot.mobile_tweezers, shot.call_timeout_s
+    with shot.stage("prepare", overhead_s, cycle):
+        with shot.stage("tones", cycle=cycle):
+            program = build()
+        duration_s = _playing_time_s(shot.call("mobile_tweezers", limit_s, mobile.prepare, program))
+        if offers(mobile, "timings"):
+            for part, host_s in shot.call("mobile_tweezers", limit_s, mobile.timings).items():
+                shot.stage_done(part, 0.0 if shot.clock.virtual else host_s, host_s, cycle=cycle)
+        if shot.clock.virtual:
+            shot.clock.sleep(max(0.0, overhead_s - (shot.clock.now() - start_s)))
+    shot.check_interlocks()
+    budget_s = duration_s + shot.margin_s("rearrange")
+    with shot.stage("play", budget_s, cycle), shot.lines_on("rearrange", duration_s):
+        shot.call("mobile_tweezers", limit_s, mobile.play)
+        shot.call("mobile_tweezers", duration_s + 2 * limit_s, mobile.wait, duration_s + limit_s)
+
+
+def _playing_time_s(answer: object) -> float:
+    """The playing time that ``prepare`` returned; every wait for the device is derived from it."""
+    if not (isinstance(answer, Real) and 0 <= float(answer) < math.inf):
+        text = f"prepare() returned {answer!r}; expected the playing time in seconds, 0 or more"
+        raise DeviceError("mobile_tweezers", text)
+    return float(answer)
