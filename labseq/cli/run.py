@@ -156,12 +156,12 @@ def stop_run(run: Path | None, profile: str | None, *, queue: bool, wait: bool) 
         wait: Whether to wait for its end.
 
     Raises:
-        ConfigError: No run is in progress, or several are; or the queue is not at work.
+        ConfigError: No run is in progress, or several are; or no process runs the queue.
         RecordingError: Its folder cannot be written to.
     """
     if queue:
         if not Queue(data_root()).ask_to_stop():
-            raise ConfigError("the queue is not at work; 'labseq stop' without --queue ends a run")
+            raise ConfigError("no process runs the queue; 'labseq stop' without --queue ends a run")
         say("the queue takes no further runs")
         if run is None and not running_here(profile):
             return

@@ -1,8 +1,7 @@
-"""The queue: runs taken one after the other, a file for each."""
+"""The queue: runs that are taken one after the other, each in a file of its own."""
 
 from __future__ import annotations
 
-import json
 import re
 import signal
 import time
@@ -10,8 +9,11 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from fractions import Fraction
+from functools import cache
 from pathlib import Path
-from typing import Any, Final, Literal, cast, get_args
+from typing import Any, Final, Literal
+
+from pydantic import TypeAdapter, ValidationError
 
 from labseq.config import StoredText, find_profile
 from labseq.errors import ConfigError, LabseqError, Problem, RecordingError, StopRequested
@@ -30,6 +32,7 @@ from labseq.text_files import decode, read_bytes
 
 FOLDER: Final = "queue"
 FORMAT: Final = 1
+"""Version of an entry's file."""
 EntryStatus = Literal["waiting", "running", "stopped", "failed"]
 
 _NUMBER: Final = re.compile(r"(\d{4,})\.(?:json|id)")
@@ -37,18 +40,18 @@ _NUMBER: Final = re.compile(r"(\d{4,})\.(?:json|id)")
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """A run that is to be taken.
+    """A queued run.
 
     Attributes:
-        id: Its number; no later entry gets it again.
+        id: Its number, counted from 1; no later entry gets it again.
         position: Entries are taken in this order.
         added_utc: When it was added, ISO 8601, UTC.
         sequence: The sequence's file, absolute.
-        text: What that said when it was added; this is what will be run.
+        text: The text of that file when it was added; this is what will run.
         options: What the user changed.
         status: "waiting", "running", or how its run ended early.
         run_dir: The folder of its run, once there is one.
-        error: Why it was not begun, or ended early; or "".
+        error: Why it did not start or ended early; or "".
         owner: The process that runs it, or did.
     """
 
@@ -64,31 +67,31 @@ class Entry:
     owner: Process | None = None
 
     @property
-    def kept(self) -> StoredText:
-        """The text, to be read in place of the file."""
+    def stored_text(self) -> StoredText:
+        """The text, to be read instead of the file."""
         return StoredText(self.text, f"{self.sequence} (as queued)")
 
     @property
     def is_interrupted(self) -> bool:
-        """Whether the process that ran it is gone before its end."""
-        gone = self.owner is None or not (self.owner.is_here and self.owner.is_running)
-        return self.status == "running" and gone
+        """Whether the process that ran it died before its end."""
+        is_gone = self.owner is None or not (self.owner.is_here and self.owner.is_running)
+        return self.status == "running" and is_gone
 
     @property
     def is_complete(self) -> bool:
-        """Whether its run is complete, by whomever it was taken to its end."""
+        """Whether its run is complete, whether the queue or `labseq resume` completed it."""
         return self.run_dir is not None and read_state(self.run_dir)[0] == "complete"
 
     @property
     def state(self) -> str:
-        """How it stands, in a word."""
+        """Its state in a word: its status, "interrupted" or "complete"."""
         if self.is_complete:
             return "complete"
         return "interrupted" if self.is_interrupted else self.status
 
     @property
     def has_changed(self) -> bool:
-        """Whether the sequence's file says something else today."""
+        """Whether the sequence's file has changed since, or is gone."""
         try:
             return decode(read_bytes(self.sequence), visible(str(self.sequence))) != self.text
         except ConfigError:
@@ -106,7 +109,7 @@ class Queue:
         self.folder = root.absolute() / FOLDER
 
     def lock(self) -> Lock:
-        """What whoever runs the queue holds."""
+        """The lock of the process that runs the queue."""
         return Lock(self.folder / ".lock", "labseq queue run")
 
     def entries(self) -> list[Entry]:
@@ -138,14 +141,13 @@ class Queue:
         return entry, report
 
     def write(self, entry: Entry) -> None:
-        """Put an entry down as it stands.
+        """Write an entry to its file.
 
         Raises:
             RecordingError: The disk is full, or the queue cannot be written to.
         """
-        values = {"format": FORMAT, **asdict(entry)}
-        values |= {"position": str(entry.position), "sequence": str(entry.sequence)}
-        write_file(self._file(entry.id), dumps(_texts(values), indent=1).encode() + b"\n")
+        values = {"format": FORMAT, **_adapter().dump_python(entry, mode="json")}
+        write_file(self._file(entry.id), dumps(values, indent=1).encode() + b"\n")
 
     def remove(self, ids: Sequence[int]) -> None:
         """Take entries out of the queue; their runs stay.
@@ -183,7 +185,7 @@ class Queue:
         self.write(replace(entry, position=(lower + other.position) / 2))
 
     def ask_to_stop(self) -> bool:
-        """Ask whoever runs the queue to take no further entry; False if nobody does.
+        """Ask the process that runs the queue to take no further entry; False if there is none.
 
         Raises:
             RecordingError: The queue cannot be written to.
@@ -195,16 +197,16 @@ class Queue:
 
     @property
     def is_asked_to_stop(self) -> bool:
-        """Whether no further entry is to be taken."""
+        """Whether the queue is asked to take no further entry."""
         return (self.folder / STOP_FILE).exists()
 
-    def forget_stop(self) -> None:
-        """Take back what was asked for before."""
+    def clear_stop(self) -> None:
+        """Withdraw the request to stop."""
         with suppress(OSError):
             (self.folder / STOP_FILE).unlink(missing_ok=True)
 
     def holder(self) -> Holder | None:
-        """Who runs the queue; None for nobody."""
+        """The process that runs the queue, or None."""
         if not self.folder.is_dir():
             return None
         lock = self.lock()
@@ -226,7 +228,7 @@ class Queue:
         return self.folder / f"{number:04d}.json"
 
     def _new_id(self) -> int:
-        """A number that no entry has or had; the file ``<number>.id`` stands for its having been given."""
+        """A number that no entry has or had; the file ``<number>.id`` marks the last one as used."""
         with explained(self.folder):
             self.folder.mkdir(parents=True, exist_ok=True)
             while True:
@@ -241,13 +243,6 @@ class Queue:
                 return number
 
 
-def _texts(values: dict[str, Any]) -> dict[str, Any]:
-    """Paths as text."""
-    options = {k: str(v) if isinstance(v, Path) else v for k, v in values["options"].items()}
-    run_dir = values["run_dir"]
-    return {**values, "options": options, "run_dir": None if run_dir is None else str(run_dir)}
-
-
 def _read(file: Path) -> Entry | None:
     """Read an entry; None if it has just been removed.
 
@@ -255,42 +250,34 @@ def _read(file: Path) -> Entry | None:
         RecordingError: It is damaged, or cannot be read.
     """
     try:
-        values = parse_object(file.read_bytes())
+        values = parse_object(file.read_bytes()) or {}
     except FileNotFoundError:
         return None
     except OSError as error:
         raise RecordingError(file, f"cannot be read: {error.strerror}; check the disk") from error
+    if values.get("format") != FORMAT:
+        raise RecordingError(file, f"is not a queue entry of format {FORMAT}; move it away")
     try:
-        return _entry(values or {})
-    except (KeyError, TypeError, ValueError) as error:
-        raise RecordingError(file, f"is no entry of a queue: {error!r}; move it away") from error
+        entry = _adapter().validate_python(values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(map(str, first["loc"]))
+        raise RecordingError(
+            file, f"is a damaged queue entry: {place}: {first['msg']}; move it away"
+        ) from error
+    return replace(entry, options=replace(entry.options, overrides=tuple(entry.options.overrides)))
 
 
-def _entry(values: dict[str, Any]) -> Entry:
-    if values["format"] != FORMAT or values["status"] not in get_args(EntryStatus):
-        raise ValueError(json.dumps(values["format"]))
-    options, run_dir, owner = values["options"], values["run_dir"], values["owner"]
-    output = None if options["output"] is None else Path(options["output"])
-    given: dict[str, Any] = {**options, "output": output, "overrides": tuple(options["overrides"])}
-    return Entry(
-        id=int(values["id"]),
-        position=Fraction(values["position"]),
-        added_utc=str(values["added_utc"]),
-        sequence=Path(values["sequence"]),
-        text=str(values["text"]),
-        options=Options(**given),
-        status=cast("EntryStatus", values["status"]),
-        run_dir=None if run_dir is None else Path(run_dir),
-        error=str(values["error"]),
-        owner=None if owner is None else Process.from_plain(owner),
-    )
+@cache
+def _adapter() -> TypeAdapter[Entry]:
+    return TypeAdapter(Entry)
 
 
-LOOK_S: Final = 0.5
+POLL_S: Final = 0.5
 """How often a queue that waits for new entries looks for them."""
 
 Opening = Callable[[RunObserver | None], Session]
-"""Opens a session that tells an observer everything."""
+"""Opens a session whose events go to an observer."""
 
 
 class QueueRun:
@@ -298,10 +285,10 @@ class QueueRun:
 
     Args:
         queue: The queue.
-        take: Runs what its argument opens, and shows it.
-        begin: Told each entry that is taken.
-        fail: Told each error of an entry after which the queue goes on.
-        keep_going: Whether the queue goes on after an entry that failed.
+        take: Runs the session that its argument opens, and shows it.
+        begin: Called with each entry that is taken.
+        fail: Called with each error after which the queue continues.
+        keep_going: Whether the queue continues after an entry that failed.
     """
 
     def __init__(
@@ -328,31 +315,31 @@ class QueueRun:
             watch: Whether to wait for new ones when none waits.
 
         Raises:
-            ConfigError: Somebody else runs the queue.
-            LabseqError: Whatever ended a run, unless the queue keeps going.
+            ConfigError: Another process runs the queue.
+            LabseqError: The error that ended a run, unless the queue keeps going.
             StopRequested: Ctrl-C or SIGTERM.
         """
         lock = self._queue.lock()
         with explained(self._queue.folder):
             holder = lock.take()
         if holder is not None:
-            raise ConfigError(Problem(f"the queue is at work already: {holder}", str(self._queue.folder)))
-        self._queue.forget_stop()
+            raise ConfigError(Problem(f"the queue is already being run: {holder}", str(self._queue.folder)))
+        self._queue.clear_stop()
         try:
             while not self._queue.is_asked_to_stop:
                 entry = self._next()
                 if entry is not None:
                     self._work(entry)
                 elif watch:
-                    time.sleep(LOOK_S)
+                    time.sleep(POLL_S)
                 else:
                     break
         finally:
-            self._queue.forget_stop()
+            self._queue.clear_stop()
             lock.release()
 
     def _next(self) -> Entry | None:
-        """The entry to take; those whose runs are complete leave the queue."""
+        """The entry to take; entries whose runs are complete leave the queue."""
         left: list[Entry] = []
         for entry in self._queue.entries():
             if entry.is_complete:
@@ -366,22 +353,22 @@ class QueueRun:
     def _work(self, entry: Entry) -> None:
         self._tried.add(entry.id)
         self._begin(entry)
-        note = _EntryObserver(
+        recorder = _EntryRecorder(
             self._queue, replace(entry, status="running", owner=Process.current(), error="")
         )
-        note.write()
+        recorder.write()
         try:
-            self._take(lambda observer: _open(entry, note.beside(observer)))
+            self._take(lambda observer: _open(entry, recorder.passing_to(observer)))
         except StopRequested as stop:
             if stop.after_shot or stop.signal_number == signal.SIGINT:
-                note.end("stopped", str(stop))
-            if not stop.after_shot:  # by SIGTERM it is interrupted, and is gone on with
+                recorder.end("stopped", str(stop))
+            if not stop.after_shot:  # after SIGTERM the entry is interrupted, and will be resumed
                 raise
         except KeyboardInterrupt:
-            note.end("stopped", "stopped by Ctrl-C")
+            recorder.end("stopped", "stopped by Ctrl-C")
             raise
         except LabseqError as error:
-            note.end("failed", str(error))
+            recorder.end("failed", str(error))
             self.first_error = self.first_error or error
             if not self._keep_going:
                 raise
@@ -390,34 +377,34 @@ class QueueRun:
             self._queue.drop(entry.id)
 
 
-class _EntryObserver:
-    """What is known of an entry that is being taken; implements ``RunObserver``."""
+class _EntryRecorder:
+    """Implements ``RunObserver``: keeps the file of the entry that is being taken up to date."""
 
     def __init__(self, queue: Queue, entry: Entry) -> None:
         self._queue = queue
         self._entry = entry
         self._observer: RunObserver | None = None
 
-    def beside(self, observer: RunObserver | None) -> _EntryObserver:
-        """Pass everything on to an observer."""
+    def passing_to(self, observer: RunObserver | None) -> _EntryRecorder:
+        """Pass all events on to an observer, too."""
         self._observer = observer
         return self
 
     def event(self, name: str, values: Mapping[str, Any]) -> None:
-        """Note the run's folder as soon as there is one."""
+        """Record the run's folder as soon as there is one."""
         if name == "run_starting":
             self._entry = replace(self._entry, run_dir=Path(values["run_dir"]))
-            with suppress(RecordingError):  # the run will tell of a full disk itself
+            with suppress(RecordingError):  # the run itself reports a full disk
                 self.write()
         if self._observer is not None:
             self._observer.event(name, values)
 
     def write(self) -> None:
-        """Put it down."""
+        """Write the entry."""
         self._queue.write(self._entry)
 
     def end(self, status: Any, error: str) -> None:
-        """Put down how it ended; what was never begun goes on waiting."""
+        """Record how it ended; an entry without a run keeps waiting."""
         if self._entry.run_dir is None:
             status = "waiting"
         self._entry = replace(self._entry, status=status, error=error, owner=None)
@@ -440,6 +427,6 @@ def _open(entry: Entry, observer: RunObserver) -> Session:
         overrides=options.overrides,
         given=options.own(),
         dry_run=options.dry_run,
-        kept=entry.kept,
+        kept=entry.stored_text,
     )
     return Session(assembly, options, observer)

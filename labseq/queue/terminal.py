@@ -1,4 +1,4 @@
-"""What `labseq queue` prints."""
+"""`labseq queue`: change the queue, run it, and print it."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def add_entry(sequence: Path, options: Options) -> None:
     entry, checked = Queue(data_root()).add(sequence, options)
     for warning in checked.warnings:
         say(*warning_lines(warning), stream=sys.stderr)
-    say(f"{entry.id}: {clean(str(sequence))}, {plural(checked.n_shots, 'shot')}, as it is written now")
+    say(f"{entry.id}: {clean(str(sequence))}, {plural(checked.n_shots, 'shot')}, with its present text")
 
 
 def list_entries(*, as_json: bool) -> None:
@@ -47,7 +47,7 @@ def list_entries(*, as_json: bool) -> None:
     holder = queue.holder()
     notes = [note for entry in entries for note in _notes(entry)]
     table = columns([_HEADER, *map(_row, entries)], right=(0,)) if entries else ["the queue is empty"]
-    say(*table, *([""] if notes else []), *notes, *([] if holder is None else ["", f"at work: {holder}"]))
+    say(*table, *([""] if notes else []), *notes, *([] if holder is None else ["", f"run by: {holder}"]))
 
 
 def remove_entries(ids: Sequence[int]) -> None:
@@ -98,7 +98,7 @@ def run_entries(run_session: RunSession, *, keep_going: bool, watch: bool) -> in
 
 
 def _report(entry: Entry) -> None:
-    again = f", goes on with {entry.run_dir}" if entry.run_dir is not None else ""
+    again = f", resuming {entry.run_dir}" if entry.run_dir is not None else ""
     say(f"queue: {entry.id} {clean(str(entry.sequence))}{again}")
 
 
@@ -119,14 +119,14 @@ def _options_text(options: Options) -> str:
 
 
 def _short(path: Path) -> str:
-    """The path from here, where it is below."""
+    """The path relative to the current folder if it is below it."""
     return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else str(path)
 
 
 def _notes(entry: Entry) -> list[str]:
     notes: list[str] = []
     if entry.has_changed and not entry.is_complete:
-        what = "has been changed or removed since; what it said then is run"
+        what = "was changed or removed since; the queued text will run"
         notes.append(f"{entry.id}: {clean(_short(entry.sequence))} {what}")
     if entry.error:
         notes.append(f"{entry.id}: {entry.error.splitlines()[0]}")

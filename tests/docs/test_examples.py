@@ -54,7 +54,7 @@ NOT_RUN = {
     "docs/how-to/cameras-genicam.md": ["changes the computer's settings", MEASURED],
     "docs/how-to/cameras-pylon.md": ["installs packages", MEASURED],
     "docs/how-to/editor.md": [
-        "tests/scaffolds/test_made.py looks for this line",
+        "tests/scaffold/test_made.py looks for this line",
         "changes the settings of the shell",
     ],
     "docs/how-to/export.md": ["installs packages"],

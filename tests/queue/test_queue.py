@@ -74,11 +74,17 @@ def test_an_entry_reads_back(queue: Queue) -> None:
     assert asdict(read) == asdict(full)
 
 
-@pytest.mark.parametrize("content", ["", "[]", "{}", '{"format": 9, "status": "waiting"}'])
-def test_a_damaged_entry_is_told(queue: Queue, content: str) -> None:
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        *((text, "is not a queue entry of format 1") for text in ("", "[]", "{}", '{"format": 9}')),
+        ('{"format": 1, "id": 1}', "is a damaged queue entry: position: "),
+    ],
+)
+def test_a_damaged_entry_is_named(queue: Queue, content: str, message: str) -> None:
     add(queue)
     (queue.folder / "0001.json").write_text(content)
-    with pytest.raises(RecordingError, match=r"0001\.json: is no entry of a queue"):
+    with pytest.raises(RecordingError, match=rf"0001\.json: {message}"):
         queue.entries()
 
 

@@ -57,7 +57,7 @@ def call(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[Any, str,
 def test_runs_are_queued_listed_moved_removed_and_run(capsys: pytest.CaptureFixture[str]) -> None:
     assert call(capsys, "queue", "list") == (0, "the queue is empty\n", "")
     added = call(capsys, "queue", "add", "s.yaml", "--shots", "2", "--set", "attempts=5")
-    assert added == (0, "1: s.yaml, 2 shots, as it is written now\n", "")
+    assert added == (0, "1: s.yaml, 2 shots, with its present text\n", "")
     call(capsys, "queue", "add", "s.yaml")
     call(capsys, "queue", "add", "s.yaml", "--seed", "7")
     assert call(capsys, "queue", "move", "3", "--before", "1")[0] == 0
@@ -85,7 +85,7 @@ def test_the_list_says_what_one_should_know(capsys: pytest.CaptureFixture[str]) 
     assert err.startswith(f"{Path.cwd() / 's.yaml'} (as queued):4:10: there is no hardware profile at ")
     code, out, _ = call(capsys, "queue", "list")
     *_, changed, why = out.splitlines()
-    assert changed == "1: s.yaml has been changed or removed since; what it said then is run"
+    assert changed == "1: s.yaml was changed or removed since; the queued text will run"
     assert why.startswith("1: ")
     assert "there is no hardware profile" in why
     values = json.loads(call(capsys, "queue", "list", "--json")[1])["entries"][0]
@@ -123,7 +123,7 @@ def test_a_queue_that_keeps_going_ends_with_the_first_failure(
         (("queue", "move", "5", "--before", "6"), "error: the queue has no entry 5; expected nothing"),
         (("stop",), "error: no run is in progress\n"),
         (("stop", "--profile", "./p.yaml"), "error: no run is in progress on the profile ./p.yaml\n"),
-        (("stop", "--queue"), "error: the queue is not at work; 'labseq stop' without --queue ends a run\n"),
+        (("stop", "--queue"), "error: no process runs the queue; 'labseq stop' without --queue ends a run\n"),
         (("stop", "nowhere"), "nowhere: no such file or folder"),
         (("resume", "nowhere"), "nowhere: no such file or folder"),
     ],

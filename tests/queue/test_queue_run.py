@@ -128,7 +128,7 @@ def test_a_run_that_is_stopped_after_its_shot_does_not_end_the_queue(queue: Queu
 def test_the_queue_may_be_stopped_too(queue: Queue) -> None:
     add(queue)
     add(queue)
-    assert not queue.ask_to_stop()  # nobody is at work
+    assert not queue.ask_to_stop()  # no process runs it
 
     def stop(run_dir: Path) -> None:
         assert queue.ask_to_stop()
@@ -146,7 +146,7 @@ def test_a_queue_is_run_by_one(queue: Queue) -> None:
     add(queue)
 
     def again(_: Path) -> None:
-        with pytest.raises(ConfigError, match=r"at work already: labseq queue run \(process \d+ on "):
+        with pytest.raises(ConfigError, match=r"already being run: labseq queue run \(process \d+ on "):
             Taking().run(queue)
 
     Taking(again).run(queue)
