@@ -63,7 +63,7 @@ def catalogue() -> list[Any]:
     """The bad files of the tests of the configuration: kind, content, and whether only values are wrong."""
     found: list[Any] = []
     for name, about_values in ABOUT_VALUES.items():
-        module = runpy.run_path(str(Path(__file__).with_name(f"test_bad_{name}.py")))
+        module = runpy.run_path(str(ROOT / "tests" / "config" / f"test_bad_{name}.py"))
         cases = {case[0]: case for case in module["CASES"]}
         assert about_values <= set(cases)
         kind = "profile" if name == "profiles" else "sequence"
