@@ -103,6 +103,17 @@ def parse_quantity(text: str, dimension: str) -> float:
     return scaled(float(match[1]), units[unit])
 
 
+def split_quantity(text: str) -> tuple[float, str]:
+    """The number and the unit of a quantity as they are written; nan and "" for other text.
+
+    Example:
+        >>> split_quantity("45 ms")
+        (45.0, 'ms')
+    """
+    match = _NUMBER.match(text)
+    return (math.nan, "") if match is None else (float(match[1]), match[2] or "")
+
+
 def parse_any(text: str) -> tuple[float, str]:
     """Read a quantity of whatever dimension into SI.
 
@@ -116,8 +127,7 @@ def parse_any(text: str) -> tuple[float, str]:
         >>> parse_any("45 ms")
         (0.045, 'time')
     """
-    match = _NUMBER.match(text)
-    unit = "" if match is None else match[2] or ""
+    unit = split_quantity(text)[1]
     dimension = "temperature" if unit == "degC" else dimension_of(unit)
     if not dimension:
         raise ValueError(f"'{text}' is no number with a unit")
@@ -141,8 +151,7 @@ def si_unit_of(text: str) -> str:
         >>> si_unit_of("60 ms"), si_unit_of("130 um/ms"), si_unit_of("75 %"), si_unit_of("7")
         ('s', 'm/s', '', '')
     """
-    match = _NUMBER.match(text)
-    unit = "" if match is None else match[2] or ""
+    unit = split_quantity(text)[1]
     if unit == "degC":
         return "K"
     known = next((units for units in UNITS.values() if unit and unit in units), {})

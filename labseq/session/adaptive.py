@@ -128,7 +128,7 @@ def make_search(scanned: ScanPoints, steps: Steps, found: ProblemCollector) -> S
 
 def _range(axis: Axis, ends: Ends, resolved: tuple[Any, Any], present: Any, name: str) -> ScanRange:
     """A range, if its ends are numbers that mean what is written."""
-    low, high = ends.si(ends.low), ends.si(ends.high)
+    low, high = ends.low.si, ends.high.si
     if not all(map(_is_number, resolved)) or not all(map(math.isclose, resolved, (low, high))):
         what = f"'{clean(axis.address)}' is no number, or not the one that is written"
         raise ConfigError(axis.key.problem(name, what, "an address of a number or quantity"))

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, strategies as st
 
 from labseq.config import Document, Override, Scan, load_sequence, read_scan
-from labseq.config.scan import MAX_POINTS, values_of
+from labseq.config.scan_values import MAX_POINTS, values_of
 from labseq.errors import ConfigError
 
 REST = """labseq: 1
