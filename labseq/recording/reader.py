@@ -244,7 +244,7 @@ class Run:
         Raises:
             ConfigError: pandas is not installed.
         """
-        from labseq.recording.export import dataframe_of
+        from labseq.recording.tables import dataframe_of
 
         return dataframe_of(self, attempts=attempts)
 
@@ -263,7 +263,7 @@ class Run:
             ConfigError: xarray is not installed.
             RecordingError: A shot's file is missing or damaged, or the scan is.
         """
-        from labseq.recording.export import dataset_of
+        from labseq.recording.tables import dataset_of
 
         return dataset_of(self, occupancies=occupancies)
 

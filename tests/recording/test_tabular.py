@@ -191,7 +191,7 @@ def test_a_missing_package_is_explained(run: Run, monkeypatch: pytest.MonkeyPatc
         return None if name == package else found(name)
 
     found = importlib.util.find_spec
-    monkeypatch.setattr("labseq.recording.export.find_spec", without)
+    monkeypatch.setattr("labseq.recording.tables.find_spec", without)
     with pytest.raises(
         ConfigError, match=rf"{package}, which is not installed; pip install 'labseq\[analysis\]'"
     ):

@@ -1,0 +1,170 @@
+"""A run as one HDF5 file.
+
+The tree::
+
+    /                        what is true of the whole run, as attributes
+      table                  NXdata: a column for each value of the shots, as in ``Run.to_dataframe``
+      run/<file>             the files of the run's folder: run.json, sequence.yaml, calibrations, ...
+      shots/shot_000000      what the shot's file has under /entry; attempts that failed, likewise
+
+Settings, devices and target are the same in all shots and are in the file once: the shots have hard links
+to them.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Final
+
+import h5py
+import numpy as np
+
+import labseq
+from labseq.errors import RecordingError
+from labseq.files import whole_file
+from labseq.plain import plain_text
+from labseq.recording import folders, schema
+from labseq.recording.columns import columns_of
+from labseq.recording.hdf5 import link_name, load_filter, set_attributes
+from labseq.recording.reader import Run
+from labseq.recording.shot import Shot
+from labseq.recording.tables import facts_of
+
+FORMAT: Final = "labseq-archive"
+FORMAT_VERSION: Final = "2.0"
+
+_SHARED: Final = ("target", "run")
+_WORTH_PACKING: Final = 1024
+"""Bytes from which compressing an array makes it smaller."""
+_PACKED: Final = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
+
+
+def write_archive(run: Run, path: Path, *, frames: bool) -> list[str]:
+    """Write the archive of a run, whole or not at all.
+
+    Args:
+        run: The run.
+        path: The file; an older one is replaced.
+        frames: Whether it holds the frames.
+
+    Returns:
+        Why shots were left out: files that are missing or damaged. Empty if all are in it.
+
+    Raises:
+        OSError: It cannot be written.
+        RuntimeError: Likewise; HDF5 raises either.
+    """
+    left_out: list[str] = []
+    with whole_file(path) as part, h5py.File(Path(part.name), "w", libver=schema.LIBRARY_VERSIONS) as file:
+        formats = {"format": FORMAT, "format_version": FORMAT_VERSION}
+        set_attributes(file, {**facts_of(run), **formats, "NX_class": "NXroot", "default": "table"})
+        file.attrs["archived_by"] = f"labseq {labseq.__version__}"
+        _write_table(file.create_group("table"), run)
+        _write_files(file.create_group("run"), run.path)
+        shots = _Shots(file.create_group("shots"), frames=frames)
+        for shot in (*run.shots, *run.attempts):
+            try:
+                shot.verify()
+                shots.add(shot)
+            except RecordingError as error:
+                left_out.append(str(error))
+    return left_out
+
+
+def _write_table(group: h5py.Group, run: Run) -> None:
+    set_attributes(group, {"NX_class": "NXdata", "signal": "filling_fraction"})
+    group.attrs["axes"] = ["shot"]
+    names: list[str] = []
+    for column in columns_of(run):
+        names.append(link_name(column.name, names))
+        values, dtype = column.values, column.values.dtype
+        if dtype.kind == "O":
+            values, dtype = list(map(plain_text, values)), h5py.string_dtype()
+        dataset = group.create_dataset(names[-1], data=values, dtype=dtype)
+        set_attributes(dataset, {"units": column.units, "description": column.description})
+
+
+def _write_files(group: h5py.Group, run_dir: Path) -> None:
+    """The files of the run's folder as they are: texts as text, others as bytes."""
+    results = group.create_group(folders.RESULTS_FOLDER)
+    for goal, folder in ((group, run_dir), (results, run_dir / folders.RESULTS_FOLDER)):
+        for path in sorted(folder.iterdir()) if folder.is_dir() else ():
+            if path.is_file() and path.suffix != ".part" and not path.name.startswith("."):
+                _write_file(goal, plain_text(path.name), path.read_bytes())
+
+
+def _write_file(group: h5py.Group, name: str, data: bytes) -> None:
+    try:
+        text = data.decode() if b"\0" not in data else None
+    except ValueError:
+        text = None
+    if text is None:
+        dataset = group.create_dataset(name, data=np.frombuffer(data, np.uint8))
+    else:
+        dataset = group.create_dataset(name, data=text, dtype=h5py.string_dtype())
+    set_attributes(dataset, {"units": "", "description": "this file of the run's folder"})
+
+
+class _Shots:
+    """Copies shots into a group; equal groups ``run`` and ``target`` are shared."""
+
+    def __init__(self, group: h5py.Group, *, frames: bool) -> None:
+        self._group = group
+        self._frames = frames
+        self._shared: dict[str, tuple[Any, Any]] = {}  # name -> content, group
+
+    def add(self, shot: Shot) -> None:
+        """Copy a shot whose file is whole.
+
+        Raises:
+            RecordingError: Its frames are compressed and the package for it is missing.
+        """
+        with h5py.File(shot.file, "r", locking=False) as source:
+            entry: Any = source["entry"]
+            for camera in entry.get("camera", {}).values() if self._frames else ():
+                load_filter(shot.file, camera["images"])
+            made = self._group.create_group(shot.file.stem)
+            made.attrs.update(entry.attrs)
+            for name in entry:
+                if name in _SHARED:
+                    self._share(entry[name], made, name)
+                elif self._frames or name != "images_view":
+                    _copy(entry, made, name, frames=self._frames)
+            if "images_view" not in made:
+                made.attrs["default"] = "detection"
+
+    def _share(self, source: Any, made: Any, name: str) -> None:
+        content = {
+            key: str(value[()]) if value.ndim == 0 else value[()].tobytes() for key, value in source.items()
+        }
+        content |= {f"@{key}": str(value) for key, value in source.attrs.items()}
+        if self._shared.get(name, (None,))[0] != content:
+            source.file.copy(source, made, name)
+            self._shared[name] = content, made[name]
+        else:
+            made[name] = self._shared[name][1]
+
+
+def _copy(source: Any, made: Any, name: str, *, frames: bool) -> None:
+    """Copy what a group has under a name; large arrays are compressed, frames left out if unwanted."""
+    link = source.get(name, getlink=True)
+    if isinstance(link, h5py.SoftLink):
+        shot = "/".join(made.name.split("/")[:3])
+        made[name] = h5py.SoftLink(link.path.replace("/entry", shot, 1))
+        return
+    node = source[name]
+    if isinstance(node, h5py.Group):
+        group = made.create_group(name)
+        group.attrs.update(node.attrs)
+        for inner in node.keys():  # noqa: SIM118 - names of the group's own, all text
+            _copy(node, group, inner, frames=frames)
+        return
+    is_image = name == "images" and node.ndim == 3
+    if is_image and not frames:
+        return
+    is_compressed = node.id.get_create_plist().get_nfilters() > 0
+    if node.dtype.kind != "O" and (node.nbytes >= _WORTH_PACKING or is_compressed):
+        chunks = (1, *node.shape[1:]) if is_image else True
+        made.create_dataset(name, data=node[()], chunks=chunks, **_PACKED).attrs.update(node.attrs)
+    else:
+        source.file.copy(node, made, name)

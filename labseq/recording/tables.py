@@ -1,0 +1,196 @@
+"""The shots of a run as a table of pandas and as a dataset of xarray; both need the extra ``analysis``."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq.errors import ConfigError, Problem, RecordingError
+from labseq.plain import dumps
+from labseq.recording.columns import columns_of
+from labseq.recording.folders import RUN_FILE
+from labseq.recording.reader import Run
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import xarray as xr
+
+NO_IMAGE: Final = -1
+"""Value of occupancies where a shot has no such image, or where there is no such shot."""
+
+
+def check_installed(*packages: str) -> None:
+    """Refuse to go on without packages of the extra ``analysis``.
+
+    Raises:
+        ConfigError: One is missing; says how to install it.
+    """
+    for package in packages:
+        if find_spec(package) is None:
+            what = f"this needs {package}, which is not installed"
+            raise ConfigError(Problem(what, hint="pip install 'labseq[analysis]'"))
+
+
+def facts_of(run: Run) -> dict[str, Any]:
+    """What is true of the whole run, as plain values."""
+    return {
+        "run_id": str(run.record.get("run_id") or run.path.name),
+        "name": run.name,
+        "status": run.status,
+        "error": run.error,
+        "seed": str(run.seed),
+        "simulated": int(run.simulated),
+        "n_shots": run.n_shots,
+        "t_start_utc": str(run.record.get("t_start_utc") or ""),
+        "creator": str(run.record.get("creator") or ""),
+    }
+
+
+def dataframe_of(run: Run, *, attempts: bool = False) -> pd.DataFrame:
+    """See :meth:`labseq.recording.Run.to_dataframe`."""
+    check_installed("pandas")
+    import pandas as pd
+
+    shots = sorted((*run.shots, *run.attempts), key=lambda s: (s.index, s.attempt)) if attempts else run.shots
+    columns = columns_of(run, shots)
+    frame = pd.DataFrame({column.name: column.values for column in columns}).set_index("shot")
+    frame.attrs.update(facts_of(run))
+    frame.attrs["units"] = {column.name: column.units for column in columns}
+    frame.attrs["descriptions"] = {column.name: column.description for column in columns}
+    return frame
+
+
+def dataset_of(run: Run, *, occupancies: bool = True) -> xr.Dataset:
+    """See :meth:`labseq.recording.Run.to_xarray`."""
+    check_installed("xarray")
+    import xarray as xr
+
+    grid = _grid_of(run)
+    axis = "shot" if grid is None else "place"
+    data: dict[str, Any] = {
+        column.name: (axis, column.values, {"units": column.units, "description": column.description})
+        for column in columns_of(run)
+    }
+    if occupancies:
+        meaning = f"1 where the detector saw an atom, 0 where not, {NO_IMAGE} where there is no such image"
+        about = {"units": "", "description": meaning}
+        data["occupancy"] = ((axis, "image", "row", "col"), _occupancies(run), about)
+    dataset = xr.Dataset(data) if grid is None else _on_grid(xr.Dataset(data), grid)
+    for name, meaning in (("fill", "hold an atom"), ("clear", "be empty")):
+        about = {"units": "", "description": f"1 where the target must {meaning}"}
+        dataset[f"target_{name}"] = (("row", "col"), getattr(run.target, name).astype(np.int8), about)
+    return dataset.assign_attrs(facts_of(run))
+
+
+def _occupancies(run: Run) -> NDArray[np.int8]:
+    from labseq.recording.shot_file import read_occupancies
+
+    found = [read_occupancies(shot.file) for shot in run.shots]
+    stack = np.full((len(found), max(map(len, found), default=0), *run.target.shape), NO_IMAGE, np.int8)
+    for of_shot, occupancies in zip(stack, found, strict=True):
+        of_shot[: len(occupancies)] = occupancies
+    return stack
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Grid:
+    """The axes of a scan.
+
+    Attributes:
+        dims: The scanned addresses and "repeat"; or "point" and "repeat" where the scan is no product
+            of its addresses.
+        shape: Length of each.
+        places: Indices of each shot along the axes.
+        coords: Scanned address -> its axis, and its values there.
+    """
+
+    dims: tuple[str, ...]
+    shape: tuple[int, ...]
+    places: list[tuple[int, ...]]
+    coords: Mapping[str, tuple[str, NDArray[Any]]]
+
+
+_MISSING: Final[Mapping[str, Any]] = {"O": "", "f": np.nan, "i": 0, "b": False}
+"""Value for a place without a shot, by kind of column; integers and booleans have no such places."""
+
+
+def _on_grid(shots: xr.Dataset, grid: _Grid) -> xr.Dataset:
+    """Spread the axis "place" over those of a scan; nan or "" where there is no shot."""
+    import pandas as pd
+    import xarray as xr
+
+    attributes = {name: shots[name].attrs for name in grid.coords if name in shots}
+    columns = shots.drop_vars([*attributes])
+    if len(grid.places) < math.prod(grid.shape):  # nan needs a float
+        counts = [str(name) for name in columns if name != "occupancy" and columns[name].dtype.kind in "bi"]
+        columns = columns.assign({name: columns[name].astype(np.float64) for name in counts})
+    missing = {name: _MISSING[columns[name].dtype.kind] for name in columns}
+    missing |= {"occupancy": NO_IMAGE} if "occupancy" in columns else {}
+    places = pd.MultiIndex.from_tuples(grid.places, names=grid.dims)
+    spread = columns.assign_coords(xr.Coordinates.from_pandas_multiindex(places, "place")).unstack(
+        "place", fill_value=missing
+    )
+    axes = dict(zip(grid.dims, map(range, grid.shape), strict=True))
+    spread = spread.reindex(axes, fill_value=missing).transpose(*grid.dims, ...).drop_vars(grid.dims)
+    coords = {name: (axis, values, attributes.get(name, {})) for name, (axis, values) in grid.coords.items()}
+    return spread.assign_coords(coords)
+
+
+def _grid_of(run: Run) -> _Grid | None:
+    """The axes of a run's scan; None without one.
+
+    Raises:
+        RecordingError: What run.json says of the scan is damaged.
+    """
+    scan: Mapping[str, Any] = run.scan
+    if not scan:
+        return None
+    try:
+        points = [int(scan["point_of_shot"][shot.index]) for shot in run.shots]
+        return _grid(list(scan["addresses"]), [list(values) for values in scan["points"]], points)
+    except (KeyError, IndexError, TypeError, ValueError) as error:
+        reason = f"has a damaged scan: {error!r}; take it from a backup"
+        raise RecordingError(run.path / RUN_FILE, reason) from error
+
+
+def _grid(addresses: list[str], points: list[list[Any]], point_of_shot: list[int]) -> _Grid:
+    counts: Counter[int] = Counter()
+    repeats: list[int] = []
+    for point in point_of_shot:
+        repeats.append(counts[point])
+        counts[point] += 1
+    keys = [tuple(map(dumps, point)) for point in points]
+    axes = [list(dict.fromkeys(column)) for column in zip(*keys, strict=True)]
+    is_product = math.prod(map(len, axes)) == len(points) == len(set(keys))
+    if is_product:
+        dims, shape = tuple(addresses), tuple(map(len, axes))
+        place_of_point = [tuple(map(list.index, axes, key)) for key in keys]
+        columns = [dict(zip(of, values, strict=True)) for of, values in _by_axis(keys, points)]
+        along = [[column[key] for key in axis] for column, axis in zip(columns, axes, strict=True)]
+    else:
+        dims, shape = ("point",), (len(points),)
+        place_of_point = [(number,) for number in range(len(points))]
+        along = list(zip(*points, strict=True))
+    axis_of = dims if is_product else ["point"] * len(addresses)
+    coords = {name: (axis, _values(of)) for name, axis, of in zip(addresses, axis_of, along, strict=True)}
+    places = [(*place_of_point[point], repeat) for point, repeat in zip(point_of_shot, repeats, strict=True)]
+    return _Grid((*dims, "repeat"), (*shape, max(counts.values(), default=0)), places, coords)
+
+
+def _by_axis(keys: Sequence[tuple[str, ...]], points: Sequence[list[Any]]) -> list[tuple[Any, Any]]:
+    """The keys and the values along each axis."""
+    return list(zip(zip(*keys, strict=True), zip(*points, strict=True), strict=True))
+
+
+def _values(values: Sequence[Any]) -> NDArray[Any]:
+    """The values along an axis: numbers, else text."""
+    if all(type(value) in (int, float) for value in values):
+        return np.array(values)
+    return np.array([value if isinstance(value, str) else dumps(value) for value in values], object)
