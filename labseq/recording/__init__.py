@@ -1,15 +1,15 @@
-"""Runs on disk: a folder per run, one HDF5 file per shot, and the way back."""
+"""Runs on disk: a folder per run, one HDF5 file per shot, and reading them back."""
 
 from labseq.files import data_root
-from labseq.recording.columns import figures_in
-from labseq.recording.folders import (
+from labseq.recording.active import (
     clear_active,
-    died,
+    find_dead_run,
     lock_files,
     mark_active,
     marker_roots,
     runs_in_progress,
 )
+from labseq.recording.columns import figures_in
 from labseq.recording.reader import Run, open_run
 from labseq.recording.shot import Shot
 from labseq.recording.writer import RunWriter
@@ -20,8 +20,8 @@ __all__ = [
     "Shot",
     "clear_active",
     "data_root",
-    "died",
     "figures_in",
+    "find_dead_run",
     "lock_files",
     "mark_active",
     "marker_roots",

@@ -21,7 +21,7 @@ from labseq.errors import (
 )
 from labseq.files import Holder, Lock, knows_no_locks
 from labseq.guard import Guard, StopFlag
-from labseq.recording import clear_active, data_root, died, lock_files, marker_roots
+from labseq.recording import clear_active, data_root, find_dead_run, lock_files, marker_roots
 from labseq.roles import Clock, Hardware, RunObserver, Simulation, offers
 from labseq.sequencer import RealClock, VirtualClock
 from labseq.sequencer.lab import Timeouts, in_safe_order
@@ -238,7 +238,7 @@ def make_safe_after_crash(
         LabseqError: The first device that is not safe.
         StopRequested: Ctrl-C or SIGTERM came meanwhile.
     """
-    dead = died(roots, key)
+    dead = find_dead_run(roots, key)
     if dead is None:
         return
     text = f"the last run on this profile ({dead}) died; its devices are made safe first"

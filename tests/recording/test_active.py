@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from labseq.errors import RecordingError
-from labseq.recording import clear_active, died, mark_active, marker_roots, runs_in_progress
+from labseq.recording import clear_active, find_dead_run, mark_active, marker_roots, runs_in_progress
 
 MARK = """
 import sys
@@ -23,9 +23,9 @@ def mark_in_a_process_that_ends(root: Path, key: str, run_dir: Path) -> None:
 
 
 def test_a_run_in_progress_has_not_died(tmp_path: Path) -> None:
-    assert died([tmp_path], "lab") is None
+    assert find_dead_run([tmp_path], "lab") is None
     mark_active([tmp_path], "lab", tmp_path / "run")
-    assert died([tmp_path], "lab") is None
+    assert find_dead_run([tmp_path], "lab") is None
     clear_active([tmp_path], "lab")
     assert list((tmp_path / ".active").iterdir()) == []
 
@@ -33,12 +33,12 @@ def test_a_run_in_progress_has_not_died(tmp_path: Path) -> None:
 def test_a_run_whose_process_is_gone_has_died(tmp_path: Path) -> None:
     key, run_dir = "/prüf/lab.yaml", tmp_path / "run µ"
     mark_in_a_process_that_ends(tmp_path, key, run_dir)
-    assert died([tmp_path], key) == run_dir
-    assert died([tmp_path], "/other/lab.yaml") is None
+    assert find_dead_run([tmp_path], key) == run_dir
+    assert find_dead_run([tmp_path], "/other/lab.yaml") is None
     mark_active([tmp_path], key, tmp_path / "next")
-    assert died([tmp_path], key) == run_dir  # until the hardware is safe
+    assert find_dead_run([tmp_path], key) == run_dir  # until the hardware is safe
     clear_active([tmp_path], key)
-    assert died([tmp_path], key) is None
+    assert find_dead_run([tmp_path], key) is None
 
 
 def test_clearing_leaves_what_belongs_to_others(tmp_path: Path) -> None:
@@ -50,11 +50,11 @@ def test_clearing_leaves_what_belongs_to_others(tmp_path: Path) -> None:
         other = living.with_name(living.name.replace(f".{values['pid']}.", f".{child.pid}."))
         other.write_text(json.dumps({**values, "pid": child.pid, "started": 0.0}))
         clear_active([tmp_path], "lab")
-        assert died([tmp_path], "lab") is None
+        assert find_dead_run([tmp_path], "lab") is None
         assert sorted(path.name for path in (tmp_path / ".active").iterdir() if "lab" in path.name) == [
             other.name
         ]
-    assert died([tmp_path], "lab") == tmp_path / "run"
+    assert find_dead_run([tmp_path], "lab") == tmp_path / "run"
     assert len(list((tmp_path / ".active").glob("virtual*"))) == 1
 
 
@@ -63,16 +63,16 @@ def test_a_damaged_marker_counts_as_a_run_that_died(tmp_path: Path, content: byt
     mark_active([tmp_path], "lab", tmp_path / "run")
     (marker,) = (tmp_path / ".active").iterdir()
     marker.write_bytes(content)
-    assert died([tmp_path], "lab") == marker
+    assert find_dead_run([tmp_path], "lab") == marker
     clear_active([tmp_path], "lab")
-    assert died([tmp_path], "lab") is None
+    assert find_dead_run([tmp_path], "lab") is None
 
 
 def test_a_run_on_another_computer_counts_as_dead(tmp_path: Path) -> None:
     mark_active([tmp_path], "lab", tmp_path / "run")
     (marker,) = (tmp_path / ".active").iterdir()
     marker.write_text(json.dumps({**json.loads(marker.read_text()), "host": "another"}))
-    assert died([tmp_path], "lab") == tmp_path / "run"
+    assert find_dead_run([tmp_path], "lab") == tmp_path / "run"
 
 
 def test_an_unwritable_root_is_explained(tmp_path: Path) -> None:
@@ -90,15 +90,15 @@ def test_a_run_that_died_is_found_from_another_data_root(
     mark_active(first, "lab", tmp_path / "run")
     markers = [marker for root in first for marker in (root / ".active").iterdir()]
     assert len(markers) == 2
-    assert died(second, "lab") is None
+    assert find_dead_run(second, "lab") is None
     for marker in markers:
         marker.write_text(json.dumps({**json.loads(marker.read_text()), "host": "another"}))
-    assert died(second, "lab") == died(first, "lab") == tmp_path / "run"
+    assert find_dead_run(second, "lab") == find_dead_run(first, "lab") == tmp_path / "run"
     clear_active(second, "lab")
-    assert died(second, "lab") is None
-    assert died(first, "lab") == tmp_path / "run"
+    assert find_dead_run(second, "lab") is None
+    assert find_dead_run(first, "lab") == tmp_path / "run"
     clear_active(first, "lab")
-    assert died(first, "lab") is None
+    assert find_dead_run(first, "lab") is None
 
 
 def test_a_state_folder_that_cannot_be_used_does_no_harm(
@@ -108,7 +108,7 @@ def test_a_state_folder_that_cannot_be_used_does_no_harm(
     monkeypatch.setenv("LABSEQ_STATE", str(tmp_path / "state"))
     roots = marker_roots(tmp_path / "data")
     mark_active(roots, "lab", tmp_path / "run")
-    assert died(roots, "lab") is None
+    assert find_dead_run(roots, "lab") is None
     assert len(list((tmp_path / "data" / ".active").iterdir())) == 1
     clear_active(roots, "lab")
     assert list((tmp_path / "data" / ".active").iterdir()) == []

@@ -105,7 +105,7 @@ def test_a_damage_is_found_and_nothing_is_deleted(run_dir: Path, plant: Callable
         (misnamed_shot, "a shot under a name that is not its own", "shot_000011.h5"),
         (foreign_skip, "a line names no shots of this run, or no reason", "skipped.jsonl"),
         (foreign_skip, "torn last line", "skipped.jsonl"),
-        (stop_left, "a request to stop that nobody followed", "STOP"),
+        (stop_left, "a request to stop that no run has followed", "STOP"),
         (holder_left, "a lock whose holder is gone", ".lock.holder"),
     ],
     ids=lambda one: getattr(one, "__name__", ""),
