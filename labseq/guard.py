@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import queue
+import signal
 import threading
 import time
 from collections.abc import Callable, Generator
@@ -76,6 +77,45 @@ class StopFlag:
                 time.sleep(min(left_s, POLL_S))
             elif self._event.wait(min(left_s, POLL_S)):
                 self.check()
+
+
+_SIGHUP: Final = getattr(signal, "SIGHUP", None)
+_EXIT_SIGNALS: Final = {  # signal -> the signal that the run reports
+    getattr(signal, name): meaning
+    for name, meaning in {
+        "SIGINT": signal.SIGINT,
+        "SIGTERM": signal.SIGTERM,
+        "SIGHUP": signal.SIGTERM,  # the terminal or the ssh connection is gone
+        "SIGBREAK": signal.SIGINT,  # Ctrl-Break on Windows
+    }.items()
+    if hasattr(signal, name)
+}
+
+
+@contextmanager
+def stop_on_signals(stop: StopFlag) -> Generator[None]:
+    """Let Ctrl-C, SIGTERM and SIGHUP set a flag while the block runs, instead of raising an exception.
+
+    A lost terminal that is ignored (``nohup``) stays ignored. Python lets only
+    the main thread handle signals; in any other this does nothing.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def handle(number: int, _frame: object) -> None:
+        stop.request(_EXIT_SIGNALS[number])
+
+    before = {number: signal.getsignal(number) for number in _EXIT_SIGNALS}
+    if before.get(_SIGHUP) is signal.SIG_IGN:
+        del before[_SIGHUP]
+    for number in before:
+        signal.signal(number, handle)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)
 
 
 class GuardedCall:

@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.errors import ConfigError, LimitError, Problem
+from labseq.guard import stop_on_signals
 from labseq.model import Frame, Occupancy, Plan, ShotRecord, StageTiming, TargetPattern, TimelineEntry
 from labseq.motion import Renderer, RenderPath, check_plan, comb_sample_rate, tone_program
 from labseq.roles import Detector, Planner, Shot, Step, StepContext
 from labseq.sequencer import Lab, Sequencer
 from labseq.sequencer.policies import RunPolicy
 from labseq.session.session import Session
-from labseq.session.signals import stop_on_signals
 
 HOST_STAGES: Final = ("detect", "plan", "check", "tone program", "renderer", "first chunk")
 """What happens between a frame in memory and the first chunk of samples."""

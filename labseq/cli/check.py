@@ -21,9 +21,9 @@ from labseq.console.text import age_text, clock_time, columns, encodes, plural, 
 from labseq.messages import clean
 from labseq.model import TimelineEntry
 from labseq.sequencer.policies import StepPolicy
-from labseq.session import Assembly, CheckReport, Session, check
+from labseq.session import Assembly, Session
 from labseq.session.adaptive import Search
-from labseq.session.check import Rehearsal
+from labseq.session.check import CheckReport, Rehearsal, check
 from labseq.session.profile import DryRun
 from labseq.units import format_quantity
 

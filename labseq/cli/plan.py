@@ -19,7 +19,8 @@ from labseq.console.text import columns, count_of, encodes, plural
 from labseq.kernel import interpret
 from labseq.model import Batch, Occupancy, TargetPattern
 from labseq.pictures.plans import occupancies, on_grid
-from labseq.session import PlannedMoves, PlanRequest, plan_moves, read_source
+from labseq.session.occupancies import read_source
+from labseq.session.planning import PlannedMoves, PlanRequest, plan_moves
 from labseq.units import format_quantity
 
 INTERPRETED_SITES: Final = 64 * 64

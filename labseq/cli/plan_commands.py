@@ -10,7 +10,7 @@ import typer
 from labseq.console.options import JsonFile
 
 if TYPE_CHECKING:
-    from labseq.session import PlanRequest
+    from labseq.session.planning import PlanRequest
 
 PLAN_EXAMPLES: Final = """\b
 Examples:
@@ -167,7 +167,7 @@ def _request(
     profile: str | None,
     overrides: list[str] | None,
 ) -> PlanRequest:
-    from labseq.session import PlanRequest
+    from labseq.session.planning import PlanRequest
 
     return PlanRequest(
         occupancy=occupancy,

@@ -1,10 +1,10 @@
-"""The composition root: sequence + profile + plugins -> open devices -> sequencer -> recorder."""
+"""Puts a run together from a sequence, a profile and plugins; opens the devices, runs and records it.
+
+``labseq check`` is in ``check``; planning without a run in ``planning``, with its ``occupancies``.
+"""
 
 from labseq.session.assembly import Assembly, assemble
-from labseq.session.check import CheckReport, check
-from labseq.session.occupancies import Source, read_source
 from labseq.session.options import Options
-from labseq.session.planning import PlannedMoves, PlanRequest, plan_moves
 from labseq.session.profile import ResolvedProfile, load_plugins, resolve_profile
 from labseq.session.provenance import gather_provenance
 from labseq.session.safe import (
@@ -19,22 +19,15 @@ from labseq.session.session import Session
 __all__ = [
     "Assembly",
     "ResolvedProfile",
-    "CheckReport",
     "CheckedDevice",
     "DevicesReport",
     "Options",
-    "PlanRequest",
-    "PlannedMoves",
     "SafeStateReport",
     "Session",
-    "Source",
     "assemble",
-    "check",
     "check_devices",
     "gather_provenance",
     "load_plugins",
     "make_profile_safe",
-    "plan_moves",
-    "read_source",
     "resolve_profile",
 ]

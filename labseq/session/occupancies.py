@@ -200,7 +200,7 @@ def _shot(path: Path, cycle: str | None) -> Source:
     if seen is None:
         raise ConfigError(Problem(f"there is no image before cycle {number}", name, expected="one"))
     label = f"{name}, before cycle {number} of {len(cycles)}"
-    machine = cast("dict[str, Any]", content.provenance.get("resolved", {})).get("profile")
+    machine = cast("dict[str, Any]", content.run["resolved"] or {}).get("profile")
     return Source(seen.occupancy, label, target=content.target, machine=machine)
 
 

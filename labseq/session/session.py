@@ -9,11 +9,10 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
-from typing import ParamSpec, Self
+from typing import Any, ParamSpec, Self
 
-from labseq.builtin.steps import DeviceStep, FollowStep
 from labseq.errors import ConfigError, DeviceError, LabseqError, Loc, Problem
-from labseq.guard import Guard, StopFlag
+from labseq.guard import Guard, StopFlag, stop_on_signals
 from labseq.model import RunRecord, TimelineEntry
 from labseq.recording import Run, RunWriter, clear_active, data_root, mark_active, marker_roots, open_run
 from labseq.roles import RunObserver, offers
@@ -33,11 +32,10 @@ from labseq.session.provenance import copies, ending, run_record
 from labseq.session.resume import ResumableRun, reopened
 from labseq.session.safe import lock_devices, make_safe_after_crash
 from labseq.session.scan import Point
-from labseq.session.signals import stop_on_signals
 
 
 def check_commands(assembly: Assembly, points: Iterable[Point], build: Callable[[Point], Lab]) -> None:
-    """Refuse what a device does not know, or would refuse, and waits for a leader that there is not.
+    """Check the commands of ``device`` steps, and that ``wait`` steps find the device with their signal.
 
     Nothing is opened.
 
@@ -47,9 +45,9 @@ def check_commands(assembly: Assembly, points: Iterable[Point], build: Callable[
         build: Constructs the devices of a point.
 
     Raises:
-        ConfigError: Everything that is wrong with them, with its place.
+        ConfigError: Every command that its device refuses or does not know, with its place.
     """
-    if not any(isinstance(step, DeviceStep | FollowStep) for _, step in assembly.steps):
+    if not any(spec.kind in ("device", "wait") for spec in assembly.sequence.shot):
         return
     labs: dict[int, Lab] = {}
     problems: dict[str, Problem] = {}
@@ -58,10 +56,10 @@ def check_commands(assembly: Assembly, points: Iterable[Point], build: Callable[
         lab = labs.get(id(point.bench)) or labs.setdefault(id(point.bench), build(point))
         for spec, (_, step) in zip(assembly.sequence.shot, point.steps, strict=True):
             problem: Problem | None = None
-            if isinstance(step, DeviceStep) and (failure := _failure(guard, lab, step)) is not None:
-                problem = assembly.document.problem((*spec.loc, "do"), str(failure))
-            elif isinstance(step, FollowStep):
-                problem = _leaderless(assembly, lab, spec.loc, step)
+            if spec.kind == "device":
+                problem = _refused_command(assembly, guard, lab, spec.loc, step)
+            elif spec.kind == "wait" and hasattr(step, "signal"):
+                problem = _missing_signal(assembly, lab, spec.loc, step)
             if problem is not None:
                 problems[str(problem)] = problem
     guard.end()
@@ -69,26 +67,26 @@ def check_commands(assembly: Assembly, points: Iterable[Point], build: Callable[
         raise ConfigError([*problems.values()])
 
 
-def _failure(guard: Guard, lab: Lab, step: DeviceStep) -> LabseqError | None:
-    device = lab.devices.get(step.settings.name)
+def _refused_command(assembly: Assembly, guard: Guard, lab: Lab, loc: Loc, step: Any) -> Problem | None:
+    settings = step.settings
+    device = lab.devices.get(settings.name)
     if device is None or not offers(device, "check_command"):
         return None
     check, timeout_s = device.check_command, lab.timeouts.call_s
     try:
-        guard.call(step.settings.name, timeout_s, check, step.settings.do, **step.settings.arguments)
+        guard.call(settings.name, timeout_s, check, settings.do, **settings.arguments)
     except LabseqError as failure:
-        return failure
+        return assembly.document.problem((*loc, "do"), str(failure))
     return None
 
 
-def _leaderless(assembly: Assembly, lab: Lab, loc: Loc, step: FollowStep) -> Problem | None:
-    """Why nobody can lead whom a step could wait for."""
+def _missing_signal(assembly: Assembly, lab: Lab, loc: Loc, step: Any) -> Problem | None:
     try:
         find_leader(dict(lab.hardware()), step.device)
     except ConfigError as error:
         hint = ""
         if assembly.dry_run == "fast":
-            hint = "virtual twins do not lead: '--dry-run' without 'fast' has one that says `go` by itself"
+            hint = "virtual twins send no signal: '--dry-run' without 'fast' has one that says `go` by itself"
         elif not dict(leaders(dict(lab.hardware()))):
             hint = "add one to its `devices`: `leader: {use: tcp_leader}`"
         key = "device" if step.device else "for"

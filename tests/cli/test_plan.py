@@ -14,7 +14,7 @@ from labseq.cli import main
 from labseq.cli.plan import PlanOutput, moves_text, plan_once, print_plan, title, totals, warnings
 from labseq.errors import ConfigError
 from labseq.model import Batch
-from labseq.session import PlannedMoves, PlanRequest, plan_moves
+from labseq.session.planning import PlannedMoves, PlanRequest, plan_moves
 
 assert numba  # loaded already, so that the command does not turn compiling off for the tests after it
 

@@ -11,7 +11,7 @@ import pytest
 from labseq.bench.waveform import PlannedWaveform, WaveformRequest, plan_waveform
 from labseq.cli import main
 from labseq.cli.waveform import WaveformOutput, note, report, show_waveform, title
-from labseq.session import PlanRequest
+from labseq.session.planning import PlanRequest
 
 assert numba  # loaded already, so that a command does not turn compiling off for the tests after it
 

@@ -14,7 +14,7 @@ import pytest
 import labseq
 from labseq import ConfigError, DeviceTimeoutError, Session, StopRequested
 from labseq.config.yaml_nodes import compose
-from labseq.session import check
+from labseq.session.check import check
 
 from .labseq_follow_rig import TcpPeer
 
@@ -170,7 +170,7 @@ def test_a_second_wait_does_not_load_again(tmp_path: Path) -> None:
             "off",
             f"{NOBODY}; add one to its `devices`: `leader: {{use: tcp_leader}}`",
         ),
-        ([], "fast", f"{NOBODY}; virtual twins do not lead"),
+        ([], "fast", f"{NOBODY}; virtual twins send no signal"),
         (["shot.0.wait.device=shutter"], "off", "no other control system leads through 'shutter'"),
         (["shot.0.wait.device=artiq"], "off", "has no device 'artiq'; expected one of 'leader', 'shutter'"),
     ],

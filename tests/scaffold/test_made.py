@@ -19,7 +19,8 @@ import pytest
 import labseq
 from labseq.config.document import Document
 from labseq.registry import KINDS
-from labseq.session import check, load_plugins
+from labseq.session import load_plugins
+from labseq.session.check import check
 
 
 def run(*command: str, cwd: Path, **environment: str) -> str:

@@ -11,7 +11,7 @@ import pytest
 import labseq
 from labseq.errors import ConfigError, DeviceError, DeviceTimeoutError
 from labseq.recording.reader import scan_points
-from labseq.session import check
+from labseq.session.check import check
 from labseq.testing.fakes import RecordingObserver
 
 from .scripted_scanner import N_LINES, OVER, SEQUENCE, opened, run

@@ -14,7 +14,7 @@ import pytest
 
 import labseq
 from labseq.errors import ConfigError, PluginLoadError
-from labseq.session import check
+from labseq.session.check import check
 
 ROOT = Path(__file__).parents[2]
 SEQUENCE = (ROOT / "sequences" / "compact_225.yaml").read_text(encoding="utf-8")

@@ -6,8 +6,7 @@ from typing import Any
 import pytest
 
 import labseq
-from labseq.session import CheckReport, check
-from labseq.session.check import N_LOADINGS
+from labseq.session.check import N_LOADINGS, CheckReport, check
 
 ROOT = Path(__file__).parents[2]
 COMPACT = ROOT / "sequences" / "compact_225.yaml"

@@ -14,8 +14,7 @@ from hypothesis import given, settings, strategies as st
 import labseq
 from labseq.errors import ConfigError
 from labseq.model import Occupancy
-from labseq.session import read_source
-from labseq.session.occupancies import MAX_BYTES, MAX_NPY_BYTES, parse_text
+from labseq.session.occupancies import MAX_BYTES, MAX_NPY_BYTES, parse_text, read_source
 from labseq.testing.strategies import occupancies
 
 ROOT = Path(__file__).parents[2]

@@ -8,8 +8,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from labseq.errors import ConfigError
-from labseq.session import PlanRequest, plan_moves
-from labseq.session.planning import read_plan
+from labseq.session.planning import PlanRequest, plan_moves, read_plan
 
 
 def planned(**options: Any) -> dict[str, Any]:

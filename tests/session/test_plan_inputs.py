@@ -8,9 +8,8 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from labseq.errors import ConfigError
-from labseq.session import PlanRequest, read_source
-from labseq.session.occupancies import Source
-from labseq.session.planning import PlanInputs, parse_target, read_inputs
+from labseq.session.occupancies import Source, read_source
+from labseq.session.planning import PlanInputs, PlanRequest, parse_target, read_inputs
 
 ROOT = Path(__file__).parents[2]
 SEQUENCE = ROOT / "sequences" / "compact_225.yaml"

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from labseq.errors import ConfigError, InvalidPlanError, PlanError, PluginLoadError
-from labseq.session import PlannedMoves, PlanRequest, plan_moves
+from labseq.session.planning import PlannedMoves, PlanRequest, plan_moves
 
 PLANNERS = '''
 import numpy as np

@@ -8,7 +8,7 @@ import pytest
 
 import labseq
 from labseq.errors import ConfigError, LabseqError, PluginLoadError
-from labseq.session import check
+from labseq.session.check import check
 from labseq.testing.fakes import RecordingObserver
 
 SEQUENCE = """labseq: 1

@@ -13,7 +13,7 @@ import pytest
 import labseq
 from labseq.errors import ConfigError
 from labseq.recording.reader import scan_points
-from labseq.session import check
+from labseq.session.check import check
 from labseq.session.lab import _reopened, rebuild_lab
 from labseq.testing.fakes import RecordingObserver
 

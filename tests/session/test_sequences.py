@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import labseq
-from labseq.session import check
+from labseq.session.check import check
 
 ROOT = Path(__file__).parents[2]
 SEQUENCES = sorted((ROOT / "sequences").glob("*.yaml"))

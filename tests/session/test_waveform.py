@@ -20,7 +20,7 @@ from labseq.bench.waveform import (
 )
 from labseq.errors import ConfigError, LimitError
 from labseq.model import Plan, SegmentKind
-from labseq.session import PlanRequest, plan_moves
+from labseq.session.planning import PlanRequest, plan_moves
 
 RATE = "250 MHz"
 ONE_ATOM = json.dumps(

@@ -16,7 +16,7 @@ from labseq.bench.waveform import (
     save_samples,
 )
 from labseq.errors import ConfigError
-from labseq.session import PlanRequest
+from labseq.session.planning import PlanRequest
 
 REQUEST = PlanRequest("random:6x6@0.7", "checkerboard:4x4", seed=3)
 
@@ -74,7 +74,7 @@ FULL = r"""
 import resource, sys
 from pathlib import Path
 from labseq.errors import ConfigError
-from labseq.session import PlanRequest
+from labseq.session.planning import PlanRequest
 from labseq.bench.waveform import WaveformRequest, plan_waveform
 from labseq.bench.waveform import save_samples
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import labseq
-from labseq.session import PlanRequest, plan_moves
+from labseq.session.planning import PlanRequest, plan_moves
 
 pytestmark = pytest.mark.system
 
