@@ -46,9 +46,9 @@ def _attribute(field: Field, value: Any) -> Any:
 
 
 def read_fields(node: Any, fields: Sequence[Field]) -> dict[str, Any]:
-    """Attributes as plain values: attribute of the record -> value."""
+    """Attributes as plain values: attribute of the record -> value; without those of a newer minor format."""
     found: dict[str, Any] = {}
-    for field in fields:
+    for field in (field for field in fields if field.name in node.attrs):
         value = node.attrs[field.name]
         value = value.item() if isinstance(value, np.generic) else value
         found[field.attribute] = int(value) if field.dtype == "integer" else value
@@ -66,8 +66,8 @@ def write_texts(group: Any, fields: Sequence[Field], record: Any) -> None:
 
 
 def read_texts(group: Any, fields: Sequence[Field]) -> dict[str, Any]:
-    """Texts and JSON values: attribute of the record -> value."""
-    texts = {field: group[field.name][()].decode() for field in fields}
+    """Texts and JSON values: attribute of the record -> value; without those of a newer minor format."""
+    texts = {field: group[field.name][()].decode() for field in fields if field.name in group}
     return {
         field.attribute: json.loads(text) if field.dtype == "json" else text for field, text in texts.items()
     }

@@ -329,8 +329,10 @@ def _flat(prefix: str, values: Mapping[str, Any], depth: int) -> Iterator[tuple[
 
 
 _KINDS: Final = {"int64": int, "bool": bool, "text": str, "float64": float | int | None}
-_IN_INDEX: Final = (
-    *((field.name, _KINDS[field.dtype]) for field in schema.SHOT if field.in_index),
+_KINDS_IN_INDEX: Final = tuple((field.name, _KINDS[field.dtype]) for field in schema.SHOT if field.in_index)
+_ALWAYS: Final = ("shot", "attempt", "status", "success", "filling_fraction", "seen_defect_free_cycle")
+_NEEDED_IN_INDEX: Final = (
+    *((name, kind) for name, kind in _KINDS_IN_INDEX if name in _ALWAYS),
     *dict.fromkeys(("stage_s", "parameters", "readings", "calibrations"), dict).items(),
     *dict.fromkeys(("images", "cycles", "simulation"), dict).items(),
     *{"counts": bool, "file": str, "sha256": str, "bytes": int}.items(),
@@ -339,8 +341,10 @@ _NOTHING: Final = object()
 
 
 def is_index_row(row: Mapping[str, Any]) -> bool:
-    """Whether a line of the index has all that :func:`index_row` wrote."""
-    if not all(isinstance(row.get(name, _NOTHING), kind) for name, kind in _IN_INDEX):
+    """Whether a line of the index is whole; a value that an older minor format lacks may be missing."""
+    if not all(isinstance(row.get(name, _NOTHING), kind) for name, kind in _NEEDED_IN_INDEX):
+        return False
+    if not all(isinstance(row.get(name), kind) for name, kind in _KINDS_IN_INDEX if name in row):
         return False
     try:
         summary_of(row)

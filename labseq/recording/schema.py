@@ -138,7 +138,9 @@ class Table:
         return table
 
     def arguments(self, kind: type, table: NDArray[Any]) -> list[dict[str, Any]]:
-        """Rows that were read, as arguments for the constructor of a record: those that it takes.
+        """Rows that were read, as arguments for the constructor of a record.
+
+        Values that its constructor does not take are left out; a column that an older file lacks is too.
 
         Args:
             kind: The record's class, a dataclass.
@@ -148,7 +150,7 @@ class Table:
         columns = {
             column.attribute: _plain_values(table[column.name])
             for column in self.columns
-            if column.attribute in taken
+            if column.attribute in taken and column.name in (table.dtype.names or ())
         }
         return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 

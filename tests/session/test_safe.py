@@ -9,7 +9,7 @@ import pytest
 
 import labseq
 from labseq.errors import ConfigError, DeviceError
-from labseq.recording import died, mark_active, marker_roots
+from labseq.recording import find_dead_run, mark_active, marker_roots
 from labseq.session import SafeStateReport, make_profile_safe
 from labseq.testing.fakes import RecordingObserver
 
@@ -144,7 +144,7 @@ def marked_as_dead() -> tuple[tuple[Path, ...], str]:
     mark_active(roots, key, Path("data/run"))
     for marker in (path for root in roots for path in (root / ".active").iterdir()):
         marker.write_text("{}", encoding="utf-8")
-    assert died(roots, key) is not None
+    assert find_dead_run(roots, key) is not None
     return roots, key
 
 
@@ -152,9 +152,9 @@ def test_a_run_that_died_is_forgotten_once_all_is_safe() -> None:
     write("{use: mine}")
     roots, key = marked_as_dead()
     secured("profile.devices.shutter.use=mine")
-    assert died(roots, key) is not None  # another device may have been named in its place
+    assert find_dead_run(roots, key) is not None  # another device may have been named in its place
     secured()
-    assert died(roots, key) is None
+    assert find_dead_run(roots, key) is None
 
 
 def test_a_run_that_died_is_remembered_as_long_as_a_device_is_not_safe() -> None:
@@ -162,7 +162,7 @@ def test_a_run_that_died_is_remembered_as_long_as_a_device_is_not_safe() -> None
     roots, key = marked_as_dead()
     outcome, _ = secured()
     assert isinstance(outcome.attempted["shutter"], DeviceError)
-    assert died(roots, key) is not None
+    assert find_dead_run(roots, key) is not None
 
 
 def test_a_run_that_died_is_remembered_as_long_as_a_device_may_have_been_left_out() -> None:
@@ -171,7 +171,7 @@ def test_a_run_that_died_is_remembered_as_long_as_a_device_may_have_been_left_ou
     outcome, _ = secured()
     assert (outcome.failures, "shutter" in outcome.attempted) == ([], False)
     assert "p.yaml:10:10: devices is 5" in str(outcome.problems)
-    assert died(roots, key) is not None
+    assert find_dead_run(roots, key) is not None
 
 
 SEQUENCE = """
@@ -198,8 +198,8 @@ def test_a_run_makes_safe_what_it_can_before_anything_of_it_can_fail() -> None:
     assert [t["device"] for t in seen.of("safe_state") if t["ok"]] == [
         "mobile_tweezers", "camera", "static_tweezers"
     ]  # fmt: skip
-    assert died(roots, key) is not None
+    assert find_dead_run(roots, key) is not None
     write("{use: mine}")
     with labseq.Session.open("s.yaml", output="elsewhere", observer=seen) as session:
         session.run()
-    assert died(marker_roots(Path("elsewhere")), key) is None
+    assert find_dead_run(marker_roots(Path("elsewhere")), key) is None
