@@ -23,23 +23,23 @@ from labseq.plugin import (
     trigger_line,
 )
 from labseq_virtual.settings import CameraSettings
-from labseq_virtual.tweezers import simulated_world
+from labseq_virtual.tweezers import require_simulation
 
 ROOM_K: Final = 293.15
 """Temperature of a sensor whose cooler is off (ours)."""
 
 COLDEST_K: Final = 183.15
-"""Coldest that the cooler makes a sensor: -90 degC (ours)."""
+"""Lowest temperature that the cooler reaches: -90 degC (ours)."""
 
 TIME_CONSTANT_S: Final = 60.0
-"""Time constant of the way there, in seconds (ours)."""
+"""Time constant of the cooling, in seconds (ours)."""
 
 SWING: Final = 0.6
-"""Radians that it swings in a time constant (ours): it overshoots by exp(-pi / 0.6), which is 0.5 %."""
+"""Phase of the oscillation per time constant, in radians (ours): it overshoots by exp(-pi / 0.6), 0.5 %."""
 
 
 class Cooler:
-    """Brings a sensor to a temperature and keeps it there: a damped swing, without noise.
+    """Brings a sensor to a temperature and keeps it there, as a damped oscillation without noise.
 
     Args:
         setpoint_k: Temperature, in kelvins; one below :data:`COLDEST_K` is not reached.
@@ -52,13 +52,13 @@ class Cooler:
         self._start_s: float | None = None
 
     def switch_on(self) -> None:
-        """Begin to cool; no effect if it is on."""
+        """Start cooling; no effect if it is on."""
         if self._start_s is None:
             self._start_s = self._clock.now()
 
     @property
     def temperature_k(self) -> float:
-        """Of the sensor now, in kelvins."""
+        """Temperature of the sensor now, in kelvins."""
         if self._start_s is None:
             return ROOM_K
         t = (self._clock.now() - self._start_s) / TIME_CONSTANT_S
@@ -67,18 +67,18 @@ class Cooler:
 
 
 class VirtualCamera(CameraDriver):
-    """Frames of the simulated world, with a real camera's manners.
+    """Frames of the simulation, with the timing and error behaviour of a real camera.
 
     A frame can be read when its exposure and read-out have passed on the clock. The shutter is open
-    and the EM gain is on in a series only. The cooler runs from the first ``open()`` on, also in the
-    safe state and when the camera is closed, as real ones do: to warm up takes longer than a run.
+    and the EM gain is on in a series only. The cooler runs from the first ``open()`` on, even in the
+    safe state and when the camera is closed: as with real cameras, warming up takes longer than a run.
 
     Args:
-        settings: Region, binning, read-out time, EM gain, cooling, failures to rehearse.
-        context: Clock, random numbers and the simulated world.
+        settings: Region, binning, read-out time, EM gain, cooling, simulated failures.
+        context: Clock, random numbers and the simulation.
 
     Raises:
-        ConfigError: There is no simulated world, or its sensor has no such region.
+        ConfigError: There is no simulation, or its sensor has no such region.
         LimitError: Its sensor has no EM register.
     """
 
@@ -86,26 +86,26 @@ class VirtualCamera(CameraDriver):
         super().__init__(context)
         self._settings = settings
         self._random = context.random
-        self._world = simulated_world(context)
-        self._sensor = SimulatedSensor(self._world, context.clock)
+        self._simulation = require_simulation(context)
+        self._sensor = SimulatedSensor(self._simulation, context.clock)
         self._is_wired = trigger_line(context.lines, "camera") is not None
         self._mode = replace(settings.mode, em_gain=settings.em_gain)
         self._idle = replace(
             self._mode, em_gain=None if settings.em_gain is None else 1.0, shutter_open=False
         )
-        self._in_force = self._idle
+        self._current = self._idle
         self._readout_s, self._frame_shape = settings.readout, None
-        if offers(self._world, "sensor_shape"):
-            if setting_error := settings.sensor_conflict(self._world.sensor_shape):
+        if offers(self._simulation, "sensor_shape"):
+            if setting_error := settings.sensor_conflict(self._simulation.sensor_shape):
                 raise ConfigError(setting_error)
-            self._readout_s *= self._world.readout_fraction(self._mode)
-            self._frame_shape = self._mode.frame_shape(self._world.sensor_shape)
+            self._readout_s *= self._simulation.readout_fraction(self._mode)
+            self._frame_shape = self._mode.frame_shape(self._simulation.sensor_shape)
         cooling = settings.cooling
         self._cooling = None if cooling is None else cooling.spec()
         self._cooler = None if cooling is None else Cooler(cooling.temperature, context.clock)
         self._opened_s = 0.0
         self._is_internal = False
-        self._coming: deque[tuple[int, bool]] = deque()
+        self._pending: deque[tuple[int, bool]] = deque()
         self._n_seen = 0
 
     @property
@@ -116,20 +116,20 @@ class VirtualCamera(CameraDriver):
         return CameraFacts(self._readout_s, self._settings.max_exposure, self._frame_shape, em_gain, triggers)
 
     def warm(self) -> None:
-        """Work out what all frames have in common, and compile their kernels or load them."""
-        if offers(self._world, "sensor_shape"):
-            self._world.prepare_sensor(self._mode)
+        """Compute what all frames have in common, and compile or load their kernels."""
+        if offers(self._simulation, "sensor_shape"):
+            self._simulation.prepare_sensor(self._mode)
 
     @property
     def settling_timeout_s(self) -> float:
-        """How long cooling may take, in seconds; 0 without."""
+        """How long cooling may take, in seconds; 0 without cooling."""
         return 0.0 if self._cooling is None else self._cooling.timeout_s
 
     def settle(self) -> None:
         """Wait until the sensor is cold.
 
         Raises:
-            DeviceTimeoutError: It does not get there in time.
+            DeviceTimeoutError: It does not reach its temperature in time.
             DeviceError: The camera is not open.
         """
         self._check_open()
@@ -137,8 +137,8 @@ class VirtualCamera(CameraDriver):
             settle(self._cooling, lambda: self._temperature_k, self._clock, self._name)
 
     def describe(self) -> Mapping[str, Any]:
-        """Model, settings, and what is in force now: shutter, EM gain, temperature in kelvins."""
-        mode = self._in_force
+        """Model, settings, and the current shutter, EM gain and temperature in kelvins."""
+        mode = self._current
         return {
             "model": "virtual camera",
             **self._settings.model_dump(mode="json"),
@@ -157,13 +157,13 @@ class VirtualCamera(CameraDriver):
         self._stop()
 
     def _start(self, series: Series) -> None:
-        self._in_force = self._mode_of(series)
-        self._sensor.arm(series, self._in_force, self._readout_s)
+        self._current = self._mode_of(series)
+        self._sensor.arm(series, self._current, self._readout_s)
         self._is_internal = series.trigger == "internal"
-        self._coming.clear()
+        self._pending.clear()
         self._n_seen = 0
         if series.trigger == "external":
-            self._world.wire("camera", self._expose)
+            self._simulation.wire("camera", self._expose)
 
     def _fire(self) -> None:
         if self._happens(self._settings.faults.missed_trigger):
@@ -174,16 +174,16 @@ class VirtualCamera(CameraDriver):
     def _take(self, timeout_s: float) -> ExposureResult | None:
         until_s = self._clock.now() + timeout_s
         while True:
-            if self._is_internal and not self._coming:
+            if self._is_internal and not self._pending:
                 self._expose()
             frame = self._sensor.take(max(0.0, until_s - self._clock.now()))
             if frame is None:
                 return None
-            number, is_lost = self._coming.popleft()
+            number, is_lost = self._pending.popleft()
             if not is_lost:
                 break
         if self._happens(self._settings.faults.transient):
-            return ExposureResult(number, None, "it did not come over the wire whole (rehearsed failure)")
+            return ExposureResult(number, None, "the frame arrived damaged (simulated failure)")
         t_start_s = frame.t_start_s
         return ExposureResult(
             number, frame.image, t_start_s=t_start_s, device_time_s=t_start_s - self._opened_s
@@ -191,17 +191,17 @@ class VirtualCamera(CameraDriver):
 
     def _stop(self) -> None:
         self._sensor.clear()
-        self._coming.clear()
+        self._pending.clear()
         self._is_internal = False
-        self._in_force = self._idle
+        self._current = self._idle
 
     def _expose(self, t_start_s: float | None = None) -> None:
-        """Begin the next exposure; with the internal trigger only when somebody reads."""
+        """Begin the next exposure; with the internal trigger, only when a frame is read."""
         faults = self._settings.faults
         late_s = faults.late_by if self._happens(faults.late) else 0.0
         is_lost = self._happens(faults.lost_in_series)
         if self._sensor.expose(late_s, t_start_s) is not None:
-            self._coming.append((self._n_seen, is_lost))
+            self._pending.append((self._n_seen, is_lost))
             self._n_seen += 1
 
     def _mode_of(self, series: Series) -> SensorMode:
@@ -213,5 +213,5 @@ class VirtualCamera(CameraDriver):
         return ROOM_K if self._cooler is None else self._cooler.temperature_k
 
     def _happens(self, probability: float) -> bool:
-        """Draw a failure; no number is drawn for one that never comes."""
+        """Draw a failure; a probability of 0 uses no random number."""
         return probability > 0 and self._random.shot.random() < probability

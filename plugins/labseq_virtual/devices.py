@@ -1,4 +1,4 @@
-"""Virtual lines, a virtual device, and the meter that measures the power of each static tweezer."""
+"""Virtual lines, a virtual instrument, and a meter of the power of each static tweezer."""
 
 from __future__ import annotations
 
@@ -26,18 +26,17 @@ from labseq_virtual.settings import DeviceSettings, LinesSettings, SpotMeterSett
 from labseq_virtual.tweezers import VirtualDriver
 
 ROUNDING_S = 1e-9
-"""How far from its limit a time may be because sums were rounded."""
+"""Tolerance of comparisons of times, in seconds: sums of times are rounded."""
 
 
 class VirtualLines(VirtualDriver, Lines):
-    """Ideal lines: the simulated world feels exactly what was compiled.
+    """Ideal lines: the simulation receives exactly the compiled program.
 
-    A firing needs a compiled program and an ``arm`` of its own, so that nothing is ever
-    fired by mistake.
+    Every ``fire`` needs a compiled program and its own ``arm``, so no program is fired by mistake.
 
     Args:
         settings: The limits.
-        context: Lines, clock and the simulated world.
+        context: Lines, clock and the simulation.
     """
 
     def __init__(self, settings: LinesSettings, context: Context) -> None:
@@ -46,7 +45,7 @@ class VirtualLines(VirtualDriver, Lines):
         self._specs = context.lines
         self._compiled: LineProgram | None = None
         self._is_armed = False
-        self._over_s = 0.0
+        self._end_s = 0.0
 
     @property
     def lines_facts(self) -> LinesFacts:
@@ -56,17 +55,17 @@ class VirtualLines(VirtualDriver, Lines):
         return LinesFacts(channels, settings.resolution, settings.shortest, settings.max_edges)
 
     def open(self) -> None:
-        """Connect to the simulated world; the lines are idle."""
+        """Connect to the simulation; the lines are idle."""
         if not self._is_open:
             super().open()
             self._play(idle_program(self._specs))
 
     def compile(self, program: LineProgram) -> None:
-        """Take a program for the next firing.
+        """Check a program and keep it for the next ``fire``.
 
         Raises:
-            LimitError: More edges, or nearer to one another, than the settings allow.
-            DeviceError: Not open, or lines that nobody declared.
+            LimitError: More edges, or edges closer to one another, than the settings allow.
+            DeviceError: Not open, or lines that the profile does not declare.
         """
         self._check_open()
         known = tuple(spec.name for spec in self._specs)
@@ -83,7 +82,7 @@ class VirtualLines(VirtualDriver, Lines):
         self._compiled, self._is_armed = program, False
 
     def arm(self) -> None:
-        """Get ready to fire what was compiled last.
+        """Get ready to fire the program compiled last.
 
         Raises:
             DeviceError: Not open, or nothing was compiled.
@@ -97,17 +96,17 @@ class VirtualLines(VirtualDriver, Lines):
         """Start the program; returns at once.
 
         Raises:
-            DeviceError: Not armed, or the last program is not over.
+            DeviceError: Not armed, or the last program has not ended.
         """
         self._check_open()
         now_s = self._clock.now()
         if not self._is_armed or self._compiled is None:
             raise DeviceError(self._name, "fired, but not armed; call arm() before each fire()")
-        if now_s < self._over_s - ROUNDING_S:
-            raise DeviceError(self._name, f"fired during a program that ends at {self._over_s:.6f} s")
+        if now_s < self._end_s - ROUNDING_S:
+            raise DeviceError(self._name, f"fired during a program that ends at {self._end_s:.6f} s")
         self._is_armed = False
         self._play(self._compiled)
-        self._over_s = now_s + self._compiled.duration_s
+        self._end_s = now_s + self._compiled.duration_s
 
     def wait(self, timeout_s: float) -> None:
         """Wait for the end of the program.
@@ -116,15 +115,15 @@ class VirtualLines(VirtualDriver, Lines):
             DeviceTimeoutError: It did not end within ``timeout_s``.
         """
         self._check_open()
-        left_s = self._over_s - self._clock.now()
+        left_s = self._end_s - self._clock.now()
         self._clock.sleep(max(0.0, min(left_s, timeout_s)))
         if left_s > timeout_s:
-            text = f"the lines' program is not over after {format_quantity(timeout_s, 'time')}"
+            text = f"the program of the lines has not ended after {format_quantity(timeout_s, 'time')}"
             raise DeviceTimeoutError(self._name, text, timeout_s)
 
     def safe_state(self) -> None:
         """Turn all lines off and forget what was compiled."""
-        self._compiled, self._is_armed, self._over_s = None, False, 0.0
+        self._compiled, self._is_armed, self._end_s = None, False, 0.0
         if self._is_open:
             self._play(off_program(self._specs))
 
@@ -134,11 +133,11 @@ class VirtualLines(VirtualDriver, Lines):
         return {"model": "virtual lines", "lines": lines, **self._settings.model_dump(mode="json")}
 
     def _play(self, program: LineProgram) -> None:
-        self._world.play("lines", program, self._clock.now())
+        self._simulation.play("lines", program, self._clock.now())
 
 
 class VirtualDevice(Device):
-    """Remembers what it was told.
+    """Accepts commands and remembers them as values.
 
     The value ``state`` is the last command ("closed" before ``open``, "ready"
     after it, "safe" in the safe state). Arguments of a command are kept as values
@@ -174,7 +173,7 @@ class VirtualDevice(Device):
         """Carry out a command.
 
         Raises:
-            DeviceError: Not open, or a command that it does not know.
+            DeviceError: Not open, or an unknown command.
         """
         self._check_open()
         if self._commands and name not in self._commands:
@@ -186,7 +185,7 @@ class VirtualDevice(Device):
         """Read a value.
 
         Raises:
-            DeviceError: Not open, or a value that it does not know.
+            DeviceError: Not open, or an unknown value.
         """
         self._check_open()
         if name not in self._values:
@@ -208,11 +207,11 @@ VALUE = "spot_powers"
 class VirtualSpotMeter(VirtualDriver, Device):
     """Measures the power of each static tweezer, with noise.
 
-    Its only value is ``spot_powers``, float64 (n_rows, n_cols), over the nominal power.
+    Its only value is ``spot_powers``, float64 (n_rows, n_cols), relative to the nominal power.
 
     Args:
         settings: Noise and time of a measurement.
-        context: Clock, random numbers and the simulated world.
+        context: Clock, random numbers and the simulation.
     """
 
     def __init__(self, settings: SpotMeterSettings, context: Context) -> None:
@@ -220,10 +219,10 @@ class VirtualSpotMeter(VirtualDriver, Device):
         self._settings = settings
 
     def safe_state(self) -> None:
-        """Nothing to do: it only looks."""
+        """Do nothing: the meter only measures."""
 
     def command(self, name: str, **arguments: Any) -> None:
-        """Refuse: it knows no commands.
+        """Refuse: the meter has no commands.
 
         Raises:
             DeviceError: Always.
@@ -235,13 +234,13 @@ class VirtualSpotMeter(VirtualDriver, Device):
         """Measure once.
 
         Raises:
-            DeviceError: Not open, or a value that it does not know.
+            DeviceError: Not open, or an unknown value.
         """
         self._check_open()
         if name != VALUE:
             raise DeviceError(self._name, f"unknown value '{name}'; expected '{VALUE}'")
         self._clock.sleep(self._settings.duration)
-        powers: NDArray[np.float64] = self._world.spot_powers()  # pyright: ignore[reportAttributeAccessIssue]
+        powers: NDArray[np.float64] = self._simulation.spot_powers()  # pyright: ignore[reportAttributeAccessIssue]
         return powers * (1 + self._settings.noise * self._random.shot.standard_normal(powers.shape))
 
     def describe(self) -> Mapping[str, Any]:

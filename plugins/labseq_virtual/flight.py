@@ -1,4 +1,7 @@
-"""Atoms carried by what an AWG has played."""
+"""Transport of atoms by the light of a played RF output: drawing atoms, moving them, phase and depth jumps.
+
+Energies and depths inside are per mass of the atom, in m^2/s^2.
+"""
 
 from __future__ import annotations
 
@@ -12,9 +15,9 @@ from numpy.typing import NDArray
 
 from labseq.plugin import MotionSpec, SiteGrid
 from labseq_virtual.handover import full_amplitudes
-from labseq_virtual.played import HOPS, WINDOW, Band, RfPulse, Tracks, refuse_blur, track_tones
-from labseq_virtual.settings import WorldSettings
-from labseq_virtual.transport import Places
+from labseq_virtual.rf_analysis import HOPS, WINDOW, Band, RfPulse, Tracks, check_resolvable, track_tones
+from labseq_virtual.settings import SimulationSettings
+from labseq_virtual.transport import TonePositions
 
 Floats = NDArray[np.float64]
 
@@ -44,26 +47,28 @@ way round. A "depth" jump is that of a tweezer, as a fraction of the full depth.
 
 INNER: Final = 3 * HOPS // 4
 OUTER: Final = 2 * HOPS
-"""Frames on each side of a place, from which to which a tone is looked at: the nearer ones see the jump."""
+"""A jump is found by extrapolating fits to the frames from OUTER to INNER before it and from INNER to
+OUTER after it; nearer frames are blurred by the jump itself."""
 MIN_RAD: Final = 0.5
+"""Smallest phase jump that is reported (ours)."""
 RESIDUAL_RAD: Final = 0.02
-"""Greatest misfit of a smooth course; where it is worse, something else happens, such as a second start."""
+"""Largest residual of the fits; where it is larger, something else happens, such as a second start."""
 CHIRP_RAD: Final = 0.3
-"""What a change of the chirp must amount to within the inner frames to tell its place."""
+"""Smallest phase that a change of the chirp adds within the inner frames for its time to be known."""
 MIN_DEPTH: Final = 0.6
-"""Change of the depth in a transit time; a ramp of 60 us makes a sixth."""
+"""Smallest reported change of the depth within a transit time; a ramp of 60 us makes a sixth."""
 
 
 def phase_jumps(tracks: Tracks, j: int) -> list[tuple[float, int, float]]:
     """The phase jumps of one of the tones.
 
-    A phase jump is the difference between what a tone's course before and after leads one to expect.
-    Both courses are quadratic in time (constant chirp). Where the chirp changes too, the jump is taken
-    where both have the same frequency: motion is continuous.
+    The phase before and the phase after are each fitted by a quadratic in time (constant chirp); the jump
+    is the difference of the two fits. Where the chirp changes too, the difference is taken at the time
+    when both have the same frequency, because the tweezer's motion is continuous.
 
     Args:
         tracks: The tones.
-        j: Which one.
+        j: Number of the tone.
 
     Returns:
         Time, frame and size in rad of each.
@@ -80,14 +85,14 @@ def phase_jumps(tracks: Tracks, j: int) -> list[tuple[float, int, float]]:
     courses = np.concatenate([np.zeros((len(steps), 1)), np.cumsum(steps, axis=1)], axis=1)
     before, after = np.arange(OUTER - INNER + 1), np.arange(OUTER + INNER, n_span)
     at_s = np.arange(-OUTER, OUTER + 1, dtype=np.float64) * step_s
-    first, setting_error = _fit(courses[:, before], at_s[before])
-    second, other_misfit = _fit(courses[:, after], at_s[after])
+    first, residual_before = _fit(courses[:, before], at_s[before])
+    second, residual_after = _fit(courses[:, after], at_s[after])
     shift, slope, bend = (second - first).T
     inner_s = INNER * step_s
     bent = np.abs(bend) * inner_s**2 > CHIRP_RAD
     place_s = np.where(bent, -slope / np.where(bent, 2 * bend, 1.0), 0.0)
     size = _wrapped(shift + slope * place_s + bend * place_s**2)
-    fine = (np.maximum(setting_error, other_misfit) < RESIDUAL_RAD) & (np.abs(place_s) <= inner_s)
+    fine = (np.maximum(residual_before, residual_after) < RESIDUAL_RAD) & (np.abs(place_s) <= inner_s)
     found = peaks(np.where(fine, np.abs(size), 0.0), MIN_RAD, 2 * INNER)
     return [(float(tracks.t_s[k + OUTER] + place_s[k]), k + OUTER, float(size[k])) for k in found]
 
@@ -106,7 +111,7 @@ def depth_jumps(depth: Floats) -> list[tuple[int, float]]:
 
 
 def peaks(values: Floats, least: float, apart: int) -> list[int]:
-    """The middle of each stretch of values above a limit; what is at most ``apart`` apart is one stretch."""
+    """Middle of each run of values above ``least``; gaps of at most ``apart`` do not end a run."""
     above = np.flatnonzero(values > least)
     if not len(above):
         return []
@@ -115,7 +120,7 @@ def peaks(values: Floats, least: float, apart: int) -> list[int]:
 
 
 def _fit(courses: Floats, at_s: Floats) -> tuple[Floats, Floats]:
-    """Coefficients of the quadratics through some courses, and their worst misfits."""
+    """Coefficients of quadratics fitted to each course, and their largest residuals."""
     powers = np.vander(at_s, 3, increasing=True)
     fit = courses @ np.linalg.pinv(powers).T
     return fit, np.abs(courses - fit @ powers.T).max(axis=1)
@@ -126,21 +131,21 @@ def _wrapped(phase_rad: Floats) -> Floats:
 
 
 WIDER: Final = np.array([2.2, 2.2, 4.0])
-"""How much wider than the harmonic law positions are proposed: enough for a beam's weaker flanks."""
+"""Width of the proposed positions relative to a harmonic well's, (x, y, z): covers a beam's weaker flanks."""
 PROPOSALS: Final = 32
-"""Proposals at once for each atom that is still to be placed; one in twenty is taken."""
+"""Proposals drawn at once for each atom still to be placed; about one in twenty is accepted."""
 
 
 def draw_atoms(
     depth: Floats, temperature: float, waist: float, rayleigh: float, rng: np.random.Generator
 ) -> Floats:
-    """Draw atoms from the Boltzmann law of a Gaussian beam, as far as the beam binds them.
+    """Draw atoms from the Boltzmann distribution in a Gaussian beam, restricted to bound atoms.
 
     Positions have the density ``exp(a) P(a)``, where ``a = -U / kT`` and
-    ``P(a) = erf(sqrt(a)) - 2 sqrt(a / pi) exp(-a)`` is the part of the Maxwell law that is slow enough
-    to be bound there. They are drawn by rejection from a wider Gaussian. Atoms drawn so stay
-    distributed as they are; those of the harmonic law would breathe. In tweezers that are too shallow for
-    the temperature they are as hot as half of the depth: hotter ones have evaporated.
+    ``P(a) = erf(sqrt(a)) - 2 sqrt(a / pi) exp(-a)`` is the fraction of the Maxwell distribution slow enough
+    to be bound there. They are drawn by rejection from a wider Gaussian. This distribution is stationary;
+    the harmonic one would breathe. In tweezers too shallow for the temperature, the temperature is half of
+    the depth: hotter atoms have evaporated.
 
     Args:
         depth: Depth of each atom's tweezer per mass, (n_atoms,), above 0.
@@ -150,7 +155,7 @@ def draw_atoms(
         rng: Random numbers.
 
     Returns:
-        Positions from the tweezers' foci, and velocities, (n_atoms, 6).
+        Positions relative to the tweezers' foci, and velocities, (n_atoms, 6).
     """
     from scipy.special import erf
 
@@ -191,13 +196,14 @@ KELVIN: Final = BOLTZMANN / RB87_KG
 """m^2/s^2 per kelvin: energies here are per mass of 87Rb (AME2020, CODATA 2018)."""
 
 STEP_S: Final = 0.1e-6
-"""Step of the integration: a seventieth of a period in a tweezer of 2.1 mK."""
+"""Step of the integration, in seconds: a seventieth of a period in a tweezer of 2.1 mK."""
 BAND_HZ: Final = 50e6
-"""Least width of the AODs' band."""
-FLIGHT_MIN_DEPTH: Final = 2e-3
-"""Fraction of the full depth of an axis below which a tone is not heard."""
+"""Smallest width of the AODs' band (ours)."""
+MIN_TONE_DEPTH: Final = 2e-3
+"""Fraction of the full depth below which a tone counts as off (ours)."""
 SLEW_HZ: Final = 4e6
-"""Most that a tone's frequency leaves its course in a transit time: 1100 um/ms at 1.6 MHz per site."""
+"""Largest deviation of a tone from its extrapolated frequency in a transit time (ours: 1100 um/ms at
+1.6 MHz per site)."""
 
 FLIGHTS: Final = np.dtype(
     [
@@ -208,7 +214,7 @@ FLIGHTS: Final = np.dtype(
         ("to_col", np.int16),
         ("offset_m", np.float32),
         ("depth_K", np.float32),
-        ("fate", "S8"),
+        ("fate", "S9"),
         ("lost_s", np.float64),
         ("lost_row", np.float32),
         ("lost_col", np.float32),
@@ -222,46 +228,43 @@ FLIGHTS: Final = np.dtype(
             "to_col": "column of the site that it came to, if it was kept",
             "offset_m": "how far the tweezer was from the site when it first held the atom",
             "depth_K": "greatest depth of the tweezer",
-            "fate": "kept, ejected, paired, spilled or drawn (by the transport loss)",
+            "fate": "kept, or the cause of the loss: ejected, collision, transport or hand_over",
             "lost_s": "when it was lost, from the start of the shot; nan: never",
             "lost_row": "row where it was lost, in sites",
             "lost_col": "column where it was lost, in sites",
         }
     },
 )
-"""What happened to an atom that a mobile tweezer held, or that was lost.
+"""The path of an atom that a mobile tweezer held, or that was lost.
 
 ``held_s`` is when it was first held (nan: never), ``offset_m`` how far the tweezer then was from the
 site, ``depth_K`` its greatest depth. ``fate`` is "kept" (on the site ``to``), "ejected" (beyond the
-grid), "paired" (came too near to another atom), "spilled" (fell out of its tweezer) or "drawn" (by the
-transport loss). ``lost_s`` is when, and ``lost_row`` and ``lost_col``, in sites, where.
+grid), "collision" (came too near to another atom), "transport" (fell out of its tweezer) or "hand_over"
+(drawn with the probability of the transport loss). ``lost_s`` is when, and ``lost_row`` and ``lost_col``,
+in sites, where.
 """
-
-CAUSES: Final = {
-    b"paired": "collision",
-    b"spilled": "transport",
-    b"ejected": "ejected",
-    b"drawn": "hand_over",
-}
-"""The cause that a fate counts as."""
 
 
 class RfTransport:
-    """Carries atoms by what the mobile tweezers' outputs played.
+    """Moves atoms in the light of what the mobile tweezers' outputs played.
 
     Args:
         grid: The grid of sites, with its frequencies.
-        motion: What drives the AODs: the amplitudes that are meant to give the full depth.
+        motion: The RF chain: the amplitudes that give the full depth.
         settings: The constants of the model.
-        places: Where the tones put their light; by default without errors of the tones.
+        positions: Where the tones put their light; by default without errors of the tones.
     """
 
     def __init__(
-        self, grid: SiteGrid, motion: MotionSpec, settings: WorldSettings, places: Places | None = None
+        self,
+        grid: SiteGrid,
+        motion: MotionSpec,
+        settings: SimulationSettings,
+        positions: TonePositions | None = None,
     ) -> None:
         light = settings.mobile_light
         self._grid, self._motion, self._settings, self._light = grid, motion, settings, light
-        self._places = places or Places(grid, light)
+        self._positions = positions or TonePositions(grid, light)
         self._full_v = _full_volts(grid, motion, light.tone_voltage)
         self._bands = _bands(grid)
         a1, a2 = grid.axes
@@ -277,20 +280,20 @@ class RfTransport:
         self._flights: list[NDArray[Any]] = []
         self._jumps: list[tuple[Any, ...]] = []
 
-    def refuse_blur(self) -> None:
-        """Refuse tones that :func:`labseq_virtual.played.track_tones` cannot tell apart.
+    def check_resolvable(self) -> None:
+        """Check that :func:`labseq_virtual.rf_analysis.track_tones` can resolve the tones of the sites.
 
         Raises:
-            LimitError: They are too near, or too fast, for the time that the sound takes across the beam.
+            LimitError: They are too close, or move too fast, for the transit time of the sound.
         """
-        refuse_blur(self._grid, self._motion, self._light.transit_time)
+        check_resolvable(self._grid, self._motion, self._light.transit_time)
 
     def begin_shot(self) -> None:
         """Forget the flights of the last shot."""
         self._flights, self._jumps = [], []
 
     def tables(self, since_s: float) -> dict[str, NDArray[Any]]:
-        """What happened since the shot began: "flights" and "jumps", times counted from ``since_s``."""
+        """Tables "flights" and "jumps" of this shot, with times counted from ``since_s``."""
         flights = np.concatenate([np.empty(0, FLIGHTS), *self._flights])
         jumps = np.array(sorted(self._jumps, key=lambda jump: jump[0]), JUMPS)
         for name in ("held_s", "lost_s"):
@@ -301,21 +304,29 @@ class RfTransport:
     def carry(
         self, occupied: Mask, pulse: RfPulse, depth: Floats, rng: np.random.Generator, loss_factor: float
     ) -> Counter[str]:
-        """Let a pulse act on the atoms.
+        """Move the atoms in the light of a pulse.
 
         Args:
             occupied: bool (n_rows, n_cols), sites that hold an atom; changed in place.
-            pulse: What was played.
-            depth: float64 (n_rows, n_cols), depths of the static tweezers, of the nominal one.
+            pulse: The output that was played.
+            depth: float64 (n_rows, n_cols), depths of the static tweezers relative to the nominal one.
             rng: Random numbers of the shot.
             loss_factor: The shot's factor on the transport loss.
 
         Returns:
-            How many atoms were lost by each cause: hand_over, transport, collision, ejected.
+            Number of atoms lost by each cause: hand_over, transport, collision, ejected.
         """
-        from labseq_virtual.atom_kernels import DEPTH, HELD_S, LOST_S, N_DIARY, OFFSET, PAIRED, follow_atoms
+        from labseq_virtual.flight_kernels import (
+            COLLIDED,
+            DEPTH,
+            HELD_S,
+            LOST_S,
+            N_COLUMNS,
+            OFFSET,
+            follow_atoms,
+        )
 
-        tones = self._listen(pulse)
+        tones = self._find_tones(pulse)
         if tones is None:
             return Counter()
         (rows, row_depth, cols, col_depth), t_s = tones
@@ -325,39 +336,39 @@ class RfTransport:
         state = draw_atoms(static[row, col], kt, self._beams[0], self._beams[1], rng)
         state[:, :2] += self._grid.positions_m[row, col]
         alive = np.ones(len(row), np.bool_)
-        diary = np.full((len(row), N_DIARY), np.nan)
+        record = np.full((len(row), N_COLUMNS), np.nan)
         n_steps = math.ceil((t_s[1] - t_s[0]) / STEP_S)
         full = KELVIN * self._light.depth
         follow_atoms(
-            state, alive, diary, rows, row_depth, cols, col_depth, t_s,
+            state, alive, record, rows, row_depth, cols, col_depth, t_s,
             static, full, self._plane, self._beams, n_steps,
         )  # fmt: skip
         to_row, to_col, bound = self._arrivals(state, static)
-        held = ~np.isnan(diary[:, HELD_S])
+        held = ~np.isnan(record[:, HELD_S])
         flights = np.zeros(len(row), FLIGHTS)
-        flights["held_s"], flights["offset_m"] = diary[:, HELD_S], diary[:, OFFSET]
-        flights["depth_K"] = diary[:, DEPTH] / KELVIN
+        flights["held_s"], flights["offset_m"] = record[:, HELD_S], record[:, OFFSET]
+        flights["depth_K"] = record[:, DEPTH] / KELVIN
         flights["from_row"], flights["from_col"] = row, col
         flights["to_row"], flights["to_col"] = to_row, to_col
-        flights["lost_s"], flights["lost_row"], flights["lost_col"] = diary[:, LOST_S:PAIRED].T
+        flights["lost_s"], flights["lost_row"], flights["lost_col"] = record[:, LOST_S:COLLIDED].T
         n_tones = max(0, _max_on(rows) + _max_on(cols) - 2)
         loss = self._settings.transport_loss + n_tones * self._settings.transport_loss_per_tone
-        drawn = held & (rng.random(len(row)) < loss * loss_factor)
-        self._judge(flights, alive, diary[:, PAIRED] == 1, bound, drawn, float(t_s[-1]))
+        unlucky = held & (rng.random(len(row)) < loss * loss_factor)
+        self._assign_fates(flights, alive, record[:, COLLIDED] == 1, bound, unlucky, float(t_s[-1]))
         kept = flights["fate"] == b"kept"
         occupied[row, col] = False
         occupied[to_row[kept], to_col[kept]] = True
         self._flights.append(flights[held | ~kept])
-        return Counter(CAUSES[fate] for fate in flights["fate"][~kept].tolist())
+        return Counter(fate.decode() for fate in flights["fate"][~kept].tolist())
 
-    def _listen(self, pulse: RfPulse) -> tuple[tuple[Floats, Floats, Floats, Floats], Floats] | None:
-        """Places (in sites) and depth factors of the row and column tones, and the times of the frames."""
+    def _find_tones(self, pulse: RfPulse) -> tuple[tuple[Floats, Floats, Floats, Floats], Floats] | None:
+        """Positions (in sites) and depth factors of the row and column tones, and the times of the frames."""
         found: list[Tracks] = []
         for axis, spans in enumerate((pulse.rows, pulse.columns)):
             if not spans:
                 return None
             start_s, end_s = pulse.start_s - self.margin_s, pulse.end_s + 2 * self.margin_s
-            min_v = float(self._full_v[axis].min()) * math.sqrt(FLIGHT_MIN_DEPTH)
+            min_v = float(self._full_v[axis].min()) * math.sqrt(MIN_TONE_DEPTH)
             transit_s = self._light.transit_time
             found.append(track_tones(spans, start_s, end_s, self._bands[axis], transit_s, min_v, SLEW_HZ))
         n_frames = min(len(tracks.t_s) for tracks in found)
@@ -365,13 +376,13 @@ class RfTransport:
         depths: list[Floats] = []
         for axis, tracks in enumerate(found):
             hz, volts = tracks.frequency_hz[:n_frames], tracks.amplitude_v[:n_frames]
-            meant, full_v = self._places.meant(axis, hz), self._full_v[axis]
-            sites.append(self._places.sites(axis, hz))
-            depths.append((volts / np.interp(meant, np.arange(len(full_v)), full_v)) ** 2)
-        self._note_jumps(found, sites, depths)
+            intended, full_v = self._positions.intended(axis, hz), self._full_v[axis]
+            sites.append(self._positions.actual(axis, hz))
+            depths.append((volts / np.interp(intended, np.arange(len(full_v)), full_v)) ** 2)
+        self._record_jumps(found, sites, depths)
         return (sites[0], depths[0], sites[1], depths[1]), found[0].t_s[:n_frames]
 
-    def _note_jumps(self, found: list[Tracks], sites: list[Floats], depths: list[Floats]) -> None:
+    def _record_jumps(self, found: list[Tracks], sites: list[Floats], depths: list[Floats]) -> None:
         for axis, tracks in enumerate(found):
             for j in range(sites[axis].shape[1]):
                 for time_s, k, size in phase_jumps(tracks, j):
@@ -387,13 +398,13 @@ class RfTransport:
                     self._jumps.append((float(found[0].t_s[k]), b"depth", *where, size))
 
     def _near(self, rows: Floats, cols: Floats) -> Mask:
-        """Sites that a tweezer comes near to, bool (n_rows, n_cols)."""
+        """Sites that any tweezer comes close to, bool (n_rows, n_cols)."""
         n_rows, n_cols = self._grid.shape
         return _lines(rows, n_rows).T.astype(np.float32) @ _lines(cols, n_cols).astype(np.float32) > 0
 
     def _arrivals(self, state: Floats, static: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp], Mask]:
-        """The sites that are nearest to some atoms, -1 beyond the grid, and whether they bind the atoms."""
-        from labseq_virtual.atom_kernels import energies
+        """Row and column of the site nearest to each atom (-1: beyond the grid), and if it binds the atom."""
+        from labseq_virtual.flight_kernels import energies
 
         waist, rayleigh = self._beams[:2]
         place = np.rint((state[:, :2] - self._plane[0]) @ self._plane[3:].T).astype(np.intp)
@@ -403,20 +414,20 @@ class RfTransport:
         bound = inside & (energies(state, sites, static[row, col], waist, rayleigh) < 0)
         return np.where(inside, row, -1), np.where(inside, col, -1), bound
 
-    def _judge(
-        self, flights: NDArray[Any], alive: Mask, paired: Mask, bound: Mask, drawn: Mask, end_s: float
+    def _assign_fates(
+        self, flights: NDArray[Any], alive: Mask, paired: Mask, bound: Mask, unlucky: Mask, end_s: float
     ) -> None:
-        """Write down the fates; what is lost without a time is lost at the end, where it then is."""
-        flights["fate"] = b"spilled"
+        """Fill in the fates; atoms lost without a recorded time are lost at the end, where they are then."""
+        flights["fate"] = b"transport"
         flights["fate"][alive & bound] = b"kept"
-        flights["fate"][alive & bound & drawn] = b"drawn"
+        flights["fate"][alive & bound & unlucky] = b"hand_over"
         to_row, to_col = flights["to_row"], flights["to_col"]
         kept = np.flatnonzero(flights["fate"] == b"kept")
         _, index, count = np.unique(
             np.stack([to_row[kept], to_col[kept]]), axis=1, return_inverse=True, return_counts=True
         )
-        flights["fate"][kept[count[index.ravel()] > 1]] = b"paired"
-        flights["fate"][paired] = b"paired"
+        flights["fate"][kept[count[index.ravel()] > 1]] = b"collision"
+        flights["fate"][paired] = b"collision"
         flights["fate"][(to_row < 0) & ~paired] = b"ejected"
         lost = flights["fate"] != b"kept"
         late = lost & np.isnan(flights["lost_s"])
@@ -426,7 +437,7 @@ class RfTransport:
 
 
 def _full_volts(grid: SiteGrid, motion: MotionSpec, tone_v: float | None) -> list[Floats]:
-    """Volts of the tones that are meant to give the full depth: for each axis, one per site."""
+    """Peak voltages of the tones that give the full depth: for each axis, one per site."""
     if tone_v is not None:
         return [np.full(n, tone_v) for n in grid.shape]
     return [motion.rf.full_scale_v * full for full in full_amplitudes(grid, motion)]

@@ -1,25 +1,24 @@
-"""Constants of picking up and dropping an atom, and the tones of an axis as tables.
+"""The model of pick-up and drop-off of an atom, its constants, and tables of the tones of an axis.
 
-Taken from the depths and places of the tweezers, without following the atoms; the constants are
-those of ``settings.py``. Energies are in kelvin. Here is why, and with which numbers; the formulas
-themselves are in ``transport_kernels.py``.
+The model uses only depths and positions of the tweezers and does not follow the atoms; its constants are
+those of ``settings.py``. Energies are in kelvin. The formulas are in ``transport_kernels.py``; the reasons:
 
-1. *Pick-up.* A static well of depth U_s and waist w_s and a mobile one of U_m and w_m at a distance d
-   are one well as long as d is below :func:`merging_distance`. Then the atom follows the mobile
-   tweezer, if that is the deeper one; else it stays.
-2. *Drop-off.* Slowly, an atom follows its well back; where the wells have parted in between (distances
-   above about a waist) it falls from one into the other and gains energy: :data:`SLOW`. At once, it has the
-   kinetic energy of an atom that the deeper well has compressed, kT sqrt(1 + U_m / U_s), beside the
-   potential energy U_s (1 - exp(-2 d^2 / w_s^2)) at its place; it is lost if the sum exceeds U_s. A ramp of
-   duration t is sudden to the part exp(-(t / 25 us)^2). All of this was held against atoms that move by
-   Newton's law (``flight.py``).
+1. *Pick-up.* A static well of depth U_s and waist w_s and a mobile one of U_m and w_m at a distance d form
+   one well as long as d is below :func:`merging_distance`. Then the atom follows the mobile tweezer if
+   that is the deeper one; otherwise it stays.
+2. *Drop-off.* In a slow ramp an atom follows its well back; where the wells separate in between (distances
+   above about a waist) it falls from one into the other and gains energy: :data:`SLOW`. In a sudden one it
+   has the kinetic energy of an atom compressed by the deeper well, kT sqrt(1 + U_m / U_s), in addition to
+   the potential energy U_s (1 - exp(-2 d^2 / w_s^2)) at its position; it is lost if the sum exceeds U_s. A
+   ramp of duration t counts as sudden with weight exp(-(t / 25 us)^2). All of this was checked against
+   atoms moved by Newton's equations (``flight.py``).
 3. *Hand-over loss.* Pick-up and drop-off together lose ``transport_loss`` at the nominal depths. The loss
-   goes as U_m / U_s: the deeper the mobile tweezer beside the static one, the less adiabatic the
-   change (the paper sees that, and gives no law).
+   is proportional to U_m / U_s: the deeper the mobile tweezer is relative to the static one, the less
+   adiabatic the change (the paper observes this and gives no formula).
 4. *Transport loss*: ``transport_loss_per_tone`` for each further tone; and where a mobile tweezer is
-   shallower than ``adiabatic_depth``, which goes as the speed squared (the kinetic energy), the part
-   ``shallow_loss`` of its atoms. Depths scatter with the intermodulation of the tones, so the threshold is
-   as wide as the scatter.
+   shallower than ``adiabatic_depth``, which scales with the speed squared (the kinetic energy), the
+   fraction ``shallow_loss`` of its atoms. Depths scatter with the intermodulation of the tones, so the
+   threshold is as wide as that scatter.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.plugin import AxisTones, MotionSpec, SiteGrid
-from labseq_virtual.settings import WorldSettings
+from labseq_virtual.settings import SimulationSettings
 
 Floats = NDArray[np.float64]
 
@@ -41,7 +40,7 @@ REFERENCE_SPEED_M_S: Final = 0.13
 REFERENCE_TONES: Final = 19
 """Further tones that the setting ``intermodulation`` belongs to: the paper measured it on 20 tweezers."""
 SUDDEN_S: Final = 25e-6
-"""Duration of a drop-off between sudden and slow: 1.4 periods of a static tweezer of 300 uK."""
+"""Duration of a drop-off between sudden and slow, in seconds: 1.4 periods in a static tweezer of 300 uK."""
 SLOW: Final = np.array(
     [
         [0.0, 0.82, 0.92, 1.02, 1.12, 1.22, 1.33, 1.43, 1.53, 1.63, 1.84],
@@ -65,7 +64,7 @@ Newton's law in tweezers of 0.3 and 2.1 mK with ramps of 60 us. Further out noth
     ADIABATIC_DEPTH,
     SHALLOW_LOSS,
 ) = range(13)
-"""Places of a world's constants in the array that the kernels take."""
+"""Indices of the constants in the array that the kernels take."""
 
 
 @lru_cache(maxsize=8)
@@ -93,8 +92,8 @@ def merging_distance(static_waist_m: float, mobile_waist_m: float) -> tuple[Floa
     return log_ratio, merged
 
 
-def constants(grid: SiteGrid, settings: WorldSettings) -> Floats:
-    """A world's constants for the kernels, float64 (13,), in the order of the names above, in SI."""
+def constants(grid: SiteGrid, settings: SimulationSettings) -> Floats:
+    """The constants for the kernels, float64 (13,), in the order of the names above, in SI."""
     a1, a2 = grid.axes
     light = settings.mobile_light
     named = {
@@ -116,14 +115,15 @@ def constants(grid: SiteGrid, settings: WorldSettings) -> Floats:
 
 
 MIXING: Final = 0.5
-"""Distance of two tones, in sites, below which their tweezers are one."""
+"""Distance of two tones, in sites, below which their tweezers merge (ours)."""
 AT_REST: Final = 1e-6
-"""Motion in a segment, in sites, below which a tweezer stands still."""
+"""Motion in a segment, in sites, below which a tweezer counts as at rest (rounding)."""
 
 START, END, POWER_START, POWER_END, ON_START, ON_END = range(6)
-"""Columns of a table of tones: places at start and end in sites, powers over those meant, light (1, 0)."""
+"""Columns of a table of tones: positions at start and end in sites, powers relative to the intended ones,
+and whether the tone is on (1 or 0)."""
 DARK, NEW, EMPTY, HELD = range(4)
-"""What a crossing of two tones is: without light, just come on, without an atom, with one."""
+"""States of a crossing of two tones: off, just switched on, on without an atom, on with an atom."""
 
 
 def tone_table(axis: AxisTones, start: Floats, end: Floats, full: Floats, on_amplitude: float) -> Floats:
@@ -131,10 +131,10 @@ def tone_table(axis: AxisTones, start: Floats, end: Floats, full: Floats, on_amp
 
     Args:
         axis: The axis of a program.
-        start: float64 (n_tones,), places at the start of the tones' segments, in sites.
-        end: float64 (n_tones,), places at the end.
-        full: float64 (n_sites,), amplitude that is meant to give the full depth.
-        on_amplitude: Amplitude above which a tone makes light.
+        start: float64 (n_tones,), positions at the start of the tones' segments, in sites.
+        end: float64 (n_tones,), positions at the end.
+        full: float64 (n_sites,), amplitude that gives the full depth.
+        on_amplitude: Amplitude above which a tone is on.
     """
     sites = np.arange(len(full))
     table = np.empty((len(start), 6))
@@ -149,7 +149,7 @@ def tone_table(axis: AxisTones, start: Floats, end: Floats, full: Floats, on_amp
 
 
 def full_amplitudes(grid: SiteGrid, motion: MotionSpec) -> tuple[Floats, Floats]:
-    """Amplitudes of the tones that are meant to give the full depth: rows' and columns', one per site."""
+    """Amplitudes that give the full depth, of the row tones and of the column tones, one per site."""
     rf = motion.rf
     given = (rf.row_amplitudes, rf.column_amplitudes)
     most = (motion.max_row_tones, motion.max_column_tones)

@@ -1,4 +1,4 @@
-"""Kernels that draw frames: whole numbers from tabulated laws, and photoelectrons onto pixels."""
+"""Kernels that draw frames: integers from tabulated distributions, and photoelectrons onto pixels."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ COUNTS = const("int64", 1)
 PLACES = const("float64", 2)
 
 START_BITS = 12
-"""Leading bits of a random word that say where to start looking in a table."""
+"""Leading bits of a random word that select where the search in a table starts."""
 _SHIFT = 32 - START_BITS
 
 
 @kernel(f"int64(uint32, {WORDS}, {STARTS})")
 def place(word: np.uint32, edges: NDArray[np.uint32], starts: NDArray[np.int32]) -> int:
-    """The first place in a table whose edge is not below a word."""
+    """Index of the first edge of a table that is not below a word."""
     j = int(starts[word >> _SHIFT])
     while edges[j] < word:
         j += 1
@@ -36,7 +36,7 @@ def draw(
     first: int,
     drawn: NDArray[np.uint16] | NDArray[np.int32],
 ) -> None:
-    """One number for each random word: ``first`` and its place in the table."""
+    """One number for each random word: ``first`` plus the word's index in the table."""
     for i in range(len(words)):
         drawn[i] = first + place(words[i], edges, starts)
 
@@ -50,7 +50,7 @@ def draw_sums(
     n_each: NDArray[np.int64],
     sums: NDArray[np.int64],
 ) -> None:
-    """Sums of ``n_each`` numbers; the words are as many as all of them together."""
+    """Sums of ``n_each`` numbers each; there is one word for every number of every sum."""
     i = 0
     for group in range(len(n_each)):
         total = n_each[group] * first
@@ -62,7 +62,7 @@ def draw_sums(
 
 @kernel(f"void({const('float32', 2)}, {PLACES}, {COUNTS}, int64, int64, int64, int32[:, ::1])")
 def scatter(
-    beside: NDArray[np.float32],
+    offset: NDArray[np.float32],
     centres: NDArray[np.float64],
     n_each: NDArray[np.int64],
     top: int,
@@ -70,10 +70,10 @@ def scatter(
     binning: int,
     light: NDArray[np.int32],
 ) -> None:
-    """Count the photoelectrons on each pixel; those beside the frame are left out.
+    """Count the photoelectrons on each pixel; those outside the frame are ignored.
 
     Args:
-        beside: How far each falls beside the centre of its spot, in pixels of the sensor (n, 2).
+        offset: Distance of each from the centre of its spot, (y, x) in pixels of the sensor (n, 2).
         centres: Centre of each spot on the sensor, (y, x) (n_spots, 2).
         n_each: Photoelectrons of each spot (n_spots,), n in all.
         top: First row of the sensor that is read.
@@ -86,7 +86,7 @@ def scatter(
     for spot in range(len(n_each)):
         middle_y, middle_x = centres[spot, 0] - top + 0.5, centres[spot, 1] - left + 0.5
         for _ in range(n_each[spot]):
-            y, x = middle_y + beside[i, 0], middle_x + beside[i, 1]
+            y, x = middle_y + offset[i, 0], middle_x + offset[i, 1]
             i += 1
             if 0.0 <= y < height and 0.0 <= x < width:
                 light[math.floor(y) // binning, math.floor(x) // binning] += 1

@@ -1,8 +1,7 @@
-"""Images of atoms: settings, optics, exposure."""
+"""Images of atoms: where their spots are, how bright they are, and the frames of an exposure."""
 
 from __future__ import annotations
 
-import importlib
 import math
 from collections import Counter
 from dataclasses import replace
@@ -12,14 +11,14 @@ from numpy.typing import NDArray
 
 from labseq.plugin import WHOLE_SENSOR, Occupancy, RandomStream, SensorMode, SiteGrid
 from labseq_virtual.sensors import Emccd, Qcmos, View
-from labseq_virtual.settings import ImageSettings, WorldSettings
+from labseq_virtual.settings import ImageSettings, SimulationSettings
 
 
 def site_spots(settings: ImageSettings, grid: SiteGrid) -> NDArray[np.float64]:
     """Centres of the sites' spots on the full sensor.
 
-    The grid is turned, stretched along an axis of the frame, put on its place, and bent by the
-    radial distortion of the lenses.
+    The grid is rotated, stretched along an axis of the frame, shifted to its centre, and distorted
+    radially by the lenses.
 
     Returns:
         float64 (n_rows, n_cols, 2), (y, x) in pixels.
@@ -35,11 +34,11 @@ def site_spots(settings: ImageSettings, grid: SiteGrid) -> NDArray[np.float64]:
 def site_brightness(
     settings: ImageSettings, spots: NDArray[np.float64], rng: np.random.Generator
 ) -> NDArray[np.float64]:
-    """How bright an atom on each site is, relative to one in the middle of the frame.
+    """Brightness of an atom on each site, relative to one in the middle of the frame.
 
     Args:
         settings: Constants of the optics.
-        spots: What :func:`site_spots` found.
+        spots: The centres from :func:`site_spots`.
         rng: Random numbers of the machine.
 
     Returns:
@@ -58,10 +57,9 @@ def photoelectrons(
 ) -> NDArray[np.int32]:
     """Draw the photoelectrons of atoms on each pixel that is read.
 
-    Each is drawn by itself: how many an atom gives (Poisson), and where each falls. In the
-    spot that is a Gaussian, sampled by the pixels without any approximation. The fraction
-    ``halo`` falls in wings of the density w / (2 pi (r^2 + w^2)^(3/2)), which fall as the mean
-    of an Airy pattern does.
+    The number from each atom is Poisson distributed, and each photoelectron is drawn on its own. Its
+    position is Gaussian in the spot, so the sampling by pixels is exact. The fraction ``halo`` lies in
+    wings of density w / (2 pi (r^2 + w^2)^(3/2)), which decay as the mean of an Airy pattern does.
 
     Args:
         settings: Constants of the optics, and the part of the sensor that is read.
@@ -77,14 +75,14 @@ def photoelectrons(
 
     n_each = rng.poisson(mean)
     n = int(n_each.sum())
-    beside = rng.standard_normal((n, 2), np.float32)
-    beside *= np.float32(settings.spot / settings.pixel_size)
+    offset = rng.standard_normal((n, 2), np.float32)
+    offset *= np.float32(settings.spot / settings.pixel_size)
     if settings.halo > 0:
         wide = np.flatnonzero(rng.random(n, np.float32) < settings.halo)
-        beside[wide] = _wings(len(wide), rng) * (settings.halo_width / settings.pixel_size)
+        offset[wide] = _wings(len(wide), rng) * (settings.halo_width / settings.pixel_size)
     top, left, height, width = settings.region
     light = np.zeros((height // binning, width // binning), np.int32)
-    kernels.scatter(beside, spots, n_each, top, left, binning, light)
+    kernels.scatter(offset, spots, n_each, top, left, binning, light)
     return light
 
 
@@ -99,7 +97,7 @@ def corner_distance(settings: ImageSettings, places: NDArray[np.float64]) -> NDA
 
 
 def _wings(n: int, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Places in wings of width 1 (n, 2): where an even light from a unit above meets the plane."""
+    """Positions in wings of width 1 (n, 2): where isotropic light from a point 1 above the plane meets it."""
     cosine = 1.0 - rng.random(n)
     radius = np.sqrt(1 / cosine**2 - 1)
     angle = 2 * np.pi * rng.random(n)
@@ -118,11 +116,11 @@ class Images:
     Args:
         settings: Constants of optics and camera.
         grid: The sites.
-        seed: Seed of what differs from site to site and from pixel to pixel.
+        seed: Seed of the differences from site to site and from pixel to pixel.
         mode: How the sensor is exposed and read.
 
     Raises:
-        LimitError: The sensor cannot be used so.
+        LimitError: The sensor has no such mode.
     """
 
     def __init__(
@@ -136,7 +134,7 @@ class Images:
         self._sensor = Emccd(view) if view.sensor == "emccd" else Qcmos(view, rng)
 
     def warm(self) -> None:
-        """Work out what all frames have in common."""
+        """Compute what all frames have in common."""
         self._sensor.warm()
 
     def take(
@@ -166,26 +164,6 @@ class Images:
         return self._sensor.read(light, exposure_s, rng)
 
 
-class SensorMixin:
-    """The part of the simulation that describes its sensor."""
-
-    _exposure: Exposure
-
-    @property
-    def sensor_shape(self) -> tuple[int, int]:
-        """(height, width) of the sensor in pixels."""
-        return self._exposure.sensor_shape
-
-    def readout_fraction(self, mode: SensorMode) -> float:
-        """Time to read a frame, relative to that of the whole sensor without binning."""
-        return self._exposure.readout_fraction(mode)
-
-    def prepare_sensor(self, mode: SensorMode) -> None:
-        """Work out what all frames of a mode have in common, and load the kernels."""
-        importlib.import_module("labseq_virtual.image_kernels")
-        self._exposure.prepare(mode)
-
-
 class Exposure:
     """Takes frames of the atoms.
 
@@ -195,7 +173,7 @@ class Exposure:
         seed: Seed of the machine's own disorder.
     """
 
-    def __init__(self, grid: SiteGrid, settings: WorldSettings, seed: int) -> None:
+    def __init__(self, grid: SiteGrid, settings: SimulationSettings, seed: int) -> None:
         self._settings = settings
         self._grid = grid
         self._seed = seed
@@ -211,15 +189,15 @@ class Exposure:
         """Time to read a frame, relative to that of the whole sensor without binning.
 
         Raises:
-            LimitError: The sensor cannot be used so.
+            LimitError: The sensor has no such mode.
         """
         return View.of(self._settings.image, mode).readout_fraction
 
     def prepare(self, mode: SensorMode) -> None:
-        """Work out what all frames of a mode have in common.
+        """Compute what all frames of a mode have in common.
 
         Raises:
-            LimitError: The sensor cannot be used so.
+            LimitError: The sensor has no such mode.
         """
         self._images_of(mode).warm()
 
@@ -229,28 +207,28 @@ class Exposure:
         exposure_s: float,
         random: np.random.Generator,
         mode: SensorMode = WHOLE_SENSOR,
-        lit: float = 1.0,
+        light_on: float = 1.0,
     ) -> tuple[NDArray[np.uint16], Counter[str]]:
-        """Take a frame; the imaging light heats some atoms out, and they shine until they are lost.
+        """Take a frame; imaging light heats some atoms out of their tweezers, and they shine until then.
 
-        It does so behind a closed shutter too, which keeps it from the sensor only.
+        A closed shutter keeps the light from the sensor only, not from the atoms.
 
         Args:
             occupied: bool (n_rows, n_cols), sites that hold an atom; changed in place.
             exposure_s: Exposure time, in seconds.
             random: Random numbers of the shot.
             mode: How the sensor is exposed and read.
-            lit: Fraction of the exposure with imaging light; without any there is no stray light either.
+            light_on: Fraction of the exposure with imaging light; at 0 there is no stray light either.
 
         Returns:
-            The frame, uint16 (height, width), read-only, and how many atoms were lost to imaging and vacuum.
+            The frame, uint16 (height, width), read-only, and the numbers of atoms lost to imaging and vacuum.
         """
-        images = self._images_of(mode if lit > 0 else replace(mode, shutter_open=False))
+        images = self._images_of(mode if light_on > 0 else replace(mode, shutter_open=False))
         row, col = np.nonzero(occupied)
-        light_hz = self._light_hz * lit
+        light_hz = self._light_hz * light_on
         rate_hz = light_hz + 1.0 / self._settings.lifetime
         life_s = random.exponential(1.0 / rate_hz, len(row))
-        shining = np.minimum(life_s / exposure_s, 1.0) * lit
+        shining = np.minimum(life_s / exposure_s, 1.0) * light_on
         image = images.take(row, col, shining, exposure_s, random)
         image.flags.writeable = False
         lost = life_s < exposure_s
@@ -260,7 +238,7 @@ class Exposure:
         return image, Counter(imaging=n_by_light, vacuum=n_lost - n_by_light)
 
     def _images_of(self, mode: SensorMode) -> Images:
-        """The same machine in each mode: a region is exactly that part of the sensor."""
+        """The images of a mode; all share the seed, so a region shows exactly that part of the sensor."""
         if mode not in self._images:
             self._images[mode] = Images(self._settings.image, self._grid, self._seed, mode)
         return self._images[mode]

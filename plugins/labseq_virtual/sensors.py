@@ -15,19 +15,19 @@ from labseq.plugin import WHOLE_SENSOR, LimitError, SensorMode
 from labseq_virtual.settings import ImageSettings
 
 NEVER: Final = 1e-13
-"""Numbers at the ends of a law that are rarer than this together are left out."""
+"""Tails of a distribution with less than this probability are cut off."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CountDistribution:
-    """A law of whole numbers: its distribution function in a table, inverted by 32 random bits.
+    """A distribution of integers: its cumulative probability in a table, inverted with 32 random bits.
 
     Probabilities are rounded to whole multiples of 2^-32.
 
     Attributes:
-        first: The least number.
+        first: The smallest number.
         edges: uint32 (n_numbers,), the last random word of each number.
-        starts: int32, where in ``edges`` to start looking, by the leading bits of the word.
+        starts: int32, index in ``edges`` where the search starts, by the leading bits of the word.
     """
 
     first: int
@@ -36,11 +36,11 @@ class CountDistribution:
 
     @classmethod
     def of(cls, probability: NDArray[np.float64], first: int = 0) -> CountDistribution:
-        """Tabulate a law.
+        """Tabulate a distribution.
 
         Args:
-            probability: float64 (n,), of the numbers from ``first`` on; need not add up to 1.
-            first: See there.
+            probability: float64 (n,), probability of ``first``, ``first`` + 1, ...; need not add up to 1.
+            first: The smallest number.
         """
         from labseq_virtual import image_kernels as kernels
 
@@ -76,7 +76,7 @@ def _words(n: int, rng: np.random.Generator) -> NDArray[np.uint32]:
 Complex = NDArray[np.complex128]
 
 N_ONE_BY_ONE: Final = 32
-"""Up to so many electrons into the register, each one's output is drawn by itself."""
+"""Up to this number of electrons into the register, the output of each is drawn separately."""
 
 
 @dataclass(frozen=True)
@@ -85,8 +85,8 @@ class Register:
 
     In a stage, each electron frees another with the probability p, where (1 + p)^n_stages is
     the gain. With the generating function of a stage, f(s) = (1 - p) s + p s^2, that of the
-    whole register is f applied n_stages times, and its Fourier transform the exact law of what
-    comes out.
+    whole register is f applied n_stages times; its Fourier transform gives the exact distribution of
+    the output.
 
     Attributes:
         n_stages: Number of stages.
@@ -118,7 +118,7 @@ class Register:
 
     @cached_property
     def one(self) -> CountDistribution:
-        """Law of the output for one electron in, without the spurious ones."""
+        """Distribution of the output for one electron in, without the spurious ones."""
         n_values = power_of_two(45 * self.gain + 64)
         return CountDistribution.of(
             np.fft.irfft(_transforms(self.n_stages, self.gain, n_values)[0], n_values)
@@ -126,17 +126,17 @@ class Register:
 
     @cached_property
     def _added(self) -> CountDistribution:
-        """Law of what the spurious electrons add to the output."""
+        """Distribution of what the spurious electrons add to the output."""
         return CountDistribution.of(
             self.output(0.0, power_of_two((self.spurious + 9 * self.spurious**0.5 + 45) * self.gain))
         )
 
     def output(self, mean_electrons: float, n_values: int) -> NDArray[np.float64]:
-        """Law of the output for a Poisson number of electrons in, spurious ones included.
+        """Distribution of the output for a Poisson number of electrons in, spurious ones included.
 
         Args:
             mean_electrons: Mean number of electrons in.
-            n_values: A power of two; larger outputs must be as good as impossible.
+            n_values: A power of two; larger outputs must be practically impossible.
 
         Returns:
             float64 (n_values,), probability of 0, 1, ... electrons out.
@@ -147,9 +147,9 @@ class Register:
     def multiply(self, n_electrons: NDArray[np.int64], rng: np.random.Generator) -> NDArray[np.int64]:
         """Draw the output for each number of electrons in.
 
-        Up to N_ONE_BY_ONE electrons it has the exact law. For more, what the stages free is
-        drawn from a negative binomial law with the exact mean and variance, which is the exact
-        law in the limit of many stages.
+        Exact up to N_ONE_BY_ONE electrons. For more, the electrons added by the stages are drawn from a
+        negative binomial distribution with the exact mean and variance, which is exact in the limit of
+        many stages.
 
         Args:
             n_electrons: int64 (n,).
@@ -173,7 +173,7 @@ class Register:
 
 
 def power_of_two(least: float) -> int:
-    """The first power of two that is not below a number."""
+    """The smallest power of two that is not below a number."""
     return 1 << max(0, int(np.ceil(np.log2(least))))
 
 
@@ -193,7 +193,7 @@ def _transforms(n_stages: int, gain: float, n_values: int) -> tuple[Complex, Com
 
 
 class View(ImageSettings):
-    """Image settings with the part of the sensor that is read, and the gain and light in force."""
+    """Image settings of one sensor mode: the part that is read, its binning, gain and stray light."""
 
     region: tuple[int, int, int, int] = Field(description="[y, x, height, width] of the part that is read")
     binning: int = Field(
@@ -203,10 +203,10 @@ class View(ImageSettings):
 
     @classmethod
     def of(cls, settings: ImageSettings, mode: SensorMode = WHOLE_SENSOR) -> Self:
-        """The settings as a mode makes them; no stray light behind a closed shutter.
+        """The settings in a mode; a closed shutter keeps stray light out too.
 
         Raises:
-            LimitError: The sensor has no such part, cannot be binned so, or has no EM register.
+            LimitError: The sensor has no such part, binning or EM register.
         """
         region = mode.region or (0, 0, *settings.frame)
         _check(settings, mode, region)
@@ -246,18 +246,18 @@ def _check(settings: ImageSettings, mode: SensorMode, region: tuple[int, int, in
 
 
 FULL_SCALE: Final = 65535
-"""Counts at which the converter of 16 bit ends."""
+"""Largest count of the 16 bit converter."""
 
 MAX_WORK: Final = 2**23
-"""Outputs of the register times counts that the read noise reaches, above which no table is made."""
+"""Size of a table (outputs of the register times counts within the read noise) above which none is made."""
 
 MAX_ELECTRONS: Final = 300
-"""Mean electrons of a dark pixel above which none is made; fewer never fill a well."""
+"""Mean electrons of a dark pixel above which no table is made; fewer never fill a well."""
 
 
 @dataclass(frozen=True)
 class Output:
-    """What comes behind the register.
+    """The output stage behind the register.
 
     Attributes:
         well: Electrons that the register holds.
@@ -281,16 +281,16 @@ class Emccd:
     """An EMCCD camera.
 
     The electrons of a pixel (photoelectrons, and the clock-induced charge of the sensor) pass the EM
-    register, then come read noise, offset and an analogue-to-digital converter of 16 bit. Pixels
-    without an atom's light all have one law, which is worked out once for an exposure time and
-    drawn from a table; the others are followed step by step.
+    register; then follow read noise, offset and an analogue-to-digital converter of 16 bit. Pixels
+    without an atom's light share one distribution, which is computed once for an exposure time and
+    drawn from a table; for the others each step is drawn.
 
     Args:
         settings: Constants of the camera, and how it is read.
     """
 
     quantum_efficiency: Final = 1.0
-    """The photoelectrons of the settings are this camera's."""
+    """Relative to itself: the settings give the photoelectrons of this camera."""
 
     def __init__(self, settings: View) -> None:
         self.binning = settings.binning
@@ -302,9 +302,9 @@ class Emccd:
         )
 
     def warm(self) -> None:
-        """Work out the tables for the exposure of the settings."""
+        """Compute the tables for the exposure of the settings."""
         _ = self.register.one
-        _dark_law(self.register, self._output, self._dark_electrons(self._settings.exposure))
+        _dark_counts(self.register, self._output, self._dark_electrons(self._settings.exposure))
 
     def read(
         self, light: NDArray[np.int32], exposure_s: float, rng: np.random.Generator
@@ -320,7 +320,7 @@ class Emccd:
             uint16 (height, width).
         """
         dark_electrons = self._dark_electrons(exposure_s)
-        dark = _dark_law(self.register, self._output, dark_electrons)
+        dark = _dark_counts(self.register, self._output, dark_electrons)
         image = np.empty(light.size, np.uint16)
         if dark is None:
             lit = slice(None)
@@ -342,8 +342,8 @@ class Emccd:
 
 
 @lru_cache(maxsize=64)
-def _dark_law(register: Register, output: Output, mean_electrons: float) -> CountDistribution | None:
-    """Law of the counts of a pixel without an atom's light; None where a table would be too long."""
+def _dark_counts(register: Register, output: Output, mean_electrons: float) -> CountDistribution | None:
+    """Distribution of the counts of a pixel without an atom's light; None if the table would be too long."""
     most = mean_electrons + register.spurious
     n_values = power_of_two((most + 9 * (2 * most) ** 0.5 + 45) * register.gain)
     spread = output.read_noise / output.electrons_per_adu
@@ -354,16 +354,16 @@ def _dark_law(register: Register, output: Output, mean_electrons: float) -> Coun
     p = p[: np.flatnonzero(p > 1e-15)[-1] + 1]
     value = np.minimum(np.arange(len(p)), output.well) / output.electrons_per_adu + output.offset
     nearest = np.rint(value).astype(np.int64)
-    law = np.zeros(FULL_SCALE + 1)
-    for beside in range(-reach, reach + 1):
-        count = nearest + beside
+    probability = np.zeros(FULL_SCALE + 1)
+    for distance in range(-reach, reach + 1):
+        count = nearest + distance
         share = _rounded(count - value, spread) * p
-        law += np.bincount(np.clip(count, 0, FULL_SCALE), share, len(law))
-    return CountDistribution.of(law)
+        probability += np.bincount(np.clip(count, 0, FULL_SCALE), share, len(probability))
+    return CountDistribution.of(probability)
 
 
 def _rounded(distance: NDArray[np.float64], spread: float) -> NDArray[np.float64]:
-    """Probability that a normal number about 0 is rounded to a count at a distance."""
+    """Probability that Gaussian noise of s.d. ``spread`` is rounded to a count ``distance`` off the mean."""
     from scipy.special import ndtr
 
     if spread == 0:
@@ -378,11 +378,11 @@ class Qcmos:
     """A qCMOS camera.
 
     Photoelectrons and dark current fill the pixel's well; its own gain, read noise and offset follow,
-    then an analogue-to-digital converter of 16 bit. Binned pixels are added up after that.
+    then an analogue-to-digital converter of 16 bit. Pixels are binned after that.
 
     Args:
         settings: Constants of the camera, and how it is read.
-        rng: Random numbers of the machine, for what differs from pixel to pixel.
+        rng: Random numbers of the machine, for the differences from pixel to pixel.
     """
 
     binning: Final = 1
@@ -394,7 +394,7 @@ class Qcmos:
         self._rng = rng
 
     def warm(self) -> None:
-        """Draw what differs from pixel to pixel."""
+        """Draw the differences from pixel to pixel."""
         _ = self._pixels
 
     def read(

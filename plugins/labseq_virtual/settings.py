@@ -1,8 +1,8 @@
 """Settings of the simulation and of every virtual device.
 
 "Paper" is Tian et al., "Parallel assembly of arbitrary defect-free atom arrays
-with a multi-tweezer algorithm"; "derived" is worked out from it; "ours" is a
-choice where it is silent.
+with a multi-tweezer algorithm"; "derived" is computed from its numbers; "ours" is our
+choice where the paper gives no value.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ PositiveLength = Annotated[Length, Field(gt=0)]
 
 
 class QcmosSettings(Settings):
-    """A qCMOS camera: no EM register, little read noise, every pixel with an amplifier of its own.
+    """A qCMOS camera: no EM register, little read noise, each pixel with its own amplifier.
 
-    "Hamamatsu" is what is quoted of the ORCA-Quest C15550-20UP and its successor.
+    "Hamamatsu" marks values quoted for the ORCA-Quest C15550-20UP and its successor.
     """
 
     quantum_efficiency: PositiveFloat = Field(
@@ -119,7 +119,7 @@ class ImageSettings(Settings):
     )
     halo_width: PositiveLength = Field(
         default=1e-6,
-        description="width w of the wings: beyond a distance r far from the spot lies w / r of their light "
+        description="width w of the wings: beyond a large distance r from the spot lies w / r of their light "
         "(ours; an ideal lens of NA 0.5 has a halo times its width of 0.16 um)",
     )
     exposure: PositiveDuration = Field(
@@ -174,7 +174,7 @@ class ImageSettings(Settings):
     )
     offset: NonNegativeFloat = Field(default=500.0, description="counts of a dark pixel (ours)")
     qcmos: QcmosSettings = Field(
-        default=QcmosSettings(), description="the camera where `sensor` is qcmos; else it plays no part"
+        default=QcmosSettings(), description="the camera if `sensor` is qcmos; ignored otherwise"
     )
 
 
@@ -187,14 +187,14 @@ class MobileLightSettings(Settings):
     """The light of the mobile tweezers."""
 
     depth: PositiveTemperature = Field(
-        default=2.1e-3, description="depth of a tweezer whose two tones have the amplitude meant (paper)"
+        default=2.1e-3, description="depth of a tweezer whose two tones have their intended amplitude (paper)"
     )
     waist: PositiveLength = Field(default=0.98e-6, description="1/e^2 radius of the intensity (paper)")
     wavelength: PositiveLength = Field(default=852e-9, description="wavelength (paper)")
     transit_time: Annotated[Duration, Field(ge=1e-6, le=50e-6)] = Field(
         default=10e-6,
         description="time that the sound takes across the beam in an AOD (1/e^2 of the intensity at both "
-        "ends): every jump of a tone is as soft as this (ours: 6 mm of slow TeO2)",
+        "ends); it smooths every jump of a tone (ours: 6 mm of slow TeO2)",
     )
     tone_voltage: Annotated[Voltage, Field(gt=0)] | None = Field(
         default=None,
@@ -203,36 +203,35 @@ class MobileLightSettings(Settings):
     )
     offset: tuple[Length, Length] = Field(
         default=(0.0, 0.0),
-        description="[along a row, from row to row]: how far the mobile tweezers stand beside the sites that "
-        "they are meant for, an error for a calibration to find (ours)",
+        description="[along a row, from row to row]: displacement of the mobile tweezers from the sites that "
+        "they are intended for, an error for a calibration to find (ours)",
     )
     magnification_error: float = Field(
         default=0.0,
         ge=-0.1,
         le=0.1,
-        description="how much further apart than meant the mobile tweezers stand, as a fraction; likewise "
-        "(ours)",
+        description="excess distance of the mobile tweezers from one another, as a fraction; likewise (ours)",
     )
     tone_error: NonNegativeLength = Field(
         default=0.0,
-        description="s.d. of the place of each row's and each column's tone about the one meant, fixed for a "
-        "seed; likewise (ours)",
+        description="s.d. of the position error of each row's and each column's tone, fixed for a seed; "
+        "likewise (ours)",
     )
     depth_drop_per_tone: Fraction = Field(
         default=0.0,
         description="the depth is divided by 1 plus this for each tone on beyond one per axis (ours; the "
-        "paper sees a drop and gives no number). Drivers whose outputs are heard make their own",
+        "paper observes a drop and gives no number). Not used for drivers that connect their outputs",
     )
     intermodulation: Fraction = Field(
         default=0.02,
-        description="relative s.d. of the depths of 20 tweezers in a line; that of n goes as the root of "
-        "n - 1 (paper: 2 %; the law is ours)",
+        description="relative s.d. of the depths of 20 tweezers in a line; that of n is proportional to "
+        "the root of n - 1 (paper: 2 %; the scaling is ours)",
     )
     adiabatic_depth: NonNegativeTemperature = Field(
         default=0.0,
-        description="least depth of a tweezer that carries its atom at 130 um/ms; it goes as the speed "
-        "squared (ours; the paper suspects such a depth, passed at 13 tweezers; 0: there is none). For "
-        "drivers that are taken at their word; where outputs are heard, the atoms fly",
+        description="smallest depth of a tweezer that carries its atom at 130 um/ms; it scales with the "
+        "speed squared (ours; the paper suspects such a depth, reached at 13 tweezers; 0: there is none). "
+        "Not used for drivers that connect their outputs, where the motion of the atoms is integrated",
     )
     shallow_loss: Fraction = Field(
         default=0.0, description="loss in tweezers that are shallower than that (ours)"
@@ -246,11 +245,13 @@ class LightSettings(Settings):
     cooling: tuple[str, ...] = Field(
         default=(), description="lines without which atoms heat up while they are moved (ours)"
     )
-    imaging: tuple[str, ...] = Field(default=(), description="lines without which atoms do not shine (ours)")
+    imaging: tuple[str, ...] = Field(
+        default=(), description="lines without which atoms do not fluoresce (ours)"
+    )
 
 
-class WorldSettings(Settings):
-    """The virtual lab's atoms and light."""
+class SimulationSettings(Settings):
+    """Atoms and light of the simulation."""
 
     loading: Fraction = Field(
         default=0.75,
@@ -266,8 +267,8 @@ class WorldSettings(Settings):
     imaging_loss: Fraction = Field(
         default=0.00314,
         lt=1,
-        description="loss in one exposure of 45 ms beside the lifetime's; longer ones lose at the same rate "
-        "(derived: with the lifetime it gives the paper's survival of 99.55 %)",
+        description="loss in one exposure of 45 ms beyond the lifetime's; longer ones lose at the same "
+        "rate (derived: with the lifetime it gives the paper's survival of 99.55 %)",
     )
     imaging_loss_exposure: PositiveDuration = Field(
         default=45e-3, description="exposure that the imaging loss belongs to (paper)"
@@ -275,13 +276,13 @@ class WorldSettings(Settings):
     transport_loss: Fraction = Field(
         default=0.0188,
         description="mean loss of an atom that is picked up, moved and dropped, at the nominal depths; it "
-        "goes as the mobile depth over the static one (derived: gives about the paper's filling of 97.66 % "
-        "after one cycle at a degree of parallelism of 7; the law is ours)",
+        "is proportional to the ratio of mobile to static depth (derived: gives about the paper's filling of "
+        "97.66 % after one cycle at a degree of parallelism of 7; the scaling is ours)",
     )
     transport_loss_per_tone: Fraction = Field(
         default=0.0,
-        description="added to it for each tone on beyond one per axis (ours; the paper sees more loss with "
-        "more tones and gives no number)",
+        description="added to it for each tone on beyond one per axis (ours; the paper observes more loss "
+        "with more tones and gives no number)",
     )
     transport_loss_spread: NonNegativeFloat = Field(
         default=0.5,
@@ -291,13 +292,13 @@ class WorldSettings(Settings):
     )
     uncooled_transport: Annotated[float, Field(ge=1)] = Field(
         default=3.0,
-        description="transport loss without cooling light, relative to that with it (ours; where lines "
-        "switch the light)",
+        description="transport loss without cooling light, relative to that with it (ours; only "
+        "if lines switch the light)",
     )
     machine_seed: Annotated[int, Field(ge=0, lt=2**63)] | None = Field(
         default=None,
-        description="seed of what does not change from run to run: depths, errors of tones, the camera's own "
-        "patterns; none: the seed of the run. Calibrations hold for one machine only (ours)",
+        description="seed of what stays the same from run to run: depths, errors of tones, the camera's "
+        "own patterns; none: the seed of the run. Calibrations hold for one machine only (ours)",
     )
     depth_disorder: Fraction = Field(
         default=0.04,
@@ -340,7 +341,7 @@ class WorldSettings(Settings):
         default=1e-3,
         gt=0,
         lt=1,
-        description="amplitude, as a fraction of full scale, above which a tone makes light (ours)",
+        description="amplitude, as a fraction of full scale, above which a tone is on (ours)",
     )
     lights: LightSettings = Field(
         default=LightSettings(), description="which lines each kind of light needs; none: it is always on"
@@ -357,21 +358,21 @@ class WorldSettings(Settings):
 
 
 class CameraFaults(Settings):
-    """Failures to rehearse; none by default."""
+    """Simulated failures; none by default."""
 
     transient: Fraction = Field(
         default=0.0,
-        description="probability that a frame is lost with an error that a repeated shot may mend",
+        description="probability that a frame is lost with an error that calls for a repeated shot",
     )
     missed_trigger: Fraction = Field(
-        default=0.0, description="probability that a trigger is not seen, so that no frame comes"
+        default=0.0, description="probability that a trigger is missed, so that no frame comes"
     )
     lost_in_series: Fraction = Field(
         default=0.0,
-        description="probability that a frame never comes, which the number of the next one tells",
+        description="probability that a frame never comes, which shows in the number of the next one",
     )
     late: Fraction = Field(default=0.0, description="probability that a frame comes late")
-    late_by: Duration = Field(default=2.0, description="how late it comes then")
+    late_by: Duration = Field(default=2.0, description="delay of a late frame")
 
 
 class CameraSettings(labseq.CameraSettings):
@@ -390,9 +391,9 @@ class CameraSettings(labseq.CameraSettings):
         "`image.em_gain` at all times",
     )
     cooling: CoolingSettings | None = Field(
-        default=None, description="how cold the sensor is before the first shot; none: it is not cooled"
+        default=None, description="target temperature before the first shot; none: no cooling"
     )
-    faults: CameraFaults = Field(default=CameraFaults(), description="failures to rehearse")
+    faults: CameraFaults = Field(default=CameraFaults(), description="simulated failures")
 
 
 class StaticTweezersSettings(Settings):
@@ -412,23 +413,23 @@ class MobileTweezersSettings(Settings):
 
     band_centre: Frequency = Field(default=100e6, description="middle of the AOD's band (ours)")
     band_half_width: Annotated[Frequency, Field(gt=0)] = Field(
-        default=18e6, description="reach of the AOD's band to each side (ours: about 36 MHz in all)"
+        default=18e6, description="half width of the AOD's band (ours: about 36 MHz in all)"
     )
     max_amplitude_sum: PositiveFloat = Field(
         default=1.0,
-        description="greatest sum of the tones' amplitudes on an axis, as a fraction of full scale: above "
-        "it the output clips",
+        description="greatest sum of the tones' amplitudes on an axis, as a fraction of full scale, above "
+        "which the output clips",
     )
 
 
 class DeviceSettings(Settings):
-    """A virtual instrument; also the stand-in for one whose driver is missing."""
+    """A virtual instrument; in a dry run it replaces one whose driver has no simulator."""
 
     commands: tuple[str, ...] = Field(
-        default=(), description="names of the commands that it knows; none: it accepts every command"
+        default=(), description="names of its commands; none: it accepts every command"
     )
     values: dict[str, bool | int | float | str] = Field(
-        default={}, description="values that it can be asked for: name -> value at the start"
+        default={}, description="values that can be read: name -> value at the start"
     )
 
 
@@ -436,9 +437,9 @@ class LinesSettings(Settings):
     """A virtual timing box."""
 
     n_channels: PositiveInt = Field(default=32, description="number of outputs, counted from 0 (ours)")
-    resolution: Duration = Field(default=0.0, description="step of its clock; 0 for any time (ours)")
-    shortest: Duration = Field(default=1e-6, description="least time between two edges (ours)")
-    max_edges: PositiveInt = Field(default=1000, description="most edges of a program (ours)")
+    resolution: Duration = Field(default=0.0, description="step of its clock; 0: any time is possible (ours)")
+    shortest: Duration = Field(default=1e-6, description="shortest time between two edges (ours)")
+    max_edges: PositiveInt = Field(default=1000, description="maximum number of edges of a program (ours)")
 
 
 class SpotMeterSettings(Settings):

@@ -1,27 +1,25 @@
-"""Atoms carried by an ideal tone program.
+"""Transport of atoms by a tone program that is carried out exactly as written.
 
-The tweezers are the crossings of the row tones and the column tones that are on.
-What a segment is *meant* for (its kind, its batch) is not looked at: only tones
-count, so that a wrong program does here what it would do in the lab.
+The tweezers are the crossings of the row tones and the column tones that are on. The purpose of a segment
+(its kind, its batch) is ignored: only tones count, so a wrong program has the effect that it would have in
+the lab.
 
 Rules, in the order in which they act on a segment:
 
-1. A crossing that was on at the end of the segment before, within the site
-   tolerance on both axes, is the same tweezer and keeps its atom. An atom whose
-   tweezer has no such successor is lost: its tone jumped or went out.
-2. A crossing that comes on takes the atom of the nearest site, if it is near and deep enough
+1. A crossing that was on at the end of the segment before, within the site tolerance on both axes, is the
+   same tweezer and keeps its atom. An atom whose tweezer has no such successor is lost: its tone jumped or
+   switched off.
+2. A crossing that switches on takes the atom of the nearest site, if it is close and deep enough
    (``handover.py``).
-3. Tones of one axis that come nearer than half a site, or pass one another, mix
-   the atoms on both: they are lost.
-4. A crossing that moves over a standing atom, or ends on one, throws it out, if it is
-   deeper than a static tweezer. The first to arrive loses its own atom too.
-5. A crossing that goes out sets its atom down on the nearest site, less the losses
-   of ``handover.py``, which are drawn then; two atoms on one site are both lost; outside of the
-   grid the atom is gone (ejected).
+3. Tones of one axis that come closer than half a site, or pass one another, mix the atoms on both: they are
+   lost.
+4. A crossing that moves over an atom on a site, or ends on one, knocks it out, if it is deeper than a static
+   tweezer. The first to arrive loses its own atom too.
+5. A crossing that switches off drops its atom on the nearest site, with the losses of ``handover.py``; two
+   atoms on one site are both lost; outside the grid the atom is gone (ejected).
 
-Atoms still held when the program ends are lost. The course of the speed within a
-segment changes nothing here: all tones follow the same one, so what meets, and in which
-order, is the same.
+Atoms still held when the program ends are lost. The velocity profile within a segment does not matter here:
+all tones follow the same one, so it does not change which atoms meet, or in which order.
 """
 
 from __future__ import annotations
@@ -35,7 +33,7 @@ from numpy.typing import NDArray
 
 from labseq.plugin import FrequencyCourse, LimitError, MotionSpec, SiteGrid, ToneProgram
 from labseq_virtual.handover import constants, full_amplitudes, merging_distance, tone_table
-from labseq_virtual.settings import MobileLightSettings, WorldSettings
+from labseq_virtual.settings import MobileLightSettings, SimulationSettings
 
 Floats = NDArray[np.float64]
 
@@ -44,15 +42,15 @@ BEYOND: Final = 1000
 
 
 class FrequencyMap:
-    """Frequency -> place along an axis, in sites; beyond the grid at the outermost step.
+    """Frequency -> position along an axis, in sites; extrapolated beyond the grid with the outermost step.
 
     Args:
         frequency_hz: float64 (n_sites,), rising or falling.
-        lone_step_hz: Step to assume where there is one site only.
+        lone_step_hz: Step to assume if there is only one site.
         axis: "row" or "column", for the error message.
 
     Raises:
-        LimitError: The frequencies neither rise nor fall all along.
+        LimitError: The frequencies neither all rise nor all fall.
     """
 
     def __init__(self, frequency_hz: Floats, lone_step_hz: float, axis: str) -> None:
@@ -70,18 +68,18 @@ class FrequencyMap:
         self._hz, self._sites = (hz, sites) if rising else (hz[::-1], sites[::-1])
 
     def sites(self, frequency_hz: Floats) -> Floats:
-        """Places of some tones, in sites from the first row or column."""
+        """Positions of tones, in sites from the first row or column."""
         return np.interp(frequency_hz, self._hz, self._sites)
 
 
-class Places:
-    """The places of row and column tones as the optics make them, with what a calibration has to find.
+class TonePositions:
+    """The true positions of row and column tones, with the errors that a calibration has to find.
 
-    The grid says where each tone is meant to be. The truth differs from it by a common offset, a
+    The grid says where each tone is intended to be. The true position differs by a common offset, a
     magnification, and an error of each tone (``settings.py``, ``mobile_light``).
 
     Args:
-        grid: The grid of sites, with the frequencies that were meant before any calibration.
+        grid: The grid of sites, with the intended frequencies before any calibration.
         light: The errors.
     """
 
@@ -103,39 +101,39 @@ class Places:
         self._known = [error.copy() for error in self._errors]
 
     def draw(self, random: np.random.Generator) -> None:
-        """Draw the errors of the tones; they belong to the machine."""
+        """Draw the errors of the tones from the machine's random numbers."""
         for axis, known in enumerate(self._known):
             scatter = random.standard_normal(len(known)) * self._light.tone_error / self._spacing_m
             self._errors[axis] = known + scatter
 
-    def meant(self, axis: int, frequency_hz: Floats) -> Floats:
-        """Where the tones of the rows (axis 0) or columns (1) are meant to be, in sites."""
+    def intended(self, axis: int, frequency_hz: Floats) -> Floats:
+        """Intended positions of tones of the rows (axis 0) or columns (axis 1), in sites."""
         return self._maps[axis].sites(frequency_hz)
 
-    def sites(self, axis: int, frequency_hz: Floats) -> Floats:
-        """Where the tones of the rows (axis 0) or columns (1) are, in sites."""
-        meant, errors = self._maps[axis].sites(frequency_hz), self._errors[axis]
+    def actual(self, axis: int, frequency_hz: Floats) -> Floats:
+        """True positions of tones of the rows (axis 0) or columns (axis 1), in sites."""
+        intended, errors = self._maps[axis].sites(frequency_hz), self._errors[axis]
         if not errors.any():
-            return meant
-        return meant + np.interp(meant, np.arange(len(errors)), errors)
+            return intended
+        return intended + np.interp(intended, np.arange(len(errors)), errors)
 
 
 Mask = NDArray[np.bool_]
 
 CAUSES: Final[tuple[str, ...]] = ("hand_over", "transport", "collision", "ejected", "program")
-"""What moved atoms are lost by. "program": their tweezer went out or jumped."""
+"""Causes of losses in transport. "program": the tweezer switched off or jumped."""
 HAND_OVER, TRANSPORT, COLLISION, EJECTED, PROGRAM = range(5)
-"""Places of these causes in the array that the kernels count in."""
+"""Indices of these causes in the array of the kernels."""
 FASTEST: Final = np.array([course.fastest for course in FrequencyCourse])
-"""Greatest speed over the mean, for each course."""
+"""Greatest speed relative to the mean speed, for each course."""
 
 
 @dataclass(frozen=True, slots=True)
-class Playing:
-    """A program on its way.
+class RunningProgram:
+    """A program that is being played.
 
     Attributes:
-        program: What is played.
+        program: The program.
         t_start_s: When it started.
     """
 
@@ -144,33 +142,37 @@ class Playing:
 
     @property
     def t_end_s(self) -> float:
-        """When it ends."""
+        """Time of its end."""
         return self.t_start_s + self.program.total_duration_s
 
     def n_segments_until(self, t_s: float) -> int:
-        """How many segments are over at a time."""
+        """Number of segments that have ended at a time."""
         ends_s = self.t_start_s + np.cumsum(self.program.duration_s)
         return int(np.searchsorted(ends_s, t_s, side="right"))
 
 
 class Transport:
-    """Carries atoms by tone programs.
+    """Moves atoms according to tone programs.
 
     Args:
         grid: The grid of sites, with its frequencies.
-        motion: The amplitudes that are meant to give the full depth.
+        motion: The RF chain: the amplitudes that give the full depth.
         settings: Tolerances and losses.
-        places: Where the tones put their light; by default without errors of the tones.
+        positions: Where the tones put their light; by default without errors of the tones.
     """
 
     def __init__(
-        self, grid: SiteGrid, motion: MotionSpec, settings: WorldSettings, places: Places | None = None
+        self,
+        grid: SiteGrid,
+        motion: MotionSpec,
+        settings: SimulationSettings,
+        positions: TonePositions | None = None,
     ) -> None:
         self._settings = settings
-        self._places = places or Places(grid, settings.mobile_light)
+        self._positions = positions or TonePositions(grid, settings.mobile_light)
         self._full = full_amplitudes(grid, motion)
-        self._law = constants(grid, settings)
-        self._reach = np.stack(merging_distance(settings.static_waist, settings.mobile_light.waist))
+        self._constants = constants(grid, settings)
+        self._merging = np.stack(merging_distance(settings.static_waist, settings.mobile_light.waist))
 
     def carry(
         self,
@@ -185,30 +187,30 @@ class Transport:
 
         Args:
             occupied: bool (n_rows, n_cols), C-contiguous, sites that hold an atom; changed in place.
-            program: What the tweezers play.
-            n_segments: How many segments are played; atoms held after them are lost.
-            depth: float64 (n_rows, n_cols), depths of the static tweezers, of the nominal one.
-            rng: Random numbers of the shot; how many are drawn depends on the program alone.
+            program: The program.
+            n_segments: Number of segments played; atoms held after them are lost.
+            depth: float64 (n_rows, n_cols), depths of the static tweezers relative to the nominal one.
+            rng: Random numbers of the shot; the number of draws depends on the program alone.
             loss_factor: The shot's factor on the transport loss.
 
         Returns:
-            How many atoms were lost by each of :data:`CAUSES` that lost any.
+            Number of atoms lost by each of :data:`CAUSES` that lost any.
         """
-        from labseq_virtual.transport_kernels import carry_atoms, most_let_go
+        from labseq_virtual.transport_kernels import carry_atoms, max_drop_offs
 
         rows, cols = self._tones(program, 0), self._tones(program, 1)
         offsets = program.row.offsets, program.column.offsets
         n_segments = min(n_segments, program.n_segments)
-        draws = rng.random((most_let_go(rows, offsets[0], cols, offsets[1], n_segments), 3))
+        draws = rng.random((max_drop_offs(rows, offsets[0], cols, offsets[1], n_segments), 3))
         lost = carry_atoms(
             occupied, depth * self._settings.static_depth, rows, offsets[0], cols, offsets[1],
-            program.duration_s, FASTEST[program.course], n_segments, loss_factor, draws, self._law,
-            self._reach,
+            program.duration_s, FASTEST[program.course], n_segments, loss_factor, draws, self._constants,
+            self._merging,
         )  # fmt: skip
         by_cause: Counter[str] = Counter(dict(zip(CAUSES, lost.tolist(), strict=True)))
         return +by_cause
 
     def _tones(self, program: ToneProgram, index: int) -> Floats:
         axis = (program.row, program.column)[index]
-        start, end = self._places.sites(index, axis.start_hz), self._places.sites(index, axis.end_hz)
+        start, end = self._positions.actual(index, axis.start_hz), self._positions.actual(index, axis.end_hz)
         return tone_table(axis, start, end, self._full[index], self._settings.on_amplitude)

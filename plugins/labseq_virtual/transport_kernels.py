@@ -1,18 +1,14 @@
-"""Kernels of an atom's transport by a mobile tweezer: hand-over, flight, collisions.
+"""Kernels of the rules in ``transport.py``: hand-over, flight and collisions, for one program.
 
-``row``, ``col``, ``state``, ``depth``, ``work``, ``ways``: see ``transport_kernels.py``.
+Arguments that occur in several kernels:
 
-``law`` stands for the constants of a world, see :func:`labseq_virtual.handover.constants`; ``reach`` for
-the logarithm of the mobile over the static depth and the distance in m below which both wells are one
-(2, n). For the other arrays see ``transport_kernels.py``.
-
-Some arrays stand for several numbers:
-
-- ``law``, ``reach``: see ``transport_kernels.py``.
+- ``constants``: the constants of the simulation, see :func:`labseq_virtual.handover.constants`.
+- ``merging``: the logarithm of the ratio of mobile to static depth, and the distance in metres below which
+  the two wells are one (2, n).
 - ``row``, ``col``: the tones of a segment, with the columns of ``handover.py`` (n_tones, N_COLUMNS).
-- ``state``, ``depth``, ``risk``: what each crossing of these tones is, its depth in kelvin, and the
-  probability that an atom fell out of it on the way; at least as many rows and columns as there are tones.
-- ``work``: room for a whole number for each crossing; ``ways`` likewise for N_WAY numbers.
+- ``state``, ``depth``, ``risk``: the state of each crossing of these tones, its depth in kelvin, and the
+  probability that an atom fell out of it during the motion; at least as many rows and columns as tones.
+- ``work``: scratch space, one integer for each crossing; ``paths``: N_PATH numbers for each.
 """
 
 from __future__ import annotations
@@ -63,8 +59,8 @@ Mask = NDArray[np.bool_]
 
 TABLE = const("float64", 2)
 
-N_WAY = 5
-"""Columns of a way: row and column at its start, the steps along both, and the square of its length."""
+N_PATH = 5
+"""Columns of a path: row and column at its start, the displacement along both, and its length squared."""
 
 
 @kernel(f"boolean({TABLE})")
@@ -78,7 +74,7 @@ def moves(tones: Floats) -> bool:
 
 @kernel(f"boolean({TABLE})")
 def crowded(tones: Floats) -> bool:
-    """Whether a tone is too near to the next in the list; if not, none mix."""
+    """Whether any tone is too close to the next one in the list."""
     for k in range(1, len(tones)):
         for at in (START, END):
             if tones[k, at] - tones[k - 1, at] < MIXING:
@@ -88,7 +84,7 @@ def crowded(tones: Floats) -> bool:
 
 @kernel(f"boolean[::1]({TABLE})")
 def find_mixed(tones: Floats) -> Mask:
-    """Which tones come too near to another, or pass it (n_tones,)."""
+    """Which tones come too close to another, or pass it (n_tones,)."""
     mixed = np.zeros(len(tones), np.bool_)
     for k in range(len(tones)):
         for m in range(k):
@@ -102,7 +98,7 @@ def find_mixed(tones: Floats) -> Mask:
 
 @kernel(f"int64({TABLE}, {TABLE}, int8[:, ::1])")
 def mix(row: Floats, col: Floats, state: States) -> int:
-    """Rule 3: the atoms on tones that mix are lost; returns how many."""
+    """Rule 3: atoms on tones that mix are lost; returns their number."""
     if not (crowded(row) or crowded(col)):
         return 0
     n_lost = 0
@@ -116,10 +112,10 @@ def mix(row: Floats, col: Floats, state: States) -> int:
 
 
 @kernel(f"int64({TABLE}, {TABLE}, int8[:, ::1], {TABLE}, float64, float64[:, ::1], int64[::1])")
-def find_ways(
-    row: Floats, col: Floats, state: States, depth: Floats, min_depth: float, ways: Floats, work: Ints
+def find_paths(
+    row: Floats, col: Floats, state: States, depth: Floats, min_depth: float, paths: Floats, work: Ints
 ) -> int:
-    """Find the crossings that move and are deep enough to throw atoms out; returns how many."""
+    """Find the moving crossings deep enough to knock atoms out; returns their number."""
     n = 0
     for i in range(len(row)):
         down = row[i, END] - row[i, START]
@@ -128,31 +124,31 @@ def find_ways(
             still = abs(down) <= AT_REST and abs(right) <= AT_REST
             if still or state[i, j] == DARK or depth[i, j] <= min_depth:
                 continue
-            ways[n, 0], ways[n, 1], ways[n, 2], ways[n, 3] = row[i, START], col[j, START], down, right
-            ways[n, 4] = down * down + right * right
+            paths[n, 0], paths[n, 1], paths[n, 2], paths[n, 3] = row[i, START], col[j, START], down, right
+            paths[n, 4] = down * down + right * right
             work[n] = i * len(col) + j
             n += 1
     return n
 
 
 @kernel(f"UniTuple(int64, 2)({TABLE}, int64, int64, int64, float64)")
-def span(ways: Floats, n: int, axis: int, n_sites: int, tolerance: float) -> tuple[int, int]:
-    """The first of the rows (axis 0) or columns (1) that n ways come near to, and the one after the last."""
+def span(paths: Floats, n: int, axis: int, n_sites: int, tolerance: float) -> tuple[int, int]:
+    """Range of the rows (axis 0) or columns (axis 1) that n paths come close to: first, last + 1."""
     low, high = math.inf, -math.inf
     for k in range(n):
-        start, end = ways[k, axis], ways[k, axis] + ways[k, 2 + axis]
+        start, end = paths[k, axis], paths[k, axis] + paths[k, 2 + axis]
         low, high = min(low, start, end), max(high, start, end)
     first, last = math.floor(low - tolerance), math.ceil(high + tolerance)
     return max(first, 0), min(last + 1, n_sites)
 
 
 @kernel(f"int64({TABLE}, int64, int64, int64, float64)")
-def first_to_hit(ways: Floats, n: int, r: int, c: int, tolerance: float) -> int:
-    """Which of n ways comes first over an atom at a site; -1: none."""
+def first_to_hit(paths: Floats, n: int, r: int, c: int, tolerance: float) -> int:
+    """Which of n paths passes over a site first; -1 if none does."""
     first, soonest = -1, math.inf
     for k in range(n):
-        to_r, to_c, down, right = r - ways[k, 0], c - ways[k, 1], ways[k, 2], ways[k, 3]
-        when = min(max((to_r * down + to_c * right) / ways[k, 4], 0.0), 1.0)
+        to_r, to_c, down, right = r - paths[k, 0], c - paths[k, 1], paths[k, 2], paths[k, 3]
+        when = min(max((to_r * down + to_c * right) / paths[k, 4], 0.0), 1.0)
         miss_r, miss_c = to_r - when * down, to_c - when * right
         if miss_r * miss_r + miss_c * miss_c <= tolerance * tolerance and when < soonest:
             first, soonest = k, when
@@ -171,21 +167,21 @@ def sweep(
     depth: Floats,
     min_depth: float,
     tolerance: float,
-    ways: Floats,
+    paths: Floats,
     work: Ints,
 ) -> int:
-    """Rule 4: moving crossings throw out standing atoms; returns how many atoms are lost.
+    """Rule 4: moving crossings knock out atoms on sites; returns the number of atoms lost.
 
-    Judged on straight lines between the two ends of a segment. The first crossing to arrive loses its
-    own atom too.
+    The motion is a straight line from the start to the end of a segment. The first crossing to arrive
+    loses its own atom too.
     """
     n_lost = 0
-    n = find_ways(row, col, state, depth, min_depth, ways, work)
-    top, bottom = span(ways, n, 0, occupied.shape[0], tolerance) if n > 0 else (0, 0)
-    left, right = span(ways, n, 1, occupied.shape[1], tolerance) if n > 0 else (0, 0)
+    n = find_paths(row, col, state, depth, min_depth, paths, work)
+    top, bottom = span(paths, n, 0, occupied.shape[0], tolerance) if n > 0 else (0, 0)
+    left, right = span(paths, n, 1, occupied.shape[1], tolerance) if n > 0 else (0, 0)
     for r in range(top, bottom):
         for c in range(left, right):
-            first = first_to_hit(ways, n, r, c, tolerance) if occupied[r, c] else -1
+            first = first_to_hit(paths, n, r, c, tolerance) if occupied[r, c] else -1
             if first < 0:
                 continue
             occupied[r, c] = False
@@ -197,7 +193,7 @@ def sweep(
     return n_lost
 
 
-LIST = const("float64", 1)
+VECTOR = const("float64", 1)
 SITES = "boolean[:, ::1]"
 STATES = "int8[:, ::1]"
 NUMBERS = "int64[::1]"
@@ -205,7 +201,7 @@ NUMBERS = "int64[::1]"
 
 @kernel(f"float64(float64, {TABLE})")
 def interpolate(x: float, table: Floats) -> float:
-    """Go along straight lines through the points (x rising, y) of a table (2, n); flat beyond its ends."""
+    """Linear interpolation in a table (2, n) of x, rising, and y; constant beyond its ends."""
     if x <= table[0, 0]:
         return float(table[1, 0])
     for k in range(1, table.shape[1]):
@@ -224,62 +220,62 @@ def exceeds(energy_over_kt: float) -> float:
 
 @kernel("float64(float64)")
 def kinetic_exceeds(energy_over_kt: float) -> float:
-    """Probability that the kinetic energy in three dimensions exceeds a value (Maxwell's law)."""
+    """Probability that the kinetic energy in three dimensions exceeds a value (Maxwell's constants)."""
     root = math.sqrt(max(energy_over_kt, 0.0))
     return math.erfc(root) + 2.0 / math.sqrt(math.pi) * root * math.exp(-root * root)
 
 
-@kernel(f"float64(float64, int64, {LIST})")
-def mobile_depth(power: float, n_further: int, law: Floats) -> float:
-    """Depth of a mobile tweezer in kelvin; ``power``: of its tones over the one meant."""
-    return float(law[MOBILE_DEPTH] * power / (1.0 + law[DEPTH_DROP] * n_further))
+@kernel(f"float64(float64, int64, {VECTOR})")
+def mobile_depth(power: float, n_further: int, constants: Floats) -> float:
+    """Depth of a mobile tweezer in kelvin; ``power``: power of its tones relative to the intended one."""
+    return float(constants[MOBILE_DEPTH] * power / (1.0 + constants[DEPTH_DROP] * n_further))
 
 
 @kernel(f"boolean(float64, float64, float64, {TABLE})")
-def takes(mobile: float, static: float, distance_m: float, reach: Floats) -> bool:
-    """Whether a mobile tweezer that comes on takes the atom of a static one; depths in kelvin."""
+def takes(mobile: float, static: float, distance_m: float, merging: Floats) -> bool:
+    """Whether a mobile tweezer that switches on takes the atom of a static one; depths in kelvin."""
     if mobile <= static:
         return False
     log_ratio = math.log(mobile / static) if static > 0.0 else math.inf
-    return distance_m < interpolate(log_ratio, reach)
+    return distance_m < interpolate(log_ratio, merging)
 
 
-@kernel(f"float64(float64, float64, int64, {LIST})")
-def shallow(mobile: float, speed_m_s: float, n_further: int, law: Floats) -> float:
+@kernel(f"float64(float64, float64, int64, {VECTOR})")
+def shallow(mobile: float, speed_m_s: float, n_further: int, constants: Floats) -> float:
     """Probability that an atom falls out of a mobile tweezer that is too shallow for its speed."""
-    if law[ADIABATIC_DEPTH] == 0.0:
+    if constants[ADIABATIC_DEPTH] == 0.0:
         return 0.0
-    missing = law[ADIABATIC_DEPTH] * (speed_m_s / REFERENCE_SPEED_M_S) ** 2 - mobile
-    scatter = law[INTERMODULATION] * math.sqrt(n_further / REFERENCE_TONES) * mobile
+    missing = constants[ADIABATIC_DEPTH] * (speed_m_s / REFERENCE_SPEED_M_S) ** 2 - mobile
+    scatter = constants[INTERMODULATION] * math.sqrt(n_further / REFERENCE_TONES) * mobile
     if scatter > 0.0:
         part = 0.5 * math.erfc(-missing / scatter / math.sqrt(2.0))
     elif missing == 0.0:
         part = 0.5
     else:
         part = 1.0 if missing > 0.0 else 0.0
-    return float(law[SHALLOW_LOSS] * part)
+    return float(constants[SHALLOW_LOSS] * part)
 
 
-@kernel(f"float64(float64, float64, float64, float64, {LIST})")
-def spilled(static: float, ratio: float, distance_m: float, ramp_s: float, law: Floats) -> float:
-    """Probability that an atom that is let go beside a site does not stay there.
+@kernel(f"float64(float64, float64, float64, float64, {VECTOR})")
+def spilled(static: float, ratio: float, distance_m: float, ramp_s: float, constants: Floats) -> float:
+    """Probability that an atom dropped off near a site does not stay there.
 
     Args:
         static: Depth of the site, in kelvin.
-        ratio: The mobile tweezer's depth over it, while it was on.
+        ratio: Depth of the mobile tweezer while it was on, relative to ``static``.
         distance_m: Distance of the atom from the site.
         ramp_s: Duration of the drop-off.
-        law: The constants.
+        constants: The constants.
     """
-    waists = distance_m / law[STATIC_WAIST]
-    slow = max(interpolate(waists, SLOW), exceeds(static / law[TEMPERATURE]))
+    waists = distance_m / constants[STATIC_WAIST]
+    slow = max(interpolate(waists, SLOW), exceeds(static / constants[TEMPERATURE]))
     left = static * math.exp(-2.0 * waists * waists)
-    sudden = kinetic_exceeds(left / (law[TEMPERATURE] * math.sqrt(1.0 + ratio)))
+    sudden = kinetic_exceeds(left / (constants[TEMPERATURE] * math.sqrt(1.0 + ratio)))
     part = math.exp(-((ramp_s / SUDDEN_S) ** 2))
     return slow + part * (max(sudden, slow) - slow)
 
 
-@kernel(f"UniTuple(float64, 3)(float64, float64, float64, float64, int64, float64, float64, {LIST})")
+@kernel(f"UniTuple(float64, 3)(float64, float64, float64, float64, int64, float64, float64, {VECTOR})")
 def risks(
     static: float,
     mobile: float,
@@ -288,48 +284,53 @@ def risks(
     n_further: int,
     ramp_s: float,
     factor: float,
-    law: Floats,
+    constants: Floats,
 ) -> tuple[float, float, float]:
-    """Probabilities that an atom that is let go near a site is lost.
+    """Probabilities that an atom dropped off near a site is lost.
 
     Args:
         static: Depth of the site, in kelvin.
         mobile: Depth of the mobile tweezer while it was on.
         distance_m: Distance of the atom from the site.
-        fallen: Probability of :func:`shallow` on the way.
+        fallen: Probability of :func:`shallow` during the motion.
         n_further: Tones that were on beyond one per axis.
         ramp_s: Duration of the drop-off, in seconds.
         factor: The shot's factor on the losses.
-        law: The constants.
+        constants: The constants.
 
     Returns:
-        That it falls beside the site or out of it; by pick-up and drop-off; on the way.
+        The probabilities of losing it to heating at the site, to pick-up and drop-off, and in motion.
     """
     ratio = math.inf if mobile > 0.0 else 0.0
     if static > 0.0:
         ratio = mobile / static
     hand_over = 0.0
-    if law[TRANSPORT_LOSS] * factor > 0.0:
-        nominal = law[MOBILE_DEPTH] / law[STATIC_DEPTH]
-        hand_over = min(1.0, factor * law[TRANSPORT_LOSS] * ratio / nominal)
-    per_tone = min(1.0, factor * law[PER_TONE] * n_further)
-    return spilled(static, ratio, distance_m, ramp_s, law), hand_over, 1.0 - (1.0 - per_tone) * (1.0 - fallen)
+    if constants[TRANSPORT_LOSS] * factor > 0.0:
+        nominal = constants[MOBILE_DEPTH] / constants[STATIC_DEPTH]
+        hand_over = min(1.0, factor * constants[TRANSPORT_LOSS] * ratio / nominal)
+    per_tone = min(1.0, factor * constants[PER_TONE] * n_further)
+    return (
+        spilled(static, ratio, distance_m, ramp_s, constants),
+        hand_over,
+        1.0 - (1.0 - per_tone) * (1.0 - fallen),
+    )
 
 
-@kernel(f"Tuple((int64, int64, float64, boolean))(float64, float64, {TABLE}, {LIST})")
-def nearest_site(row: float, col: float, static: Floats, law: Floats) -> tuple[int, int, float, bool]:
-    """The site nearest to a place, how far it is in metres, and whether the place is in the grid."""
+@kernel(f"Tuple((int64, int64, float64, boolean))(float64, float64, {TABLE}, {VECTOR})")
+def nearest_site(row: float, col: float, static: Floats, constants: Floats) -> tuple[int, int, float, bool]:
+    """The site nearest to a position, its distance in metres, and whether the position is in the grid."""
     r, c = round(row), round(col)
     down, right = row - r, col - c
     away_m = math.sqrt(
-        (down * down + right * right) * (law[SPACING] * law[SPACING]) + down * right * law[SKEW]
+        (down * down + right * right) * (constants[SPACING] * constants[SPACING])
+        + down * right * constants[SKEW]
     )
     inside = 0 <= r < static.shape[0] and 0 <= c < static.shape[1]
     r, c = min(max(r, 0), static.shape[0] - 1), min(max(c, 0), static.shape[1] - 1)
     return r, c, away_m, inside
 
 
-@kernel(f"void({SITES}, {TABLE}, {TABLE}, {TABLE}, {STATES}, {TABLE}, {LIST}, {TABLE})")
+@kernel(f"void({SITES}, {TABLE}, {TABLE}, {TABLE}, {STATES}, {TABLE}, {VECTOR}, {TABLE})")
 def pick_up(
     occupied: Mask,
     static: Floats,
@@ -337,24 +338,24 @@ def pick_up(
     col: Floats,
     state: States,
     depth: Floats,
-    law: Floats,
-    reach: Floats,
+    constants: Floats,
+    merging: Floats,
 ) -> None:
-    """Rule 2: crossings that come on take the atoms of the sites near to them, row by row."""
+    """Rule 2: crossings that switch on take the atoms of the sites close to them, row by row."""
     for i in range(len(row)):
         for j in range(len(col)):
             if state[i, j] != NEW:
                 continue
             state[i, j] = EMPTY
-            r, c, away_m, inside = nearest_site(row[i, START], col[j, START], static, law)
-            if inside and occupied[r, c] and takes(depth[i, j], static[r, c], away_m, reach):
+            r, c, away_m, inside = nearest_site(row[i, START], col[j, START], static, constants)
+            if inside and occupied[r, c] and takes(depth[i, j], static[r, c], away_m, merging):
                 state[i, j] = HELD
                 occupied[r, c] = False
 
 
 @kernel("int64(boolean[:, ::1], int64[::1], int64)")
 def land(occupied: Mask, sites: Ints, n: int) -> int:
-    """Put n atoms on their sites, all at once; where two meet, all are lost; returns how many."""
+    """Put n atoms on their sites, all at once; atoms that share a site are lost; returns their number."""
     n_lost = 0
     for k in range(n):
         site, n_here = int(sites[k]), 0
@@ -373,7 +374,7 @@ def land(occupied: Mask, sites: Ints, n: int) -> int:
 
 @kernel(
     f"int64({SITES}, {TABLE}, {TABLE}, {TABLE}, {STATES}, {TABLE}, {TABLE}, int64, float64, float64, "
-    f"{TABLE}, int64, {LIST}, {NUMBERS}, {NUMBERS})"
+    f"{TABLE}, int64, {VECTOR}, {NUMBERS}, {NUMBERS})"
 )
 def set_down(
     occupied: Mask,
@@ -388,11 +389,11 @@ def set_down(
     factor: float,
     draws: Floats,
     n_drawn: int,
-    law: Floats,
+    constants: Floats,
     work: Ints,
     lost: Ints,
 ) -> int:
-    """Rule 5: crossings that go out set their atoms down; returns how many draws are used up by now."""
+    """Rule 5: crossings that switch off drop their atoms; returns the number of draws used so far."""
     n = 0
     for i in range(len(row)):
         for j in range(len(col)):
@@ -401,9 +402,9 @@ def set_down(
             held, state[i, j] = state[i, j] == HELD, DARK
             if not held:
                 continue
-            r, c, away_m, inside = nearest_site(row[i, END], col[j, END], static, law)
+            r, c, away_m, inside = nearest_site(row[i, END], col[j, END], static, constants)
             spilled, hand_over, transport = risks(
-                static[r, c], depth[i, j], away_m, risk[i, j], n_further, ramp_s, factor, law
+                static[r, c], depth[i, j], away_m, risk[i, j], n_further, ramp_s, factor, constants
             )
             draw = draws[n_drawn]
             n_drawn += 1
@@ -423,15 +424,15 @@ def set_down(
 Offsets = NDArray[np.int32]
 
 OFFSETS = const("int32", 1)
-OWN = "float64[:, ::1]"
+OUTPUT = "float64[:, ::1]"
 
 INSTANT_S = 1e-12
-"""Duration that a segment without one is taken for."""
+"""Duration assumed for a segment of duration 0, in seconds."""
 
 
 @kernel(f"int64({TABLE}, int64, int64)")
 def count_on(tones: Floats, one: int, other: int) -> int:
-    """How many tones are on in both of two columns (start and end; or twice the same)."""
+    """Number of tones that are on in both of two columns (start and end, or the same column twice)."""
     n = 0
     for tone in range(len(tones)):
         n += tones[tone, one] * tones[tone, other] > 0.0
@@ -440,7 +441,7 @@ def count_on(tones: Floats, one: int, other: int) -> int:
 
 @kernel(f"int64({TABLE})")
 def count_lit(tones: Floats) -> int:
-    """How many tones are on at the start or at the end."""
+    """Number of tones that are on at the start or at the end."""
     n = 0
     for tone in range(len(tones)):
         n += tones[tone, ON_START] + tones[tone, ON_END] > 0.0
@@ -455,10 +456,10 @@ def any_lit(row: Floats, col: Floats) -> bool:
 
 
 @kernel(f"int64({TABLE}, {OFFSETS}, {TABLE}, {OFFSETS}, int64)")
-def most_let_go(
+def max_drop_offs(
     rows: Floats, row_offsets: Offsets, cols: Floats, col_offsets: Offsets, n_segments: int
 ) -> int:
-    """How many crossings go out within the first segments: no more atoms are let go."""
+    """Number of crossings that switch off within the first segments: an upper limit on the drop-offs."""
     n = 0
     for k in range(n_segments):
         row, col = rows[row_offsets[k] : row_offsets[k + 1]], cols[col_offsets[k] : col_offsets[k + 1]]
@@ -469,7 +470,7 @@ def most_let_go(
 
 @kernel(f"int64({STATES}, {TABLE}, {TABLE})")
 def count_held(state: States, row: Floats, col: Floats) -> int:
-    """How many crossings hold an atom."""
+    """Number of crossings that hold an atom."""
     n = 0
     for i in range(len(row)):
         for j in range(len(col)):
@@ -479,7 +480,7 @@ def count_held(state: States, row: Floats, col: Floats) -> int:
 
 @kernel(f"boolean({TABLE}, {TABLE}, float64)")
 def unchanged(before: Floats, now: Floats, tolerance: float) -> bool:
-    """Whether the tones are the same in the same order: nearly always so."""
+    """Whether the tones continue in the same order, as they nearly always do."""
     if len(before) != len(now):
         return False
     furthest = 0.0
@@ -490,9 +491,9 @@ def unchanged(before: Floats, now: Floats, tolerance: float) -> bool:
 
 @kernel(f"{NUMBERS}({TABLE}, {TABLE}, float64)")
 def match(before: Floats, now: Floats, tolerance: float) -> Ints:
-    """For each tone the nearest of the segment before (n_tones,); -1 where none is near enough.
+    """For each tone the nearest one of the segment before (n_tones,); -1 where none is close enough.
 
-    One that is the nearest of several goes on as the nearest of these, or the first of them.
+    A tone that is the nearest one to several continues as the closest of these, or the first of them.
     """
     nearest, distance = np.full(len(now), -1), np.empty(len(now))
     for tone in range(len(now)):
@@ -509,7 +510,7 @@ def match(before: Floats, now: Floats, tolerance: float) -> Ints:
     return nearest
 
 
-@kernel(f"void({TABLE}, {TABLE}, {STATES}, {OWN}, {TABLE}, {TABLE}, {STATES}, {OWN}, float64)")
+@kernel(f"void({TABLE}, {TABLE}, {STATES}, {OUTPUT}, {TABLE}, {TABLE}, {STATES}, {OUTPUT}, float64)")
 def follow(
     old_row: Floats,
     old_col: Floats,
@@ -521,7 +522,7 @@ def follow(
     risk: Floats,
     tolerance: float,
 ) -> None:
-    """Rule 1: tweezers that were on before and still are keep their atoms; others are new or dark."""
+    """Rule 1: tweezers that stay on keep their atoms; other crossings are new or dark."""
     if unchanged(old_row, row, tolerance) and unchanged(old_col, col, tolerance):
         from_row, from_col = np.arange(len(row)), np.arange(len(col))
     else:
@@ -537,7 +538,7 @@ def follow(
                 state[i, j], risk[i, j] = NEW if lit else DARK, 0.0
 
 
-@kernel(f"void({TABLE}, {TABLE}, {STATES}, {TABLE}, {OWN}, int64, float64, {LIST})")
+@kernel(f"void({TABLE}, {TABLE}, {STATES}, {TABLE}, {OUTPUT}, int64, float64, {VECTOR})")
 def run_risks(
     row: Floats,
     col: Floats,
@@ -546,22 +547,22 @@ def run_risks(
     risk: Floats,
     n_further: int,
     speed: float,
-    law: Floats,
+    constants: Floats,
 ) -> None:
-    """The risk of tweezers too shallow for their speed; ``speed``: of one that moves by 1 m."""
+    """Risk of tweezers too shallow for their speed; ``speed``: peak speed per metre of displacement."""
     for i in range(len(row)):
         for j in range(len(col)):
             if state[i, j] != HELD:
                 continue
             down, right = row[i, END] - row[i, START], col[j, END] - col[j, START]
-            speed_m_s = math.hypot(down, right) * law[SPACING] * speed
+            speed_m_s = math.hypot(down, right) * constants[SPACING] * speed
             if speed_m_s > 0.0:
-                risk[i, j] = max(risk[i, j], shallow(depth[i, j], speed_m_s, n_further, law))
+                risk[i, j] = max(risk[i, j], shallow(depth[i, j], speed_m_s, n_further, constants))
 
 
 @kernel(f"int64({OFFSETS}, int64)")
 def max_tones(offsets: Offsets, n_segments: int) -> int:
-    """The most tones of an axis in one of the first segments."""
+    """Largest number of tones of an axis in one of the first segments."""
     most = 0
     for k in range(n_segments):
         most = max(most, offsets[k + 1] - offsets[k])
@@ -569,8 +570,8 @@ def max_tones(offsets: Offsets, n_segments: int) -> int:
 
 
 @kernel(
-    f"int64({SITES}, {TABLE}, {TABLE}, {TABLE}, {STATES}, {OWN}, {OWN}, float64, float64, float64, {TABLE}, "
-    f"int64, {LIST}, {TABLE}, {OWN}, {NUMBERS}, {NUMBERS})"
+    f"int64({SITES}, {TABLE}, {TABLE}, {TABLE}, {STATES}, {OUTPUT}, {OUTPUT}, float64, float64, float64, "
+    f"{TABLE}, int64, {VECTOR}, {TABLE}, {OUTPUT}, {NUMBERS}, {NUMBERS})"
 )
 def play(
     occupied: Mask,
@@ -585,35 +586,35 @@ def play(
     factor: float,
     draws: Floats,
     n_drawn: int,
-    law: Floats,
-    reach: Floats,
-    ways: Floats,
+    constants: Floats,
+    merging: Floats,
+    paths: Floats,
     work: Ints,
     lost: Ints,
 ) -> int:
-    """Rules 2 to 5 for a segment; returns how many draws are used up by now."""
+    """Rules 2 to 5 for a segment; returns the number of draws used so far."""
     n_further = count_lit(row) + count_lit(col) - 2
     for i in range(len(row)):
         for j in range(len(col)):
             start, end = row[i, POWER_START] * col[j, POWER_START], row[i, POWER_END] * col[j, POWER_END]
-            depth[i, j] = mobile_depth(max(start, end), n_further, law)
-    pick_up(occupied, static, row, col, state, depth, law, reach)
+            depth[i, j] = mobile_depth(max(start, end), n_further, constants)
+    pick_up(occupied, static, row, col, state, depth, constants, merging)
     lost[COLLISION] += mix(row, col, state)
     if moves(row) or moves(col):
         lost[COLLISION] += sweep(
-            occupied, row, col, state, depth, law[STATIC_DEPTH], law[TOLERANCE], ways, work
+            occupied, row, col, state, depth, constants[STATIC_DEPTH], constants[TOLERANCE], paths, work
         )
         speed = fastest / max(duration_s, INSTANT_S)
-        run_risks(row, col, state, depth, risk, n_further, speed, law)
+        run_risks(row, col, state, depth, risk, n_further, speed, constants)
     return set_down(
-        occupied, static, row, col, state, depth, risk, n_further, duration_s, factor, draws, n_drawn, law,
-        work, lost,
+        occupied, static, row, col, state, depth, risk, n_further, duration_s, factor, draws, n_drawn,
+        constants, work, lost,
     )  # fmt: skip
 
 
 @kernel(
-    f"{NUMBERS}({SITES}, {TABLE}, {TABLE}, {OFFSETS}, {TABLE}, {OFFSETS}, {LIST}, {LIST}, int64, "
-    f"float64, {TABLE}, {LIST}, {TABLE})"
+    f"{NUMBERS}({SITES}, {TABLE}, {TABLE}, {OFFSETS}, {TABLE}, {OFFSETS}, {VECTOR}, {VECTOR}, int64, "
+    f"float64, {TABLE}, {VECTOR}, {TABLE})"
 )
 def carry_atoms(
     occupied: Mask,
@@ -627,8 +628,8 @@ def carry_atoms(
     n_segments: int,
     factor: float,
     draws: Floats,
-    law: Floats,
-    reach: Floats,
+    constants: Floats,
+    merging: Floats,
 ) -> Ints:
     """Carry atoms by the first segments of a program.
 
@@ -640,31 +641,31 @@ def carry_atoms(
         cols: Column tones, likewise.
         col_offsets: Likewise.
         duration_s: Durations of the segments.
-        fastest: Their greatest speeds over the mean.
-        n_segments: How many segments are played.
+        fastest: Their greatest speed relative to their mean speed.
+        n_segments: Number of segments played.
         factor: The shot's factor on the transport loss.
-        draws: Uniform random numbers (at least :func:`most_let_go`, 3).
-        law: The constants.
-        reach: The distances of merging.
+        draws: Uniform random numbers (at least :func:`max_drop_offs`, 3).
+        constants: The constants.
+        merging: The merging distances.
 
     Returns:
-        How many atoms were lost by each cause (5,).
+        Number of atoms lost by each cause (5,).
     """
     shape = max_tones(row_offsets, n_segments), max_tones(col_offsets, n_segments)
     old_state, state = np.zeros(shape, np.int8), np.zeros(shape, np.int8)
     old_risk, risk, depth = np.zeros(shape), np.zeros(shape), np.zeros(shape)
-    ways = np.zeros((shape[0] * shape[1], N_WAY))
+    paths = np.zeros((shape[0] * shape[1], N_PATH))
     work, lost, n_drawn = np.zeros(shape[0] * shape[1], np.int64), np.zeros(5, np.int64), 0
     old_row, old_col = rows[:0], cols[:0]
     for k in range(n_segments):
         row, col = rows[row_offsets[k] : row_offsets[k + 1]], cols[col_offsets[k] : col_offsets[k + 1]]
         lost[PROGRAM] += count_held(old_state, old_row, old_col)
         if any_lit(row, col):
-            follow(old_row, old_col, old_state, old_risk, row, col, state, risk, law[TOLERANCE])
+            follow(old_row, old_col, old_state, old_risk, row, col, state, risk, constants[TOLERANCE])
             lost[PROGRAM] -= count_held(state, row, col)
             n_drawn = play(
                 occupied, static, row, col, state, depth, risk, duration_s[k], fastest[k], factor, draws,
-                n_drawn, law, reach, ways, work, lost,
+                n_drawn, constants, merging, paths, work, lost,
             )  # fmt: skip
             old_row, old_col, old_state, old_risk, state, risk = row, col, state, risk, old_state, old_risk
         else:

@@ -1,4 +1,4 @@
-"""Virtual static and mobile tweezers."""
+"""Virtual mobile and static tweezers, and the base class of virtual drivers."""
 
 from __future__ import annotations
 
@@ -30,25 +30,25 @@ from labseq_virtual.settings import MobileTweezersSettings, StaticTweezersSettin
 
 
 class VirtualDriver(Hardware):
-    """Base of the virtual drivers that act on the simulated world.
+    """Base of the virtual drivers that act on the simulation.
 
     Args:
-        context: Name, clock, random numbers and the simulated world.
+        context: Name, clock, random numbers and the simulation.
         role: Name to use where the context has none.
 
     Raises:
-        ConfigError: There is no simulated world.
+        ConfigError: There is no simulation.
     """
 
     def __init__(self, context: Context, role: str) -> None:
         self._name = context.name or role
         self._clock = context.clock
         self._random = context.random
-        self._world = simulated_world(context)
+        self._simulation = require_simulation(context)
         self._is_open = False
 
     def open(self) -> None:
-        """Connect to the simulated world."""
+        """Connect to the simulation."""
         self._is_open = True
 
     def close(self) -> None:
@@ -65,15 +65,15 @@ class VirtualDriver(Hardware):
             raise DeviceError(self._name, "not open; call open() first")
 
 
-def simulated_world(context: Context) -> Simulation:
-    """The world that virtual hardware acts on.
+def require_simulation(context: Context) -> Simulation:
+    """The simulation that virtual hardware acts on.
 
     Raises:
-        ConfigError: There is none.
+        ConfigError: The profile has none.
     """
     if context.simulation is None:
         raise ConfigError(
-            "virtual hardware needs a simulated world; add `simulation: {use: virtual}` to the profile"
+            "virtual hardware needs a simulation; add `simulation: {use: virtual}` to the profile"
         )
     return context.simulation
 
@@ -87,15 +87,15 @@ ROUNDING: Final = 1e-9
 
 
 class VirtualMobileTweezers(VirtualDriver, MobileTweezers):
-    """Ideal mobile tweezers: what a tone program says is what the atoms feel.
+    """Ideal mobile tweezers: the atoms feel exactly the tones of the program.
 
     A program is refused before it plays if it leaves the AOD's band or would clip.
-    Each ``play`` needs a ``prepare`` of its own, so that nothing is ever replayed
-    by mistake. ``safe_state`` cuts a program short: atoms in flight are lost.
+    Each ``play`` needs its own ``prepare``, so no program is replayed by mistake.
+    ``safe_state`` stops a program early: atoms in flight are lost.
 
     Args:
         settings: The limits.
-        context: Grid, clock and the simulated world.
+        context: Grid, clock and the simulation.
     """
 
     def __init__(self, settings: MobileTweezersSettings, context: Context) -> None:
@@ -106,14 +106,14 @@ class VirtualMobileTweezers(VirtualDriver, MobileTweezers):
         self._playing_until_s: float | None = None
 
     def warm(self) -> None:
-        """Compile the kernels of atoms that these tweezers carry, or load them."""
+        """Compile or load the kernels of transport."""
         importlib.import_module("labseq_virtual.transport_kernels")
 
     def prepare(self, program: ToneProgram) -> float:
         """Check a program and keep it for the next ``play``.
 
         Returns:
-            Playing time in seconds.
+            RunningProgram time in seconds.
 
         Raises:
             LimitError: It has no length, leaves the AOD's band, or clips.
@@ -129,7 +129,7 @@ class VirtualMobileTweezers(VirtualDriver, MobileTweezers):
         return program.total_duration_s
 
     def play(self) -> None:
-        """Start playing what was prepared; returns at once.
+        """Start playing the prepared program; returns at once.
 
         Raises:
             DeviceError: Nothing was prepared since the last ``play``, or still playing.
@@ -142,11 +142,11 @@ class VirtualMobileTweezers(VirtualDriver, MobileTweezers):
             )
         program, self._prepared = self._prepared, None
         now_s = self._clock.now()
-        self._world.play("mobile_tweezers", program, now_s)
+        self._simulation.play("mobile_tweezers", program, now_s)
         self._playing_until_s = now_s + program.total_duration_s
 
     def wait(self, timeout_s: float) -> None:
-        """Wait until the program has been played to its end; at once if none is playing.
+        """Wait for the end of the program; returns at once if none is playing.
 
         Raises:
             DeviceTimeoutError: It did not end within ``timeout_s``.
@@ -168,10 +168,10 @@ class VirtualMobileTweezers(VirtualDriver, MobileTweezers):
         self._prepared = None
         if self._playing_until_s is not None:
             self._playing_until_s = None
-            self._world.play("mobile_tweezers", SILENCE, self._clock.now())
+            self._simulation.play("mobile_tweezers", SILENCE, self._clock.now())
 
     def self_test(self) -> None:
-        """See whether the tones of all sites are in the AOD's band; nothing is played.
+        """Check that the tones of all sites are in the AOD's band; nothing is played.
 
         Raises:
             DeviceError: Not open, or a site is out of reach.
@@ -235,7 +235,7 @@ class VirtualMobileTweezers(VirtualDriver, MobileTweezers):
 
 
 def _first_outside(values: NDArray[np.float64], low: float, high: float) -> list[tuple[int, float]]:
-    """Row and value of the first that is not within the limits, or nothing; nan is outside."""
+    """Row and value of the first number outside the limits, or an empty list; nan is outside."""
     rows, columns = np.nonzero(~((values >= low) & (values <= high)))
     return [(int(rows[0]), float(values[rows[0], columns[0]]))] if len(rows) else []
 
@@ -257,13 +257,13 @@ Amplitudes = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 class VirtualStaticTweezers(VirtualDriver, StaticTweezers):
-    """The static array of the simulated world.
+    """The static array of the simulation.
 
-    The world's depths follow the tones' amplitudes, ``start`` and ``ramp``.
+    Depths in the simulation follow the amplitudes of the tones, ``start`` and ``ramp``.
 
     Args:
         settings: Limits.
-        context: Grid, clock and the simulated world.
+        context: Grid, clock and the simulation.
     """
 
     def __init__(self, settings: StaticTweezersSettings, context: Context) -> None:
@@ -275,20 +275,20 @@ class VirtualStaticTweezers(VirtualDriver, StaticTweezers):
         self._depth = 0.0
 
     def load(self, amplitudes: Amplitudes | None) -> None:
-        """Set the tone amplitudes of the rows (n_rows,) and columns (n_cols,); None: as calibrated.
+        """Set the tone amplitudes of the rows (n_rows,) and columns (n_cols,); None: the calibrated ones.
 
         Raises:
-            LimitError: Wrong number of tones, negative or not finite, or too much together.
+            LimitError: Wrong number of tones, or amplitudes negative, not finite or too large in sum.
         """
         self._check_open()
         if amplitudes is not None:
             self._check(amplitudes)
         self._amplitudes = amplitudes
         rows, cols = self._calibrated if amplitudes is None else amplitudes
-        self._world.play("static_tweezers", TweezerAmplitudes(rows, cols), self._clock.now())
+        self._simulation.play("static_tweezers", TweezerAmplitudes(rows, cols), self._clock.now())
 
     def start(self) -> None:
-        """Bring the array to its nominal depth; no effect if it is there."""
+        """Ramp the array to its nominal depth; no effect if it is there."""
         self._check_open()
         if self._depth == 0.0:
             self.load(self._amplitudes)
@@ -318,19 +318,19 @@ class VirtualStaticTweezers(VirtualDriver, StaticTweezers):
             self._play(0.0, 0.0)
 
     def self_test(self) -> None:
-        """See whether the array can have the calibrated amplitudes; no light goes on.
+        """Check the calibrated amplitudes against the limits; no light is switched on.
 
         Raises:
-            DeviceError: Not open, or it cannot.
+            DeviceError: Not open, or the amplitudes exceed a limit.
         """
         self._check_open()
         try:
             self._check(self._calibrated)
         except LimitError as error:
-            raise DeviceError(self._name, f"it cannot have the calibrated amplitudes: {error}") from error
+            raise DeviceError(self._name, f"the calibrated amplitudes exceed a limit: {error}") from error
 
     def describe(self) -> Mapping[str, Any]:
-        """Model, settings, depth and amplitudes in force."""
+        """Model, settings, depth and current amplitudes."""
         tones = self._amplitudes
         amplitudes = (
             "calibrated" if tones is None else {"row": tones[0].tolist(), "column": tones[1].tolist()}
@@ -344,7 +344,7 @@ class VirtualStaticTweezers(VirtualDriver, StaticTweezers):
 
     def _play(self, depth: float, duration_s: float) -> None:
         start, self._depth = self._depth, depth
-        self._world.play("static_tweezers", DepthRamp(start, depth, duration_s), self._clock.now())
+        self._simulation.play("static_tweezers", DepthRamp(start, depth, duration_s), self._clock.now())
 
     def _check(self, amplitudes: Amplitudes) -> None:
         rows, cols = amplitudes
@@ -362,7 +362,7 @@ class VirtualStaticTweezers(VirtualDriver, StaticTweezers):
 
 
 def _calibrated(context: Context) -> Amplitudes:
-    """The amplitudes of the calibration in use; without one all equal, full scale together."""
+    """The amplitudes of the active calibration; without one all equal, with a sum of full scale."""
     found = context.calibrations.get("tweezers")
     if found is None:
         n_rows, n_cols = context.grid.shape

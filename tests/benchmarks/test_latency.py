@@ -13,8 +13,8 @@ import pytest
 from labseq_psca.planner import PscaPlanner, PscaSettings
 from labseq_spcm.dds import choose_cores, compile_commands
 from labseq_spcm.settings import SpcmSettings
-from labseq_virtual.settings import WorldSettings
-from labseq_virtual.world import World
+from labseq_virtual.settings import SimulationSettings
+from labseq_virtual.simulation import VirtualSimulation
 
 from labseq import Context, DepthRamp, Frame, MotionSpec, RandomStream, SiteGrid, TargetPattern
 from labseq.bench.latency import CHUNK
@@ -56,7 +56,7 @@ class Case:
 
 def take_frame() -> Frame:
     random = RandomStream(0)
-    world = World(WorldSettings(), Context("simulation", GRID, random=random))
+    world = VirtualSimulation(SimulationSettings(), Context("simulation", GRID, random=random))
     world.open()
     world.play("static_tweezers", DepthRamp(0.0, 1.0), 0.0)
     random.begin_shot(0, 0)

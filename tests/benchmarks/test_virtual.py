@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 from labseq_virtual.images import Images
-from labseq_virtual.settings import ImageSettings, WorldSettings
+from labseq_virtual.settings import ImageSettings, SimulationSettings
 from labseq_virtual.transport import Transport
-from labseq_virtual.world import World
+from labseq_virtual.simulation import VirtualSimulation
 
 from labseq import Context, DepthRamp, MotionSpec, Plan, RandomStream, SiteGrid, tone_program
 from labseq.detection.threshold import ThresholdDetector, ThresholdSettings
@@ -18,10 +18,10 @@ GRID = SiteGrid()
 
 
 @pytest.fixture
-def world() -> World:
+def world() -> VirtualSimulation:
     """A world with 75 % of 400 atoms, at 1 s."""
     random = RandomStream(0)
-    world = World(WorldSettings(), Context("simulation", GRID, random=random))
+    world = VirtualSimulation(SimulationSettings(), Context("simulation", GRID, random=random))
     world.open()
     world.play("static_tweezers", DepthRamp(0.0, 1.0), 0.0)
     random.begin_shot(0, 0)
@@ -48,7 +48,7 @@ def test_normal_numbers_for_each_pixel(benchmark: Any) -> None:
     assert benchmark(rng.standard_normal, 512 * 512, np.float32).size == 512 * 512
 
 
-def test_detecting_400_sites(benchmark: Any, world: World) -> None:
+def test_detecting_400_sites(benchmark: Any, world: VirtualSimulation) -> None:
     """Goal: under 100 us."""
     detector = ThresholdDetector(ThresholdSettings(), Context("detector", GRID))
     frame = world.expose(1.0, 45e-3)
@@ -60,7 +60,7 @@ def test_carrying_atoms_through_40_batches(benchmark: Any) -> None:
     """Goal: under 0.5 ms; rows and columns in turn, 7 tones each, with whatever collides."""
     batches = [_shift(line, along_row=line % 2 == 0) for line in range(20) for _ in range(2)]
     program = tone_program(Plan.from_batches(batches), grid=GRID)
-    transport, rng = Transport(GRID, MotionSpec(), WorldSettings()), np.random.default_rng(0)
+    transport, rng = Transport(GRID, MotionSpec(), SimulationSettings()), np.random.default_rng(0)
     depth = np.ones(GRID.shape)
     occupied = rng.random(GRID.shape) < 0.75
     benchmark(lambda: transport.carry(occupied.copy(), program, program.n_segments, depth, rng, 1.0))

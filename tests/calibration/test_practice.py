@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 from labseq_virtual.images import site_spots
-from labseq_virtual.settings import WorldSettings
-from labseq_virtual.world import World
+from labseq_virtual.settings import SimulationSettings
+from labseq_virtual.simulation import VirtualSimulation
 from numpy.typing import NDArray
 
 import labseq
@@ -41,11 +41,11 @@ class Practice:
         self.profile = folder / "practice.yaml"
         shutil.copy(ROOT / "hardware_profiles" / "practice.yaml", self.profile)
         document, spec = load_profile(str(self.profile), beside=folder)
-        physics = document.validate(WorldSettings, ("simulation",), drop={"use"})
+        physics = document.validate(SimulationSettings, ("simulation",), drop={"use"})
         self.detector = document.validate(ThresholdSettings, ("detector",), drop={"use"})
         self.grid, self.image = spec.grid_model(), physics.image
         self.random = RandomStream(2026)
-        self.world = World(physics, Context("simulation", self.grid, random=self.random))
+        self.world = VirtualSimulation(physics, Context("simulation", self.grid, random=self.random))
         self.world.open()
         self.world.play("static_tweezers", DepthRamp(0.0, 1.0), 0.0)
         self.found: dict[str, CalibrationEntry] = {}

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from labseq_virtual.settings import WorldSettings
-from labseq_virtual.world import World
+from labseq_virtual.settings import SimulationSettings
+from labseq_virtual.simulation import VirtualSimulation
 from PIL import Image
 
 from labseq import Context, DepthRamp, RandomStream, SiteGrid, TweezerAmplitudes
@@ -78,8 +78,8 @@ def lab(tmp_path: Path) -> Lab:
 
 def true_spread(outcome: Outcome | None = None) -> float:
     """Separable part of the powers themselves, at the amplitudes that were found."""
-    physics = WorldSettings.model_validate({"machine_seed": 3, "tone_response": 0.08})
-    world = World(physics, Context("simulation", GRID, random=RandomStream(0)))
+    physics = SimulationSettings.model_validate({"machine_seed": 3, "tone_response": 0.08})
+    world = VirtualSimulation(physics, Context("simulation", GRID, random=RandomStream(0)))
     world.open()
     world.play("static_tweezers", DepthRamp(0.0, 1.0), 0.0)
     if outcome is not None:

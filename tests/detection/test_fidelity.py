@@ -14,8 +14,8 @@ from typing import Any, Literal
 
 import numpy as np
 import pytest
-from labseq_virtual.settings import WorldSettings
-from labseq_virtual.world import World
+from labseq_virtual.settings import SimulationSettings
+from labseq_virtual.simulation import VirtualSimulation
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
@@ -58,8 +58,8 @@ class Errors:
 def exposures(spacing: float, spot: float, n_frames: int) -> Iterator[tuple[Frame, Bools, Bools]]:
     """Frame, atoms that survived it, atoms before it."""
     random = RandomStream(2026)
-    settings = WorldSettings.model_validate({"image": PLACE | {"spot": spot}})
-    world = World(settings, Context("simulation", SiteGrid(spacing_m=spacing), random=random))
+    settings = SimulationSettings.model_validate({"image": PLACE | {"spot": spot}})
+    world = VirtualSimulation(settings, Context("simulation", SiteGrid(spacing_m=spacing), random=random))
     world.open()
     world.play("static_tweezers", DepthRamp(0.0, 1.0), 0.0)
     for shot in range(n_frames):

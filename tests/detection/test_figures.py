@@ -9,8 +9,8 @@ import os
 
 import numpy as np
 import pytest
-from labseq_virtual.settings import WorldSettings
-from labseq_virtual.world import World
+from labseq_virtual.settings import SimulationSettings
+from labseq_virtual.simulation import VirtualSimulation
 
 from labseq import Context, DepthRamp, RandomStream, SiteGrid
 from labseq.calibration.lattice import find_lattice
@@ -62,7 +62,9 @@ def test_sites_of_the_virtual_lab() -> None:
     """50 frames with a hidden offset and angle; the truth is the world's own."""
     random, grid = RandomStream(7), SiteGrid()
     image = {"centre_px": (247.3, 261.8), "angle": np.deg2rad(2.0)}
-    world = World(WorldSettings.model_validate({"image": image}), Context("simulation", grid, random=random))
+    world = VirtualSimulation(
+        SimulationSettings.model_validate({"image": image}), Context("simulation", grid, random=random)
+    )
     world.open()
     world.play("static_tweezers", DepthRamp(0.0, 1.0), 0.0)
     average = FrameAverage()

@@ -14,8 +14,8 @@ import numpy as np
 from labseq_genicam.aravis.library import library
 from labseq_soapy_sim import build_module
 from labseq_ttl.counterpart.build import runner
-from labseq_virtual.settings import WorldSettings
-from labseq_virtual.world import World
+from labseq_virtual.settings import SimulationSettings
+from labseq_virtual.simulation import VirtualSimulation
 
 import labseq as api
 from tests.plugins.needs import need_library
@@ -125,7 +125,7 @@ def prepare(page: str, blocks: list[Block], to: Path, store: Store) -> Given:
 
 
 def _andor(to: Path) -> Given:
-    world = World(WorldSettings(), api.Context("simulation"))
+    world = VirtualSimulation(SimulationSettings(), api.Context("simulation"))
     return Given(names={"context": api.Context("camera", simulation=world)})
 
 

@@ -6,8 +6,8 @@ import threading
 
 import pytest
 from hypothesis import given, strategies as st
-from labseq_virtual.settings import WorldSettings
-from labseq_virtual.world import World
+from labseq_virtual.settings import SimulationSettings
+from labseq_virtual.simulation import VirtualSimulation
 
 from labseq import Context, SensorMode, Series, SimulatedSensor
 from labseq.roles import WHOLE_SENSOR
@@ -140,7 +140,7 @@ def test_frames_are_taken_in_the_mode_of_the_series(bench: ResolvedProfile) -> N
 
 def test_another_thread_may_expose() -> None:
     clock = FakeClock()
-    world = World(WorldSettings(), Context("simulation", clock=clock))
+    world = VirtualSimulation(SimulationSettings(), Context("simulation", clock=clock))
     world.open()
     sensor = SimulatedSensor(world, clock)
     sensor.arm(Series(20, 1e-3, "internal"), WHOLE_SENSOR, READOUT_S)

@@ -10,8 +10,8 @@ from typing import cast
 import numpy as np
 import pytest
 from labseq_soapy_sim import Fault
-from labseq_virtual.settings import WorldSettings
-from labseq_virtual.world import World
+from labseq_virtual.settings import SimulationSettings
+from labseq_virtual.simulation import VirtualSimulation
 
 from labseq import Context, DeviceError, RandomStream, TransientError, TweezerAmplitudes
 from labseq.roles import RfSource, ToneSource
@@ -146,7 +146,7 @@ class Lab:
         self.clock = FakeClock()
         settings = {"loading": 1.0, "lifetime": 2e6, "imaging_loss": 0.0, **physics}
         context = Context("simulation", GRID, clock=self.clock, random=RandomStream(0))
-        self.world = World(WorldSettings.model_validate(settings), context)
+        self.world = VirtualSimulation(SimulationSettings.model_validate(settings), context)
         self.world.open()
         self.world.begin_shot()
 

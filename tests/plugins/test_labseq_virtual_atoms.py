@@ -7,19 +7,19 @@ import math
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
-from labseq_virtual.atom_kernels import (
+from labseq_virtual.flight import KELVIN
+from labseq_virtual.flight_kernels import (
+    COLLIDED,
     DEPTH,
     HELD_S,
     LOST_S,
-    N_DIARY,
+    N_COLUMNS,
     OFFSET,
-    PAIRED,
     energies,
     follow_atoms,
     move,
     pull,
 )
-from labseq_virtual.flight import KELVIN
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
@@ -49,13 +49,13 @@ class Light:
         self.t_s: Floats = np.arange(len(row), dtype=np.float64) * HOP_S
 
     def act(self, state: Floats, n_steps: int = 25) -> tuple[NDArray[np.bool_], Floats]:
-        """Move atoms; returns who is alive and the diary."""
-        alive, diary = np.ones(len(state), np.bool_), np.full((len(state), N_DIARY), np.nan)
+        """Move atoms; returns who is alive and the record."""
+        alive, record = np.ones(len(state), np.bool_), np.full((len(state), N_COLUMNS), np.nan)
         follow_atoms(
-            state, alive, diary, self.rows, np.ones_like(self.rows), self.cols, self.depth, self.t_s,
+            state, alive, record, self.rows, np.ones_like(self.rows), self.cols, self.depth, self.t_s,
             np.full(GRID.shape, STATIC), MOBILE, plane(), BEAMS, n_steps,
         )  # fmt: skip
-        return alive, diary
+        return alive, record
 
 
 def carriage(sites: float, speed: float = 0.13, ramp_s: float = 60e-6, hold_s: float = 30e-6) -> Light:
@@ -134,12 +134,12 @@ def test_energy_is_kept_in_a_static_tweezer() -> None:
 
 def test_an_atom_is_carried_and_set_down() -> None:
     state = at_rest((5, 3))
-    alive, diary = carriage(4).act(state)
+    alive, record = carriage(4).act(state)
     assert alive[0]
     assert np.hypot(*(state[0, :2] - GRID.positions_m[5, 7])) < 0.3e-6
-    assert 0 < diary[0, HELD_S] < 60e-6
-    assert diary[0, OFFSET] == pytest.approx(0, abs=1e-12)
-    assert diary[0, DEPTH] == pytest.approx(MOBILE)
+    assert 0 < record[0, HELD_S] < 60e-6
+    assert record[0, OFFSET] == pytest.approx(0, abs=1e-12)
+    assert record[0, DEPTH] == pytest.approx(MOBILE)
 
 
 def test_a_sudden_start_shakes_the_atom_as_an_oscillator_says() -> None:
@@ -175,18 +175,18 @@ def test_light_that_goes_out_between_sites_lets_the_atom_fall() -> None:
     light = carriage(1.5)
     state = at_rest((5, 3))
     state[0, 3] = 0.05
-    alive, diary = light.act(state)
+    alive, record = light.act(state)
     site = GRID.positions_m[5, 4]
     assert not alive[0] or np.hypot(*(state[0, :2] - site)) > WAIST
-    assert alive[0] or diary[0, LOST_S] > light.t_s[-30]
+    assert alive[0] or record[0, LOST_S] > light.t_s[-30]
 
 
 def test_two_atoms_in_one_tweezer_are_both_lost() -> None:
     state = at_rest((5, 3), (5, 5), (5, 9))
-    alive, diary = carriage(3).act(state)
+    alive, record = carriage(3).act(state)
     assert alive.tolist() == [False, False, True]
-    assert diary[:2, PAIRED].tolist() == [1.0, 1.0]
-    assert diary[0, LOST_S] == diary[1, LOST_S] > 60e-6
+    assert record[:2, COLLIDED].tolist() == [1.0, 1.0]
+    assert record[0, LOST_S] == record[1, LOST_S] > 60e-6
 
 
 def test_atoms_that_no_tweezer_comes_near_are_left_alone() -> None:
@@ -199,6 +199,6 @@ def test_atoms_that_no_tweezer_comes_near_are_left_alone() -> None:
 def test_an_atom_in_flight_is_lost_when_nothing_catches_it() -> None:
     state = at_rest((5, 3))
     state[0, 3] = 1.0
-    alive, diary = carriage(3).act(state)
+    alive, record = carriage(3).act(state)
     assert not alive[0]
-    assert diary[0, LOST_S] < 10e-6
+    assert record[0, LOST_S] < 10e-6

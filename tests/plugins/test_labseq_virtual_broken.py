@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 import pytest
 from labseq_virtual.flight import KELVIN, RfTransport
-from labseq_virtual.played import PulseReceiver, RfPulse
-from labseq_virtual.settings import MobileLightSettings, WorldSettings
+from labseq_virtual.rf_analysis import PulseReceiver, RfPulse
+from labseq_virtual.settings import MobileLightSettings, SimulationSettings
 from numpy.typing import NDArray
 
 from labseq.model import ToneProgram, TonesNow
@@ -72,16 +72,18 @@ class OnceHeard(RfTransport):
         super().__init__(*arguments)
         self.heard: dict[int, Any] = {}
 
-    def _listen(self, pulse: RfPulse) -> Any:
+    def _find_tones(self, pulse: RfPulse) -> Any:
         if id(pulse) not in self.heard:
-            self.heard[id(pulse)] = super()._listen(pulse)
+            self.heard[id(pulse)] = super()._find_tones(pulse)
         return self.heard[id(pulse)]
 
 
 def world_loss(case: Broken) -> tuple[int, NDArray[Any], NDArray[Any]]:
     """How many of :data:`N_ATOMS` the world loses, with its tables."""
     light = MobileLightSettings(offset=(case.offset_m, 0.0), depth=case.depth_k, transit_time=TRANSIT_S)
-    flight = OnceHeard(GRID, spec(), WorldSettings(transport_loss=0.0, temperature=HOT_K, mobile_light=light))
+    flight = OnceHeard(
+        GRID, spec(), SimulationSettings(transport_loss=0.0, temperature=HOT_K, mobile_light=light)
+    )
     outputs, rng = played(case.program), np.random.default_rng(7)
     episodes = [*PulseReceiver(PlayedRfSource(outputs), 60e-6).receive_until(START_S + 10.0)]
     columns = np.array(case.columns)

@@ -14,11 +14,11 @@ from labseq_virtual.settings import (
     CameraSettings,
     DeviceSettings,
     MobileTweezersSettings,
+    SimulationSettings,
     StaticTweezersSettings,
-    WorldSettings,
 )
+from labseq_virtual.simulation import VirtualSimulation
 from labseq_virtual.tweezers import VirtualMobileTweezers, VirtualStaticTweezers
-from labseq_virtual.world import World
 
 from labseq import Context
 from labseq.testing import (
@@ -71,13 +71,13 @@ class TestVirtualDevice(DeviceContract):
 
 class TestVirtualWorld(SimulationContract):
     @pytest.fixture
-    def factory(self) -> Callable[[Context], World]:
+    def factory(self) -> Callable[[Context], VirtualSimulation]:
         settings = {"image": {"frame": [80, 96], "centre_px": [39.5, 47.5]}}
-        return partial(World, WorldSettings.model_validate(settings))
+        return partial(VirtualSimulation, SimulationSettings.model_validate(settings))
 
 
 def in_the_world(context: Context) -> Context:
-    return replace(context, simulation=World(WorldSettings(), context))
+    return replace(context, simulation=VirtualSimulation(SimulationSettings(), context))
 
 
 class TestVirtualCameraInItsWorld(CameraContract):

@@ -11,11 +11,11 @@ from labseq_virtual.camera import VirtualCamera
 from labseq_virtual.settings import (
     CameraSettings,
     MobileTweezersSettings,
+    SimulationSettings,
     StaticTweezersSettings,
-    WorldSettings,
 )
+from labseq_virtual.simulation import VirtualSimulation
 from labseq_virtual.tweezers import VirtualMobileTweezers, VirtualStaticTweezers
-from labseq_virtual.world import World
 
 from labseq import (
     ConfigError,
@@ -41,10 +41,12 @@ class Lab:
         self.clock = FakeClock()
         self.random = RandomStream(0)
         physics = {"loading": 1.0, "lifetime": 2e6, "imaging_loss": 0.0, "transport_loss": 0.0}
-        settings = WorldSettings.model_validate(
+        settings = SimulationSettings.model_validate(
             {**physics, "image": {"frame": (64, 64), "centre_px": (31.5, 31.5)}}
         )
-        self.world = World(settings, Context("simulation", GRID, clock=self.clock, random=self.random))
+        self.world = VirtualSimulation(
+            settings, Context("simulation", GRID, clock=self.clock, random=self.random)
+        )
         self.static = VirtualStaticTweezers(StaticTweezersSettings(), self.context("static_tweezers"))
         self.camera = VirtualCamera(CameraSettings(), self.context("camera"))
         self.mobile = VirtualMobileTweezers(MobileTweezersSettings(), self.context("mobile_tweezers"))
@@ -270,7 +272,7 @@ def test_the_static_tweezers_tell_amplitudes_that_they_cannot_have(lab: Lab) -> 
     static = VirtualStaticTweezers(settings, lab.context("static_tweezers"))
     static.open()
     with pytest.raises(
-        DeviceError, match=r"cannot have the calibrated amplitudes: .* is 1; the limit is 0\.5"
+        DeviceError, match=r"the calibrated amplitudes exceed a limit: .*.* is 1; the limit is 0\.5"
     ):
         static.self_test()
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from labseq_virtual.images import photoelectrons
 from labseq_virtual.sensors import Emccd, View
-from labseq_virtual.settings import ImageSettings, WorldSettings
-from labseq_virtual.world import World
+from labseq_virtual.settings import ImageSettings, SimulationSettings
+from labseq_virtual.simulation import VirtualSimulation
 from numpy.typing import NDArray
 
 from labseq import Context, DepthRamp, RandomStream
@@ -103,7 +103,7 @@ def test_a_frame_need_not_be_square() -> None:
 def test_the_shipped_detector_reaches_the_papers_fidelity() -> None:
     """Mean fidelity 99.946 %: of 6,000 empty sites 6 look full, of 18,000 atoms 1 is missed."""
     random = RandomStream(3)
-    world = World(WorldSettings(), Context("simulation", random=random))
+    world = VirtualSimulation(SimulationSettings(), Context("simulation", random=random))
     world.open()
     world.play("static_tweezers", DepthRamp(0.0, 1.0), 0.0)
     detector = ThresholdDetector(ThresholdSettings(), Context("detector"))

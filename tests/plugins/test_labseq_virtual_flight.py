@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 from hypothesis.extra.numpy import arrays
-from labseq_virtual.atom_kernels import energies
 from labseq_virtual.flight import KELVIN, RfTransport, draw_atoms
-from labseq_virtual.played import PulseReceiver
-from labseq_virtual.settings import MobileLightSettings, WorldSettings
+from labseq_virtual.flight_kernels import energies
+from labseq_virtual.rf_analysis import PulseReceiver
+from labseq_virtual.settings import MobileLightSettings, SimulationSettings
 from numpy.typing import NDArray
 
 from labseq.model import SiteGrid, ToneProgram
@@ -20,11 +20,11 @@ from labseq.testing.rf import FULL_SCALE_V, GRID, START_S, PlayedRfSource, SiteP
 
 Floats = NDArray[np.float64]
 
-SURE = WorldSettings(transport_loss=0.0)
+SURE = SimulationSettings(transport_loss=0.0)
 
 
 def fly(
-    program: ToneProgram, atoms: list[tuple[int, int]], settings: WorldSettings = SURE, seed: int = 1
+    program: ToneProgram, atoms: list[tuple[int, int]], settings: SimulationSettings = SURE, seed: int = 1
 ) -> tuple[set[tuple[int, int]], NDArray[Any]]:
     """The sites that hold atoms afterwards, and the table of flights."""
     flight = RfTransport(GRID, spec(), settings)
@@ -65,7 +65,7 @@ def test_rows_that_move_by_a_site_at_equal_distance_keep_all_atoms() -> None:
 def test_an_atom_that_is_moved_over_another_costs_both() -> None:
     sites, flights = fly(program_of(batch(((5, 2), (5, 8)))), [(5, 2), (5, 5)])
     assert sites == set()
-    assert flights["fate"].tolist() == [b"paired", b"paired"]
+    assert flights["fate"].tolist() == [b"collision", b"collision"]
     assert flights["lost_col"] == pytest.approx([5, 5], abs=0.3)
     assert flights["lost_s"][0] == pytest.approx(0.5e-3 + 60e-6 + 3 * 4.49e-6 / 0.13, abs=10e-6)
 
@@ -73,7 +73,7 @@ def test_an_atom_that_is_moved_over_another_costs_both() -> None:
 def test_an_atom_that_is_set_down_on_another_costs_both() -> None:
     sites, flights = fly(program_of(batch(((5, 2), (5, 5)))), [(5, 2), (5, 5)])
     assert sites == set()
-    assert flights["fate"].tolist() == [b"paired", b"paired"]
+    assert flights["fate"].tolist() == [b"collision", b"collision"]
 
 
 def test_an_atom_that_leaves_the_grid_is_ejected() -> None:
@@ -83,10 +83,10 @@ def test_an_atom_that_leaves_the_grid_is_ejected() -> None:
 
 
 def test_the_transport_loss_is_drawn_for_who_was_held() -> None:
-    settings = WorldSettings(transport_loss=1.0)
+    settings = SimulationSettings(transport_loss=1.0)
     sites, flights = fly(program_of(batch(((5, 2), (5, 4)))), [(5, 2), (9, 9)], settings)
     assert sites == {(9, 9)}
-    assert flights["fate"].tolist() == [b"drawn"]
+    assert flights["fate"].tolist() == [b"hand_over"]
 
 
 @pytest.mark.parametrize("axis", [0, 1])
@@ -95,7 +95,7 @@ def test_a_misplaced_tweezer_is_told_and_far_ones_move_nothing(axis: int) -> Non
     for offset_m, moves in ((0.3e-6, True), (2.2e-6, False)):
         offset = (offset_m, 0.0) if axis == 0 else (0.0, offset_m)
         light = MobileLightSettings(offset=offset)
-        sites, flights = fly(program, [(5, 2)], WorldSettings(transport_loss=0.0, mobile_light=light))
+        sites, flights = fly(program, [(5, 2)], SimulationSettings(transport_loss=0.0, mobile_light=light))
         assert sites == ({(5, 4)} if moves else {(5, 2)})
         if moves:
             assert flights["offset_m"] == pytest.approx([offset_m], rel=0.05)
@@ -106,7 +106,7 @@ def test_a_misplaced_tweezer_is_told_and_far_ones_move_nothing(axis: int) -> Non
 def test_half_the_volts_on_one_axis_are_a_quarter_of_the_depth() -> None:
     program = program_of(batch(((5, 2), (5, 4))))
     light = MobileLightSettings(tone_voltage=FULL_SCALE_V / 20 * 2**0.5)
-    _, flights = fly(program, [(5, 2)], WorldSettings(transport_loss=0.0, mobile_light=light))
+    _, flights = fly(program, [(5, 2)], SimulationSettings(transport_loss=0.0, mobile_light=light))
     assert flights["depth_K"] == pytest.approx([2.1e-3 / 4], rel=0.01)
 
 
@@ -114,7 +114,7 @@ def test_hotter_atoms_are_lost_more_often() -> None:
     program = program_of(batch(*(((r, 2), (r, 6)) for r in (4,))))
     kept = [
         sum((4, 6) in fly(program, [(4, 2)], settings, seed)[0] for seed in range(40))
-        for settings in (SURE, WorldSettings(transport_loss=0.0, temperature=150e-6))
+        for settings in (SURE, SimulationSettings(transport_loss=0.0, temperature=150e-6))
     ]
     assert kept[0] == 40 > kept[1]
 
@@ -122,12 +122,12 @@ def test_hotter_atoms_are_lost_more_often() -> None:
 @pytest.mark.parametrize(("temperature", "fine"), [(150e-6, True), (151e-6, False), (1.0, False)])
 def test_a_temperature_that_the_tweezers_cannot_hold_is_refused(temperature: float, fine: bool) -> None:
     if fine:
-        assert WorldSettings(temperature=temperature).temperature == temperature
+        assert SimulationSettings(temperature=temperature).temperature == temperature
     else:
         with pytest.raises(
             ValueError, match="too hot for tweezers with a static_depth of 300 uK; expected at"
         ):
-            WorldSettings(temperature=temperature)
+            SimulationSettings(temperature=temperature)
 
 
 @pytest.mark.parametrize("depth", [1e-9, 15e-6, 30e-6, 300e-6])
@@ -155,6 +155,6 @@ def test_near_a_tweezer_are_the_sites_around_it(rows: Floats, cols: Floats) -> N
 def test_the_same_seed_gives_the_same_flights() -> None:
     program = program_of(batch(((5, 2), (5, 4)), ((5, 7), (5, 12))))
     first, second = (
-        fly(program, [(5, 2), (5, 7)], WorldSettings(temperature=100e-6), 3)[1] for _ in range(2)
+        fly(program, [(5, 2), (5, 7)], SimulationSettings(temperature=100e-6), 3)[1] for _ in range(2)
     )
     assert first.tobytes() == second.tobytes()

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, strategies as st
 from labseq_virtual import transport_kernels as kernels
 from labseq_virtual.handover import SLOW, constants, merging_distance
-from labseq_virtual.settings import WorldSettings
+from labseq_virtual.settings import SimulationSettings
 from numpy.typing import NDArray
 from scipy.integrate import quad
 from scipy.special import ndtr
@@ -22,7 +22,7 @@ REACH = np.stack(merging_distance(WAIST_M, WAIST_M))
 
 
 def law(light: dict[str, Any] | None = None, **world: Any) -> NDArray[np.float64]:
-    return constants(SiteGrid(), WorldSettings.model_validate({**world, "mobile_light": light or {}}))
+    return constants(SiteGrid(), SimulationSettings.model_validate({**world, "mobile_light": light or {}}))
 
 
 @pytest.mark.parametrize("x", [0.0, 0.5, 3.0, 20.0])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from labseq_virtual.played import PulseReceiver, RfPulse
+from labseq_virtual.rf_analysis import PulseReceiver, RfPulse
 
 from labseq.model import RfSamples, RfSpan, RfTones
 

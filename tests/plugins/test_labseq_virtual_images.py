@@ -10,8 +10,8 @@ from hypothesis import given, strategies as st
 from labseq_virtual.camera import VirtualCamera
 from labseq_virtual.images import Images, corner_distance, photoelectrons, site_brightness, site_spots
 from labseq_virtual.sensors import View
-from labseq_virtual.settings import CameraSettings, ImageSettings, WorldSettings
-from labseq_virtual.world import World
+from labseq_virtual.settings import CameraSettings, ImageSettings, SimulationSettings
+from labseq_virtual.simulation import VirtualSimulation
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
@@ -170,7 +170,7 @@ REGION = {"y": 56, "x": 6, "height": 400, "width": 500}
 
 
 def test_a_camera_delivers_the_region_that_it_tells_of() -> None:
-    world = World(WorldSettings(), Context("simulation", random=RandomStream(0)))
+    world = VirtualSimulation(SimulationSettings(), Context("simulation", random=RandomStream(0)))
     settings = CameraSettings.model_validate({"region": REGION, "binning": 2, "readout": 8e-3})
     camera = VirtualCamera(settings, Context("camera", simulation=world))
     world.open()
@@ -213,7 +213,7 @@ def test_impossible_settings_are_refused(image: dict[str, Any], reason: str) -> 
     ],
 )
 def test_a_sensor_refuses_what_it_cannot_do(mode: SensorMode, image: dict[str, Any], reason: str) -> None:
-    world = World(WorldSettings.model_validate({"image": image}), Context("simulation"))
+    world = VirtualSimulation(SimulationSettings.model_validate({"image": image}), Context("simulation"))
     for use in (world.readout_fraction, world.prepare_sensor):
         with pytest.raises(LimitError, match=reason):
             use(mode)

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 from labseq_virtual.flight import RfTransport
-from labseq_virtual.played import PulseReceiver
-from labseq_virtual.settings import WorldSettings
+from labseq_virtual.rf_analysis import PulseReceiver
+from labseq_virtual.settings import SimulationSettings
 from numpy.typing import NDArray
 
 from labseq.model import ToneProgram
@@ -19,7 +19,7 @@ MOVE = ([(5, 2), (5, 5)], [(5, 5), (5, 9)])
 
 
 def jumps_of(program: ToneProgram) -> NDArray[np.void]:
-    flight = RfTransport(GRID, spec(), WorldSettings(transport_loss=0.0))
+    flight = RfTransport(GRID, spec(), SimulationSettings(transport_loss=0.0))
     occupied = np.zeros(GRID.shape, np.bool_)
     occupied[5, 2] = occupied[5, 5] = True
     for pulse in PulseReceiver(PlayedRfSource(played(program)), 60e-6).receive_until(START_S + 1.0):

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 from labseq_virtual.devices import VirtualLines
-from labseq_virtual.settings import LightSettings, LinesSettings, WorldSettings
-from labseq_virtual.world import Lights, World
+from labseq_virtual.settings import LightSettings, LinesSettings, SimulationSettings
+from labseq_virtual.simulation import Lights, VirtualSimulation
 
 import labseq
 from labseq.errors import ConfigError
@@ -91,7 +91,7 @@ class Lit:
         self.context = Context(
             "simulation", SiteGrid(), clock=self.clock, random=RandomStream(3), lines=SPECS
         )
-        self.world = World(WorldSettings(lights=NEEDS, **settings), self.context)
+        self.world = VirtualSimulation(SimulationSettings(lights=NEEDS, **settings), self.context)
         self.world.open()
         self.world.play("static_tweezers", labseq.DepthRamp(0.0, 1.0), 0.0)
         self.context.random.begin_shot(0, 0)

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 from labseq_virtual.flight import RfTransport
-from labseq_virtual.played import PulseReceiver
-from labseq_virtual.settings import WorldSettings
-from labseq_virtual.world import World
+from labseq_virtual.rf_analysis import PulseReceiver
+from labseq_virtual.settings import SimulationSettings
+from labseq_virtual.simulation import VirtualSimulation
 
 from labseq import Context, DepthRamp, DeviceError, LimitError, MotionSpec, Plan, RandomStream, SiteGrid
 from labseq.motion import tone_program
@@ -28,11 +28,11 @@ CALM = {
 PROGRAM = program_of(([(5, 2)], [(5, 4)]))
 
 
-def new_world(clock: FakeClock, motion: MotionSpec | None = None, **physics: Any) -> World:
+def new_world(clock: FakeClock, motion: MotionSpec | None = None, **physics: Any) -> VirtualSimulation:
     """A world with an atom on each site, the one at the goal of :data:`PROGRAM` too."""
     random = RandomStream(1)
     context = Context("simulation", GRID, motion or spec(), clock, random)
-    world = World(WorldSettings.model_validate(CALM | physics), context)
+    world = VirtualSimulation(SimulationSettings.model_validate(CALM | physics), context)
     world.open()
     world.play("static_tweezers", DepthRamp(0.0, 1.0), clock.now())
     random.begin_shot(0, 0)
@@ -150,7 +150,7 @@ def test_what_is_just_not_refused_carries_neighbours(
 def test_a_grid_with_one_site_has_no_tones_to_tell_apart(clock: FakeClock) -> None:
     hz = np.array([100e6])
     grid = SiteGrid(1, 1, row_frequency_hz=hz, column_frequency_hz=hz)
-    world = World(WorldSettings(), Context("simulation", grid, spec(), clock))
+    world = VirtualSimulation(SimulationSettings(), Context("simulation", grid, spec(), clock))
     world.open()
     world.connect_outputs("mobile_tweezers", PlayedRfSource(([], [])))
 
@@ -177,7 +177,7 @@ def test_axes_of_different_lengths_are_heard_at_the_same_times() -> None:
     program = tone_program(Plan.from_batches([(there, back), (back, there)] * 6), grid, motion)
     occupied = np.zeros(grid.shape, np.bool_)
     occupied[5, [9, 30]] = True
-    flight = RfTransport(grid, motion, WorldSettings(transport_loss=0.0, temperature=1e-6))
+    flight = RfTransport(grid, motion, SimulationSettings(transport_loss=0.0, temperature=1e-6))
     for pulse in PulseReceiver(PlayedRfSource(played(program)), 2 * flight.margin_s).receive_until(
         START_S + 10.0
     ):

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from labseq_virtual.settings import WorldSettings
+from labseq_virtual.settings import SimulationSettings
 from labseq_virtual.transport import Transport
 from numpy.typing import NDArray
 
@@ -26,7 +26,7 @@ def atoms(*sites: tuple[int, int]) -> NDArray[np.bool_]:
 def remain(tape: ToneProgramBuilder, *sites: tuple[int, int], **physics: Any) -> set[tuple[int, int]]:
     """Where the atoms are after a program."""
     occupied = atoms(*sites)
-    transport = Transport(GRID, MotionSpec(), WorldSettings.model_validate(physics))
+    transport = Transport(GRID, MotionSpec(), SimulationSettings.model_validate(physics))
     transport.carry(occupied, tape.program(), len(tape.segments), FULL, np.random.default_rng(0), 1.0)
     return {(int(r), int(c)) for r, c in np.argwhere(occupied)}
 
@@ -35,7 +35,7 @@ def survivors(n_repeats: int, n_tones: int, loss_factor: float = 1.0, **physics:
     """How many of 5 atoms, carried ``n_repeats`` times with ``n_tones`` column tones, survive in all."""
     cols = [(0, 1), *((c, c) for c in range(2, n_tones + 1))]
     program = ToneProgramBuilder().move([(r, r) for r in range(5)], cols).program()
-    transport = Transport(GRID, MotionSpec(), WorldSettings.model_validate(physics))
+    transport = Transport(GRID, MotionSpec(), SimulationSettings.model_validate(physics))
     rng = np.random.default_rng(2)
     total = 0
     for _ in range(n_repeats):
@@ -70,7 +70,7 @@ def lost_by(
     tape: ToneProgramBuilder, *sites: tuple[int, int], depth: float = 1.0, **physics: Any
 ) -> dict[str, int]:
     """What the atoms of a program are lost by."""
-    settings = WorldSettings.model_validate({"transport_loss": 0.0, "temperature": 1e-6} | physics)
+    settings = SimulationSettings.model_validate({"transport_loss": 0.0, "temperature": 1e-6} | physics)
     transport = Transport(tape.grid, MotionSpec(), settings)
     static = np.full(tape.grid.shape, depth)
     occupied = atoms(*sites)
@@ -101,7 +101,7 @@ def test_every_loss_has_its_cause() -> None:
 def test_a_shallow_tweezer_at_full_speed_loses_its_atom_on_the_way() -> None:
     occupied = atoms((0, 0))
     light = {"adiabatic_depth": 3e-3, "shallow_loss": 1.0}
-    settings = WorldSettings.model_validate({"transport_loss": 0.0, "mobile_light": light})
+    settings = SimulationSettings.model_validate({"transport_loss": 0.0, "mobile_light": light})
     program = ToneProgramBuilder().move([(0, 0)], [(0, 2)]).program(segment_s=2 * GRID.spacing_m / 0.13)
     transport = Transport(GRID, MotionSpec(), settings)
     assert transport.carry(occupied, program, 3, FULL, np.random.default_rng(0), 1.0) == {"transport": 1}
@@ -130,7 +130,7 @@ def test_pick_up_and_drop_off_beside_the_site_keeps_what_the_energy_allows(
         .add(rows, [(c, c, 0.0, ON) for c in cols])
         .add(rows, [(c, c, ON, 0.0) for c in cols])
     )
-    transport = Transport(GRID, MotionSpec(), WorldSettings(transport_loss=0.0))
+    transport = Transport(GRID, MotionSpec(), SimulationSettings(transport_loss=0.0))
     rng, total = np.random.default_rng(3), 0
     for _ in range(60):
         occupied = np.ones(GRID.shape, np.bool_)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from labseq_virtual.settings import WorldSettings
+from labseq_virtual.settings import SimulationSettings
 from labseq_virtual.transport import Transport
 from numpy.typing import NDArray
 
@@ -22,7 +22,7 @@ PROFILES = pytest.mark.parametrize("profile", ["constant", "minimum_jerk", "cons
 def carried(plan: Plan, occupied: NDArray[np.bool_], profile: SpeedProfile = "constant") -> NDArray[np.bool_]:
     program = tone_program(plan, grid=GRID, motion=MotionSpec(speed_profile=profile))
     result = occupied.copy()
-    transport = Transport(GRID, MotionSpec(), WorldSettings(transport_loss=0.0))
+    transport = Transport(GRID, MotionSpec(), SimulationSettings(transport_loss=0.0))
     transport.carry(result, program, program.n_segments, np.ones(GRID.shape), np.random.default_rng(0), 1.0)
     return result
 

@@ -14,8 +14,8 @@ from labseq_virtual.settings import (
     CameraSettings,
     DeviceSettings,
     MobileTweezersSettings,
+    SimulationSettings,
     StaticTweezersSettings,
-    WorldSettings,
 )
 
 from labseq import MotionSpec, Registry, RfSpec, Settings, SiteGrid
@@ -28,7 +28,7 @@ MODELS: Mapping[str, type[Settings]] = {
     "static_tweezers": StaticTweezersSettings,
     "mobile_tweezers": MobileTweezersSettings,
     "detector": ThresholdSettings,
-    "simulation": WorldSettings,
+    "simulation": SimulationSettings,
 }
 
 
@@ -64,11 +64,11 @@ def test_the_profiles_describe_the_papers_machine(name: str) -> None:
     np.testing.assert_allclose(grid.row_frequency_hz, paper.row_frequency_hz)
     np.testing.assert_allclose(grid.column_frequency_hz, paper.column_frequency_hz)
     assert document.validate(ThresholdSettings, ("detector",), drop={"use"}) == ThresholdSettings()
-    assert document.validate(WorldSettings, ("simulation",), drop={"use"}).lifetime == 33.0
+    assert document.validate(SimulationSettings, ("simulation",), drop={"use"}).lifetime == 33.0
 
 
 def test_camera_and_detector_agree_on_where_the_atoms_are() -> None:
-    image, detector = WorldSettings().image, ThresholdSettings()
+    image, detector = SimulationSettings().image, ThresholdSettings()
     for name in ("frame", "centre_px", "pixel_size", "angle", "offset"):
         assert getattr(image, name) == getattr(detector, name)
 
@@ -108,7 +108,9 @@ def fields(model: type[Settings]) -> dict[str, str | None]:
     return found
 
 
-@pytest.mark.parametrize("name", [name for name in flat(WorldSettings().model_dump()) if name != "image"])
+@pytest.mark.parametrize(
+    "name", [name for name in flat(SimulationSettings().model_dump()) if name != "image"]
+)
 def test_every_constant_of_the_world_says_where_it_comes_from(name: str) -> None:
-    description = fields(WorldSettings)[name] or ""
+    description = fields(SimulationSettings)[name] or ""
     assert any(source in description for source in ("paper", "derived", "ours"))

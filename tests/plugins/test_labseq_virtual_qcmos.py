@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 from labseq_virtual.sensors import Qcmos, View
-from labseq_virtual.settings import ImageSettings, WorldSettings
-from labseq_virtual.world import World
+from labseq_virtual.settings import ImageSettings, SimulationSettings
+from labseq_virtual.simulation import VirtualSimulation
 from numpy.typing import NDArray
 
 from labseq import Context, DepthRamp, RandomStream, SensorMode
@@ -91,8 +91,8 @@ def test_binned_pixels_are_added_up_after_the_read_out() -> None:
 def test_both_detectors_work_on_its_frames() -> None:
     """Expected of 18,000 atoms and 6,000 empty sites: see docs/explanation/virtual-images.md."""
     random = RandomStream(5)
-    settings = WorldSettings.model_validate({"image": {"sensor": "qcmos"}})
-    world = World(settings, Context("simulation", random=random))
+    settings = SimulationSettings.model_validate({"image": {"sensor": "qcmos"}})
+    world = VirtualSimulation(settings, Context("simulation", random=random))
     world.open()
     world.play("static_tweezers", DepthRamp(0.0, 1.0), 0.0)
     camera: dict[str, Any] = {"offset": 200.0, "threshold": 0.0}

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 from labseq_virtual.camera import COLDEST_K, ROOM_K, Cooler, VirtualCamera
-from labseq_virtual.settings import CameraSettings, WorldSettings
-from labseq_virtual.world import World
+from labseq_virtual.settings import CameraSettings, SimulationSettings
+from labseq_virtual.simulation import VirtualSimulation
 from numpy.typing import NDArray
 
 import labseq
@@ -53,9 +53,9 @@ class Lab:
     def __init__(self, image: dict[str, Any] | None = None, **camera: Any) -> None:
         self.clock = FakeClock()
         random = RandomStream(1)
-        settings = WorldSettings.model_validate({"image": SMALL | (image or {}), "loading": 1.0})
+        settings = SimulationSettings.model_validate({"image": SMALL | (image or {}), "loading": 1.0})
         grid = SiteGrid(4, 4)
-        self.world = World(settings, Context("simulation", grid, clock=self.clock, random=random))
+        self.world = VirtualSimulation(settings, Context("simulation", grid, clock=self.clock, random=random))
         context = Context("camera", grid, clock=self.clock, simulation=self.world)
         self.camera = VirtualCamera(CameraSettings.model_validate(camera), context)
         self.world.open()

@@ -9,8 +9,8 @@ from typing import ClassVar
 import numpy as np
 import pytest
 from labseq_virtual.devices import VirtualSpotMeter
-from labseq_virtual.settings import SpotMeterSettings, WorldSettings
-from labseq_virtual.world import World
+from labseq_virtual.settings import SimulationSettings, SpotMeterSettings
+from labseq_virtual.simulation import VirtualSimulation
 
 from labseq import Context, DepthRamp, DeviceError, RandomStream, SiteGrid, TweezerAmplitudes
 from labseq.testing import DeviceContract
@@ -20,8 +20,8 @@ GRID = SiteGrid(12, 15)
 
 
 def in_the_world(context: Context) -> Context:
-    physics = WorldSettings.model_validate({"depth_disorder": 0.04, "tone_response": 0.06})
-    return replace(context, simulation=World(physics, context))
+    physics = SimulationSettings.model_validate({"depth_disorder": 0.04, "tone_response": 0.06})
+    return replace(context, simulation=VirtualSimulation(physics, context))
 
 
 class TestVirtualSpotMeter(DeviceContract):
@@ -40,10 +40,12 @@ def context() -> Context:
     return in_the_world(Context("trap_camera", GRID, clock=FakeClock(), random=RandomStream(4)))
 
 
-def meter(context: Context, noise: float = 0.0, level: float = 1.0) -> tuple[VirtualSpotMeter, World]:
+def meter(
+    context: Context, noise: float = 0.0, level: float = 1.0
+) -> tuple[VirtualSpotMeter, VirtualSimulation]:
     """One that is open, on a world with the light on."""
     world = context.simulation
-    assert isinstance(world, World)
+    assert isinstance(world, VirtualSimulation)
     world.open()
     context.random.begin_shot(0, 0)
     world.begin_shot()

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from labseq_virtual.settings import WorldSettings
-from labseq_virtual.world import StaticArray
+from labseq_virtual.settings import SimulationSettings
+from labseq_virtual.simulation import StaticArray
 
 from labseq import DepthRamp, SiteGrid, TweezerAmplitudes
 
@@ -14,7 +14,7 @@ GRID = SiteGrid(12, 15)
 
 def array(level: float = 1.0, **physics: float) -> StaticArray:
     """An array with the light on."""
-    static = StaticArray(GRID, WorldSettings.model_validate({"depth_disorder": 0.0} | physics))
+    static = StaticArray(GRID, SimulationSettings.model_validate({"depth_disorder": 0.0} | physics))
     static.draw(np.random.default_rng(3))
     static.ramp(DepthRamp(0.0, level), np.zeros(GRID.shape, np.bool_))
     return static

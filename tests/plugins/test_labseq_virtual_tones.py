@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
-from labseq_virtual.played import Band, Tracks, active_spans, envelope, track_tones
+from labseq_virtual.rf_analysis import Band, Tracks, active_spans, envelope, track_tones
 
 from labseq.model import RfSamples, RfSpan, RfTones, TonesNow
 from labseq.testing.rf import FULL_SCALE_V, RATE_HZ, START_S, played, program_of

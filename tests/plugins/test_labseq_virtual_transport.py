@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
-from labseq_virtual.settings import WorldSettings
+from labseq_virtual.settings import SimulationSettings
 from labseq_virtual.transport import Transport
 from numpy.typing import NDArray
 
@@ -29,7 +29,7 @@ def after(
 ) -> set[tuple[int, int]]:
     """Where the atoms are after a program."""
     occupied = atoms(*sites, grid=tape.grid)
-    settings = WorldSettings.model_validate({"transport_loss": 0.0, "temperature": 1e-6} | physics)
+    settings = SimulationSettings.model_validate({"transport_loss": 0.0, "temperature": 1e-6} | physics)
     transport = Transport(tape.grid, MotionSpec(), settings)
     n = len(tape.segments) if n_segments is None else n_segments
     transport.carry(occupied, tape.program(), n, np.ones(tape.grid.shape), np.random.default_rng(0), 1.0)

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 from hypothesis import event, given, settings, strategies as st
-from labseq_virtual import transport_kernels as laws
+from labseq_virtual import transport_kernels as kernels
 from labseq_virtual.handover import AT_REST, END, MIXING, ON_END, ON_START, POWER_END, POWER_START, START
-from labseq_virtual.settings import WorldSettings
+from labseq_virtual.settings import SimulationSettings
 from labseq_virtual.transport import FASTEST, Transport
-from labseq_virtual.transport_kernels import most_let_go
+from labseq_virtual.transport_kernels import max_drop_offs
 from numpy.typing import NDArray
 
 from labseq import MotionSpec, SiteGrid, ToneProgram
@@ -52,11 +52,11 @@ class Before:
 
 
 class NaiveTransport:
-    """The rules of ``transport.py``, without any short cut, on a transport's own tables and laws."""
+    """The rules of ``transport.py``, without any short cut, on a transport's own tables and kernels."""
 
-    def __init__(self, transport: Transport, settings: WorldSettings, draws: Floats) -> None:
+    def __init__(self, transport: Transport, settings: SimulationSettings, draws: Floats) -> None:
         self.transport, self.settings, self.draws = transport, settings, draws
-        self.law, self.reach = transport._law, transport._reach
+        self.law, self.reach = transport._constants, transport._merging
         self.n_drawn = 0
         self.lost: Counter[str] = Counter()
 
@@ -90,7 +90,7 @@ class NaiveTransport:
         loaded = loaded & lit_start
         self.lost["program"] -= count(loaded)
         power = np.maximum(crossings(row, col, POWER_START), crossings(row, col, POWER_END))
-        depth = np.vectorize(lambda each: laws.mobile_depth(each, further, self.law))(power)
+        depth = np.vectorize(lambda each: kernels.mobile_depth(each, further, self.law))(power)
         taken = self._picked_up(lit & ~(on & lit_start), depth, row, col)
         shallow[taken] = 0.0
         loaded |= taken
@@ -101,7 +101,7 @@ class NaiveTransport:
         if (np.abs(down) > AT_REST).any() or (np.abs(right) > AT_REST).any():
             self._sweep(lit & (depth > self.settings.static_depth), loaded, row, col)
             speed = np.hypot(down, right) * GRID.spacing_m * (fastest / max(duration_s, 1e-12))
-            fallen = np.vectorize(lambda u, v: laws.shallow(u, v, further, self.law))(depth, speed)
+            fallen = np.vectorize(lambda u, v: kernels.shallow(u, v, further, self.law))(depth, speed)
             shallow = np.where(speed > 0, np.maximum(shallow, fallen), shallow)
         self._set_down(loaded & ~lit_end, depth, shallow, row, col, further, duration_s)
         return Before(row, col, lit_end, loaded & lit_end, shallow)
@@ -133,7 +133,7 @@ class NaiveTransport:
         for i, j in np.argwhere(taken):
             site = r[i, j], c[i, j]
             static = float(self.depth[site])
-            taken[i, j] = self.occupied[site] and laws.takes(depth[i, j], static, away_m[i, j], self.reach)
+            taken[i, j] = self.occupied[site] and kernels.takes(depth[i, j], static, away_m[i, j], self.reach)
             self.occupied[site] &= not taken[i, j]
         return taken
 
@@ -174,7 +174,7 @@ class NaiveTransport:
         i, j = np.nonzero(let_go)
         r, c, away_m, inside = self._nearest(row[i, END], col[j, END])
         args = zip(self.depth[r, c], depth[i, j], away_m, shallow[i, j], strict=True)
-        risks = [laws.risks(*each, further, duration_s, self.factor, self.law) for each in args]
+        risks = [kernels.risks(*each, further, duration_s, self.factor, self.law) for each in args]
         draws = self.draws[self.n_drawn : self.n_drawn + len(i)]
         self.n_drawn += len(i)
         unlucky = draws < np.array(risks).reshape(-1, 3)
@@ -261,7 +261,7 @@ def test_the_kernels_do_exactly_what_the_rules_say(
     rng = np.random.default_rng(seed)
     occupied = rng.random(GRID.shape) < filling
     depth = rng.uniform(0.5, 1.5, GRID.shape)
-    physics = WorldSettings.model_validate(world)
+    physics = SimulationSettings.model_validate(world)
     transport = Transport(GRID, MotionSpec(), physics)
     naive = NaiveTransport(transport, physics, np.random.default_rng(seed).random((2000, 3)))
     expected, result = occupied.copy(), occupied.copy()
@@ -274,4 +274,4 @@ def test_the_kernels_do_exactly_what_the_rules_say(
     assert lost == lost_naively
     tones = transport._tones(program, 0), transport._tones(program, 1)
     offsets = program.row.offsets, program.column.offsets
-    assert naive.n_drawn <= most_let_go(tones[0], offsets[0], tones[1], offsets[1], n_segments)
+    assert naive.n_drawn <= max_drop_offs(tones[0], offsets[0], tones[1], offsets[1], n_segments)

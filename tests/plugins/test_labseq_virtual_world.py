@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from labseq_virtual.settings import WorldSettings
+from labseq_virtual.settings import SimulationSettings
+from labseq_virtual.simulation import VirtualSimulation
 from labseq_virtual.tweezers import SILENCE
-from labseq_virtual.world import World
 
 from labseq import (
     Context,
@@ -27,11 +27,13 @@ GRID = SiteGrid(20, 20)
 TINY_IMAGE = {"frame": (2, 2), "background": 0.0}
 
 
-def new_world(seed: int = 0, *, on: bool = True, **physics: Any) -> World:
+def new_world(seed: int = 0, *, on: bool = True, **physics: Any) -> VirtualSimulation:
     """A world without losses but those that are asked for, in its first shot, with small frames."""
     calm = {"lifetime": 2e6, "imaging_loss": 0.0, "transport_loss": 0.0, "image": TINY_IMAGE}
     random = RandomStream(seed)
-    world = World(WorldSettings.model_validate(calm | physics), Context("simulation", GRID, random=random))
+    world = VirtualSimulation(
+        SimulationSettings.model_validate(calm | physics), Context("simulation", GRID, random=random)
+    )
     world.open()
     if on:
         world.play("static_tweezers", DepthRamp(0.0, 1.0), 0.0)
@@ -40,7 +42,7 @@ def new_world(seed: int = 0, *, on: bool = True, **physics: Any) -> World:
     return world
 
 
-def n_atoms(world: World) -> int:
+def n_atoms(world: VirtualSimulation) -> int:
     return int(world.truth().sum())
 
 
@@ -116,7 +118,7 @@ def test_the_weakest_tweezers_lose_their_atoms_first() -> None:
 def test_the_machine_is_the_same_in_every_shot_and_another_for_another_seed() -> None:
     def held_at_the_edge(seed: int, shot: int) -> bytes:
         random = RandomStream(seed)
-        world = World(WorldSettings(loading=1.0), Context("simulation", GRID, random=random))
+        world = VirtualSimulation(SimulationSettings(loading=1.0), Context("simulation", GRID, random=random))
         world.open()
         world.play("static_tweezers", DepthRamp(0.0, 1.0), 0.0)
         random.begin_shot(shot, 0)
@@ -155,7 +157,7 @@ def test_an_exposure_loses_what_the_paper_says(exposure_s: float) -> None:
 
 
 def test_the_papers_survival_of_one_image() -> None:
-    defaults = WorldSettings()
+    defaults = SimulationSettings()
     survival = (1 - defaults.imaging_loss) * np.exp(-45e-3 / defaults.lifetime)
     assert survival == pytest.approx(0.9955, abs=1e-5)
 
@@ -243,7 +245,7 @@ def test_a_role_that_cannot_play_tones_is_named(role: str) -> None:
 
 
 def test_a_world_that_is_not_open_says_so() -> None:
-    world = World(WorldSettings(), Context("simulation"))
+    world = VirtualSimulation(SimulationSettings(), Context("simulation"))
     with pytest.raises(DeviceError, match="not open"):
         world.begin_shot()
     world.close()
@@ -260,7 +262,7 @@ def test_an_exposure_takes_time(exposure_s: float) -> None:
 def test_the_same_seed_gives_the_same_shot_whatever_came_before() -> None:
     def shot(seed: int, indices: list[tuple[int, int]]) -> tuple[bytes, bytes]:
         random = RandomStream(seed)
-        world = World(WorldSettings(), Context("simulation", GRID, random=random))
+        world = VirtualSimulation(SimulationSettings(), Context("simulation", GRID, random=random))
         world.open()
         world.play("static_tweezers", DepthRamp(0.0, 1.0), 0.0)
         frame = world.truth().tobytes(), b""

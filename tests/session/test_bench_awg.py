@@ -62,7 +62,7 @@ def test_filling_agrees_with_the_virtual_profile(
     for shot in played.shots:
         flights = shot.atom_events["flights"]
         held = flights[~np.isnan(flights["held_s"])]
-        n_wrong = np.count_nonzero(np.isin(held["fate"], [b"spilled", b"paired"]))
+        n_wrong = np.count_nonzero(np.isin(held["fate"], [b"transport", b"collision"]))
         assert len(held) > 100
         assert n_wrong < 0.02 * len(held)
         assert held["offset_m"].max() < 5e-9

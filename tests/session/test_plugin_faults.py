@@ -133,7 +133,7 @@ def test_a_step_without_an_attribute_of_its_role_is_named() -> None:
 
 def test_check_constructs_what_a_run_opens() -> None:
     write(PLUGIN, PROFILE.replace("simulation:", "# simulation:"))
-    with pytest.raises(ConfigError, match=r"p\.yaml:\d:\d+: virtual hardware needs a simulated world"):
+    with pytest.raises(ConfigError, match=r"p\.yaml:\d:\d+: virtual hardware needs a simulation"):
         check(labseq.Session.open("s.yaml"))
 
 

@@ -1,9 +1,9 @@
-"""What outputs have played, as tones and envelopes.
+"""Finding the tones in what RF outputs have played.
 
-The light that an AOD sends to one place of the focal plane is the Fourier component of the
-acoustic wave within the beam: the spectrum of the last microseconds, in a window that is
-the beam's profile. So the spectra here are both a measurement and the AOD's own answer: a jump
-of amplitude, phase or frequency acts as softly as the sound crosses the beam.
+The light that an AOD sends to a point in the focal plane is the Fourier component of the acoustic wave
+inside the beam: the spectrum of the last microseconds, in a window with the beam's profile. The spectra
+here are therefore both a measurement and the response of the AOD: a jump of amplitude, phase or frequency
+is smoothed over the time that the sound takes to cross the beam.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from labseq.plugin import (
 )
 
 BLOCK: Final = 1024
-"""Samples that are looked at together when silence is searched for."""
+"""Samples tested together in the search for silence."""
 
 EDGE: Final = 0.05
-"""Fraction of the band at each end in which the AOD's response falls to nothing."""
+"""Fraction of the band at each end over which the AOD's response falls to 0 (ours)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,8 +40,8 @@ class Band:
 
     Attributes:
         low_hz: The lowest one.
-        width_hz: From there to the highest. It sets the rate of the envelope: bands of the same
-            width have their values at the same times.
+        width_hz: Distance to the highest. It sets the sample rate of the envelope, so bands of the same
+            width are sampled at the same times.
     """
 
     low_hz: float
@@ -55,7 +55,7 @@ class Envelope:
     Attributes:
         start_s: Time of the first value.
         rate_hz: Values per second.
-        low_hz: Frequency that stands at 0.
+        low_hz: Frequency that is shifted to 0.
         values: complex64 (n,), in volts.
     """
 
@@ -66,7 +66,7 @@ class Envelope:
 
 
 def active_spans(span: RfSpan) -> list[tuple[float, float]]:
-    """When a span is not silent: (start, end) in seconds, in time's order."""
+    """Times when a span is not silent: (start, end) in seconds, in order."""
     if isinstance(span, RfTones):
         return [(span.start_s, span.end_s)] if len(span.frequency_hz) else []
     n_blocks = math.ceil(len(span.samples) / BLOCK)
@@ -82,12 +82,12 @@ def active_spans(span: RfSpan) -> list[tuple[float, float]]:
 def envelope(spans: Sequence[RfSpan], start_s: float, end_s: float, band: Band) -> Envelope:
     """The part of an output within a band, between two times.
 
-    Samples are taken to the band by one Fourier transform of the whole stretch; tones are
-    added up as they are. The band's edges are soft.
+    Samples are filtered by one Fourier transform of the whole interval; tones are
+    added up directly. The band's edges are soft.
 
     Args:
-        spans: What the output played, in time's order, all samples at one rate.
-        start_s: Start of the stretch.
+        spans: What the output played, in order of time, all samples at one rate.
+        start_s: Start of the interval.
         end_s: Its end.
         band: The AOD's band.
     """
@@ -147,7 +147,7 @@ def _of_tones(spans: Sequence[RfTones], start_s: float, end_s: float, band: Band
 
 
 def _response(n: int) -> NDArray[np.float64]:
-    """How well each frequency of the band is deflected: 1 but for the soft edges."""
+    """Diffraction efficiency over the band: 1 except at the soft edges."""
     from_edge = np.minimum(np.arange(n) + 0.5, n - np.arange(n) - 0.5) / n
     return np.sin(np.pi / 2 * np.minimum(1.0, from_edge / EDGE)) ** 2
 
@@ -155,25 +155,25 @@ def _response(n: int) -> NDArray[np.float64]:
 Floats = NDArray[np.float64]
 
 WINDOW: Final = 2.5
-"""Length of the windows, in transit times: at its ends a Gaussian beam is down to e^-12.5."""
+"""Length of a window in transit times: at its ends a Gaussian beam is down to e^-12.5."""
 HOPS: Final = 8
 """Windows per transit time."""
 REACH_HZ: Final = 800e3
-"""Half the width of the part of a spectrum that is taken for one tone."""
+"""Half the width of the part of a spectrum that belongs to one tone (ours)."""
 APART_HZ: Final = 450e3
-"""Least distance of two tones that are told apart."""
-MOST: Final = 64
-"""Most tones of an axis at once."""
+"""Smallest distance of two tones that can be resolved (ours)."""
+MAX_TONES: Final = 64
+"""Maximum number of simultaneous tones of an axis."""
 FRAMES: Final = 4096
-"""Spectra worked out together: 40 MB at 10 us of transit, however long a program is."""
+"""Spectra computed at once: 40 MB at a transit time of 10 us, for programs of any length."""
 
 
 MIN_TURNS: Final = 2.0
-"""Least number of beats of two tones within a transit time: with fewer, their peaks are one."""
+"""Smallest number of beats of two tones within a transit time: with fewer, their peaks merge."""
 MAX_SITES: Final = 0.6
-"""Most sites that a tweezer moves in a transit time: a faster chirp is as broad as the gap to the next."""
+"""Largest motion of a tweezer in a transit time: a faster chirp is as broad as the gap to the next tone."""
 PEAK_SPEED: Final = {"constant": 1.0, "minimum_jerk": 15 / 8, "constant_jerk": 2.0}
-"""Greatest speed over the mean, see :class:`labseq.model.FrequencyCourse`."""
+"""Greatest speed over the mean, see :class:`labseq.plugin.FrequencyCourse`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -193,28 +193,28 @@ class Tracks:
     phase_rad: Floats
 
 
-def refuse_blur(grid: SiteGrid, motion: MotionSpec, transit_s: float) -> None:
-    """Refuse what :func:`track_tones` could not tell apart, so that it is no loss of atoms.
+def check_resolvable(grid: SiteGrid, motion: MotionSpec, transit_s: float) -> None:
+    """Check that :func:`track_tones` can resolve the tones; otherwise atoms would be lost in the analysis.
 
     Args:
         grid: The grid, with the tones of its sites.
         motion: The speed.
-        transit_s: Time that the sound takes across the beam.
+        transit_s: Time that the sound takes to cross the beam.
 
     Raises:
-        LimitError: The tones of two neighbours are too near to one another, or too fast.
+        LimitError: The tones of two neighbours are too close, or move too fast.
     """
-    hint = "change `transit_time`, `speed` or `grid`, or leave the physics out (--dry-run=fast)"
+    hint = "change `transit_time`, `speed` or `grid`, or run without the physics (--dry-run=fast)"
     transit = format_quantity(transit_s, "time")
     steps_hz = [np.abs(np.diff(hz)) for hz in (grid.row_frequency_hz, grid.column_frequency_hz)]
     step_hz = float(np.concatenate(steps_hz).min(initial=np.inf))
     if step_hz < (min_hz := max(APART_HZ, MIN_TURNS / transit_s)):
         step, least = (format_quantity(hz, "frequency") for hz in (step_hz, min_hz))
         what = f"the smallest step of the sites' tones at a transit_time of {transit}"
-        raise LimitError(what, step, f"at least {least}: less cannot be told apart", hint)
+        raise LimitError(what, step, f"at least {least}: tones closer than that cannot be resolved", hint)
     sites = PEAK_SPEED[motion.speed_profile] * motion.speed_m_s * transit_s / grid.spacing_m
     if sites > MAX_SITES:
-        what = f"the way of a mobile tweezer in a transit_time of {transit}"
+        what = f"the motion of a mobile tweezer in a transit_time of {transit}"
         raise LimitError(what, f"{sites:.2g} sites", f"{MAX_SITES:g}: a faster chirp blurs the tones", hint)
 
 
@@ -227,29 +227,29 @@ def track_tones(
     min_v: float,
     slew_hz: float,
 ) -> Tracks:
-    """Recover the tones from what an output played, without knowing what was meant.
+    """Recover the tones from what an output played, without knowing the program.
 
     Frequency, amplitude and phase are means over the beam, weighted with its intensity
     ``exp(-2 (2 t / transit)^2)``. The amplitude is coherent, the overlap with the beam of a tone
     that does not jump: one that jumps by pi in the middle of the beam has none for a moment.
 
     Args:
-        spans: What the output played, in time's order.
-        start_s: Start of the stretch.
+        spans: What the output played, in order of time.
+        start_s: Start of the interval.
         end_s: Its end.
         band: The AOD's band.
         transit_s: Time that the sound takes across the beam, 1/e^2 of the intensity at both ends.
-        min_v: Least amplitude of a tone.
-        slew_hz: Most that a tone's frequency changes in a transit time.
+        min_v: Smallest amplitude of a tone, in volts.
+        slew_hz: Largest change of a tone's frequency in a transit time.
     """
-    from labseq_virtual.atom_kernels import find_tones, link_tones, measure_tones
+    from labseq_virtual.rf_kernels import find_tones, link_tones, measure_tones
 
     signal = envelope(spans, start_s, end_s, band)
     sound = _Spectra(signal.values, transit_s * signal.rate_hz)
     bin_hz = signal.rate_hz / sound.n_window
     reach, apart = (max(2, round(hz / bin_hz)) for hz in (REACH_HZ, APART_HZ))
     parts = range(0, sound.n_frames, FRAMES)
-    found = [find_tones(_power(sound.spectra(k)), min_v**2, apart, reach, MOST) for k in parts]
+    found = [find_tones(_power(sound.spectra(k)), min_v**2, apart, reach, MAX_TONES) for k in parts]
     centroid, count = (np.concatenate(part) for part in zip(*found, strict=True))
     tracks, n_tracks = link_tones(centroid, count, slew_hz / HOPS / bin_hz)
     tracks = np.ascontiguousarray(tracks[:, :n_tracks])
@@ -262,11 +262,11 @@ def track_tones(
 
 
 class _Spectra:
-    """What is in the beam from frame to frame.
+    """Spectra of the acoustic wave inside the beam, frame by frame.
 
     Args:
-        values: An output's slowly varying part.
-        transit: The transit time, in values.
+        values: The envelope of an output.
+        transit: The transit time, in samples of the envelope.
     """
 
     def __init__(self, values: NDArray[np.complex64], transit: float) -> None:
@@ -284,7 +284,7 @@ class _Spectra:
         self._last: tuple[int, NDArray[np.complex64]] | None = None
 
     def spectra(self, first: int) -> NDArray[np.complex64]:
-        """The spectra of the next frames, phases as of the middle of each; the last ones are kept."""
+        """Spectra of the frames from ``first`` on, phases as of the middle of each; cached."""
         from scipy import fft
 
         if self._last is None or self._last[0] != first:
@@ -300,19 +300,19 @@ def _power(spectra: NDArray[np.complex64]) -> NDArray[np.float32]:
 
 
 ROUNDING_S: Final = 1e-8
-"""How near to a cut a sound must begin to be the same sound."""
+"""A pulse that begins within this time of the last cut continues the pulse before it, in seconds."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RfPulse:
-    """A time in which light is on, from silence to silence.
+    """An interval during which the light is on, from silence to silence.
 
     Attributes:
-        start_s: When the first output begins to sound.
+        start_s: When the first output begins to play.
         end_s: When the last one has ended.
-        rows: What the row output played, in time's order.
+        rows: What the row output played, in order of time.
         columns: What the column output played.
-        continued: Whether the light was on when the episode before was cut off.
+        continued: Whether it continues a pulse that was cut off at the end of the previous call.
     """
 
     start_s: float
@@ -323,11 +323,11 @@ class RfPulse:
 
 
 class PulseReceiver:
-    """Hears what a driver's outputs play, and parts it at the silences.
+    """Splits what a driver's outputs play into pulses, at the silences.
 
     Args:
         source: The outputs.
-        silence_s: Shortest silence that ends an episode.
+        silence_s: Shortest silence that ends a pulse.
     """
 
     def __init__(self, source: RfSource, silence_s: float) -> None:
@@ -336,16 +336,16 @@ class PulseReceiver:
         self._cut_s = -math.inf
 
     def receive_until(self, until_s: float) -> Iterator[RfPulse]:
-        """What was played until a time, in episodes; the last one is cut off there if it must be.
+        """The pulses played until a time; the last one is cut off there if it has not ended.
 
         Args:
-            until_s: The time; what the source plays later is left for the next call.
+            until_s: The time; later output is left for the next call.
         """
-        heard = self._source.played(until_s)
+        played = self._source.played(until_s)
         cut_s, self._cut_s = self._cut_s, until_s
-        times = [times for spans in heard for span in spans for times in active_spans(span)]
-        for start_s, end_s in _joined(times, self._silence_s):
-            rows, columns = (_between(spans, start_s, end_s) for spans in heard)
+        times = [times for spans in played for span in spans for times in active_spans(span)]
+        for start_s, end_s in _merged(times, self._silence_s):
+            rows, columns = (_between(spans, start_s, end_s) for spans in played)
             yield RfPulse(start_s, end_s, rows, columns, start_s < cut_s + ROUNDING_S)
 
 
@@ -353,8 +353,8 @@ def _between(spans: Sequence[RfSpan], start_s: float, end_s: float) -> tuple[RfS
     return tuple(span for span in spans if span.end_s > start_s and span.start_s < end_s)
 
 
-def _joined(times: list[tuple[float, float]], silence_s: float) -> list[tuple[float, float]]:
-    """Times in order, with the silences that are too short left out."""
+def _merged(times: list[tuple[float, float]], silence_s: float) -> list[tuple[float, float]]:
+    """Intervals in order, merged across silences that are too short."""
     joined: list[tuple[float, float]] = []
     for start_s, end_s in sorted(times):
         if joined and start_s - joined[-1][1] < silence_s:
