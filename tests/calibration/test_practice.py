@@ -79,7 +79,7 @@ class Practice:
             grid = replace(grid, row_frequency_hz=tones["row_hz"], column_frequency_hz=tones["column_hz"])
             grid = standing_on_sites(grid, self.found["overlay"].values["offset_m"])
         row, col = (
-            self.world._places.sites(axis, hz) - np.arange(len(hz))
+            self.world._positions.actual(axis, hz) - np.arange(len(hz))
             for axis, hz in enumerate((grid.row_frequency_hz, grid.column_frequency_hz))
         )
         return np.linalg.norm(row[:, None, None] * grid.axes[1] + col[:, None] * grid.axes[0], axis=-1)
