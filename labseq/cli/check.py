@@ -1,4 +1,4 @@
-"""`labseq check`: the timeline and limits of a sequence, and every mistake in it."""
+"""`labseq check`: the timeline and limits of a sequence, and every error in it."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ def timeline_table(timeline: Timeline, block: str, width: int = BAR_WIDTH) -> li
 
     Args:
         timeline: Name of each step and its bars.
-        block: What bars are made of.
-        width: Characters of the longest bar; 0 for none.
+        block: The character of the bars.
+        width: Width of the longest bar in characters; 0 for no bars.
     """
     total_s = sum(bar.duration_s for _, bars in timeline for bar in bars)
     rows = [("step", "", "start", "at most", "")]
@@ -68,21 +68,21 @@ def lines_table(
     """A row per line: for how long it is on, and a bar for when.
 
     Args:
-        lines: Name -> (start, end) of each time that it is on, in seconds.
+        lines: Name -> (start, end) of each time that the line is on, in seconds.
         total_s: Duration of the shot, in seconds.
-        block: What bars are made of.
-        width: Characters of the longest bar; 0 for none.
+        block: The character of the bars.
+        width: Width of the longest bar in characters; 0 for no bars.
     """
     if not lines:
         return []
     rows = [("line", "", "times on", "at most", "")]
     for name, spans in lines.items():
-        lit_s = sum(end_s - start_s for start_s, end_s in spans)
+        on_s = sum(end_s - start_s for start_s, end_s in spans)
         drawn = [" "] * width
         for start_s, end_s in spans:
             for place, mark in enumerate(_bar(start_s, end_s - start_s, total_s, block, width)):
                 drawn[place] = mark if mark != " " else drawn[place]
-        rows.append((name, "", str(len(spans)), format_quantity(lit_s, "time"), "".join(drawn).rstrip()))
+        rows.append((name, "", str(len(spans)), format_quantity(on_s, "time"), "".join(drawn).rstrip()))
     return columns(rows, right=(2, 3))
 
 
@@ -90,11 +90,11 @@ _THEN = {"repeat_shot": "repeats the shot", "skip_point": "skips its point", "st
 
 
 def policy_texts(assembly: Assembly) -> list[str]:
-    """What differs from doing without policies, a line for the run, each step and each check."""
+    """How the policies differ from the defaults: a line for the run, each step and each check."""
     policy, spec = assembly.policy, assembly.sequence
     texts = [text for text in [_differing(policy.otherwise, StepPolicy())] if text]
     if policy.when_exhausted == "skip_point":
-        texts.append("a shot whose attempts are used up skips its point")
+        texts.append("if all attempts at a shot fail, its point is skipped")
     for number, (step, own) in enumerate(zip(spec.shot, policy.steps, strict=True)):
         if text := _differing(own, policy.otherwise):
             texts.append(f"step {number} ({step.name or step.kind}): {text}")
@@ -106,11 +106,11 @@ def _differing(own: StepPolicy, otherwise: StepPolicy) -> str:
     if own.timeout_s < math.inf:
         parts.append(f"{format_quantity(own.timeout_s, 'time')} at most")
     if own.retries:
-        parts.append("tried again once" if own.retries == 1 else f"tried again {own.retries} times")
+        parts.append("retried once" if own.retries == 1 else f"retried {own.retries} times")
     if own.on_failure and own.on_failure != otherwise.on_failure:
         parts.append(f"a failure {_THEN[own.on_failure]}")
     if own.over_budget != otherwise.over_budget:
-        then = {"record": "is just recorded", "warn": "is a warning"} | _THEN
+        then = {"record": "is only recorded", "warn": "is a warning"} | _THEN
         parts.append(f"a stage over its budget {then[own.over_budget]}")
     return ", ".join(parts)
 
@@ -123,7 +123,7 @@ def _check(check: CheckSettings) -> str:
     ]
     of = "each shot" if check.shots == 1 else f"the mean of {check.shots} shots"
     then = {"warn": "a warning"} | _THEN
-    return f"{check.value} of {of} {' and '.join(limits)}; else {then[check.then]}"
+    return f"{check.value} of {of} {' and '.join(limits)}; otherwise {then[check.then]}"
 
 
 _TEXT_WIDTH: Final = 48  # of the timeline without its bars
@@ -132,14 +132,14 @@ _TEXT_WIDTH: Final = 48  # of the timeline without its bars
 def check_sequence(
     sequence: Path, profile: str | None, overrides: Sequence[str], dry_run: DryRun, *, as_json: bool
 ) -> None:
-    """Check a sequence and print all that can be known of it without opening a device.
+    """Check a sequence and print what is known about it without opening a device.
 
     Args:
         sequence: The sequence file.
         profile: Name or path of the profile, instead of the sequence's own.
         overrides: ``"address=value"`` strings.
         dry_run: "off", "full" or "fast".
-        as_json: Whether to print everything as one line of JSON, alone on stdout.
+        as_json: Whether to print all of it as one line of JSON, alone on stdout.
 
     Raises:
         ConfigError: Sequence, profile or an override is wrong.
@@ -168,10 +168,10 @@ def _print(assembly: Assembly, checked: CheckReport) -> None:
     room = shutil.get_terminal_size((_TEXT_WIDTH + BAR_WIDTH, 24)).columns - _TEXT_WIDTH
     width = max(0, min(BAR_WIDTH, room))
     parts = (
-        columns(_what(assembly)),
+        columns(_subject(assembly)),
         timeline_table(checked.timeline, block, width),
         lines_table(checked.lines, checked.longest_shot_s, block, width),
-        columns([*_sums(checked, assembly), *_rehearsed(checked)]),
+        columns([*_totals(checked, assembly), *_rehearsed(checked)]),
         columns(_limits(assembly)),
     )
     say("\n\n".join("\n".join(lines) for lines in parts if lines))
@@ -205,7 +205,7 @@ def _quantiles(rehearsal: Rehearsal) -> dict[str, float]:
     return {"median": float(median), "p95": float(p95), "n_loadings": rehearsal.n_loadings}
 
 
-def _what(assembly: Assembly) -> list[tuple[str, str]]:
+def _subject(assembly: Assembly) -> list[tuple[str, str]]:
     target, spec = assembly.target, assembly.sequence
     grid, document = assembly.bench.grid, assembly.bench.document
     listed = settings_text({k: v for k, v in assembly.planner.dump().items() if k != "use"})
@@ -253,12 +253,12 @@ def _scanned(assembly: Assembly) -> list[str]:
     repeats = f", {plural(scan.repeats, 'shot')} of each" if scan.repeats > 1 else ""
     return [
         *lines,
-        f"{plural(scan.n_points, 'point')}{repeats}, {scan.order}; all else here is of the first one",
+        f"{plural(scan.n_points, 'point')}{repeats}, {scan.order}; everything else here is for the first one",
     ]
 
 
 def _chosen(search: Search) -> list[str]:
-    """A line for each range of an adaptive scan, and what is chosen from them."""
+    """A line for each range of an adaptive scan, and one about the choice of points."""
     scan, adaptive = search.scanned.scan, search.adaptive
     lines: list[str] = []
     for axis, ends in zip(scan.axes, adaptive.ends, strict=True):
@@ -266,8 +266,8 @@ def _chosen(search: Search) -> list[str]:
         lines.append(f"{axis.address} from {_ends(axis)}{steps}")
     repeats = f", {plural(scan.repeats, 'shot')} of each" if scan.repeats > 1 else ""
     what = f"points chosen during the run by {search.chosen.entry.name}, at most {adaptive.n_points}{repeats}"
-    aim = f"{'most' if adaptive.maximise else 'least'} {clean(adaptive.figure)}"
-    return [*lines, f"{what}, for the {aim}; all else here is as in the files"]
+    aim = f"{'highest' if adaptive.maximise else 'lowest'} {clean(adaptive.figure)}"
+    return [*lines, f"{what}, for the {aim}; everything else here is for the values in the files"]
 
 
 def _ends(axis: Axis) -> str:
@@ -281,7 +281,7 @@ def _simulation(assembly: Assembly) -> str:
     return ", simulated" if assembly.virtual_time else ""
 
 
-def _sums(checked: CheckReport, assembly: Assembly) -> list[tuple[str, str]]:
+def _totals(checked: CheckReport, assembly: Assembly) -> list[tuple[str, str]]:
     shot = [format_quantity(t, "time") for t in (checked.shortest_shot_s, checked.longest_shot_s)]
     n = checked.n_shots
     run = [clock_time(t) for t in checked.run_s]
@@ -300,7 +300,7 @@ def _rehearsed(checked: CheckReport) -> list[tuple[str, str]]:
         return []
     found = _quantiles(checked.rehearsal)
     median, p95 = (format_quantity(found[name], "time") for name in ("median", "p95"))
-    text = f"{median} in the median, {p95} in 19 of 20, on {checked.rehearsal.n_loadings} random loadings"
+    text = f"{median} (median), {p95} (95 %), on {checked.rehearsal.n_loadings} random loadings"
     return [("first cycle", text)]
 
 
@@ -314,7 +314,7 @@ def _limits(assembly: Assembly) -> list[tuple[str, str]]:
     return [
         *(("window", text) for text in _windows(assembly.resolved)),
         ("mobile tweezers", at_once),
-        ("attempts", f"{spec.attempts} at a shot that is repeated"),
+        ("attempts", f"at most {spec.attempts} per shot"),
         *(("policy", text) for text in policy_texts(assembly)),
         ("timeouts", ", ".join(f"{what} {format_quantity(value, 'time')}" for what, value in waits)),
     ]
@@ -331,6 +331,10 @@ def _windows(resolved: Mapping[str, Any]) -> list[str]:
         values = cast("list[float]", window if isinstance(window, list) else [window])
         times = ", ".join(format_quantity(value, "time") for value in values)
         each = "for the moves of each cycle" if len(values) == 1 else "for the moves of the cycles"
-        image = "follows the last batch" if settings["window_mode"] == "early" else "waits for its end"
+        image = (
+            "follows the last batch"
+            if settings["window_mode"] == "early"
+            else "waits for the end of the window"
+        )
         texts.append(f"{times} {each}, {plural(settings['cycles'], 'cycle')} at most; the image {image}")
     return texts

@@ -12,15 +12,15 @@ from labseq.console.text import columns, plural
 from labseq.errors import ConfigError, Problem, RecordingError
 from labseq.messages import visible
 from labseq.recording import Run, data_root
-from labseq.recording.doctor import Report, examine as look_for_damage
+from labseq.recording.doctor import Report, examine as find_damage
 from labseq.recording.export import ENDINGS, check_export, export_run, files_of
 
 MAX_ROWS: Final = 200
-"""Findings that are told; of more only how many there are."""
+"""Maximum number of findings that are printed."""
 
 
 def examine(data: Path | None, *, dry_run: bool, as_json: bool) -> int:
-    """Look for damage, repair what can be repaired, and print what was found.
+    """Find damage, repair it where possible, and print what was found.
 
     Args:
         data: A data folder or a run's; None for LABSEQ_DATA or ./data.
@@ -28,7 +28,7 @@ def examine(data: Path | None, *, dry_run: bool, as_json: bool) -> int:
         as_json: Whether to print one line of JSON instead of a table.
 
     Returns:
-        The exit code: 0 if nothing is left that is wrong, else 1.
+        The exit code: 1 if damage is left, else 0.
 
     Raises:
         ConfigError: There is no such folder.
@@ -38,7 +38,7 @@ def examine(data: Path | None, *, dry_run: bool, as_json: bool) -> int:
     if not root.is_dir():
         hint = "give a data folder or a run's folder, or set LABSEQ_DATA"
         raise ConfigError(Problem("there is no such folder", visible(str(root)), hint=hint))
-    report = look_for_damage(root, dry_run=dry_run)
+    report = find_damage(root, dry_run=dry_run)
     if as_json:
         say(as_line(_as_values(report)))
     else:
@@ -47,7 +47,7 @@ def examine(data: Path | None, *, dry_run: bool, as_json: bool) -> int:
 
 
 def table(report: Report, root: Path, *, dry_run: bool) -> list[str]:
-    """A row per finding, and an empty line; nothing if all is well."""
+    """A row per finding, and an empty line; nothing without findings."""
     if not report.findings:
         return []
     shown = report.findings[:MAX_ROWS]
@@ -60,18 +60,18 @@ def table(report: Report, root: Path, *, dry_run: bool) -> list[str]:
 
 
 def summary(report: Report, *, dry_run: bool) -> list[str]:
-    """What was looked at, and what came of it."""
-    lines = [f"{plural(report.n_runs, 'run')} looked at, {plural(report.n_shots, 'shot')} whole"]
+    """How much was checked, and the result."""
+    lines = [f"{plural(report.n_runs, 'run')} checked, {plural(report.n_shots, 'shot')} intact"]
     if report.in_progress:
-        lines.append(f"{plural(len(report.in_progress), 'run')} in progress left alone")
+        lines.append(f"{plural(len(report.in_progress), 'run')} in progress not checked")
     n_left = sum(one.left for one in report.findings)
     if not report.findings:
-        lines.append("nothing is wrong")
+        lines.append("no damage found")
     elif dry_run:
-        lines.append(f"{plural(len(report.findings), 'thing')} wrong; nothing was changed")
+        lines.append(f"{plural(len(report.findings), 'defect')} found; nothing was changed")
     else:
         n_done = len(report.findings) - n_left
-        lines.append(f"{plural(len(report.findings), 'thing')} wrong: {n_done} put right, {n_left} left")
+        lines.append(f"{plural(len(report.findings), 'defect')} found: {n_done} repaired, {n_left} left")
     return lines
 
 
@@ -96,7 +96,7 @@ def _as_values(report: Report) -> dict[str, Any]:
 
 
 def export_to(run: Path | None, kind: str, output: Path | None, *, frames: bool, replace: bool) -> int:
-    """Export a run, and say what was written.
+    """Export a run, and print the names of the files.
 
     Args:
         run: The run's folder or any file in it; None for the newest run.
@@ -106,7 +106,7 @@ def export_to(run: Path | None, kind: str, output: Path | None, *, frames: bool,
         replace: Whether files that are there may be replaced.
 
     Returns:
-        The exit code: 1 if shots had to be left out.
+        The exit code: 1 if shots are missing in the file.
 
     Raises:
         ConfigError: There is no such run, or the file cannot be written.
@@ -126,10 +126,10 @@ def export_to(run: Path | None, kind: str, output: Path | None, *, frames: bool,
 
 
 def state_lines(run: Run) -> list[str]:
-    """What is to be known of a run that did not complete."""
+    """What the user should know about a run that did not complete."""
     shots = f"{plural(len(run.shots), 'shot')} of {run.n_shots}"
     if run.status == "running":
-        return [f"the run still goes on; exported are the {shots} that it had"]
+        return [f"the run is still in progress; exported are the {shots} taken so far"]
     lines = (
         [] if run.status == "complete" else [f"the run did not complete ({run.status}); exported are {shots}"]
     )

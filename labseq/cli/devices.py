@@ -35,12 +35,12 @@ def show_devices(profile: str, overrides: Sequence[str], dry_run: DryRun, *, as_
         as_json: Whether to print everything as one line of JSON, alone on stdout.
 
     Returns:
-        The exit code: 0 if all is well, 3 if a device failed, 2 if only some could not be constructed.
+        The exit code: 0 if all devices work, 3 if one failed, else 2 if one could not be constructed.
 
     Raises:
-        ConfigError: The profile is wrong; no device was touched.
-        DeviceError: Somebody else uses the same devices; none was touched.
-        StopRequested: Ctrl-C or SIGTERM came meanwhile; told are the devices that were tried.
+        ConfigError: The profile is wrong; no device was opened.
+        DeviceError: Another process uses the same devices; none was opened.
+        StopRequested: It was stopped by Ctrl-C or SIGTERM; the devices tested so far were printed.
     """
     answer = stdout_to_stderr() if as_json else None
     try:
@@ -62,7 +62,7 @@ def show_devices(profile: str, overrides: Sequence[str], dry_run: DryRun, *, as_
 
 
 def exit_code(report: DevicesReport) -> int:
-    """3 if a device failed, else 2 if one could not be constructed, else 0."""
+    """0 if all devices work, 3 if one failed, else 2 if one could not be constructed."""
     if any(not found.ok and found.constructed for found in report.devices):
         return DeviceError.exit_code
     return 0 if all(found.ok for found in report.devices) else ConfigError.exit_code
@@ -83,7 +83,7 @@ def _row(found: CheckedDevice, plugin: str) -> tuple[str, ...]:
 
 
 def _reason(found: CheckedDevice) -> str:
-    """What went wrong, on one line; "" if nothing did."""
+    """Why a device failed, on one line; "" if it works."""
     parts = [("", found.failure), ("NOT SAFE: ", found.unsafe), ("could not be closed: ", found.unclosed)]
     texts = [f"{about}{error}" for about, error in parts if error is not None]
     return "; ".join(line for text in texts for line in text.splitlines())
@@ -109,7 +109,7 @@ def _as_values(report: DevicesReport) -> dict[str, Any]:
 
 
 def secure_profile(profile: str, overrides: Sequence[str]) -> int:
-    """Make a profile's devices safe; prints a line per device as it is done.
+    """Make a profile's devices safe; print a line for each.
 
     Args:
         profile: Name or path of the profile.
@@ -120,7 +120,7 @@ def secure_profile(profile: str, overrides: Sequence[str]) -> int:
         failed, else 2.
 
     Raises:
-        ConfigError: The profile cannot be read; no device was touched.
+        ConfigError: The profile cannot be read; no device was opened.
     """
     secured = make_profile_safe(profile, overrides, _Lines())
     if secured.problems is not None:
@@ -164,7 +164,7 @@ def list_plugins(profile: str | None, *, as_json: bool = False) -> None:
 
 
 def plugins_table(host: PluginHost) -> list[str]:
-    """A row per plugin, and below them why one failed to load, and what one did besides."""
+    """A row per plugin; below them why plugins failed to load, and notes."""
     rows = [("plugin", "state", "version", "origin", "offers")]
     told: list[str] = []
     for info in host.infos:
@@ -186,7 +186,7 @@ def _values(host: PluginHost, info: PluginInfo) -> dict[str, Any]:
 
 
 def _folders(profile: str | None) -> tuple[list[Path], float]:
-    """The profile's plugin folders and patience; the plugins that it names need not exist for that."""
+    """The profile's plugin folders and its load timeout; the plugins that it names need not exist."""
     if profile is None:
         return [path for path in (Path(PLUGINS),) if path.is_dir()], LOAD_S
     document, spec = load_profile(profile, beside=Path())

@@ -24,12 +24,12 @@ from labseq.session.planning import PlannedMoves, PlanRequest, plan_moves
 from labseq.units import format_quantity
 
 INTERPRETED_SITES: Final = 64 * 64
-"""Up to this size a plan in plain Python takes less time than numba to load."""
+"""Up to this size, planning in plain Python is faster than loading numba."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlanOutput:
-    """What is printed and written.
+    """Which output is printed and written.
 
     Attributes:
         step: Whether to print the plan batch by batch.
@@ -46,8 +46,8 @@ def plan_once(request: PlanRequest, output: PlanOutput) -> None:
     """Plan the moves for one occupancy, and print or write them.
 
     Args:
-        request: What is to be planned.
-        output: What is printed and written.
+        request: What to plan.
+        output: What to print and write.
 
     Raises:
         ConfigError: Something in the request is wrong, or a file cannot be written.
@@ -76,11 +76,13 @@ def plan_once(request: PlanRequest, output: PlanOutput) -> None:
 
 
 def warnings(moves: PlannedMoves, request: PlanRequest) -> list[str]:
-    """What the user should know of a plan although nothing is wrong with it."""
+    """What the user should know about a plan that is valid."""
     texts: list[str] = []
     asked, used = request.degree_of_parallelism, moves.degree_of_parallelism
     if asked is not None and asked != used:
-        texts.append(f"--dop {asked}: planned with {used}, the most that the planner and the machine allow")
+        texts.append(
+            f"--dop {asked}: planned with {used}, the maximum that the planner and the machine allow"
+        )
     n_defects, n_surplus = moves.report.n_defects, moves.report.n_surplus
     n_atoms, n_sites = int(moves.occupancy.sum()), moves.target.n_atoms
     if moves.n_missing_atoms:
@@ -89,7 +91,9 @@ def warnings(moves: PlannedMoves, request: PlanRequest) -> list[str]:
         )
         texts.append(f"{too_few}; the plan fills {moves.n_filled}")
     elif n_defects:
-        texts.append(f"the plan leaves {plural(n_defects, 'target site')} empty, with atoms enough")
+        texts.append(
+            f"the plan leaves {plural(n_defects, 'target site')} empty, although there are enough atoms"
+        )
     if n_surplus:
         texts.append(f"the plan leaves {plural(n_surplus, 'atom')} on sites that must be empty")
     return texts
@@ -107,7 +111,7 @@ def _draw(moves: PlannedMoves, path: Path) -> None:
 GAP: Final = 4
 """Characters between two arrays."""
 LEAST: Final = len("before")
-"""Characters that an array takes at least."""
+"""Least width of an array in characters."""
 
 Sites = NDArray[np.int16]
 NOWHERE: Final[Sites] = np.empty((0, 2), np.int16)
@@ -125,8 +129,8 @@ class Canvas:
     """Draws arrays of one grid.
 
     Attributes:
-        target: What the array shall look like.
-        shear: As of :class:`labseq.model.SiteGrid`; 0 on a square lattice.
+        target: The target.
+        shear: As in :class:`labseq.model.SiteGrid`; 0 on a square lattice.
         width: Characters per line.
         glyphs: The characters to draw with.
     """
@@ -142,17 +146,17 @@ class Canvas:
         arrays: Sequence[Occupancy],
         marked: Sequence[Sites] = (NOWHERE, NOWHERE),
     ) -> list[Text]:
-        """Draw two arrays, as large as there is room; no arrays where even small ones find none.
+        """Draw two arrays as large as they fit; only a note if they do not fit.
 
         Args:
-            titles: What stands above the one and the other.
+            titles: The title above each.
             arrays: Both occupancies, bool (n_rows, n_cols).
-            marked: Sites on the grid that are shown inverted in them, int16 (n, 2) each.
+            marked: Sites of each that are shown inverted, int16 (n, 2).
         """
         beside, scale = self._arrangement
         if scale is None:
             n_rows, n_cols = self.target.shape
-            return [Text(f"({n_rows} x {n_cols} sites find no room in {self.width} characters)", "dim")]
+            return [Text(f"({n_rows} x {n_cols} sites do not fit into {self.width} characters)", "dim")]
         drawn = [
             [Text(title, "bold"), *self._numbered(self._draw(array, sites, scale), scale)]
             for title, array, sites in zip(titles, arrays, marked, strict=True)
@@ -167,7 +171,7 @@ class Canvas:
         return lines
 
     def key(self, *arrays: Occupancy) -> Text:
-        """Explain the characters that occur in these arrays; empty if none does."""
+        """Explain the characters that occur in these arrays; empty if there are none."""
         if self._arrangement[1] is None:
             return Text()
         shown = {int(kind) for array in arrays for kind in np.unique(site_kinds(array, self.target))}
@@ -181,7 +185,7 @@ class Canvas:
 
     @property
     def _arrangement(self) -> tuple[bool, Scale | None]:
-        """Whether two arrays stand side by side, and the scale; None if there is no room."""
+        """Whether the arrays are drawn side by side, and the scale; None if they do not fit."""
         widths = [(scale, scale.size(*self.target.shape, self.shear != 0)[0]) for scale in (ROOMY, DENSE)]
         for beside in (True, False):
             for scale, width in widths:
@@ -192,7 +196,7 @@ class Canvas:
 
     @property
     def _margin(self) -> int:
-        """Characters that the row numbers take."""
+        """Width of the row numbers in characters."""
         return len(str(self.target.shape[0] - 1)) + 1
 
     def _draw(self, array: Occupancy, marked: Sites, scale: Scale) -> list[Text]:
@@ -204,7 +208,7 @@ class Canvas:
         return lines
 
     def _column(self, row: int, col: int, scale: Scale) -> int:
-        """Where a site stands in its line."""
+        """The column of a site in its line of text."""
         return scale.indent(row, self.target.shape[0], self.shear) + col * scale.cell
 
     def _numbered(self, lines: list[Text], scale: Scale) -> list[Text]:
@@ -222,12 +226,12 @@ class Canvas:
 
 @dataclass(frozen=True, slots=True)
 class Steps:
-    """What is shown of each batch.
+    """The description of each batch.
 
     Attributes:
         moves: The plan.
         canvas: Draws the array.
-        arrow: Stands between the ends of a move.
+        arrow: Printed between the ends of a move.
     """
 
     moves: PlannedMoves
@@ -255,17 +259,17 @@ class Steps:
             f"done at {format_quantity(float(report.batch_end_s[index]), 'time')}",
         ]
         if batch.linked:
-            parts.append("with the tweezers still on from the batch before")
+            parts.append("with the tweezers still on from the previous batch")
         return ", ".join(parts)
 
 
 def moves_text(batch: Batch, shape: tuple[int, int], arrow: str = "->") -> list[str]:
-    """Name the moves of a batch, a line of text per row or column.
+    """Describe the moves of a batch, a line of text per row or column.
 
     Args:
         batch: The batch.
         shape: (n_rows, n_cols) of the grid.
-        arrow: Stands between the ends of a move.
+        arrow: Printed between the ends of a move.
 
     Example:
         >>> moves_text(Batch([(2, 0), (2, 4)], [(2, 3), (2, 5)]), (5, 5))
@@ -286,11 +290,11 @@ def moves_text(batch: Batch, shape: tuple[int, int], arrow: str = "->") -> list[
 
 
 PLAIN_WIDTH: Final = 132
-"""Characters per line where there is no terminal."""
+"""Characters per line without a terminal."""
 
 
 class _Console(Console):
-    """One that leaves it to others what a closed pipe means, where rich would end the process."""
+    """A console that raises on a closed pipe, where rich would end the process."""
 
     def on_broken_pipe(self) -> NoReturn:
         raise  # noqa: PLE0704 - rich calls this while it handles the error
@@ -301,9 +305,8 @@ def print_plan(moves: PlannedMoves, stream: TextIO, *, step: bool) -> None:
 
     Args:
         moves: The plan.
-        stream: Where to; if it is a terminal, and the keyboard is there too, the
-            batches wait for Enter.
-        step: Whether to print it batch by batch first.
+        stream: Where to print. If it is a terminal, and stdin too, each batch waits for Enter.
+        step: Whether to print the plan batch by batch first.
 
     Raises:
         RecordingError: It cannot be written, for example to a full disk.
@@ -317,7 +320,7 @@ def _print_all(console: Console, moves: PlannedMoves, *, step: bool) -> None:
     width = console.width if console.is_terminal else PLAIN_WIDTH
     shear = moves.grid.shear if moves.grid.lattice == "triangular" else 0
     canvas = Canvas(moves.target, shear, width, glyphs_for(console.encoding))
-    _print(console, *map(Text, columns(what(moves))), Text())
+    _print(console, *map(Text, columns(subject(moves))), Text())
     if step:
         arrow = "→" if encodes(console.encoding, "→") else "->"
         _print_steps(console, Steps(moves, canvas, arrow))
@@ -332,11 +335,11 @@ def _print_steps(console: Console, steps: Iterable[list[Text]]) -> None:
     waits = console.is_terminal and sys.stdin.isatty()
     for lines in steps:
         _print(console, *lines, Text())
-        if waits and not _goes_on(console):
+        if waits and not _wait_for_enter(console):
             break
 
 
-def _goes_on(console: Console) -> bool:
+def _wait_for_enter(console: Console) -> bool:
     """Wait for Enter; False for "q" or the end of the input."""
     console.print(Text("Enter: next batch, q: skip the rest ", "dim"), end="")
     answer = sys.stdin.readline()
@@ -351,7 +354,7 @@ def _print(console: Console, *lines: Text) -> None:
 
 
 def title(moves: PlannedMoves) -> str:
-    """The plan in a line."""
+    """The plan on one line."""
     plan = moves.plan
     parts = [
         moves.target.name,
@@ -362,8 +365,8 @@ def title(moves: PlannedMoves) -> str:
     return f"{moves.planner}, degree of parallelism {moves.degree_of_parallelism}: {', '.join(parts)}"
 
 
-def what(moves: PlannedMoves) -> list[tuple[str, str]]:
-    """What was planned from what."""
+def subject(moves: PlannedMoves) -> list[tuple[str, str]]:
+    """Occupancy, target and planner."""
     grid, target = moves.grid, moves.target
     sites = (
         f"{grid.n_rows} x {grid.n_cols} sites, {grid.lattice}, {format_quantity(grid.spacing_m, 'length')}"

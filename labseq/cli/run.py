@@ -1,4 +1,4 @@
-"""`labseq run`, `labseq resume` and `labseq stop`."""
+"""`labseq run`, `labseq resume`, `labseq stop` and `labseq demo`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from labseq.config import packaged_profiles_dir, packaged_sequences_dir
 from labseq.console.errors import lines_of
 from labseq.console.output import as_line, say, stdout_to_stderr
 from labseq.console.runs import existing_run
-from labseq.console.text import columns, plural
+from labseq.console.text import plural
 from labseq.errors import ConfigError, LabseqError, Problem, RecordingError, StopRequested
 from labseq.messages import visible
 from labseq.queue.queue import Queue
@@ -29,15 +29,15 @@ from labseq.session.between_shots import ask_to_stop, find_running, is_running, 
 
 
 def run_sequence(sequence: Path, options: Options, *, as_json: bool) -> None:
-    """Run a sequence and say what came of it, also when it was stopped or failed.
+    """Run a sequence and print the result, also if it was stopped or failed.
 
     Args:
         sequence: The sequence file.
         options: What the user changed.
-        as_json: Whether to print the outcome as JSON, last and alone on stdout.
+        as_json: Whether to print the result as JSON, last and alone on stdout.
 
     Raises:
-        LabseqError: Whatever ended the run.
+        LabseqError: The error that ended the run.
     """
 
     def start(observer: RunObserver | None) -> Session:
@@ -47,16 +47,16 @@ def run_sequence(sequence: Path, options: Options, *, as_json: bool) -> None:
 
 
 def resume_run(path: Path, *, accept_changes: bool, realtime: bool, as_json: bool) -> None:
-    """Go on with a run that ended early, and say what came of it.
+    """Resume a run that ended early, and print the result.
 
     Args:
         path: The run's folder or any file in it.
-        accept_changes: Whether to go on although something differs from then.
-        realtime: Let virtual time take as long as it says.
-        as_json: Whether to print the outcome as JSON, last and alone on stdout.
+        accept_changes: Whether to resume even if something has changed since.
+        realtime: Whether virtual time passes as fast as real time.
+        as_json: Whether to print the result as JSON, last and alone on stdout.
 
     Raises:
-        LabseqError: Whatever ended the run.
+        LabseqError: The error that ended the run.
     """
 
     def resume(observer: RunObserver | None) -> Session:
@@ -67,14 +67,14 @@ def resume_run(path: Path, *, accept_changes: bool, realtime: bool, as_json: boo
 
 
 def run_session(opening: Callable[[RunObserver | None], Session], *, as_json: bool) -> None:
-    """Run a session and say what came of it, also when it was stopped or failed.
+    """Run a session and print the result, also if it was stopped or failed.
 
     Args:
-        opening: Opens the session; is given the observer that shows it.
-        as_json: Whether to print the outcome as JSON, last and alone on stdout.
+        opening: Opens the session; its argument is the observer that shows it.
+        as_json: Whether to print the result as JSON, last and alone on stdout.
 
     Raises:
-        LabseqError: Whatever ended the run.
+        LabseqError: The error that ended the run.
     """
     answer = stdout_to_stderr() if as_json else None
     observer = observer_for(sys.stdout)
@@ -88,7 +88,7 @@ def run_session(opening: Callable[[RunObserver | None], Session], *, as_json: bo
         failure = error
         raise
     finally:
-        with suppress(Exception):  # a broken screen must not hide what came of the run
+        with suppress(Exception):  # a broken terminal must not hide the result of the run
             observer.close()
         run = _read_back(session)
         if run is not None:
@@ -98,34 +98,34 @@ def run_session(opening: Callable[[RunObserver | None], Session], *, as_json: bo
 
 
 def json_result(session: Session | None, run: Run | None, failure: BaseException | None) -> str:
-    """What came of a run, as one line of JSON.
+    """The result of a run as one line of JSON.
 
     Args:
-        session: The session, if it came to one.
+        session: The session, if it could be opened.
         run: The run as it is on disk, if it can be read.
         failure: What ended the run, or None.
     """
     values = json_summary(run)
     if run is None and session is not None and session.run_dir is not None:
         values["run_dir"] = str(session.run_dir)
-    if failure is not None:  # the disk may be too full to have taken the status
+    if failure is not None:  # a full disk may not have taken the status
         values["status"] = "stopped" if isinstance(failure, StopRequested | KeyboardInterrupt) else "failed"
         values["error"] = "\n".join(lines_of(failure))
     return as_line(values)
 
 
 def _report(run: Run) -> None:
-    """Print the summary; a full disk behind stdout takes nothing from the run."""
+    """Print the summary; a full disk behind stdout does not affect the run."""
     lines = summary_lines(run)
     try:
         say(*lines)
     except RecordingError as error:
         with suppress(RecordingError):
-            say(f"warning: {error}; the run is not touched by that", *lines, stream=sys.stderr)
+            say(f"warning: {error}; the run is not affected", *lines, stream=sys.stderr)
 
 
 def _answer(answer: Callable[[str], None], line: str, failure: BaseException | None) -> None:
-    """Print the outcome; where that fails, what ended the run is still the first to be told."""
+    """Print the result; if that fails, the error that ended the run is still the one that is reported."""
     try:
         answer(line)
     except RecordingError:
@@ -142,18 +142,18 @@ def _read_back(session: Session | None) -> Run | None:
         return None
 
 
-LOOK_S: Final = 0.1
-"""How often ``--wait`` looks."""
+POLL_S: Final = 0.1
+"""How often ``--wait`` checks whether the run has ended."""
 
 
 def stop_run(run: Path | None, profile: str | None, *, queue: bool, wait: bool) -> None:
-    """Ask a run in progress to end after the shot at hand, and say what will happen.
+    """Ask a run in progress to end after its current shot, and say what will happen.
 
     Args:
-        run: Its folder; the only one in progress if left out.
-        profile: Its profile, in place of its folder.
-        queue: Whether the queue shall end as well.
-        wait: Whether to wait for its end.
+        run: Its folder; None if it is the only one in progress.
+        profile: Its profile, instead of its folder.
+        queue: Whether the queue ends as well.
+        wait: Whether to wait for the end of the run.
 
     Raises:
         ConfigError: No run is in progress, or several are; or no process runs the queue.
@@ -162,17 +162,17 @@ def stop_run(run: Path | None, profile: str | None, *, queue: bool, wait: bool) 
     if queue:
         if not Queue(data_root()).ask_to_stop():
             raise ConfigError("no process runs the queue; 'labseq stop' without --queue ends a run")
-        say("the queue takes no further runs")
+        say("the queue starts no further runs")
         if run is None and not running_here(profile):
             return
     folder = find_running(None if run is None else existing_run(run), profile)
     ask_to_stop(folder)
-    say(f"{folder} ({owner_text(folder)}) ends after the shot at hand")
-    say(f"go on later with: labseq resume {folder}")
+    say(f"{folder} ({owner_text(folder)}) ends after its current shot")
+    say(f"resume it later with: labseq resume {folder}")
     while wait and is_running(folder):
-        time.sleep(LOOK_S)
+        time.sleep(POLL_S)
     if wait:
-        say("it has ended")
+        say("the run has ended")
 
 
 SEQUENCE: Final = "compact_225"
@@ -181,17 +181,17 @@ SHOTS: Final = 10
 
 
 def run_demo(shots: int | None, output: Path | None) -> None:
-    """Run a packaged sequence on the packaged virtual lab; say before and after what that is.
+    """Run a packaged sequence on the packaged virtual profile, and explain it before and after.
 
     Args:
         shots: Number of shots; None for :data:`SHOTS`.
         output: Folder for the data; None for LABSEQ_DATA or ./data.
 
     Raises:
-        LabseqError: Whatever ended the run.
+        LabseqError: The error that ended the run.
     """
     opened: list[Session] = []
-    profile = str(packaged_profiles_dir() / f"{PROFILE}.yaml")  # not one of that name in this folder
+    profile = str(packaged_profiles_dir() / f"{PROFILE}.yaml")  # not one of this name in the current folder
     options = Options(profile, SHOTS if shots is None else shots, output=output)
 
     def start(observer: RunObserver | None) -> Session:
@@ -206,7 +206,7 @@ def run_demo(shots: int | None, output: Path | None) -> None:
 
 
 def beginning(session: Session) -> list[str]:
-    """What is about to happen."""
+    """What the run will do."""
     assembly = session.assembly
     target, grid = assembly.target.fill, assembly.bench.grid
     steps: list[Any] = [step for _, step in assembly.steps]
@@ -214,10 +214,10 @@ def beginning(session: Session) -> list[str]:
     rows, cols = (int(target.any(axis=axis).sum()) for axis in (1, 0))
     grid_is, shots = f"{grid.n_rows} x {grid.n_cols}", plural(assembly.sequence.shots, "shot")
     return [
-        f"This is {SEQUENCE}, a sequence that comes with labseq, on its virtual lab: no hardware is touched.",
+        f"This is {SEQUENCE}, a sequence that comes with labseq, on simulated hardware: no device is used.",
         f"Each of {shots} loads atoms at random into {grid_is} tweezers, takes an image, rearranges",
         f"the atoms into an array of {rows} x {cols} in up to {cycles} cycles of plan, check, move, image,",
-        "and takes the image on which it is judged. The first time, labseq compiles its kernels.",
+        "and takes the image that decides its success. The first time, labseq compiles its kernels.",
         "",
     ]
 
@@ -228,28 +228,32 @@ def ending(run_dir: Path) -> list[str]:
     has_matplotlib = importlib.util.find_spec("matplotlib") is not None
     needs = "" if has_matplotlib else '; first: pip install "labseq[plot]"'
     rows = [
-        (f"  labseq show {run}", "these numbers again; --shots and --timing tell more"),
+        (f"  labseq show {run}", "these numbers again; --shots and --timing print more"),
         (f"  labseq plot {run}", f"the run as a picture{needs}"),
         (f"  labseq check {SEQUENCE}", "what a shot does, step by step"),
         (f"  labseq run {SEQUENCE} --set planner.degree_of_parallelism=15", "with one value changed"),
-        ("  labseq demo --copy .", "copies of the sequences and profiles, for you to change"),
+        ("  labseq demo --copy .", "copy the sequences and profiles, for you to change"),
     ]
-    return [f"The data are in {run_dir}, a file per shot. What next:", *columns(rows)]
+    width = max(len(command) for command, _ in rows)  # unlike a table, never wrapped: commands are copied
+    return [
+        f"The data are in {run_dir}, one file per shot. What next:",
+        *(f"{c.ljust(width)}  {text}" for c, text in rows),
+    ]
 
 
 def copy_files(folder: Path) -> None:
-    """Copy the packaged sequences and profiles, to be changed; what is there is never replaced.
+    """Copy the packaged sequences and profiles for the user to change; no file is replaced.
 
     Args:
         folder: Gets the folders ``sequences`` and ``hardware_profiles``.
 
     Raises:
-        ConfigError: One of the files is there already, and none was copied; or it cannot be written to.
+        ConfigError: One of the files exists already, and none was copied; or one cannot be written.
     """
     copies = list(_copies(folder))
     if taken := [new for _, new in copies if new.exists()]:
         more = f" (and {plural(len(taken) - 1, 'more file')})" if len(taken) > 1 else ""
-        what = f"this is there already{more}; nothing was copied"
+        what = f"this file exists already{more}; nothing was copied"
         raise ConfigError(Problem(what, visible(str(taken[0])), expected="a folder without them"))
     for old, new in copies:
         try:
@@ -263,12 +267,12 @@ def copy_files(folder: Path) -> None:
         f"{plural(len(copies), 'file')} copied to sequences and hardware_profiles in {visible(str(folder))}. "
         "There:",
         f"  labseq run sequences/{SEQUENCE}.yaml",
-        "A sequence that says 'profile: virtual' takes the copy in ./hardware_profiles now.",
+        "A sequence with 'profile: virtual' now uses the copy in ./hardware_profiles.",
     )
 
 
 def _copies(folder: Path) -> Iterator[tuple[Path, Path]]:
-    """Each packaged file, and where its copy goes."""
+    """Each packaged file and the path of its copy."""
     for source in (packaged_sequences_dir(), packaged_profiles_dir()):
         for path in sorted(path for path in source.iterdir() if path.is_file()):
             yield path, folder / source.name / path.name

@@ -1,4 +1,4 @@
-"""``labseq waveform``: what the AWG would play, in numbers, as a picture and as samples."""
+"""`labseq waveform`: what the AWG would play, as numbers, picture and samples."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from labseq.bench.waveform import AxisStatistics, PlannedWaveform, WaveformRequest, plan_waveform
-from labseq.cli.plan import warnings, what
+from labseq.cli.plan import subject, warnings
 from labseq.console.output import check_different, json_writer, report_compiling, say
 from labseq.console.text import columns, percent, plural, size_text
 from labseq.model import RfSpec
@@ -18,7 +18,7 @@ Both = tuple[AxisStatistics, AxisStatistics]
 
 @dataclass(frozen=True, slots=True)
 class WaveformOutput:
-    """What is written besides the report.
+    """What is written in addition to the report.
 
     Attributes:
         json: Name of the file for the numbers as JSON; "-" for stdout, which then holds nothing else.
@@ -32,11 +32,11 @@ class WaveformOutput:
 
 
 def show_waveform(request: WaveformRequest, output: WaveformOutput) -> None:
-    """Render the waveform of a plan, print what it is, and write it on request.
+    """Render the waveform of a plan, print its numbers, and write the output files.
 
     Args:
         request: Which waveform.
-        output: What is written.
+        output: What to write.
 
     Raises:
         ConfigError: Something in the request is wrong, there is nothing to play, or a file
@@ -89,11 +89,11 @@ def _draw(waveform: PlannedWaveform, both: Both, path: Path) -> None:
 
 
 def report(waveform: PlannedWaveform, both: Both) -> list[str]:
-    """The waveform in numbers, in lines."""
+    """The numbers of the waveform, as lines of text."""
     duration, on = (format_quantity(s, "time") for s in (waveform.duration_s, waveform.tones_on_s))
     n, rate = len(waveform.samples), _rate(waveform)
     rows = [
-        *what(waveform.moves),
+        *subject(waveform.moves),
         ("batches", _batches(waveform)),
         ("duration", f"{duration}, {on} of it with tones on"),
         ("samples", f"{n} per channel at {rate}, {size_text(waveform.n_bytes)}"),
@@ -102,7 +102,7 @@ def report(waveform: PlannedWaveform, both: Both) -> list[str]:
 
 
 def title(waveform: PlannedWaveform) -> str:
-    """The waveform in a line."""
+    """The waveform on one line."""
     duration, on = (format_quantity(s, "time") for s in (waveform.duration_s, waveform.tones_on_s))
     n = len(waveform.batches)
     which = plural(n, "batch") if n == 1 else f"{n} batches"
@@ -114,7 +114,7 @@ def title(waveform: PlannedWaveform) -> str:
 
 
 def note(axis: AxisStatistics) -> str:
-    """An axis in a line."""
+    """An axis on one line."""
     parts = [
         f"{axis.name} axis: at most {plural(axis.max_tones, 'tone')}",
         _span(axis.lowest_hz, axis.highest_hz),
@@ -126,7 +126,7 @@ def note(axis: AxisStatistics) -> str:
 
 
 def _table(both: Both, rf: RfSpec) -> list[tuple[str, str, str]]:
-    """What both axes play, side by side."""
+    """The numbers of both axes, side by side."""
     row, column = (_axis_rows(axis, rf) for axis in both)
     return [(label, left, right) for (label, left), (_, right) in zip(row, column, strict=True)]
 
@@ -139,13 +139,13 @@ def _axis_rows(axis: AxisStatistics, rf: RfSpec) -> list[tuple[str, str]]:
         ("tones at once", f"at most {axis.max_tones}"),
         ("frequencies", _span(axis.lowest_hz, axis.highest_hz)),
         ("band of the AOD", _span(*axis.band_hz)),
-        ("moved onto a comb", f"by at most {1e9 * axis.snapped_m:.3g} nm" if axis.snapped_m else "-"),
+        ("shifted onto a comb", f"by at most {1e9 * axis.snapped_m:.3g} nm" if axis.snapped_m else "-"),
         ("sum of amplitudes", f"at most {axis.amplitude_sum:.3g} of full scale"),
         (
             f"peak voltage (limit {volts})",
             f"{format_quantity(axis.peak_v, 'voltage')}, in batch {axis.peak_batch + 1}",
         ),
-        ("  behind the amplifier", format_quantity(axis.aod_peak_v, "voltage")),
+        ("  after the amplifier", format_quantity(axis.aod_peak_v, "voltage")),
         ("crest factor", _crest(axis)),
         ("mean power into 50 Ohm", _power(axis.mean_power_w, axis.highest_power_w)),
         (f"  at the AOD (limit {watts})", _power(axis.aod_mean_power_w, axis.aod_highest_power_w)),

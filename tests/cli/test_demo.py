@@ -37,12 +37,12 @@ def suggested(out: str) -> list[list[str]]:
 
 def test_first_look(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     Path("hardware_profiles").mkdir()
-    Path("hardware_profiles/virtual.yaml").write_text("a profile of this lab, which is not meant")
+    Path("hardware_profiles/virtual.yaml").write_text("a profile of this lab, which must not be used")
     assert run("demo", "--shots", "1") == 0
     out = capsys.readouterr().out
     (run_dir,) = here.glob("data/*/*")
     assert labseq.open_run(run_dir).record["name"] == "compact-225"
-    assert "no hardware is touched" in out
+    assert "no device is used" in out
     assert "Each of 1 shot loads atoms at random into 20 x 20 tweezers" in out
     assert "an array of 15 x 15 in up to 10 cycles" in out
     assert f"The data are in {run_dir}" in out
@@ -70,7 +70,7 @@ def test_copies_can_be_run_and_are_never_replaced(capsys: pytest.CaptureFixture[
     assert session.assembly.target.fill.sum() == 177
     Path("lab/sequences/kagome.yaml").unlink()
     with pytest.raises(
-        ConfigError, match=r"climb_dop_ramp\.yaml: this is there already \(and 17 more files\)"
+        ConfigError, match=r"climb_dop_ramp\.yaml: this file exists already \(and 17 more files\)"
     ):
         demo.copy_files(Path("lab"))
     assert not Path("lab/sequences/kagome.yaml").exists()

@@ -29,7 +29,7 @@ def called(*arguments: str) -> int:
 
 def test_what_is_well_is_told_in_two_lines(run_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert called() == called(str(run_dir)) == 0
-    assert capsys.readouterr().out == "1 run looked at, 2 shots whole\nnothing is wrong\n" * 2
+    assert capsys.readouterr().out == "1 run checked, 2 shots intact\nno damage found\n" * 2
 
 
 def test_a_dry_run_tells_what_there_is_to_do(run_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -40,7 +40,7 @@ def test_a_dry_run_tells_what_there_is_to_do(run_dir: Path, capsys: pytest.Captu
     assert lines[0].split() == ["what", "where", "to", "do"]
     where = part.relative_to(run_dir.parents[1])
     assert lines[1].split("  ") == ["half-written", str(where), "moved to quarantine"]
-    assert lines[-1] == "1 thing wrong; nothing was changed"
+    assert lines[-1] == "1 defect found; nothing was changed"
     assert part.exists()
 
 
@@ -51,7 +51,7 @@ def test_what_is_put_right_is_told(run_dir: Path, capsys: pytest.CaptureFixture[
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].split() == ["what", "where", "done"]
     assert lines[1].split("  ")[-1] == "moved to quarantine"
-    assert lines[-1] == "2 things wrong: 2 put right, 0 left"
+    assert lines[-1] == "2 defects found: 2 repaired, 0 left"
 
 
 def test_what_is_left_makes_the_exit_code(run_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -59,13 +59,13 @@ def test_what_is_left_makes_the_exit_code(run_dir: Path, capsys: pytest.CaptureF
     assert called() == 1
     out = capsys.readouterr().out
     assert "take it from a backup" in out
-    assert out.endswith("1 thing wrong: 0 put right, 1 left\n")
+    assert out.endswith("1 defect found: 0 repaired, 1 left\n")
 
 
 def test_runs_in_progress_are_told(run_dir: Path, fake: Any, capsys: pytest.CaptureFixture[str]) -> None:
     RunWriter.create(run_dir.parents[1], fake.run())
     assert called() == 0
-    assert "1 run in progress left alone" in capsys.readouterr().out
+    assert "1 run in progress not checked" in capsys.readouterr().out
 
 
 def test_findings_are_told_as_json(run_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:

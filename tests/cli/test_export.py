@@ -69,7 +69,7 @@ def test_what_cannot_be_exported_is_told(
 @pytest.mark.parametrize(
     ("status", "told"),
     [
-        (None, "warning: the run still goes on; exported are the 1 shot of 2 that it had\n"),
+        (None, "warning: the run is still in progress; exported are the 1 shot of 2 taken so far\n"),
         ("stopped", "warning: the run did not complete (stopped); exported are 1 shot of 2\n"),
     ],
 )

@@ -121,7 +121,7 @@ def test_what_falls_short_is_told() -> None:
     moves = plan_moves(short)
     n_atoms = int(moves.occupancy.sum())
     assert warnings(moves, short) == [
-        "--dop 30: planned with 20, the most that the planner and the machine allow",
+        "--dop 30: planned with 20, the maximum that the planner and the machine allow",
         f"{n_atoms} atoms for 16 target sites, {16 - n_atoms} too few; the plan fills {n_atoms}",
     ]
     assert warnings(plan_moves(REQUEST), REQUEST) == []
@@ -153,7 +153,7 @@ def test_a_planner_that_leaves_defects_and_surplus_is_told(
     request = PlanRequest("random:6x6@0.7", "checkerboard:4x4", "lazy", seed=3)
     moves = plan_moves(request)
     assert warnings(moves, request) == [
-        f"the plan leaves {moves.report.n_defects} target sites empty, with atoms enough",
+        f"the plan leaves {moves.report.n_defects} target sites empty, although there are enough atoms",
         f"the plan leaves {moves.report.n_surplus} atoms on sites that must be empty",
     ]
     assert ("surplus", f"{moves.report.n_surplus} atoms on sites that must be empty") in totals(moves)

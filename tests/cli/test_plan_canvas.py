@@ -38,7 +38,7 @@ def test_two_arrays_side_by_side() -> None:
         (20, ["before      after", "  0           0", "0 @ o .     0 o @", "1 x   .     1   ."]),
         (19, ["before    after", "  0         0", "0 @o.     0 o@", "1 x .     1  ."]),
         (13, ["before", "  0", "0 @ o .", "1 x   .", "", "after", "  0", "0 o @", "1   ."]),
-        (4, ["(2 x 3 sites find no room in 4 characters)"]),
+        (4, ["(2 x 3 sites do not fit into 4 characters)"]),
     ],
 )
 def test_arrays_shrink_then_stand_below_one_another_then_go(width: int, expected: list[str]) -> None:

@@ -200,7 +200,7 @@ def test_a_full_disk_behind_stdout_takes_nothing_from_the_run(perform: Any) -> N
     assert caught is None
     lines = err.splitlines()
     assert lines[0] == (
-        "warning: /dev/full: cannot be written: No space left on device; the run is not touched by that"
+        "warning: /dev/full: cannot be written: No space left on device; the run is not affected"
     )
     assert lines[1] == f"run               {session.run_dir}"
 

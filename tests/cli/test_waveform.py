@@ -41,7 +41,7 @@ def test_the_report_tells_what_is_played(made: PlannedWaveform) -> None:
         "tones at once",
         "frequencies",
         "band of the AOD",
-        "moved onto a comb",
+        "shifted onto a comb",
         "sum of amplitudes",
         "peak voltage (limit 2 V)",
         "",

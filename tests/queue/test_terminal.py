@@ -187,5 +187,5 @@ def test_a_run_in_progress_is_asked(stopped: Path, capsys: pytest.CaptureFixture
     code, out, err = call(capsys, "stop")
     assert (code, err) == (0, "")
     assert out.splitlines()[0].startswith(f"{stopped} (process ")
-    assert out.splitlines()[1] == f"go on later with: labseq resume {stopped}"
+    assert out.splitlines()[1] == f"resume it later with: labseq resume {stopped}"
     assert (stopped / "STOP").exists()
