@@ -20,13 +20,8 @@ from labseq.errors import (
     StopRequested,
 )
 from labseq.files import Holder, Lock, knows_no_locks
-<<<<<<< HEAD
-from labseq.guard import Guard, StopFlag
-from labseq.recording import clear_active, data_root, find_dead_run, lock_files, marker_roots
-=======
 from labseq.guard import Guard, StopFlag, stop_on_signals
-from labseq.recording import clear_active, data_root, died, lock_files, marker_roots
->>>>>>> e1057b9 (The session loads what a run needs; import-linter holds that plugins import labseq.plugin alone)
+from labseq.recording import clear_active, data_root, find_dead_run, lock_files, marker_roots
 from labseq.roles import Clock, Hardware, RunObserver, Simulation, offers
 from labseq.sequencer import RealClock, VirtualClock
 from labseq.sequencer.lab import Timeouts, in_safe_order
