@@ -89,7 +89,7 @@ def take(sequence: str, n_shots: int, overrides: Sequence[str], seed: int) -> Ta
     lab = session.build_lab()
     session.warm(lab)
     tally = Tally(target=lab.target)
-    first = session.course.first
+    first = session.scan_run.first
     sequencer = Sequencer(
         lab,
         first.steps,

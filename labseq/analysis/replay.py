@@ -36,7 +36,6 @@ from labseq.recording.folders import PROFILE_FILE, SEQUENCE_FILE
 from labseq.roles import Detector, NeedsWarmUp, NeverStopped, Planner
 from labseq.session.assembly import Assembly, assemble
 from labseq.session.construct import construct
-from labseq.session.course import course_of, point_of
 from labseq.session.lab import parallelism_of
 from labseq.session.occupancies import image_before
 from labseq.session.options import Options
@@ -44,6 +43,7 @@ from labseq.session.planning import call_planner, changed_settings
 from labseq.session.profile import ChosenPlugin, RecordedSetup, resolve
 from labseq.session.recorded import calibrations_of, machine_of, stored_text
 from labseq.session.scan import Point
+from labseq.session.scan_run import point_of, scan_run_of
 from labseq.settings import Choice
 
 N_ATOMS_TRUE = "simulation.n_atoms_true"
@@ -460,7 +460,7 @@ def replay(run: Run, request: ReplayRequest, *, announce: Callable[[str], None] 
 
     changes, wanted = request.changes(), shots_of(run, request.shots)
     assembly = assembly_of(run)
-    course = course_of(assembly, run.seed, StopFlag())
+    scan_run = scan_run_of(assembly, run.seed, StopFlag())
     replayer = _Replayer(run, assembly, machine_of(run).grid, calibrations_of(run), changes)
     plans: list[ReplayedPlan] = []
     images = ReplayedImages.none(replayer.grid.shape)
@@ -468,7 +468,7 @@ def replay(run: Run, request: ReplayRequest, *, announce: Callable[[str], None] 
     with announcing(announce):
         chosen = replayer.at(assembly.begun).chosen
         for shot in wanted:
-            crew = replayer.at(point_of(assembly, shot, course))
+            crew = replayer.at(point_of(assembly, shot, scan_run))
             for stream in crew.streams:
                 stream.begin_shot(shot.index, shot.attempt)
             try:

@@ -1,4 +1,4 @@
-"""Adaptive scans: a scanner chooses the next point from the results of the last ones."""
+"""Adaptive scans: a scanner chooses each point from the results of the points before."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ from labseq.session.scan import Point, ScanPoints
 from labseq.units import written
 
 CLIMBED: Final = "to climb on"
-"""What the figure of an adaptive scan is for."""
+"""The purpose of the figure, for messages."""
 
 Steps = Sequence[tuple[str, Step]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Search:
-    """What chooses the points of an adaptive scan.
+    """The scanner of an adaptive scan, and the ranges that it chooses from.
 
     Attributes:
-        scanned: The scan; its points are the corners of what may be chosen from.
-        adaptive: What the sequence says of it.
+        scanned: The scan; its points are the corners of the ranges.
+        adaptive: The settings in the sequence.
         chosen: The scanner.
-        ranges: What it may choose from.
+        ranges: The range of each address.
     """
 
     scanned: ScanPoints
@@ -57,7 +57,7 @@ class Search:
         return [ends.unit for ends in self.adaptive.ends]
 
     def space(self, seed: int) -> ScanSpace:
-        """What the scanner is constructed with."""
+        """The argument of the scanner's constructor."""
         return ScanSpace(self.ranges, self.adaptive.n_points, self.scanned.scan.repeats, seed)
 
     def at(self, values: Mapping[str, float]) -> Point:
@@ -73,7 +73,7 @@ class Search:
         except ConfigError as error:
             raise alone.scan.explained(error) from None
 
-    def told(self, values: Mapping[str, Any]) -> dict[str, str]:
+    def written(self, values: Mapping[str, Any]) -> dict[str, str]:
         """The values of a point as they are written: address -> text."""
         pairs = zip(self.ranges, self.units, strict=True)
         return {one.address: written(values[one.address], unit) for one, unit in pairs}
@@ -93,14 +93,14 @@ class Search:
 
 
 def make_search(scanned: ScanPoints, steps: Steps, found: ProblemCollector) -> Search | None:
-    """Check what chooses a scan's points; None if nothing does, or something is wrong.
+    """The scanner of a scan, checked; None if the scan is not adaptive, or something is wrong.
 
-    The scanner is constructed once, to see whether it can be.
+    The scanner is constructed once, to check that its constructor accepts the settings.
 
     Args:
         scanned: The scan, its ends checked.
         steps: Name and step, in order.
-        found: Where the problems go.
+        found: Receives the problems.
     """
     adaptive = scanned.scan.adaptive
     if adaptive is None:
@@ -127,7 +127,7 @@ def make_search(scanned: ScanPoints, steps: Steps, found: ProblemCollector) -> S
 
 
 def _range(axis: Axis, ends: Ends, resolved: tuple[Any, Any], present: Any, name: str) -> ScanRange:
-    """A range, if its ends are numbers that mean what is written."""
+    """A range, if its ends are numbers and the settings model leaves them as they are written."""
     low, high = ends.low.si, ends.high.si
     if not all(map(_is_number, resolved)) or not all(map(math.isclose, resolved, (low, high))):
         what = f"'{clean(axis.address)}' is no number, or not the one that is written"
@@ -149,7 +149,7 @@ def _is_number(value: object) -> bool:
 
 @dataclass(slots=True)
 class PointScore:
-    """How a point stands.
+    """The scores of a point, over all its visits.
 
     Attributes:
         first: Its first visit.
@@ -171,7 +171,7 @@ class PointScore:
 
 @dataclass(slots=True, eq=False)
 class Results:
-    """What came of the points of an adaptive scan.
+    """The results of the points of an adaptive scan.
 
     Attributes:
         search: What chooses the points.
@@ -181,55 +181,55 @@ class Results:
     search: Search
     shots: dict[int, Shot]
     _visited: list[VisitedPoint] = field(default_factory=list[VisitedPoint])
-    _given_up: dict[int, dict[str, float]] = field(default_factory=dict[int, dict[str, float]])
+    _skipped: dict[int, dict[str, float]] = field(default_factory=dict[int, dict[str, float]])
     _point_scores: dict[str, PointScore] = field(default_factory=dict[str, PointScore])
     _n_counted: int = 0
     _warned: bool = False
 
     @property
     def is_empty(self) -> bool:
-        """Whether no shot has been tried."""
-        return not (self.shots or self._given_up)
+        """Whether no shot has been taken."""
+        return not (self.shots or self._skipped)
 
     def add(self, shot: Shot) -> None:
-        """Take in one more."""
+        """Add a shot."""
         self.shots[shot.index] = shot
 
-    def give_up(self, shot: int, parameters: Mapping[str, Any]) -> None:
-        """Remember the point of a shot that was given up: the scanner is told that nothing came of it."""
+    def add_skipped(self, shot: int, parameters: Mapping[str, Any]) -> None:
+        """Remember the point of a skipped shot: the scanner receives it without a score."""
         visit = shot // self.search.scanned.scan.repeats
-        self._given_up[visit] = self._values_in(parameters)
+        self._skipped[visit] = self._values_in(parameters)
 
     def values(self, visit: int) -> dict[str, float] | None:
-        """The values of a point of which a shot was tried; None if none was."""
+        """The values of a point; None if no shot was tried at it."""
         shots = self._shots_of(visit)
-        return self._values_in(shots[0].row["parameters"]) if shots else self._given_up.get(visit)
+        return self._values_in(shots[0].row["parameters"]) if shots else self._skipped.get(visit)
 
     def _values_in(self, parameters: Mapping[str, Any]) -> dict[str, float]:
         return {one.address: parameters[one.address] for one in self.search.ranges}
 
     def before(self, visit: int) -> list[VisitedPoint]:
-        """What came of the points before one: those of which a shot was tried."""
+        """The results of the points before one, as the scanner receives them."""
         while len(self._visited) < visit:
             self._visited.append(self._visit(len(self._visited)))
         return [one for one in self._visited[:visit] if one.values]
 
     def missing_figure(self, shot: int) -> str:
-        """What to say, once, of a shot that has not what the scan climbs on; "" if it has."""
+        """A warning, given once, that a shot does not have the scan's figure; "" if it has."""
         figure, figures = self.search.adaptive.figure, figures_in(self.shots[shot].row)
         if self._warned or figure in figures:
             return ""
         self._warned = True
         return missing_figure(shot, figure, CLIMBED, figures)
 
-    def told(self, visit: int) -> dict[str, Any]:
-        """A point and the best one so far, JSON-ready, for the run's events."""
+    def progress(self, visit: int) -> dict[str, Any]:
+        """The score of a point and the best one so far, JSON-ready, for the run's events."""
         own = self._visit(visit)
         sign = 1.0 if self.search.adaptive.maximise else -1.0
 
         def plain(number: int, values: Mapping[str, Any], score: float) -> dict[str, Any]:
             value = None if math.isnan(score) else sign * score
-            return {"point": number, "written": self.search.told(values), "value": value}
+            return {"point": number, "written": self.search.written(values), "value": value}
 
         while self._n_counted <= visit:
             self._count(self._n_counted)
@@ -244,10 +244,10 @@ class Results:
     def _count(self, visit: int) -> None:
         """Add a visit to those of its point: all of them count together."""
         one = self._visit(visit)
-        standing = self._point_scores.setdefault(dumps(dict(one.values)), PointScore(visit, one.values))
+        point = self._point_scores.setdefault(dumps(dict(one.values)), PointScore(visit, one.values))
         if not math.isnan(one.score):
-            standing.total += one.score
-            standing.n_scores += 1
+            point.total += one.score
+            point.n_scores += 1
         self._n_counted += 1
 
     def _shots_of(self, visit: int) -> list[Shot]:
@@ -264,10 +264,10 @@ class Results:
 
 
 class ScannerCall:
-    """A scanner, with a deadline, and a check of each answer.
+    """Calls a scanner, with a timeout, and checks its answers.
 
     Args:
-        search: What chooses, and from what.
+        search: The scanner and its ranges.
         seed: The run's seed.
         stop: The request to stop.
 
@@ -282,13 +282,13 @@ class ScannerCall:
         self._timeout_s = search.scanned.bench.profile.timeouts.call
         self._scanner: Scanner = construct_one(search.chosen, search.space(seed))
 
-    def ask(self, visited: Sequence[VisitedPoint]) -> dict[str, float] | None:
+    def choose(self, visited: Sequence[VisitedPoint]) -> dict[str, float] | None:
         """The next point, address -> value; None if the scanner wants no more.
 
         Raises:
-            DeviceError: It raised, or gave something else than a point of its ranges; names it.
+            DeviceError: It raised, or returned something else than a point of its ranges; names it.
             DeviceTimeoutError: It did not answer in time.
-            StopRequested: The run is to stop.
+            StopRequested: The operator asked to stop.
         """
         guard = Guard(self._stop)
         try:
@@ -314,7 +314,7 @@ class ScannerCall:
         return {address: self._value(one, given[address], units[address]) for address, one in ranges.items()}
 
     def _value(self, range_: ScanRange, value: object, unit: str) -> float:
-        """A value that its range allows, without the dust of rounding."""
+        """A value that its range allows, without rounding errors."""
         what = "a whole number" if range_.is_whole else "a number"
         expected = f"{what} from {written(range_.low, unit)} to {written(range_.high, unit)}"
         expected += f" on one of its {range_.n_steps} steps" if range_.n_steps else ""

@@ -129,7 +129,7 @@ def check(session: Session) -> CheckReport:
         ConfigError: A step sends a command that its device does not know.
     """
     assembly = session.assembly
-    check_commands(assembly, session.course.each(), session.build_lab)
+    check_commands(assembly, session.scan_run.each(), session.build_lab)
     lab = session.build_lab()
     timeline = session.timeline()
     windows = _windows(assembly.steps)
@@ -147,13 +147,13 @@ def check(session: Session) -> CheckReport:
     warnings += _parallelism_warnings(session)
     warnings += _deadline_warnings(session, lab, timeline)
     warnings += timeout_warnings(assembly, timeline)
-    for point in session.course.representative_labs():
+    for point in session.scan_run.representative_labs():
         session.build_lab(point)  # whether the constructors accept the settings
     warnings += [Problem(text) for text in assembly.bench.host.notes]
     return CheckReport(
         timeline,
         assembly.sequence.shots,
-        None if assembly.scanned is None else session.course.n_points,
+        None if assembly.scanned is None else session.scan_run.n_points,
         _run_s(session, lab),
         tuple(warnings),
         rehearsal,
@@ -166,7 +166,7 @@ def _run_s(session: Session, lab: Lab) -> tuple[float, float]:
     """Least and most duration of the run, each shot at its own point of the scan, or at any corner of it."""
     guard = Guard()
     min_duration_s, most_s = list[float](), list[float]()
-    for point, n in session.course.counted():
+    for point, n in session.scan_run.counted():
         context = replace(lab.step_context, motion=point.bench.profile.motion)
         bars = [bar for bars in lay_out(lab, guard, point.steps, context) for bar in bars]
         min_duration_s.append(n * sum(bar.min_duration_s for bar in bars))
@@ -174,7 +174,7 @@ def _run_s(session: Session, lab: Lab) -> tuple[float, float]:
     guard.end()
     return (
         (min(min_duration_s), max(most_s))
-        if session.course.is_adaptive
+        if session.scan_run.is_adaptive
         else (sum(min_duration_s), sum(most_s))
     )
 

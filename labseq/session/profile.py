@@ -1,4 +1,4 @@
-"""The profile with its plugins: entries found by name, settings validated, objects constructed; nothing is opened."""
+"""The profile with its plugins: found by name, settings validated; nothing is opened."""
 
 from __future__ import annotations
 

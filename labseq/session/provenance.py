@@ -112,7 +112,7 @@ def run_record(
         assembly: The run.
         seed: Its seed.
         changes: What options changed: address -> value.
-        scan: Its scan, see :meth:`labseq.session.course.Course.record`.
+        scan: Its scan, see :meth:`labseq.session.scan_run.ScanRun.record`.
         folder: The working folder, absolute: relative paths in the settings are relative to it.
     """
     spec, bench = assembly.sequence, assembly.bench

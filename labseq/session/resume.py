@@ -21,11 +21,11 @@ from labseq.recording.folders import INDEX_FILE, LOCK_FILE, PROFILE_FILE, RUN_FI
 from labseq.recording.reader import SCANNER
 from labseq.recording.run_file import encode_run, read_owner, read_run, read_state
 from labseq.session.assembly import Assembly, assemble
-from labseq.session.course import course_of
 from labseq.session.options import Options
 from labseq.session.profile import RecordedSetup
 from labseq.session.provenance import now_utc, run_record
 from labseq.session.recorded import stored_text
+from labseq.session.scan_run import scan_run_of
 from labseq.text_files import decode, read_bytes
 
 _NOTHING: Final = "nothing"
@@ -289,8 +289,8 @@ class ResumableRun:
             ConfigError: Something differs and is not accepted; or the shots themselves would be others.
         """
         record, folder = self.run.record, self.run.path
-        course = course_of(assembly, self.run.seed, StopFlag())
-        today = run_record(assembly, self.run.seed, options.changes(), course.record(), Path.cwd())
+        scan_run = scan_run_of(assembly, self.run.seed, StopFlag())
+        today = run_record(assembly, self.run.seed, options.changes(), scan_run.record(), Path.cwd())
         for what in ("n_shots", "scan", "target"):
             if found := differences(record, today, what):
                 raise _refused(folder, f"its shots would be others today: {found[0]}")

@@ -22,7 +22,6 @@ from labseq.sequencer.leading import find_leader, leaders
 from labseq.sequencer.run import lay_out
 from labseq.session.assembly import Assembly, assemble
 from labseq.session.between_shots import ShotHooks
-from labseq.session.course import course_of
 from labseq.session.lab import build_lab, clock_for, warm
 from labseq.session.observers import Observers
 from labseq.session.options import Options, path_of
@@ -32,6 +31,7 @@ from labseq.session.provenance import copies, ending, run_record
 from labseq.session.resume import ResumableRun, reopened
 from labseq.session.safe import lock_devices, make_safe_after_crash
 from labseq.session.scan import Point
+from labseq.session.scan_run import scan_run_of
 
 
 def check_commands(assembly: Assembly, points: Iterable[Point], build: Callable[[Point], Lab]) -> None:
@@ -125,7 +125,7 @@ class Session:
         self._profile_key = profile if options.dry_run == "off" else f"{profile} (dry run)"
         self.stop_flag = StopFlag()
         before, done = (None, ()) if earlier is None else (earlier.run, earlier.done)
-        self.course = course_of(assembly, self.seed, self.stop_flag, before, done)
+        self.scan_run = scan_run_of(assembly, self.seed, self.stop_flag, before, done)
         self._observers = Observers(assembly.bench.host, observer)
         self._hold: Callable[[str], None] = lambda _: None
         self._sequencer: Sequencer | None = None
@@ -243,7 +243,7 @@ class Session:
         roots = marker_roots(root if self.earlier is None else self.earlier.root)
         for text in (*self.assembly.warnings, *(() if self.earlier is None else self.earlier.warnings)):
             self._warn(text)
-        check_commands(self.assembly, self.course.each(), self.build_lab)
+        check_commands(self.assembly, self.scan_run.each(), self.build_lab)
         with ExitStack() as stack:
             stack.enter_context(stop_on_signals(self.stop_flag))
             if not self.assembly.virtual_time:
@@ -251,11 +251,11 @@ class Session:
                 self._hold = stack.enter_context(lock_devices(self.assembly.bench, roots, what, self._warn))
             bench, key = self.assembly.bench, self._profile_key
             make_safe_after_crash(bench, roots, key, self.stop_flag, self._observers)
-            if not self.course.shots:  # its process died between the last shot and the last word
+            if not self.scan_run.shots:  # its process died between the last shot and the last word
                 _, writer = self._begin(roots[0])
                 writer.finish("complete")
                 return open_run(writer.run_dir)
-            labs = (self.build_lab(point) for point in self.course.representative_labs())
+            labs = (self.build_lab(point) for point in self.scan_run.representative_labs())
             lab = next(labs)
             for one in itertools.chain([lab], labs):
                 self.warm(one)
@@ -300,7 +300,7 @@ class Session:
 
     def _take_shots(self, lab: Lab, roots: Sequence[Path], writer: RunWriter, record: RunRecord) -> None:
         about = {"record": record, "run_dir": str(writer.run_dir), "n_before": writer.n_written}
-        first, changes = self.course.first, self.options.changes()
+        first, changes = self.scan_run.first, self.options.changes()
         sequencer = self._sequencer = Sequencer(
             lab,
             first.steps,
@@ -319,17 +319,17 @@ class Session:
         self._observers.event("run_started", about)
         before = () if self.earlier is None else self.earlier.rows
         checks = Checks(self.assembly.sequence.policy.checks, before, self._warn)
-        self.course.follow(writer, self._observers)
-        self.course.run(sequencer, lab, changes, ShotHooks(writer, checks, self._observers.event))
+        self.scan_run.follow(writer, self._observers)
+        self.scan_run.run(sequencer, lab, changes, ShotHooks(writer, checks, self._observers.event))
 
     def _begin(self, root: Path) -> tuple[RunRecord, RunWriter]:
         """The run's folder, a new one or that of the run that goes on."""
-        changes, scan, earlier = self.options.changes(), self.course.record(), self.earlier
+        changes, scan, earlier = self.options.changes(), self.scan_run.record(), self.earlier
         record = run_record(self.assembly, self.seed, changes, scan, self._folder)
         if earlier is None:
             writer = RunWriter.create(root, record, copies(self.assembly.bench.calibrations))
         else:
-            writer = earlier.reopen(record, next(iter(self.course.shots), None))
+            writer = earlier.reopen(record, next(iter(self.scan_run.shots), None))
         self.run_dir = writer.run_dir
         self._observers.log = writer.event
         self._hold(f"the run {writer.run_dir}")
