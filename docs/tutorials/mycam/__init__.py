@@ -1,6 +1,6 @@
 """The camera `mycam`."""
 
-from labseq import Registry, hookimpl
+from labseq.plugin import Registry, hookimpl
 
 LABSEQ_API = 1
 

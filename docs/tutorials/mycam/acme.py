@@ -1,4 +1,4 @@
-"""The library of a camera maker, as such libraries are. There is no camera: its pictures are noise."""
+"""The library of a camera maker. There is no camera behind it: its frames are noise."""
 
 from __future__ import annotations
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from pydantic import Field
 
-from labseq import (
+from labseq.plugin import (
     CameraDriver,
     CameraFacts,
     Context,
@@ -21,14 +21,14 @@ from labseq import (
 
 
 class MycamSettings(Settings):
-    """What a profile can set beside `use: mycam`."""
+    """Settings in the profile, next to `use: mycam`."""
 
-    serial: str = Field(description="serial number, as it stands on the camera")
+    serial: str = Field(description="serial number printed on the camera")
     readout: Duration = Field(default=5e-3, description="time to read a frame out")
 
 
 class MycamCamera(CameraDriver):
-    """One camera of Acme, by its software trigger.
+    """A camera of Acme, triggered by software.
 
     Args:
         settings: Which camera.
@@ -52,7 +52,7 @@ class MycamCamera(CameraDriver):
         )
 
     def describe(self) -> Mapping[str, Any]:
-        """What stands in the record of each run."""
+        """Details for the record of each run."""
         firmware = None if self._camera is None else self._camera.firmware
         return {"model": "Acme", "serial_number": self._settings.serial, "firmware": firmware}
 

@@ -7,7 +7,7 @@ from functools import partial
 
 import pytest
 
-from labseq import Context, DeviceError
+from labseq.plugin import Context, DeviceError
 from labseq.testing import CameraContract
 
 from .camera import MycamCamera, MycamSettings
