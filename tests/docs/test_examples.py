@@ -17,7 +17,7 @@ from labseq.cli.app import app
 from labseq.cli.entry import arrange
 from labseq.config import ProfileSpec, SequenceSpec
 from labseq.config.yaml_nodes import compose
-from labseq.console.errors import told
+from labseq.console.errors import format_config_error
 
 from .blocks import BLOCKS, COMMENT, PAGES, ROOT, Block, commands_of, inline_of
 from .running import split
@@ -216,4 +216,4 @@ def test_the_error_in_the_reference_is_what_labseq_says(
     Path("compact.yaml").write_text(example.text.replace("window", "winow"))
     with pytest.raises(labseq.ConfigError) as caught:
         labseq.Session.open("compact.yaml")
-    assert "\n".join(told(caught.value)) == shown.text.rstrip()
+    assert "\n".join(format_config_error(caught.value)) == shown.text.rstrip()
