@@ -39,7 +39,7 @@ from labseq.model.estimate import Estimate, mean
 from labseq.pictures.figures import Series
 from labseq.pictures.plans import on_grid
 from labseq.recording import Run, Shot
-from labseq.recording.reader import scan_points
+from labseq.recording.points import scan_points
 
 MeasureName = Literal["filling", "success"]
 

@@ -32,7 +32,7 @@ from labseq.pictures.figures import (
     tidy,
 )
 from labseq.recording import Run
-from labseq.recording.reader import ScanPoint, scan_points
+from labseq.recording.points import ScanPoint, scan_points
 from labseq.units import format_quantity
 
 if TYPE_CHECKING:

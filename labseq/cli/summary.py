@@ -13,7 +13,7 @@ from labseq.messages import clean
 from labseq.model.estimate import Estimate
 from labseq.plain import to_plain
 from labseq.recording import Run
-from labseq.recording.reader import scan_points
+from labseq.recording.points import scan_points
 from labseq.units import format_quantity
 
 MAX_ROWS: Final = 40

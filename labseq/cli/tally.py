@@ -12,7 +12,7 @@ from typing import Any, Final
 from labseq.console.events import best_text
 from labseq.model import ImageRecord, RunRecord, ShotRecord, StageTiming
 from labseq.model.estimate import Estimate, mean
-from labseq.recording.reader import SCANNER, ChosenPoints
+from labseq.recording.points import SCANNER, ChosenPoints
 
 STAGES: Final = ("expose", "read_out", "detect", "plan", "check", "prepare", "play", "move", "write")
 """The stages that are shown; a shot has others."""

@@ -1,4 +1,8 @@
-"""Markers of runs in progress: which process uses which profile's hardware, for which run."""
+"""Markers of runs in progress: which process uses which profile's hardware, for which run.
+
+They are in the folder ``.active`` of the data root, and in the user's state folder for runs with another
+data root, from before the devices are opened until they are safe again.
+"""
 
 from __future__ import annotations
 

@@ -1,9 +1,4 @@
-"""Folders of runs, and which run is in progress in which process.
-
-A marker belongs to a profile (its hardware) and to a process. It stands in the folder
-``.active`` of the data root, and in that of the user's state folder for runs whose data
-lie elsewhere, from before the devices are opened until they are safe again.
-"""
+"""A run's folder: the names of its files, making it, and finding it."""
 
 from __future__ import annotations
 
@@ -29,9 +24,9 @@ SHOTS_FOLDER: Final = "shots"
 RESULTS_FOLDER: Final = "analysis"
 """Results of analyses: a file of lines for each."""
 STOP_FILE: Final = "STOP"
-"""Stands in a run's folder while it is asked to end after the shot at hand."""
+"""There while the run is requested to end after the current shot."""
 LOCK_FILE: Final = ".lock"
-"""Locked by whoever goes on with a run."""
+"""Locked by the process that resumes or repairs the run."""
 OWN_NAMES: Final = frozenset(
     {RUN_FILE, STATE_FILE, INDEX_FILE, EVENTS_FILE, SEQUENCE_FILE, PROFILE_FILE, STOP_FILE}
     | {SKIPPED_FILE}
@@ -43,7 +38,7 @@ _MAX_SLUG: Final = 60
 
 
 def slug(name: str) -> str:
-    """A name that every file system takes.
+    """A name that every file system accepts.
 
     Example:
         >>> slug("20 x 20: to/from µ")
@@ -61,8 +56,8 @@ def shot_file_name(shot_index: int, attempt: int, *, counts: bool, take: int = 1
     Args:
         shot_index: Index of the shot, from 0.
         attempt: Which attempt it is, from 0.
-        counts: Whether the shot is done with it.
-        take: Counted up from 1 where a run was resumed and the file of an earlier take is kept.
+        counts: Whether the attempt completed the shot.
+        take: Counted up from 1 in a resumed run that keeps the file of an earlier take.
 
     Example:
         >>> shot_file_name(17, 1, counts=False)
@@ -79,8 +74,7 @@ def make_run_folder(root: Path, name: str, started: datetime) -> Path:
     """Make ``<root>/<local date>/<counter>_<slug>``; no two runs of a day share a counter.
 
     A counter is claimed by making the folder ``.<counter>.claim``, which succeeds
-    for one process only. Whoever comes later, when the claim is gone again, sees
-    the run's folder.
+    for one process only. When the claim is gone again, the run's folder is there.
 
     Raises:
         RecordingError: The place cannot be written to.
@@ -117,13 +111,13 @@ def _counters(day: Path, *, claims: bool = True) -> list[int]:
 
 
 def find_run(path: Path) -> Path:
-    """The run that a path belongs to.
+    """The folder of the run that a path belongs to.
 
     Args:
         path: A run's folder or any file or folder in it.
 
     Raises:
-        RecordingError: It is no part of a run; the text says what to give instead.
+        RecordingError: It is no part of a run; the message says what to give instead.
     """
     path = Path(path).expanduser().resolve()
     if not path.exists():

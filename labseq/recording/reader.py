@@ -3,90 +3,39 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Generator, Iterable, Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 from labseq.errors import RecordingError
 from labseq.files import read_lines
 from labseq.model import TargetPattern
 from labseq.model.estimate import mean
 from labseq.model.records import RunStatus
-from labseq.plain import dumps, parse_object, to_plain
+from labseq.plain import parse_object, to_plain
 from labseq.recording import folders
-from labseq.recording.folders import RUN_FILE
+from labseq.recording.points import SCANNER, completed
 from labseq.recording.results import rows_of
 from labseq.recording.run_file import is_index_row, is_skip_row, read_run, read_state, target_of
 from labseq.recording.shot import Shot, load_content
-from labseq.units import written
 
 if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
 
-SCANNER: Final = "scanner"
-"""Key of a scan's record that only an adaptive one has: the scanner and its settings."""
-
-
-class ChosenPoints:
-    """The points that were chosen, each once, in the order in which they were first taken.
-
-    Args:
-        scan: What run.json says of the scan.
-
-    Attributes:
-        points: The values of each point, SI.
-        written: The same in the units of the sequence.
-    """
-
-    def __init__(self, scan: Mapping[str, Any]) -> None:
-        self.points: list[list[Any]] = []
-        self.written: list[list[str]] = []
-        self._addresses = [str(address) for address in scan["addresses"]]
-        self._units = [str(unit) for unit in scan["units"]]
-        self._numbers: dict[str, int] = {}
-
-    def number(self, parameters: Mapping[str, Any]) -> int:
-        """The number of a shot's point, counted from 0.
-
-        Args:
-            parameters: Address -> value, as the shot's line of the index has it.
-        """
-        values = [parameters[address] for address in self._addresses]
-        number = self._numbers.setdefault(dumps(values), len(self.points))
-        if number == len(self.points):
-            self.points.append(values)
-            self.written.append([written(v, unit) for v, unit in zip(values, self._units, strict=True)])
-        return number
-
-
-def completed(scan: Mapping[str, Any], rows: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
-    """What run.json says of an adaptive scan, with the points as those of any other scan.
-
-    Args:
-        scan: What run.json says.
-        rows: The lines of the index, in any order; ``point_of_shot`` is -1 for a shot without one.
-    """
-    chosen = ChosenPoints(scan)
-    of_shot: dict[int, int] = {}
-    for row in sorted(rows, key=lambda row: (row["shot"], row["attempt"])):
-        of_shot[row["shot"]] = chosen.number(row["parameters"])
-    point_of_shot = [of_shot.get(shot, -1) for shot in range(max(of_shot, default=-1) + 1)]
-    return {**scan, "points": chosen.points, "written": chosen.written, "point_of_shot": point_of_shot}
-
 
 def open_run(path: str | Path) -> Run:
-    """Open a run, finished, still running, or killed.
+    """Open a run that is finished, still running, or was killed.
 
-    Reads the index only; a shot's file is read when something of it is asked for.
+    Only the index is read. A shot's file is read when one of its values is needed.
 
     Args:
         path: The run's folder or any file in it.
 
     Raises:
-        RecordingError: It is no run, is damaged, or is of a newer labseq.
+        RecordingError: It is no run, is damaged, or has another format.
     """
     try:
         path = Path(path)
@@ -97,8 +46,10 @@ def open_run(path: str | Path) -> Run:
     status, error = read_state(folder)
     rows, damaged = read_lines(folder / folders.INDEX_FILE)
     usable = [row for row in rows if is_index_row(row)]
-    load = lru_cache(maxsize=8)(load_content)  # looking at several values of a shot reads its file once
-    counted = {row["shot"]: row for row in usable if row["counts"]}  # a shot written again: the last one
+    load = lru_cache(maxsize=8)(load_content)  # several values of a shot read its file once
+    counted = {
+        row["shot"]: row for row in usable if row["counts"]
+    }  # of a shot that was written twice, the last
     return Run(
         path=folder,
         record=record,
@@ -125,8 +76,8 @@ class Run:
 
     Attributes:
         path: The run's folder.
-        record: What run.json says: settings, devices, versions, ...
-        status: "running", "complete", "stopped" or "failed"; so is one whose process is gone without a word.
+        record: The content of run.json: settings, devices, versions, ...
+        status: "running", "complete", "stopped" or "failed"; a run whose process is gone has failed.
         error: Why it did not complete, or "".
         shots: The shots that count, in order.
         attempts: Attempts at shots that failed or were interrupted, in the order they were made.
@@ -175,10 +126,10 @@ class Run:
     def scan(self) -> Mapping[str, Any]:
         """The scan: addresses, points and the point of each shot; empty without one.
 
-        Those of an adaptive scan are the points that have been chosen so far; worked out at each call.
+        For an adaptive scan, the points are those chosen so far; they are worked out at each call.
 
         Raises:
-            RecordingError: What run.json or the index say of it is damaged.
+            RecordingError: Its record in run.json or the index is damaged.
         """
         scan: Mapping[str, Any] = self.record.get("scan") or {}
         if SCANNER not in scan:
@@ -201,7 +152,7 @@ class Run:
 
     @property
     def events(self) -> tuple[dict[str, Any], ...]:
-        """The event log: dicts with ``t_utc``, ``event`` and ``values``; read anew each time.
+        """The event log: dicts with ``t_utc``, ``event`` and ``values``; read from the file each time.
 
         Raises:
             RecordingError: The file cannot be read.
@@ -209,9 +160,9 @@ class Run:
         return tuple(read_lines(self.path / folders.EVENTS_FILE)[0])
 
     def analysis(self, name: str) -> list[dict[str, Any]]:
-        """The results of an analysis: a row per shot, with "shot", its index, and what came of it.
+        """The results of an analysis: a row per shot, with its index as "shot" beside the results.
 
-        A row with "error" says why there is nothing else in it.
+        A row with "error" says why the shot has no result.
 
         Raises:
             RecordingError: There are no results of that name, or they cannot be read.
@@ -219,7 +170,7 @@ class Run:
         return rows_of(self.path, name)
 
     def summary(self) -> dict[str, Any]:
-        """The run in a few JSON-ready numbers; None where there is none."""
+        """The run in a few JSON-ready numbers; None for a missing one."""
         return {
             "run_dir": str(self.path),
             "shots": len(self.shots),
@@ -235,7 +186,7 @@ class Run:
         The columns: ``attempt``, ``status``, times, ``success``, ``filling_fraction``, counts of cycles,
         batches, atom moves and defects, ``duration_s``; what was scanned or set, by its address; ``stage.*``,
         how long each stage took; ``reading.*``, values read from devices; ``calibration.*``, ids. Numbers
-        are SI, and nan where there is none. ``attrs`` has ``units`` and ``descriptions`` by column,
+        are SI, and nan where they are missing. ``attrs`` has ``units`` and ``descriptions`` by column,
         and what is true of the whole run.
 
         Args:
@@ -268,52 +219,8 @@ class Run:
         return dataset_of(self, occupancies=occupancies)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ScanPoint:
-    """A point of a scan and its shots.
-
-    Attributes:
-        parameters: Scanned address -> value, SI.
-        written: The same as the sequence has it: "60 ms".
-        shots: The shots there that count, in order.
-    """
-
-    parameters: Mapping[str, Any]
-    written: Mapping[str, str]
-    shots: tuple[Shot, ...]
-
-
-def scan_points(run: Run) -> list[ScanPoint]:
-    """The points of a run's scan that have a shot, in the scan's own order; none without a scan.
-
-    Raises:
-        RecordingError: What run.json says of the scan is damaged.
-    """
-    scan: Mapping[str, Any] = run.scan
-    if not scan:
-        return []
-    shots: dict[int, list[Shot]] = {}
-    try:
-        for shot in run.shots:
-            shots.setdefault(int(scan["point_of_shot"][shot.index]), []).append(shot)
-        addresses = scan["addresses"]
-        return [
-            ScanPoint(
-                dict(zip(addresses, scan["points"][point], strict=True)),
-                dict(zip(addresses, scan["written"][point], strict=True)),
-                tuple(shots[point]),
-            )
-            for point in sorted(shots)
-        ]
-    except (KeyError, IndexError, TypeError, ValueError) as error:
-        reason = f"has a damaged scan: {error!r}; take it from a backup"
-        raise RecordingError(run.path / RUN_FILE, reason) from error
-
-
 class Follower:
-    """Gives each shot that counts once, when it is in the index of its run.
-
-    It keeps nothing but its place in the index.
+    """Follows the index of a run: gives each shot that counts once, when its line is there.
 
     Args:
         run_dir: The run's folder.
@@ -324,7 +231,7 @@ class Follower:
         self._offset = 0
 
     def new(self) -> Generator[Shot]:
-        """The shots since the last time, until there are no more for now.
+        """The shots that were added since the last call.
 
         Raises:
             RecordingError: The index cannot be read.

@@ -1,8 +1,8 @@
-"""What analyses made of a run's shots: in its folder, a file of lines for each analysis.
+"""Results of analyses: a file of JSON lines for each analysis, in the run's folder.
 
-A line with "shot" is the result of a shot; of several of the same shot the last one counts. Any
-other line says what made those that follow it: plugin, version, settings; where it has "anew", the lines
-before it do not count any more.
+A line with "shot" is the result of a shot; of several lines for the same shot the last one counts. Any
+other line says what made the results that follow it: plugin, version, settings. If "anew" in it is true,
+the lines before it no longer count.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ def results_file(run_dir: Path, name: str) -> Path:
 
 
 class ResultsLog:
-    """The file of an analysis, for writing: every line is on the disk before the next shot is looked at.
+    """The file of an analysis, for writing: each line is on the disk before the next shot is analysed.
 
     Args:
-        path: The file; its folder is made if there is none.
-        about: What makes the results; with "anew" true they are begun again.
+        path: The file; its folder is made if it does not exist.
+        about: What makes the results; if "anew" is true in it, earlier results no longer count.
 
     Raises:
         RecordingError: The file cannot be written.
@@ -46,10 +46,10 @@ class ResultsLog:
 
     @staticmethod
     def checked(result: object) -> Mapping[str, Any]:
-        """A result that can be written.
+        """Check that a result can be written.
 
         Raises:
-            TypeError: It is none.
+            TypeError: It is no mapping of names to values.
         """
         if not isinstance(result, Mapping):
             raise TypeError(f"the result is {type(result).__name__}; expected a mapping of names to values")
@@ -60,7 +60,7 @@ class ResultsLog:
         return values
 
     def write(self, shot: int, result: Mapping[str, Any]) -> None:
-        """Keep the result of a shot.
+        """Write the result of a shot.
 
         Raises:
             RecordingError: The disk is full.
@@ -68,7 +68,7 @@ class ResultsLog:
         self._log.append({SHOT: shot, **result}, sync=True)
 
     def fail(self, shot: int, error: BaseException) -> None:
-        """Keep why there is no result of a shot.
+        """Write why a shot has no result.
 
         Raises:
             RecordingError: The disk is full.
@@ -80,7 +80,7 @@ def read_results(path: Path) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     """Read the file of an analysis, whatever state it is in.
 
     Returns:
-        The row of each shot, in the order of the shots; and what made the last of them, {} if nobody said.
+        The row of each shot, in the order of the shots; and what made the last of them, {} if unknown.
 
     Raises:
         RecordingError: The file exists but cannot be read.
@@ -103,7 +103,7 @@ def done(rows: Iterable[Mapping[str, Any]]) -> set[int]:
 
 
 def rows_of(run_dir: Path, name: str) -> list[dict[str, Any]]:
-    """The row of each shot that an analysis has looked at.
+    """The row of each shot that was analysed.
 
     Raises:
         RecordingError: There are no results of that name, or they cannot be read.

@@ -1,4 +1,4 @@
-"""Writes a run's folder while the run goes on."""
+"""Writes a run's folder while the run is in progress."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ if TYPE_CHECKING:
 class RunWriter:
     """The folder of a run in progress; made by :meth:`create` or :meth:`reopen`, used by one process.
 
-    A shot is on the disk, whole, before its line is in the index. Whatever
-    happens, also a kill or a full disk, the shots in the index stay whole.
+    A shot is whole and on the disk before its line is in the index. Whatever
+    happens, be it a kill or a full disk, the shots in the index stay whole.
 
     Attributes:
         run_dir: The run's folder.
-        n_written: Shots written that count; failed attempts do not.
+        n_written: Shots written that count; failed attempts do not count.
         last_row: The line in the index of the attempt that was written last; empty before the first.
     """
 
@@ -49,7 +49,7 @@ class RunWriter:
         self._events = LineLog(run_dir / folders.EVENTS_FILE)
         self._events_lock = threading.Lock()
         self._n_events_lost = 0
-        self._before: dict[str, Any] | None = None  # run.json, if the run was begun by another process
+        self._before: dict[str, Any] | None = None  # run.json, if another process began the run
         self._kept: frozenset[str] = frozenset()
 
     @classmethod
@@ -61,9 +61,9 @@ class RunWriter:
         *,
         compress: bool = False,
     ) -> RunWriter:
-        """Make ``<root>/<local date>/<counter>_<name>/`` and put down what is known at the start.
+        """Make ``<root>/<local date>/<counter>_<name>/`` and write what is known at the start.
 
-        Safe against other processes that do the same at the same time.
+        Other processes may do the same at the same time.
 
         Args:
             root: Data root; made if it does not exist.
@@ -104,12 +104,12 @@ class RunWriter:
 
     @classmethod
     def reopen(cls, run_dir: Path, run: RunRecord, *, n_written: int, compress: bool = False) -> RunWriter:
-        """Go on with a run that ended before its last shot; nobody else may write to it.
+        """Resume a run that ended before its last shot; no other process may write to it.
 
         Args:
             run_dir: Its folder.
             run: What is known of it now, for the next shots' files; only its ``resumed`` goes into run.json.
-            n_written: Shots written before that count.
+            n_written: Shots that count and were written before.
             compress: Whether frames are compressed; needs ``labseq[compress]``.
 
         Raises:
@@ -126,7 +126,7 @@ class RunWriter:
         return writer
 
     def set_devices(self, devices: Mapping[str, Mapping[str, Any]]) -> None:
-        """Add what the devices say of themselves; before the first shot, once they are open.
+        """Add what the devices report about themselves; before the first shot, once they are open.
 
         Args:
             devices: Role or device name -> its ``describe()``.
@@ -138,7 +138,7 @@ class RunWriter:
         self._encoder = self._make_encoder()
         if self._before is None:
             write_file(self.run_dir / folders.RUN_FILE, encode_run(self._run, _run_id(self.run_dir)))
-        elif not self._before.get("devices"):  # it had not come so far
+        elif not self._before.get("devices"):  # it ended before its devices were open
             self._before["devices"] = devices
             write_file(self.run_dir / folders.RUN_FILE, dumps(self._before, indent=1).encode() + b"\n")
 
@@ -161,7 +161,7 @@ class RunWriter:
         file = self._free_name(shot, counts=counts)
         path = self.run_dir / file
         data = self._encoder.encode(shot)
-        with ThreadPoolExecutor(1) as beside:  # while the disk is waited for
+        with ThreadPoolExecutor(1) as beside:  # while the disk writes
             checksum = beside.submit(lambda: hashlib.sha256(data).hexdigest())
             write_file(path, data)
             sha256 = checksum.result()
@@ -172,11 +172,11 @@ class RunWriter:
         return path
 
     def skip(self, shots: Sequence[int], why: str) -> None:
-        """Put down that shots will not be taken, also if the run is resumed.
+        """Record that shots will not be taken, even if the run is resumed.
 
         Args:
             shots: Their indices.
-            why: What their point is skipped for.
+            why: Why their point is skipped.
 
         Raises:
             RecordingError: The disk is full.
@@ -188,7 +188,7 @@ class RunWriter:
             sync_folder(self.run_dir)  # it may be the first
 
     def _free_name(self, shot: ShotRecord, *, counts: bool) -> str:
-        """The name of a shot's file; none that the run had before it was resumed."""
+        """The name of a shot's file, different from those that the run had before it was resumed."""
         for take in itertools.count(1):
             file = folders.shot_file_name(shot.shot_index, shot.attempt, counts=counts, take=take)
             if Path(file).name not in self._kept:
@@ -198,7 +198,7 @@ class RunWriter:
     def event(self, name: str, /, **values: Any) -> None:
         """Add a line to the event log; never raises, from any thread.
 
-        A line that the disk does not take is lost; the next line counts the lost ones.
+        A line that cannot be written is lost; the next line says how many were.
         """
         line: dict[str, Any] = {
             "t_utc": datetime.now(UTC).isoformat(timespec="microseconds"),

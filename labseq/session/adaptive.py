@@ -16,7 +16,7 @@ from labseq.model import ScanRange, ScanSpace, VisitedPoint
 from labseq.plain import dumps
 from labseq.recording import Shot
 from labseq.recording.columns import figures_in
-from labseq.recording.reader import SCANNER
+from labseq.recording.points import SCANNER
 from labseq.roles import Scanner, Step
 from labseq.session.construct import construct_one
 from labseq.session.policies import check_figure, missing_figure

@@ -18,7 +18,7 @@ from labseq.model import RunRecord
 from labseq.plain import dumps
 from labseq.recording import Run, RunWriter, open_run
 from labseq.recording.folders import INDEX_FILE, LOCK_FILE, PROFILE_FILE, RUN_FILE, SEQUENCE_FILE, find_run
-from labseq.recording.reader import SCANNER
+from labseq.recording.points import SCANNER
 from labseq.recording.run_file import encode_run, read_owner, read_run, read_state
 from labseq.session.assembly import Assembly, assemble
 from labseq.session.options import Options

@@ -11,7 +11,7 @@ from labseq_climb.scanner import Climb
 import labseq
 from labseq.cli.check import check_sequence
 from labseq.cli.show import Tables, show_run
-from labseq.recording.reader import scan_points
+from labseq.recording.points import scan_points
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "how-to" / "climb.md"

@@ -13,7 +13,7 @@ import pytest
 from labseq.errors import RecordingError
 from labseq.model import RunRecord, ShotRecord
 from labseq.recording import RunWriter, open_run
-from labseq.recording.reader import scan_points
+from labseq.recording.points import scan_points
 
 SCAN: dict[str, Any] = {
     "addresses": ["shot.sort.window", "planner"],

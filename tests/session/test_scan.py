@@ -12,7 +12,7 @@ import pytest
 
 import labseq
 from labseq.errors import ConfigError
-from labseq.recording.reader import scan_points
+from labseq.recording.points import scan_points
 from labseq.session.check import check
 from labseq.session.lab import _reopened, rebuild_lab
 from labseq.testing.fakes import RecordingObserver

@@ -1,0 +1,108 @@
+"""The points of a scan, with the shots that were taken at each."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+from labseq.errors import RecordingError
+from labseq.plain import dumps
+from labseq.recording.folders import RUN_FILE
+from labseq.units import written
+
+if TYPE_CHECKING:
+    from labseq.recording.reader import Run
+    from labseq.recording.shot import Shot
+
+SCANNER: Final = "scanner"
+"""Key that only the record of an adaptive scan has: the scanner and its settings."""
+
+
+class ChosenPoints:
+    """The points that an adaptive scan has chosen, each once, in the order in which they were first taken.
+
+    Args:
+        scan: The scan's record in run.json.
+
+    Attributes:
+        points: The values of each point, SI.
+        written: The same in the units of the sequence.
+    """
+
+    def __init__(self, scan: Mapping[str, Any]) -> None:
+        self.points: list[list[Any]] = []
+        self.written: list[list[str]] = []
+        self._addresses = [str(address) for address in scan["addresses"]]
+        self._units = [str(unit) for unit in scan["units"]]
+        self._numbers: dict[str, int] = {}
+
+    def number(self, parameters: Mapping[str, Any]) -> int:
+        """The number of a shot's point, counted from 0.
+
+        Args:
+            parameters: Address -> value, as the shot's line of the index has it.
+        """
+        values = [parameters[address] for address in self._addresses]
+        number = self._numbers.setdefault(dumps(values), len(self.points))
+        if number == len(self.points):
+            self.points.append(values)
+            self.written.append([written(v, unit) for v, unit in zip(values, self._units, strict=True)])
+        return number
+
+
+def completed(scan: Mapping[str, Any], rows: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
+    """The record of an adaptive scan, completed with its points so that it reads like any other scan's.
+
+    Args:
+        scan: The scan's record in run.json.
+        rows: The lines of the index, in any order; ``point_of_shot`` is -1 for a shot without one.
+    """
+    chosen = ChosenPoints(scan)
+    of_shot: dict[int, int] = {}
+    for row in sorted(rows, key=lambda row: (row["shot"], row["attempt"])):
+        of_shot[row["shot"]] = chosen.number(row["parameters"])
+    point_of_shot = [of_shot.get(shot, -1) for shot in range(max(of_shot, default=-1) + 1)]
+    return {**scan, "points": chosen.points, "written": chosen.written, "point_of_shot": point_of_shot}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScanPoint:
+    """A point of a scan and its shots.
+
+    Attributes:
+        parameters: Scanned address -> value, SI.
+        written: The same as the sequence has it: "60 ms".
+        shots: The shots there that count, in order.
+    """
+
+    parameters: Mapping[str, Any]
+    written: Mapping[str, str]
+    shots: tuple[Shot, ...]
+
+
+def scan_points(run: Run) -> list[ScanPoint]:
+    """The points of a run's scan that have a shot, in the scan's own order; none without a scan.
+
+    Raises:
+        RecordingError: The scan's record in run.json is damaged.
+    """
+    scan: Mapping[str, Any] = run.scan
+    if not scan:
+        return []
+    shots: dict[int, list[Shot]] = {}
+    try:
+        for shot in run.shots:
+            shots.setdefault(int(scan["point_of_shot"][shot.index]), []).append(shot)
+        addresses = scan["addresses"]
+        return [
+            ScanPoint(
+                dict(zip(addresses, scan["points"][point], strict=True)),
+                dict(zip(addresses, scan["written"][point], strict=True)),
+                tuple(shots[point]),
+            )
+            for point in sorted(shots)
+        ]
+    except (KeyError, IndexError, TypeError, ValueError) as error:
+        reason = f"has a damaged scan: {error!r}; take it from a backup"
+        raise RecordingError(run.path / RUN_FILE, reason) from error
