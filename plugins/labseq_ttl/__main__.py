@@ -7,13 +7,12 @@ from argparse import ArgumentParser
 from collections.abc import Sequence
 
 from labseq.plugin import LabseqError, NeverStopped
-from labseq_ttl.box import Box
-from labseq_ttl.connection import MAX_WAIT_S
-from labseq_ttl.port import open_box
+from labseq_ttl.access import MAX_WAIT_S
+from labseq_ttl.box import Box, open_box
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Say what a box is; returns the exit code: 3 if there is none."""
+    """Print what a box is; returns the exit code: 3 if there is none."""
     parser = ArgumentParser(prog="python -m labseq_ttl", description="Look at a timing box.")
     parser.add_argument("port", help="its serial port, /dev/ttyACM0")
     parser.add_argument("--serial", type=int, help="give it this serial number, 0 to 65535", metavar="N")

@@ -1,15 +1,40 @@
-"""The commands of the box."""
+"""The box at its serial port: lines with checksums, its commands, and the errors that it reports."""
 
 from __future__ import annotations
 
+import threading
 import time
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Callable, Generator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, TypeVar
 
-from labseq.plugin import Clock, DeviceError, DeviceTimeoutError, Port, clean
-from labseq_ttl.conversation import TRIES, Conversation
-from labseq_ttl.protocol import NAME, PER_LINE, VERSION, Edge
+from labseq.plugin import (
+    BROKEN,
+    Clock,
+    DeviceError,
+    DeviceTimeoutError,
+    Port,
+    clean,
+    format_quantity,
+    open_port,
+    wait_for,
+)
+from labseq_ttl.protocol import NAME, PER_LINE, STOP, VERSION, Edge, framed, unframed
+
+T = TypeVar("T")
+
+BAUD_RATE: Final = 500_000
+WRITE_TIMEOUT_S: Final = 1.0
+TRIES: Final = 3
+"""How often a command is sent before the box counts as silent."""
+
+MAX_BYTES: Final = 4096
+SHOWN_BYTES: Final = 60
+_TAGS: Final = "0123456789abcdef"
+_REFUSED: Final = "? no damaged"
+_GARBLED: Final = "?"
 
 BOOT_S: Final = 3.0
 """How long a box may take to its first answer: an Arduino is reset when its port is opened."""
@@ -20,14 +45,200 @@ CAUSES: Final = {1: "power-up", 2: "reset input", 4: "supply voltage too low", 8
 """Bits of the processor's register MCUSR."""
 
 
+def open_box(name: str, device: str) -> Port:
+    """Open the serial port of a box exclusively.
+
+    Args:
+        name: Name of the port, as in the profile.
+        device: Name of the box, for messages.
+
+    Raises:
+        DeviceError: There is no such port, or another program has it open.
+    """
+    return open_port(name, device, BAUD_RATE, write_timeout=WRITE_TIMEOUT_S)
+
+
+class Conversation:
+    """Commands to the box and its answers, one after the other.
+
+    Every line carries a tag, which the answer repeats, so that a late answer is not taken for that of
+    another command. A damaged line is sent again, on either side. The box also sends messages without
+    being asked, such as the end of a program.
+
+    Args:
+        port: The port, open.
+        device: Name of the box, for messages.
+        clock: The session's clock.
+        max_wait_s: How long an answer may take, in seconds.
+    """
+
+    def __init__(self, port: Port, device: str, clock: Clock, max_wait_s: float) -> None:
+        self.lock = threading.RLock()
+        self._port = port
+        self._device = device
+        self._clock = clock
+        self._max_wait_s = max_wait_s
+        self._aborted = False
+        self._n_asked = 0
+        self._came = bytearray()
+        self._noise = b""
+        self._answers: deque[str] = deque(maxlen=len(_TAGS))
+        self._news: deque[list[str]] = deque(maxlen=64)
+
+    def ask(
+        self, question: str, *, again: bool = True, max_wait_s: float | None = None, tries: int = TRIES
+    ) -> list[str]:
+        """Send a command and wait for the answer.
+
+        Args:
+            question: The command and its arguments.
+            again: Whether it may be sent again if no answer comes.
+            max_wait_s: How long an answer may take, in seconds; None: the usual time.
+            tries: How often it is sent at most.
+
+        Returns:
+            The words after "ok".
+
+        Raises:
+            DeviceTimeoutError: No answer.
+            DeviceError: The box refuses, or the line is broken.
+            StopRequested: The operator asked the run to stop.
+        """
+        max_wait_s = self._max_wait_s if max_wait_s is None else max_wait_s
+        with self.lock:
+            self._n_asked += 1
+            tag = _TAGS[self._n_asked % len(_TAGS)]
+            self._answers.clear()
+            for _ in range(tries):
+                self.send(framed(f"{tag} {question}"))
+                answer = self._wait(lambda: self._answer(tag, again), max_wait_s)
+                if answer is None and not again:
+                    break
+                if answer in (None, _REFUSED, _GARBLED):
+                    continue
+                word, *rest = answer.split()[1:]
+                if word == "ok":
+                    return rest
+                raise DeviceError(
+                    self._device, f"the box refuses '{question}': {' '.join(rest)}; see its PROTOCOL.md"
+                )
+        raise DeviceTimeoutError(self._device, self._silence_text(question, max_wait_s), max_wait_s)
+
+    def new_events(self, timeout_s: float = 0.0) -> list[str] | None:
+        """Wait for a message of the box that is no answer; returns its words, or None if none came.
+
+        Raises:
+            DeviceError: The line is broken.
+            StopRequested: The operator asked the run to stop.
+        """
+        return self._wait(lambda: self._news.popleft() if self._news else None, timeout_s)
+
+    def drop_messages(self) -> None:
+        """Drop the messages that came until now."""
+        with self.lock:
+            self._pump(wait=False)
+            self._news.clear()
+
+    def stop(self) -> None:
+        """Turn all lines off, whatever the box is doing, and end the waits of other threads.
+
+        Raises:
+            DeviceError: The box does not confirm it.
+        """
+        self._aborted = True
+        try:
+            self.send(STOP)
+            with self.lock:
+                self._aborted = False
+                self.ask("off", tries=1)
+        finally:
+            self._aborted = False
+
+    def close(self) -> None:
+        """Close the port; legal in any state."""
+        with suppress(*BROKEN):
+            self._port.close()
+
+    def send(self, data: bytes) -> None:
+        """Send bytes as they are.
+
+        Raises:
+            DeviceError: The line is broken.
+        """
+        with self._unbroken():
+            self._port.write(data)
+
+    def _wait(self, look: Callable[[], T | None], timeout_s: float) -> T | None:
+        def poll(slice_s: float) -> T | None:
+            with self.lock:
+                found = look()
+                if found is None:
+                    self._pump(wait=slice_s > 0)
+                    found = look()
+            if found is None and self._aborted:
+                raise DeviceError(self._device, "aborted by the safe state")
+            return found
+
+        return wait_for(poll, timeout_s, self._clock)
+
+    def _answer(self, tag: str, again: bool) -> str | None:
+        while self._answers:
+            answer = self._answers.popleft()
+            if answer == _REFUSED or (again and answer == _GARBLED):
+                return answer
+            if answer[:2] == f"{tag} " and len(answer.split()) > 1:
+                return answer
+        return None
+
+    def _pump(self, *, wait: bool) -> None:
+        """Read and sort the lines that came; with ``wait``, wait a little if nothing has."""
+        with self._unbroken():
+            n_bytes = self._port.in_waiting
+            came = self._port.read(min(max(1, n_bytes), MAX_BYTES)) if n_bytes or wait else b""
+        *lines, rest = (bytes(self._came) + came).split(b"\n")
+        self._came = bytearray(rest[-MAX_BYTES:])
+        for line in lines:
+            said = unframed(line.removesuffix(b"\r"))
+            if said is None:
+                self._noise = line
+                self._answers.append(_GARBLED)
+            elif said.startswith("!"):
+                self._news.append(said[1:].split())
+                if said.startswith("!boot"):  # it has lost the command
+                    self._answers.append(_GARBLED)
+            else:
+                self._answers.append(said)
+
+    def _silence_text(self, question: str, max_wait_s: float) -> str:
+        waited = format_quantity(max_wait_s, "time")
+        noise = self._noise or bytes(self._came)
+        if not noise:
+            what = f"no answer to '{question}' within {waited}"
+            return f"{what}; is this the box's port, and does the box have labseq's firmware?"
+        shown = clean(noise[:SHOWN_BYTES].decode("ascii", "backslashreplace"))
+        what = f"no answer to '{question}' within {waited} but '{shown}'"
+        return f"{what}; expected a line that ends in its checksum; is this the box's port?"
+
+    @contextmanager
+    def _unbroken(self) -> Generator[None]:
+        """Turn errors of the port into errors of the device."""
+        try:
+            yield
+        except BROKEN as error:
+            if isinstance(error, DeviceError):  # a timeout of ours is an OSError too
+                raise
+            reason = " ".join(str(error).split())
+            raise DeviceError(self._device, f"the line to the box broke ({reason}); unplugged?") from error
+
+
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """What the box says of itself.
+    """What the box reports about itself.
 
     Attributes:
-        serial_number: As it was given to it.
+        serial_number: The number that it was given.
         boots: How often it has started in its life, modulo 65536.
-        cause: Why it started last, in words.
+        cause: Why it started last.
     """
 
     serial_number: int
@@ -68,14 +279,14 @@ class Box:
     def __init__(self, port: Port, device: str, clock: Clock, max_wait_s: float) -> None:
         self.line = Conversation(port, device, clock, max_wait_s)
         self._device = device
-        self._patience_s = max_wait_s
+        self._max_wait_s = max_wait_s
 
     def identify(self) -> Identity:
-        """Wait until the box answers, and see that it is one.
+        """Wait until the box answers, and check that it is one.
 
         Raises:
             DeviceTimeoutError: Nothing answers.
-            DeviceError: It is something else, or its firmware speaks another language.
+            DeviceError: It is something else, or its firmware has another version of the protocol.
         """
         words = self._first_answer()
         if len(words) < 2 or words[0] != NAME:
@@ -83,25 +294,25 @@ class Box:
             raise DeviceError(self._device, text)
         (version,) = self._numbers(words[1:2], 1)
         if version != VERSION:
-            text = f"the box's firmware speaks version {version} of the protocol; expected {VERSION}"
+            text = f"the box's firmware has version {version} of the protocol; expected {VERSION}"
             raise DeviceError(self._device, f"{text}; flash it again, see docs/how-to/timing-box.md")
         serial_number, boots, cause = self._numbers(words[2:], 3)
         return Identity(serial_number, boots, cause_text(cause))
 
     def state(self, tries: int = TRIES) -> BoxState:
-        """What it is doing; no answer while a program runs."""
+        """Read what it is doing; it does not answer while a program runs."""
         return BoxState(*self._numbers(self.line.ask("state", tries=tries)[1:], 4))
 
     def set_polarity(self, mask: int) -> None:
-        """Keep for good which outputs are low when they are on."""
+        """Store permanently which outputs are low when they are on."""
         self.line.ask(f"polarity {mask:x}")
 
     def set_serial_number(self, number: int) -> None:
-        """Keep a serial number for good."""
+        """Store a serial number permanently."""
         self.line.ask(f"serial {number:x}")
 
     def set_watchdog_timeout(self, timeout_s: float) -> None:
-        """Turn all lines off if nothing is heard for so long; 0: never."""
+        """Turn all lines off if nothing is received for this long; 0: never."""
         self.line.ask(f"timeout {round(timeout_s * 1e3):x}")
 
     def set_lines(self, mask: int) -> None:
@@ -120,7 +331,7 @@ class Box:
         return ticks, mask
 
     def arm(self, slot: int, n_edges: int) -> int:
-        """Get a program ready.
+        """Prepare a program.
 
         Returns:
             How often the box has started.
@@ -129,18 +340,18 @@ class Box:
         return boots
 
     def fire(self, *, external: bool = False) -> None:
-        """Play it now, or at the next edge of the start input; never sent twice."""
+        """Play the program now, or at the next edge of the start input; the command is never repeated."""
         self.line.ask("await" if external else "fire", again=False)
 
     def ask_numbers(self, question: str, n: int) -> list[int]:
-        """Ask for so many numbers."""
+        """Send a command that is answered with ``n`` numbers."""
         return self._numbers(self.line.ask(question), n)
 
     def _first_answer(self) -> list[str]:
-        deadline_s = time.monotonic() + max(BOOT_S, self._patience_s)
-        try_s = max(BOOT_TRY_S, self._patience_s / 2)
+        deadline_s = time.monotonic() + max(BOOT_S, self._max_wait_s)
+        try_s = max(BOOT_TRY_S, self._max_wait_s / 2)
         while True:
-            self.line.send(b"\n")  # ends what others may have left unfinished
+            self.line.send(b"\n")  # ends an unfinished line of another program
             try:
                 return self.line.ask("id", max_wait_s=try_s, tries=1)
             except DeviceTimeoutError:
@@ -166,3 +377,29 @@ def cause_text(bits: int) -> str:
         ('watchdog', 'unknown')
     """
     return ", ".join(text for bit, text in CAUSES.items() if bits & bit) or "unknown"
+
+
+def reset_error(device: str, cause: int) -> DeviceError:
+    """The box was reset in the middle of its work."""
+    text = f"the box was reset (reason: {cause_text(cause)}) and turned all lines off"
+    return DeviceError(device, f"{text}; check its supply and cable")
+
+
+def turned_off_error(device: str) -> DeviceError:
+    """The box received a stop that this driver did not send."""
+    text = "the box was told to turn all lines off, but not by this driver"
+    return DeviceError(device, f"{text}; does another program use it?")
+
+
+def watchdog_error(device: str, timeout_s: float) -> DeviceError:
+    """The box received nothing from this computer for too long."""
+    text = f"the box heard nothing for {format_quantity(timeout_s, 'time')} and turned all lines off"
+    return DeviceError(device, f"{text}; is this computer too busy? raise 'watchdog_timeout'")
+
+
+def late_error(device: str, timeout_s: float, *, is_external: bool = False) -> DeviceTimeoutError:
+    """A program has not ended in time."""
+    text = f"the lines' program is not over after {format_quantity(timeout_s, 'time')}"
+    if is_external:
+        text += "; did the edge at the start input come?"
+    return DeviceTimeoutError(device, text, timeout_s)

@@ -1,9 +1,11 @@
-"""The driver."""
+"""The driver of the timing box."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+import threading
+import time
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from typing import Any, Final, NoReturn
 
@@ -15,44 +17,61 @@ from labseq.plugin import (
     LineProgram,
     Lines,
     LinesFacts,
+    format_quantity,
     idle_program,
     off_program,
     one_of,
 )
-from labseq_ttl import faults
-from labseq_ttl.box import Box
-from labseq_ttl.connection import SIMULATED_MAX_WAIT_S, Connection
-from labseq_ttl.counterpart import warm_simulator
-from labseq_ttl.programs import MAX_EDGES, as_played, edges_of, mask_of
-from labseq_ttl.protocol import CHANNELS, SHORTEST_S, TICK_S, VERSION
-from labseq_ttl.self_test import check_box
+from labseq_ttl.access import choose_box
+from labseq_ttl.box import Box, Identity, late_error, reset_error, turned_off_error, watchdog_error
+from labseq_ttl.programs import MAX_EDGES, Slots, edges_of, mask_of
+from labseq_ttl.protocol import (
+    CHANNELS,
+    EDGES,
+    LONGEST,
+    OUTPUTS,
+    SHORTEST,
+    SHORTEST_S,
+    TICK_S,
+    VERSION,
+    Edge,
+)
 from labseq_ttl.settings import TtlSettings
-from labseq_ttl.slots import Slots
 
 LATENCY_S: Final = 0.4e-3
 """From the end of ``fire`` on the line to the first edge, without the computer's own delays."""
 
-ROUNDING_S: Final = 1e-9
+BEATS_PER_TIMEOUT: Final = 4
+"""How often the box receives something within its watchdog timeout."""
+TEST_TICKS: Final = 200_000
+TEST_WAIT_S: Final = 15.0
+TOO_FAST: Final = 0.95
+"""A self test that takes less than this part of its time fails. More is the computer's delay."""
 
 
 class TtlLines(Lines):
     """A timing box with labseq's firmware.
 
     Args:
-        settings: Port, start, who simulates it.
-        context: Lines, clock and, for a simulated box, the world that feels the lines.
+        settings: Port, start, the kind of a simulated box.
+        context: Lines, clock and simulation.
+
+    Attributes:
+        access: How the driver gets to the box.
     """
 
     def __init__(self, settings: TtlSettings, context: Context) -> None:
         self._settings = settings
         self._name = context.name or "lines"
         self._clock = context.clock
-        self._world = context.simulation
         self._specs = context.lines
         self._names = tuple(spec.name for spec in self._specs)
         self._polarity = mask_of([spec.active_low for spec in self._specs], self._specs)
         self._polarity |= 0 if settings.go is None else settings.go.polarity
-        self._connection: Connection | None = None
+        self.access = choose_box(settings, context, self._polarity)
+        self._box: Box | None = None
+        self._identity = Identity(0, 0, "")
+        self._heartbeat: Heartbeat | None = None
         self._slots = Slots()
         self._n_boots = self._n_runs = 0
         self._was_lost = False
@@ -64,35 +83,34 @@ class TtlLines(Lines):
         return LinesFacts(CHANNELS, TICK_S, SHORTEST_S, MAX_EDGES, LATENCY_S)
 
     def warm(self) -> None:
-        """Compile what runs the firmware of a simulated box, if that is what simulates it.
+        """Do what takes long before the first shot.
 
         Raises:
-            DeviceError: It cannot be compiled.
+            DeviceError: It failed.
         """
-        if self._settings.is_simulated:
-            warm_simulator(self._settings.simulated_by, self._name)
+        self.access.warm()
 
     def open(self) -> None:
         """Connect to the box; the lines are idle. No effect if it is open.
 
         Raises:
             ConfigError: A line is on a channel that the box does not have.
-            DeviceError: It does not answer, or is another than the profile says.
+            DeviceError: It does not answer, or is not the one that the profile names.
         """
-        if self._connection is not None:
+        if self._box is not None:
             return
         for spec in self._specs:
             if spec.channel not in CHANNELS:
                 text = f"{self._name}: the box has no channel {spec.channel} for '{spec.name}'"
                 raise ConfigError(f"{text}; expected {one_of(tuple(map(str, CHANNELS)))}")
         idle = idle_program(self._specs)
-        box = self._connect()
+        self._connect()
         try:
-            box.set_lines(mask_of(idle.on[-1].tolist(), self._specs))
+            self._opened().set_lines(mask_of(idle.on[-1].tolist(), self._specs))
         except BaseException:
             self._disconnect()
             raise
-        self._apply_lines(idle)
+        self.access.lines_set(idle)
 
     def close(self) -> None:
         """Turn all lines off and disconnect; legal in any state."""
@@ -102,32 +120,32 @@ class TtlLines(Lines):
             self._disconnect()
 
     def safe_state(self) -> None:
-        """Turn all lines off, whatever the box is doing; it is tried once more on a new connection.
+        """Turn all lines off, whatever the box is doing; if that fails, once more on a new connection.
 
         Raises:
             DeviceError: The box does not confirm it.
         """
         self._forget()
-        if self._connection is None:
+        if self._box is None:
             return
         try:
-            self._connection.box.line.stop()
-            self._connection.box.line.drop_messages()
+            self._box.line.stop()
+            self._box.line.drop_messages()
         except DeviceError:
             self._was_lost = True
         if self._was_lost:
             self._disconnect()
-            self._connect()  # which turns all off
-        self._apply_lines(off_program(self._specs))
+            self._connect()  # which turns all lines off
+        self.access.lines_set(off_program(self._specs))
 
     def compile(self, program: LineProgram) -> None:
-        """Take a program for the next firing; one that the box knows already is not sent again.
+        """Take a program for the next firing; one that the box stores already is not sent again.
 
         Raises:
-            LimitError: More edges, or nearer to one another, than the box can make.
-            DeviceError: Not open, a program runs, or lines that nobody declared.
+            LimitError: More edges, or closer together, than the box can make.
+            DeviceError: Not open, a program runs, or lines that the profile does not have.
         """
-        connection = self._opened()
+        box = self._opened()
         if program.lines != self._names:
             text = f"a program has the lines {program.lines}; expected {self._names}"
             raise DeviceError(self._name, text)
@@ -136,22 +154,22 @@ class TtlLines(Lines):
         slot = self._slots.find(edges)
         if slot is None:
             slot = self._slots.free()
-            connection.box.put(slot, edges)
+            box.put(slot, edges)
             self._slots.keep(edges, slot)
         self._compiled, self._is_armed = (program, slot, len(edges)), False
 
     def arm(self) -> None:
-        """Get ready to fire what was compiled last.
+        """Prepare the program that was compiled last.
 
         Raises:
             DeviceError: Not open, nothing was compiled, a program runs, or the box was reset.
         """
-        connection = self._opened()
+        box = self._opened()
         self._refuse_while_running("armed")
         if self._compiled is None:
             raise DeviceError(self._name, "armed, but nothing was compiled; call compile() first")
         _, slot, n_edges = self._compiled
-        boots = connection.box.arm(slot, n_edges)
+        boots = box.arm(slot, n_edges)
         if boots != self._n_boots:
             self._was_reset(boots)
         self._is_armed = True
@@ -162,18 +180,15 @@ class TtlLines(Lines):
         Raises:
             DeviceError: Not armed, or a program runs.
         """
-        connection = self._opened()
+        box = self._opened()
         if not self._is_armed or self._compiled is None:
             raise DeviceError(self._name, "fired, but not armed; call arm() before each fire()")
         self._refuse_while_running("fired")
         program = self._compiled[0]
         self._is_armed, self._is_running = False, True
-        connection.box.fire(external=self._settings.start == "external")
-        now_s = self._clock.now()
-        self._over_s = now_s + program.duration_s
-        if connection.counterpart is not None:
-            edges = connection.counterpart.played(self._polarity)
-            self._apply_lines(as_played(edges, program, self._specs))
+        box.fire(external=self._settings.start == "external")
+        self._end_s = self._clock.now() + program.duration_s
+        self.access.fired(program)
 
     def wait(self, timeout_s: float) -> None:
         """Wait for the end of the program.
@@ -182,15 +197,10 @@ class TtlLines(Lines):
             DeviceTimeoutError: It did not end within ``timeout_s``.
             DeviceError: The box was reset or stopped, or the line is broken.
         """
-        connection = self._opened()
-        if connection.counterpart is not None:  # it plays a program at once: here its time passes
-            left_s = self._over_s - self._clock.now()
-            self._clock.sleep(max(0.0, min(left_s, timeout_s)))
-            if left_s > timeout_s + ROUNDING_S:
-                raise self._too_late(timeout_s)
-            timeout_s = SIMULATED_MAX_WAIT_S
+        box = self._opened()
+        max_wait_s = self.access.wait_until(self._end_s, timeout_s)
         if self._is_running:
-            self._wait_for_box(connection.box, timeout_s)
+            self._wait_for_box(box, max_wait_s)
 
     def self_test(self) -> None:
         """Write a program, read it back, and play one that changes no line.
@@ -198,80 +208,120 @@ class TtlLines(Lines):
         Raises:
             DeviceError: Not open, a program runs, or the box does something else.
         """
-        connection = self._opened()
+        box, slot = self._opened(), self._slots.free()
         self._refuse_while_running("tested")
         self._compiled, self._is_armed = None, False
-        check_box(connection, self._slots.free(), self._name, self._polarity)
-        self._n_runs = connection.box.state().runs
+        written = bit_pattern()
+        box.put(slot, written)
+        for i, edge in enumerate(written):
+            if (read := box.get(slot, i)) != edge:
+                raise DeviceError(self._name, f"edge {i} in slot {slot} reads {read}; expected {edge}")
+        on = box.state().on
+        box.put(slot, ((0, on), (TEST_TICKS, on)))
+        box.arm(slot, 2)
+        started_s, expected_s = time.monotonic(), TEST_TICKS * TICK_S
+        box.fire()
+        self.access.fired(None)
+        event = box.line.new_events(TEST_WAIT_S)
+        took_s = time.monotonic() - started_s
+        if event is None or event[0] != "done":
+            sent = "nothing" if event is None else " ".join(event)
+            raise DeviceError(self._name, f"at the end of a program the box sends '{sent}'; expected 'done'")
+        if self.access.real_time and took_s < TOO_FAST * expected_s:
+            text = (
+                f"the box played {format_quantity(expected_s, 'time')} in {format_quantity(took_s, 'time')}"
+            )
+            raise DeviceError(self._name, f"{text}; does its processor run at 16 MHz?")
+        self._n_runs = box.state().runs
 
     def describe(self) -> Mapping[str, Any]:
-        """Firmware, serial number, starts, lines, settings in force."""
-        told: dict[str, Any] = {"model": "labseq timing box", **self._settings.model_dump(mode="json")}
-        if self._connection is not None:
-            identity = self._connection.identity
-            told |= {"firmware": f"protocol {VERSION}", "serial_number": identity.serial_number}
-            told |= {"n_boots": self._n_boots, "started_by": identity.cause}
-        return {**told, "lines": {spec.name: spec.channel for spec in self._specs}}
+        """Firmware, serial number, starts, lines, settings."""
+        facts: dict[str, Any] = {"model": "labseq timing box", **self._settings.model_dump(mode="json")}
+        if self._box is not None:
+            facts |= {"firmware": f"protocol {VERSION}", "serial_number": self._identity.serial_number}
+            facts |= {"n_boots": self._n_boots, "started_by": self._identity.cause}
+        return {**facts, "lines": {spec.name: spec.channel for spec in self._specs}}
 
-    def _connect(self) -> Box:
-        """A box with all lines off."""
+    def _connect(self) -> None:
+        """Open the port, check the box, turn all lines off, and set what stays the same."""
         self._forget()
-        connection = Connection(self._settings, self._polarity, self._name, self._clock)
         self._slots.clear()
-        self._n_boots, self._n_runs = connection.identity.boots, connection.n_runs
-        self._connection, self._was_lost = connection, False
-        return connection.box
+        try:
+            self._box = box = Box(self.access.connect(), self._name, self._clock, self.access.max_wait_s)
+            self._identity = box.identify()
+            self._check_serial_number(self._identity.serial_number)
+            box.line.drop_messages()
+            box.line.ask("off")
+            state = box.state()
+            if state.polarity != self._polarity:
+                box.set_polarity(self._polarity)
+            self._start_watchdog(box)
+        except BaseException:
+            self._disconnect()
+            raise
+        self._n_boots, self._n_runs, self._was_lost = self._identity.boots, state.runs, False
+
+    def _check_serial_number(self, found: int) -> None:
+        expected = self._settings.serial_number
+        if self.access.real_time and expected is not None and expected != found:
+            text = f"the box at {self._settings.port} has the serial number {found}; expected {expected}"
+            raise DeviceError(self._name, f"{text}; is this the right port?")
+
+    def _start_watchdog(self, box: Box) -> None:
+        timeout_s = self._settings.watchdog_timeout if self.access.real_time else 0.0
+        box.set_watchdog_timeout(timeout_s)
+        if timeout_s:
+            self._heartbeat = Heartbeat(
+                lambda: box.line.send(b"\n"), timeout_s
+            )  # the box ignores empty lines
+            self._heartbeat.start()
 
     def _disconnect(self) -> None:
-        connection, self._connection = self._connection, None
-        if connection is not None:
-            connection.close()
+        heartbeat, self._heartbeat = self._heartbeat, None
+        if heartbeat is not None:
+            heartbeat.stop()
+        box, self._box = self._box, None
+        if box is not None:
+            box.line.close()
+        self.access.disconnect()
 
     def _forget(self) -> None:
         self._compiled: tuple[LineProgram, int, int] | None = None
         self._is_armed = self._is_running = False
-        self._over_s = -math.inf
+        self._end_s = -math.inf
 
-    def _opened(self) -> Connection:
-        if self._connection is None:
+    def _opened(self) -> Box:
+        if self._box is None:
             raise DeviceError(self._name, "not open; call open() first")
-        return self._connection
-
-    def _apply_lines(self, program: LineProgram) -> None:
-        """Let the simulated world feel the lines of a simulated box."""
-        simulated = self._connection is not None and self._connection.counterpart is not None
-        if simulated and self._world is not None:
-            self._world.play("lines", program, self._clock.now())
+        return self._box
 
     def _refuse_while_running(self, what: str) -> None:
-        while (new_events := self._opened().box.line.new_events()) is not None:
-            self._hear(new_events)
-        if self._is_running or self._clock.now() < self._over_s - ROUNDING_S:
+        while (event := self._opened().line.new_events()) is not None:
+            self._handle(event)
+        if self._is_running or not self.access.is_over(self._end_s):
             raise DeviceError(self._name, f"{what} while a program runs; call wait() first")
 
     def _wait_for_box(self, box: Box, timeout_s: float) -> None:
-        new_events = box.line.new_events(timeout_s)
-        while new_events is not None:
-            self._hear(new_events)
+        while (event := box.line.new_events(timeout_s)) is not None:
+            self._handle(event)
             if not self._is_running:
                 return
-            new_events = box.line.new_events(timeout_s)
-        with suppress(DeviceTimeoutError):  # perhaps it has said so, and nobody understood it
+        with suppress(DeviceTimeoutError):  # perhaps the message of the end was damaged
             state = box.state(tries=1)
             if state.boots != self._n_boots:
                 self._was_reset(state.boots)
             if state.runs == (self._n_runs + 1) & 0xFFFF:
                 self._has_ended(state.runs)
                 return
-        raise self._too_late(timeout_s)
+        raise late_error(self._name, timeout_s, is_external=self._settings.start == "external")
 
-    def _hear(self, new_events: list[str]) -> None:
-        """What the box says unasked.
+    def _handle(self, event: list[str]) -> None:
+        """Act on a message that the box sent without being asked.
 
         Raises:
             DeviceError: It turned all lines off.
         """
-        what, *words = new_events
+        what, *words = event
         numbers = [int(word, 16) for word in words]
         if what == "done":
             self._has_ended(numbers[-1])
@@ -279,22 +329,49 @@ class TtlLines(Lines):
             self._was_reset(*numbers)
         elif what == "off":
             self._forget()
-            raise faults.turned_off_error(self._name)
+            raise turned_off_error(self._name)
         elif what == "alone":
             self._forget()
-            raise faults.watchdog_error(self._name, self._settings.watchdog_timeout)
+            raise watchdog_error(self._name, self._settings.watchdog_timeout)
 
     def _has_ended(self, n_runs: int) -> None:
         self._is_running, self._n_runs = False, n_runs
-        if self._opened().counterpart is None:
-            self._over_s = -math.inf
 
     def _was_reset(self, n_boots: int, cause: int = 0) -> NoReturn:
         self._forget()
         self._slots.clear()
         self._n_boots, self._n_runs, self._was_lost = n_boots, 0, True
-        raise faults.reset_error(self._name, cause)
+        raise reset_error(self._name, cause)
 
-    def _too_late(self, timeout_s: float) -> DeviceTimeoutError:
-        is_external = self._settings.start == "external"
-        return faults.is_too_late(self._name, timeout_s, is_external=is_external)
+
+class Heartbeat(threading.Thread):
+    """Sends something to a box regularly, so that its watchdog does not turn all lines off.
+
+    Args:
+        beat: Sends it; it may fail, for the driver's next command finds out why.
+        timeout_s: The box's watchdog timeout.
+    """
+
+    def __init__(self, beat: Callable[[], object], timeout_s: float) -> None:
+        super().__init__(name="labseq ttl heartbeat", daemon=True)
+        self._beat = beat
+        self._period_s = timeout_s / BEATS_PER_TIMEOUT
+        self._stopped = threading.Event()
+
+    def run(self) -> None:
+        """Run until it is stopped."""
+        while not self._stopped.wait(self._period_s):
+            with suppress(DeviceError):
+                self._beat()
+
+    def stop(self) -> None:
+        """Stop; returns when the thread has ended."""
+        self._stopped.set()
+        self.join()
+
+
+def bit_pattern() -> tuple[Edge, ...]:
+    """A program in which every bit is once 0 and once 1."""
+    first = (0, OUTPUTS & 0x5555)
+    others = [(LONGEST ^ i, OUTPUTS & 0xAAAA) if i % 2 else (SHORTEST + i, OUTPUTS) for i in range(1, EDGES)]
+    return first, *others

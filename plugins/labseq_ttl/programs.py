@@ -1,31 +1,32 @@
-"""From a line program to the edges of the box, and back from what it played."""
+"""Line programs as the edges of the box, and which programs the box stores."""
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
 
 from labseq.plugin import LimitError, LineProgram, LineSpec, format_quantity
-from labseq_ttl.protocol import EDGES, LONGEST, SHORTEST, TICK_S, Edge
+from labseq_ttl.protocol import EDGES, LONGEST, SHORTEST, SLOTS, TICK_S, Edge
 
 MAX_EDGES: Final = EDGES - 1
 """Edges of a program; one more marks its end."""
 
 
 def edges_of(program: LineProgram, specs: Sequence[LineSpec], device: str) -> tuple[Edge, ...]:
-    """What the box is told of a program.
+    """The edges of a program.
 
-    An edge without a change marks its end, so that the box itself says when all is over.
+    An edge without a change marks its end, so that the box itself reports when it is over.
 
     Args:
-        program: What the lines shall do.
+        program: The program.
         specs: The lines, in the program's order.
         device: Name of the box, for messages.
 
     Raises:
-        LimitError: More edges, or nearer to one another, than the box can make.
+        LimitError: More edges, or closer together, than the box can make.
     """
     what = f"{device}: `{program.kind}`"
     if len(program.t_s) > MAX_EDGES:
@@ -47,14 +48,14 @@ def edges_of(program: LineProgram, specs: Sequence[LineSpec], device: str) -> tu
 
 
 def as_played(edges: Sequence[Edge], program: LineProgram, specs: Sequence[LineSpec]) -> LineProgram:
-    """What the lines did, as a program; edges at which nothing changed are left out.
+    """The played edges as a program; edges at which nothing changed are left out.
 
     Args:
         edges: Ticks since the first edge, and what was on from then on.
-        program: What they should have done.
+        program: The program that was fired.
         specs: The lines, in the program's order.
     """
-    ours = sum(1 << spec.channel for spec in specs)  # others may be a leader's
+    ours = sum(1 << spec.channel for spec in specs)  # other outputs may belong to a leader
     edges = [(tick, mask & ours) for tick, mask in edges]
     changes = [edge for i, edge in enumerate(edges) if i == 0 or edge[1] != edges[i - 1][1]]
     on = [[bool(mask >> spec.channel & 1) for spec in specs] for _, mask in changes]
@@ -64,13 +65,40 @@ def as_played(edges: Sequence[Edge], program: LineProgram, specs: Sequence[LineS
 
 
 def mask_of(row: Sequence[bool], specs: Sequence[LineSpec]) -> int:
-    """What is on, as the box counts it: bit n is channel n."""
+    """The lines that are on, as the box counts them: bit n is channel n."""
     return sum(1 << spec.channel for spec, is_on in zip(specs, row, strict=True) if is_on)
 
 
 def _edge(program: LineProgram, i: int) -> str:
-    """An edge in words: who changes, and when."""
+    """Describe an edge: the lines that change, and when."""
     now = program.on[i]
     before = program.on[i - 1] if i else np.zeros_like(now)
     names = ", ".join(f"'{line}'" for line, new in zip(program.lines, now != before, strict=True) if new)
     return f"of {names or 'no line'} at {format_quantity(float(program.t_s[i]), 'time', 7)}"
+
+
+class Slots:
+    """The programs that the box stores; a new one replaces the one that was not used for the longest time."""
+
+    def __init__(self) -> None:
+        self._slot_of: OrderedDict[tuple[Edge, ...], int] = OrderedDict()
+
+    def find(self, program: tuple[Edge, ...]) -> int | None:
+        """The slot of a program, which counts as used now; None if the box does not store it."""
+        if program in self._slot_of:
+            self._slot_of.move_to_end(program)
+        return self._slot_of.get(program)
+
+    def free(self) -> int:
+        """A slot for a new program; the program that was there is dropped."""
+        if len(self._slot_of) < SLOTS:
+            return min(set(range(SLOTS)) - set(self._slot_of.values()))
+        return self._slot_of.popitem(last=False)[1]
+
+    def keep(self, program: tuple[Edge, ...], slot: int) -> None:
+        """Record that a program is in a slot."""
+        self._slot_of[program] = slot
+
+    def clear(self) -> None:
+        """Drop all: the box was reset."""
+        self._slot_of.clear()

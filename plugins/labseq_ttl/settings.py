@@ -28,7 +28,7 @@ Channel: TypeAlias = Annotated[int, AfterValidator(_is_output)]
 
 
 class GoSettings(Settings):
-    """A leader at the box: `go` is a rising edge at the start input (D8), outputs are the answer."""
+    """An external control system: `go` is a rising edge at the start input (D8), outputs answer."""
 
     deadline: Annotated[Duration, Field(ge=0.1, le=MAX_DEADLINE_S)] = Field(
         default=10.0,
@@ -43,7 +43,7 @@ class GoSettings(Settings):
     failed: Channel | None = Field(
         default=None, description="output that goes high when it failed or was late, until the next `go`"
     )
-    active_low: bool = Field(default=False, description="these outputs are low while they say something")
+    active_low: bool = Field(default=False, description="these outputs are low when they are active")
     simulated_go_delay: Duration = Field(
         default=0.5,
         description="with a simulated box: time after which a simulated leader raises `go`; atoms load "
@@ -62,7 +62,7 @@ class GoSettings(Settings):
         return sum(1 << pin for pin in self.outputs.values()) if self.active_low else 0
 
     @model_validator(mode="after")
-    def _are_apart(self) -> Self:
+    def _check_outputs(self) -> Self:
         pins = self.outputs
         if not {"ready", "failed"} <= set(pins):
             missing = "ready" if "ready" not in pins else "failed"
@@ -93,8 +93,8 @@ class TtlSettings(Settings):
     )
     watchdog_timeout: Annotated[Duration, Field(le=MAX_WATCHDOG_S)] = Field(
         default=0.0,
-        description="how long the box waits for a word of labseq before it turns all lines off, while no "
-        "program runs; 0: for ever",
+        description="how long the box waits for a sign of life from labseq before it turns all lines off, "
+        "while no program runs; 0: for ever",
     )
     simulated_by: Literal["python", "simavr"] = Field(
         default="python",
@@ -104,7 +104,8 @@ class TtlSettings(Settings):
 
     go: GoSettings | None = Field(
         default=None,
-        description="lets another control system lead through the box, see [the guide](../how-to/follow.md)",
+        description="lets an external control system start the shots through the box, see "
+        "[the guide](../how-to/follow.md)",
     )
 
     @property
@@ -113,12 +114,10 @@ class TtlSettings(Settings):
         return self.port == SIMULATED
 
     @model_validator(mode="after")
-    def _somebody_starts_it(self) -> Self:
+    def _check_start(self) -> Self:
         if self.is_simulated and self.start == "external":
-            raise setting_error(
-                "nobody gives a simulated box its external start", "`start: serial`", at=("start",)
-            )
+            raise setting_error("a simulated box has no external start", "`start: serial`", at=("start",))
         if self.go is not None and self.start == "external":
-            what = "the start input cannot be a leader's and start programs too"
+            what = "the start input cannot take `go` and start programs too"
             raise setting_error(what, "`start: serial` beside 'go'", at=("start",))
         return self

@@ -13,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 from labseq_genicam.aravis.library import library
 from labseq_soapy_sim import build_module
-from labseq_ttl.counterpart.build import runner
+from labseq_ttl_sim.simavr import runner
 from labseq_virtual.settings import SimulationSettings
 from labseq_virtual.simulation import VirtualSimulation
 

@@ -8,12 +8,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from labseq_ttl.connection import Connection
-from labseq_ttl.counterpart.build import runner
-from labseq_ttl.counterpart.simavr import SimavrBox
+from labseq_ttl.box import Box
 from labseq_ttl.lines import TtlLines
 from labseq_ttl.protocol import framed, unframed
 from labseq_ttl.settings import TtlSettings
+from labseq_ttl_sim.simavr import SimavrBox, runner
 
 from labseq import Context, LineProgram, LineSpec
 from labseq.roles.shot import NeverStopped
@@ -54,13 +53,14 @@ class Rig:
         return [(args[1], args[2]) for args in plays]
 
     @property
-    def connection(self) -> Connection:
+    def driver_box(self) -> Box:
+        """The box as the driver sees it."""
         return self.lines._opened()
 
     @property
     def box(self) -> Any:
-        """The simulated box."""
-        return self.connection.counterpart
+        """The simulated box; None for one at a serial port."""
+        return getattr(self.lines.access, "box", None)
 
     def program(self, kind: str = "image", duration_s: float = 10e-3) -> LineProgram:
         return line_program(self.specs, kind, duration_s)
@@ -97,7 +97,7 @@ def works(lab: Rig) -> None:
     """A shot's worth of it."""
     program = lab.fire("load", 20e-3)
     lab.lines.wait(60.0)
-    if lab.connection.counterpart is not None:
+    if lab.box is not None:
         np.testing.assert_allclose(lab.played[-1][0].t_s, program.t_s, atol=1e-12)
 
 

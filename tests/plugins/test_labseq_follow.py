@@ -76,24 +76,24 @@ def test_go_is_answered_by_busy_and_then_by_what_came_of_it() -> None:
         peer.say("go run 17")
         assert device.wait_for("go", 20.0) == "run 17"
         assert peer.hear() == "busy"
-        assert device.tell("ready", {"shot": 12, "success": True, "filling": 0.98666}) == "ready"
+        assert device.report("ready", {"shot": 12, "success": True, "filling": 0.98666}) == "ready"
         assert peer.hear() == "ready shot=12 success=1 filling=0.9867"
         peer.say("go")
         assert device.wait_for("go", 20.0) == ""
         assert peer.hear() == "busy"
-        assert device.tell("failed", {"reason": "camera: no frame\nwithin 1 s", "shot": 13}) == "failed"
+        assert device.report("failed", {"reason": "camera: no frame\nwithin 1 s", "shot": 13}) == "failed"
         assert peer.hear() == r"failed shot=13 reason=camera: no frame\nwithin 1 s"
 
 
 def test_nothing_is_said_to_a_leader_that_is_owed_nothing() -> None:
     with led() as (device, peer):
-        assert device.tell("ready", {"shot": 0}) == ""
+        assert device.report("ready", {"shot": 0}) == ""
         peer.say("go")
         assert peer.ask("state?") == "state busy"
-        assert device.tell("ready", {"shot": 0}) == "", "no step has waited for it"
+        assert device.report("ready", {"shot": 0}) == "", "no step has waited for it"
         device.wait_for("go", 20.0)
-        assert [peer.hear(), device.tell("ready", {}), peer.hear()] == ["busy", "ready", "ready"]
-        assert device.tell("failed", {"reason": "too late"}) == ""
+        assert [peer.hear(), device.report("ready", {}), peer.hear()] == ["busy", "ready", "ready"]
+        assert device.report("failed", {"reason": "too late"}) == ""
         assert peer.ask("state?") == "state idle"
 
 
@@ -118,7 +118,7 @@ def test_a_second_go_is_refused_and_does_not_disturb_the_first() -> None:
         device.wait_for("go", 20.0)
         assert peer.hear() == "busy"
         assert peer.ask("go") == "failed reason=busy"
-        device.tell("ready", {"shot": 0})
+        device.report("ready", {"shot": 0})
         assert peer.hear() == "ready shot=0"
         assert "`go` came while labseq was busy, and was refused" in device.new_events()
 
@@ -132,7 +132,7 @@ def test_at_the_deadline_it_answers_by_itself_and_a_late_ready_is_not_sent() -> 
         now_s = 11.0
         assert [peer.hear(), peer.hear()] == ["busy", "failed reason=deadline"]
         assert peer.ask("go") == "failed reason=busy", "the moves may still go on"
-        assert device.tell("ready", {"shot": 3}) == "late"
+        assert device.report("ready", {"shot": 3}) == "late"
         assert peer.ask("state?") == "state idle"
         assert any("not over at the deadline" in text for text in device.new_events())
 
@@ -194,7 +194,7 @@ def test_a_serial_line_speaks_the_same() -> None:
         peer.say("go 5")
         assert device.wait_for("go", 20.0) == "5"
         assert peer.hear() == "busy"
-        assert device.tell("ready", {"shot": 0, "success": False, "filling": 0.5}) == "ready"
+        assert device.report("ready", {"shot": 0, "success": False, "filling": 0.5}) == "ready"
         assert peer.hear() == "ready shot=0 success=0 filling=0.5"
         assert peer.ask("state?") == "state idle"
         assert device.describe()["address"] == peer.port
@@ -239,10 +239,10 @@ def test_a_simulated_leader_loads_and_says_go_by_itself_on_the_sessions_clock() 
     assert device.wait_for("go", 10.0) == "1"
     assert clock.now() == 0.4
     assert [str(call) for call in world.calls.of("simulation.load")] == ["simulation.load(0.0, 0.4)"]
-    assert device.tell("ready", {"shot": 0}) == "ready"
+    assert device.report("ready", {"shot": 0}) == "ready"
     assert device.wait_for("go", 10.0) == "2"
     clock.sleep(3.0)
-    assert device.tell("ready", {"shot": 1}) == "late"
+    assert device.report("ready", {"shot": 1}) == "late"
     with pytest.raises(DeviceTimeoutError, match="the simulated leader says 'go' after 400 ms"):
         device.wait_for("go", 0.1)
 
@@ -271,7 +271,7 @@ def test_each_go_gets_exactly_one_answer(events: list[str]) -> None:
         elif event == "take" and (taken := dialogue.take(now_s)) is not None:
             said += taken[1]
         elif event == "tell":
-            said += dialogue.tell("ready", {"shot": 0}, now_s)[1]
+            said += dialogue.report("ready", {"shot": 0}, now_s)[1]
         elif event == "leave":
             n_lost += (
                 n_go_signals - n_lost - n_answers

@@ -96,7 +96,7 @@ def test_after_a_disconnect_the_shot_goes_on_and_nobody_else_is_told_of_it() -> 
         peer.leave()
         again = reconnect(device)
         assert again.ask("go") == "failed reason=busy"
-        assert device.tell("ready", {"shot": 0}) == "gone"
+        assert device.report("ready", {"shot": 0}) == "gone"
         assert again.ask("state?") == "state idle"
         again.say("go")
         device.wait_for("go", 20.0)
@@ -177,7 +177,7 @@ def test_a_serial_line_that_breaks_is_told_and_the_shot_goes_on() -> None:
     peer.leave()
     while device.read("is_connected"):
         pass
-    assert device.tell("ready", {"shot": 0}) == "gone"
+    assert device.report("ready", {"shot": 0}) == "gone"
     assert "unplugged?" in told(device)
     device.safe_state()
     device.close()

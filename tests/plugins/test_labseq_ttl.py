@@ -1,4 +1,4 @@
-"""The timing box: the driver, with a model of the box and with its firmware."""
+"""The timing box: the driver and whole runs, with a model of the box and with its firmware."""
 
 from __future__ import annotations
 
@@ -6,24 +6,25 @@ import json
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 from labseq_ttl.lines import TtlLines
-from labseq_ttl.programs import MAX_EDGES, as_played, edges_of
+from labseq_ttl.programs import MAX_EDGES, Slots, as_played, edges_of
 from labseq_ttl.protocol import CHANNELS, SHORTEST, SLOTS, TICK_S, unframed
 from labseq_ttl.settings import TtlSettings
-from labseq_ttl.slots import Slots
 from pydantic import ValidationError
 
-from labseq import ConfigError, Context, LineProgram, LineSpec
+from labseq import ConfigError, Context, LineProgram, LineSpec, Run, Session
 from labseq.errors import DeviceError, DeviceTimeoutError, LimitError, StopRequested
-from labseq.sequencer.lines import line_program
 from labseq.testing import LinesContract
 
 from .labseq_ttl_rig import make_rig, need_simavr, rig
+from .needs import need_library
 
 SIMULATED = pytest.mark.parametrize("simulated_by", ["python", "simavr"])
 
@@ -78,7 +79,7 @@ def test_the_self_test_changes_no_line(simulated_by: str) -> None:
         n_played = len(lab.played)
         lab.lines.self_test()
         assert len(lab.played) == n_played
-        assert lab.connection.box.state().on == 1 << 2  # cooling
+        assert lab.driver_box.state().on == 1 << 2  # cooling
         lab.fire()
         lab.lines.wait(1.0)
 
@@ -94,10 +95,8 @@ def test_it_says_what_it_is(simulated_by: str) -> None:
 def test_a_known_program_is_not_sent_again(monkeypatch: pytest.MonkeyPatch) -> None:
     with rig() as lab:
         sent: list[int] = []
-        put = lab.connection.box.put
-        monkeypatch.setattr(
-            lab.connection.box, "put", lambda slot, edges: (sent.append(slot), put(slot, edges))
-        )
+        put = lab.driver_box.put
+        monkeypatch.setattr(lab.driver_box, "put", lambda slot, edges: (sent.append(slot), put(slot, edges)))
         for kind in ("load", "image", "load", "image"):
             lab.fire(kind)
             lab.lines.wait(1.0)
@@ -116,14 +115,6 @@ def test_the_program_that_was_not_used_for_the_longest_time_gives_way() -> None:
     assert [slots.find(program) for program in (programs[0], programs[2], programs[-1])] == [0, 2, 1]
 
 
-def test_more_programs_than_slots_all_play() -> None:
-    with rig() as lab:
-        for n in range(3 * SLOTS):
-            program = lab.fire("rearrange", 1e-3 * (1 + n % (SLOTS + 3)))
-            lab.lines.wait(1.0)
-            np.testing.assert_allclose(lab.played[-1][0].t_s, program.t_s, atol=1e-12)
-
-
 def two_edges_apart(apart_s: float) -> LineProgram:
     on = np.array([[False, True], [True, True], [True, False]])
     return LineProgram("image", ("a", "b"), np.array([0.0, 1e-3, 1e-3 + apart_s]), on, 0.0, 1.0)
@@ -133,13 +124,13 @@ TWO = (LineSpec("a", 2, frozenset()), LineSpec("b", 9, frozenset()))
 
 
 def test_edges_too_near_to_one_another_are_named() -> None:
-    with pytest.raises(LimitError) as told:
+    with pytest.raises(LimitError) as raised:
         edges_of(two_edges_apart(3e-6), TWO, "lines")
     text = (
         "lines: `image`: time between the edges of 'a' at 1 ms and of 'b' at 1.003 ms is 3 us; the limit is"
     )
-    assert text in str(told.value)
-    assert "at least 5 us" in str(told.value)
+    assert text in str(raised.value)
+    assert "at least 5 us" in str(raised.value)
     edges_of(two_edges_apart(SHORTEST * TICK_S), TWO, "lines")
 
 
@@ -179,7 +170,7 @@ def test_a_line_on_a_channel_that_the_box_does_not_have_is_refused() -> None:
 
 
 def test_nobody_starts_a_simulated_box_from_outside() -> None:
-    with pytest.raises(ValidationError, match="nobody gives a simulated box its external start"):
+    with pytest.raises(ValidationError, match="a simulated box has no external start"):
         TtlSettings(start="external")
     assert TtlSettings(port="/dev/ttyACM0", start="external").start == "external"
 
@@ -222,20 +213,72 @@ def test_facts_tell_what_the_box_can_do() -> None:
     assert math.isfinite(facts.latency_s)
 
 
-def test_the_most_that_ten_lines_do_in_a_step_fits() -> None:
-    specs = tuple(
-        LineSpec(f"line {c}", c, frozenset({"image"}), lead_s=1e-4 * c, lag_s=1.1e-4 * c) for c in CHANNELS
-    )
-    program = line_program(specs, "image", 0.045)
-    assert len(program.t_s) == 20
-    assert len(edges_of(program, specs, "lines")) <= MAX_EDGES + 1
-
-
-def settings(**given: Any) -> TtlSettings:
-    return TtlSettings.model_validate(given)
-
-
 @pytest.mark.parametrize("wrong", [{"port": ""}, {"serial_number": 70000}, {"watchdog_timeout": "2 min"}])
 def test_settings_out_of_range_are_refused(wrong: dict[str, Any]) -> None:
     with pytest.raises(ValidationError):
-        settings(**wrong)
+        TtlSettings.model_validate(wrong)
+
+
+ROOT = Path(__file__).parents[2]
+SEQUENCE = ROOT / "sequences" / "compact_225.yaml"
+VIRTUAL = ROOT / "hardware_profiles" / "virtual.yaml"
+LINES = """
+lines:
+  use: USE
+  channels:
+    cooling: {channel: 2, on: [load, rearrange, wait, image, idle]}
+    mot: {channel: 3, on: [load], lag: 2 ms}
+    imaging: {channel: 4, on: [image], lead: 1 ms, lag: 1 ms}
+    shutter: {channel: 9, on: [image], lead: 3 ms, lag: 2 ms, active_low: true}
+  mutually_exclusive: [[mot, imaging]]
+"""
+LIGHTS = "  lights: {loading: [mot], cooling: [cooling], imaging: [imaging, shutter]}\n"
+
+
+@pytest.fixture(autouse=True, scope="module")
+def offered() -> None:
+    def find() -> None:
+        if not entry_points(group="labseq", name="labseq_ttl"):
+            raise RuntimeError("labseq_ttl is no plugin of this installation; install labseq again")
+
+    need_library(find)
+
+
+def profile(folder: Path, use: str) -> str:
+    """``virtual`` with lines."""
+    path = folder / "with_lines.yaml"
+    text = VIRTUAL.read_text().replace(
+        "simulation:\n  use: virtual\n", f"simulation:\n  use: virtual\n{LIGHTS}"
+    )
+    assert LIGHTS in text
+    path.write_text(text + LINES.replace("USE", use))
+    return str(path)
+
+
+def run(folder: Path, use: str, dry_run: Literal["off", "full"] = "off") -> Run:
+    folder.mkdir()
+    with Session.open(
+        SEQUENCE, profile=profile(folder, use), shots=2, seed=1, output=folder, dry_run=dry_run
+    ) as session:
+        return session.run()
+
+
+def assert_equal(one: Run, other: Run) -> None:
+    for a, b in zip(one.shots, other.shots, strict=True):
+        np.testing.assert_array_equal(a.occupancies, b.occupancies)
+        assert a.occupancies[0].sum() > 200, "no light where light is needed"
+
+
+def test_the_firmware_switches_the_lines_as_the_virtual_box_does(tmp_path: Path) -> None:
+    need_simavr()
+    virtual = run(tmp_path / "virtual", "virtual")
+    firmware = run(tmp_path / "firmware", "ttl\n  port: simulated\n  simulated_by: simavr")
+    assert firmware.simulated
+    assert_equal(firmware, virtual)
+
+
+def test_a_dry_run_with_a_real_boxs_profile_takes_the_model(tmp_path: Path) -> None:
+    virtual = run(tmp_path / "virtual", "virtual")
+    dry = run(tmp_path / "dry", "ttl\n  port: /dev/ttyACM0\n  start: external", dry_run="full")
+    assert dry.simulated
+    assert_equal(dry, virtual)

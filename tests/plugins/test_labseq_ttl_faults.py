@@ -1,18 +1,22 @@
-"""The timing box: everything that can go wrong with it, made by a box that really does it."""
+"""Faults of the timing box, and the firmware at the end of a real serial port."""
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Generator
 from pathlib import Path
 from typing import Any
 
 import pytest
 from labseq_ttl import box as box_module
-from labseq_ttl.counterpart.build import SOURCE, runner
-from labseq_ttl.counterpart.emulator import EmulatedBox
+from labseq_ttl.__main__ import main
+from labseq_ttl.lines import Heartbeat
 from labseq_ttl.protocol import framed
+from labseq_ttl_sim.model import ModelBox
+from labseq_ttl_sim.simavr import SOURCE, SimavrBox, runner
 
-from labseq.errors import DeviceError, DeviceTimeoutError
+from labseq.errors import DeviceError, DeviceTimeoutError, StopRequested
+from labseq.roles.shot import NeverStopped
 
 from .labseq_ttl_rig import Rig, make_rig, need_simavr, rig, works
 
@@ -29,20 +33,20 @@ def lab(request: pytest.FixtureRequest) -> Generator[Rig]:
         yield made
 
 
-def test_a_reset_in_the_middle_of_a_program_turns_all_lines_off_and_is_told(lab: Rig) -> None:
+def test_a_reset_in_the_middle_of_a_program_turns_all_lines_off_and_is_reported(lab: Rig) -> None:
     lab.box.reset(MIDDLE)
     lab.fire("load", 20e-3)
     played = lab.played[-1][0]
     assert played.t_s.tolist() == pytest.approx([0.0, 5e-3])
     assert not played.on[-1].any()
-    with pytest.raises(DeviceError, match=r"the box was reset \(reason: reset input\)") as told:
+    with pytest.raises(DeviceError, match=r"the box was reset \(reason: reset input\)") as raised:
         lab.lines.wait(1.0)
-    assert told.value.device == "lines"
+    assert raised.value.device == "lines"
     lab.lines.safe_state()
     works(lab)
 
 
-def test_a_reset_between_two_steps_is_told_before_anything_is_fired(lab: Rig) -> None:
+def test_a_reset_between_two_steps_is_reported_before_anything_is_fired(lab: Rig) -> None:
     works(lab)
     lab.box.reset()
     with pytest.raises(DeviceError, match="the box was reset"):
@@ -54,7 +58,7 @@ def test_a_reset_between_two_steps_is_told_before_anything_is_fired(lab: Rig) ->
 
 def unplug(lab: Rig) -> None:
     box = lab.box
-    if isinstance(box, EmulatedBox):
+    if isinstance(box, ModelBox):
         box.unplug()
     else:
         box._process.kill()
@@ -79,7 +83,7 @@ def test_an_unplugged_box_is_an_error_and_safe_again_once_it_is_back(lab: Rig, u
     works(lab)
 
 
-class DamagesLines(EmulatedBox):
+class DamagesLines(ModelBox):
     """Every other line is damaged on its way to the box."""
 
     n_lines = 0
@@ -89,23 +93,23 @@ class DamagesLines(EmulatedBox):
         return super().write(data.replace(b" ", b"_", 1) if self.n_lines % 2 else data)
 
 
-class DamagesAnswers(EmulatedBox):
+class DamagesAnswers(ModelBox):
     """Every other answer is damaged on its way back, but not that to `fire`, which is never sent twice."""
 
     n_told = 0
 
-    def _tell(self, text: str) -> None:
+    def _send(self, text: str) -> None:
         self.n_told += 1
         is_answer = not text.startswith("!") and text[1:] != " ok"
         self._out += framed(text).replace(b"*", b"+") if is_answer and self.n_told % 2 else framed(text)
 
 
 def use_box(monkeypatch: pytest.MonkeyPatch, box: Any) -> None:
-    monkeypatch.setattr("labseq_ttl.connection.start_simulator", lambda *_: box)
+    monkeypatch.setattr("labseq_ttl_sim.access.SimulatedAccess._new_box", lambda _: box)
 
 
 @pytest.mark.parametrize("cable", [DamagesLines, DamagesAnswers])
-def test_what_came_damaged_is_sent_again(monkeypatch: pytest.MonkeyPatch, cable: type[EmulatedBox]) -> None:
+def test_what_came_damaged_is_sent_again(monkeypatch: pytest.MonkeyPatch, cable: type[ModelBox]) -> None:
     use_box(monkeypatch, cable())
     with rig() as lab:
         for _ in range(5):
@@ -113,23 +117,23 @@ def test_what_came_damaged_is_sent_again(monkeypatch: pytest.MonkeyPatch, cable:
         lab.lines.self_test()
 
 
-class KeepsQuiet(EmulatedBox):
+class KeepsQuiet(ModelBox):
     """Nobody hears that its program is over."""
 
-    def _tell(self, text: str) -> None:
+    def _send(self, text: str) -> None:
         if not text.startswith("!done"):
-            super()._tell(text)
+            super()._send(text)
 
 
 def test_an_end_that_nobody_heard_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("labseq_ttl.lines.SIMULATED_MAX_WAIT_S", 0.01)
+    monkeypatch.setattr("labseq_ttl_sim.access.SimulatedAccess.max_wait_s", 0.01)
     use_box(monkeypatch, KeepsQuiet())
     with rig() as lab:
         works(lab)
         works(lab)
 
 
-class Dies(EmulatedBox):
+class Dies(ModelBox):
     """Plays nothing more, and does not say so."""
 
     def _fire(self, words: list[str]) -> str:
@@ -142,16 +146,16 @@ class Dies(EmulatedBox):
 
 
 def test_a_program_that_never_ends_is_too_late(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("labseq_ttl.lines.SIMULATED_MAX_WAIT_S", 0.01)
+    monkeypatch.setattr("labseq_ttl_sim.access.SimulatedAccess.max_wait_s", 0.01)
     use_box(monkeypatch, Dies())
     with rig() as lab:
-        lab.connection.counterpart._edges = [(0, 0)]  # type: ignore[union-attr]
+        lab.box._edges = [(0, 0)]  # type: ignore[union-attr]
         lab.fire()
         with pytest.raises(DeviceTimeoutError, match="not over after"):
             lab.lines.wait(1.0)
 
 
-class Other(EmulatedBox):
+class Other(ModelBox):
     """Something else that speaks in lines."""
 
     says = "shutter 01 0000 0000 01"
@@ -164,7 +168,7 @@ class Other(EmulatedBox):
     ("says", "told"),
     [
         ("shutter 01 0000 0000 01", "'shutter 01 0000 0000 01' answers; expected 'labseq-ttl'"),
-        ("labseq-ttl 03 0000 0000 01", "speaks version 3 of the protocol; expected 2"),
+        ("labseq-ttl 03 0000 0000 01", "has version 3 of the protocol; expected 2"),
         ("labseq-ttl 02 what", "the box answers 'what'; expected 3 hexadecimal numbers"),
         ("labseq-ttl nn", "the box answers 'nn'; expected 1 hexadecimal numbers"),
         ("", "'' answers; expected 'labseq-ttl'"),
@@ -178,14 +182,14 @@ def test_something_else_at_the_port_is_refused(monkeypatch: pytest.MonkeyPatch, 
         make_rig().lines.open()
 
 
-class Babble(EmulatedBox):
+class Babble(ModelBox):
     """An instrument that does not speak the protocol at all."""
 
     def _answer(self) -> None:
         self._out += b"ERR -113\r\n"
 
 
-class Mute(EmulatedBox):
+class Mute(ModelBox):
     """Nobody is there."""
 
     def _answer(self) -> None:
@@ -193,11 +197,11 @@ class Mute(EmulatedBox):
 
 
 @pytest.mark.parametrize(("box", "told"), [(Babble, "but 'ERR -113"), (Mute, "is this the box's port")])
-def test_a_port_at_which_no_box_answers_is_told(
-    monkeypatch: pytest.MonkeyPatch, box: type[EmulatedBox], told: str
+def test_a_port_at_which_no_box_answers_is_reported(
+    monkeypatch: pytest.MonkeyPatch, box: type[ModelBox], told: str
 ) -> None:
     monkeypatch.setattr(box_module, "BOOT_S", 0.0)
-    monkeypatch.setattr("labseq_ttl.connection.SIMULATED_MAX_WAIT_S", 0.01)
+    monkeypatch.setattr("labseq_ttl_sim.access.SimulatedAccess.max_wait_s", 0.01)
     use_box(monkeypatch, box())
     with pytest.raises(DeviceTimeoutError, match=told):
         make_rig().lines.open()
@@ -225,9 +229,9 @@ def test_a_box_that_turned_all_lines_off_by_itself_is_an_error(says: str, told: 
 
 def test_a_bad_memory_is_found_by_the_self_test(monkeypatch: pytest.MonkeyPatch) -> None:
     with rig() as lab:
-        get = lab.connection.box.get
+        get = lab.driver_box.get
         monkeypatch.setattr(
-            lab.connection.box, "get", lambda slot, i: (get(slot, i)[0] ^ (i == 17), get(slot, i)[1])
+            lab.driver_box, "get", lambda slot, i: (get(slot, i)[0] ^ (i == 17), get(slot, i)[1])
         )
         with pytest.raises(DeviceError, match="edge 17 in slot 0 reads"):
             lab.lines.self_test()
@@ -240,12 +244,12 @@ def test_what_is_missing_for_simavr_is_named(monkeypatch: pytest.MonkeyPatch, tm
         runner("lines")
 
 
-def test_a_compiler_without_the_library_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
+def test_a_compiler_without_the_library_is_reported(monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
     need_simavr()
     monkeypatch.setenv("LABSEQ_CACHE", str(tmp_path))
     broken = tmp_path / "runner.c"
     broken.write_text("#include <simavr/none.h>\n" + SOURCE.read_text())
-    monkeypatch.setattr("labseq_ttl.counterpart.build.SOURCE", broken)
+    monkeypatch.setattr("labseq_ttl_sim.simavr.SOURCE", broken)
     with pytest.raises(DeviceError, match=r"none\.h: No such file .*`apt-get install .* libsimavr-dev"):
         runner("lines")
     assert not list(tmp_path.glob("ttl/*/runner"))
@@ -264,3 +268,158 @@ def test_what_takes_long_is_done_before_the_box_is_opened(
     monkeypatch.setenv("PATH", "")
     lines.open()
     lines.close()
+
+
+@pytest.fixture
+def plugged() -> Generator[SimavrBox]:
+    """The firmware at the end of a cable: a serial port of this computer."""
+    need_simavr()
+    simavr = SimavrBox("lines", NeverStopped())
+    yield simavr
+    simavr.close()
+
+
+def test_a_box_that_is_unplugged_during_a_program_is_an_error(plugged: SimavrBox) -> None:
+    with rig(port=plugged.name, start="external") as lab:
+        lab.fire()
+        plugged._process.kill()
+        with pytest.raises(DeviceError, match="the line to the box broke"):
+            lab.lines.wait(60.0)
+        with pytest.raises(DeviceError, match="cannot open"):
+            lab.lines.safe_state()
+
+
+def test_a_box_that_stays_unplugged_cannot_be_made_safe(plugged: SimavrBox) -> None:
+    with rig(port=plugged.name) as lab:
+        works(lab)
+        plugged._process.kill()
+        plugged._process.wait()
+        with pytest.raises(DeviceError):
+            lab.lines.safe_state()
+        lab.lines.safe_state()
+        lab.lines.close()
+
+
+def test_a_real_port_does_the_same_as_a_simulated_box(plugged: SimavrBox) -> None:
+    with rig(port=plugged.name) as lab:
+        for _ in range(3):
+            works(lab)
+        assert lab.lines.describe()["port"] == plugged.name
+
+
+def test_the_self_test_finds_a_processor_that_runs_too_fast(plugged: SimavrBox) -> None:
+    with rig(port=plugged.name) as lab, pytest.raises(DeviceError, match="does its processor run at 16 MHz"):
+        lab.lines.self_test()  # simavr plays without a pause
+
+
+def test_the_port_has_one_user(plugged: SimavrBox) -> None:
+    with rig(port=plugged.name) as lab:
+        with pytest.raises(DeviceError, match="another program has it open"):
+            make_rig(port=plugged.name).lines.open()
+        works(lab)
+
+
+def test_a_port_that_is_not_there_is_named() -> None:
+    with pytest.raises(DeviceError, match="cannot open /dev/ttyNONE: there is no such port"):
+        make_rig(port="/dev/ttyNONE").lines.open()
+    with pytest.raises(DeviceError, match="cannot open socket://here: it is no network port; expected"):
+        make_rig(port="socket://here").lines.open()
+
+
+def test_a_box_with_another_serial_number_is_refused(plugged: SimavrBox) -> None:
+    with pytest.raises(DeviceError, match="has the serial number 0; expected 7"):
+        make_rig(port=plugged.name, serial_number=7).lines.open()
+    with rig(port=plugged.name, serial_number=0) as lab:
+        works(lab)
+
+
+def test_an_external_start_is_waited_for(plugged: SimavrBox) -> None:
+    with rig(port=plugged.name, start="external") as lab:
+        lab.fire("load", 20e-3)
+        with pytest.raises(DeviceTimeoutError, match="did the edge at the start input come"):
+            lab.lines.wait(0.05)
+        plugged.start()
+        lab.lines.wait(60.0)
+        works_with_start(lab, plugged)
+        lab.fire("load", 20e-3)
+        lab.lines.safe_state()
+        works_with_start(lab, plugged)
+
+
+def works_with_start(lab: Rig, plugged: SimavrBox) -> None:
+    lab.fire("load", 20e-3)
+    plugged.start()
+    lab.lines.wait(60.0)
+
+
+def test_a_wait_for_a_start_ends_with_a_request_to_stop(plugged: SimavrBox) -> None:
+    with rig(port=plugged.name, start="external") as lab:
+        lab.fire()
+        lab.clock.stop.request()
+        with pytest.raises(StopRequested):
+            lab.lines.wait(60.0)
+        with lab.clock.stop.held():
+            lab.lines.close()
+
+
+def test_safe_state_ends_the_wait_of_another_thread(plugged: SimavrBox) -> None:
+    with rig(port=plugged.name, start="external") as lab:
+        lab.fire()
+        failures: list[Exception] = []
+
+        def wait() -> None:
+            try:
+                lab.lines.wait(60.0)
+            except DeviceError as failure:
+                failures.append(failure)
+
+        thread = threading.Thread(target=wait)
+        thread.start()
+        lab.lines.safe_state()
+        thread.join(60.0)
+        assert not thread.is_alive()
+        works_with_start(lab, plugged)
+
+
+def test_signs_of_life_go_on_past_a_failure() -> None:
+    beats, enough = [0], threading.Event()
+
+    def beat() -> None:
+        beats[0] += 1
+        if beats[0] == 3:
+            enough.set()
+        raise DeviceError("lines", "unplugged")
+
+    heartbeat = Heartbeat(beat, 0.004)
+    heartbeat.start()
+    assert enough.wait(60.0)
+    heartbeat.stop()
+    assert not heartbeat.is_alive()
+
+
+def test_a_box_with_lights_out_hears_signs_of_life_until_it_is_closed(plugged: SimavrBox) -> None:
+    with rig(port=plugged.name, watchdog_timeout="60 s") as lab:
+        works(lab)
+        assert any(isinstance(thread, Heartbeat) for thread in threading.enumerate())
+    assert not any(isinstance(thread, Heartbeat) for thread in threading.enumerate())
+
+
+def test_the_command_gives_a_box_its_serial_number(
+    plugged: SimavrBox, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([plugged.name, "--serial", "12"]) == 0
+    assert main([plugged.name]) == 0
+    assert capsys.readouterr().out.startswith(
+        "serial number 12, started 0 times, last by power-up; active low: none"
+    )
+    with rig(port=plugged.name, serial_number=12) as lab:
+        works(lab)
+    main([plugged.name])
+    assert "active low: 6" in capsys.readouterr().out
+
+
+def test_the_command_says_what_is_wrong(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["/dev/ttyNONE"]) == 3
+    assert "there is no such port" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["/dev/ttyNONE", "--serial", "70000"])

@@ -11,11 +11,10 @@ from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, given, settings, strategies as st
-from labseq_ttl.counterpart.build import FIRMWARE
-from labseq_ttl.counterpart.emulator import EmulatedBox
-from labseq_ttl.counterpart.simavr import APART_CYCLES, CYCLES_PER_TICK
 from labseq_ttl.lines import LATENCY_S
 from labseq_ttl.protocol import CHANNELS, EDGES, OUTPUTS, SHORTEST, SLOTS, framed, unframed
+from labseq_ttl_sim.model import ModelBox
+from labseq_ttl_sim.simavr import APART_CYCLES, CYCLES_PER_TICK, FIRMWARE
 
 from .labseq_ttl_rig import Firmware, need_simavr
 from .needs import need_library
@@ -219,7 +218,7 @@ def test_no_bytes_hang_it(running: Firmware, noise: list[bytes]) -> None:
 
 hexes = st.integers(0, 2**34).map(lambda n: f"{n:x}") | st.sampled_from(["0", "7", "a", "18", "204", "g", ""])
 arguments = st.lists(hexes, max_size=6).map(" ".join)
-names = st.sampled_from([*(name for name in EmulatedBox()._commands if name != "await"), "bogus", ""])
+names = st.sampled_from([*(name for name in ModelBox()._commands if name != "await"), "bogus", ""])
 edge_words = st.tuples(st.integers(0, 2000), masks).map(lambda edge: f"{edge[0]:x} {edge[1]:x}")
 sensible = st.one_of(
     st.tuples(st.integers(0, SLOTS), st.integers(0, 3), st.lists(edge_words, min_size=1, max_size=3)).map(
@@ -237,14 +236,14 @@ questions = st.one_of(sensible, st.tuples(names, arguments).map(" ".join).map(st
 @settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(asked=st.lists(questions, max_size=12))
 def test_the_model_answers_as_the_firmware_does(running: Firmware, asked: list[str]) -> None:
-    model = EmulatedBox()
+    model = ModelBox()
     fresh = [f"put {slot:x} 0 0 0" for slot in range(SLOTS)]
     ready = ["polarity 0", "serial 0", "timeout 0", "off", "deaf", *fresh]
     for question in (*ready, *(q for q in asked if len(framed(f"a {q}")) < 96)):
         assert plain(running.ask(f"a {question}")) == plain(ask(model, f"a {question}")), question
 
 
-def ask(model: EmulatedBox, question: str) -> str:
+def ask(model: ModelBox, question: str) -> str:
     model.read(4096)
     model.write(framed(question))
     return unframed(model.read(4096).split(b"\n")[0]) or ""
@@ -266,7 +265,7 @@ PROTOCOL = Path(FIRMWARE).with_name("PROTOCOL.md").read_text()
 
 
 def test_the_examples_of_the_protocol_are_true() -> None:
-    model = EmulatedBox()
+    model = ModelBox()
     model.read(4096)
     said: list[str] = []
     for direction, line in re.findall(r"^([<>]) (.*)$", PROTOCOL, re.MULTILINE):
@@ -280,7 +279,7 @@ def test_the_examples_of_the_protocol_are_true() -> None:
 
 
 def test_the_protocol_names_every_command() -> None:
-    assert set(re.findall(r"^\| `([a-z]+)", PROTOCOL, re.MULTILINE)) == set(EmulatedBox()._commands)
+    assert set(re.findall(r"^\| `([a-z]+)", PROTOCOL, re.MULTILINE)) == set(ModelBox()._commands)
 
 
 def test_the_firmware_is_that_of_its_source(tmp_path: Path) -> None:

@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from labseq_ttl.leader import HIGH, MORE
-from labseq_ttl.leading_lines import LeadingLines, ttl_lines
+from labseq_ttl.go_lines import HIGH, MORE, GoLines, ttl_lines
 from labseq_ttl.protocol import CHANNELS, OUTPUTS
 from labseq_ttl.settings import GoSettings, TtlSettings
 from pydantic import ValidationError
@@ -76,7 +75,7 @@ class Pins:
         return course
 
 
-def test_the_box_raises_busy_at_the_edge_and_what_it_is_told_afterwards(running: Firmware) -> None:
+def test_the_box_raises_busy_at_the_edge_and_what_it_is_reported_afterwards(running: Firmware) -> None:
     pins = Pins(running)
     assert pins.go().split()[2] == "0001"
     assert pins.state() == ["02", "0001", "00", "01"]
@@ -90,7 +89,7 @@ def test_the_box_raises_busy_at_the_edge_and_what_it_is_told_afterwards(running:
     assert pins.state() == ["01", "0002", "00", "01"]
 
 
-def test_an_edge_while_it_is_busy_is_told_and_starts_nothing(running: Firmware) -> None:
+def test_an_edge_while_it_is_busy_is_reported_and_starts_nothing(running: Firmware) -> None:
     pins = Pins(running)
     pins.go()
     running.simavr.start()
@@ -190,14 +189,14 @@ class Rig:
         self.lines = ttl_lines(TtlSettings.model_validate({"go": GO, **settings}), context)
 
     @property
-    def leader(self) -> LeadingLines:
-        assert isinstance(self.lines, LeadingLines)
+    def leader(self) -> GoLines:
+        assert isinstance(self.lines, GoLines)
         assert isinstance(self.lines, LeaderLink)
         return self.lines
 
     @property
     def box(self) -> Any:
-        return self.lines._opened().counterpart
+        return getattr(self.lines.access, "box", None)
 
 
 @pytest.fixture
@@ -223,42 +222,42 @@ def test_go_comes_by_the_pin_and_is_answered(simulated_by: str) -> None:
         for state, n_go_signals in (("ready", 1), ("failed", 2)):
             assert made.leader.wait_for("go", 10.0) == ""
             assert made.leader._opened_pins().look().n_go_signals == n_go_signals
-            assert made.leader.tell(state, {"shot": 0}) == state
-            assert made.leader.tell(state, {"shot": 0}) == ""  # it is owed nothing any more
+            assert made.leader.report(state, {"shot": 0}) == state
+            assert made.leader.report(state, {"shot": 0}) == ""  # it is owed nothing any more
     finally:
         made.lines.close()
 
 
 def test_its_outputs_say_what_came_of_it(rig: Rig) -> None:
     rig.leader.wait_for("go", 10.0)
-    assert rig.box.signs == 1 << BUSY
-    rig.leader.tell("ready", {})
-    assert rig.box.signs == 1 << READY
+    assert rig.box.signals == 1 << BUSY
+    rig.leader.report("ready", {})
+    assert rig.box.signals == 1 << READY
     rig.leader.wait_for("go", 10.0)
-    rig.leader.tell("failed", {"reason": "no atoms"})
-    assert rig.box.signs == 1 << FAILED
+    rig.leader.report("failed", {"reason": "no atoms"})
+    assert rig.box.signals == 1 << FAILED
 
 
-def test_safe_state_leaves_the_leader_its_outputs_and_it_is_told(rig: Rig) -> None:
+def test_safe_state_leaves_the_leader_its_outputs_and_it_is_reported(rig: Rig) -> None:
     rig.leader.wait_for("go", 10.0)
     rig.lines.safe_state()
-    assert (rig.box.on, rig.box.signs) == (0, 1 << BUSY)
-    assert rig.leader.tell("failed", {}) == "failed"
+    assert (rig.box.on, rig.box.signals) == (0, 1 << BUSY)
+    assert rig.leader.report("failed", {}) == "failed"
 
 
-def test_a_shot_that_is_late_is_told_once(rig: Rig) -> None:
+def test_a_shot_that_is_late_is_reported_once(rig: Rig) -> None:
     rig.leader.wait_for("go", 10.0)
     rig.box.pass_deadline()
-    assert rig.box.signs == 1 << BUSY | 1 << FAILED
-    assert rig.leader.tell("ready", {}) == "late"
-    assert rig.box.signs == 1 << FAILED
+    assert rig.box.signals == 1 << BUSY | 1 << FAILED
+    assert rig.leader.report("ready", {}) == "late"
+    assert rig.box.signals == 1 << FAILED
     assert "not over at the deadline" in rig.leader.new_events()[-1]
 
 
-def test_an_edge_while_labseq_is_busy_is_refused_and_told(rig: Rig) -> None:
+def test_an_edge_while_labseq_is_busy_is_refused_and_reported(rig: Rig) -> None:
     rig.leader.wait_for("go", 10.0)
     rig.box.start()
-    rig.leader.tell("ready", {})
+    rig.leader.report("ready", {})
     assert rig.leader.new_events()[-1] == MORE
     assert rig.leader._opened_pins().look().n_go_signals == 1
 
@@ -269,7 +268,7 @@ class NoLeader(Rig):
     def __init__(self) -> None:
         super().__init__()
         self.lines.open()
-        self.leader._go_by_itself = lambda timeout_s: timeout_s  # type: ignore[method-assign]
+        self.lines.access.raise_go = lambda timeout_s: timeout_s  # type: ignore[method-assign]
 
 
 def test_a_go_that_came_a_little_early_counts() -> None:
@@ -286,13 +285,13 @@ def test_a_go_that_came_too_early_has_failed_and_the_next_counts() -> None:
     with pytest.raises(DeviceTimeoutError, match=r"no rising edge .* within 100 ms; it is high"):
         made.leader.wait_for("go", 0.1)
     assert "no step waited for `go`" in made.leader.new_events()[-1]
-    assert made.box.signs == 1 << FAILED
+    assert made.box.signals == 1 << FAILED
     made.box.start()
     assert made.leader.wait_for("go", 1.0) == ""
     made.lines.close()
 
 
-def test_a_go_that_never_comes_is_told_with_the_level_of_the_input() -> None:
+def test_a_go_that_never_comes_is_reported_with_the_level_of_the_input() -> None:
     made = NoLeader()
     assert made.leader.new_events() == [HIGH]
     made.box.lower()
@@ -309,7 +308,7 @@ def test_a_word_of_the_box_that_got_lost_is_asked_for() -> None:
     made.lines.close()
 
 
-def test_a_reset_in_a_shot_is_an_error_and_the_leader_is_told_of_it() -> None:
+def test_a_reset_in_a_shot_is_an_error_and_the_leader_is_reported_of_it() -> None:
     made = NoLeader()
     made.box.start()
     made.leader.wait_for("go", 1.0)
@@ -317,8 +316,8 @@ def test_a_reset_in_a_shot_is_an_error_and_the_leader_is_told_of_it() -> None:
     with pytest.raises(DeviceError, match="the box was reset"):
         made.leader.compile(line_program(SPECS, "image", 1e-3))
     made.lines.safe_state()
-    assert made.leader.tell("failed", {}) == "failed"
-    assert made.box.signs == 1 << FAILED
+    assert made.leader.report("failed", {}) == "failed"
+    assert made.box.signals == 1 << FAILED
     made.lines.close()
 
 
@@ -364,7 +363,7 @@ def test_outputs_that_are_lines_are_refused() -> None:
 
 
 def test_the_start_input_is_for_one_of_two() -> None:
-    with pytest.raises(ValidationError, match="cannot be a leader's and start programs too"):
+    with pytest.raises(ValidationError, match="cannot take `go` and start programs too"):
         TtlSettings.model_validate({"port": "/dev/ttyACM0", "start": "external", "go": GO})
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from labseq_genicam.aravis.library import library
 from labseq_soapy_sim import build_module
-from labseq_ttl.counterpart.build import runner
+from labseq_ttl_sim.simavr import runner
 
 from labseq import Run, Session
 from labseq.cli import main

@@ -1,6 +1,6 @@
 """A model of the box: the same answers to the same lines, without its firmware.
 
-It plays a program in no time at all, and its own answers come at once.
+It plays a program in no time at all, and answers at once.
 """
 
 from __future__ import annotations
@@ -9,17 +9,17 @@ import threading
 from collections.abc import Callable, Mapping
 from typing import Final
 
-from labseq.plugin import Port
-from labseq_ttl.counterpart.leader_input import LeaderInput
-from labseq_ttl.counterpart.words import RefusedError, numbers
 from labseq_ttl.protocol import (
     DEAF,
     EDGES,
+    IDLE,
+    LATE,
     LINE,
     LONGEST,
     MAX_MS,
     NAME,
     OUTPUTS,
+    OWED,
     SHORTEST,
     SLOTS,
     STOP,
@@ -29,15 +29,88 @@ from labseq_ttl.protocol import (
     unframed,
 )
 
+from labseq.plugin import Port
+
 IDLE_S: Final = 1e-3
-"""How long a read waits in vain, in seconds."""
+"""How long a read waits if nothing came, in seconds."""
 
 POWER_UP: Final = 1
 RESET_INPUT: Final = 2
 
 
-class EmulatedBox:
-    """A box in this process; it is its own port too.
+class RefusedError(Exception):
+    """The box refuses a command."""
+
+
+def numbers(words: list[str], *most: int) -> list[int]:
+    """Read hexadecimal numbers and check their upper limits; each bit of a mask must be an output."""
+    if len(words) != len(most):
+        raise RefusedError("arguments")
+    read: list[int] = []
+    for word, limit in zip(words, most, strict=True):
+        if not 1 <= len(word) <= 8 or not set(word) <= set("0123456789abcdefABCDEF"):
+            raise RefusedError("arguments")
+        number = int(word, 16)
+        if number > limit or (limit == OUTPUTS and number & ~OUTPUTS):
+            raise RefusedError("arguments")
+        read.append(number)
+    return read
+
+
+class LeaderInput:
+    """The start input at which a leader raises `go`, as in ``firmware/lead.c`` but without its clock.
+
+    Attributes:
+        state: One of ``DEAF``, ``IDLE``, ``OWED``, ``LATE``.
+        signals: Outputs that are on for the leader.
+        n_go_signals: Edges that were taken.
+        more_came: Whether an edge came that could not be taken.
+        level: Level of the input; it is pulled up.
+    """
+
+    def __init__(self) -> None:
+        self.state = DEAF
+        self.signals = self.n_go_signals = 0
+        self.more_came = False
+        self.level = 1
+        self._busy = self._ready = self._failed = 0
+
+    def begin(self, busy: int, ready: int, failed: int) -> None:
+        """Accept edges from now on; earlier ones do not count."""
+        self._busy, self._ready, self._failed = busy, ready, failed
+        self.state, self.signals, self.more_came = IDLE, 0, False
+
+    def end(self) -> None:
+        """Accept no more edges."""
+        if self.state != DEAF:
+            self.signals = self._failed if self.state == OWED else self.signals & ~self._busy
+        self.state, self.more_came = DEAF, False
+
+    def rise(self) -> bool:
+        """The input rises; returns whether that is a `go`."""
+        self.level = 1
+        self.more_came = self.state in (OWED, LATE)
+        if self.state != IDLE:
+            return False
+        self.state, self.signals = OWED, self._busy
+        self.n_go_signals = (self.n_go_signals + 1) & 0xFFFF
+        return True
+
+    def pass_deadline(self) -> None:
+        """The answer is late."""
+        if self.state == OWED:
+            self.state, self.signals = LATE, self._busy | self._failed
+
+    def answer(self, *, is_ready: bool) -> str:
+        """Send the leader the result of its `go`; returns the box's answer."""
+        said = f"{self.state:02x} {self.more_came:02x}"
+        self.signals = self._ready if is_ready and self.state != LATE else self._failed
+        self.state, self.more_came = IDLE, False
+        return said
+
+
+class ModelBox:
+    """A box in this process; it is its own serial port too.
 
     Attributes:
         on: What is on: bit n is channel n.
@@ -72,9 +145,9 @@ class EmulatedBox:
         self._boot(POWER_UP)
 
     @property
-    def signs(self) -> int:
-        """Outputs that are on for a leader, beside those of the lines."""
-        return self._leader.signs
+    def signals(self) -> int:
+        """Outputs that are on for a leader, in addition to those of the lines."""
+        return self._leader.signals
 
     @property
     def port(self) -> Port:
@@ -88,7 +161,7 @@ class EmulatedBox:
         return len(self._out)
 
     def read(self, size: int = 1, /) -> bytes:
-        """What the box said."""
+        """Bytes that the box sent."""
         self._check_plugged()
         if not self._out:
             threading.Event().wait(IDLE_S)
@@ -96,26 +169,26 @@ class EmulatedBox:
         return bytes(came)
 
     def write(self, data: bytes, /) -> int:
-        """What is said to the box."""
+        """Send bytes to the box."""
         self._check_plugged()
         for byte in data:
             self._take(byte)
         return len(data)
 
     def reset_input_buffer(self) -> None:
-        """Forget what the box said."""
+        """Drop the bytes that the box sent."""
         self._out.clear()
 
     def close(self) -> None:
         """Nothing is open."""
 
     def played(self, polarity: int) -> list[Edge]:
-        """What the outputs did; see :class:`~labseq_ttl.counterpart.Counterpart`."""
-        del polarity  # it is known here
+        """What the outputs did since the start of the last program; see :meth:`SimavrBox.played`."""
+        del polarity  # the model records what is on, not the levels
         return self._edges
 
     def reset(self, after_ticks: int | None = None) -> None:
-        """Press the reset button, now or so long after the first edge of the next program."""
+        """Press the reset button, now or some ticks after the first edge of the next program."""
         self._reset_after = after_ticks
         if after_ticks is None:
             self._boot(RESET_INPUT)
@@ -130,7 +203,7 @@ class EmulatedBox:
         self._leader.level = 0
 
     def pass_deadline(self) -> None:
-        """Let the deadline of a leader pass; no time passes here by itself."""
+        """Let the deadline of a leader pass; the model has no clock."""
         self._leader.pass_deadline()
 
     def unplug(self) -> None:
@@ -138,7 +211,7 @@ class EmulatedBox:
         self._unplugged = True
 
     def say(self, data: bytes) -> None:
-        """Say something that nobody asked for."""
+        """Send something without a command."""
         self._out += data
 
     def _check_plugged(self) -> None:
@@ -210,7 +283,7 @@ class EmulatedBox:
         return ""
 
     def _set_limit(self, words: list[str]) -> str:
-        numbers(words, 0xFFFF)  # no time passes here
+        numbers(words, 0xFFFF)  # the model has no clock
         return ""
 
     def _put(self, words: list[str]) -> str:

@@ -1,37 +1,49 @@
-"""The firmware itself, on a simulated processor in a process of its own."""
+"""The firmware itself, on a simulated processor (simavr) in a separate process."""
 
 from __future__ import annotations
 
+import hashlib
 import os
 import select
+import shutil
 import subprocess
+import tempfile
 from contextlib import suppress
+from pathlib import Path
 from typing import Final
 
-from labseq.plugin import BROKEN, Clock, DeviceError, Port, wait_for
-from labseq_ttl.counterpart.build import FIRMWARE, runner
-from labseq_ttl.port import open_box
+import labseq_ttl
+from labseq_ttl.box import open_box
 from labseq_ttl.protocol import OUTPUTS, Edge
 
+from labseq.plugin import BROKEN, Clock, DeviceError, Port, cache_root, wait_for
+
+SOURCE: Final = Path(__file__).with_name("runner.c")
+FIRMWARE: Final = Path(labseq_ttl.__file__).parent / "firmware" / "labseq_ttl.hex"
+PACKAGES: Final = "gcc libc6-dev libsimavr-dev libelf-dev"
+"""Debian packages that the runner needs."""
+
+COMPILE_TIMEOUT_S: Final = 120.0
+_LIBRARIES: Final = ("-lsimavr", "-lelf", "-lutil")
 CYCLES_PER_TICK: Final = 8
 GATE: Final = 1 << 13
 APART_CYCLES: Final = 3
-"""The two ports of the processor do not switch in the same cycle; what is nearer than this is one edge."""
+"""The two ports of the processor do not switch in the same cycle; changes closer than this are one edge."""
 
 MAX_WAIT_S: Final = 60.0
 """How long the simulated processor may take for a program, on a computer that is busy."""
 
 
 class SimavrBox:
-    """A box made of the firmware and simavr.
+    """A box: the firmware run by simavr.
 
     Args:
         device: Name of the box, for messages.
-        clock: The session's clock, asked for a stop request.
+        clock: The session's clock, checked for a stop request.
 
     Attributes:
         name: Name of its serial port.
-        port: The port, open; None if it was not to be opened.
+        port: The port.
 
     Raises:
         DeviceError: It cannot be built or started.
@@ -50,7 +62,7 @@ class SimavrBox:
             bufsize=0,
         )
         try:
-            while (words := self._next_line())[0] != "pty":  # what its outputs did at power-up
+            while (words := self._next_line())[0] != "pty":  # changes of its outputs at power-up
                 pass
             self.name = words[1]
         except BaseException:
@@ -70,12 +82,12 @@ class SimavrBox:
         return self._process.pid
 
     def command(self, text: str) -> None:
-        """Tell the simulator something; ``runner.c`` says what it knows."""
+        """Send a command to the simulator; ``runner.c`` lists them."""
         assert self._process.stdin is not None
         self._process.stdin.write(f"{text}\n".encode())
 
     def reset(self, after_ticks: int | None = None) -> None:
-        """Press the reset button, now or so long after the first edge of the next program."""
+        """Press the reset button, now or some ticks after the first edge of the next program."""
         self.command("reset" if after_ticks is None else f"reset {after_ticks * CYCLES_PER_TICK}")
 
     def start(self) -> None:
@@ -87,7 +99,14 @@ class SimavrBox:
         self.command("low")
 
     def played(self, polarity: int) -> list[Edge]:
-        """What the outputs did; see :class:`~labseq_ttl.counterpart.Counterpart`."""
+        """What the outputs did since the start of the program that was just fired.
+
+        Args:
+            polarity: Outputs that are low when they are on.
+
+        Returns:
+            Ticks since the first edge, and what was on from then on; after a reset nothing is.
+        """
         first: int | None = None
         edges: list[tuple[int, int]] = []
         for cycle, levels in self.course():
@@ -101,7 +120,7 @@ class SimavrBox:
         return [(round((cycle - (first or 0)) / CYCLES_PER_TICK), on) for cycle, on in edges]
 
     def course(self) -> list[tuple[int, int | None]]:
-        """What the output registers did while the gate was high, cycle by cycle.
+        """The output registers while the gate was high, cycle by cycle.
 
         Returns:
             Clock cycle, and the levels from then on; None after a reset.
@@ -135,10 +154,10 @@ class SimavrBox:
                     pipe.close()
 
     def _next_line(self) -> list[str]:
-        """The next line of the simulator, in words."""
+        """The words of the simulator's next line."""
         words = wait_for(self._look, MAX_WAIT_S, self._clock)
         if words is None:
-            raise DeviceError(self._device, "the simulated processor is silent; expected what it put out")
+            raise DeviceError(self._device, "the simulated processor is silent; expected its outputs")
         return words
 
     def _look(self, timeout_s: float) -> list[str] | None:
@@ -153,3 +172,43 @@ class SimavrBox:
             self._rest += came
         line, _, self._rest = self._rest.partition(b"\n")
         return line.decode("ascii", "replace").split()
+
+
+def runner(device: str) -> Path:
+    """The compiled program that runs the firmware, from labseq's cache.
+
+    Args:
+        device: Name of the box, for messages.
+
+    Raises:
+        DeviceError: It cannot be compiled; the text says what to install.
+    """
+    digest = hashlib.sha256(SOURCE.read_bytes()).hexdigest()[:24]
+    program = cache_root() / "ttl" / digest / "runner"
+    if not program.is_file():
+        compiler = shutil.which("cc") or shutil.which("gcc")
+        if compiler is None:
+            raise _missing(device, "there is no C compiler")
+        try:
+            _compile(compiler, program)
+        except subprocess.CalledProcessError as error:
+            first = next((line for line in error.stderr.splitlines() if "error" in line), error.stderr[:200])
+            raise _missing(device, first) from error
+        except (OSError, subprocess.TimeoutExpired) as error:
+            raise _missing(device, str(error)) from error
+    return program
+
+
+def _compile(compiler: str, program: Path) -> None:
+    program.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=program.parent) as folder:
+        made = Path(folder) / "runner"
+        command = [compiler, "-O2", "-std=gnu11", str(SOURCE), "-o", str(made), *_LIBRARIES]
+        subprocess.run(command, check=True, capture_output=True, text=True, timeout=COMPILE_TIMEOUT_S)  # noqa: S603 - a compiler, on our own file
+        os.replace(made, program)  # noqa: PTH105 - whole or not at all, also if another process does the same
+
+
+def _missing(device: str, reason: str) -> DeviceError:
+    text = f"the firmware cannot be simulated: {reason}"
+    hint = f"`apt-get install --no-install-recommends {PACKAGES}`, or set `simulated_by: python`"
+    return DeviceError(device, f"{text}; {hint}")

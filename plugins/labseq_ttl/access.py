@@ -1,0 +1,115 @@
+"""How the driver gets to its box: a real one at a serial port, or a simulated one."""
+
+from __future__ import annotations
+
+from typing import Final, Protocol
+
+from labseq.plugin import Context, LineProgram, Port
+from labseq_ttl.box import open_box
+from labseq_ttl.settings import TtlSettings
+
+MAX_WAIT_S: Final = 1.0
+"""How long an answer of a real box may take, in seconds."""
+
+
+class BoxAccess(Protocol):
+    """A box that the driver can connect to.
+
+    Attributes:
+        max_wait_s: How long an answer may take, in seconds.
+        real_time: Whether the box takes as long as a program lasts, and keeps time limits itself.
+    """
+
+    max_wait_s: float
+    real_time: bool
+
+    def warm(self) -> None:
+        """Do what takes long before the first shot."""
+        ...
+
+    def connect(self) -> Port:
+        """Open the serial port of the box."""
+        ...
+
+    def disconnect(self) -> None:
+        """The port was closed; no effect if it is not connected."""
+        ...
+
+    def lines_set(self, program: LineProgram) -> None:
+        """The lines were set to the state of this program, at once."""
+        ...
+
+    def fired(self, program: LineProgram | None) -> None:
+        """A program was fired; None: one that changes no line."""
+        ...
+
+    def is_over(self, end_s: float) -> bool:
+        """Whether a program is over that the box has played, and that ends at this time."""
+        ...
+
+    def wait_until(self, end_s: float, timeout_s: float) -> float:
+        """Wait for the end of a program; returns how long to wait for the box's message."""
+        ...
+
+    def raise_go(self, timeout_s: float) -> float:
+        """Wait for a leader's `go`; returns how long to wait for the box's message."""
+        ...
+
+
+class RealBox:
+    """A box at a serial port.
+
+    Args:
+        port: Name of the port.
+        device: Name of the box, for messages.
+    """
+
+    max_wait_s = MAX_WAIT_S
+    real_time = True
+
+    def __init__(self, port: str, device: str) -> None:
+        self._port = port
+        self._device = device
+
+    def warm(self) -> None:
+        """Nothing to do."""
+
+    def connect(self) -> Port:
+        """Open the port."""
+        return open_box(self._port, self._device)
+
+    def disconnect(self) -> None:
+        """Nothing to do."""
+
+    def lines_set(self, program: LineProgram) -> None:
+        """Nothing to do."""
+
+    def fired(self, program: LineProgram | None) -> None:
+        """Nothing to do."""
+
+    def is_over(self, end_s: float) -> bool:  # noqa: ARG002 - the box itself has reported it
+        """A program that the box has played is over."""
+        return True
+
+    def wait_until(self, end_s: float, timeout_s: float) -> float:  # noqa: ARG002 - the box reports the end
+        """The box reports the end itself."""
+        return timeout_s
+
+    def raise_go(self, timeout_s: float) -> float:
+        """The leader raises it."""
+        return timeout_s
+
+
+def choose_box(settings: TtlSettings, context: Context, polarity: int) -> BoxAccess:
+    """The box that the setting ``port`` names.
+
+    Args:
+        settings: Of the driver.
+        context: Name, clock, lines and simulation.
+        polarity: Outputs that are low when they are on: bit n is channel n.
+    """
+    if not settings.is_simulated:
+        return RealBox(settings.port, context.name or "lines")
+    from labseq_ttl_sim import SimulatedAccess
+
+    return SimulatedAccess(settings, context, polarity)

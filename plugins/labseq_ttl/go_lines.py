@@ -1,0 +1,223 @@
+"""The timing box with an external control system: its start signal `go` is an edge at the start input."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+from labseq.plugin import ConfigError, Context, DeviceError, DeviceTimeoutError, format_quantity
+from labseq_ttl.box import Box
+from labseq_ttl.lines import TtlLines
+from labseq_ttl.protocol import LATE, OWED
+from labseq_ttl.settings import GoSettings, TtlSettings
+
+GO: Final = "go"
+LOOK_S: Final = 0.2
+"""Time after which the box is asked, in case its message of an edge came damaged."""
+HIGH: Final = "the start input is high: not wired, or raised too early; its next rising edge counts"
+MORE: Final = "`go` rose again while labseq was busy, and was refused"
+
+
+def ttl_lines(settings: TtlSettings, context: Context) -> TtlLines:
+    """The driver, with the start signal of an external control system if the profile has it.
+
+    Raises:
+        ConfigError: A line is on an output of the external control system.
+    """
+    if settings.go is None:
+        return TtlLines(settings, context)
+    outputs = settings.go.outputs
+    for spec in context.lines:
+        if name := next((name for name, pin in outputs.items() if pin == spec.channel), ""):
+            text = f"'{spec.name}' is on channel {spec.channel}, which is '{name}' of the leader"
+            raise ConfigError(f"{text}; expected an output for each")
+    return GoLines(settings, settings.go, context)
+
+
+class GoLines(TtlLines):
+    """A timing box that also connects to an external control system; implements ``labseq.LeaderLink``.
+
+    The box itself detects the edge, raises `busy`, and keeps the deadline, also if labseq hangs or dies.
+
+    Args:
+        settings: Of the box.
+        go: What is wired to the external control system.
+        context: See :class:`~labseq_ttl.lines.TtlLines`.
+    """
+
+    def __init__(self, settings: TtlSettings, go: GoSettings, context: Context) -> None:
+        super().__init__(settings, context)
+        self._go = go
+        self._pins: LeaderPins | None = None
+        self._is_owed = False
+        self._news: deque[str] = deque(maxlen=100)
+
+    @property
+    def deadline_s(self) -> float:
+        """Longest time from `go` to its answer, in seconds."""
+        return self._go.deadline
+
+    def close(self) -> None:
+        """Answer a `go` that waits for an answer, turn all lines off and disconnect; legal in any state."""
+        try:
+            self.safe_state()
+            if self._pins is not None and self._box is not None:
+                self._pins.end()
+        finally:
+            self._pins, self._is_owed = None, False
+            self._disconnect()
+
+    def wait_for(self, signal: str, timeout_s: float) -> str:
+        """Wait for `go`; see ``labseq.LeaderLink``.
+
+        Raises:
+            DeviceError: Not open, another signal, or the box was reset.
+            DeviceTimeoutError: It did not come in time.
+            StopRequested: The operator asked the run to stop.
+        """
+        pins, box = self._opened_pins(), self._opened()
+        if signal != GO:
+            raise DeviceError(self._name, f"unknown signal '{signal}'; expected '{GO}'")
+        timeout_s = self.access.raise_go(timeout_s)
+        until_s = self._clock.now() + timeout_s
+        while not self._take(pins):
+            left_s = until_s - self._clock.now()
+            if left_s <= 0:
+                raise self._no_go(timeout_s, is_high=pins.look().is_high)
+            if (event := box.line.new_events(min(left_s, LOOK_S))) is not None:
+                self._handle(event)
+        return ""
+
+    def report(self, state: str, about: Mapping[str, bool | int | float | str]) -> str:
+        """Raise `ready` or `failed`; see ``labseq.LeaderLink``.
+
+        Raises:
+            DeviceError: Not open, or the box does not answer: it raises `failed` itself at the deadline.
+        """
+        del about  # an edge carries no more than that
+        if not self._is_owed:
+            return ""
+        pins = self._opened_pins()
+        self._clock.check()  # a stop now is better than one between `ready` and its confirmation
+        is_late, more_came = pins.answer(is_ready=state == "ready")
+        self._is_owed = False
+        if more_came:
+            self._news.append(MORE)
+        if is_late:
+            self._news.append("the shot is not over at the deadline; the leader received `failed`")
+        return "late" if is_late else state
+
+    def new_events(self) -> Sequence[str]:
+        """Messages since the last call."""
+        new_events = [*self._news]
+        self._news.clear()
+        return new_events
+
+    def describe(self) -> Mapping[str, Any]:
+        """As for the box, with the outputs for the leader."""
+        return {
+            **super().describe(),
+            "leader": {"input": 8, **self._go.outputs, "deadline_s": self.deadline_s},
+        }
+
+    def _connect(self) -> None:
+        super()._connect()
+        try:
+            deadline_s = self._go.deadline if self.access.real_time else 0.0
+            self._pins = LeaderPins(self._opened(), self._go, deadline_s)
+            if self._pins.poll_input():
+                self._news.append(HIGH)
+        except BaseException:
+            self._disconnect()
+            raise
+
+    def _take(self, pins: LeaderPins) -> bool:
+        """Take a `go` that the box has detected, unless its deadline has passed."""
+        leader = pins.look()
+        if not leader.has_gone or self._is_owed:
+            return False
+        if leader.is_late:
+            self._news.append("no step waited for `go` before its deadline; the leader received `failed`")
+            pins.answer(is_ready=False)
+            return False
+        self._is_owed = True
+        return True
+
+    def _opened_pins(self) -> LeaderPins:
+        self._opened()
+        assert self._pins is not None
+        return self._pins
+
+    def _no_go(self, timeout_s: float, *, is_high: bool) -> DeviceTimeoutError:
+        what = f"no rising edge at the box's start input within {format_quantity(timeout_s, 'time')}"
+        why = "it is high: not wired, or raised before labseq was ready" if is_high else "it is low"
+        return DeviceTimeoutError(self._name, f"{what}; {why}; see 'timeout' of the wait", timeout_s)
+
+
+@dataclass(frozen=True, slots=True)
+class Leader:
+    """The state of the box towards the leader.
+
+    Attributes:
+        state: DEAF, IDLE, OWED or LATE of the protocol.
+        n_go_signals: Edges that the box accepted since its start.
+        more_came: Whether one came that it could not accept.
+        is_high: Level of the start input.
+    """
+
+    state: int
+    n_go_signals: int
+    more_came: bool
+    is_high: bool
+
+    @property
+    def has_gone(self) -> bool:
+        """Whether a `go` was accepted that labseq has not answered."""
+        return self.state in (OWED, LATE)
+
+    @property
+    def is_late(self) -> bool:
+        """Whether its deadline has passed."""
+        return self.state == LATE
+
+
+class LeaderPins:
+    """The start input and the outputs of a leader.
+
+    Args:
+        box: The box.
+        settings: Which outputs they are.
+        deadline_s: Of an answer; 0 for none.
+    """
+
+    def __init__(self, box: Box, settings: GoSettings, deadline_s: float) -> None:
+        self._box = box
+        self._settings = settings
+        self._deadline_s = deadline_s
+
+    def poll_input(self) -> bool:
+        """Accept rising edges from now on; returns whether the input is high."""
+        pins = (self._settings.busy, self._settings.ready, self._settings.failed)
+        masks = " ".join(f"{0 if pin is None else 1 << pin:x}" for pin in pins)
+        (level,) = self._box.ask_numbers(f"lead {masks} {int(self._deadline_s * 1e3):x}", 1)
+        return bool(level)
+
+    def look(self) -> Leader:
+        """Read the state; a quick command."""
+        state, n_go_signals, more, level = self._box.ask_numbers("leader", 4)
+        return Leader(state, n_go_signals, bool(more), bool(level))
+
+    def answer(self, *, is_ready: bool) -> tuple[bool, bool]:
+        """Raise `ready` or `failed`, and lower `busy`.
+
+        Returns:
+            Whether the deadline had passed, and whether further edges came meanwhile.
+        """
+        was, more = self._box.ask_numbers(f"answer {is_ready:d}", 2)
+        return was == LATE, bool(more)
+
+    def end(self) -> None:
+        """Accept no more edges; a `go` without an answer has failed."""
+        self._box.line.ask("deaf")

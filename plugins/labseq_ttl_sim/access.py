@@ -1,0 +1,133 @@
+"""``port: simulated``: the driver connects to a simulated box, and the simulation receives its outputs."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from labseq_ttl.box import late_error
+from labseq_ttl.programs import as_played
+from labseq_ttl.settings import TtlSettings
+
+from labseq.plugin import Context, DeviceError, DeviceTimeoutError, LineProgram, Port, format_quantity
+from labseq_ttl_sim.model import ModelBox
+from labseq_ttl_sim.simavr import SimavrBox, runner
+
+ROUNDING_S: Final = 1e-9
+
+
+class SimulatedAccess:
+    """A simulated box. It plays a program at once, while the session's clock decides how long that takes.
+
+    Args:
+        settings: Of the driver.
+        context: Name, clock, lines and simulation.
+        polarity: Outputs that are low when they are on: bit n is channel n.
+
+    Attributes:
+        box: The box, while connected.
+    """
+
+    max_wait_s = 15.0  # on a busy computer
+    real_time = False
+
+    def __init__(self, settings: TtlSettings, context: Context, polarity: int) -> None:
+        self._name = context.name or "lines"
+        self._settings = settings
+        self._clock = context.clock
+        self._simulation = context.simulation
+        self._specs = context.lines
+        self._polarity = polarity
+        self.box: ModelBox | SimavrBox | None = None
+
+    def warm(self) -> None:
+        """Compile what runs the firmware, unless the box is the model.
+
+        Raises:
+            DeviceError: It cannot be compiled.
+        """
+        if self._settings.simulated_by == "simavr":
+            runner(self._name)
+
+    def connect(self) -> Port:
+        """Turn a new box on; returns its serial port, open.
+
+        Raises:
+            DeviceError: It cannot be compiled or started.
+        """
+        self.box = self._new_box()
+        return self.box.port
+
+    def _new_box(self) -> ModelBox | SimavrBox:
+        if self._settings.simulated_by == "simavr":
+            return SimavrBox(self._name, self._clock)
+        return ModelBox()
+
+    def disconnect(self) -> None:
+        """Turn the box off; no effect if there is none."""
+        box, self.box = self.box, None
+        if box is not None:
+            box.close()
+
+    def lines_set(self, program: LineProgram) -> None:
+        """The driver has set the lines to the state of this program, at once."""
+        if self._simulation is not None:
+            self._simulation.play("lines", program, self._clock.now())
+
+    def fired(self, program: LineProgram | None) -> None:
+        """The driver has fired a program: pass what the outputs did to the simulation.
+
+        Args:
+            program: The program; None for one that changes no line.
+        """
+        edges = self._connected().played(self._polarity)
+        if program is not None:
+            self.lines_set(as_played(edges, program, self._specs))
+
+    def is_over(self, end_s: float) -> bool:
+        """Whether a program that the box has played is over on the session's clock."""
+        return self._clock.now() >= end_s - ROUNDING_S
+
+    def wait_until(self, end_s: float, timeout_s: float) -> float:
+        """Let the session's time pass until the end of a program.
+
+        Returns:
+            How long to wait for the box, in seconds.
+
+        Raises:
+            DeviceTimeoutError: It does not end within ``timeout_s``.
+        """
+        left_s = end_s - self._clock.now()
+        self._clock.sleep(max(0.0, min(left_s, timeout_s)))
+        if left_s > timeout_s + ROUNDING_S:
+            raise late_error(self._name, timeout_s)
+        return self.max_wait_s
+
+    def raise_go(self, timeout_s: float) -> float:
+        """Play the leader: load atoms if there are none, then raise `go`.
+
+        Returns:
+            How long to wait for the box, in seconds.
+
+        Raises:
+            DeviceTimeoutError: It takes longer than ``timeout_s``.
+        """
+        assert self._settings.go is not None
+        delay_s, simulation, start_s = (
+            self._settings.go.simulated_go_delay,
+            self._simulation,
+            self._clock.now(),
+        )
+        if delay_s > timeout_s:
+            self._clock.sleep(timeout_s)
+            text = f"the simulated leader raises 'go' after {format_quantity(delay_s, 'time')}"
+            raise DeviceTimeoutError(self._name, f"{text}; see 'simulated_go_delay'", timeout_s)
+        self._clock.sleep(delay_s)
+        if simulation is not None and ((truth := simulation.truth()) is None or not truth.any()):
+            simulation.load(start_s, delay_s)
+        self._connected().start()
+        return self.max_wait_s
+
+    def _connected(self) -> ModelBox | SimavrBox:
+        if self.box is None:
+            raise DeviceError(self._name, "the simulated box is not connected")
+        return self.box
