@@ -1,16 +1,19 @@
-# ruff: noqa: E501, RUF012 - messages stand here as they are printed; pydantic copies defaults
+"""Values against settings models: every message with its place."""
+
+# ruff: noqa: E501, RUF012 - messages are quoted as they are printed; pydantic copies defaults
 
 from __future__ import annotations
 
 from datetime import date
 from enum import Enum
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
+import numpy as np
 import pytest
-from pydantic import Field
+from pydantic import Field, field_validator, model_validator
 
-from labseq.config import Document
+from labseq.config import Document, validate_values
 from labseq.config.validation import MAX_HINTS
 from labseq.errors import ConfigError
 from labseq.settings import Duration, Fraction, Length, Settings
@@ -267,3 +270,115 @@ def test_of_very_many_unknown_keys_only_the_first_are_compared_with_the_known_on
         Document.parse(text, "f.yaml").validate(Inner)
     hints = [problem.hint for problem in caught.value.problems]
     assert hints == ["did you mean 'width'?"] * MAX_HINTS + ["", ""]
+
+
+class Shade(Enum):
+    RED = "red"
+
+
+class Values(Settings):
+    rows: int = 1
+    sizes: tuple[float, ...] = ()
+    path: Path = Path()
+    colour: Shade | None = None
+    window: Duration = 0.06
+    nested: dict[str, int] = {}
+
+
+def test_python_and_numpy_values() -> None:
+    values = {
+        "rows": np.int64(3),
+        "sizes": np.array([1.0, 2.0]),
+        "path": Path("a") / "b",
+        "colour": Shade.RED,
+        "window": "45 ms",
+        "nested": {"a": 1},
+    }
+    made = validate_values(Values, values, "planner 'x'")
+    assert made.model_dump() == {
+        "rows": 3,
+        "sizes": (1.0, 2.0),
+        "path": Path("a") / "b",
+        "colour": Shade.RED,
+        "window": 0.045,
+        "nested": {"a": 1},
+    }
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"rows": "3"}, "rows is '3'; expected a whole number; write 3 without quotes"),
+        (
+            {"row": 3},
+            "'row' is not a setting of it; expected one of rows, sizes, path, colour, window, nested; ",
+        ),
+        ({"sizes": (1, None)}, "sizes.1 is empty; expected a number"),
+        ({"sizes": [float("nan")]}, "sizes.0 is nan; expected a finite number"),
+        ({"rows": object()}, "a value of type object is no setting; expected a number, text, list or dict"),
+        ({"window": 1e300}, "window is 1e+300; expected at most 720 h, which is 30 days"),
+        ({"window": "721 h"}, "window is '721 h'; expected at most 720 h, which is 30 days"),
+        ({"window": "1 K"}, "window: '1 K' is a temperature, not a time"),
+    ],
+)
+def test_refusals(values: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        validate_values(Values, values, "planner 'x'")
+    assert str(caught.value).startswith(f"planner 'x': {message}")
+
+
+def test_values_for_a_plugin_without_settings() -> None:
+    assert validate_values(None, {}, "planner 'x'") is None
+    with pytest.raises(
+        ConfigError, match=r"^planner 'x': it takes no settings, but 'a' is given; remove it$"
+    ):
+        validate_values(None, {"a": 1}, "planner 'x'")
+
+
+class Custom(Settings):
+    pair: tuple[int, ...] = ()
+    limit: int = 5
+
+    @model_validator(mode="before")
+    @classmethod
+    def _any(cls, value: Any) -> Any:
+        return value
+
+    @field_validator("limit")
+    @classmethod
+    def _limit(cls, limit: int) -> int:
+        if limit == 13:
+            raise KeyError("unlucky")
+        if limit == 12:
+            raise ValueError("12 is reserved; expected another number; ask the night shift")
+        if limit == 11:
+            raise AssertionError("11 is\n   odd")
+        return limit
+
+    @model_validator(mode="after")
+    def _together(self) -> Self:
+        if self.limit < len(self.pair):
+            raise ValueError("more numbers than the limit")
+        return self
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("limit: 12", "1:12: limit: 12 is reserved; expected another number; ask the night shift"),
+        ("limit: 11", "1:12: limit: 11 is odd"),
+        ("limit: 13", "1:4: these settings make the plugin's check fail: KeyError: 'unlucky'"),
+        ("limit: 1, pair: [1, 2]", "1:4: a: more numbers than the limit"),
+        ("pair: [1, x]", "1:15: pair.1 is 'x'"),
+        ("pair: 5", "1:11: pair is 5; expected a list"),
+    ],
+)
+def test_validators_of_plugins(text: str, message: str) -> None:
+    document = Document.parse(f"a: {{{text}}}", "f.yaml")
+    with pytest.raises(ConfigError) as caught:
+        document.validate(Custom, ("a",))
+    assert str(caught.value).removeprefix("f.yaml:").startswith(message)
+
+
+def test_lists_become_tuples_behind_validators_too() -> None:
+    assert Document.parse("a: {pair: [1, 2]}", "f.yaml").validate(Custom, ("a",)).pair == (1, 2)

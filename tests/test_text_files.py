@@ -1,3 +1,5 @@
+"""Text files that are missing, too large, not UTF-8 or no files."""
+
 from __future__ import annotations
 
 import os

@@ -1,6 +1,6 @@
 """Text that is no strict YAML, and what is said of it: the first message, exactly."""
 
-# ruff: noqa: E501 - messages stand here as they are printed
+# ruff: noqa: E501 - messages are quoted as they are printed
 
 from __future__ import annotations
 

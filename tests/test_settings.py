@@ -1,3 +1,5 @@
+"""The types of settings: quantities in SI, durations, frozen models."""
+
 from __future__ import annotations
 
 import pytest
