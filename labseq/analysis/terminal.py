@@ -1,4 +1,4 @@
-"""What `labseq replay`, `labseq analyse` and `labseq plot` print."""
+"""`labseq replay`, `labseq analyse` and `labseq plot`: do the work and print the result."""
 
 from __future__ import annotations
 
@@ -30,25 +30,25 @@ from labseq.session.analyses import USE, AnalysisOutcome, analyse_missing, analy
 from labseq.units import format_quantity
 
 MAX_REPORTED: Final = 5
-"""Failures that are told one by one."""
+"""Maximum number of failures that are printed one by one."""
 WIDEST: Final = 64
-"""Widest array whose differing sites are drawn."""
+"""Maximum width of an array whose differing sites are drawn."""
 
 
 def replay_run(path: Path | None, request: ReplayRequest, output: Path | None, *, as_json: bool) -> int:
-    """Replay a run, and print what came of it.
+    """Replay a run and print the comparison.
 
     Args:
         path: The run's folder or any file in it; None for the newest run.
-        request: What is to be tried.
-        output: File for all of it as JSON, or None.
-        as_json: Whether to print that as one line instead.
+        request: What to try.
+        output: File for all results as JSON, or None.
+        as_json: Whether to print them as one line of JSON instead.
 
     Returns:
-        The exit code: 1 if the run's own planner or detector did not give what was recorded.
+        The exit code: 1 if the run's own planner or detector did not reproduce the recorded results.
 
     Raises:
-        LabseqError: Something in the request is wrong, or the run cannot be replayed.
+        LabseqError: The request is wrong, or the run cannot be replayed.
     """
     run = chosen_run(path)
     write = json_writer(None if output is None else str(output))
@@ -65,12 +65,12 @@ def replay_run(path: Path | None, request: ReplayRequest, output: Path | None, *
 
 
 def report_lines(found: Replay) -> list[str]:
-    """What came of a replay, in tables."""
+    """The comparison, in tables."""
     lines = [f"{found.run.path}: {plural(found.n_shots, 'shot')}"]
     if found.plans:
         lines += ["", *_plan_lines(found)]
     elif "planner" in found.used:
-        lines += ["", "planner: nothing was planned in these shots"]
+        lines += ["", "planner: these shots have no plans"]
     if "detector" in found.used:
         lines += ["", *_image_lines(found)]
     if found.is_own:
@@ -80,7 +80,9 @@ def report_lines(found: Replay) -> list[str]:
 
 def _verdict(found: Replay) -> str:
     if not found.is_reproduced:
-        return "NOT REPRODUCED: the run's own planner or detector gives something else than was recorded"
+        return (
+            "NOT REPRODUCED: the results of the run's own planner or detector differ from the recorded ones"
+        )
     n_images = len(found.images.images)
     if not found.plans and not n_images:
         return "nothing to reproduce: no plans, and no frames were kept"
@@ -109,7 +111,7 @@ def _plan_lines(found: Replay) -> list[str]:
 
 
 def _groups(plans: Sequence[ReplayedPlan]) -> Iterator[tuple[str, list[ReplayedPlan]]]:
-    """The plans of each cycle, then all; cycles are counted over all rearrangements of the shot."""
+    """The plans of each cycle, then all; cycles are counted from 1 over all rearrangements of a shot."""
     by_cycle: dict[int, list[ReplayedPlan]] = {}
     numbers: dict[int, int] = {}
     for plan in plans:
@@ -151,8 +153,8 @@ def _image_lines(found: Replay) -> list[str]:
     rows = [
         ("images", str(len(images.images)) + _without(images)),
         ("sites that differ", f"{images.n_differing} of {n_sites}, on {plural(differing, 'image')}"),
-        ("  atom, before none", str(appeared)),
-        ("  none, before an atom", str(vanished)),
+        ("  atom, none before", str(appeared)),
+        ("  no atom, one before", str(vanished)),
         (
             "atoms on an image",
             f"recorded {_mean(images, 'n_atoms')}, now {_mean(images, 'n_atoms_replayed')}",
@@ -161,11 +163,11 @@ def _image_lines(found: Replay) -> list[str]:
     ]
     known = [one for one in images.images if one.n_atoms_true is not None]
     if known:
-        told = (
+        means = (
             (name, str(mean([getattr(one, key) for one in known])))
             for name, key in (("recorded", "n_atoms"), ("now", "n_atoms_replayed"), ("truth", "n_atoms_true"))
         )
-        rows.append(("on a last image", ", ".join(f"{name} {value}" for name, value in told)))
+        rows.append(("on a last image", ", ".join(f"{name} {value}" for name, value in means)))
     return [*lines, *columns(rows), *_map(images)]
 
 
@@ -178,12 +180,12 @@ def _mean(images: ReplayedImages, name: str) -> str:
 
 
 def _map(images: ReplayedImages) -> list[str]:
-    """The sites that differ: + an atom where there was none, - none where there was one, * both."""
+    """A map of the sites that differ: + a new atom, - a missing atom, * both."""
     if not images.n_differing or images.appeared.shape[1] > WIDEST:
         return []
     kinds = np.array([".", "+", "-", "*"])[(images.appeared > 0) + 2 * (images.vanished > 0)]
     rows = [" ".join(row) for row in kinds.tolist()]
-    return ["", "+ an atom, before none; - none, before an atom; * both", *rows]
+    return ["", "+ atom, none before; - no atom, one before; * both", *rows]
 
 
 def _failure_lines(found: Replay) -> list[str]:
@@ -200,7 +202,7 @@ def _failure_lines(found: Replay) -> list[str]:
 
 
 def as_values(found: Replay) -> dict[str, Any]:
-    """Everything, JSON-ready; shots and images count from 0, times are in seconds, None is not known."""
+    """All results, JSON-ready: shots and images counted from 0, times in seconds, None for unknown."""
     images = found.images
     return to_plain(
         {
@@ -247,7 +249,7 @@ def _means_values(means: MeanCounts) -> dict[str, Any]:
 
 
 def analyse_run(path: Path | None, use: str | None, overrides: Sequence[str], *, again: bool) -> int:
-    """Analyse the shots of a run that have no result yet, and say what came of it.
+    """Analyse the shots of a run that have no result yet, and print how many.
 
     Args:
         path: The run's folder or any file in it; None for the newest run.
@@ -256,10 +258,10 @@ def analyse_run(path: Path | None, use: str | None, overrides: Sequence[str], *,
         again: Whether to analyse all shots again.
 
     Returns:
-        The exit code: 1 if there is no result of a shot.
+        The exit code: 1 if the analysis of a shot failed.
 
     Raises:
-        LabseqError: Something that was asked for is wrong, or the results cannot be written.
+        LabseqError: An option is wrong, or the results cannot be written.
     """
     run = chosen_run(path)
     failed = False
@@ -271,20 +273,20 @@ def analyse_run(path: Path | None, use: str | None, overrides: Sequence[str], *,
 
 
 def _wanted(run: Run, use: str | None, overrides: Sequence[str]) -> list[dict[str, Any]]:
-    """The settings of each analysis that is meant.
+    """The settings of each analysis to run.
 
     Raises:
-        ConfigError: None is meant, or an option is wrong.
+        ConfigError: There is none, or an option is wrong.
     """
     own = analyses_of(run)
     if use is not None:
         settings = next((one for one in own if one[USE] == use), {USE: use})
         return [{**settings, **_changes(overrides)}]
     if overrides:
-        what, hint = "it is not said of which analysis this is a setting", "name it with --use"
+        what, hint = "it does not say which analysis has this setting", "name it with --use"
         raise ConfigError(Problem(what, clean(f"--set {overrides[0]}"), hint=hint))
     if not own:
-        what, hint = "the run's sequence asks for no analysis", "name one with --use"
+        what, hint = "the run's sequence has no analysis", "name one with --use"
         raise ConfigError(Problem(what, clean(str(run.path)), hint=hint))
     return own
 
@@ -293,11 +295,11 @@ def _changes(overrides: Sequence[str]) -> dict[str, Any]:
     """The values of ``--set``.
 
     Raises:
-        ConfigError: One is not of the form key=value, or its value is no YAML.
+        ConfigError: One is not of the form key=value, or its value is not YAML.
     """
     for_sequence, for_profile = split_overrides(overrides)
     if for_profile:
-        what = "an analysis has no part of the profile"
+        what = "an analysis has no settings in the profile"
         raise ConfigError(Problem(what, for_profile[0].source, expected="key=value"))
     parents = {one.address.rpartition(".")[0] for one in for_sequence}
     return Document.parse("{}", "the command line").override_all(for_sequence, may_add=parents).data
@@ -306,9 +308,9 @@ def _changes(overrides: Sequence[str]) -> dict[str, Any]:
 def _report(done: AnalysisOutcome) -> None:
     before = f", {done.n_before} had a result already" if done.n_before else ""
     say(f"{done.name}: {plural(done.n_done, 'shot')} analysed{before}; see {done.path}")
-    told = [f"{done.name}: shot {shot + 1} failed: {text}" for shot, text in done.failures.items()]
-    more = len(told) - MAX_REPORTED
-    say(*told[:MAX_REPORTED], *([f"and {more} more shots failed"] if more > 0 else []), stream=sys.stderr)
+    failed = [f"{done.name}: shot {shot + 1} failed: {text}" for shot, text in done.failures.items()]
+    more = len(failed) - MAX_REPORTED
+    say(*failed[:MAX_REPORTED], *([f"and {more} more shots failed"] if more > 0 else []), stream=sys.stderr)
 
 
 FIGURES: Final = ("4", "5")
@@ -317,14 +319,14 @@ FIGURES: Final = ("4", "5")
 
 @dataclass(frozen=True, slots=True)
 class PlotRequest:
-    """What is to be drawn of a run; at most one of ``figure``, ``what`` and ``shot`` is given.
+    """What to draw of a run; at most one of ``figure``, ``what`` and ``shot`` is given.
 
     Attributes:
         what: A part of the overview; None for all of it.
         figure: One of :data:`FIGURES`, a figure of the paper.
         compare: Another run for that figure.
         shot: A shot, counted from 1.
-        cycle: A cycle of it.
+        cycle: A cycle of it, counted from 1.
     """
 
     what: str | None = None
@@ -334,7 +336,7 @@ class PlotRequest:
     cycle: int | None = None
 
     def check(self) -> None:
-        """Find out whether the options go together.
+        """Check that the options fit together.
 
         Raises:
             ConfigError: They do not, or there is no such picture.
@@ -349,7 +351,7 @@ class PlotRequest:
                 Problem("these are different pictures", " and ".join(given), expected="one of them")
             )
         if self.cycle is not None and self.shot is None:
-            raise ConfigError(Problem("a cycle is one of a shot", "--cycle", expected="--shot as well"))
+            raise ConfigError(Problem("a cycle belongs to a shot", "--cycle", expected="--shot as well"))
         if self.compare is not None and self.figure is None:
             expected = "--figure 4 or --figure 5 as well"
             raise ConfigError(
@@ -365,7 +367,7 @@ class PlotRequest:
 
     @property
     def name(self) -> str:
-        """What the file is called if nothing is said, without its ending.
+        """The default name of the file, without its ending.
 
         Example:
             >>> PlotRequest(shot=3, cycle=1).name, PlotRequest(figure="5").name, PlotRequest().name
@@ -381,11 +383,11 @@ def plot_run(run: Path | None, request: PlotRequest, output: Path | None) -> Non
 
     Args:
         run: The run's folder or any file in it; None for the newest run.
-        request: What is to be drawn.
-        output: The picture; None for a name of its own in the current folder.
+        request: What to draw.
+        output: The picture; None for the default name in the current folder.
 
     Raises:
-        ConfigError: There is no such run or picture, the run has nothing to show in it, or the
+        ConfigError: There is no such run or picture, the run has no data for it, or the
             picture cannot be written.
         RecordingError: A run is damaged.
     """

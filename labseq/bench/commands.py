@@ -1,4 +1,4 @@
-"""`labseq bench`."""
+"""The commands of `labseq bench`."""
 
 from __future__ import annotations
 
@@ -7,10 +7,12 @@ from typing import Annotated
 
 import typer
 
+from labseq.console.options import JsonFile, profile_names
+
 bench = typer.Typer(
     name="bench",
     help="Measure and compare parts of labseq.",
-    short_help="Compare planners; measure rendering, and the time to the light.",
+    short_help="Compare planners; measure rendering and latency.",
     no_args_is_help=True,
     rich_markup_mode=None,
 )
@@ -31,13 +33,6 @@ Examples:
   labseq bench latency sequences/compact_225.yaml --profile bench_awg --set profile.mobile_tweezers.mode=fifo
 """
 
-JsonFile = Annotated[
-    str | None,
-    typer.Option(
-        metavar="FILE|-", help="Write the result as JSON; with '-' to stdout, and all else to stderr."
-    ),
-]
-
 
 @bench.command(epilog=PLANNERS_EXAMPLES, short_help="Compare planners on the same random loadings.")
 def planners(
@@ -45,16 +40,15 @@ def planners(
         str | None,
         typer.Option(
             metavar="2b|2c|3a|3b",
-            help="Reproduce a figure of the paper; draws figure-2b.png and writes figure-2b.csv unless other "
-            "files are named.",
+            help="Reproduce a figure of the paper; draws figure-2b.png and writes figure-2b.csv unless you "
+            "name other files.",
         ),
     ] = None,
     planners: Annotated[
         str | None,
         typer.Option(
             metavar="NAME,...",
-            help="Planners, each perhaps with settings that only it has: psca,psca:variant=paper. "
-            "Default: psca.",
+            help="Planners, optionally with their own settings: psca,psca:variant=paper. Default: psca.",
         ),
     ] = None,
     grid: Annotated[
@@ -71,27 +65,29 @@ def planners(
         int | None,
         typer.Option(
             metavar="N",
-            help="Degree of parallelism of all planners that have one; each planner's default if left out.",
+            help="Degree of parallelism of all planners that have one. Default: each planner's own.",
         ),
     ] = None,
     loadings: Annotated[
-        int, typer.Option(metavar="N", min=1, help="Random loadings; the paper's figures have 10000.")
+        int,
+        typer.Option(metavar="N", min=1, help="Number of random loadings; the paper's figures use 10000."),
     ] = 1000,
     seed: Annotated[
-        int, typer.Option(metavar="N", min=0, help="Seed of all loadings: the same seed, the same result.")
+        int,
+        typer.Option(metavar="N", min=0, help="Seed of all loadings; the same seed gives the same result."),
     ] = 1,
     overrides: Annotated[
         list[str] | None,
         typer.Option(
             "--set",
             metavar="ADDRESS=VALUE",
-            help="planner.KEY=VALUE changes every planner, profile.mobile_tweezers.KEY=VALUE how tweezers "
-            "move; may be given several times.",
+            help="planner.KEY=VALUE changes every planner, profile.mobile_tweezers.KEY=VALUE the motion "
+            "of the tweezers; may be given several times.",
         ),
     ] = None,
     workers: Annotated[
         int | None,
-        typer.Option(metavar="N", min=1, help="Processes that share the work; all cores if left out."),
+        typer.Option(metavar="N", min=1, help="Number of processes. Default: one per core."),
     ] = None,
     json: JsonFile = None,
     csv: Annotated[
@@ -99,10 +95,10 @@ def planners(
     ] = None,
     png: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Draw the figure, or how the numbers of batches spread."),
+        typer.Option(metavar="FILE", help="Draw the figure, or a histogram of the number of batches."),
     ] = None,
 ) -> None:
-    """Let planners plan the same random loadings, check every plan, and compare what comes of it."""
+    """Let planners plan the same random loadings, check every plan, and compare the results."""
     from labseq.bench.planners import BenchRequest
     from labseq.bench.terminal import BenchOutput, bench_planners
 
@@ -121,13 +117,13 @@ def planners(
     bench_planners(request, BenchOutput(json=json, csv=csv, png=png))
 
 
-@bench.command(epilog=LATENCY_EXAMPLES, short_help="Measure the time from a frame to the light.")
+@bench.command(epilog=LATENCY_EXAMPLES, short_help="Measure the time from a frame to the first light.")
 def latency(
     sequence: Annotated[
         Path,
         typer.Argument(
             metavar="SEQUENCE",
-            help="A sequence: its target, its planner, and how its first image is taken.",
+            help="The sequence; its target, its planner and its first image are used.",
             show_default=False,
         ),
     ],
@@ -138,19 +134,20 @@ def latency(
             "-p",
             metavar="NAME|FILE",
             help="Hardware profile, instead of the one that the sequence names.",
+            autocompletion=profile_names,
         ),
     ] = None,
     loadings: Annotated[int, typer.Option(metavar="N", min=1, help="Random loadings.")] = 200,
     seed: Annotated[int, typer.Option(metavar="N", min=0, help="Seed of all loadings.")] = 1,
     overrides: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="ADDRESS=VALUE", help="As for run; may be given several times."),
+        typer.Option("--set", metavar="ADDRESS=VALUE", help="As for labseq run; may be given several times."),
     ] = None,
     json: JsonFile = None,
 ) -> None:
-    """Measure what passes between the end of an exposure and the first light of the mobile tweezers.
+    """Measure the time from the end of an exposure to the first light of the mobile tweezers.
 
-    Shots are taken in a dry run up to the first image, and carried on to the start of the moves.
+    Shots are taken in a dry run up to the first image, and continued to the start of the moves.
     """
     from labseq.bench.latency import LatencyRequest
     from labseq.bench.terminal import bench_latency
@@ -158,14 +155,14 @@ def latency(
     bench_latency(LatencyRequest(sequence, profile, tuple(overrides or ()), loadings, seed), json)
 
 
-@bench.command(short_help="Measure how fast tones become samples.")
+@bench.command(short_help="Measure the speed of rendering.")
 def waveform(
     repeats: Annotated[
-        int, typer.Option(metavar="N", min=1, help="How often everything is rendered; the best one counts.")
+        int, typer.Option(metavar="N", min=1, help="Number of repetitions; the fastest one counts.")
     ] = 15,
     json: JsonFile = None,
 ) -> None:
-    """Measure rendering: by kind of segment, for a plan, and beside the stored-waveform way and numpy."""
+    """Measure rendering: by kind of segment, for a plan, and compared with stored waveforms and numpy."""
     from labseq.bench.terminal import bench_rendering
 
     bench_rendering(repeats, json)

@@ -1,4 +1,4 @@
-"""What `labseq bench` prints."""
+"""`labseq bench`: run a benchmark, print its tables, write its files."""
 
 from __future__ import annotations
 
@@ -43,23 +43,23 @@ from labseq.pictures.plans import check_picture
 from labseq.units import format_quantity
 
 _STEPS: Final = 10
-"""How often progress is told where there is no terminal."""
+"""Number of progress lines without a terminal."""
 
 
 @contextmanager
 def progress_of(what: str) -> Generator[Callable[[int, int], None]]:
-    """A bar on stderr if that is a terminal, else a line now and then.
+    """A progress bar on stderr if it is a terminal, else a line for every tenth.
 
     Args:
         what: What is counted, in the plural.
     """
     if not sys.stderr.isatty():
-        told = 0
+        reported = 0
 
         def report_progress(done: int, wanted: int) -> None:
-            nonlocal told
-            if done * _STEPS // wanted > told:
-                told = done * _STEPS // wanted
+            nonlocal reported
+            if done * _STEPS // wanted > reported:
+                reported = done * _STEPS // wanted
                 say(f"{done} of {wanted} {what}", stream=sys.stderr)
 
         yield report_progress
@@ -77,9 +77,9 @@ _TEXT_COLUMNS: Final = {"planner", "target", "grid"}
 
 
 def table(report: Report) -> list[str]:
-    """A line per planner and condition; conditions are named only where they differ."""
+    """A row per planner and condition; a condition has a column only if it varies."""
     if not report.rows:
-        return ["nothing was done"]
+        return ["no plan was made"]
     rows = [_cells(row, report) for row in report.rows]
     header = list(rows[0])
     right = [i for i, name in enumerate(header) if name not in _TEXT_COLUMNS]
@@ -87,10 +87,10 @@ def table(report: Report) -> list[str]:
 
 
 def notes(report: Report, figure: Figure | None) -> list[str]:
-    """What the table cannot say: fits, what is left out, what went wrong."""
+    """Notes below the table: fits, missing atoms, wrong plans."""
     lines = [_extent(report)]
     if any(row.scans for row in report.rows):
-        lines.append("scans: what the source of the planner counts instead of batches, and their time")
+        lines.append("scans: what the paper of the planner counts instead of batches, and their duration")
     lines += _shortages(report)
     if figure is not None:
         lines += [*_fits(report, figure), f"the paper, figure {figure.name}: {figure.paper}"]
@@ -126,7 +126,7 @@ def _cells(row: Row, report: Report) -> dict[str, str]:
 
 
 def _fits(report: Report, figure: Figure) -> list[str]:
-    """The power laws, and what the curves come to at the last point."""
+    """The fitted power laws, and the values at the last point."""
     every = [points for points in points_of(report, figure) if points.law is not None]
     if not every:
         return []
@@ -143,6 +143,10 @@ def _fits(report: Report, figure: Figure) -> list[str]:
 
 def _time(duration_s: float) -> str:
     return "-" if math.isnan(duration_s) else format_quantity(duration_s, "time")
+
+
+def _nonzero_time(duration_s: float) -> str:
+    return _time(duration_s) if duration_s else "-"
 
 
 def _extent(report: Report) -> str:
@@ -176,7 +180,7 @@ def _failure(report: Report, row: Row) -> list[str]:
 
 
 def _again(report: Report, row: Row, loading: int) -> str:
-    """How one loading is planned again."""
+    """The command that plans one loading again."""
     condition, comparison = row.condition, report.comparison
     rows, cols = condition.shape
     seed = loading_seed(comparison.seed, loading)
@@ -193,7 +197,7 @@ def _again(report: Report, row: Row, loading: int) -> str:
 
 @dataclass(frozen=True, slots=True)
 class BenchOutput:
-    """What is written besides the table.
+    """What is written in addition to the table.
 
     Attributes:
         json: Name of the file for everything as JSON; "-" for stdout, which then holds nothing else.
@@ -207,17 +211,17 @@ class BenchOutput:
 
 
 def bench_planners(request: BenchRequest, output: BenchOutput) -> None:
-    """Compare planners and tell what came of it, also when it was stopped.
+    """Compare planners and print the result, also if it was stopped.
 
     Args:
-        request: What is to be compared.
-        output: What is written besides the table.
+        request: What to compare.
+        output: What to write in addition to the table.
 
     Raises:
         ConfigError: Something in the request is wrong, or a file cannot be written.
         PluginLoadError: A plugin that is named failed to load.
         PlanError: A planner failed, or a plan breaks a rule, for some loadings.
-        StopRequested: It was stopped; what was done until then has been told.
+        StopRequested: It was stopped; the results so far were printed.
     """
     answer = stdout_to_stderr() if output.json == STDOUT else None
     comparison, figure = read_request(request)
@@ -240,7 +244,7 @@ def bench_planners(request: BenchRequest, output: BenchOutput) -> None:
 
 
 def _files(output: BenchOutput, figure: Figure | None) -> dict[str, Path]:
-    """The files that are to be written, by kind."""
+    """The files to write, by kind."""
     named = {"csv": output.csv, "png": output.png}
     if output.json not in (None, STDOUT):
         named["json"] = Path(output.json)
@@ -271,42 +275,40 @@ def _raise_failures(report: Report) -> None:
     if failed:
         n, of = sum(row.n_failed for row in failed), sum(row.n_loadings for row in failed)
         names = ", ".join(dict.fromkeys(f"'{row.planner_entry.planner}'" for row in failed))
-        raise PlanError(f"{n} of {of} plans of {names} are wrong; they do not count in the table")
+        raise PlanError(f"{n} of {of} plans of {names} are wrong; they are not counted in the table")
 
 
 def bench_latency(request: LatencyRequest, json: str | None = None) -> None:
-    """Measure and tell.
+    """Measure the latency from a frame to the first light, and print it.
 
     Args:
-        request: What is to be measured.
+        request: What to measure.
         json: Name of the file for everything as JSON; "-" for stdout, which then holds nothing else.
 
     Raises:
         ConfigError: Something in the request is wrong, or the file cannot be written.
         PluginLoadError: A plugin that is named failed to load.
-        LabseqError: Whatever ended a shot.
+        LabseqError: The error that ended a shot.
     """
     write = json_writer(json)
     with progress_of("loadings") as progress:
         report = measure_latency(request, announce=report_compiling, progress=progress)
-    say(*bench_latency_table(report), "", *light_table(report), "", *bench_latency_notes(report))
+    say(*latency_table(report), "", *light_table(report), "", *latency_notes(report))
     say(*(f"warning: {text}" for text in report.warnings), stream=sys.stderr)
     write(report.as_dict())
 
 
-def bench_latency_table(report: LatencyReport) -> list[str]:
+def latency_table(report: LatencyReport) -> list[str]:
     """From a frame in memory to the first chunk of samples."""
     rows = [("stage", "median", "99 %", "share")]
     for stage in (*report.stages, report.total):
         share = percent(stage.median_s / report.total.median_s, 0)
-        rows.append(
-            (stage.name, _bench_latency_time(stage.median_s), _bench_latency_time(stage.p99_s), share)
-        )
+        rows.append((stage.name, _time(stage.median_s), _time(stage.p99_s), share))
     return columns(rows, right=(1, 2, 3))
 
 
 def light_table(report: LatencyReport) -> list[str]:
-    """From the end of the exposure to the output; what the hardware takes is modelled."""
+    """From the end of the exposure to the output; the times of the hardware are modelled."""
     parts = (
         Stage("camera read-out", 0.0, 0.0, report.readout_s),
         report.planned,
@@ -314,22 +316,25 @@ def light_table(report: LatencyReport) -> list[str]:
         report.start,
         Stage("trigger", 0.0, 0.0, report.trigger_s),
     )
-    rows = [("to the light", "here", "99 %", "modelled")]
-    rows += [(s.name, _or_none(s.median_s), _or_none(s.p99_s), _or_none(s.modelled_s)) for s in parts]
+    rows = [("to the light", "this computer", "99 %", "modelled")]
+    rows += [
+        (s.name, _nonzero_time(s.median_s), _nonzero_time(s.p99_s), _nonzero_time(s.modelled_s))
+        for s in parts
+    ]
     here_s = sum(stage.median_s for stage in parts)
     rows.append(
         (
             "end of exposure to light",
-            _bench_latency_time(here_s),
+            _time(here_s),
             "-",
-            _bench_latency_time(report.to_light_s - here_s),
+            _time(report.to_light_s - here_s),
         )
     )
     return columns(rows, right=(1, 2, 3))
 
 
-def bench_latency_notes(report: LatencyReport) -> list[str]:
-    """What was measured, where, and what the tables cannot say."""
+def latency_notes(report: LatencyReport) -> list[str]:
+    """Notes below the tables: what was measured, and on which computer."""
     device = f"{report.device}, mode {report.mode}" if report.mode else report.device
     load = "" if report.load is None else f", load {report.load:.2g}"
     playing, rate = format_quantity(report.playing_s, "time"), report.sample_rate_hz
@@ -340,20 +345,12 @@ def bench_latency_notes(report: LatencyReport) -> list[str]:
         f"{plural(report.n_loadings, 'loading')}, seed {report.seed}; {plural(report.n_cores, 'core')}{load}",
         f"{planner}: {report.n_batches:g} batches, played in {playing}",
         f"profile {report.profile}: {device}; first chunk at {format_quantity(rate, 'frequency')}",
-        "prepare: the driver's own rendering included, and the work of a simulated device",
+        "prepare includes the driver's own rendering and the work of a simulated device",
     ]
 
 
-def _bench_latency_time(duration_s: float) -> str:
-    return format_quantity(duration_s, "time")
-
-
-def _or_none(duration_s: float) -> str:
-    return _bench_latency_time(duration_s) if duration_s else "-"
-
-
 def bench_rendering(repeats: int, json: str | None = None) -> None:
-    """Measure and tell.
+    """Measure the speed of rendering, and print it.
 
     Args:
         repeats: How often everything is rendered.
@@ -364,12 +361,12 @@ def bench_rendering(repeats: int, json: str | None = None) -> None:
     """
     write = json_writer(json)
     report = bench_waveform(repeats, announce=report_compiling)
-    say(*bench_waveform_table(report), "", *ratios(report), "", _bench_waveform_extent(report))
+    say(*rendering_table(report), "", *ratios(report), "", _rendering_extent(report))
     write(report.as_dict())
 
 
-def bench_waveform_table(report: WaveformReport) -> list[str]:
-    """A line per measurement."""
+def rendering_table(report: WaveformReport) -> list[str]:
+    """A row per measurement."""
     rows = [("two channels", "Gsample/s", "playing/rendering", "goal")]
     for row in report.rows:
         goal = "-" if row.goal is None else f">= {row.goal:g}"
@@ -378,7 +375,7 @@ def bench_waveform_table(report: WaveformReport) -> list[str]:
 
 
 def ratios(report: WaveformReport) -> list[str]:
-    """A line per ratio of rendering times."""
+    """A row per ratio of rendering times."""
     rows = [("rendering times", "ratio", "goal")]
     for ratio in report.ratios:
         sign = "<=" if ratio.at_most else ">="
@@ -386,6 +383,6 @@ def ratios(report: WaveformReport) -> list[str]:
     return columns(rows, right=(1, 2))
 
 
-def _bench_waveform_extent(report: WaveformReport) -> str:
+def _rendering_extent(report: WaveformReport) -> str:
     rate = format_quantity(report.sample_rate_hz, "frequency")
     return f"{rate}, two threads; the best of {report.repeats}"

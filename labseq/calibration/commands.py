@@ -1,4 +1,4 @@
-"""`labseq calibrate` and `labseq calibration`."""
+"""The commands `labseq calibrate` and `labseq calibration`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ calibration = typer.Typer(
     rich_markup_mode=None,
 )
 
-ID_HELP = "Id of a calibration, or so much of its beginning that no other one is meant."
+ID_HELP = "Id of a calibration, or an unambiguous beginning of it."
 
 USE_EXAMPLES = """\b
 Examples:
@@ -42,7 +42,7 @@ DryRun = Annotated[
     DryRunKind | None,
     typer.Option(
         "--dry-run",
-        help="Those of dry runs: what is measured on virtual devices does not count for real ones.",
+        help="The calibrations of dry runs; they are kept apart from those of real devices.",
         metavar="[=fast]",
         show_choices=False,
     ),
@@ -62,31 +62,33 @@ def list_all(profile: Profile = "virtual", dry_run: DryRun = None, as_json: Json
     list_calibrations(profile, _mode(dry_run), as_json=as_json)
 
 
-@calibration.command(short_help="Show what a calibration found.")
+@calibration.command(short_help="Show one calibration.")
 def show(
     calibration_id: Id, profile: Profile = "virtual", dry_run: DryRun = None, as_json: Json = False
 ) -> None:
-    """Show what a calibration found, how good it is, and where it comes from."""
+    """Show the values of a calibration, its quality, and its origin."""
     from labseq.calibration.terminal import show_calibration
 
     show_calibration(calibration_id, profile, _mode(dry_run), as_json=as_json)
 
 
-@calibration.command(epilog=USE_EXAMPLES, short_help="Put a calibration to use, or aside.")
+@calibration.command(epilog=USE_EXAMPLES, short_help="Use a calibration, or none of its kind.")
 def use(
     choice: Annotated[
         str,
         typer.Argument(
-            metavar="ID", help=f"{ID_HELP} With overlay=off, none of that kind.", show_default=False
+            metavar="ID",
+            help=f"{ID_HELP} With overlay=off no calibration of that kind is used.",
+            show_default=False,
         ),
     ],
     profile: Profile = "virtual",
     dry_run: DryRun = None,
     force: Annotated[
-        bool, typer.Option("--force", help="Use also one that is worse than the one in use.")
+        bool, typer.Option("--force", help="Use it even if it is worse than the one in use.")
     ] = False,
 ) -> None:
-    """Put a calibration to use from the next run on; runs in progress keep theirs."""
+    """Use a calibration from the next run on; runs in progress keep theirs."""
     from labseq.calibration.terminal import use_calibration
 
     use_calibration(choice, profile, _mode(dry_run), force=force)
@@ -100,7 +102,7 @@ def diff(
     dry_run: DryRun = None,
     as_json: Json = False,
 ) -> None:
-    """Compare two calibrations of one kind: how far every value has moved, and the figures of merit."""
+    """Compare two calibrations of one kind: the change of every value, and the quality."""
     from labseq.calibration.terminal import compare_calibrations
 
     compare_calibrations(before, after, profile, _mode(dry_run), as_json=as_json)
@@ -111,7 +113,7 @@ def calibrate(
         str,
         typer.Argument(
             metavar="KIND",
-            help="What is calibrated: sites, thresholds, tweezers, frequencies or overlay.",
+            help="What to calibrate: sites, thresholds, tweezers, frequencies or overlay.",
             show_default=False,
         ),
     ],
@@ -121,8 +123,8 @@ def calibrate(
         typer.Option(
             "--from",
             metavar="RUN|FILE",
-            help="Analyse a run that was taken before; or take the sites of an irregular array from a .npy "
-            "or .csv file.",
+            help="Analyse an earlier run instead of taking one; or read the sites of an irregular array from "
+            "a .npy or .csv file.",
         ),
     ] = None,
     shots: Annotated[
@@ -140,7 +142,7 @@ def calibrate(
     ] = False,
     as_json: Json = False,
 ) -> None:
-    """Calibrate a profile: take a run, analyse it, keep the result, and use it unless it is worse."""
+    """Calibrate a profile: take a run, analyse it, store the result, and use it unless it is worse."""
     from labseq.calibration.measure import CalibrationRequest
     from labseq.calibration.terminal import calibrate_kind
 

@@ -1,4 +1,4 @@
-"""What `labseq calibrate` and `labseq calibration` print."""
+"""`labseq calibrate` and `labseq calibration`: do the work and print the result."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from labseq.calibration.measure import METHODS, CalibrationRequest, Outcome, cal
 from labseq.calibration.store import DECIDING, Damaged, Store, Stored, figure_of, grid_text
 from labseq.config import CalibrationChoices
 from labseq.config.profile import OFF
-from labseq.console.events import LASTING, event_text
+from labseq.console.events import LASTING, LogLines
 from labseq.console.output import as_line, say, stdout_to_stderr
 from labseq.console.text import age_text, columns
 from labseq.errors import ConfigError, Problem
 from labseq.messages import clean, did_you_mean, listing
-from labseq.model import CALIBRATION_KINDS, CalibrationEntry, CalibrationKind, RunRecord
+from labseq.model import CALIBRATION_KINDS, CalibrationEntry, CalibrationKind
 from labseq.session.calibrations import open_store
 from labseq.session.profile import DryRun
 from labseq.units import format_quantity
 
 MAX_LISTED: Final = 4
-"""Numbers of a value that are all shown; of more, only lowest, highest and mean."""
+"""Up to this many numbers of a value are printed; of more, only lowest, highest and mean."""
 
 _DIMENSIONS: Final = {"m": "length", "Hz": "frequency", "rad": "angle", "s": "time"}
 
@@ -95,37 +95,37 @@ def show_calibration(wanted: str, profile: str, dry_run: str, *, as_json: bool) 
 
 
 def use_calibration(choice: str, profile: str, dry_run: str, *, force: bool) -> None:
-    """Put a calibration to use, or none of a kind.
+    """Use a calibration, or none of a kind.
 
     Args:
         choice: Its id, or "KIND=off".
         profile: Name or path of the profile.
         dry_run: "off", "full" or "fast".
-        force: Whether also one that is worse than the one in use.
+        force: Whether to use it even if it is worse than the one in use.
 
     Raises:
-        ConfigError: There is no such calibration, it is of another grid, or it is worse.
+        ConfigError: There is no such calibration, it belongs to another grid, or it is worse.
     """
     store, spec = open_store(profile, cast("DryRun", dry_run))
     name, equals, value = choice.partition("=")
     if equals:
         kind = _kind(name, value)
         store.use_none(kind)
-        say(f"no calibration of {kind} is in use any more")
+        say(f"no calibration of {kind} is in use from the next run on")
     else:
         stored = store.find(choice)
         kind = stored.entry.kind
         store.use(stored, spec.grid_model(), force=force)
         say(f"{kind} {stored.entry.id} is in use from the next run on")
     if pin := spec.calibrations.use.of(kind):
-        say(f"warning: the profile says 'calibrations.use.{kind}: {clean(pin)}', and that counts")
+        say(f"warning: the profile has 'calibrations.use.{kind}: {clean(pin)}', which takes precedence")
 
 
 def compare_calibrations(before: str, after: str, profile: str, dry_run: str, *, as_json: bool) -> None:
     """Print what changed from one calibration to another.
 
     Raises:
-        ConfigError: They are of different kinds, or one of them cannot be had.
+        ConfigError: They are of different kinds, or one cannot be read.
     """
     store, _ = open_store(profile, cast("DryRun", dry_run))
     one, other = store.find(before).entry, store.find(after).entry
@@ -155,7 +155,7 @@ def difference_table(differences: Sequence[Difference]) -> list[str]:
 
 
 def in_use(store: Store, choices: CalibrationChoices) -> dict[str, str]:
-    """Kind -> id, or name of the file, of the calibration that counts."""
+    """Kind -> file name of the calibration in use."""
     used = {kind: one.file for kind, one in store.active().items()}
     for kind in CALIBRATION_KINDS:
         pin = choices.of(kind)
@@ -187,7 +187,7 @@ def quantity(value: float | None, name: str) -> str:
 
 
 def quality_text(entry: CalibrationEntry) -> str:
-    """The deciding figure of a calibration in words; "-" if it has none."""
+    """The deciding figure of a calibration as text; "-" if it has none."""
     deciding, figure = DECIDING[entry.kind], figure_of(entry)
     return "-" if math.isnan(figure) else f"{deciding.label} {quantity(figure, deciding.figure)}"
 
@@ -265,21 +265,21 @@ def _or_none(value: float) -> float | None:
 
 
 N_MARKS: Final = 10
-"""How often the progress of a run is told."""
+"""Number of progress lines of a run."""
 
 
 def calibrate_kind(kind: str, request: CalibrationRequest, *, as_json: bool) -> None:
-    """Make a calibration, keep it, and put it to use unless it is worse.
+    """Make a calibration, store it, and use it unless it is worse.
 
     Args:
-        kind: What is calibrated.
-        request: For what, and of what.
-        as_json: Whether to print the outcome as one line of JSON, alone on stdout.
+        kind: What to calibrate.
+        request: The profile and the run.
+        as_json: Whether to print the result as one line of JSON, alone on stdout.
 
     Raises:
-        ConfigError: Something in the request is wrong; or the calibration is worse than the one in
-            use, and was kept only.
-        LabseqError: Nothing came of it.
+        ConfigError: The request is wrong; or the calibration is worse than the one in use, and was
+            only stored.
+        LabseqError: The calibration failed.
     """
     method = METHODS.get(kind)
     if method is None:
@@ -293,7 +293,7 @@ def calibrate_kind(kind: str, request: CalibrationRequest, *, as_json: bool) -> 
         answer(as_line(_calibrate_values_of(outcome)))
     if outcome.refused:
         entry = outcome.stored.entry
-        what = f"{entry.kind} {entry.id} is kept but not in use: {outcome.refused}"
+        what = f"{entry.kind} {entry.id} is stored but not in use: {outcome.refused}"
         options = f"--force --profile {quote(request.profile)}"
         options += "" if request.dry_run == "off" else " --dry-run"
         hint = f"look at it, then 'labseq calibration use {entry.id} {options}'"
@@ -301,15 +301,19 @@ def calibrate_kind(kind: str, request: CalibrationRequest, *, as_json: bool) -> 
 
 
 def summary_lines(outcome: Outcome) -> list[str]:
-    """What was found, how far it is from what was in use, and where it is kept."""
+    """The result, the change from the calibration in use, and where it is stored."""
     entry, picture = outcome.stored.entry, outcome.stored.picture
     state = "in use from the next run on" if not outcome.refused else "not in use"
     figures = [(name, quantity(value, name)) for name, value in entry.quality.items()]
     lines = [f"{entry.kind} {entry.id}: {state}", *outcome.summary_lines]
     lines += ["", *columns(figures)] if figures else []
     if outcome.before is not None:
-        lines += ["", f"against {outcome.before.id}, which was in use:", *difference_table(outcome.changes)]
-    lines += ["", f"kept as {outcome.stored.path}", *([f"look at {picture}"] if picture else [])]
+        lines += [
+            "",
+            f"compared with {outcome.before.id}, which was in use:",
+            *difference_table(outcome.changes),
+        ]
+    lines += ["", f"stored as {outcome.stored.path}", *([f"look at {picture}"] if picture else [])]
     return [*lines, *(f"warning: {text}" for text in outcome.warnings)]
 
 
@@ -329,21 +333,21 @@ def _calibrate_values_of(outcome: Outcome) -> dict[str, Any]:
     }
 
 
-class _Progress:
-    """Implements ``RunObserver`` with a line for every tenth of the shots; the detector is blind in them."""
+class _Progress(LogLines):
+    """Implements ``RunObserver`` with a line for every tenth of the shots, and one for each lasting event."""
 
     def __init__(self) -> None:
-        self._run: RunRecord | None = None
+        super().__init__(sys.stderr, LASTING)
+        self._n_shots = 1
         self._n_done = 0
 
     def event(self, name: str, values: Mapping[str, Any]) -> None:
-        """Print what lasts, and how far it is."""
+        """Print the line of an event, if it has one."""
+        super().event(name, values)
         if name == "run_starting":
-            self._run = values["record"]
-        if name in LASTING and (text := event_text(name, values, self._run)):
-            say(text, stream=sys.stderr)
-        if name == "shot_finished" and self._run is not None:
+            self._n_shots = values["record"].n_shots
+        elif name == "shot_finished":
             self._n_done += 1
-            n, before = (k * N_MARKS // self._run.n_shots for k in (self._n_done, self._n_done - 1))
+            n, before = (k * N_MARKS // self._n_shots for k in (self._n_done, self._n_done - 1))
             if n > before:
-                say(f"{self._n_done} of {self._run.n_shots} shots", stream=sys.stderr)
+                say(f"{self._n_done} of {self._n_shots} shots", stream=sys.stderr)

@@ -97,7 +97,7 @@ app.add_typer(queue)
 app.command(epilog=CALIBRATE_EXAMPLES, short_help="Calibrate sites, thresholds, tones or overlay.")(calibrate)
 
 
-@app.command(short_help="Take a first look, without any file.")
+@app.command(short_help="Run an example sequence on simulated hardware.")
 def demo(
     shots: Annotated[
         int | None, typer.Option(metavar="N", help="Number of shots; default: 10.", show_default=False)

@@ -1,4 +1,4 @@
-"""`labseq new` and `labseq schema`."""
+"""The commands `labseq new` and `labseq schema`."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def new(
     ],
     package: Annotated[
         bool,
-        typer.Option("--package", help="Make a plugin a Python package of its own, to be installed."),
+        typer.Option("--package", help="Make the plugin a Python package that can be installed."),
     ] = False,
     profile: Annotated[
         str | None,
@@ -53,14 +53,14 @@ def new(
     folder: Annotated[
         Path,
         typer.Option(
-            metavar="DIR", help="Folder of your sequences and profiles; the current one by default."
+            metavar="DIR", help="Folder of your sequences and profiles; default: the current folder."
         ),
     ] = Path(),
 ) -> None:
     """Make a plugin, a sequence or a profile that runs at once.
 
-    A plugin goes into the folder `plugins`: the plugin, its settings, tests of the promises of its role, a
-    README. New sequences and profiles look there. Nothing that exists is changed.
+    A plugin goes into the folder `plugins`, with its settings, the contract tests of its role and a README.
+    New sequences and profiles load plugins from there. No existing file is changed, except schemas.
     """
     from labseq.scaffold.terminal import make_new
 
@@ -78,18 +78,21 @@ def schema(
         ),
     ],
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", metavar="FILE", help="Write it there instead of stdout.")
+        Path | None,
+        typer.Option(
+            "--output", "-o", metavar="FILE", help="Write the schema to this file instead of stdout."
+        ),
     ] = None,
     plugins: Annotated[
         list[Path] | None,
         typer.Option(
             metavar="DIR",
-            help="Folder of plugins whose settings belong to it; may be given several times. Default: the "
-            "folder plugins, if there is one.",
+            help="Folder of plugins whose settings the schema includes; may be given several times. Default: "
+            "the folder plugins, if it exists.",
         ),
     ] = None,
 ) -> None:
-    """Write the JSON schema of sequences or profiles, with the settings of every plugin, for editors."""
+    """Write the JSON schema of sequences or profiles for editors, with the settings of every plugin."""
     from labseq.scaffold.terminal import write_schema
 
     write_schema(kind, output, plugins)

@@ -70,7 +70,7 @@ def test_each_picture_has_a_name_of_its_own(
         (PlotRequest(what="scan"), "a.png", "nothing to show of the scan; expected a run of a sequence with"),
         (PlotRequest(shot=9), "a.png", "--shot: the run has no shot 9; expected one from 1 to 2"),
         (PlotRequest(shot=1, what="scan"), "a.png", "--what and --shot: these are different pictures"),
-        (PlotRequest(cycle=1), "a.png", "--cycle: a cycle is one of a shot; expected --shot as well"),
+        (PlotRequest(cycle=1), "a.png", "--cycle: a cycle belongs to a shot; expected --shot as well"),
         (PlotRequest(compare=Path("x")), "a.png", "--compare: only figures of the paper compare runs"),
     ],
 )

@@ -56,13 +56,13 @@ def test_what_was_found_is_told_and_kept(store: Store, capsys: pytest.CaptureFix
     lines = out.splitlines()
     assert lines[0] == f"sites {stored.entry.id}: in use from the next run on"
     assert lines[1].startswith("36 of 36 sites found on the mean of 20 frames, ")
-    assert lines[-2:] == [f"kept as {stored.path}", f"look at {stored.picture}"]
+    assert lines[-2:] == [f"stored as {stored.path}", f"look at {stored.picture}"]
     assert "20 shots, seed 1, profile bench, simulated" in err
     assert [line for line in err.splitlines() if line.endswith("of 20 shots")][-1] == "20 of 20 shots"
     (run,) = Path("data").glob("*/*_calibrate-sites")
     code, out, _ = call(capsys, "sites", "--from", str(run))
     assert code == 0
-    assert f"against {stored.entry.id}, which was in use:" in out
+    assert f"compared with {stored.entry.id}, which was in use:" in out
 
 
 def test_a_worse_one_is_kept_and_told(store: Store, capsys: pytest.CaptureFixture[str]) -> None:
@@ -72,7 +72,7 @@ def test_a_worse_one_is_kept_and_told(store: Store, capsys: pytest.CaptureFixtur
     new = next(one for one in store.entries() if one.path != better.path)
     assert code == 2
     assert out.startswith(f"sites {new.path.stem[-12:]}: not in use")
-    assert "is kept but not in use: it found 36 sites, the one in use 40; look at it, then" in err
+    assert "is stored but not in use: it found 36 sites, the one in use 40; look at it, then" in err
 
 
 def test_an_analysis_that_fails(store: Store, capsys: pytest.CaptureFixture[str]) -> None:

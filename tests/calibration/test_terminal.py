@@ -117,7 +117,7 @@ def test_one_that_the_profile_chooses_is_marked(store: Store, capsys: pytest.Cap
     _, out, _ = call(capsys, "list")
     assert ["in use" in line for line in out.splitlines()[1:]] == [True, False]
     _, out, _ = call(capsys, "use", active.entry.id)
-    assert f"the profile says 'calibrations.use.overlay: {chosen.entry.id}', and that counts" in out
+    assert f"the profile has 'calibrations.use.overlay: {chosen.entry.id}', which takes precedence" in out
     Path("bench.yaml").write_text(PROFILE + "calibrations: {use: {overlay: off}}\n", "utf-8")
     _, out, _ = call(capsys, "list")
     assert "in use" not in out
@@ -167,7 +167,7 @@ def test_putting_to_use_and_aside(store: Store, capsys: pytest.CaptureFixture[st
     assert code == 2
     assert "its error_m is 1e-06, that of the one in use 2e-08; use it nevertheless with --force" in err
     assert call(capsys, "use", worse.entry.id, "--force")[0] == 0
-    assert call(capsys, "use", "overlay=off")[:2] == (0, "no calibration of overlay is in use any more\n")
+    assert call(capsys, "use", "overlay=off")[:2] == (0, "no calibration of overlay is in use from the next run on\n")
     assert [one.id for one in store.history()] == [good.entry.id, worse.entry.id, ""]
 
 

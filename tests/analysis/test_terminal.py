@@ -127,12 +127,12 @@ def test_an_analysis_that_fails_exits_with_1(run, capsys):
 @pytest.mark.parametrize(
     ("use", "overrides", "expected"),
     [
-        (None, [], "the run's sequence asks for no analysis; name one with --use"),
+        (None, [], "the run's sequence has no analysis; name one with --use"),
         (None, ["atoms=all"], "--set atoms=all: .*; name it with --use"),
         ("sruvival", [], "unknown analysis 'sruvival'.*did you mean 'survival'"),
         ("survival", ["atom=all"], "'atom' is not a setting.*did you mean 'atoms'"),
         ("survival", ["atoms=some"], "atoms is 'some'"),
-        ("survival", ["profile.atoms=all"], "an analysis has no part of the profile"),
+        ("survival", ["profile.atoms=all"], "an analysis has no settings in the profile"),
         ("survival", ["atoms"], "not of the form"),
     ],
 )
