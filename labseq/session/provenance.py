@@ -1,4 +1,4 @@
-"""The record of a run when it starts, and which code made the data."""
+"""The record of a run when it starts, with the code, host and packages that make the data."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _GIT_TIMEOUT_S: Final = 5.0
 
 
 def gather_provenance(sequence_folder: Path) -> dict[str, Any]:
-    """Collect what is needed to know, years later, which code made the data.
+    """Collect what identifies, years later, the code that made the data.
 
     Args:
         sequence_folder: Folder of the sequence; its repository is recorded beside
@@ -56,13 +56,13 @@ def git_state(folder: Path, of: str = "") -> dict[str, Any] | None:
 
     Args:
         folder: The folder.
-        of: A file in it that must be tracked: what is installed in an environment
-            inside of somebody's repository does not come from that.
+        of: A file in it that must be tracked by the repository. A package installed in an
+            environment inside a repository is not part of that repository.
 
     Returns:
         ``{"commit": str, "dirty": bool, "code_sha256": str}``, or None outside of a repository or
         where git is not installed. ``dirty`` is whether any tracked file differs; ``code_sha256``
-        stands for what differs in Python files, "" for nothing.
+        is the digest of what differs in Python files, "" for nothing.
     """
     if of and _git(folder, "ls-files", "--error-unmatch", of) is None:
         return None
@@ -91,7 +91,7 @@ def _git(folder: Path, *arguments: str) -> str | None:
 
 @functools.cache
 def _packages() -> dict[str, str]:
-    """Name -> version of all that is installed, read once: it takes as long as a quick shot."""
+    """Name -> version of each installed package; read once because that takes as long as a quick shot."""
     about = [distribution.metadata for distribution in importlib.metadata.distributions()]
     return {name: one["Version"] for one in about if (name := one["Name"])}
 
@@ -106,7 +106,7 @@ def _user() -> str:
 def run_record(
     assembly: Assembly, seed: int, changes: Mapping[str, Any], scan: Mapping[str, Any], folder: Path
 ) -> RunRecord:
-    """What is known of a run before anything is opened.
+    """The record of a run before anything is opened.
 
     Args:
         assembly: The run.

@@ -1,4 +1,4 @@
-"""What a run was taken with, from its own folder: whatever files and calibrations say today."""
+"""What a run was taken with, from its own folder: settings, plugins, calibrations, grid."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any, cast
 from labseq.calibration.store import read_entry
 from labseq.config import StoredText
 from labseq.errors import RecordingError
+from labseq.files import read_file
 from labseq.model import CalibrationEntry, RandomStream
 from labseq.plugins import PluginHost
 from labseq.recording import Run
@@ -24,7 +25,7 @@ def resolved_of(run: Run) -> dict[str, Any]:
     """Every setting of a run, SI; of a scan, at its first point.
 
     Raises:
-        RecordingError: They are not there.
+        RecordingError: run.json lacks them.
     """
     found: Any = run.record.get("resolved")
     if not (isinstance(found, dict) and isinstance(found.get("profile"), dict)):
@@ -37,25 +38,22 @@ def stored_text(path: Path, sha256: str) -> StoredText:
 
     Args:
         path: The file.
-        sha256: What it was when the run was begun.
+        sha256: Its SHA-256 when the run was begun.
 
     Raises:
-        RecordingError: It is missing, or something else.
+        RecordingError: It is missing or has been changed.
     """
-    try:
-        text = path.read_bytes().decode("utf-8", "surrogateescape")
-    except OSError as error:
-        raise RecordingError(path, f"cannot be read: {error.strerror}; take it from a backup") from error
+    text = read_file(path).decode("utf-8", "surrogateescape")
     if sha256_of_text(text) != sha256:
         raise RecordingError(path, f"is not what {RUN_FILE} says it was; take it from a backup")
     return StoredText(text, str(path))
 
 
 def plugins_of(run: Run) -> PluginHost:
-    """The plugins that a run can name: those installed now, and those of its own folders.
+    """The plugins that a run can use: those installed now, and those of its own folders.
 
     Raises:
-        ConfigError: A folder does not exist any more.
+        ConfigError: A folder no longer exists.
         RecordingError: The run does not say where they are.
     """
     resolved = resolved_of(run)
@@ -74,7 +72,7 @@ def calibrations_of(run: Run) -> dict[str, CalibrationEntry]:
 
     Raises:
         ConfigError: A copy is missing or damaged.
-        RecordingError: A copy is of another calibration than the run's.
+        RecordingError: A copy is not the calibration that the run was taken with.
     """
     entries: dict[str, CalibrationEntry] = {}
     for kind, own in cast("Mapping[str, str]", run.record.get("calibrations") or {}).items():
@@ -90,22 +88,22 @@ def machine_of(run: Run) -> Machine:
     """The grid of a run, with the tones of its calibrations, and its motion; of a scan, at its first point.
 
     Raises:
-        ConfigError: What the run says of them makes no sense.
-        RecordingError: It says nothing.
+        ConfigError: The recorded settings are invalid.
+        RecordingError: run.json lacks them.
     """
     return recorded_machine(resolved_of(run)["profile"], str(run.path / RUN_FILE))
 
 
 def context_of(run: Run, name: str) -> Context:
-    """What a plugin is given that looks at a run afterwards.
+    """The context of a plugin that evaluates a recorded run.
 
     Args:
         run: The run.
         name: The plugin's role or name.
 
     Raises:
-        ConfigError: What the run says of itself makes no sense, or a calibration is missing.
-        RecordingError: It does not say enough.
+        ConfigError: The recorded settings are invalid, or a calibration is missing.
+        RecordingError: run.json lacks settings.
     """
     machine, stream = machine_of(run), RandomStream(run.seed, name)
     return Context(name, machine.grid, machine.motion, random=stream, calibrations=calibrations_of(run))
