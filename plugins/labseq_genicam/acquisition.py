@@ -1,4 +1,4 @@
-"""Taking frames with an open camera."""
+"""Series of frames with an open camera."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import math
 from collections.abc import Mapping
 from typing import Final, Literal, TypeAlias
 
+from labseq_aravis import Buffer, Camera, Stream, StreamOptions
+
 from labseq.plugin import DeviceError, ExposureResult, LimitError, Series, format_quantity
-from labseq_genicam.aravis import Buffer, Camera, Stream, StreamOptions
-from labseq_genicam.counting import FrameCounter
-from labseq_genicam.link import Link
+from labseq_genicam.connection import Link
 from labseq_genicam.settings import GenicamSettings
 
 BUFFER_BYTES: Final = 256 * 2**20
-"""Memory for frames that were not read yet; a series that needs more uses its buffers again."""
+"""Memory for frames that were not read yet; a series that needs more reuses its buffers."""
 
 INCOMPLETE: Final = "some of its network packets are missing"
 FAULTS: Final[Mapping[str, str]] = {"success": "", "missing packets": INCOMPLETE, "timeout": INCOMPLETE}
@@ -23,14 +23,17 @@ RATE: Final = "AcquisitionFrameRate"
 ROUNDING: Final = 1e-6
 
 Start: TypeAlias = Literal["software", "line", "free"]
-"""What starts the exposures, as the camera is set."""
+"""What starts the exposures: a software trigger, an edge at an input, or the camera at its frame rate."""
+
+LAST_ID: Final = 65535
+"""GigE cameras count frames from 1 to this and continue with 1, unless they use 64 bits."""
 
 
 class Acquisition:
     """The series of an open camera.
 
-    A camera that waits for software triggers goes on waiting from one series to the next: to start
-    it anew can take as long as an exposure. What was triggered before is told by its number.
+    A camera that waits for software triggers continues to wait from one series to the next, since starting it
+    again can take as long as an exposure. Late frames of an earlier series are recognised by their numbers.
 
     Args:
         link: The open camera, set up.
@@ -55,19 +58,19 @@ class Acquisition:
             start: What starts its exposures.
 
         Returns:
-            From one exposure to the next with the internal trigger, in seconds; else nan.
+            Time from one exposure to the next with the internal trigger, in seconds; else nan.
 
         Raises:
-            LimitError: The camera cannot expose so long, so briefly or so often.
+            LimitError: The exposure or the frame rate is out of the camera's range.
             DeviceError: It has no such trigger, or is gone.
         """
-        goes_on = start == self._start == "software" and self._is_in_step()
-        if not goes_on:
+        continues = start == self._start == "software" and self._has_all_frames()
+        if not continues:
             self.stop()
         period_s = math.nan
         with self._link.doing("prepare the series") as camera:
             self._set_exposure(camera, series.exposure_s)
-            if not goes_on:
+            if not continues:
                 self._set_trigger(camera, start)
             if series.trigger == "internal":
                 period_s = self._set_period(camera, series.exposure_s, start)
@@ -76,10 +79,10 @@ class Acquisition:
         return period_s
 
     def begin(self, start: Start) -> None:
-        """Start what was prepared, unless the camera waits already.
+        """Start the prepared series, unless the camera is already waiting for triggers.
 
         Raises:
-            DeviceError: It cannot, or is gone.
+            DeviceError: The camera cannot start, or is gone.
         """
         if self._start is None:
             with self._link.doing("start the series") as camera:
@@ -97,10 +100,10 @@ class Acquisition:
         self._n_triggered += 1
 
     def poll(self, seconds: float) -> ExposureResult | None:
-        """Wait for the next frame of the series, for at most so long; None if none came.
+        """Wait for the next frame of the series, for at most ``seconds``; None if none came.
 
         Raises:
-            DeviceError: The camera is gone, or sends what cannot be read.
+            DeviceError: The camera is gone, or the frame cannot be decoded.
         """
         buffer = self._pop(seconds)
         if buffer is None:
@@ -114,19 +117,19 @@ class Acquisition:
         fault = FAULTS.get(buffer.status, f"its buffer is '{buffer.status}'")
         return ExposureResult(number, buffer.image, fault, self._exposure_s, device_time_s=time_s)
 
-    def ask(self) -> None:
-        """Ask the camera for a sign of life.
+    def check_alive(self) -> None:
+        """Check that the camera still answers.
 
         Raises:
             DeviceError: It is gone.
         """
-        self._link.ask()
+        self._link.check_alive()
 
     def stop(self) -> None:
-        """End the acquisition; frames that were not read are dropped, also those on their way.
+        """End the acquisition; frames that were not read are dropped, including those being transferred.
 
         Raises:
-            DeviceError: The camera is gone, which was not known yet.
+            DeviceError: The camera turns out to be gone.
         """
         stream, start = self._stream, self._start
         self._stream = self._start = None
@@ -138,8 +141,8 @@ class Acquisition:
         if stream is not None:
             stream.close()
 
-    def _is_in_step(self) -> bool:
-        """Whether all frames came that were triggered; those that nobody read are dropped."""
+    def _has_all_frames(self) -> bool:
+        """Whether all triggered frames have come; those that were not read are dropped."""
         while (buffer := self._pop(0.0)) is not None:
             self._counter.number(buffer.frame_id if buffer.image is not None else None)
         return self._counter.n_frames == self._n_triggered
@@ -172,12 +175,12 @@ class Acquisition:
             camera.set_string("TriggerActivation", "FallingEdge")
 
     def _set_period(self, camera: Camera, exposure_s: float, start: Start) -> float:
-        """Set how often the camera exposes where it runs freely; returns its period."""
+        """Set the frame rate of a camera without a trigger; returns its period."""
         wanted_hz, natural_s = self._settings.frame_rate, exposure_s + self._settings.readout
         if not camera.is_available(RATE):
             if wanted_hz is None:
                 return natural_s
-            text = "the camera has no frame rate that could be set; leave out `frame_rate`"
+            text = "the frame rate of the camera cannot be set; leave out `frame_rate`"
             raise DeviceError(self._link.name, text)
         low_hz, high_hz = camera.float_bounds(RATE)
         rate_hz = wanted_hz or min(max(1.0 / natural_s, low_hz), high_hz)
@@ -191,7 +194,7 @@ class Acquisition:
         return 1.0 / camera.frame_rate_hz
 
     def _provide(self, camera: Camera, n_frames: int) -> None:
-        """Have buffers for as many frames, as far as the memory goes."""
+        """Allocate buffers for the series, as far as the memory allows."""
         if self._stream is None:
             self._n_buffers = self._n_triggered = 0
             self._counter = FrameCounter()
@@ -200,3 +203,38 @@ class Acquisition:
         n_missing = max(2, min(n_frames, BUFFER_BYTES // payload)) - self._n_buffers
         self._stream.allocate(n_missing, payload)
         self._n_buffers += max(0, n_missing)
+
+
+class FrameCounter:
+    """Numbers the frames of an acquisition, including those that never came.
+
+    The first frame that comes has the number 0. An incomplete frame is counted as the next one, since its
+    frame id is not reliable.
+
+    Example:
+        >>> counter = FrameCounter()
+        >>> [counter.number(frame_id) for frame_id in (65533, 65534, None, 1, 3)]
+        [0, 1, 2, 3, 5]
+        >>> counter.n_frames
+        6
+    """
+
+    def __init__(self) -> None:
+        self.n_frames = 0
+        self._last: tuple[int, int] | None = None
+
+    def number(self, frame_id: int | None) -> int:
+        """Number of the frame that has just come, from 0.
+
+        Args:
+            frame_id: The camera's number of it; None for an incomplete frame.
+        """
+        number = self.n_frames
+        if frame_id is not None and self._last is not None:
+            last_number, last_id = self._last
+            n_steps = frame_id - last_id
+            number = last_number + (n_steps if n_steps >= 0 else n_steps + LAST_ID)
+        if frame_id is not None:
+            self._last = number, frame_id
+        self.n_frames = number + 1
+        return number

@@ -14,24 +14,26 @@ FORMATS: Final[tuple[PixelFormat, ...]] = ("Mono16", "Mono14", "Mono12", "Mono10
 """Pixel formats, the one with the most bits first."""
 
 SIMULATED: Final = "simulated"
-"""The camera that needs no camera."""
+"""Value of `camera` for the simulated camera."""
 
 
 class FaultSettings(Settings):
-    """Failures to rehearse with the simulated camera; none by default."""
+    """Failures of the simulated camera; none by default."""
 
     packet_loss: Fraction = Field(
         default=0.0, description="fraction of the network packets of frames that are never sent"
     )
     failed_frames: tuple[NonNegativeInt, ...] = Field(
-        default=(), description="frames that lose half of their packets, counted from 0 since it was opened"
+        default=(),
+        description="frames that lose half of their packets, counted from 0 since the camera was opened",
     )
-    late_by: Duration = Field(default=0.0, description="how late each frame comes")
+    late_by: Duration = Field(default=0.0, description="delay of each frame")
     unplugged_at: NonNegativeInt | None = Field(
-        default=None, description="frame at which the camera is gone, counted likewise; none: never"
+        default=None,
+        description="number, from 0 at opening, of the frame at which it is unplugged; none: never",
     )
     busy: bool = Field(default=False, description="another program controls the camera")
-    ignores_triggers: bool = Field(default=False, description="its software trigger leads nowhere")
+    ignores_triggers: bool = Field(default=False, description="the camera ignores software triggers")
 
 
 class GenicamSettings(IndustrialCameraSettings):
@@ -41,12 +43,12 @@ class GenicamSettings(IndustrialCameraSettings):
         default=None,
         min_length=1,
         description="serial number, id or IP address of the camera; none: the only one that is connected; "
-        "`simulated`: a camera on this computer's own network, which shows the simulated atoms",
+        "`simulated`: a camera on this computer's loopback network that sees the simulated atoms",
     )
     model: str | None = Field(default=None, description="model that the camera must be; none: any")
     serial: str | None = Field(default=None, description="serial number that the camera must have; none: any")
     pixel_format: PixelFormat | None = Field(
-        default=None, description="bits of a pixel; none: as many as the camera has"
+        default=None, description="bits of a pixel; none: the most that the camera offers"
     )
     gain: float | None = Field(
         default=None,
@@ -56,26 +58,24 @@ class GenicamSettings(IndustrialCameraSettings):
     )
     frame_rate: Annotated[Frequency, Field(gt=0)] | None = Field(
         default=None,
-        description="exposures per second with the internal trigger, as `100 Hz`; none: each begins at the "
-        "end of the read-out before",
+        description="exposures per second with the internal trigger, such as `100 Hz`; none: each begins "
+        "when the one before is read out",
     )
     packet_size: Annotated[int, Field(ge=576, le=65535)] | None = Field(
         default=None,
-        description="bytes of a network packet (GigE); none: as the camera is set, or less if that does not "
-        "come through",
+        description="bytes of a network packet (GigE); none: as the camera is set, or less if the network "
+        "does not transmit that",
     )
     packet_timeout: Annotated[Duration, Field(gt=0)] = Field(
-        default=20e-3, description="after which time a missing network packet is asked for again (GigE)"
+        default=20e-3, description="time after which a missing network packet is requested again (GigE)"
     )
     frame_timeout: Annotated[Duration, Field(gt=0)] = Field(
-        default=0.5, description="after which time without a packet an incomplete frame is given up (GigE)"
+        default=0.5, description="time without a packet after which an incomplete frame is abandoned (GigE)"
     )
-    faults: FaultSettings = Field(
-        default=FaultSettings(), description="failures to rehearse with the simulated camera"
-    )
+    faults: FaultSettings = Field(default=FaultSettings(), description="failures of the simulated camera")
 
     @field_validator("camera", "serial", mode="before")
     @classmethod
     def _number_is_text(cls, value: object) -> object:
-        """YAML takes a serial number without quotes for a number."""
+        """YAML reads a serial number without quotes as a number."""
         return str(value) if type(value) is int else value

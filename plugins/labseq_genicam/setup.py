@@ -4,24 +4,25 @@ from __future__ import annotations
 
 from typing import Any
 
+from labseq_aravis import Camera
+
 from labseq.plugin import ZERO_CELSIUS_K, DeviceError, LimitError, nearest, one_of
-from labseq_genicam.aravis import Camera
-from labseq_genicam.link import Link
+from labseq_genicam.connection import Link
 from labseq_genicam.settings import FORMATS, GenicamSettings, PixelFormat
 
 
 def identify(link: Link, settings: GenicamSettings) -> dict[str, Any]:
-    """What an open camera is: JSON-ready.
+    """Model, serial number and firmware of an open camera: JSON-ready.
 
     Raises:
-        DeviceError: It is another than the settings say.
+        DeviceError: It is not the camera that the settings name.
     """
-    with link.doing("ask the camera what it is") as camera:
+    with link.doing("identify the camera") as camera:
         found = {
             "vendor": camera.vendor,
             "model": camera.model,
             "serial_number": camera.serial,
-            "firmware": camera.firmware,
+            "firmware": _firmware(camera),
             "connection": "GigE Vision" if camera.is_ethernet else "USB3 Vision",
         }
     for key, wanted in (("model", settings.model), ("serial_number", settings.serial)):
@@ -32,19 +33,20 @@ def identify(link: Link, settings: GenicamSettings) -> dict[str, Any]:
     return found
 
 
-def set_up(link: Link, settings: GenicamSettings) -> dict[str, Any]:
+def set_up(link: Link, settings: GenicamSettings, packet_size: int | None) -> dict[str, Any]:
     """Bring a camera from any state into the driver's.
 
     Args:
         link: The open camera.
         settings: The driver's settings.
+        packet_size: Bytes of a network packet; None: as the camera is set.
 
     Returns:
-        What it is set to: JSON-ready.
+        The resulting settings: JSON-ready.
 
     Raises:
-        LimitError: It does not go so far as the settings do.
-        DeviceError: It does not have what they set.
+        LimitError: A setting is out of the camera's range.
+        DeviceError: The camera lacks a feature that is set.
     """
     with link.doing("set the camera up") as camera:
         camera.stop()
@@ -59,7 +61,7 @@ def set_up(link: Link, settings: GenicamSettings) -> dict[str, Any]:
         sensor_shape = _set_binning(link.name, camera, settings.binning)
         frame_shape = _set_region(link.name, camera, settings, sensor_shape)
         _set_gain(link.name, camera, settings.gain)
-        _set_packets(link.name, camera, settings)
+        _set_packets(link.name, camera, packet_size, settings.packet_delay)
         return {
             "pixel_format": pixel_format,
             "sensor_shape": sensor_shape,
@@ -69,8 +71,16 @@ def set_up(link: Link, settings: GenicamSettings) -> dict[str, Any]:
         }
 
 
+def _firmware(camera: Camera) -> str:
+    """Version of the firmware; empty if the camera does not report it."""
+    for feature in ("DeviceFirmwareVersion", "DeviceVersion"):
+        if camera.is_available(feature):
+            return camera.get_string(feature)
+    return ""
+
+
 def temperature_k(camera: Camera) -> float | None:
-    """Temperature of camera or sensor, whichever is selected, in kelvins; None if it does not tell."""
+    """Temperature of camera or sensor, whichever is selected, in kelvins; None if it has no sensor."""
     if not camera.is_available("DeviceTemperature"):
         return None
     return round(camera.get_float("DeviceTemperature") + ZERO_CELSIUS_K, 2)
@@ -87,7 +97,7 @@ def _set_pixel_format(name: str, camera: Camera, wanted: PixelFormat | None) -> 
 
 
 def _set_binning(name: str, camera: Camera, binning: int) -> tuple[int, int]:
-    """Set the binning; returns (height, width) of the sensor, which some cameras tell after binning."""
+    """Set the binning; returns (height, width) of the sensor, which some cameras report after binning."""
     can_bin = camera.is_available("BinningHorizontal") and camera.is_available("BinningVertical")
     if not can_bin and binning > 1:
         raise LimitError(f"{name}: binning", binning, "1, as the camera does not bin", "leave out `binning`")
@@ -113,7 +123,7 @@ def _set_region(
         hint = "choose a smaller or another one"
         raise LimitError(f"{name}: end of the region", end, f"the sensor's {size}", hint)
     can_move = camera.is_available("OffsetX") and camera.is_available("OffsetY")
-    for axis, size in (("Y", "Height"), ("X", "Width")):  # where it begins limits its size, and the reverse
+    for axis, size in (("Y", "Height"), ("X", "Width")):  # each limits the range of the other
         camera.set_integer(size, camera.integer_bounds(size)[0])
         if can_move:
             camera.set_integer(f"Offset{axis}", 0)
@@ -134,13 +144,13 @@ def _set_region(
 
 
 def _check(name: str, what: str, value: int, bounds: tuple[int, int, int], unit: int = 1) -> None:
-    """Refuse a number that the camera does not take; names the nearest good one.
+    """Refuse a number that the camera does not accept; the error names the nearest valid one.
 
     Args:
         name: Name of the camera.
-        what: What the number is.
+        what: Name of the number, for errors.
         value: The number, in pixels of the sensor.
-        bounds: Least, greatest and increment, in the camera's own pixels.
+        bounds: Smallest, largest and increment, in the camera's own pixels.
         unit: Pixels of the sensor per pixel of the camera: the binning.
     """
     low, high, step = (unit * bound for bound in bounds)
@@ -162,11 +172,11 @@ def _set_gain(name: str, camera: Camera, gain: float | None) -> None:
     camera.set_gain(gain)
 
 
-def _set_packets(name: str, camera: Camera, settings: GenicamSettings) -> None:
-    for key in ("packet_size", "packet_delay"):
-        if getattr(settings, key) is not None and not camera.is_ethernet:
+def _set_packets(name: str, camera: Camera, packet_size: int | None, packet_delay_s: float | None) -> None:
+    for key, value in (("packet_size", packet_size), ("packet_delay", packet_delay_s)):
+        if value is not None and not camera.is_ethernet:
             raise DeviceError(name, f"only GigE cameras have packets: leave out `{key}`")
-    if settings.packet_size is not None:
-        camera.set_packet_size(settings.packet_size)
-    if settings.packet_delay is not None:
-        camera.set_packet_delay_s(settings.packet_delay)
+    if packet_size is not None:
+        camera.set_packet_size(packet_size)
+    if packet_delay_s is not None:
+        camera.set_packet_delay_s(packet_delay_s)

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
-from labseq_genicam.aravis import Camera, Region, Stream, StreamOptions
+from labseq_aravis import Camera, Stream, StreamOptions
 from labseq_genicam.camera import GenicamCamera
-from labseq_genicam.counterpart.fake import FakeCamera
-from labseq_genicam.counterpart.faults import Faults
-from labseq_genicam.counterpart.images import Request
 from labseq_genicam.settings import GenicamSettings
+from labseq_genicam_sim.fake import FakeCamera
+from labseq_genicam_sim.messages import Exposure, Faults
 from numpy.typing import NDArray
 
 from labseq import Clock, Context, Frame, LineSpec, SensorMode
@@ -20,24 +19,30 @@ from labseq.model import SiteGrid
 from labseq.roles import WHOLE_SENSOR
 from labseq.testing.fakes import Calls, FakeClock, RecordingSimulation
 
-REGION = Region(8, 4, 256, 200)
+REGION = {"OffsetX": 8, "OffsetY": 4, "Width": 256, "Height": 200}
 PACKET_SIZE = 15800
 RETENTION_S = 0.5
-"""When an incomplete frame is given up: late enough for a machine with much to do."""
+"""When an incomplete frame is abandoned: late enough for a busy machine."""
 WAIT_S = 20.0
 """Longer than anything takes that comes at all."""
 
 
-def pattern(request: Request) -> NDArray[np.uint16]:
-    """Every pixel tells its place on the sensor and the number of the exposure."""
+def pattern(request: Exposure) -> NDArray[np.uint16]:
+    """Every pixel depends on its place on the sensor and on the number of the exposure."""
     rows = np.arange(request.y, request.y + request.height, dtype=np.uint16)[:, None]
     columns = np.arange(request.x, request.x + request.width, dtype=np.uint16)
     return (rows * 7 + columns + request.n * 1000).astype(np.uint16)
 
 
+def set_region(camera: Camera, region: Mapping[str, int]) -> None:
+    """Set the region; the sizes first, which limit the offsets."""
+    for feature in ("Width", "Height", "OffsetX", "OffsetY"):
+        camera.set_integer(feature, region[feature])
+
+
 @contextmanager
 def plugged_in(
-    expose: Callable[[Request], NDArray[np.uint16]] = pattern,
+    expose: Callable[[Exposure], NDArray[np.uint16]] = pattern,
     faults: Faults | None = None,
     sensor_shape: tuple[int, int] = (2048, 2048),
 ) -> Generator[FakeCamera]:
@@ -50,14 +55,14 @@ def plugged_in(
 def opened(
     fake: FakeCamera,
     trigger: str | None = "Software",
-    region: Region = REGION,
+    region: Mapping[str, int] = REGION,
     pixel_format: str = "Mono16",
     n_buffers: int = 6,
 ) -> Generator[tuple[Camera, Stream]]:
     """A camera that acquires, and its stream."""
     with Camera(fake.address) as camera:
         camera.set_pixel_format(pixel_format)
-        camera.set_region(region)
+        set_region(camera, region)
         camera.set_packet_size(PACKET_SIZE)
         camera.set_trigger(trigger)
         stream = camera.create_stream(n_buffers, StreamOptions(frame_retention_s=RETENTION_S, resend=False))

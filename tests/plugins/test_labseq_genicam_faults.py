@@ -1,121 +1,336 @@
-"""What a client sees of a camera when things go wrong, each really done by the simulated one."""
+"""Failures of a GenICam camera, in the driver and in whole runs; the simulated camera really fails."""
 
 from __future__ import annotations
 
-import pytest
-from labseq_genicam.aravis import AravisError, Camera
-from labseq_genicam.aravis.library import library
-from labseq_genicam.counterpart.faults import Faults, Setup, faults_from, setup_from, to_json
+import json
+import sys
+from pathlib import Path
+from typing import Any
 
-from .labseq_genicam_rig import WAIT_S, opened, plugged_in
+import labseq_aravis.library as aravis_library
+import numpy as np
+import pytest
+import yaml
+from labseq_aravis import load_library
+from labseq_genicam.setup import _check
+from labseq_genicam_sim import connection
+
+from labseq import DeviceError, LimitError, Run, Session, TransientError
+from labseq.cli import main
+from labseq.errors import DeviceTimeoutError
+
+from .labseq_genicam_rig import WAIT_S, Rig, assert_shown, plugged_in, rig
 from .needs import need_library
 
-FAILED = ("missing packets", "timeout")
-"""What a frame with lost packets is called: the first if a later one is whole before it is given up."""
+SEQUENCE = Path(__file__).parents[2] / "sequences" / "compact_225.yaml"
+VIRTUAL = Path(__file__).parents[2] / "hardware_profiles" / "virtual.yaml"
+LARGE = (512, 512)
+"""A sensor whose frames have so many packets that some of a failed one always come."""
+GONE = "camera: the camera is gone: it does not answer; check its cable and power"
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture(autouse=True, scope="module")
 def aravis() -> None:
-    need_library(library)
+    need_library(load_library)
 
 
-def test_lost_packets_fail_their_frames_and_are_counted() -> None:
-    with plugged_in(faults=Faults(packet_loss=0.02)) as fake, opened(fake, trigger=None) as (camera, stream):
-        buffers = [stream.pop(WAIT_S) for _ in range(20)]
-        camera.stop()
-        statistics = stream.statistics
-    statuses = [buffer.status for buffer in buffers if buffer is not None]
-    assert "success" in statuses
-    assert set(statuses) & set(FAILED)
-    assert all(
-        (buffer.image is None) == (buffer.status != "success") for buffer in buffers if buffer is not None
-    )
-    assert statistics.n_failed > 0
-    assert statistics.n_missing > 0
+def opening(**settings: Any) -> DeviceError | LimitError:
+    made = Rig(**settings)
+    with pytest.raises((DeviceError, LimitError)) as caught:
+        made.camera.open()
+    made.camera.close()
+    return caught.value
 
 
-def test_one_failed_frame_does_not_touch_the_next() -> None:
-    with plugged_in(faults=Faults(failed_frames=(1,))) as fake, opened(fake) as (camera, stream):
-        statuses: list[str] = []
-        for _ in range(3):
-            camera.trigger()
-            buffer = stream.pop(WAIT_S)
-            assert buffer is not None
-            statuses.append(buffer.status)
-    assert statuses[::2] == ["success", "success"]
-    assert statuses[1] in FAILED
+def test_an_address_where_nobody_is_is_told() -> None:
+    error = str(opening(camera="127.255.0.9"))
+    assert "camera: cannot open the camera" in error
+    assert "127.255.0.9" in error
+    assert "check its cable, power and network address" in error
 
 
-def test_a_late_frame_comes_after_the_time_is_up() -> None:
-    with plugged_in() as fake, opened(fake) as (camera, stream):
-        fake.set_faults(Faults(late_s=0.3))
-        camera.trigger()
-        assert stream.pop(0.05) is None
-        buffer = stream.pop(WAIT_S)
-        assert buffer is not None
-        assert buffer.status == "success"
+def test_a_camera_that_another_program_has_is_told() -> None:
+    error = str(opening(faults={"busy": True}))
+    assert "camera: cannot open the camera: another program controls it; close that one" in error
 
 
-def test_nobody_fires_a_line_trigger() -> None:
-    with plugged_in() as fake, opened(fake, trigger="Line1") as (_, stream):
-        assert stream.pop(0.2) is None
-        assert fake.n_begun == 0
+@pytest.mark.parametrize(
+    ("settings", "text"),
+    [
+        ({"model": "BFS-1"}, r"SIM1 (Simulated) has the model Simulated; expected BFS-1"),
+        ({"serial": "7"}, r"SIM1 (Simulated) has the serial number SIM1; expected 7"),
+        ({"pixel_format": "Mono14"}, "pixel format cannot be Mono14; the camera offers Mono8, Mono10"),
+        ({"gain": 2000.0}, "gain is 2000; the limit is 0 to 1000, which the camera can do"),
+        (
+            {"binning": 16},
+            "binning is 16; the limit is 1 to 8, in steps of 1, which the camera can do; the n",
+        ),
+        (
+            {"binning": 2, "region": {"y": 3, "x": 0, "height": 32, "width": 32}},
+            "region's y is 3; the limit is 0 to 64, in steps of 2, which the camera can do; the nearest good",
+        ),
+    ],
+)
+def test_what_the_camera_is_not_or_cannot_is_refused_when_it_is_opened(
+    settings: dict[str, Any], text: str
+) -> None:
+    assert text in str(opening(**settings))
 
 
-def test_software_triggers_can_be_ignored() -> None:
-    with plugged_in(faults=Faults(ignores_triggers=True)) as fake, opened(fake) as (camera, stream):
-        camera.trigger()
-        assert stream.pop(0.2) is None
-        assert fake.n_begun == 0
-
-
-def test_another_model_is_told() -> None:
-    faults = Faults(vendor="Other Cameras", model="OC-1 <&>")
-    with plugged_in(faults=faults) as fake, Camera(fake.address) as camera:
-        assert (camera.vendor, camera.model) == ("Other Cameras", "OC-1 <&>")
-
-
-def test_a_camera_that_another_program_controls_is_refused_until_it_is_free() -> None:
-    with plugged_in(faults=Faults(is_busy=True)) as fake:
-        with pytest.raises(AravisError, match="controlled by another program") as caught:
-            Camera(fake.address)
-        assert caught.value.code == "not controller"
-        fake.set_faults(Faults())
-        with Camera(fake.address) as camera:
-            assert camera.serial == "T1"
-
-
-def test_a_camera_unplugged_in_a_series_is_lost() -> None:
-    with plugged_in(faults=Faults(unplugged_at=1)) as fake, opened(fake) as (camera, stream):
-        camera.trigger()
-        assert stream.pop(WAIT_S) is not None
-        camera.trigger()
-        assert stream.pop(0.2) is None
-        with pytest.raises(AravisError, match="timeout") as caught:
-            camera.trigger()
-        assert caught.value.code == "timeout"
-        assert camera.wait_lost(WAIT_S)
-        assert camera.is_lost
-        assert not fake.is_running
-        fake.set_faults(Faults())
-        fake.start()  # plugged in again, it answers the client that lets go of it
-
-
-def test_a_killed_camera_can_be_used_again_when_it_is_back() -> None:
+def test_a_region_beyond_the_cameras_sensor_is_refused() -> None:
+    region = {"y": 0, "x": 2000, "height": 64, "width": 100}
     with plugged_in() as fake:
-        with opened(fake) as (_, stream):
-            fake.unplug()
-            assert stream.pop(0.05) is None
-            fake.start()
-        with opened(fake) as (camera, stream):
-            camera.trigger()
-            buffer = stream.pop(WAIT_S)
-        assert buffer is not None
-        assert buffer.status == "success"
+        error = str(opening(camera=fake.address, region=region))
+    assert "end of the region is row 64, column 2100; the limit is the sensor's 2048 x 2048 pixels" in error
 
 
-def test_faults_reach_the_process_as_they_are() -> None:
-    faults = Faults(0.1, (1, 5), 0.2, 7, is_busy=True, ignores_triggers=True, vendor="a", model="b")
-    setup = Setup("S1", (512, 1024), "127.0.0.9", faults)
-    assert faults_from(to_json(faults)) == faults
-    assert setup_from(to_json(setup)) == setup
+def test_a_region_between_the_cameras_steps_is_refused_with_the_nearest_good_one() -> None:
+    """Without a camera: the simulated one takes steps of one pixel."""
+    with pytest.raises(LimitError, match=r"width is 500; .*in steps of 32.*the nearest good one is 512"):
+        _check("camera", "region's width", 500, (16, 1024, 16), 2)
+
+
+def test_a_failed_buffer_is_a_lost_frame_and_the_series_goes_on() -> None:
+    faults = {"failed_frames": [1]}
+    with rig(sensor_shape=LARGE, faults=faults, frame_timeout="50 ms") as lab:
+        lab.camera.arm(3, 0.01, "software")
+        lab.camera.trigger()
+        frames = [lab.camera.read(1.0)]
+        lab.camera.trigger()
+        with pytest.raises(
+            TransientError,
+            match="frame 2 was lost, of a series of 3: some of its network packets are missing",
+        ):
+            lab.camera.read(1.0)
+        del lab.world.shown[1]
+        lab.camera.trigger()
+        frames.append(lab.camera.read(1.0))
+        assert [frame.number for frame in frames] == [0, 2]
+        assert_shown(frames, lab)
+
+
+def test_frames_of_which_nothing_comes_are_missed_by_their_numbers() -> None:
+    """The second and third frame: for the camera, not for the world, the line is cut between them."""
+    with rig(sensor_shape=LARGE) as lab:
+        lab.camera.arm(4, 0.01, "software")
+        lab.camera.trigger()
+        first = lab.camera.read(1.0)
+        assert lab.camera._acquisition is not None
+        for _ in range(2):
+            lab.camera.trigger()
+            lab.clock.sleep(0.01)
+            assert lab.camera._acquisition._stream is not None
+            assert lab.camera._acquisition._stream.pop(WAIT_S) is not None
+        lab.camera.trigger()
+        with pytest.raises(TransientError, match=r"frames 2 to 3 were lost, of a series of 4: .* have a gap"):
+            lab.camera.read(1.0)
+        last = lab.camera.read(1.0)
+        assert (last.number, last.t_start_s) == (3, pytest.approx(first.t_start_s + 0.035))
+        assert [call.number for call in lab.take(2)] == [0, 1]
+
+
+def test_a_frame_that_comes_too_late_is_a_timeout_and_does_not_turn_up_in_the_next_series() -> None:
+    with rig(faults={"late_by": "100 ms"}) as lab:
+        lab.camera.arm(1, 0.01, "software")
+        lab.camera.trigger()
+        with pytest.raises(DeviceTimeoutError, match=r"no frame within 50 ms: frame 1 of 1 is not ready"):
+            lab.camera.read(0.05)
+        lab.camera.safe_state()
+        del lab.world.shown[:]
+        assert_shown(lab.take(2), lab)
+
+
+def test_an_unplugged_camera_is_told_once_and_nothing_waits_for_it_again() -> None:
+    made = Rig(faults={"unplugged_at": 1})
+    made.camera.open()
+    made.camera.arm(3, 0.01, "software")
+    made.camera.trigger()
+    made.camera.read(1.0)
+    made.camera.trigger()
+    with pytest.raises(DeviceError, match=GONE):
+        made.camera.read(1.0)
+    for use in (
+        lambda: made.camera.read(60.0),
+        lambda: made.camera.arm(1, 0.01, "software"),
+        made.camera.describe,
+    ):
+        with pytest.raises(DeviceError, match=GONE):
+            use()
+    made.camera.safe_state()
+    made.camera.close()
+    made.camera.open()
+    del made.world.shown[:]
+    assert_shown(made.take(1), made)
+    made.camera.close()
+
+
+def test_a_loss_that_the_library_notices_ends_a_wait() -> None:
+    """The library needs 6 s to notice; here the loss is reported to it."""
+    with rig() as lab:
+        lab.camera.arm(1, 0.01, "external")
+        assert lab.camera._link is not None
+        lab.camera._link.camera._lost.set()
+        with pytest.raises(DeviceError, match=GONE):
+            lab.camera.read(60.0)
+
+
+def test_a_wire_that_never_comes_is_a_timeout() -> None:
+    with rig() as lab:
+        lab.camera.arm(2, 0.01, "external")
+        with pytest.raises(DeviceTimeoutError, match="frame 1 of 2 waits for its external trigger; check"):
+            lab.camera.read(0.05)
+        assert len(lab.take(1)) == 1
+
+
+def test_a_software_trigger_that_is_not_seen_is_a_timeout(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(connection, "MAX_WAIT_S", 0.1)
+    with rig(faults={"ignores_triggers": True}) as lab:
+        lab.camera.arm(1, 0.01, "software")
+        lab.camera.trigger()
+        with pytest.raises(DeviceTimeoutError, match="frame 1 of 1 is not ready"):
+            lab.camera.read(1.0)
+
+
+@pytest.mark.parametrize(
+    ("settings", "text"),
+    [
+        ({"trigger_line": "Line9"}, "trigger source cannot be Line9; the camera offers Software, Line1"),
+        ({"trigger_edge": "falling"}, "cannot prepare the series: .*FallingEdge"),
+    ],
+)
+def test_a_trigger_that_the_camera_does_not_have_is_refused(settings: dict[str, Any], text: str) -> None:
+    with rig(**settings) as lab:
+        with pytest.raises(DeviceError, match=text):
+            lab.camera.arm(1, 0.01, "external")
+        assert len(lab.take(1)) == 1
+
+
+def test_exposures_beyond_the_cameras_limits_are_refused() -> None:
+    with rig(max_exposure="60 s", frame_rate="200 Hz") as lab:
+        with pytest.raises(LimitError, match="exposure is 20 s; the limit is more than 0 and at most 10 s"):
+            lab.camera.arm(1, 20.0, "software")
+        with pytest.raises(LimitError, match="exposure is 1 us; the limit is 10 us to 10 s"):
+            lab.camera.arm(1, 1e-6, "software")
+        with pytest.raises(
+            LimitError, match=r"frame rate is 200; the limit is 0\.1 to 100 per second at this"
+        ):
+            lab.camera.arm(2, 0.01, "internal")
+        assert len(lab.take(1)) == 1
+
+
+def test_a_camera_that_reads_another_region_than_it_was_told_is_noticed() -> None:
+    with rig(region={"y": 0, "x": 0, "height": 32, "width": 32}) as lab:
+        assert lab.camera._link is not None
+        lab.camera._link.camera.set_integer("OffsetX", 5)
+        lab.camera.arm(1, 0.01, "software")
+        with pytest.raises(DeviceError, match=r"the camera reads .*\(0, 5, 32, 32, \(1, 1\)\); expected"):
+            lab.camera.trigger()
+
+
+def test_without_the_library_the_error_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(aravis_library, "_library", None)
+    monkeypatch.setattr(aravis_library, "NAMES", {sys.platform: (("libnone.so.1", "none"),)})
+    error = str(opening())
+    assert "camera: the library libaravis 0.8 cannot be loaded" in error
+    assert "apt-get install libaravis-0.8-0" in error
+    assert "use: virtual" in error
+
+
+# whole runs
+
+
+def profile(folder: Path, **camera: Any) -> Path:
+    """``virtual`` with another camera."""
+    parts = yaml.safe_load(VIRTUAL.read_text())
+    parts["camera"] = {"use": "genicam", "camera": "simulated", "frame_timeout": "50 ms", **camera}
+    path = folder / "cameras.yaml"
+    path.write_text(yaml.safe_dump(parts))
+    return path
+
+
+def run(output: Path, profile: str, *overrides: str, shots: int = 1, dry_run: Any = "off") -> Run:
+    with Session.open(
+        SEQUENCE, profile=profile, shots=shots, seed=1, output=output, overrides=overrides, dry_run=dry_run
+    ) as session:
+        return session.run()
+
+
+def failing(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], **camera: Any
+) -> tuple[int, str, list[dict[str, Any]]]:
+    """Exit code of ``labseq run``, what it says, and what it logs."""
+    output = tmp_path / "data"
+    command = ["run", str(SEQUENCE), "--profile", str(profile(tmp_path, **camera)), "--shots", "2", "--seed"]
+    with pytest.raises(SystemExit) as left:
+        main([*command, "1", "--output", str(output)])
+    logs = [line for log in output.glob("*/*/events.jsonl") for line in log.read_text().splitlines()]
+    assert isinstance(left.value.code, int)
+    return left.value.code, capfd.readouterr().err, [json.loads(line) for line in logs]
+
+
+def of(events: list[dict[str, Any]], name: str) -> list[dict[str, Any]]:
+    return [event["values"] for event in events if event["event"] == name]
+
+
+def test_a_dry_run_with_a_real_cameras_profile_takes_the_simulated_one(tmp_path: Path) -> None:
+    cut = (
+        "profile.camera.region={y: 20, x: 6, height: 472, width: 500}",
+        "profile.camera.readout=0 ms",
+        "profile.detector.frame=[472, 500]",
+        "profile.detector.centre_px=[235.5, 249.5]",
+    )
+    real = profile(tmp_path, camera="192.168.7.2", model="BFS-PGE-50S5M", serial="23456789")
+    done = run(tmp_path, str(real), *cut, dry_run="full")
+    assert done.simulated
+    assert done.record["devices"]["camera"]["serial_number"] == "SIM1"
+    virtual = run(tmp_path, "virtual", *cut)
+    for shot, expected in zip(done.shots, virtual.shots, strict=True):
+        np.testing.assert_array_equal(shot.occupancies, expected.occupancies)
+
+
+def test_a_shot_with_a_lost_frame_is_repeated(tmp_path: Path) -> None:
+    done = run(tmp_path, str(profile(tmp_path, faults={"failed_frames": [1]})))
+    assert done.status == "complete"
+    (log,) = tmp_path.glob("*/*/events.jsonl")
+    events = [json.loads(line) for line in log.read_text().splitlines()]
+    (repeated,) = of(events, "shot_repeated")
+    assert "camera: frame 1 was lost, of a series of 1:" in str(repeated)
+    assert "some of its network packets are missing" in str(repeated)
+
+
+def test_when_packets_are_lost_the_shot_is_repeated_and_then_the_run_ends_safely(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """2 % of 360 packets: no frame comes whole."""
+    code, said, events = failing(tmp_path, capfd, packet_size=1500, faults={"packet_loss": 0.02})
+    assert code == 3
+    assert "camera: frame 1 was lost, of a series of 1:" in said
+    assert "some of its network packets are missing" in said
+    assert len(of(events, "shot_repeated")) == 2
+    assert all(event["ok"] for event in of(events, "safe_state"))
+
+
+def test_a_camera_unplugged_in_a_shot_ends_the_run_safely(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    code, said, events = failing(tmp_path, capfd, faults={"unplugged_at": 2})
+    assert code == 3
+    assert "camera: the camera is gone: it does not answer; check its cable and power" in said
+    assert "camera is gone" in str(of(events, "shot_finished"))
+    assert all(event["ok"] for event in of(events, "safe_state"))
+
+
+def test_a_region_beyond_the_sensor_is_shown_in_the_profile(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    region = {"y": 500, "x": 0, "height": 100, "width": 512}
+    code, said, _ = failing(tmp_path, capfd, region=region)
+    assert code == 2
+    assert "cameras.yaml:" in said
+    assert "`region` ends at row 600 and column 512, beyond the sensor of 512 x 512 pixels" in said
+
+
+def test_the_only_camera_may_be_the_wrong_one(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    code, said, _ = failing(tmp_path, capfd, model="BFS-PGE-50S5M")
+    assert code == 3
+    assert "camera: the camera SIM1 (Simulated) has the model Simulated; expected BFS-PGE-50S5M" in said

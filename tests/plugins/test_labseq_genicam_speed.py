@@ -10,9 +10,8 @@ import time
 
 import numpy as np
 import pytest
-from labseq_genicam.aravis import Region
-from labseq_genicam.aravis.library import library
-from labseq_genicam.counterpart.images import Request
+from labseq_aravis import load_library
+from labseq_genicam_sim.messages import Exposure
 from numpy.typing import NDArray
 
 from labseq.roles import NeverStopped
@@ -21,18 +20,18 @@ from .labseq_genicam_rig import PACKET_SIZE, WAIT_S, opened, pattern, plugged_in
 from .needs import need_library
 
 N_FRAMES = int(os.environ.get("LABSEQ_FRAMES", "25"))
-REGION = Region(0, 0, 512, 512)
+REGION = {"OffsetX": 0, "OffsetY": 0, "Width": 512, "Height": 512}
 N_BUFFERS = 6
 
-IMAGE = pattern(Request(0, 0.0, 0.0, 0, 0, REGION.width, REGION.height, (1, 1)))
+IMAGE = pattern(Exposure(0, 0, 0, 0, 0, 0, 512, 512, 1, 1))
 
 
 @pytest.fixture(autouse=True)
 def aravis() -> None:
-    need_library(library)
+    need_library(load_library)
 
 
-def _expose(request: Request) -> NDArray[np.uint16]:
+def _expose(request: Exposure) -> NDArray[np.uint16]:
     image = IMAGE.copy()
     image[0, 0] = request.n
     return image
@@ -65,7 +64,7 @@ def test_every_software_trigger_makes_a_frame() -> None:
         for n in range(N_FRAMES):
             begun_s = time.perf_counter()
             camera.trigger()
-            assert fake.wait_for_request(n, WAIT_S)
+            assert fake.wait_for_exposure(n, WAIT_S)
             exposed_s = time.perf_counter()
             buffer = stream.pop(WAIT_S)
             times_s.append((exposed_s - begun_s, time.perf_counter() - begun_s))

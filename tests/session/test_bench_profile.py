@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from labseq_genicam.aravis.library import library
+from labseq_aravis import load_library
 from labseq_soapy_sim import build_module
 from labseq_ttl_sim.simavr import runner
 
@@ -20,7 +20,7 @@ SEQUENCE = Path(__file__).parents[2] / "sequences" / "compact_225.yaml"
 
 @pytest.fixture(autouse=True, scope="module")
 def installed() -> None:
-    for load in (library, build_module, lambda: runner("lines")):
+    for load in (load_library, build_module, lambda: runner("lines")):
         need_library(load)
 
 

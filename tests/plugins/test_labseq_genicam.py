@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
-from labseq_genicam.aravis.library import library
+from labseq_aravis import load_library
+from labseq_genicam.acquisition import LAST_ID, FrameCounter
 from labseq_genicam.camera import GenicamCamera
-from labseq_genicam.counterpart.images import Request
-from labseq_genicam.counting import LAST_ID, FrameCounter
 from labseq_genicam.settings import FORMATS, GenicamSettings
+from labseq_genicam_sim.messages import Exposure
 from numpy.typing import NDArray
 
 from labseq import ConfigError, Context, Frame, SensorMode
@@ -29,7 +29,7 @@ from .needs import need_library
 
 @pytest.fixture(autouse=True, scope="module")
 def aravis() -> None:
-    need_library(library)
+    need_library(load_library)
 
 
 class TestGenicamCamera(CameraContract):
@@ -156,10 +156,11 @@ def test_the_world_shows_the_region_that_the_camera_reads(sensor: dict[str, Any]
         told = lab.camera.facts.frame_shape
         (frame,) = lab.take(1)
         assert lab.camera._link is not None
-        read = lab.camera._link.camera.region
+        features = ("OffsetY", "OffsetX", "Height", "Width")
+        read = [lab.camera._link.camera.get_integer(feature) for feature in features]
     wanted = sensor.get("region") or {"y": 0, "x": 0, "height": 96, "width": 128}
     binned = [wanted[key] // sensor["binning"] for key in ("y", "x", "height", "width")]
-    assert [read.y, read.x, read.height, read.width] == binned
+    assert read == binned
     assert told == tuple(binned[2:])
     largest = 2 ** int(sensor["pixel_format"].removeprefix("Mono")) - 1
     np.testing.assert_array_equal(frame.image, np.minimum(lab.world.shown[0], largest))
@@ -179,11 +180,11 @@ def test_a_frame_is_due_when_a_real_camera_would_have_it() -> None:
 
 
 def test_a_computer_that_is_slow_costs_no_time_on_a_virtual_clock(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("labseq_genicam.camera.ASK_S", 1e-3)
+    monkeypatch.setattr("labseq_genicam.camera.CHECK_PERIOD_S", 1e-3)
     with rig(readout="5 ms") as lab:
         acquisition, asked = lab.camera._opened(), list[None]()
         poll = acquisition.poll
-        monkeypatch.setattr(acquisition, "ask", lambda: asked.append(None))
+        monkeypatch.setattr(acquisition, "check_alive", lambda: asked.append(None))
         monkeypatch.setattr(acquisition, "poll", lambda s: poll(s) if len(asked) > 2 else None)
         frames = lab.take(1, 0.01)
         assert len(asked) == 3
@@ -198,7 +199,7 @@ def test_the_camera_answers_while_its_image_is_made(monkeypatch: pytest.MonkeyPa
         assert link is not None
 
         def slow(t_start_s: float, exposure_s: float, mode: SensorMode) -> Frame:
-            link.ask()
+            link.check_alive()
             return expose(t_start_s, exposure_s, mode)
 
         monkeypatch.setattr(lab.world, "expose", slow)
@@ -229,7 +230,7 @@ def test_a_camera_with_an_address_is_used_as_a_real_one() -> None:
     region = {"y": 8, "x": 16, "height": 24, "width": 32}
     settings = {"region": region, "packet_size": PACKET_SIZE, "readout": "1 ms", "frame_rate": "500 Hz"}
 
-    def expose(request: Request) -> NDArray[np.uint16]:
+    def expose(request: Exposure) -> NDArray[np.uint16]:
         return np.full((request.height, request.width), request.n, np.uint16)
 
     with (

@@ -1,4 +1,4 @@
-"""The parent's side of the simulated camera."""
+"""The parent's side of a simulated camera: starts its process and makes its images."""
 
 from __future__ import annotations
 
@@ -10,13 +10,11 @@ from collections.abc import Callable
 from typing import IO, Final
 
 import numpy as np
+from labseq_aravis.library import AravisError, load_library
+from labseq_aravis.stream import MONO
 from numpy.typing import NDArray
 
-from labseq_genicam.aravis.errors import AravisError
-from labseq_genicam.aravis.library import library
-from labseq_genicam.counterpart.faults import Faults, Setup, to_json
-from labseq_genicam.counterpart.images import Request, made
-from labseq_genicam.counterpart.messages import (
+from labseq_genicam_sim.messages import (
     DONE,
     EXPOSE,
     FAULTS,
@@ -27,6 +25,9 @@ from labseq_genicam.counterpart.messages import (
     SETUP,
     Channel,
     Exposure,
+    Faults,
+    Setup,
+    to_json,
 )
 
 START_TIMEOUT_S: Final = 30.0
@@ -35,24 +36,27 @@ START_TIMEOUT_S: Final = 30.0
 STOP_TIMEOUT_S: Final = 5.0
 """How long an exposure that is being made may take to end."""
 
+SATURATION: Final = {MONO["Mono8"]: 2**8 - 1, MONO["Mono10"]: 2**10 - 1, MONO["Mono12"]: 2**12 - 1}
+"""Largest value of a pixel, by pixel format."""
+
 
 class FakeCamera:
     """A simulated GigE Vision camera whose pixels come from a function.
 
     Args:
-        expose: Makes the image of an exposure, uint16 (height, width), clipped to what the pixel
-            format holds. A thread of this object calls it, one exposure at a time.
+        expose: Makes the image of an exposure, uint16 (height, width). A thread of this object calls
+            it, one exposure at a time.
         serial: Its serial number, at most 15 characters.
         sensor_shape: Height and width of the sensor, in pixels.
-        faults: What goes wrong.
+        faults: Failures to simulate.
 
     Attributes:
-        address: What it is opened by; "" before it has started.
+        address: IP address; empty before it has started.
     """
 
     def __init__(
         self,
-        expose: Callable[[Request], NDArray[np.uint16]],
+        expose: Callable[[Exposure], NDArray[np.uint16]],
         *,
         serial: str = "SIM1",
         sensor_shape: tuple[int, int] = (2048, 2048),
@@ -64,12 +68,9 @@ class FakeCamera:
         self._faults = faults
         self._process: subprocess.Popen[bytes] | None = None
         self._errors: list[Exception] = []
-        self._news = threading.Condition()
-        self._n_begun = 0
-        self._n_answered = 0
-        self._n_done = 0
-        self._is_ready = False
-        self._has_ended = False
+        self._changed = threading.Condition()
+        self._n_begun = self._n_answered = self._n_done = 0
+        self._is_ready = self._has_ended = False
         self.address = ""
 
     def start(self) -> None:
@@ -77,17 +78,17 @@ class FakeCamera:
 
         Raises:
             LibraryMissingError: There is no library.
-            AravisError: It cannot start; says why.
+            AravisError: It cannot start; the message says why.
         """
         if self.is_running:
             return
         self.stop()
-        library()  # a missing one is told here
+        load_library()  # reports a missing one here
         self._log: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 - closed by stop()
         self._n_begun = self._n_answered = 0
         self._is_ready = self._has_ended = False
         self._process = subprocess.Popen(
-            [sys.executable, "-P", "-m", "labseq_genicam.counterpart"],
+            [sys.executable, "-P", "-m", "labseq_genicam_sim"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._log,
@@ -105,9 +106,8 @@ class FakeCamera:
         try:
             self._send(SETUP, to_json(setup))
             if not self._wait(lambda: self._is_ready or self._has_ended, START_TIMEOUT_S):
-                raise AravisError(
-                    f"the simulated camera did not start within {START_TIMEOUT_S:g} s", "timeout"
-                )
+                text = f"the simulated camera did not start within {START_TIMEOUT_S:g} s"
+                raise AravisError(text, "timeout")
             if not self._is_ready:
                 raise self._errors.pop() if self._errors else AravisError(self._reason(), "not connected")
         except BaseException:
@@ -115,7 +115,7 @@ class FakeCamera:
             raise
 
     def stop(self) -> None:
-        """End the process; legal at any time, and again."""
+        """End the process; legal at any time, and repeatedly."""
         if self._process is None:
             return
         self.unplug()
@@ -139,16 +139,16 @@ class FakeCamera:
 
     @property
     def n_begun(self) -> int:
-        """How many exposures the camera has begun: the number that the next one will have."""
-        with self._news:
+        """How many exposures the camera has begun: the number of the next one."""
+        with self._changed:
             return self._n_begun
 
-    def wait_for_request(self, n: int, timeout_s: float, *, answered: bool = False) -> bool:
+    def wait_for_exposure(self, n: int, timeout_s: float, *, answered: bool = False) -> bool:
         """Wait until the camera has begun an exposure.
 
         Args:
             n: Number of the exposure, from 0.
-            timeout_s: How long.
+            timeout_s: How long to wait.
             answered: Whether to wait until its image has been made, too.
 
         Returns:
@@ -157,10 +157,10 @@ class FakeCamera:
         return self._wait(lambda: n < (self._n_answered if answered else self._n_begun), timeout_s)
 
     def set_faults(self, faults: Faults) -> None:
-        """Change what goes wrong; in force for frames begun from now on.
+        """Change the failures to simulate, for frames that begin from now on.
 
         Raises:
-            AravisError: The camera does not take them.
+            AravisError: The camera does not accept them.
         """
         self._faults = faults
         if not self.is_running:
@@ -171,7 +171,7 @@ class FakeCamera:
             raise AravisError(self._reason(), "not connected")
 
     def unplug(self) -> None:
-        """Let the camera vanish, whatever it is doing; :meth:`start` plugs it in again, at its address."""
+        """Kill the camera, whatever it is doing; :meth:`start` plugs it in again, at its address."""
         if self._process is not None:
             self._process.kill()
             self._process.wait()
@@ -183,34 +183,34 @@ class FakeCamera:
 
     def _serve(self, channel: Channel) -> None:
         """Answer the camera until it is gone."""
-        while (message := _received(channel)) is not None:
+        while (message := _receive(channel)) is not None:
             kind, data = message
             if kind == EXPOSE:
-                self._answer(channel, Exposure.unpacked(data))
-            with self._news:
+                self._answer(channel, Exposure.from_bytes(data))
+            with self._changed:
                 if kind == READY:
                     self.address, self._is_ready = data.decode(), True
                 elif kind == REFUSED:
                     self._errors.append(AravisError(data.decode(), "refused"))
                 elif kind == DONE:
                     self._n_done += 1
-                self._news.notify_all()
-        with self._news:
+                self._changed.notify_all()
+        with self._changed:
             self._has_ended = self._has_ended or channel is self._channel
-            self._news.notify_all()
+            self._changed.notify_all()
 
     def _answer(self, channel: Channel, exposure: Exposure) -> None:
-        with self._news:
+        with self._changed:
             self._n_begun += 1
-            self._news.notify_all()
+            self._changed.notify_all()
         try:
-            image = made(self._expose, exposure)
+            image = _pixels(self._expose(exposure), exposure)
         except Exception as error:  # noqa: BLE001 - kept for raise_pending
             self._errors.append(error)
             image = None
-        with self._news:
+        with self._changed:
             self._n_answered += 1
-            self._news.notify_all()
+            self._changed.notify_all()
         try:
             channel.send(NO_IMAGE if image is None else IMAGE, b"" if image is None else image)
         except (OSError, ValueError):
@@ -225,20 +225,36 @@ class FakeCamera:
             raise AravisError(self._reason(), "not connected") from error
 
     def _wait(self, condition: Callable[[], bool], timeout_s: float) -> bool:
-        with self._news:
-            return self._news.wait_for(condition, timeout_s)
+        with self._changed:
+            return self._changed.wait_for(condition, timeout_s)
 
     def _reason(self) -> str:
-        """Why the camera is gone, as far as its process told."""
+        """Why the camera is gone, from the last line that its process printed."""
         if self._process is None:
             return "the simulated camera is not running; call start() first"
         self._log.seek(0)
         lines = self._log.read().decode(errors="replace").split("\n")
-        said = next((line for line in reversed(lines) if line.strip()), "it said nothing")
-        return f"the process of the simulated camera has ended: {said}"
+        last = next((line for line in reversed(lines) if line.strip()), "it printed nothing")
+        return f"the process of the simulated camera has ended: {last}"
 
 
-def _received(channel: Channel) -> tuple[bytes, bytearray] | None:
+def _pixels(image: NDArray[np.uint16], exposure: Exposure) -> NDArray[np.uint16] | NDArray[np.uint8]:
+    """An image in the camera's pixel format: uint16 or, for Mono8, uint8 (height, width), little-endian.
+
+    Raises:
+        ValueError: The image is not uint16 (height, width) of the region.
+    """
+    shape = (exposure.height, exposure.width)
+    if image.shape != shape or image.dtype != np.uint16:
+        text = f"the image of exposure {exposure.n} is {image.dtype} {image.shape}; expected uint16 {shape}"
+        raise ValueError(text)
+    largest = SATURATION.get(exposure.pixel_format)
+    if largest is not None:
+        image = np.minimum(image, np.uint16(largest))
+    return np.ascontiguousarray(image, np.uint8 if exposure.pixel_format == MONO["Mono8"] else "<u2")
+
+
+def _receive(channel: Channel) -> tuple[bytes, bytearray] | None:
     try:
         return channel.receive()
     except (OSError, ValueError):  # closed meanwhile

@@ -1,4 +1,4 @@
-"""Frames of a camera, as they come."""
+"""Frames of a camera: the stream that receives them, and their pixels."""
 
 from __future__ import annotations
 
@@ -6,13 +6,59 @@ import ctypes
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
-from labseq_genicam.aravis.errors import AravisError
-from labseq_genicam.aravis.library import G_TYPE_INT, G_TYPE_UINT, Library
-from labseq_genicam.aravis.pixels import NAMES, unpacked
+from labseq_aravis.library import G_TYPE_INT, G_TYPE_UINT, AravisError, Library, PixelFormatError
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
+
+MONO: Final = {
+    "Mono8": 0x01080001,
+    "Mono10": 0x01100003,
+    "Mono12": 0x01100005,
+    "Mono14": 0x01100025,
+    "Mono16": 0x01100007,
+}
+"""Codes of the supported formats, by name, after the Pixel Format Naming Convention of GenICam."""
+
+NAMES: Final = {code: name for name, code in MONO.items()}
+"""Names of those formats, by code."""
+
+
+def unpacked(
+    address: int, n_bytes: int, pixel_format: int, shape: tuple[int, int], padding: int = 0
+) -> NDArray[np.uint16]:
+    """Copy an image out of memory.
+
+    Args:
+        address: Address of its first byte.
+        n_bytes: Its size, in bytes.
+        pixel_format: Code of its pixel format.
+        shape: Height and width, in pixels.
+        padding: Bytes that follow each line.
+
+    Returns:
+        The image, uint16 (height, width).
+
+    Raises:
+        PixelFormatError: The format is none of :data:`MONO`.
+        AravisError: There are fewer bytes than the image has.
+    """
+    import numpy as np  # the process of a simulated camera starts faster without it
+
+    if pixel_format not in NAMES:
+        raise PixelFormatError(pixel_format)
+    height, width = shape
+    dtype = np.dtype(np.uint8 if pixel_format == MONO["Mono8"] else "<u2")
+    n_line = width * dtype.itemsize
+    stride = n_line + padding
+    if height * stride > n_bytes:
+        text = f"a frame of {height} x {width} pixels has {n_bytes} bytes; expected {height * stride}"
+        raise AravisError(text, "size")
+    raw = np.ctypeslib.as_array((ctypes.c_uint8 * (height * stride)).from_address(address))
+    lines = raw.reshape(height, stride)[:, :n_line]
+    return np.ascontiguousarray(lines).view(dtype).astype(np.uint16)  # always a copy
+
 
 STATUS_NAMES: Final = (
     "success",
@@ -28,41 +74,33 @@ STATUS_NAMES: Final = (
 
 FRAMES_IN_SOCKET: Final = 4
 MIN_SOCKET_BUFFER: Final = 2**20
-"""Size of the socket's buffer, in frames, and its least size, in bytes. That of one frame, the
-library's own choice, loses packets: the kernel counts each with its overhead, up to twice its size."""
+"""Size of the socket's buffer, in frames, and its minimum size, in bytes. A buffer for one frame, the
+library's default, loses packets: the kernel counts each packet with its overhead, up to twice its size."""
 
 
 @dataclass(frozen=True, slots=True)
 class StreamOptions:
-    """How a GigE stream receives; of USB, none counts. None leaves the library's value.
+    """How a GigE stream receives; no effect for USB. None leaves the library's value.
 
     Attributes:
-        packet_timeout_s: After which time a missing packet is asked for again.
-        frame_retention_s: After which time without a packet an incomplete frame is given up.
-        resend: Whether missing packets are asked for again.
-        socket_buffer_bytes: Size of the socket's buffer; None for four frames, and at least 1 MiB.
-            The system may give less: on Linux, twice ``net.core.rmem_max``.
-        packet_socket: Whether Linux's packet sockets are used where the program may
-            (CAP_NET_RAW): faster, but it hears every packet of the machine.
+        packet_timeout_s: Time after which a missing packet is requested again.
+        frame_retention_s: Time without a packet after which an incomplete frame is abandoned.
+        resend: Whether missing packets are requested again.
     """
 
     packet_timeout_s: float | None = None
     frame_retention_s: float | None = None
     resend: bool = True
-    socket_buffer_bytes: int | None = None
-    packet_socket: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class Buffer:
-    """A frame, or what came of it.
+    """A received frame, or the reason why it failed.
 
     Attributes:
-        status: "success", or why there is no image: one of :data:`STATUS_NAMES`, or "unknown".
-        frame_id: Number that the camera gave it; GigE cameras count 1 to 65535 and again from 1.
+        status: "success", or the reason why there is no image: one of :data:`STATUS_NAMES`, or "unknown".
+        frame_id: Number given by the camera; GigE cameras count 1 to 65535 and again from 1.
         camera_time_ns: Start of its transfer or exposure on the camera's clock, in nanoseconds.
-        system_time_ns: When its first packet came, on this machine's clock, in nanoseconds
-            since 1970.
         pixel_format: Name of its pixel format; "" if there is no image.
         image: uint16 (height, width), a copy; None unless the status is "success".
     """
@@ -70,21 +108,20 @@ class Buffer:
     status: str
     frame_id: int
     camera_time_ns: int
-    system_time_ns: int
     pixel_format: str
     image: NDArray[np.uint16] | None
 
 
 @dataclass(frozen=True, slots=True)
 class Statistics:
-    """What has come since the stream was made.
+    """Counts since the stream was made.
 
     Attributes:
-        n_completed: Frames that are whole.
-        n_failed: Frames that are not.
-        n_underruns: Frames that came when there was no free buffer.
-        n_resent: Packets that came after they were asked for again; GigE only.
-        n_missing: Packets that never came; GigE only.
+        n_completed: Complete frames.
+        n_failed: Incomplete frames.
+        n_underruns: Frames that arrived when there was no free buffer.
+        n_resent: Packets that arrived after they were requested again; GigE only.
+        n_missing: Packets that never arrived; GigE only.
     """
 
     n_completed: int
@@ -117,8 +154,7 @@ class Stream:
             if time_s is not None:
                 self._set(name, round(time_s * 1e6), G_TYPE_UINT)
         self._set("socket-buffer", 0, lib.arv_gv_stream_socket_buffer_get_type())  # fixed
-        size = options.socket_buffer_bytes or max(FRAMES_IN_SOCKET * payload, MIN_SOCKET_BUFFER)
-        self._set("socket-buffer-size", size, G_TYPE_INT)
+        self._set("socket-buffer-size", max(FRAMES_IN_SOCKET * payload, MIN_SOCKET_BUFFER), G_TYPE_INT)
 
     def allocate(self, n_buffers: int, payload: int) -> None:
         """Add buffers of ``payload`` bytes each."""
@@ -127,7 +163,7 @@ class Stream:
             self._library.arv_stream_push_buffer(self._open_handle(), buffer)
 
     def close(self) -> None:
-        """Stop receiving and free the buffers; legal at any time, and again."""
+        """Stop receiving and free the buffers; legal at any time, and repeatedly."""
         if self._handle is not None:
             self._library.g_object_unref(self._handle)
             self._handle = None
@@ -140,16 +176,16 @@ class Stream:
         self.close()
 
     def pop(self, timeout_s: float) -> Buffer | None:
-        """Wait for the next frame, or for what came of it.
+        """Wait for the next frame, complete or not.
 
         Args:
-            timeout_s: How long; other threads run meanwhile.
+            timeout_s: How long to wait; other threads run meanwhile.
 
         Returns:
             The frame; None if none came in time.
 
         Raises:
-            AravisError: It cannot be read: see :func:`unpacked`. The buffer is used again all the same.
+            AravisError: Its pixels cannot be read, see :func:`unpacked`. The buffer is reused anyway.
         """
         handle = self._open_handle()
         buffer = self._library.arv_stream_timeout_pop_buffer(handle, max(0, round(timeout_s * 1e6)))
@@ -162,7 +198,7 @@ class Stream:
 
     @property
     def statistics(self) -> Statistics:
-        """What has come so far."""
+        """Counts since the stream was made."""
         values = [ctypes.c_uint64() for _ in range(5)]
         places = [ctypes.byref(value) for value in values]
         self._library.arv_stream_get_statistics(self._open_handle(), *places[:3])
@@ -178,7 +214,6 @@ class Stream:
             status,
             lib.arv_buffer_get_frame_id(buffer),
             lib.arv_buffer_get_timestamp(buffer),
-            lib.arv_buffer_get_system_timestamp(buffer),
             *(self._image(buffer) if status == "success" else ("", None)),
         )
 

@@ -1,4 +1,4 @@
-"""How the simulated camera describes its features: a GenICam description of its registers.
+"""The GenICam description of the simulated camera's registers, by which clients find its features.
 
 Addresses are those of Aravis' simulated camera and of the GigE Vision bootstrap registers.
 """
@@ -9,7 +9,9 @@ from collections.abc import Iterable, Mapping
 from html import escape
 from typing import Final
 
-from labseq_genicam.aravis.pixels import MONO
+from labseq_aravis.stream import MONO
+
+from labseq_genicam_sim.messages import GAIN_STEP
 
 REGISTERS: Final = {
     "Width": 0x100,
@@ -44,11 +46,8 @@ TEXTS: Final = {
 }
 """Addresses and lengths of texts, in bytes."""
 
-GAIN_STEP: Final = 1e-3
-"""What one unit of the gain's register stands for."""
-
 TRIGGERS: Final = {"Software": 1, "Line1": 2}
-"""Trigger sources. No wire leads to Line1."""
+"""Trigger sources. Line1 is connected to nothing."""
 
 CATEGORIES: Final = {
     "DeviceControl": tuple(TEXTS),
@@ -71,9 +70,9 @@ def description(vendor: str, model: str, *, ignores_triggers: bool = False) -> s
     """The description, as XML.
 
     Args:
-        vendor: Maker of the camera, for its head.
-        model: Model of the camera, likewise.
-        ignores_triggers: Whether its software trigger is connected to nothing.
+        vendor: Manufacturer of the camera.
+        model: Model of the camera.
+        ignores_triggers: Whether its software trigger has no effect.
     """
     places = dict(REGISTERS)
     if ignores_triggers:
@@ -182,7 +181,7 @@ def _command(name: str, register: str, value: int) -> str:
 def _float(
     name: str, register: str, formula: str, bounds: tuple[int, int], scale: float = 1.0
 ) -> Iterable[str]:
-    """A number that its register holds as an integer: the formula makes one of the other."""
+    """A float that its register holds as an integer; the formula converts one to the other."""
     to, back = formula.format("FROM", scale), formula.format("TO", 1 / scale)
     least, greatest = bounds
     yield f'<Float Name="{name}"><pValue>{name}Converter</pValue></Float>'

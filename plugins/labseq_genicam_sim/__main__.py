@@ -1,37 +1,54 @@
-"""The simulated camera itself: Aravis' own, with its pixels from elsewhere. In a process of its own."""
+"""The process of a simulated camera: Aravis' own, with pixels that its parent makes."""
 
 from __future__ import annotations
 
 import contextlib
 import ctypes
+import json
 import os
+import queue
+import signal
 import socket
+import sys
 import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
-from labseq_genicam.aravis.errors import AravisError
-from labseq_genicam.aravis.library import G_TYPE_DOUBLE, library
-from labseq_genicam.counterpart.description import REGISTERS, TEXTS, description
-from labseq_genicam.counterpart.faults import Setup
-from labseq_genicam.counterpart.messages import Exposure
-from labseq_genicam.counterpart.sockets import FIRST_ADDRESS, has_port, move, own_addresses
+from labseq_aravis.camera import Camera
+from labseq_aravis.library import G_TYPE_DOUBLE, AravisError, load_library
+
+from labseq_genicam_sim.description import REGISTERS, TEXTS, description
+from labseq_genicam_sim.messages import (
+    DONE,
+    EXPOSE,
+    FAULTS,
+    IMAGE,
+    NO_IMAGE,
+    READY,
+    REFUSED,
+    Channel,
+    Exposure,
+    Faults,
+    Setup,
+)
+from labseq_genicam_sim.network import FIRST_ADDRESS, has_port, move, own_addresses
 
 TRIGGER_POLLS_HZ: Final = 250.0
-"""How often it looks for a software trigger. Faster makes it spin: it polls in whole milliseconds."""
+"""How often it polls for a software trigger. A higher rate would use all of a core, since it waits whole
+milliseconds."""
 
 HALF: Final = 0.5
-"""Fraction of the packets that a failed frame loses: all of a frame's do not come by chance."""
+"""Fraction of the packets that a failed frame loses."""
 
 CURRENT_ADDRESS: Final = 0x24
 STREAM_PORT: Final = 0xD00
 STREAM_ADDRESS: Final = 0xD18
-"""Bootstrap registers of GigE Vision: its own address, and where frames go to."""
+"""Bootstrap registers of GigE Vision: its own address, and the destination of frames."""
 
 START_TIMEOUT_S: Final = 5.0
-"""How long it waits for the address that each simulated camera begins at."""
+"""How long it waits for the address at which each simulated camera starts."""
 
 FillPattern = ctypes.CFUNCTYPE(
     None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_uint32, ctypes.c_uint32, ctypes.c_uint32
@@ -42,20 +59,20 @@ class SimulatedCamera:
     """A GigE Vision camera on loopback, as long as this process lives.
 
     Args:
-        setup: What it is.
-        expose: Makes a frame's bytes, in its pixel format; None fails it. Called by the camera's
-            own thread, which answers nothing meanwhile.
+        setup: Serial number, sensor, failures to simulate.
+        expose: Makes a frame's bytes, in its pixel format; None fails the frame. Called by the
+            camera's own thread, which answers nothing meanwhile.
 
     Raises:
         AravisError: It cannot run.
     """
 
     def __init__(self, setup: Setup, expose: Callable[[Exposure], bytes | bytearray | None]) -> None:
-        self._library = library()
+        self._library = load_library()
         self._expose = expose
         self.faults = setup.faults
         self._n = 0
-        self._camera = _started(setup)
+        self._camera = _start_camera(setup)
         self._registers = self._library.arv_gv_fake_camera_get_fake_camera(self._camera)
         addresses = (*filter(None, [setup.address]), *own_addresses())
         self._cable = next(filter(None, map(move, addresses)), None)
@@ -80,11 +97,11 @@ class SimulatedCamera:
         for name, value in sizes.items():
             self._library.arv_fake_camera_write_register(self._registers, REGISTERS[name], value)
         self._library.arv_fake_camera_set_trigger_frequency(self._registers, TRIGGER_POLLS_HZ)
-        self._fill_pattern = FillPattern(self._fill)  # kept, or it would be collected
+        self._fill_pattern = FillPattern(self._fill)  # a reference, or it would be garbage-collected
         self._library.arv_fake_camera_set_fill_pattern(self._registers, self._fill_pattern, None)
 
     def _fill(self, buffer: int, _data: Any, exposure_us: int, gain: int, pixel_format: int) -> None:
-        """Fill a frame; the library calls this when it begins one."""
+        """Fill a frame; the library calls this when it begins the frame."""
         n, self._n = self._n, self._n + 1
         names = ("OffsetX", "OffsetY", "Width", "Height", "BinningHorizontal", "BinningVertical")
         values = (self._register(REGISTERS[name]) for name in names)
@@ -119,9 +136,9 @@ class SimulatedCamera:
         self._library.arv_fake_camera_write_memory(self._registers, address, len(data), data)
 
 
-def _started(setup: Setup) -> int:
-    """Make the camera; waits while another one is being made on this machine."""
-    lib = library()
+def _start_camera(setup: Setup) -> int:
+    """Start the camera; waits while another one is being started on this machine."""
+    lib = load_library()
     faults = setup.faults
     xml = description(faults.vendor, faults.model, ignores_triggers=faults.ignores_triggers)
     file, name = tempfile.mkstemp(suffix=".xml")
@@ -141,5 +158,71 @@ def _started(setup: Setup) -> int:
                 raise AravisError(text, "busy")
             time.sleep(0.01)
     finally:
-        with contextlib.suppress(OSError):  # Windows keeps what is in use
+        with contextlib.suppress(OSError):  # Windows does not delete a file in use
             Path(name).unlink()
+
+
+class Process:
+    """The camera, and its communication with the parent.
+
+    Args:
+        channel: Messages from and to the parent.
+    """
+
+    def __init__(self, channel: Channel) -> None:
+        self._channel = channel
+        self._images: queue.SimpleQueue[bytearray | None] = queue.SimpleQueue()
+        self._other: Camera | None = None
+
+    def run(self) -> None:
+        """Run the camera until the parent is gone."""
+        message = self._channel.receive()
+        if message is None:
+            return
+        setup = Setup.from_json(message[1])
+        try:
+            self._camera = SimulatedCamera(setup, self._expose)
+            self._occupy(setup.faults)
+        except AravisError as error:
+            self._channel.send(REFUSED, str(error).encode())
+            return
+        self._channel.send(READY, self._camera.address.encode())
+        while (message := self._channel.receive()) is not None:
+            kind, data = message
+            if kind == FAULTS:
+                self._camera.faults = Faults.from_values(json.loads(data))
+                self._occupy(self._camera.faults)
+                self._channel.send(DONE)
+            elif kind in (IMAGE, NO_IMAGE):
+                self._images.put(data if kind == IMAGE else None)
+
+    def _expose(self, exposure: Exposure) -> bytearray | None:
+        try:
+            self._channel.send(EXPOSE, exposure.to_bytes())
+        except OSError:
+            os._exit(0)
+        return self._images.get()
+
+    def _occupy(self, faults: Faults) -> None:
+        """Take control of the camera as another application would, or release it."""
+        if faults.is_busy and self._other is None:
+            self._other = Camera(self._camera.address)
+        elif not faults.is_busy and self._other is not None:
+            self._other.close()
+            self._other = None
+
+
+def main() -> None:
+    """Run until the parent is gone, then end at once, whatever the camera is doing."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides when it ends
+    output = os.dup(1)
+    os.dup2(2, 1)  # what libraries print must not mix with the messages
+    reader = os.fdopen(0, "rb", buffering=0)
+    writer = os.fdopen(output, "wb", buffering=0)
+    Process(Channel(reader, writer)).run()
+    sys.stderr.flush()
+    os._exit(0)
+
+
+if __name__ == "__main__":
+    main()

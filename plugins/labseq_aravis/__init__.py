@@ -1,0 +1,23 @@
+"""A ctypes binding of the C library Aravis: GigE Vision and USB3 Vision cameras, with any Python.
+
+The library is loaded when a camera is first searched or opened. The package imports nothing of labseq, so
+that the process of a simulated camera starts fast.
+"""
+
+from labseq_aravis.camera import Camera, FoundCamera, find_cameras
+from labseq_aravis.library import AravisError, LibraryMissingError, PixelFormatError, load_library
+from labseq_aravis.stream import Buffer, Statistics, Stream, StreamOptions
+
+__all__ = [
+    "AravisError",
+    "Buffer",
+    "Camera",
+    "FoundCamera",
+    "LibraryMissingError",
+    "PixelFormatError",
+    "Statistics",
+    "Stream",
+    "StreamOptions",
+    "find_cameras",
+    "load_library",
+]

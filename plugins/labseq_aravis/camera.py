@@ -1,0 +1,376 @@
+"""Cameras: finding them, and one that is open."""
+
+from __future__ import annotations
+
+import ctypes
+import ipaddress
+import threading
+from dataclasses import dataclass
+from typing import Any, Final
+
+from labseq_aravis.library import AravisError, Library, load_library, text
+from labseq_aravis.stream import Stream, StreamOptions
+
+INTERFACES: Final = ("GigEVision", "USB3Vision")
+"""Interfaces that are searched. The library's others play back its own patterns, or are not GenICam."""
+
+CHECK_RANGES: Final = 1
+CONTINUOUS: Final = 0
+NO_PACKET_SOCKET: Final = 1
+"""Numbers of the library's policies for ranges, acquisition modes and streams."""
+
+_ControlLost = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)
+
+
+@dataclass(frozen=True, slots=True)
+class FoundCamera:
+    """A camera that answered.
+
+    Attributes:
+        id: Name by which the library opens it.
+        physical_id: Its name on the network or the bus: a MAC address, a USB GUID.
+        vendor: Manufacturer.
+        model: Model.
+        serial: Serial number.
+        address: IP address; empty for a camera on USB.
+        protocol: "GigEVision" or "USB3Vision".
+    """
+
+    id: str
+    physical_id: str
+    vendor: str
+    model: str
+    serial: str
+    address: str
+    protocol: str
+
+    def __str__(self) -> str:
+        return f"{self.vendor} {self.model}, serial number {self.serial}, {self.address or self.protocol}"
+
+
+def find_cameras(interfaces: tuple[str, ...] = INTERFACES) -> tuple[FoundCamera, ...]:
+    """Search all networks and buses for cameras; takes about a second.
+
+    Args:
+        interfaces: Interfaces to search.
+
+    Raises:
+        LibraryMissingError: There is no library.
+    """
+    lib = load_library()
+    for index in range(lib.arv_get_n_interfaces()):
+        name = lib.arv_get_interface_id(index)
+        switch = lib.arv_enable_interface if text(name) in interfaces else lib.arv_disable_interface
+        switch(name)
+    lib.arv_update_device_list()
+    return tuple(_found(lib, index) for index in range(lib.arv_get_n_devices()))
+
+
+def _found(lib: Library, index: int) -> FoundCamera:
+    protocol = text(lib.arv_get_device_protocol(index))
+    return FoundCamera(
+        id=text(lib.arv_get_device_id(index)),
+        physical_id=text(lib.arv_get_device_physical_id(index)),
+        vendor=text(lib.arv_get_device_vendor(index)),
+        model=text(lib.arv_get_device_model(index)),
+        serial=text(lib.arv_get_device_serial_nbr(index)),
+        address=text(lib.arv_get_device_address(index)) if protocol == "GigEVision" else "",
+        protocol=protocol,
+    )
+
+
+def camera_id(name: str | None) -> str:
+    """The id by which the library opens a camera.
+
+    Args:
+        name: IP address, id or serial number of the camera; None for the only one.
+
+    Raises:
+        AravisError: There is no such camera, or more than one; the message lists those that were found.
+    """
+    if name is not None and _is_address(name):
+        return name  # opened without a search, which also reaches cameras behind a router
+    found = find_cameras()
+    matches = [camera for camera in found if name in (None, camera.id, camera.physical_id, camera.serial)]
+    if len(matches) == 1:
+        return matches[0].address or matches[0].id  # ids need not be unique
+    if not found:
+        raise AravisError("no camera answered; expected one that is switched on and reachable", "not found")
+    listed = "; ".join(str(camera) for camera in found)
+    if name is None:
+        raise AravisError(f"there are {len(found)} cameras: {listed}; name one of them", "not found")
+    how_many = "no camera" if not matches else "more than one camera"
+    raise AravisError(f"{how_many} has the id or the serial number {name!r}; found: {listed}", "not found")
+
+
+def _is_address(name: str) -> bool:
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        return False
+    return True
+
+
+class Camera:
+    """A camera that this process controls as long as it is open.
+
+    Features have their GenICam names. Every method raises :class:`AravisError` if the camera has no such
+    feature, refuses the value, or does not answer. Values out of a feature's range are refused.
+
+    Args:
+        name: IP address, id or serial number; None for the only camera there is.
+
+    Attributes:
+        is_ethernet: Whether it is a GigE camera.
+
+    Raises:
+        LibraryMissingError: There is no library.
+        AravisError: There is no such camera, it does not answer, or another program controls it.
+    """
+
+    def __init__(self, name: str | None = None) -> None:
+        self._library = lib = load_library()
+        id_ = camera_id(name)
+        self._handle: int | None = lib.call("arv_camera_new", id_.encode())
+        self._streams: list[Stream] = []
+        self._lost = threading.Event()
+        self._signal: tuple[int, int, Any] | None = None
+        self.is_ethernet = bool(lib.arv_camera_is_gv_device(self._handle))
+        device = lib.arv_camera_get_device(self._handle)
+        if self.is_ethernet and not lib.arv_gv_device_is_controller(device):
+            self.close()
+            raise AravisError(f"the camera {id_} is controlled by another program", "not controller")
+        lib.arv_camera_set_range_check_policy(self._handle, CHECK_RANGES)
+        callback = _ControlLost(lambda _device, _data: self._lost.set())
+        signal = lib.g_signal_connect_data(device, b"control-lost", callback, None, None, 0)
+        self._signal = (device, signal, callback)
+
+    def close(self) -> None:
+        """Close its streams and release the camera; legal at any time, and repeatedly."""
+        for stream in tuple(self._streams):
+            stream.close()
+        if self._signal is not None:
+            device, signal, _callback = self._signal
+            self._library.g_signal_handler_disconnect(device, signal)
+            self._signal = None
+        if self._handle is not None:
+            self._library.g_object_unref(self._handle)
+            self._handle = None
+
+    def __enter__(self) -> Camera:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether the library has noticed that the camera no longer answers."""
+        return self._lost.is_set()
+
+    def wait_lost(self, timeout_s: float) -> bool:
+        """Wait until the camera is lost; returns whether it is."""
+        return self._lost.wait(timeout_s)
+
+    @property
+    def vendor(self) -> str:
+        """Manufacturer."""
+        return text(self._call("arv_camera_get_vendor_name"))
+
+    @property
+    def model(self) -> str:
+        """Model."""
+        return text(self._call("arv_camera_get_model_name"))
+
+    @property
+    def serial(self) -> str:
+        """Serial number."""
+        return text(self._call("arv_camera_get_device_serial_number"))
+
+    # features by name
+
+    def is_available(self, feature: str) -> bool:
+        """Whether the camera has a feature and offers it now."""
+        return bool(self._call("arv_camera_is_feature_available", feature.encode()))
+
+    def get_string(self, feature: str) -> str:
+        """Value of a text or of an enumeration."""
+        return text(self._call("arv_camera_get_string", feature.encode()))
+
+    def set_string(self, feature: str, value: str) -> None:
+        """Set a text or an enumeration."""
+        self._call("arv_camera_set_string", feature.encode(), value.encode())
+
+    def get_integer(self, feature: str) -> int:
+        """Value of an integer."""
+        return int(self._call("arv_camera_get_integer", feature.encode()))
+
+    def set_integer(self, feature: str, value: int) -> None:
+        """Set an integer."""
+        self._call("arv_camera_set_integer", feature.encode(), value)
+
+    def integer_bounds(self, feature: str) -> tuple[int, int, int]:
+        """Smallest value, largest value and increment of an integer."""
+        low, high = self._pair(ctypes.c_int64, "arv_camera_get_integer_bounds", feature.encode())
+        return low, high, int(self._call("arv_camera_get_integer_increment", feature.encode()))
+
+    def get_float(self, feature: str) -> float:
+        """Value of a float."""
+        return float(self._call("arv_camera_get_float", feature.encode()))
+
+    def float_bounds(self, feature: str) -> tuple[float, float]:
+        """Smallest and largest value of a float."""
+        return self._pair(ctypes.c_double, "arv_camera_get_float_bounds", feature.encode())
+
+    # what the library sets by itself, since names and units differ between cameras
+
+    @property
+    def sensor_shape(self) -> tuple[int, int]:
+        """Height and width of the sensor, in pixels."""
+        width, height = self._pair(ctypes.c_int, "arv_camera_get_sensor_size")
+        return height, width
+
+    def set_binning(self, vertical: int, horizontal: int) -> None:
+        """Set how many pixels are added up."""
+        if self._pair(ctypes.c_int, "arv_camera_get_binning") != (horizontal, vertical):
+            self._call("arv_camera_set_binning", horizontal, vertical)
+
+    @property
+    def pixel_formats(self) -> tuple[str, ...]:
+        """Pixel formats that the camera offers."""
+        return self._library.texts("arv_camera_dup_available_pixel_formats_as_strings", self._open_handle())
+
+    def set_pixel_format(self, name: str) -> None:
+        """Choose the pixel format, by name."""
+        self._call("arv_camera_set_pixel_format_from_string", name.encode())
+
+    @property
+    def exposure_s(self) -> float:
+        """Exposure time, in seconds."""
+        return float(self._call("arv_camera_get_exposure_time")) * 1e-6
+
+    def set_exposure_s(self, exposure_s: float) -> None:
+        """Set the exposure time, in seconds."""
+        self._call("arv_camera_set_exposure_time", exposure_s * 1e6)
+
+    @property
+    def exposure_bounds_s(self) -> tuple[float, float]:
+        """Shortest and longest exposure, in seconds."""
+        shortest, longest = self._pair(ctypes.c_double, "arv_camera_get_exposure_time_bounds")
+        return shortest * 1e-6, longest * 1e-6
+
+    @property
+    def has_gain(self) -> bool:
+        """Whether the gain can be set."""
+        return bool(self._call("arv_camera_is_gain_available"))
+
+    @property
+    def gain(self) -> float:
+        """Gain, in the camera's unit (dB, or raw)."""
+        return float(self._call("arv_camera_get_gain"))
+
+    def set_gain(self, gain: float) -> None:
+        """Set the gain, in the camera's unit."""
+        self._call("arv_camera_set_gain", gain)
+
+    @property
+    def gain_bounds(self) -> tuple[float, float]:
+        """Smallest and largest gain, in the camera's unit."""
+        return self._pair(ctypes.c_double, "arv_camera_get_gain_bounds")
+
+    @property
+    def frame_rate_hz(self) -> float:
+        """Frames per second without a trigger."""
+        return float(self._call("arv_camera_get_frame_rate"))
+
+    def set_frame_rate_hz(self, frame_rate_hz: float) -> None:
+        """Let the camera run without a trigger, at a frame rate in frames per second."""
+        self._call("arv_camera_set_frame_rate", frame_rate_hz)
+
+    @property
+    def trigger_sources(self) -> tuple[str, ...]:
+        """Possible triggers: "Software", "Line1", ..."""
+        return self._library.texts("arv_camera_dup_available_trigger_sources", self._open_handle())
+
+    def set_trigger(self, source: str | None) -> None:
+        """Choose what starts a frame.
+
+        Args:
+            source: One of :attr:`trigger_sources`, on its rising edge; None to run without a trigger.
+        """
+        if source is None:
+            self._call("arv_camera_clear_triggers")
+        else:
+            self._call("arv_camera_set_trigger", source.encode())
+
+    @property
+    def payload(self) -> int:
+        """Size of a frame, in bytes."""
+        return int(self._call("arv_camera_get_payload"))
+
+    @property
+    def packet_size(self) -> int:
+        """Maximum size of a frame's packets, in bytes; GigE only."""
+        return int(self._call("arv_camera_gv_get_packet_size"))
+
+    def set_packet_size(self, n_bytes: int) -> None:
+        """Set the maximum size of packets, headers included; GigE only.
+
+        Without this, the library determines the largest size that is transmitted when a stream is made.
+        """
+        self._library.arv_camera_gv_set_packet_size_adjustment(self._open_handle(), 0)  # never
+        self._call("arv_camera_gv_set_packet_size", n_bytes)
+
+    @property
+    def packet_delay_s(self) -> float:
+        """Pause between packets, in seconds; GigE only."""
+        return int(self._call("arv_camera_gv_get_packet_delay")) * 1e-9
+
+    def set_packet_delay_s(self, delay_s: float) -> None:
+        """Set the pause between packets, in seconds; GigE only."""
+        self._call("arv_camera_gv_set_packet_delay", round(delay_s * 1e9))
+
+    # acquisition
+
+    def create_stream(self, n_buffers: int, options: StreamOptions | None = None) -> Stream:
+        """Get ready to receive frames of the current region and pixel format.
+
+        Args:
+            n_buffers: How many frames can wait until they are read.
+            options: How the stream handles losses; None for the defaults.
+        """
+        if self.is_ethernet:
+            self._library.arv_camera_gv_set_stream_options(self._open_handle(), NO_PACKET_SOCKET)
+        handle = self._call("arv_camera_create_stream", None, None)
+        stream = Stream(self._library, handle, self.is_ethernet, self._streams)
+        payload = self.payload
+        stream.apply(options or StreamOptions(), payload)
+        stream.allocate(n_buffers, payload)
+        return stream
+
+    def start(self) -> None:
+        """Start the acquisition: frames come at the frame rate, or at each trigger."""
+        self._call("arv_camera_set_acquisition_mode", CONTINUOUS)
+        self._call("arv_camera_start_acquisition")
+
+    def trigger(self) -> None:
+        """Trigger a frame by software; returns when the camera has confirmed it."""
+        self._call("arv_camera_software_trigger")
+
+    def stop(self) -> None:
+        """End the acquisition."""
+        self._call("arv_camera_stop_acquisition")
+
+    def _call(self, name: str, *arguments: Any) -> Any:
+        return self._library.call(name, self._open_handle(), *arguments)
+
+    def _pair(self, type_: Any, name: str, *arguments: Any) -> tuple[Any, Any]:
+        """Call a function that writes two numbers."""
+        first, second = type_(), type_()
+        self._call(name, *arguments, ctypes.byref(first), ctypes.byref(second))
+        return first.value, second.value
+
+    def _open_handle(self) -> int:
+        if self._handle is None:
+            raise AravisError("the camera is closed; open it first", "closed")
+        return self._handle

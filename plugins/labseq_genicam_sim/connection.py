@@ -1,0 +1,197 @@
+"""The simulated camera as the driver uses it: exposures of the simulation, on the session's clock."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+from labseq_genicam.acquisition import Acquisition, Start
+from labseq_genicam.connection import CameraConnection, translated_errors
+from labseq_genicam.settings import GenicamSettings
+from numpy.typing import NDArray
+
+from labseq.plugin import (
+    Context,
+    DeviceError,
+    ExposureResult,
+    Frame,
+    Series,
+    SimulatedSensor,
+    trigger_line,
+)
+from labseq_genicam_sim.fake import FakeCamera
+from labseq_genicam_sim.messages import Exposure, Faults
+
+MAX_WAIT_S: Final = 5.0
+"""How long the simulated camera may take to begin an exposure, and to send its frame, in real time."""
+
+PACKET_SIZE: Final = 15800
+"""Bytes of the packets if the settings name no size: large, since each packet takes the same time."""
+
+
+class SimulatedConnection(CameraConnection):
+    """A GigE Vision camera in a separate process that shows the simulation.
+
+    Args:
+        settings: Region, binning, read-out time, failures to simulate.
+        context: Clock, simulation, lines.
+
+    Raises:
+        ConfigError: There is no simulation, it does not describe its sensor, or the region is beyond it.
+    """
+
+    def __init__(self, settings: GenicamSettings, context: Context) -> None:
+        super().__init__(settings, context)
+        self._world = settings.simulated_world(context)
+        self.sensor_shape = self._world.sensor_shape
+        self.packet_size = settings.packet_size or PACKET_SIZE
+        self._clock = context.clock
+        self._is_wired = trigger_line(context.lines, "camera") is not None
+        self._mode = settings.mode
+        self._readout_s = settings.readout
+        faults = settings.faults
+        self._late_s = faults.late_by
+        self._ignores_triggers = faults.ignores_triggers
+        self._made: deque[Frame | None] = deque()
+        self._sensor = SimulatedSensor(self._world, context.clock)
+        self._fake = FakeCamera(
+            self._expose,
+            sensor_shape=self._world.sensor_shape,
+            faults=Faults(
+                faults.packet_loss,
+                faults.failed_frames,
+                faults.late_by,
+                faults.unplugged_at,
+                is_busy=faults.busy,
+                ignores_triggers=faults.ignores_triggers,
+            ),
+        )
+        self._acquisition: Acquisition | None = None
+        self._series: Series | None = None
+        self._edge_s: float | None = None
+        self._due: Frame | None = None
+        self._n_exposed = self._n_due = 0
+
+    def warm(self) -> None:
+        """Compute what all frames have in common."""
+        self._world.prepare_sensor(self._mode)
+
+    def open(self) -> str:
+        """Start the camera's process; returns its IP address."""
+        with translated_errors(self._name, "start the simulated camera"):
+            self._fake.start()
+        return self._fake.address
+
+    def close(self) -> None:
+        """End the camera's process."""
+        self.clear()
+        self._fake.stop()
+
+    def start_of(self, series: Series) -> Start:
+        """What starts the camera's exposures.
+
+        A camera that runs without a trigger does not wait for a virtual clock, and edges of lines come from
+        the simulation: in both cases the camera is triggered by software at the right time.
+        """
+        if series.trigger == "internal":
+            return "software" if self._clock.virtual else "free"
+        return "line" if series.trigger == "external" and not self._is_wired else "software"
+
+    def arm(self, series: Series, period_s: float, acquisition: Acquisition) -> None:
+        """Get ready for a series, before the camera starts."""
+        self.clear()
+        self._series, self._acquisition = series, acquisition
+        self._sensor.arm(series, self._mode, self._readout_s, None if math.isnan(period_s) else period_s)
+        if series.trigger == "external":
+            self._world.wire("camera", self._on_edge)
+
+    def fire(self, acquisition: Acquisition) -> None:
+        """Trigger an exposure, and return when it has begun on the session's clock.
+
+        Its image is made before the trigger is sent: the camera answers nothing while it waits for an image,
+        and on a busy computer it would seem to be gone.
+
+        Raises:
+            DeviceError: The camera is gone, or the simulation is already at a later time.
+        """
+        n = self._fake.n_begun
+        if not self._ignores_triggers:
+            self._made.append(self._sensor.expose(self._late_s, self._edge_s))
+        acquisition.fire()
+        if not self._fake.wait_for_exposure(n, MAX_WAIT_S, answered=True):
+            self._made.clear()  # its frame will be missing
+        self._fake.raise_pending()
+
+    def wait(self, wait: Callable[[float], ExposureResult | None], timeout_s: float) -> ExposureResult | None:
+        """Wait on the session's clock until the next frame is due, then in real time until it has come."""
+        max_wait_s = self._wait_until_due(timeout_s)
+        taken = None if max_wait_s is None else wait(max_wait_s)
+        self._fake.raise_pending()
+        return None if taken is None else replace(taken, t_start_s=self._start_s(taken.number))
+
+    def clear(self) -> None:
+        """Forget the series."""
+        self._sensor.clear()
+        self._made.clear()
+        self._series = self._edge_s = self._due = None
+        self._n_exposed = self._n_due = 0
+
+    def _wait_until_due(self, timeout_s: float) -> float | None:
+        """Returns how long the frame may then take, in seconds of real time; None if it is not due."""
+        series = self._series
+        if series is None or self._acquisition is None:
+            return None
+        if self.start_of(series) != "software":
+            return timeout_s  # only the camera knows when it exposes
+        if series.trigger == "internal" and self._n_exposed == self._n_due:
+            self.fire(self._acquisition)
+        if self._due is None:
+            self._take(timeout_s)
+        return None if self._due is None else max(timeout_s, MAX_WAIT_S)
+
+    def _start_s(self, number: int) -> float:
+        """When the exposure of a received frame began, on the session's clock; nan if unknown."""
+        while self._n_due <= number < self._n_exposed:  # the frames before it never came
+            self._take(math.inf)
+        frame, self._due = self._due, None
+        return math.nan if frame is None or self._n_due != number + 1 else frame.t_start_s
+
+    def _take(self, timeout_s: float) -> None:
+        self._due = self._sensor.take(timeout_s)
+        self._n_due += self._due is not None
+
+    def _on_edge(self, t_s: float) -> None:
+        """An edge of the line that is connected to the trigger input."""
+        if self._series is not None and self._series.trigger == "external" and self._acquisition is not None:
+            self._edge_s = t_s
+            self.fire(self._acquisition)
+
+    def _expose(self, exposure: Exposure) -> NDArray[np.uint16]:
+        """What the sensor sees; black if no exposure is armed. Called by the camera's own thread."""
+        if self._series is not None:
+            self._check(exposure)
+        frame = self._made.popleft() if self._made else self._sensor.expose(self._late_s, self._edge_s)
+        if frame is None:
+            return np.zeros((exposure.height, exposure.width), np.uint16)
+        self._n_exposed += 1
+        return frame.image
+
+    def _check(self, exposure: Exposure) -> None:
+        """Raise if the camera is not set to what the simulation shows."""
+        binning, (y, x) = self._mode.binning, (self._mode.region or (0, 0))[:2]
+        height, width = self._mode.frame_shape(self._world.sensor_shape)
+        wanted = (y // binning, x // binning, height, width, (binning, binning))
+        came = (
+            exposure.y,
+            exposure.x,
+            exposure.height,
+            exposure.width,
+            (exposure.binning_y, exposure.binning_x),
+        )
+        if came != wanted:
+            text = f"the camera reads (y, x, height, width, binning) = {came}; expected {wanted}"
+            raise DeviceError(self._name, text)

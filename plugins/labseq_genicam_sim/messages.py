@@ -1,0 +1,185 @@
+"""Messages between a simulated camera's process and its parent, through two pipes."""
+
+from __future__ import annotations
+
+import json
+import struct
+import threading
+from dataclasses import asdict, astuple, dataclass
+from typing import IO, Any, Final
+
+HEAD: Final = struct.Struct("<4sQ")
+"""Kind of a message, and size of its data in bytes."""
+
+# from the parent
+SETUP: Final = b"SET1"  # JSON of a Setup
+FAULTS: Final = b"FAUL"  # JSON of Faults; answered by DONE
+IMAGE: Final = b"IMAG"  # the bytes of a frame, in the camera's pixel format
+NO_IMAGE: Final = b"NONE"  # there is no image; the frame fails
+# from the camera
+READY: Final = b"HELO"  # its address
+REFUSED: Final = b"ERRO"  # why it cannot start
+EXPOSE: Final = b"EXPO"  # an Exposure
+DONE: Final = b"DONE"  # the faults are active
+
+GAIN_STEP: Final = 1e-3
+"""Gain per step of its register."""
+
+_EXPOSURE: Final = struct.Struct("<10Q")
+
+
+@dataclass(frozen=True, slots=True)
+class Faults:
+    """Failures to simulate. The camera's process, or the library in it, really fails.
+
+    Attributes:
+        packet_loss: Fraction of the packets of frames that are never sent, 0 to 1.
+        failed_frames: Numbers of the frames, from 0, that come with half of their packets.
+        late_s: Delay of each frame, in seconds. The camera answers nothing meanwhile.
+        unplugged_at: Number of the frame at which the camera vanishes, before it is sent; None for never.
+        is_busy: Whether another application controls the camera.
+        ignores_triggers: Whether its software trigger has no effect; fixed when it starts.
+        vendor: Manufacturer that it reports; fixed when it starts.
+        model: Model that it reports; fixed when it starts.
+    """
+
+    packet_loss: float = 0.0
+    failed_frames: tuple[int, ...] = ()
+    late_s: float = 0.0
+    unplugged_at: int | None = None
+    is_busy: bool = False
+    ignores_triggers: bool = False
+    vendor: str = "labseq"
+    model: str = "Simulated"
+
+    @classmethod
+    def from_values(cls, values: dict[str, Any]) -> Faults:
+        """Faults from decoded JSON, which has lists for tuples."""
+        values["failed_frames"] = tuple(values["failed_frames"])
+        return cls(**values)
+
+
+@dataclass(frozen=True, slots=True)
+class Setup:
+    """How the camera starts.
+
+    Attributes:
+        serial: Serial number, at most 15 bytes.
+        sensor_shape: Height and width of the sensor, in pixels.
+        address: Address that it had before; empty for any.
+        faults: Failures to simulate.
+    """
+
+    serial: str
+    sensor_shape: tuple[int, int]
+    address: str
+    faults: Faults
+
+    @classmethod
+    def from_json(cls, data: bytes | bytearray) -> Setup:
+        """Setup from JSON."""
+        values = json.loads(data)
+        height, width = values["sensor_shape"]
+        faults = Faults.from_values(values["faults"])
+        return cls(values["serial"], (height, width), values["address"], faults)
+
+
+def to_json(message: Setup | Faults) -> bytes:
+    """JSON of a message."""
+    return json.dumps(asdict(message)).encode()
+
+
+@dataclass(frozen=True, slots=True)
+class Exposure:
+    """A frame that the camera begins.
+
+    Attributes:
+        n: Number of the frame, from 0.
+        exposure_us: Exposure time, in microseconds.
+        gain_steps: Gain, in steps of its register.
+        pixel_format: Code of the pixel format.
+        x: First column of the region, in binned pixels.
+        y: First row of the region, in binned pixels.
+        width: Number of columns, in binned pixels.
+        height: Number of rows, in binned pixels.
+        binning_x: Columns that are added up.
+        binning_y: Rows that are added up.
+    """
+
+    n: int
+    exposure_us: int
+    gain_steps: int
+    pixel_format: int
+    x: int
+    y: int
+    width: int
+    height: int
+    binning_x: int
+    binning_y: int
+
+    @property
+    def exposure_s(self) -> float:
+        """Exposure time, in seconds."""
+        return self.exposure_us * 1e-6
+
+    @property
+    def gain(self) -> float:
+        """The camera's gain; 0 unless it was set."""
+        return self.gain_steps * GAIN_STEP
+
+    def to_bytes(self) -> bytes:
+        """The exposure as bytes."""
+        return _EXPOSURE.pack(*astuple(self))
+
+    @classmethod
+    def from_bytes(cls, data: bytes | bytearray) -> Exposure:
+        """The exposure from bytes."""
+        return cls(*_EXPOSURE.unpack(data))
+
+
+class Channel:
+    """Messages over a pipe in each direction; any thread may send, one receives.
+
+    Args:
+        reader: Source of messages.
+        writer: Destination of messages, unbuffered.
+    """
+
+    def __init__(self, reader: IO[bytes], writer: IO[bytes]) -> None:
+        self._reader = reader
+        self._writer = writer
+        self._sending = threading.Lock()
+
+    def send(self, kind: bytes, data: Any = b"") -> None:
+        """Send a message; ``data`` is any object with contiguous bytes.
+
+        Raises:
+            OSError: The other side is gone.
+        """
+        view = memoryview(data).cast("B")
+        with self._sending:
+            self._write(memoryview(HEAD.pack(kind, len(view))))
+            self._write(view)
+
+    def receive(self) -> tuple[bytes, bytearray] | None:
+        """Wait for a message; None when the other side is gone."""
+        head = self._read(HEAD.size)
+        if head is None:
+            return None
+        kind, size = HEAD.unpack(head)
+        data = self._read(size)
+        return None if data is None else (kind, data)
+
+    def _write(self, view: memoryview) -> None:
+        while view:
+            view = view[self._writer.write(view) :]
+
+    def _read(self, size: int) -> bytearray | None:
+        data = bytearray(size)
+        view = memoryview(data)
+        while view:
+            n = self._reader.readinto(view)  # type: ignore[attr-defined]
+            if not n:
+                return None
+            view = view[n:]
+        return data
