@@ -1,11 +1,12 @@
-"""Simulate the paper's figures 4 and 5 with many shots, and write their tables and pictures.
+"""Draw the paper's figures 4 and 5, from runs or from the simulated tables.
 
+    python docs/make_paper_figures.py --figure 5 RUN [RUN2] --output figure5.png
     python docs/make_paper_figures.py --shots-4 20000 --shots-5 10000
 
-The shots are those of ``sequences/figure4_dop_scan.yaml`` and ``figure5_multicycle.yaml``, taken by
-labseq's own sequencer; instead of a file for each, their sums are kept. Every point of figure 4 that is
-done is appended to its table at once, and skipped when it is there already: a long simulation can be
-stopped and goes on.
+The first command draws a run of ``sequences/figure5_multicycle.yaml`` or ``figure4_dop_scan.yaml``, or two
+runs to compare. The second takes many shots of these sequences with labseq's sequencer, keeps their sums
+instead of files, and draws the figures of the documentation. Each point of figure 4 is appended to its table
+as soon as it is done, and skipped if it is there already: a long simulation can be stopped and continued.
 """
 
 from __future__ import annotations
@@ -18,23 +19,17 @@ from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
 
-from labseq import Session, ShotRecord
-from labseq.analysis.paper import (
-    PAPERS_DEFECT_FREE,
-    PAPERS_FILLING,
-    PAPERS_LIFETIME_S,
-    CyclesDrawing,
-    ParallelismDrawing,
-    save_cycles,
-    save_parallelism,
-    survival,
-)
-from labseq.analysis.statistics import Rate
-from labseq.pictures.figures import Series
+from labseq import Run, Session, ShotRecord, open_run
+from labseq.analysis.statistics import Rate, Statistics, statistics_of
+from labseq.recording.points import scan_points
 from labseq.sequencer import Sequencer
 from labseq.sequencer.policies import RunPolicy
 
@@ -43,6 +38,16 @@ SEQUENCES = DOCS.parent / "sequences"
 FIGURES = DOCS / "_static" / "paper"
 
 FIGURE_4, FIGURE_5 = "figure4_dop_scan.yaml", "figure5_multicycle.yaml"
+DOP = "planner.degree_of_parallelism"
+
+DARK, LIGHT, ORANGE, LIGHT_ORANGE, RED, GREY = "#1f4e8c", "#86b6e0", "#f28e2b", "#f7c48f", "#c8102e", "0.5"
+
+PAPER_ATOMS = 225
+PAPER_LIFETIME_S = 33.0
+PAPER_FILLING = ((7, 0.9766, 0.0004),)
+"""Degree of parallelism, filling after one cycle, its error (figure 4)."""
+PAPER_DEFECT_FREE = ((1, 0.015, 0.003), (2, 0.169, 0.008), (10, 0.33, 0.01))
+"""Cycles, defect-free probability, its error (figure 5)."""
 
 WINDOWS_MS = {2: 94, 3: 68}
 """The windows of figure 4 that are longer than the shortest, 60 ms; see the sequence."""
@@ -57,12 +62,12 @@ UNTUNED = (
     "profile.simulation.imaging_loss=0.314 %",
     "planner.repair_below=0",
 )
-"""What makes the fitted profile one with nothing fitted but the loss of a moved atom."""
+"""Overrides of the profile `paper`, after which only the loss of a moved atom is fitted."""
 
 
 @dataclass
 class Tally:
-    """A sink for shots: what the figures need of each."""
+    """A recorder that keeps what the figures need of each shot."""
 
     defects: list[list[int]] = field(default_factory=list[list[int]])
     n_atom_moves: list[list[int]] = field(default_factory=list[list[int]])
@@ -76,8 +81,8 @@ class Tally:
         shot.images.clear()
 
 
-class Nobody:
-    """Watches a run without a word."""
+class NoObserver:
+    """Ignores the events of a run."""
 
     def event(self, name: str, values: Mapping[str, Any]) -> None:
         del name, values
@@ -95,7 +100,7 @@ def take(sequence: str, n_shots: int, overrides: Sequence[str], seed: int) -> Ta
         first.steps,
         session.stop_flag,
         tally,
-        Nobody(),
+        NoObserver(),
         seed=seed,
         policy=RunPolicy(attempts=1),
         parameters={},
@@ -160,10 +165,7 @@ def simulate_5(n_shots: int, n_processes: int) -> None:
     parts = [n_shots // n_processes] * n_processes
     for name, overrides in (("figure5", ()), ("figure5_untuned", UNTUNED)):
         with ProcessPoolExecutor(n_processes) as pool:
-            tasks = [
-                pool.submit(take, "figure5_multicycle.yaml", n, overrides, secrets.randbits(63))
-                for n in parts
-            ]
+            tasks = [pool.submit(take, FIGURE_5, n, overrides, secrets.randbits(63)) for n in parts]
             tallies = [task.result() for task in tasks]
         defects = np.concatenate([tally.defects for tally in tallies])
         moves = np.concatenate([tally.n_atom_moves for tally in tallies])
@@ -183,66 +185,406 @@ def simulate_5(n_shots: int, n_processes: int) -> None:
             )
 
 
+class Points(NamedTuple):
+    """Points of a figure: fractions with the ends of their 1 sigma intervals."""
+
+    label: str
+    x: NDArray[np.float64]
+    y: NDArray[np.float64]
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, label: str, rows: Iterable[Sequence[float]]) -> Points:
+        """Points from rows of x, y and the ends of the interval."""
+        return cls(label, *np.array(list(rows), np.float64).reshape(-1, 4).T)
+
+
+class AtomLosses(NamedTuple):
+    """Losses of atoms that are not moved, and missed atoms.
+
+    Attributes:
+        lifetime_s: Lifetime of an atom in a tweezer, exposures included.
+        imaging_loss: Loss in one exposure, in addition to that of the lifetime.
+        imaging_loss_exposure_s: The exposure that the imaging loss belongs to.
+        false_negative: Probability that an atom is not seen; None if it is not known.
+    """
+
+    lifetime_s: float
+    imaging_loss: float
+    imaging_loss_exposure_s: float
+    false_negative: float | None = None
+
+    @classmethod
+    def of(cls, devices: Mapping[str, Any]) -> AtomLosses | None:
+        """The constants of a run's simulation; None if the run does not contain them.
+
+        Args:
+            devices: ``describe()`` of each device, as in ``run.record["devices"]``.
+        """
+        simulation: Any = devices.get("simulation")
+        if not isinstance(simulation, Mapping):
+            return None
+        names = ("lifetime", "imaging_loss", "imaging_loss_exposure", "false_negative")
+        values = [simulation.get(name) for name in names]
+        values = [v if isinstance(v, float | int) and math.isfinite(v) else None for v in values]
+        lifetime_s, loss, exposure_s, missed = values
+        if lifetime_s is None or loss is None or exposure_s is None:
+            return None
+        if lifetime_s <= 0 or exposure_s <= 0 or not 0 <= loss < 1:
+            return None
+        return cls(lifetime_s, loss, exposure_s, missed)
+
+
+def max_defect_free(n_atoms: int, period_s: float, exposure_s: float, losses: AtomLosses) -> float:
+    """The highest probability that an array is defect-free on the image that ends a cycle.
+
+    Between its detection on one image and on the next one, an atom is exposed to the loss of one
+    exposure and to the vacuum for a whole period. What is lost in that time is missing on the
+    next image, even if every plan is perfect and no atom is lost in a move. An atom that is not
+    seen counts as a defect on this image. If it was not seen on the image before, a second
+    atom was moved to its site, and both are lost. So each of N atoms is in its place with::
+
+        p = exp(-T / lifetime) (1 - loss) ^ (exposure / 45 ms) (1 - false negative)^2
+
+    and the array with p^N. Empty sites that are taken for full ones change that by about a part in
+    a thousand, because few sites are empty.
+
+    Args:
+        n_atoms: Atoms of the target, N.
+        period_s: From the start of an exposure to the start of the next one, T.
+        exposure_s: Exposure time.
+        losses: Lifetime, loss in the light and missed atoms.
+    """
+    exposures = exposure_s / losses.imaging_loss_exposure_s
+    log_stays = -period_s / losses.lifetime_s + exposures * math.log1p(-losses.imaging_loss)
+    log_seen = 2 * math.log1p(-losses.false_negative) if losses.false_negative else 0.0
+    return math.exp(n_atoms * (log_stays + log_seen))
+
+
+def after_moves(highest: float, n_atom_moves: float, loss: float) -> float:
+    """The highest defect-free probability if moved atoms may be lost as well.
+
+    An atom lost in a move is missing on the next image, so each of the m moved atoms contributes
+    a factor ``1 - loss``. The number of moves differs from shot to shot; with its mean this is an
+    estimate, accurate as long as ``m loss`` is small.
+
+    Args:
+        highest: From :func:`max_defect_free`.
+        n_atom_moves: Mean number of atom moves of a cycle, m.
+        loss: Loss of a moved atom.
+    """
+    return highest * (1.0 - loss) ** n_atom_moves
+
+
+def survival(window_s: float, lifetime_s: float) -> float:
+    """Probability that an atom outlives a window (paper, figure 4)."""
+    return math.exp(-window_s / lifetime_s)
+
+
+def style(axes: Axes, x: str, y: str) -> None:
+    """Label the axes; a thin frame, a faint grid, whole numbers on the x axis."""
+    axes.set_xlabel(x)
+    axes.set_ylabel(y)
+    axes.grid(visible=True, axis="y", color="0.92", linewidth=0.7)
+    axes.set_axisbelow(True)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+
+
+def errorbars(axes: Axes, points: Points, colour: str, marker: str) -> None:
+    """Draw points with error bars, in per cent; the paper's own points are stars."""
+    y = 100 * points.y
+    bars = np.nan_to_num([y - 100 * points.low, 100 * points.high - y]).clip(min=0.0)
+    look: dict[str, Any] = {"markersize": 5, "linewidth": 0.9, "zorder": 3}
+    if marker == "*":
+        look = {"markersize": 11, "linestyle": "none", "markeredgecolor": "white", "zorder": 4}
+    axes.errorbar(points.x, y, bars, label=points.label, color=colour, marker=marker, capsize=2, **look)
+
+
+def draw_figure_4(
+    path: Path,
+    note: str,
+    fixed: Sequence[Points],
+    optimised: Sequence[Points],
+    windows: Points,
+    quoted: Points | None,
+) -> None:
+    """Draw filling after one cycle against the degree of parallelism.
+
+    Args:
+        path: The picture.
+        note: Line below the title.
+        fixed: Points with one window, of each run.
+        optimised: Points with a window for each degree, of each run.
+        windows: Survival of the window at each degree.
+        quoted: The paper's points; None if they are of another array.
+    """
+    figure, axes = plt.subplots(figsize=(6.4, 4.6), layout="constrained")
+    for points, colour in zip(fixed, (LIGHT, LIGHT_ORANGE), strict=False):
+        errorbars(axes, points, colour, "s")
+    for points, colour in zip(optimised, (DARK, ORANGE), strict=False):
+        errorbars(axes, points, colour, "o")
+    if quoted is not None:
+        errorbars(axes, quoted, RED, "*")
+    axes.margins(y=0.2)
+    style(axes, "degree of parallelism", "filling after one cycle (%)")
+    right = axes.twinx()
+    right.plot(windows.x, 100 * windows.y, color=GREY, linewidth=1, label=windows.label)
+    room = 0.25 * max(float(np.ptp(100 * windows.y)), 0.5)
+    right.set_ylim(100 * windows.y.min() - room, 100 * windows.y.max() + room)
+    right.set_ylabel("survival of the window (%)", color=GREY)
+    right.tick_params(colors=GREY)
+    axes.set_zorder(right.get_zorder() + 1)
+    axes.patch.set_visible(False)
+    figure.legend(loc="outside lower center", ncols=2, fontsize=8, frameon=False)
+    figure.suptitle(f"figure 4: filling after one cycle\n{note}", fontsize=9)
+    figure.savefig(path, dpi=150)
+    plt.close(figure)
+
+
+def draw_figure_5(
+    path: Path,
+    note: str,
+    series: Sequence[Points],
+    defects: Sequence[NDArray[np.int64]],
+    quoted: Points | None,
+    ceiling: Points | None = None,
+) -> None:
+    """Draw the defect-free probability against the number of cycles, and the defects that are left.
+
+    Args:
+        path: The picture.
+        note: Line below the title.
+        series: P_n of each run.
+        defects: For each of them, how many shots have 0, 1, 2, ... defects after the last cycle.
+        quoted: The paper's points; None if they are of another array.
+        ceiling: The highest P_n that losses and detection allow; None if it is not known.
+    """
+    figure, (left, right) = plt.subplots(
+        1, 2, figsize=(8.6, 4.4), width_ratios=(2.3, 1.0), layout="constrained"
+    )
+    for points, colour, marker in zip(series, (DARK, ORANGE), "os", strict=False):
+        errorbars(left, points, colour, marker)
+    if quoted is not None:
+        errorbars(left, quoted, RED, "*")
+    if ceiling is not None:
+        left.plot(ceiling.x, 100 * ceiling.y, "--", color=GREY, linewidth=1, label=ceiling.label)
+    left.set_ylim(0.0, 1.35 * left.get_ylim()[1])
+    left.set_xlim(0.5, max(points.x[-1] for points in (*series, *([quoted] if quoted else []))) + 0.5)
+    style(left, "rearrangement cycles n", "defect-free on the image that ends cycle n (%)")
+    handles, labels = left.get_legend_handles_labels()
+    order = sorted(range(len(labels)), key=lambda i: labels[i].startswith("ceiling"))
+    key: dict[str, Any] = {"frameon": False, "fontsize": 8, "loc": "upper left"}
+    left.legend([handles[i] for i in order], [labels[i] for i in order], **key)
+    for counts, inside, rim in zip(defects, (LIGHT, None), (DARK, ORANGE), strict=False):
+        share, edges = 100 * counts / max(1, counts.sum()), np.arange(len(counts) + 1) - 0.5
+        if inside is not None:
+            right.stairs(share, edges, fill=True, color=inside)
+        right.stairs(share, edges, color=rim, linewidth=0.9)
+    right.set_xlim(-0.8, max(4, *(len(counts) - 1 for counts in defects)) + 0.8)
+    right.set_ylim(bottom=0.0)
+    style(right, f"defects after cycle {int(series[0].x[-1])}", "shots (%)")
+    figure.suptitle(f"figure 5: defect-free probability after n cycles\n{note}", fontsize=9)
+    figure.savefig(path, dpi=150)
+    plt.close(figure)
+
+
+def paper_points(points: Sequence[tuple[int, float, float]], n_atoms: int = PAPER_ATOMS) -> Points | None:
+    """Points that the paper states; None for arrays of another size."""
+    if n_atoms != PAPER_ATOMS:
+        return None
+    return Points.of("Tian et al.", [(x, y, y - error, y + error) for x, y, error in points])
+
+
+def note_of(run: Run) -> str:
+    """Name, target and seed of a run."""
+    kind = "simulated" if run.simulated else "measured"
+    return f"{run.path.name}: {run.target.n_atoms} atoms, {len(run.shots)} shots, seed {run.seed}, {kind}"
+
+
+def labels_of(runs: Sequence[Run]) -> list[str]:
+    """Names of the runs, or of their folders if the names are the same."""
+    names = [run.name for run in runs]
+    return [run.path.name if len({*names}) < len(names) else run.name for run in runs]
+
+
+def cycles_of(run: Run) -> Statistics:
+    """Statistics of a run for figure 5.
+
+    Raises:
+        SystemExit: The run scans, or not all of its shots make every cycle.
+    """
+    statistics = statistics_of(run.shots, run.target)
+    if run.record.get("scan"):
+        raise SystemExit(f"{run.path}: figure 5 needs a run without a scan, such as of {FIGURE_5}")
+    if not statistics.cycles or statistics.cycles[-1].n_shots < statistics.cycles[0].n_shots:
+        raise SystemExit(f"{run.path}: figure 5 needs shots that all make every cycle: 'stop_when: never'")
+    return statistics
+
+
+def figure_5_of(path: Path, runs: Sequence[Run]) -> None:
+    """Draw figure 5 from runs."""
+    found = [cycles_of(run) for run in runs]
+    series = [
+        Points.of(
+            f"{label}, {statistics.n_shots} shots",
+            [(c.cycle, c.defect_free.value, *c.defect_free.interval) for c in statistics.cycles],
+        )
+        for label, statistics in zip(labels_of(runs), found, strict=True)
+    ]
+    defects = [np.array(statistics.cycles[-1].defects, np.int64) for statistics in found]
+    n_atoms = runs[0].target.n_atoms
+    ceiling = ceiling_of(runs[0], found[0])
+    draw_figure_5(path, note_of(runs[0]), series, defects, paper_points(PAPER_DEFECT_FREE, n_atoms), ceiling)
+
+
+def ceiling_of(run: Run, statistics: Statistics) -> Points | None:
+    """The highest defect-free probability for the times that a run took; None on real hardware."""
+    losses = AtomLosses.of(run.record.get("devices") or {})
+    if losses is None:
+        return None
+    images = run.shots[0].summary.images
+    exposures = [s for s, cycle in zip(images.exposure_s, images.cycle, strict=True) if cycle]
+    label = "ceiling: losses in the light and with time"
+    label += "" if losses.false_negative is None else ", missed atoms"
+    highest = [
+        max_defect_free(run.target.n_atoms, cycle.period_s.value, exposure_s, losses)
+        for cycle, exposure_s in zip(statistics.cycles, exposures, strict=False)
+    ]
+    return Points.of(label, [(n, y, y, y) for n, y in enumerate(highest, start=1)])
+
+
+def figure_4_of(path: Path, runs: Sequence[Run]) -> None:
+    """Draw figure 4 from runs."""
+    parted = [divided(run) for run in runs]
+    prefixes = [f"{label}, " if len(runs) > 1 else "" for label in labels_of(runs)]
+    fixed, optimised = (
+        [
+            Points.of(prefix + window_text(rows), [(dop, *ends) for dop, _, *ends in rows])
+            for prefix, part in zip(prefixes, parted, strict=True)
+            if (rows := part[kind])
+        ]
+        for kind in (0, 1)
+    )
+    losses = AtomLosses.of(runs[0].record.get("devices") or {})
+    lifetime_s = PAPER_LIFETIME_S if losses is None else losses.lifetime_s
+    rows = parted[0][1] or parted[0][0]
+    left = [(dop, p, p, p) for dop, window_s, *_ in rows for p in (survival(window_s, lifetime_s),)]
+    windows = Points.of(f"survival of the {window_text(rows)} (lifetime {lifetime_s:g} s)", left)
+    quoted = paper_points(PAPER_FILLING, runs[0].target.n_atoms)
+    draw_figure_4(path, note_of(runs[0]), fixed, optimised, windows, quoted)
+
+
+Filling = tuple[float, float, float, float, float]
+"""Degree of parallelism, window in seconds, filling and the ends of its interval."""
+
+
+def divided(run: Run) -> tuple[list[Filling], list[Filling]]:
+    """Points of a run with its longest window, and those with the shortest window of each degree.
+
+    The second list is empty if all points have one window.
+
+    Raises:
+        SystemExit: The run is not a scan of the degree of parallelism in shots of one cycle.
+    """
+    by_dop: dict[int, list[Filling]] = {}
+    for scanned in scan_points(run):
+        others = [
+            address for address in scanned.parameters if address != DOP and not address.endswith("window")
+        ]
+        if others:
+            raise SystemExit(
+                f"{run.path}: figure 4 needs a scan of {DOP} and the window alone, not {others[0]}"
+            )
+        statistics = statistics_of(scanned.shots, run.target)
+        if DOP not in scanned.parameters or len(statistics.cycles) != 1:
+            raise SystemExit(f"{run.path}: figure 4 needs a scan of {DOP} with one cycle, such as {FIGURE_4}")
+        dop, filling = int(scanned.parameters[DOP]), statistics.cycles[0].filling
+        ends = filling.value, filling.value - filling.error, filling.value + filling.error
+        by_dop.setdefault(dop, []).append((dop, window_of(run, scanned.parameters), *ends))
+    if not by_dop:
+        raise SystemExit(f"{run.path}: figure 4 needs a scan of {DOP}, such as {FIGURE_4}")
+    ordered = [sorted(by_dop[dop], key=lambda row: row[1]) for dop in sorted(by_dop)]
+    if max(map(len, ordered)) > 2:
+        raise SystemExit(f"{run.path}: figure 4 needs at most two windows for a degree of parallelism")
+    longest_s = max(rows[-1][1] for rows in ordered)
+    fixed = [rows[-1] for rows in ordered if rows[-1][1] == longest_s]
+    shortest = [rows[0] for rows in ordered]
+    return fixed, [] if all(row[1] == longest_s for row in shortest) else shortest
+
+
+def window_of(run: Run, parameters: Mapping[str, Any]) -> float:
+    """The window of the cycle in seconds, scanned or set in the sequence."""
+    scanned = [value for address, value in parameters.items() if address.endswith("window")]
+    steps: Sequence[Mapping[str, Any]] = run.record.get("resolved", {}).get("shot", ())
+    window: Any = [*scanned, *(step["rearrange"].get("window") for step in steps if "rearrange" in step)][0]
+    return float(window[0] if isinstance(window, list) else window)
+
+
+def window_text(rows: Sequence[Filling]) -> str:
+    """The windows of points: "windows 60 to 94 ms"."""
+    low, high = (1e3 * end(row[1] for row in rows) for end in (min, max))
+    return f"window {low:.3g} ms" if low == high else f"windows {low:.3g} to {high:.3g} ms"
+
+
 def draw_4(path: Path) -> None:
+    """Draw figure 4 from its table."""
     rows = rows_of(FIGURES / "figure4.csv")
     by_key = {(int(row["dop"]), int(row["window_ms"])): row for row in rows}
-    series: list[Series] = []
-    for label, keys in (("window 200 ms", POINTS[:14]), ("windows 60 to 94 ms", POINTS[14:])):
-        found = [(dop, by_key[dop, window]) for dop, window in keys if (dop, window) in by_key]
-        x = np.array([float(dop) for dop, _ in found])
-        y = np.array([float(row["filling"]) for _, row in found])
-        error = np.array([float(row["error"]) for _, row in found])
-        series.append(Series(label, x, y, y - error, y + error))
-    x = np.array([float(dop) for dop, _ in POINTS[14:]])
-    left = np.array([survival(window / 1e3, PAPERS_LIFETIME_S) for _, window in POINTS[14:]])
-    nan = np.full(len(x), np.nan)
+    series = [
+        Points.of(
+            label,
+            [
+                (dop, y, y - error, y + error)
+                for dop, window in keys
+                if (dop, window) in by_key
+                for y, error in [(float(by_key[dop, window]["filling"]), float(by_key[dop, window]["error"]))]
+            ],
+        )
+        for label, keys in (("window 200 ms", POINTS[:14]), ("windows 60 to 94 ms", POINTS[14:]))
+    ]
+    left = [
+        (dop, p, p, p) for dop, window in POINTS[14:] for p in (survival(window / 1e3, PAPER_LIFETIME_S),)
+    ]
+    windows = Points.of("survival of the windows 60 to 94 ms (lifetime 33 s)", left)
     shots = min(int(row["shots"]) for row in rows)
-    drawing = ParallelismDrawing(
-        title="figure 4: filling after one cycle",
-        note=f"profile paper, {shots} shots for each point",
-        fixed=(series[0],),
-        optimised=(series[1],),
-        survival=Series("survival of the windows 60 to 94 ms (lifetime 33 s)", x, left, nan, nan),
-        quoted=quoted(PAPERS_FILLING),
-    )
-    save_parallelism(path, drawing)
+    note = f"profile paper, {shots} shots for each point"
+    draw_figure_4(path, note, series[:1], series[1:], windows, paper_points(PAPER_FILLING))
 
 
 def draw_5(path: Path) -> None:
-    series: list[Series] = []
-    defects: list[Any] = []
+    """Draw figure 5 from its tables."""
+    series: list[Points] = []
+    defects: list[NDArray[np.int64]] = []
     for name, label in (("figure5", "profile paper"), ("figure5_untuned", "only the loss per atom fitted")):
         rows = rows_of(FIGURES / f"{name}.csv")
         rates = [Rate(int(row["defects_0"]), int(row["shots"])) for row in rows]
-        low, high = np.array([rate.interval for rate in rates]).T
-        x = np.arange(1.0, len(rates) + 1)
-        values = np.array([rate.value for rate in rates])
-        series.append(Series(f"{label}, {rows[0]['shots']} shots", x, values, low, high))
+        points = [(n, rate.value, *rate.interval) for n, rate in enumerate(rates, start=1)]
+        series.append(Points.of(f"{label}, {rows[0]['shots']} shots", points))
         defects.append(np.array([int(rows[-1][f"defects_{n}"]) for n in range(10)]))
-    drawing = CyclesDrawing(
-        title="figure 5: defect-free probability after n cycles",
-        note="15 x 15 atoms, degree of parallelism 7",
-        series=tuple(series),
-        defects=tuple(defects),
-        quoted=quoted(PAPERS_DEFECT_FREE),
-    )
-    save_cycles(path, drawing)
+    note = "15 x 15 atoms, degree of parallelism 7"
+    draw_figure_5(path, note, series, defects, paper_points(PAPER_DEFECT_FREE))
 
 
-def quoted(points: Sequence[tuple[int, float, float]]) -> Series:
-    """Points that the paper states."""
-    x, y, error = (np.array(column, np.float64) for column in zip(*points, strict=True))
-    return Series("Tian et al.", x, y, y - error, y + error)
-
-
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Draw the figures."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--figure", choices=("4", "5"), help="draw this figure from runs")
+    parser.add_argument("runs", nargs="*", type=Path, help="a run of its sequence, and one to compare")
+    parser.add_argument("--output", type=Path, help="the picture; by default figure4.png or figure5.png")
     parser.add_argument(
         "--shots-4", type=int, default=0, help="shots of each point of figure 4; 0: draw only"
     )
     parser.add_argument("--shots-5", type=int, default=0, help="shots of figure 5; 0: draw only")
     parser.add_argument("--processes", type=int, default=2)
-    given = parser.parse_args()
+    given = parser.parse_args(arguments)
+    if given.figure is not None:
+        if not 1 <= len(given.runs) <= 2:
+            parser.error("give one run, or two to compare")
+        output = given.output or Path(f"figure{given.figure}.png")
+        draw = figure_4_of if given.figure == "4" else figure_5_of
+        draw(output, [open_run(path) for path in given.runs])
+        return
     FIGURES.mkdir(parents=True, exist_ok=True)
     if given.shots_4:
         simulate_4(given.shots_4, given.processes, POINTS)

@@ -1,560 +1,366 @@
-"""Charts of the figures that runs give."""
+"""Panels of a run's picture: functions that draw on matplotlib axes."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from labseq.analysis.statistics import Estimated
+from labseq.analysis.timing import StageStatistics
 from labseq.model import SiteGrid
-from labseq.pictures.figures import (
-    DARK,
-    LIGHT,
-    OTHER,
-    QUOTED,
-    Series,
-    cell,
-    make_figure,
-    outline,
-    paint_series,
-    place_sites,
-    plain,
-    save_figure,
-    span,
-    tidy,
-)
+from labseq.model.estimate import Estimate
+from labseq.pictures.figures import DARK, LIGHT, ORANGE, RED, cell, outline, place_sites
 from labseq.units import format_quantity
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.axis import Axis
-    from matplotlib.colorbar import Colorbar
-    from matplotlib.figure import Figure
 
-TITLE_PT: Final = 9
-LABEL_PT: Final = 9
-TICK_PT: Final = 8
-KEY_PT: Final = 8
+Floats = NDArray[np.float64]
+Panel = Callable[["Axes"], None]
+"""Draws on axes."""
 
 COLOURS: Final = "cividis"
-"""Colour map of fractions: rises evenly in lightness, for every kind of colour vision and in print."""
-NOTHING: Final = "0.94"
-"""Of cells without a value."""
+"""Colour map of fractions: its lightness rises evenly, for every kind of colour vision and in print."""
+NO_VALUE: Final = "0.94"
+BARS: Final[dict[str, Any]] = {"ecolor": DARK, "capsize": 2, "error_kw": {"elinewidth": 0.9, "capthick": 0.9}}
+MIN_DEFECTS: Final = 4
+"""The histogram of defects has at least this range."""
+MANY: Final = 500
+"""From this number on, points are smaller."""
+PIXELS: Final = 2000
+"""From this number on, points are pixels in vector graphics too."""
+MIN_RANGE_PERCENT: Final = 1.0
+MIN_GAP: Final = 0.09
+"""Values get a tick each if they are this far apart, relative to their range."""
+MAX_CELLS_WITH_TEXT: Final = 6
+MAX_TICKS: Final = 10
+HIDDEN_S: Final = 1e-6
+"""Shorter times are those of models that neglect a stage."""
 
 
-def label(axes: Axes, title: str, x: str, y: str) -> None:
-    """Name a panel and its axes.
+STYLE: Final[dict[str, Any]] = {
+    "axes.axisbelow": True,
+    "axes.edgecolor": "0.35",
+    "axes.grid": True,
+    "axes.grid.axis": "y",
+    "axes.labelsize": 9,
+    "axes.linewidth": 0.7,
+    "axes.titlelocation": "left",
+    "axes.titlesize": 9,
+    "figure.titlesize": 10,
+    "grid.color": "0.92",
+    "grid.linewidth": 0.7,
+    "legend.fontsize": 8,
+    "legend.frameon": False,
+    "xtick.color": "0.35",
+    "xtick.labelcolor": "black",
+    "xtick.labelsize": 8,
+    "xtick.major.width": 0.7,
+    "ytick.color": "0.35",
+    "ytick.labelcolor": "black",
+    "ytick.labelsize": 8,
+    "ytick.major.width": 0.7,
+}
+"""Settings of matplotlib: thin grey frames, a faint grid, small text."""
+
+
+def points_of(x: Sequence[float], values: Sequence[Estimated]) -> Floats:
+    """Means with the ends of their 1 sigma intervals; unknown means are left out.
 
     Args:
-        axes: The panel.
-        title: What stands above it.
-        x: What the x axis shows, with its unit.
-        y: What the y axis shows, with its unit.
+        x: Their places.
+        values: Means with standard errors, or rates with Jeffreys intervals.
+
+    Returns:
+        float64 (4, n): x, mean, lower and upper end.
     """
-    tidy(axes)
-    axes.set_title(plain(title), fontsize=TITLE_PT, loc="left")
-    axes.set_xlabel(plain(x), fontsize=LABEL_PT)
-    axes.set_ylabel(plain(y), fontsize=LABEL_PT)
-    axes.tick_params(labelsize=TICK_PT)
+    rows = [
+        (at, value.value, *value.interval)
+        for at, value in zip(x, values, strict=True)
+        if not math.isnan(value.value)
+    ]
+    return np.array(rows, np.float64).reshape(-1, 4).T
 
 
-def count_along(axes: Axes, *, x: bool = True) -> None:
-    """Let an axis tick at whole numbers only."""
+def draw_trend(
+    axes: Axes, *, title: str, label: str, shots: Floats, values: Floats, running: Floats, is_rate: bool
+) -> None:
+    """Draw a fraction for each shot, and its running mean with the error.
+
+    Args:
+        axes: Where to draw.
+        title: Title.
+        label: Label of the y axis.
+        shots: float64 (n,), numbers of the shots.
+        values: float64 (n,), a fraction for each.
+        running: The running mean, see :func:`points_of`.
+        is_rate: Whether each value is 0 or 1; the scale is then 0 to 100 %.
+    """
+    is_few = len(shots) <= MANY
+    look: dict[str, Any] = {"marker": "o", "markersize": 3 if is_few else 1, "markeredgewidth": 0}
+    if is_rate:
+        look = {"marker": "|", "markersize": 5 if is_few else 3, "markeredgewidth": 0.8 if is_few else 0.3}
+    axes.plot(shots, 100 * values, color=LIGHT, linestyle="none", rasterized=len(shots) > PIXELS, **look)
+    x, y, low, high = running
+    known = np.isfinite(low) & np.isfinite(high)
+    axes.fill_between(x, 100 * low, 100 * high, where=known, color=DARK, alpha=0.2, linewidth=0, zorder=3)
+    axes.plot(x, 100 * y, color=DARK, linewidth=1.4, marker="o" if len(x) == 1 else "", zorder=4)
+    axes.set(title=title, xlabel="shot", ylabel=label, xlim=(shots[0] - 0.5, shots[-1] + 0.5))
+    axes.set_ylim(*((-4.0, 104.0) if is_rate else _with_room(values, 0.1, MIN_RANGE_PERCENT)))
+    whole_numbers(axes.xaxis)
+
+
+def draw_curves(
+    axes: Axes,
+    *,
+    title: str,
+    x_label: str,
+    y_label: str,
+    curves: Mapping[str, Floats],
+    ticks: Sequence[str] = (),
+    whole: bool = False,
+    logarithmic: bool = False,
+    from_zero: bool = False,
+) -> None:
+    """Draw fractions with error bars.
+
+    Args:
+        axes: Where to draw.
+        title: Title.
+        x_label: Label of the x axis.
+        y_label: Label of the y axis.
+        curves: Name -> points, see :func:`points_of`; at least one of each.
+        ticks: Text at x = 0, 1, 2, ... instead of numbers; the points are then not joined.
+        whole: Whether x is a count.
+        logarithmic: Whether the x axis is logarithmic.
+        from_zero: Whether the y axis begins at 0.
+    """
+    for (name, (x, y, low, high)), colour, marker in zip(curves.items(), (DARK, ORANGE), "os", strict=False):
+        bars = 100 * np.nan_to_num([y - low, high - y]).clip(min=0.0)
+        look: dict[str, Any] = {"markersize": 5, "linewidth": 0.9, "capsize": 2, "capthick": 0.9, "zorder": 3}
+        line = "none" if ticks else "-"
+        axes.errorbar(x, 100 * y, bars, label=name, color=colour, marker=marker, linestyle=line, **look)
+    axes.set(title=title, xlabel=x_label, ylabel=y_label)
+    all_x, *ends = np.concatenate([*curves.values()], axis=1)
+    if logarithmic:
+        _plain_logarithmic(axes)
+    elif ticks:
+        turned = len(ticks) * max(map(len, ticks)) > 32
+        axes.set_xticks(np.arange(len(ticks)), list(ticks), rotation=90 if turned else 0)
+    elif whole:
+        whole_numbers(axes.xaxis)
+    elif len(all_x) < 2 or np.diff(np.unique(all_x)).min(initial=np.inf) >= MIN_GAP * np.ptp(all_x) > 0:
+        axes.set_xticks(np.unique(all_x))
+    if whole or ticks:
+        axes.set_xlim(all_x.min() - 0.5, all_x.max() + 0.5)
+    low, high = _with_room(np.concatenate(ends), 0.12, MIN_RANGE_PERCENT / 2)
+    axes.set_ylim(0.0 if from_zero else low, high)
+    if len(curves) > 1:
+        axes.legend()
+
+
+def draw_map(
+    axes: Axes,
+    *,
+    title: str,
+    x_label: str,
+    y_label: str,
+    x_ticks: Sequence[str],
+    y_ticks: Sequence[str],
+    values: Floats,
+    label: str,
+    limits: tuple[float, float],
+) -> None:
+    """Draw a fraction against two scanned values, a cell for each pair.
+
+    Args:
+        axes: Where to draw.
+        title: Title.
+        x_label: The address along x.
+        y_label: The address along y.
+        x_ticks: Its values, as written.
+        y_ticks: Likewise.
+        values: float64 (len(y_ticks), len(x_ticks)), fractions; NaN where there is none.
+        label: Label of the colour bar.
+        limits: Range of the colours.
+    """
+    from matplotlib import colormaps
+
+    low, high = (100 * end for end in limits)
+    image = axes.imshow(
+        np.ma.masked_invalid(100 * values),
+        origin="lower",
+        aspect="auto",
+        cmap=colormaps[COLOURS].with_extremes(bad=NO_VALUE),
+        vmin=low,
+        vmax=max(high, low + 1e-9),
+    )
+    axes.set(title=title, xlabel=x_label, ylabel=y_label)
+    axes.grid(visible=False)
+    for axis, words in ((axes.xaxis, x_ticks), (axes.yaxis, y_ticks)):
+        at = range(0, len(words), -(-len(words) // MAX_TICKS))
+        axis.set_ticks(at, [words[i] for i in at])
+    if max(values.shape) <= MAX_CELLS_WITH_TEXT:
+        for (row, col), value in np.ndenumerate(100 * values):
+            if np.isfinite(value):
+                colour = "white" if value < (low + high) / 2 else "black"
+                axes.text(col, row, f"{value:.3g}", ha="center", va="center", fontsize=8, color=colour)
+    axes.figure.colorbar(image, ax=axes, pad=0.02, label=label)
+
+
+def draw_sites(
+    axes: Axes, *, title: str, label: str, grid: SiteGrid, values: Floats, outlined: NDArray[np.bool_]
+) -> None:
+    """Draw a fraction for each site, in its cell.
+
+    Args:
+        axes: Where to draw.
+        title: Title.
+        label: Label of the colour bar.
+        grid: The grid of sites.
+        values: float64 (n_rows, n_cols), fractions; NaN where there is none.
+        outlined: bool (n_rows, n_cols), the target, around which a line is drawn.
+    """
+    from matplotlib import colormaps
+    from matplotlib.collections import LineCollection, PolyCollection
+
+    rows, cols = np.indices(values.shape)
+    cells = place_sites(np.stack([rows.ravel(), cols.ravel()], axis=1), grid)[:, None] + cell(grid)
+    colours = colormaps[COLOURS].with_extremes(bad=NO_VALUE, under="black")
+    filled = PolyCollection(list(cells), cmap=colours, edgecolors="white", linewidths=0.3)
+    filled.set_array(np.ma.masked_invalid(100 * values.ravel()))
+    known = values[np.isfinite(values)]
+    low, high = 0.0, 1.0
+    if len(known):  # a site of few atoms must not take up all of the range
+        high = float(known.max())
+        low = min(float(np.quantile(known, 0.02)), high - 0.01)
+    filled.set_clim(100 * low, 100 * high)
+    axes.add_collection(filled)
+    line: dict[str, Any] = {"colors": RED, "linewidths": 1.0, "capstyle": "round"}
+    axes.add_collection(LineCollection(list(outline(outlined, grid)), **line))
+    x, y = cells.reshape(-1, 2).T
+    axes.set(title=title, aspect="equal")
+    axes.set_xlim(x.min() - 0.3, x.max() + 0.3)
+    axes.set_ylim(y.max() + 0.3, y.min() - 0.3)
+    axes.set_axis_off()
+    extend = "min" if (known < low).any() else "neither"
+    axes.figure.colorbar(filled, ax=axes, pad=0.02, shrink=0.85, extend=extend, label=label)
+
+
+def draw_defects(axes: Axes, *, title: str, x_label: str, shares: Floats, expected: Floats) -> None:
+    """Draw the share of the shots with each number of defects.
+
+    Args:
+        axes: Where to draw.
+        title: Title.
+        x_label: Label of the x axis.
+        shares: Share of the shots at 0, 1, 2, ... defects, see :func:`points_of`.
+        expected: float64 (n,), the shares for independent sites with the same mean filling.
+    """
+    x, y, low, high = shares
+    errors = 100 * np.stack([y - low, high - y]).clip(min=0.0)
+    axes.bar(x, 100 * y, width=0.8, color=LIGHT, yerr=errors, label="shots", **BARS)
+    points: dict[str, Any] = {
+        "marker": "D",
+        "markersize": 4,
+        "linewidth": 0.9,
+        "linestyle": "--",
+        "zorder": 3,
+    }
+    axes.plot(np.arange(len(expected)), 100 * expected, color=ORANGE, label="independent sites", **points)
+    axes.set(title=title, xlabel=x_label, ylabel="shots (%)")
+    axes.set_xlim(-0.6, max(MIN_DEFECTS, x[-1], len(expected) - 1) + 0.6)
+    axes.set_ylim(bottom=0.0)
+    whole_numbers(axes.xaxis)
+    axes.legend()
+
+
+def draw_loss_causes(axes: Axes, *, title: str, x_label: str, losses: Mapping[str, Estimate]) -> None:
+    """Draw a bar for the atoms lost to each cause."""
+    means, errors = np.array([[loss.value, loss.error] for loss in losses.values()]).T
+    at = np.arange(len(losses))
+    axes.barh(at, means, height=0.65, color=LIGHT, xerr=np.nan_to_num(errors), **BARS)
+    axes.set_yticks(at, list(losses))
+    axes.invert_yaxis()
+    axes.set(title=title, xlabel=x_label)
+    _vertical_grid(axes)
+    axes.set_xlim(left=0.0)
+
+
+def draw_stages(
+    axes: Axes, *, title: str, stages: Sequence[StageStatistics], clocks: Mapping[str, str]
+) -> None:
+    """Draw the times of a shot's stages below one another, on a logarithmic scale.
+
+    A point is the median, a line leads to the 99th percentile, a mark is the budget.
+
+    Args:
+        axes: Where to draw.
+        title: Title.
+        stages: The stages, in order.
+        clocks: "session_s" and perhaps "host_s" -> name of the clock.
+    """
+    from matplotlib.ticker import FuncFormatter, NullFormatter
+
+    shown_s: list[float] = []
+    for number, ((clock, name), colour) in enumerate(zip(clocks.items(), (DARK, ORANGE), strict=False)):
+        aside = 0.17 * (2 * number - 1) if len(clocks) > 1 else 0.0
+        times = np.array([getattr(stage, clock) for stage in stages], np.float64)
+        y = np.flatnonzero(times[:, 0] > (HIDDEN_S if clock == "session_s" else 0.0))
+        p50, p99 = times[y, 0], np.fmax(times[y, 0], times[y, 1])
+        axes.hlines(y + aside, p50, p99, color=colour, linewidth=1.6, capstyle="round")
+        axes.plot(p50, y + aside, color=colour, marker="o", markersize=5, linestyle="none", label=name)
+        shown_s += [*p50, *p99]
+    budgets = np.array([stage.budget_s for stage in stages])
+    y = np.flatnonzero(budgets > 0)
+    if len(y):
+        look: dict[str, Any] = {"linestyle": "none", "marker": "|", "markersize": 13, "markeredgewidth": 1.6}
+        axes.plot(budgets[y], y, color=RED, label="budget", zorder=4, **look)
+        shown_s += [*budgets[y]]
+    low, high = (min(shown_s), max(shown_s)) if shown_s else (1e-3, 1.0)
+    axes.set(title=title, xlabel="time: median, line to the 99th percentile", xscale="log")
+    axes.set_xlim(10 ** math.floor(math.log10(low)), 10 ** math.ceil(math.log10(1.05 * high)))
+    axes.xaxis.set_major_formatter(FuncFormatter(_time_text))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.set_yticks(range(len(stages)), [stage.stage for stage in stages])
+    axes.set_ylim(len(stages) - 0.5, -0.5)
+    _vertical_grid(axes)
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=3)
+
+
+def whole_numbers(axis: Axis) -> None:
+    """Put ticks at whole numbers only."""
     from matplotlib.ticker import MaxNLocator
 
-    axis = axes.xaxis if x else axes.yaxis
     axis.set_major_locator(MaxNLocator(nbins=6, integer=True, min_n_ticks=1))
 
 
-def finish_bar(bar: Colorbar, text: str) -> None:
-    """Name a colour bar."""
-    bar.set_label(plain(text), fontsize=LABEL_PT)
-    bar.ax.tick_params(labelsize=TICK_PT, width=0.7)
-    bar.outline.set_linewidth(0.5)  # pyright: ignore[reportCallIssue, reportUnknownMemberType]
+def _time_text(time_s: float, _: object) -> str:
+    return format_quantity(time_s, "time").replace("us", "µs")
 
 
-Floats = NDArray[np.float64]
-
-BARS: Final[dict[str, Any]] = {"ecolor": DARK, "capsize": 2, "error_kw": {"elinewidth": 0.9, "capthick": 0.9}}
-LEAST: Final = 4
-"""Number of defects up to which the histogram goes at least."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class DefectsChart:
-    """How many defects are left in how many of the shots.
-
-    Attributes:
-        title: Stands above it.
-        x_label: What is counted.
-        shares: Share of the shots at 0, 1, 2, ... defects, with errors.
-        expected: float64 (n,), the shares of independent sites with the same mean filling, from 0 on.
-    """
-
-    title: str
-    x_label: str
-    shares: Series
-    expected: Floats
-
-    def paint(self, axes: Axes) -> None:
-        """Paint bars for what was found, and points for what independent sites would give."""
-        y, low, high = (100 * part for part in (self.shares.y, self.shares.low, self.shares.high))
-        errors = np.stack([y - low, high - y]).clip(min=0.0)
-        axes.bar(
-            self.shares.x, y, width=0.8, color=LIGHT, yerr=errors, label=plain(self.shares.label), **BARS
-        )
-        points: dict[str, Any] = {
-            "color": OTHER,
-            "marker": "D",
-            "markersize": 4,
-            "linewidth": 0.9,
-            "linestyle": "--",
-        }
-        axes.plot(
-            np.arange(len(self.expected)), 100 * self.expected, label="independent sites", zorder=3, **points
-        )
-        label(axes, self.title, self.x_label, "shots (%)")
-        count_along(axes)
-        axes.set_xlim(-0.6, max(LEAST, self.shares.x[-1], len(self.expected) - 1) + 0.6)
-        axes.set_ylim(bottom=0.0)
-        axes.legend(frameon=False, fontsize=KEY_PT)
+def _with_room(fractions: Floats, room: float, min_range: float) -> tuple[float, float]:
+    """Limits of an axis in per cent, with room above and below, relative to the range."""
+    low, high = 100 * float(np.nanmin(fractions)), 100 * float(np.nanmax(fractions))
+    room *= max(high - low, min_range)
+    return low - room, high + room
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LossCausesChart:
-    """What atoms were lost to.
-
-    Attributes:
-        title: Stands above it.
-        x_label: What is counted.
-        causes: Their names, the worst first.
-        means: float64 (n,).
-        errors: float64 (n,), standard errors; NaN where they are not known.
-    """
-
-    title: str
-    x_label: str
-    causes: tuple[str, ...]
-    means: Floats
-    errors: Floats
-
-    def paint(self, axes: Axes) -> None:
-        """Paint a bar for each cause."""
-        at = np.arange(len(self.causes))
-        axes.barh(at, self.means, height=0.65, color=LIGHT, xerr=np.nan_to_num(self.errors), **BARS)
-        axes.set_yticks(at, list(map(plain, self.causes)))
-        axes.invert_yaxis()
-        label(axes, self.title, self.x_label, "")
-        axes.grid(visible=False, axis="y")
-        axes.grid(visible=True, axis="x", color="0.92", linewidth=0.7)
-        axes.set_xlim(left=0.0)
+def _vertical_grid(axes: Axes) -> None:
+    axes.grid(visible=False, axis="y")
+    axes.grid(visible=True, axis="x")
 
 
-MANY: Final = 500
-"""From so many points on they are smaller."""
-PIXELS: Final = 2000
-"""From so many points on they are pixels in a vector picture too."""
-MIN_RANGE: Final = 1.0
-"""Least range that is shown, in per cent."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class TrendChart:
-    """A fraction against the shot.
-
-    Attributes:
-        title: Stands above it.
-        label: What is shown, with its unit.
-        shots: float64 (n,), numbers of the shots, rising.
-        values: float64 (n,), a fraction for each; NaN where there is none.
-        running: The mean over neighbouring shots, with its error.
-        is_rate: Whether each value is 0 or 1, a mark at the edge; the scale then goes from 0 to 100 %.
-    """
-
-    title: str
-    label: str
-    shots: Floats
-    values: Floats
-    running: Series
-    is_rate: bool = False
-
-    def paint(self, axes: Axes) -> None:
-        """Paint the shots faintly, and their running mean with its error."""
-        look: dict[str, Any] = {"linestyle": "none", "zorder": 2, "rasterized": len(self.shots) > PIXELS}
-        few = len(self.shots) <= MANY
-        if self.is_rate:
-            look |= {"marker": "|", "markersize": 5 if few else 3, "markeredgewidth": 0.8 if few else 0.3}
-        else:
-            look |= {"marker": "o", "markersize": 3 if few else 1, "markeredgewidth": 0}
-        axes.plot(self.shots, 100 * self.values, color=LIGHT, **look)
-        run = self.running
-        low, high = 100 * run.low, 100 * run.high
-        known = np.isfinite(low) & np.isfinite(high)
-        axes.fill_between(run.x, low, high, where=known, color=DARK, alpha=0.2, linewidth=0, zorder=3)
-        axes.plot(
-            run.x, 100 * run.y, color=DARK, linewidth=1.4, marker="o" if len(run.x) == 1 else "", zorder=4
-        )
-        label(axes, self.title, "shot", self.label)
-        count_along(axes)
-        axes.set_xlim(self.shots[0] - 0.5, self.shots[-1] + 0.5)
-        axes.set_ylim(*self._limits())
-
-    def _limits(self) -> tuple[float, float]:
-        if self.is_rate:
-            return -4.0, 104.0
-        low, high = 100 * float(np.nanmin(self.values)), 100 * float(np.nanmax(self.values))
-        room = 0.1 * max(high - low, MIN_RANGE)
-        return low - room, high + room
-
-
-CURVES_COLOURS: Final = (DARK, OTHER, "#2a9d6f", "#a05195")
-MARKERS: Final = "osD^"
-ROOM: Final = 0.12
-"""Room above and below the points, relative to their range."""
-CURVES_MIN_RANGE: Final = 0.5
-"""Least range that is shown, in per cent."""
-MIN_GAP: Final = 0.09
-"""Least distance of values, relative to their range, that are all written below the axis."""
-LONG: Final = 4
-"""Letters from which on tick labels are turned where there are many."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class CurvesChart:
-    """Points with errors, joined by thin lines.
-
-    Attributes:
-        title: Stands above it.
-        x_label: What the x axis shows, with its unit.
-        y_label: What the y axis shows, with its unit.
-        series: The points, fractions; each with at least one.
-        ticks: Words at x = 0, 1, 2, ... instead of numbers; none for numbers.
-        whole: Whether x is a count.
-        logarithmic: Whether the x axis is.
-        from_zero: Whether the y axis begins at 0.
-    """
-
-    title: str
-    x_label: str
-    y_label: str
-    series: tuple[Series, ...]
-    ticks: tuple[str, ...] = ()
-    whole: bool = False
-    logarithmic: bool = False
-    from_zero: bool = False
-
-    def paint(self, axes: Axes) -> None:
-        """Paint."""
-        for one, colour, marker in zip(self.series, CURVES_COLOURS, MARKERS, strict=False):
-            paint_series(axes, one, colour, marker, joined=not self.ticks)
-        label(axes, self.title, self.x_label, self.y_label)
-        if self.logarithmic:
-            _make_logarithmic(axes)
-        if self.ticks:
-            turned = len(self.ticks) * max(map(len, self.ticks)) > 8 * LONG
-            axes.set_xticks(
-                np.arange(len(self.ticks)), list(map(plain, self.ticks)), rotation=90 if turned else 0
-            )
-        elif self.whole:
-            count_along(axes)
-        elif not self.logarithmic and _are_apart(x := self.series[0].x):
-            axes.set_xticks(x)
-        if self.whole or self.ticks:
-            x = np.concatenate([one.x for one in self.series])
-            axes.set_xlim(x.min() - 0.5, x.max() + 0.5)
-        low, high = span(self.series)
-        room = ROOM * max(high - low, CURVES_MIN_RANGE)
-        axes.set_ylim(0.0 if self.from_zero else low - room, high + room)
-        if len(self.series) > 1:
-            axes.legend(frameon=False, fontsize=KEY_PT)
-
-
-def _are_apart(x: NDArray[np.float64]) -> bool:
-    """Whether every value has room for its number."""
-    return len(x) < 2 or bool(np.diff(x).min() >= MIN_GAP * np.ptp(x) > 0)
-
-
-def _make_logarithmic(axes: Axes) -> None:
-    """Plain numbers on a logarithmic axis, as far as there is room for them."""
+def _plain_logarithmic(axes: Axes) -> None:
+    """A logarithmic x axis with plain numbers, as many as there is room for."""
     from matplotlib.ticker import LogFormatter
 
     axes.set_xscale("log")
     axes.xaxis.set_major_formatter(LogFormatter())
     axes.xaxis.set_minor_formatter(LogFormatter(minor_thresholds=(2, 0.5)))
     axes.tick_params(which="both", labelsize=8)
-
-
-MAX_WORDS: Final = 6
-"""Up to so many rows and columns each cell says its value."""
-MAX_TICKS: Final = 10
-"""Up to so many values of an axis are written."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class MapChart:
-    """A fraction against two scanned values, a cell for each pair.
-
-    Attributes:
-        title: Stands above it.
-        x_label: The address along x.
-        y_label: The address along y.
-        x_ticks: Its values, as written.
-        y_ticks: Likewise.
-        values: float64 (len(y_ticks), len(x_ticks)), fractions; NaN where there is none.
-        label: What the colours show.
-        limits: Fractions that the colours go from and to.
-    """
-
-    title: str
-    x_label: str
-    y_label: str
-    x_ticks: tuple[str, ...]
-    y_ticks: tuple[str, ...]
-    values: Floats
-    label: str
-    limits: tuple[float, float]
-
-    def paint(self, axes: Axes) -> None:
-        """Paint cells, with their values where there are few."""
-        from matplotlib import colormaps
-
-        low, high = (100 * end for end in self.limits)
-        colours = colormaps[COLOURS].with_extremes(bad=NOTHING)
-        values = np.ma.masked_invalid(100 * self.values)
-        image = axes.imshow(
-            values, origin="lower", aspect="auto", cmap=colours, vmin=low, vmax=max(high, low + 1e-9)
-        )
-        label(axes, self.title, self.x_label, self.y_label)
-        axes.grid(visible=False)
-        _write_ticks(axes.xaxis, self.x_ticks)
-        _write_ticks(axes.yaxis, self.y_ticks)
-        if max(self.values.shape) <= MAX_WORDS:
-            self._write_values(axes, low, high)
-        finish_bar(axes.figure.colorbar(image, ax=axes, pad=0.02), self.label)
-
-    def _write_values(self, axes: Axes, low: float, high: float) -> None:
-        for (row, col), value in np.ndenumerate(100 * self.values):
-            if np.isfinite(value):
-                dark = value < (low + high) / 2
-                text = f"{value:.3g}"
-                axes.text(
-                    col, row, text, ha="center", va="center", fontsize=8, color="white" if dark else "black"
-                )
-
-
-def _write_ticks(axis: Axis, words: tuple[str, ...]) -> None:
-    every = -(-len(words) // MAX_TICKS)
-    at = np.arange(0, len(words), every)
-    axis.set_ticks(at, [plain(words[i]) for i in at])
-
-
-DPI: Final = 150
-PANEL_IN: Final = (3.7, 3.1)
-"""Width and height of a panel where there are several, in inches."""
-ALONE_IN: Final = (6.4, 4.4)
-"""Those of a panel that is alone."""
-HEAD_IN: Final = 0.55
-"""Room for the title, in inches."""
-
-
-class Chart(Protocol):
-    """Paints itself into a panel."""
-
-    def paint(self, axes: Axes) -> None:
-        """Paint."""
-        ...
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RunDrawing:
-    """What is drawn.
-
-    Attributes:
-        title: Stands at the top.
-        note: Stands below it.
-        rows: The charts, row by row; none of the rows is empty.
-    """
-
-    title: str
-    note: str
-    rows: tuple[tuple[Chart, ...], ...]
-
-
-def save_run(path: Path, drawing: RunDrawing) -> None:
-    """Draw charts of a run on a sheet.
-
-    Args:
-        path: The PNG, SVG or PDF file.
-        drawing: What is drawn.
-
-    Raises:
-        ConfigError: The file cannot be written.
-    """
-    save_figure(path, lambda: _draw(drawing), dpi=DPI)
-
-
-def _draw(drawing: RunDrawing) -> Figure:
-    n_rows, n_cols = len(drawing.rows), max(map(len, drawing.rows))
-    width, height = ALONE_IN if n_rows == n_cols == 1 else (n_cols * PANEL_IN[0], n_rows * PANEL_IN[1])
-    figure = make_figure(width, height + HEAD_IN, layout="constrained")
-    figure.get_layout_engine().set(w_pad=0.08, h_pad=0.08)  # pyright: ignore[reportOptionalMemberAccess, reportCallIssue]
-    parts = figure.subfigures(n_rows, 1, squeeze=False)[:, 0]
-    for part, charts in zip(parts, drawing.rows, strict=True):
-        for axes, chart in zip(part.subplots(1, len(charts), squeeze=False)[0], charts, strict=True):
-            chart.paint(axes)
-    figure.suptitle(f"{plain(drawing.title)}\n{plain(drawing.note)}".rstrip(), fontsize=10)
-    return figure
-
-
-SITES_MIN_RANGE: Final = 0.01
-"""Least range of the colours."""
-OUTLINE: Final = "#c8102e"
-LOW_PART: Final = 0.02
-"""So many of the sites may lie below the scale of colours: a site of few atoms must not take all of it."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SitesChart:
-    """A fraction for each site, in its cell.
-
-    Attributes:
-        title: Stands above it.
-        label: What the colours show.
-        grid: The grid of sites.
-        values: float64 (n_rows, n_cols), fractions; NaN where there is none.
-        outlined: bool (n_rows, n_cols), sites that a line is drawn around: the target.
-    """
-
-    title: str
-    label: str
-    grid: SiteGrid
-    values: NDArray[np.float64]
-    outlined: NDArray[np.bool_]
-
-    def paint(self, axes: Axes) -> None:
-        """Paint each site's cell, and the outline."""
-        from matplotlib import colormaps
-        from matplotlib.collections import LineCollection, PolyCollection
-
-        rows, cols = np.indices(self.values.shape)
-        places = place_sites(np.stack([rows.ravel(), cols.ravel()], axis=1), self.grid)
-        cells = places[:, None] + cell(self.grid)
-        colours = colormaps[COLOURS].with_extremes(bad=NOTHING, under="black")
-        painted = PolyCollection(list(cells), cmap=colours, edgecolors="white", linewidths=0.3)
-        painted.set_array(np.ma.masked_invalid(100 * self.values.ravel()))
-        low, high = self._limits()
-        painted.set_clim(100 * low, 100 * high)
-        axes.add_collection(painted)
-        line: dict[str, Any] = {"colors": OUTLINE, "linewidths": 1.0, "capstyle": "round"}
-        axes.add_collection(LineCollection(list(outline(self.outlined, self.grid)), **line))
-        x, y = cells.reshape(-1, 2).T
-        axes.set_xlim(x.min() - 0.3, x.max() + 0.3)
-        axes.set_ylim(y.max() + 0.3, y.min() - 0.3)
-        axes.set_aspect("equal")
-        axes.set_axis_off()
-        axes.set_title(plain(self.title), fontsize=TITLE_PT, loc="left")
-        below = bool((self.values < low).any())
-        bar = axes.figure.colorbar(
-            painted, ax=axes, pad=0.02, shrink=0.85, extend="min" if below else "neither"
-        )
-        finish_bar(bar, self.label)
-
-    def _limits(self) -> tuple[float, float]:
-        known = self.values[np.isfinite(self.values)]
-        if not len(known):
-            return 0.0, 1.0
-        low, high = float(np.quantile(known, LOW_PART)), float(known.max())
-        return min(low, high - SITES_MIN_RANGE), high
-
-
-ASIDE: Final = 0.17
-"""Distance of the two clocks of a stage from its line, where there are two."""
-
-
-@dataclass(frozen=True, slots=True)
-class StageBar:
-    """A stage.
-
-    Attributes:
-        name: Its name.
-        clocks: Median and 99th percentile on each clock, in seconds; NaN where a clock tells nothing.
-        budget_s: What it may take; NaN if it has no budget.
-    """
-
-    name: str
-    clocks: tuple[tuple[float, float], ...]
-    budget_s: float
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class StagesChart:
-    """Stages below one another, on a logarithmic scale of time.
-
-    Attributes:
-        title: Stands above it.
-        clocks: What the clocks are called.
-        stages: The stages, in the order they come.
-    """
-
-    title: str
-    clocks: tuple[str, ...]
-    stages: tuple[StageBar, ...]
-
-    def paint(self, axes: Axes) -> None:
-        """Paint a point at the median, a line on to the 99th percentile, and a mark at the budget."""
-        names = [stage.name for stage in self.stages]
-        for clock, (name, colour) in enumerate(zip(self.clocks, (DARK, OTHER), strict=False)):
-            aside = ASIDE * (2 * clock - 1) if len(self.clocks) > 1 else 0.0
-            self._paint_clock(axes, clock, aside, colour, name)
-        with_budget = [(i, stage.budget_s) for i, stage in enumerate(self.stages) if stage.budget_s > 0]
-        if with_budget:
-            y, x = zip(*with_budget, strict=True)
-            look: dict[str, Any] = {"color": QUOTED, "linestyle": "none", "marker": "|"}
-            axes.plot(x, y, label="budget", markersize=13, markeredgewidth=1.6, zorder=4, **look)
-        axes.set_xscale("log")
-        axes.set_yticks(range(len(names)), list(map(plain, names)))
-        axes.set_ylim(len(names) - 0.5, -0.5)
-        label(axes, self.title, "time: median, line to the 99th percentile", "")
-        axes.grid(visible=False, axis="y")
-        axes.grid(visible=True, axis="x", color="0.92", linewidth=0.7)
-        self._write_times(axes)
-        axes.legend(frameon=False, fontsize=KEY_PT, loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=3)
-
-    def _paint_clock(self, axes: Axes, clock: int, aside: float, colour: str, name: str) -> None:
-        shown = [(i + aside, *stage.clocks[clock]) for i, stage in enumerate(self.stages)]
-        shown = [one for one in shown if one[1] > 0]
-        for y, p50_s, p99_s in shown:
-            axes.plot(
-                [p50_s, max(p50_s, p99_s)],
-                [y, y],
-                color=colour,
-                linewidth=1.6,
-                solid_capstyle="round",
-                zorder=2,
-            )
-        points = [(p50_s, y) for y, p50_s, _ in shown]
-        x, y = zip(*points, strict=True) if points else ((), ())
-        axes.plot(x, y, color=colour, marker="o", markersize=5, linestyle="none", label=plain(name), zorder=3)
-
-    def _write_times(self, axes: Axes) -> None:
-        """Decades as "1 ms", with room for all that is shown."""
-        from matplotlib.ticker import FuncFormatter, NullFormatter
-
-        times = [s for stage in self.stages for s in _times(stage)]
-        low, high = (min(times), max(times)) if times else (1e-3, 1.0)
-        axes.set_xlim(10 ** math.floor(math.log10(low)), 10 ** math.ceil(math.log10(1.05 * high)))
-        axes.xaxis.set_major_formatter(FuncFormatter(_written))
-        axes.xaxis.set_minor_formatter(NullFormatter())
-
-
-def _written(time_s: float, _: object) -> str:
-    return format_quantity(time_s, "time").replace("us", "µs")
-
-
-def _times(stage: StageBar) -> Sequence[float]:
-    return [s for s in (*(value for clock in stage.clocks for value in clock), stage.budget_s) if s > 0]

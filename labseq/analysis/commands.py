@@ -27,7 +27,6 @@ Examples:
   labseq plot data/2026-11-21/0004_scan-dop --what scan -o scan.pdf
   labseq plot --shot 3
   labseq plot --shot 3 --cycle 1 -o first_cycle.svg
-  labseq plot data/2026-11-21/0003_figure5 --figure 5 --compare data/2026-11-20/0007_figure5
 """
 
 
@@ -129,17 +128,6 @@ def plot(
             metavar="K", help="Only one cycle of that shot, counted from 1: the images before and after it."
         ),
     ] = None,
-    figure: Annotated[
-        str | None,
-        typer.Option(
-            metavar="4|5",
-            help="A figure of the paper. 4: filling against the degree of parallelism; 5: defect-free "
-            "probability against the number of cycles.",
-        ),
-    ] = None,
-    compare: Annotated[
-        Path | None, typer.Option(metavar="RUN2", help="Draw a second run into the same figure of the paper.")
-    ] = None,
     output: Annotated[
         Path | None,
         typer.Option(
@@ -150,7 +138,7 @@ def plot(
         ),
     ] = None,
 ) -> None:
-    """Draw a run, finished or not: an overview, one part of it, a shot, or a figure of the paper."""
+    """Draw a run, finished or not: an overview, one part of it, or a shot."""
     from labseq.analysis.terminal import PlotRequest, plot_run
 
-    plot_run(run, PlotRequest(what, figure, compare, shot, cycle), output)
+    plot_run(run, PlotRequest(what, shot, cycle), output)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.analysis.overview import grid_of, note_of, sites_of, unfit
+from labseq.analysis.overview import cannot_draw, grid_of, note_of, sites_of
 from labseq.errors import ConfigError, Problem
 from labseq.messages import clean
 from labseq.model import CycleRecord, ImageRecord, Occupancy, ShotRecord, SiteGrid, TargetPattern
@@ -264,9 +264,9 @@ def shot_picture(run: Run, number: int, cycle: int | None = None) -> ShotDrawing
     record, target = shot.record(), run.target
     if max(target.shape) > MAX_SITES:
         what = f"{target.shape[0]} x {target.shape[1]} sites are too many to be made out"
-        raise unfit(run, what, f"at most {MAX_SITES} rows and columns", "picture")
+        raise cannot_draw(run, what, f"at most {MAX_SITES} rows and columns")
     if not record.images:
-        raise unfit(run, f"shot {number} has no images", "a shot with an 'image' step", "picture")
+        raise cannot_draw(run, f"shot {number} has no images", "a shot with an 'image' step")
     panels = _panels(record, target)
     if cycle is not None:
         panels = _of_cycle(run, number, record, panels, cycle)

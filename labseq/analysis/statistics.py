@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import accumulate
-from typing import Any, Final
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 
@@ -23,14 +23,14 @@ ONE_SIGMA: Final = math.erf(math.sqrt(0.5))
 
 @dataclass(frozen=True, slots=True)
 class Rate:
-    """How many of how many."""
+    """``n`` of ``n_trials``."""
 
     n: int
     n_trials: int
 
     @property
     def value(self) -> float:
-        """The fraction; nan of nothing."""
+        """The fraction; nan without trials."""
         return self.n / self.n_trials if self.n_trials else math.nan
 
     @property
@@ -39,8 +39,12 @@ class Rate:
         return jeffreys(self.n, self.n_trials)
 
 
+Estimated: TypeAlias = Estimate | Rate
+"""A mean with its standard error, or a rate with its Jeffreys interval."""
+
+
 def jeffreys(n: int, n_trials: int, level: float = ONE_SIGMA) -> tuple[float, float]:
-    """The equal-tailed interval of a probability, after Jeffreys' prior.
+    """The equal-tailed interval of a probability, with Jeffreys' prior.
 
     Between the quantiles of the beta distribution with ``n + 1/2`` and ``n_trials - n + 1/2``. The
     lower end is 0 if it never happened, and the upper end 1 if it always did (Brown, Cai, DasGupta,
@@ -48,7 +52,7 @@ def jeffreys(n: int, n_trials: int, level: float = ONE_SIGMA) -> tuple[float, fl
 
     Args:
         n: How often it happened.
-        n_trials: Of how many times.
+        n_trials: Number of trials.
         level: Probability of the interval, between 0 and 1.
 
     Returns:
@@ -76,26 +80,26 @@ def jeffreys(n: int, n_trials: int, level: float = ONE_SIGMA) -> tuple[float, fl
 
 
 LOST: Final = "lost."
-"""What the names of a simulation's losses begin with."""
+"""Prefix of a simulation's losses among its readings."""
 
 
 @dataclass(frozen=True, slots=True)
 class CycleStatistics:
-    """What came of one cycle, in the shots that made it.
+    """Statistics of one cycle, over the shots that made it.
 
     Standard errors are over shots, not sites: the losses within a shot are correlated.
 
     Attributes:
-        cycle: Which one, counted from 1 over all rearrangements of the shot.
-        n_shots: How many shots made it.
-        defect_free: In how many of them the image that ended it shows the target met.
-        seen: In how many of all shots that image or one that ended an earlier cycle does.
+        cycle: Its number, counted from 1 over all rearrangements of the shot.
+        n_shots: Number of shots that made it.
+        defect_free: Shots in which the image that ends it is defect-free.
+        seen: Shots, of all, in which that image or one that ends an earlier cycle is defect-free.
         filling: Filling of the target on that image.
         n_atom_moves: Atom moves that were played.
         n_batches: Batches that were played.
         n_left_out: Batches that did not fit into the window.
         period_s: From the start of the exposure before it to the start of its own.
-        defects: How many shots have 0, 1, 2, ... empty target sites on its image.
+        defects: Number of shots with 0, 1, 2, ... empty target sites on its image.
     """
 
     cycle: int
@@ -112,21 +116,21 @@ class CycleStatistics:
 
 @dataclass(frozen=True, slots=True)
 class Statistics:
-    """What came of some shots.
+    """Statistics of some shots.
 
     Attributes:
-        n_shots: How many shots.
-        unreadable: Indices of shots whose index line tells nothing of their cycles and whose file
-            cannot be read: they are left out of all but ``defect_free``, ``seen`` and ``filling``.
-        defect_free: How many of the shots that were judged met the target. A shot is judged on
-            its last ``image`` step, if it does not rearrange after that.
-        seen: In how many shots some image after a rearrangement shows the target met.
-        filling: Filling of the target in those that were judged.
-        cycles: What came of each cycle.
-        defects: How many shots that were judged have 0, 1, 2, ... empty target sites on that image.
-        too_short: In how many shots the plan of some cycle did not fit into its window.
-        losses: Cause -> atoms lost in a shot, the truth of a simulation; empty on real hardware.
-        defects_true: Empty target sites at the end of a shot, the truth of a simulation.
+        n_shots: Number of shots.
+        unreadable: Indices of shots without cycles in the index, whose file cannot be read:
+            they only count in ``defect_free``, ``seen`` and ``filling``.
+        defect_free: Judged shots that met the target. A shot is judged on its last ``image``
+            step, if it does not rearrange after that.
+        seen: Shots in which some image after a rearrangement is defect-free.
+        filling: Filling of the target in the judged shots.
+        cycles: Statistics of each cycle.
+        defects: Number of judged shots with 0, 1, 2, ... empty target sites on that image.
+        too_short: Shots in which the plan of a cycle did not fit into its window.
+        losses: Cause -> atoms lost in a shot, known in simulations; empty on real hardware.
+        defects_true: Empty target sites at the end of a shot, known in simulations.
         defects_seen: Those on the last image of the same shots.
     """
 
@@ -143,15 +147,15 @@ class Statistics:
     defects_seen: Estimate
 
     def as_dict(self) -> dict[str, Any]:
-        """Everything, JSON-ready: rates and means with their errors; None for what is not known."""
+        """All of it, JSON-ready: rates and means with their errors; None for unknown values."""
         return to_plain(_named(self))
 
 
 def statistics_of(shots: Iterable[Shot], target: TargetPattern) -> Statistics:
-    """Sum up shots; no frames are read, and of runs since format 1.1 the index alone.
+    """Sum up shots, from the index of their run where it contains them; no frames are read.
 
     Args:
-        shots: The shots that count.
+        shots: The shots.
         target: The target of their run.
     """
     all_shots = list(shots)
@@ -202,7 +206,7 @@ class _ShotCycle:
 
 
 def _made(summary: ShotSummary) -> list[_ShotCycle]:
-    """The cycles of a shot, as far as each has an image that ended it."""
+    """The cycles of a shot that have an image at their end."""
     images, cycles = summary.images, summary.cycles
     ends = [i for i, cycle in enumerate(images.cycle) if cycle > 0]
     return [

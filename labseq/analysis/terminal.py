@@ -11,9 +11,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from labseq.analysis.charts import save_run
 from labseq.analysis.overview import CHOICES, overview, picture_of
-from labseq.analysis.paper import figure_4, figure_5, save_cycles, save_parallelism
 from labseq.analysis.replay import MeanCounts, Replay, ReplayedImages, ReplayedPlan, ReplayRequest, replay
 from labseq.analysis.shot import save_shot, shot_picture
 from labseq.config import Document, split_overrides
@@ -313,69 +311,46 @@ def _report(done: AnalysisOutcome) -> None:
     say(*failed[:MAX_REPORTED], *([f"and {more} more shots failed"] if more > 0 else []), stream=sys.stderr)
 
 
-FIGURES: Final = ("4", "5")
-"""Figures of the paper that a run can be drawn as."""
-
-
 @dataclass(frozen=True, slots=True)
 class PlotRequest:
-    """What to draw of a run; at most one of ``figure``, ``what`` and ``shot`` is given.
+    """What to draw of a run; at most one of ``what`` and ``shot`` is given.
 
     Attributes:
         what: A part of the overview; None for all of it.
-        figure: One of :data:`FIGURES`, a figure of the paper.
-        compare: Another run for that figure.
         shot: A shot, counted from 1.
         cycle: A cycle of it, counted from 1.
     """
 
     what: str | None = None
-    figure: str | None = None
-    compare: Path | None = None
     shot: int | None = None
     cycle: int | None = None
 
     def check(self) -> None:
-        """Check that the options fit together.
+        """Check that the options are compatible.
 
         Raises:
-            ConfigError: They do not, or there is no such picture.
+            ConfigError: They are not, or there is no such picture.
         """
-        given = [
-            option
-            for option, value in (("--what", self.what), ("--figure", self.figure), ("--shot", self.shot))
-            if value is not None
-        ]
-        if len(given) > 1:
-            raise ConfigError(
-                Problem("these are different pictures", " and ".join(given), expected="one of them")
-            )
+        if self.what is not None and self.shot is not None:
+            what = "these are different pictures"
+            raise ConfigError(Problem(what, "--what and --shot", expected="one of them"))
         if self.cycle is not None and self.shot is None:
             raise ConfigError(Problem("a cycle belongs to a shot", "--cycle", expected="--shot as well"))
-        if self.compare is not None and self.figure is None:
-            expected = "--figure 4 or --figure 5 as well"
-            raise ConfigError(
-                Problem("only figures of the paper compare runs", "--compare", expected=expected)
-            )
-        for option, value, known in (
-            ("--figure", self.figure, FIGURES),
-            ("--what", self.what, sorted(CHOICES)),
-        ):
-            if value is not None and value not in known:
-                problem = Problem(f"there is no figure '{value}' of a run", option, expected=one_of(known))
-                raise ConfigError(problem)
+        if self.what is not None and self.what not in CHOICES:
+            what = f"there is no picture '{clean(self.what)}' of a run"
+            raise ConfigError(Problem(what, "--what", expected=one_of(sorted(CHOICES))))
 
     @property
     def name(self) -> str:
-        """The default name of the file, without its ending.
+        """Default name of the file, without suffix.
 
         Example:
-            >>> PlotRequest(shot=3, cycle=1).name, PlotRequest(figure="5").name, PlotRequest().name
-            ('shot-3-cycle-1', 'figure-5', 'overview')
+            >>> PlotRequest(shot=3, cycle=1).name, PlotRequest(what="scan").name, PlotRequest().name
+            ('shot-3-cycle-1', 'scan', 'overview')
         """
         if self.shot is not None:
             return f"shot-{self.shot}" + (f"-cycle-{self.cycle}" if self.cycle is not None else "")
-        return f"figure-{self.figure}" if self.figure is not None else self.what or "overview"
+        return self.what or "overview"
 
 
 def plot_run(run: Path | None, request: PlotRequest, output: Path | None) -> None:
@@ -384,24 +359,19 @@ def plot_run(run: Path | None, request: PlotRequest, output: Path | None) -> Non
     Args:
         run: The run's folder or any file in it; None for the newest run.
         request: What to draw.
-        output: The picture; None for the default name in the current folder.
+        output: The picture; None for its default name in the current folder.
 
     Raises:
         ConfigError: There is no such run or picture, the run has no data for it, or the
             picture cannot be written.
-        RecordingError: A run is damaged.
+        RecordingError: The run is damaged.
     """
     request.check()
     path = Path(f"{request.name}.png") if output is None else output
     check_place(path)
     chosen = chosen_run(run)
-    other = None if request.compare is None else chosen_run(request.compare)
     if request.shot is not None:
         save_shot(path, shot_picture(chosen, request.shot, request.cycle))
-    elif request.figure == "4":
-        save_parallelism(path, figure_4(chosen, other))
-    elif request.figure == "5":
-        save_cycles(path, figure_5(chosen, other))
     else:
-        save_run(path, overview(chosen) if request.what is None else picture_of(chosen, request.what))
+        (overview(chosen) if request.what is None else picture_of(chosen, request.what)).save(path)
     say(f"written: {path}")

@@ -192,10 +192,10 @@ def _read_timing(run: Run) -> RunTiming:
     Raises:
         ConfigError: It has no shots that can be read.
     """
-    from labseq.analysis.overview import A_LOOK, spread
+    from labseq.analysis.overview import PART_SHOTS, evenly
     from labseq.analysis.timing import timing_of
 
-    timing = timing_of(run, spread(run.shots, A_LOOK))
+    timing = timing_of(run, evenly(run.shots, PART_SHOTS))
     if not timing.n_read:
         what = "the run has no shots yet whose files can be read"
         raise ConfigError(Problem(what, clean(str(run.path)), expected="at least one"))

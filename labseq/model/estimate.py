@@ -43,6 +43,11 @@ class Estimate:
             return f"{round(self.value, -digit):.0f}({error * 10**digit})"
         return f"{self.value:.{-digit}f}({error})"
 
+    @property
+    def interval(self) -> tuple[float, float]:
+        """The value minus and plus its standard error."""
+        return self.value - self.error, self.value + self.error
+
     def scaled(self, factor: float) -> Estimate:
         """The same in another unit."""
         return Estimate(self.value * factor, self.error * factor)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from itertools import product
@@ -19,11 +19,15 @@ from labseq.files import whole_file
 from labseq.model import Plan, SiteGrid
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 ENDINGS: Final = (".png", ".svg", ".pdf")
 """Kinds of pictures."""
+DARK, LIGHT, ORANGE, RED = "#1f4e8c", "#86b6e0", "#f28e2b", "#c8102e"
+"""Colours of points and lines, of areas, of a second series, and of what is compared."""
+
+_STYLE: Final[dict[str, Any]] = {"svg.hashsalt": "labseq", "text.parse_math": False}
+
 _UNDATED: Final = {".png": {"Software": None}, ".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
 
 
@@ -82,7 +86,7 @@ def encode_figure(draw: Callable[[], Figure], kind: str = ".png", **options: Any
     """
     from matplotlib import style
 
-    with style.context(["default", {"svg.hashsalt": "labseq"}]):
+    with style.context(["default", _STYLE]):
         data = io.BytesIO()
         options.setdefault("metadata", _UNDATED[kind])
         draw().savefig(data, format=kind[1:], **options)
@@ -118,84 +122,6 @@ def save_figure(path: Path, draw: Callable[[], Figure], **options: Any) -> None:
 
 
 Floats = NDArray[np.float64]
-
-DARK, LIGHT, OTHER, ANOTHER = "#1f4e8c", "#86b6e0", "#f28e2b", "#f7c48f"
-QUOTED, LIMIT = "#c8102e", "0.5"
-FRAME: Final = "0.35"
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Series:
-    """Points that belong together.
-
-    Attributes:
-        label: What the key calls them; plain text.
-        x: float64 (n,), rising.
-        y: float64 (n,), fractions.
-        low: float64 (n,), lower ends of their errors; NaN where the error is not known.
-        high: float64 (n,), upper ends.
-    """
-
-    label: str
-    x: Floats
-    y: Floats
-    low: Floats
-    high: Floats
-
-
-def span(series: Iterable[Series | None]) -> tuple[float, float]:
-    """The lowest and the highest end of any point, in per cent."""
-    ends = [values for one in series if one is not None for values in (one.y, one.low, one.high)]
-    return 100 * float(np.nanmin(np.concatenate(ends))), 100 * float(np.nanmax(np.concatenate(ends)))
-
-
-def paint_series(axes: Axes, series: Series, colour: str, marker: str, *, joined: bool) -> None:
-    """Paint points with error bars, in per cent.
-
-    Args:
-        axes: The panel.
-        series: The points.
-        colour: Of points and bars.
-        marker: matplotlib's name of the shape.
-        joined: Whether a thin line leads from point to point.
-    """
-    y, low, high = (100 * values for values in (series.y, series.low, series.high))
-    bars = np.nan_to_num(np.stack([y - low, high - y])).clip(min=0.0)
-    look: dict[str, Any] = {"color": colour, "markersize": 5, "linewidth": 0.9, "capsize": 2, "capthick": 0.9}
-    line = "-" if joined else "none"
-    axes.errorbar(
-        series.x, y, bars, label=plain(series.label), marker=marker, linestyle=line, zorder=3, **look
-    )
-
-
-def paint_quoted(axes: Axes, series: Series) -> None:
-    """Paint points that were not measured here, as stars."""
-    y, low, high = (100 * values for values in (series.y, series.low, series.high))
-    look: dict[str, Any] = {
-        "color": QUOTED,
-        "marker": "*",
-        "markersize": 11,
-        "linestyle": "none",
-        "capsize": 2,
-    }
-    rim: dict[str, Any] = {"markeredgecolor": "white", "markeredgewidth": 0.6}
-    bars = np.stack([y - low, high - y])
-    axes.errorbar(series.x, y, bars, label=plain(series.label), zorder=4, **look, **rim)
-
-
-def tidy(axes: Axes) -> None:
-    """Thin grey frame and ticks, a faint grid behind everything."""
-    for spine in axes.spines.values():
-        spine.set(color=FRAME, linewidth=0.7)
-    axes.tick_params(color=FRAME, width=0.7, labelsize=9)
-    axes.grid(visible=True, axis="y", color="0.92", linewidth=0.7)
-    axes.set_axisbelow(True)
-
-
-def plain(text: str) -> str:
-    """A text in which mathtext finds nothing to set."""
-    return text.replace("$", r"\$")
-
 
 PANEL_IN: Final = 4.4
 """Width of a panel, in inches, as long as its sites are neither too small nor too large in it."""

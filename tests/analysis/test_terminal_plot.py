@@ -31,15 +31,10 @@ def test_the_newest_run_goes_to_the_current_folder(
     monkeypatch.setenv("LABSEQ_DATA", str(run_dir.parents[1]))
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit) as leaving:
-        main(["plot", "--figure", "5"])
+        main(["plot", "--what", "filling"])
     assert leaving.value.code == 0
-    assert capsys.readouterr().out == "written: figure-5.png\n"
-    assert (tmp_path / "figure-5.png").read_bytes().startswith(b"\x89PNG")
-
-
-def test_two_runs_in_one_picture(run_dir: Path, tmp_path: Path) -> None:
-    plot_run(run_dir, PlotRequest(figure="5", compare=run_dir / "run.json"), tmp_path / "both.svg")
-    assert "both.svg" in {path.name for path in tmp_path.iterdir()}
+    assert capsys.readouterr().out == "written: filling.png\n"
+    assert (tmp_path / "filling.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_without_options_the_whole_run_is_drawn(run_dir: Path, tmp_path: Path) -> None:
@@ -59,19 +54,12 @@ def test_each_picture_has_a_name_of_its_own(
 @pytest.mark.parametrize(
     ("request_", "output", "told"),
     [
-        (PlotRequest(figure="6"), "a.png", "no figure '6' of a run; expected one of '4', '5'"),
-        (PlotRequest(what="x"), "a.png", "no figure 'x' of a run; expected one of 'defects', 'filling'"),
-        (PlotRequest(figure="5"), "a.bmp", "no name of a PNG or SVG or PDF file"),
-        (
-            PlotRequest(figure="4"),
-            "a.png",
-            "it does not scan planner.degree_of_parallelism; expected a run of",
-        ),
+        (PlotRequest(what="x"), "a.png", "no picture 'x' of a run; expected one of 'defects', 'filling'"),
+        (PlotRequest(), "a.bmp", "no name of a PNG or SVG or PDF file"),
         (PlotRequest(what="scan"), "a.png", "nothing to show of the scan; expected a run of a sequence with"),
         (PlotRequest(shot=9), "a.png", "--shot: the run has no shot 9; expected one from 1 to 2"),
         (PlotRequest(shot=1, what="scan"), "a.png", "--what and --shot: these are different pictures"),
         (PlotRequest(cycle=1), "a.png", "--cycle: a cycle belongs to a shot; expected --shot as well"),
-        (PlotRequest(compare=Path("x")), "a.png", "--compare: only figures of the paper compare runs"),
     ],
 )
 def test_what_cannot_be_drawn_is_told(
@@ -85,4 +73,4 @@ def test_what_cannot_be_drawn_is_told(
 
 def test_what_is_no_run_is_told(tmp_path: Path) -> None:
     with pytest.raises(ConfigError):
-        plot_run(tmp_path, PlotRequest(figure="5"), tmp_path / "a.png")
+        plot_run(tmp_path, PlotRequest(), tmp_path / "a.png")

@@ -4,8 +4,13 @@ from __future__ import annotations
 
 import csv
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
+
+import labseq
+from labseq.analysis.statistics import statistics_of
 
 from .scripts import load_script
 
@@ -67,3 +72,51 @@ def test_the_script_takes_a_point_and_draws(tmp_path: Path, monkeypatch: pytest.
     script.draw_5(tmp_path / "figure5.png")
     assert (tmp_path / "figure4.png").stat().st_size > 10_000
     assert (tmp_path / "figure5.png").stat().st_size > 10_000
+
+
+def take(folder: Path, name: str, shots: int, *overrides: str) -> Path:
+    sequence, profile = ROOT / "sequences" / f"{name}.yaml", ROOT / "hardware_profiles" / "virtual.yaml"
+    with labseq.Session.open(
+        sequence, profile=str(profile), shots=shots, seed=1, output=folder, overrides=overrides
+    ) as session:
+        return session.run().path
+
+
+def test_runs_are_drawn_and_compared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    script = load_script("make_paper_figures")
+    drawn: dict[str, tuple[Any, ...]] = {}
+    for name in ("draw_figure_4", "draw_figure_5"):
+        monkeypatch.setattr(script, name, lambda *data, name=name: drawn.__setitem__(name, data))
+    cycles, dops = take(tmp_path, "figure5_multicycle", 5), take(tmp_path, "figure4_dop_scan", 28)
+    script.main(["--figure", "5", str(cycles), str(cycles)])
+    _, _, (series, other), defects, quoted, ceiling = drawn["draw_figure_5"]
+    run = labseq.open_run(cycles)
+    of_cycles = statistics_of(run.shots, run.target).cycles
+    assert series.y.tolist() == [cycle.defect_free.value for cycle in of_cycles]
+    assert (series.low <= series.y).all()
+    assert (series.y <= series.high).all()
+    assert other.label.startswith(run.path.name)
+    assert defects[0].sum() == 5
+    assert quoted.y.tolist() == [0.015, 0.169, 0.33]
+    assert ceiling.y[0] == ceiling.y.min()  # the first cycle takes longest
+    assert ((ceiling.y > 0.25) & (ceiling.y < 0.36)).all()
+    script.main(["--figure", "4", str(dops)])
+    _, _, (fixed,), (own,), windows, _ = drawn["draw_figure_4"]
+    assert fixed.x.tolist() == own.x.tolist() == list(range(2, 16))
+    assert (fixed.label, own.label) == ("window 200 ms", "windows 60 to 94 ms")
+    assert windows.y[[0, -1]] == pytest.approx(np.exp([-0.094 / 33, -0.06 / 33]))
+
+
+@pytest.mark.parametrize(
+    ("name", "shots", "figure", "message"),
+    [
+        ("compact_225", 2, "5", "figure 5 needs shots that all make every cycle"),
+        ("scan_dop", 4, "5", "figure 5 needs a run without a scan"),
+        ("compact_225", 1, "4", "figure 4 needs a scan of planner.degree_of_parallelism"),
+        ("scan_dop", 4, "4", "with one cycle"),
+    ],
+)
+def test_other_runs_are_refused(tmp_path: Path, name: str, shots: int, figure: str, message: str) -> None:
+    script = load_script("make_paper_figures")
+    with pytest.raises(SystemExit, match=message):
+        script.main(["--figure", figure, str(take(tmp_path, name, shots))])

@@ -112,7 +112,7 @@ DRAWS = """
 import sys
 from pathlib import Path
 import numpy as np
-from labseq.drawing import PlanDrawing, save_plan
+from labseq.pictures.plans import PlanDrawing, save_plan
 from labseq.model import Plan, PlanReport, SiteGrid, TargetPattern
 assert "matplotlib" not in sys.modules
 full = np.ones((2, 2), np.bool_)

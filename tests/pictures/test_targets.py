@@ -75,5 +75,5 @@ def test_a_picture_that_cannot_be_written_is_an_error_with_its_place(tmp_path: P
 
 
 def test_matplotlib_is_imported_only_to_draw() -> None:
-    code = "import sys, labseq.drawing; sys.exit('matplotlib' in sys.modules)"
+    code = "import sys, labseq.pictures.plans; sys.exit('matplotlib' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -25,7 +25,7 @@ from labseq.model import (
 )
 from labseq.recording import Run, RunWriter, open_run
 
-ROOT = Path(__file__).parents[3]
+ROOT = Path(__file__).parents[2]
 SHAPE = (4, 5)
 START = "2026-11-20T10:00:00+00:00"
 

@@ -10,7 +10,7 @@ from itertools import pairwise
 import pytest
 from hypothesis import given, strategies as st
 
-from labseq.analysis.overview import spread
+from labseq.analysis.overview import evenly
 from labseq.analysis.timing import quantiles, timing_of, writing_s
 from labseq.model import ShotRecord
 from labseq.recording import Run, open_run
@@ -74,7 +74,7 @@ def test_quantiles_lie_within_the_values(values: list[float]) -> None:
 
 @given(st.integers(0, 50), st.integers(1, 20))
 def test_chosen_shots_are_spread_over_the_run(n: int, most: int) -> None:
-    chosen = spread(range(n), most)
+    chosen = evenly(range(n), most)
     assert len(chosen) == min(n, most)
     steps = [b - a for a, b in pairwise(chosen)]
     assert not steps or max(steps) - min(steps) <= 1

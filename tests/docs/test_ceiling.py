@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
-from labseq.analysis.paper import AtomLosses, max_defect_free
+from .scripts import load_script
+
+script = load_script("make_paper_figures")
+AtomLosses, max_defect_free = script.AtomLosses, script.max_defect_free
 
 PAPER = AtomLosses(lifetime_s=33.0, imaging_loss=0.00314, imaging_loss_exposure_s=0.045)
 TOLD: dict[str, Any] = {"lifetime": 33.0, "imaging_loss": 0.00314, "imaging_loss_exposure": 0.045}
 
 
 def perfect_rearrangement(
-    n_shots: int, n_atoms: int, period_s: float, losses: AtomLosses, seed: int
+    n_shots: int, n_atoms: int, period_s: float, losses: Any, seed: int
 ) -> float:  # fmt: skip
     """Share of the shots seen defect-free in the end, if every move succeeds: atom by atom."""
     rng = np.random.default_rng(seed)
@@ -36,7 +38,7 @@ def perfect_rearrangement(
 @pytest.mark.parametrize("missed", [None, 5e-4])
 @pytest.mark.parametrize("period_s", [0.05, 0.2])
 def test_perfect_rearrangement_reaches_it(period_s: float, missed: float | None) -> None:
-    losses = replace(PAPER, false_negative=missed)
+    losses = PAPER._replace(false_negative=missed)
     n_shots = 6_000
     reached = perfect_rearrangement(n_shots, 225, period_s, losses, seed=3)
     most = max_defect_free(225, period_s, 0.045, losses)
@@ -49,7 +51,7 @@ def test_the_papers_constants_give_the_papers_ceiling() -> None:
 
 @given(st.integers(1, 1000), st.floats(0.01, 1.0), st.floats(0.01, 0.2), st.floats(0.0, 1e-3))
 def test_it_falls_with_atoms_time_light_and_missed_atoms(n: int, t: float, s: float, missed: float) -> None:
-    losses = replace(PAPER, false_negative=missed)
+    losses = PAPER._replace(false_negative=missed)
     most = max_defect_free(n, t, s, losses)
     assert 0.0 < most < 1.0
     assert max_defect_free(n + 1, t, s, losses) < most
@@ -60,8 +62,8 @@ def test_it_falls_with_atoms_time_light_and_missed_atoms(n: int, t: float, s: fl
 
 def test_the_losses_are_those_that_the_simulation_tells() -> None:
     assert AtomLosses.of({"simulation": TOLD}) == PAPER
-    assert AtomLosses.of({"simulation": {**TOLD, "false_negative": 6e-5}}) == replace(
-        PAPER, false_negative=6e-5
+    assert AtomLosses.of({"simulation": {**TOLD, "false_negative": 6e-5}}) == PAPER._replace(
+        false_negative=6e-5
     )
 
 

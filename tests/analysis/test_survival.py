@@ -7,8 +7,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from labseq.analysis.overview import Survival, expected, steps_that_load
 from labseq.analysis.statistics import Rate
+from labseq.analysis.survival import Survival, expected, steps_that_load
 from labseq.errors import RecordingError
 from labseq.model import CycleRecord, Plan, PlanReport, ShotRecord
 from labseq.recording import Run
@@ -24,7 +24,7 @@ def cycle(plan: Plan, n_played: int) -> CycleRecord:
 
 
 def counted(run: Run) -> Survival:
-    found = Survival.of_nothing(run.target.shape)
+    found = Survival.empty(run.target.shape)
     for one in run.shots:
         found.add(one, steps_that_load(run))
     return found
@@ -69,5 +69,5 @@ def test_atoms_are_not_followed_through_a_load(
 def test_a_file_that_is_not_what_the_index_tells_of_is_damaged(write: Write, shot: Shot) -> None:
     run = write([shot(0), shot(1, n_cycles=2)])
     run.shots[0].file.write_bytes(run.shots[1].file.read_bytes())
-    with pytest.raises(RecordingError, match="has other images than the index tells of"):
+    with pytest.raises(RecordingError, match="has other images than the index says"):
         counted(run)

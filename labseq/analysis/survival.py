@@ -1,0 +1,137 @@
+"""Survival of atoms between an image and the next one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq.analysis.statistics import Rate
+from labseq.errors import RecordingError
+from labseq.model import CycleRecord, Occupancy
+from labseq.pictures.plans import on_grid
+from labseq.recording import Run, Shot
+
+Counts = NDArray[np.int64]
+
+
+@dataclass(slots=True, eq=False)
+class SurvivalCounts:
+    """Number of atoms expected and seen on each site.
+
+    Attributes:
+        n_expected: int64 (n_rows, n_cols).
+        n_seen: int64 (n_rows, n_cols), those of them on the next image.
+    """
+
+    n_expected: Counts
+    n_seen: Counts
+
+    @property
+    def rate(self) -> Rate:
+        """The survival over all sites."""
+        return Rate(int(self.n_seen.sum()), int(self.n_expected.sum()))
+
+    @property
+    def fractions(self) -> NDArray[np.float64]:
+        """The survival on each site, float64 (n_rows, n_cols); NaN where no atom was expected."""
+        with np.errstate(invalid="ignore"):
+            return np.where(self.n_expected > 0, self.n_seen / np.maximum(self.n_expected, 1), np.nan)
+
+    def add(self, expected: Occupancy, seen: Occupancy) -> None:
+        """Count the atoms of one shot."""
+        self.n_expected += expected
+        self.n_seen += expected & seen
+
+
+@dataclass(slots=True, eq=False)
+class Survival:
+    """Survival of atoms between an image and the next one.
+
+    As detected: an atom that is missed counts as lost, and another atom on its site counts as
+    the atom.
+
+    Attributes:
+        moved: Atoms that were moved, by the site that they were moved to.
+        kept: Atoms that stayed on their site.
+        by_cycle: Moved and kept for each cycle, counted from 1 over all rearrangements of the shot.
+        n_read: Number of shots.
+    """
+
+    moved: SurvivalCounts
+    kept: SurvivalCounts
+    by_cycle: list[tuple[SurvivalCounts, SurvivalCounts]] = field(
+        default_factory=list[tuple[SurvivalCounts, SurvivalCounts]]
+    )
+    n_read: int = 0
+
+    @classmethod
+    def empty(cls, shape: tuple[int, int]) -> Survival:
+        """Without any shot, on a grid of this shape."""
+        return cls(_nothing(shape), _nothing(shape))
+
+    def add(self, shot: Shot, loads: frozenset[int]) -> None:
+        """Count the atoms of a shot.
+
+        Args:
+            shot: Its file is read.
+            loads: Indices of the steps that load atoms; survival is not counted across them.
+
+        Raises:
+            RecordingError: The file cannot be read.
+        """
+        occupancies, cycles, images = shot.occupancies, iter(shot.cycles), shot.summary.images
+        loaded_s = [timing.t_start_s for timing in shot.timing if timing.step in loads]
+        if len(images) != len(occupancies):
+            raise RecordingError(shot.file, "has other images than the index says; restore it from a backup")
+        number = 0
+        for i, is_cycle in enumerate(images.cycle):
+            made = next(cycles, None) if is_cycle else None
+            number += made is not None
+            start_s, end_s = images.t_start_s[i - 1] if i else -1.0, images.t_start_s[i]
+            if not i or any(start_s <= t_s < end_s for t_s in loaded_s):
+                continue
+            moved, kept = expected(occupancies[i - 1], made)
+            self._count(moved, kept, occupancies[i], number if made is not None else 0)
+        self.n_read += 1
+
+    def _count(self, moved: Occupancy, kept: Occupancy, seen: Occupancy, cycle: int) -> None:
+        self.moved.add(moved, seen)
+        self.kept.add(kept, seen)
+        if cycle:
+            while len(self.by_cycle) < cycle:
+                self.by_cycle.append((_nothing(seen.shape), _nothing(seen.shape)))
+            self.by_cycle[cycle - 1][0].add(moved, seen)
+            self.by_cycle[cycle - 1][1].add(kept, seen)
+
+
+def steps_that_load(run: Run) -> frozenset[int]:
+    """Indices of the steps of a run's shots that load atoms."""
+    resolved: Mapping[str, Any] = run.record.get("resolved") or {}
+    steps: Sequence[Mapping[str, Any]] = resolved.get("shot", ())
+    return frozenset(i for i, step in enumerate(steps) if "load" in step)
+
+
+def expected(before: Occupancy, cycle: CycleRecord | None) -> tuple[Occupancy, Occupancy]:
+    """Sites with atoms after a cycle without losses: those that were moved, and those that stayed.
+
+    Args:
+        before: bool (n_rows, n_cols), the image that the cycle was planned on.
+        cycle: The cycle; None if nothing was moved.
+
+    Returns:
+        Two arrays, bool (n_rows, n_cols).
+    """
+    atoms, moved = before.copy(), np.zeros_like(before)
+    for batch in () if cycle is None else cycle.plan.batches[: cycle.n_batches_played]:
+        start, end = batch.from_sites, batch.to_sites[on_grid(batch.to_sites, before.shape)]
+        atoms[tuple(start.T)] = moved[tuple(start.T)] = False
+        atoms[tuple(end.T)] = moved[tuple(end.T)] = True
+    return moved, atoms & ~moved
+
+
+def _nothing(shape: tuple[int, ...]) -> SurvivalCounts:
+    return SurvivalCounts(np.zeros(shape, np.int64), np.zeros(shape, np.int64))

@@ -1,0 +1,163 @@
+"""Panels on matplotlib axes, and pictures of several."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree as ET
+
+import numpy as np
+import pytest
+
+from labseq.analysis.charts import (
+    Panel,
+    draw_curves,
+    draw_defects,
+    draw_loss_causes,
+    draw_map,
+    draw_sites,
+    draw_stages,
+    draw_trend,
+    points_of,
+)
+from labseq.analysis.overview import RunPicture
+from labseq.analysis.statistics import Rate
+from labseq.analysis.timing import StageStatistics
+from labseq.model import SiteGrid
+from labseq.model.estimate import Estimate
+from labseq.pictures.figures import RED, make_figure
+
+NAN = math.nan
+
+
+def points(n: int = 4) -> np.ndarray[Any, np.dtype[np.float64]]:
+    return points_of(range(1, n + 1), [Estimate(value, 0.1) for value in np.linspace(0.2, 0.9, n).tolist()])
+
+
+def stage(name: str, session_s: tuple[float, float], host_s: tuple[float, float], budget_s: float) -> Any:
+    return StageStatistics(name, 1, 1.0, budget_s, session_s, host_s, 0.5, 0)
+
+
+def trend(n: int, *, is_rate: bool = False) -> Panel:
+    shots = np.arange(1.0, n + 1)
+    values = shots % 2 if is_rate else 1 - 0.01 * (shots % 3)
+    running = points(min(n, 5))
+    return partial(
+        draw_trend, title="trend", label="%", shots=shots, values=values, running=running, is_rate=is_rate
+    )
+
+
+def curves(**changes: Any) -> Panel:
+    kept: dict[str, Any] = {
+        "title": "curves",
+        "x_label": "a $x$ (ms)",
+        "y_label": "%",
+        "curves": {"": points()},
+    }
+    return partial(draw_curves, **kept | changes)
+
+
+def map_of(values: Any, x_ticks: str, y_ticks: str) -> Panel:
+    labels = {"title": "map", "x_label": "x", "y_label": "y", "label": "filling (%)"}
+    limits = float(np.nanmin(values)), float(np.nanmax(values))
+    return partial(draw_map, x_ticks=x_ticks, y_ticks=y_ticks, values=values, limits=limits, **labels)
+
+
+def sites(values: Any, grid: SiteGrid) -> Panel:
+    return partial(draw_sites, title="sites", label="%", grid=grid, values=values, outlined=values > 0.9)
+
+
+CLOCKS = {"session_s": "modelled", "host_s": "this computer"}
+PANELS: dict[str, Panel] = {
+    "shots": trend(30),
+    "one shot": trend(1),
+    "many rates": trend(3000, is_rate=True),
+    "two curves": curves(curves={"one": points(), "other": points(3)}),
+    "text below the axis": curves(curves={"": points(3)}, ticks=("psca", "a" * 30, "x"), from_zero=True),
+    "a single count": curves(curves={"": points(1)}, whole=True),
+    "ratios": curves(logarithmic=True),
+    "map with a gap": map_of(np.array([[0.1, NAN], [0.5, 0.9]]), "12", "34"),
+    "map of equal values": map_of(np.full((1, 12), 0.5), "abcdefghijkl", "3"),
+    "defects": partial(
+        draw_defects, title="d", x_label="defects", shares=points(3), expected=np.array([0.5, 0.3])
+    ),
+    "causes": partial(
+        draw_loss_causes,
+        title="c",
+        x_label="atoms",
+        losses={"imaging": Estimate(3.0, 0.1), "$x$": Estimate(1.0, NAN)},
+    ),
+    "one clock": partial(
+        draw_stages, title="s", stages=[stage("plan", (NAN, NAN), (1e-3, 2e-3), NAN)], clocks=CLOCKS
+    ),
+    "no times": partial(
+        draw_stages,
+        title="s",
+        stages=[stage("plan", (NAN, NAN), (NAN, NAN), NAN)],
+        clocks={"session_s": "measured"},
+    ),
+    "sites": sites(np.where(np.eye(4, 5) > 0, NAN, 0.97), SiteGrid(4, 5)),
+    "unknown sites": sites(np.full((2, 2), NAN), SiteGrid(2, 2, lattice="square")),
+}
+
+
+@pytest.mark.parametrize("name", PANELS)
+def test_every_panel_can_be_drawn(name: str) -> None:
+    figure = make_figure(3.0, 3.0)
+    axes = figure.add_subplot()
+    PANELS[name](axes)
+    figure.canvas.draw()
+    assert axes.get_title()
+
+
+def test_points_are_means_with_their_intervals() -> None:
+    found = points_of([1, 2, 3], [Estimate(0.5, 0.1), Estimate(NAN, NAN), Rate(1, 2)])
+    assert found[0].tolist() == [1, 3]
+    assert found[1:, 0] == pytest.approx([0.5, 0.4, 0.6])
+    assert found[1:, 1].tolist() == [0.5, *Rate(1, 2).interval]
+
+
+def test_curves_are_drawn_in_per_cent_with_error_bars() -> None:
+    axes = make_figure(3.0, 3.0).add_subplot()
+    curves()(axes)
+    (line, _, (bars,)), *_ = axes.containers
+    assert line.get_ydata().tolist() == pytest.approx((100 * points()[1]).tolist())
+    assert bars.get_segments()[0][:, 1].tolist() == pytest.approx([10.0, 30.0])
+
+
+def test_a_stage_has_its_median_and_its_budget() -> None:
+    axes = make_figure(3.0, 3.0).add_subplot()
+    draw_stages(
+        axes,
+        title="s",
+        stages=[stage("play", (3e-3, 5e-3), (NAN, NAN), 4e-3)],
+        clocks={"session_s": "measured"},
+    )
+    lines = {line.get_label(): line for line in axes.get_lines()}
+    assert lines["measured"].get_xdata() == [3e-3]
+    assert lines["budget"].get_xdata() == [4e-3]
+    assert lines["budget"].get_color() == RED
+
+
+def test_a_site_of_few_atoms_does_not_take_up_the_range_of_the_colours() -> None:
+    axes = make_figure(3.0, 3.0).add_subplot()
+    values = np.full((20, 20), 0.98)
+    values[::2], values[0, 0] = 1.0, 0.0
+    sites(values, SiteGrid())(axes)
+    cells: Any = axes.collections[0]
+    assert cells.get_clim() == pytest.approx((98.0, 100.0))
+
+
+@pytest.mark.parametrize(("suffix", "start"), [("png", b"\x89PNG"), ("svg", b"<?xml"), ("PDF", b"%PDF")])
+def test_the_same_picture_has_the_same_bytes(tmp_path: Path, suffix: str, start: bytes) -> None:
+    picture = RunPicture("a $ run", "a $note$", ((trend(5), PANELS["sites"]), (trend(5, is_rate=True),)))
+    path = tmp_path / f"run.{suffix}"
+    picture.save(path)
+    first = path.read_bytes()
+    assert first.startswith(start)
+    picture.save(path)
+    assert path.read_bytes() == first
+    if suffix == "svg":
+        assert ET.parse(path).getroot().tag.endswith("svg")
