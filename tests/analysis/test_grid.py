@@ -15,6 +15,7 @@ from labseq.calibration.store import encode_entry
 from labseq.model import CalibrationEntry, SiteGrid
 from labseq.model.calibration import grid_facts
 from labseq.recording import Run, open_run
+from labseq.recording.schema import RUN_FORMAT_VERSION
 
 Floats = NDArray[np.float64]
 
@@ -31,7 +32,7 @@ def run_at(folder: Path, resolved: dict[str, Any], **changes: Any) -> Run:
     """A run of 2 x 3 sites that says no more than it must."""
     record = {
         "format": "labseq-run",
-        "format_version": "1.1",
+        "format_version": RUN_FORMAT_VERSION,
         "name": "x",
         "n_shots": 0,
         "seed": 1,
