@@ -25,7 +25,7 @@ from labseq.queue.queue import Queue
 from labseq.recording import Run, data_root, open_run
 from labseq.roles import RunObserver
 from labseq.session import Options, Session
-from labseq.session.between_shots import ask_to_stop, find_running, is_running, owner_text, running_here
+from labseq.session.stopping import ask_to_stop, find_running, is_running, owner_text, running_here
 
 
 def run_sequence(sequence: Path, options: Options, *, as_json: bool) -> None:

@@ -29,7 +29,7 @@ class RealClock:
 
 
 class VirtualClock:
-    """Time that passes only when somebody waits, and then at no cost."""
+    """Time that passes only in waits, which take no real time."""
 
     virtual = True
 
@@ -52,7 +52,7 @@ class VirtualClock:
 
 
 class PacedClock(VirtualClock):
-    """Virtual time that takes as long as it says: a dry run to be watched."""
+    """Virtual time at the speed of real time: a dry run to watch."""
 
     def sleep(self, duration_s: float) -> None:
         """Wait really, then let the same time pass."""

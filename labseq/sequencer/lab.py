@@ -1,4 +1,4 @@
-"""The devices of a run: opened, checked against interlocks, closed."""
+"""The devices of a run, their safe state and their end."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from labseq.sequencer.lines import blinding_lines
 
 @dataclass(frozen=True, slots=True)
 class Blinding:
-    """When a device's light blinds a camera with EM gain: while one of its values is one of these.
+    """When a device's light would damage a camera with EM gain: while one of its values is one of these.
 
     Attributes:
         value: Name of the value, as ``Device.read`` takes it.
@@ -48,7 +48,7 @@ class Blinding:
 
 
 def check_blinding(lab: Lab, guard: Guard) -> None:
-    """Refuse an exposure with EM gain while light is on that would age or destroy the register.
+    """Refuse an exposure with EM gain while light is on that would age or destroy the EM register.
 
     Raises:
         DeviceError: Such a light is on; nothing was exposed.
@@ -67,12 +67,12 @@ def check_blinding(lab: Lab, guard: Guard) -> None:
 
 
 def _on(lab: Lab, marks: Mapping[str, Blinding], guard: Guard) -> dict[str, Any]:
-    """The marked devices whose light is on, and what they say."""
-    said = {
+    """The marked devices whose light is on, with their values."""
+    values = {
         name: guard.call(name, lab.timeouts.call_s, lab.devices[name].read, mark.value)
         for name, mark in marks.items()
     }
-    return {name: value for name, value in said.items() if value in marks[name].when}
+    return {name: value for name, value in values.items() if value in marks[name].when}
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +92,11 @@ class Timeouts:
 
 @dataclass(frozen=True, slots=True)
 class Lab:
-    """Everything that a shot is made with; ``budgets``: what stages may take that know it not themselves."""
+    """Everything that a shot is made with.
+
+    Attributes:
+        budgets: Budgets of stages that do not have their own: stage -> seconds.
+    """
 
     grid: SiteGrid
     motion: MotionSpec
@@ -140,8 +144,8 @@ class Lab:
 def in_safe_order(devices: Mapping[str, Hardware]) -> Iterator[tuple[str, Hardware]]:
     """Name and device, in the order of the safe state.
 
-    Mobile tweezers ramp down first, then devices, lines and camera, static tweezers last; what
-    is missing is left out.
+    Mobile tweezers ramp down first, then devices, lines and camera, static tweezers last; missing devices are
+    left out.
     """
     ends = ("mobile_tweezers", "camera", "static_tweezers")
     others = tuple(name for name in devices if name not in ends)
@@ -151,13 +155,13 @@ def in_safe_order(devices: Mapping[str, Hardware]) -> Iterator[tuple[str, Hardwa
 
 
 Outcome = dict[str, LabseqError | None]
-"""Device name -> what went wrong, or None; in the order of the calls."""
+"""Device name -> its failure, or None; in the order of the calls."""
 
 
 def make_safe(lab: Lab, guard: Guard) -> Outcome:
     """Bring every device to its safe state; one that fails never stops the others.
 
-    Each device has a timeout of its own.
+    Each device has its own timeout.
     """
     return _each(lab.safe_order(), guard, "safe_state", lab.timeouts.safe_state_s)
 
@@ -184,7 +188,7 @@ def _each(
 
 
 def describe(lab: Lab, guard: Guard) -> dict[str, Mapping[str, Any]]:
-    """What each device says of itself: name -> JSON-ready values."""
+    """The description of each device: name -> JSON-ready values."""
     parts: dict[str, Hardware | Simulation] = dict(lab.hardware())
     if lab.simulation is not None:
         parts["simulation"] = lab.simulation

@@ -1,4 +1,4 @@
-"""What digital lines do around a step."""
+"""The program of the digital lines around a step."""
 
 from __future__ import annotations
 
@@ -16,8 +16,9 @@ TIMES_APART_S = 1e-9
 def line_program(specs: Sequence[LineSpec], kind: str, duration_s: float) -> LineProgram:
     """Lay out the edges of all lines around one step.
 
-    The step begins after the longest lead and the program ends after the longest lag, of the lines that
-    the step turns on. What is on between steps but not during this one goes off when the program is fired.
+    The step begins after the longest lead, and the program ends after the longest lag, of the lines that
+    the step turns on. Lines that are on between steps but not in this one switch off when it is
+    fired.
 
     Args:
         specs: The lines.
@@ -45,7 +46,7 @@ def line_program(specs: Sequence[LineSpec], kind: str, duration_s: float) -> Lin
 
 
 def idle_program(specs: Sequence[LineSpec]) -> LineProgram:
-    """What the lines do between steps: one state, at once."""
+    """The state of the lines between steps."""
     return line_program(specs, IDLE, 0.0)
 
 
@@ -58,7 +59,7 @@ def off_program(specs: Sequence[LineSpec]) -> LineProgram:
 def spans_on(
     specs: Sequence[LineSpec], bars: Iterable[TimelineEntry]
 ) -> dict[str, list[tuple[float, float]]]:
-    """When each line is on in a shot that takes as long as it may, for a picture of it.
+    """When each line is on in the longest possible shot, for a picture of it.
 
     Args:
         specs: The lines.
@@ -92,7 +93,7 @@ def blinding_lines(specs: Iterable[LineSpec], kind: str) -> list[str]:
 
 
 def _join(spans: list[tuple[float, float]], more: Iterable[tuple[float, float]]) -> None:
-    """Add spans in time's order; what touches becomes one."""
+    """Add spans in order of time; spans that touch become one."""
     for start_s, end_s in more:
         if spans and start_s - spans[-1][1] < TIMES_APART_S:
             spans[-1] = (spans[-1][0], end_s)
@@ -122,7 +123,7 @@ def _is_on(
 
 
 def _apart(times: Sequence[float]) -> list[float]:
-    """Sorted, without those that are hardly apart; 0 stays 0."""
+    """Sorted, without times that are hardly apart; 0 stays 0."""
     found: list[float] = []
     for t in sorted(times):
         if not found or t - found[-1] > TIMES_APART_S:

@@ -1,4 +1,4 @@
-"""What follows when a step fails, takes too long or goes over a budget."""
+"""What follows when a step fails, takes too long or exceeds a budget."""
 
 from __future__ import annotations
 
@@ -37,19 +37,19 @@ _ENDING: Final = (
     PluginLoadError,
     UnknownPluginError,
 )
-"""Failures after which no policy goes on: the operator asks for the end, somebody should look, or nothing
-would be different the next time."""
+"""Failures that end the run whatever the policy: the operator asks for it, a person must look at the
+machine, or a repetition would fail again."""
 
 
 @dataclass(frozen=True, slots=True)
 class StepPolicy:
-    """What holds for a step.
+    """The policy of a step.
 
     Attributes:
-        timeout_s: How long it may take, on the session's clock; a try that takes longer has failed.
-        retries: How often it is tried again before it counts as failed.
+        timeout_s: How long an attempt may take, on the session's clock; one that takes longer has failed.
+        retries: How often it is retried before it counts as failed.
         on_failure: What follows then; None: a transient failure repeats the shot, others stop the run.
-        over_budget: What follows a stage of it that goes over its budget.
+        over_budget: What follows a stage of it that exceeds its budget.
     """
 
     timeout_s: float = math.inf
@@ -60,13 +60,13 @@ class StepPolicy:
 
 @dataclass(frozen=True, slots=True)
 class RunPolicy:
-    """What holds for a run.
+    """The policies of a run.
 
     Attributes:
-        attempts: How often a shot is tried.
+        attempts: Maximum number of attempts at a shot.
         when_exhausted: What follows when it has failed that often.
-        otherwise: What holds between the steps, and for the steps that are not in ``steps``.
-        steps: What holds for each step, in their order.
+        otherwise: The policy between the steps, and for the steps that are not in ``steps``.
+        steps: The policy of each step, in order.
     """
 
     attempts: int = 3
@@ -75,7 +75,7 @@ class RunPolicy:
     steps: Sequence[StepPolicy] = ()
 
     def of_step(self, number: int | None) -> StepPolicy:
-        """What holds for a step; None: outside of all steps."""
+        """The policy of a step; None: outside of all steps."""
         if number is None or number >= len(self.steps):
             return self.otherwise
         return self.steps[number]
@@ -84,8 +84,8 @@ class RunPolicy:
         """What follows a failure.
 
         Args:
-            error: What went wrong.
-            step: Index of the step in which it did; None outside of all steps.
+            error: The failure.
+            step: Index of the step that failed; None outside of all steps.
             attempt: Which attempt at the shot it was, from 0.
         """
         if isinstance(error, _ENDING):
@@ -97,7 +97,7 @@ class RunPolicy:
 
 
 def may_be_retried(error: LabseqError) -> bool:
-    """Whether a step that failed so may go better the next time, in the same shot."""
+    """Whether a step that failed like this may succeed if it is retried in the same shot."""
     if isinstance(error, (*_ENDING, OverBudgetError)):
         return False
     return isinstance(error, DeviceError | TransientError)

@@ -19,13 +19,13 @@ from labseq.model import ShotRecord, TimelineEntry
 from labseq.model.records import ShotStatus
 from labseq.roles import RunObserver, Step, StepContext, offers
 from labseq.sequencer.lab import Lab, Outcome, close_all, make_safe
-from labseq.sequencer.leading import Emit, LeaderHandshakes
+from labseq.sequencer.leader import Emit, LeaderAnswers
 from labseq.sequencer.policies import RunPolicy, StepPolicy, Then, may_be_retried
 from labseq.sequencer.shot import RunningShot, Stages
 
 
 class State(Enum):
-    """Where a run stands."""
+    """The state of a run."""
 
     CLOSED = "closed"
     OPENING = "opening"
@@ -34,9 +34,9 @@ class State(Enum):
     SHOT = "shot"
     WRITING = "writing"
     RECOVERING = "recovering"
-    """After a failure that does not end the run: what may be busy is silenced."""
+    """After a failure that does not end the run: devices that may be busy are made safe."""
     REOPENING = "reopening"
-    """Between shots: devices whose settings change are closed through their safe state and opened anew."""
+    """Between shots: devices whose settings change are closed through their safe state and opened again."""
     MAKING_SAFE = "making safe"
     SAFE = "safe"
     CLOSING = "closing"
@@ -58,7 +58,7 @@ TRANSITIONS: Final = MappingProxyType(
 )
 """The state table: state -> states that may follow.
 
-Every state in which a device may be on leads to MAKING_SAFE; an ending that was itself cut short begins anew.
+Every state in which a device may be on leads to MAKING_SAFE; an ending that was interrupted begins again.
 """
 
 
@@ -90,7 +90,7 @@ def open_devices(lab: Lab, guard: Guard, stop: StopFlag, emit: Emit, names: Coll
     for name, part in (*simulation, *lab.hardware()):
         if name in names:
             stop.check()
-            # Nothing is made safe beside an open() that is only slow: what that does last would undo it.
+            # A slow open() must end first: its last actions would undo the safe state.
             guard.call_to_the_end(name, timeout_s, part.open)
     if "static_tweezers" in names:
         guard.call("static_tweezers", timeout_s, lab.static_tweezers.load, None)
@@ -178,7 +178,7 @@ class Sequencer:
         steps: The steps of a shot, with their names.
         stop: The request to stop.
         sink: Where shots are written.
-        observer: Told everything that happens.
+        observer: Receives every event.
         seed: The run's seed.
         policy: What follows failures and exceeded budgets.
         parameters: What differs from the files, kept with each shot: address -> value.
@@ -214,7 +214,7 @@ class Sequencer:
 
     @property
     def state(self) -> State:
-        """Where the run stands."""
+        """The state of the run."""
         return self._states.state
 
     def open(self) -> None:
@@ -230,14 +230,14 @@ class Sequencer:
         parameters: Mapping[str, Any],
         reopened: Collection[str] = (),
     ) -> None:
-        """Go on with other settings, between two shots.
+        """Continue with other settings, between two shots.
 
         Args:
-            lab: What the next shots are made with; of the devices that are not reopened, the same.
+            lab: The lab of the next shots; devices that are not reopened are the same objects.
             steps: Their steps, with their names.
             parameters: What differs from the files in them: address -> value.
-            reopened: Devices, "simulation" among them, that ``lab`` has anew: the present ones are
-                made safe and closed, then those opened.
+            reopened: Devices, or "simulation", that are new in ``lab``: the present ones are made safe
+                and closed, then the new ones opened.
 
         Raises:
             LabseqError: A device fails; the caller must call :meth:`shut_down`.
@@ -265,22 +265,22 @@ class Sequencer:
         """Take the shots, and repeat those that fail, as the policy says.
 
         Returns:
-            Shots that were given up, and why; the points of the scan that they are at shall be skipped.
+            Shots that failed for good, and why; the points of the scan that they belong to are to be skipped.
 
         Raises:
             LabseqError: Whatever ended the run before its last shot. The caller
                 must call :meth:`shut_down` on this way out too.
         """
-        given_up = dict[int, str]()
+        failed = dict[int, str]()
         for index in shot_indices:
             for attempt in itertools.count():
                 self._stop.check()
                 then, why = self._take(index, attempt)
                 if then == "skip_point":
-                    given_up[index] = why
+                    failed[index] = why
                 if then != "repeat_shot":
                     break
-        return given_up
+        return failed
 
     def shut_down(self) -> Mapping[str, LabseqError]:
         """Safe state of every device, then close; from any state, any number of times.
@@ -304,11 +304,11 @@ class Sequencer:
         with self._stop.held():
             outcome = make_safe(self.lab, self.guard)
         self._unsafe = {name: error for name, error in outcome.items() if error is not None}
-        self._report("safe_state", outcome)  # only now: neither a screen nor a disk shall delay the devices
+        self._report("safe_state", outcome)  # only now: neither a screen nor a disk may delay the devices
         self._states.to(State.SAFE)
 
     def _take(self, index: int, attempt: int) -> tuple[Then | None, str]:
-        """Take one attempt at a shot and write it; what follows, if it failed, and why it did."""
+        """Take one attempt at a shot and write it; returns what follows and why, if it failed."""
         self._states.to(State.SHOT)
         record = ShotRecord(index, attempt, self._seed, _utc_now(), parameters=self._parameters)
         record.calibrations = {kind: entry.id for kind, entry in self.lab.calibrations.items()}
@@ -336,14 +336,14 @@ class Sequencer:
         host_s = time.perf_counter() - start_s
         self._emit("shot_repeated" if then == "repeat_shot" else "shot_finished", {"shot": record})
         self._states.to(State.IDLE)
-        self._mind_writing(shot.stages, host_s)
+        self._check_writing_time(shot.stages, host_s)
         return then, record.error
 
-    def _mind_writing(self, stages: Stages, host_s: float) -> None:
-        """Tell how long writing took; a model knows of no disk, so in a simulated run it takes no time.
+    def _check_writing_time(self, stages: Stages, host_s: float) -> None:
+        """Record how long writing took; a simulated run has no disk, so there it takes no time.
 
         Raises:
-            OverBudgetError: It took longer than its budget, and the run's policy wants to stop then.
+            OverBudgetError: It took longer than its budget, and the run's policy is to stop.
         """
         then = self._policy.otherwise.over_budget
         stages.policy = StepPolicy(over_budget=then if then in ("record", "stop") else "warn")
@@ -368,7 +368,7 @@ class Sequencer:
         shot.record_truth()
 
     def _run_step(self, shot: RunningShot, number: int, name: str, step: Step) -> None:
-        """Run a step, and again if it fails and its policy lets it be tried again."""
+        """Run a step, and retry it if it fails and its policy allows that."""
         policy, images = self._policy.of_step(number), shot.record.images
         n_before = len(images)
         for left in range(policy.retries, -1, -1):
@@ -380,7 +380,7 @@ class Sequencer:
             except LabseqError as error:
                 if not (left and may_be_retried(error)):
                     raise
-                del images[n_before:]  # the n-th image shall be the same one in every shot
+                del images[n_before:]  # image n must be the same one in every shot
                 self._recover()
                 self._states.to(State.SHOT)
                 self._emit("step_repeated", {"shot": shot.index, "step": number, "error": str(error)})
@@ -388,7 +388,7 @@ class Sequencer:
                 return
 
     def _recover(self) -> None:
-        """Silence what may still be busy."""
+        """Make the devices safe that may still be busy."""
         self._states.to(State.RECOVERING)
         lab, timeout_s = self.lab, self.lab.timeouts.safe_state_s
         busy = [("mobile_tweezers", lab.mobile_tweezers), ("camera", lab.camera)]
@@ -397,9 +397,9 @@ class Sequencer:
                 self.guard.call_to_the_end(name, timeout_s, device.safe_state)
 
     def _abort(self, record: ShotRecord, status: ShotStatus, error: BaseException) -> None:
-        """Safety first; only then is who leads told, and what the shot has written down."""
+        """Make the devices safe; only then answer the other control system and write the shot."""
         self._secure()
-        with self._stop.held():  # a driver that waits for its device's word shall be able to tell
+        with self._stop.held():  # a driver may have to wait for its device in order to answer
             self._leaders(record).failed(error)
         self._close_record(record, status, error)
         try:
@@ -408,8 +408,8 @@ class Sequencer:
             self._emit("warning", {"text": f"the interrupted shot could not be written: {failure}"})
         self._emit("shot_finished", {"shot": record})
 
-    def _leaders(self, record: ShotRecord) -> LeaderHandshakes:
-        return LeaderHandshakes(self.lab, self.guard, record, self._emit)
+    def _leaders(self, record: ShotRecord) -> LeaderAnswers:
+        return LeaderAnswers(self.lab, self.guard, record, self._emit)
 
     def _close_record(self, record: ShotRecord, status: ShotStatus, error: BaseException | None) -> None:
         record.status = status

@@ -16,24 +16,24 @@ from labseq.model import CycleRecord, Frame, ImageRecord, Occupancy, ShotRecord,
 from labseq.model.records import OVERSHOOT_S
 from labseq.roles import Device, offers
 from labseq.sequencer.lab import Lab, check_blinding
-from labseq.sequencer.leading import Emit, LeaderHandshakes
+from labseq.sequencer.leader import Emit, LeaderAnswers
 from labseq.sequencer.lines import line_program, margin_s, trigger_line
 from labseq.sequencer.policies import StepPolicy
 from labseq.units import format_quantity
 
 
 class Stages:
-    """Times the stages of one attempt at a shot, and holds its steps to their policies.
+    """Times the stages of one attempt at a shot, and enforces the policies of its steps.
 
     Args:
-        lab: The clock, and budgets of stages that do not know their own.
+        lab: The clock, and budgets of stages that do not have their own.
         record: Where the timings go.
-        emit: Told every event: name and values.
+        emit: Receives every event: name and values.
 
     Attributes:
         start_s: Start of the shot, on the session's clock.
         step: Index of the running step.
-        policy: What holds for it.
+        policy: Its policy.
     """
 
     def __init__(self, lab: Lab, record: ShotRecord, emit: Callable[[str, Mapping[str, Any]], None]) -> None:
@@ -46,24 +46,24 @@ class Stages:
         self._emit = emit
         self._name = ""
         self._is_warned = False
-        self._try_start_s = self.start_s
+        self._attempt_start_s = self.start_s
 
     def begin_step(self, number: int, name: str, policy: StepPolicy) -> None:
-        """What follows belongs to this step."""
+        """Begin a step: the stages that follow belong to it."""
         self.step, self._name, self.policy, self._is_warned = number, name, policy, False
 
     def begin_attempt(self) -> None:
-        """A try at the step begins: its timeout counts from here."""
-        self._try_start_s = self._clock.now()
+        """Start an attempt at the step: its timeout counts from here."""
+        self._attempt_start_s = self._clock.now()
 
     def check_timeout(self) -> None:
-        """See whether the step still has time.
+        """Check the timeout of the step.
 
         Raises:
-            StepTimeoutError: It has not.
+            StepTimeoutError: It has passed.
         """
         limit_s = self.policy.timeout_s
-        if self._clock.now() - self._try_start_s > limit_s + OVERSHOOT_S:
+        if self._clock.now() - self._attempt_start_s > limit_s + OVERSHOOT_S:
             text = f"step {self.step} ({self._name}) is not done after its timeout of "
             raise StepTimeoutError(text + format_quantity(limit_s, "time"), limit_s)
 
@@ -72,7 +72,7 @@ class Stages:
         """Time a stage against its budget; it is recorded however it ends.
 
         Raises:
-            OverBudgetError: It took longer, and the policy of the step does not let that pass.
+            OverBudgetError: It took longer, and the policy of the step does not allow that.
         """
         start_s, host_start_s = self._clock.now(), time.perf_counter()
         try:
@@ -81,16 +81,16 @@ class Stages:
             host_s = time.perf_counter() - host_start_s
             duration_s = self._clock.now() - start_s
             timing = self._keep(name, start_s, duration_s, host_s, budget_s, cycle)
-        self._mind(timing)
+        self._check_budget(timing)
 
     def done(self, name: str, duration_s: float, host_s: float, budget_s: float, cycle: int) -> None:
-        """Keep the time of a stage that has just ended.
+        """Record a stage that has just ended.
 
         Raises:
-            OverBudgetError: It took longer, and the policy of the step does not let that pass.
+            OverBudgetError: It took longer, and the policy of the step does not allow that.
         """
         start_s = self._clock.now() - duration_s
-        self._mind(self._keep(name, start_s, duration_s, host_s, budget_s, cycle))
+        self._check_budget(self._keep(name, start_s, duration_s, host_s, budget_s, cycle))
 
     def _keep(
         self, name: str, start_s: float, duration_s: float, host_s: float, budget_s: float, cycle: int
@@ -102,8 +102,8 @@ class Stages:
         self._emit("stage", {"timing": timing})
         return timing
 
-    def _mind(self, timing: StageTiming) -> None:
-        """Do what the step's policy says of a stage over its budget."""
+    def _check_budget(self, timing: StageTiming) -> None:
+        """Apply the step's policy to a stage over its budget."""
         then = self.policy.over_budget
         if then == "record" or not timing.over_budget or self._is_warned:
             return
@@ -111,7 +111,9 @@ class Stages:
         text = f"'{timing.stage}' took {took}; its budget is {budget}"
         if then != "warn":
             raise OverBudgetError(text, then)
-        self._is_warned = True  # the stages around it, the step among them, are over theirs by it as well
+        self._is_warned = (
+            True  # the stages around it, and the step, are over their budgets for the same reason
+        )
         self._emit("warning", {"text": f"shot {self._record.shot_index + 1}: {text}"})
 
 
@@ -125,8 +127,8 @@ class RunningShot:
     Args:
         lab: The devices.
         guard: Runs every call into them.
-        record: Filled while the shot runs, so that what it has is never lost.
-        emit: Told every event: name and values.
+        record: Filled while the shot runs, so that nothing is lost if it fails.
+        emit: Receives every event: name and values.
     """
 
     def __init__(self, lab: Lab, guard: Guard, record: ShotRecord, emit: Emit) -> None:
@@ -152,7 +154,7 @@ class RunningShot:
         self.in_step = False
         self.stages = Stages(lab, record, emit)
         self.start_s = self.stages.start_s
-        self.leaders = LeaderHandshakes(lab, guard, record, emit)
+        self.leaders = LeaderAnswers(lab, guard, record, emit)
         self._guard = guard
         self._emit = emit
 
@@ -168,10 +170,10 @@ class RunningShot:
 
     @contextmanager
     def of_step(self, number: int, name: str, policy: StepPolicy, budget_s: float) -> Generator[None]:
-        """Around a step: the stages, images and failures within belong to it.
+        """Context manager around a step: the stages, images and failures within belong to it.
 
         Raises:
-            OverBudgetError: It took longer than its budget, and its policy does not let that pass.
+            OverBudgetError: It took longer than its budget, and its policy does not allow that.
         """
         self.in_step = True
         self.stages.begin_step(number, name, policy)
@@ -199,14 +201,14 @@ class RunningShot:
         return self._guard.call(owner, timeout_s, function, *args, **kwargs)
 
     def poll(self) -> None:
-        """Keep with the shot what devices are read for at its start."""
+        """Record the values that are read from devices at the start of a shot."""
         for name, device in self.lab.hardware():
             if offers(device, "poll"):
                 values = self.call(name, self.call_timeout_s, device.poll)
                 self.record.readings.update({f"{name}.{value}": read for value, read in values.items()})
 
     def check_interlocks(self) -> None:
-        """Ask every device that watches something; see ``labseq.roles.Shot``."""
+        """Check the interlocks of every device; see ``labseq.plugin.Shot``."""
         for name, device in self.lab.hardware():
             if offers(device, "check_interlocks"):
                 try:
@@ -216,7 +218,7 @@ class RunningShot:
                     raise InterlockError(error.device, text) from error
 
     def follow(self, signal: str, timeout_s: float, device: str = "") -> None:
-        """Wait until another control system says to go on; see ``labseq.roles.Shot``."""
+        """Wait for the start signal of another control system; see ``labseq.plugin.Shot``."""
         self.leaders.follow(signal, timeout_s, device)
 
     def margin_s(self, kind: str) -> float:
@@ -234,7 +236,7 @@ class RunningShot:
         self.call("lines", timeout_s, lines.compile, program)
         self.call("lines", timeout_s, lines.arm)
         self.call("lines", timeout_s, lines.fire)
-        fired_s = self.clock.now()  # now: on its way the command took a moment
+        fired_s = self.clock.now()  # after the call, which takes a moment
         self.clock.sleep(max(0.0, program.begin_s - (self.clock.now() - fired_s)))
         yield
         left_s = max(0.0, program.duration_s - (self.clock.now() - fired_s)) + timeout_s
@@ -247,15 +249,15 @@ class RunningShot:
     def stage_done(
         self, name: str, duration_s: float, host_s: float, budget_s: float = math.nan, cycle: int = 0
     ) -> None:
-        """Keep the time of a stage that has just ended; see ``labseq.roles.Shot``."""
+        """Record a stage that has just ended; see ``labseq.plugin.Shot``."""
         self.stages.done(name, duration_s, host_s, budget_s, cycle)
 
     def take_image(self, exposure_s: float, cycle: int = 0) -> Occupancy:
         """Expose, read, detect and record an image.
 
         Raises:
-            DeviceError: Camera or detector delivered something of the wrong kind, or a light is on that
-                would blind the camera.
+            DeviceError: Camera or detector returned an object of the wrong type, or a light is on that
+                would damage the camera.
         """
         timeout_s, start_s = self.call_timeout_s, self.elapsed_s
         check_blinding(self.lab, self._guard)
@@ -274,7 +276,7 @@ class RunningShot:
         return occupancy
 
     def _expose(self, exposure_s: float, cycle: int) -> object:
-        """Take a frame; what lies behind the end of the exposure is the stage of its read-out."""
+        """Take a frame; the stage "read_out" begins at the end of the exposure."""
         camera, specs, timeout_s = self.lab.camera, self.lab.line_specs, self.call_timeout_s
         limit_s, readout_s = timeout_s + exposure_s, self.lab.step_context.camera.readout_s
         by_line = trigger_line(specs, "camera") is not None
@@ -310,7 +312,7 @@ class RunningShot:
         self._emit("cycle", {"cycle": cycle})
 
     def note(self, name: str, value: float | Sequence[Any]) -> None:
-        """Keep a value with the shot, among its readings."""
+        """Record a value among the shot's readings."""
         self.record.readings[name] = value
 
     def log(self, event: str, **values: Any) -> None:

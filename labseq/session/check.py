@@ -18,7 +18,7 @@ from labseq.model import TimelineEntry
 from labseq.motion import check_plan
 from labseq.roles import Step, offers
 from labseq.sequencer.lab import Lab
-from labseq.sequencer.leading import find_leader
+from labseq.sequencer.leader import find_leader
 from labseq.sequencer.lines import spans_on
 from labseq.sequencer.run import lay_out
 from labseq.session.assembly import Assembly

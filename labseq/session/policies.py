@@ -13,10 +13,11 @@ import numpy as np
 from labseq.config import CheckSettings, Document, SequenceSpec, StepPolicySettings, StepSpec
 from labseq.errors import CheckFailedError, Loc, ProblemCollector
 from labseq.messages import clean, did_you_mean, listing
-from labseq.recording import figures_in
+from labseq.recording import RunWriter, figures_in
 from labseq.recording.columns import FIGURES
 from labseq.roles import Step
 from labseq.sequencer.policies import RunPolicy, StepPolicy
+from labseq.session.stopping import check_stop_file
 
 _JUDGED: Final = frozenset(
     {"success", "filling_fraction", "n_defects", "n_surplus", "seen_defect_free_cycle"}
@@ -218,3 +219,62 @@ def _beyond(check: CheckSettings, values: deque[float]) -> str:
     if check.at_most is not None and mean > check.at_most:
         return f"{check.value} is {mean:.6g}{of}; it should be at most {check.at_most:g}"
     return ""
+
+
+class ShotHooks:
+    """What happens before and after each shot: stop requests, checks of results, skipped shots.
+
+    Args:
+        writer: The run's folder.
+        checks: The checks of the sequence.
+        emit: Receives every event: name and values.
+    """
+
+    def __init__(
+        self, writer: RunWriter, checks: Checks, emit: Callable[[str, Mapping[str, Any]], None]
+    ) -> None:
+        self._writer = writer
+        self._checks = checks
+        self._emit = emit
+
+    @property
+    def left_open(self) -> tuple[int, str]:
+        """The last shot of an interrupted run, and why the others of its point are to be skipped; or "".
+
+        The skip may have been recorded before the interruption, or not.
+        """
+        return self._checks.left_open
+
+    def before(self) -> None:
+        """Check for a stop request before a shot.
+
+        Raises:
+            StopRequested: The run was asked to end.
+        """
+        check_stop_file(self._writer.run_dir)
+
+    def after(self, failed: Sequence[str]) -> str:
+        """Check the results after a shot.
+
+        Args:
+            failed: Why the shot failed for good, if it did.
+
+        Returns:
+            Why the other shots of its point are to be skipped, or "".
+
+        Raises:
+            CheckFailedError: A value is beyond the limits of a check that stops the run.
+        """
+        return failed[0] if failed else self._checks.after(self._writer.last_row)
+
+    def skip(self, shots: Sequence[int], why: str) -> None:
+        """Record that shots will not be taken.
+
+        Raises:
+            RecordingError: The disk is full.
+        """
+        if shots:
+            self._writer.skip(shots, why)
+            which = f"shot {shots[0] + 1} is" if len(shots) == 1 else f"{len(shots)} shots are"
+            self._emit("warning", {"text": f"{which} skipped: {why}"})
+            self._emit("shots_skipped", {"shots": list(shots), "why": why})

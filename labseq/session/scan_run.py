@@ -18,8 +18,8 @@ from labseq.sequencer import Sequencer
 from labseq.sequencer.lab import Lab
 from labseq.session.adaptive import Results, ScannerCall, Search
 from labseq.session.assembly import Assembly
-from labseq.session.between_shots import ShotHooks
 from labseq.session.lab import rebuild_lab
+from labseq.session.policies import ShotHooks
 from labseq.session.scan import Point
 
 

@@ -18,14 +18,13 @@ from labseq.recording import Run, RunWriter, clear_active, data_root, mark_activ
 from labseq.roles import RunObserver, offers
 from labseq.sequencer import Sequencer
 from labseq.sequencer.lab import Lab, describe
-from labseq.sequencer.leading import find_leader, leaders
+from labseq.sequencer.leader import find_leader, leaders
 from labseq.sequencer.run import lay_out
 from labseq.session.assembly import Assembly, assemble
-from labseq.session.between_shots import ShotHooks
 from labseq.session.lab import build_lab, clock_for, warm
 from labseq.session.observers import Observers
 from labseq.session.options import Options, path_of
-from labseq.session.policies import Checks
+from labseq.session.policies import Checks, ShotHooks
 from labseq.session.profile import DryRun
 from labseq.session.provenance import copies, ending, run_record
 from labseq.session.resume import ResumableRun, reopened

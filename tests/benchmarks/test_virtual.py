@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from labseq_virtual.images import Images
 from labseq_virtual.settings import ImageSettings, SimulationSettings
-from labseq_virtual.transport import Transport
 from labseq_virtual.simulation import VirtualSimulation
+from labseq_virtual.transport import Transport
 
 from labseq import Context, DepthRamp, MotionSpec, Plan, RandomStream, SiteGrid, tone_program
 from labseq.detection.threshold import ThresholdDetector, ThresholdSettings

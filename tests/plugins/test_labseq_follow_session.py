@@ -84,7 +84,7 @@ def test_the_leader_of_the_guide_drives_a_run(tmp_path: Path, capsys: pytest.Cap
         for shot in done.shots
     ]
     assert [shot.readings["leader.go"] for shot in done.shots] == [["0"], ["1"], ["2"]]
-    assert [shot.readings["leader.told"] for shot in done.shots] == [["ready"]] * 3
+    assert [shot.readings["leader.answer"] for shot in done.shots] == [["ready"]] * 3
     assert min(shot.filling_fraction for shot in done.shots) > 0.94
     logged = [event["values"].get("text", "") for event in events(done.path)]
     assert "go 2" in logged
@@ -128,7 +128,7 @@ def test_the_shot_goes_on_when_its_leader_leaves(tmp_path: Path) -> None:
         peer.leave()
 
     done = run_led(lead, tmp_path, shots=1)
-    assert done.shots[0].readings["leader.told"] == ["gone"]
+    assert done.shots[0].readings["leader.answer"] == ["gone"]
     assert done.shots[0].filling_fraction > 0.94
 
 
@@ -148,7 +148,7 @@ def test_a_dry_run_needs_no_leader_and_no_time(tmp_path: Path) -> None:
     with Session.open(FOLLOW, dry_run="full", shots=2, seed=1, output=tmp_path) as session:
         done = session.run()
         assert session.assembly.virtual_time
-    assert [shot.readings["leader.told"] for shot in done.shots] == [["ready"], ["ready"]]
+    assert [shot.readings["leader.answer"] for shot in done.shots] == [["ready"], ["ready"]]
     assert all(shot.occupancies[0].mean() > 0.6 for shot in done.shots), "the leader has loaded"
 
 
@@ -158,7 +158,7 @@ def test_a_second_wait_does_not_load_again(tmp_path: Path) -> None:
         FOLLOW, dry_run="full", shots=1, seed=1, output=tmp_path, overrides=[second]
     ) as session:
         done = session.run()
-    assert done.shots[0].readings["leader.told"] == ["ready", "ready"]
+    assert done.shots[0].readings["leader.answer"] == ["ready", "ready"]
     assert done.shots[0].readings["simulation.n_defects_true"] < 10, "the atoms are those that were moved"
 
 

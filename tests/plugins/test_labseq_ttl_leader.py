@@ -387,5 +387,5 @@ def test_a_run_is_led_through_the_box(tmp_path: Path) -> None:
         run = session.run()
     assert run.status == "complete"
     for shot in run.shots:
-        assert list(shot.readings["lines.told"]) == ["ready"]
+        assert list(shot.readings["lines.answer"]) == ["ready"]
         assert shot.filling_fraction > 0.9

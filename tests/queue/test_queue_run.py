@@ -15,7 +15,7 @@ from labseq.files import Process
 from labseq.queue.queue import Opening, Queue, QueueRun
 from labseq.recording import open_run
 from labseq.session import Session
-from labseq.session.between_shots import ask_to_stop
+from labseq.session.stopping import ask_to_stop
 
 from .queued import PROFILE, SEQUENCE, Taking, add, queue, states
 

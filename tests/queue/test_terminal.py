@@ -11,7 +11,7 @@ import pytest
 import labseq
 from labseq.cli import main
 from labseq.errors import StopRequested
-from labseq.session.between_shots import ask_to_stop
+from labseq.session.stopping import ask_to_stop
 from labseq.testing.fakes import RecordingObserver
 
 SEQUENCE = """

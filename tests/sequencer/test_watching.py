@@ -148,7 +148,8 @@ def test_too_few_atoms_are_said() -> None:
     _, observer = run(fake_lab([few], grid=GRID), check_overlay())
     (warning,) = observer.of("warning")
     assert (
-        warning["text"] == "shot 1: check_overlay cannot measure the overlay to 100 nm with 3 atoms in this shot"
+        warning["text"]
+        == "shot 1: check_overlay cannot measure the overlay to 100 nm with 3 atoms in this shot"
     )
 
 

@@ -13,7 +13,7 @@ from labseq.errors import ConfigError, RecordingError, StopRequested
 from labseq.files import write_file
 from labseq.recording import mark_active, marker_roots
 from labseq.recording.run_file import encode_state
-from labseq.session.between_shots import ask_to_stop, find_running, is_running, owner_text
+from labseq.session.stopping import ask_to_stop, find_running, is_running, owner_text
 from labseq.testing.fakes import RecordingObserver
 
 from .small_runs import interrupted, write

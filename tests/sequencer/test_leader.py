@@ -16,7 +16,7 @@ from labseq.errors import (
 )
 from labseq.model import LineSpec, ShotRecord
 from labseq.roles import Context, LeaderLink, StepContext
-from labseq.sequencer.leading import find_leader
+from labseq.sequencer.leader import find_leader
 from labseq.testing import StepContract
 from labseq.testing.contracts.step import Factory
 from labseq.testing.fakes import FakeLab, ListSink, RecordingDevice, RecordingLeader
@@ -99,7 +99,7 @@ def test_the_leader_is_told_what_came_of_each_shot() -> None:
         ("ready", {"shot": 1, "success": False, "filling": 0.5}),
     ]
     assert [shot.readings["leader.go"] for shot in made.sink.shots] == [["1"], ["2"]]
-    assert [shot.readings["leader.told"] for shot in made.sink.shots] == [["ready"], ["ready"]]
+    assert [shot.readings["leader.answer"] for shot in made.sink.shots] == [["ready"], ["ready"]]
 
 
 def test_a_shot_that_nobody_judges_has_no_filling() -> None:
@@ -124,7 +124,7 @@ def test_a_second_wait_in_the_shot_says_first_that_the_first_part_is_ready() -> 
     made.run()
     assert states(made) == ["ready", "ready"]
     assert made.record().readings["leader.go"] == ["1", "2"]
-    assert made.record().readings["leader.told"] == ["ready", "ready"]
+    assert made.record().readings["leader.answer"] == ["ready", "ready"]
     names = made.lab.calls.names("leader", "camera")
     after_the_image = names[names.index("camera.read") + 1 :]
     assert after_the_image[:3] == ["leader.report", "leader.wait_for", "camera.arm"]
@@ -135,7 +135,7 @@ def test_each_attempt_waits_for_atoms_of_its_own() -> None:
     made.run()
     assert states(made) == ["failed", "ready"]
     assert "a frame was lost" in leader_of(made).answers[0][1]["reason"]
-    assert [shot.readings["leader.told"] for shot in made.sink.shots] == [["failed"], ["ready"]]
+    assert [shot.readings["leader.answer"] for shot in made.sink.shots] == [["failed"], ["ready"]]
 
 
 def test_it_is_told_of_a_passing_failure_after_the_devices_are_silent_again() -> None:
@@ -154,7 +154,7 @@ def test_a_failure_is_told_after_all_devices_are_safe_and_before_they_are_closed
     names = made.lab.calls.names()
     told = len(names) - 1 - names[::-1].index("leader.report")
     assert names.index("static_tweezers.safe_state") < told < names.index("leader.close")
-    assert made.record().readings["leader.told"] == ["failed"]
+    assert made.record().readings["leader.answer"] == ["failed"]
 
 
 def test_a_last_attempt_that_fails_is_told_once() -> None:
@@ -245,7 +245,7 @@ def test_one_that_cannot_be_told_is_a_warning_and_hides_nothing() -> None:
     with pytest.raises(DeviceError, match="cable"):
         made.run()
     (warning,) = made.observer.of("warning")
-    assert "could not be told" in warning["text"]
+    assert "could not be reported" in warning["text"]
     assert "unplugged" in warning["text"]
     assert made.sink.shots, "it was written all the same"
 
@@ -254,14 +254,14 @@ def test_what_it_said_and_was_told_is_in_the_log() -> None:
     made = rig()
     leader_of(made).noted = ["127.0.0.1:40001 leads"]
     made.run()
-    assert made.observer.of("leader_news") == [
+    assert made.observer.of("leader_event") == [
         {"shot": 0, "device": "leader", "text": "127.0.0.1:40001 leads"}
     ]
     assert made.observer.of("leader_awaited") == [
         {"shot": 0, "device": "leader", "signal": "go", "timeout_s": 10.0}
     ]
-    assert [said["text"] for said in made.observer.of("leader_said")] == ["go 1"]
-    assert [told["text"] for told in made.observer.of("leader_told")] == ["ready"]
+    assert [said["text"] for said in made.observer.of("leader_signal")] == ["go 1"]
+    assert [told["text"] for told in made.observer.of("leader_answered")] == ["ready"]
 
 
 def test_lines_stay_idle_while_it_waits() -> None:

@@ -1,4 +1,4 @@
-"""Another control system leads: waiting for its signal, and reporting the outcome to it."""
+"""Runs led by another control system: waiting for its start signal, and answering with the outcome."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ Emit = Callable[[str, Mapping[str, Any]], None]
 
 
 def leaders(devices: Mapping[str, object]) -> Iterator[tuple[str, LeaderLink]]:
-    """The devices, or lines, through which other control systems lead, with their names."""
+    """Name and device, of the devices or lines through which another control system can lead."""
     for name, device in devices.items():
         if isinstance(device, LeaderLink):
             yield name, device
 
 
 def find_leader(devices: Mapping[str, object], name: str = "") -> tuple[str, LeaderLink]:
-    """The device whose leader a step waits for.
+    """The device that receives the signal that a step waits for.
 
     Args:
         devices: All hardware of the profile.
-        name: Of the device; "" for the only one that leads.
+        name: Name of the device; "" for the only one that can.
 
     Raises:
-        ConfigError: It cannot lead, or nobody can, or it is not clear who is meant.
+        ConfigError: It cannot receive one, no device can, or several can.
     """
     able = dict(leaders(devices))
     if name in able:
@@ -46,16 +46,17 @@ def find_leader(devices: Mapping[str, object], name: str = "") -> tuple[str, Lea
 
 
 @dataclass(frozen=True, slots=True)
-class LeaderHandshakes:
-    """Those who lead a shot: whoever said `go` is told what came of it.
+class LeaderAnswers:
+    """Waits for the start signals of one attempt at a shot, and answers each of them.
 
-    A device knows itself whether it owes an answer, and gives it once; so all are told at each end of a shot.
+    A device knows whether it owes an answer, and answers each signal once; so all devices are called at
+    the end of a shot.
 
     Attributes:
         lab: The devices.
         guard: Runs every call into them.
-        record: Of the shot.
-        emit: Told every event: name and values.
+        record: Record of the shot.
+        emit: Receives every event: name and values.
     """
 
     lab: Lab
@@ -64,39 +65,39 @@ class LeaderHandshakes:
     emit: Emit
 
     def follow(self, signal: str, timeout_s: float, device: str) -> None:
-        """Wait for a signal; see ``labseq.roles.Shot.follow``."""
+        """Wait for a signal; see ``labseq.plugin.Shot.follow``."""
         name, leader = find_leader(dict(self.lab.hardware()), device)
-        self._report(name, leader, "ready", self.guard.call)  # of an earlier signal in this shot
+        self._answer(name, leader, "ready", self.guard.call)  # to an earlier signal in this shot
         awaited = {"shot": self.record.shot_index, "device": name, "signal": signal, "timeout_s": timeout_s}
         self.emit("leader_awaited", awaited)
         try:
             text = self.guard.call(name, timeout_s + DRIVER_MARGIN_S, leader.wait_for, signal, timeout_s)
         finally:
-            self._log_news(name, leader)
-        self._note(f"{name}.{signal}", text)
-        self._log("leader_said", name, f"{signal} {text}".strip())
+            self._log_events(name, leader)
+        self._record(f"{name}.{signal}", text)
+        self._log("leader_signal", name, f"{signal} {text}".strip())
 
     def ready(self) -> None:
-        """The last step is over.
+        """Answer "ready" after the last step.
 
         Raises:
             DeviceError: A device fails.
-            StopRequested: The run was asked to stop; they are to be told that it failed.
+            StopRequested: The run was asked to stop; the caller must answer "failed".
         """
         for name, leader in leaders(dict(self.lab.hardware())):
-            self._report(name, leader, "ready", self.guard.call)
+            self._answer(name, leader, "ready", self.guard.call)
 
     def failed(self, error: BaseException) -> None:
-        """The shot failed, or was interrupted; no failure to tell it stands in the way of anything."""
+        """Answer "failed" with a reason; a device that cannot is a warning."""
         reason = str(error) or type(error).__name__
         for name, leader in leaders(dict(self.lab.hardware())):
             try:
-                self._report(name, leader, "failed", self.guard.call_to_the_end, reason)
+                self._answer(name, leader, "failed", self.guard.call_to_the_end, reason)
             except LabseqError as failure:
-                text = f"the system that leads through '{name}' could not be told of the failure: {failure}"
+                text = f"the failure could not be reported to the system behind '{name}': {failure}"
                 self.emit("warning", {"text": text})
 
-    def _report(
+    def _answer(
         self,
         name: str,
         leader: LeaderLink,
@@ -109,22 +110,21 @@ class LeaderHandshakes:
             about |= {"success": self.record.success, "filling": self.record.filling_fraction}
         if reason:
             about["reason"] = reason
-        told = call(name, self.lab.timeouts.call_s, leader.report, state, about)
-        if told:
-            self._note(f"{name}.told", told)
-            self._log("leader_told", name, told)
-        self._log_news(name, leader)
+        if answer := call(name, self.lab.timeouts.call_s, leader.report, state, about):
+            self._record(f"{name}.answer", answer)
+            self._log("leader_answered", name, answer)
+        self._log_events(name, leader)
 
-    def _log_news(self, name: str, leader: LeaderLink) -> None:
+    def _log_events(self, name: str, leader: LeaderLink) -> None:
         try:
             new_events = self.guard.call_to_the_end(name, self.lab.timeouts.call_s, leader.new_events)
         except LabseqError as failure:
             new_events = [str(failure)]
         for text in new_events:
-            self._log("leader_news", name, text)
+            self._log("leader_event", name, text)
 
-    def _note(self, name: str, text: str) -> None:
-        """Add to the shot's readings; there may be several waits in a shot."""
+    def _record(self, name: str, text: str) -> None:
+        """Add to a reading of the shot, which is a list because a shot may wait several times."""
         self.record.readings[name] = [*self.record.readings.get(name, ()), text]
 
     def _log(self, event: str, device: str, text: str) -> None:
