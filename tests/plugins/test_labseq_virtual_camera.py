@@ -1,32 +1,43 @@
-"""The virtual camera: its times, its triggers, and failures to rehearse."""
+"""The virtual camera: timing, triggers, simulated failures, sensor modes, cooling."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
-from labseq_virtual.camera import VirtualCamera
-from labseq_virtual.settings import CameraSettings
+from labseq_virtual.camera import COLDEST_K, ROOM_K, Cooler, VirtualCamera
+from labseq_virtual.settings import CameraSettings, SimulationSettings
+from labseq_virtual.simulation import VirtualSimulation
+from numpy.typing import NDArray
 
+import labseq
 from labseq import (
+    ConfigError,
     Context,
+    DepthRamp,
     DeviceError,
     DeviceTimeoutError,
     LimitError,
     RandomStream,
+    SensorMode,
+    SiteGrid,
     TransientError,
 )
 from labseq.roles import offers
 from labseq.testing.fakes import FakeClock, RecordingSimulation
 
 
-class Lab:
-    """A camera before a dark world."""
+class DarkLab:
+    """A camera before a dark simulation."""
 
     def __init__(self, **settings: Any) -> None:
         self.clock = FakeClock()
-        self.world = RecordingSimulation()
-        context = Context("camera", clock=self.clock, random=RandomStream(0, "camera"), simulation=self.world)
+        self.simulation = RecordingSimulation()
+        context = Context(
+            "camera", clock=self.clock, random=RandomStream(0, "camera"), simulation=self.simulation
+        )
         self.camera = VirtualCamera(CameraSettings.model_validate(settings), context)
         self.camera.open()
 
@@ -38,117 +49,55 @@ class Lab:
             self.clock.sleep(exposure_s)
 
     def exposed_s(self) -> list[float]:
-        """Start of each exposure of the world."""
-        return [call.args[0] for call in self.world.calls]
+        """Start of each exposure of the simulation."""
+        return [call.args[0] for call in self.simulation.calls]
 
 
 @pytest.fixture
-def lab() -> Lab:
-    return Lab()
+def dark() -> DarkLab:
+    return DarkLab()
 
 
-def test_a_frame_takes_exposure_and_read_out(lab: Lab) -> None:
-    lab.clock.sleep(1.0)
-    lab.camera.arm(1, 45e-3, "software")
-    lab.camera.trigger()
-    assert lab.clock.now() == 1.0
-    frame = lab.camera.read(1.0)
-    assert lab.clock.now() == pytest.approx(1.05)
+def test_a_frame_takes_exposure_and_read_out(dark: DarkLab) -> None:
+    dark.clock.sleep(1.0)
+    dark.camera.arm(1, 45e-3, "software")
+    dark.camera.trigger()
+    assert dark.clock.now() == 1.0
+    frame = dark.camera.read(1.0)
+    assert dark.clock.now() == pytest.approx(1.05)
     assert (frame.camera, frame.exposure_s, frame.t_start_s, frame.number) == ("camera", 45e-3, 1.0, 0)
 
 
 def test_time_stamps_count_from_when_the_camera_was_opened() -> None:
-    lab = Lab()
-    lab.camera.close()
-    lab.clock.sleep(100.0)
-    lab.camera.open()
-    lab.clock.sleep(0.5)
-    lab.fire(1)
-    assert lab.camera.read(1.0).device_time_s == pytest.approx(0.5)
+    dark = DarkLab()
+    dark.camera.close()
+    dark.clock.sleep(100.0)
+    dark.camera.open()
+    dark.clock.sleep(0.5)
+    dark.fire(1)
+    assert dark.camera.read(1.0).device_time_s == pytest.approx(0.5)
 
 
-def test_frames_come_in_the_order_of_their_triggers(lab: Lab) -> None:
-    lab.fire(2, 10e-3)
-    first, second = lab.camera.read(1.0), lab.camera.read(1.0)
-    assert second.t_start_s - first.t_start_s == pytest.approx(10e-3)
-    assert (first.number, second.number) == (0, 1)
-
-
-def test_with_the_internal_trigger_exposures_follow_one_another_and_begin_when_read(lab: Lab) -> None:
-    lab.clock.sleep(2.0)
-    lab.camera.arm(3, 45e-3, "internal")
-    assert lab.exposed_s() == []
-    lab.clock.sleep(0.06)
-    frames = [lab.camera.read(1.0) for _ in range(3)]
+def test_with_the_internal_trigger_exposures_follow_one_another_and_begin_when_read(dark: DarkLab) -> None:
+    dark.clock.sleep(2.0)
+    dark.camera.arm(3, 45e-3, "internal")
+    assert dark.exposed_s() == []
+    dark.clock.sleep(0.06)
+    frames = [dark.camera.read(1.0) for _ in range(3)]
     assert [frame.t_start_s for frame in frames] == pytest.approx([2.0, 2.05, 2.1])
-    assert lab.exposed_s() == [frame.t_start_s for frame in frames]
-    assert lab.clock.now() == pytest.approx(2.15)
+    assert dark.exposed_s() == [frame.t_start_s for frame in frames]
+    assert dark.clock.now() == pytest.approx(2.15)
     with pytest.raises(DeviceTimeoutError, match="all 3 frames of the series were read"):
-        lab.camera.read(0.1)
+        dark.camera.read(0.1)
 
 
-def test_a_short_wait_does_not_begin_another_exposure(lab: Lab) -> None:
-    lab.camera.arm(2, 45e-3, "internal")
-    for _ in range(3):
-        with pytest.raises(DeviceTimeoutError, match="frame 1 of 2 is not ready"):
-            lab.camera.read(0.01)
-    assert lab.camera.read(0.1).t_start_s == 0.0
-    assert lab.exposed_s() == [0.0]
-
-
-def test_a_camera_that_is_not_armed_does_not_expose(lab: Lab) -> None:
-    with pytest.raises(DeviceError, match=r"not armed.*arm\(\)"):
-        lab.camera.trigger()
-    lab.fire(1)
-    lab.camera.read(1.0)
-    with pytest.raises(DeviceError, match="not armed for another frame"):
-        lab.camera.trigger()
-
-
-def test_a_trigger_during_an_exposure_is_refused(lab: Lab) -> None:
-    lab.camera.arm(2, 10e-3, "software")
-    lab.camera.trigger()
-    with pytest.raises(DeviceError, match="during an exposure"):
-        lab.camera.trigger()
-
-
-def test_reading_without_a_frame_waits_for_the_timeout(lab: Lab) -> None:
-    lab.camera.arm(1, 45e-3, "software")
-    start_s = lab.clock.now()
-    with pytest.raises(DeviceTimeoutError, match="was not triggered") as caught:
-        lab.camera.read(0.3)
-    assert caught.value.timeout_s == 0.3
-    assert lab.clock.now() - start_s == pytest.approx(0.3)
-    lab.camera.trigger()
-    with pytest.raises(DeviceTimeoutError, match="is not ready"):
-        lab.camera.read(0.01)
-    lab.camera.read(0.1)
-
-
-@pytest.mark.parametrize("exposure_s", [0.0, -1.0, 11.0, float("nan")])
-def test_an_exposure_out_of_range_is_refused(lab: Lab, exposure_s: float) -> None:
-    with pytest.raises(LimitError, match="camera: exposure"):
-        lab.camera.arm(1, exposure_s, "software")
-    with pytest.raises(LimitError, match="number of frames"):
-        lab.camera.arm(0, 0.1, "software")
-
-
-def test_no_wire_brings_an_external_trigger(lab: Lab) -> None:
+def test_no_wire_brings_an_external_trigger(dark: DarkLab) -> None:
     with pytest.raises(DeviceError, match="no external trigger; expected one of 'software', 'internal'"):
-        lab.camera.arm(1, 0.1, "external")
+        dark.camera.arm(1, 0.1, "external")
 
 
-def test_arming_and_the_safe_state_drop_old_frames(lab: Lab) -> None:
-    for drop in (lambda: lab.camera.arm(1, 10e-3, "software"), lab.camera.safe_state):
-        lab.fire(1)
-        lab.clock.sleep(0.1)
-        drop()
-        with pytest.raises(DeviceTimeoutError):
-            lab.camera.read(0.0)
-
-
-def test_rehearsed_failures_come_with_their_probability() -> None:
-    flaky = Lab(faults={"transient": 0.3})
+def test_simulated_failures_come_with_their_probability() -> None:
+    flaky = DarkLab(faults={"transient": 0.3})
     n_lost = 0
     for _ in range(100):
         flaky.fire(1)
@@ -160,8 +109,8 @@ def test_rehearsed_failures_come_with_their_probability() -> None:
     assert 12 < n_lost < 48
 
 
-def test_a_missed_trigger_ends_in_a_timeout_and_leaves_the_atoms_in_the_dark() -> None:
-    deaf = Lab(faults={"missed_trigger": 1.0})
+def test_a_missed_trigger_ends_in_a_timeout_and_exposes_no_atoms() -> None:
+    deaf = DarkLab(faults={"missed_trigger": 1.0})
     deaf.fire(1)
     with pytest.raises(DeviceTimeoutError, match="frame 1 of 1 is not ready"):
         deaf.camera.read(1.0)
@@ -169,7 +118,7 @@ def test_a_missed_trigger_ends_in_a_timeout_and_leaves_the_atoms_in_the_dark() -
 
 
 def test_a_frame_lost_in_a_series_leaves_a_gap_in_the_numbers() -> None:
-    lossy = Lab(faults={"lost_in_series": 0.5})
+    lossy = DarkLab(faults={"lost_in_series": 0.5})
     lossy.fire(20)
     numbers, n_told = list[int](), 0
     for _ in range(40):
@@ -188,7 +137,7 @@ def test_a_frame_lost_in_a_series_leaves_a_gap_in_the_numbers() -> None:
 
 @pytest.mark.parametrize("trigger", ["software", "internal"])
 def test_when_all_frames_are_lost_none_comes(trigger: Any) -> None:
-    lossy = Lab(faults={"lost_in_series": 1.0})
+    lossy = DarkLab(faults={"lost_in_series": 1.0})
     lossy.camera.arm(2, 1e-3, trigger)
     if trigger == "software":
         lossy.camera.trigger()
@@ -197,8 +146,8 @@ def test_when_all_frames_are_lost_none_comes(trigger: Any) -> None:
     assert lossy.clock.now() == pytest.approx(1.0)
 
 
-def test_a_late_frame_comes_when_it_comes() -> None:
-    late = Lab(faults={"late": 1.0, "late_by": "3 s"})
+def test_a_late_frame_can_be_read_later() -> None:
+    late = DarkLab(faults={"late": 1.0, "late_by": "3 s"})
     late.fire(1)
     with pytest.raises(DeviceTimeoutError, match="is not ready"):
         late.camera.read(2.0)
@@ -206,13 +155,13 @@ def test_a_late_frame_comes_when_it_comes() -> None:
     assert late.clock.now() == pytest.approx(3.006)
 
 
-def test_the_self_test_takes_a_frame_and_leaves_none(lab: Lab) -> None:
-    assert offers(lab.camera, "self_test")
-    lab.camera.self_test()
-    assert lab.clock.now() == pytest.approx(15e-3)
-    lab.camera.arm(1, 10e-3, "software")
+def test_the_self_test_takes_a_frame_and_leaves_none(dark: DarkLab) -> None:
+    assert offers(dark.camera, "self_test")
+    dark.camera.self_test()
+    assert dark.clock.now() == pytest.approx(15e-3)
+    dark.camera.arm(1, 10e-3, "software")
     with pytest.raises(DeviceTimeoutError, match="was not triggered"):
-        lab.camera.read(0.1)
+        dark.camera.read(0.1)
 
 
 @pytest.mark.parametrize(
@@ -224,6 +173,223 @@ def test_the_self_test_takes_a_frame_and_leaves_none(lab: Lab) -> None:
         ("transient", TransientError),
     ],
 )
-def test_the_self_test_tells_when_no_frame_comes(fault: str, error: type[Exception]) -> None:
+def test_the_self_test_fails_when_no_frame_comes(fault: str, error: type[Exception]) -> None:
     with pytest.raises(error, match="frame"):
-        Lab(faults={fault: 1.0, "late_by": "10 s"}).camera.self_test()
+        DarkLab(faults={fault: 1.0, "late_by": "10 s"}).camera.self_test()
+
+
+EXPOSURE_S = 45e-3
+SMALL: dict[str, Any] = {"frame": (120, 120), "centre_px": (59.5, 59.5)}
+PROFILE = """labseq: 1
+name: p
+grid: {rows: 5, cols: 6, spacing: 4.49 um}
+camera: {use: virtual, CAMERA}
+static_tweezers: {use: virtual}
+mobile_tweezers: {use: virtual}
+detector: {use: threshold, frame: [128, 128], centre_px: [63.5, 63.5]}
+simulation: {use: virtual, image: {sensor: qcmos, frame: [128, 128], centre_px: [63.5, 63.5]}}
+"""
+
+SEQUENCE = """labseq: 1
+name: s
+profile: p.yaml
+target: {pattern: compact, rows: 2, cols: 2}
+planner: {use: psca}
+shot: [load: {duration: 500 ms}, image: {exposure: 45 ms}]
+"""
+
+
+class Lab:
+    """A camera before a real simulated simulation, with atoms on about all of 4 x 4 sites."""
+
+    def __init__(self, image: dict[str, Any] | None = None, **camera: Any) -> None:
+        self.clock = FakeClock()
+        random = RandomStream(1)
+        settings = SimulationSettings.model_validate({"image": SMALL | (image or {}), "loading": 1.0})
+        grid = SiteGrid(4, 4)
+        self.simulation = VirtualSimulation(
+            settings, Context("simulation", grid, clock=self.clock, random=random)
+        )
+        context = Context("camera", grid, clock=self.clock, simulation=self.simulation)
+        self.camera = VirtualCamera(CameraSettings.model_validate(camera), context)
+        self.simulation.open()
+        self.simulation.play("static_tweezers", DepthRamp(0.0, 1.0), 0.0)
+        random.begin_shot(0, 0)
+        self.simulation.begin_shot()
+        self.simulation.load(0.0, 0.5)
+        self.clock.sleep(0.5)
+        self.camera.open()
+
+    def take(self) -> NDArray[np.float64]:
+        """A frame, as the camera takes it."""
+        self.camera.arm(1, EXPOSURE_S, "software")
+        self.camera.trigger()
+        return self.camera.read(1.0).image.astype(float)
+
+    def said(self, key: str) -> Any:
+        """What the camera says of itself now."""
+        return self.camera.describe()[key]
+
+
+def run(folder: Path) -> None:
+    """A shot with the sequence and the profile in a folder."""
+    with labseq.Session.open(folder / "s.yaml", shots=1, output=folder / "runs") as session:
+        session.run()
+
+
+@pytest.mark.parametrize("sensor", ["emccd", "qcmos"])
+def test_a_region_of_a_bright_sensor_is_that_part_of_it(sensor: str) -> None:
+    image = {"sensor": sensor, "read_noise": 0.0, "em_gain": 1.0, "photoelectrons": 1e4}
+    region = {"y": 20, "x": 10, "height": 60, "width": 80}
+    whole, part = Lab(image).take(), Lab(image, region=region).take()
+    assert part.shape == (60, 80)
+    spots = part > part.mean() + part.std()
+    assert part[spots] == pytest.approx(whole[20:80, 10:90][spots], rel=0.02)
+
+
+def test_a_camera_without_a_gain_of_its_own_leaves_it_to_the_simulation() -> None:
+    lab = Lab({"em_gain": 100.0})
+    assert (lab.camera.facts.em_gain, lab.said("em_gain_now")) == (1.0, None)
+    np.testing.assert_array_equal(lab.take(), Lab({"em_gain": 7.0}, em_gain=100).take())
+
+
+def test_the_cameras_gain_wins_over_the_simulations() -> None:
+    frames = [Lab({"em_gain": 300.0}, em_gain=g).take() - 500 for g in (10, 100)]
+    assert frames[1].sum() / frames[0].sum() == pytest.approx(10.0, rel=0.25)
+    assert Lab(em_gain=10).camera.facts.em_gain == 10.0
+
+
+def test_gain_and_shutter_are_on_in_a_series_only() -> None:
+    lab = Lab(em_gain=300)
+
+    def state() -> tuple[Any, Any]:
+        return lab.said("em_gain_now"), lab.said("shutter")
+
+    assert state() == (1.0, "closed")
+    lab.camera.arm(1, EXPOSURE_S, "software")
+    assert state() == (300.0, "open")
+    lab.camera.safe_state()
+    assert state() == (1.0, "closed")
+    lab.take()
+    lab.camera.self_test()
+    assert state() == (1.0, "open")
+    lab.camera.close()
+    assert state() == (1.0, "closed")
+
+
+def test_the_self_test_takes_its_frame_without_gain() -> None:
+    image = {"background": 50.0, "read_noise": 1.0}
+    lab = Lab(image, em_gain=300)
+    taken = list[NDArray[np.float64]]()
+    expose = lab.simulation.expose
+
+    def noted(*arguments: Any) -> labseq.Frame:
+        frame = expose(*arguments)
+        taken.append(frame.image.astype(float))
+        return frame
+
+    vars(lab.simulation)["expose"] = noted
+    lab.camera.self_test()
+    lab.take()
+    assert taken[0].mean() < 510
+    assert taken[1].mean() > 2000
+
+
+@pytest.mark.parametrize("sensor", ["emccd", "qcmos"])
+def test_behind_a_closed_shutter_it_is_dark_and_the_light_still_takes_atoms(sensor: str) -> None:
+    bright = {
+        "sensor": sensor,
+        "background": 5.0,
+        "clock_induced_charge": 0.5,
+        "qcmos": {"dark_current": 10.0},
+    }
+    lab = Lab(bright)
+    frame = lab.simulation.expose(0.5, 20.0, SensorMode(shutter_open=False)).image
+    ground = {"emccd": 500 + 0.5 * 60, "qcmos": 200 + 200 / 0.11}[
+        sensor
+    ]  # dark counts: per frame, per second
+    assert frame.mean() == pytest.approx(ground, rel=0.03)
+    atoms = [lab.simulation.truth().sum(), lab.simulation.losses()["imaging"]]
+    assert atoms[0] < 16
+    assert atoms[1] > 0
+
+
+@pytest.mark.parametrize(
+    ("camera", "text"),
+    [
+        (
+            "region: {y: 100, height: 60, width: 60}",
+            "ends at row 160 and column 60, beyond the sensor of 128",
+        ),
+        ("binning: 3", "128 x 128 pixels cannot be binned by 3; choose a `region`"),
+        ("em_gain: 300", "the EM gain is 300; the limit is 1: a qCMOS sensor has no EM register; leave the"),
+        ("em_gain: 0.5", "em_gain is 0.5; expected"),
+        ("cooling: {temperature: -70}", "temperature is -70 K (-343 degC); expected -123 to 50 degC"),
+    ],
+)
+def test_settings_that_the_sensor_lacks_are_reported_with_their_line(
+    tmp_path: Path, camera: str, text: str
+) -> None:
+    (tmp_path / "p.yaml").write_text(PROFILE.replace("CAMERA", camera), encoding="utf-8")
+    (tmp_path / "s.yaml").write_text(SEQUENCE, encoding="utf-8")
+    with pytest.raises(ConfigError) as caught:
+        run(tmp_path)
+    assert "p.yaml:4:" in str(caught.value)
+    assert text in str(caught.value)
+
+
+def test_a_gain_on_a_sensor_without_em_register_is_refused_at_once() -> None:
+    with pytest.raises(LimitError, match="qCMOS sensor has no EM register"):
+        Lab({"sensor": "qcmos"}, em_gain=2)
+    assert Lab({"sensor": "qcmos"}, em_gain=1).take().shape == (120, 120)
+
+
+COLD: dict[str, Any] = {"temperature": "-70 degC"}
+
+
+def test_a_sensor_cools_from_room_temperature_past_its_set_point_and_back() -> None:
+    clock = FakeClock()
+    cooler = Cooler(203.15, clock)
+    assert cooler.temperature_k == ROOM_K
+    cooler.switch_on()
+    temperatures = list[float]()
+    for _ in range(1000):
+        temperatures.append(cooler.temperature_k)
+        clock.sleep(1.0)
+    assert temperatures[0] == ROOM_K
+    assert 202.15 < min(temperatures) < 203.0
+    assert temperatures[-1] == pytest.approx(203.15, abs=0.01)
+    cooler.switch_on()
+    assert cooler.temperature_k == pytest.approx(203.15, abs=0.01)
+
+
+def test_the_camera_waits_until_it_is_cold() -> None:
+    lab = Lab(cooling=COLD)
+    assert offers(lab.camera, "settle")
+    assert lab.camera.settling_timeout_s == 900.0
+    assert lab.said("temperature_k") == ROOM_K
+    start_s = lab.clock.now()
+    lab.camera.settle()
+    assert 120.0 < lab.clock.now() - start_s < 600.0
+    assert lab.said("temperature_k") == pytest.approx(203.15, abs=1.0)
+
+
+def test_it_stays_cold_in_the_safe_state_and_while_it_is_closed() -> None:
+    lab = Lab(cooling=COLD)
+    lab.camera.settle()
+    lab.camera.safe_state()
+    lab.camera.close()
+    lab.clock.sleep(100.0)
+    lab.camera.open()
+    start_s = lab.clock.now()
+    lab.camera.settle()
+    assert lab.clock.now() - start_s == 5.0
+
+
+def test_a_set_point_that_the_cooler_does_not_reach_times_out() -> None:
+    lab = Lab(cooling={"temperature": "-100 degC", "timeout": "20 min"})
+    with pytest.raises(
+        DeviceTimeoutError, match=r"the sensor is at -90.0 degC after 1200 s; expected -100.0"
+    ):
+        lab.camera.settle()
+    assert lab.said("temperature_k") == pytest.approx(COLDEST_K, abs=0.01)

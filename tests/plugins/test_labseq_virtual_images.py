@@ -169,13 +169,13 @@ def test_a_part_of_the_sensor_reads_out_faster() -> None:
 REGION = {"y": 56, "x": 6, "height": 400, "width": 500}
 
 
-def test_a_camera_delivers_the_region_that_it_tells_of() -> None:
-    world = VirtualSimulation(SimulationSettings(), Context("simulation", random=RandomStream(0)))
+def test_a_camera_delivers_its_region() -> None:
+    simulation = VirtualSimulation(SimulationSettings(), Context("simulation", random=RandomStream(0)))
     settings = CameraSettings.model_validate({"region": REGION, "binning": 2, "readout": 8e-3})
-    camera = VirtualCamera(settings, Context("camera", simulation=world))
-    world.open()
+    camera = VirtualCamera(settings, Context("camera", simulation=simulation))
+    simulation.open()
     camera.open()
-    world.play("static_tweezers", DepthRamp(0.0, 1.0), 0.0)
+    simulation.play("static_tweezers", DepthRamp(0.0, 1.0), 0.0)
     assert camera.facts.frame_shape == (200, 250)
     assert camera.facts.readout_s == pytest.approx(8e-3 * 400 * 500 / 512**2 / 4)
     camera.arm(1, 45e-3, "software")
@@ -212,9 +212,9 @@ def test_impossible_settings_are_refused(image: dict[str, Any], reason: str) -> 
         ),
     ],
 )
-def test_a_sensor_refuses_what_it_cannot_do(mode: SensorMode, image: dict[str, Any], reason: str) -> None:
-    world = VirtualSimulation(SimulationSettings.model_validate({"image": image}), Context("simulation"))
-    for use in (world.readout_fraction, world.prepare_sensor):
+def test_a_sensor_refuses_impossible_modes(mode: SensorMode, image: dict[str, Any], reason: str) -> None:
+    simulation = VirtualSimulation(SimulationSettings.model_validate({"image": image}), Context("simulation"))
+    for use in (simulation.readout_fraction, simulation.prepare_sensor):
         with pytest.raises(LimitError, match=reason):
             use(mode)
 

@@ -1,9 +1,9 @@
 """The model of the EMCCD against frames of a real one.
 
 The frames (5,000 of 3 x 3 pixels at three gains, from github.com/fatmac78/EMCCD-calibration) are not part of
-this repository: they are looked for in LABSEQ_EMCCD_DATA, else beside the checkout in ``shared/data/emccd``.
-Offset, read noise, light and counts per electron of that camera are not known, so what is compared does
-not depend on them. ``-s`` prints the figures of ``docs/explanation/virtual-images.md``.
+this repository; the tests read them from the folder LABSEQ_EMCCD_DATA, else from ``shared/data/emccd`` next to
+the checkout. Offset, read noise, light and counts per electron of that camera are not known, so the compared
+figures do not depend on them. ``-s`` prints the figures of ``docs/explanation/virtual-images.md``.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ from scipy.special import ndtr
 from scipy.stats import chi2
 
 Floats = NDArray[np.float64]
-
 FOLDER = Path(os.environ.get("LABSEQ_EMCCD_DATA") or Path(__file__).parents[3] / "shared" / "data" / "emccd")
 FILES = {
     1: "ADU__1x-gain_level-03.tif",
@@ -29,7 +28,6 @@ FILES = {
     300: "gain-GS__300x-gain.tif",
 }
 N_BINS = 50
-
 pytestmark = pytest.mark.skipif(
     not all((FOLDER / name).is_file() for name in FILES.values()),
     reason="no measured frames: LABSEQ_EMCCD_DATA names no folder that holds them",
@@ -51,15 +49,15 @@ class Moments:
     """Mean, variance within a pixel, skewness and excess kurtosis."""
 
     def __init__(self, counts: Floats) -> None:
-        beside = counts - counts.mean(axis=0)  # the pixels do not get quite the same light
+        deviation = counts - counts.mean(axis=0)  # the pixels do not get quite the same light
         self.mean = float(counts.mean())
-        self.variance = float((beside**2).mean())
-        self.skewness = float((beside**3).mean() / self.variance**1.5)
-        self.kurtosis = float((beside**4).mean() / self.variance**2 - 3)
+        self.variance = float((deviation**2).mean())
+        self.skewness = float((deviation**3).mean() / self.variance**1.5)
+        self.kurtosis = float((deviation**4).mean() / self.variance**2 - 3)
 
 
 def spread(counts: Floats, statistic: Any) -> float:
-    """Standard error of a statistic, by drawing frames anew."""
+    """Standard error of a statistic, by bootstrap over frames."""
     rng = np.random.default_rng(0)
     values = [statistic(Moments(counts[rng.integers(0, len(counts), len(counts))])) for _ in range(100)]
     return float(np.std(values))
@@ -122,7 +120,7 @@ def test_with_gain_the_histogram_has_the_models_shape(gain: int) -> None:
     assert distance * counts.size**0.5 < 1.36
     assert square < chi2.ppf(0.999, N_BINS - 4)
     normal = (counts - counts.mean(axis=0)) / Moments(counts).variance ** 0.5
-    assert setting_error(ndtr(normal))[1] > 3 * square  # a normal law is refused
+    assert setting_error(ndtr(normal))[1] > 3 * square  # a normal distribution is refused
 
 
 def test_the_kurtosis_is_that_which_the_skewness_foretells() -> None:

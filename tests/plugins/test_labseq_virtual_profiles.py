@@ -111,6 +111,6 @@ def fields(model: type[Settings]) -> dict[str, str | None]:
 @pytest.mark.parametrize(
     "name", [name for name in flat(SimulationSettings().model_dump()) if name != "image"]
 )
-def test_every_constant_of_the_world_says_where_it_comes_from(name: str) -> None:
+def test_every_constant_of_the_simulation_says_where_it_comes_from(name: str) -> None:
     description = fields(SimulationSettings)[name] or ""
     assert any(source in description for source in ("paper", "derived", "ours"))

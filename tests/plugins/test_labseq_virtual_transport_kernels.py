@@ -1,20 +1,36 @@
-"""The kernels of the transport against a naive one that works on whole segments with numpy."""
+"""The kernels of the transport against a naive version in numpy, integrals and brute force."""
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
+import pytest
 from hypothesis import event, given, settings, strategies as st
 from labseq_virtual import transport_kernels as kernels
-from labseq_virtual.handover import AT_REST, END, MIXING, ON_END, ON_START, POWER_END, POWER_START, START
+from labseq_virtual.handover import (
+    AT_REST,
+    END,
+    MIXING,
+    ON_END,
+    ON_START,
+    POWER_END,
+    POWER_START,
+    SLOW,
+    START,
+    constants,
+    merging_distance,
+)
 from labseq_virtual.settings import SimulationSettings
 from labseq_virtual.transport import FASTEST, Transport
 from labseq_virtual.transport_kernels import max_drop_offs
 from numpy.typing import NDArray
+from scipy.integrate import quad
+from scipy.special import ndtr
 
 from labseq import MotionSpec, SiteGrid, ToneProgram
 from labseq.testing.rf import ON, ToneProgramBuilder
@@ -56,7 +72,7 @@ class NaiveTransport:
 
     def __init__(self, transport: Transport, settings: SimulationSettings, draws: Floats) -> None:
         self.transport, self.settings, self.draws = transport, settings, draws
-        self.law, self.reach = transport._constants, transport._merging
+        self.constants, self.reach = transport._constants, transport._merging
         self.n_drawn = 0
         self.lost: Counter[str] = Counter()
 
@@ -90,7 +106,7 @@ class NaiveTransport:
         loaded = loaded & lit_start
         self.lost["program"] -= count(loaded)
         power = np.maximum(crossings(row, col, POWER_START), crossings(row, col, POWER_END))
-        depth = np.vectorize(lambda each: kernels.mobile_depth(each, further, self.law))(power)
+        depth = np.vectorize(lambda each: kernels.mobile_depth(each, further, self.constants))(power)
         taken = self._picked_up(lit & ~(on & lit_start), depth, row, col)
         shallow[taken] = 0.0
         loaded |= taken
@@ -101,7 +117,7 @@ class NaiveTransport:
         if (np.abs(down) > AT_REST).any() or (np.abs(right) > AT_REST).any():
             self._sweep(lit & (depth > self.settings.static_depth), loaded, row, col)
             speed = np.hypot(down, right) * GRID.spacing_m * (fastest / max(duration_s, 1e-12))
-            fallen = np.vectorize(lambda u, v: kernels.shallow(u, v, further, self.law))(depth, speed)
+            fallen = np.vectorize(lambda u, v: kernels.shallow(u, v, further, self.constants))(depth, speed)
             shallow = np.where(speed > 0, np.maximum(shallow, fallen), shallow)
         self._set_down(loaded & ~lit_end, depth, shallow, row, col, further, duration_s)
         return Before(row, col, lit_end, loaded & lit_end, shallow)
@@ -163,7 +179,7 @@ class NaiveTransport:
 
     def _set_down(
         self,
-        let_go: Mask,
+        dropping: Mask,
         depth: Floats,
         shallow: Floats,
         row: Floats,
@@ -171,10 +187,10 @@ class NaiveTransport:
         further: int,
         duration_s: float,
     ) -> None:
-        i, j = np.nonzero(let_go)
+        i, j = np.nonzero(dropping)
         r, c, away_m, inside = self._nearest(row[i, END], col[j, END])
         args = zip(self.depth[r, c], depth[i, j], away_m, shallow[i, j], strict=True)
-        risks = [kernels.risks(*each, further, duration_s, self.factor, self.law) for each in args]
+        risks = [kernels.risks(*each, further, duration_s, self.factor, self.constants) for each in args]
         draws = self.draws[self.n_drawn : self.n_drawn + len(i)]
         self.n_drawn += len(i)
         unlucky = draws < np.array(risks).reshape(-1, 3)
@@ -250,8 +266,8 @@ WORLDS = st.fixed_dictionaries(
 
 @given(PROGRAMS, WORLDS, st.sampled_from([0.1, 0.4, 1.0]), st.sampled_from([1e-5, 1e-4, 1e-3]), st.data())
 @settings(max_examples=150, deadline=None)
-def test_the_kernels_do_exactly_what_the_rules_say(
-    parts: list[Any], world: dict[str, Any], filling: float, segment_s: float, data: st.DataObject
+def test_the_kernels_agree_with_the_naive_transport(
+    parts: list[Any], simulation: dict[str, Any], filling: float, segment_s: float, data: st.DataObject
 ) -> None:
     program = ToneProgramBuilder(GRID, [segment for part in parts for segment in part]).program(segment_s)
     n_segments = program.n_segments
@@ -261,7 +277,7 @@ def test_the_kernels_do_exactly_what_the_rules_say(
     rng = np.random.default_rng(seed)
     occupied = rng.random(GRID.shape) < filling
     depth = rng.uniform(0.5, 1.5, GRID.shape)
-    physics = SimulationSettings.model_validate(world)
+    physics = SimulationSettings.model_validate(simulation)
     transport = Transport(GRID, MotionSpec(), physics)
     naive = NaiveTransport(transport, physics, np.random.default_rng(seed).random((2000, 3)))
     expected, result = occupied.copy(), occupied.copy()
@@ -275,3 +291,130 @@ def test_the_kernels_do_exactly_what_the_rules_say(
     tones = transport._tones(program, 0), transport._tones(program, 1)
     offsets = program.row.offsets, program.column.offsets
     assert naive.n_drawn <= max_drop_offs(tones[0], offsets[0], tones[1], offsets[1], n_segments)
+
+
+WAIST_M = 0.98e-6
+REACH = np.stack(merging_distance(WAIST_M, WAIST_M))
+
+
+def constants_of(light: dict[str, Any] | None = None, **simulation: Any) -> NDArray[np.float64]:
+    return constants(
+        SiteGrid(), SimulationSettings.model_validate({**simulation, "mobile_light": light or {}})
+    )
+
+
+@pytest.mark.parametrize("x", [0.0, 0.5, 3.0, 20.0])
+def test_thermal_energies_follow_boltzmann_in_three_dimensions(x: float) -> None:
+    energy = (
+        np.random.default_rng(1).chisquare(6, 400_000) / 2
+    )  # three kinetic, three potential degrees of freedom
+    assert np.mean(energy > x) == pytest.approx(kernels.exceeds(x), abs=4e-3)
+    exact, _ = quad(lambda e: e**2 * math.exp(-e) / 2, x, math.inf)
+    assert kernels.exceeds(x) == pytest.approx(exact, rel=1e-6)
+
+
+@pytest.mark.parametrize("ratio", [0.5, 1.0, 3.0, 7.0, 25.0])
+@pytest.mark.parametrize("side", [-1, 1])
+def test_wells_merge_where_the_middle_minimum_vanishes(ratio: float, side: int) -> None:
+    log_ratio, merged_m = merging_distance(WAIST_M, WAIST_M)
+    distance_m = float(np.interp(math.log(ratio), log_ratio, merged_m)) * (1 + 0.04 * side)
+    x = np.linspace(-1e-6, 4.5e-6, 40_001)
+    depth = np.exp(-2 * x**2 / WAIST_M**2) + ratio * np.exp(-2 * (x - distance_m) ** 2 / WAIST_M**2)
+    n_minima = np.count_nonzero((depth[1:-1] > depth[:-2]) & (depth[1:-1] > depth[2:]))
+    assert n_minima == (1 if side < 0 else 2)
+
+
+@pytest.mark.parametrize("mobile_waists", [1.0, 1.5, 2.5, 3.5])
+def test_the_deeper_and_the_wider_the_mobile_well_the_further_it_reaches(mobile_waists: float) -> None:
+    log_ratio, merged_m = merging_distance(WAIST_M, mobile_waists * WAIST_M)
+    reach_m = merged_m[log_ratio > math.log(2 * mobile_waists**2)]
+    assert np.all(np.diff(reach_m) >= 0)
+    assert len(reach_m) > 0
+    assert np.all(reach_m > 0.9 * mobile_waists * WAIST_M)
+
+
+def test_a_mobile_tweezer_takes_only_from_a_shallower_one() -> None:
+    taken = [kernels.takes(mobile, 0.3e-3, 0.0, REACH) for mobile in (0.29e-3, 0.3e-3, 0.31e-3)]
+    assert taken == [False, False, True]
+
+
+def test_a_static_tweezer_that_is_off_holds_nothing_back() -> None:
+    assert kernels.takes(1e-3, 0.0, 1.8e-6, REACH)
+    assert not kernels.takes(0.0, 0.0, 0.0, REACH)
+    assert kernels.risks(0.0, 2e-3, 0.0, 0.0, 0, 60e-6, 1.0, constants_of(transport_loss=0.0))[0] == 1.0
+
+
+@given(st.floats(-1.0, 3.0))
+def test_tables_are_read_along_straight_lines(x: float) -> None:
+    assert kernels.interpolate(x, SLOW) == pytest.approx(float(np.interp(x, *SLOW)), abs=1e-15)
+
+
+@pytest.mark.parametrize("x", [0.0, 0.5, 3.0])
+def test_kinetic_energies_follow_maxwell(x: float) -> None:
+    energy = np.random.default_rng(1).chisquare(3, 400_000) / 2
+    assert np.mean(energy > x) == pytest.approx(kernels.kinetic_exceeds(x), abs=4e-3)
+
+
+NEWTON = {0.0: (0.995, 1.0), 0.5: (0.98, 0.995), 0.9: (0.39, 0.565), 1.1: (0.115, 0.305)}
+"""Survival of a drop-off in 0.5 and in 10 us at some distances in um: atoms moved by Newton's equations."""
+
+
+@pytest.mark.parametrize("distance_um", NEWTON)
+def test_an_atom_dropped_beside_its_site_is_lost_about_as_newtons_equations_say(distance_um: float) -> None:
+    constants_ = constants_of(temperature=15e-6, transport_loss=0.0)
+    for ramp_s, survived in zip((0.5e-6, 10e-6), NEWTON[distance_um], strict=True):
+        spilled, _, _ = kernels.risks(300e-6, 2.1e-3, distance_um * 1e-6, 0.0, 0, ramp_s, 1.0, constants_)
+        assert 1 - spilled == pytest.approx(survived, abs=0.17)
+
+
+@pytest.mark.parametrize(
+    ("static", "mobile", "lost"), [(300e-6, 2.1e-3, 0.03), (300e-6, 4.2e-3, 0.06), (150e-6, 2.1e-3, 0.06)]
+)
+def test_the_hand_over_loss_goes_as_the_ratio_of_the_depths(
+    static: float, mobile: float, lost: float
+) -> None:
+    _, hand_over, transport = kernels.risks(
+        static, mobile, 0.0, 0.0, 5, 60e-6, 1.5, constants_of(transport_loss=0.02)
+    )
+    assert hand_over == pytest.approx(lost)
+    assert transport == 0.0
+
+
+def test_more_tones_make_shallower_tweezers() -> None:
+    constants_ = constants_of({"depth": 2e-3, "depth_drop_per_tone": 0.1})
+    assert kernels.mobile_depth(1.0, 0, constants_) == pytest.approx(2e-3)
+    assert kernels.mobile_depth(0.5, 10, constants_) == pytest.approx(0.5e-3)
+
+
+def test_a_tweezer_below_the_adiabatic_depth_loses_its_atoms_and_the_scatter_softens_the_step() -> None:
+    constants_ = constants_of({"adiabatic_depth": 1e-3, "shallow_loss": 0.3, "intermodulation": 0.02})
+    depth = np.array([0.9e-3, 0.999e-3, 1e-3, 1.001e-3, 1.1e-3])
+    soft = [kernels.shallow(each, 0.13, 19, constants_) for each in depth]
+    assert soft == pytest.approx(0.3 * ndtr((1e-3 - depth) / (0.02 * depth)))
+    sharp = [kernels.shallow(each, 0.13, 0, constants_) for each in depth]
+    assert sharp == pytest.approx([0.3, 0.3, 0.15, 0.0, 0.0])
+
+
+def test_the_adiabatic_depth_goes_as_the_speed_squared() -> None:
+    constants_ = constants_of({"adiabatic_depth": 1e-3, "shallow_loss": 0.3})
+    lost = [kernels.shallow(2e-3, speed, 5, constants_) for speed in (0.0, 0.13, 0.19)]
+    assert lost == pytest.approx([0.0, 0.0, 0.3], abs=1e-3)
+
+
+@given(
+    st.floats(0.0, 5e-3), st.floats(0.0, 5e-3), st.floats(0.0, 5e-6), st.floats(0.0, 1.0),
+    st.integers(0, 40), st.floats(0.0, 1e-3), st.floats(0.0, 100.0),
+)  # fmt: skip
+def test_risks_are_probabilities(
+    static: float,
+    mobile: float,
+    distance_m: float,
+    fallen: float,
+    further: int,
+    ramp_s: float,
+    factor: float,
+) -> None:
+    constants_ = constants_of({"adiabatic_depth": 1e-3, "shallow_loss": 1.0}, transport_loss_per_tone=0.01)
+    risks = kernels.risks(static, mobile, distance_m, fallen, further, ramp_s, factor, constants_)
+    for value in (*risks, kernels.shallow(mobile, 0.2, further, constants_)):
+        assert 0 <= value <= 1

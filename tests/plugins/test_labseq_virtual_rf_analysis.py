@@ -1,4 +1,4 @@
-"""The tones that the world finds in what is played, against those that were meant."""
+"""Tones found in played outputs, against the intended ones; pulses between silences."""
 
 from __future__ import annotations
 
@@ -7,7 +7,15 @@ import math
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
-from labseq_virtual.rf_analysis import Band, Tracks, active_spans, envelope, track_tones
+from labseq_virtual.rf_analysis import (
+    Band,
+    PulseReceiver,
+    RfPulse,
+    Tracks,
+    active_spans,
+    envelope,
+    track_tones,
+)
 
 from labseq.model import RfSamples, RfSpan, RfTones, TonesNow
 from labseq.testing.rf import FULL_SCALE_V, RATE_HZ, START_S, played, program_of
@@ -64,7 +72,7 @@ def test_a_program_is_recovered_from_its_samples(axis: int, speed_profile: str, 
 
 @settings(max_examples=30, deadline=None)
 @given(st.lists(st.floats(0.5, 3.0), min_size=1, max_size=10), st.floats(83e6, 90e6), st.floats(0.004, 0.02))
-def test_parked_tones_are_told_apart_down_to_the_least_spacing(
+def test_parked_tones_are_resolved_down_to_the_least_spacing(
     gaps_mhz: list[float], first_hz: float, volts: float
 ) -> None:
     hz = first_hz + np.cumsum([0.0, *gaps_mhz[1:]]) * 1e6
@@ -74,7 +82,7 @@ def test_parked_tones_are_told_apart_down_to_the_least_spacing(
     assert middle[:, 1] == pytest.approx(np.full(len(hz), volts), rel=2e-2)
 
 
-def test_tones_and_their_samples_are_heard_alike() -> None:
+def test_tones_and_their_samples_give_the_same_tones() -> None:
     tones = parked([96e6, 99.3e6], [0.01, 0.005])
     t_s = np.arange(round(200e-6 * RATE_HZ)) / RATE_HZ
     waves = tones.amplitude_v[:, None] * np.cos(
@@ -108,7 +116,7 @@ def test_tones_beyond_the_band_make_no_light() -> None:
     assert found(tracks, len(tracks.t_s) // 2)[:, 0] == pytest.approx([100e6], abs=1e3)
 
 
-def test_silence_is_heard_as_silence() -> None:
+def test_silence_is_found_as_silence() -> None:
     silent = RfSamples(START_S, RATE_HZ, np.zeros(100_000, np.int16), 1e-6)
     assert active_spans(silent) == []
     assert np.isnan(follow([silent], START_S, START_S + 100e-6).frequency_hz).all()
@@ -131,3 +139,56 @@ def test_spans_that_follow_one_another_are_one_signal() -> None:
     ]
     one, two = (envelope(spans, START_S + 4e-4, START_S + 8e-4, BAND).values for spans in ([whole], parts))
     np.testing.assert_array_equal(one, two)
+
+
+class Outputs:
+    """An ``RfSource`` that says when it was asked, and answers what is put into it."""
+
+    def __init__(self) -> None:
+        self.rows: list[RfSpan] = []
+        self.columns: list[RfSpan] = []
+        self.asked: list[float] = []
+
+    def played(self, until_s: float) -> tuple[list[RfSpan], list[RfSpan]]:
+        self.asked.append(until_s)
+        spans = self.rows, self.columns
+        self.rows, self.columns = [], []
+        return spans
+
+
+def tone(start_s: float, end_s: float) -> RfTones:
+    one = np.ones(1)
+    return RfTones(start_s, end_s, 1e8 * one, 0 * one, one, 0 * one, 0 * one)
+
+
+def times(found: list[RfPulse]) -> list[tuple[float, float]]:
+    return [(pulse.start_s, pulse.end_s) for pulse in found]
+
+
+def test_a_long_silence_separates_pulses_and_a_short_one_does_not() -> None:
+    outputs = Outputs()
+    outputs.rows = [tone(1.0, 1.1), tone(1.15, 1.2), tone(2.0, 2.1)]
+    found = list(PulseReceiver(outputs, 0.1).receive_until(3.0))
+    assert times(found) == [(1.0, 1.2), (2.0, 2.1)]
+    assert [len(pulse.rows) for pulse in found] == [2, 1]
+    assert outputs.asked == [3.0]
+
+
+def test_a_pulse_lasts_while_either_output_plays() -> None:
+    outputs = Outputs()
+    outputs.rows, outputs.columns = [tone(1.0, 1.5)], [tone(0.8, 1.2), tone(4.0, 4.1)]
+    first, second = PulseReceiver(outputs, 0.1).receive_until(5.0)
+    assert times([first, second]) == [(0.8, 1.5), (4.0, 4.1)]
+    assert (len(first.rows), len(first.columns), len(second.rows)) == (1, 1, 0)
+
+
+def test_a_pulse_that_continues_across_two_calls_is_marked() -> None:
+    outputs = Outputs()
+    receiver = PulseReceiver(outputs, 0.1)
+    outputs.rows = [tone(1.0, 2.0)]
+    (before,) = receiver.receive_until(2.0)
+    outputs.rows = [tone(2.0, 2.5)]
+    (after,) = receiver.receive_until(3.0)
+    outputs.rows = [tone(3.5, 3.6)]
+    (later,) = receiver.receive_until(4.0)
+    assert [pulse.continued for pulse in (before, after, later)] == [False, True, False]

@@ -1,0 +1,685 @@
+"""The virtual tweezers, lines, instruments and spot meter; the contracts of all virtual drivers."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+from labseq_virtual.camera import VirtualCamera
+from labseq_virtual.devices import VirtualDevice, VirtualLines, VirtualSpotMeter
+from labseq_virtual.settings import (
+    CameraSettings,
+    DeviceSettings,
+    LightSettings,
+    LinesSettings,
+    MobileTweezersSettings,
+    SimulationSettings,
+    SpotMeterSettings,
+    StaticTweezersSettings,
+)
+from labseq_virtual.simulation import Lights, VirtualSimulation
+from labseq_virtual.tweezers import VirtualMobileTweezers, VirtualStaticTweezers
+
+import labseq
+from labseq import (
+    ConfigError,
+    Context,
+    DepthRamp,
+    DeviceError,
+    DeviceTimeoutError,
+    LimitError,
+    NeedsWarmUp,
+    RandomStream,
+    SiteGrid,
+    ToneProgram,
+    TweezerAmplitudes,
+)
+from labseq.model import AxisTones, LineProgram, LineSpec
+from labseq.sequencer.lines import line_program
+from labseq.testing import (
+    CameraContract,
+    DeviceContract,
+    LinesContract,
+    MobileTweezersContract,
+    SimulationContract,
+    StaticTweezersContract,
+)
+from labseq.testing.fakes import FakeClock
+
+
+class TestVirtualCamera(CameraContract):
+    @pytest.fixture
+    def factory(self) -> Callable[[Context], VirtualCamera]:
+        return partial(VirtualCamera, CameraSettings())
+
+
+class TestVirtualCameraWithEverything(CameraContract):
+    @pytest.fixture
+    def factory(self) -> Callable[[Context], VirtualCamera]:
+        settings = {
+            "region": {"y": 10, "x": 20, "height": 100, "width": 60},
+            "binning": 2,
+            "em_gain": 300,
+            "cooling": {"temperature": "-70 degC"},
+        }
+        return partial(VirtualCamera, CameraSettings.model_validate(settings))
+
+
+class TestVirtualStaticTweezers(StaticTweezersContract):
+    @pytest.fixture
+    def factory(self) -> Callable[[Context], VirtualStaticTweezers]:
+        return partial(VirtualStaticTweezers, StaticTweezersSettings())
+
+
+class TestVirtualMobileTweezers(MobileTweezersContract):
+    @pytest.fixture
+    def factory(self) -> Callable[[Context], VirtualMobileTweezers]:
+        return partial(VirtualMobileTweezers, MobileTweezersSettings())
+
+
+class TestVirtualDevice(DeviceContract):
+    commands: ClassVar = {"open": {}, "set": {"power": 0.5}}
+    values: ClassVar = ("state", "power")
+
+    @pytest.fixture
+    def factory(self) -> Callable[[Context], VirtualDevice]:
+        return partial(VirtualDevice, DeviceSettings(commands=("open", "set"), values={"power": 1.0}))
+
+
+class TestVirtualWorld(SimulationContract):
+    @pytest.fixture
+    def factory(self) -> Callable[[Context], VirtualSimulation]:
+        settings = {"image": {"frame": [80, 96], "centre_px": [39.5, 47.5]}}
+        return partial(VirtualSimulation, SimulationSettings.model_validate(settings))
+
+
+def with_simulation(context: Context) -> Context:
+    return replace(context, simulation=VirtualSimulation(SimulationSettings(), context))
+
+
+class TestVirtualCameraInItsWorld(CameraContract):
+    def context(self) -> Context:
+        return with_simulation(super().context())
+
+    @pytest.fixture
+    def factory(self) -> Callable[[Context], VirtualCamera]:
+        return partial(VirtualCamera, CameraSettings())
+
+
+class TestVirtualStaticTweezersInTheirWorld(StaticTweezersContract):
+    def context(self) -> Context:
+        return with_simulation(super().context())
+
+    @pytest.fixture
+    def factory(self) -> Callable[[Context], VirtualStaticTweezers]:
+        return partial(VirtualStaticTweezers, StaticTweezersSettings())
+
+
+class TestVirtualMobileTweezersInTheirWorld(MobileTweezersContract):
+    def context(self) -> Context:
+        return with_simulation(super().context())
+
+    @pytest.fixture
+    def factory(self) -> Callable[[Context], VirtualMobileTweezers]:
+        return partial(VirtualMobileTweezers, MobileTweezersSettings())
+
+
+GRID = SiteGrid(2, 3)
+
+
+class Lab:
+    """A small virtual lab with all atoms loaded and nothing that loses them."""
+
+    def __init__(self) -> None:
+        self.clock = FakeClock()
+        self.random = RandomStream(0)
+        physics = {"loading": 1.0, "lifetime": 2e6, "imaging_loss": 0.0, "transport_loss": 0.0}
+        settings = SimulationSettings.model_validate(
+            {**physics, "image": {"frame": (64, 64), "centre_px": (31.5, 31.5)}}
+        )
+        self.simulation = VirtualSimulation(
+            settings, Context("simulation", GRID, clock=self.clock, random=self.random)
+        )
+        self.static = VirtualStaticTweezers(StaticTweezersSettings(), self.context("static_tweezers"))
+        self.camera = VirtualCamera(CameraSettings(), self.context("camera"))
+        self.mobile = VirtualMobileTweezers(MobileTweezersSettings(), self.context("mobile_tweezers"))
+        self.simulation.open()
+        self.simulation.begin_shot()
+        for device in (self.static, self.camera, self.mobile):
+            device.open()
+        self.static.start()
+        self.simulation.load(self.clock.now(), 0.5)
+        self.clock.sleep(0.5)
+
+    def context(self, name: str) -> Context:
+        return Context(name, GRID, clock=self.clock, random=RandomStream(0, name), simulation=self.simulation)
+
+    @property
+    def n_atoms(self) -> int:
+        return int(self.simulation.truth().sum())
+
+
+@pytest.fixture
+def lab() -> Lab:
+    return Lab()
+
+
+def axis(hz: list[float], amplitude: list[float]) -> AxisTones:
+    """One tone in each of ``len(hz) - 1`` segments, through given frequencies and amplitudes."""
+    n = len(hz) - 1
+    offsets = np.arange(n + 1, dtype=np.int32)
+    f, a = np.array(hz), np.array(amplitude)
+    return AxisTones(offsets, f[:-1], f[1:], a[:-1], a[1:], np.zeros(n))
+
+
+def program(
+    row_hz: float = GRID.row_frequency_hz[0],
+    col_hz: float = GRID.column_frequency_hz[0],
+    end_hz: float = GRID.column_frequency_hz[2],
+    amplitude: float = 0.5,
+    duration_s: float = 1e-3,
+) -> ToneProgram:
+    """Take the atom at (0, 0) to (0, 2)."""
+    return ToneProgram(
+        axis([row_hz] * 4, [amplitude] * 4),
+        axis([col_hz, col_hz, end_hz, end_hz], [0.0, amplitude, amplitude, 0.0]),
+        np.full(3, duration_s),
+        np.zeros(3, np.int8),
+        np.array([0, 0, 1], np.int32),
+    )
+
+
+def test_static_tweezers_hold_atoms_until_they_are_made_safe(lab: Lab) -> None:
+    assert lab.n_atoms == 6
+    start_s = lab.clock.now()
+    lab.static.ramp(0.5, 10e-3)
+    assert lab.clock.now() - start_s == pytest.approx(10e-3)
+    assert lab.static.describe()["depth"] == 0.5
+    lab.static.start()
+    assert lab.static.describe()["depth"] == 1.0
+    assert lab.n_atoms == 6
+    lab.static.safe_state()
+    assert lab.n_atoms == 0
+    assert lab.static.describe()["depth"] == 0.0
+
+
+@pytest.mark.parametrize(("depth", "duration_s"), [(-0.1, 0.0), (2.0, 0.0), (1.0, -1.0), (float("nan"), 0.0)])
+def test_an_impossible_ramp_is_refused(lab: Lab, depth: float, duration_s: float) -> None:
+    with pytest.raises(LimitError, match="static_tweezers"):
+        lab.static.ramp(depth, duration_s)
+    assert lab.n_atoms == 6
+
+
+@pytest.mark.parametrize(
+    ("rows", "cols", "what"),
+    [
+        ([0.1, 0.1], [0.1, 0.1], "shape of the column amplitudes"),
+        ([0.1, -0.1], [0.1] * 3, "a row amplitude"),
+        ([0.1, float("nan")], [0.1] * 3, "a row amplitude"),
+        ([0.1, 0.1], [0.4] * 3, "sum of the column amplitudes"),
+    ],
+)
+def test_impossible_amplitudes_are_refused(lab: Lab, rows: list[float], cols: list[float], what: str) -> None:
+    with pytest.raises(LimitError, match=what):
+        lab.static.load((np.array(rows), np.array(cols)))
+
+
+def test_amplitudes_are_kept_for_the_record(lab: Lab) -> None:
+    assert lab.static.describe()["amplitudes"] == "calibrated"
+    lab.static.load((np.array([0.5, 0.5]), np.array([0.25, 0.25, 0.5])))
+    assert lab.static.describe()["amplitudes"] == {"row": [0.5, 0.5], "column": [0.25, 0.25, 0.5]}
+
+
+def test_mobile_tweezers_carry_an_atom(lab: Lab) -> None:
+    lab.simulation.truth()
+    lab.simulation._occupied[0, 1:] = False
+    assert lab.mobile.prepare(program()) == pytest.approx(3e-3)
+    start_s = lab.clock.now()
+    lab.mobile.play()
+    assert lab.clock.now() == start_s
+    lab.mobile.wait(1.0)
+    assert lab.clock.now() - start_s == pytest.approx(3e-3)
+    assert lab.simulation.truth().tolist() == [[False, False, True], [True, True, True]]
+    lab.mobile.wait(1.0)
+    assert lab.clock.now() - start_s == pytest.approx(3e-3)
+
+
+def test_nothing_is_started_while_a_program_plays(lab: Lab) -> None:
+    lab.mobile.prepare(program())
+    lab.mobile.play()
+    with pytest.raises(DeviceError, match=r"play\(\) while a program plays"):
+        lab.mobile.play()
+    with pytest.raises(DeviceError, match=r"prepare\(\) while a program plays"):
+        lab.mobile.prepare(program())
+
+
+def test_waiting_too_short_is_a_timeout(lab: Lab) -> None:
+    lab.mobile.prepare(program())
+    lab.mobile.play()
+    with pytest.raises(DeviceTimeoutError, match="still playing after 1 ms") as caught:
+        lab.mobile.wait(1e-3)
+    assert caught.value.timeout_s == 1e-3
+    lab.mobile.wait(1.0)
+
+
+def test_a_camera_cannot_look_while_atoms_move(lab: Lab) -> None:
+    lab.mobile.prepare(program())
+    lab.mobile.play()
+    lab.camera.arm(1, 10e-3, "software")
+    with pytest.raises(DeviceError, match=r"mobile_tweezers\.wait"):
+        lab.camera.trigger()
+
+
+def test_the_safe_state_drops_atoms_in_flight(lab: Lab) -> None:
+    lab.mobile.prepare(program())
+    lab.mobile.play()
+    lab.clock.sleep(1.5e-3)
+    lab.mobile.safe_state()
+    lab.mobile.safe_state()
+    assert not lab.simulation.truth()[0, 0]
+    assert lab.n_atoms == 5
+    lab.mobile.prepare(program())
+
+
+def test_the_safe_state_of_all_in_any_order_ends_dark(lab: Lab) -> None:
+    lab.mobile.prepare(program())
+    lab.mobile.play()
+    lab.static.safe_state()
+    lab.camera.safe_state()
+    lab.mobile.safe_state()
+    assert lab.n_atoms == 0
+
+
+@pytest.mark.parametrize(
+    ("wrong", "what"),
+    [
+        (
+            {"col_hz": 80e6},
+            r"column tone 0 in segment 0 \(batch 0\) is 80 MHz; the limit is the band of 82 to 118 MHz",
+        ),
+        ({"end_hz": 118.1e6}, r"column tone 0 in segment 1 \(batch 0\) is 118\.1 MHz"),
+        ({"row_hz": float("nan")}, "row tone 0 in segment 0"),
+        ({"amplitude": 1.1}, r"amplitude of row tone 0 .* is 1\.1 of full scale"),
+        ({"amplitude": -0.1}, "amplitude of row tone 0"),
+        ({"duration_s": 0.0}, "length of the program is 0 s"),
+        ({"duration_s": -1.0}, "a segment's duration"),
+        ({"duration_s": float("nan")}, "a segment's duration"),
+    ],
+)
+def test_an_impossible_program_is_refused_before_it_plays(
+    lab: Lab, wrong: dict[str, float], what: str
+) -> None:
+    with pytest.raises(LimitError, match=what):
+        lab.mobile.prepare(program(**wrong))
+    with pytest.raises(DeviceError, match="without a prepared program"):
+        lab.mobile.play()
+
+
+def test_tones_that_would_clip_together_are_refused(lab: Lab) -> None:
+    hz, on = np.array([99e6, 101e6]), np.array([0.6, 0.6])
+    two = AxisTones(np.array([0, 2], np.int32), hz, hz, on, on, np.zeros(2))
+    one = axis([100e6, 100e6], [1.0, 1.0])
+    clipping = ToneProgram(two, one, np.array([1e-3]), np.zeros(1, np.int8), np.array([7], np.int32))
+    with pytest.raises(LimitError, match=r"sum of the row amplitudes in segment 0 \(batch 7\) is 1\.2"):
+        lab.mobile.prepare(clipping)
+
+
+def test_closing_makes_safe(lab: Lab) -> None:
+    lab.static.close()
+    assert lab.n_atoms == 0
+
+
+@pytest.mark.parametrize("driver", [VirtualCamera, VirtualStaticTweezers, VirtualMobileTweezers])
+def test_virtual_hardware_needs_a_simulation(driver: Any) -> None:
+    with pytest.raises(ConfigError, match=r"simulation: \{use: virtual\}"):
+        driver(object(), Context("camera"))
+
+
+def test_the_self_tests_of_the_tweezers_pass_and_change_nothing(lab: Lab) -> None:
+    for device in (lab.static, lab.mobile):
+        before = device.describe()
+        device.self_test()
+        assert device.describe() == before
+    assert lab.n_atoms == 6
+
+
+def test_self_tests_need_an_open_device(lab: Lab) -> None:
+    for device in (lab.static, lab.mobile, lab.camera):
+        device.close()
+        with pytest.raises(DeviceError, match="not open"):
+            device.self_test()
+
+
+def test_the_static_tweezers_refuse_calibrated_amplitudes_beyond_a_limit(lab: Lab) -> None:
+    settings = StaticTweezersSettings(max_amplitude_sum=0.5)
+    static = VirtualStaticTweezers(settings, lab.context("static_tweezers"))
+    static.open()
+    with pytest.raises(
+        DeviceError, match=r"the calibrated amplitudes exceed a limit: .*.* is 1; the limit is 0\.5"
+    ):
+        static.self_test()
+
+
+def test_the_self_test_names_a_site_out_of_reach(lab: Lab) -> None:
+    settings = MobileTweezersSettings(band_half_width=1e6)
+    mobile = VirtualMobileTweezers(settings, lab.context("mobile_tweezers"))
+    mobile.open()
+    with pytest.raises(
+        DeviceError, match=r"column 0 is out of reach: its tone of .* is not in the band of 99 to"
+    ):
+        mobile.self_test()
+
+
+def test_no_kernel_is_left_to_be_compiled_by_the_first_image(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kernels = "labseq_virtual.transport_kernels"  # which takes longer than a camera may
+    monkeypatch.delitem(sys.modules, kernels, raising=False)
+    assert isinstance(lab.mobile, NeedsWarmUp)
+    lab.mobile.warm()
+    assert kernels in sys.modules
+
+
+ROOT = Path(__file__).parents[2]
+SPECS = (
+    LineSpec("cooling", 2, frozenset({"load", "rearrange", "idle"})),
+    LineSpec("mot", 3, frozenset({"load"})),
+    LineSpec("imaging", 4, frozenset({"image"}), lead_s=1e-3),
+    LineSpec("repump", 5, frozenset({"image"})),
+    LineSpec("camera_trigger", 6, frozenset({"image"}), pulse_s=1e-3, triggers="camera"),
+)
+
+NEEDS = LightSettings(loading=("mot",), cooling=("cooling",), imaging=("imaging", "repump"))
+
+
+class TestVirtualLines(LinesContract):
+    @pytest.fixture
+    def factory(self):
+        return partial(VirtualLines, LinesSettings())
+
+
+def fire(lights: Lights, kind: str, duration_s: float, t_s: float) -> LineProgram:
+    program = line_program(SPECS, kind, duration_s)
+    lights.switch(program, t_s)
+    return program
+
+
+def test_without_lines_all_light_is_on() -> None:
+    lights = Lights(NEEDS, ())
+    assert lights.fraction_on("imaging", 0.0, 1.0) == 1.0
+
+
+def test_light_that_needs_no_line_is_always_on() -> None:
+    lights = Lights(LightSettings(), SPECS)
+    fire(lights, "load", 0.1, 0.0)
+    assert lights.fraction_on("imaging", 0.0, 0.1) == 1.0
+
+
+def test_light_needs_all_of_its_lines() -> None:
+    lights = Lights(NEEDS, SPECS)
+    fire(lights, "image", 10e-3, 5.0)
+    assert lights.fraction_on("imaging", 5.0, 5.001) == pytest.approx(0.0)  # imaging leads, repump does not
+    assert lights.fraction_on("imaging", 5.001, 5.011) == pytest.approx(1.0)
+    assert lights.fraction_on("imaging", 5.006, 5.016) == pytest.approx(0.5)
+    assert lights.fraction_on("loading", 5.001, 5.011) == 0.0
+
+
+def test_idle_lines_stay_on_between_steps() -> None:
+    lights = Lights(NEEDS, SPECS)
+    fire(lights, "load", 0.1, 0.0)
+    fire(lights, "image", 0.1, 1.0)
+    assert lights.fraction_on("cooling", 0.0, 1.0) == 1.0
+    assert lights.fraction_on("cooling", 1.0, 1.101) == 0.0
+    assert lights.fraction_on("cooling", 1.2, 9.0) == 1.0
+
+
+def test_an_undeclared_line_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"`lights.loading` names a line 'mott'; the profile has 'cooling'"):
+        Lights(LightSettings(loading=("mott",)), SPECS)
+
+
+def test_an_edge_reaches_the_device_wired_to_it() -> None:
+    lights, seen = Lights(NEEDS, SPECS), list[float]()
+    lights.wire("camera", seen.append)
+    fire(lights, "image", 10e-3, 2.0)
+    fire(lights, "load", 10e-3, 3.0)
+    assert seen == [pytest.approx(2.001)]
+
+
+class LabWithLines:
+    """A simulation with lines."""
+
+    def __init__(self, **settings: Any) -> None:
+        self.clock = FakeClock()
+        self.context = Context(
+            "simulation", SiteGrid(), clock=self.clock, random=RandomStream(3), lines=SPECS
+        )
+        self.simulation = VirtualSimulation(SimulationSettings(lights=NEEDS, **settings), self.context)
+        self.simulation.open()
+        self.simulation.play("static_tweezers", labseq.DepthRamp(0.0, 1.0), 0.0)
+        self.context.random.begin_shot(0, 0)
+        self.simulation.begin_shot()
+        self.t_s = 0.0
+
+    def fire(self, kind: str, duration_s: float) -> None:
+        self.t_s += 1.0
+        self.simulation.play("lines", line_program(SPECS, kind, duration_s), self.t_s)
+
+    def n_atoms(self) -> int:
+        return int(np.count_nonzero(self.simulation.truth()))
+
+
+def loaded(kind: str) -> int:
+    lit = LabWithLines()
+    lit.fire(kind, 0.5)
+    lit.simulation.load(lit.t_s, 0.5)
+    return lit.n_atoms()
+
+
+def test_without_the_mot_nothing_loads() -> None:
+    assert loaded("wait") == 0
+    assert 250 < loaded("load") < 350
+
+
+def bright_pixels(kind: str) -> tuple[int, int]:
+    """Pixels that shine brighter than noise does, and atoms lost to imaging."""
+    lit = LabWithLines()
+    lit.fire("load", 0.5)
+    lit.simulation.load(lit.t_s, 0.5)
+    lit.fire(kind, 45e-3)
+    image = lit.simulation.expose(lit.t_s + 1e-3, 45e-3).image
+    return int(np.count_nonzero(image > 800)), int(lit.simulation.losses()["imaging"])
+
+
+def test_without_imaging_light_a_frame_is_dark_and_no_atom_is_lost_to_it() -> None:
+    dark, n_lost_in_the_dark = bright_pixels("wait")
+    bright, _ = bright_pixels("image")
+    assert dark < 30 < 10 * dark < bright
+    assert n_lost_in_the_dark == 0
+
+
+PROFILE = (ROOT / "hardware_profiles" / "virtual.yaml").read_text("utf-8")
+LINES = """
+lines:
+  use: virtual
+  channels:
+    cooling: {channel: 2, on: [load, rearrange, idle]}
+    mot: {channel: 3, on: [load], lag: 5 ms, blinding: true}
+    imaging: {channel: 4, on: [image], lead: 0.2 ms}
+    camera_trigger: {channel: 6, on: [image], pulse: 1 ms, triggers: camera}
+"""
+
+MOVED = ("simulation.lost.transport", "simulation.lost.hand_over")
+LIT = "simulation:\n  lights: {loading: [mot], cooling: [cooling], imaging: [imaging]}\n"
+
+
+def run(tmp_path: Path, lines: str, *overrides: str, shots: int = 4) -> labseq.Run:
+    tmp_path.mkdir(exist_ok=True)
+    profile = tmp_path / "lined.yaml"
+    profile.write_text(PROFILE.replace("simulation:\n", LIT) + lines, "utf-8")
+    with labseq.Session.open(
+        ROOT / "sequences" / "compact_225.yaml",
+        profile=str(profile),
+        shots=shots,
+        seed=5,
+        overrides=["record_frames=none", *overrides],
+        output=tmp_path / "data",
+    ) as session:
+        return session.run()
+
+
+def test_a_run_without_molasses_in_the_moves_loses_more_atoms(tmp_path: Path) -> None:
+    lit = run(tmp_path / "a", LINES)
+    dark = run(tmp_path / "b", LINES.replace("[load, rearrange, idle]", "[load, idle]"))
+    n_cool, n_hot = (
+        sum(n for shot in one.shots for cause, n in shot.readings.items() if cause in MOVED)
+        for one in (lit, dark)
+    )
+    assert n_hot > 1.8 * n_cool > 0
+
+
+def test_the_trigger_line_starts_the_exposures(tmp_path: Path) -> None:
+    made = run(tmp_path / "a", LINES, shots=1).shots[0]
+    by_software = run(tmp_path / "b", LINES.replace(", triggers: camera", ""), shots=1).shots[0]
+    assert made.filling_fraction > 0.9
+    assert np.array_equal(made.occupancies, by_software.occupancies)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (
+            "on: [load], lag",
+            "on: [laod], lag",
+            r"lined.yaml:\d+:\d+: there is no kind of step 'laod'.*'load'",
+        ),
+        ("channel: 3", "channel: 2", "'cooling' and 'mot' are both on channel 2"),
+        ("channel: 3", "channel: 77", "the box has no channel 77"),
+        ("lag: 5 ms", "pulse: 1 ms, lag: 5 ms", "lag is set beside pulse"),
+        ("on: [image], pulse", "on: [load], pulse", "a line that triggers the camera is on at other times"),
+        (
+            "  channels:",
+            "  mutually_exclusive: [[mot, cooling]]\n  channels:",
+            "'mot' and 'cooling' must never be on together, but both are during 'load'",
+        ),
+        ("  channels:", "  mutually_exclusive: [[mot, x]]\n  channels:", "there is no line 'x'"),
+        ("  use: virtual", "  use: virtuel", "unknown lines 'virtuel'"),
+    ],
+)
+def test_mistakes_in_lines_are_reported_with_line_and_column(
+    tmp_path: Path, old: str, new: str, message: str
+) -> None:
+    with pytest.raises(ConfigError, match=message) as caught:
+        run(tmp_path / "x", LINES.replace(old, new))
+    assert all(problem.line > 0 for problem in caught.value.problems)
+
+
+def test_a_blinding_line_in_an_exposure_with_em_gain_is_refused_before_the_run(tmp_path: Path) -> None:
+    lines = LINES.replace("on: [load], lag", "on: [load, image], lag")
+    with pytest.raises(ConfigError, match="'mot' is blinding and on during `image`, with an EM gain of 300"):
+        run(tmp_path, lines, "profile.camera.em_gain=300")
+
+
+def test_a_device_remembers_its_commands() -> None:
+    shutter = VirtualDevice(
+        DeviceSettings(commands=("open", "close"), values={"power": 1.5}), Context("shutter")
+    )
+    shutter.open()
+    shutter.command("open", power=2.5)
+    assert shutter.read("state") == "open"
+    assert shutter.read("power") == 2.5
+    shutter.safe_state()
+    assert shutter.read("state") == "safe"
+    with pytest.raises(DeviceError, match="unknown command 'opne'; expected one of 'open', 'close'"):
+        shutter.command("opne")
+    with pytest.raises(DeviceError, match="unknown value 'depth'; expected one of 'power', 'state'"):
+        shutter.read("depth")
+
+
+def test_a_device_without_commands_takes_every_command() -> None:
+    device = VirtualDevice(DeviceSettings(), Context("laser"))
+    with pytest.raises(DeviceError, match="laser: not open"):
+        device.command("on")
+    device.open()
+    device.command("set", power=0.1)
+    assert device.read("power") == 0.1
+
+
+SPOTS = SiteGrid(12, 15)
+
+
+def with_disorder(context: Context) -> Context:
+    physics = SimulationSettings.model_validate({"depth_disorder": 0.04, "tone_response": 0.06})
+    return replace(context, simulation=VirtualSimulation(physics, context))
+
+
+class TestVirtualSpotMeter(DeviceContract):
+    values: ClassVar = ("spot_powers",)
+
+    def context(self) -> Context:
+        return with_disorder(super().context())
+
+    @pytest.fixture
+    def factory(self) -> Callable[[Context], VirtualSpotMeter]:
+        return lambda context: VirtualSpotMeter(SpotMeterSettings(), context)
+
+
+@pytest.fixture
+def context() -> Context:
+    return with_disorder(Context("trap_camera", SPOTS, clock=FakeClock(), random=RandomStream(4)))
+
+
+def meter(
+    context: Context, noise: float = 0.0, level: float = 1.0
+) -> tuple[VirtualSpotMeter, VirtualSimulation]:
+    """One that is open, on a simulation with the light on."""
+    simulation = context.simulation
+    assert isinstance(simulation, VirtualSimulation)
+    simulation.open()
+    context.random.begin_shot(0, 0)
+    simulation.begin_shot()
+    simulation.play("static_tweezers", DepthRamp(0.0, level), 0.0)
+    made = VirtualSpotMeter(SpotMeterSettings(noise=noise), context)
+    made.open()
+    return made, simulation
+
+
+def test_it_measures_the_depth_of_each_tweezer(context: Context) -> None:
+    spots, simulation = meter(context)
+    before = spots.read("spot_powers")
+    assert before.shape == SPOTS.shape
+    assert before.dtype == np.float64
+    np.testing.assert_array_equal(before, simulation.spot_powers())
+    simulation.play("static_tweezers", TweezerAmplitudes(np.full(12, 0.5 / 12), np.full(15, 1 / 15)), 0.0)
+    np.testing.assert_allclose(spots.read("spot_powers"), 0.25 * before)
+
+
+def test_its_noise_is_relative_and_new_each_time(context: Context) -> None:
+    spots, simulation = meter(context, noise=0.05)
+    off = np.stack([spots.read("spot_powers") for _ in range(50)]) / simulation.spot_powers() - 1
+    assert off.std() == pytest.approx(0.05, rel=0.05)
+    assert abs(off.mean()) < 4 * 0.05 / off.size**0.5
+    assert abs(np.corrcoef(off[0].ravel(), off[1].ravel())[0, 1]) < 0.3
+
+
+def test_a_measurement_takes_its_time(context: Context) -> None:
+    spots, _ = meter(context)
+    start_s = context.clock.now()
+    spots.read("spot_powers")
+    assert context.clock.now() - start_s == pytest.approx(20e-3)
+
+
+def test_it_only_measures(context: Context) -> None:
+    spots, _ = meter(context)
+    with pytest.raises(
+        DeviceError, match="trap_camera: unknown command 'on'; it only measures: read 'spot_powers'"
+    ):
+        spots.command("on")
+    with pytest.raises(DeviceError, match="trap_camera: unknown value 'power'; expected 'spot_powers'"):
+        spots.read("power")

@@ -1,0 +1,556 @@
+"""The simulation: loading, losses, time, the static array, and connected outputs."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from labseq_virtual.settings import SimulationSettings
+from labseq_virtual.simulation import StaticArray, VirtualSimulation
+from labseq_virtual.tweezers import SILENCE
+
+from labseq import (
+    Context,
+    DepthRamp,
+    DeviceError,
+    LimitError,
+    MotionSpec,
+    Plan,
+    RandomStream,
+    SiteGrid,
+    ToneProgram,
+    TweezerAmplitudes,
+)
+from labseq.model import AxisTones
+from labseq.motion import tone_program
+from labseq.roles import offers
+from labseq.testing.fakes import FakeClock
+from labseq.testing.rf import GRID as RF_GRID, START_S, PlayedRfSource, played, program_of, spec
+
+GRID = SiteGrid(20, 20)
+TINY_IMAGE = {"frame": (2, 2), "background": 0.0}
+
+
+def new_simulation(seed: int = 0, *, on: bool = True, **physics: Any) -> VirtualSimulation:
+    """A simulation without losses but those that are asked for, in its first shot, with small frames."""
+    calm = {"lifetime": 2e6, "imaging_loss": 0.0, "transport_loss": 0.0, "image": TINY_IMAGE}
+    random = RandomStream(seed)
+    simulation = VirtualSimulation(
+        SimulationSettings.model_validate(calm | physics), Context("simulation", GRID, random=random)
+    )
+    simulation.open()
+    if on:
+        simulation.play("static_tweezers", DepthRamp(0.0, 1.0), 0.0)
+    random.begin_shot(0, 0)
+    simulation.begin_shot()
+    return simulation
+
+
+def n_atoms(simulation: VirtualSimulation) -> int:
+    return int(simulation.truth().sum())
+
+
+def within_four_sigma(count: int, n: int, p: float) -> bool:
+    return abs(count - n * p) <= 4 * np.sqrt(n * p * (1 - p))
+
+
+def carry_row_0(n_sites: int = 1, moves_s: float = 1e-3) -> ToneProgram:
+    """Take the atom at (0, 0) along row 0 to column ``n_sites``: pick-up, transport, drop-off."""
+    hz = GRID.column_frequency_hz
+    places, ramp = hz[[0, 0, n_sites, n_sites]], np.array([0.0, 0.1, 0.1, 0.0])
+    offsets, phase = np.arange(4, dtype=np.int32), np.zeros(3)
+    still, on = np.full(3, GRID.row_frequency_hz[0]), np.full(3, 0.1)
+    return ToneProgram(
+        AxisTones(offsets, still, still, on, on, phase),
+        AxisTones(offsets, places[:3], places[1:], ramp[:3], ramp[1:], phase),
+        np.array([60e-6, moves_s, 60e-6]),
+        np.zeros(3, np.int8),
+        np.zeros(3, np.int32),
+    )
+
+
+@pytest.mark.parametrize(
+    ("duration_s", "filling"), [(0.5, 0.75), (0.05, 0.75 * (1 - np.exp(-1))), (0.0, 0.0)]
+)
+def test_loading_saturates(duration_s: float, filling: float) -> None:
+    loaded = 0
+    simulation = new_simulation()
+    for _ in range(25):
+        simulation.begin_shot()
+        simulation.load(1.0, duration_s)
+        loaded += n_atoms(simulation)
+    assert within_four_sigma(loaded, 25 * 400, filling)
+
+
+def test_loading_twice_is_loading_once() -> None:
+    simulation = new_simulation(loading=0.5)
+    for k in range(25):
+        simulation.load(float(k), 0.5)
+        assert within_four_sigma(n_atoms(simulation), 400, 0.5)
+
+
+def test_no_light_no_atoms() -> None:
+    simulation = new_simulation(on=False)
+    simulation.load(1.0, 0.5)
+    assert n_atoms(simulation) == 0
+
+
+def test_a_shot_begins_empty() -> None:
+    simulation = new_simulation(loading=1.0)
+    simulation.load(1.0, 0.5)
+    simulation.begin_shot()
+    assert n_atoms(simulation) == 0
+
+
+@pytest.mark.parametrize(("depth", "kept"), [(0.0, 0), (0.05, 0), (0.5, 400)])
+def test_a_ramp_too_low_loses_the_atoms_for_good(depth: float, kept: int) -> None:
+    simulation = new_simulation(loading=1.0)
+    simulation.load(1.0, 0.5)
+    assert n_atoms(simulation) == 400
+    simulation.play("static_tweezers", DepthRamp(1.0, depth, 0.01), 2.0)
+    simulation.play("static_tweezers", DepthRamp(depth, 1.0, 0.01), 2.1)
+    assert n_atoms(simulation) == kept
+
+
+def test_the_weakest_tweezers_lose_their_atoms_first() -> None:
+    simulation = new_simulation(loading=1.0, depth_disorder=0.04, lost_below_depth=0.1)
+    simulation.load(1.0, 0.5)
+    simulation.play("static_tweezers", DepthRamp(1.0, 0.1), 2.0)
+    assert within_four_sigma(n_atoms(simulation), 400, 0.5)
+
+
+def test_the_machine_is_the_same_in_every_shot_and_another_for_another_seed() -> None:
+    def held_at_the_edge(seed: int, shot: int) -> bytes:
+        random = RandomStream(seed)
+        simulation = VirtualSimulation(
+            SimulationSettings(loading=1.0), Context("simulation", GRID, random=random)
+        )
+        simulation.open()
+        simulation.play("static_tweezers", DepthRamp(0.0, 1.0), 0.0)
+        random.begin_shot(shot, 0)
+        simulation.begin_shot()
+        simulation.load(1.0, 60.0)
+        simulation.play("static_tweezers", DepthRamp(1.0, 0.1), 61.0)
+        return simulation.truth().tobytes()
+
+    assert held_at_the_edge(1, 0) == held_at_the_edge(1, 5)
+    assert held_at_the_edge(1, 0) != held_at_the_edge(2, 0)
+
+
+def test_the_lifetime_acts_between_events_whatever_their_number() -> None:
+    survived, total = 0, 0
+    for seed in range(10):
+        simulation = new_simulation(seed, lifetime=33.0)
+        simulation.load(0.0, 0.5)
+        total += n_atoms(simulation)
+        for t_s in (5.0, 12.0, 17.0, 33.5):
+            simulation.play("static_tweezers", DepthRamp(1.0, 1.0), t_s)
+        survived += n_atoms(simulation)
+    assert within_four_sigma(survived, total, np.exp(-1))
+
+
+@pytest.mark.parametrize("exposure_s", [45e-3, 90e-3])
+def test_an_exposure_loses_what_the_paper_says(exposure_s: float) -> None:
+    survived, total = 0, 0
+    for seed in range(20):
+        simulation = new_simulation(seed, imaging_loss=0.1, lifetime=1.0)
+        simulation.load(0.0, 0.5)
+        total += n_atoms(simulation)
+        simulation.expose(0.5, exposure_s)
+        survived += n_atoms(simulation)
+    n_exposures = exposure_s / 45e-3
+    assert within_four_sigma(survived, total, (0.9 * np.exp(-45e-3)) ** n_exposures)
+
+
+def test_a_program_carries_atoms_and_takes_its_time() -> None:
+    simulation = new_simulation(loading=1.0)
+    simulation.load(0.0, 0.5)
+    before = simulation.truth()
+    simulation.play("mobile_tweezers", carry_row_0(20 - 1), 1.0)
+    after = simulation.truth()
+    assert before.all()
+    assert not after[0].all()
+    with pytest.raises(DeviceError, match=r"lasts until 1\.001120 s"):
+        simulation.expose(1.0005, 45e-3)
+    simulation.expose(1.00112, 45e-3)
+
+
+def test_the_transport_loss_spreads_from_shot_to_shot_and_keeps_its_mean() -> None:
+    factors: list[float] = []
+    simulation = new_simulation(transport_loss_spread=0.5)
+    for _ in range(4000):
+        simulation.begin_shot()
+        factors.append(simulation._loss_factor)
+    assert np.mean(factors) == pytest.approx(1.0, abs=4 * 0.53 / np.sqrt(4000))
+    assert np.std(np.log(factors)) == pytest.approx(0.5, abs=0.03)
+
+
+@pytest.mark.parametrize("t_cut_s", [1.00003, 1.0005, 1.00107])
+def test_silence_cuts_a_program_short_and_atoms_in_flight_are_lost(t_cut_s: float) -> None:
+    simulation = new_simulation(loading=1.0)
+    simulation.load(0.0, 0.5)
+    for col in range(1, 20):
+        simulation._occupied[0, col] = False
+    simulation.play("mobile_tweezers", carry_row_0(19), 1.0)
+    simulation.play("mobile_tweezers", SILENCE, t_cut_s)
+    truth = simulation.truth()
+    assert truth[1:].all()
+    caught = t_cut_s > 1.00006
+    assert truth[0].sum() == (0 if caught else 1)
+    assert truth[0, 0] == (not caught)
+    simulation.expose(t_cut_s, 45e-3)
+
+
+def test_safety_is_never_refused_however_far_the_world_is() -> None:
+    simulation = new_simulation(loading=1.0)
+    simulation.load(0.0, 0.5)
+    simulation.expose(1.0, 45e-3)
+    simulation.play("mobile_tweezers", SILENCE, 1.01)
+    simulation.play("static_tweezers", DepthRamp(1.0, 0.0), 1.01)
+    assert n_atoms(simulation) == 0
+
+
+def test_a_ramp_during_a_program_acts_at_its_end() -> None:
+    simulation = new_simulation(loading=1.0)
+    simulation.load(0.0, 0.5)
+    simulation.play("mobile_tweezers", carry_row_0(), 1.0)
+    simulation.play("static_tweezers", DepthRamp(1.0, 0.0), 1.0005)
+    assert n_atoms(simulation) == 0
+
+
+def test_events_in_the_past_are_refused() -> None:
+    simulation = new_simulation()
+    simulation.load(1.0, 0.5)
+    with pytest.raises(DeviceError, match=r"an exposure at 1\.400000 s.*lasts until 1\.500000 s"):
+        simulation.expose(1.4, 45e-3)
+    with pytest.raises(DeviceError, match="loading at"):
+        simulation.load(1.0, 0.5)
+    with pytest.raises(DeviceError, match="a program of the mobile tweezers at"):
+        simulation.play("mobile_tweezers", carry_row_0(), 1.0)
+    simulation.expose(1.5, 45e-3)
+
+
+def test_a_new_program_takes_the_place_of_one_that_plays() -> None:
+    simulation = new_simulation(loading=1.0)
+    simulation.load(0.0, 0.5)
+    simulation.play("mobile_tweezers", carry_row_0(), 1.0)
+    simulation.play("mobile_tweezers", carry_row_0(), 1.0005)
+    assert not simulation.truth()[0, 0]
+
+
+@pytest.mark.parametrize("role", ["camera", "static_tweezers"])
+def test_a_role_that_cannot_play_tones_is_named(role: str) -> None:
+    with pytest.raises(DeviceError, match=f"'{role}' played a ToneProgram"):
+        new_simulation().play(role, SILENCE, 0.0)
+
+
+def test_a_simulation_that_is_not_open_raises() -> None:
+    simulation = VirtualSimulation(SimulationSettings(), Context("simulation"))
+    with pytest.raises(DeviceError, match="not open"):
+        simulation.begin_shot()
+    simulation.close()
+    with pytest.raises(DeviceError, match="not open"):
+        simulation.expose(0.0, 1.0)
+
+
+@pytest.mark.parametrize("exposure_s", [0.0, -1.0, float("nan")])
+def test_an_exposure_takes_time(exposure_s: float) -> None:
+    with pytest.raises(LimitError, match="exposure"):
+        new_simulation().expose(0.0, exposure_s)
+
+
+def test_the_same_seed_gives_the_same_shot_whatever_came_before() -> None:
+    def shot(seed: int, indices: list[tuple[int, int]]) -> tuple[bytes, bytes]:
+        random = RandomStream(seed)
+        simulation = VirtualSimulation(SimulationSettings(), Context("simulation", GRID, random=random))
+        simulation.open()
+        simulation.play("static_tweezers", DepthRamp(0.0, 1.0), 0.0)
+        frame = simulation.truth().tobytes(), b""
+        for number, (index, attempt) in enumerate(indices):
+            random.begin_shot(index, attempt)
+            simulation.begin_shot()
+            start_s = 10.0 * number
+            simulation.load(start_s, 0.5)
+            simulation.play("mobile_tweezers", carry_row_0(3), start_s + 1.0)
+            image = simulation.expose(start_s + 2.0, 45e-3).image
+            frame = simulation.truth().tobytes(), image.tobytes()
+        return frame
+
+    assert shot(1, [(3, 0)]) == shot(1, [(0, 0), (1, 0), (3, 0)])
+    assert shot(1, [(3, 0)]) != shot(1, [(3, 1)])
+    assert shot(1, [(3, 0)]) != shot(2, [(3, 0)])
+
+
+def test_the_truth_is_a_copy() -> None:
+    simulation = new_simulation(loading=1.0)
+    assert offers(simulation, "truth")
+    simulation.load(0.0, 0.5)
+    simulation.truth()[...] = False
+    assert n_atoms(simulation) == 400
+
+
+def test_the_description_is_ready_for_json() -> None:
+    described = json.loads(json.dumps(dict(new_simulation(seed=7).describe())))
+    assert described["seed"] == 7
+    assert described["image"]["em_gain"] == 300.0
+
+
+def test_a_machine_with_a_seed_of_its_own_is_the_same_in_every_run() -> None:
+    assert np.array_equal(
+        new_simulation(1, machine_seed=9).spot_powers(), new_simulation(2, machine_seed=9).spot_powers()
+    )
+    assert not np.array_equal(new_simulation(1).spot_powers(), new_simulation(2).spot_powers())
+
+
+ARRAY_GRID = SiteGrid(12, 15)
+
+
+def array(level: float = 1.0, **physics: float) -> StaticArray:
+    """An array with the light on."""
+    static = StaticArray(ARRAY_GRID, SimulationSettings.model_validate({"depth_disorder": 0.0} | physics))
+    static.draw(np.random.default_rng(3))
+    static.ramp(DepthRamp(0.0, level), np.zeros(ARRAY_GRID.shape, np.bool_))
+    return static
+
+
+def equal(factor: float = 1.0) -> TweezerAmplitudes:
+    return TweezerAmplitudes(np.full(12, factor / 12), np.full(15, 1 / 15))
+
+
+def test_equal_amplitudes_at_full_scale_give_the_nominal_depth() -> None:
+    np.testing.assert_allclose(array().depth, np.ones(ARRAY_GRID.shape))
+    static = array()
+    static.drive(equal())
+    np.testing.assert_allclose(static.depth, np.ones(ARRAY_GRID.shape))
+
+
+def test_the_depth_goes_as_the_amplitude_squared() -> None:
+    static = array()
+    static.drive(equal(0.7))
+    np.testing.assert_allclose(static.depth, np.full(ARRAY_GRID.shape, 0.49))
+
+
+def test_disorder_of_the_sites_cannot_be_resolved_from_rows_and_columns_and_stays() -> None:
+    depth = array(depth_disorder=0.04).depth
+    assert depth.std() == pytest.approx(0.04, rel=0.15)
+    separable = depth.mean(axis=1, keepdims=True) * depth.mean(axis=0) / depth.mean()
+    assert (depth / separable).std() == pytest.approx(0.04, rel=0.2)
+
+
+def test_the_response_of_the_tones_is_undone_by_amplitudes() -> None:
+    static = array(tone_response=0.1)
+    depth = static.depth
+    assert 0.08 < depth.std() < 0.25
+    rows, cols = depth[:, 0] / depth[0, 0], depth[0]
+    static.drive(TweezerAmplitudes(rows**-0.5 / 12, cols**-0.5 / 15))
+    np.testing.assert_allclose(static.depth, np.ones(ARRAY_GRID.shape))
+
+
+def test_atoms_are_lost_where_the_light_is_too_weak() -> None:
+    static = array(depth_disorder=0.2, lost_below_depth=0.5)
+    occupied = np.ones(ARRAY_GRID.shape, np.bool_)
+    assert static.ramp(DepthRamp(1.0, 1.0), occupied) == np.count_nonzero(~occupied)
+    n_before = np.count_nonzero(occupied)
+    n_lost = static.ramp(DepthRamp(1.0, 0.5), occupied)
+    assert 0 < n_lost == n_before - np.count_nonzero(occupied)
+    np.testing.assert_array_equal(occupied, static.holds())
+    static.switch_off()
+    assert not static.holds().any()
+
+
+class PlayedAmplitudes:
+    """A ``ToneSource`` that answers what is put into it."""
+
+    def __init__(self) -> None:
+        self.queued: list[TweezerAmplitudes] = []
+
+    def played(self, until_s: float) -> list[TweezerAmplitudes]:
+        queued, self.queued = self.queued, []
+        return queued
+
+
+def test_connected_outputs_alone_set_the_light() -> None:
+    static, outputs = array(), PlayedAmplitudes()
+    static.connect_outputs(outputs)
+    occupied = np.zeros(ARRAY_GRID.shape, np.bool_)
+    assert static.receive_until(0.0, occupied) == 0
+    assert not static.holds().any()
+    outputs.queued = [equal()]
+    static.receive_until(1.0, occupied)
+    np.testing.assert_allclose(static.depth, np.ones(ARRAY_GRID.shape))
+    static.receive_until(2.0, occupied)
+    np.testing.assert_allclose(static.depth, np.ones(ARRAY_GRID.shape))
+
+
+def test_atoms_are_lost_in_a_dark_moment_between_two_reads_of_the_outputs() -> None:
+    static, outputs = array(), PlayedAmplitudes()
+    static.connect_outputs(outputs)
+    occupied = np.ones(ARRAY_GRID.shape, np.bool_)
+    outputs.queued = [equal(), equal(0.9)]
+    assert static.receive_until(0.0, occupied) == 0
+    outputs.queued = [equal(0.0), equal()]
+    assert static.receive_until(1.0, occupied) == 12 * 15
+    assert static.holds().all()
+
+
+def test_outputs_are_ignored_after_the_light_was_switched_off() -> None:
+    static, outputs = array(), PlayedAmplitudes()
+    static.connect_outputs(outputs)
+    static.switch_off()
+    outputs.queued = [equal()]
+    static.receive_until(0.0, np.zeros(ARRAY_GRID.shape, np.bool_))
+    assert not static.holds().any()
+
+
+CALM = {
+    "lifetime": 2e6,
+    "imaging_loss": 0.0,
+    "transport_loss": 0.0,
+    "loading": 1.0,
+    "loading_time": 1e-3,
+    "image": {"frame": (2, 2)},
+}
+
+PROGRAM = program_of(([(5, 2)], [(5, 4)]))
+
+
+def with_atoms(clock: FakeClock, motion: MotionSpec | None = None, **physics: Any) -> VirtualSimulation:
+    """A simulation with an atom on each site, the one at the goal of :data:`PROGRAM` too."""
+    random = RandomStream(1)
+    context = Context("simulation", RF_GRID, motion or spec(), clock, random)
+    simulation = VirtualSimulation(SimulationSettings.model_validate(CALM | physics), context)
+    simulation.open()
+    simulation.play("static_tweezers", DepthRamp(0.0, 1.0), clock.now())
+    random.begin_shot(0, 0)
+    simulation.begin_shot()
+    simulation.load(clock.now(), 0.1)
+    return simulation
+
+
+def after(clock: FakeClock) -> float:
+    """Some time after the program's end."""
+    clock.sleep(START_S + 1.0 - clock.now())
+    return clock.now()
+
+
+@pytest.fixture
+def clock() -> FakeClock:
+    clock = FakeClock()
+    assert clock.now() < START_S - 0.2
+    return clock
+
+
+def test_played_output_acts_before_the_next_event(clock: FakeClock) -> None:
+    simulation = with_atoms(clock)
+    simulation.connect_outputs("mobile_tweezers", PlayedRfSource(played(PROGRAM)))
+    simulation.expose(after(clock), 1e-3)
+    assert np.argwhere(~simulation.truth()).tolist() == [[5, 2], [5, 3], [5, 4]]
+
+
+def test_output_played_before_a_new_connection_still_acts(clock: FakeClock) -> None:
+    simulation = with_atoms(clock)
+    simulation.connect_outputs("mobile_tweezers", PlayedRfSource(played(PROGRAM)))
+    after(clock)
+    simulation.connect_outputs("mobile_tweezers", PlayedRfSource(([], [])))
+    assert not simulation.truth()[5, 2]
+
+
+@pytest.mark.parametrize("event", ["exposure", "ramp"])
+def test_light_during_another_event_is_an_error(clock: FakeClock, event: str) -> None:
+    simulation = with_atoms(clock)
+    simulation.connect_outputs("mobile_tweezers", PlayedRfSource(([], [])))
+    if event == "exposure":
+        simulation.expose(START_S - 0.1, 0.2)
+    else:
+        simulation.play("static_tweezers", DepthRamp(1.0, 0.9, 0.2), START_S - 0.1)
+    simulation.connect_outputs("mobile_tweezers", PlayedRfSource(played(PROGRAM)))
+    after(clock)
+    with pytest.raises(DeviceError, match=r"were on at 3\.00\d+ s, together with something else; wait"):
+        simulation.truth()
+
+
+def test_the_light_of_the_last_shot_moves_nothing_in_the_next(clock: FakeClock) -> None:
+    simulation = with_atoms(clock)
+    simulation.connect_outputs("mobile_tweezers", PlayedRfSource(played(PROGRAM)))
+    after(clock)
+    simulation.begin_shot()
+    simulation.load(clock.now(), 0.1)
+    assert simulation.truth()[5, 2]
+    assert len(simulation.atom_events(0.0)["flights"]) == 0
+
+
+def test_a_site_without_light_is_left_alone(clock: FakeClock) -> None:
+    simulation = with_atoms(clock, lost_below_depth=0.0)
+    simulation.play("static_tweezers", DepthRamp(1.0, 0.0, 0.1), START_S - 0.5)
+    simulation.connect_outputs("mobile_tweezers", PlayedRfSource(played(PROGRAM)))
+    after(clock)
+    assert simulation.truth().any()
+
+
+@pytest.mark.parametrize(
+    ("changes", "transit_s", "text"),
+    [
+        ({"speed_m_s": 0.3}, 10e-6, r"in a transit_time of 10 us is 0\.67 sites; the limit is 0\.6"),
+        ({"speed_profile": "constant_jerk", "speed_m_s": 0.2}, 10e-6, r"0\.89 sites"),
+        ({}, 50e-6, r"1\.4 sites"),
+        (
+            {},
+            1e-6,
+            r"step of the sites' tones at a transit_time of 1 us is 1\.6 MHz; the limit is at least 2 MHz",
+        ),
+    ],
+)
+def test_unresolvable_tones_are_refused(
+    clock: FakeClock, changes: dict[str, float | str], transit_s: float, text: str
+) -> None:
+    simulation = with_atoms(clock, spec(**changes), mobile_light={"transit_time": transit_s})
+    with pytest.raises(LimitError, match=text):
+        simulation.connect_outputs("mobile_tweezers", PlayedRfSource(([], [])))
+
+
+@pytest.mark.parametrize(
+    ("changes", "transit_s"),
+    [
+        ({"speed_m_s": 0.26}, 10e-6),
+        ({"speed_profile": "constant_jerk"}, 10e-6),
+        ({}, 1.5e-6),
+        ({}, 20e-6),
+    ],
+)
+def test_barely_resolvable_tones_carry_neighbours(
+    clock: FakeClock, changes: dict[str, float | str], transit_s: float
+) -> None:
+    motion = spec(**changes)
+    simulation = with_atoms(clock, motion, mobile_light={"transit_time": transit_s})
+    sources = [(5, c) for c in (1, 2, 3, 16)]
+    program = program_of((sources, [(5, 3), (5, 4), (5, 5), (5, 16)]), **changes)
+    simulation.connect_outputs("mobile_tweezers", PlayedRfSource(played(program)))
+    after(clock)
+    flights = simulation.atom_events(0.0)["flights"]
+    known = {(int(f["from_row"]), int(f["from_col"])): f["fate"] for f in flights}
+    # Those at 1 and 2 meet the atoms on 4 and 5, which stay in their way.
+    assert known[5, 16] == b"kept"
+    assert len(flights) == 6
+
+
+def test_a_grid_with_one_site_needs_no_resolution(clock: FakeClock) -> None:
+    hz = np.array([100e6])
+    grid = SiteGrid(1, 1, row_frequency_hz=hz, column_frequency_hz=hz)
+    simulation = VirtualSimulation(SimulationSettings(), Context("simulation", grid, spec(), clock))
+    simulation.open()
+    simulation.connect_outputs("mobile_tweezers", PlayedRfSource(([], [])))
+
+
+def test_preassigned_amplitudes_give_the_full_depth(clock: FakeClock) -> None:
+    motion = spec()
+    amplitudes = tuple(np.linspace(0.02, 0.05, 20).tolist())
+    motion = replace(motion, rf=replace(motion.rf, row_amplitudes=amplitudes))
+    simulation = with_atoms(clock, motion)
+    program = tone_program(Plan.from_batches([([(5, 2)], [(9, 2)])]), RF_GRID, motion)
+    simulation.connect_outputs("mobile_tweezers", PlayedRfSource(played(program)))
+    after(clock)
+    flights = simulation.atom_events(0.0)["flights"]
+    assert flights["depth_K"][flights["from_row"] == 5] == pytest.approx([2.1e-3], rel=0.02)
