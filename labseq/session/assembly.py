@@ -1,4 +1,4 @@
-"""Puts a run together: files, plugins, settings and objects, without opening anything."""
+"""Assembles a run from its files: plugins, settings and objects; nothing is opened."""
 
 from __future__ import annotations
 
@@ -46,21 +46,21 @@ from labseq.session.scan import Point, ScanPoints
 
 @dataclass(frozen=True, slots=True)
 class Assembly:
-    """A run before anything is opened.
+    """A run before its devices are opened.
 
     Attributes:
         document: The sequence's file.
-        sequence: What it says.
+        sequence: Its content.
         bench: The profile.
-        target: What the array shall look like.
+        target: The pattern of atoms to end with.
         planner: What plans the moves.
         steps: Name and step, in order.
         dry_run: "off", "full" or "fast".
         resolved: Every setting after defaults and overrides, SI, JSON-ready; of a scan, at its first
             point, as everything else here.
         scanned: The points of the scan; None without one.
-        policy: What follows failures and exceeded budgets.
-        search: What chooses the points, if they are not known beforehand.
+        policy: Reactions to failures and exceeded budgets.
+        search: The scanner, if it chooses the points during the run.
     """
 
     document: Document
@@ -77,18 +77,18 @@ class Assembly:
 
     @property
     def virtual_time(self) -> bool:
-        """Whether the run need not wait in real time."""
+        """Whether the run's clock is virtual, without real waiting times."""
         return self.dry_run != "off" or self.bench.virtual_time
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What the user should know although it is no error."""
+        """Warnings for the user."""
         notes = () if self.scanned is None else self.scanned.scan.notes
         return (*self.bench.warnings, *notes)
 
     @property
     def begun(self) -> Point:
-        """The settings of the first point of a scan; those of the files where no point is known yet."""
+        """The settings of the first point of a scan; those of the files if no point is known yet."""
         alone = self.scanned is None or self.search is not None
         return Point(self.planner, self.steps, self.bench, {}) if alone else self.at(0)
 
@@ -115,11 +115,11 @@ def assemble(
         sequence_path: The sequence file, or the name of one; see :func:`labseq.config.find_sequence`.
         profile: Name or path of the profile, instead of the sequence's own.
         overrides: ``"address=value"`` strings, as given to ``--set``; they win.
-        given: Values of other options.
-        dry_run: "full": every device by its simulated counterpart where its plugin
-            declares one, else its virtual twin; "fast": virtual twins only.
-        kept: What the sequence's file says, in place of what it says today.
-        again: Profile and calibrations, if the run was begun before.
+        given: Overrides from other options.
+        dry_run: "full": every device by its simulator if its plugin has one, else by its virtual
+            twin; "fast": virtual twins only.
+        kept: The sequence's text when the run began, if it is resumed.
+        again: Profile and calibrations when the run began, if it is resumed.
 
     Raises:
         ConfigError: The sequence, the profile or an override is wrong.
@@ -164,7 +164,7 @@ def _put_together(
     found: ProblemCollector,
     dry_run: DryRun,
 ) -> Assembly:
-    """Make what the sequence asks for, on its profile."""
+    """Make the target, planner, steps and analyses of a sequence on its profile."""
     is_whole = not found.problems
     made: dict[str, Any] = {}
     with found:
@@ -206,7 +206,7 @@ def _explained(error: ConfigError, scan: Scan | None) -> ConfigError:
 
 
 def _check_alone(document: Document, sequence: SequenceSpec, found: ProblemCollector) -> None:
-    """Check a sequence without its profile: the settings of what needs no plugin folder."""
+    """Check a sequence whose profile is wrong: the settings of all plugins that need no plugin folder."""
     host = PluginHost()
     host.load_builtin(builtins)
     host.load_entry_points()
@@ -223,7 +223,7 @@ def _check_alone(document: Document, sequence: SequenceSpec, found: ProblemColle
 
 
 def _expressions(sequence: Document, profile: Document) -> dict[str, str]:
-    """The text of each expression, by its address; their values stand among the settings."""
+    """Address -> text of each expression; the record has their values among the settings."""
     texts: dict[str, str] = {}
     for prefix, document in (("", sequence), ("profile.", profile)):
         for loc, text in ({} if document.expressions is None else document.expressions.texts).items():

@@ -1,4 +1,4 @@
-"""From an entry and its settings to the object: devices, target, planner, steps and analyses."""
+"""Constructs objects from registry entries and settings: devices, target, planner, steps, analyses."""
 
 from __future__ import annotations
 
@@ -62,73 +62,53 @@ def construct(
     seed: int,
     simulation: Simulation | None = None,
     calibrations: Mapping[str, CalibrationEntry] | None = None,
-    world_grid: SiteGrid | None = None,
+    true_grid: SiteGrid | None = None,
     lines: tuple[LineSpec, ...] = (),
+    *,
+    refused: dict[str, LabseqError] | None = None,
 ) -> tuple[dict[str, Any], tuple[RandomStream, ...]]:
     """Construct the object of every role; constructors do no I/O, so nothing is open yet.
 
     Args:
-        chosen: Role -> what plays it.
+        chosen: Role -> its plugin.
         grid: The grid of sites, with calibrated tones.
         motion: How the mobile tweezers move.
         clock: The session's clock.
         seed: The run's seed.
-        simulation: The world, where none is among the chosen.
-        calibrations: Those in use: kind -> entry.
-        world_grid: The grid without calibrations, for the simulation: it is the truth that they are
-            measured on; None where there are none.
-        lines: What is wired to the timing box.
+        simulation: The simulation, if none is among the chosen.
+        calibrations: The active calibrations: kind -> entry.
+        true_grid: The grid without calibrations, for the simulation, in which they are measured; None
+            without calibrations.
+        lines: The lines connected to the timing box.
+        refused: Receives the errors, role -> error; without it they are raised.
 
     Returns:
-        Role -> object, and the random streams that were handed out.
+        Role -> object, and the random streams that the objects received.
 
     Raises:
         ConfigError: A constructor refuses its settings; with their place.
         PluginLoadError: A constructor raised, or made no object of that role; names the plugin.
     """
-    made, streams, refused = construct_each(
-        chosen, grid, motion, clock, seed, simulation, calibrations, world_grid, lines
-    )
-    for error in refused.values():
-        raise error
-    return made, streams
-
-
-def construct_each(
-    chosen: Mapping[str, ChosenPlugin],
-    grid: SiteGrid,
-    motion: MotionSpec,
-    clock: Clock,
-    seed: int,
-    simulation: Simulation | None = None,
-    calibrations: Mapping[str, CalibrationEntry] | None = None,
-    world_grid: SiteGrid | None = None,
-    lines: tuple[LineSpec, ...] = (),
-) -> tuple[dict[str, Any], tuple[RandomStream, ...], dict[str, LabseqError]]:
-    """The same, but one that cannot be constructed never keeps the others from it.
-
-    Returns:
-        Role -> object, the random streams, and role -> why it could not be constructed.
-    """
     made: dict[str, Any] = {}
     streams: list[RandomStream] = []
-    refused: dict[str, LabseqError] = {}
-    for role in sorted(chosen, key=lambda role: role != "simulation"):  # the world comes first
-        is_world = role == "simulation"
-        stream = RandomStream(seed, "" if is_world else role)
+    for role in sorted(chosen, key=lambda role: role != "simulation"):  # the others receive the simulation
+        is_simulation = role == "simulation"
+        stream = RandomStream(seed, "" if is_simulation else role)
         streams.append(stream)
-        sites = world_grid if is_world and world_grid is not None else grid
-        world = made.get("simulation", simulation)
-        context = Context(role, sites, motion, clock, stream, calibrations or {}, world, lines)
+        sites = true_grid if is_simulation and true_grid is not None else grid
+        shared = made.get("simulation", simulation)
+        context = Context(role, sites, motion, clock, stream, calibrations or {}, shared, lines)
         try:
             made[role] = construct_one(chosen[role], context)
         except LabseqError as error:
+            if refused is None:
+                raise
             refused[role] = error
-    return made, tuple(streams), refused
+    return made, tuple(streams)
 
 
 def construct_one(chosen: ChosenPlugin, context: Context | ScanSpace) -> Any:
-    """Construct the object of one role; that of a scanner is given what it may choose from.
+    """Construct the object of one role; a scanner receives the ranges that it may choose from.
 
     Raises:
         ConfigError: Its constructor refuses its settings; with their place.
@@ -142,11 +122,11 @@ def construct_one(chosen: ChosenPlugin, context: Context | ScanSpace) -> Any:
 
 
 def construct_role(entry: Entry, *arguments: Any) -> Any:
-    """Call a factory, and see whether what it made plays its role.
+    """Call a factory, and check that its object has the methods of its role.
 
     Args:
-        entry: Whose factory.
-        *arguments: What it is called with.
+        entry: The entry with the factory.
+        *arguments: The factory's arguments.
 
     Raises:
         LabseqError: The factory raised this one.
@@ -162,11 +142,11 @@ def construct_role(entry: Entry, *arguments: Any) -> Any:
 
 
 def construct_target(chosen: ChosenPlugin, grid: SiteGrid) -> TargetPattern:
-    """Make a target of its pattern.
+    """Make a target from its pattern.
 
     Raises:
         LabseqError: The pattern refuses, for example because it does not fit on the grid.
-        PluginLoadError: The pattern's plugin is at fault; names it.
+        PluginLoadError: The pattern's plugin failed; names it.
     """
     entry = chosen.entry
     target = call_plugin(entry.owner, f"pattern '{entry.name}'", lambda: entry.factory(chosen.settings, grid))
@@ -207,7 +187,7 @@ def _called(made: object) -> str:
 
 
 DEVICE_KEYS: Final = {"device": "name", "equalise": "device", "wait": "device"}
-"""Steps that need a device of the profile -> the setting that names it; a wait need not name one."""
+"""Step that uses a device of the profile -> the setting that names it, which is optional for a wait."""
 
 
 def make_target(
@@ -217,7 +197,7 @@ def make_target(
 
     Raises:
         ConfigError: The pattern is unknown, its settings are wrong, or it does not fit on the grid.
-        PluginLoadError: The pattern's plugin is at fault; names it.
+        PluginLoadError: The pattern's plugin failed; names it.
     """
     choice, grid = sequence.target, bench.grid
     chosen = resolve(bench.host, document, "pattern", choice)
@@ -239,8 +219,8 @@ def make_steps(
     Args:
         bench: The profile.
         document: The sequence's file.
-        sequence: What it says.
-        found: Where the problems go.
+        sequence: Its content.
+        found: Receives the problems.
     """
     steps: list[tuple[str, Step]] = []
     dumps: list[dict[str, Any]] = []
@@ -254,7 +234,7 @@ def make_steps(
             if step.needs_image and not image_seen:
                 what = f"'{spec.kind}' needs an image before it in the shot"
                 raise document.error(spec.loc, what, "an 'image' step before it", key=True)
-        # Whether a step that is wrong would take an image, nobody knows.
+        # A wrong step counts as one that takes an image: it might be meant as one.
         image_seen = image_seen or step is None or step.takes_image
     return steps, dumps
 
@@ -278,15 +258,15 @@ def make_step(bench: ResolvedProfile, document: Document, spec: StepSpec) -> tup
 def make_analyses(
     bench: ResolvedProfile, document: Document, sequence: SequenceSpec, found: ProblemCollector
 ) -> list[dict[str, Any]]:
-    """What is worked out from each shot: the settings of each analysis for the record.
+    """The settings of each analysis of the sequence, for the record.
 
-    Each is constructed once, to see whether it can be: those of the run live in processes of their own.
+    Each is constructed once, to check that it can be; during the run they have their own processes.
 
     Args:
         bench: The profile.
         document: The sequence's file.
-        sequence: What it says.
-        found: Where the problems go.
+        sequence: Its content.
+        found: Receives the problems.
     """
     dumps: list[dict[str, Any]] = []
     for choice in sequence.analysis:

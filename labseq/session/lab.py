@@ -53,7 +53,7 @@ def build_lab(point: Point, target: TargetPattern, clock: Clock, seed: int) -> L
         clock,
         seed,
         calibrations=bench.calibrations,
-        world_grid=profile.grid_model(),
+        true_grid=profile.grid_model(),
         lines=profile.line_specs,
     )
     lab = Lab(

@@ -22,22 +22,22 @@ from labseq.session.stopping import check_stop_file
 _JUDGED: Final = frozenset(
     {"success", "filling_fraction", "n_defects", "n_surplus", "seen_defect_free_cycle"}
 )
-"""Figures that only a shot with an image has."""
+"""Figures that only shots with an image have."""
 _UNFORESEEN: Final = ("reading.", "stage.")
-"""What the names of figures begin with that only a shot can tell."""
+"""Prefixes of figures that depend on the shot."""
 
 
 def check_figure(
     document: Document, place: Loc, figure: str, purpose: str, steps: Sequence[tuple[str, Step]] | None
 ) -> None:
-    """See whether shots may have a figure.
+    """Check that shots may have a figure.
 
     Args:
         document: The sequence.
         place: Where it is named.
         figure: Its name.
-        purpose: What it is for: "to climb on".
-        steps: The steps of a shot, if all are known.
+        purpose: Its use: "to climb on".
+        steps: The steps of a shot, or None if some are wrong.
 
     Raises:
         ConfigError: No shot can have it.
@@ -52,13 +52,13 @@ def check_figure(
 
 
 def missing_figure(shot: int, figure: str, purpose: str, figures: Iterable[str]) -> str:
-    """What to say of a shot that has not the figure that it should have.
+    """A warning that a shot does not have a figure.
 
     Args:
         shot: Its index.
         figure: Name of the figure.
-        purpose: What it is for: "to climb on".
-        figures: Names of those that it has.
+        purpose: Its use: "to climb on".
+        figures: Names of the figures that it has.
     """
     known = list(figures)
     hint = did_you_mean(figure, known) or f"it has {listing(known)}"
@@ -71,13 +71,13 @@ _CHECKED: Final = "to check"
 def make_policy(
     document: Document, sequence: SequenceSpec, steps: Sequence[tuple[str, Step]], found: ProblemCollector
 ) -> RunPolicy:
-    """What holds for a run and its steps.
+    """The policies of a run and its steps.
 
     Args:
         document: The sequence's file.
-        sequence: What it says.
-        steps: The steps that could be made.
-        found: Where the problems go.
+        sequence: Its content.
+        steps: The steps without errors.
+        found: Receives the problems.
     """
     own = sequence.policy
     otherwise = StepPolicy(on_failure=own.on_failure, over_budget=own.over_budget)
@@ -104,7 +104,7 @@ def make_policy(
 def with_policies(
     document: Document, sequence: SequenceSpec, dumps: Sequence[Mapping[str, Any]]
 ) -> list[dict[str, Any]]:
-    """The settings of the steps for the record, with the policies that they have of their own."""
+    """The settings of the steps for the record, with their own policies."""
     return [
         {
             **dumped,
@@ -139,15 +139,15 @@ def _is_repeatable(step: Step) -> bool:
 
 
 class Checks:
-    """Looks at values of the last shots between two shots.
+    """Checks figures of the last shots, between two shots.
 
     Args:
-        checks: What the sequence asks for.
-        rows: The index's lines of the shots that were taken before, in order.
-        warn: Told what is let pass with a warning.
+        checks: The checks of the sequence.
+        rows: The index's lines of earlier shots of a resumed run, in order.
+        warn: Receives the warnings.
 
     Attributes:
-        left_open: The last of these shots, and why a check would skip the rest of its point, or "".
+        left_open: The last of the earlier shots, and why a check would skip the rest of its point, or "".
     """
 
     def __init__(
@@ -161,54 +161,54 @@ class Checks:
         self._unseen = {check.value for check in checks}
         self.left_open = -1, ""
         for row in rows:
-            skipping = [told for check, told in self._look(row) if check.then == "skip_point"]
-            self.left_open = row["shot"], skipping[0] if skipping else ""  # the rest was done then
-            self._unseen.clear()  # said then
+            skipping = [message for check, message in self._look(row) if check.then == "skip_point"]
+            self.left_open = row["shot"], skipping[0] if skipping else ""  # earlier skips are recorded
+            self._unseen.clear()  # warned then
 
     def after(self, row: Mapping[str, Any]) -> str:
-        """Look at a shot that was taken.
+        """Check a shot that was taken.
 
         Args:
             row: Its line in the index.
 
         Returns:
-            Why the rest of its point shall be skipped, or "".
+            Why to skip the rest of its point, or "".
 
         Raises:
-            CheckFailedError: A value is beyond the limits of a check that stops the run.
+            CheckFailedError: A check that stops the run failed.
         """
         skipped = ""
         self._warn_unchecked(row)
-        for check, told in self._look(row):
+        for check, message in self._look(row):
             if check.then == "stop":
-                raise CheckFailedError(told, check.value)
+                raise CheckFailedError(message, check.value)
             if check.then == "skip_point":
-                skipped = skipped or told
+                skipped = skipped or message
             else:
-                self._warn(f"shot {row['shot'] + 1}: {told}")
+                self._warn(f"shot {row['shot'] + 1}: {message}")
         return skipped
 
     def _warn_unchecked(self, row: Mapping[str, Any]) -> None:
-        """Tell, after the first shot, of the values that it has not: their names may be misspelt."""
+        """Warn, after the first shot, of figures that it does not have: their names may be misspelt."""
         figures = figures_in(row) if self._unseen else {}
         for value in sorted(self._unseen.difference(figures)):
             self._warn(missing_figure(row["shot"], value, _CHECKED, figures))
         self._unseen.clear()
 
     def _look(self, row: Mapping[str, Any]) -> list[tuple[CheckSettings, str]]:
-        """The checks that a shot breaks, and what is wrong."""
+        """The checks that fail with a shot, each with a message."""
         broken: list[tuple[CheckSettings, str]] = []
         figures = figures_in(row) if self._checks else {}
         for check, values in self._checks:
             values.append(figures.get(check.value, math.nan))
-            if told := _beyond(check, values):
-                broken.append((check, told))
-                values.clear()  # said once, and then again after as many shots
+            if message := _failure(check, values):
+                broken.append((check, message))
+                values.clear()  # the next message comes after as many shots again
         return broken
 
 
-def _beyond(check: CheckSettings, values: deque[float]) -> str:
-    """What is wrong with the last values, or ""; shots without the value do not count."""
+def _failure(check: CheckSettings, values: deque[float]) -> str:
+    """The message if the mean of the last values is out of range, or ""; shots without a value are left out."""
     known = [value for value in values if not np.isnan(value)]
     if len(values) < check.shots or not known:
         return ""

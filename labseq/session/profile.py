@@ -49,7 +49,7 @@ _CORE_KEYS: Final = {
     "device": frozenset(DEVICE_KEYS),
     "lines": frozenset(LINES_KEYS),
 }
-"""Keys that stand beside a plugin's own, and belong to the core."""
+"""Keys next to a plugin's own that belong to the core."""
 
 HARDWARE_KINDS: Final = frozenset({"camera", "static_tweezers", "mobile_tweezers", "device", "lines"})
 
@@ -61,7 +61,7 @@ class ChosenPlugin:
     Attributes:
         entry: What was chosen.
         settings: Its settings; None if it takes none.
-        document: The file that chose it; None if nobody did.
+        document: The file that chose it; None if no file did.
         loc: Where its settings are in that file.
     """
 
@@ -72,7 +72,7 @@ class ChosenPlugin:
 
     @property
     def virtual_time(self) -> bool:
-        """Whether it keeps to the session's clock only: always, or with the settings of a dry run."""
+        """Whether it uses only the session's clock: always, or with the settings of a dry run."""
         simulated = self.entry.simulated
         if self.entry.virtual_time or simulated is None or self.settings is None:
             return self.entry.virtual_time
@@ -83,7 +83,7 @@ class ChosenPlugin:
         return {"use": self.entry.name, **dump(self.entry, self.settings)}
 
     def placed(self, error: LabseqError) -> LabseqError:
-        """Why it cannot be constructed, with the place that its settings stand in."""
+        """The error of its constructor, with the place of its settings."""
         is_placed = isinstance(error, ConfigError) and any(problem.source for problem in error.problems)
         if self.document is None or is_placed:
             return error
@@ -96,13 +96,13 @@ class ResolvedProfile:
 
     Attributes:
         document: The profile's file.
-        profile: What it says.
+        profile: Its content.
         host: The plugins.
         grid: The grid of sites, with calibrated tones.
-        chosen: Role or device name -> what plays it; no planner.
-        warnings: What the user should know although it is no error.
-        refused: Role or device name -> why nothing could be chosen.
-        calibrations: Those in use: kind -> entry.
+        chosen: Role or device name -> its plugin; without the planner.
+        warnings: For the user.
+        refused: Role or device name -> why no plugin could be chosen.
+        calibrations: The active calibrations: kind -> entry.
     """
 
     document: Document
@@ -116,7 +116,7 @@ class ResolvedProfile:
 
     @property
     def hardware_key(self) -> str:
-        """What its hardware is known by in the markers of runs."""
+        """The name of its hardware in the markers of active runs."""
         return str(self.document.path.resolve())
 
     @property
@@ -128,12 +128,12 @@ class ResolvedProfile:
 def resolve(
     host: PluginHost, document: Document, kind: str, choice: Choice, drop: frozenset[str] = frozenset()
 ) -> ChosenPlugin:
-    """Find what a file names and validate the settings given there.
+    """Find the plugin that a file names, and validate the settings given there.
 
     Args:
         host: The plugins.
         document: The file.
-        kind: Kind of plugin that is wanted.
+        kind: Kind of plugin.
         choice: Name, and place in the file.
         drop: Keys at that place that belong to the core.
 
@@ -154,13 +154,13 @@ def named(
     Args:
         host: The plugins.
         document: The file.
-        kind: Kind of plugin that is wanted.
+        kind: Kind of plugin.
         name: Its name.
-        loc: Where the name stands in the file.
+        loc: Where the name is in the file.
         key: Whether the name is the key there.
 
     Raises:
-        ConfigError: Nothing offers it, or what would have did not load.
+        ConfigError: No plugin offers it, or the one that does failed to load.
     """
     try:
         return host.get(kind, name)
@@ -200,7 +200,7 @@ def choose(
     choice: Choice,
     dry_run: DryRun = "off",
 ) -> tuple[ChosenPlugin, str]:
-    """Choose the entry that plays a role, in a dry run its simulated counterpart.
+    """Choose the plugin of a role; in a dry run its simulator, or its virtual twin.
 
     Returns:
         The choice, and a warning for the user or "".
@@ -224,7 +224,7 @@ def choose(
 
 
 def _absence(host: PluginHost, kind: str, name: str) -> str:
-    """Why nothing offers a name: its plugin did not load, or there is none; "" if something does."""
+    """Why no plugin offers a name: it failed to load, or there is none; "" if one does."""
     if host.registry.find(kind, name) is not None:
         return ""
     try:
@@ -238,10 +238,10 @@ def _absence(host: PluginHost, kind: str, name: str) -> str:
 
 
 def check_dry_run(dry_run: object) -> None:
-    """Refuse what is no kind of dry run: a wrong word must not open hardware, or fail to.
+    """Refuse an unknown kind of dry run: a misspelt word must not open hardware.
 
     Raises:
-        ConfigError: It is none.
+        ConfigError: It is unknown.
     """
     if dry_run not in get_args(DryRun):
         raise ConfigError(
@@ -266,17 +266,17 @@ def _defaults(entry: Entry) -> Settings | None:
 
 
 _LINELESS: Final = frozenset({"device", "check_sites", "check_overlay", "equalise"})
-"""Steps that take no time of their own."""
+"""Steps during which no line can be on: they take no time of their own."""
 
 
 def check_kinds(document: Document, spec: ProfileSpec, host: PluginHost, found: ProblemCollector) -> None:
-    """Find lines that belong to steps that nobody offers.
+    """Find lines that are on during unknown steps.
 
     Args:
         document: The profile's file.
-        spec: What it says.
+        spec: Its content.
         host: The plugins.
-        found: Where the problems go.
+        found: Receives the problems.
     """
     if spec.lines is None:
         return
@@ -292,11 +292,11 @@ def check_kinds(document: Document, spec: ProfileSpec, host: PluginHost, found: 
 
 
 def wiring_problems(document: Document, lab: Lab) -> list[Problem]:
-    """What the timing box cannot do, and what would harm or leave out the camera; with its place.
+    """Lines that the timing box does not have, that would harm the camera, or that cannot trigger it.
 
     Args:
         document: The profile's file.
-        lab: Its devices; nothing is open.
+        lab: Its devices; none is open.
     """
     problems: list[Problem] = []
     camera = lab.step_context.camera
@@ -325,7 +325,7 @@ def refuse_wrong_wiring(document: Document, lab: Lab) -> None:
     """The same, raised.
 
     Raises:
-        ConfigError: Something is wrong; says what and where.
+        ConfigError: There are any.
     """
     problems = wiring_problems(document, lab)
     if problems:
@@ -333,11 +333,11 @@ def refuse_wrong_wiring(document: Document, lab: Lab) -> None:
 
 
 class RecordedSetup(NamedTuple):
-    """What a run goes by that was begun before, whatever files and calibrations say today.
+    """The profile and calibrations that a run began with, for resuming it.
 
     Attributes:
         profile: The text of the profile.
-        calibrations: The ids of the calibrations, by kind, and no others.
+        calibrations: Kind -> id of the calibrations; no others are active.
     """
 
     profile: StoredText
@@ -356,18 +356,18 @@ def resolve_profile(
     found: ProblemCollector | None = None,
     again: RecordedSetup | None = None,
 ) -> ResolvedProfile:
-    """Read a profile, load the plugins and choose what plays each role.
+    """Read a profile, load the plugins and choose the plugin of each role.
 
     Args:
         profile: Name or path of the profile.
         beside: Folder of the file that names it.
-        overrides: Values that replace those of the file.
+        overrides: Values that replace those in the file.
         dry_run: "off", "full" or "fast".
         named_in: The sequence that names the profile, for messages.
-        plugin_folders: Folders with plugins beside those that the profile names.
-        scan: The sequence's scan; the profile's values are those of its first point.
-        found: Where the problems of a profile that can be read go; without it they are raised.
-        again: The profile's text and calibrations, if the run was begun before.
+        plugin_folders: Further folders with plugins.
+        scan: The sequence's scan; the profile receives the values of its first point.
+        found: Receives the problems of a readable profile; without it they are raised.
+        again: The profile's text and calibrations, if a run is resumed.
 
     Raises:
         ConfigError: The profile is wrong.
@@ -400,23 +400,23 @@ def choose_plugins(
     found: ProblemCollector,
     calibrations: Mapping[str, str] | None = None,
 ) -> ResolvedProfile:
-    """Choose what plays each role of a profile.
+    """Choose the plugin of each role of a profile.
 
     Args:
         document: The profile's file.
-        spec: What it says; stand-ins for what was wrong, if anything was found.
+        spec: Its content, with fallbacks for wrong values.
         host: The plugins.
         dry_run: "off", "full" or "fast".
-        found: Where the problems go.
-        calibrations: The ids of those that count, by kind; None for what profile and store say.
+        found: Receives the problems.
+        calibrations: Kind -> id of the active ones; None for those chosen by profile and store.
     """
-    mended = bool(found.problems)
+    repaired = bool(found.problems)
     chosen: dict[str, ChosenPlugin] = {}
     warnings: list[str] = []
     refused: dict[str, ConfigError] = {}
     for role, choice in {**spec.choices, **spec.devices}.items():
         kind = role if role in ROLES else "device"
-        if mended and _is_stand_in(document, choice):
+        if repaired and _is_fallback(document, choice):
             refused[role] = ConfigError("what the profile says of it is wrong")
             continue
         try:
@@ -429,15 +429,15 @@ def choose_plugins(
     detector = chosen["detector"].dump() if "detector" in chosen else {}
     made = (
         ActiveCalibrations({}, spec.grid_model())
-        if mended
+        if repaired
         else calibrated(document, spec, found, dry_run, detector, calibrations)
     )
     warnings += made.warnings
     return ResolvedProfile(document, spec, host, made.grid, chosen, tuple(warnings), refused, made.entries)
 
 
-def _is_stand_in(document: Document, choice: Choice) -> bool:
-    """Whether nobody wrote this, in a profile of which something was wrong: it has no place of its own."""
+def _is_fallback(document: Document, choice: Choice) -> bool:
+    """Whether a choice is a fallback for a wrong value: then it has the place of its parent."""
     here, around = document.locate(choice.loc), document.locate(choice.loc[:-1])
     return choice.use == VIRTUAL_TWIN and here == around
 
@@ -448,8 +448,8 @@ def load_plugins(
     """Load labseq's own, the installed and the folders' plugins.
 
     Args:
-        folders: Folders with plugins, beside those of LABSEQ_PLUGIN_PATH.
-        found: Where the problem of a folder that cannot be read goes; without it it is raised.
+        folders: Folders with plugins, in addition to those of LABSEQ_PLUGIN_PATH.
+        found: Receives the problem of an unreadable folder; without it, it is raised.
         max_wait_s: How long a plugin may take to load, and a constructor to return.
 
     Raises:

@@ -25,7 +25,7 @@ from labseq.recording import clear_active, data_root, find_dead_run, lock_files,
 from labseq.roles import Clock, Hardware, RunObserver, Simulation, offers
 from labseq.sequencer import RealClock, VirtualClock
 from labseq.sequencer.lab import Timeouts, in_safe_order
-from labseq.session.construct import construct_each
+from labseq.session.construct import construct
 from labseq.session.lab import WARM_S, timeouts_of
 from labseq.session.profile import (
     HARDWARE_KINDS,
@@ -181,15 +181,17 @@ def construct_hardware(bench: ResolvedProfile, clock: Clock) -> tuple[dict[str, 
         Role or device name -> object, and -> why it could not be constructed, with its place.
     """
     chosen = {role: c for role, c in bench.chosen.items() if c.entry.kind in _NEEDED_KINDS}
-    made, _, failures = construct_each(
+    failures: dict[str, LabseqError] = {}
+    made, _ = construct(
         chosen,
         bench.grid,
         bench.profile.motion,
         clock,
         seed=0,
         calibrations=bench.calibrations,
-        world_grid=bench.profile.grid_model(),
+        true_grid=bench.profile.grid_model(),
         lines=bench.profile.line_specs,
+        refused=failures,
     )
     return made, {role: chosen[role].placed(error) for role, error in failures.items()}
 
