@@ -7,7 +7,7 @@ LABSEQ_API = 1
 
 @hookimpl
 def labseq_register(registry: Registry) -> None:
-    """Offer the device ``serial``; in a dry run it speaks to an instrument made of its own description."""
+    """Offer the device ``serial``; in a dry run the instrument is simulated from its description."""
     from labseq_serial.device import SerialDevice
     from labseq_serial.settings import SIMULATED, SerialSettings
 

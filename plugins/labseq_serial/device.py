@@ -3,31 +3,178 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, Final, TypeVar
 
 from labseq.plugin import (
+    Clock,
     Context,
     Device,
     DeviceError,
+    DeviceTimeoutError,
     LabseqError,
     LimitError,
     TransientError,
     clean,
+    format_quantity,
 )
-from labseq_serial.arguments import Scalar
-from labseq_serial.instrument import Instrument
-from labseq_serial.line import Line
-from labseq_serial.ports import open_line
-from labseq_serial.settings import SIMULATED, SerialSettings, known
-from labseq_serial.simulated import SimulatedPort
+from labseq_serial.line import Line, open_line
+from labseq_serial.patterns import compiled
+from labseq_serial.settings import Call, SerialSettings, call_of, known
+from labseq_serial.values import Scalar
+
+T = TypeVar("T")
+
+LOOK_S: Final = 0.02
+"""Time between two readings of a value that a command changes, in seconds."""
+IDENTITY: Final = ("model", "serial_number", "firmware")
+"""Groups of the pattern of an identity that ``describe`` shows."""
+
+
+class RefusedError(DeviceError):
+    """The instrument reported an error; sending the same again does not help."""
+
+
+class Instrument:
+    """The commands and values of an instrument on an open line.
+
+    Args:
+        line: The line.
+        settings: The description.
+        device: Its name, for messages.
+        clock: The session's clock.
+    """
+
+    def __init__(self, line: Line, settings: SerialSettings, device: str, clock: Clock) -> None:
+        self.line = line
+        self._settings = settings
+        self._device = device
+        self._clock = clock
+
+    def identify(self) -> dict[str, str]:
+        """Ask the instrument what it is; empty if the profile has no ``identify``.
+
+        Raises:
+            DeviceError: It is another instrument, or does not answer.
+        """
+        identify = self._settings.identify
+        if identify is None:
+            return {}
+
+        def ask() -> dict[str, str]:
+            reply = self.line.exchange(identify.ask, self._settings.timeout)
+            match = compiled(identify.reply).fullmatch(reply)
+            if match is None:
+                what = f"the instrument reports that it is '{clean(reply)}'"
+                raise DeviceError(
+                    self._device, f"{what}; expected '{clean(identify.reply)}'; is it the right port?"
+                )
+            identity = {key: text for key, text in match.groupdict().items() if key in IDENTITY and text}
+            return {"model": reply, **identity}
+
+        return self._retried(ask)
+
+    def read(self, name: str) -> Scalar:
+        """Read a value, in SI.
+
+        Raises:
+            DeviceError: No reply, or one that the description does not have.
+        """
+        value = self._settings.values[name]
+
+        def ask() -> Scalar:
+            reply = self.line.exchange(value.ask, value.timeout or self._settings.timeout)
+            self._refuse(value.error, value.ask, reply)
+            try:
+                return value.value_in(reply)
+            except ValueError as error:
+                text = f"{name}: '{clean(value.ask)}' was answered by '{clean(reply)}': {error}"
+                raise DeviceError(self._device, text) from None
+
+        return self._retried(ask)
+
+    def carry_out(self, name: str, values: Mapping[str, Scalar]) -> None:
+        """Send a command, wait for its reply, and until the values are as the command makes them.
+
+        Args:
+            name: Its name.
+            values: Its arguments, in SI, checked.
+
+        Raises:
+            DeviceError: No or a wrong reply.
+        """
+        command = self._settings.commands[name]
+        timeout_s = command.timeout or self._settings.timeout
+        text = command.text(values)
+
+        def send() -> None:
+            reply = self.line.exchange(text, timeout_s, answered=command.reply is not None)
+            self._refuse(command.error, text, reply)
+            if command.reply is not None and compiled(command.reply).fullmatch(reply) is None:
+                what = f"{name}: '{clean(text)}' was answered by '{clean(reply)}'"
+                raise DeviceError(self._device, f"{what}; expected '{clean(command.reply)}'")
+
+        if command.makes and self._differing(command.makes) is None:
+            return
+        self._retried(send) if command.repeatable else send()
+        end_s = self._clock.now() + timeout_s
+        while (differing := self._differing(command.makes)) is not None:
+            if self._clock.now() >= end_s:
+                waited = format_quantity(timeout_s, "time")
+                text = f"{name}: '{clean(text)}' was sent, but after {waited} {differing}"
+                raise DeviceTimeoutError(self._device, text, timeout_s)
+            self._clock.sleep(LOOK_S)
+
+    def carry_out_all(self, calls: Iterable[Call]) -> list[LabseqError]:
+        """Carry out calls of the description, also after one that fails.
+
+        Returns:
+            The failures.
+        """
+        failures: list[LabseqError] = []
+        for call in calls:
+            try:
+                self.call(call)
+            except LabseqError as failure:
+                failures.append(failure)
+        return failures
+
+    def call(self, call: Call) -> None:
+        """Carry out a call of the description; its arguments were checked with the profile."""
+        name, given = call_of(call)
+        arguments = self._settings.commands[name].arguments
+        self.carry_out(name, {key: arguments[key].value_of(value) for key, value in given.items()})
+
+    def _differing(self, makes: Mapping[str, Scalar]) -> str | None:
+        """Describe the first value that is not as a command makes it; None if all are."""
+        for name, made in makes.items():
+            value = self._settings.values[name]
+            if (reading := self.read(name)) != made:
+                return f"{name} is {value.shown(reading)}; expected {value.shown(made)}"
+        return None
+
+    def _refuse(self, pattern: str | None, text: str, reply: str) -> None:
+        if pattern is not None and compiled(pattern).fullmatch(reply):
+            raise RefusedError(self._device, f"'{clean(text)}' was refused: '{clean(reply)}'")
+
+    def _retried(self, ask: Callable[[], T]) -> T:
+        """Repeat after no reply or an unreadable one, as often as the profile says."""
+        for _ in range(self._settings.retries):
+            try:
+                return ask()
+            except RefusedError:
+                raise
+            except DeviceError:
+                if self.line.aborted.is_set():
+                    raise
+        return ask()
 
 
 class SerialDevice(Device):
     """An instrument on a serial line, described in the profile.
 
     A line that breaks in a shot fails the shot with ``TransientError``. The next call opens the port once
-    more, makes sure that the same instrument is there, and sends ``on_open`` again; if that fails, it is a
+    more, checks that it is the same instrument, and sends ``on_open`` again; if that fails, it is a
     ``DeviceError``, which ends the run.
 
     Args:
@@ -45,10 +192,10 @@ class SerialDevice(Device):
         self._readings: dict[str, tuple[float, Scalar]] = {}
 
     def open(self) -> None:
-        """Open the port, make sure that it is the right instrument, and send ``on_open``.
+        """Open the port, check that it is the right instrument, and send ``on_open``.
 
         Raises:
-            DeviceError: It cannot be opened, does not answer, or is another.
+            DeviceError: It cannot be opened, does not answer, or is another instrument.
         """
         with self._lock:
             if self._instrument is None:
@@ -70,9 +217,9 @@ class SerialDevice(Device):
         instrument = self._instrument
         if instrument is None or not self._settings.safe_state:
             return
-        instrument.line.given_up.set()  # whoever waits for a reply shall not keep us
+        instrument.line.aborted.set()  # end a wait for a reply in another thread
         with self._lock:
-            instrument.line.given_up.clear()
+            instrument.line.aborted.clear()
             if self._instrument is None:
                 return
             failures = self._ready(on_open=False).carry_out_all(self._settings.safe_state)
@@ -88,7 +235,7 @@ class SerialDevice(Device):
 
         Raises:
             DeviceError: Not open, an unknown command or argument, no or a wrong reply.
-            LimitError: An argument is past its limit; nothing was sent.
+            LimitError: An argument is outside its limits; nothing was sent.
             TransientError: The line broke.
         """
         values = self._checked(name, arguments)
@@ -100,12 +247,12 @@ class SerialDevice(Device):
 
         Raises:
             DeviceError: An unknown command or argument, or one of another type.
-            LimitError: An argument is past its limit.
+            LimitError: An argument is outside its limits.
         """
         self._checked(name, arguments)
 
     def read(self, name: str) -> Scalar:
-        """Ask for a declared value; quantities are in SI.
+        """Read a declared value; quantities are in SI.
 
         Raises:
             DeviceError: Not open, an unknown or implausible value, no or a wrong reply.
@@ -121,14 +268,14 @@ class SerialDevice(Device):
             return reading
 
     def poll(self) -> Mapping[str, Scalar]:
-        """Read the values that are kept with each shot."""
+        """Read the values that are recorded with each shot."""
         return {name: self.read(name) for name, value in self._settings.values.items() if value.poll}
 
     def check_interlocks(self) -> None:
         """Read the values that have an interlock, unless they were read just now.
 
         Raises:
-            DeviceError: One is past its limit, or cannot be read.
+            DeviceError: One is outside its limits, or cannot be read.
             TransientError: The line broke.
         """
         for name, value in self._settings.values.items():
@@ -148,7 +295,7 @@ class SerialDevice(Device):
             self.read(name)
 
     def describe(self) -> Mapping[str, Any]:
-        """Port, commands, values, and what the instrument says of itself; it is asked anew if it is open."""
+        """Port, commands, values, and the identity of the instrument, read again if it is open."""
         settings, instrument = self._settings, self._instrument
         if instrument is not None:
             with self._lock:
@@ -163,7 +310,7 @@ class SerialDevice(Device):
         }
 
     def _ready(self, *, on_open: bool = True) -> Instrument:
-        """The instrument; a line that broke is opened anew."""
+        """The instrument; a line that broke is opened again."""
         if self._instrument is None:
             raise DeviceError(self._name, "not open; call open() first")
         if self._instrument.line.broken:
@@ -178,8 +325,7 @@ class SerialDevice(Device):
     def _connected(self, *, on_open: bool = True) -> Instrument:
         """The right instrument on an open line."""
         settings = self._settings
-        is_simulated = settings.port == SIMULATED
-        port = SimulatedPort(settings, self._clock) if is_simulated else open_line(settings, self._name)
+        port = open_line(settings, self._name, self._clock)
         line = Line(port, settings, self._name, self._clock)
         instrument = Instrument(line, settings, self._name, self._clock)
         try:
@@ -195,7 +341,7 @@ class SerialDevice(Device):
         return instrument
 
     def _begin(self, instrument: Instrument) -> None:
-        """Send ``on_open``; after a failure nothing stays half set up."""
+        """Send ``on_open``; after a failure also ``safe_state``."""
         try:
             for call in self._settings.on_open:
                 instrument.call(call)
@@ -227,5 +373,5 @@ class SerialDevice(Device):
         return values
 
     def _unnamed(self, error: LabseqError) -> str:
-        """What an error says, without the name that stands before it."""
+        """The text of an error without the device's name."""
         return str(error).removeprefix(f"{self._name}: ")

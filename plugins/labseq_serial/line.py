@@ -1,11 +1,11 @@
-"""The line: what is sent, what comes back, and everything that can be wrong with it."""
+"""The line: opening the port, what is sent and received, and everything that can go wrong with it."""
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Generator
 from contextlib import contextmanager, suppress
-from typing import Final
+from typing import Any, Final
 
 from labseq.plugin import (
     BROKEN,
@@ -17,9 +17,13 @@ from labseq.plugin import (
     clean,
     format_quantity,
     is_write_timeout,
+    open_port,
+    ports_here,
+    ports_text,
     wait_for,
 )
-from labseq_serial.settings import SerialSettings
+from labseq_serial.settings import SIMULATED, SerialSettings, UsbSettings
+from labseq_serial.simulated import SimulatedPort
 
 MAX_REPLY: Final = 4096
 """Longest reply in bytes; more is noise."""
@@ -30,18 +34,18 @@ class Line:
 
     Args:
         port: The port, open.
-        settings: How the instrument speaks.
+        settings: The description of the instrument.
         device: Its name, for messages.
         clock: The session's clock.
 
     Attributes:
-        broken: Whether the port was lost; it must be opened anew.
-        given_up: Set by another thread to end a wait for a reply.
+        broken: Whether the port was lost; it must be opened again.
+        aborted: Set by another thread to end a wait for a reply.
     """
 
     def __init__(self, port: Port, settings: SerialSettings, device: str, clock: Clock) -> None:
         self.broken = False
-        self.given_up = threading.Event()
+        self.aborted = threading.Event()
         self._port = port
         self._settings = settings
         self._device = device
@@ -49,15 +53,15 @@ class Line:
         self._free_s = clock.now() + settings.wait_after_open
 
     def exchange(self, text: str, timeout_s: float, *, answered: bool = True) -> str:
-        """Send a text and wait for the reply; what came before, late or unasked, is dropped.
+        """Send a text and wait for the reply; what came before is dropped.
 
         Args:
-            text: What is sent, without its end.
+            text: The text to send, without its end.
             timeout_s: How long the reply may take, in seconds.
-            answered: Whether a reply comes at all.
+            answered: Whether a reply is expected.
 
         Returns:
-            The reply without its end and without spaces around it; "" if none is waited for.
+            The reply without its end and surrounding spaces; "" if none is expected.
 
         Raises:
             DeviceTimeoutError: No reply, or one without an end.
@@ -89,12 +93,12 @@ class Line:
             self._port.close()
 
     def _receive(self, text: str, echo: bytes, end: bytes, timeout_s: float) -> bytes:
-        """What comes between the echo and the end; nothing is read if both are empty."""
+        """Read the bytes between the echo and the end; nothing is read if both are empty."""
         came = bytearray()
 
         def look(_: float) -> int | None:
-            if self.given_up.is_set():
-                raise DeviceError(self._device, f"'{clean(text)}' was given up for the safe state")
+            if self.aborted.is_set():
+                raise DeviceError(self._device, f"'{clean(text)}' was aborted by the safe state")
             came.extend(self._port.read(min(max(1, self._port.in_waiting), MAX_REPLY)))
             at = came.find(end, len(echo))
             return at if at >= 0 or len(came) > len(echo) + MAX_REPLY else None
@@ -124,7 +128,7 @@ class Line:
 
     @contextmanager
     def _unbroken(self, text: str, timeout_s: float) -> Generator[None]:
-        """Put what a port raises in words."""
+        """Turn errors of the port into errors of the device."""
         try:
             yield
         except BROKEN as error:
@@ -141,3 +145,52 @@ class Line:
 
 def _visible(came: bytes) -> str:
     return clean(came.decode("ascii", "backslashreplace"))
+
+
+def open_line(settings: SerialSettings, device: str, clock: Clock) -> Port:
+    """Open the port of a profile exclusively, or a simulated instrument.
+
+    Args:
+        settings: The port and its parameters.
+        device: Name of the instrument, for messages.
+        clock: The session's clock.
+
+    Raises:
+        DeviceError: There is no such port, or another program has it open.
+    """
+    if settings.port == SIMULATED:
+        return SimulatedPort(settings, clock)
+    port = settings.port if settings.usb is None else _find(settings.usb, device)
+    assert port is not None
+    options: dict[str, Any] = {
+        "bytesize": settings.data_bits,
+        "parity": settings.parity[0].upper(),
+        "stopbits": settings.stop_bits,
+        "rtscts": settings.flow_control == "rts_cts",
+        "dsrdtr": settings.flow_control == "dsr_dtr",
+        "xonxoff": settings.flow_control == "xon_xoff",
+        "write_timeout": settings.timeout,
+    }
+    return open_port(port, device, settings.baud_rate, **options)
+
+
+def _find(usb: UsbSettings, device: str) -> str:
+    """The port of an adapter."""
+    wanted = {"vid": usb.vid, "pid": usb.pid, "serial_number": usb.serial}
+    given = {key: value for key, value in wanted.items() if value is not None}
+    fits = [
+        port
+        for port in ports_here()
+        if all(getattr(port, key, None) == value for key, value in given.items())
+    ]
+    if len(fits) == 1:
+        return fits[0].device
+    described = ", ".join(
+        f"{key} {value:#06x}" if isinstance(value, int) else f"{key} {value}" for key, value in given.items()
+    )
+    if fits:
+        names = ", ".join(f"{port.device} ({port.serial_number})" for port in fits)
+        text = f"{len(fits)} adapters have {described}: {names}; add 'serial' to tell them apart"
+        raise DeviceError(device, text)
+    text = f"no USB adapter has {described}; expected {ports_text()}; is it plugged in?"
+    raise DeviceError(device, text)

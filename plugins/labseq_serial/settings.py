@@ -1,37 +1,247 @@
-"""An instrument on a serial line, as the profile describes it."""
+"""An instrument on a serial line, as the profile describes it: port, commands, checks of all of it."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from typing import Final, Literal, Self
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Annotated, Final, Literal, Self, TypeAlias
 
 from pydantic import Field, model_validator
 
 from labseq.plugin import Duration, Settings, Text, clean, closest, is_network_port, one_of, setting_error
-from labseq_serial.arguments import Scalar, placed
-from labseq_serial.commands import Call, CommandSettings, IdentifySettings, PositiveDuration, call_of
-from labseq_serial.values import ValueSettings
+from labseq_serial.patterns import Sent, Template, compiled, example_of
+from labseq_serial.values import ArgumentSettings, Scalar, ValueSettings, placed
+
+RESERVED: Final = frozenset({"self", "name", "owner", "timeout_s", "function"})
+"""Names that arguments cannot have, because labseq's own calls use them."""
+_SLACK: Final = 1e-9
+
+PositiveDuration: TypeAlias = Annotated[Duration, Field(gt=0)]
+"""Seconds, more than 0; "0.5 s"."""
+
+
+class CallSettings(Settings):
+    """A command and its arguments, as in a step."""
+
+    do: Text = Field(description="a command")
+    arguments: dict[str, Scalar] = Field(default={}, description="its arguments")
+
+
+Call: TypeAlias = Text | CallSettings
+"""A command that the driver sends on its own: its name, or name and arguments."""
+
+
+class IdentifySettings(Settings):
+    """How the instrument reports what it is."""
+
+    ask: Text = Field(description="text that is sent")
+    reply: Text = Field(
+        description="pattern of the reply; groups `model`, `serial_number` and `firmware` are shown by "
+        "`labseq devices`"
+    )
+    example: Text | None = Field(default=None, description="an example of a reply, for dry runs")
+
+    def simulated_reply(self) -> str | None:
+        """A reply that matches."""
+        return self.example if self.example is not None else example_of(self.reply)
+
+    @model_validator(mode="after")
+    def _check_reply(self) -> Self:
+        check_reply(self.reply, self.simulated_reply())
+        return self
+
+
+class CommandSettings(Settings):
+    """A command of the instrument."""
+
+    send: Text = Field(
+        description="what is sent; `{name}` or `{name:.3f}` stands for an argument, `{{` for a brace"
+    )
+    arguments: dict[str, ArgumentSettings] = Field(default={}, description="its arguments, by name")
+    reply: str | None = Field(
+        default=None,
+        description='pattern that the reply must match, as that of a value; `""` for an empty line or a '
+        "mere prompt; none: no reply comes",
+    )
+    error: Text | None = Field(default=None, description="pattern of a reply that reports an error")
+    makes: dict[str, bool | int | str] = Field(
+        default={},
+        description="values that the command leads to: they are read before, and if they have these values "
+        "already nothing is sent, and after, until they have them",
+    )
+    repeatable: bool = Field(
+        default=False, description="whether it may be sent again when the reply is missing or unreadable"
+    )
+    timeout: PositiveDuration | None = Field(
+        default=None,
+        description="how long the reply, and what the command makes, may take; none: as for all",
+    )
+    example: str | None = Field(default=None, description="an example of a reply, for dry runs")
+
+    @property
+    def template(self) -> Template:
+        """The parsed template ``send``."""
+        return Template.parse(self.send)
+
+    @property
+    def kinds(self) -> dict[str, type[Sent]]:
+        """The type of each argument on the line."""
+        return {name: argument.kind for name, argument in self.arguments.items()}
+
+    def text(self, values: Mapping[str, Scalar]) -> str:
+        """The text for these arguments, in SI."""
+        return self.template.format(
+            {name: self.arguments[name].to_line(value) for name, value in values.items()}
+        )
+
+    def values_in(self, text: str) -> dict[str, Scalar] | None:
+        """The arguments, in SI, in a text that was sent; None if it is not this command."""
+        sent = self.template.read(text, self.kinds)
+        if sent is None:
+            return None
+        values = {name: self.arguments[name].from_line(one) for name, one in sent.items()}
+        known = {name: value for name, value in values.items() if value is not None}
+        return known if len(known) == len(values) else None
+
+    def simulated_reply(self) -> str | None:
+        """A reply that matches; None if no reply comes, or none can be generated."""
+        if self.reply is None or self.example is not None:
+            return self.example
+        return example_of(self.reply)
+
+    def extremes(self) -> list[dict[str, Scalar]]:
+        """Arguments at their limits: all at the lowest, all at the highest, and mixed."""
+        ends = {name: argument.extremes() for name, argument in self.arguments.items()}
+        if not ends:
+            return [{}]
+        orders = ((0, 0), (1, 1), (0, 1), (1, 0))
+        return [{name: pair[order[k % 2]] for k, (name, pair) in enumerate(ends.items())} for order in orders]
+
+    @model_validator(mode="after")
+    def _check_placeholders(self) -> Self:
+        for name in self.arguments:
+            if not name.isidentifier() or name in RESERVED:
+                expected = f"a word of letters, digits and '_', none of {', '.join(sorted(RESERVED))}"
+                raise setting_error(
+                    f"an argument is called '{clean(name)}'", expected, at=("arguments", name), key=True
+                )
+        try:
+            names = self.template.names
+        except ValueError as error:
+            raise placed(error, "send") from None
+        for name in names:
+            if name not in self.arguments:
+                meant = closest(name, self.arguments)
+                hint = f"did you mean '{meant}'?" if meant else f"declare '{name}' below 'arguments'"
+                raise setting_error(
+                    f"'{{{name}}}' is not an argument", _listed(self.arguments), hint, at=("send",)
+                )
+        for name in self.arguments:
+            if name not in names:
+                what = f"the argument '{name}' has no place in '{clean(self.send)}'"
+                raise setting_error(
+                    what, f"a placeholder {{{name}}} in 'send'", at=("arguments", name), key=True
+                )
+        return self
+
+    @model_validator(mode="after")
+    def _check_round_trip(self) -> Self:
+        for values in self.extremes():
+            sent = {name: self.arguments[name].to_line(value) for name, value in values.items()}
+            try:
+                rounded, text = self.template.rounded(sent), self.template.format(sent)
+            except ValueError as error:
+                raise placed(error, "send") from None
+            if self.template.read(text, self.kinds) != rounded:
+                what = f"the arguments cannot be told apart in '{clean(text)}'"
+                raise setting_error(what, "something between the placeholders", at=("send",))
+            for name, value in rounded.items():
+                self._check_rounded(name, value, text)
+        return self
+
+    def _check_rounded(self, name: str, sent: Sent, text: str) -> None:
+        argument = self.arguments[name]
+        value = argument.from_line(sent)
+        if value is None or isinstance(value, str | bool):
+            return
+        low, high = argument.limits
+        slack = _SLACK * max(abs(low), abs(high))
+        if not low - slack <= value <= high + slack:
+            key = "min" if value < low else "max"
+            what = f"as '{clean(text)}' it would be {argument.quantity.shown(value)}, beyond the limit"
+            raise setting_error(
+                what, "a limit with no more digits than are sent", at=("arguments", name, key)
+            )
+
+    @model_validator(mode="after")
+    def _check_replies(self) -> Self:
+        if self.reply is None:
+            for key in ("error", "example"):
+                if getattr(self, key) is not None:
+                    what = f"'{key}' is about a reply, but no 'reply' is waited for"
+                    raise setting_error(what, "a 'reply'", at=(key,), key=True)
+            return self
+        check_reply(self.reply, self.simulated_reply())
+        check_pattern(self.error, "error")
+        return self
+
+
+def check_pattern(pattern: str | None, key: str) -> re.Pattern[str] | None:
+    """Refuse a text that is not a pattern.
+
+    Raises:
+        PydanticCustomError: With its place.
+    """
+    try:
+        return None if pattern is None else compiled(pattern)
+    except ValueError as error:
+        raise placed(error, key) from None
+
+
+def check_reply(pattern: str, example: str | None) -> None:
+    """Refuse a pattern of replies for which there is no example.
+
+    Raises:
+        PydanticCustomError: With its place.
+    """
+    compiled_pattern = check_pattern(pattern, "reply")
+    if example is None:
+        what = f"labseq cannot generate a reply like '{clean(pattern)}'"
+        raise setting_error(what, "an example of one", "add 'example'", at=("reply",))
+    if compiled_pattern is not None and compiled_pattern.fullmatch(example) is None:
+        what = f"the reply '{clean(example)}' does not match"
+        raise setting_error(what, f"one like '{clean(pattern)}'", at=("example",))
+
+
+def call_of(call: Call) -> tuple[str, Mapping[str, Scalar]]:
+    """Name and arguments of a call."""
+    return (call, {}) if isinstance(call, str) else (call.do, call.arguments)
+
+
+def _listed(names: Mapping[str, object] | Sequence[str]) -> str:
+    return f"one of {', '.join(names)}" if names else "no placeholder: the command has no arguments"
+
 
 SIMULATED: Final = "simulated"
-"""The port that needs no instrument."""
+"""The port of a simulated instrument."""
 _SCHEMES: Final = ("socket", "rfc2217")
 _MADE: Final[Mapping[str, tuple[type[Scalar], str]]] = {
     "bool": (bool, "true or false"),
     "int": (int, "a whole number"),
     "text": (str, "text, in quotes"),
 }
-"""Types of values that a command can make, and in words."""
+"""Types of values that a command can make, with their descriptions."""
 
 
 class UsbSettings(Settings):
-    """A USB adapter, whichever port it has today."""
+    """A USB adapter, on any port."""
 
     vid: int | None = Field(default=None, ge=0, le=0xFFFF, description="vendor's number, as 0x0403")
     pid: int | None = Field(default=None, ge=0, le=0xFFFF, description="product's number, as 0x6001")
     serial: Text | None = Field(default=None, description="serial number")
 
     @model_validator(mode="after")
-    def _says_something(self) -> Self:
+    def _check_any(self) -> Self:
         if self.vid is None and self.pid is None and self.serial is None:
             raise setting_error("this fits every adapter", "vid, pid or serial")
         return self
@@ -45,7 +255,7 @@ class SerialSettings(Settings):
         description="where it is connected: `/dev/ttyUSB0`, `COM3`, `socket://host:port`, "
         "`rfc2217://host:port`, or `simulated` for an instrument made of this description",
     )
-    usb: UsbSettings | None = Field(default=None, description="the adapter, in the place of a port")
+    usb: UsbSettings | None = Field(default=None, description="the adapter, instead of a port")
     baud_rate: int = Field(default=9600, ge=50, le=12_000_000, description="bits per second")
     data_bits: Literal[5, 6, 7, 8] = Field(default=8, description="bits per character")
     parity: Literal["none", "even", "odd", "mark", "space"] = Field(
@@ -53,10 +263,10 @@ class SerialSettings(Settings):
     )
     stop_bits: Literal[1, 2] = Field(default=1, description="bits between characters")
     flow_control: Literal["none", "rts_cts", "dsr_dtr", "xon_xoff"] = Field(
-        default="none", description="how the instrument says that it can take no more"
+        default="none", description="how the instrument signals that it can take no more"
     )
     write_ends_with: Text = Field(
-        description='what ends a command, in double quotes, as `"\\r"`; it is added to what is sent'
+        description='what ends a command, in double quotes, as `"\\r"`; it is added to each text'
     )
     read_ends_with: Text = Field(
         description='what ends a reply: the end of the line, or the next prompt, as `"\\r\\n> "`',
@@ -68,29 +278,28 @@ class SerialSettings(Settings):
         default=2,
         ge=0,
         le=10,
-        description="how often what can be repeated is asked again after no reply or an unreadable one",
+        description="how often a question or repeatable command is repeated if its reply is missing or "
+        "unreadable",
     )
     pause: Duration = Field(default=0.0, description="time that the instrument needs before the next command")
     wait_after_open: Duration = Field(
         default=0.0, description="time that it needs after the port was opened: an Arduino restarts then"
     )
     identify: IdentifySettings | None = Field(
-        default=None, description="how the instrument says what it is; another one is refused"
+        default=None, description="how the instrument reports what it is; another one is refused"
     )
     on_open: tuple[Call, ...] = Field(
         default=(),
         description="commands sent when it was opened: `[remote, {do: mode, arguments: {number: 1}}]`",
     )
     commands: dict[Text, CommandSettings] = Field(default={}, description="its commands, by name")
-    values: dict[Text, ValueSettings] = Field(
-        default={}, description="values that it can be asked for, by name"
-    )
+    values: dict[Text, ValueSettings] = Field(default={}, description="values that can be read, by name")
     safe_state: tuple[Call, ...] = Field(
-        default=(), description="commands that make it harmless; none: it is left as it is"
+        default=(), description="commands that make it safe; none: it is left as it is"
     )
 
-    def asked(self) -> Iterator[tuple[tuple[str, ...], str]]:
-        """Everything that may be sent, with its place: questions, and commands at their limits."""
+    def texts(self) -> Iterator[tuple[tuple[str, ...], str]]:
+        """All texts that may be sent, with their places: questions, and commands at their limits."""
         if self.identify is not None:
             yield ("identify", "ask"), self.identify.ask
         for name, value in self.values.items():
@@ -100,7 +309,7 @@ class SerialSettings(Settings):
                 yield ("commands", name, "send"), command.text(values)
 
     def why_unsendable(self, text: str) -> str:
-        """Why a text cannot be sent, and what to do; "" if it can."""
+        """Why a text cannot be sent, and what to do; "" if it can be sent."""
         if self.write_ends_with in text:
             what = f"'{clean(text)}' holds what ends a command"
             return f"{what}; expected it without: 'write_ends_with' is added to what is sent"
@@ -109,7 +318,7 @@ class SerialSettings(Settings):
         return ""
 
     @model_validator(mode="after")
-    def _has_one_port(self) -> Self:
+    def _check_port(self) -> Self:
         if self.port is None and self.usb is None:
             raise setting_error(
                 "it has no port", "'port' or 'usb'", "`labseq devices` names the ports if one is wrong"
@@ -125,7 +334,7 @@ class SerialSettings(Settings):
         return self
 
     @model_validator(mode="after")
-    def _texts_can_be_sent(self) -> Self:
+    def _check_texts(self) -> Self:
         for key in ("write_ends_with", "read_ends_with"):
             text: str = getattr(self, key)
             if "\\" in text:
@@ -139,13 +348,13 @@ class SerialSettings(Settings):
                 raise setting_error(
                     f"'{clean(text)}' is not {self.encoding}", "another encoding", at=("encoding",)
                 )
-        for at, text in self.asked():
+        for at, text in self.texts():
             if problem := self.why_unsendable(text):
                 raise placed(ValueError(problem), *at)
         return self
 
     @model_validator(mode="after")
-    def _calls_can_be_made(self) -> Self:
+    def _check_calls(self) -> Self:
         for key in ("on_open", "safe_state"):
             calls: tuple[Call, ...] = getattr(self, key)
             for i, call in enumerate(calls):
@@ -178,7 +387,7 @@ class SerialSettings(Settings):
             raise setting_error(what, f"{{do: {name}, arguments: {{{first}: ...}}}}", at=place)
 
     @model_validator(mode="after")
-    def _commands_make_values(self) -> Self:
+    def _check_made_values(self) -> Self:
         for name, command in self.commands.items():
             for made, state in command.makes.items():
                 at = ("commands", name, "makes", made)
@@ -194,7 +403,7 @@ class SerialSettings(Settings):
 
 
 def known(names: Mapping[str, object]) -> str:
-    """What the profile declares of something, in words."""
+    """The names that the profile declares, for a message."""
     return one_of(list(names)) if names else "none: the profile declares none"
 
 

@@ -1,4 +1,4 @@
-"""An instrument made of its description, on a line in memory: a dry run tests the one with the other."""
+"""An instrument simulated from its description: a dry run tests the description."""
 
 from __future__ import annotations
 
@@ -6,18 +6,17 @@ import threading
 from typing import Final
 
 from labseq.plugin import Clock
-from labseq_serial.arguments import Scalar
-from labseq_serial.commands import CommandSettings
-from labseq_serial.settings import SerialSettings
+from labseq_serial.settings import CommandSettings, SerialSettings
+from labseq_serial.values import Scalar
 
 _IDLE_S: Final = 0.005
 
 
 class SimulatedPort:
-    """Takes what the driver sends, finds the command in it, remembers its arguments, and replies.
+    """A port that recognises the commands that the driver sends, keeps their arguments, and replies.
 
-    A value that has the name of an argument is what the argument was last; one that a command ``makes``
-    is so; any other is plausible. Bytes take the time that they would take on the line.
+    A value that has the name of an argument is that argument's last value; a value that a command ``makes``
+    is as the command made it; any other value is plausible. Bytes take the time that they take on a line.
 
     Args:
         settings: The description.
@@ -47,7 +46,7 @@ class SimulatedPort:
         return data
 
     def write(self, data: bytes, /) -> int:
-        """Carry out what is complete by now."""
+        """Carry out the commands that are complete."""
         settings = self._settings
         end = settings.write_ends_with.encode(settings.encoding)
         self._come += data
@@ -81,7 +80,7 @@ class SimulatedPort:
             for command in settings.commands.values()
             if (values := command.values_in(text)) is not None
         ]
-        # Where two commands send the same, a toggle, it is the one that changes something.
+        # Two commands may send the same text, a toggle: take the one that changes something.
         for command, values in sorted(fits, key=lambda fit: self._is_made(fit[0])):
             self._values.update({**values, **command.makes})
             return command.simulated_reply()

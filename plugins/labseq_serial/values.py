@@ -1,16 +1,323 @@
-"""Values that an instrument is asked for."""
+"""Arguments of commands and values of an instrument: types, units, limits."""
 
 from __future__ import annotations
 
 import math
-from typing import Annotated, Final, Self
+from dataclasses import dataclass
+from typing import Annotated, Final, Literal, Self, TypeAlias
 
 from pydantic import Field, model_validator
+from pydantic_core import PydanticCustomError
 
-from labseq.plugin import Duration, Settings, Text, clean, one_of, setting_error
-from labseq_serial.arguments import Number, Scalar, TypedSettings, check_limits, format_limits, placed
-from labseq_serial.replies import VALUE, compiled, example_of
-from labseq_serial.units import Unit
+from labseq.plugin import (
+    UNITS,
+    ZERO_CELSIUS_K,
+    Duration,
+    Settings,
+    Text,
+    clean,
+    expected,
+    format_quantity,
+    one_of,
+    parse_quantity,
+    scaled,
+    setting_error,
+)
+from labseq_serial.patterns import VALUE, Sent, compiled, example_of
+
+_DIMENSION_OF: Final = {unit: dimension for dimension, units in UNITS.items() for unit in units if unit}
+_DIGITS: Final = 9
+
+
+@dataclass(frozen=True, slots=True)
+class Unit:
+    """The unit of a number on the line.
+
+    Attributes:
+        name: As the profile writes it; "" for a bare number.
+        dimension: One of labseq's dimensions: the number is a quantity then, in SI for the user; "" if
+            labseq does not know the unit: the user's number is the one on the line.
+    """
+
+    name: str = ""
+    dimension: str = ""
+
+    @classmethod
+    def of(cls, name: str) -> Self:
+        """The unit of this name.
+
+        Raises:
+            ValueError: It differs from a unit that labseq knows only by its capitals.
+
+        Example:
+            >>> Unit.of("MHz").dimension, Unit.of("mA").dimension
+            ('frequency', '')
+        """
+        if name == "degC":
+            return cls(name, "temperature")
+        if name in _DIMENSION_OF:
+            return cls(name, _DIMENSION_OF[name])
+        alike = next((known for known in _DIMENSION_OF if known.lower() == name.lower()), None)
+        if alike is not None:
+            raise ValueError(f"labseq knows no unit '{name}'; expected another one; did you mean '{alike}'?")
+        return cls(name)
+
+    @property
+    def is_si(self) -> bool:
+        """Whether the number on the line is the one that the user gives."""
+        return not self.dimension or UNITS[self.dimension].get(self.name) == 1.0
+
+    def read(self, given: object) -> float:
+        """A number as the user gives it: SI, or text with a unit.
+
+        Raises:
+            ValueError: It is no finite number, or one of another dimension.
+        """
+        number = self._number(given)
+        if not math.isfinite(number):
+            raise ValueError(f"{number} is no number; expected a finite one")
+        return number
+
+    def _number(self, given: object) -> float:
+        if isinstance(given, int | float) and not isinstance(given, bool):
+            return float(given)
+        if isinstance(given, str) and self.dimension:
+            return parse_quantity(given, self.dimension)
+        if isinstance(given, str) and self.name and given.strip().endswith(self.name):
+            try:
+                return float(given.strip().removesuffix(self.name))
+            except ValueError:
+                pass
+        raise ValueError(f"{given!r} is not accepted; expected {self.expected()}")
+
+    def expected(self) -> str:
+        """Describe a number in this unit."""
+        if self.dimension:
+            return expected(self.dimension)
+        return f"a number in {self.name}" if self.name else "a number"
+
+    def to_line(self, number: float) -> float:
+        """Convert from SI to the unit on the line.
+
+        Example:
+            >>> Unit.of("MHz").to_line(80e6), Unit.of("degC").to_line(298.15)
+            (80.0, 25.0)
+        """
+        if self.name == "degC":
+            return round(number - ZERO_CELSIUS_K, 9)
+        factor = UNITS[self.dimension][self.name] if self.dimension else 1.0
+        return scaled(number, 1.0 / factor) if factor < 1.0 else number / factor
+
+    def from_line(self, number: float) -> float:
+        """Convert from the unit on the line to SI."""
+        if self.name == "degC":
+            return number + ZERO_CELSIUS_K
+        return scaled(number, UNITS[self.dimension][self.name]) if self.dimension else number
+
+    def shown(self, number: float) -> str:
+        """Format a number in SI.
+
+        Example:
+            >>> Unit.of("kHz").shown(80e6), Unit.of("mA").shown(120.0)
+            ('80 MHz', '120 mA')
+        """
+        if self.dimension and self.name != "degC":
+            return format_quantity(number, self.dimension, _DIGITS)
+        return f"{self.to_line(number):.{_DIGITS}g} {self.name}".rstrip()
+
+
+Scalar: TypeAlias = bool | int | float | str
+Number: TypeAlias = float | str
+"""A number, or a quantity such as "80 MHz"."""
+
+MAX_TEXT: Final = 200
+"""Longest text that is sent as an argument."""
+
+
+class TypedSettings(Settings):
+    """Type, unit and limits of an argument or value."""
+
+    type: Literal["float", "int", "bool", "text"] = Field(default="float", description="what it is")
+    unit: Text | None = Field(
+        default=None,
+        description="unit of the number on the line; with one that labseq knows, as MHz or degC, it is a "
+        "quantity in sequences and results, else, as with mA, the number itself",
+    )
+    words: tuple[Text, Text] = Field(
+        default=("0", "1"), description="what false and true are on the line, of a bool"
+    )
+    min: Number | None = Field(default=None, description="least that it may be")
+    max: Number | None = Field(default=None, description="highest allowed value")
+
+    @property
+    def is_number(self) -> bool:
+        """Whether it is a float or an int."""
+        return self.type in ("float", "int")
+
+    @property
+    def quantity(self) -> Unit:
+        """The unit; that of a bare number where none is given."""
+        return Unit.of(self.unit or "")
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """Least and most, in SI; infinite where there is none."""
+        low, high = self.min, self.max
+        read = self.quantity.read
+        return (-math.inf if low is None else read(low), math.inf if high is None else read(high))
+
+    def allows(self, value: Scalar) -> bool:
+        """Whether a value, in SI, is within the limits; anything but a number is."""
+        return isinstance(value, str | bool) or self.limits[0] <= value <= self.limits[1]
+
+    def shown(self, value: Scalar) -> str:
+        """Format a value with its unit."""
+        if isinstance(value, bool):
+            return str(value).lower()
+        return clean(value) if isinstance(value, str) else self.quantity.shown(value)
+
+    def shown_limits(self) -> str:
+        """Describe the limits."""
+        return format_limits(*self.limits, self.quantity)
+
+    @model_validator(mode="after")
+    def _type_unit_and_limits_fit(self) -> Self:
+        given = self.model_fields_set
+        allowed = {"float": {"unit", "min", "max"}, "int": {"min", "max"}, "bool": {"words"}}
+        for key in ("unit", "min", "max", "words"):
+            if key in given and getattr(self, key) is not None and key not in allowed.get(self.type, ()):
+                kinds = " or ".join(kind for kind, keys in allowed.items() if key in keys)
+                raise setting_error(
+                    f"'{key}' does not go with type {self.type}", f"type {kinds}", at=(key,), key=True
+                )
+        if self.words[0] == self.words[1]:
+            raise setting_error(f"false and true are both '{self.words[0]}'", "two words", at=("words",))
+        check_limits(self.unit, self.min, self.max)
+        return self
+
+
+class ArgumentSettings(TypedSettings):
+    """An argument of a command."""
+
+    choices: tuple[Text, ...] = Field(default=(), description="what it may be, of a text; none: any text")
+
+    @property
+    def kind(self) -> type[Sent]:
+        """Its type on the line."""
+        return {"float": float, "int": int}.get(self.type, str)
+
+    def value_of(self, given: object) -> Scalar:
+        """The value of an argument as a step gives it, in SI.
+
+        Raises:
+            ValueError: It is of another type, or not one of the choices.
+        """
+        if self.type == "float":
+            return self.quantity.read(given)
+        if self.type == "bool" and isinstance(given, bool):
+            return given
+        if self.type == "text" and isinstance(given, str) and self._may_be_sent(given):
+            return given
+        if self.type == "int" and type(given) in (int, float) and float(str(given)).is_integer():
+            return int(float(str(given)))
+        raise ValueError(f"{given!r} is not accepted; expected {self._expected()}")
+
+    def to_line(self, value: Scalar) -> Sent:
+        """Convert a value to the argument on the line."""
+        if isinstance(value, bool):
+            return self.words[value]
+        return self.quantity.to_line(value) if self.type == "float" and not isinstance(value, str) else value
+
+    def from_line(self, sent: Sent) -> Scalar | None:
+        """The value of an argument on the line; None if it is not a value of this argument."""
+        if self.type == "bool":
+            return self.words.index(str(sent)) == 1 if sent in self.words else None
+        if self.type == "text":
+            return sent if not self.choices or sent in self.choices else None
+        return self.quantity.from_line(float(sent)) if self.type == "float" else sent
+
+    def extremes(self) -> tuple[Scalar, Scalar]:
+        """Its limits, or its first and last choice."""
+        if self.type == "bool":
+            return False, True
+        if self.type == "text":
+            return (self.choices[0], self.choices[-1]) if self.choices else ("A", "B9")
+        low, high = self.limits
+        return (low, high) if self.type == "float" else (math.ceil(low), math.floor(high))
+
+    def _may_be_sent(self, text: str) -> bool:
+        if self.choices:
+            return text in self.choices
+        return text.isprintable() and 0 < len(text) <= MAX_TEXT and text == text.strip()
+
+    def _expected(self) -> str:
+        if self.choices:
+            return f"one of {', '.join(self.choices)}"
+        return {
+            "int": "a whole number",
+            "bool": "true or false",
+        }.get(self.type, f"1 to {MAX_TEXT} characters on one line, no space at either end")
+
+    @model_validator(mode="after")
+    def _numbers_have_limits(self) -> Self:
+        if self.choices and self.type != "text":
+            raise setting_error(
+                f"'choices' do not go with type {self.type}", "type text", at=("choices",), key=True
+            )
+        for key in ("min", "max") if self.is_number else ():
+            if getattr(self, key) is None:
+                raise setting_error(f"'{key}' is missing", "both limits of a number that is sent")
+        low, high = self.limits
+        if self.type == "int" and math.ceil(low) > math.floor(high):
+            raise setting_error("there is no whole number within the limits", "some", at=("min",))
+        return self
+
+
+def check_limits(unit: str | None, low: Number | None, high: Number | None, *at: str) -> None:
+    """Refuse limits that are no quantities of their unit, or the wrong way round.
+
+    Args:
+        unit: The unit, as the profile has it.
+        low: The least.
+        high: The most.
+        *at: Where the limits are, below what is validated.
+
+    Raises:
+        PydanticCustomError: With its place.
+    """
+    try:
+        quantity = Unit.of(unit or "")
+    except ValueError as error:
+        raise placed(error, "unit") from None
+    read: list[float] = []
+    for key, limit in (("min", low), ("max", high)):
+        if isinstance(limit, float | int) and not quantity.is_si:
+            what = f"{key} is {limit:g}, without a unit"
+            raise setting_error(what, f"'{limit:g} {unit}', or the number in its unit", at=(*at, key))
+        try:
+            read += [] if limit is None else [quantity.read(limit)]
+        except ValueError as error:
+            raise placed(error, *at, key) from None
+    if len(read) == 2 and read[0] > read[1]:
+        shown = [quantity.shown(limit) for limit in read]
+        raise setting_error(f"min is {shown[0]}, more than max, {shown[1]}", "min below max", at=(*at, "min"))
+
+
+def format_limits(low: float, high: float, quantity: Unit) -> str:
+    """Describe limits; infinite ones are left out."""
+    if math.isinf(low):
+        return "anything" if math.isinf(high) else f"at most {quantity.shown(high)}"
+    if math.isinf(high):
+        return f"at least {quantity.shown(low)}"
+    return f"{quantity.shown(low)} to {quantity.shown(high)}"
+
+
+def placed(error: ValueError, *at: str | int, key: bool = False) -> PydanticCustomError:
+    """The error of a text reader, "what; expected this; do that", with its place."""
+    what, _, rest = str(error).partition("; expected ")
+    expected, _, hint = rest.partition("; ")
+    return setting_error(what, expected, hint, at=at, key=key)
+
 
 _PLAIN: Final = (".12g", ".9f", ".6f", ".3f", ".2f", ".1f", ".0f", ".6e", ".6E")
 _SPECS: Final = (*_PLAIN, *(f"+{spec}" for spec in _PLAIN))
@@ -18,19 +325,19 @@ _SPECS: Final = (*_PLAIN, *(f"+{spec}" for spec in _PLAIN))
 
 
 class InterlockSettings(Settings):
-    """What a value must be, or nothing is picked up."""
+    """Condition on a value, without which no atoms are picked up."""
 
-    min: Number | None = Field(default=None, description="least that the value may be")
-    max: Number | None = Field(default=None, description="most that it may be")
-    one_of: tuple[Scalar, ...] = Field(default=(), description="what it may be, of a bool or text")
-    message: str = Field(default="", description="what to do when it is not, for the message")
+    min: Number | None = Field(default=None, description="lowest allowed value")
+    max: Number | None = Field(default=None, description="highest allowed value")
+    one_of: tuple[Scalar, ...] = Field(default=(), description="allowed values of a bool or text")
+    message: str = Field(default="", description="what to do if the condition is not met, for the message")
     max_age: Duration = Field(
         default=0.0,
         description="how old a reading may be; each check that needs a new one waits for the instrument",
     )
 
     def allows(self, value: Scalar, quantity: Unit) -> bool:
-        """Whether a value, in SI, is as it must be."""
+        """Whether a value, in SI, meets the condition."""
         if self.one_of:
             return any(type(value) is type(good) and value == good for good in self.one_of)
         low, high = self.limits(quantity)
@@ -42,7 +349,7 @@ class InterlockSettings(Settings):
         return low, math.inf if self.max is None else quantity.read(self.max)
 
     def shown(self, quantity: Unit) -> str:
-        """What is allowed, in words."""
+        """Describe the allowed values."""
         if self.one_of:
             return " or ".join(
                 str(good).lower() if isinstance(good, bool) else str(good) for good in self.one_of
@@ -51,9 +358,9 @@ class InterlockSettings(Settings):
 
 
 class ValueSettings(TypedSettings):
-    """A value that the instrument is asked for."""
+    """A value that is read from the instrument."""
 
-    ask: Text = Field(description="what is sent, as it stands")
+    ask: Text = Field(description="text that is sent")
     reply: Text = Field(
         default=f"(?P<{VALUE}>.*)",
         description="pattern of the reply: a regular expression for all of it, without spaces at its ends, "
@@ -61,24 +368,25 @@ class ValueSettings(TypedSettings):
     )
     error: Text | None = Field(default=None, description="pattern of a reply that reports an error")
     poll: bool = Field(
-        default=False, description="whether it is read at the start of each shot and kept with it"
+        default=False, description="whether it is read at the start of each shot and recorded with it"
     )
     interlock: InterlockSettings | None = Field(
-        default=None, description="what it must be, or nothing is picked up and the run ends"
+        default=None,
+        description="condition on the value; if it is not met, no atoms are picked up and the run ends",
     )
     timeout: Annotated[Duration, Field(gt=0)] | None = Field(
         default=None, description="how long the reply may take; none: as for all"
     )
     example: Text | None = Field(
         default=None,
-        description="a reply as it may come, for dry runs; only needed if labseq cannot make one up",
+        description="an example of a reply, for dry runs; only needed if labseq cannot generate one",
     )
 
     def value_in(self, reply: str) -> Scalar:
-        """Read the value, in SI, out of a reply.
+        """Read the value, in SI, from a reply.
 
         Raises:
-            ValueError: The reply is another than expected, or its value is implausible.
+            ValueError: The reply does not match, or its value is implausible.
         """
         match = compiled(self.reply).fullmatch(reply)
         if match is None or match[VALUE] is None:
@@ -182,7 +490,7 @@ class ValueSettings(TypedSettings):
         if self.example is None:
             reply = self.reply_with(self.typical)
             if reply is None:
-                what = f"labseq cannot make up a reply like '{clean(self.reply)}' with the value "
+                what = f"labseq cannot generate a reply like '{clean(self.reply)}' with the value "
                 raise setting_error(
                     what + self.shown(self.typical), "an example of one", "add 'example'", at=("reply",)
                 )
@@ -191,5 +499,7 @@ class ValueSettings(TypedSettings):
         try:
             self.value_in(reply)
         except ValueError as error:
-            raise placed(ValueError(f"the reply '{clean(reply)}' does not do: {error}"), "example") from None
+            raise placed(
+                ValueError(f"the reply '{clean(reply)}' does not match: {error}"), "example"
+            ) from None
         return self

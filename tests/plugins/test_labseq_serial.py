@@ -1,21 +1,33 @@
-"""The driver of serial instruments: what it does when all is well."""
+"""The serial device: on a simulated instrument, at a pty, over the network, and in whole runs."""
 
 from __future__ import annotations
 
+import importlib
+import json
+import re
+import socket
+import socketserver
 import sys
-from collections.abc import Callable, Iterator
+import threading
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
+from pathlib import Path
 from typing import Any, ClassVar
 
 import pytest
 from labseq_serial.device import SerialDevice
 
-from labseq import Context, DeviceError, LimitError
+from labseq import ConfigError, Context, DeviceError, LimitError, Session, TransientError
+from labseq.config import find_profile
+from labseq.config.yaml_nodes import compose
+from labseq.recording import Run
 from labseq.roles import offers
+from labseq.session import check_devices
+from labseq.session.check import check
 from labseq.testing import DeviceContract
 from labseq.testing.fakes import FakeClock
 
-from .labseq_serial_rig import Counterpart, opened, settings
+from .labseq_serial_rig import PROFILE, Counterpart, opened, settings
 
 Factory = Callable[..., Any]
 on_a_pty = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no ptys")
@@ -113,7 +125,7 @@ def test_what_fails_on_open_is_taken_back(counterpart: Counterpart) -> None:
         ("set", {}, DeviceError, "'set' has no arguments; expected frequency"),
         ("open", {"now": 1}, DeviceError, "'open' has the arguments now; expected none"),
         ("set", {"frequency": "80 mm"}, DeviceError, "'80 mm' is a length, not a frequency"),
-        ("set", {"frequency": True}, DeviceError, "True does not do; expected a frequency"),
+        ("set", {"frequency": True}, DeviceError, "True is not accepted; expected a frequency"),
         ("set", {"frequency": "0.2 GHz "}, None, ""),
         (
             "set",
@@ -228,3 +240,204 @@ def test_an_instrument_that_echoes_and_prompts_is_read() -> None:
     device.command("time", duration="45 ms")
     assert device.read("duration") == pytest.approx(45e-3)
     device.close()
+
+
+class Answering(socketserver.StreamRequestHandler):
+    """An instrument on the network; it hangs up when told so."""
+
+    def handle(self) -> None:
+        for line in self.rfile:
+            if line == b"BYE\n":
+                return
+            self.wfile.write(line.replace(b"T?", b"21.5"))
+
+
+def test_an_instrument_behind_a_network_port_is_the_same() -> None:
+    values = {"t": {"ask": "T?"}, "bye": {"ask": "BYE"}}
+    with socketserver.TCPServer(("127.0.0.1", 0), Answering) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        port = f"socket://127.0.0.1:{server.server_address[1]}"
+        with opened(port, values=values, commands={}, safe_state=[], identify=None) as synth:
+            assert synth.read("t") == 21.5
+            with pytest.raises(TransientError, match="synth: the line broke at 'BYE'"):
+                synth.read("bye")
+            assert synth.read("t") == 21.5, "it was opened again"
+        server.shutdown()
+
+
+@pytest.mark.filterwarnings("ignore:set(Daemon|Name)")  # pyserial 3.5
+def test_an_instrument_behind_a_terminal_server_is_the_same() -> None:
+    serial: Any = importlib.import_module("serial.rfc2217")
+    behind: Any = importlib.import_module("serial").serial_for_url("loop://", timeout=0.02)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        threading.Thread(target=serve_rfc2217, args=(serial, behind, server), daemon=True).start()
+        port = f"rfc2217://127.0.0.1:{server.getsockname()[1]}"
+        values = {"t": {"ask": "T?", "type": "text"}}
+        with opened(port, values=values, commands={}, safe_state=[], identify=None) as synth:
+            assert synth.read("t") == "T?", "behind the server is a loop"
+
+
+def serve_rfc2217(serial: Any, behind: Any, server: socket.socket) -> None:
+    """One client of a terminal server, until it hangs up."""
+    client, _ = server.accept()
+    with client, client.makefile("wb", 0) as out:
+        manager = serial.PortManager(behind, out)
+        while data := client.recv(1024):
+            behind.write(b"".join(manager.filter(data)))
+            if behind.in_waiting:
+                client.sendall(b"".join(manager.escape(behind.read(behind.in_waiting))))
+
+
+SEQUENCE = """
+labseq: 1
+name: serial
+profile: ./lab.yaml
+shots: 2
+seed: 1
+target: {pattern: compact, rows: 3, cols: 3}
+planner: {use: psca}
+shot:
+  - load: {duration: 10 ms}
+  - device: {name: synth, do: set, arguments: {frequency: 80 MHz}}
+  - device: {name: synth, do: toggle_on}
+  - image: {exposure: 5 ms}
+"""
+
+
+@pytest.fixture
+def session_counterpart(tmp_path: Path) -> Iterator[Counterpart]:
+    with Counterpart(tmp_path) as session_counterpart:
+        yield session_counterpart
+
+
+def lab(folder: Path, port: str, **more: Any) -> Path:
+    """A sequence in a folder, and the virtual lab with the instrument as its profile."""
+    text = find_profile("virtual", folder).read_text()
+    profile, synth = compose(text, ""), compose(f"synth:\n{PROFILE}", "")
+    assert profile is not None
+    assert synth is not None
+    device = {"use": "serial", "port": port, **synth.plain()["synth"], **more}
+    (folder / "lab.yaml").write_text(json.dumps({**profile.plain(), "devices": {"synth": device}}))
+    (folder / "sequence.yaml").write_text(SEQUENCE)
+    return folder / "sequence.yaml"
+
+
+def run(sequence: Path, **options: Any) -> Run:
+    with Session.open(sequence, output=sequence.parent / "data", **options) as session:
+        return session.run()
+
+
+class Observer:
+    """Notes what becomes of each attempt at a shot; unplugs an instrument when the first one begins.
+
+    Attributes:
+        ends: How each attempt ended, and its error.
+    """
+
+    def __init__(self, unplugged: Counterpart | None = None) -> None:
+        self.ends: list[tuple[str, str]] = []
+        self._unplugged = unplugged
+
+    def event(self, name: str, values: Mapping[str, Any]) -> None:
+        if name == "shot_started" and self._unplugged is not None and not self.ends:
+            self._unplugged.order("unplug")
+        if name in ("shot_finished", "shot_repeated"):
+            self.ends.append((values["shot"].status, values["shot"].error))
+
+
+def test_a_dry_run_speaks_to_an_instrument_made_of_the_description(tmp_path: Path) -> None:
+    done = run(lab(tmp_path, "/dev/ttyNOSUCH7"), dry_run="full")
+    readings = [shot.readings for shot in done.shots]
+    assert [reading["synth.is_open"] for reading in readings] == [False, True]
+    assert [reading["synth.frequency"] for reading in readings] == [0.0, 80e6]
+    assert done.record["devices"]["synth"]["port"] == "simulated"
+
+
+def test_a_simulated_port_takes_no_real_time(tmp_path: Path) -> None:
+    with Session.open(lab(tmp_path, "simulated"), output=tmp_path / "data") as session:
+        assert session.assembly.virtual_time
+
+
+@on_a_pty
+def test_values_are_kept_with_each_shot(
+    tmp_path: Path, session_counterpart: Counterpart
+) -> None:
+    done = run(lab(tmp_path, session_counterpart.port))
+    assert [shot.readings["synth.frequency"] for shot in done.shots] == [100e6, 80e6]
+    assert session_counterpart.log[-2:] == ["FREQ 1.000000", "CLOSE"], "it was made safe"
+
+
+@on_a_pty
+def test_the_first_command_of_the_day_names_the_instrument(
+    tmp_path: Path, session_counterpart: Counterpart
+) -> None:
+    report = check_devices(
+        str(lab(tmp_path, session_counterpart.port).with_name("lab.yaml"))
+    )
+    (synth,) = [found for found in report.devices if found.name == "synth"]
+    assert synth.ok
+    assert synth.tested
+    assert synth.described["serial_number"] == "0042"
+    assert synth.latency_s
+
+
+@on_a_pty
+def test_a_value_past_its_interlock_ends_the_run_before_anything_is_done(
+    tmp_path: Path, session_counterpart: Counterpart
+) -> None:
+    session_counterpart.order("set", "temperature", "25.60")
+    observer = Observer()
+    text = "synth: temperature is 25.6 degC; the interlock expects 15 degC to 25 degC; look at the chiller"
+    with pytest.raises(DeviceError, match=re.escape(text)):
+        run(lab(tmp_path, session_counterpart.port), observer=observer)
+    assert "TOGGLE" not in session_counterpart.log
+    assert session_counterpart.log[-1] == "CLOSE"
+    assert observer.ends == [("failed", f"InterlockError: {text}")]
+
+
+@on_a_pty
+def test_a_shot_in_which_the_line_breaks_is_repeated_and_ends_the_run_if_it_stays_broken(
+    tmp_path: Path, session_counterpart: Counterpart
+) -> None:
+    observer = Observer(unplugged=session_counterpart)
+    with pytest.raises(DeviceError, match="synth: the line broke and could not be opened again"):
+        run(lab(tmp_path, session_counterpart.port), observer=observer)
+    (first, first_error), (second, second_error) = observer.ends
+    assert (first, second) == ("failed", "failed")
+    assert first_error.startswith("TransientError: synth: the line broke at 'STATE?'")
+    assert second_error.startswith("DeviceError: ")
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "message"),
+    [
+        (
+            "do: set,",
+            "do: sett,",
+            ":11:31: synth: unknown command 'sett'; expected one of 'open', 'close', 'once'",
+        ),
+        ("80 MHz", "300 MHz", ":11:31: synth: frequency of 'set' is 300 MHz; the limit is 1 MHz to 200 MHz"),
+        ("frequency: 80 MHz", "", ":11:31: synth: 'set' has no arguments; expected frequency"),
+    ],
+)
+def test_a_command_that_the_device_does_not_know_is_refused_before_anything_is_opened(
+    tmp_path: Path, right: str, wrong: str, message: str
+) -> None:
+    sequence = lab(tmp_path, "/dev/ttyNOSUCH7")
+    sequence.write_text(SEQUENCE.replace(right, wrong, 1))
+    with Session.open(sequence, output=tmp_path / "data") as session:
+        for attempt in (partial(check, session), session.run):
+            with pytest.raises(ConfigError, match=re.escape(message)):
+                attempt()
+    assert not (tmp_path / "data").exists()
+
+
+def test_a_scan_beyond_a_limit_is_refused_before_anything_is_opened(tmp_path: Path) -> None:
+    scan = "scan: {shot.1.device.arguments.frequency: [80 MHz, 90 MHz, 300 MHz]}"
+    sequence = lab(tmp_path, "simulated")
+    sequence.write_text(SEQUENCE.replace("shots: 2", scan))
+    with (
+        Session.open(sequence, output=tmp_path / "data") as session,
+        pytest.raises(ConfigError, match="synth: frequency of 'set' is 300 MHz; the limit"),
+    ):
+        session.run()

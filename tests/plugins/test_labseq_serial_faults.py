@@ -117,7 +117,7 @@ def test_a_wrong_baud_rate_is_suspected(counterpart: Counterpart) -> None:
 def test_another_instrument_is_refused(counterpart: Counterpart) -> None:
     identify = {"ask": "*IDN?", "reply": "THORLABS SC10.*"}
     device = SerialDevice(settings(port=counterpart.port, identify=identify), Context("synth"))
-    text = "says that it is 'LAB,COUNTERPART,0042,1.7'; expected 'THORLABS SC10.*'; is it the right port"
+    text = "reports that it is 'LAB,COUNTERPART,0042,1.7'; expected 'THORLABS SC10.*'; is it the right port"
     with pytest.raises(DeviceError, match=text):
         device.open()
     assert {*counterpart.log} == {"*IDN?"}, "it was sent nothing else"
@@ -237,7 +237,7 @@ def test_the_safe_state_does_not_wait_for_somebody_elses_reply(counterpart: Coun
         asking = Asking(synth)
         asking.has_begun(counterpart)
         synth.safe_state()
-        assert "given up for the safe state" in str(asking.outcome())
+        assert "aborted by the safe state" in str(asking.outcome())
         assert counterpart.log[-2:] == ["FREQ 1.000000", "CLOSE"]
 
 

@@ -1,9 +1,10 @@
-"""What is sent: text with places for arguments, ``FREQ {frequency:.3f}``."""
+"""Texts on the line: templates of commands, and patterns of replies."""
 
 from __future__ import annotations
 
 import re
 import string
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final, Self, TypeAlias
@@ -19,7 +20,7 @@ _SHORT: Final = ".12g"
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """Literal text, and the placeholder behind it.
+    """Literal text, and the placeholder after it.
 
     Attributes:
         literal: The text.
@@ -34,7 +35,7 @@ class Piece:
 
 @dataclass(frozen=True, slots=True)
 class Template:
-    """A command with places for arguments.
+    """A command with placeholders for arguments: ``FREQ {frequency:.3f}``.
 
     Attributes:
         text: As the profile has it.
@@ -46,10 +47,10 @@ class Template:
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """Take a template apart.
+        """Parse a template.
 
         Raises:
-            ValueError: A brace without its other, or a placeholder that is no name.
+            ValueError: An unmatched brace, or a placeholder that is no name.
 
         Example:
             >>> Template.parse("FREQ {frequency:.3f}").names
@@ -73,14 +74,14 @@ class Template:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The arguments that it has places for, in order."""
+        """The names of its placeholders, in order."""
         return tuple(dict.fromkeys(piece.name for piece in self.pieces if piece.name))
 
     def format(self, values: Mapping[str, Sent]) -> str:
-        """Write the arguments into their places.
+        """Fill in the arguments.
 
         Raises:
-            ValueError: A format is not for the type of its argument.
+            ValueError: A format does not suit the type of its argument.
 
         Example:
             >>> Template.parse("F{channel:02d} {frequency:.3f}").format({"frequency": 80.0, "channel": 1})
@@ -92,10 +93,10 @@ class Template:
         )
 
     def rounded(self, values: Mapping[str, Sent]) -> dict[str, Sent]:
-        """The arguments as they are once they are written.
+        """The arguments as rounded by their formats.
 
         Raises:
-            ValueError: A format is not for the type of its argument, or what it makes cannot be read.
+            ValueError: A format does not suit the type of its argument, or its output cannot be read back.
 
         Example:
             >>> Template.parse("FREQ {frequency:.1f}").rounded({"frequency": 80.04})
@@ -108,14 +109,14 @@ class Template:
         }
 
     def read(self, text: str, types: Mapping[str, type[Sent]]) -> dict[str, Sent] | None:
-        """Find the arguments in what was sent, as the instrument does.
+        """Read the arguments from a text that was sent, as the instrument does.
 
         Args:
-            text: What was sent.
+            text: The text.
             types: Type of each argument.
 
         Returns:
-            None if this is not what the template makes.
+            None if the text does not match the template.
 
         Example:
             >>> Template.parse("FREQ {frequency:.3f}").read("FREQ 80.000", {"frequency": float})
@@ -168,3 +169,108 @@ def _read(text: str, kind: type[Sent], spec: str) -> Sent:
         return float(text) if kind is float else int(text, _BASES.get(spec[-1:], 10))
     except ValueError:
         raise ValueError(f"'{text}' cannot be read back; expected a format of plain numbers") from None
+
+
+VALUE: Final = "value"
+"""Name of the group that holds a value."""
+
+_TOKEN: Final = re.compile(
+    r"""\[\^?\]?(?:\\.|[^\]\\])*\]          # a set of characters
+    | \\x..|\\u....|\\.                     # an escape
+    | \(\?P<\w+>|\(\?:|\(|\)|\|             # groups and alternatives
+    | (?:[*+?]|\{\d+(?:,\d*)?\})[?+]?       # how often
+    | .""",
+    re.DOTALL | re.VERBOSE,
+)
+_NOTHING: Final = frozenset({"^", "$", r"\A", r"\Z", r"\b", r"\B"})
+_CANDIDATES: Final = "0A" + string.printable
+
+
+def compiled(pattern: str) -> re.Pattern[str]:
+    """Compile a pattern that a whole reply must match.
+
+    Raises:
+        ValueError: It is no regular expression.
+    """
+    try:
+        return re.compile(pattern, re.DOTALL)
+    except re.error as error:
+        text = f"'{pattern}' is no regular expression: {error}"
+        raise ValueError(f"{text}; expected one; put a \\ before a special character") from None
+
+
+def example_of(pattern: str, value: str = "") -> str | None:
+    """Generate a reply that matches a pattern.
+
+    Of alternatives the first is taken; optional parts are left out if possible.
+
+    Args:
+        pattern: A regular expression that compiles.
+        value: Content of the group ``value``.
+
+    Returns:
+        None for a pattern that is too complex, for example with a look-ahead.
+
+    Example:
+        >>> example_of(r"T=(?P<value>[-+.0-9eE]+) ?degC", "21.5")
+        'T=21.5degC'
+        >>> example_of("(OK|DONE) [A-F]{2}.*")
+        'OK AA'
+    """
+    for least in (0, 1):  # repetitions of optional parts
+        try:
+            text = _Maker(pattern, value, least).alternatives()
+            match = compiled(pattern).fullmatch(text)
+        except (IndexError, ValueError, re.error, StopIteration):
+            continue
+        if match is not None and text == text.strip() and match.groupdict().get(VALUE, value) == value:
+            return text
+    return None
+
+
+class _Maker:
+    """Goes through a pattern and generates a text."""
+
+    def __init__(self, pattern: str, value: str, least: int) -> None:
+        self._tokens = deque(_TOKEN.findall(pattern))
+        self._value = value
+        self._least = least
+
+    def alternatives(self) -> str:
+        """The first of some alternatives; the others are gone through."""
+        text = self._sequence()
+        while self._tokens and self._tokens[0] == "|":
+            self._tokens.popleft()
+            self._sequence()
+        return text
+
+    def _sequence(self) -> str:
+        pieces: list[str] = []
+        tokens = self._tokens
+        while tokens and tokens[0] not in ("|", ")"):
+            token = tokens.popleft()
+            is_value = token == f"(?P<{VALUE}>"
+            if token.startswith("("):
+                piece = self.alternatives()
+                tokens.popleft()
+            else:
+                piece = _character(token)
+            if tokens and tokens[0][0] in "*+?{" and tokens[0] != "{":
+                piece *= self._count(tokens.popleft())
+            pieces.append(self._value if is_value else piece)
+        return "".join(pieces)
+
+    def _count(self, quantifier: str) -> int:
+        if quantifier[0] == "{":
+            return int(quantifier.strip("{}?+").partition(",")[0])
+        return 1 if quantifier[0] == "+" else self._least
+
+
+def _character(atom: str) -> str:
+    if atom in _NOTHING:
+        return ""
+    if len(atom) == 1 and atom != ".":
+        return atom
+    if atom[:2] in (r"\x", r"\u"):
+        return atom.encode().decode("unicode_escape")
+    return next(char for char in _CANDIDATES if re.fullmatch(atom, char))
