@@ -183,6 +183,12 @@ CASES = [
     ),
     ("negative window in a list", "- 50 ms", "- -1", "s.yaml:22:11: window.1 is -1; expected at least 0"),
     (
+        "too many windows",
+        "        - 50 ms\n",
+        "        - 50 ms\n        - 40 ms\n",
+        "s.yaml:21:9: the list has 4 entries, but cycles is 3; expected 3, one per cycle",
+    ),
+    (
         "too few windows",
         "        - 50 ms\n",
         "",

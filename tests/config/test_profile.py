@@ -23,7 +23,7 @@ from labseq.config import (
     load_sequence,
     read_scan,
 )
-from labseq.config.profile import GridSettings, RfSettings, TimeoutSettings
+from labseq.config.profile import ChannelSettings, GridSettings, RfSettings, TimeoutSettings
 from labseq.errors import ConfigError
 from labseq.model import CALIBRATION_KINDS, MotionSpec, RfSpec, SiteGrid
 from labseq.settings import Settings
@@ -86,6 +86,18 @@ def test_every_motion_key_reaches_the_core(key: str) -> None:
     ]
     assert len(different) == 1
     assert different[0].removesuffix("_s").removesuffix("_m") == key
+
+
+def test_every_key_of_a_line_reaches_the_core() -> None:
+    channel = ChannelSettings.model_validate(
+        {"channel": 3, "on": ["image"], "lead": "2 ms", "lag": "1 ms", "blinding": True, "active_low": True}
+    )
+    spec = channel.spec("probe")
+    assert (spec.name, spec.channel, spec.on, spec.blinding, spec.active_low) == (
+        *("probe", 3, frozenset({"image"})),
+        *(True, True),
+    )
+    assert (spec.lead_s, spec.lag_s) == (2e-3, 1e-3)
 
 
 def test_motion_keys_and_the_plugin_s_share_a_mapping(loaded: tuple[Document, ProfileSpec]) -> None:
@@ -203,6 +215,12 @@ CASES = [
         "step: -1.6 MHz",
         "step: 16 MHz",
         "p.yaml:10:18: the lowest of the 20 tones is at -52 MHz; expected all tones above 0 Hz; choose a smaller step",
+    ),
+    (
+        "comb that begins at zero",
+        "{centre: 100 MHz, step: -1.6 MHz}",
+        "{centre: 95 MHz, step: 10 MHz}",
+        "p.yaml:10:18: the lowest of the 20 tones is at 0 Hz; expected all tones above 0 Hz; choose a smaller step",
     ),
     (
         "comb of one frequency",

@@ -94,6 +94,26 @@ def test_a_batch_that_does_not_fit_is_not_started():
     assert (told["n_batches"], told["n_batches_played"]) == (1, 0)
 
 
+class LatePlanner(ScriptedPlanner):
+    """Takes longer than the overhead that the window allows for."""
+
+    clock: Any = None
+
+    def plan(self, occupancy, target):
+        self.clock.sleep(0.013 + 0.005)
+        return super().plan(occupancy, target)
+
+
+@pytest.mark.parametrize(("window", "n_played"), [(0.0160, 0), (0.0200, 1)])
+def test_the_time_that_planning_takes_beyond_the_overhead_shortens_the_window(window, n_played):
+    planner = LatePlanner([Plan.from_batches([([(0, 2)], [(0, 1)])])])
+    rig = rearranging([HALF], planner=planner, window=window, cycles=1)
+    planner.clock = rig.lab.clock
+    rig.run()
+    (cycle,) = rig.record().cycles
+    assert (cycle.plan.n_batches, cycle.n_batches_played) == (1, n_played)
+
+
 def test_an_image_is_needed():
     settings_given = given(
         cycles=1, exposure=0.02, stop_when="never", window_mode="early", window_of=lambda c: 0.06
