@@ -244,8 +244,8 @@ class InvalidPlanError(PlanError):
 
     Attributes:
         rule: The rule that was broken, one of :data:`labseq.motion.RULES`.
-        batch: Index of the batch, or -1 when the plan as a whole is wrong.
-        move: Index of the atom move within the batch, or -1.
+        batch: Index of the batch, from 0; -1 if the plan as a whole is wrong. The message counts from 1.
+        move: Index of the atom move within the batch, from 0, or -1. The message counts from 1.
         detail: What exactly is wrong, with the sites.
     """
 
@@ -254,9 +254,9 @@ class InvalidPlanError(PlanError):
         self.batch = batch
         self.move = move
         self.detail = detail
-        where = f"batch {batch}" if batch >= 0 else "plan"
+        where = f"batch {batch + 1}" if batch >= 0 else "plan"
         if move >= 0:
-            where += f", atom move {move}"
+            where += f", atom move {move + 1}"
         super().__init__(f"{where} breaks the rule '{rule}': {detail}", planner)
 
 

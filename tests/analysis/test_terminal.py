@@ -85,7 +85,7 @@ def test_plans_that_break_a_rule_are_told(run, capsys):
     assert replayed(run, planner="wrong", shots="2") == 0
     told = capsys.readouterr()
     assert "INVALID: 2 of 2 (100.0 %)" in told.out
-    assert re.match(r"shot 2, cycle 1: planner 'wrong': batch 0.* breaks the rule", told.err)
+    assert re.match(r"shot 2, cycle 1: planner 'wrong': batch 1.* breaks the rule", told.err)
 
 
 def test_sites_that_differ_are_drawn(run, capsys):

@@ -172,7 +172,7 @@ def test_more_parallelism_than_the_machine_has_is_not_used() -> None:
         ("raises", PlanError, "planner 'raises': plan() raised ZeroDivisionError: oh"),
         ("refuses", PlanError, "planner 'refuses': no plan today"),
         ("lies", PlanError, "planner 'lies'"),
-        ("breaks", InvalidPlanError, "planner 'breaks': batch 0, atom move 0 breaks the rule"),
+        ("breaks", InvalidPlanError, "planner 'breaks': batch 1, atom move 1 breaks the rule"),
         ("fails", PluginLoadError, "the constructor of planner 'fails' raised OSError: no licence"),
     ],
 )

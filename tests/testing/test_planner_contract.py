@@ -85,7 +85,7 @@ def test_a_message_draws_the_case_that_failed() -> None:
 def test_the_smallest_case_is_reported() -> None:
     with pytest.raises(ContractViolation) as raised:
         PlannerContract().test_creates_no_atom(partial(CreatesAnAtom, None))
-    assert raised.value.detail == "batch 0 takes an atom from (0, 0); there is none"
+    assert raised.value.detail == "batch 1 takes an atom from (0, 0); there is none"
 
 
 def test_what_is_no_plan_is_named() -> None:
