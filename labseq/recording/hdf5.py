@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Container, Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
@@ -23,15 +24,18 @@ _SCALAR: Final = h5s.create(h5s.SCALAR)
 
 def set_attributes(node: Any, values: Mapping[str, Any]) -> None:
     """Add attributes to a group or dataset that has none of these names; text is made fit for HDF5."""
-    for name, value in values.items():
+    for name, value in values.items():  # node.attrs[name] = value takes twice the time
         if isinstance(value, str):
             _add_text(node, name, np.array(plain_text(value), _STRING), _SCALAR)
+        elif isinstance(value, np.generic):
+            kind = h5t.py_create(value.dtype, logical=True)
+            h5a.create(node.id, name.encode(), kind, _SCALAR).write(np.asarray(value))
         else:
             node.attrs[name] = value
 
 
 def _add_text(node: Any, name: str, text: Any, space: Any) -> None:
-    h5a.create(node.id, name.encode(), _STRING_TYPE, space).write(text)  # attrs[...] takes twice the time
+    h5a.create(node.id, name.encode(), _STRING_TYPE, space).write(text)
 
 
 def write_fields(node: Any, fields: Sequence[Field], record: Any) -> None:
@@ -41,7 +45,7 @@ def write_fields(node: Any, fields: Sequence[Field], record: Any) -> None:
 
 def _attribute(field: Field, value: Any) -> Any:
     if field.dtype == "integer":
-        return value if -(2**63) <= value < 2**63 else str(value)
+        return np.int64(value) if -(2**63) <= value < 2**63 else str(value)
     return value if field.dtype == "text" else np.dtype(field.dtype).type(value)
 
 
@@ -89,11 +93,22 @@ def describe(dataset: Any, what: Dataset) -> None:
 def write_table(group: Any, table: Table, rows: NDArray[Any], name: str = "") -> None:
     """Add a table of the schema under ``name``, else the last part of its path."""
     dataset = group.create_dataset(name or table.path.rpartition("/")[2], data=rows)
-    units, descriptions = describe_columns(rows.dtype, table)
-    space = h5s.create_simple((len(units),))
-    for key, texts in (("units", units), ("descriptions", descriptions)):
-        _add_text(dataset, key, np.array(list(map(plain_text, texts)), _STRING), space)
+    of_columns = _of_known_columns(table) if table.columns else _of_columns(rows.dtype, table)
+    units, descriptions, space = of_columns
+    _add_text(dataset, "units", units, space)
+    _add_text(dataset, "descriptions", descriptions, space)
     set_attributes(dataset, {"description": table.description})
+
+
+@cache  # the same for all shots
+def _of_known_columns(table: Table) -> tuple[Any, Any, Any]:
+    return _of_columns(np.dtype([(column.name, "?") for column in table.columns]), table)
+
+
+def _of_columns(dtype: np.dtype[Any], table: Table) -> tuple[Any, Any, Any]:
+    """Units and descriptions of the columns as arrays of text, and their shape."""
+    texts = [np.array(list(map(plain_text, of)), _STRING) for of in describe_columns(dtype, table)]
+    return *texts, h5s.create_simple((len(texts[0]),))
 
 
 def link_name(name: str, taken: Container[str]) -> str:

@@ -24,7 +24,8 @@ def file(make_run: MakeRun, make_shot: MakeShot) -> Iterator[Any]:
     """A shot's file with everything that one can hold."""
     columns = {"descriptions": {"t_s": "when it jumped"}}
     jumps = np.zeros(2, np.dtype([("t_s", "f8"), ("row", "f4")], metadata=columns))
-    data = ShotEncoder(make_run(), "day/run").encode(make_shot(atom_events={"jumps": jumps}))
+    events = {"plain": jumps.view(np.dtype([("t_s", "f8"), ("row", "f4")])), "jumps": jumps}
+    data = ShotEncoder(make_run(), "day/run").encode(make_shot(atom_events=events))
     with h5py.File(io.BytesIO(data)) as opened:
         yield opened
 
@@ -68,6 +69,7 @@ def test_a_simulation_may_describe_its_columns(file: Any) -> None:
     jumps = file["entry/atom_events/jumps"]
     assert list(jumps.attrs["descriptions"]) == ["when it jumped", schema.UNDESCRIBED]
     assert list(jumps.attrs["units"]) == ["s", ""]
+    assert list(file["entry/atom_events/plain"].attrs["descriptions"]) == [schema.UNDESCRIBED] * 2
 
 
 def test_the_file_holds_the_attributes_of_the_schema(file: Any) -> None:
