@@ -1,4 +1,4 @@
-"""Settings addressed from outside of the file: ``--set shot.2.rearrange.window="40 ms"``."""
+"""Addresses of settings: in ``--set shot.2.rearrange.window="40 ms"``, scans, expressions and records."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ _SHOWN: Final = 80
 
 
 class Override(NamedTuple):
-    """A value that replaces the one in the file.
+    """A value that replaces one in a file.
 
     Attributes:
         address: For example "planner.degree_of_parallelism".
         value: As typed, YAML.
-        origin: The option, for messages; "" stands for ``--set address=value``.
+        origin: The option, for messages; "" means ``--set address=value``.
     """
 
     address: str
@@ -43,13 +43,13 @@ class Override(NamedTuple):
 
     @property
     def source(self) -> str:
-        """What messages name as the place."""
+        """The place that messages name."""
         text = self.origin or f"--set {self.address}={self.value}"
         return visible(text if len(text) <= _SHOWN else text[: _SHOWN - 3] + "...")
 
 
 def split_overrides(options: Sequence[str]) -> tuple[list[Override], list[Override]]:
-    """Read the values of ``--set`` and part those of the sequence from those of the profile.
+    """Read the values of ``--set``, and separate those of the sequence from those of the profile.
 
     ``profile=lab`` chooses the sequence's profile; ``profile.camera.gain=5``
     sets a value in it.
@@ -117,7 +117,7 @@ def profile_overrides(options: Sequence[str]) -> list[Override]:
 def find(root: Node, address: str, name: str, source: str, may_add: Collection[str] = ()) -> Loc:
     """Turn an address into a location; the last key of a mapping need not exist yet.
 
-    A list item with a ``name`` is addressed by it, and then stands for its
+    A list item with a ``name`` is addressed by it, and the address continues in its
     settings: ``shot.sort.window`` for ``shot.2.rearrange.window``.
 
     Raises:
@@ -142,7 +142,7 @@ def find(root: Node, address: str, name: str, source: str, may_add: Collection[s
 
 
 def _steps(node: Node, part: str) -> Loc:
-    """The way that one part of an address goes; () if it leads nowhere."""
+    """The keys and indices of one part of an address; () if it leads nowhere."""
     if isinstance(node.value, dict):
         return (part,) if part in node.value else ()
     if not isinstance(node.value, list):

@@ -1,4 +1,4 @@
-"""Where hardware profiles and sequences are, those that come with labseq among them."""
+"""Finds hardware profiles and sequences by name, including those that come with labseq."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from labseq.messages import clean, did_you_mean, listing, visible
 
 
 def is_path(name: str) -> bool:
-    """Whether what names a profile or a sequence is a path, not a name.
+    """Whether a text is a path, not the name of a profile or sequence.
 
     Example:
         >>> is_path("virtual"), is_path("mine.yaml"), is_path("../mine")

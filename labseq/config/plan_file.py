@@ -1,4 +1,4 @@
-"""A plan out of the JSON that ``labseq plan --json`` writes."""
+"""Reads the JSON that ``labseq plan --json`` writes."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class GridFile(Settings):
 
 
 class TargetFile(Settings):
-    """What the array shall look like."""
+    """The pattern of atoms to reach."""
 
     fill: Rows = Field(description="sites that must hold an atom")
     clear: Rows = Field(description="sites that must be empty")
@@ -78,31 +78,31 @@ class BatchFile(Settings):
 
 
 class _Header(Settings):
-    """A plan's file but for its batches; what follows from the rest is not read."""
+    """The keys of a plan's file without its batches; derived values in it are ignored."""
 
     model_config = ConfigDict(extra="ignore")
 
-    planner: Name = Field(description="what planned")
+    planner: Name = Field(description="name of the planner")
     grid: GridFile = Field(description="the sites that it is for")
     degree_of_parallelism: int = Field(ge=1, le=1_000_000, description="most mobile tweezers on at once")
     seed: int | None = Field(
         default=None, ge=0, description="seed of all random numbers; null if there were none"
     )
     occupancy: Rows = Field(description="before the plan, rows of 0 and 1")
-    target: TargetFile = Field(description="what the array shall look like")
+    target: TargetFile = Field(description="the pattern of atoms to reach")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlanFile:
-    """A plan and what it was made for, as a file says; not checked yet.
+    """A plan and its inputs, as read from a file; the plan is not checked yet.
 
     Attributes:
-        planner: What planned.
+        planner: Name of the planner.
         degree_of_parallelism: Most tweezers on at once that the planner was allowed.
         seed: Seed of all random numbers; None if there were none.
         grid: The grid of sites, with the tones that a grid of its size has by default.
         occupancy: bool (n_rows, n_cols), before the plan.
-        target: What the array shall look like.
+        target: The pattern of atoms to reach.
         plan: The batches.
     """
 

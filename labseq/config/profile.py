@@ -48,16 +48,18 @@ _DEVICE_NAME: Final = re.compile(r"[^\W\d][\w-]*")
 
 
 class BlindingSettings(Settings):
-    """When a device's light would blind a camera with EM gain."""
+    """When a device's light would damage a camera with EM gain."""
 
-    value: Text = Field(default="state", description="the value of the device that tells")
+    value: Text = Field(
+        default="state", description="the reading of the device that says whether its light is on"
+    )
     when: Annotated[tuple[bool | int | float | str, ...], Field(min_length=1)] = Field(
-        default=("on",), description="what the value is while the light is on"
+        default=("on",), description="readings while the light is on"
     )
 
 
 class DeviceChoice(Choice):
-    """The plugin of an instrument, and what the core must know of it."""
+    """The plugin of an instrument, and the core's settings for it."""
 
     blinding: BlindingSettings | None = Field(
         default=None,
@@ -70,14 +72,14 @@ DEVICE_KEYS: Final = ("blinding",)
 
 
 def device_name(name: str, what: str) -> None:
-    """Refuse what cannot be a name in an address or a file."""
+    """Refuse a name that cannot be used in an address or a file."""
     if not _DEVICE_NAME.fullmatch(name):
         expected = "a word of letters, digits, '_' and '-' that begins with a letter"
         raise setting_error(f"{what} is called '{clean(name)}'", expected, at=(name,), key=True)
 
 
 def named(devices: dict[str, DeviceChoice]) -> dict[str, DeviceChoice]:
-    """Refuse names that a device cannot have, and tell each choice its place."""
+    """Refuse names that a device cannot have, and give each choice its place."""
     for name in devices:
         if name in (*ROLES, "planner"):
             raise setting_error(
@@ -88,11 +90,11 @@ def named(devices: dict[str, DeviceChoice]) -> dict[str, DeviceChoice]:
 
 
 OFF: Final = "off"
-"""In place of an id, or of a folder: none."""
+"""Instead of an id or of a folder: no calibration."""
 
 
 class CalibrationChoices(Settings):
-    """A calibration of each kind that takes the place of the one that is in use otherwise."""
+    """Which calibration of each kind to use instead of the active one."""
 
     sites: Text | None = Field(
         default=None, description="where the sites are on the frames: an id, or `off` for none"
@@ -105,18 +107,18 @@ class CalibrationChoices(Settings):
         default=None, description="tones of the mobile tweezers: an id, or `off`"
     )
     overlay: Text | None = Field(
-        default=None, description="how the mobile tweezers stand on the static ones: an id, or `off`"
+        default=None, description="position of the mobile tweezers on the static ones: an id, or `off`"
     )
 
     def of(self, kind: str) -> str | None:
-        """The choice for a kind: an id, "off", or None for what is in use."""
+        """The choice for a kind: an id, "off", or None for the active one."""
         return cast("str | None", getattr(self, kind))
 
 
 class CalibrationSettings(Settings):
-    """Where the profile's calibrations are kept, and which of them count.
+    """Where the profile's calibrations are stored, and which of them are used.
 
-    Just a folder, or `off` for none at all, may stand in place of the mapping.
+    The mapping may be replaced by a folder alone, or by `off` for no calibrations.
     """
 
     folder: FilePath | None = Field(
@@ -126,7 +128,7 @@ class CalibrationSettings(Settings):
     )
     use: Annotated[CalibrationChoices, empty_is({})] = Field(
         default=CalibrationChoices(),
-        description="calibrations that count in place of those put to use by `labseq calibration use`",
+        description="calibrations to use instead of those activated by `labseq calibration use`",
     )
 
     @model_validator(mode="before")
@@ -188,7 +190,7 @@ class ChannelSettings(Settings):
         return self
 
     def spec(self, name: str) -> LineSpec:
-        """The same for the core."""
+        """The settings as the core's type."""
         return LineSpec(
             name,
             self.channel,
@@ -217,7 +219,7 @@ def _distinct(channels: dict[str, ChannelSettings]) -> dict[str, ChannelSettings
 
 
 class LinesChoice(Choice):
-    """The timing box, and what is wired to it."""
+    """The timing box and its lines."""
 
     channels: Annotated[dict[str, ChannelSettings], AfterValidator(_distinct)] = Field(
         default={}, description="name of each line -> its channel, and when it is on"
@@ -265,7 +267,7 @@ Amplitudes: TypeAlias = tuple[Annotated[Fraction, Field(gt=0)], ...]
 
 
 class RfSettings(Settings):
-    """What drives the AODs of the mobile tweezers, and what they bear."""
+    """The RF drive of the mobile tweezers' AODs, and its limits."""
 
     row_band: Band = Field(
         default=_RF.row_band_hz, description="[lowest, highest] frequency of the row axis' AOD"
@@ -274,7 +276,7 @@ class RfSettings(Settings):
         default=_RF.column_band_hz, description="[lowest, highest] frequency of the column axis' AOD"
     )
     min_spacing: Annotated[Frequency, Field(ge=0)] = Field(
-        default=_RF.min_spacing_hz, description="least distance of two tones of an axis"
+        default=_RF.min_spacing_hz, description="smallest distance of two tones of an axis"
     )
     row_amplitudes: Amplitudes = Field(
         default=_RF.row_amplitudes,
@@ -296,13 +298,13 @@ class RfSettings(Settings):
         default=_RF.full_scale_v, description="peak voltage of the output at full scale, across 50 Ohm"
     )
     max_peak: Annotated[Voltage, Field(gt=0)] = Field(
-        default=_RF.max_peak_v, description="greatest peak voltage that the amplifiers bear"
+        default=_RF.max_peak_v, description="largest peak voltage that the amplifiers tolerate"
     )
     amplifier_gain: float = Field(
         default=_RF.amplifier_gain_db, description="power gain between the output and each AOD, in dB"
     )
     max_mean_power: Annotated[Power, Field(gt=0)] = Field(
-        default=_RF.max_mean_power_w, description="greatest mean RF power at each AOD"
+        default=_RF.max_mean_power_w, description="largest mean RF power at each AOD"
     )
     snap_within: Annotated[Length, Field(ge=0)] = Field(
         default=_RF.snap_within_m,
@@ -311,7 +313,7 @@ class RfSettings(Settings):
     )
 
     def spec(self) -> RfSpec:
-        """The same for the core."""
+        """The settings as the core's type."""
         return RfSpec(
             row_band_hz=self.row_band,
             column_band_hz=self.column_band,
@@ -335,7 +337,7 @@ Sites: TypeAlias = Annotated[int, Field(ge=1, le=1000)]
 
 
 class MotionSettings(Settings):
-    """How the mobile tweezers move, whatever their driver."""
+    """How the mobile tweezers move, for every driver."""
 
     pick_up: Duration = Field(default=_MOTION.pick_up_s, description="duration of the pick-up ramp")
     drop_off: Duration = Field(default=_MOTION.drop_off_s, description="duration of the drop-off ramp")
@@ -351,12 +353,14 @@ class MotionSettings(Settings):
     overhead_per_cycle: Duration = Field(
         default=_MOTION.overhead_per_cycle_s, description="time that passes before the first batch of a cycle"
     )
-    max_tweezers: Sites = Field(default=_MOTION.max_tweezers, description="most mobile tweezers on at once")
+    max_tweezers: Sites = Field(
+        default=_MOTION.max_tweezers, description="largest number of mobile tweezers on at once"
+    )
     max_row_tones: Sites = Field(
-        default=_MOTION.max_row_tones, description="most tones on the row axis at once"
+        default=_MOTION.max_row_tones, description="largest number of tones on the row axis at once"
     )
     max_column_tones: Sites = Field(
-        default=_MOTION.max_column_tones, description="most tones on the column axis at once"
+        default=_MOTION.max_column_tones, description="largest number of tones on the column axis at once"
     )
     eject_slots: int = Field(
         default=_MOTION.eject_slots,
@@ -365,11 +369,11 @@ class MotionSettings(Settings):
         description="how many sites beyond the grid the tones reach, on each side",
     )
     rf: Annotated[RfSettings, empty_is({})] = Field(
-        default=RfSettings(), description="what drives the AODs, and what they bear"
+        default=RfSettings(), description="the RF drive of the AODs, and its limits"
     )
 
     def spec(self) -> MotionSpec:
-        """The same for the core."""
+        """The settings as the core's type."""
         return MotionSpec(
             pick_up_s=self.pick_up,
             drop_off_s=self.drop_off,
@@ -397,13 +401,15 @@ Timeout: TypeAlias = Annotated[Duration, Field(gt=0)]
 
 
 class TimeoutSettings(Settings):
-    """How long plugins may take before they count as hung."""
+    """How long calls into plugins may take before they count as hung."""
 
-    call: Timeout = Field(default=10.0, description="longest device call, beyond what it does by itself")
-    safe_state: Timeout = Field(default=5.0, description="longest way of a device to its safe state")
+    call: Timeout = Field(
+        default=10.0, description="longest device call, in addition to the duration of its action"
+    )
+    safe_state: Timeout = Field(default=5.0, description="longest time for a device to reach its safe state")
     plan: Timeout = Field(default=5.0, description="longest planning of a cycle")
     load: Timeout = Field(
-        default=30.0, description="longest loading of a plugin, and longest way of a constructor"
+        default=30.0, description="longest loading of a plugin, and longest call of a constructor"
     )
 
 
@@ -454,17 +460,19 @@ class GridSettings(Settings):
 
 
 class ProfileSpec(Settings):
-    """A hardware profile, checked but for the settings of its plugins."""
+    """A hardware profile; the settings of its plugins are checked later."""
 
     labseq: FormatVersion = Field(description="version of the file format: 1")
     name: Name = Field(description="name of the machine")
     grid: GridSettings = Field(description="the grid of sites")
-    camera: Annotated[Choice, placed_by_field] = Field(description="what takes images")
-    static_tweezers: Annotated[Choice, placed_by_field] = Field(description="what makes the static array")
+    camera: Annotated[Choice, placed_by_field] = Field(description="the camera's plugin")
+    static_tweezers: Annotated[Choice, placed_by_field] = Field(description="the plugin of the static array")
     mobile_tweezers: Annotated[MobileTweezersChoice, placed_by_field] = Field(
-        description="what moves the atoms, and how"
+        description="the plugin that moves the atoms, and how they move"
     )
-    detector: Annotated[Choice, placed_by_field] = Field(description="what finds the atoms on an image")
+    detector: Annotated[Choice, placed_by_field] = Field(
+        description="the plugin that finds the atoms on an image"
+    )
     devices: Annotated[dict[str, DeviceChoice], empty_is({}), AfterValidator(named)] = Field(
         default={}, description="further instruments, by name"
     )
@@ -472,10 +480,10 @@ class ProfileSpec(Settings):
         default=None, description="the timing box that switches light and sends triggers, and its lines"
     )
     simulation: Annotated[Choice, placed_by_field] | None = Field(
-        default=None, description="the simulated world that virtual devices act on"
+        default=None, description="the simulation that virtual devices act on"
     )
     calibrations: Annotated[CalibrationSettings, empty_is({})] = Field(
-        default=CalibrationSettings(), description="which calibrations count: a mapping, a folder, or `off`"
+        default=CalibrationSettings(), description="which calibrations to use: a mapping, a folder, or `off`"
     )
     plugin_folders: Folders = Field(default=[], description="folders with plugins, relative to this file")
     variables: Variables = Field(default={}, description="numbers and quantities that expressions refer to")
@@ -483,7 +491,7 @@ class ProfileSpec(Settings):
         default=TimeoutSettings(), description="how long plugins may take"
     )
     budgets: Annotated[BudgetSettings, empty_is({})] = Field(
-        default=BudgetSettings(), description="what the computer may take for its part of a shot"
+        default=BudgetSettings(), description="time budgets of the computer for its part of a shot"
     )
 
     @property
@@ -509,7 +517,7 @@ class ProfileSpec(Settings):
 
 _VIRTUAL: Final = {"use": "virtual"}
 _NARROW: Final = {"step": 1.0}
-_STAND_INS: Final = FallbackValues(
+_FALLBACKS: Final = FallbackValues(
     values={
         "labseq": FORMAT,
         "name": "x",
@@ -544,25 +552,24 @@ def load_profile(
     Args:
         name_or_path: See :func:`find_profile`.
         beside: Folder of the file that names the profile.
-        overrides: Values that replace those of the file, addresses without "profile.".
+        overrides: Values that replace those in the file, addresses without "profile.".
         named_in: The sequence whose key ``profile`` names it, for messages.
-        scan: The sequence's scan; the values of its first point count.
-        kept: What the file says, in place of what it says today.
-        found: Where the problems of a file that can be read go; without it they are raised.
+        scan: The sequence's scan; the profile receives the values of its first point.
+        kept: The file's text when the run began, if it is resumed.
+        found: Receives the problems of a readable file; without it they are raised.
 
     Returns:
-        The document, overrides included, and what it says; stand-ins for everything of which
-        a problem was found.
+        The document, overrides included, and its content, with fallbacks for wrong values.
 
     Raises:
-        ConfigError: Everything that is wrong, but for the settings of plugins.
+        ConfigError: Everything that is wrong, except for settings of plugins.
     """
     document = Document.read(find_profile(name_or_path, beside, named_in=named_in), kept)
     check_kind(document, "hardware profile")
     placed = [_of_profile(Override(*override)) for override in overrides]
     document = document.override_all(placed, may_add=MAY_ADD, found=found).evaluated()
     document = document if scan is None else bind_scan(scan, document).begun(document, profile=True)
-    return load_checked(document, ProfileSpec, "a hardware profile", _STAND_INS, found)
+    return load_checked(document, ProfileSpec, "a hardware profile", _FALLBACKS, found)
 
 
 def _of_profile(override: Override) -> Override:

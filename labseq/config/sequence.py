@@ -33,41 +33,43 @@ from labseq.settings import (
 
 
 class StepPolicySettings(Settings):
-    """``policy`` beside a step: what holds for it, in place of what holds for the run."""
+    """``policy`` of a step, in place of the run's policy."""
 
     timeout: Annotated[Duration, Field(gt=0)] | None = Field(
-        default=None, description="how long a try at the step may take; one that takes longer has failed"
+        default=None, description="longest duration of an attempt at the step; a longer one has failed"
     )
     retries: int = Field(
         default=0,
         ge=0,
         le=100,
-        description="how often the step is tried again, in the same shot, before it counts as failed; for "
-        "steps that leave the atoms where they are",
+        description="how often the step is repeated, in the same shot, before it counts as failed; for "
+        "steps that do not move atoms",
     )
     on_failure: Literal["repeat_shot", "skip_point", "stop"] | None = Field(
         default=None,
-        description="what follows its failure; none: as the run's policy says",
+        description="reaction to its failure; none: that of the run's policy",
     )
     over_budget: Literal["record", "warn", "repeat_shot", "skip_point", "stop"] | None = Field(
         default=None,
-        description="what follows a stage of it that takes longer than its budget; none: as the run's "
-        "policy says",
+        description="reaction to a stage of it that takes longer than its budget; none: that of the run's "
+        "policy",
     )
 
 
 class CheckSettings(Settings):
-    """A value of the last shots that is looked at between two shots."""
+    """A check of a figure of the last shots, between two shots."""
 
     value: Text = Field(
         description="name of the value, as `labseq export` calls it: `filling_fraction`, `n_missing_atoms`, "
         "`stage.plan_s`, `reading.laser.power_w`"
     )
-    at_least: float | None = Field(default=None, description="smallest mean that is let pass, SI")
-    at_most: float | None = Field(default=None, description="largest mean that is let pass, SI")
-    shots: int = Field(default=1, ge=1, le=10_000, description="of how many shots, the latest, the mean is")
+    at_least: float | None = Field(default=None, description="smallest allowed mean, SI")
+    at_most: float | None = Field(default=None, description="largest allowed mean, SI")
+    shots: int = Field(
+        default=1, ge=1, le=10_000, description="number of latest shots that the mean is taken over"
+    )
     then: Literal["warn", "skip_point", "stop"] = Field(
-        default="warn", description="what follows a mean beyond the limits"
+        default="warn", description="reaction to a mean outside of the limits"
     )
 
     @model_validator(mode="after")
@@ -81,25 +83,25 @@ class CheckSettings(Settings):
 
 
 class PolicySettings(Settings):
-    """``policy`` of a sequence: what holds for the run, and for every step that says nothing else."""
+    """``policy`` of a sequence: reactions to failures, for the run and every step without its own policy."""
 
     on_failure: Literal["repeat_shot", "skip_point", "stop"] | None = Field(
         default=None,
-        description="what follows a failure; none: a transient one repeats the shot, any other stops the run",
+        description="reaction to a failure; none: a transient one repeats the shot, any other stops the run",
     )
     when_exhausted: Literal["skip_point", "stop"] = Field(
-        default="stop", description="what follows when a shot has failed `attempts` times"
+        default="stop", description="reaction when a shot has failed `attempts` times"
     )
     over_budget: Literal["record", "warn", "repeat_shot", "skip_point", "stop"] = Field(
-        default="record", description="what follows a stage that takes longer than its budget"
+        default="record", description="reaction to a stage that takes longer than its budget"
     )
     checks: Annotated[tuple[CheckSettings, ...], empty_is(())] = Field(
-        default=(), description="values that are looked at between the shots"
+        default=(), description="figures that are checked between the shots"
     )
 
 
 class BudgetSettings(Settings):
-    """What the computer may take for the stages whose length nothing else says."""
+    """Time budgets of the computer for the stages of a shot."""
 
     detect: Duration = Field(default=5e-3, description="finding the atoms on a frame")
     plan: Duration = Field(default=5e-3, description="planning a cycle")
@@ -116,7 +118,8 @@ class AnalysisChoice(Choice):
     """An analysis chosen by name, with the plugin's settings as further keys of the same mapping."""
 
     finish_within: Duration = Field(
-        default=10.0, description="how long it may go on after the run, for the shots it has not come to"
+        default=10.0,
+        description="how long it may continue after the run, for shots that it has not analysed yet",
     )
 
 
@@ -136,7 +139,7 @@ Analyses: TypeAlias = Annotated[tuple[AnalysisChoice, ...], empty_is(()), AfterV
 DEFAULT_PLANNER: Final = "psca"
 
 _BESIDE: Final = ("name", "policy")
-"""Keys of a step that are no kind of step."""
+"""Keys of a step other than its kind."""
 _STEP_NAME: Final = re.compile(r"[^\W\d][\w-]*")
 
 
@@ -203,7 +206,7 @@ Steps: TypeAlias = Annotated[
 
 
 class SequenceSpec(Settings):
-    """A sequence file, checked but for the settings of its plugins."""
+    """A sequence file; the settings of its plugins are checked later."""
 
     labseq: FormatVersion = Field(description="version of the file format: 1")
     name: Name = Field(description="name of the sequence and of its run folders")
@@ -218,10 +221,11 @@ class SequenceSpec(Settings):
         default="all", description="which camera frames of a shot are kept"
     )
     attempts: int = Field(
-        default=3, ge=1, le=100, description="how often a shot is tried before the run stops"
+        default=3, ge=1, le=100, description="number of attempts at a shot before the run stops"
     )
     policy: Annotated[PolicySettings, empty_is({})] = Field(
-        default=PolicySettings(), description="what follows failures, exceeded budgets and values gone astray"
+        default=PolicySettings(),
+        description="reactions to failures, exceeded budgets and figures out of range",
     )
     plugin_folders: Folders = Field(default=[], description="folders with plugins, relative to this file")
     scan: dict[str, Any] | list[dict[str, Any]] | None = Field(
@@ -230,11 +234,11 @@ class SequenceSpec(Settings):
     repeats: int = Field(default=1, ge=1, le=1_000_000, description="shots of each point of the scan")
     order: ScanOrder = Field(default="sequential", description="order of the scan's shots")
     variables: Variables = Field(default={}, description="numbers and quantities that expressions refer to")
-    analysis: Analyses = Field(default=(), description="what is worked out from each shot, beside the run")
+    analysis: Analyses = Field(default=(), description="analyses of each shot, in parallel to the run")
     shot: Steps = Field(description="the steps of a shot")
 
 
-_STAND_INS: Final = FallbackValues(
+_FALLBACKS: Final = FallbackValues(
     values={
         "labseq": FORMAT,
         "name": "x",
@@ -259,17 +263,17 @@ def load_sequence(
 
     Args:
         path: The file.
-        overrides: Values that replace those of the file: (address, value) each.
-        profile_set: Overrides of the profile, with their "profile.": a scan of theirs is replaced.
-        kept: What the file says, in place of what it says today.
-        found: Where the problems of a file that can be read go; without it they are raised.
+        overrides: Values that replace those in the file: (address, value) each.
+        profile_set: Overrides of the profile, with their "profile."; they replace a scan of their address.
+        kept: The file's text when the run began, if it is resumed.
+        found: Receives the problems of a readable file; without it they are raised.
 
     Returns:
-        The document, overrides, the default planner and the first point of its scan included,
-        and what it says; stand-ins for everything of which a problem was found.
+        The document, with overrides, the default planner and the first point of its scan; and its
+        content, with fallbacks for wrong values.
 
     Raises:
-        ConfigError: Everything that is wrong, but for the settings of plugins.
+        ConfigError: Everything that is wrong, except for settings of plugins.
     """
     document = Document.read(path, kept)
     check_kind(document, "sequence")
@@ -281,7 +285,7 @@ def load_sequence(
     document = _at_first_point(document, [Override(*one) for one in overrides], profile_set, problems)
     if found is None:
         problems.raise_any()
-    return load_checked(document, SequenceSpec, "a sequence", _STAND_INS, found)
+    return load_checked(document, SequenceSpec, "a sequence", _FALLBACKS, found)
 
 
 def _at_first_point(

@@ -61,9 +61,7 @@ class ValidationContext:
 
     def known_keys(self, model: type[BaseModel], loc: Loc) -> list[str]:
         """The keys of the mapping at a location."""
-        keys = [
-            _key(name, field) for one in _models_at(model, loc) for name, field in one.model_fields.items()
-        ]
+        keys = keys_of(models_at(model, loc))
         own = keys if loc else [*(key for key in keys if key not in self.drop), *self.other_keys]
         return list(dict.fromkeys(own))
 
@@ -264,7 +262,7 @@ def _unknown_key(
 
 def _missing_key(loc: Loc, model: type[BaseModel], top: Node, context: ValidationContext) -> Finding:
     parent, key, around = top.at(loc[:-1]), str(loc[-1]), loc[:-1]
-    about = _description(_models_at(model, around), key)
+    about = _description(models_at(model, around), key)
     where = f" from {context.mapping(around)}" if context.name or around else ""
     what = f"'{key}' is missing{where}" + (f" ({about})" if about else "")
     known = context.known_keys(model, around)
@@ -285,11 +283,17 @@ def _key(name: str, field: FieldInfo) -> str:
     return field.validation_alias if isinstance(field.validation_alias, str) else name
 
 
+def keys_of(models: list[type[BaseModel]]) -> list[str]:
+    """The keys of the models, in order."""
+    keys = [_key(name, field) for model in models for name, field in model.model_fields.items()]
+    return list(dict.fromkeys(keys))
+
+
 def _field(model: type[BaseModel], key: str | int) -> FieldInfo | None:
     return next((field for name, field in model.model_fields.items() if key == _key(name, field)), None)
 
 
-def _models_at(model: type[BaseModel], loc: Loc) -> list[type[BaseModel]]:
+def models_at(model: type[BaseModel], loc: Loc) -> list[type[BaseModel]]:
     """The settings models of a location below a model: several in a union."""
     models = [model]
     for step in loc:

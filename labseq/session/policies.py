@@ -208,7 +208,7 @@ class Checks:
 
 
 def _failure(check: CheckSettings, values: deque[float]) -> str:
-    """The message if the mean of the last values is out of range, or ""; shots without a value are left out."""
+    """The message if the mean of the last values is out of range, or ""; shots without one are left out."""
     known = [value for value in values if not np.isnan(value)]
     if len(values) < check.shots or not known:
         return ""

@@ -174,7 +174,7 @@ CASES = [
         "role missing",
         "camera: {use: virtual, readout: 5 ms}\n",
         "",
-        "p.yaml:2:1: 'camera' is missing (what takes images)",
+        "p.yaml:2:1: 'camera' is missing (the camera's plugin)",
     ),
     (
         "role by name alone",
