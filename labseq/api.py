@@ -134,7 +134,7 @@ def _find(kind: str, name: str, folders: Folders) -> Entry:
 
 
 def _grid(grid: SiteGrid | tuple[int, int] | None) -> SiteGrid:
-    """The grid that is meant by a size.
+    """The grid for a size.
 
     Raises:
         ConfigError: It is none.

@@ -32,11 +32,11 @@ VIRTUAL_TWIN: Final = "virtual"
 """Name under which a plugin offers the virtual twin of a hardware role."""
 
 LOAD_S: Final = 30.0
-"""How long a plugin may take to load, and a constructor to return, where no profile says else."""
+"""Default for how long a plugin may take to load, and a constructor to return."""
 
 _NAME: Final = re.compile(r"[^\W\d][\w-]{0,63}")
 _NOT_NAMES: Final = {"true", "false", "null"}
-"""Words that YAML takes for something else."""
+"""Words that YAML does not read as text."""
 _SETTINGS: Final = ("labseq.settings", "Settings")
 
 Factory = Callable[..., Any]
@@ -44,11 +44,11 @@ Factory = Callable[..., Any]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Owner:
-    """A plugin as the owner of what it offers: whom to blame, and how long to wait for its code.
+    """The plugin that offers something: its name for error messages, and how long to wait for its code.
 
     Attributes:
         name: Name of the plugin.
-        source: Its file, or the distribution that it came with, in words; "" for labseq's own.
+        source: Its file or its distribution, as text; "" for labseq's own.
         home: The file or the folder that its code is in; None if that is not known.
         max_wait_s: How long it may take to load, and a constructor to return.
         notes: What it printed when it was loaded, or in a constructor.
@@ -84,7 +84,7 @@ class Entry:
         origin: Name of the plugin that registered it.
         virtual_time: Whether it keeps to the session's clock only, so that a run
             need not wait in real time.
-        simulated: Settings that turn a driver into its own simulated counterpart, for
+        simulated: Settings that make a driver use its simulated device, for
             example ``{"card": "simulated"}``; None if it has none. A dry run gives them;
             a driver that has them keeps to the session's clock.
         owner: The plugin that registered it.
@@ -107,7 +107,7 @@ class Registry:
     A name that is taken is an error that names both origins.
 
     Attributes:
-        contested: Kind and name of what more than one plugin offers, and what is said of that.
+        contested: Kind and name that more than one plugin offers -> the error.
     """
 
     def __init__(self) -> None:
@@ -118,7 +118,7 @@ class Registry:
 
     @contextmanager
     def opened_for(self, owner: Owner) -> Generator[Registry]:
-        """What a plugin is given to register with, for as long as the block lasts.
+        """The registry that a plugin registers with, within the block.
 
         Nothing of the plugin stays if the block fails.
         """
@@ -147,7 +147,7 @@ class Registry:
         fault = self._owner.fault
         if not isinstance(name, str) or not name:  # pyright: ignore[reportUnnecessaryIsInstance]
             raise fault(f"a {kind} needs a name, not {name!r}")
-        is_key = (kind, name) == ("step", "name")  # which stands beside a step in a sequence
+        is_key = (kind, name) == ("step", "name")  # a key next to a step in a sequence
         if _NAME.fullmatch(name) is None or name.lower() in _NOT_NAMES or is_key:
             text = f"a {kind} cannot be called {name[:80]!r}"
             raise fault(f"{text}; expected a letter, then letters, digits, '_' and '-', and no word of YAML")
@@ -192,11 +192,11 @@ class Registry:
         self._add("pattern", name, factory, settings_model)
 
     def simulation(self, name: str, factory: Factory, settings_model: type[Any] | None = None) -> None:
-        """Offer a simulated world: ``factory(settings, context) -> Simulation``."""
+        """Offer a simulation: ``factory(settings, context) -> Simulation``."""
         self._add("simulation", name, factory, settings_model, virtual_time=True)
 
     def scanner(self, name: str, factory: Factory, settings_model: type[Any] | None = None) -> None:
-        """Offer what chooses the points of adaptive scans: ``factory(settings, space) -> Scanner``."""
+        """Offer a scanner for adaptive scans: ``factory(settings, space) -> Scanner``."""
         self._add("scanner", name, factory, settings_model)
 
     def analysis(self, name: str, factory: Factory, settings_model: type[Any] | None = None) -> None:
@@ -262,7 +262,7 @@ class Registry:
 
 
 def _is_settings(model: object) -> bool:
-    """Whether this is a subclass of ``labseq.Settings``, told by its name: that stands on an upper floor."""
+    """Whether this is a subclass of ``Settings``, recognised by name: that is in a higher layer."""
     return isinstance(model, type) and any(
         (base.__module__, base.__qualname__) == _SETTINGS for base in model.__mro__
     )

@@ -289,7 +289,7 @@ IN_THE_CONSTRUCTOR: dict[str, tuple[str, str, str]] = {
         'registry.planner("mine", lambda s, c: 5)',
         "planner 'mine' has no plan",
     ),
-    "has no method": ("def plan(", "def plann(", "planner 'mine' has no plan; see labseq.Planner"),
+    "has no method": ("def plan(", "def plann(", "planner 'mine' has no plan; see labseq.plugin.Planner"),
     "method is no method": (
         "    def plan(",
         "    plan = 3\n    def _(",

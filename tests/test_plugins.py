@@ -80,6 +80,20 @@ def test_hidden_files_and_other_files_are_left_alone(host, tmp_path):
     assert host.infos == []
 
 
+def test_an_installed_library_in_a_folder_is_not_a_plugin(host, tmp_path, monkeypatch):
+    (tmp_path / "some_simulator.py").write_text("x = 1\n")
+    (tmp_path / "mine.py").write_text(GOOD)
+    monkeypatch.syspath_prepend(tmp_path)
+    host.load_folders([tmp_path])
+    assert host.infos == []
+    monkeypatch.undo()
+    host.load_folders([tmp_path])
+    assert [(info.name, info.state) for info in host.infos] == [
+        ("mine", "loaded"),
+        ("some_simulator", "failed"),
+    ]
+
+
 def test_a_file_whose_name_cannot_be_imported_is_reported(host, tmp_path):
     info = load(host, tmp_path, GOOD, "my-planner")
     assert (info.name, info.state) == ("my-planner", "failed")

@@ -95,5 +95,5 @@ def after_moves(held: Occupancy, moved: Occupancy, plan: Plan) -> tuple[Occupanc
 
 
 def _place(record: ImageRecord | CycleRecord) -> tuple[int, int]:
-    """Where it stands in the shot: the image that ends a cycle has the cycle's own place."""
+    """Its place in the shot: the image that ends a cycle has the place of the cycle."""
     return record.step, record.cycle

@@ -367,7 +367,7 @@ class EqualiseStep(Step):
 
 
 def _in_force(shot: Shot) -> tuple[Floats, Floats]:
-    """The amplitudes to begin with: those of the calibration; without one all equal, adding up to full scale."""
+    """The amplitudes to begin with: those of the calibration; else all equal, adding up to full scale."""
     entry = shot.calibrations.get("tweezers")
     if entry is not None:
         return entry.values["row_amplitudes"], entry.values["column_amplitudes"]

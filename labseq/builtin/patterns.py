@@ -154,7 +154,7 @@ class BitmapSettings(Settings):
     @model_validator(mode="after")
     def _read(self) -> Self:
         if self.sites is not None and self.file is not None:
-            raise setting_error("'file' stands beside 'sites'", "one of them", at=("file",), key=True)
+            raise setting_error("'file' excludes 'sites'", "one of them", at=("file",), key=True)
         if self.file is not None:
             try:
                 self._mask = read_drawing(self.file, self.fill)

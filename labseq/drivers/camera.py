@@ -43,7 +43,7 @@ class ExposureResult:
 
     Attributes:
         number: Its place in the series as the camera counted it, from 0.
-        image: uint16 (height, width), nobody else's; None if the frame was lost.
+        image: uint16 (height, width), not used elsewhere; None if the frame was lost.
         fault: What happened to a frame that was lost.
         exposure_s: Exposure time as the camera made it, in seconds; nan: as asked for.
         t_start_s: Start of the exposure on the session's clock; nan: worked out from the trigger.
@@ -88,7 +88,7 @@ class CameraDriver(Camera):
 
     @abstractmethod
     def describe(self) -> Mapping[str, Any]:
-        """Model, serial number, firmware, settings in force: JSON-ready values."""
+        """Model, serial number, firmware, current settings: JSON-ready values."""
 
     @abstractmethod
     def _connect(self) -> None:
@@ -217,9 +217,9 @@ class CameraDriver(Camera):
         exposure_s = min(max(TEST_EXPOSURE_S, facts.readout_s), facts.max_exposure_s)
         self._arm(1, exposure_s, "software", 1.0)
         self.trigger()
-        shape, told = self.read(exposure_s + facts.readout_s + 2.0).image.shape, facts.frame_shape
-        if told is not None and shape != told:
-            raise DeviceError(self._name, f"a frame has the shape {shape}; expected {told}")
+        shape, expected = self.read(exposure_s + facts.readout_s + 2.0).image.shape, facts.frame_shape
+        if expected is not None and shape != expected:
+            raise DeviceError(self._name, f"a frame has the shape {shape}; expected {expected}")
 
     def _arm(self, n_frames: int, exposure_s: float, trigger: Trigger, em_gain: float) -> None:
         self._check_open()
@@ -290,7 +290,7 @@ LOOK_S: Final = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Cooling:
-    """How cold a sensor shall be.
+    """The temperature of a cooled sensor.
 
     Attributes:
         setpoint_k: Temperature, in kelvins.
@@ -306,7 +306,7 @@ class Cooling:
 
 
 def settle(cooling: Cooling, read_k: Callable[[], float], clock: Clock, name: str) -> None:
-    """Wait until a sensor is as cold as it shall be, and stays so.
+    """Wait until a sensor has its temperature, and keeps it.
 
     Args:
         cooling: How cold, how steady, how long.

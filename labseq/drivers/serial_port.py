@@ -92,13 +92,13 @@ def open_port(port: str, device: str, baud_rate: int, **options: Any) -> Port:
     Reads wait for the first byte for at most 20 ms, so that a driver sees a stop request.
 
     Args:
-        port: "/dev/ttyUSB0", "COM3", or a URL that pyserial knows, which nobody can keep for himself.
+        port: "/dev/ttyUSB0", "COM3", or a URL that pyserial knows, which cannot be locked.
         device: Name of the instrument, for messages.
         baud_rate: Bits per second.
         **options: Further ones of pyserial.
 
     Raises:
-        DeviceError: There is no such port, or somebody else has it open.
+        DeviceError: There is no such port, or another program has it open.
     """
     serial: Any = importlib.import_module("serial")
     if port.startswith(("socket://", "rfc2217://")) and not is_network_port(port):

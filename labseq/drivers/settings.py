@@ -24,7 +24,7 @@ class RegionSettings(Settings):
 
 
 class CameraSettings(Settings):
-    """What every camera can be told of its sensor; a plugin's own settings come on top."""
+    """Settings of the sensor that every camera has; a plugin adds its own."""
 
     region: RegionSettings | None = Field(
         default=None, description="the part of the sensor that is read; none: all of it"
@@ -74,7 +74,7 @@ class CameraSettings(Settings):
 
 
 class IndustrialCameraSettings(CameraSettings):
-    """What cameras on GigE Vision and USB3 Vision can be told besides."""
+    """Further settings of cameras on GigE Vision and USB3 Vision."""
 
     readout: Duration = Field(
         default=5e-3,
@@ -95,7 +95,7 @@ class IndustrialCameraSettings(CameraSettings):
 
 
 class CoolingSettings(Settings):
-    """How cold the sensor shall be."""
+    """The temperature of the sensor."""
 
     temperature: Temperature = Field(description='of the sensor, "-70 degC"')
     tolerance: Annotated[float, Field(gt=0, le=20)] = Field(

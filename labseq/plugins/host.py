@@ -57,7 +57,7 @@ def check_api(module: ModuleType, owner: Owner) -> None:
         raise owner.fault(f"{came}, which is no whole number; {here}")
     remedy = "update labseq, or take an older version of the plugin"
     if written_for < LABSEQ_API:
-        remedy = "take a newer version of the plugin, or adapt it (the changelog tells what has changed)"
+        remedy = "take a newer version of the plugin, or adapt it (the changelog says what has changed)"
     raise owner.fault(f"{came}; {here}; {remedy}")
 
 
@@ -65,7 +65,7 @@ def hooks_of(module: ModuleType, owner: Owner) -> Hooks:
     """The hooks that a plugin implements.
 
     Raises:
-        PluginLoadError: It implements none, or one that labseq would not call as meant; with what to change.
+        PluginLoadError: It implements none, or one that labseq could not call; with what to change.
     """
     hooks: Hooks = {}
     unmarked: list[str] = []
@@ -107,7 +107,7 @@ PATH_VARIABLE: Final = "LABSEQ_PLUGIN_PATH"
 
 @dataclass(frozen=True, slots=True)
 class PluginInfo:
-    """What is known of a plugin.
+    """A plugin, and whether it was loaded.
 
     Attributes:
         name: Import name, for a folder plugin without the ``labseq_local.`` prefix.
@@ -115,7 +115,7 @@ class PluginInfo:
         version: Version of its distribution, or "".
         state: "loaded" or "failed".
         reason: Why it failed, or "".
-        source: Its file or its distribution, in words; "" for labseq's own.
+        source: Its file or its distribution, as text; "" for labseq's own.
         notes: What it printed when it was loaded, or in a constructor: a sentence each.
     """
 
@@ -158,7 +158,7 @@ class PluginHost:
         return [f"plugin '{info.name}' ({info.source}): {note}" for info in used for note in info.notes]
 
     def load_builtin(self, module: ModuleType) -> None:
-        """Register a module of labseq itself; its failure is a fault in labseq and raises."""
+        """Register a module of labseq itself; its failure is a bug in labseq and raises."""
         info = PluginInfo(module.__name__, "built in", _version("labseq"))
         self._register(info, None, lambda: module)
         self._infos[info.name] = info
@@ -199,6 +199,8 @@ class PluginHost:
             path = path / "__init__.py"
         if path.suffix != ".py" or not path.is_file() or self._is_loaded(path):
             return
+        if module_location(name) == plugin_location(path):
+            return  # a library of an installed distribution, such as a simulator
         info = PluginInfo(name, str(path), source=str(path))
         if not name.isidentifier():
             reason = "its name is no Python name: letters, digits and '_' only; rename it"
@@ -276,7 +278,7 @@ class PluginHost:
             raise UnknownPluginError(kind, name, error.known, hint) from None
 
     def listeners(self, hook: str, **values: Any) -> list[tuple[str, Callable[[], object]]]:
-        """Name of each plugin that implements an observer hook, and the call that tells it."""
+        """Name of each plugin that implements an observer hook, and the call of the hook."""
         return [
             (found.plugin_name, partial(found.function, **{name: values[name] for name in found.argnames}))
             for found in getattr(self._pluggy.hook, hook).get_hookimpls()

@@ -1,4 +1,4 @@
-"""Analyses of a run's shots, each in a process of its own beside the run."""
+"""Analyses of a run's shots, each in its own process next to the run."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from labseq.units import format_quantity
 USE: Final = "use"
 FINISH_WITHIN: Final = "finish_within"
 FAILED: Final = "failed: "
-"""What a line of a process's log begins with that the run is to tell."""
+"""Prefix of the lines of a process's log that the run shows as a warning."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,8 +37,8 @@ class PreparedAnalysis:
 
     Attributes:
         name: Its name.
-        analysis: What analyses.
-        about: What the file of the results says of it.
+        analysis: The analysis itself.
+        about: Its description in the file of the results.
     """
 
     name: str
@@ -48,7 +48,7 @@ class PreparedAnalysis:
 
 @dataclass(frozen=True, slots=True)
 class AnalysisOutcome:
-    """What came of an analysis.
+    """The result of an analysis.
 
     Attributes:
         name: Its name.
@@ -111,7 +111,7 @@ def results_of(
 ) -> Generator[tuple[ResultsLog, set[int]]]:
     """The results of an analysis, for writing by this process alone.
 
-    Results of other settings never stand beside new ones: all shots are analysed again then.
+    Results of other settings are not mixed with new ones: all shots are analysed again then.
 
     Args:
         run_dir: The run's folder.
@@ -138,13 +138,13 @@ def analyse(
     log: ResultsLog,
     failed: Callable[[int, BaseException], None],
 ) -> int:
-    """Analyse shots; one that raises is noted and told, and the next one comes.
+    """Analyse shots; one that fails is recorded and reported, and the next one follows.
 
     Args:
         prepared: The analysis.
         shots: The shots.
         log: Where the results go.
-        failed: Told the index of a shot, and what was raised.
+        failed: Receives the index of a failed shot, and the error.
 
     Returns:
         How many have a result.
@@ -220,7 +220,7 @@ MAX_READ: Final = 1 << 16
 """Bytes of a log that are looked at, from its end."""
 _MODULE: Final = "labseq.session.analysis_process"
 
-Tell = Callable[[str], None]
+Warn = Callable[[str], None]
 
 
 class AnalysisProcesses:
@@ -229,34 +229,34 @@ class AnalysisProcesses:
     Args:
         run_dir: The run's folder.
         analyses: "use" and "finish_within" of each.
-        tell: Told what went wrong.
+        warn: Receives warnings.
     """
 
-    def __init__(self, run_dir: Path, analyses: Sequence[Mapping[str, Any]], tell: Tell) -> None:
+    def __init__(self, run_dir: Path, analyses: Sequence[Mapping[str, Any]], warn: Warn) -> None:
         self._run_dir = run_dir
-        self._report = tell
-        self._analysts: list[_AnalysisProcess] = []
+        self._report = warn
+        self._processes: list[_AnalysisProcess] = []
         for analysis in analyses:
             name = str(analysis[USE])
             try:
-                self._analysts.append(_AnalysisProcess(run_dir, name, float(analysis[FINISH_WITHIN])))
+                self._processes.append(_AnalysisProcess(run_dir, name, float(analysis[FINISH_WITHIN])))
             except OSError as error:
-                tell(f"the process of analysis '{name}' could not be started: {error.strerror}")
+                warn(f"the process of analysis '{name}' could not be started: {error.strerror}")
 
     def look(self) -> None:
-        """Tell of each analysis, once, that it has failed; quick, for use between shots."""
-        for one in self._analysts:
+        """Warn once of each analysis that has failed; quick, for use between shots."""
+        for one in self._processes:
             one.look(self._report)
 
     def finish(self) -> None:
-        """The run is over: give each its time for the shots that are left, then tell what is missing."""
-        for one in self._analysts:
+        """After the run: give each analysis time for the remaining shots, then report what is missing."""
+        for one in self._processes:
             one.end_of_run()
         end_s = time.monotonic()
-        for one in self._analysts:
+        for one in self._processes:
             one.wait(end_s, self._report)
             self._report_missing(one.name)
-        self._analysts = []
+        self._processes = []
 
     def _report_missing(self, name: str) -> None:
         with suppress(LabseqError):
@@ -266,7 +266,7 @@ class AnalysisProcesses:
             if n_missing:
                 failed = f" ({n_failed} failed)" if n_failed else ""
                 text = f"analysis '{name}' has no result of {n_missing} of {len(shots)} shots{failed}"
-                self._report(f"{text}; 'labseq analyse {self._run_dir}' makes up what is missing")
+                self._report(f"{text}; 'labseq analyse {self._run_dir}' computes the missing results")
 
 
 class _AnalysisProcess:
@@ -275,7 +275,7 @@ class _AnalysisProcess:
     def __init__(self, run_dir: Path, name: str, finish_within_s: float) -> None:
         self.name = name
         self._finish_within_s = finish_within_s
-        self._told = False
+        self._has_warned = False
         self._log = results_file(run_dir, name).with_suffix(".log")
         self._log.parent.mkdir(exist_ok=True)
         with self._log.open("ab") as log:
@@ -285,13 +285,13 @@ class _AnalysisProcess:
                 stdin=subprocess.PIPE,
                 stdout=log,
                 stderr=log,
-                start_new_session=True,  # Ctrl-C and a lost terminal are the run's matter
+                start_new_session=True,  # Ctrl-C and a lost terminal are handled by the run
                 creationflags=_flags(),
             )
 
-    def look(self, tell: Tell) -> None:
-        """Tell the first failure; all of them stand in its log."""
-        if self._told:
+    def look(self, warn: Warn) -> None:
+        """Report the first failure; its log has all of them."""
+        if self._has_warned:
             return
         code = self._process.poll()
         with suppress(OSError):
@@ -300,21 +300,21 @@ class _AnalysisProcess:
             if code and not failed:
                 failed = [": ".join([f"its process ended with exit code {code}", *lines[-1:]])]
             if failed:
-                tell(f"analysis '{self.name}' failed: {failed[0]}; see {self._log}")
-                self._told = True
+                warn(f"analysis '{self.name}' failed: {failed[0]}; see {self._log}")
+                self._has_warned = True
 
     def end_of_run(self) -> None:
-        """Tell it that no more shots come."""
+        """Signal that no more shots come."""
         assert self._process.stdin is not None
         with suppress(OSError):  # it is gone
             self._process.stdin.close()
 
-    def wait(self, end_s: float, tell: Tell) -> None:
+    def wait(self, end_s: float, warn: Warn) -> None:
         """Wait until it has ended, and end it if its time is up.
 
         Args:
             end_s: When the run ended, on this computer's monotonic clock.
-            tell: Told what went wrong.
+            warn: Receives warnings.
         """
         left_s = end_s + self._finish_within_s + GRACE_S - time.monotonic()
         try:
@@ -323,15 +323,15 @@ class _AnalysisProcess:
             self._process.kill()
             self._process.wait()
             within = format_quantity(self._finish_within_s, "time")
-            tell(f"analysis '{self.name}' did not finish within {within} after the run, and was ended")
-            self._told = True
-        self.look(tell)
+            warn(f"analysis '{self.name}' did not finish within {within} after the run, and was ended")
+            self._has_warned = True
+        self.look(warn)
         with suppress(OSError):
             if not self._log.stat().st_size:
                 self._log.unlink()
 
     def _new_lines(self) -> list[str]:
-        """What its log has got since the last look, the end of it."""
+        """The last lines of its log that are new since the last call."""
         if self._log.stat().st_size == self._seen:
             return []
         with self._log.open("rb") as log:

@@ -1,8 +1,8 @@
 """The process of one analysis: ``python -m labseq.session.analysis_process RUN_DIR NAME FINISH_WITHIN``.
 
-It reads the run's index, in which a shot stands as soon as it is whole on the disk: the index is the
-queue. So the run never waits for an analysis, one that falls behind takes no memory, and one that
-is begun again goes on where it was. The end of standard input is the end of the run.
+It reads the run's index, which lists a shot as soon as it is complete on disk: the index is the queue. So
+the run never waits for an analysis, an analysis that falls behind takes no memory, and one that is
+started again continues where it was. The end of standard input signals the end of the run.
 """
 
 from __future__ import annotations

@@ -18,10 +18,10 @@ from labseq.registry import VIRTUAL_TWIN
 
 FOLDER: Final = "calibrations"
 DRY_RUN_FOLDER: Final = "dry-run"
-"""Within a store: that of dry runs, because what is measured on virtual atoms is not true of real ones."""
+"""Within a store: that of dry runs, because measurements on virtual atoms do not hold for real ones."""
 
 BASIS: Final[Mapping[CalibrationKind, CalibrationKind]] = {"overlay": "frequencies", "thresholds": "sites"}
-"""Kind -> the kind that it was measured on top of: without that one it says nothing, or less."""
+"""Kind -> the kind that it was measured on top of, and is only valid together with."""
 
 
 PLACES: Final = frozenset({"threshold", "width", "sites", "frame", "centre_px", "angle"})
@@ -35,7 +35,7 @@ class ActiveCalibrations:
     Attributes:
         entries: Kind -> entry.
         grid: The grid, with the tones that they give.
-        warnings: What the user should know although it is no error.
+        warnings: Notes for the user that are not errors.
     """
 
     entries: Mapping[str, CalibrationEntry]
@@ -81,7 +81,7 @@ def calibrated(
     detector: Mapping[str, Any] | None = None,
     pins: Mapping[str, str] | None = None,
 ) -> ActiveCalibrations:
-    """Read the calibrations that a profile goes by, and apply those of the tones.
+    """Read the calibrations that a profile uses, and apply those of the tones.
 
     Args:
         document: The profile's file.
@@ -89,14 +89,14 @@ def calibrated(
         found: Where the problems go; a calibration that has one is not used.
         dry_run: "off", "full" or "fast".
         detector: Settings of the detector in use, for the record; None where they do not matter.
-        pins: The ids of those that count, by kind, and no others; None for what profile and store say.
+        pins: Kind -> id of the only calibrations to use; None for those of profile and store.
     """
     grid, store = profile.grid_model(), store_of(document, profile, dry_run)
     entries: dict[str, CalibrationEntry] = {}
     if pins is None and any(profile.calibrations.use.of(kind) is None for kind in CALIBRATION_KINDS):
         try:
             store.active()
-        except ConfigError as error:  # told once, not for each kind
+        except ConfigError as error:  # reported once, not for each kind
             found.add(error)
             return ActiveCalibrations(entries, grid)
     for kind in CALIBRATION_KINDS:
@@ -119,7 +119,7 @@ def calibrated_grid(document: Document, profile: ProfileSpec) -> SiteGrid:
     """The grid of a profile, with the tones that its calibrations give.
 
     Raises:
-        ConfigError: A calibration that it goes by cannot be used.
+        ConfigError: A calibration that it uses is missing or damaged.
     """
     found = ProblemCollector()
     grid = calibrated(document, profile, found).grid
@@ -148,7 +148,7 @@ def with_tones(resolved: dict[str, Any], grid: SiteGrid, own: SiteGrid) -> dict[
 
 
 def _chosen(document: Document, profile: ProfileSpec, store: Store, kind: CalibrationKind) -> Stored | None:
-    """The entry of a kind that the profile goes by.
+    """The entry of a kind that the profile uses.
 
     Raises:
         ConfigError: It is missing or damaged.
@@ -170,19 +170,19 @@ def _chosen(document: Document, profile: ProfileSpec, store: Store, kind: Calibr
 
 
 def why_left_out(entry: CalibrationEntry, entries: Mapping[str, CalibrationEntry]) -> str:
-    """Why runs would leave out a calibration although it is in use; "" if they would not.
+    """Why runs leave out a calibration although it is in use; "" if they do not.
 
     Args:
         entry: The calibration.
-        entries: Kind -> those that count beside it.
+        entries: Kind -> the other calibrations in use.
     """
-    if entry.kind != "overlay" or _stands_on(entry, entries):
+    if entry.kind != "overlay" or _has_basis(entry, entries):
         return ""
     return "it was measured with other frequencies of the mobile tweezers"
 
 
 def _dropped(entries: dict[str, CalibrationEntry]) -> list[str]:
-    """Leave out an overlay that was measured with other frequencies: their tones hold it already, or not."""
+    """Leave out an overlay that was measured with other frequencies: it depends on their tones."""
     overlay = entries.get("overlay")
     if overlay is None or not (reason := why_left_out(overlay, entries)):
         return []
@@ -191,12 +191,12 @@ def _dropped(entries: dict[str, CalibrationEntry]) -> list[str]:
 
 
 def _doubtful(entries: Mapping[str, CalibrationEntry], detector: Mapping[str, Any]) -> list[str]:
-    """What is used although something else would be better."""
+    """Calibrations that are used although they should be measured again."""
     thresholds = entries.get("thresholds")
     if thresholds is None:
         return []
     what = f"calibration thresholds {thresholds.id} was measured with"
-    doubts = [] if _stands_on(thresholds, entries) else [f"{what} other sites; measure it again"]
+    doubts = [] if _has_basis(thresholds, entries) else [f"{what} other sites; measure it again"]
     then = thresholds.origin.get("detector")
     if isinstance(then, dict) and then.get("use") == detector.get("use"):
         other = [
@@ -207,8 +207,8 @@ def _doubtful(entries: Mapping[str, CalibrationEntry], detector: Mapping[str, An
     return doubts
 
 
-def _stands_on(entry: CalibrationEntry, entries: Mapping[str, CalibrationEntry]) -> bool:
-    """Whether what an entry was measured on top of is in use."""
+def _has_basis(entry: CalibrationEntry, entries: Mapping[str, CalibrationEntry]) -> bool:
+    """Whether the calibration that an entry was measured on top of is in use."""
     basis = BASIS[entry.kind]
     now = entries[basis].id if basis in entries else None
     then = entry.origin.get("calibrations")

@@ -1,4 +1,4 @@
-"""`labseq check`: everything that can be known of a run without opening a device."""
+"""`labseq check`: what a run will do and need, without opening a device."""
 
 from __future__ import annotations
 
@@ -52,18 +52,18 @@ N_LOADINGS: Final = 200
 MAX_WAIT_S: Final = 5.0
 """Host time after which no further loading is tried."""
 PAPERS_LOADING: Final = 0.75
-"""Loading probability where the profile has no simulation that tells it."""
+"""Loading probability if the profile has no simulation that reports it."""
 SHOT_OVERHEAD_BYTES: Final = 60_000
 """Size of a shot file without frames, roughly."""
 
 
 @dataclass(frozen=True, slots=True)
 class Rehearsal:
-    """What the planner made of random loadings.
+    """The planner's results for random loadings.
 
     Attributes:
         n_loadings: How many were tried.
-        n_filled: How many had atoms enough, and a plan that meets the target.
+        n_filled: How many had enough atoms and a plan that meets the target.
         duration_s: float64 (n_loadings,), from the start of a cycle to the end of its last batch.
         first_batch_s: float64 (n_loadings,), the same for its first batch.
     """
@@ -83,9 +83,9 @@ class CheckReport:
         n_shots: Shots of the run.
         n_points: Points of the scan that these shots are at; None without a scan.
         run_s: Duration of the run, at least and at most.
-        warnings: What is allowed but hardly meant, with its place in the files.
-        rehearsal: What the planner made of random loadings; None without a rearrangement.
-        shot_bytes: Size of a shot on disk at most; None if the camera does not tell its frames.
+        warnings: What is allowed but probably not intended, with its place in the files.
+        rehearsal: The planner's results for random loadings; None without a rearrangement.
+        shot_bytes: Size of a shot on disk at most; None if the camera does not report its frame shape.
         lines: Name of each line -> when it is on in the longest shot, as (start, end) in seconds.
     """
 
@@ -191,7 +191,7 @@ def _windows(steps: Sequence[tuple[str, Step]]) -> list[tuple[int, list[float]]]
 
 
 def _rehearse(lab: Lab) -> tuple[Rehearsal | None, str]:
-    """Plan for random loadings; what the planner does wrong is told, not raised."""
+    """Plan for random loadings; returns the results, or the planner's failure as text."""
     loading = None
     if lab.simulation is not None and offers(lab.simulation, "loading_probability"):
         loading = lab.simulation.loading_probability
@@ -229,9 +229,9 @@ def _window_warnings(
         enough = format_quantity(float(np.quantile(rehearsal.duration_s, 0.95)), "time")
         if 2 * n_fit < rehearsal.n_loadings:
             what = f"the first cycle's window of {format_quantity(first, 'time')} is too short for most plans"
-            told = f"{n_fit} of {rehearsal.n_loadings} fit"
+            share = f"{n_fit} of {rehearsal.n_loadings} fit"
             problems.append(
-                document.problem(loc, f"{what} ({told})", f"about {enough}, which 19 of 20 fit into")
+                document.problem(loc, f"{what} ({share})", f"about {enough}, which 19 of 20 fit into")
             )
         elif shortest < np.median(rehearsal.first_batch_s):
             what = f"a window of {format_quantity(shortest, 'time')} is over before the first batch is"
@@ -285,7 +285,7 @@ def _parallelism_warnings(session: Session) -> list[Problem]:
 def _deadline_warnings(
     session: Session, lab: Lab, timeline: Sequence[tuple[str, Sequence[TimelineEntry]]]
 ) -> list[Problem]:
-    """What comes after a wait for a leader, up to the next or the end, must fit into its deadline."""
+    """The steps after a wait for a signal, up to the next wait or the end, must fit into its deadline."""
     problems: list[Problem] = []
     steps = [step for _, step in session.assembly.steps]
     for number, step in enumerate(steps):
@@ -299,7 +299,7 @@ def _deadline_warnings(
             what = f"what follows takes up to {longest}, but '{name}' must be answered within "
             what += format_quantity(leader.deadline_s, "time")
             loc = (*session.assembly.sequence.shot[number].loc, "for")
-            hint = "raise 'deadline' in the profile, or it is told that the shot failed"
+            hint = "raise 'deadline' in the profile, or the other system is told that the shot failed"
             problems.append(session.assembly.document.problem(loc, what, hint=hint))
     return problems
 

@@ -29,7 +29,7 @@ def clock_for(stop: StopFlag, *, virtual: bool, paced: bool = False) -> Clock:
 
     Args:
         stop: The request to stop.
-        virtual: Whether time passes only when somebody waits.
+        virtual: Whether time passes only in waits.
         paced: Whether virtual time takes as long as it says.
     """
     if not virtual:
@@ -83,17 +83,17 @@ def build_lab(point: Point, target: TargetPattern, clock: Clock, seed: int) -> L
 
 
 def rebuild_lab(lab: Lab, before: Point, after: Point, seed: int) -> tuple[Lab, frozenset[str]]:
-    """Construct anew what differs between two points; all else stays as it is, open.
+    """Construct again what differs between two points; everything else stays open as it is.
 
     A device of which a setting differs must be closed before and opened after. The mobile
-    tweezers stay open while only such motion differs as they are told with each program. A
+    tweezers stay open if the motion differs only in what each program contains. A
     simulated lab stays open only if nothing of its devices and of the motion differs: its devices hold
     on to the simulation, and that to the motion.
 
     Args:
         lab: As it is at the point before.
         before: The point that the lab is at.
-        after: The point that it shall be at.
+        after: The next point.
         seed: The run's seed.
 
     Returns:
@@ -185,7 +185,7 @@ def warm(lab: Lab, stop_flag: StopFlag, observer: RunObserver, *, devices: bool 
     Args:
         lab: What will need kernels.
         stop_flag: Looked at before each compile.
-        observer: Told what is compiled, and how long it took.
+        observer: Receives which modules are compiled, and how long it took.
         devices: Whether the devices will need theirs, too; else only what plans and detects.
 
     Raises:

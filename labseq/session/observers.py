@@ -1,4 +1,4 @@
-"""Fans a run's events out: event log, plugins' observer hooks, live view; and watches its analyses."""
+"""Passes the events of a run to its log, plugins' observer hooks and the live view; starts its analyses."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from labseq.roles import RunObserver
 from labseq.session.analyses import AnalysisProcesses
 
 _QUIET: Final = frozenset({"image", "cycle", "state", "compiling", "compiled", "run_finished"})
-"""Events that the shot files tell better than the log would, and the one that the writer logs itself."""
-_HOOKS: Final = {  # event -> hook of plugins, and what it is told of the event's values
+"""Events that are not logged: the shot files hold them, or the writer logs them itself."""
+_HOOKS: Final = {  # event -> hook of plugins, and its arguments from the event's values
     "run_started": ("labseq_run_started", {"run": "record"}),
     "shot_finished": ("labseq_shot_finished", {"shot": "shot"}),
     "run_finished": ("labseq_run_finished", {"run": "record"}),
@@ -25,7 +25,7 @@ MAX_WAIT_S: Final = 5.0
 
 
 class Observers:
-    """Implements ``RunObserver`` for the sequencer; no failure of a listener stops the run.
+    """Implements ``RunObserver`` for the sequencer; no failure of a receiver stops the run.
 
     Attributes:
         log: Writes a line into the run's event log; set once the run has a folder.
@@ -35,51 +35,51 @@ class Observers:
         self._host = host
         self._observer = observer
         self._guard = Guard()
-        self._given_up: set[str] = set()
-        self._analysts: AnalysisProcesses | None = None
+        self._hung: set[str] = set()
+        self._analyses: AnalysisProcesses | None = None
         self.log: Callable[..., None] | None = None
 
     def event(self, name: str, values: Mapping[str, Any]) -> None:
-        """Tell everybody."""
+        """Pass an event on to every receiver."""
         self._write(name, values)
         self._notify(name, values)
         self._show(name, values)
-        if name == "shot_finished" and self._analysts is not None:
-            self._analysts.look()
+        if name == "shot_finished" and self._analyses is not None:
+            self._analyses.look()
 
-    def report_plugin_changes(self) -> None:
-        """Tell what the plugins in use have done to the process, from loading to constructing."""
+    def report_prints(self) -> None:
+        """Warn of what the plugins in use printed while they were loaded and constructed."""
         for text in self._host.notes:
             self.event("warning", {"text": text})
 
     def analyse(self, run_dir: Path, analyses: Sequence[Mapping[str, Any]]) -> None:
-        """Start what analyses the run's shots, each in a process of its own."""
-        self._analysts = AnalysisProcesses(
+        """Start the analyses of the run's shots, each in its own process."""
+        self._analyses = AnalysisProcesses(
             run_dir, analyses, lambda text: self.event("warning", {"text": text})
         )
 
     def finish_analyses(self) -> None:
-        """Let the analyses finish; when the devices are safe."""
-        if self._analysts is not None:
-            self._analysts.finish()
+        """Let the analyses finish, once the devices are safe."""
+        if self._analyses is not None:
+            self._analyses.finish()
 
     def end(self) -> None:
-        """Let the plugins' threads end."""
+        """End the plugins' threads."""
         self._guard.end()
 
     def _notify(self, name: str, values: Mapping[str, Any]) -> None:
         if name not in _HOOKS:
             return
         hook, names = _HOOKS[name]
-        told = {argument: values[key] for argument, key in names.items()}
-        for plugin, tell in self._host.listeners(hook, **told):
-            if plugin in self._given_up:
+        arguments = {argument: values[key] for argument, key in names.items()}
+        for plugin, call in self._host.listeners(hook, **arguments):
+            if plugin in self._hung:
                 continue
             try:
-                self._guard.call_to_the_end(plugin, MAX_WAIT_S, tell)
+                self._guard.call_to_the_end(plugin, MAX_WAIT_S, call)
             except LabseqError as error:
                 if isinstance(error, DeviceTimeoutError):
-                    self._given_up.add(plugin)
+                    self._hung.add(plugin)
                 warning = {"text": f"plugin '{plugin}' failed in its observer hook: {error}"}
                 self._write("warning", warning)
                 self._show("warning", warning)

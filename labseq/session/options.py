@@ -1,4 +1,4 @@
-"""What a user may change when opening a session."""
+"""The options of a session."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from labseq.messages import clean
 from labseq.session.profile import DryRun
 
 _NOT_SET: Final = ("profile", "dry_run")
-"""Options that are no values of the sequence."""
+"""Options that are not values of the sequence."""
 
 
 def path_of(value: Any, name: str) -> Path:
-    """A path that somebody gave.
+    """A path given by a caller.
 
     Raises:
-        ConfigError: It is none.
+        ConfigError: It is not a path.
     """
     try:
         return Path(value)
@@ -30,7 +30,7 @@ def path_of(value: Any, name: str) -> Path:
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """What a user may change when opening a session.
+    """The options of a session: what differs from its files.
 
     Attributes:
         profile: Name or path of the profile, instead of the sequence's own.
@@ -39,7 +39,7 @@ class Options:
         overrides: ``"address=value"`` strings, as given to ``--set``; they win.
         output: Folder for the data, instead of LABSEQ_DATA or ``./data``.
         dry_run: "off", "full" or "fast".
-        realtime: Let virtual time take as long as it says.
+        realtime: Let virtual time pass at the speed of real time.
     """
 
     profile: str | None = None

@@ -265,7 +265,7 @@ class PlannedMoves:
     Attributes:
         source: Where the occupancy comes from, for people.
         occupancy: bool (n_rows, n_cols), before.
-        target: What the array shall look like.
+        target: The target pattern.
         grid: The grid of sites.
         motion: How the mobile tweezers move.
         planner: Name of the planner.

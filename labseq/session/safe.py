@@ -47,24 +47,24 @@ def lock_devices(
     *,
     in_spite: bool = False,
 ) -> Generator[Callable[[str], None]]:
-    """Keep everybody else from a profile's devices in the block.
+    """Keep other processes from a profile's devices within the block.
 
-    A lock goes with its process: one that is killed leaves none. It stands in the data root and in the
-    user's state folder, as the markers of runs do, so that it counts whatever ``--output`` says.
+    A lock ends with its process, also if that is killed. Locks are in the data root and in the user's
+    state folder, like the markers of runs, so that they hold whatever ``--output`` says.
 
     Args:
         bench: The profile.
-        roots: See :func:`labseq.recording.marker_roots`; those that do not exist are passed over, but
-            for the user's own.
-        what: What the devices are held for, for whoever finds them held.
-        warn: Told what the user should know: that nothing keeps others from the devices.
-        in_spite: Whether to go on where somebody else holds them, and only tell.
+        roots: See :func:`labseq.recording.marker_roots`; those that do not exist are skipped, except
+            the user's own.
+        what: What the devices are used for, shown to others who find them locked.
+        warn: Receives a warning if nothing keeps others from the devices.
+        in_spite: Whether to continue with a warning if another process holds them.
 
     Yields:
-        What tells anew what the devices are held for.
+        A function that changes the description of what the devices are used for.
 
     Raises:
-        DeviceError: Somebody else holds them; says who.
+        DeviceError: Another process holds them; names it.
     """
     standing = [root for root in roots if root.is_dir() or root not in roots[:1]]
     locks: list[Lock] = []
@@ -106,7 +106,7 @@ _NEEDED_KINDS: Final = HARDWARE_KINDS | {"simulation"}
 
 @dataclass(frozen=True, slots=True)
 class SafeStateReport:
-    """What became of the devices of a profile.
+    """The outcome of making the devices of a profile safe.
 
     Attributes:
         tried: Name of each device that could be constructed -> why it is not safe, or None.
@@ -135,12 +135,12 @@ def make_each_safe(
     Args:
         devices: Name and device, in the order of the safe state.
         timeouts: How long each call may take.
-        simulation: The world that virtual devices act on.
-        observer: Told each device's outcome.
+        simulation: The simulation that virtual devices act on.
+        observer: Receives each device's outcome.
 
     Returns:
-        Device name -> why it is not safe, or None. One that is safe and only cannot be
-        closed is told to the observer alone, as at the end of a run.
+        Device name -> why it is not safe, or None. A device that is safe but
+        cannot be closed is only reported to the observer, as at the end of a run.
     """
     guard = Guard()
     outcome: dict[str, LabseqError | None] = {}
@@ -148,7 +148,7 @@ def make_each_safe(
         guard.call_to_the_end("simulation", timeouts.call_s, simulation.open)
     for name, device in devices:
         opened = attempt(guard, name, timeouts.call_s, device.open)
-        # Perhaps it can be made safe even if it did not open.
+        # it may be possible to make it safe even if it did not open
         safe = attempt(guard, name, timeouts.safe_state_s, device.safe_state)
         closed = attempt(guard, name, timeouts.safe_state_s, device.close)
         outcome[name] = opened or safe
@@ -201,12 +201,12 @@ def make_profile_devices_safe(
 ) -> SafeStateReport:
     """Construct each device of a profile, open it, make it safe and close it.
 
-    One that cannot be constructed never keeps the others from it; it is told at the end.
+    A device that cannot be constructed does not affect the others; it is reported at the end.
 
     Args:
         bench: The profile.
         stop: The request to stop; not obeyed here.
-        observer: Told each device's outcome.
+        observer: Receives each device's outcome.
     """
     clock = VirtualClock(stop) if bench.virtual_time else RealClock(stop)
     made, failures = construct_hardware(bench, clock)
@@ -226,14 +226,14 @@ def make_safe_after_crash(
 ) -> None:
     """If the last run on a profile died, its devices may still be on: make them safe.
 
-    Before anything else is constructed or compiled, which may fail.
+    This comes first, because constructing and compiling may fail.
 
     Args:
         bench: The profile.
         roots: See :func:`labseq.recording.marker_roots`.
-        key: What its hardware is known by.
+        key: Identifies its hardware.
         stop: The request to stop; obeyed once every device has been tried.
-        observer: Told each device's outcome, and warnings.
+        observer: Receives each device's outcome, and warnings.
 
     Raises:
         LabseqError: The first device that is not safe.
@@ -259,14 +259,14 @@ def make_profile_safe(
 ) -> SafeStateReport:
     """Bring every device of a profile to its safe state.
 
-    It does so whoever else uses them, and says who does: a run in progress fails, or is seen to be at
-    work again. Ctrl-C does not leave it half done: it is obeyed once every device has been tried. If
-    all are safe, nothing is left to do for the next run, whatever became of the last one.
+    It does so even while another process uses them, with a warning that names it: a run in progress fails,
+    or switches its devices on again. Ctrl-C is obeyed once every device has been tried. If all devices are
+    safe, the next run need not make them safe, however the last one ended.
 
     Args:
         profile: Name or path of the profile.
         overrides: ``"profile.address=value"`` strings, as given to ``--set``.
-        observer: Told each device's outcome, and warnings.
+        observer: Receives each device's outcome, and warnings.
 
     Raises:
         ConfigError: The profile cannot be read, or does not exist; no device was touched.
@@ -285,9 +285,9 @@ def make_profile_safe(
             stack.enter_context(lock_devices(bench, roots, "labseq safe", warn, in_spite=True))
         stack.enter_context(stop_on_signals(stop))
         secured = make_profile_devices_safe(bench, stop, observer)
-    told = [problem for error in bench.refused.values() for problem in error.problems]
-    others = [problem for problem in found.problems if problem not in told]
-    # A problem or an override may have left a device out, or put another in its place.
+    refused = [problem for error in bench.refused.values() for problem in error.problems]
+    others = [problem for problem in found.problems if problem not in refused]
+    # a problem or an override may have left out or replaced a device
     if not (secured.failures or others or overrides):
         try:
             clear_active(roots, key)
@@ -299,14 +299,14 @@ def make_profile_safe(
 
 
 def _read(profile: str, overrides: Sequence[str], found: ProblemCollector) -> ResolvedProfile:
-    """Read a profile and choose its devices, past everything that is wrong but can be gone past."""
+    """Read a profile and choose its devices, in spite of any mistake that leaves some of them usable."""
     for_profile = profile_overrides(overrides)
     document, spec = load_profile(profile, beside=Path(), overrides=for_profile, found=found)
     with found:
         plugin_paths(document, spec.plugin_folders)
     folders: list[Path] = []
     for folder in spec.plugin_folders:
-        with suppress(ConfigError):  # told already
+        with suppress(ConfigError):  # reported already
             folders += plugin_paths(document, [folder])
     return choose_plugins(document, spec, load_plugins(folders, found, spec.timeouts.load), "off", found)
 
@@ -320,15 +320,15 @@ _OPENING: Final = {"static_tweezers": 0, "camera": 1, "mobile_tweezers": 3}
 
 @dataclass(frozen=True, slots=True)
 class CheckedDevice:
-    """What was found out about one device.
+    """The result of checking one device.
 
     Attributes:
         name: Its role, or its name in the profile.
-        described: What it says of itself; empty if it did not get so far.
+        described: Its own description; empty if it did not get so far.
         tested: Whether it passed its self test; False also if it has none.
         latency_s: Time of a ``describe()``, from the call to the answer; None if it did not get so far.
         constructed: Whether its plugin made it at all; if not, ``failure`` says why.
-        failure: Why it could not be opened, identified or tested, or what broke that off; or None.
+        failure: Why it could not be opened, identified or tested, or what interrupted that; or None.
         unsafe: Why it is not in its safe state, or None.
         unclosed: Why it could not be closed, or None.
     """
@@ -344,19 +344,19 @@ class CheckedDevice:
 
     @property
     def ok(self) -> bool:
-        """Whether nothing went wrong."""
+        """Whether everything worked."""
         return self.failure is None and self.unsafe is None and self.unclosed is None
 
 
 @dataclass(frozen=True, slots=True)
 class DevicesReport:
-    """What was found out about the devices of a profile.
+    """The result of checking the devices of a profile.
 
     Attributes:
         devices: Each that was tried, in order, then those that could not be constructed.
         plugins: Name of a device -> what plays it, as after ``use:`` in the profile.
-        warnings: What the user should know although it is no error.
-        stopped: The request to stop that broke it off, or None.
+        warnings: Notes for the user that are not errors.
+        stopped: The request to stop that ended the check, or None.
     """
 
     devices: Sequence[CheckedDevice]
@@ -413,7 +413,7 @@ def check_each_device(
         devices: Name and device, in the order of opening.
         timeouts: How long each call may take.
         stop: The request to stop: the device at hand is made safe and closed, the rest left alone.
-        simulation: The world that virtual devices act on: opened before them, closed after them.
+        simulation: The simulation that virtual devices act on: opened before them, closed after them.
 
     Returns:
         Those that were tried, the simulation first.
@@ -443,7 +443,7 @@ def check_each_device(
 
 
 def _examined(guard: Guard, name: str, device: Any, timeouts: Timeouts) -> CheckedDevice:
-    """Open, identify and test a device, as far as it goes."""
+    """Open, identify and test a device, up to the first failure."""
     found = CheckedDevice(name)
     try:
         if name != "simulation" and offers(device, "warm"):

@@ -118,8 +118,8 @@ class Session:
         seed = assembly.sequence.seed if earlier is None else earlier.run.seed
         self.seed = secrets.randbits(63) if seed is None else seed
         self.run_dir: Path | None = None
-        self._folder = Path.cwd()  # now: vendors' libraries change it
-        # What the hardware is known by; a dry run touches none, and says nothing about it.
+        self._folder = Path.cwd()  # now: some vendors' libraries change it
+        # Identifies the hardware; a dry run touches none, so it has a key of its own.
         profile = assembly.bench.hardware_key
         self._profile_key = profile if options.dry_run == "off" else f"{profile} (dry run)"
         self.stop_flag = StopFlag()
@@ -153,8 +153,8 @@ class Session:
             overrides: ``"address=value"`` strings.
             output: Folder for the data.
             dry_run: "off", "full" or "fast".
-            realtime: Let virtual time take as long as it says.
-            observer: Told everything that happens.
+            realtime: Let virtual time pass at the speed of real time.
+            observer: Receives every event.
 
         Raises:
             ConfigError: Sequence, profile or an option is wrong; names file, line and column.
@@ -181,17 +181,17 @@ class Session:
         realtime: bool = False,
         observer: RunObserver | None = None,
     ) -> Session:
-        """Read a run back that ended before its last shot; it goes on with the shots that are missing.
+        """Read back a run that ended before its last shot, in order to take the missing shots.
 
-        It goes by the sequence, the profile, the calibrations and the options that it was begun with,
-        whatever the files say today. Until the session is closed, nobody else can resume the run.
+        It uses the sequence, the profile, the calibrations and the options that the run began with,
+        whatever the files say today. Until the session is closed, no other process can resume the run.
 
         Args:
             run: The run's folder or any file in it.
-            accept_changes: Whether to go on although code, plugins or settings differ from then; run.json
-                tells of it.
-            realtime: Let virtual time take as long as it says.
-            observer: Told everything that happens.
+            accept_changes: Whether to continue although code, plugins or settings have changed; run.json
+                records the changes.
+            realtime: Let virtual time pass at the speed of real time.
+            observer: Receives every event.
 
         Raises:
             ConfigError: The run is complete or in progress, or something differs from then.
@@ -216,7 +216,7 @@ class Session:
             self.earlier.release()
 
     def timeline(self) -> list[tuple[str, list[TimelineEntry]]]:
-        """What a shot will do: name of each step and its bars."""
+        """The timeline of a shot: name and entries of each step."""
         lab, guard = self.build_lab(), Guard(self.stop_flag)
         steps = self.assembly.steps
         try:
@@ -250,7 +250,7 @@ class Session:
                 self._hold = stack.enter_context(lock_devices(self.assembly.bench, roots, what, self._warn))
             bench, key = self.assembly.bench, self._profile_key
             make_safe_after_crash(bench, roots, key, self.stop_flag, self._observers)
-            if not self.scan_run.shots:  # its process died between the last shot and the last word
+            if not self.scan_run.shots:  # its process died between the last shot and the end of the run
                 _, writer = self._begin(roots[0])
                 writer.finish("complete")
                 return open_run(writer.run_dir)
@@ -258,13 +258,13 @@ class Session:
             lab = next(labs)
             for one in itertools.chain([lab], labs):
                 self.warm(one)
-            gc.unfreeze()  # what an earlier run in this process has left
+            gc.unfreeze()  # left by an earlier run in this process
             gc.collect()
-            gc.freeze()  # what is loaded by now stays: going through it all would take 0.1 s of a shot
+            gc.freeze()  # loaded modules stay: searching them for garbage would take 0.1 s of a shot
             return self._run(lab, roots)
 
     def build_lab(self, point: Point | None = None) -> Lab:
-        """Construct every role's object on the clock that the run will have; nothing is opened.
+        """Construct the object of every role on the run's clock; nothing is opened.
 
         Args:
             point: Of the scan; None for the first one.
@@ -273,12 +273,12 @@ class Session:
         return build_lab(point or self.assembly.begun, self.assembly.target, clock, self.seed)
 
     def warm(self, lab: Lab, *, devices: bool = True) -> None:
-        """Compile what a lab will need; see :func:`labseq.session.lab.warm`."""
+        """Compile the kernels of a lab; see :func:`labseq.session.lab.warm`."""
         warm(lab, self.stop_flag, self._observers, devices=devices)
 
     def _run(self, lab: Lab, roots: Sequence[Path]) -> Run:
         record, writer = self._begin(roots[0])
-        self._observers.report_plugin_changes()
+        self._observers.report_prints()
         error: BaseException | None = None
         try:
             self._take_shots(lab, roots, writer, record)
@@ -322,7 +322,7 @@ class Session:
         self.scan_run.run(sequencer, lab, changes, ShotHooks(writer, checks, self._observers.event))
 
     def _begin(self, root: Path) -> tuple[RunRecord, RunWriter]:
-        """The run's folder, a new one or that of the run that goes on."""
+        """Create the run's folder, or reopen that of a resumed run."""
         changes, scan, earlier = self.options.changes(), self.scan_run.record(), self.earlier
         record = run_record(self.assembly, self.seed, changes, scan, self._folder)
         if earlier is None:
@@ -346,7 +346,7 @@ class Session:
         self._observers.event("run_finished", {"record": record, "status": status, "error": text})
 
     def _try(self, act: Callable[P, None], *args: P.args, **kwargs: P.kwargs) -> None:
-        """Do what a full disk may prevent; that must not hide how the run ended."""
+        """Do something that a full disk may prevent, which must not hide how the run ended."""
         try:
             act(*args, **kwargs)
         except LabseqError as failure:

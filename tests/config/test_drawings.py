@@ -172,7 +172,7 @@ def test_a_drawing_may_stand_in_the_sequence(tmp_path: Path) -> None:
     ("settings", "message"),
     [
         ("", r"sequence\.yaml:6:9: a bitmap needs a drawing; expected 'sites' or 'file'"),
-        (", sites: '#', file: a.txt", r"sequence\.yaml:6:39: 'file' stands beside 'sites'"),
+        (", sites: '#', file: a.txt", r"sequence\.yaml:6:39: 'file' excludes 'sites'"),
         (", file: a.txt", r"sequence\.yaml:6:33: .*a\.txt: there is no such file"),
         (", sites: '...'", r"sequence\.yaml:6:34: the drawing holds no atom"),
     ],

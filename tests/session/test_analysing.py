@@ -142,7 +142,7 @@ def test_an_analysis_that_does_not_finish_is_ended(tmp_path, monkeypatch):
     ended, left = warnings(done)
     assert ended == "analysis 'hangs' did not finish within 0 s after the run, and was ended"
     missing = "analysis 'hangs' has no result of 3 of 3 shots"
-    assert left == f"{missing}; 'labseq analyse {done.path}' makes up what is missing"
+    assert left == f"{missing}; 'labseq analyse {done.path}' computes the missing results"
 
 
 def test_a_wrong_setting_is_told_before_the_run(tmp_path):

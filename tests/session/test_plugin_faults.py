@@ -126,7 +126,7 @@ def test_code_that_fails_is_named(where: str, says: str, error: str) -> None:
 def test_a_step_without_an_attribute_of_its_role_is_named() -> None:
     write(PLUGIN.replace("needs_image = takes_image = False", "needs_image = False"))
     with pytest.raises(
-        ConfigError, match=r"s\.yaml:8:11: .*step 'mine' has no takes_image; see labseq\.Step"
+        ConfigError, match=r"s\.yaml:8:11: .*step 'mine' has no takes_image; see labseq\.plugin\.Step"
     ):
         labseq.Session.open("s.yaml")
 
