@@ -1,4 +1,4 @@
-"""Another control system leads, over TCP or a serial line; labseq images and rearranges when it says `go`."""
+"""An external control system starts the shots with the signal `go`, over TCP or a serial line."""
 
 from labseq.plugin import Registry, hookimpl
 
@@ -7,7 +7,7 @@ LABSEQ_API = 1
 
 @hookimpl
 def labseq_register(registry: Registry) -> None:
-    """Offer the devices that a leader speaks through; in a dry run, one that says `go` by itself."""
+    """Offer the devices that connect an external control system; in a dry run it is simulated."""
     from labseq_follow.leader import serial_leader, tcp_leader
     from labseq_follow.settings import SIMULATED, SerialLeaderSettings, TcpLeaderSettings
 

@@ -1,4 +1,4 @@
-"""Settings of the devices that a leader speaks through."""
+"""Settings of the devices that connect an external control system."""
 
 from __future__ import annotations
 
@@ -15,49 +15,51 @@ PositiveDuration: TypeAlias = Annotated[Duration, Field(gt=0)]
 
 
 class LeaderSettings(Settings):
-    """What does not depend on the line."""
+    """Settings for any connection."""
 
     deadline: PositiveDuration = Field(
-        default=10.0, description="longest time from `go` to `ready` or `failed`; the leader is told it"
+        default=10.0, description="longest time from `go` to `ready` or `failed`; it is sent in `hello`"
     )
     leader: Literal["real", "simulated"] = Field(
-        default="real", description="simulated: one that says `go` by itself, as in a dry run"
+        default="real", description="simulated: a simulated control system sends `go`, as in a dry run"
     )
     simulated_go_delay: Duration = Field(
-        default=0.5, description="time after which the simulated leader says `go`; atoms load meanwhile"
+        default=0.5,
+        description="time after which the simulated control system sends `go`; atoms load meanwhile",
     )
     loads: bool = Field(
         default=False,
-        description="with a real leader of a simulated lab: atoms load at `go`, unless there are some",
+        description="with a real control system and a simulated lab: atoms load at `go`, unless there "
+        "are some",
     )
 
 
 class TcpLeaderSettings(LeaderSettings):
-    """A leader that connects over TCP."""
+    """An external control system that connects over TCP."""
 
     host: Annotated[str, Field(min_length=1)] = Field(
         default="127.0.0.1", description="address of this computer on which labseq listens"
     )
     port: int = Field(
-        default=5750, ge=0, le=65535, description="port on which labseq listens; 0 takes any that is free"
+        default=5750, ge=0, le=65535, description="port on which labseq listens; 0: any free one"
     )
     allow_remote: bool = Field(
-        default=False, description="whether other computers may lead: whoever reaches the port may then"
+        default=False, description="whether other computers may connect: any that reaches the port"
     )
 
     @model_validator(mode="after")
-    def _is_local(self) -> Self:
+    def _check_host(self) -> Self:
         if not self.allow_remote and not _is_loopback(self.host):
-            what = f"host is '{clean(self.host)}', which other computers reach"
-            hint = "or set 'allow_remote: true' in a network where everybody may lead"
+            what = f"host is '{clean(self.host)}', which other computers can reach"
+            hint = "or set 'allow_remote: true' in a network where every computer may connect"
             raise setting_error(
-                what, "an address of this computer alone, such as 127.0.0.1", hint, at=("host",)
+                what, "an address that only this computer can reach, such as 127.0.0.1", hint, at=("host",)
             )
         return self
 
 
 class SerialLeaderSettings(LeaderSettings):
-    """A leader on a serial line: 8 data bits, no parity, 1 stop bit."""
+    """An external control system on a serial line: 8 data bits, no parity, 1 stop bit."""
 
     port: Annotated[str, Field(min_length=1)] = Field(
         description="the port: `/dev/ttyUSB0`, `COM3`, or a URL of pyserial"

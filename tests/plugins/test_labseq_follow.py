@@ -11,8 +11,8 @@ from typing import Any, ClassVar
 
 import pytest
 from hypothesis import given, strategies as st
-from labseq_follow.dialogue import Dialogue, Splitter
 from labseq_follow.leader import serial_leader, tcp_leader
+from labseq_follow.protocol import Dialogue, Splitter
 from labseq_follow.settings import SerialLeaderSettings, TcpLeaderSettings
 
 from labseq import ConfigError, Context, Device, DeviceError, DeviceTimeoutError, StopRequested
@@ -221,7 +221,7 @@ def test_only_this_computer_may_lead_unless_it_is_allowed() -> None:
     document = Document.parse("leader: {host: 0.0.0.0}", "p.yaml")
     with pytest.raises(ConfigError) as caught:
         document.validate(TcpLeaderSettings, ("leader",))
-    text = "p.yaml:1:16: host is '0.0.0.0', which other computers reach; expected an address of this computer"
+    text = "p.yaml:1:16: host is '0.0.0.0', which other computers can reach; expected an address"
     assert str(caught.value).startswith(text)
     assert TcpLeaderSettings(host="0.0.0.0", allow_remote=True).host == "0.0.0.0"
     for host in ("127.0.0.1", "127.1.2.3", "::1", "localhost"):
@@ -265,9 +265,9 @@ def test_each_go_gets_exactly_one_answer(events: list[str]) -> None:
         n_answers = sum(line.startswith(("ready", "failed")) for line in said)
         if event == "go":
             n_go_signals += 1
-            said += dialogue.heard("go", now_s)
+            said += dialogue.receive_line("go", now_s)
         elif event == "noise":
-            said += dialogue.heard("gog", now_s)
+            said += dialogue.receive_line("gog", now_s)
         elif event == "take" and (taken := dialogue.take(now_s)) is not None:
             said += taken[1]
         elif event == "tell":

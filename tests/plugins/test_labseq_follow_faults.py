@@ -48,7 +48,7 @@ def test_errors_and_empty_lines_are_not_answered() -> None:
     with led() as (device, peer):
         peer.send(b"error what is 'hello'?\n\r\n\n")
         assert peer.ask("state?") == "state idle"
-        assert "the leader said 'error what is" in told(device)
+        assert "the leader sent 'error what is" in told(device)
 
 
 def test_a_line_may_come_in_pieces_and_end_as_on_windows() -> None:
@@ -88,7 +88,7 @@ def test_a_second_leader_is_turned_away_with_a_line_that_says_so() -> None:
         assert "was turned away" in told(device)
 
 
-def test_after_a_disconnect_the_shot_goes_on_and_nobody_else_is_told_of_it() -> None:
+def test_after_a_disconnect_the_shot_goes_on_and_its_result_is_sent_to_no_other() -> None:
     with led() as (device, peer):
         peer.say("go")
         device.wait_for("go", 20.0)
@@ -102,7 +102,7 @@ def test_after_a_disconnect_the_shot_goes_on_and_nobody_else_is_told_of_it() -> 
         device.wait_for("go", 20.0)
         assert again.hear() == "busy"
         again.leave()
-        assert "nobody will be told how it ends" in told(device)
+        assert "its result will not be sent" in told(device)
 
 
 def test_a_go_whose_leader_left_before_a_step_waited_is_forgotten() -> None:
@@ -137,7 +137,7 @@ def test_one_that_reads_nothing_counts_as_gone() -> None:
 
 def test_a_fault_of_its_own_is_told_to_the_step_that_waits(monkeypatch: pytest.MonkeyPatch) -> None:
     with listening() as device:
-        monkeypatch.setattr(device._link, "serve", lambda _: 1 / 0)
+        monkeypatch.setattr(device._link, "poll", lambda: 1 / 0)
         with pytest.raises(DeviceError, match=r"it does not listen any more: ZeroDivisionError"):
             device.wait_for("go", 20.0)
 

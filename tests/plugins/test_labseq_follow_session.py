@@ -201,6 +201,6 @@ def test_the_profile_is_the_virtual_lab_with_a_leader() -> None:
 
 
 def test_the_guide_names_every_line_of_the_protocol() -> None:
-    source = (ROOT / "plugins" / "labseq_follow" / "dialogue.py").read_text()
+    source = (ROOT / "plugins" / "labseq_follow" / "protocol.py").read_text()
     for word in re.findall(r'"reason": "([^"]+)"', source):
         assert f"failed reason={word}" in GUIDE

@@ -1,4 +1,4 @@
-"""What a leader says and what it is told: the protocol, without any line to speak it on."""
+"""The protocol between labseq and an external control system, without I/O."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ GO: Final = "go"
 VERSION: Final = 1
 MAX_LINE: Final = 200
 """Longest line in bytes; more is noise."""
-MAX_NEWS: Final = 100
-"""Most news that are kept; a line full of noise must not fill the memory."""
+MAX_EVENTS: Final = 100
+"""How many messages are kept; a noisy line must not fill the memory."""
 NOT_ANSWERED: Final = "error"
-"""Lines that begin so are never answered: two that do not understand each other would never end."""
+"""Lines that begin so are never answered, or two programs could exchange errors forever."""
 
 About = Mapping[str, bool | int | float | str]
 
@@ -26,10 +26,10 @@ class _Go:
     """A `go` whose shot is not over.
 
     Attributes:
-        text: What stood behind it.
+        text: The text after it.
         due_s: When it must be answered.
         taken: Whether a step has waited for it.
-        answered: "late" or "gone" if there is nothing more to say; "" if an answer is owed.
+        answered: "late" or "gone" if no answer follows any more; "" if one is still to come.
     """
 
     text: str
@@ -41,14 +41,14 @@ class _Go:
 class Dialogue:
     """Makes sure that each `go` gets exactly one answer. It does no I/O and is not safe for threads.
 
-    All that it returns is to be sent to the leader, line by line; all times are on one clock.
+    The lines that its methods return are to be sent; all times are on one clock.
 
     Args:
         deadline_s: Longest time from `go` to its answer.
 
     Attributes:
         is_waiting: Whether a step waits for `go`.
-        is_connected: Whether there is a leader.
+        is_connected: Whether a control system is connected.
     """
 
     def __init__(self, deadline_s: float) -> None:
@@ -56,7 +56,7 @@ class Dialogue:
         self.is_connected = False
         self._deadline_s = deadline_s
         self._go: _Go | None = None
-        self._news: deque[str] = deque(maxlen=MAX_NEWS)
+        self._events: deque[str] = deque(maxlen=MAX_EVENTS)
 
     @property
     def state(self) -> str:
@@ -66,51 +66,51 @@ class Dialogue:
         return "waiting" if self.is_waiting else "idle"
 
     def connected(self, who: str) -> list[str]:
-        """A leader is there."""
+        """A control system has connected."""
         self.is_connected = True
         self.note(f"{who} leads")
         return [self._hello()]
 
     def lost(self, reason: str) -> None:
-        """The leader is gone: a `go` that nobody took is forgotten, the shot of another goes on."""
+        """The control system is gone: a `go` for which no step waited is dropped; a shot goes on."""
         self.is_connected = False
         self.note(f"the leader is gone: {reason}")
         if self._go is not None and not self._go.taken:
             self._go = None
         elif self._go is not None and not self._go.answered:
             self._go.answered = "gone"
-            self.note("its shot goes on; nobody will be told how it ends")
+            self.note("its shot goes on; its result will not be sent")
 
     def receive_line(self, line: str, now_s: float) -> list[str]:
-        """A line came."""
+        """Handle a line that came."""
         word, _, text = line.strip().partition(" ")
         if word == GO:
-            return self._heard_go(text.strip(), now_s)
+            return self._receive_go(text.strip(), now_s)
         if word == "state?" and not text:
             return [f"state {self.state}"]
         if word == "hello":
             return [self._hello()]
         if word:
-            self.note(f"the leader said '{clean(line.strip())}'")
+            self.note(f"the leader sent '{clean(line.strip())}'")
         if not word or word == NOT_ANSWERED:
             return []
         return [f"error what is '{_one_line(line)[:40]}'? expected go, state? or hello"]
 
     def take(self, now_s: float) -> tuple[str, list[str]] | None:
-        """What stood behind a `go` that nobody took, for a step that waits; None if there is none."""
+        """Take a pending `go` for a step that waits: its text and lines to send; None if there is none."""
         if self._go is None or self._go.taken or now_s >= self._go.due_s:
             return None
         self._go.taken = True
         return self._go.text, ["busy"]
 
     def report(self, state: str, about: About, now_s: float) -> tuple[str, list[str]]:
-        """The shot of a `go` is over: what the leader was told of it, see ``labseq.LeaderLink.report``."""
+        """The shot of a `go` is over: the answer, see ``labseq.LeaderLink.report``, and lines to send."""
         if self._go is None or not self._go.taken:
             return "", []
-        said = self.overdue(now_s)
+        late = self.overdue(now_s)
         go, self._go = self._go, None
         if go.answered:
-            return go.answered, said
+            return go.answered, late
         return state, [_answer(state, about)]
 
     def overdue(self, now_s: float) -> list[str]:
@@ -120,28 +120,28 @@ class Dialogue:
             return []
         if go.taken:
             go.answered = "late"
-            self.note("the shot is not over at the deadline; the leader was told that it failed")
+            self.note("the shot is not over at the deadline; the leader received `failed`")
         else:
             self._go = None
-            self.note("no step waited for `go` before its deadline; the leader was told of a failure")
+            self.note("no step waited for `go` before its deadline; the leader received `failed`")
         return [_answer("failed", {"reason": "deadline"})]
 
     def end(self) -> list[str]:
-        """Nothing more will be said: whoever is owed an answer gets it."""
+        """Answer a pending `go`, because labseq ends."""
         go, self._go = self._go, None
         return [] if go is None or go.answered else [_answer("failed", {"reason": "labseq ends"})]
 
     def note(self, text: str) -> None:
-        """Keep something for the log."""
-        self._news.append(text)
+        """Keep a message for the log."""
+        self._events.append(text)
 
     def new_events(self) -> list[str]:
-        """What was noted since the last call."""
-        new_events = [*self._news]
-        self._news.clear()
+        """The messages since the last call."""
+        new_events = [*self._events]
+        self._events.clear()
         return new_events
 
-    def _heard_go(self, text: str, now_s: float) -> list[str]:
+    def _receive_go(self, text: str, now_s: float) -> list[str]:
         if self._go is not None:
             self.note("`go` came while labseq was busy, and was refused")
             return [_answer("failed", {"reason": "busy"})]
@@ -153,7 +153,7 @@ class Dialogue:
 
 
 class Splitter:
-    """Makes lines of what comes in pieces."""
+    """Splits the received bytes into lines."""
 
     def __init__(self) -> None:
         self._begun = bytearray()
@@ -172,7 +172,7 @@ class Splitter:
         return lines
 
     def rest(self) -> str:
-        """What came of a line that has not ended; it is forgotten."""
+        """The part of a line that has not ended; it is dropped."""
         rest = self._begun.decode("utf-8", "backslashreplace")
         self._begun.clear()
         self._is_noise = False
@@ -187,12 +187,12 @@ class Splitter:
 
 
 def encoded(line: str) -> bytes:
-    """A line as it is sent: ASCII."""
+    """Encode a line for sending, as ASCII."""
     return line.encode("ascii", "backslashreplace")[:MAX_LINE] + b"\n"
 
 
 def _answer(state: str, about: About) -> str:
-    """For example "ready shot=12 success=1 filling=0.987"; a reason goes to the end of the line."""
+    """Format an answer: "ready shot=12 success=1 filling=0.987"; a reason comes last."""
     parts = [state]
     for key, value in sorted(about.items(), key=lambda item: item[0] == "reason"):
         if isinstance(value, bool | int):
