@@ -1,4 +1,4 @@
-"""Taking frames with an open camera, as pylon does it."""
+"""Series of frames with an open camera."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from labseq.plugin import (
     format_quantity,
     wait_for,
 )
-from labseq_pylon import nodes as n
-from labseq_pylon.library import Sdk
-from labseq_pylon.nodes import Nodes
+from labseq_pylon.library import (
+    EXPOSURE,
+    Nodes,
+    Sdk,
+)
 from labseq_pylon.setup import ticks_per_s
 
 BUFFER_BYTES: Final = 256 * 2**20
-"""Memory for frames that were not read yet; a series that needs more uses its buffers again."""
+"""Memory for frames that were not read yet; a series that needs more reuses its buffers."""
 GIGE: Final = "BaslerGigE"
 MAX_GIGE_FRAMES: Final = 65535
 """GigE cameras number their frames from 1, with 16 bits."""
 NO_NUMBER: Final = 2**64 - 1
-READY_S: Final = 1.0
-"""How long a real camera may take until it would see a trigger, in seconds."""
 
 
 class Acquisition:
@@ -39,11 +39,11 @@ class Acquisition:
         sdk: pylon.
         camera: pylon's ``InstantCamera``, open.
         nodes: Its nodes.
-        clock: The session's clock: looked at for stop requests.
-        ready_s: How long the camera may take until it would see a trigger, in seconds.
+        clock: The session's clock, checked for stop requests.
+        ready_s: How long the camera may take until it accepts a trigger, in seconds.
     """
 
-    def __init__(self, sdk: Sdk, camera: Any, nodes: Nodes, clock: Clock, ready_s: float = READY_S) -> None:
+    def __init__(self, sdk: Sdk, camera: Any, nodes: Nodes, clock: Clock, ready_s: float) -> None:
         self._sdk = sdk
         self._camera = camera
         self._nodes = nodes
@@ -54,14 +54,14 @@ class Acquisition:
         self._exposure_s = math.nan
 
     def set_exposure(self, exposure_s: float) -> None:
-        """Set the exposure time; frames tell the one that the camera took.
+        """Set the exposure time; frames carry the value that the camera accepted.
 
         Raises:
-            LimitError: The camera cannot expose so long or so briefly.
+            LimitError: The exposure is out of the camera's range.
             DeviceError: The camera is gone.
         """
         self._check_connected()
-        node = self._nodes.get(n.EXPOSURE, "exposure time")
+        node = self._nodes.get(EXPOSURE, "exposure time")
         taken_us = self._nodes.set_real(node, "exposure", 1e6 * exposure_s, _microseconds)
         self._exposure_s = 1e-6 * taken_us
 
@@ -90,22 +90,22 @@ class Acquisition:
         """Queue the buffers and start; with the internal trigger the first exposure begins.
 
         Raises:
-            LimitError: A GigE camera cannot number so many frames.
+            LimitError: More frames than a GigE camera can number.
             DeviceError: pylon cannot start.
         """
         if self._is_gige and n_frames > MAX_GIGE_FRAMES:
             what = f"{self._sdk.name}: number of frames"
-            raise LimitError(what, n_frames, f"{MAX_GIGE_FRAMES}, as far as GigE cameras count")
+            raise LimitError(what, n_frames, f"{MAX_GIGE_FRAMES}, the highest frame number of GigE cameras")
         with self._sdk.doing("start the series"):
             n_buffers = BUFFER_BYTES // max(1, self._camera.PayloadSize.GetValue())
             self._camera.MaxNumBuffer.SetValue(max(2, min(n_frames, n_buffers)))
             self._camera.StartGrabbingMax(n_frames, self._sdk.pylon.GrabStrategy_OneByOne)
 
     def wait_until_ready(self) -> None:
-        """Wait until the camera would see a trigger.
+        """Wait until the camera accepts a trigger.
 
         Raises:
-            DeviceTimeoutError: It does not get there.
+            DeviceTimeoutError: It takes too long.
             DeviceError: The camera is gone.
         """
         camera, pylon = self._camera, self._sdk.pylon
@@ -128,10 +128,10 @@ class Acquisition:
             self._camera.ExecuteSoftwareTrigger()
 
     def poll(self, seconds: float) -> ExposureResult | None:
-        """Wait for the next buffer, for at most so long; None if none came.
+        """Wait for the next buffer, for at most ``seconds``; None if none came.
 
         Raises:
-            DeviceError: The camera is gone, and nothing is left to be read.
+            DeviceError: The camera is gone, and no frame is left to be read.
         """
         camera, pylon = self._camera, self._sdk.pylon
         with self._sdk.doing("read a frame"):
@@ -150,9 +150,9 @@ class Acquisition:
             self._camera.StopGrabbing()
 
     def _check_connected(self) -> None:
-        """Not every call of pylon fails when a camera is gone."""
+        """Raise if the camera is gone: not every call of pylon fails then."""
         if self._camera.IsCameraDeviceRemoved():
-            raise DeviceError(self._sdk.name, "the camera is gone; look after its cable and power")
+            raise DeviceError(self._sdk.name, "the camera is gone; check its cable and power")
 
     def _taken(self, result: Any) -> ExposureResult:
         number = result.BlockID - int(self._is_gige)

@@ -1,9 +1,9 @@
-"""pylon's emulated camera, as the counterpart: it takes its pictures from files.
+"""pylon's emulated camera as the simulator: it takes its pictures from files.
 
-The emulated camera exposes on a software trigger, cuts the region out of a picture, converts its
-pixels to the pixel format, and sends a buffer that pylon receives as it does any camera's. It reads the
-n-th file of a folder when it takes the n-th frame of a series, and no sooner; so a file that is written
-before the trigger is what that exposure sees. A file that was read is not read again in the same series.
+The emulated camera exposes on a software trigger, cuts the region out of a picture, converts its pixels to
+the pixel format, and sends a buffer that pylon receives as it does any camera's. It reads the n-th file of a
+folder when it takes the n-th frame of a series, and not before; so a file that is written before the trigger
+is what that exposure sees. A file that was read is not read again in the same series.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import threading
 import weakref
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from tempfile import mkdtemp
 from typing import Any, Final
@@ -22,32 +23,40 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.plugin import Context, DeviceError, Frame, Series, SimulatedSensor, Trigger
-from labseq_pylon.finding import EMULATION
-from labseq_pylon.library import Sdk
-from labseq_pylon.nodes import Nodes
+from labseq.plugin import Context, DeviceError, ExposureResult, Series, SimulatedSensor, Trigger, wait_for
+from labseq_pylon.acquisition import Acquisition
+from labseq_pylon.connection import EMULATION, CameraConnection
+from labseq_pylon.library import Nodes, Sdk
 from labseq_pylon.settings import BITS, PixelFormat, PylonSettings
 
 VARIABLE: Final = "PYLON_CAMEMU"
+"""Environment variable with the number of emulated cameras that pylon lists."""
+
+MAX_WAIT_S: Final = 5.0
+"""How long the emulated camera may take, in real time, for a frame that is due on the session's clock, and
+until it accepts a trigger: on a busy computer it is slow."""
+
 _LOCK: Final = threading.Lock()
 
 
-class EmulatedCamera:
-    """Feeds pylon's emulated camera with the exposures of the simulated world.
+class EmulatedCamera(CameraConnection):
+    """Gives the exposures of the simulation to pylon's emulated camera.
 
     Args:
         settings: Region, binning, read-out time.
-        context: Clock and simulated world.
+        context: Clock and simulation.
 
     Raises:
-        ConfigError: There is no simulated world, it does not know its sensor, or the region is beyond that.
+        ConfigError: There is no simulation, it does not describe its sensor, or the region is beyond it.
     """
 
     def __init__(self, settings: PylonSettings, context: Context) -> None:
-        world = settings.simulated_world(context)
-        self._world = world
-        self._sensor = SimulatedSensor(world, context.clock)
-        self._clock = context.clock
+        super().__init__(settings, context)
+        self._world = settings.simulated_world(context)
+        self._shape: tuple[int, int] = self._world.sensor_shape
+        self.sensor_shape = self._shape
+        self.ready_s = MAX_WAIT_S
+        self._sensor = SimulatedSensor(self._world, context.clock)
         self._mode = settings.mode
         self._readout_s = settings.readout
         self._folder: Path | None = None
@@ -56,104 +65,100 @@ class EmulatedCamera:
         self._nodes: Nodes | None = None
         self._bits = 16
         self._trigger: Trigger = "software"
-        self._n_exposed = self._n_waited_for = 0
-
-    @property
-    def sensor_shape(self) -> tuple[int, int]:
-        """(height, width) of the simulated sensor."""
-        return self._world.sensor_shape
-
-    @property
-    def waits_for_wire(self) -> bool:
-        """Whether the series has the external trigger, whose line nothing pulls."""
-        return self._trigger == "external"
-
-    @property
-    def runs_by_itself(self) -> bool:
-        """Whether the series has the internal trigger, and the next exposure was not begun yet."""
-        return self._trigger == "internal" and self._n_exposed == self._n_waited_for
+        self._n_exposed = self._n_due = 0
 
     def warm(self) -> None:
-        """Work out what all frames have in common."""
+        """Compute what all frames have in common."""
         self._world.prepare_sensor(self._mode)
 
     def device(self, sdk: Sdk) -> Any:
-        """An emulated camera, pylon's device; several drivers may have the same, each its own one.
+        """Create an emulated camera; each driver gets its own.
 
         Raises:
             DeviceError: pylon has none.
         """
-        with sdk.doing("make an emulated camera"), shown():
-            factory = sdk.pylon.TlFactory.GetInstance()
-            layer: Any = factory.CreateTl(EMULATION)
+        with sdk.doing("create an emulated camera"), listed():
+            layer: Any = sdk.pylon.TlFactory.GetInstance().CreateTl(EMULATION)
             if layer is None or not (infos := layer.EnumerateDevices()):
-                raise DeviceError(sdk.name, "this pylon has no emulated camera; install `pypylon` anew")
+                raise DeviceError(sdk.name, "this pylon has no emulated camera; reinstall `pypylon`")
             self._layer = layer
             return layer.CreateDevice(infos[0])
 
-    def set_up(self, nodes: Nodes) -> None:
-        """Let an open emulated camera read files, of the simulated sensor's size where it goes so low."""
-        for name, size in zip(("HeightMax", "WidthMax"), self.sensor_shape, strict=True):
+    def set_up(self, nodes: Nodes) -> tuple[int, int]:
+        """Make the camera read files of the simulated sensor's size, or of its minimum size."""
+        for name, size in zip(("HeightMax", "WidthMax"), self._shape, strict=True):
             node = nodes.get((name,), "size")
             nodes.set_integer(node, "size", max(size, node.Min))
         nodes.choose(("TestImageSelector",), "test image", "Off")
         self._folder = Path(mkdtemp(prefix="labseq-pylon-"))
         self._remove = weakref.finalize(self, shutil.rmtree, self._folder, ignore_errors=True)
         self._nodes = nodes
+        return self._shape
+
+    def trigger_of(self, series: Series) -> Trigger:
+        """The internal trigger is made by software: the camera would not wait for its pictures."""
+        return "software" if series.trigger == "internal" else series.trigger
 
     def arm(self, series: Series, pixel_format: PixelFormat) -> None:
         """Get ready for a series, before the camera is started.
 
-        The camera's own exposure is as long as that of the series, on a virtual clock as short as it can
-        be. (It has a node ``ExposureTime`` too, which is checked and read back, but has no effect.)
+        The camera's own exposure is as long as that of the series; on a virtual clock it is as short as
+        possible. (Its node ``ExposureTime`` is checked and read back, but has no effect.)
         """
         assert self._nodes is not None
         nodes, self._bits, self._trigger = self._nodes, BITS[pixel_format], series.trigger
-        self._n_exposed = self._n_waited_for = 0
+        self._n_exposed = self._n_due = 0
         for number in range(series.n_frames):
             self._path(number).touch()
         nodes.get(("ImageFilename",), "image file").SetValue(str(self._path(0).parent))
         nodes.choose(("ImageFileMode",), "image file", "On")
         node = nodes.get(("ExposureTimeAbs",), "exposure")
-        node.SetValue(
-            node.Min if self._clock.virtual else min(max(1e6 * series.exposure_s, node.Min), node.Max)
-        )
+        own_us = min(max(1e6 * series.exposure_s, node.Min), node.Max)
+        node.SetValue(node.Min if self._clock.virtual else own_us)
         self._sensor.arm(series, self._mode, self._readout_s)
 
-    def expose(self) -> bool:
-        """Begin an exposure on the session's clock, and put what it sees where the camera will look.
-
-        Returns:
-            Whether there was one left in the series.
+    def fire(self, acquisition: Acquisition) -> None:
+        """Expose on the session's clock, write what the sensor sees to the next file, and trigger the camera.
 
         Raises:
-            DeviceError: The world is further in time already.
+            DeviceError: The camera is gone, or the simulation is already at a later time.
         """
+        acquisition.wait_until_ready()
         frame = self._sensor.expose()
-        if frame is None:
-            return False
-        self._path(self._n_exposed).write_bytes(tiff(self._picture(frame.image)))
-        self._n_exposed += 1
-        return True
+        if frame is not None:
+            self._path(self._n_exposed).write_bytes(tiff(self._picture(frame.image)))
+            self._n_exposed += 1
+            acquisition.trigger()
 
-    def wait(self, timeout_s: float) -> Frame | None:
-        """Wait on the session's clock until the next frame could be read; None if that is later."""
+    def wait(self, acquisition: Acquisition, timeout_s: float) -> ExposureResult | None:
+        """Wait on the session's clock until the next frame is due, then in real time until it has come."""
+        if self._trigger == "external":  # no line is connected to the emulated camera
+            return super().wait(acquisition, timeout_s)
+        if self._trigger == "internal" and self._n_exposed == self._n_due:
+            self.fire(acquisition)
         frame = self._sensor.take(timeout_s)
-        self._n_waited_for += frame is not None
-        return frame
-
-    def drop(self, number: int) -> None:
-        """Forget the picture of a frame that was taken."""
-        self._path(number).write_bytes(b"")
+        if frame is None:
+            return None
+        self._n_due += 1
+        taken = wait_for(acquisition.poll, MAX_WAIT_S, self._clock)
+        if taken is None:
+            return None
+        self._path(taken.number).write_bytes(b"")
+        return replace(taken, t_start_s=frame.t_start_s)
 
     def clear(self) -> None:
         """Forget the series."""
         self._sensor.clear()
 
+    @contextmanager
+    def closing(self) -> Generator[None]:
+        """The camera must be listed while it is closed, or pylon leaves its pipes open."""
+        with listed():
+            yield
+
     def close(self) -> None:
         """Remove the files."""
-        self._nodes = self._layer = None
-        self._folder = None
+        self._nodes = self._layer = self._folder = None
         self._remove()
 
     def _path(self, number: int) -> Path:
@@ -161,8 +166,8 @@ class EmulatedCamera:
         return self._folder / f"{number:06d}.tif"
 
     def _picture(self, image: NDArray[np.uint16]) -> NDArray[np.uint16]:
-        """The whole sensor, with a frame where the camera will cut its region, in the upper bits."""
-        height, width = (size // self._mode.binning for size in self.sensor_shape)
+        """A picture of the whole sensor with a frame in its region, in the upper bits; zeros elsewhere."""
+        height, width = (size // self._mode.binning for size in self._shape)
         y, x = (start // self._mode.binning for start in (self._mode.region or (0, 0))[:2])
         picture = np.zeros((height, width), np.uint16)
         counts = np.minimum(image, 2**self._bits - 1) << (16 - self._bits)
@@ -171,7 +176,7 @@ class EmulatedCamera:
 
 
 def tiff(image: NDArray[np.uint16]) -> bytes:
-    """An image as a TIFF file: one strip, not compressed.
+    """An image as an uncompressed TIFF file with one strip.
 
     Args:
         image: uint16 (height, width).
@@ -183,7 +188,7 @@ def tiff(image: NDArray[np.uint16]) -> bytes:
         258: 16,  # bits
         259: 1,  # not compressed
         262: 1,  # 0 is black
-        273: 0,  # where the pixels begin, see below
+        273: 0,  # offset of the pixels, see below
         277: 1,  # one sample per pixel
         278: height,  # rows per strip
         279: image.nbytes,
@@ -195,8 +200,8 @@ def tiff(image: NDArray[np.uint16]) -> bytes:
 
 
 @contextmanager
-def shown() -> Generator[None]:
-    """Let pylon show emulated cameras; otherwise they never stand among real ones."""
+def listed() -> Generator[None]:
+    """Make pylon list emulated cameras within the block, so that they never appear among real ones."""
     with _LOCK:
         before = os.environ.get(VARIABLE)
         os.environ[VARIABLE] = "1"

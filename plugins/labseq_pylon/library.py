@@ -1,22 +1,39 @@
-"""The vendor's package ``pypylon``, imported only when a camera is opened."""
+"""The vendor's package ``pypylon``, imported only when a camera is opened, and the settings of a camera."""
 
 from __future__ import annotations
 
 import importlib
 import warnings
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final, TypeAlias
 
-from labseq.plugin import DeviceError
+from labseq.plugin import DeviceError, LimitError, nearest, one_of
 
-OTHERWISE = "to try things without it, use another camera, for example `use: virtual`"
+OTHERWISE: Final = "to try things without it, use another camera, for example `use: virtual`"
+
+
+Names: TypeAlias = tuple[str, ...]
+"""Names of a node, those of newer cameras first."""
+
+EXPOSURE: Final[Names] = ("ExposureTime", "ExposureTimeAbs")
+GAIN: Final[Names] = ("Gain",)
+GAIN_RAW: Final[Names] = ("GainRaw",)
+TEMPERATURE: Final[Names] = ("DeviceTemperature", "TemperatureAbs")
+FIRMWARE: Final[Names] = ("DeviceFirmwareVersion", "DeviceVersion")
+READOUT: Final[Names] = ("SensorReadoutTime", "ReadoutTimeAbs")
+FRAME_RATE_ON: Final[Names] = ("AcquisitionFrameRateEnable",)
+SENSOR_HEIGHT: Final[Names] = ("SensorHeight", "HeightMax")
+SENSOR_WIDTH: Final[Names] = ("SensorWidth", "WidthMax")
+TICKS_PER_S: Final[Names] = ("GevTimestampTickFrequency",)
+PACKET_SIZE: Final[Names] = ("GevSCPSPacketSize",)
+PACKET_DELAY: Final[Names] = ("GevSCPD",)
 
 
 @dataclass(frozen=True, slots=True)
 class Sdk:
-    """pylon, on behalf of one camera.
+    """The modules of pylon, and the name of a camera for errors.
 
     Attributes:
         name: Name of the camera in the profile, for errors.
@@ -30,10 +47,14 @@ class Sdk:
 
     @contextmanager
     def doing(self, what: str, hint: str = "") -> Generator[None]:
-        """Tell in labseq's terms what went wrong.
+        """Turn errors of pylon into errors of labseq.
+
+        Args:
+            what: What is being done, to complete "cannot ...".
+            hint: What the user can do.
 
         Raises:
-            DeviceError: pylon raised something.
+            DeviceError: pylon raised an error.
         """
         try:
             yield
@@ -45,7 +66,7 @@ class Sdk:
 def load_pypylon(name: str) -> Sdk:
     """Import ``pypylon``.
 
-    Its types make Python warn when they are made; as of 26.9 the process dies if warnings are errors.
+    Its types make Python warn when they are created; as of 26.9 the process dies if warnings are errors.
 
     Args:
         name: Name of the camera, for the message.
@@ -66,6 +87,124 @@ def load_pypylon(name: str) -> Sdk:
 
 
 def _reason(error: Exception) -> str:
-    """What pylon says, without the place in its sources."""
+    """The message of pylon, without the place in its source code."""
     lines = str(error).splitlines() or [type(error).__name__]
     return lines[0].partition(" : ")[0].rstrip(". ")
+
+
+class Nodes:
+    """The settings of an open camera, which GenICam calls nodes; their names differ between generations.
+
+    Args:
+        sdk: pylon.
+        node_map: pylon's map of nodes.
+    """
+
+    def __init__(self, sdk: Sdk, node_map: Any) -> None:
+        self._sdk = sdk
+        self._map = node_map
+
+    def find(self, names: Names) -> Any | None:
+        """The first of these nodes that the camera has now; None if it has none."""
+        for name in names:
+            node = self._map.GetNode(name)
+            if node is not None and self._sdk.genicam.IsAvailable(node):
+                return node
+        return None
+
+    def get(self, names: Names, what: str, hint: str = "") -> Any:
+        """The first of these nodes that the camera has now.
+
+        Raises:
+            DeviceError: It has none of them.
+        """
+        node = self.find(names)
+        if node is None:
+            text = f"the camera has no {what} (no node {one_of(names)})"
+            raise DeviceError(self._sdk.name, f"{text}; {hint}" if hint else text)
+        return node
+
+    def read(self, names: Names) -> Any | None:
+        """The value of a node; None if the camera has none or does not answer."""
+        try:
+            node = self.find(names)
+            return None if node is None else node.GetValue()
+        except self._sdk.genicam.GenericException:
+            return None
+
+    def choose(self, names: Names, what: str, value: str, *, if_there: bool = False) -> None:
+        """Set a node to one of several values.
+
+        Args:
+            names: Names of the node.
+            what: Its name in errors.
+            value: The value to choose.
+            if_there: Whether to do nothing if the camera does not have it, or does not allow changes.
+
+        Raises:
+            DeviceError: The camera has no such node, or not this value.
+        """
+        if if_there and not self._can_write(self.find(names)):
+            return
+        node = self.get(names, what)
+        if value not in node.Symbolics:
+            text = f"its {what} cannot be {value}; expected {one_of(node.Symbolics)}"
+            raise DeviceError(self._sdk.name, text)
+        with self._sdk.doing(f"set its {what} to {value}"):
+            node.SetValue(value)
+
+    def switch_off(self, names: Names) -> None:
+        """Set a node to False, if the camera has it."""
+        node = self.find(names)
+        if node is not None and self._can_write(node):
+            with self._sdk.doing(f"switch {names[0]} off"):
+                node.SetValue(False)
+
+    def set_real(
+        self, node: Any, what: str, value: float, say: Callable[[float], str] = "{:g}".format
+    ) -> float:
+        """Set a node that holds a real number.
+
+        Args:
+            node: The node.
+            what: Its name in errors.
+            value: In the node's unit.
+            say: Formats a value for errors.
+
+        Returns:
+            The value that the camera accepted.
+
+        Raises:
+            LimitError: The value is out of the camera's range.
+        """
+        with self._sdk.doing(f"set its {what}"):
+            low, high = node.Min, node.Max
+            if not low <= value <= high:
+                limit = f"{say(low)} to {say(high)}, which the camera can do"
+                raise LimitError(f"{self._sdk.name}: {what}", say(value), limit)
+            node.SetValue(value)
+            return float(node.GetValue())
+
+    def set_integer(self, node: Any, what: str, value: int, unit: int = 1) -> None:
+        """Set a node that holds an integer.
+
+        Args:
+            node: The node.
+            what: Its name in errors.
+            value: In the node's unit.
+            unit: Of the node, for errors: pixels of the sensor per pixel of a frame.
+
+        Raises:
+            LimitError: The value is out of range, or not a valid step; the error names the nearest valid one.
+        """
+        with self._sdk.doing(f"set its {what}"):
+            low, high, step = node.Min, node.Max, node.Inc
+            good = nearest(value, low, high, step)
+            if good != value:
+                limit = f"{low * unit} to {high * unit}, in steps of {step * unit}, which the camera can do"
+                hint = f"the nearest good one is {good * unit}"
+                raise LimitError(f"{self._sdk.name}: {what}", value * unit, limit, hint)
+            node.SetValue(value)
+
+    def _can_write(self, node: Any | None) -> bool:
+        return node is not None and bool(self._sdk.genicam.IsWritable(node))

@@ -11,10 +11,10 @@ from labseq.plugin import IndustrialCameraSettings
 PixelFormat: TypeAlias = Literal["Mono8", "Mono10", "Mono12", "Mono16"]
 
 BITS: Final[dict[PixelFormat, int]] = {"Mono16": 16, "Mono12": 12, "Mono10": 10, "Mono8": 8}
-"""Bits of a pixel, the most first."""
+"""Bits of a pixel, by pixel format, the most first."""
 
 SIMULATED: Final = "simulated"
-"""The camera that needs no camera."""
+"""Value of `camera` for the simulated camera."""
 
 
 class PylonSettings(IndustrialCameraSettings):
@@ -24,13 +24,11 @@ class PylonSettings(IndustrialCameraSettings):
         default=None,
         min_length=1,
         description="serial number of the camera; none: the only one that is connected; `simulated`: pylon's "
-        "emulated camera, which shows the simulated atoms",
+        "emulated camera, which sees the simulated atoms",
     )
-    model: str | None = Field(
-        default=None, description='model that the camera must be, "acA1920-40um"; none: any'
-    )
+    model: str | None = Field(default=None, description='expected model, such as "acA1920-40um"; none: any')
     pixel_format: PixelFormat | None = Field(
-        default=None, description="bits of a pixel; none: as many as the camera has"
+        default=None, description="bits of a pixel; none: the most that the camera offers"
     )
     gain: float | None = Field(
         default=None, ge=-100, le=100, description="analogue gain in dB; none: as the camera is set"
@@ -47,7 +45,7 @@ class PylonSettings(IndustrialCameraSettings):
     @field_validator("camera", mode="before")
     @classmethod
     def _number_is_text(cls, camera: object) -> object:
-        """YAML takes a serial number without quotes for a number."""
+        """YAML reads a serial number without quotes as a number."""
         return str(camera) if type(camera) is int else camera
 
     @model_validator(mode="after")

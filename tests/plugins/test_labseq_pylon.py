@@ -1,4 +1,4 @@
-"""The pylon camera: what the simulated world shows comes through pylon, every pixel of it."""
+"""The pylon camera: every pixel of the simulation comes through pylon, in series and whole runs."""
 
 from __future__ import annotations
 
@@ -13,17 +13,22 @@ from typing import Any
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
-from labseq_pylon import camera
+from labseq_pylon import connection
 from labseq_pylon.camera import PylonCamera
 from labseq_pylon.library import load_pypylon
 from labseq_pylon.settings import BITS, PylonSettings
 
-from labseq import ConfigError, Context
+from labseq import ConfigError, Context, Run, Session
 from labseq.errors import DeviceTimeoutError, StopRequested
+from labseq.session.profile import DryRun
 from labseq.testing import CameraContract
 
 from .labseq_pylon_rig import Rig, rig, serial_numbers
 from .needs import need_library
+
+ROOT = Path(__file__).parents[2]
+SEQUENCE = ROOT / "sequences" / "compact_225.yaml"
+VIRTUAL = ROOT / "hardware_profiles" / "virtual.yaml"
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -122,7 +127,7 @@ def test_a_frame_is_due_when_a_real_camera_would_have_it() -> None:
 def test_a_computer_that_is_slow_fails_no_trigger_and_costs_no_time_on_a_virtual_clock(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(camera, "READY_S", 0.0)  # a real camera's, which is not this one's
+    monkeypatch.setattr(connection, "READY_S", 0.0)  # a real camera's, which is not this one's
     with rig(readout="5 ms") as lab:
         wait, n_waits = lab.pylon.WaitForFrameTriggerReady, 0
 
@@ -221,3 +226,60 @@ def test_a_serial_number_may_be_written_as_a_number() -> None:
 def test_one_gain_is_enough() -> None:
     with pytest.raises(ValueError, match="set one of them"):
         PylonSettings(gain=3.0, gain_raw=200)
+
+
+# whole runs
+
+
+def profile(folder: Path, camera: str) -> str:
+    """``virtual`` with another camera."""
+    text = (
+        (ROOT / "hardware_profiles" / "virtual.yaml")
+        .read_text()
+        .replace("camera:\n  use: virtual\n", f"camera:\n  use: pylon\n{camera}", 1)
+    )
+    assert "use: pylon" in text
+    plugins = folder / "plugins"
+    plugins.mkdir()
+    (plugins / "labseq_pylon").symlink_to(ROOT / "plugins" / "labseq_pylon")
+    path = folder / "bench_pylon.yaml"
+    path.write_text(text.replace("plugin_folders: []", f"plugin_folders: [{plugins}]"))
+    return str(path)
+
+
+def run(tmp_path: Path, profile: str, *overrides: str, dry_run: DryRun = "off") -> Run:
+    with Session.open(
+        SEQUENCE,
+        profile=profile,
+        shots=2,
+        seed=1,
+        output=tmp_path,
+        overrides=overrides,
+        dry_run=dry_run,
+    ) as session:
+        return session.run()
+
+
+def assert_equal(one: Run, other: Run) -> None:
+    for a, b in zip(one.shots, other.shots, strict=True):
+        np.testing.assert_array_equal(a.occupancies, b.occupancies)
+
+
+def test_the_whole_experiment_sees_what_the_virtual_camera_sees(tmp_path: Path) -> None:
+    virtual = run(tmp_path, "virtual")
+    emulated = run(tmp_path, profile(tmp_path, "  camera: simulated\n"))
+    assert emulated.simulated
+    assert_equal(emulated, virtual)
+
+
+def test_a_dry_run_with_a_real_cameras_profile_takes_the_emulated_one(tmp_path: Path) -> None:
+    cut = (
+        "profile.camera.region={y: 20, x: 6, height: 472, width: 500}",
+        "profile.camera.readout=0 ms",
+        "profile.detector.frame=[472, 500]",
+        "profile.detector.centre_px=[235.5, 249.5]",
+    )
+    real = profile(tmp_path, "  camera: 22345678\n  model: acA1920-40um\n")
+    done = run(tmp_path, real, *cut, dry_run="full")
+    assert done.simulated
+    assert_equal(done, run(tmp_path, "virtual", *cut))

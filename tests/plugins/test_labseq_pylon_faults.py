@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from labseq_pylon import finding
+from labseq_pylon import connection
 from labseq_pylon.library import load_pypylon
 from labseq_pylon.settings import PylonSettings
 
@@ -62,7 +62,7 @@ def test_an_unplugged_camera_is_told_and_can_be_opened_again() -> None:
     made.camera.read(1.0)
     made.camera.trigger()
     made.pylon.FirePnPCallback.Execute()
-    gone = "camera: the camera is gone; look after its cable and power"
+    gone = "camera: the camera is gone; check its cable and power"
     made.camera.read(1.0)  # it was on its way
     with pytest.raises(DeviceError, match=gone):
         made.camera.trigger()
@@ -167,7 +167,7 @@ def emulated_only(monkeypatch: pytest.MonkeyPatch) -> Any:
     """pylon, with two emulated cameras and whatever is plugged into this computer left out."""
     monkeypatch.setenv("PYLON_CAMEMU", "2")
     sdk = load_pypylon("camera")
-    layer: Any = sdk.pylon.TlFactory.GetInstance().CreateTl(finding.EMULATION)
+    layer: Any = sdk.pylon.TlFactory.GetInstance().CreateTl(connection.EMULATION)
     factory = SimpleNamespace(GetInstance=lambda: layer)
     monkeypatch.setattr(sdk.pylon, "TlFactory", factory)
     return sdk
@@ -175,14 +175,14 @@ def emulated_only(monkeypatch: pytest.MonkeyPatch) -> Any:
 
 def test_without_a_camera_it_says_so_and_does_not_take_an_emulated_one(emulated_only: Any) -> None:
     with pytest.raises(DeviceError, match=r"no Basler camera was found; .*set `camera: simulated`"):
-        finding.find_camera(emulated_only, PylonSettings())
+        connection.find_camera(emulated_only, PylonSettings())
 
 
 def test_of_two_cameras_one_must_be_named(emulated_only: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(finding, "EMULATION", "no class")  # as if these two were real
+    monkeypatch.setattr(connection, "EMULATION", "no class")  # as if these two were real
     text = "2 cameras were found: Emulation '0815-0000', Emulation '0815-0001'; name the serial number"
     with pytest.raises(DeviceError, match=text):
-        finding.find_camera(emulated_only, PylonSettings())
+        connection.find_camera(emulated_only, PylonSettings())
 
 
 def test_a_camera_that_another_program_has_is_told(monkeypatch: pytest.MonkeyPatch) -> None:

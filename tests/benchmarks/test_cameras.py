@@ -1,0 +1,88 @@
+"""Benchmarks: the camera drivers with their simulated cameras, in real time, 512 x 512 pixels.
+
+Times include exposure and read-out: 1 ms, and for Andor 17.5 ms with the settings used here.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Generator
+from typing import Any, Final
+
+import numpy as np
+import pytest
+from labseq_andor.camera import AndorCamera
+from labseq_andor.library import load_pylablib
+from labseq_andor.settings import AndorSettings
+from labseq_aravis import load_library
+from labseq_genicam.camera import GenicamCamera
+from labseq_genicam.settings import GenicamSettings
+from labseq_pylon.camera import PylonCamera
+from labseq_pylon.library import load_pypylon
+from labseq_pylon.settings import PylonSettings
+
+from labseq import Context, Frame, SensorMode, SiteGrid
+from labseq.plugin import CameraDriver
+from labseq.roles import WHOLE_SENSOR, NeverStopped
+from labseq.testing.fakes import RecordingSimulation
+from tests.plugins.needs import need_library
+
+N_FRAMES: Final = int(os.environ.get("LABSEQ_FRAMES", "25"))
+EXPOSURE_S: Final = 1e-3
+
+
+class StillWorld(RecordingSimulation):
+    """Always shows the same picture, so that drawing it takes no time."""
+
+    picture = np.random.default_rng(0).poisson(530, (512, 512)).astype(np.uint16)
+
+    def expose(self, t_start_s: float, exposure_s: float, mode: SensorMode = WHOLE_SENSOR) -> Frame:
+        height, width = mode.frame_shape(self.picture.shape)
+        return Frame(self.picture[:height, :width], exposure_s, t_start_s)
+
+
+def andor(context: Context) -> CameraDriver:
+    need_library(lambda: load_pylablib("camera"))
+    return AndorCamera(AndorSettings.model_validate({"camera": "simulated"}), context)
+
+
+def genicam(context: Context) -> CameraDriver:
+    need_library(load_library)
+    settings = {"camera": "simulated", "readout": "0 ms", "frame_rate": "100 Hz"}
+    return GenicamCamera(GenicamSettings.model_validate(settings), context)
+
+
+def pylon(context: Context) -> CameraDriver:
+    need_library(lambda: load_pypylon("camera"))
+    return PylonCamera(PylonSettings.model_validate({"camera": "simulated", "readout": "0 ms"}), context)
+
+
+@pytest.fixture(params=[andor, genicam, pylon], ids=lambda make: make.__name__)
+def camera(request: pytest.FixtureRequest) -> Generator[CameraDriver]:
+    make: Callable[[Context], CameraDriver] = request.param
+    context = Context("camera", SiteGrid(), clock=NeverStopped(), simulation=StillWorld())
+    camera = make(context)
+    camera.open()
+    yield camera
+    camera.close()
+
+
+def test_from_arming_to_a_frame(benchmark: Any, camera: CameraDriver) -> None:
+    benchmark.group = "camera: arm, software trigger, read"
+
+    def take() -> Frame:
+        camera.arm(1, EXPOSURE_S, "software")
+        camera.trigger()
+        return camera.read(5.0)
+
+    assert benchmark(take).image.shape == (512, 512)
+
+
+def test_a_series_with_the_internal_trigger(benchmark: Any, camera: CameraDriver) -> None:
+    benchmark.group = f"camera: {N_FRAMES} frames with the internal trigger"
+
+    def take() -> list[int]:
+        camera.arm(N_FRAMES, EXPOSURE_S, "internal")
+        return [camera.read(5.0).number for _ in range(N_FRAMES)]
+
+    assert benchmark(take) == list(range(N_FRAMES))
