@@ -1,24 +1,76 @@
-"""The target patterns, measured on the lattice as it stands in the atom plane."""
+"""The patterns, their settings and the contract."""
 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import pytest
 from hypothesis import given, settings as hypothesis_settings, strategies as st
+from labseq_patterns import (
+    patterns as checkerboard,
+    patterns as honeycomb,
+    patterns as kagome,
+    patterns as ring,
+    patterns as settings,
+    patterns as sierpinski,
+)
 from labseq_patterns.patterns import BlockSettings, RingSettings, SierpinskiSettings
+from labseq_scans.pattern import InterleavedSettings, interleaved
 from numpy.typing import NDArray
 from pydantic import BaseModel, ValidationError
 
 import labseq
 from labseq import ConfigError, LimitError, SiteGrid, TargetPattern, make_target
+from labseq.builtin.patterns import BitmapSettings, CompactSettings, bitmap, compact
+from labseq.testing import PatternContract
+
+BLOCK = settings.BlockSettings(rows=7, cols=8)
+
+PATTERNS: dict[str, Callable[[SiteGrid], TargetPattern]] = {
+    "compact": partial(compact, CompactSettings(rows=5, cols=6)),
+    "bitmap": partial(bitmap, BitmapSettings(sites=".#.\n###")),
+    "kagome": partial(kagome.kagome, BLOCK),
+    "link_kagome": partial(kagome.link_kagome, BLOCK),
+    "honeycomb": partial(honeycomb.honeycomb, BLOCK),
+    "checkerboard": partial(checkerboard.checkerboard, BLOCK),
+    "sierpinski": partial(sierpinski.sierpinski, settings.SierpinskiSettings(order=3)),
+    "ring": partial(ring.ring, settings.RingSettings(radius=4)),
+    "interleaved": partial(interleaved, InterleavedSettings(rows=6, cols=6)),
+}
+
+
+@pytest.mark.parametrize("name", PATTERNS)
+class TestPatterns(PatternContract):
+    @pytest.fixture
+    def factory(self, name: str) -> Callable[[SiteGrid], TargetPattern]:
+        return PATTERNS[name]
+
+
+def test_every_pattern_is_held_to_them() -> None:
+    import labseq_patterns
+    import labseq_scans
+
+    import labseq.builtin
+    from labseq.registry import Registry
+
+    registry, modules = Registry(), (labseq.builtin, labseq_patterns, labseq_scans)
+    for module in modules:
+        plugin: Any = module
+        plugin.labseq_register(registry)
+    assert {*registry.names("pattern")} == {*PATTERNS}
+
 
 TRIANGULAR = ("honeycomb", "kagome", "link_kagome")
+
 ANYWHERE = ("checkerboard", "ring", "sierpinski")
+
 BOTH_SHEARS = pytest.mark.parametrize("shear", [1, -1])
+
 A_BLOCK: dict[str, Any] = {"rows": 16, "cols": 16}
 
 
