@@ -238,10 +238,6 @@ EBADI = MotionSpec(
 )
 
 
-def mta1(dop: int = 7) -> Mta1Planner:
-    return Mta1Planner(Mta1Settings(degree_of_parallelism=dop), Context())
-
-
 def drawn(*rows: str) -> tuple[Bools, TargetPattern]:
     """Atoms and target of a drawing, with the marks of :func:`labseq.testing.strategies.drawn`."""
     marks = np.array([list(row) for row in rows])
@@ -382,10 +378,6 @@ def test_scans_of_the_sources_geometry() -> None:
         assert set(scanned.lines_passed.tolist()) <= set(range(2, 17)) | {33}
         n_scans.append(scanned.n_scans)
     assert np.mean(n_scans) == pytest.approx(17.4, abs=0.5)
-
-
-def tetris(dop: int = 7) -> TetrisPlanner:
-    return TetrisPlanner(TetrisSettings(degree_of_parallelism=dop), Context())
 
 
 def test_the_rows_are_piled_up_from_the_top() -> None:
