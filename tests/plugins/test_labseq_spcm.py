@@ -118,6 +118,17 @@ class TestPlaying:
                 lab.tweezers.play()
 
     @pytest.mark.parametrize("mode", MODES)
+    def test_takes_the_program_and_the_delay_of_the_trigger(self, driver: Any, mode: str) -> None:
+        with driver(mode) as lab:
+            program = lab.program(3)
+            delay_s = float(lab.tweezers.describe()["trigger_delay_s"])
+            assert 0.1e-6 < delay_s < 10e-6
+            assert lab.tweezers.prepare(program) == pytest.approx(
+                program.total_duration_s + delay_s, abs=1.5 / lab.rate_hz * 32
+            )
+            assert lab.tweezers.prepare(program) > program.total_duration_s + 0.9 * delay_s
+
+    @pytest.mark.parametrize("mode", MODES)
     def test_starts_at_the_external_trigger(self, driver: Any, mode: str) -> None:
         with driver(mode, trigger="external") as lab:
             duration_s = lab.tweezers.prepare(lab.program())
@@ -290,6 +301,14 @@ def test_programs_are_streamed_beyond_what_card_and_ring_hold(driver: Any) -> No
         lab.tweezers.wait(1.0)
         assert np.array_equal(lab.samples(0)[: rendered.shape[1]], rendered[0])
         assert np.array_equal(lab.samples(1)[: rendered.shape[1]], rendered[1])
+
+
+@pytest.mark.parametrize("fill_s", [8e-3, 20e-3])
+def test_card_and_ring_are_filled_about_as_far_ahead_as_the_profile_says(driver: Any, fill_s: float) -> None:
+    with driver("fifo", fill=fill_s) as lab:
+        lab.tweezers.prepare(lab.program(100))
+        ahead_s = lab.card._machine.fifo._handed / 4 / lab.rate_hz
+        assert fill_s / 1.5 < ahead_s < 1.5 * fill_s
 
 
 @pytest.mark.parametrize("fill_s", [1e-3, 8e-3, 20e-3])
