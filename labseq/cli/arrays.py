@@ -1,7 +1,8 @@
-"""An occupancy drawn as text: one character per site, or one per two rows of sites."""
+"""Occupancies drawn as text: one character per site, or one per two rows of sites."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from typing import Final
@@ -133,3 +134,118 @@ def _half_line(upper: list[int], lower: list[int], glyphs: Glyphs) -> Text:
         style = Style(color=_COLOURS[a or b], bgcolor=_COLOURS[b] if a and b else None)
         line.append(block * len(list(sites)), style)
     return line
+
+
+_GAP: Final = 4
+"""Characters between two arrays."""
+_MIN_WIDTH: Final = len("before")
+"""Least width of an array in characters."""
+
+Sites = NDArray[np.int16]
+_NOWHERE: Final[Sites] = np.empty((0, 2), np.int16)
+
+_KEY: Final = {
+    ATOM: "atom on a target site",
+    DEFECT: "empty target site",
+    SURPLUS: "surplus atom",
+    RESERVOIR: "atom in the reservoir",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class ArrayPair:
+    """Draws two arrays of one grid, before and after, with numbered rows and columns.
+
+    Attributes:
+        target: The target.
+        shear: As in :class:`labseq.model.SiteGrid`; 0 on a square lattice.
+        width: Characters per line.
+        glyphs: The characters to draw with.
+    """
+
+    target: TargetPattern
+    shear: int
+    width: int
+    glyphs: Glyphs
+
+    def lines(
+        self,
+        titles: Sequence[str],
+        arrays: Sequence[Occupancy],
+        marked: Sequence[Sites] = (_NOWHERE, _NOWHERE),
+    ) -> list[Text]:
+        """Draw two arrays as large as they fit; only a note if they do not fit.
+
+        Args:
+            titles: The title above each.
+            arrays: Both occupancies, bool (n_rows, n_cols).
+            marked: Sites of each that are shown inverted, int16 (n, 2).
+        """
+        beside, scale = self._arrangement
+        if scale is None:
+            n_rows, n_cols = self.target.shape
+            return [Text(f"({n_rows} x {n_cols} sites do not fit into {self.width} characters)", "dim")]
+        drawn = [
+            [Text(title, "bold"), *self._numbered(self._draw(array, sites, scale), scale)]
+            for title, array, sites in zip(titles, arrays, marked, strict=True)
+        ]
+        if not beside:
+            return [*drawn[0], Text(), *drawn[1]]
+        left_width = max(line.cell_len for line in drawn[0])
+        lines: list[Text] = []
+        for left, right in zip(*drawn, strict=True):
+            left.pad_right(left_width + _GAP - left.cell_len)
+            lines.append(Text.assemble(left, right))
+        return lines
+
+    def key(self, *arrays: Occupancy) -> Text:
+        """Explain the characters that occur in these arrays; empty if there are none."""
+        if self._arrangement[1] is None:
+            return Text()
+        shown = {int(kind) for array in arrays for kind in np.unique(site_kinds(array, self.target))}
+        parts = [
+            Text.assemble((self.glyphs.sites[kind], _STYLES[kind]), f" {text}")
+            for kind, text in _KEY.items()
+            if kind in shown
+        ]
+        return Text("   ").join(parts)
+
+    @property
+    def _arrangement(self) -> tuple[bool, Scale | None]:
+        """Whether the arrays are drawn side by side, and the scale; None if they do not fit."""
+        widths = [(scale, scale.size(*self.target.shape, self.shear)[0]) for scale in (ROOMY, DENSE)]
+        for beside in (True, False):
+            for scale, width in widths:
+                each = max(width + self._margin, _MIN_WIDTH)
+                if (2 * each + _GAP if beside else each) <= self.width:
+                    return beside, scale
+        return False, None
+
+    @property
+    def _margin(self) -> int:
+        """Width of the row numbers in characters."""
+        return len(str(self.target.shape[0] - 1)) + 1
+
+    def _draw(self, array: Occupancy, marked: Sites, scale: Scale) -> list[Text]:
+        lines = draw_array(array, self.target, self.shear, scale, self.glyphs)
+        for row, col in marked.tolist():
+            line, at = lines[row], self._column(row, col, scale)
+            line.pad_right(max(0, at + 1 - line.cell_len))
+            line.stylize("reverse", at, at + 1)
+        return lines
+
+    def _column(self, row: int, col: int, scale: Scale) -> int:
+        """The column of a site in its line of text."""
+        return scale.indent(row, self.target.shape[0], self.shear) + col * scale.cell
+
+    def _numbered(self, lines: list[Text], scale: Scale) -> list[Text]:
+        """Number the rows on the left, and every fifth column above the first row."""
+        head = ""
+        for col in range(0, self.target.shape[1], 5):
+            head = head.ljust(self._margin + self._column(0, col, scale)) + str(col)
+        width = self._margin + scale.size(*self.target.shape, self.shear)[0]
+        numbered = [Text(head if len(head) <= width else head.rstrip("0123456789"), "dim")]
+        for i, line in enumerate(lines):
+            number = f"{i:>{self._margin - 1}} "
+            numbered.append(Text.assemble((number, "dim"), line))
+        return numbered

@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, NoReturn, TextIO
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.text import Text
 
-from labseq.cli.arrays import DENSE, ROOMY, Glyphs, Scale, draw_array, glyphs_for, site_kinds
+from labseq.cli.arrays import ArrayPair, glyphs_for
 from labseq.console.output import STDOUT, check_different, json_writer, report_compiling, say, writing_to
 from labseq.console.text import columns, count_of, encodes, plural
 from labseq.kernel import interpret
-from labseq.model import Batch, Occupancy, TargetPattern
+from labseq.model import Batch
 from labseq.pictures.plans import occupancies, on_grid
 from labseq.session.occupancies import read_source
 from labseq.session.planning import PlannedMoves, PlanRequest, plan_moves
@@ -108,159 +107,32 @@ def _draw(moves: PlannedMoves, path: Path) -> None:
     save_plan(path, drawing)
 
 
-GAP: Final = 4
-"""Characters between two arrays."""
-LEAST: Final = len("before")
-"""Least width of an array in characters."""
+def batch_lines(moves: PlannedMoves, canvas: ArrayPair, arrow: str) -> Iterator[list[Text]]:
+    """Describe and draw each batch.
 
-Sites = NDArray[np.int16]
-NOWHERE: Final[Sites] = np.empty((0, 2), np.int16)
-
-_KEY: Final = (
-    ("atom on a target site", True, True, False),
-    ("empty target site", False, True, False),
-    ("surplus atom", True, False, True),
-    ("atom in the reservoir", True, False, False),
-)
-
-
-@dataclass(frozen=True, slots=True)
-class Canvas:
-    """Draws arrays of one grid.
-
-    Attributes:
-        target: The target.
-        shear: As in :class:`labseq.model.SiteGrid`; 0 on a square lattice.
-        width: Characters per line.
-        glyphs: The characters to draw with.
-    """
-
-    target: TargetPattern
-    shear: int
-    width: int
-    glyphs: Glyphs
-
-    def pair(
-        self,
-        titles: Sequence[str],
-        arrays: Sequence[Occupancy],
-        marked: Sequence[Sites] = (NOWHERE, NOWHERE),
-    ) -> list[Text]:
-        """Draw two arrays as large as they fit; only a note if they do not fit.
-
-        Args:
-            titles: The title above each.
-            arrays: Both occupancies, bool (n_rows, n_cols).
-            marked: Sites of each that are shown inverted, int16 (n, 2).
-        """
-        beside, scale = self._arrangement
-        if scale is None:
-            n_rows, n_cols = self.target.shape
-            return [Text(f"({n_rows} x {n_cols} sites do not fit into {self.width} characters)", "dim")]
-        drawn = [
-            [Text(title, "bold"), *self._numbered(self._draw(array, sites, scale), scale)]
-            for title, array, sites in zip(titles, arrays, marked, strict=True)
-        ]
-        if not beside:
-            return [*drawn[0], Text(), *drawn[1]]
-        left_width = max(line.cell_len for line in drawn[0])
-        lines: list[Text] = []
-        for left, right in zip(*drawn, strict=True):
-            left.pad_right(left_width + GAP - left.cell_len)
-            lines.append(Text.assemble(left, right))
-        return lines
-
-    def key(self, *arrays: Occupancy) -> Text:
-        """Explain the characters that occur in these arrays; empty if there are none."""
-        if self._arrangement[1] is None:
-            return Text()
-        shown = {int(kind) for array in arrays for kind in np.unique(site_kinds(array, self.target))}
-        parts: list[Text] = []
-        for text, atom, fill, clear in _KEY:
-            site = np.array([[atom]])
-            target = TargetPattern(np.array([[fill]]), np.array([[clear]]))
-            if int(site_kinds(site, target)[0, 0]) in shown:
-                parts.append(Text.assemble(draw_array(site, target, 0, DENSE, self.glyphs)[0], f" {text}"))
-        return Text("   ").join(parts)
-
-    @property
-    def _arrangement(self) -> tuple[bool, Scale | None]:
-        """Whether the arrays are drawn side by side, and the scale; None if they do not fit."""
-        widths = [(scale, scale.size(*self.target.shape, self.shear != 0)[0]) for scale in (ROOMY, DENSE)]
-        for beside in (True, False):
-            for scale, width in widths:
-                each = max(width + self._margin, LEAST)
-                if (2 * each + GAP if beside else each) <= self.width:
-                    return beside, scale
-        return False, None
-
-    @property
-    def _margin(self) -> int:
-        """Width of the row numbers in characters."""
-        return len(str(self.target.shape[0] - 1)) + 1
-
-    def _draw(self, array: Occupancy, marked: Sites, scale: Scale) -> list[Text]:
-        lines = draw_array(array, self.target, self.shear, scale, self.glyphs)
-        for row, col in marked.tolist():
-            line, at = lines[row], self._column(row, col, scale)
-            line.pad_right(max(0, at + 1 - line.cell_len))
-            line.stylize("reverse", at, at + 1)
-        return lines
-
-    def _column(self, row: int, col: int, scale: Scale) -> int:
-        """The column of a site in its line of text."""
-        return scale.indent(row, self.target.shape[0], self.shear) + col * scale.cell
-
-    def _numbered(self, lines: list[Text], scale: Scale) -> list[Text]:
-        """Number the rows on the left, and every fifth column above the first row."""
-        head = ""
-        for col in range(0, self.target.shape[1], 5):
-            head = head.ljust(self._margin + self._column(0, col, scale)) + str(col)
-        width = self._margin + scale.size(*self.target.shape, self.shear != 0)[0]
-        numbered = [Text(head if len(head) <= width else head.rstrip("0123456789"), "dim")]
-        for i, line in enumerate(lines):
-            number = f"{i:>{self._margin - 1}} "
-            numbered.append(Text.assemble((number, "dim"), line))
-        return numbered
-
-
-@dataclass(frozen=True, slots=True)
-class Steps:
-    """The description of each batch.
-
-    Attributes:
+    Args:
         moves: The plan.
-        canvas: Draws the array.
+        canvas: Draws the arrays before and after.
         arrow: Printed between the ends of a move.
     """
-
-    moves: PlannedMoves
-    canvas: Canvas
-    arrow: str
-
-    def __iter__(self) -> Iterator[list[Text]]:
-        plan, shape = self.moves.plan, self.moves.grid.shape
-        arrays = occupancies(plan, self.moves.occupancy)
-        for i, batch in enumerate(plan.batches):
-            landed = batch.to_sites[on_grid(batch.to_sites, shape)]
-            drawn = self.canvas.pair(("before", "after"), arrays[i : i + 2], (batch.from_sites, landed))
-            yield [
-                Text.assemble((f"batch {i + 1} of {plan.n_batches}", "bold"), "  ", self._words(i, batch)),
-                *(Text(f"  {line}") for line in moves_text(batch, shape, self.arrow)),
-                *drawn,
-            ]
-
-    def _words(self, index: int, batch: Batch) -> str:
-        report = self.moves.report
-        n_ejected = int(np.count_nonzero(~on_grid(batch.to_sites, self.moves.grid.shape)))
+    plan, report, shape = moves.plan, moves.report, moves.grid.shape
+    arrays = occupancies(plan, moves.occupancy)
+    for i, batch in enumerate(plan.batches):
+        stays = on_grid(batch.to_sites, shape)
+        n_ejected = int(np.count_nonzero(~stays))
         parts = [
             plural(len(batch), "atom") + (f", {n_ejected} ejected" if n_ejected else ""),
-            plural(int(report.n_tweezers[index]), "tweezer"),
-            f"done at {format_quantity(float(report.batch_end_s[index]), 'time')}",
+            plural(int(report.n_tweezers[i]), "tweezer"),
+            f"done at {format_quantity(float(report.batch_end_s[i]), 'time')}",
         ]
         if batch.linked:
             parts.append("with the tweezers still on from the previous batch")
-        return ", ".join(parts)
+        marked = batch.from_sites, batch.to_sites[stays]
+        yield [
+            Text.assemble((f"batch {i + 1} of {plan.n_batches}", "bold"), "  ", ", ".join(parts)),
+            *(Text(f"  {line}") for line in moves_text(batch, shape, arrow)),
+            *canvas.lines(("before", "after"), arrays[i : i + 2], marked),
+        ]
 
 
 def moves_text(batch: Batch, shape: tuple[int, int], arrow: str = "->") -> list[str]:
@@ -319,13 +191,13 @@ def print_plan(moves: PlannedMoves, stream: TextIO, *, step: bool) -> None:
 def _print_all(console: Console, moves: PlannedMoves, *, step: bool) -> None:
     width = console.width if console.is_terminal else PLAIN_WIDTH
     shear = moves.grid.shear if moves.grid.lattice == "triangular" else 0
-    canvas = Canvas(moves.target, shear, width, glyphs_for(console.encoding))
+    canvas = ArrayPair(moves.target, shear, width, glyphs_for(console.encoding))
     _print(console, *map(Text, columns(subject(moves))), Text())
     if step:
         arrow = "→" if encodes(console.encoding, "→") else "->"
-        _print_steps(console, Steps(moves, canvas, arrow))
+        _print_steps(console, batch_lines(moves, canvas, arrow))
     before, after = moves.occupancy, moves.report.predicted
-    _print(console, *canvas.pair(("before", "after"), (before, after)), Text())
+    _print(console, *canvas.lines(("before", "after"), (before, after)), Text())
     if key := canvas.key(before, after):
         _print(console, key, Text())
     _print(console, *map(Text, columns(totals(moves))))

@@ -5,8 +5,7 @@ import pytest
 from hypothesis import example, given, settings, strategies as st
 from rich.text import Text
 
-from labseq.cli.arrays import ASCII, UNICODE, Glyphs
-from labseq.cli.plan import Canvas
+from labseq.cli.arrays import ASCII, UNICODE, ArrayPair, Glyphs
 from labseq.model import Occupancy, TargetPattern
 from labseq.testing.strategies import cases
 
@@ -18,12 +17,12 @@ def plain(lines: list[Text]) -> list[str]:
     return [line.plain.rstrip() for line in lines]
 
 
-def canvas(width: int = 100, shear: int = 0, glyphs: Glyphs = ASCII) -> Canvas:
-    return Canvas(TARGET, shear, width, glyphs)
+def canvas(width: int = 100, shear: int = 0, glyphs: Glyphs = ASCII) -> ArrayPair:
+    return ArrayPair(TARGET, shear, width, glyphs)
 
 
 def test_two_arrays_side_by_side() -> None:
-    lines = canvas().pair(("before", "after"), (OCCUPANCY, ~OCCUPANCY))
+    lines = canvas().lines(("before", "after"), (OCCUPANCY, ~OCCUPANCY))
     assert plain(lines) == [
         "before      after",
         "  0           0",
@@ -42,15 +41,15 @@ def test_two_arrays_side_by_side() -> None:
     ],
 )
 def test_arrays_shrink_then_stand_below_one_another_then_go(width: int, expected: list[str]) -> None:
-    assert plain(canvas(width).pair(("before", "after"), (OCCUPANCY, ~OCCUPANCY))) == expected
+    assert plain(canvas(width).lines(("before", "after"), (OCCUPANCY, ~OCCUPANCY))) == expected
 
 
 def test_rows_are_sheared_as_on_the_lattice() -> None:
-    assert plain(canvas(shear=1).pair(("a", "b"), (OCCUPANCY, OCCUPANCY)))[2:] == [
+    assert plain(canvas(shear=1).lines(("a", "b"), (OCCUPANCY, OCCUPANCY)))[2:] == [
         "0 @ o .      0 @ o .",
         "1  x   .     1  x   .",
     ]
-    assert plain(canvas(shear=-1).pair(("a", "b"), (OCCUPANCY, OCCUPANCY)))[2:] == [
+    assert plain(canvas(shear=-1).lines(("a", "b"), (OCCUPANCY, OCCUPANCY)))[2:] == [
         "0  @ o .     0  @ o .",
         "1 x   .      1 x   .",
     ]
@@ -74,7 +73,7 @@ def test_no_line_is_wider_than_the_screen(
 ) -> None:
     target, occupancy = case
     every_site = np.argwhere(np.ones(target.shape)).astype(np.int16)
-    lines = Canvas(target, shear, width, glyphs).pair(
+    lines = ArrayPair(target, shear, width, glyphs).lines(
         ("before", "after"), (occupancy, occupancy), (every_site, every_site)
     )
     assert max(len(line) for line in plain(lines)) <= width or len(lines) == 1
@@ -83,7 +82,7 @@ def test_no_line_is_wider_than_the_screen(
 @pytest.mark.parametrize(("width", "shear"), [(100, 1), (100, -1), (22, 0), (8, 0)])
 def test_marked_sites_are_inverted(width: int, shear: int) -> None:
     marked = np.array([[1, 2], [0, 0]], np.int16), np.array([[1, 1]], np.int16)
-    lines = canvas(width, shear).pair(("before", "after"), (OCCUPANCY, OCCUPANCY), marked)
+    lines = canvas(width, shear).lines(("before", "after"), (OCCUPANCY, OCCUPANCY), marked)
     found = [
         line.plain[span.start : span.end] for line in lines for span in line.spans if span.style == "reverse"
     ]
@@ -92,7 +91,7 @@ def test_marked_sites_are_inverted(width: int, shear: int) -> None:
 
 def test_columns_are_numbered_where_they_stand() -> None:
     target = TargetPattern(np.ones((1, 12), np.bool_), np.zeros((1, 12), np.bool_))
-    head, row = plain(Canvas(target, 0, 200, ASCII).pair(("a", "b"), (target.fill, target.fill)))[1:3]
+    head, row = plain(ArrayPair(target, 0, 200, ASCII).lines(("a", "b"), (target.fill, target.fill)))[1:3]
     assert [row[head.index(number)] for number in ("0", "5", "10")] == ["@", "@", "@"]
     assert row[: head.index("10")].count("@") == 10
 
@@ -103,5 +102,5 @@ def test_the_key_explains_what_occurs() -> None:
     )
     assert canvas().key(TARGET.fill).plain == "@ atom on a target site"
     nothing = np.zeros_like(OCCUPANCY)
-    assert Canvas(TargetPattern(nothing, nothing), 0, 80, ASCII).key(nothing).plain == ""
+    assert ArrayPair(TargetPattern(nothing, nothing), 0, 80, ASCII).key(nothing).plain == ""
     assert canvas(4).key(OCCUPANCY).plain == ""
