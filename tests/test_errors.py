@@ -37,7 +37,7 @@ def test_a_problem_from_an_option_has_no_line():
     assert str(Problem("bad", "--set shots=x")) == "--set shots=x: bad"
 
 
-def test_all_problems_are_told():
+def test_all_problems_are_reported():
     error = ConfigError([Problem("one", "a", 1, 1), Problem("two", "a", 2, 1)])
     assert str(error) == "a:1:1: one\na:2:1: two"
     assert len(error.problems) == 2

@@ -81,11 +81,11 @@ def test_a_run_that_does_not_come_out_the_same_exits_with_1(run, capsys, monkeyp
     assert capsys.readouterr().out.splitlines()[-1].startswith("NOT REPRODUCED: ")
 
 
-def test_plans_that_break_a_rule_are_told(run, capsys):
+def test_plans_that_break_a_rule_are_reported(run, capsys):
     assert replayed(run, planner="wrong", shots="2") == 0
-    told = capsys.readouterr()
-    assert "INVALID: 2 of 2 (100.0 %)" in told.out
-    assert re.match(r"shot 2, cycle 1: planner 'wrong': batch 1.* breaks the rule", told.err)
+    printed = capsys.readouterr()
+    assert "INVALID: 2 of 2 (100.0 %)" in printed.out
+    assert re.match(r"shot 2, cycle 1: planner 'wrong': batch 1.* breaks the rule", printed.err)
 
 
 def test_sites_that_differ_are_drawn(run, capsys):
@@ -109,7 +109,7 @@ def test_everything_is_written_as_json(run, tmp_path, capsys):
     assert values["planner"]["replayed"]["n_plans"] == 4
 
 
-def test_an_analysis_is_made_up_and_told(run, capsys):
+def test_an_analysis_is_made_up_and_reported(run, capsys):
     assert analyse_run(run.path, "survival", ["atoms=moved"], again=False) == 0
     path = run.path / "analysis" / "survival.jsonl"
     assert capsys.readouterr().out == f"survival: 2 shots analysed; see {path}\n"

@@ -52,7 +52,7 @@ def test_each_picture_has_a_name_of_its_own(
 
 
 @pytest.mark.parametrize(
-    ("request_", "output", "told"),
+    ("request_", "output", "printed"),
     [
         (PlotRequest(what="x"), "a.png", "no picture 'x' of a run; expected one of 'defects', 'filling'"),
         (PlotRequest(), "a.bmp", "no name of a PNG or SVG or PDF file"),
@@ -62,15 +62,15 @@ def test_each_picture_has_a_name_of_its_own(
         (PlotRequest(cycle=1), "a.png", "--cycle: a cycle belongs to a shot; expected --shot as well"),
     ],
 )
-def test_what_cannot_be_drawn_is_told(
-    run_dir: Path, tmp_path: Path, request_: PlotRequest, output: str, told: str
+def test_what_cannot_be_drawn_is_reported(
+    run_dir: Path, tmp_path: Path, request_: PlotRequest, output: str, printed: str
 ) -> None:
     with pytest.raises(ConfigError) as caught:
         plot_run(run_dir, request_, tmp_path / output)
-    assert told in str(caught.value)
+    assert printed in str(caught.value)
     assert not list(tmp_path.iterdir())
 
 
-def test_what_is_no_run_is_told(tmp_path: Path) -> None:
+def test_a_missing_run_is_reported(tmp_path: Path) -> None:
     with pytest.raises(ConfigError):
         plot_run(tmp_path, PlotRequest(), tmp_path / "a.png")

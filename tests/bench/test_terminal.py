@@ -94,7 +94,7 @@ def test_a_figure_is_drawn_where_one_stands(
     assert "the paper, figure 2b: PSCA 0.48(2), modified LSAP 1.16(1)" in out
 
 
-def test_wrong_plans_are_told_with_a_way_to_see_one(
+def test_wrong_plans_are_reported_with_a_way_to_see_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "moody.py").write_text(MOODY, "utf-8")
@@ -112,7 +112,7 @@ def test_wrong_plans_are_told_with_a_way_to_see_one(
         plan_moves(request)
 
 
-def test_too_few_atoms_are_told(capsys: pytest.CaptureFixture[str]) -> None:
+def test_too_few_atoms_are_reported(capsys: pytest.CaptureFixture[str]) -> None:
     assert code_of(*SMALL, "--loading", "30 %") == 0
     assert "loadings hold fewer atoms than compact:5x5 has sites" in capsys.readouterr().out
 

@@ -127,14 +127,14 @@ def test_one_in_detail(store: Store, capsys: pytest.CaptureFixture[str]) -> None
     origin = {"command": "labseq calibrate overlay", "calibrations": {"frequencies": "abc"}}
     stored = add(store, values={"offset_m": [1.5e-7, -2e-8]}, origin=origin)
     code, out, _ = call(capsys, "show", stored.entry.id[:4])
-    told = {line.split()[0]: line.split(maxsplit=1)[1] for line in out.splitlines()}
+    printed = {line.split()[0]: line.split(maxsplit=1)[1] for line in out.splitlines()}
     assert code == 0
-    assert told["calibration"] == f"overlay {stored.entry.id}"
-    assert told["offset_m"] == "150 nm, -20 nm"
-    assert told["quality.error_m"] == "20 nm"
-    assert told["origin.calibrations"] == "frequencies abc"
-    assert told["picture"] == str(stored.picture)
-    assert told["grid"] == "4 x 5 sites, triangular, 4.49 um, shear +1"
+    assert printed["calibration"] == f"overlay {stored.entry.id}"
+    assert printed["offset_m"] == "150 nm, -20 nm"
+    assert printed["quality.error_m"] == "20 nm"
+    assert printed["origin.calibrations"] == "frequencies abc"
+    assert printed["picture"] == str(stored.picture)
+    assert printed["grid"] == "4 x 5 sites, triangular, 4.49 um, shear +1"
 
 
 def test_many_numbers_are_summed_up(store: Store, capsys: pytest.CaptureFixture[str]) -> None:
@@ -167,7 +167,10 @@ def test_putting_to_use_and_aside(store: Store, capsys: pytest.CaptureFixture[st
     assert code == 2
     assert "its error_m is 1e-06, that of the one in use 2e-08; use it nevertheless with --force" in err
     assert call(capsys, "use", worse.entry.id, "--force")[0] == 0
-    assert call(capsys, "use", "overlay=off")[:2] == (0, "no calibration of overlay is in use from the next run on\n")
+    assert call(capsys, "use", "overlay=off")[:2] == (
+        0,
+        "no calibration of overlay is in use from the next run on\n",
+    )
     assert [one.id for one in store.history()] == [good.entry.id, worse.entry.id, ""]
 
 
@@ -196,9 +199,9 @@ def test_what_changed(store: Store, capsys: pytest.CaptureFixture[str]) -> None:
     assert lines[3] == ["offset_m", "40", "nm", "35.4", "nm", "30", "nm,", "-40", "nm"]
     assert lines[6] == ["error_m", "20", "nm", "10", "nm"]
     _, out, _ = call(capsys, "diff", one.entry.id, other.entry.id, "--json")
-    told = json.loads(out)
-    assert told["values"][0]["mean"] == pytest.approx([3e-8, -4e-8])
-    assert told["quality"][0]["after"] == 1e-8
+    printed = json.loads(out)
+    assert printed["values"][0]["mean"] == pytest.approx([3e-8, -4e-8])
+    assert printed["quality"][0]["after"] == 1e-8
 
 
 def test_different_kinds_are_not_compared(store: Store, capsys: pytest.CaptureFixture[str]) -> None:
@@ -213,9 +216,9 @@ def test_check_lists_what_is_in_use(store: Store) -> None:
     store.use(stored, GRID)
     Path("look.yaml").write_text(SEQUENCE, "utf-8")
     command = [sys.executable, "-m", "labseq", "check", "look.yaml"]
-    told = subprocess.run(command, capture_output=True, encoding="utf-8", check=True).stdout
-    (line,) = (line for line in told.splitlines() if line.startswith("calibration "))
+    printed = subprocess.run(command, capture_output=True, encoding="utf-8", check=True).stdout
+    (line,) = (line for line in printed.splitlines() if line.startswith("calibration "))
     assert re.fullmatch(rf"calibration  overlay {stored.entry.id}, \d+ \w+ old, error 20 nm", line)
-    told = subprocess.run([*command, "--json"], capture_output=True, encoding="utf-8", check=True).stdout
-    (told_of,) = json.loads(told)["calibrations"]
-    assert (told_of["kind"], told_of["id"]) == ("overlay", stored.entry.id)
+    printed = subprocess.run([*command, "--json"], capture_output=True, encoding="utf-8", check=True).stdout
+    (entry,) = json.loads(printed)["calibrations"]
+    assert (entry["kind"], entry["id"]) == ("overlay", stored.entry.id)

@@ -48,7 +48,7 @@ def call(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str,
     return code, out, err
 
 
-def test_what_was_found_is_told_and_kept(store: Store, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_was_found_is_reported_and_kept(store: Store, capsys: pytest.CaptureFixture[str]) -> None:
     code, out, err = call(capsys, "sites", "--shots", "20")
     stored = store.entry_in_use("sites")
     assert code == 0
@@ -65,7 +65,7 @@ def test_what_was_found_is_told_and_kept(store: Store, capsys: pytest.CaptureFix
     assert f"compared with {stored.entry.id}, which was in use:" in out
 
 
-def test_a_worse_one_is_kept_and_told(store: Store, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_worse_one_is_kept_and_reported(store: Store, capsys: pytest.CaptureFixture[str]) -> None:
     better = store.add(fake_calibration("sites", GRID, quality={"residual_px": 1e-3, "n_sites_found": 40}))
     store.use(better, GRID)
     code, out, err = call(capsys, "sites", "--shots", "20")
@@ -119,9 +119,9 @@ def test_the_outcome_as_json(store: Store) -> None:
         "--json",
     ]
     done = subprocess.run(command, capture_output=True, encoding="utf-8", check=True)
-    told = json.loads(done.stdout)
+    printed = json.loads(done.stdout)
     stored = store.entry_in_use("sites")
     assert stored is not None
-    assert (told["id"], told["in_use"], told["refused"]) == (stored.entry.id, True, None)
-    assert told["quality"]["n_sites_found"] == 36
-    assert Path(told["run_dir"]).is_dir()
+    assert (printed["id"], printed["in_use"], printed["refused"]) == (stored.entry.id, True, None)
+    assert printed["quality"]["n_sites_found"] == 36
+    assert Path(printed["run_dir"]).is_dir()

@@ -45,7 +45,7 @@ shot:
 
 
 @pytest.fixture(scope="module")
-def told(tmp_path_factory: pytest.TempPathFactory) -> tuple[labseq.Run, list[str]]:
+def printed(tmp_path_factory: pytest.TempPathFactory) -> tuple[labseq.Run, list[str]]:
     """A run, and the lines that it printed."""
     folder = tmp_path_factory.mktemp("climbs")
     (folder / "p.yaml").write_text(PROFILE, "utf-8")
@@ -55,8 +55,8 @@ def told(tmp_path_factory: pytest.TempPathFactory) -> tuple[labseq.Run, list[str
         return session.run(), stream.getvalue().splitlines()
 
 
-def test_each_point_is_told_with_the_best_so_far(told: tuple[labseq.Run, list[str]]) -> None:
-    lines = [line for line in told[1] if line.startswith("point ")]
+def test_each_point_is_reported_with_the_best_so_far(printed: tuple[labseq.Run, list[str]]) -> None:
+    lines = [line for line in printed[1] if line.startswith("point ")]
     assert len(lines) == 5
     assert lines[0].startswith(f"point 1 ({DOP} 2, shot.2.rearrange.window 60 ms): filling_fraction ")
     assert lines[0].endswith("best so far this")
@@ -64,27 +64,29 @@ def test_each_point_is_told_with_the_best_so_far(told: tuple[labseq.Run, list[st
 
 
 def test_the_table_has_the_points_in_the_order_in_which_they_were_chosen(
-    told: tuple[labseq.Run, list[str]], capfd: pytest.CaptureFixture[str]
+    printed: tuple[labseq.Run, list[str]], capfd: pytest.CaptureFixture[str]
 ) -> None:
-    show_run(told[0].path, as_json=False, tables=Tables(scan=True))
+    show_run(printed[0].path, as_json=False, tables=Tables(scan=True))
     header, first, *rest = capfd.readouterr().out.splitlines()
     assert header.split()[:3] == [DOP, "shot.2.rearrange.window", "shots"]
     assert first.split()[:4] == ["2", "60", "ms", "2"]
     assert len(rest) == 4
-    show_run(told[0].path, as_json=True)
+    show_run(printed[0].path, as_json=True)
     points = json.loads(capfd.readouterr().out)["points"]
     assert points[0]["parameters"] == {DOP: 2, "shot.2.rearrange.window": 0.06}
     assert sum(point["shots"] for point in points) == 10
 
 
-def test_a_view_in_another_process_learns_the_points_and_the_best(told: tuple[labseq.Run, list[str]]) -> None:
-    reader = EventReader(told[0])
+def test_a_view_in_another_process_learns_the_points_and_the_best(
+    printed: tuple[labseq.Run, list[str]],
+) -> None:
+    reader = EventReader(printed[0])
     tally, lines = Tally(reader.now), list[str]()
     for name, values in reader.read():
         tally.add(name, values)
         lines.append(event_text(name, values, tally.record))
     assert [line for line in lines if line.startswith("point ")] == [
-        line for line in told[1] if line.startswith("point ")
+        line for line in printed[1] if line.startswith("point ")
     ]
     assert tally.scan is not None
     points = tally.scan.points()
@@ -98,11 +100,11 @@ def test_a_view_in_another_process_learns_the_points_and_the_best(told: tuple[la
     assert ", point " in tally.best
 
 
-def test_a_run_that_is_exported_has_its_points(told: tuple[labseq.Run, list[str]], tmp_path: Path) -> None:
-    export_run(told[0], "csv", tmp_path / "t.csv")
+def test_a_run_that_is_exported_has_its_points(printed: tuple[labseq.Run, list[str]], tmp_path: Path) -> None:
+    export_run(printed[0], "csv", tmp_path / "t.csv")
     with (tmp_path / "t.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
-    assert [int(row[DOP]) for row in rows] == [shot.parameters[DOP] for shot in told[0].shots]
+    assert [int(row[DOP]) for row in rows] == [shot.parameters[DOP] for shot in printed[0].shots]
     with (tmp_path / "t.units.csv").open(encoding="utf-8") as file:
         units = {row[0]: row[1] for row in csv.reader(file)}
     assert units["shot.2.rearrange.window"] == "s"

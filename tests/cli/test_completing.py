@@ -15,7 +15,7 @@ from labseq.registry import KINDS
 
 
 def completed(line: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> list[str]:
-    """What bash is told for a line whose last word is not finished."""
+    """The completions that bash gets for a line whose last word is not finished."""
     monkeypatch.setenv("_LABSEQ_COMPLETE", "complete_bash")
     monkeypatch.setenv("COMP_WORDS", line)
     monkeypatch.setenv("COMP_CWORD", str(len(line.split(" ")) - 1))

@@ -83,7 +83,7 @@ def test_a_folder_that_cannot_be_written_to() -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "printed"),
     [
         (["--copy", ".", "--shots", "3"], "it runs nothing; leave out --shots and --output"),
         (["--copy", ".", "--output", "x"], "it runs nothing"),
@@ -91,7 +91,7 @@ def test_a_folder_that_cannot_be_written_to() -> None:
         (["compact_225"], "unexpected extra argument"),
     ],
 )
-def test_mistakes(arguments: list[str], told: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_mistakes(arguments: list[str], printed: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("demo", *arguments) == 2
-    assert told in capsys.readouterr().err
+    assert printed in capsys.readouterr().err
     assert list(Path().iterdir()) == []

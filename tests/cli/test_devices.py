@@ -82,7 +82,7 @@ def rows(out: str) -> dict[str, str]:
     return {line.split()[0]: line for line in out.splitlines()[1:]}
 
 
-def test_a_device_that_is_fine_is_told_with_model_serial_number_and_firmware(
+def test_a_device_that_is_fine_is_reported_with_model_serial_number_and_firmware(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     write("fine")
@@ -99,15 +99,15 @@ def test_a_device_that_is_fine_is_told_with_model_serial_number_and_firmware(
     ("method", "says"),
     [("open", ""), ("describe", ""), ("self_test", ""), ("safe_state", "NOT SAFE: "), ("close", "closed: ")],
 )
-def test_a_device_that_fails_is_told_with_its_reason_and_the_others_are_fine(
+def test_a_device_that_fails_is_reported_with_its_reason_and_the_others_are_fine(
     method: str, says: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     write(f"no_{method}")
     assert show_devices("./p.yaml", (), "off", as_json=False) == 3
-    told = rows(capsys.readouterr().out)
-    assert f"{says}shutter: " in told["shutter"]
-    assert told["shutter"].endswith("raised OSError: jammed")
-    assert all(" ok" in told[name] for name in OTHERS)
+    printed = rows(capsys.readouterr().out)
+    assert f"{says}shutter: " in printed["shutter"]
+    assert printed["shutter"].endswith("raised OSError: jammed")
+    assert all(" ok" in printed[name] for name in OTHERS)
 
 
 def test_a_device_that_cannot_be_constructed_is_a_fault_of_the_profile(
@@ -115,13 +115,13 @@ def test_a_device_that_cannot_be_constructed_is_a_fault_of_the_profile(
 ) -> None:
     write("refusing")
     assert show_devices("./p.yaml", (), "off", as_json=False) == 2
-    told = rows(capsys.readouterr().out)
-    assert "p.yaml:10:12: " in told["shutter"]
-    assert "raised OSError: no port" in told["shutter"]
-    assert all(" ok" in told[name] for name in OTHERS)
+    printed = rows(capsys.readouterr().out)
+    assert "p.yaml:10:12: " in printed["shutter"]
+    assert "raised OSError: no port" in printed["shutter"]
+    assert all(" ok" in printed[name] for name in OTHERS)
 
 
-def test_after_a_stop_the_devices_that_were_tried_are_told(
+def test_after_a_stop_the_devices_that_were_tried_are_reported(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     stopped = StopRequested(2)
@@ -140,7 +140,7 @@ def as_json(*arguments: str) -> tuple[int, dict[str, Any]]:
 
 
 @pytest.mark.system
-def test_json_tells_all_that_a_device_says_of_itself() -> None:
+def test_json_reports_all_that_a_device_says_of_itself() -> None:
     write("fine")
     code, answer = as_json("./p.yaml", "--dry-run")
     assert code == 0
@@ -164,7 +164,7 @@ def test_json_tells_all_that_a_device_says_of_itself() -> None:
 
 
 @pytest.mark.system
-def test_json_tells_what_is_wrong_with_a_profile() -> None:
+def test_json_reports_what_is_wrong_with_a_profile() -> None:
     write("gone")
     code, answer = as_json("./p.yaml")
     assert (code, answer["problems"][0]["what"]) == (2, "unknown device 'gone'")

@@ -27,12 +27,12 @@ def called(*arguments: str) -> int:
     return int(str(ended.value.code or 0))
 
 
-def test_what_is_well_is_told_in_two_lines(run_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_intact_run_takes_two_lines(run_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert called() == called(str(run_dir)) == 0
     assert capsys.readouterr().out == "1 run checked, 2 shots intact\nno damage found\n" * 2
 
 
-def test_a_dry_run_tells_what_there_is_to_do(run_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_dry_run_only_reports(run_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
     part = run_dir / "shots" / "shot_000002.h5.part"
     part.touch()
     assert called("--dry-run") == 1
@@ -44,7 +44,7 @@ def test_a_dry_run_tells_what_there_is_to_do(run_dir: Path, capsys: pytest.Captu
     assert part.exists()
 
 
-def test_what_is_put_right_is_told(run_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_repaired_is_reported(run_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (run_dir / "shots" / "shot_000002.h5.part").touch()
     (run_dir / "run.json.part").touch()
     assert called(str(run_dir)) == 0
@@ -62,13 +62,13 @@ def test_what_is_left_makes_the_exit_code(run_dir: Path, capsys: pytest.CaptureF
     assert out.endswith("1 defect found: 0 repaired, 1 left\n")
 
 
-def test_runs_in_progress_are_told(run_dir: Path, fake: Any, capsys: pytest.CaptureFixture[str]) -> None:
+def test_runs_in_progress_are_reported(run_dir: Path, fake: Any, capsys: pytest.CaptureFixture[str]) -> None:
     RunWriter.create(run_dir.parents[1], fake.run())
     assert called() == 0
     assert "1 run in progress not checked" in capsys.readouterr().out
 
 
-def test_findings_are_told_as_json(run_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_findings_are_reported_as_json(run_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (run_dir / "run.json.part").touch()
     assert called("--json") == 0
     (found,) = json.loads(capsys.readouterr().out)["findings"]
@@ -80,7 +80,9 @@ def test_findings_are_told_as_json(run_dir: Path, capsys: pytest.CaptureFixture[
     }
 
 
-def test_of_very_many_findings_the_first_are_told(run_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_of_very_many_findings_the_first_are_reported(
+    run_dir: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     for number in range(MAX_ROWS + 5):
         (run_dir / "shots" / f"{number}.part").touch()
     assert called("--dry-run") == 1

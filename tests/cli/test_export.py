@@ -58,7 +58,7 @@ def test_a_file_that_is_there_is_replaced_by_force_only(
         (("-o", "no/a.csv"), "there is no such folder"),
     ],
 )
-def test_what_cannot_be_exported_is_told(
+def test_what_cannot_be_exported_is_reported(
     run_dir: Path, arguments: tuple[str, ...], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert called(*arguments) == 2
@@ -67,25 +67,25 @@ def test_what_cannot_be_exported_is_told(
 
 
 @pytest.mark.parametrize(
-    ("status", "told"),
+    ("status", "printed"),
     [
         (None, "warning: the run is still in progress; exported are the 1 shot of 2 taken so far\n"),
         ("stopped", "warning: the run did not complete (stopped); exported are 1 shot of 2\n"),
     ],
 )
 def test_a_run_that_did_not_complete_is_exported_as_far_as_it_came(
-    run_dir: Path, fake: Any, status: Any, told: str, capsys: pytest.CaptureFixture[str]
+    run_dir: Path, fake: Any, status: Any, printed: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     writer = RunWriter.create(run_dir.parents[1], fake.run(n_shots=2))
     writer.write_shot(fake.shot(0))
     if status is not None:
         writer.finish(status)
     assert called("-o", "a.csv") == 0
-    assert capsys.readouterr().err == told
+    assert capsys.readouterr().err == printed
     assert len(Path("a.csv").read_text("utf-8").splitlines()) == 2
 
 
-def test_shots_left_out_of_an_archive_are_told(run_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_shots_left_out_of_an_archive_are_reported(run_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (run_dir / "shots" / "shot_000001.h5").unlink()
     assert called("--to", "archive", "-o", "a.h5") == 1
     captured = capsys.readouterr()

@@ -75,7 +75,7 @@ def test_only_debug_shows_the_traceback(debug: bool, capsys: pytest.CaptureFixtu
     assert err.endswith("error: no plan\n")
 
 
-def test_of_very_many_problems_the_first_are_told(capsys: pytest.CaptureFixture[str]) -> None:
+def test_of_very_many_problems_the_first_are_reported(capsys: pytest.CaptureFixture[str]) -> None:
     assert report(ConfigError([Problem(f"wrong {i}") for i in range(MAX_REPORTED + 3)])) == 2
     lines = capsys.readouterr().err.splitlines()
     assert lines[-2:] == [f"error: wrong {MAX_REPORTED - 1}", "and 3 more problems"]

@@ -28,7 +28,7 @@ def test_a_run_in_lines(fake: Any) -> None:
     ]
 
 
-def test_what_goes_wrong_is_told(fake: Any) -> None:
+def test_what_goes_wrong_is_reported(fake: Any) -> None:
     failed = fake.shot(status="failed", error="TransientError: no light", attempt=1)
     events = [
         ("warning", {"text": "the laser is warm"}),
@@ -61,7 +61,7 @@ def test_what_goes_wrong_is_told(fake: Any) -> None:
         ({"success": False, "seen": 0, "filling": math.nan}, "not judged: no image"),
     ],
 )
-def test_a_shot_in_words(fake: Any, changes: Any, words: str) -> None:
+def test_a_shot_as_text(fake: Any, changes: Any, words: str) -> None:
     text = event_text("shot_finished", {"shot": fake.shot(2, **changes)}, fake.run())
     assert text == f"shot 3/20  {words}  1.9 s"
 
@@ -71,7 +71,7 @@ def test_a_shot_that_was_interrupted_needs_no_reason(fake: Any) -> None:
     assert event_text("shot_finished", {"shot": shot}, fake.run()) == "shot 1/20  interrupted"
 
 
-def test_missing_atoms_are_told(fake: Any) -> None:
+def test_missing_atoms_are_reported(fake: Any) -> None:
     shot = fake.shot(0, success=False, seen=0, filling=0.9)
     shot.n_missing_atoms = 3
     assert "3 atoms too few loaded" in event_text("shot_finished", {"shot": shot}, fake.run())

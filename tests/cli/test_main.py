@@ -104,7 +104,7 @@ def test_ctrl_c_outside_of_a_run(monkeypatch: pytest.MonkeyPatch) -> None:
     assert code_of("show", "x") == 130
 
 
-def test_wrong_numbers_of_shots_and_seeds_are_told_as_all_other_settings(
+def test_wrong_numbers_of_shots_and_seeds_are_reported_as_all_other_settings(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     assert code_of("run", str(SEQUENCE), "--shots", "0", "--seed", "-1") == 2

@@ -45,7 +45,7 @@ def test_say_prints_whole_lines() -> None:
     assert stream.getvalue() == "a\nb\n"
 
 
-def test_say_tells_when_nothing_can_be_written(tmp_path: Path) -> None:
+def test_say_reports_when_nothing_can_be_written(tmp_path: Path) -> None:
     path = tmp_path / "out"
     path.touch()
     with path.open(encoding="utf-8") as stream, pytest.raises(RecordingError, match="out: cannot be written"):
@@ -83,7 +83,7 @@ def test_a_reader_that_went_away_is_no_error(command: str, buffered: bool) -> No
 
 @pytest.mark.skipif(not FULL.exists(), reason="no full device")
 @pytest.mark.parametrize(("command", "buffered"), [*COMMANDS, ("--help", True)])
-def test_a_full_disk_is_told_in_a_line(command: str, buffered: bool) -> None:
+def test_a_full_disk_is_reported_in_a_line(command: str, buffered: bool) -> None:
     with FULL.open("w", encoding="utf-8") as full:
         done = perform(command, full.fileno(), buffered)
     assert done.returncode == 1

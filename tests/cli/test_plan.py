@@ -56,7 +56,7 @@ def test_a_plan_without_a_terminal_is_plain_text(moves: PlannedMoves) -> None:
     assert all(line == line.rstrip() for line in lines)
 
 
-def test_each_batch_is_told_on_request(moves: PlannedMoves) -> None:
+def test_each_batch_is_reported_on_request(moves: PlannedMoves) -> None:
     text = printed(moves, step=True)
     n = moves.plan.n_batches
     assert [f"batch {i + 1} of {n}  " in text for i in range(n)] == [True] * n
@@ -116,7 +116,7 @@ def test_the_title_of_a_picture(moves: PlannedMoves) -> None:
     assert title(nothing).endswith("compact 3 x 3, 0 batches, 0 atom moves, 0 s")
 
 
-def test_what_falls_short_is_told() -> None:
+def test_what_falls_short_is_reported() -> None:
     short = PlanRequest("random:6x6@0.2", "compact:4x4", seed=3, degree_of_parallelism=30)
     moves = plan_moves(short)
     n_atoms = int(moves.occupancy.sum())
@@ -145,7 +145,7 @@ def labseq_register(registry):
 """
 
 
-def test_a_planner_that_leaves_defects_and_surplus_is_told(
+def test_a_planner_that_leaves_defects_and_surplus_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "lazy.py").write_text(LAZY, "utf-8")
@@ -159,7 +159,9 @@ def test_a_planner_that_leaves_defects_and_surplus_is_told(
     assert ("surplus", f"{moves.report.n_surplus} atoms on sites that must be empty") in totals(moves)
 
 
-def test_json_in_a_file_stands_beside_the_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_json_in_a_file_is_printed_with_the_report(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = tmp_path / "plan.json"
     plan_once(REQUEST, PlanOutput(json=str(path)))
     out, err = capsys.readouterr()
@@ -170,7 +172,7 @@ def test_json_in_a_file_stands_beside_the_report(tmp_path: Path, capsys: pytest.
 
 
 @pytest.mark.parametrize(("name", "reason"), [("", "Is a directory"), ("gone/plan.json", "No such file")])
-def test_json_that_cannot_be_written_is_told(tmp_path: Path, name: str, reason: str) -> None:
+def test_json_that_cannot_be_written_is_reported(tmp_path: Path, name: str, reason: str) -> None:
     with pytest.raises(ConfigError, match=f"it cannot be written: {reason}"):
         plan_once(REQUEST, PlanOutput(json=str(tmp_path / name)))
 

@@ -66,7 +66,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize(("arguments", "words"), BAD)
-def test_every_mistake_is_told_in_words(
+def test_every_mistake_is_reported_as_text(
     folder: Path,
     arguments: list[str],
     words: str,

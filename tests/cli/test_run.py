@@ -21,7 +21,7 @@ NOTHING = {"run_dir": None, "shots": 0, "defect_free": None, "filling_fraction":
 
 
 class FakeSession:
-    """Records what it was opened with; takes the shots that it was given and then fails, if told to."""
+    """Records its arguments; takes the given shots, then raises the given error, if any."""
 
     def __init__(self, root: Path, run: Any, shots: Any, error: BaseException | None = None) -> None:
         self.root, self.record, self.shots, self.error = root, run, shots, error

@@ -67,7 +67,7 @@ TO_JAMMED = {"shutter: {use: virtual": "shutter: {use: jammed"}
         ({"name: bench": "name: 5"}, 2, [MOBILE, SHUTTER, CAMERA, STATIC]),
     ],
 )
-def test_every_device_is_told_and_the_exit_code_is_that_of_the_worst(
+def test_every_device_is_reported_and_the_exit_code_is_that_of_the_worst(
     changes: dict[str, str], code: int, lines: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     text = PROFILE

@@ -16,12 +16,12 @@ SCAN = ROOT / "sequences" / "scan_dop.yaml"
 PROFILE = str(ROOT / "hardware_profiles" / "virtual.yaml")
 
 
-def test_check_tells_points_shots_and_time(capfd: pytest.CaptureFixture[str]) -> None:
+def test_check_reports_points_shots_and_time(capfd: pytest.CaptureFixture[str]) -> None:
     check_sequence(SCAN, PROFILE, (), "off", as_json=False)
-    told = capfd.readouterr().out
-    assert "4 values of planner.degree_of_parallelism 3 to 15" in told
-    assert "4 points, 10 shots of each, shuffled" in told
-    assert "4 points, 40 shots, " in told
+    printed = capfd.readouterr().out
+    assert "4 values of planner.degree_of_parallelism 3 to 15" in printed
+    assert "4 points, 10 shots of each, shuffled" in printed
+    assert "4 points, 40 shots, " in printed
 
 
 def test_check_says_that_an_option_replaces_the_scan(capfd: pytest.CaptureFixture[str]) -> None:

@@ -116,13 +116,13 @@ def test_show_finds_the_newest_run_itself(
 @pytest.mark.parametrize(
     ("status", "shown"), [("stopped", "stopped"), ("failed", "failed: DeviceError: camera: mute")]
 )
-def test_why_a_run_failed_is_told(fake: Any, tmp_path: Path, status: Any, shown: str) -> None:
+def test_why_a_run_failed_is_reported(fake: Any, tmp_path: Path, status: Any, shown: str) -> None:
     writer = RunWriter.create(tmp_path, fake.run())
     writer.finish(status, "DeviceError: camera: mute")
     assert f"status            {shown}" in summary_lines(open_run(writer.run_dir))
 
 
-def test_damaged_lines_are_told(fake: Any, tmp_path: Path) -> None:
+def test_damaged_lines_are_reported(fake: Any, tmp_path: Path) -> None:
     folder = write_run(tmp_path, fake, [fake.shot(0)])
     index = folder / "index.jsonl"
     index.write_text("{}\n" + index.read_text("utf-8"), "utf-8")
@@ -150,7 +150,9 @@ def skipped(fake: Any, tmp_path: Path) -> Path:
     return writer.run_dir
 
 
-def test_what_was_skipped_is_told_with_the_reasons(skipped: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_was_skipped_is_reported_with_the_reasons(
+    skipped: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     show_run(skipped, as_json=False)
     lines = capsys.readouterr().out.splitlines()
     assert "shots             0 of 8, 8 skipped" in lines
@@ -260,20 +262,21 @@ def test_json_holds_the_same(folder: Path, capsys: pytest.CaptureFixture[str]) -
 
 
 @pytest.mark.parametrize(
-    ("table", "told"), [("scan", "the run has no scan"), ("timing", "no shots yet whose files can be read")]
+    ("table", "printed"),
+    [("scan", "the run has no scan"), ("timing", "no shots yet whose files can be read")],
 )
 @pytest.mark.parametrize("json_wanted", [False, True])
-def test_what_a_run_has_not_is_told(
-    tmp_path: Path, fake: Any, capsys: pytest.CaptureFixture[str], table: str, told: str, json_wanted: bool
+def test_a_table_without_data_is_reported(
+    tmp_path: Path, fake: Any, capsys: pytest.CaptureFixture[str], table: str, printed: str, json_wanted: bool
 ) -> None:
     run_dir = RunWriter.create(tmp_path, fake.run()).run_dir
-    with pytest.raises(ConfigError, match=told):
+    with pytest.raises(ConfigError, match=printed):
         show_run(run_dir, as_json=json_wanted, tables=Tables(**{table: True}))
     out = capsys.readouterr().out
-    assert not json_wanted or told in json.loads(out)["error"]
+    assert not json_wanted or printed in json.loads(out)["error"]
 
 
-def test_devices_that_were_not_opened_are_told(
+def test_devices_that_were_not_opened_are_reported(
     tmp_path: Path, fake: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert shown(RunWriter.create(tmp_path, fake.run()).run_dir, capsys, devices=True) == [

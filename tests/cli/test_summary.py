@@ -55,29 +55,31 @@ def test_success_and_what_was_only_seen_stand_apart() -> None:
 
 
 def test_shots_that_are_not_judged_are_said_not_to_be() -> None:
-    told = lines(defect_free=Rate(0, 0), filling=UNKNOWN, defects=())
-    assert (told["defect-free"], told["filling"]) == (NOT_JUDGED, "-")
-    assert told["defects"] == "none in 1, 1 in 4, 2 in 15 shots, after cycle 1"
+    printed = lines(defect_free=Rate(0, 0), filling=UNKNOWN, defects=())
+    assert (printed["defect-free"], printed["filling"]) == (NOT_JUDGED, "-")
+    assert printed["defects"] == "none in 1, 1 in 4, 2 in 15 shots, after cycle 1"
 
 
 def test_no_shots_are_no_reason_to_complain() -> None:
-    told = lines(n_shots=0, defect_free=Rate(0, 0), seen=Rate(0, 0), filling=UNKNOWN, cycles=(), defects=())
-    assert told == {"defect-free": "0 of 0", "seen defect-free": "0 of 0", "filling": "-"}
+    printed = lines(
+        n_shots=0, defect_free=Rate(0, 0), seen=Rate(0, 0), filling=UNKNOWN, cycles=(), defects=()
+    )
+    assert printed == {"defect-free": "0 of 0", "seen defect-free": "0 of 0", "filling": "-"}
 
 
-def test_the_truth_of_a_simulation_is_told() -> None:
-    told = lines(
+def test_the_truth_of_a_simulation_is_reported() -> None:
+    printed = lines(
         losses={"vacuum": Estimate(3.9, 0.6), "hand_over": Estimate(3.5, 0.5), "light": Estimate(0.0, 0.0)},
         defects_true=Estimate(1.9, 0.3),
         defects_seen=Estimate(1.3, 0.2),
     )
-    assert told["lost in a shot"] == "vacuum 3.9(6), hand over 3.5(5)"
-    assert told["true defects"] == "1.9(3) in a shot, 1.3(2) on its last image"
+    assert printed["lost in a shot"] == "vacuum 3.9(6), hand over 3.5(5)"
+    assert printed["true defects"] == "1.9(3) in a shot, 1.3(2) on its last image"
     assert lines(losses={"vacuum": Estimate(0.0, 0.0)})["lost in a shot"] == "no atoms"
 
 
 @pytest.mark.parametrize(
-    ("unreadable", "told"),
+    ("unreadable", "printed"),
     [
         ((3,), "1 shot cannot be read and is left out of cycles and defects: 4"),
         (
@@ -86,11 +88,11 @@ def test_the_truth_of_a_simulation_is_told() -> None:
         ),
     ],
 )
-def test_shots_that_cannot_be_read_are_named(unreadable: Sequence[int], told: str) -> None:
-    assert lines(unreadable=tuple(unreadable))["warning"] == told
+def test_shots_that_cannot_be_read_are_named(unreadable: Sequence[int], printed: str) -> None:
+    assert lines(unreadable=tuple(unreadable))["warning"] == printed
 
 
-def test_windows_that_were_too_short_are_told() -> None:
+def test_windows_that_were_too_short_are_reported() -> None:
     assert lines(too_short=Rate(3, 20))["window"] == "too short in 3 of 20 (15.0 %)"
 
 

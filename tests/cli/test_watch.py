@@ -16,7 +16,7 @@ from labseq.errors import ConfigError
 from labseq.recording import RunWriter, open_run
 
 
-class ResolvedProfile:
+class WatchedRun:
     """A run that is written while it is watched."""
 
     def __init__(self, root: Path, fake: Any, n_shots: int = 3) -> None:
@@ -31,8 +31,8 @@ class ResolvedProfile:
         self.writer.event("shot_started", shot=index, attempt=shot.attempt)
         self.writer.write_shot(shot)
         names = ("shot_index", "attempt", "status", "error", "success", "filling_fraction")
-        told = {name: getattr(shot, name) for name in names}
-        self.writer.event("shot_finished" if shot.status == "complete" else "shot_repeated", shot=told)
+        printed = {name: getattr(shot, name) for name in names}
+        self.writer.event("shot_finished" if shot.status == "complete" else "shot_repeated", shot=printed)
 
     def watch(self, *meanwhile: Callable[[], None]) -> list[str]:
         """Watch the run; between the looks at it, do these things."""
@@ -48,17 +48,17 @@ class ResolvedProfile:
 
 
 @pytest.fixture
-def bench(tmp_path: Path, fake: Any) -> ResolvedProfile:
-    return ResolvedProfile(tmp_path, fake)
+def watched(tmp_path: Path, fake: Any) -> WatchedRun:
+    return WatchedRun(tmp_path, fake)
 
 
-def test_a_run_is_watched_to_its_end(bench: ResolvedProfile) -> None:
-    bench.take(0)
-    lines = bench.watch(
-        lambda: bench.take(1, status="failed", error="TransientError: no light"),
-        lambda: bench.take(1, attempt=1),
+def test_a_run_is_watched_to_its_end(watched: WatchedRun) -> None:
+    watched.take(0)
+    lines = watched.watch(
+        lambda: watched.take(1, status="failed", error="TransientError: no light"),
+        lambda: watched.take(1, attempt=1),
         lambda: None,
-        lambda: bench.writer.finish("stopped"),
+        lambda: watched.writer.finish("stopped"),
     )
     assert lines[0].endswith("3 shots, seed 1, profile virtual, simulated")
     assert lines[1:4] == [
@@ -69,24 +69,24 @@ def test_a_run_is_watched_to_its_end(bench: ResolvedProfile) -> None:
     assert "shots             2 of 3, 1 attempt kept that did not complete" in lines
 
 
-def test_a_finished_run_is_shown_at_once(bench: ResolvedProfile) -> None:
-    bench.take(0)
-    bench.writer.finish("complete")
-    assert "status            complete" in bench.watch()
+def test_a_finished_run_is_shown_at_once(watched: WatchedRun) -> None:
+    watched.take(0)
+    watched.writer.finish("complete")
+    assert "status            complete" in watched.watch()
 
 
-def test_ctrl_c_leaves_the_run_alone(bench: ResolvedProfile) -> None:
+def test_ctrl_c_leaves_the_run_alone(watched: WatchedRun) -> None:
     def interrupt() -> None:
         raise KeyboardInterrupt
 
-    lines = bench.watch(interrupt)
-    assert lines[-1] == f"no longer watched; the run {bench.writer.run_dir} continues"
-    assert open_run(bench.writer.run_dir).status == "running"
+    lines = watched.watch(interrupt)
+    assert lines[-1] == f"no longer watched; the run {watched.writer.run_dir} continues"
+    assert open_run(watched.writer.run_dir).status == "running"
 
 
-def test_the_view_learns_what_the_runs_own_view_does(bench: ResolvedProfile) -> None:
-    bench.take(0)
-    reader = EventReader(open_run(bench.writer.run_dir), lambda: 1e10)
+def test_the_view_learns_what_the_runs_own_view_does(watched: WatchedRun) -> None:
+    watched.take(0)
+    reader = EventReader(open_run(watched.writer.run_dir), lambda: 1e10)
     tally = Tally(reader.now)
     for name, values in reader.read():
         tally.add(name, values)
@@ -96,26 +96,26 @@ def test_the_view_learns_what_the_runs_own_view_does(bench: ResolvedProfile) -> 
     assert [*reader.read()] == []
 
 
-def test_lines_of_another_version_and_damaged_ones_are_passed_over(bench: ResolvedProfile) -> None:
-    path = bench.writer.run_dir / "events.jsonl"
-    bench.take(0)
+def test_lines_of_another_version_and_damaged_ones_are_passed_over(watched: WatchedRun) -> None:
+    path = watched.writer.run_dir / "events.jsonl"
+    watched.take(0)
     odd: list[Any] = [
         {},
         {"event": "warning"},
         {"t_utc": "2026-11-20T10:00:00+00:00", "event": "shot_finished", "values": {}},
     ]
-    bench.writer.finish("complete")
+    watched.writer.finish("complete")
     path.write_text(
         "x\n" + "".join(f"{json.dumps(line)}\n" for line in odd) + path.read_text("utf-8"), "utf-8"
     )
-    assert any(line.startswith("shot 1/3") for line in bench.watch())
+    assert any(line.startswith("shot 1/3") for line in watched.watch())
 
 
-def test_a_shot_whose_file_is_gone_is_still_told(bench: ResolvedProfile) -> None:
-    bench.take(0)
-    bench.writer.finish("complete")
-    next(bench.writer.run_dir.glob("shots/*.h5")).unlink()
-    assert any(line.startswith("shot 1/3") for line in bench.watch())
+def test_a_shot_whose_file_is_gone_is_still_reported(watched: WatchedRun) -> None:
+    watched.take(0)
+    watched.writer.finish("complete")
+    next(watched.writer.run_dir.glob("shots/*.h5")).unlink()
+    assert any(line.startswith("shot 1/3") for line in watched.watch())
 
 
 def test_only_whole_lines_are_read_and_each_once(tmp_path: Path) -> None:
@@ -129,12 +129,12 @@ def test_only_whole_lines_are_read_and_each_once(tmp_path: Path) -> None:
     assert tail.read() == []
 
 
-def test_a_record_knows_the_scan(bench: ResolvedProfile) -> None:
-    run = open_run(bench.writer.run_dir)
+def test_a_record_knows_the_scan(watched: WatchedRun) -> None:
+    run = open_run(watched.writer.run_dir)
     run.record["scan"] = {"addresses": ["a"]}
     assert record_of(run).scan == {"addresses": ["a"]}
 
 
-def test_what_is_no_run_is_told(tmp_path: Path) -> None:
+def test_a_missing_run_is_reported(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="no such file or folder"):
         watch_run(tmp_path / "x")

@@ -30,7 +30,7 @@ def code_of(*arguments: str) -> Any:
     return leaving.value.code
 
 
-def test_the_report_tells_what_is_played(made: PlannedWaveform) -> None:
+def test_the_report_reports_what_is_played(made: PlannedWaveform) -> None:
     lines = report(made, made.statistics())
     n = made.moves.plan.n_batches
     assert lines[0] == "occupancy  random:6x6@0.7, seed 3: 27 atoms on 6 x 6 sites, triangular, 4.49 um"
@@ -54,17 +54,17 @@ def test_the_report_tells_what_is_played(made: PlannedWaveform) -> None:
 
 
 @pytest.mark.parametrize(
-    ("batches", "words", "told"),
+    ("batches", "words", "printed"),
     [
         ("1", "batch 1 of 5, ", "batches    1 of 5"),
         ("2-3", "batches 2 to 3 of 5, ", "batches    2 to 3 of 5"),
     ],
 )
-def test_some_batches_are_named_in_report_and_title(batches: str, words: str, told: str) -> None:
+def test_some_batches_are_named_in_report_and_title(batches: str, words: str, printed: str) -> None:
     made = plan_waveform(WaveformRequest(REQUEST.plan, batches, REQUEST.sample_rate))
     n = made.moves.plan.n_batches
     assert title(made).startswith(f"psca, degree of parallelism 7: {words.replace('of 5', f'of {n}')}")
-    assert told.replace("of 5", f"of {n}") in report(made, made.statistics())
+    assert printed.replace("of 5", f"of {n}") in report(made, made.statistics())
 
 
 def test_an_axis_in_a_line(made: PlannedWaveform) -> None:
@@ -104,7 +104,7 @@ def test_everything_can_be_written_at_once(tmp_path: Path, capsys: pytest.Captur
     assert largest.tolist() == pytest.approx([document["row"]["peak_v"], document["column"]["peak_v"]])
 
 
-def test_what_falls_short_is_told_as_plan_tells_it(capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_falls_short_is_reported_as_plan_reports_it(capsys: pytest.CaptureFixture[str]) -> None:
     few = PlanRequest("random:6x6@0.2", "compact:4x4", seed=3)
     show_waveform(WaveformRequest(few, None, "250 MHz"), WaveformOutput())
     assert "warning: 7 atoms for 16 target sites, 9 too few; the plan fills 7" in capsys.readouterr().err
@@ -160,7 +160,7 @@ BAD = [
 
 
 @pytest.mark.parametrize(("arguments", "words"), BAD)
-def test_every_mistake_is_told_in_words(
+def test_every_mistake_is_reported_as_text(
     tmp_path: Path,
     arguments: list[str],
     words: str,

@@ -28,7 +28,7 @@ __all__ = ["queue"]
         (("rows: 2", "rows: 20"), "20"),
     ],
 )
-def test_what_is_wrong_is_told_at_once(queue: Queue, spoil: tuple[str, str], message: str) -> None:
+def test_what_is_wrong_is_reported_at_once(queue: Queue, spoil: tuple[str, str], message: str) -> None:
     Path("s.yaml").write_text(SEQUENCE.replace(*spoil), encoding="utf-8")
     with pytest.raises(ConfigError, match=message):
         add(queue)

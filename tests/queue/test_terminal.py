@@ -93,7 +93,7 @@ def test_the_list_says_what_one_should_know(capsys: pytest.CaptureFixture[str]) 
     assert values["options"]["dry_run"] == "off"
 
 
-def test_what_is_wrong_with_a_sequence_is_told_with_its_line(capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_wrong_with_a_sequence_is_reported_with_its_line(capsys: pytest.CaptureFixture[str]) -> None:
     Path("s.yaml").write_text(SEQUENCE.replace("compact", "kompact"), encoding="utf-8")
     code, out, err = call(capsys, "queue", "add", "s.yaml")
     assert (code, out) == (2, "")
@@ -166,7 +166,7 @@ def test_a_run_is_resumed(stopped: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert (code, err) == (2, f"{stopped}: the run cannot be resumed: it is complete: no shot is missing\n")
 
 
-def test_what_has_changed_is_told_line_by_line(stopped: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_has_changed_is_reported_line_by_line(stopped: Path, capsys: pytest.CaptureFixture[str]) -> None:
     record = json.loads((stopped / "run.json").read_text(encoding="utf-8"))
     record["resolved"]["attempts"] = 7
     (stopped / "run.json").write_text(json.dumps(record), encoding="utf-8")

@@ -94,19 +94,19 @@ def test_what_exists_is_never_written_over(tmp_path: Path) -> None:
     assert [*(tmp_path / "plugins").iterdir()] == [tmp_path / "plugins" / "spiral"]
 
 
-def test_a_folder_that_is_not_there_is_told(tmp_path: Path) -> None:
+def test_a_folder_that_is_not_there_is_reported(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="nowhere: there is no such folder"):
         make_plugin("planner", "spiral", tmp_path / "nowhere")
 
 
-def test_a_file_in_the_way_is_told(tmp_path: Path) -> None:
+def test_a_file_in_the_way_is_reported(tmp_path: Path) -> None:
     (tmp_path / "plugins").write_text("")
     with pytest.raises(ConfigError, match="it cannot be made"):
         make_plugin("planner", "spiral", tmp_path)
 
 
 @pytest.mark.parametrize("name", ["plugins", ".labseq"])
-def test_a_file_in_the_way_of_a_folder_is_told(name: str, tmp_path: Path) -> None:
+def test_a_file_in_the_way_of_a_folder_is_reported(name: str, tmp_path: Path) -> None:
     (tmp_path / name).write_text("")
     with pytest.raises(ConfigError, match=rf"{name}.*: it (exists already|cannot be made)"):
         make_file("sequence", "first", tmp_path)
@@ -117,7 +117,7 @@ def test_a_file_in_the_way_of_a_folder_is_told(name: str, tmp_path: Path) -> Non
 @given(name=st.text(max_size=50))
 @example(name="x\n")
 @settings(max_examples=50)
-def test_any_text_is_a_name_or_refused_in_words(name: str) -> None:
+def test_any_text_is_a_name_or_refused_as_text(name: str) -> None:
     host = PluginHost()
     for check in (
         lambda: check_plugin_name("planner", name, name, host),
@@ -133,7 +133,7 @@ def test_any_text_is_a_name_or_refused_in_words(name: str) -> None:
 
 
 @pytest.mark.skipif(sys.platform == "win32" or os.geteuid() == 0, reason="nothing is forbidden here")
-def test_a_folder_that_cannot_be_written_is_told(tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_written_is_reported(tmp_path: Path) -> None:
     tmp_path.chmod(0o500)
     try:
         with pytest.raises(ConfigError, match="Permission denied"):
@@ -174,7 +174,7 @@ def test_class_names() -> None:
     assert class_prefix("my_2nd_spiral") == "My2ndSpiral"
 
 
-def test_what_the_tests_need_is_told_where_it_is_missing(
+def test_what_the_tests_need_is_reported_where_it_is_missing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("labseq.scaffold.new.find_spec", lambda _: None)

@@ -25,19 +25,20 @@ FILES = [
     *(("profile", path) for path in sorted((ROOT / "hardware_profiles").glob("*.yaml"))),
 ]
 ABOUT_VALUES = {
-    "sequences": {
+    "sequence": {
         "shots as a float",
         "name with a separator",
         "name with a control character",
         "name of dots",
     },
-    "steps": {
+    "bad_steps": {
         "step name twice",
         "zero exposure",
         "infinite time",
         "time that is no number",
         "time beyond numbers",
         "too few windows",
+        "too many windows",
         "limit of nothing",
         "argument infinite",
         "required setting missing in an empty step",
@@ -47,26 +48,27 @@ ABOUT_VALUES = {
         "depth of a ramp above 1",
         "ramp that takes no time",
     },
-    "profiles": {
+    "profile": {
         "spacing of zero",
         "comb below zero",
+        "comb that begins at zero",
         "comb of one frequency",
         "device called like a role",
         "device with a space",
         "timeout of zero",
     },
 }
-"""What is wrong about the values of a file that is built rightly, and for `labseq check` to say."""
+"""What is wrong about the values of a file that is well-formed; `labseq check` reports it."""
 
 
 def catalogue() -> list[Any]:
     """The bad files of the tests of the configuration: kind, content, and whether only values are wrong."""
     found: list[Any] = []
     for name, about_values in ABOUT_VALUES.items():
-        module = runpy.run_path(str(ROOT / "tests" / "config" / f"test_bad_{name}.py"))
+        module = runpy.run_path(str(ROOT / "tests" / "config" / f"test_{name}.py"))
         cases = {case[0]: case for case in module["CASES"]}
         assert about_values <= set(cases)
-        kind = "profile" if name == "profiles" else "sequence"
+        kind = "profile" if name == "profile" else "sequence"
         for case, (_, old, new, _) in cases.items():
             try:
                 node = compose(module["GOOD"].replace(old, new, 1), case)
@@ -209,7 +211,7 @@ def test_profiles_with_more(more: str, good: bool, is_valid: Valid) -> None:
     assert is_valid("profile", {**profile.plain(), **further.plain()}) is good
 
 
-def test_a_bare_name_is_told_once(registry: Registry) -> None:
+def test_a_bare_name_is_reported_once(registry: Registry) -> None:
     validator = jsonschema.Draft7Validator(file_schema("profile", registry)["properties"]["detector"])
     assert [error.message for error in validator.iter_errors("threshold")] == [
         "'threshold' is not of type 'object'"
@@ -251,7 +253,7 @@ class Odd(labseq.Settings):
     pair: tuple[labseq.Duration, Literal["a", "b"]] = Field(default=(0.1, "a"), description="two")
 
 
-def test_a_model_that_is_hard_to_describe_still_tells_its_keys() -> None:
+def test_a_model_that_is_hard_to_describe_still_reports_its_keys() -> None:
     definitions: dict[str, Any] = {}
     schema = model_schema(Odd, "odd.", definitions)
     assert [*schema["properties"]] == ["of_the_plugin", "inner", "pair"]

@@ -1,4 +1,4 @@
-"""What is imported when, and on which systems: told by processes in which nothing is imported yet."""
+"""What is imported when, and on which systems, seen in new processes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 pytestmark = pytest.mark.system
 
 
-def told(code: str, *arguments: str, cwd: Path) -> str:
+def printed(code: str, *arguments: str, cwd: Path) -> str:
     """What a fresh process prints."""
     command = [sys.executable, "-c", code, *arguments]
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=cwd)
@@ -40,7 +40,7 @@ except SystemExit as leaving:
     print("left with", leaving.code)
 print(loaded())
 """
-    first, own, *_, left, last = told(code, cwd=tmp_path).splitlines()
+    first, own, *_, left, last = printed(code, cwd=tmp_path).splitlines()
     assert (first, own, left) == ("[]", "[]", "left with 0")
     assert last == "[]"
 
@@ -60,7 +60,7 @@ Sequencer.open = lambda self: (before.append(kernels()), opening(self))[1]
 labseq.Session.open("compact_225", shots=1, seed=1, output=sys.argv[1]).run()
 print(sorted(kernels() - before[0]))
 """
-    assert told(code, str(tmp_path), cwd=tmp_path) == "[]\n"
+    assert printed(code, str(tmp_path), cwd=tmp_path) == "[]\n"
 
 
 def test_every_module_can_be_imported_where_there_is_no_posix(tmp_path: Path) -> None:
@@ -104,5 +104,5 @@ print(n, wrong)
 """
     plugins = sorted(path.parent.name for path in Path(__file__).parents[2].glob("plugins/*/__init__.py"))
     assert len(plugins) > 10
-    n, _, wrong = told(code, *plugins, cwd=tmp_path).strip().partition(" ")
+    n, _, wrong = printed(code, *plugins, cwd=tmp_path).strip().partition(" ")
     assert (int(n) > 300, wrong) == (True, "[]")

@@ -114,7 +114,7 @@ def test_a_shot_is_planned_again_as_it_was(tmp_path: Path) -> None:
     assert moves == shot.plans[1].moves.tolist()
 
 
-def test_a_mistake_is_told_in_words(tmp_path: Path) -> None:
+def test_a_mistake_is_reported_as_text(tmp_path: Path) -> None:
     done = call(RANDOM, "--target", "kagomee:5x5", cwd=tmp_path)
     assert (done.returncode, done.stdout) == (2, "")
     assert "did you mean 'kagome'?" in done.stderr
