@@ -54,9 +54,7 @@ class IdentifySettings(Settings):
 class CommandSettings(Settings):
     """A command of the instrument."""
 
-    send: Text = Field(
-        description="what is sent; `{name}` or `{name:.3f}` stands for an argument, `{{` for a brace"
-    )
+    send: Text = Field(description="text that is sent; `{name}` or `{name:.3f}` is an argument, `{{` a brace")
     arguments: dict[str, ArgumentSettings] = Field(default={}, description="its arguments, by name")
     reply: str | None = Field(
         default=None,
@@ -153,7 +151,7 @@ class CommandSettings(Settings):
             except ValueError as error:
                 raise placed(error, "send") from None
             if self.template.read(text, self.kinds) != rounded:
-                what = f"the arguments cannot be told apart in '{clean(text)}'"
+                what = f"the arguments cannot be separated in '{clean(text)}'"
                 raise setting_error(what, "something between the placeholders", at=("send",))
             for name, value in rounded.items():
                 self._check_rounded(name, value, text)

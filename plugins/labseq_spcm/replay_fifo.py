@@ -123,7 +123,7 @@ class Fifo:
     Rendered chunks go into a ring in the computer, from there over the bus into the card's memory,
     and from there to the outputs. Ring and memory are bounded, so a program is rendered about
     ``fill`` ahead. Before the start both are filled, or hold the whole program. The card knows how
-    many samples to play: it ends by itself, and reports when it runs dry before.
+    many samples to play: it stops after them, and reports if it runs dry before.
 
     Args:
         card: The open card.

@@ -1,4 +1,4 @@
-"""Settings of the driver; how the tweezers move, and the volts, stand beside them in the profile."""
+"""Settings of the driver. The motion and voltages are set in the same section of the profile."""
 
 from __future__ import annotations
 

@@ -38,9 +38,9 @@ class LogEntry:
 
 
 class Log:
-    """The writes of late, in order.
+    """The latest register writes, in order.
 
-    Those of one call are kept as they came, and told apart only when somebody looks.
+    The writes of one call are stored as they came, and split only when the log is read.
 
     Args:
         size: How many writes are kept, about.
@@ -52,7 +52,7 @@ class Log:
         self._calls: deque[tuple[float, Sequence[int], Sequence[Number]]] = deque()
 
     def add(self, time_s: float, registers: Sequence[int], values: Sequence[Number]) -> None:
-        """Note the writes of one call."""
+        """Record the writes of one call."""
         self._calls.append((time_s, registers, values))
         self._n += len(registers)
         while self._n - len(self._calls[0][1]) >= self._size:
@@ -73,11 +73,11 @@ class Log:
 
 
 LOOK_S: Final = 0.05
-"""How long a wait goes on before it looks again at what other threads have done."""
+"""How often a wait checks what other threads have done."""
 MIN_S: Final = 1e-9
-"""Shortest wait, so that rounding cannot keep time from passing."""
+"""Shortest wait, so that time passes in spite of rounding."""
 DRIVER_VERSION: Final = (7 << 24) | (9 << 16) | 22000
-"""A version that ``spcm`` is content with; it is none of the vendor's."""
+"""A version that ``spcm`` accepts; the vendor has no such version."""
 
 
 def real_values(entries: NDArray[np.void]) -> NDArray[np.float64]:
@@ -97,7 +97,7 @@ def list_writes(entries: NDArray[np.void]) -> Iterator[tuple[int, Number]]:
 
 
 class SimulatedCard:
-    """A Spectrum M4i.6631-x8 that exists only here, with the manners of the real one.
+    """A Spectrum M4i.6631-x8 in software, which behaves as the real one.
 
     It is thread-safe. Time is the session's clock: replays, transfers and waits take as
     long as they would, but only on that clock.
@@ -142,22 +142,22 @@ class SimulatedCard:
             r.SPC_GETDRVTYPE: 1,
         }
 
-    # What a laboratory does with it
+    # From outside: trigger input, outputs
 
     def trigger(self, voltage_v: float = 3.3) -> bool:
         """A pulse from 0 V at the input Ext0, now.
 
         Returns:
-            Whether the card took it for a trigger; it does not if it is not started, not
+            Whether the card accepted it as a trigger; it does not if it is not started, not
             enabled, set to another source, or set to a level that the pulse does not cross.
         """
         with self._changed:
-            heard = self._machine.pulse(voltage_v, self._advance())
+            accepted = self._machine.pulse(voltage_v, self._advance())
             self._changed.notify_all()
-            return heard
+            return accepted
 
     def played(self, channel: int) -> list[Span]:
-        """What a channel has put out up to now, in time's order, with nothing between the spans."""
+        """The output of a channel up to now, in time's order; between the spans there is silence."""
         with self._changed:
             return self._machine.played(channel, self._advance())
 
@@ -189,7 +189,7 @@ class SimulatedCard:
         with self._changed:
             return self._machine.amplifiers[0].enabled, self._machine.amplifiers[1].enabled
 
-    # What the driver's functions do
+    # Functions of the driver library
 
     def _advance(self) -> float:
         now_s = self._clock.now()
@@ -202,7 +202,7 @@ class SimulatedCard:
         return refusal.code
 
     def break_down(self, reason: str) -> None:
-        """Lock the driver for a fault of the simulator itself."""
+        """Lock the driver because of a fault of the simulator."""
         with self._changed:
             self._error = ErrorInfo(r.ERR_INTERNAL_ERROR, text=f"fault of the simulator: {reason}")
 
@@ -249,7 +249,7 @@ class SimulatedCard:
             now_s, values = self._advance(), real_values(entries)
             try:
                 busy_s = self._machine.dds.write_many(entries["register"], values, now_s)
-            except Refusal:  # one by one it is told what is wrong, if anything is
+            except Refusal:  # written one by one, the wrong entry is reported
                 return self.write_all(list_writes(entries))
             self.log.add(now_s, entries["register"].tolist(), values.tolist())
             self._changed.notify_all()

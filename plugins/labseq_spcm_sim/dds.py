@@ -1,4 +1,4 @@
-"""The DDS: a list in the driver, a queue on the card, shadow registers, and what is put out.
+"""The DDS: a list in the driver, a queue on the card, shadow registers, and the output.
 
 Commands gather in the list; WRITE_TO_CARD sends it to the queue. From the queue a block at
 a time goes into the shadow registers, where it waits for its trigger: an edge or a force
@@ -25,14 +25,14 @@ Masks = tuple[int, int]
 """For each channel the cores that it has, a bit each."""
 
 FREQUENCY, FREQUENCY_SLOPE, AMPLITUDE, AMPLITUDE_SLOPE, PHASE = range(5)
-"""Rows of what the cores do, in the order of their registers and of the fields of :class:`Tone`."""
+"""Rows of the cores' state, in the order of their registers and of the fields of :class:`Tone`."""
 KIND: Final = 1000
-"""From the registers of one kind to those of the next."""
+"""Difference between the register numbers of one kind and the next."""
 
 
 @dataclass(frozen=True, slots=True)
 class CoreOutputs:
-    """What all cores put out between two events.
+    """The output of all cores between two events.
 
     Attributes:
         start_s: When it was first at the output, on the session's clock.
@@ -48,11 +48,11 @@ class CoreOutputs:
     masks: Masks
 
     def until(self, now_s: float) -> CoreOutputs:
-        """What of it was put out by now."""
+        """The part that was output by now."""
         return self if self.end_s <= now_s else replace(self, end_s=now_s)
 
     def spans(self, channel: int) -> list[ToneSpan]:
-        """What a channel put out, the volts left to its amplifier; none if that was silence."""
+        """The output of a channel, without its voltage; empty for silence."""
         own = _in_mask(self.masks[channel])
         found = zip(own, self.cores[:, own].T.tolist(), strict=True)
         tones = tuple(Tone(core, *does) for core, does in found if does[AMPLITUDE] or does[AMPLITUDE_SLOPE])
@@ -72,30 +72,30 @@ class Cores:
         n_cores: How many there are.
 
     Attributes:
-        chords: What was put out between events since the start, in time's order.
+        outputs: The output between events since the start, in time's order.
     """
 
     def __init__(self, n_cores: int) -> None:
         self._n_cores = n_cores
-        self.chords: list[CoreOutputs] = []
+        self.outputs: list[CoreOutputs] = []
         self.silence()
 
     def silence(self) -> None:
-        """Everything to zero."""
+        """Set all cores to zero."""
         self._now = np.zeros((5, self._n_cores))
         self._phase_deg: dict[int, float] = {}
         self._since_s = math.inf
 
-    def go_on(self, to_s: float, masks: Masks) -> None:
-        """Keep what was put out up to the next event, and carry all cores on to it."""
-        self.chords += self.current_outputs(to_s, masks)
+    def advance_to(self, to_s: float, masks: Masks) -> None:
+        """Record the output up to the next event, and advance all cores to it."""
+        self.outputs += self.current_outputs(to_s, masks)
         duration_s = to_s - self._since_s
         self._since_s = to_s
         if duration_s > 0:
-            self._now = carried_on(self._now, duration_s)
+            self._now = later_state(self._now, duration_s)
 
     def write(self, register: int, value: float, *, shift: bool) -> None:
-        """Give a core a new value; its phase is set, or shifted by what differs from the phase set before."""
+        """Set a value of a core; its phase is set, or shifted by the difference from the phase set before."""
         kind, core = divmod(register - r.SPC_DDS_CORE0_FREQ, KIND)
         if kind == PHASE:
             before_deg = self._phase_deg.get(core, 0.0)
@@ -106,15 +106,15 @@ class Cores:
         self._now[kind, core] = value
 
     def current_outputs(self, until_s: float, masks: Masks) -> list[CoreOutputs]:
-        """What has been put out since the last event."""
+        """The output since the last event."""
         silent = not self._now[AMPLITUDE : AMPLITUDE_SLOPE + 1].any()
         if self._since_s >= until_s or silent:
             return []
         return [CoreOutputs(self._since_s, until_s, self._now.copy(), masks)]
 
 
-def carried_on(cores: NDArray[np.float64], duration_s: float) -> NDArray[np.float64]:
-    """What cores do some time later: straight lines, amplitudes within full scale.
+def later_state(cores: NDArray[np.float64], duration_s: float) -> NDArray[np.float64]:
+    """The state of cores some time later: linear changes, amplitudes within full scale.
 
     Args:
         cores: float64 (5, n), as in :class:`CoreOutputs`.
@@ -139,7 +139,7 @@ KINDS: Final = (
     r.SPC_DDS_CORE0_PHASE,
 )
 """First register of each kind that there is per core."""
-DDS_VALUES_PHASE: Final = KINDS.index(r.SPC_DDS_CORE0_PHASE)
+PHASE_KIND: Final = KINDS.index(r.SPC_DDS_CORE0_PHASE)
 
 LIMITS: Final = {
     r.SPC_DDS_AVAIL_FREQ_MIN: 0.0,
@@ -176,7 +176,7 @@ LONE_CORE: Final = 1 << 20
 
 
 class DdsValues:
-    """What was written to the DDS registers last, rounded as the driver rounds it.
+    """The last values of the DDS registers, rounded as the driver rounds them.
 
     Args:
         n_cores: How many cores the card has.
@@ -261,7 +261,7 @@ class DdsValues:
         if not (known.all() and np.isfinite(values).all()):
             raise Refusal(r.ERR_REG, "there is another register, or a value that is not finite")
         low, high, step = self._ranges()[:, kinds]
-        phases = kinds == DDS_VALUES_PHASE
+        phases = kinds == PHASE_KIND
         wanted = np.where(phases, values % 360, values)
         if ((wanted < low) | (wanted > high)).any():
             raise Refusal(r.ERR_VALUE, "a value is out of range")
@@ -388,7 +388,7 @@ class Dds:
     def start(self) -> None:
         """The card starts: silent until the first event; what is queued stays."""
         self._silence()
-        self._cores.chords = []
+        self._cores.outputs = []
         self.running = True
         self._primed = bool(self._shadow or self._queue)
 
@@ -404,11 +404,11 @@ class Dds:
             All that was put out since the start.
         """
         self.advance(now_s)
-        chords = self.played(now_s)
-        self._cores.chords = []
+        outputs = self.played(now_s)
+        self._cores.outputs = []
         self.running = self.free_running = False
         self._silence()
-        return chords
+        return outputs
 
     def write(self, register: int, value: Number, now_s: float) -> float:
         """Take a command.
@@ -458,7 +458,7 @@ class Dds:
 
     def _command(self, command: int, now_s: float) -> float:
         if command & r.SPCM_DDS_CMD_RESET:
-            self._cores.go_on(now_s, self._values.masks)
+            self._cores.advance_to(now_s, self._values.masks)
             self.reset()
         if command & r.SPCM_DDS_CMD_EXEC_NOW and not (self.running and self._primed):
             raise Refusal(
@@ -539,7 +539,7 @@ class Dds:
         return max(block.arrival_s, self._retrigger_s)
 
     def _skip_ticks(self, now_s: float) -> None:
-        """Without a block the timer ticks on unheard until the next one comes."""
+        """Without a block the timer ticks on without effect until the next one comes."""
         self.free_running = False
         if self._source == r.SPCM_DDS_TRG_SRC_TIMER:
             until_s = min(now_s, self._queue[0].arrival_s) if self._queue else now_s
@@ -566,7 +566,7 @@ class Dds:
         self._n_events += 1
         self._retrigger_s = at_s + facts.DDS_RETRIGGER_S
         out_s = at_s + facts.DDS_TRIGGER_DELAY_S
-        self._cores.go_on(out_s, self._values.masks)
+        self._cores.advance_to(out_s, self._values.masks)
         self._shift = bool(block.writes.get(r.SPC_DDS_PHASE_BEHAVIOUR, self._shift))
         for register, value in block.writes.items():
             if register < r.SPC_DDS_TRG_SRC:
@@ -577,9 +577,9 @@ class Dds:
 
     def played(self, now_s: float) -> list[CoreOutputs]:
         """All that was put out since the start, up to now."""
-        ended = [chord.until(now_s) for chord in self._cores.chords if chord.start_s < now_s]
+        ended = [output.until(now_s) for output in self._cores.outputs if output.start_s < now_s]
         return ended + self._cores.current_outputs(now_s, self._values.masks)
 
     def forget(self, before_s: float) -> None:
         """Drop what ended before a time."""
-        self._cores.chords = [chord for chord in self._cores.chords if chord.end_s > before_s]
+        self._cores.outputs = [output for output in self._cores.outputs if output.end_s > before_s]

@@ -38,7 +38,7 @@ OUTPUTS: Final = {r.SPC_ENABLEOUT0: 0, r.SPC_ENABLEOUT1: 1}
 
 
 class Machine:
-    """The state of one card. Every call says what time it is; nothing here waits.
+    """The state of one card. Every call gets the time; nothing here waits.
 
     Args:
         model: What card it is.
@@ -77,7 +77,7 @@ class Machine:
         self._power_on()
 
     def advance(self, now_s: float) -> None:
-        """Let everything happen that is due, in its order."""
+        """Do everything that is due, in time's order."""
         while self.memory.uploads and self.memory.uploads[0].done_s <= now_s:
             upload = self.memory.uploads.popleft()
             if self.run is not None:
@@ -137,7 +137,7 @@ class Machine:
         return 0.0
 
     def _after(self, register: int, now_s: float) -> None:
-        """What some registers do beyond keeping their value."""
+        """The side effects of some registers."""
         value = self.setup[register]
         if register in AMPLITUDES:
             self.amplifiers[AMPLITUDES[register]].set_amplitude(value, now_s)
@@ -271,7 +271,7 @@ class Machine:
                 self.fire(now_s)
 
     def fire(self, now_s: float) -> None:
-        """A trigger, whatever it came from."""
+        """A trigger from any source."""
         if not self.running:
             return
         self.triggered = True
@@ -286,7 +286,7 @@ class Machine:
         """A pulse from 0 V at the input Ext0.
 
         Returns:
-            Whether the card took it for a trigger.
+            Whether the card accepted it as a trigger.
         """
         setup, level_v = self.setup, self.setup[r.SPC_TRIG_EXT0_LEVEL0] / 1000
         accepted = (

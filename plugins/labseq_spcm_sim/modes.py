@@ -29,9 +29,9 @@ class Buffer:
 
     Attributes:
         address: Where it starts.
-        offset: Where its data shall go, in bytes from the start of the memory or segment.
+        offset: Where its data go, in bytes from the start of the memory.
         n_bytes: Its length.
-        notify_bytes: How much must have been transferred until somebody is told; 0: all.
+        notify_bytes: Granularity in which the card reports what it has transferred; 0: all at once.
     """
 
     address: int
@@ -132,13 +132,13 @@ class Memory:
 
 
 AREA: Final = 1 << 21
-"""Samples that are asked for at a time."""
+"""Samples that are allocated at a time."""
 MAX_AHEAD: Final = 1 << 27
-"""Most samples that are asked for before they are needed."""
+"""Most samples that are allocated in advance."""
 
 
 class Store:
-    """Memory that is used again once nobody looks at what is in it any more.
+    """Memory that is reused when nothing refers to its content any more.
 
     To get fresh memory from the operating system, page by page, can take longer than to play what
     is put there: a stream would run dry for a reason that no real card has.
@@ -149,10 +149,10 @@ class Store:
         self._rest: Samples = np.empty(0, np.int16)
 
     def reserve(self, n: int) -> None:
-        """See that there is memory for a number of samples, or for as many as are asked for ahead."""
+        """Allocate memory for a number of samples, up to a limit."""
         while len(self._free) * AREA < min(n, MAX_AHEAD):
             area = np.empty(AREA, np.int16)
-            area.fill(0)  # until then it is only promised
+            area.fill(0)  # before, the operating system has not provided it
             self._free.append(area)
 
     def take(self, n: int) -> Samples:
@@ -162,7 +162,7 @@ class Store:
         if len(self._rest) < n:
             self.reserve(n)
             area = self._free.pop()
-            self._rest = np.frombuffer(area.data, np.int16)  # all that is cut from it keeps it alive
+            self._rest = np.frombuffer(area.data, np.int16)  # slices of it keep it alive
             weakref.finalize(self._rest, self._free.append, area)
         taken, self._rest = self._rest[:n], self._rest[n:]
         return taken
@@ -188,16 +188,16 @@ class Run(Protocol):
 
     @property
     def finished(self) -> bool:
-        """Whether it came to its end by itself."""
+        """Whether it has played everything."""
         ...
 
     @property
     def failed(self) -> bool:
-        """Whether it broke off for want of data."""
+        """Whether it stopped because data were missing."""
         ...
 
     def advance(self, now_s: float) -> None:
-        """Let everything happen that is due."""
+        """Do everything that is due."""
         ...
 
     def trigger(self, out_s: float) -> None:
@@ -209,7 +209,7 @@ class Run(Protocol):
         ...
 
     def played(self, now_s: float) -> list[Stretch]:
-        """What was played up to now."""
+        """The samples played up to now."""
         ...
 
 
@@ -264,7 +264,7 @@ class Replay:
 
 
 SMALL: float = 1e-3
-"""Bytes that are rounding of time."""
+"""Bytes that are a rounding error of time."""
 
 
 class Fifo:
@@ -272,7 +272,7 @@ class Fifo:
 
     Bytes are handed over by the user, transferred by the bus while there is room on the
     card, and consumed by the output from the trigger on. When the output finds none it
-    breaks off: an underrun.
+    stops: an underrun.
 
     Args:
         buffer: The ring.
@@ -310,7 +310,7 @@ class Fifo:
         self.finished = False
 
     def set_length(self, n_samples: int) -> None:
-        """How many samples per channel shall be played; 0: until the stop."""
+        """Set the number of samples per channel to play; 0: until the stop."""
         self._total = n_samples * self._frame if n_samples else math.inf
 
     def hand_over(self, n_bytes: int) -> None:
@@ -380,7 +380,7 @@ class Fifo:
         return self.failed or self.finished
 
     def _speed(self) -> float:
-        """What the bus carries now, in bytes per second."""
+        """Present speed of the bus, in bytes per second."""
         if not self._dma or self._over or self._transferred >= self._handed - SMALL:
             return 0.0
         full = self._transferred - self._consumed >= self._room - SMALL
@@ -395,7 +395,7 @@ class Fifo:
         self._now_s = max(self._now_s, now_s)
 
     def _flow(self, now_s: float) -> None:
-        """Flow until something changes: the start, the end of the data, full, empty, or now."""
+        """Transfer until something changes: the start, the end of the data, full, empty, or now."""
         drain, speed = self._drain(), self._speed()
         fill = self._transferred - self._consumed
         if drain > speed and fill <= SMALL:
@@ -429,7 +429,7 @@ class Fifo:
         return end_s if end_s < math.inf else None
 
     def played(self, now_s: float) -> list[Stretch]:
-        """What came out of the FIFO so far."""
+        """The samples that were output so far."""
         n_samples = math.floor((self._consumed + SMALL) / self._frame)
         stretches = [
             Stretch(self._play_s + first / self._rate, piece.samples, min(piece.n_samples, n_samples - first))

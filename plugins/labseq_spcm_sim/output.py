@@ -1,4 +1,4 @@
-"""What the card puts out: spans of samples or of DDS tones, and the amplifier behind them."""
+"""The output of the card: spans of samples or of DDS tones, and the amplifier."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from labseq_spcm_sim.setup import CardModel
 
 FULL_SCALE = 32767
-"""Sample that stands for the amplitude that is set."""
+"""Sample value of the full amplitude."""
 ROUNDING = 0.01
-"""Fraction of a sample that is rounding of time."""
+"""Fraction of a sample that is a rounding error of time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,7 +27,7 @@ class SampleSpan:
         samples: int16 (n,): one period of what was played; it repeats.
         first: Index in ``samples`` of the first sample played.
         n_samples: How many samples were played.
-        amplitude_v: Volts into 50 Ohm that a sample of 32767 stands for.
+        amplitude_v: Voltage into 50 Ohm of a sample of 32767.
     """
 
     start_s: float
@@ -70,7 +70,7 @@ class SampleSpan:
 
 @dataclass(frozen=True, slots=True)
 class Tone:
-    """What one DDS core does from a moment on.
+    """The output of one DDS core from a certain time on.
 
     Attributes:
         core: Index of the core.
@@ -90,7 +90,7 @@ class Tone:
 
     @property
     def silent(self) -> bool:
-        """Whether the core puts nothing out, and will not."""
+        """Whether the core is silent, and stays so."""
         return self.amplitude == 0.0 and self.amplitude_slope == 0.0
 
     def after(self, duration_s: float) -> Tone:
@@ -120,7 +120,7 @@ class ToneSpan:
     Attributes:
         start_s: When they were first at the output, on the session's clock.
         end_s: When the next event changed them.
-        amplitude_v: Volts into 50 Ohm that full scale stands for.
+        amplitude_v: Voltage into 50 Ohm of full scale.
         tones: The tones as they were at ``start_s``; silent cores are left out.
     """
 
@@ -156,7 +156,7 @@ class Amplifier:
     """The output stage of one channel: on or off, amplitude, the relay between its two paths.
 
     The settings act at once, also while the card plays. When an amplitude needs the other
-    path, the output is off for a while.
+    path, the output is off for some time.
 
     Attributes:
         model: The card.
@@ -171,21 +171,21 @@ class Amplifier:
     _ready_s: float = -math.inf
 
     def set_amplitude(self, amplitude_mv: int, now_s: float) -> None:
-        """Change the amplitude, through the relay if it must be."""
+        """Change the amplitude, with the relay if necessary."""
         low, high = self.model.low_path_mv
         needs_high = amplitude_mv > high if not self._high else amplitude_mv >= low
         if needs_high != self._high:
             self._high = needs_high
             self._ready_s = now_s + self.model.relay_s
         self.amplitude_mv = amplitude_mv
-        self._note(now_s)
+        self._record(now_s)
 
     def enable(self, on: bool, now_s: float) -> None:
         """Close or open the output relay."""
         self.enabled = on
-        self._note(now_s)
+        self._record(now_s)
 
-    def _note(self, now_s: float) -> None:
+    def _record(self, now_s: float) -> None:
         volts = self.amplitude_mv / 1000 if self.enabled else 0.0
         self.changes = [change for change in self.changes if change[0] < now_s]
         if now_s < self._ready_s:
@@ -194,7 +194,7 @@ class Amplifier:
             self.changes.append((now_s, volts))
 
     def cut(self, span: S) -> list[S]:
-        """The parts of a span that reached the connector, with their volts."""
+        """The parts of a span that reached the connector, with their voltages."""
         ends = [*(start_s for start_s, _ in self.changes[1:]), math.inf]
         parts: list[S] = []
         for (start_s, volts), end_s in zip(self.changes, ends, strict=True):

@@ -1,7 +1,7 @@
 """The registers of the card, and the values that they take, under the vendor's names.
 
 Only those that the simulator knows. The numbers are those of the vendor's header files;
-``spcm`` cannot be asked for them, because it cannot be imported before there is a library.
+They cannot be taken from ``spcm``, which cannot be imported without a driver library.
 """
 
 from __future__ import annotations

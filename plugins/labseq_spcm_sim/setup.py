@@ -2,7 +2,7 @@
 
 Source, where no other is named: Spectrum's manual "M4i.66xx/M4i.96xx", chapters on analog
 outputs, generation modes, trigger, sequence mode and DDS20; for the DDS steps and for
-manners that the manual does not tell, what ColdMatter (EDMSuite, ``HANDOFF.md``) measured
+behaviour that the manual does not describe, what ColdMatter (EDMSuite, ``HANDOFF.md``) measured
 on an M4i.9622-x8.
 
 A refused value leaves the old one in place, as the card does. What the simulator does not
@@ -92,7 +92,7 @@ DDS_SINGLE_PER_S: Final = 400e3
 DDS_DMA_PER_S: Final = 10e6
 """Commands per second that reach the card by DMA, in the background."""
 DDS_DMA_LATENCY_S: Final = 20e-6
-"""What a block takes at least by DMA."""
+"""Latency of a block by DMA."""
 DDS_DMA_QUEUE: Final = 512 * 1024**2
 """Commands that the on-board memory queues in DMA mode."""
 
@@ -100,7 +100,7 @@ DDS_DMA_QUEUE: Final = 512 * 1024**2
 Number = int | float
 
 
-class Refusal(Exception):  # noqa: N818 - it is what the card answers, not a fault of the program
+class Refusal(Exception):  # noqa: N818 - an answer of the card, not a fault of the program
     """The card refuses a call.
 
     Attributes:
@@ -120,8 +120,8 @@ class ErrorInfo:
 
     Attributes:
         code: The vendor's code; 0: none.
-        register: The register where it came up.
-        value: The value that was meant for it.
+        register: The register that was accessed.
+        value: The value for it.
         text: What was wrong.
     """
 

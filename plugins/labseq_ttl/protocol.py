@@ -1,4 +1,4 @@
-"""The language of the box, which ``firmware/PROTOCOL.md`` describes, and its limits."""
+"""The protocol of the box, as in ``firmware/PROTOCOL.md``, and its limits."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import binascii
 from typing import Final, TypeAlias
 
 NAME: Final = "labseq-ttl"
-"""What the box calls itself."""
+"""Name that the box reports."""
 
 VERSION: Final = 2
 """Version of the protocol."""
@@ -42,16 +42,16 @@ PER_LINE: Final = 5
 """Edges that fit on a line, however long their numbers are."""
 
 DEAF: Final = 0
-"""What the box does about a leader: it hears none."""
+"""State of the box towards a leader: it ignores the start input."""
 
 IDLE: Final = 1
-"""It listens for one."""
+"""It waits for `go`."""
 
 OWED: Final = 2
-"""One has said go, and is owed an answer."""
+"""`go` came, and needs an answer."""
 
 LATE: Final = 3
-"""The deadline of the answer has passed: the leader was told of a failure."""
+"""The deadline of the answer has passed: the leader received `failed`."""
 
 Edge: TypeAlias = tuple[int, int]
 """Ticks since the edge before, and what is on from then on: bit n is channel n."""
@@ -68,7 +68,7 @@ def checksum(text: bytes) -> int:
 
 
 def framed(text: str) -> bytes:
-    r"""A line as it is sent.
+    r"""Add checksum and line end to a text.
 
     Example:
         >>> framed("a id")
@@ -78,7 +78,7 @@ def framed(text: str) -> bytes:
 
 
 def unframed(line: bytes) -> str | None:
-    """What a line says; None if it is damaged.
+    """The text of a line; None if it is damaged.
 
     Args:
         line: Without its end.

@@ -119,5 +119,5 @@ class TtlSettings(Settings):
             raise setting_error("a simulated box has no external start", "`start: serial`", at=("start",))
         if self.go is not None and self.start == "external":
             what = "the start input cannot take `go` and start programs too"
-            raise setting_error(what, "`start: serial` beside 'go'", at=("start",))
+            raise setting_error(what, "`start: serial` with 'go'", at=("start",))
         return self

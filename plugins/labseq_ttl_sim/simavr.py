@@ -71,7 +71,7 @@ class SimavrBox:
 
     @property
     def port(self) -> Port:
-        """Its serial port, opened when it is first asked for."""
+        """Its serial port, opened on first use."""
         if self._port is None:
             self._port = open_box(self.name, self._device)
         return self._port

@@ -109,7 +109,7 @@ def test_mistakes_about_the_line(right: str, wrong: str, message: str) -> None:
         ("{f:.1f}", "{f", "10:13: 'FREQ {f,{n:02d},{wave}' is no template"),
         ("{f:.1f}", "{}", "10:13: the placeholder '{}' is not the name of an argument"),
         ("{f:.1f}", "{f.real}", "10:13: the placeholder '{f.real}' is not the name"),
-        (",{n:02d},{wave}", "{n}{wave}", "10:13: the arguments cannot be told apart in 'FREQ 200.015SQU'"),
+        (",{n:02d},{wave}", "{n}{wave}", "10:13: the arguments cannot be separated in 'FREQ 200.015SQU'"),
         (
             "min: 1 MHz",
             "min: 1.04 MHz",
