@@ -21,7 +21,7 @@ import os
 import pathlib
 
 from labseq import Context, Settings, hookimpl
-from labseq_virtual import camera, device, mobile_tweezers, settings, static_tweezers
+from labseq_virtual import camera, devices, settings, tweezers
 
 LABSEQ_API = 1
 LOG = pathlib.Path(os.environ["WATCHED_LOG"])
@@ -54,7 +54,7 @@ def watched(cls, role):
     return type("Watched" + cls.__name__, (cls,), {n: noting(n) for n in names})
 
 
-class Shutter(device.VirtualDevice):
+class Shutter(devices.VirtualDevice):
     def __init__(self, settings, context):
         super().__init__(settings, context)
         self._clock = context.clock
@@ -62,7 +62,7 @@ class Shutter(device.VirtualDevice):
 
 @hookimpl
 def labseq_register(registry):
-    mobile, static = mobile_tweezers.VirtualMobileTweezers, static_tweezers.VirtualStaticTweezers
+    mobile, static = tweezers.VirtualMobileTweezers, tweezers.VirtualStaticTweezers
     add = {"virtual_time": True}
     registry.camera("watched", watched(camera.VirtualCamera, "camera"), settings.CameraSettings, **add)
     static, mobile = watched(static, "static_tweezers"), watched(mobile, "mobile_tweezers")
