@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 from labseq_andor.library import load_pylablib
-from labseq_frames.picture import BadFramesError, load
+from labseq_frames.files import BadFramesError, load
 from labseq_optuna.scanner import OptunaScanner, OptunaSettings
 from labseq_pylon.library import load_pypylon
 

@@ -7,8 +7,7 @@ LABSEQ_API = 1
 
 @hookimpl
 def labseq_register(registry: Registry) -> None:
-    """Offer the camera ``frames``; it keeps to the session's clock."""
-    from labseq_frames.camera import FramesCamera
-    from labseq_frames.settings import FramesSettings
+    """Register the camera ``frames``; it runs on the session's clock."""
+    from labseq_frames.camera import FramesCamera, FramesSettings
 
     registry.camera("frames", FramesCamera, FramesSettings, virtual_time=True)

@@ -6,7 +6,9 @@ import math
 from collections import deque
 from collections.abc import Generator, Mapping
 from contextlib import suppress
-from typing import Any, Final
+from typing import Any, Final, Literal
+
+from pydantic import Field
 
 from labseq.plugin import (
     CameraDriver,
@@ -14,24 +16,51 @@ from labseq.plugin import (
     ConfigError,
     Context,
     DeviceError,
+    Duration,
     ExposureResult,
+    FilePath,
     Problem,
     Series,
+    Settings,
 )
-from labseq_frames.picture import BadFramesError, Picture, told
-from labseq_frames.settings import FramesSettings
-from labseq_frames.sources import Source, find_source
+from labseq_frames.files import BadFramesError, Picture, Source, find_source, format_shape
 
 MAX_EXPOSURE_S: Final = 3600.0
-"""Longest exposure that may be asked for, in seconds: none makes a difference to what is in a file."""
+"""Longest exposure, in seconds; frames from files do not depend on it."""
+
+
+class FramesSettings(Settings):
+    """Frames from files instead of a camera."""
+
+    path: FilePath = Field(
+        description="files to play, relative to this file: the folder of a run, a TIFF stack, a folder of "
+        "PNG or of TIFF files, or a pattern such as `frames/*.png`; files in the natural order of their names"
+    )
+    images: Literal["all", "first"] = Field(
+        default="all",
+        description="of a run: all frames of all shots in order, or only the first image of each shot",
+    )
+    at_end: Literal["stop", "repeat"] = Field(
+        default="stop",
+        description="after the last frame: end the run with an error that gives their number, or "
+        "begin again with the first",
+    )
+    readout: Duration = Field(
+        default=0.0, description="time from the end of an exposure until its frame can be read"
+    )
+    time_stamps: Literal["session", "recorded"] = Field(
+        default="session",
+        description="start of the exposure of a frame: on the clock of this session, or as recorded, on the "
+        "clock of the earlier session, if the file contains it",
+    )
 
 
 class FramesCamera(CameraDriver):
-    """Frames from files, with a real camera's manners.
+    """Frames from files, with the timing and error behaviour of a real camera.
 
-    Each trigger takes the next frame, whatever the exposure; with the internal trigger reading does. It
-    can be read when exposure and read-out have passed on the clock. A frame tells the exposure that it
-    was recorded with, or else the one that was asked for.
+    Each trigger takes the next frame, whatever the exposure; with the internal trigger each reading does. A
+    frame can be read when exposure and read-out have passed on the clock. It has the exposure that it was
+    recorded with if the file contains it, else the requested one.
 
     Args:
         settings: Which files, and what to do after the last frame.
@@ -44,7 +73,7 @@ class FramesCamera(CameraDriver):
         self._source: Source | None = None
         self._pictures: Generator[Picture] | None = None
         self._damage: BadFramesError | None = None
-        self._shape: tuple[int, int] | None = None
+        self._shape: tuple[int, ...] | None = None
         self._has_looked = False
         self._n_played = 0
         self._playing: Series | None = None
@@ -56,35 +85,43 @@ class FramesCamera(CameraDriver):
     def facts(self) -> CameraFacts:
         """Read-out time, longest exposure, and the shape of the first frame if there is one.
 
-        The first use before :meth:`open` looks at the files; what is wrong with them is told by that.
+        The first use before :meth:`open` reads the files; :meth:`open` reports what is wrong with them.
         """
         if not self._has_looked:
-            self._has_looked = True
             with suppress(BadFramesError):
                 self._look()
-        readout_s, triggers = self._settings.readout, ("software", "internal")
-        return CameraFacts(readout_s, MAX_EXPOSURE_S, self._shape, triggers=triggers)
+        readout_s, shape = self._settings.readout, self._shape
+        frame_shape = None if shape is None else (shape[0], shape[1])
+        return CameraFacts(readout_s, MAX_EXPOSURE_S, frame_shape, triggers=("software", "internal"))
 
     def describe(self) -> Mapping[str, Any]:
-        """Settings, what they led to, and the size of the frames."""
-        found = {} if self._source is None else self._source.describe()
+        """Settings, the files that were found, and the size of the frames."""
+        about = {} if self._source is None else self._source.about
         settings = self._settings.model_dump(mode="json")
-        return {"model": "frames from files", **found, "frame_shape": self._shape, **settings}
+        return {"model": "frames from files", **about, "frame_shape": self._shape, **settings}
 
     def _connect(self) -> None:
-        """Find the files and read the first frame; the series begins with that.
-
-        Raises:
-            ConfigError: There is no such file, or something is wrong with one; says which and what.
-        """
         try:
             self._source = self._look()
         except BadFramesError as error:
             raise ConfigError(
                 Problem(error.what, f"{self._name}: {error.path}", expected=error.expected, hint=error.hint)
             ) from error
-        self._has_looked = True
         self._n_played = 0
+
+    def _look(self) -> Source:
+        """Find the files and the shape of the first frame."""
+        self._has_looked = True
+        source = find_source(self._settings.path, self._settings.images)
+        pictures = source.pictures()
+        try:
+            first = next(pictures, None)
+        finally:
+            pictures.close()
+        if first is None:
+            raise BadFramesError(self._settings.path, "holds no frames", "at least one")
+        self._shape = first.image.shape
+        return source
 
     def _disconnect(self) -> None:
         """Close the files; after the next :meth:`open` the first frame comes again."""
@@ -108,43 +145,30 @@ class FramesCamera(CameraDriver):
         return None if missing_s > timeout_s else self._coming.popleft()[1]
 
     def _stop(self) -> None:
-        """Frames not yet read are dropped; they are not played again."""
+        """Drop frames that were not read; they are not played again."""
         self._coming.clear()
         self._playing = None
 
     def _expose(self, t_start_s: float) -> None:
-        """Take the next frame.
+        assert self._playing is not None
+        due_s = t_start_s + self._playing.exposure_s + self._settings.readout
+        picture = self._next()
+        exposure_s = math.nan if picture.exposure_s is None else picture.exposure_s
+        if self._settings.time_stamps == "recorded" and picture.t_start_s is not None:
+            t_start_s = picture.t_start_s
+        self._coming.append((due_s, ExposureResult(self._n_taken, picture.image, "", exposure_s, t_start_s)))
+        self._n_taken += 1
+
+    def _next(self) -> Picture:
+        """The next frame.
 
         Raises:
             DeviceError: No frame is left, or the next one is damaged or of another size.
         """
-        assert self._playing is not None
-        picture = self._next()
-        exposure_s = math.nan if picture.exposure_s is None else picture.exposure_s
-        recorded_s = picture.t_start_s if self._settings.time_stamps == "recorded" else None
-        told_s = t_start_s if recorded_s is None else recorded_s
-        due_s = t_start_s + self._playing.exposure_s + self._settings.readout
-        self._coming.append((due_s, ExposureResult(self._n_taken, picture.image, "", exposure_s, told_s)))
-        self._n_taken += 1
-
-    def _look(self) -> Source:
-        """Find the frames and the size of the first one."""
-        source = find_source(self._settings.path, self._settings.images)
-        pictures = source.pictures()
-        try:
-            first = next(pictures, None)
-        finally:
-            pictures.close()
-        if first is None:
-            raise BadFramesError(self._settings.path, "holds no frames", "at least one")
-        self._shape = _shape_of(first)
-        return source
-
-    def _next(self) -> Picture:
-        if self._damage is not None:  # what comes behind it is not what comes next
+        if self._damage is not None:  # the frame after the damaged one is not the next one
             raise DeviceError(self._name, str(self._damage))
         try:
-            picture = self._read_on()
+            picture = self._read()
         except BadFramesError as error:
             self._damage = error
             raise DeviceError(self._name, str(error)) from error
@@ -155,30 +179,15 @@ class FramesCamera(CameraDriver):
         self._n_played += 1
         return picture
 
-    def _read_on(self) -> Picture | None:
-        """The next frame; None after the last.
-
-        Raises:
-            BadFramesError: It is damaged, or of another size than the first.
-        """
-        if self._pictures is None:
-            self._pictures = self._started()
-        picture = next(self._pictures, None)
-        if picture is None and self._settings.at_end == "repeat":
-            self._pictures = self._started()
+    def _read(self) -> Picture | None:
+        """Read the next frame; None after the last."""
+        assert self._source is not None
+        picture = None if self._pictures is None else next(self._pictures, None)
+        if picture is None and (self._pictures is None or self._settings.at_end == "repeat"):
+            self._pictures = self._source.pictures()
             picture = next(self._pictures, None)
-        if picture is not None and self._shape != _shape_of(picture):
-            text = (
-                f"the frame has {told(picture.image.shape)} pixels, the first one {told(self._shape or ())}"
-            )
+        if picture is not None and picture.image.shape != self._shape:
+            came, first = format_shape(picture.image.shape), format_shape(self._shape or ())
+            text = f"the frame has {came} pixels, the first one {first}"
             raise BadFramesError(picture.place, text, hint="play them one size at a time")
         return picture
-
-    def _started(self) -> Generator[Picture]:
-        assert self._source is not None
-        return self._source.pictures()
-
-
-def _shape_of(picture: Picture) -> tuple[int, int]:
-    height, width = picture.image.shape
-    return height, width

@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from labseq_frames.camera import FramesCamera
-from labseq_frames.settings import FramesSettings
+from labseq_frames.camera import FramesCamera, FramesSettings
 from numpy.typing import NDArray
 
 from labseq import ConfigError, Context, DeviceError, DeviceTimeoutError, Frame, LimitError
@@ -37,12 +36,22 @@ def stack_of(n_frames: int, shape: tuple[int, int] = (4, 6)) -> Stack:
     return (1000 * np.arange(n_frames)[:, None, None] + np.arange(np.prod(shape)).reshape(shape)).astype("u2")
 
 
-def write_run(root: Path, frames_of_shots: Sequence[Stack], exposure_s: float = 0.01) -> Path:
+def write_run(
+    root: Path,
+    frames_of_shots: Sequence[Stack],
+    exposure_s: float = 0.01,
+    record_frames: str = "all",
+    ends: bool = True,
+) -> Path:
     """A run with these frames; image i of shot k was taken at 100 k + i seconds."""
     sites = np.ones((1, 2), np.bool_)
     record: dict[Any, Any] = {**dict.fromkeys(RunRecord.__slots__)}
     record |= {"name": "earlier", "n_shots": len(frames_of_shots), "seed": 1, "simulated": True}
-    record |= {"target": TargetPattern(sites, ~sites, "x"), "t_start_utc": UTC, "record_frames": "all"}
+    record |= {
+        "target": TargetPattern(sites, ~sites, "x"),
+        "t_start_utc": UTC,
+        "record_frames": record_frames,
+    }
     record |= {"sequence_text": "", "profile_text": "", "grid_spacing_m": 5e-6, "lattice": "square"}
     record |= {"resolved": {}, "overrides": {}, "devices": {}, "plugins": (), "provenance": {}}
     writer = RunWriter.create(root, RunRecord(**record))
@@ -53,7 +62,8 @@ def write_run(root: Path, frames_of_shots: Sequence[Stack], exposure_s: float = 
         shot = ShotRecord(k, 0, 1, UTC)
         shot.images, shot.status, shot.t_end_utc = images, "complete", UTC
         writer.write_shot(shot)
-    writer.finish("complete")
+    if ends:
+        writer.finish("complete")
     return writer.run_dir
 
 

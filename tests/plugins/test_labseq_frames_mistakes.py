@@ -1,4 +1,4 @@
-"""What can be wrong with files that shall be played, and what is said of it."""
+"""Errors of files to be played, and their messages."""
 
 from __future__ import annotations
 
@@ -11,20 +11,16 @@ from typing import Any
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st
-from labseq_frames.camera import FramesCamera
-from labseq_frames.settings import FramesSettings
-from labseq_frames.sources import natural
+from labseq_frames.camera import FramesCamera, FramesSettings
+from labseq_frames.files import natural
 
 from labseq import ConfigError, Context, DeviceError
-from labseq.model import Frame, ImageRecord, RunRecord, ShotRecord, TargetPattern
-from labseq.recording import RunWriter
 from labseq.testing.fakes import FakeClock
+
+from .test_labseq_frames import stack_of, write_run
 
 IMAGE = pytest.importorskip("PIL.Image")
 TIFFFILE = pytest.importorskip("tifffile")
-
-UTC = "2026-11-20T10:00:00.000000+00:00"
-SITES = np.ones((1, 2), np.bool_)
 
 
 def pixels(height: int = 4, width: int = 6, dtype: str = "u2") -> Any:
@@ -45,7 +41,7 @@ def play(camera: FramesCamera, n_frames: int) -> None:
 
 
 def refusal(path: Path, **settings: Any) -> str:
-    """What open() says."""
+    """The message of open()."""
     camera = camera_of(path, **settings)
     with pytest.raises(ConfigError):
         camera.open()
@@ -59,7 +55,7 @@ def refusal(path: Path, **settings: Any) -> str:
 
 
 def failure(path: Path, n_good: int, **settings: Any) -> str:
-    """What trigger() says after so many good frames, and says again."""
+    """The message of trigger() after some good frames, twice."""
     camera = camera_of(path, **settings)
     play(camera, n_good)
     messages: set[str] = set()
@@ -73,27 +69,10 @@ def failure(path: Path, n_good: int, **settings: Any) -> str:
     return message
 
 
-def writer_of(root: Path, record_frames: Any = "all", n_shots: int = 2, n_images: int = 2) -> RunWriter:
-    """A run that is being written."""
-    run: dict[Any, Any] = {**dict.fromkeys(RunRecord.__slots__)}
-    run |= {"n_shots": n_shots, "seed": 1, "simulated": True, "target": TargetPattern(SITES, ~SITES, "x")}
-    run |= {"resolved": {}, "overrides": {}, "devices": {}, "plugins": (), "provenance": {}, "scan": None}
-    run |= {"name": "x", "t_start_utc": UTC, "sequence_text": "", "profile_text": ""}
-    run |= {"record_frames": record_frames, "grid_spacing_m": 5e-6, "lattice": "square", "calibrations": {}}
-    writer = RunWriter.create(root, RunRecord(**run))
-    for k in range(n_shots):
-        shot = ShotRecord(k, 0, 1, UTC)
-        frames = [Frame(pixels(), 0.01, float(i)) for i in range(n_images)]
-        shot.images = [ImageRecord(f, SITES, np.ones((1, 2), np.float32), 1, 0, 0.1, 0.01) for f in frames]
-        shot.status, shot.t_end_utc = "complete", UTC
-        writer.write_shot(shot)
-    return writer
-
-
-def finished(root: Path, **options: Any) -> Path:
-    writer = writer_of(root, **options)
-    writer.finish("complete")
-    return writer.run_dir
+def recorded(
+    root: Path, record_frames: str = "all", n_shots: int = 2, n_images: int = 2, **options: Any
+) -> Path:
+    return write_run(root, [stack_of(n_images)] * n_shots, record_frames=record_frames, **options)
 
 
 def test_a_path_that_does_not_exist_is_named_with_one_like_it(tmp_path: Path) -> None:
@@ -114,7 +93,7 @@ def test_an_empty_folder_holds_no_frames(tmp_path: Path) -> None:
 
 
 def test_a_folder_of_runs_names_one_of_them(tmp_path: Path) -> None:
-    run = finished(tmp_path)
+    run = recorded(tmp_path)
     assert f"holds 1 run and is none itself; give one of them, for example {run}" in refusal(tmp_path)
 
 
@@ -123,7 +102,7 @@ def test_files_of_another_kind_are_refused(tmp_path: Path) -> None:
     IMAGE.fromarray(pixels()).save(tmp_path / "x.png")
     TIFFFILE.imwrite(tmp_path / "x.tif", pixels())
     assert "x.sif: is neither a TIFF nor a PNG" in refusal(tmp_path / "x.sif")
-    assert "means 1 PNG and 1 TIFF files; expected files of one kind" in refusal(tmp_path)
+    assert "contains 1 PNG and 1 TIFF files; expected files of one kind" in refusal(tmp_path)
     assert "x.tif: is no run, so that `images: first` has no meaning" in refusal(
         tmp_path / "x.tif", images="first"
     )
@@ -229,24 +208,26 @@ def test_what_is_no_tiff_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_run_that_is_being_written_is_refused(tmp_path: Path) -> None:
-    assert "the run is still being written; wait until it has ended" in refusal(writer_of(tmp_path).run_dir)
+    assert "the run is still being written; wait until it has ended" in refusal(
+        recorded(tmp_path, ends=False)
+    )
 
 
 def test_a_run_without_frames_is_refused(tmp_path: Path) -> None:
-    text = refusal(finished(tmp_path / "none", record_frames="none"))
+    text = refusal(recorded(tmp_path / "none", record_frames="none"))
     assert "the run holds no frames; expected one that was made with `record_frames: all`" in text
-    assert "the run holds no complete shot" in refusal(finished(tmp_path / "empty", n_shots=0))
-    assert "holds no frames; expected at least one" in refusal(finished(tmp_path / "dark", n_images=0))
+    assert "the run holds no complete shot" in refusal(recorded(tmp_path / "empty", n_shots=0))
+    assert "holds no frames; expected at least one" in refusal(recorded(tmp_path / "dark", n_images=0))
 
 
 def test_a_first_image_that_was_not_kept_is_not_replaced_by_another(tmp_path: Path) -> None:
-    run = finished(tmp_path, record_frames="last")
+    run = recorded(tmp_path, record_frames="last")
     assert "the first image of the shot was not kept; record with" in refusal(run, images="first")
     camera_of(run).open()
 
 
 def test_a_shot_that_is_damaged_or_gone_is_named(tmp_path: Path) -> None:
-    run = finished(tmp_path)
+    run = recorded(tmp_path)
     second = sorted((run / "shots").iterdir())[1]
     whole = second.read_bytes()
     second.write_bytes(whole[: len(whole) // 2])

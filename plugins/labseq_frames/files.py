@@ -1,0 +1,364 @@
+"""Frames in files: runs of labseq, TIFF stacks, PNG files."""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import logging
+import re
+import struct
+from collections.abc import Callable, Generator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq.plugin import Problem, RecordingError, Run, open_run
+
+PNG: Final = (".png",)
+TIFF: Final = (".tif", ".tiff")
+EXPECTED: Final = "a run's folder, a TIFF stack, or a folder of PNG or TIFF files"
+
+PNG_SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
+PNG_HEADER_BYTES: Final = 26
+PNG_COLOURS: Final = {
+    0: "gray",
+    2: "colour",
+    3: "palette colour",
+    4: "gray with transparency",
+    6: "colour with transparency",
+}
+
+_LOG = logging.getLogger("tifffile")
+_LOG.addHandler(logging.NullHandler())  # we report what it logs about damaged files
+
+
+class BadFramesError(Exception):
+    """Files that cannot be played; the camera turns it into an error of labseq.
+
+    Attributes:
+        path: The file or folder, or a place in a file.
+        what: What is wrong with it.
+        expected: What was expected; may be empty.
+        hint: What to do; may be empty.
+    """
+
+    def __init__(self, path: Path | str, what: str, expected: str = "", hint: str = "") -> None:
+        self.path = path
+        self.what = what
+        self.expected = expected
+        self.hint = hint
+        super().__init__(str(Problem(what, str(path), expected=expected, hint=hint)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Picture:
+    """A frame in a file.
+
+    Attributes:
+        image: uint16 (height, width), in camera counts (ADU), pixel (y, x).
+        place: File and place in it, for messages.
+        exposure_s: Exposure time, in seconds; None if the file does not contain it.
+        t_start_s: Start of the exposure on the clock of its own session, in seconds; None likewise.
+    """
+
+    image: NDArray[np.uint16]
+    place: str
+    exposure_s: float | None = None
+    t_start_s: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """Files that were found and checked.
+
+    Attributes:
+        pictures: Starts to read all frames in order, one at a time; closing the generator closes its file.
+            Raises BadFramesError if a file is damaged or contains something else.
+        about: Kind and number of files: JSON-ready values.
+    """
+
+    pictures: Callable[[], Generator[Picture]]
+    about: Mapping[str, Any]
+
+
+def find_source(path: Path, images: Literal["all", "first"] = "all") -> Source:
+    """Find the frames at a path, and check the header of each file.
+
+    Args:
+        path: A run's folder, a TIFF stack, a PNG, a folder of either, or a pattern for files.
+        images: Which frames of a run.
+
+    Raises:
+        BadFramesError: There are no frames, or files of the wrong kind.
+    """
+    try:
+        source = _find(path, images)
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise BadFramesError(path, f"cannot be read: {reason}", hint="check path and rights") from error
+    if images == "first" and source.about["source"] != "run":
+        hint = "leave `images` out, or give a run's folder"
+        raise BadFramesError(path, "is no run, so that `images: first` has no meaning", hint=hint)
+    return source
+
+
+def _find(path: Path, images: Literal["all", "first"]) -> Source:
+    if path.is_dir():
+        return _in_folder(path, images)
+    if path.is_file():
+        return _of_kind(path, [path])
+    if path.exists():
+        raise BadFramesError(path, "is neither a file nor a folder", EXPECTED)
+    if re.search(r"[*?\[]", str(path)):
+        return _of_kind(path, _matching(path))
+    names = [sibling.name for sibling in path.parent.iterdir()] if path.parent.is_dir() else []
+    similar = difflib.get_close_matches(path.name, names, n=1)
+    hint = f"did you mean '{similar[0]}'?" if similar else "check `path`; it is relative to the profile"
+    raise BadFramesError(path, "no such file or folder", EXPECTED, hint)
+
+
+def _in_folder(folder: Path, images: Literal["all", "first"]) -> Source:
+    """A run, or the pictures in a folder; the folder of a run may contain pictures, too."""
+    files = [file for file in folder.iterdir() if file.suffix.lower() in (*PNG, *TIFF)]
+    files = [file for file in files if file.is_file() and not file.name.startswith(".")]
+    if files and not (folder / "run.json").is_file():
+        return _of_kind(folder, files)
+    try:
+        return run_source(open_run(folder), images)
+    except RecordingError as error:
+        reason = str(error).removeprefix(f"{error.path}: ")
+        if files or error.path != str(folder.resolve()):
+            raise BadFramesError(Path(error.path), reason) from error
+        raise BadFramesError(folder, f"holds no PNG or TIFF files, and {reason}") from error
+
+
+def _matching(path: Path) -> list[Path]:
+    """The files that match a pattern; brackets in the names of existing folders are not a pattern."""
+    root, pattern = path.parent, path.name
+    while not root.is_dir():
+        root, pattern = root.parent, f"{root.name}/{pattern}"
+    try:
+        files = [file for file in root.glob(pattern) if file.is_file()]
+    except (ValueError, NotImplementedError) as error:
+        raise BadFramesError(path, f"is no pattern: {str(error).lower()}", "one like frames/*.png") from error
+    if not files:
+        raise BadFramesError(path, f"no file in {root} matches", hint="check the pattern")
+    return files
+
+
+def _of_kind(path: Path, files: Sequence[Path]) -> Source:
+    files = sorted(files, key=natural)
+    pngs, tiffs = ([file for file in files if file.suffix.lower() in kind] for kind in (PNG, TIFF))
+    if others := [file for file in files if file.suffix.lower() not in (*PNG, *TIFF)]:
+        raise BadFramesError(others[0], "is neither a TIFF nor a PNG", EXPECTED)
+    if pngs and tiffs:
+        text = f"contains {len(pngs)} PNG and {len(tiffs)} TIFF files"
+        raise BadFramesError(path, text, "files of one kind", "give a pattern such as *.png")
+    return png_source(pngs) if pngs else tiff_source(tiffs)
+
+
+def natural(path: Path) -> tuple[list[str | int], str]:
+    """Key that sorts numbers in names by their value.
+
+    Example:
+        >>> [p.name for p in sorted(map(Path, ["x10.png", "x9.png", "x1.png"]), key=natural)]
+        ['x1.png', 'x9.png', 'x10.png']
+    """
+    words = re.split(r"(\d+)", str(path))  # every second one is a number
+    return [int(word) if i % 2 else word for i, word in enumerate(words)], str(path)
+
+
+def load(package: str, name: str, path: Path) -> Any:
+    """Import a package that reads a kind of file.
+
+    Args:
+        package: Its name in Python.
+        name: Its name.
+        path: The file that it is needed for, for the message.
+
+    Raises:
+        BadFramesError: It is not installed.
+    """
+    try:
+        return importlib.import_module(package)
+    except ImportError as error:
+        text = f"reading it needs {name}, which cannot be imported ({error})"
+        raise BadFramesError(path, text, hint='install it with `pip install "labseq[frames]"`') from error
+
+
+def format_shape(shape: tuple[int, ...]) -> str:
+    """A shape as text.
+
+    Example:
+        >>> format_shape((512, 256))
+        '512 x 256'
+    """
+    return " x ".join(map(str, shape))
+
+
+def _check_shape(file: Path, shape: tuple[int, ...], first: Path, expected: tuple[int, ...]) -> None:
+    if shape != expected:
+        text = f"its frames have {format_shape(shape)} pixels, those of {first.name} {format_shape(expected)}"
+        raise BadFramesError(file, text, "frames of one size", "play them one size at a time")
+
+
+# runs
+
+
+def run_source(run: Run, images: Literal["all", "first"]) -> Source:
+    """The frames that a run of labseq recorded.
+
+    Args:
+        run: The run.
+        images: All frames, or the first image of each shot.
+
+    Raises:
+        BadFramesError: The run is still being written, or recorded no frames.
+    """
+    if run.status == "running":
+        raise BadFramesError(run.path, "the run is still being written", hint="wait until it has ended")
+    if not run.shots:
+        raise BadFramesError(run.path, "the run holds no complete shot", "one with frames")
+    if run.record.get("record_frames") == "none":
+        text = "one that was made with `record_frames: all`"
+        raise BadFramesError(run.path, "the run holds no frames", text)
+    about = {"source": "run", "run_id": str(run.record.get("run_id", "")), "n_shots": len(run.shots)}
+    return Source(lambda: _run_pictures(run, first_only=images == "first"), about)
+
+
+def _run_pictures(run: Run, *, first_only: bool) -> Generator[Picture]:
+    """Shot by shot; failed attempts are left out."""
+    for shot in run.shots:
+        try:
+            images = shot.record().images
+        except RecordingError as error:
+            raise BadFramesError(Path(error.path), str(error).removeprefix(f"{error.path}: ")) from error
+        for i, image in enumerate(images[:1] if first_only else images):
+            frame = image.frame
+            if frame is not None:
+                yield Picture(frame.image, f"{shot.file}, image {i}", frame.exposure_s, frame.t_start_s)
+            elif first_only:
+                hint = "record with `record_frames: all`, or set `images: all` to play what was kept"
+                raise BadFramesError(shot.file, "the first image of the shot was not kept", hint=hint)
+
+
+# PNG files
+
+
+def png_source(files: Sequence[Path]) -> Source:
+    """One frame from each PNG file, 16 bit gray, read with Pillow.
+
+    Args:
+        files: In order; at least one.
+
+    Raises:
+        BadFramesError: A file is not a PNG, not 16 bit gray, or of another size.
+    """
+    expected = _png_shape(files[0])
+    for file in files[1:]:
+        _check_shape(file, _png_shape(file), files[0], expected)
+    return Source(lambda: _png_pictures(files), {"source": "PNG", "n_files": len(files)})
+
+
+def _png_pictures(files: Sequence[Path]) -> Generator[Picture]:
+    pillow = load("PIL.Image", "Pillow", files[0])
+    for file in files:
+        try:
+            with pillow.open(file, formats=["PNG"]) as opened:
+                pixels = np.asarray(opened)
+        except Exception as error:  # Pillow raises SyntaxError, OSError, ValueError, zlib.error ...
+            raise BadFramesError(file, f"is damaged: {error}", hint="take it from a backup") from error
+        yield Picture(pixels.astype(np.uint16), str(file))  # older versions of Pillow give int32
+
+
+def _png_shape(file: Path) -> tuple[int, int]:
+    """(height, width), from the header, which also gives the number of bits that Pillow hides."""
+    with file.open("rb") as opened:
+        header = opened.read(PNG_HEADER_BYTES)
+    if len(header) < PNG_HEADER_BYTES or not header.startswith(PNG_SIGNATURE):
+        raise BadFramesError(file, "is not a PNG", hint="take it from a backup, or leave it out")
+    width, height, depth, colour = struct.unpack(">IIBB", header[16:])
+    if (depth, colour) != (16, 0):
+        text = f"the picture is {depth} bit {PNG_COLOURS.get(colour, 'of an unknown kind')}"
+        raise BadFramesError(
+            file, text, "16 bit gray", "save the camera's own counts, not a viewer's picture"
+        )
+    return height, width
+
+
+# TIFF stacks
+
+
+def tiff_source(files: Sequence[Path]) -> Source:
+    """One frame from each page of each TIFF file, uint16, read with tifffile one page at a time.
+
+    Args:
+        files: In order; at least one.
+
+    Raises:
+        BadFramesError: tifffile is missing; a file is not a TIFF, is cut off, or its first page is not
+            uint16, not gray, or of another size.
+    """
+    tifffile = load("tifffile", "tifffile", files[0])
+    n_pages = 0
+    expected: tuple[int, ...] | None = None
+    for file in files:
+        with _opened_tiff(tifffile, file) as stack:
+            shape = _tiff_shape(file, 0, stack.pages[0])
+            expected = expected or shape
+            _check_shape(file, shape, files[0], expected)
+            n_pages += _count_pages(file, stack)
+    about = {"source": "TIFF", "n_files": len(files), "n_frames": n_pages}
+    return Source(lambda: _tiff_pictures(tifffile, files), about)
+
+
+def _tiff_pictures(tifffile: Any, files: Sequence[Path]) -> Generator[Picture]:
+    for file in files:
+        with _opened_tiff(tifffile, file) as stack:
+            for number, page in enumerate(stack.pages):
+                _tiff_shape(file, number, page)
+                yield Picture(np.ascontiguousarray(page.asarray(), np.uint16), f"{file}, page {number}")
+
+
+@contextmanager
+def _opened_tiff(tifffile: Any, file: Path) -> Generator[Any]:
+    try:
+        with tifffile.TiffFile(file) as stack:
+            yield stack
+    except BadFramesError:
+        raise
+    except Exception as error:  # damaged data make it raise ValueError, zlib.error, struct.error ...
+        raise BadFramesError(
+            file, f"cannot be read as a TIFF: {error}", hint="take it from a backup"
+        ) from error
+
+
+def _tiff_shape(file: Path, number: int, page: Any) -> tuple[int, int]:
+    if page.dtype != np.uint16 or len(page.shape) != 2:
+        text = f"page {number} is {page.dtype}, {format_shape(page.shape)}"
+        raise BadFramesError(file, text, "uint16, height x width", "save the camera's own counts, gray")
+    return page.shape
+
+
+def _count_pages(file: Path, stack: Any) -> int:
+    """Number of pages; refuses a file in which some are missing, which tifffile only logs."""
+    messages: list[str] = []
+    handler = logging.Handler(logging.ERROR)
+    handler.emit = lambda record: messages.append(record.getMessage())
+    _LOG.addHandler(handler)
+    try:
+        n_pages = len(stack.pages)
+    finally:
+        _LOG.removeHandler(handler)
+    if messages:
+        text = f"is cut off or damaged after page {n_pages - 1} ({messages[0]})"
+        raise BadFramesError(file, text, hint="take it from a backup")
+    if n_pages == 1 and stack.series[0].size > stack.pages[0].size:
+        shape = format_shape(stack.series[0].shape)
+        text = f"holds {shape} counts behind a single page, as large ImageJ stacks do"
+        raise BadFramesError(file, text, "a page for each frame", "save it as BigTIFF, or in several files")
+    return n_pages
