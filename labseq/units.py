@@ -1,7 +1,7 @@
-"""Quantities with units, read into plain SI numbers.
+"""Quantities with units, converted to plain SI numbers.
 
-Only YAML and the screen speak of "45 ms"; everything inside labseq and on disk
-is SI. A plain number is taken as SI.
+Only YAML files and displays use units such as "45 ms"; all values inside labseq and on disk
+are SI. A plain number is in SI.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ _MICRO = ("u", "µ", "μ")  # ASCII, MICRO SIGN, GREEK SMALL LETTER MU
 
 
 def _with_micro(units: dict[str, float]) -> Mapping[str, float]:
-    """Let every unit spelled with "u" be spelled with either micro sign too."""
+    """Accept both micro signs in every unit with "u"."""
     spelled = dict(units)
     for unit, factor in units.items():
         if unit.startswith("u"):
@@ -54,19 +54,19 @@ EXAMPLES: Final[Mapping[str, str]] = MappingProxyType(
         "fraction": "75 %",
     }
 )
-"""Dimension -> what a quantity of it looks like."""
+"""Dimension -> an example of a quantity."""
 
 _READABLE: Final = 1e9
 """Numbers from here on are written with an exponent."""
 
 ZERO_CELSIUS_K: Final = 273.15
-"""0 degC in kelvins; degC is the one unit with a zero of its own."""
+"""0 degC in kelvins; degC is the only unit with a different zero."""
 
 _NUMBER = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(\S.*?)?\s*\Z")
 
 
 def parse_quantity(text: str, dimension: str) -> float:
-    """Read a quantity such as "45 ms" into SI.
+    """Convert a quantity such as "45 ms" to SI.
 
     Args:
         text: A number and a unit; the space between them may be left out.
@@ -115,7 +115,7 @@ def split_quantity(text: str) -> tuple[float, str]:
 
 
 def parse_any(text: str) -> tuple[float, str]:
-    """Read a quantity of whatever dimension into SI.
+    """Convert a quantity of any dimension to SI.
 
     Returns:
         The value, and its dimension; "fraction" for percents.
@@ -135,7 +135,7 @@ def parse_any(text: str) -> tuple[float, str]:
 
 
 def dimension_of(unit: str) -> str:
-    """The dimension that a unit belongs to; "" for what is none.
+    """The dimension of a unit; "" for an unknown unit.
 
     Example:
         >>> dimension_of("um/ms")
@@ -145,7 +145,7 @@ def dimension_of(unit: str) -> str:
 
 
 def si_unit_of(text: str) -> str:
-    """The SI unit that a quantity is read into, whatever its dimension; "" for a fraction or no quantity.
+    """The SI unit of a quantity of any dimension; "" for a fraction and for other text.
 
     Example:
         >>> si_unit_of("60 ms"), si_unit_of("130 um/ms"), si_unit_of("75 %"), si_unit_of("7")
@@ -159,12 +159,12 @@ def si_unit_of(text: str) -> str:
 
 
 def factor_of(unit: str) -> float:
-    """Factor of a unit, of whatever dimension, to SI; 1 for "" and for what is no unit."""
+    """Factor of a unit of any dimension to SI; 1 for "" and for an unknown unit."""
     return next((units[unit] for units in UNITS.values() if unit and unit in units), 1.0)
 
 
 def written(value: float, unit: str) -> str:
-    """A value in SI as it is written in a unit of any dimension, without the dust of rounding.
+    """A value in SI as text in a unit of any dimension, without rounding errors.
 
     Example:
         >>> written(0.0002, "us"), written(7, "")
@@ -189,7 +189,7 @@ def scaled(number: float, factor: float) -> float:
 
 
 def expected(dimension: str) -> str:
-    """Say in words what a quantity of this dimension looks like.
+    """Describe a quantity of a dimension, for messages.
 
     Example:
         >>> expected("time")
@@ -204,7 +204,7 @@ def expected(dimension: str) -> str:
 
 
 def unit_names(dimension: str) -> list[str]:
-    """Name the units of a dimension, micro spelled with "u" only.
+    """The units of a dimension, micro with "u" only.
 
     Example:
         >>> unit_names("time")
@@ -218,9 +218,9 @@ def _a(dimension: str) -> str:
 
 
 def format_quantity(value: float, dimension: str, digits: int = 3) -> str:
-    """Write an SI value with the unit that a physicist would choose.
+    """Format an SI value with the unit that a physicist would choose.
 
-    What no unit makes readable keeps its exponent.
+    Very large values are written with an exponent.
 
     Example:
         >>> format_quantity(0.045, "time")

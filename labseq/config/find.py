@@ -5,11 +5,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from labseq import text_files as reading
 from labseq.config.document import Document
 from labseq.errors import ConfigError, Problem
 from labseq.files import PROFILES, SEQUENCES, packaged_profiles_dir, packaged_sequences_dir
 from labseq.messages import clean, did_you_mean, listing, visible
+from labseq.text_files import (
+    YAML_SUFFIXES,
+    alike_file,
+    beside as path_beside,
+    files_in,
+    is_file,
+    is_folder,
+    something_else,
+)
 
 
 def is_path(name: str) -> bool:
@@ -19,33 +27,33 @@ def is_path(name: str) -> bool:
         >>> is_path("virtual"), is_path("mine.yaml"), is_path("../mine")
         (False, True, True)
     """
-    return "/" in name or "\\" in name or name.lower().endswith(reading.YAML_SUFFIXES)
+    return "/" in name or "\\" in name or name.lower().endswith(YAML_SUFFIXES)
 
 
 def find_profile(name_or_path: str | Path, beside: Path, *, named_in: Document | None = None) -> Path:
     """Find a hardware profile.
 
     Args:
-        name_or_path: A name, looked for in ``beside``, in ./hardware_profiles and
+        name_or_path: A name, searched in ``beside``, in ./hardware_profiles and
             among the packaged profiles; text with a path separator or with the
             ending .yaml or .yml is a path, relative to ``beside``; a ``Path`` is
-            taken as it is, relative to the working directory.
+            relative to the working directory.
         beside: Folder of the file that names the profile.
         named_in: The sequence whose key ``profile`` names it, for messages.
 
     Raises:
-        ConfigError: There is no such profile; with the places and the names there are.
+        ConfigError: There is no such profile; names the searched folders and the known profiles.
     """
     if isinstance(name_or_path, Path):
         return name_or_path
     folders = list(dict.fromkeys((beside, Path(PROFILES), packaged_profiles_dir())))
     if is_path(name_or_path):
-        path = reading.beside(beside, name_or_path)
-        if reading.is_file(path):
+        path = path_beside(beside, name_or_path)
+        if is_file(path):
             return path
-        kind = "a folder, not a hardware profile," if reading.is_folder(path) else "no hardware profile"
+        kind = "a folder, not a hardware profile," if is_folder(path) else "no hardware profile"
         what, expected = f"there is {kind} at {visible(str(path))}", ""
-        hint = reading.alike_file(path)
+        hint = alike_file(path)
     else:
         found = _named(name_or_path, folders)
         if found is not None:
@@ -65,26 +73,26 @@ def find_sequence(given: Path) -> Path:
 
     Args:
         given: A path, relative to the working directory; or a name, without a path separator and without
-            the ending .yaml or .yml: it is looked for in the working directory, in ./sequences and
+            the ending .yaml or .yml: it is searched in the working directory, in ./sequences and
             among the packaged sequences.
 
     Raises:
-        ConfigError: There is no sequence of this name; with the places and the names there are.
+        ConfigError: There is no sequence of this name; names the searched folders and the known sequences.
     """
     name = str(given)
     if is_path(name) or given.suffix:
         packaged = packaged_sequences_dir() / given.name
-        if reading.is_file(packaged) and not reading.is_file(given) and not reading.something_else(given):
+        if is_file(packaged) and not is_file(given) and not something_else(given):
             raise ConfigError(Problem("there is no such file", visible(name), hint=_hint_at(packaged)))
         return given
     folders = (Path(), Path(SEQUENCES), packaged_sequences_dir())
-    found = given if reading.is_file(given) else _named(name, folders)
-    if found is not None or reading.something_else(given):
+    found = given if is_file(given) else _named(name, folders)
+    if found is not None or something_else(given):
         return found or given
     names = _names([*folders[1:]])
     places = ", ".join(visible(str(folder)) for folder in folders)
     what = f"there is no sequence '{clean(name)}' in {places}"
-    hint = did_you_mean(name, names) or reading.alike_file(given)
+    hint = did_you_mean(name, names) or alike_file(given)
     raise ConfigError(Problem(what, expected=listing(names) if names else "a file", hint=hint))
 
 
@@ -93,11 +101,11 @@ def _hint_at(packaged: Path) -> str:
 
 
 def _named(name: str, folders: Sequence[Path]) -> Path | None:
-    """The first file of a name in the folders, whichever YAML ending it has."""
-    paths = (folder / f"{name}{suffix}" for folder in folders for suffix in reading.YAML_SUFFIXES)
-    return next((path for path in paths if reading.is_file(path)), None)
+    """The first file of a name in the folders, with either YAML ending."""
+    paths = (folder / f"{name}{suffix}" for folder in folders for suffix in YAML_SUFFIXES)
+    return next((path for path in paths if is_file(path)), None)
 
 
 def _names(folders: list[Path]) -> list[str]:
-    """Names of the profiles in the folders; a sequence's folder is full of other files."""
-    return list(dict.fromkeys(Path(name).stem for folder in folders for name in reading.files_in(folder)))
+    """Names of the YAML files in the folders, without their endings."""
+    return list(dict.fromkeys(Path(name).stem for folder in folders for name in files_in(folder)))

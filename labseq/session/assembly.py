@@ -153,10 +153,10 @@ def assemble(
     except ConfigError as error:
         _check_alone(document, sequence, found)
         raise _explained(found.stop(error), scan) from None
-    return _put_together(document, sequence, bench, scan, found, dry_run)
+    return _assembled(document, sequence, bench, scan, found, dry_run)
 
 
-def _put_together(
+def _assembled(
     document: Document,
     sequence: SequenceSpec,
     bench: ResolvedProfile,
