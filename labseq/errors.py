@@ -1,8 +1,8 @@
-"""The one error tree of labseq.
+"""The error tree of labseq.
 
 Every error that labseq raises on purpose is a :class:`LabseqError`. It carries
-its values as fields, and its text says what came, what was expected and what
-to do about it. ``exit_code`` is what the command line exits with.
+its values as attributes, and its message says what came, what was expected and
+what to do. ``exit_code`` is the exit code of the command line.
 """
 
 from __future__ import annotations
@@ -24,17 +24,16 @@ class LabseqError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """One thing that is wrong in a configuration file.
+    """One problem in a configuration file.
 
     Attributes:
         what: What is wrong, naming the offending key or value.
         source: File name, or the option it came from (``--set a.b=c``).
         line: Line in ``source``, counted from 1; 0 if the source has no lines.
         column: Column in ``source``, counted from 1; 0 if there is none.
-        expected: What would have been right, or "".
+        expected: What would be right, or "".
         hint: What to do, for example "did you mean 'rows'?", or "".
-        notes: Where else to look: the place of a value that this one does not go with,
-            or the default that it meets.
+        notes: Other places to look at: the value that this one conflicts with, or a default.
     """
 
     what: str
@@ -61,7 +60,7 @@ class ConfigError(LabseqError, ValueError):
     """A sequence, a profile or an option is wrong.
 
     Attributes:
-        problems: Everything that was found, in file order.
+        problems: All problems that were found, in file order.
     """
 
     exit_code: ClassVar[int] = 2
@@ -148,11 +147,11 @@ class PluginLoadError(LabseqError):
 
 
 class UnknownPluginError(LabseqError, LookupError):
-    """No installed plugin offers what was asked for.
+    """No installed plugin offers something of this name.
 
     Attributes:
-        kind: What was asked for: "planner", "camera", "pattern", ...
-        name: The name asked for.
+        kind: "planner", "camera", "pattern", ...
+        name: The unknown name.
         known: The names that exist.
         hint: What to do, or "".
     """
@@ -199,11 +198,11 @@ class DeviceTimeoutError(DeviceError, TimeoutError):
 
 
 class DeviceHungError(DeviceTimeoutError):
-    """A call into a device, its driver or a step did not come back; its thread may still act."""
+    """A call into a device, its driver or a step did not return; its thread may still run."""
 
 
 class InterlockError(DeviceError):
-    """A value that a device watches is past its limit, or cannot be told; no policy goes on after it."""
+    """A value that a device watches exceeds its limit or cannot be read; no policy continues the run."""
 
 
 class LimitError(LabseqError, ValueError):
@@ -211,8 +210,8 @@ class LimitError(LabseqError, ValueError):
 
     Attributes:
         what: The quantity, for example "row tones in batch 3".
-        value: The value that came.
-        limit: The limit that it broke.
+        value: The value.
+        limit: The limit that it exceeds.
     """
 
     exit_code: ClassVar[int] = 2
@@ -246,7 +245,7 @@ class InvalidPlanError(PlanError):
         rule: The rule that was broken, one of :data:`labseq.motion.RULES`.
         batch: Index of the batch, from 0; -1 if the plan as a whole is wrong. The message counts from 1.
         move: Index of the atom move within the batch, from 0, or -1. The message counts from 1.
-        detail: What exactly is wrong, with the sites.
+        detail: What is wrong, with the sites.
     """
 
     def __init__(self, rule: str, detail: str, *, batch: int = -1, move: int = -1, planner: str = "") -> None:
@@ -275,7 +274,7 @@ class RecordingError(LabseqError):
 
 
 class TransientError(LabseqError):
-    """Something rare went wrong that a repetition of the shot may mend.
+    """A rare failure; repeating the shot may succeed.
 
     Attributes:
         device: Role or device name, or "".
@@ -292,7 +291,7 @@ class StepTimeoutError(TransientError):
     """A step took longer than the ``timeout`` of its policy.
 
     Attributes:
-        timeout_s: What it may take, in seconds.
+        timeout_s: Its limit, in seconds.
     """
 
     def __init__(self, message: str, timeout_s: float) -> None:
@@ -301,10 +300,10 @@ class StepTimeoutError(TransientError):
 
 
 class OverBudgetError(TransientError):
-    """A stage took longer than its budget, and the policy of its step does not let that pass.
+    """A stage took longer than its budget, and the policy of its step does not allow that.
 
     Attributes:
-        then: What the policy wants: "repeat_shot", "skip_point" or "stop".
+        then: The reaction that the policy sets: "repeat_shot", "skip_point" or "stop".
     """
 
     def __init__(self, message: str, then: Literal["repeat_shot", "skip_point", "stop"]) -> None:
@@ -313,7 +312,7 @@ class OverBudgetError(TransientError):
 
 
 class CheckFailedError(LabseqError):
-    """A value of the last shots is past what a check of the sequence allows.
+    """A value of the last shots is outside the limits of a check of the sequence.
 
     Attributes:
         value: Its name, for example "filling_fraction".
@@ -327,11 +326,11 @@ class CheckFailedError(LabseqError):
 
 
 class StopRequested(LabseqError):  # noqa: N818 - a request, not an error
-    """The operator asked the run to stop; raised by every wait, within 50 ms, or between two shots.
+    """The user asked the run to stop; every wait raises it within 50 ms, or it is raised between two shots.
 
     Attributes:
         signal_number: 2 for Ctrl-C (SIGINT), 15 for SIGTERM and for ``labseq stop``.
-        after_shot: Whether ``labseq stop`` asked for it, and the shot at hand was taken to its end.
+        after_shot: Whether ``labseq stop`` asked for it, and the current shot was completed.
     """
 
     def __init__(self, signal_number: int = 2, *, after_shot: bool = False) -> None:
@@ -342,7 +341,7 @@ class StopRequested(LabseqError):  # noqa: N818 - a request, not an error
 
 
 def one_of(names: Sequence[str]) -> str:
-    """Name the alternatives in words.
+    """List the alternatives as text.
 
     Example:
         >>> one_of(["psca", "lsap"])

@@ -38,7 +38,7 @@ class Glyphs:
     blocks: str = ""
 
 
-UNICODE: Final = Glyphs(" ·×●○", "▁▂▃▄▅▆▇█", "▀▄█")  # noqa: RUF001 - the multiplication sign is meant
+UNICODE: Final = Glyphs(" ·×●○", "▁▂▃▄▅▆▇█", "▀▄█")  # noqa: RUF001 - a multiplication sign
 ASCII: Final = Glyphs(" .x@o", ".:#")
 
 

@@ -75,8 +75,8 @@ def table(report: DevicesReport) -> list[str]:
 
 
 def _row(found: CheckedDevice, plugin: str) -> tuple[str, ...]:
-    told = (found.described.get(key) for key in ("model", "serial_number", "firmware"))
-    identity = ("-" if value in (None, "") else clean(str(value)) for value in told)
+    values = (found.described.get(key) for key in ("model", "serial_number", "firmware"))
+    identity = ("-" if value in (None, "") else clean(str(value)) for value in values)
     latency = "-" if found.latency_s is None else format_quantity(found.latency_s, "time")
     state = _reason(found) or ("ok" if found.tested else "ok, no self test")
     return found.name, plugin, *identity, latency, state
@@ -166,14 +166,14 @@ def list_plugins(profile: str | None, *, as_json: bool = False) -> None:
 def plugins_table(host: PluginHost) -> list[str]:
     """A row per plugin; below them why plugins failed to load, and notes."""
     rows = [("plugin", "state", "version", "origin", "offers")]
-    told: list[str] = []
+    remarks: list[str] = []
     for info in host.infos:
         rows.append(
             (info.name, info.state, info.version or "-", info.origin, ", ".join(_offers(host, info)) or "-")
         )
-        told += [f"{info.name}: {info.reason}"] if info.reason else []
-        told += [f"{info.name}: warning: {note}" for note in info.notes]
-    return [*columns(rows), *([""] if told else []), *told]
+        remarks += [f"{info.name}: {info.reason}"] if info.reason else []
+        remarks += [f"{info.name}: warning: {note}" for note in info.notes]
+    return [*columns(rows), *([""] if remarks else []), *remarks]
 
 
 def _offers(host: PluginHost, info: PluginInfo) -> list[str]:
