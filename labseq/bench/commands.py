@@ -22,8 +22,7 @@ Examples:
   labseq bench planners --planners psca,lsap --dop 15 --loadings 10000
   labseq bench planners --planners psca,psca:variant=paper --grid 30x30 --target kagome:20x20 --loading "60 %"
   labseq bench planners --planners psca --dop 15 --json - | jq .rows[0].n_batches
-  labseq bench planners --figure 2b --loadings 10000
-  labseq bench planners --figure 3b --set profile.mobile_tweezers.speed="130 um/ms"
+  labseq bench planners --planners psca,mta1 --set profile.mobile_tweezers.speed="130 um/ms"
 """
 
 LATENCY_EXAMPLES = """\b
@@ -36,31 +35,18 @@ Examples:
 
 @bench.command(epilog=PLANNERS_EXAMPLES, short_help="Compare planners on the same random loadings.")
 def planners(
-    figure: Annotated[
-        str | None,
-        typer.Option(
-            metavar="2b|2c|3a|3b",
-            help="Reproduce a figure of the paper; draws figure-2b.png and writes figure-2b.csv unless you "
-            "name other files.",
-        ),
-    ] = None,
     planners: Annotated[
-        str | None,
+        str,
         typer.Option(
             metavar="NAME,...",
-            help="Planners, optionally with their own settings: psca,psca:variant=paper. Default: psca.",
+            help="Planners, optionally with their own settings: psca,psca:variant=paper.",
         ),
-    ] = None,
-    grid: Annotated[
-        str | None, typer.Option(metavar="ROWSxCOLS", help="Sites of the grid. Default: 20x20.")
-    ] = None,
+    ] = "psca",
+    grid: Annotated[str, typer.Option(metavar="ROWSxCOLS", help="Sites of the grid.")] = "20x20",
     target: Annotated[
-        str | None,
-        typer.Option(metavar="PATTERN", help="A pattern such as kagome:15x15. Default: compact:15x15."),
-    ] = None,
-    loading: Annotated[
-        str | None, typer.Option(metavar="P", help="Probability that a site is loaded. Default: 75 %.")
-    ] = None,
+        str, typer.Option(metavar="PATTERN", help="A pattern such as kagome:15x15.")
+    ] = "compact:15x15",
+    loading: Annotated[str, typer.Option(metavar="P", help="Probability that a site is loaded.")] = "75 %",
     dop: Annotated[
         int | None,
         typer.Option(
@@ -70,7 +56,7 @@ def planners(
     ] = None,
     loadings: Annotated[
         int,
-        typer.Option(metavar="N", min=1, help="Number of random loadings; the paper's figures use 10000."),
+        typer.Option(metavar="N", min=1, help="Number of random loadings."),
     ] = 1000,
     seed: Annotated[
         int,
@@ -95,7 +81,7 @@ def planners(
     ] = None,
     png: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Draw the figure, or a histogram of the number of batches."),
+        typer.Option(metavar="FILE", help="Draw a histogram of the number of batches."),
     ] = None,
 ) -> None:
     """Let planners plan the same random loadings, check every plan, and compare the results."""
@@ -103,7 +89,6 @@ def planners(
     from labseq.bench.terminal import BenchOutput, bench_planners
 
     request = BenchRequest(
-        figure=figure,
         planners=planners,
         grid=grid,
         target=target,

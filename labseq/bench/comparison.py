@@ -1,4 +1,4 @@
-"""What a comparison of planners consists of, and the planning, checking and counting that its processes do."""
+"""A comparison of planners: its conditions, and the planning, checking and counting of its processes."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class PlannerEntry:
         """What tables call it.
 
         Example:
-            >>> Entrant("psca", (("variant", "paper"),)).label
+            >>> PlannerEntry("psca", (("variant", "paper"),)).label
             'psca variant=paper'
         """
         return " ".join([self.planner, *(f"{key}={value}" for key, value in self.settings)])

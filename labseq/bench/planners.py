@@ -29,24 +29,24 @@ from labseq.bench.comparison import (
     set_up,
     warm,
 )
-from labseq.bench.report import Figure, Report, Tally, find_figure
-from labseq.errors import ConfigError, LabseqError, Problem, StopRequested
+from labseq.bench.report import Report, Tally
+from labseq.errors import LabseqError, StopRequested
 
 _LOOK_S: Final = 0.1
-"""How often the wait for results gives Ctrl-C a chance: Windows does not interrupt it."""
+"""How often waiting for results is interrupted: on Windows, Ctrl-C does not end it."""
 _FAREWELL_S: Final = 1.0
 
 
 def run_jobs(comparison: Comparison, jobs: Iterable[Job], n_workers: int) -> Generator[Done]:
-    """Do all jobs, in this process if there is to be one worker only.
+    """Do all jobs; with one worker, in this process.
 
     Args:
-        comparison: The comparison that the jobs are of, known to be valid.
-        jobs: The jobs; their order is about the order of the results.
+        comparison: The comparison of the jobs, valid.
+        jobs: The jobs; the results come in nearly the same order.
         n_workers: Number of processes.
 
     Yields:
-        What came of each job, as soon as it is done. A generator that is closed early
+        The results of each job, as soon as it is done. A generator that is closed early
         ends its processes at once.
 
     Raises:
@@ -114,7 +114,7 @@ def _stop_workers(workers: dict[Connection, BaseProcess]) -> None:
 
 
 def _serve(connection: Connection, comparison: Comparison) -> None:
-    """Do jobs until nobody asks for more."""
+    """Do jobs until the connection is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches every process; the first one decides
     do: Callable[[Job], Done] = prepare(comparison)
     with suppress(EOFError, OSError):  # the first process is gone
@@ -134,35 +134,32 @@ def _interrupts_ignored() -> Generator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-DEFAULTS: Final = {"planners": "psca", "grid": "20x20", "target": "compact:15x15", "loading": "75 %"}
 MAX_AT_ONCE: Final = 50
-"""Most loadings of a job: what is lost of each process when a comparison is stopped."""
+"""Maximum number of loadings of a job: those of each process are lost when a comparison is stopped."""
 ALONE_S: Final = 2.0
-"""How long one process works before it starts others: about what their start takes."""
+"""How long one process works before others start: about the time that their start takes."""
 
 
 @dataclass(frozen=True, slots=True)
 class BenchRequest:
-    """What is to be compared, in the words of the command line; None for the default.
+    """What to compare, as on the command line.
 
     Attributes:
-        figure: A figure of the paper, which says all but what follows ``dop``.
         planners: See :func:`labseq.bench.comparison.parse_entrants`.
         grid: "20x20".
         target: "compact:15x15".
         loading: "75 %".
         dop: Degree of parallelism, for every planner that has such a setting.
         loadings: Number of loadings of each condition.
-        seed: What all of them are drawn from.
+        seed: Seed of all loadings.
         overrides: See :func:`labseq.bench.comparison.parse_overrides`.
-        workers: Number of processes; as many as there are cores, if there is work enough, if None.
+        workers: Number of processes; None for one per core, if there is enough work.
     """
 
-    figure: str | None = None
-    planners: str | None = None
-    grid: str | None = None
-    target: str | None = None
-    loading: str | None = None
+    planners: str = "psca"
+    grid: str = "20x20"
+    target: str = "compact:15x15"
+    loading: str = "75 %"
     dop: int | None = None
     loadings: int = 1000
     seed: int = 1
@@ -170,27 +167,19 @@ class BenchRequest:
     workers: int | None = None
 
 
-def read_request(request: BenchRequest) -> tuple[Comparison, Figure | None]:
-    """Read what is to be compared.
+def read_request(request: BenchRequest) -> Comparison:
+    """Read what to compare.
 
     Raises:
         ConfigError: Something in it is wrong; says what was expected.
     """
     settings, motion = parse_overrides(request.overrides)
-    if request.figure is None:
-        given = {name: getattr(request, name) or default for name, default in DEFAULTS.items()}
-        shape, loading = parse_grid(given["grid"]), parse_loading(given["loading"])
-        condition = Condition(shape, given["target"], loading, request.dop, (*BARE_MOTION, *motion))
-        planner_entries = parse_entrants(given["planners"])
-        called = f"--planners {given['planners']}"
-        return Comparison(
-            planner_entries, (condition,), request.loadings, request.seed, settings, called
-        ), None
-    figure = find_figure(request.figure)
-    _check_figure_alone(request, figure, bool(settings))
-    conditions = tuple(figure.with_motion(motion))
-    called = f"figure {figure.name}"
-    return Comparison(figure.planner_entries, conditions, request.loadings, request.seed, (), called), figure
+    shape, loading = parse_grid(request.grid), parse_loading(request.loading)
+    condition = Condition(shape, request.target, loading, request.dop, (*BARE_MOTION, *motion))
+    called = f"--planners {request.planners}"
+    return Comparison(
+        parse_entrants(request.planners), (condition,), request.loadings, request.seed, settings, called
+    )
 
 
 def compare(
@@ -202,18 +191,18 @@ def compare(
 ) -> Report:
     """Let all planners plan all loadings, check every plan, and sum up.
 
-    The same comparison gives the same report, times aside, whatever the number of
+    The same comparison gives the same report, except for times, with any number of
     processes. Ctrl-C or SIGTERM ends it early with what is done until then.
 
     Args:
-        comparison: What is to be compared.
-        n_workers: Number of processes; as many as there are cores, if there is work enough, if None.
+        comparison: What to compare.
+        n_workers: Number of processes; None for one per core, if there is enough work.
         announce: Called with the name of a module before its kernels are compiled.
         progress: Called with the numbers of loadings that are done and wanted.
 
     Raises:
         ConfigError: Something in the comparison is wrong; says what was expected.
-        PluginLoadError: A plugin that is named failed to load.
+        PluginLoadError: A named plugin failed to load.
     """
     from labseq.kernel import announcing
 
@@ -241,7 +230,7 @@ def compare(
 
 
 def _results(comparison: Comparison, n_workers: int | None) -> Generator[Done]:
-    """What comes of all loadings, the order aside."""
+    """The results of all loadings, in any order."""
     todo = _jobs(comparison, n_workers or _n_cores())
     if n_workers is None:
         start_s, n_done = time.perf_counter(), 0
@@ -253,16 +242,6 @@ def _results(comparison: Comparison, n_workers: int | None) -> Generator[Done]:
         todo = todo[n_done:]
     if todo:
         yield from run_jobs(comparison, todo, min(n_workers or _n_cores(), len(todo)))
-
-
-def _check_figure_alone(request: BenchRequest, figure: Figure, has_settings: bool) -> None:
-    names = [*DEFAULTS, "dop"]
-    given = [f"--{name}" for name in names if getattr(request, name) is not None]
-    given += ["--set planner.*"] if has_settings else []
-    if given:
-        what = f"{' and '.join(given)} cannot be given besides: figure {figure.name} says that itself"
-        expected = "--loadings, --seed and --set profile.mobile_tweezers.KEY=VALUE at most"
-        raise ConfigError(Problem(what, f"--figure {figure.name}", expected=expected))
 
 
 def _jobs(comparison: Comparison, n_workers: int) -> list[Job]:
@@ -288,7 +267,7 @@ def _n_cores() -> int:
 
 @contextmanager
 def _interrupted_by_signals(received: list[int]) -> Generator[None]:
-    """Let SIGTERM interrupt as Ctrl-C does, and note which it was."""
+    """Let SIGTERM interrupt as Ctrl-C does, and record which it was."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

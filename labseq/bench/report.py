@@ -1,9 +1,4 @@
-"""The results of a comparison: rows, ratios, power laws and curves.
-
-What the paper leaves open is chosen here and said in ``docs/explanation/planners.md``:
-the size of the grid beside that of the target, and in figure 3 the degree of
-parallelism.
-"""
+"""The results of a comparison of planners: a row per condition and planner, and a histogram."""
 
 from __future__ import annotations
 
@@ -11,15 +6,14 @@ import csv
 import io
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from types import MappingProxyType
-from typing import Any, Final, Literal
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from labseq.bench.comparison import (
-    BARE_MOTION,
     LOADING,
     RESULT,
     Comparison,
@@ -28,12 +22,14 @@ from labseq.bench.comparison import (
     Failure,
     PlannerEntry,
     PreparedCondition,
-    Words,
 )
-from labseq.bench.pictures import ComparisonDrawing, Curve, Histogram
-from labseq.errors import ConfigError, LabseqError, Problem, one_of
-from labseq.messages import clean, did_you_mean
+from labseq.errors import LabseqError
 from labseq.model.estimate import Estimate, mean
+from labseq.pictures.figures import make_figure, save_figure
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 
 def ratio_of_means(numerator: ArrayLike, denominator: ArrayLike) -> Estimate:
@@ -48,53 +44,6 @@ def ratio_of_means(numerator: ArrayLike, denominator: ArrayLike) -> Estimate:
         return Estimate(math.nan, math.nan)
     ratio = float(above.mean() / below.mean())
     return Estimate(ratio, mean(above - ratio * below).error / float(below.mean()))
-
-
-@dataclass(frozen=True, slots=True)
-class PowerLaw:
-    """``factor * x ** exponent``."""
-
-    factor: float
-    exponent: Estimate
-
-
-def fit_power_law(x: ArrayLike, y: ArrayLike, errors: ArrayLike) -> PowerLaw | None:
-    """Fit a straight line to the logarithms, weighted by the errors.
-
-    Measured means never follow a power law to within their tiny errors, so the
-    exponent's error comes from the scatter about the line: the weights tell only
-    how the points compare.
-
-    Args:
-        x: Positive values, such as numbers of atoms; those of points that cannot
-            be used (no positive value, no error) are left out.
-        y: Means.
-        errors: Their standard errors.
-
-    Returns:
-        The fit; None with fewer than three usable points.
-
-    Example:
-        >>> law = fit_power_law([1, 4, 9], [2.0, 4.1, 5.9], [0.1, 0.1, 0.1])
-        >>> print(law.exponent)
-        0.48(2)
-    """
-    x, y, errors = (np.asarray(values, np.float64) for values in (x, y, errors))
-    usable = (x > 0) & (y > 0) & (errors > 0)
-    if np.count_nonzero(usable) < 3:
-        return None
-    log_x, log_y = np.log(x[usable]), np.log(y[usable])
-    weight = (y[usable] / errors[usable]) ** 2
-    weight /= weight.sum()
-    mid_x, mid_y = weight @ log_x, weight @ log_y
-    spread = weight @ (log_x - mid_x) ** 2
-    if spread == 0.0:
-        return None
-    slope = float(weight @ ((log_x - mid_x) * (log_y - mid_y)) / spread)
-    rest = log_y - mid_y - slope * (log_x - mid_x)
-    scatter = float(weight @ rest**2) / (len(rest) - 2)
-    exponent = Estimate(slope, math.sqrt(scatter / float(spread)))
-    return PowerLaw(math.exp(float(mid_y) - slope * float(mid_x)), exponent)
 
 
 ESTIMATES: Final = (
@@ -114,26 +63,26 @@ ESTIMATES: Final = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Row:
-    """What one planner made of the loadings of one condition.
+    """Results of one planner under one condition.
 
-    The means are over the loadings whose plan was right.
+    The means are over the loadings with a valid plan.
 
     Attributes:
         entrant: The planner.
-        condition: What it was given.
+        condition: Grid, target, loading and motion.
         settings: All its settings, JSON-ready.
-        degree_of_parallelism: Most tweezers on at once that its plans were checked for.
+        degree_of_parallelism: Maximum number of tweezers on at once for which its plans were checked.
         n_target_atoms: Atoms in the target.
         n_loadings: Number of loadings.
         n_short: How many of them hold fewer atoms than the target.
-        n_failed: For how many of them the planner raised or its plan broke a rule.
+        n_failed: Loadings for which the planner failed or its plan broke a rule.
         first_failure: The first of these, or None.
         n_batches: Mean number of batches, linked ones counted as one.
         n_atoms_moved: Mean number of atoms moved; one that is picked up again counts again.
         distance_m: Mean of the distances of all atom moves together, in metres.
         motion_s: Mean time of ramps and transport, in seconds, with the overheads
             that the condition names.
-        n_scans: Mean number of scans, which the source of some planners counts
+        n_scans: Mean number of scans, which the papers of some planners count
             instead of batches; NaN for all others.
         scan_s: Mean time of the scans, in seconds.
         planning_median_s: Median time of a call of ``plan()``, in seconds.
@@ -144,7 +93,7 @@ class Row:
             :func:`labseq.bench.comparison.lines_to_cover`.
         ratio_to_bound: Mean number of batches over mean bound, both over the loadings
             whose target was filled.
-        counts: int64 (most batches + 1,), number of plans with so many batches.
+        counts: int64 (n,), number of plans with 0, 1, 2, ... batches.
     """
 
     planner_entry: PlannerEntry
@@ -172,11 +121,11 @@ class Row:
 
     @property
     def scans(self) -> bool:
-        """Whether the planner's source counts scans."""
+        """Whether the planner's paper counts scans."""
         return not math.isnan(self.n_scans.value)
 
     def as_dict(self) -> dict[str, Any]:
-        """Everything but the failure's words, JSON-ready, SI; None for what is not known."""
+        """All values except the failure's message, JSON-ready, SI; None for unknown ones."""
         rows, cols = self.condition.shape
         values: dict[str, Any] = {
             "planner": self.planner_entry.planner,
@@ -200,14 +149,14 @@ class Row:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Report:
-    """What came of a comparison.
+    """The results of a comparison.
 
     Attributes:
-        comparison: What was asked for.
-        rows: A row per condition and planner; a condition of which nothing was done has none.
+        comparison: The comparison.
+        rows: A row per condition and planner; none for a condition without any loading done.
         n_done: Loadings that were done, over all conditions.
         duration_s: How long it took, in seconds.
-        ended_by: What ended it before all was done, or None.
+        ended_by: The error that ended it early, or None.
     """
 
     comparison: Comparison
@@ -218,12 +167,18 @@ class Report:
 
     @property
     def n_wanted(self) -> int:
-        """Loadings that were asked for, over all conditions."""
+        """Requested loadings, over all conditions."""
         return self.comparison.n_loadings * len(self.comparison.conditions)
 
     def rows_of(self, planner_entry: PlannerEntry) -> list[Row]:
         """The rows of one planner, in the order of the conditions."""
         return [row for row in self.rows if row.planner_entry == planner_entry]
+
+    @property
+    def extent_text(self) -> str:
+        """Number of loadings and seed, as text."""
+        incomplete = "" if self.ended_by is None else f", incomplete: {self.n_done} of {self.n_wanted}"
+        return f"{self.comparison.n_loadings} loadings{incomplete}, seed {self.comparison.seed}"
 
     def as_dict(self) -> dict[str, Any]:
         """Everything, JSON-ready."""
@@ -246,7 +201,7 @@ class Report:
 
 
 class Tally:
-    """Gathers what comes of the jobs of a comparison."""
+    """Collects the results of the jobs of a comparison."""
 
     def __init__(self, comparison: Comparison, courses: Sequence[PreparedCondition]) -> None:
         n_entrants, n_loadings = len(comparison.planner_entries), comparison.n_loadings
@@ -263,7 +218,7 @@ class Tally:
         return sum(int(np.count_nonzero(done)) for done in self._is_done)
 
     def add(self, done: Done) -> None:
-        """Take in what came of a job."""
+        """Add the results of a job."""
         i, span = done.job.condition, slice(done.job.start, done.job.stop)
         self._results[i][:, span] = done.results
         self._loadings[i][span] = done.loadings
@@ -274,7 +229,7 @@ class Tally:
                 self._failures[key] = failure
 
     def rows(self) -> tuple[Row, ...]:
-        """A row per condition and planner, of what is done."""
+        """A row per condition and planner, of the loadings that are done."""
         return tuple(
             self._row(i, planner_entry)
             for i, done in enumerate(self._is_done)
@@ -321,7 +276,7 @@ def _known(value: float) -> float | None:
 
 
 def _flat(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Nested values beside one another: n_batches_mean, n_batches_error, ..."""
+    """Flatten nested values: n_batches_mean, n_batches_error, ..."""
     flat: dict[str, Any] = {}
     for key, value in values.items():
         if key == "settings":
@@ -333,271 +288,51 @@ def _flat(values: Mapping[str, Any]) -> dict[str, Any]:
     return flat
 
 
-Quantity = Literal["n_target_atoms", "degree_of_parallelism", "n_batches", "motion_s"]
+def save_histogram(path: Path, report: Report) -> None:
+    """Draw how many batches the planners need, for a comparison with one condition.
 
-
-@dataclass(frozen=True, slots=True)
-class Figure:
-    """What a figure shows.
-
-    Attributes:
-        name: Its name in the paper.
-        title: What is compared, and how.
-        x: What differs between the conditions.
-        y: What is drawn over it.
-        entrants: A curve each.
-        conditions: A point each.
-        fitted: Whether the curves are power laws of x.
-        paper: What the paper states of it, in words.
-        paper_points: What the paper states of it: (x, y) each.
-        histograms_at: Values of x for which the first planner's batches are drawn as histograms.
-    """
-
-    name: str
-    title: str
-    x: Quantity
-    y: Quantity
-    planner_entries: tuple[PlannerEntry, ...]
-    conditions: tuple[Condition, ...]
-    fitted: bool
-    paper: str
-    paper_points: tuple[tuple[float, float], ...] = ()
-    histograms_at: tuple[int, ...] = ()
-
-    def with_motion(self, motion: Words) -> list[Condition]:
-        """The conditions with some settings of the motion changed."""
-        return [replace(condition, motion=(*condition.motion, *motion)) for condition in self.conditions]
-
-
-PSCA: Final = PlannerEntry("psca")
-PSCA_OF_THE_PAPER: Final = PlannerEntry("psca", (("variant", "paper"),))
-
-EBADI: Final[Words] = (("speed", "75 um/ms"), ("pick_up", "15 us"), ("drop_off", "15 us"))
-"""Transport speed and capture time of S. Ebadi et al., Nature 595, 227 (2021)."""
-
-
-def _compact(side: int) -> Condition:
-    """A centred square, four sites of the grid for three of the target along each side, as 20 for 15."""
-    grid = round(side * 4 / 3)
-    return Condition((grid, grid), f"compact:{side}x{side}", 0.75, 15)
-
-
-def _interleaved(side: int) -> Condition:
-    """Target rows with a reservoir row after each, and a tenth of the columns more on both sides.
-
-    At 55 % loading that makes 1.32 atoms per target site, nearly as many as 20 x 20
-    for 15 x 15 at 75 %. All atoms of a line may move at once.
-    """
-    rows, cols = 2 * side, round(1.2 * side)
-    limits = ("max_tweezers", "max_row_tones", "max_column_tones")
-    motion = (*BARE_MOTION, *EBADI, *((limit, str(rows)) for limit in limits))
-    return Condition((rows, cols), f"interleaved:{side}x{side}", 0.55, rows, motion)
-
-
-_COMPACT: Final = tuple(_compact(side) for side in (6, 9, 12, 15))
-_INTERLEAVED: Final = tuple(_interleaved(side) for side in (5, 7, 10, 13, 15, 18, 20))
-_MTA1: Final = (PSCA, PSCA_OF_THE_PAPER, PlannerEntry("mta1"))
-
-FIGURES: Final[Mapping[str, Figure]] = MappingProxyType(
-    {
-        figure.name: figure
-        for figure in (
-            Figure(
-                name="2b",
-                title="compact targets, 75 % loading, degree of parallelism 15",
-                x="n_target_atoms",
-                y="n_batches",
-                planner_entries=(PSCA, PSCA_OF_THE_PAPER, PlannerEntry("lsap_squared")),
-                conditions=_COMPACT,
-                fitted=True,
-                paper="PSCA 0.48(2), modified LSAP 1.16(1)",
-            ),
-            Figure(
-                name="2c",
-                title="15 x 15 out of 20 x 20, 75 % loading",
-                x="degree_of_parallelism",
-                y="n_batches",
-                planner_entries=(PSCA, PSCA_OF_THE_PAPER),
-                conditions=tuple(Condition((20, 20), "compact:15x15", 0.75, dop) for dop in range(2, 16)),
-                fitted=False,
-                paper="PSCA 160.0(2) batches at 2, 29.61(3) at 15",
-                paper_points=((2, 160.0), (15, 29.61)),
-                histograms_at=(2, 3, 5, 7, 15),
-            ),
-            Figure(
-                name="3a",
-                title="interleaved targets, 55 % loading, any degree of parallelism",
-                x="n_target_atoms",
-                y="n_batches",
-                planner_entries=_MTA1,
-                conditions=_INTERLEAVED,
-                fitted=True,
-                paper="PSCA 0.388(2), MTA1 0.47(1)",
-            ),
-            Figure(
-                name="3b",
-                title="interleaved targets, 55 % loading, any degree of parallelism",
-                x="n_target_atoms",
-                y="motion_s",
-                planner_entries=_MTA1,
-                conditions=_INTERLEAVED,
-                fitted=True,
-                paper="at 400 atoms PSCA takes a quarter of MTA1's time",
-            ),
-        )
-    }
-)
-"""Name -> figure."""
-
-
-def find_figure(name: str) -> Figure:
-    """The figure of that name.
+    Args:
+        path: The PNG file.
+        report: The comparison.
 
     Raises:
-        ConfigError: There is none.
-    """
-    figure = FIGURES.get(name)
-    if figure is None:
-        hint = did_you_mean(name, FIGURES)
-        expected = one_of(list(FIGURES))
-        raise ConfigError(
-            Problem("there is no such figure", clean(f"--figure {name}"), expected=expected, hint=hint)
-        )
-    return figure
-
-
-AXES: Final[Mapping[Quantity, str]] = {
-    "n_target_atoms": "atoms in the target, N",
-    "degree_of_parallelism": "degree of parallelism",
-    "n_batches": "mean number of batches",
-    "motion_s": "mean time of ramps and transport (ms)",
-}
-"""What axes are called."""
-BOUND: Final = "bound"
-"""What the rows and columns that cover the vacancies are called."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Points:
-    """One curve of a figure.
-
-    Attributes:
-        label: The planner, and what is counted if not batches; or the bound.
-        x: float64 (n,).
-        y: float64 (n,), means.
-        error: float64 (n,), their standard errors.
-        law: The power law through them; None if the figure has none or the points are too few.
+        ConfigError: The file cannot be written.
     """
 
-    label: str
-    x: NDArray[np.float64]
-    y: NDArray[np.float64]
-    error: NDArray[np.float64]
-    law: PowerLaw | None
+    def draw() -> Figure:
+        (condition,) = report.comparison.conditions
+        figure = make_figure(5.4, 4.2, layout="constrained")
+        axes = figure.add_subplot()
+        for i, row in enumerate(report.rows):
+            label = f"{row.planner_entry.label}: {row.n_batches}"
+            draw_histogram(axes, row.counts, f"C{i % 10}", label)
+        axes.set_xlabel("batches")
+        axes.set_ylabel("share of the loadings")
+        if any(row.counts.any() for row in report.rows):
+            axes.legend(frameon=False, fontsize=8)
+        rows, cols = condition.shape
+        given = f"{100 * condition.loading:g} % loading"
+        if condition.degree_of_parallelism is not None:
+            given += f", degree of parallelism {condition.degree_of_parallelism}"
+        title = f"{condition.target} out of {rows} x {cols}, {given}\n{report.extent_text}"
+        figure.suptitle(title, fontsize=9)
+        return figure
+
+    save_figure(path, draw, dpi=150)
 
 
-def points_of(report: Report, figure: Figure) -> list[Points]:
-    """Each planner's points, as far as they are done, and the bound where batches are counted."""
-    found: list[Points] = []
-    for planner_entry in report.comparison.planner_entries:
-        rows = report.rows_of(planner_entry)
-        label = f"{planner_entry.label} (scans)" if any(row.scans for row in rows) else planner_entry.label
-        found.append(_points(label, rows, figure, [_y(row, figure.y) for row in rows]))
-    if figure.y == "n_batches":
-        rows = report.rows_of(report.comparison.planner_entries[0])
-        found.append(_points(BOUND, rows, figure, [row.bound for row in rows]))
-    return found
+def draw_histogram(axes: Axes, counts: NDArray[np.int64], colour: str, label: str) -> None:
+    """Draw the share of each number of batches.
 
-
-def _points(label: str, rows: list[Row], figure: Figure, y: list[Estimate]) -> Points:
-    x = np.array([_x(row, figure.x) for row in rows], np.float64)
-    means = np.array([one.value for one in y], np.float64)
-    errors = np.array([one.error for one in y], np.float64)
-    return Points(label, x, means, errors, fit_power_law(x, means, errors) if figure.fitted else None)
-
-
-def figure_drawing(report: Report, figure: Figure) -> ComparisonDrawing:
-    """A figure of the paper, as measured."""
-    unit = 1e3 if figure.y == "motion_s" else 1.0
-    curves = [_curve(points, unit) for points in points_of(report, figure)]
-    if figure.paper_points:
-        x, y = np.array(figure.paper_points, np.float64).T
-        curves.append(Curve("the paper", x, y, np.zeros(len(x)), is_quoted=True))
-    first = report.comparison.planner_entries[0]
-    histograms = [
-        Histogram(f"DOP {row.degree_of_parallelism}", row.counts)
-        for row in report.rows_of(first)
-        if row.degree_of_parallelism in figure.histograms_at
-    ]
-    return ComparisonDrawing(
-        title=f"figure {figure.name}: {figure.title}",
-        note=f"{_extent(report)}\nthe paper: {figure.paper}",
-        x_label=AXES[figure.x],
-        y_label=AXES[figure.y],
-        counted=f"batches of {_plain(first.label)}",
-        curves=tuple(curves),
-        histograms=tuple(histograms),
-        logarithmic=figure.fitted,
-    )
-
-
-def histogram_drawing(report: Report) -> ComparisonDrawing:
-    """A comparison that is no figure of the paper: how many batches the planners need."""
-    (condition,) = report.comparison.conditions
-    rows, cols = condition.shape
-    dop = condition.degree_of_parallelism
-    given = f"{100 * condition.loading:g} % loading"
-    given += f", degree of parallelism {dop}" if dop is not None else ""
-    return ComparisonDrawing(
-        title=f"{_plain(condition.target)} out of {rows} x {cols}, {given}",
-        note=_extent(report),
-        x_label="",
-        y_label="",
-        counted="batches",
-        histograms=tuple(
-            Histogram(f"{row.planner_entry.label}: {row.n_batches}", row.counts) for row in report.rows
-        ),
-    )
-
-
-def fits_as_dicts(points: list[Points]) -> list[dict[str, Any]]:
-    """The power laws, JSON-ready."""
-    return [
-        {
-            "label": one.label,
-            "factor": one.law.factor,
-            "exponent": {"value": one.law.exponent.value, "error": one.law.exponent.error},
-        }
-        for one in points
-        if one.law is not None
-    ]
-
-
-def _x(row: Row, quantity: Quantity) -> float:
-    return row.n_target_atoms if quantity == "n_target_atoms" else row.degree_of_parallelism
-
-
-def _y(row: Row, quantity: Quantity) -> Estimate:
-    """As the algorithm's source counts it."""
-    if quantity == "motion_s":
-        return row.scan_s if row.scans else row.motion_s
-    return row.n_scans if row.scans else row.n_batches
-
-
-def _curve(points: Points, unit: float) -> Curve:
-    law, label = points.law, _plain(points.label)
-    if law is not None:
-        label = f"{label}: $N^{{{law.exponent}}}$"
-    fitted = None if law is None else (law.factor * unit, law.exponent.value)
-    limit = points.label == BOUND
-    return Curve(label, points.x, points.y * unit, points.error * unit, fitted, is_limit=limit)
-
-
-def _plain(text: str) -> str:
-    """A text in which mathtext finds nothing to set."""
-    return text.replace("$", r"\$")
-
-
-def _extent(report: Report) -> str:
-    incomplete = "" if report.ended_by is None else f", incomplete: {report.n_done} of {report.n_wanted}"
-    return f"{report.comparison.n_loadings} loadings{incomplete}, seed {report.comparison.seed}"
+    Args:
+        axes: Where to draw.
+        counts: int64 (n,), how often 0, 1, 2, ... batches were needed.
+        colour: Colour of the bars.
+        label: Name in the legend.
+    """
+    seen = np.flatnonzero(counts)
+    if len(seen):
+        first, last = int(seen[0]), int(seen[-1])
+        edges, share = np.arange(first, last + 2) - 0.5, counts[first : last + 1] / counts.sum()
+        axes.stairs(share, edges, fill=True, color=colour, alpha=0.45, label=label)
+        axes.stairs(share, edges, color=colour, linewidth=1)

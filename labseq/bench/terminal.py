@@ -9,22 +9,13 @@ from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from labseq.bench.comparison import BARE_MOTION, loading_seed
 from labseq.bench.latency import GOAL_S, LatencyReport, LatencyRequest, Stage, measure_latency
-from labseq.bench.pictures import save_comparison
 from labseq.bench.planners import BenchRequest, compare, read_request
 from labseq.bench.rendering import WaveformReport, bench_waveform
-from labseq.bench.report import (
-    Figure,
-    Report,
-    Row,
-    figure_drawing,
-    fits_as_dicts,
-    histogram_drawing,
-    points_of,
-)
+from labseq.bench.report import Report, Row, save_histogram
 from labseq.console.output import (
     STDOUT,
     as_line,
@@ -38,7 +29,6 @@ from labseq.console.output import (
 )
 from labseq.console.text import columns, percent, plural
 from labseq.errors import PlanError
-from labseq.model.estimate import Estimate
 from labseq.pictures.plans import check_picture
 from labseq.units import format_quantity
 
@@ -86,14 +76,12 @@ def table(report: Report) -> list[str]:
     return columns([header, *([row[name] for name in header] for row in rows)], right)
 
 
-def notes(report: Report, figure: Figure | None) -> list[str]:
-    """Notes below the table: fits, missing atoms, wrong plans."""
+def notes(report: Report) -> list[str]:
+    """Notes below the table: missing atoms, wrong plans."""
     lines = [_extent(report)]
     if any(row.scans for row in report.rows):
         lines.append("scans: what the paper of the planner counts instead of batches, and their duration")
     lines += _shortages(report)
-    if figure is not None:
-        lines += [*_fits(report, figure), f"the paper, figure {figure.name}: {figure.paper}"]
     for row in report.rows:
         lines += _failure(report, row)
     return ["", *lines]
@@ -123,22 +111,6 @@ def _cells(row: Row, report: Report) -> dict[str, str]:
         "met": percent(row.target_met.value, 2),
         "/bound": str(row.ratio_to_bound),
     }
-
-
-def _fits(report: Report, figure: Figure) -> list[str]:
-    """The fitted power laws, and the values at the last point."""
-    every = [points for points in points_of(report, figure) if points.law is not None]
-    if not every:
-        return []
-    what, unit, factor = ("time", " ms", 1e3) if figure.y == "motion_s" else ("number", "", 1.0)
-    lines = [f"{points.label}: {what} ~ N^{points.law.exponent}" for points in every if points.law]
-    first = every[0].y[-1]
-    last = [
-        f"{points.label} {Estimate(points.y[-1], points.error[-1]).scaled(factor)}{unit}"
-        f" (x {points.y[-1] / first:.3g})"
-        for points in every
-    ]
-    return [*lines, f"at {every[0].x[-1]:.0f} atoms: {', '.join(last)}"]
 
 
 def _time(duration_s: float) -> str:
@@ -224,8 +196,7 @@ def bench_planners(request: BenchRequest, output: BenchOutput) -> None:
         StopRequested: It was stopped; the results so far were printed.
     """
     answer = stdout_to_stderr() if output.json == STDOUT else None
-    comparison, figure = read_request(request)
-    files = _files(output, figure)
+    comparison, files = read_request(request), _files(output)
     check_different(*files.values())
     for kind, path in files.items():
         if kind == "png":
@@ -233,41 +204,32 @@ def bench_planners(request: BenchRequest, output: BenchOutput) -> None:
         check_writable(path)
     with progress_of("loadings") as progress:
         report = compare(comparison, request.workers, announce=report_compiling, progress=progress)
-    say(*table(report), *notes(report, figure))
+    say(*table(report), *notes(report))
     if report.rows:
-        _write_files(files, report, figure)
+        _write_files(files, report)
     if answer is not None:
-        answer(as_line(_as_dict(report, figure)))
+        answer(as_line(report.as_dict()))
     if report.ended_by is not None:
         raise report.ended_by
     _raise_failures(report)
 
 
-def _files(output: BenchOutput, figure: Figure | None) -> dict[str, Path]:
+def _files(output: BenchOutput) -> dict[str, Path]:
     """The files to write, by kind."""
     named = {"csv": output.csv, "png": output.png}
     if output.json not in (None, STDOUT):
         named["json"] = Path(output.json)
-    if figure is not None:
-        named = {kind: path or Path(f"figure-{figure.name}.{kind}") for kind, path in named.items()}
     return {kind: path for kind, path in named.items() if path is not None}
 
 
-def _write_files(files: dict[str, Path], report: Report, figure: Figure | None) -> None:
+def _write_files(files: dict[str, Path], report: Report) -> None:
     for kind, path in files.items():
         if kind == "png":
-            save_comparison(path, figure_drawing(report, figure) if figure else histogram_drawing(report))
+            save_histogram(path, report)
             continue
-        write_text(path, report.as_csv() if kind == "csv" else f"{as_line(_as_dict(report, figure))}\n")
+        write_text(path, report.as_csv() if kind == "csv" else f"{as_line(report.as_dict())}\n")
     if files:
         say(f"written: {', '.join(map(str, files.values()))}")
-
-
-def _as_dict(report: Report, figure: Figure | None) -> dict[str, Any]:
-    values = report.as_dict()
-    if figure is not None:
-        values |= {"figure": figure.name, "fits": fits_as_dicts(points_of(report, figure))}
-    return values
 
 
 def _raise_failures(report: Report) -> None:

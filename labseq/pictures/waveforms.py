@@ -57,7 +57,7 @@ class WaveformPieces:
             pieces: First sample of each, and the one after its last.
 
         Example:
-            >>> Stretches.of([(10, 14), (20, 25)]).at.tolist()
+            >>> WaveformPieces.of([(10, 14), (20, 25)]).at.tolist()
             [0, 4, 9]
         """
         bounds = np.array(pieces, np.int64).reshape(-1, 2)

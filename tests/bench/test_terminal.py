@@ -67,33 +67,6 @@ def test_files_hold_what_the_table_does(tmp_path: Path, capsys: pytest.CaptureFi
     assert "written: " in capsys.readouterr().out
 
 
-def test_a_figure_is_drawn_where_one_stands(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    from dataclasses import replace
-
-    from labseq.bench import report as bench_figures
-    from labseq.bench.comparison import Condition, PlannerEntry
-
-    conditions = tuple(Condition((4 * n, 4 * n), f"compact:{3 * n}x{3 * n}", 0.75, 5) for n in (1, 2, 3))
-    figure = replace(
-        bench_figures.FIGURES["2b"], planner_entries=(PlannerEntry("psca"),), conditions=conditions
-    )
-    monkeypatch.setattr(bench_figures, "FIGURES", {"2b": figure})
-    monkeypatch.chdir(tmp_path)
-    assert code_of("--figure", "2b", "--loadings", "10", "--workers", "1", "--json", "figure.json") == 0
-    assert sorted(path.name for path in tmp_path.iterdir()) == [
-        "figure-2b.csv",
-        "figure-2b.png",
-        "figure.json",
-    ]
-    values = json.loads((tmp_path / "figure.json").read_text("utf-8"))
-    assert [fit["label"] for fit in values["fits"]] == ["psca", "bound"]
-    out = capsys.readouterr().out
-    assert "psca: number ~ N^" in out
-    assert "the paper, figure 2b: PSCA 0.48(2), modified LSAP 1.16(1)" in out
-
-
 def test_wrong_plans_are_reported_with_a_way_to_see_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -122,8 +95,6 @@ def test_too_few_atoms_are_reported(capsys: pytest.CaptureFixture[str]) -> None:
     [
         (["--planners", "psac"], "--planners psac: unknown planner 'psac'"),
         (["--target", "compact:30x30"], "--target compact:30x30: "),
-        (["--figure", "2d"], "--figure 2d: there is no such figure; expected one of '2b', '2c', '3a', '3b'"),
-        (["--figure", "2c", "--dop", "3"], "--dop cannot be given besides"),
         (["--loadings", "0"], "--loadings"),
         (["--loading", "1.5"], "--loading 1.5: this is no probability"),
         (["--dop", "0"], "--dop 0: "),
@@ -162,7 +133,7 @@ def test_a_file_that_was_there_is_not_lost_to_a_mistake(
 def test_help_names_every_option(capsys: pytest.CaptureFixture[str]) -> None:
     assert code_of("--help") == 0
     out = capsys.readouterr().out
-    options = ("figure", "planners", "grid", "target", "loading", "dop", "loadings", "seed", "set", "workers")
+    options = ("planners", "grid", "target", "loading", "dop", "loadings", "seed", "set", "workers")
     assert all(f"--{option} " in out for option in (*options, "json", "csv", "png"))
 
 

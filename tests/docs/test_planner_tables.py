@@ -7,8 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from labseq.bench.report import FIGURES
-
 from .scripts import load_script
 
 ROOT = Path(__file__).parents[2]
@@ -16,6 +14,7 @@ PAGE = (ROOT / "docs" / "explanation" / "planners.md").read_text(encoding="utf-8
 
 
 SCRIPT = load_script("make_planner_tables")
+FIGURES = SCRIPT.FIGURES
 
 
 def test_every_figure_has_a_measured_part_and_a_picture() -> None:

@@ -13,7 +13,7 @@ import pytest
 from labseq.bench import planners as bench
 from labseq.bench.comparison import Comparison, Condition, PlannerEntry, draw, set_up
 from labseq.bench.planners import BenchRequest, compare, read_request
-from labseq.bench.report import Report, find_figure
+from labseq.bench.report import Report
 from labseq.errors import ConfigError, PlanError
 
 SMALL = Comparison((PlannerEntry("psca"),), (Condition((8, 8), "compact:5x5", 0.75, 4),), 60, 5)
@@ -186,34 +186,26 @@ def test_csv_and_json_hold_the_same() -> None:
         (BenchRequest(overrides=["planner.dop=3"]), "--set planner.dop=3: 'dop' is not a setting"),
         (BenchRequest(overrides=["profile.mobile_tweezers.sped=3"]), "'sped' is .*did you mean 'speed'?"),
         (BenchRequest(overrides=["profile.mobile_tweezers.speed=3 ms"]), "'3 ms' is a time, not a speed"),
-        (BenchRequest(figure="2d"), "--figure 2d: there is no such figure; expected one of '2b', '2c'"),
-        (BenchRequest(figure="2b", dop=3, grid="5x5"), "--grid and --dop cannot be given besides: figure 2b"),
     ],
 )  # fmt: skip
 def test_wrong_requests_are_refused_in_words(request_: BenchRequest, words: str) -> None:
     with pytest.raises(ConfigError, match=words):
-        compare(read_request(request_)[0], 1)
+        compare(read_request(request_), 1)
 
 
 def test_the_tone_limits_bound_the_degree_of_parallelism() -> None:
     limits = [f"profile.mobile_tweezers.max_{axis}_tones=5" for axis in ("row", "column")]
     with pytest.raises(ConfigError, match=r"--dop 6: .*; expected at most 5, the most tones of an axis"):
-        compare(read_request(BenchRequest(dop=6, overrides=limits))[0], 1)
+        compare(read_request(BenchRequest(dop=6, overrides=limits)), 1)
 
 
 def test_a_request_without_anything_is_the_papers_array() -> None:
-    comparison, figure = read_request(BenchRequest())
-    assert figure is None
+    comparison = read_request(BenchRequest())
     assert comparison.planner_entries == (PlannerEntry("psca"),)
     assert comparison.conditions == (Condition((20, 20), "compact:15x15", 0.75),)
 
 
-def test_a_figure_can_move_at_another_speed() -> None:
-    speed = "profile.mobile_tweezers.speed=130 um/ms"
-    comparison, figure = read_request(BenchRequest(figure="3b", overrides=[speed]))
-    assert figure is find_figure("3b")
-    conditions = tuple(replace(c, target="compact:2x2") for c in comparison.conditions)
-    courses = set_up(replace(comparison, planner_entries=(PlannerEntry("psca"),), conditions=conditions))
-    assert {(c.motion.speed_m_s, c.motion.pick_up_s, c.motion.drop_off_s) for c in courses} == {
-        (0.13, 15e-6, 15e-6)
-    }
+def test_tweezers_can_move_at_another_speed() -> None:
+    request = BenchRequest(target="compact:2x2", overrides=["profile.mobile_tweezers.speed=130 um/ms"])
+    (course,) = set_up(read_request(request))
+    assert course.motion.speed_m_s == 0.13

@@ -4,20 +4,19 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
+from PIL import Image
 
 from labseq.bench.comparison import Comparison, Condition, PlannerEntry, set_up
 from labseq.bench.planners import compare
-from labseq.bench.report import (
-    FIGURES,
-    Figure,
-    Report,
-    figure_drawing,
-    fits_as_dicts,
-    histogram_drawing,
-    points_of,
-)
+from labseq.bench.report import Report, save_histogram
+from labseq.errors import ConfigError, StopRequested
+from labseq.pictures.figures import make_figure
+
+from .scripts import load_script
+
+SCRIPT = load_script("make_planner_tables")
+FIGURES, points_of = SCRIPT.FIGURES, SCRIPT.points_of
 
 CONDITIONS = tuple(Condition((4 * n, 4 * n), f"compact:{3 * n}x{3 * n}", 0.75, 5) for n in (1, 2, 3))
 
@@ -64,45 +63,41 @@ def report() -> Report:
     return compared()
 
 
-def figure(**changes: Any) -> Figure:
+def figure(**changes: Any) -> Any:
     return replace(FIGURES["2b"], planner_entries=(PlannerEntry("psca"),), conditions=CONDITIONS, **changes)
 
 
-def test_the_bound_is_drawn_beside_the_planners(report: Report) -> None:
+def curves(report: Report, drawn: Any) -> dict[str, Any]:
+    """Label in the legend -> its curve."""
+    axes = make_figure(4.0, 3.0).add_subplot()
+    SCRIPT.draw_curves(axes, points_of(report, drawn), drawn)
+    return dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
+
+
+def test_the_bound_is_drawn_with_the_planners(report: Report) -> None:
     points = points_of(report, figure())
     assert [one.label for one in points] == ["psca", "bound"]
     assert points[0].x.tolist() == points[1].x.tolist() == [9.0, 36.0, 81.0]
     assert (points[0].y >= points[1].y).all()
-    drawing = figure_drawing(report, figure())
-    assert [curve.is_limit for curve in drawing.curves] == [False, True]
-
-
-def test_every_law_that_is_drawn_is_in_the_json(report: Report) -> None:
-    points = points_of(report, figure())
-    laws = fits_as_dicts(points)
-    curves = figure_drawing(report, figure()).curves
-    assert [(law["factor"], law["exponent"]["value"]) for law in laws] == [curve.law for curve in curves]
-    assert points[0].law is not None
-    assert curves[0].label == f"psca: $N^{{{points[0].law.exponent}}}$"
+    assert [*curves(report, figure())] == [f"{one.label}: $N^{{{one.law.exponent}}}$" for one in points]
 
 
 def test_times_are_drawn_in_milliseconds(report: Report) -> None:
-    (curve,) = figure_drawing(report, figure(y="motion_s")).curves
     (points,) = points_of(report, figure(y="motion_s"))
-    assert np.array_equal(curve.y, 1e3 * points.y)
-    assert curve.law is not None
-    assert np.allclose(curve.law[0] * curve.x ** curve.law[1], curve.y, rtol=0.5)
+    (curve,) = curves(report, figure(y="motion_s")).values()
+    assert curve.lines[0].get_ydata().tolist() == pytest.approx((1e3 * points.y).tolist())
 
 
-def test_a_figure_over_the_degree_of_parallelism_has_no_law_but_histograms() -> None:
+def test_a_figure_over_the_degree_of_parallelism_has_no_law_but_histograms(tmp_path: Path) -> None:
     conditions = tuple(replace(CONDITIONS[1], degree_of_parallelism=dop) for dop in (2, 3, 5))
     over_dop = replace(FIGURES["2c"], planner_entries=(PlannerEntry("psca"),), conditions=conditions)
     report = compared(conditions)
-    drawing = figure_drawing(report, over_dop)
     assert [one.law for one in points_of(report, over_dop)] == [None, None]
-    assert [histogram.label for histogram in drawing.histograms] == ["DOP 2", "DOP 3", "DOP 5"]
-    assert [curve.label for curve in drawing.curves] == ["psca", "bound", "the paper"]
-    assert not drawing.logarithmic
+    assert {*curves(report, over_dop)} == {"psca", "bound", "the paper"}
+    for name, drawn in (("two", over_dop), ("one", replace(over_dop, histograms_at=()))):
+        SCRIPT.draw_figure(tmp_path / f"{name}.png", report, drawn)
+    with Image.open(tmp_path / "one.png") as one, Image.open(tmp_path / "two.png") as two:
+        assert (two.width, two.height) == (2 * one.width, one.height)
 
 
 def test_a_planner_that_scans_is_drawn_by_its_scans(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -116,22 +111,30 @@ def test_a_planner_that_scans_is_drawn_by_its_scans(tmp_path: Path, monkeypatch:
     assert (times[1].y < 0.1).all()
 
 
-def test_an_incomplete_figure_says_so(report: Report) -> None:
-    from labseq.errors import StopRequested
-
+def test_an_incomplete_comparison_says_so(report: Report) -> None:
     stopped = replace(report, n_done=7, ended_by=StopRequested(), rows=report.rows[:1])
-    drawing = figure_drawing(stopped, figure())
-    assert "incomplete: 7 of 30" in drawing.note
-    assert [curve.law for curve in drawing.curves] == [None, None]
+    assert "incomplete: 7 of 30" in stopped.extent_text
+    assert [one.law for one in points_of(stopped, figure())] == [None, None]
 
 
-def test_a_plain_comparison_shows_how_batches_spread() -> None:
-    drawing = histogram_drawing(
-        compared(CONDITIONS[:1], PlannerEntry("psca", (("degree_of_parallelism", "3"),)))
-    )
-    (histogram,) = drawing.histograms
-    assert histogram.counts.sum() == 10
-    assert drawing.title == "compact:3x3 out of 4 x 4, 75 % loading, degree of parallelism 5"
+def test_the_script_draws_one_figure(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(SCRIPT, "FIGURES", {"2b": figure()})
+    path = tmp_path / "2b.png"
+    SCRIPT.main(["--figure", "2b", "--loadings", "5", "--set", "speed=130 um/ms", "--output", str(path)])
+    assert path.read_bytes().startswith(b"\x89PNG")
+    assert "psca: N^" in capsys.readouterr().out
+
+
+def test_a_comparison_is_drawn_as_a_histogram(tmp_path: Path) -> None:
+    entry = PlannerEntry("psca", (("degree_of_parallelism", "3"),))
+    report = compared(CONDITIONS[:1], entry, PlannerEntry("psca"))
+    save_histogram(tmp_path / "histogram.png", report)
+    assert (tmp_path / "histogram.png").read_bytes().startswith(b"\x89PNG")
+    save_histogram(tmp_path / "none.png", replace(report, rows=()))
+    with pytest.raises(ConfigError, match="the picture cannot be written"):
+        save_histogram(tmp_path / "nowhere" / "histogram.png", report)
 
 
 @pytest.mark.parametrize("name", FIGURES)
