@@ -194,7 +194,7 @@ def read_lines(path: Path) -> tuple[list[dict[str, Any]], list[int]]:
 
     Returns:
         The lines that are whole, and the numbers (from 1) of damaged lines. An unfinished last line is
-        neither: it was never reported as written. Without the file, none of both.
+        neither: it was never reported as written. Both are empty if there is no file.
 
     Raises:
         RecordingError: The file exists but cannot be read.
@@ -215,7 +215,7 @@ SEQUENCES: Final = "sequences"
 def packaged_dir(folder: str) -> Path:
     """The folder of the profiles or the sequences that come with labseq.
 
-    In a wheel it lies in ``labseq/config``, in a checkout at the top.
+    In a wheel it is in ``labseq/config``, in a checkout at the top.
     """
     here = Path(__file__).resolve().parent
     packaged = here / "config" / folder
@@ -233,10 +233,10 @@ def packaged_sequences_dir() -> Path:
 
 
 def profile_dir(profile: Path) -> Path:
-    """The folder in which what belongs to a profile is kept: its own.
+    """The folder for what belongs to a profile, such as its calibrations: the profile's own folder.
 
-    Of an installed profile it is ./hardware_profiles, where a copy of it would stand: what is installed
-    is everybody's, may be read-only, and goes with the next version.
+    For a profile that is installed with labseq it is ./hardware_profiles, where a copy of the profile would
+    be. The installed folder is shared by all users, may be read-only, and is replaced by the next version.
     """
     folder = profile.resolve().parent
     is_installed = folder == Path(__file__).resolve().parent / "config" / PROFILES
@@ -244,7 +244,7 @@ def profile_dir(profile: Path) -> Path:
 
 
 def data_root() -> Path:
-    """Where runs are kept if nothing else is said: LABSEQ_DATA, else ``./data``."""
+    """Default folder of runs: LABSEQ_DATA, else ``./data``."""
     return Path(os.environ.get("LABSEQ_DATA") or "data").expanduser()
 
 
@@ -340,7 +340,7 @@ def _start_time(pid: int) -> float | None:
 
 _NO_LOCKS: Final = frozenset({errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOTSUP})
 _FOR_ALL: Final = 0o666
-"""Other users may lock the same file, whatever this user's mask is."""
+"""Other users may lock the same file, whatever this user's umask is."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -348,8 +348,8 @@ class Holder:
     """Who holds a lock.
 
     Attributes:
-        what: What it does, for example "the run data/2026-01-02/0001_compact"; "" if nobody knows.
-        pid: Its process; 0 if nobody knows.
+        what: What it does, for example "the run data/2026-01-02/0001_compact"; "" if unknown.
+        pid: Its process; 0 if unknown.
         host: Its computer.
         since_utc: Since when, ISO 8601, UTC.
     """
@@ -361,17 +361,17 @@ class Holder:
 
     def __str__(self) -> str:
         if not self.pid:
-            return "a process that has not said what it does"
+            return "an unknown process"
         return f"{self.what} (process {self.pid} on {self.host}, since {_local(self.since_utc)})"
 
 
 class Lock:
-    """A lock of the system on a file: whoever holds it loses it with its process.
+    """A lock of the operating system on a file; it is released when its process ends, however it ends.
 
-    Beside the file stands ``<file>.holder``, which says who holds it.
+    ``<file>.holder`` beside the file says who holds it.
 
     Args:
-        path: The file; it is made if there is none, and its folder, and it stays.
+        path: The file; it and its folder are made if they do not exist, and stay.
         what: What the holder does.
     """
 
@@ -384,10 +384,13 @@ class Lock:
         )
 
     def take(self) -> Holder | None:
-        """Take it if it is free; who holds it if it is not.
+        """Take the lock if it is free.
+
+        Returns:
+            None, or the holder if it is not free.
 
         Raises:
-            OSError: The file cannot be made; or the folder knows no locks, see :func:`knows_no_locks`.
+            OSError: The file cannot be made; or its folder has no locks, see :func:`knows_no_locks`.
         """
         from filelock import FileLock, SoftFileLock, Timeout  # takes 0.05 s to import
 
@@ -395,13 +398,13 @@ class Lock:
         lock: Any = FileLock(self.path, timeout=0, mode=_FOR_ALL, thread_local=False)
         try:
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # of the package, where it makes do with less than a lock
+                warnings.simplefilter("ignore")  # filelock warns where it falls back to a lock file
                 lock.acquire()
         except Timeout:
             return self._other()
         except NotImplementedError as error:
             raise OSError(errno.ENOSYS, str(error)) from error
-        if isinstance(lock, SoftFileLock):  # it would outlive its holder
+        if isinstance(lock, SoftFileLock):  # a lock file would outlive its holder
             lock.release()
             raise OSError(errno.ENOSYS, os.strerror(errno.ENOSYS))
         self._lock = lock
@@ -409,13 +412,13 @@ class Lock:
         return None
 
     def describe(self, what: str) -> None:
-        """Say what is done meanwhile; what cannot be written is not said."""
+        """Write what the holder does beside the lock, if that can be written."""
         self._holder = replace(self._holder, what=what)
         with suppress(OSError), whole_file(self._about) as file:
             file.write(json.dumps(asdict(self._holder)).encode())
 
     def release(self) -> None:
-        """Free it; legal at any time."""
+        """Free the lock; legal at any time."""
         if self._lock is not None:
             with suppress(OSError):
                 self._about.unlink(missing_ok=True)
@@ -433,7 +436,7 @@ class Lock:
 
 
 def knows_no_locks(error: OSError) -> bool:
-    """Whether a lock failed because its folder, perhaps one of the network, has none to give."""
+    """Whether a lock failed because its folder, perhaps on a network, does not support locks."""
     return error.errno in _NO_LOCKS
 
 

@@ -89,14 +89,6 @@ def test_who_writes_alone_refuses_a_second_one(tmp_path: Path) -> None:
     assert [*tmp_path.iterdir()] == [path]
 
 
-def test_a_written_file_replaces_the_older_one(tmp_path: Path) -> None:
-    path = tmp_path / "file"
-    write_file(path, b"one")
-    write_file(path, memoryview(b"two"))
-    assert path.read_bytes() == b"two"
-    assert list(tmp_path.iterdir()) == [path]
-
-
 @pytest.mark.parametrize("call", ["write", "fsync", "replace"])
 def test_a_write_that_fails_leaves_the_older_file(
     call: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -153,18 +145,6 @@ def test_a_log_goes_on_after_a_torn_line(tmp_path: Path) -> None:
     LineLog(path).append({"a": 3}, sync=False)
     assert read_lines(path) == ([{"a": 1}, {"a": 3}], [2])
     assert path.read_bytes() == b'{"a": 1}\n{"a": 2, "torn\n{"a": 3}\n'
-
-
-@given(st.binary(max_size=60).filter(lambda torn: b"\n" not in torn))
-def test_no_torn_line_of_a_process_that_is_gone_is_lost_or_glued(
-    tmp_path_factory: pytest.TempPathFactory, torn: bytes
-) -> None:
-    path = tmp_path_factory.mktemp("log") / "log"
-    path.write_bytes(b'{"a": 1}\n' + torn)
-    for b in (2, 3):
-        LineLog(path).append({"b": b}, sync=False)
-    rest = torn + b"\n" if torn else b""
-    assert path.read_bytes() == b'{"a": 1}\n' + rest + b'{"b": 2}\n{"b": 3}\n'
 
 
 @given(st.binary(max_size=60).filter(lambda torn: b"\n" not in torn))
@@ -311,10 +291,6 @@ def test_a_later_process_of_the_same_number_is_another_one() -> None:
     assert not owner.is_running
 
 
-def test_an_impossible_number_is_no_process() -> None:
-    assert not replace(Process.current(), pid=2**40).is_running
-
-
 def test_another_computer_is_not_here() -> None:
     assert not replace(Process.current(), host="another").is_here
 
@@ -373,12 +349,8 @@ def test_a_holder_that_cannot_be_read_is_still_one(tmp_path: Path, content: byte
     about = tmp_path / "a.lock.holder"
     about.unlink() if content is None else about.write_bytes(content)
     assert second.take() == Holder("", 0, "", "")
-    assert str(second.take()) == "a process that has not said what it does"
+    assert str(second.take()) == "an unknown process"
     first.release()
-
-
-def test_an_odd_time_is_told_as_it_is() -> None:
-    assert str(Holder("a run", 5, "pc", "yesterday")) == "a run (process 5 on pc, since yesterday)"
 
 
 @pytest.mark.parametrize("number", [errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP])

@@ -147,7 +147,7 @@ def _last(values: Sequence[Any] | None) -> Any:
     return values[-1] if values else None
 
 
-def _duration_s(stage_s: Mapping[str, float]) -> float | None:
+def _duration_s(stage_s: Mapping[str, float | None]) -> float | None:
     steps = [seconds for name, seconds in stage_s.items() if name.startswith("step ") and seconds is not None]
     return math.fsum(steps) if steps else None
 

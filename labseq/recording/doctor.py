@@ -116,7 +116,7 @@ def examine(path: Path, *, dry_run: bool = False) -> Report:
 
 
 def _examine_run(run_dir: Path, report: Report, *, dry_run: bool) -> None:
-    """Check a run; repair it while nobody else can resume it."""
+    """Check a run, and repair it under its lock, so that no process resumes it meanwhile."""
     if _is_in_progress(run_dir):
         report.in_progress.append(run_dir)
         return
@@ -337,7 +337,7 @@ class _Check:
             if _SHOT_NAME.fullmatch(name) and f"{folder.name}/{name}" not in of_file:
                 row = self._row_of_stray(folder / name, run_id)
                 if row is not None:
-                    # If the shot has another line, that line goes on to count: the last one does.
+                    # The last line of a shot counts, so another line of this shot keeps counting.
                     index.kept.insert(0 if row["shot"] in counted else len(index.kept), dumps(row).encode())
                     remedy = "line added: the file is whole"
                     index.problems.append(("no line in the index", folder / name, remedy))

@@ -35,7 +35,7 @@ def check_export(kind: str, path: Path, *, frames: bool = False, replace: bool =
     Args:
         kind: One of :data:`ENDINGS`.
         path: The file.
-        frames: Whether frames are asked for; only the archive has them.
+        frames: Whether to export frames; only the archive has them.
         replace: Whether files that are there may be replaced.
 
     Raises:

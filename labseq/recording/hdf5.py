@@ -107,8 +107,10 @@ def _of_known_columns(table: Table) -> tuple[Any, Any, Any]:
 
 def _of_columns(dtype: np.dtype[Any], table: Table) -> tuple[Any, Any, Any]:
     """Units and descriptions of the columns as arrays of text, and their shape."""
-    texts = [np.array(list(map(plain_text, of)), _STRING) for of in describe_columns(dtype, table)]
-    return *texts, h5s.create_simple((len(texts[0]),))
+    units, descriptions = (
+        np.array(list(map(plain_text, texts)), _STRING) for texts in describe_columns(dtype, table)
+    )
+    return units, descriptions, h5s.create_simple(units.shape)
 
 
 def link_name(name: str, taken: Container[str]) -> str:

@@ -104,7 +104,7 @@ class Run:
 
     @property
     def n_shots(self) -> int:
-        """Shots asked for."""
+        """Number of shots that the sequence asks for."""
         return int(self.record["n_shots"])
 
     @property

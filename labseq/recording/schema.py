@@ -301,7 +301,7 @@ def _batch_of_move(cycle: CycleRecord) -> NDArray[np.int_]:
     return np.repeat(_batch_numbers(cycle), _moves_in_batch(cycle))
 
 
-_LINKED: Final = "whether the batch goes on with the tweezers of the one before still on"
+_LINKED: Final = "whether the tweezers of the batch before stay on for this one"
 _PLAYED: Final = "whether it fitted into the window and was played"
 
 BATCHES: Final = Table(
