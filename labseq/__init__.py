@@ -1,7 +1,8 @@
 """labseq: lab control for neutral-atom tweezer arrays.
 
-The flat public namespace for users and plugin writers. Names are resolved when
-they are first used, so that importing labseq costs next to nothing.
+The namespace for notebooks and scripts: sessions, runs, plans, domain types and errors. Authors of
+plugins import :mod:`labseq.plugin`. Names are resolved when they are first used, so that importing labseq
+takes little time.
 """
 
 from __future__ import annotations
@@ -10,30 +11,10 @@ import importlib
 from typing import Any, Final
 
 _HOMES: Final = {
-    "labseq.hookspecs": ("LABSEQ_API", "hookimpl"),
-    "labseq.api": ("make_planner", "make_target", "tone_program"),
-    "labseq.settings": (
-        "Angle",
-        "Duration",
-        "FilePath",
-        "Fraction",
-        "Frequency",
-        "Length",
-        "Power",
-        "Settings",
-        "Speed",
-        "Temperature",
-        "Voltage",
-    ),
-    "labseq.drivers.settings": ("CameraSettings", "CoolingSettings"),
-    "labseq.drivers": (
-        "CameraDriver",
-        "Cooling",
-        "Series",
-        "SimulatedSensor",
-        "ExposureResult",
-        "settle",
-        "wait_for",
+    "labseq.api": (
+        "make_planner",
+        "make_target",
+        "tone_program",
     ),
     "labseq.errors": (
         "ConfigError",
@@ -52,62 +33,30 @@ _HOMES: Final = {
     "labseq.model": (
         "Batch",
         "CalibrationEntry",
-        "CameraFacts",
-        "DepthRamp",
         "Frame",
         "LineProgram",
         "LineSpec",
-        "LinesFacts",
         "MotionSpec",
         "Occupancy",
         "Plan",
         "PlanReport",
-        "RandomStream",
-        "RfSamples",
-        "RfSpan",
         "RfSpec",
-        "RfTones",
         "RunRecord",
         "ScanRange",
-        "ScanSpace",
-        "SensorMode",
         "ShotRecord",
         "SiteGrid",
         "TargetPattern",
-        "TimelineEntry",
         "ToneProgram",
-        "TweezerAmplitudes",
         "VisitedPoint",
-        "Waveform",
         "as_occupancy",
     ),
-    "labseq.motion": ("check_plan", "render"),
-    "labseq.recording": ("Run", "open_run"),
-    "labseq.registry": ("Registry",),
-    "labseq.roles": (
-        "Analysis",
-        "Camera",
-        "Clock",
-        "Context",
-        "Detector",
-        "Device",
-        "LeaderLink",
-        "Lines",
-        "ReceivesOutput",
-        "MobileTweezers",
-        "Planner",
-        "RecordedShot",
-        "RfSource",
-        "Scanner",
-        "Shot",
-        "ReportsSignals",
-        "Simulation",
-        "StaticTweezers",
-        "Step",
-        "StepContext",
-        "ToneSource",
-        "Trigger",
-        "NeedsWarmUp",
+    "labseq.motion": (
+        "check_plan",
+        "render",
+    ),
+    "labseq.recording": (
+        "Run",
+        "open_run",
     ),
     "labseq.session": ("Session",),
 }
@@ -117,6 +66,8 @@ __version__: Final = "0.2.0"
 
 
 def __getattr__(name: str) -> Any:
+    if name == "plugin":
+        return importlib.import_module("labseq.plugin")
     home = _HOME_OF.get(name)
     if home is None:
         raise AttributeError(f"module 'labseq' has no attribute '{name}'")

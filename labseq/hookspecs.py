@@ -1,7 +1,7 @@
 """The four hooks of labseq plugins.
 
 A plugin is a module (or an installed package with an entry point of group
-``labseq``) that implements any of these with ``@labseq.hookimpl`` and states the
+``labseq``) that implements any of these with ``@labseq.plugin.hookimpl`` and states the
 ``LABSEQ_API`` it was written for.
 """
 

@@ -80,7 +80,7 @@ class Entry:
         factory: ``factory(settings, context)``; steps: ``factory(settings)``;
             patterns: ``factory(settings, grid)``; scanners: ``factory(settings, space)``.
         settings_model: pydantic model of its settings, a subclass of
-            ``labseq.Settings``; None if it takes none.
+            ``labseq.plugin.Settings``; None if it takes none.
         origin: Name of the plugin that registered it.
         virtual_time: Whether it keeps to the session's clock only, so that a run
             need not wait in real time.
@@ -165,7 +165,7 @@ class Registry:
             raise error
         if settings_model is not None and not _is_settings(settings_model):
             text = f"the settings model of {kind} '{name}' is {settings_model!r:.200}"
-            raise fault(f"{text}; expected a subclass of labseq.Settings")
+            raise fault(f"{text}; expected a subclass of labseq.plugin.Settings")
         if simulated is not None:
             known = {} if settings_model is None else settings_model.model_fields
             if not isinstance(simulated, Mapping) or not set(simulated) <= set(known):  # pyright: ignore[reportUnnecessaryIsInstance]

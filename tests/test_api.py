@@ -10,7 +10,7 @@ import labseq
 from labseq.errors import ConfigError, PluginLoadError
 
 PLUGIN = """
-from labseq import hookimpl
+from labseq.plugin import hookimpl
 LABSEQ_API = 1
 
 class Mine:

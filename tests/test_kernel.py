@@ -217,7 +217,7 @@ def test_numba_is_imported_only_with_a_kernel() -> None:
 def test_kernels_are_plain_python_without_the_compiler() -> None:
     code = """
         import numpy as np
-        from labseq import Context, MotionSpec, SiteGrid, TargetPattern, check_plan, tone_program
+        from labseq.plugin import Context, MotionSpec, SiteGrid, TargetPattern, check_plan, tone_program
         from labseq_psca.planner import PscaPlanner, PscaSettings
 
         atoms = np.random.default_rng(3).random((8, 7)) < 0.7

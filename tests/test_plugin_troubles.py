@@ -29,7 +29,7 @@ from labseq.session.construct import construct_one, construct_target
 from labseq.session.profile import ChosenPlugin, validate
 
 GOOD = '''
-from labseq import Settings, hookimpl
+from labseq.plugin import Settings, hookimpl
 LABSEQ_API = 1
 # at the top
 
@@ -176,7 +176,7 @@ AT_LOADING: dict[str, tuple[str, str, str]] = {
     "settings of plain pydantic": (
         "Mine)  #",
         "Mine, __import__('pydantic').BaseModel)  #",
-        "expected a subclass of labseq.Settings",
+        "expected a subclass of labseq.plugin.Settings",
     ),
     "settings that cannot be made": (
         "# at the top",

@@ -12,7 +12,7 @@ from labseq.errors import ConfigError, PluginLoadError, UnknownPluginError
 from labseq.plugins import LOCAL_PACKAGE, PluginHost
 
 GOOD = """
-from labseq import hookimpl
+from labseq.plugin import hookimpl
 LABSEQ_API = 1
 
 class Mine:
@@ -151,7 +151,7 @@ def test_a_missing_folder_is_the_users_mistake(host, tmp_path):
         ("LABSEQ_API = '1'\n", "was written for LABSEQ_API '1', which is no whole number; this labseq has"),
         ("class Odd(BaseException): pass\nraise Odd('no')\n", "Odd: no"),
         ("raise ValueError('two\\nlines\\x1b[31m')\n", "ValueError: two lines?[31m"),
-        (GOOD.replace('"mine", Mine', '"mine", Mine, dict'), "expected a subclass of labseq.Settings"),
+        (GOOD.replace('"mine", Mine', '"mine", Mine, dict'), "expected a subclass of labseq.plugin.Settings"),
         (
             GOOD.replace("def labseq_register(registry)", "def labseq_register(register)"),
             "an argument 'register'",
@@ -240,7 +240,7 @@ def test_one_failing_entry_point_takes_nothing_down(host, monkeypatch):
 
 def test_observers_that_fail_are_named_and_the_others_called(host, tmp_path):
     watcher = """
-from labseq import hookimpl
+from labseq.plugin import hookimpl
 LABSEQ_API = 1
 seen = []
 

@@ -23,7 +23,7 @@ class ClimbSettings(Settings):
 
 
 class Climb:
-    """Implements :class:`labseq.Scanner`."""
+    """Implements :class:`labseq.plugin.Scanner`."""
 
     def __init__(self, settings: ClimbSettings, space: ScanSpace) -> None:
         self._settings = settings

@@ -40,7 +40,7 @@ def serial_leader(settings: SerialLeaderSettings, context: Context) -> LeaderDev
 
 
 class LeaderDevice(Device):
-    """Receives the start signal `go`, and answers with the result; implements ``labseq.LeaderLink``.
+    """Receives the start signal `go`, and answers with the result; implements ``labseq.plugin.LeaderLink``.
 
     A thread receives, and keeps the deadline while a shot goes on. The device has no commands; its
     values are ``state`` ("idle", "waiting", "busy") and ``is_connected``.
@@ -137,7 +137,7 @@ class LeaderDevice(Device):
         return self._dialogue.state if name == "state" else self._dialogue.is_connected
 
     def wait_for(self, signal: str, timeout_s: float) -> str:
-        """Wait for `go`, and answer `busy`; see ``labseq.LeaderLink``.
+        """Wait for `go`, and answer `busy`; see ``labseq.plugin.LeaderLink``.
 
         Raises:
             DeviceError: Not open, or another signal.
@@ -165,7 +165,7 @@ class LeaderDevice(Device):
         return text
 
     def report(self, state: str, about: About) -> str:
-        """Answer a `go`; see ``labseq.LeaderLink``.
+        """Answer a `go`; see ``labseq.plugin.LeaderLink``.
 
         Raises:
             DeviceError: Not open.

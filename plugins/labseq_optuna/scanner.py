@@ -31,7 +31,7 @@ class OptunaSettings(Settings):
 
 
 class OptunaScanner:
-    """Implements :class:`labseq.Scanner`.
+    """Implements :class:`labseq.plugin.Scanner`.
 
     Raises:
         ConfigError: Optuna is not installed.

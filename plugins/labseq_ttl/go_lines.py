@@ -37,7 +37,7 @@ def ttl_lines(settings: TtlSettings, context: Context) -> TtlLines:
 
 
 class GoLines(TtlLines):
-    """A timing box that also connects to an external control system; implements ``labseq.LeaderLink``.
+    """A timing box that also connects to an external control system; implements ``labseq.plugin.LeaderLink``.
 
     The box itself detects the edge, raises `busy`, and keeps the deadline, also if labseq hangs or dies.
 
@@ -70,7 +70,7 @@ class GoLines(TtlLines):
             self._disconnect()
 
     def wait_for(self, signal: str, timeout_s: float) -> str:
-        """Wait for `go`; see ``labseq.LeaderLink``.
+        """Wait for `go`; see ``labseq.plugin.LeaderLink``.
 
         Raises:
             DeviceError: Not open, another signal, or the box was reset.
@@ -91,7 +91,7 @@ class GoLines(TtlLines):
         return ""
 
     def report(self, state: str, about: Mapping[str, bool | int | float | str]) -> str:
-        """Raise `ready` or `failed`; see ``labseq.LeaderLink``.
+        """Raise `ready` or `failed`; see ``labseq.plugin.LeaderLink``.
 
         Raises:
             DeviceError: Not open, or the box does not answer: it raises `failed` itself at the deadline.

@@ -375,7 +375,7 @@ class CameraFaults(Settings):
     late_by: Duration = Field(default=2.0, description="delay of a late frame")
 
 
-class CameraSettings(labseq.CameraSettings):
+class CameraSettings(labseq.plugin.CameraSettings):
     """The virtual camera; what it sees is set in the simulation."""
 
     readout: Duration = Field(

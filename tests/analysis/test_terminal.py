@@ -38,7 +38,7 @@ class Wrong:
     def shot(self, shot):
         raise ValueError("too dark")
 
-@labseq.hookimpl
+@labseq.plugin.hookimpl
 def labseq_register(registry):
     registry.planner("wrong", Wrong)
     registry.analysis("wrong", Wrong)

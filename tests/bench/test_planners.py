@@ -45,7 +45,7 @@ class Cold(Moody):
         raise RuntimeError("no kernels")
 
 
-@labseq.hookimpl
+@labseq.plugin.hookimpl
 def labseq_register(registry):
     registry.planner("moody", Moody)
     registry.planner("cold", Cold)

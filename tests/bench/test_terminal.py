@@ -29,7 +29,7 @@ class Moody:
         return labseq.Plan.from_batches([])
 
 
-@labseq.hookimpl
+@labseq.plugin.hookimpl
 def labseq_register(registry):
     registry.planner("moody", Moody)
 """

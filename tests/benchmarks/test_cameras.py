@@ -21,8 +21,7 @@ from labseq_pylon.camera import PylonCamera
 from labseq_pylon.library import load_pypylon
 from labseq_pylon.settings import PylonSettings
 
-from labseq import Context, Frame, SensorMode, SiteGrid
-from labseq.plugin import CameraDriver
+from labseq.plugin import CameraDriver, Context, Frame, SensorMode, SiteGrid
 from labseq.roles import WHOLE_SENSOR, NeverStopped
 from labseq.testing.fakes import RecordingSimulation
 from tests.plugins.needs import need_library

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from labseq import Context, Frame, SiteGrid
 from labseq.detection.threshold import ThresholdDetector, ThresholdSettings
 from labseq.detection.weighted import WeightedDetector, WeightedSettings
+from labseq.plugin import Context, Frame, SiteGrid
 
 
 @pytest.fixture

@@ -16,11 +16,11 @@ from labseq_spcm.settings import SpcmSettings
 from labseq_virtual.settings import SimulationSettings
 from labseq_virtual.simulation import VirtualSimulation
 
-from labseq import Context, DepthRamp, Frame, MotionSpec, RandomStream, SiteGrid, TargetPattern
 from labseq.bench.latency import CHUNK
 from labseq.detection.threshold import ThresholdDetector, ThresholdSettings
 from labseq.model import ToneProgram
 from labseq.motion import Renderer, check_plan, comb_sample_rate, render_chunks, tone_program
+from labseq.plugin import Context, DepthRamp, Frame, MotionSpec, RandomStream, SiteGrid, TargetPattern
 
 GRID = SiteGrid()
 RATE_HZ = comb_sample_rate(GRID)

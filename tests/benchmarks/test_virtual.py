@@ -11,8 +11,8 @@ from labseq_virtual.settings import ImageSettings, SimulationSettings
 from labseq_virtual.simulation import VirtualSimulation
 from labseq_virtual.transport import Transport
 
-from labseq import Context, DepthRamp, MotionSpec, Plan, RandomStream, SiteGrid, tone_program
 from labseq.detection.threshold import ThresholdDetector, ThresholdSettings
+from labseq.plugin import Context, DepthRamp, MotionSpec, Plan, RandomStream, SiteGrid, tone_program
 
 GRID = SiteGrid()
 

@@ -221,7 +221,7 @@ def test_a_run_of_another_lab_is_refused(lab: Lab, tmp_path: Path) -> None:
     (tmp_path / "plugins" / "slow.py").write_text(
         "import labseq\nfrom labseq_virtual.camera import VirtualCamera\n"
         "from labseq_virtual.settings import CameraSettings\nLABSEQ_API = 1\n"
-        "@labseq.hookimpl\n"
+        "@labseq.plugin.hookimpl\n"
         "def labseq_register(registry): registry.camera('slow', VirtualCamera, CameraSettings)\n",
         "utf-8",
     )

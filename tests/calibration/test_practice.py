@@ -13,7 +13,6 @@ from labseq_virtual.simulation import VirtualSimulation
 from numpy.typing import NDArray
 
 import labseq
-from labseq import Context, DepthRamp, RandomStream, Run, TweezerAmplitudes
 from labseq.builtin.equalise import factors
 from labseq.calibration.measure import METHODS, CalibrationRequest, calibrate
 from labseq.config import load_profile
@@ -21,6 +20,7 @@ from labseq.detection.sites import known_sites, region_corners, spot_light
 from labseq.detection.threshold import ThresholdDetector, ThresholdSettings
 from labseq.model import CalibrationEntry
 from labseq.motion import standing_on_sites
+from labseq.plugin import Context, DepthRamp, RandomStream, Run, TweezerAmplitudes
 
 Floats = NDArray[np.float64]
 

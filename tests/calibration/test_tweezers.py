@@ -11,11 +11,11 @@ from labseq_virtual.settings import SimulationSettings
 from labseq_virtual.simulation import VirtualSimulation
 from PIL import Image
 
-from labseq import Context, DepthRamp, RandomStream, SiteGrid, TweezerAmplitudes
 from labseq.builtin.equalise import factors
 from labseq.calibration.measure import METHODS, CalibrationRequest, Outcome, calibrate
 from labseq.calibration.store import Store
 from labseq.errors import ConfigError, DeviceError
+from labseq.plugin import Context, DepthRamp, RandomStream, SiteGrid, TweezerAmplitudes
 
 PROFILE = """labseq: 1
 name: uneven
@@ -48,7 +48,7 @@ class HalfBlind(VirtualSpotMeter):
         return power
 
 
-@labseq.hookimpl
+@labseq.plugin.hookimpl
 def labseq_register(registry):
     registry.device("half_blind", HalfBlind, SpotMeterSettings, virtual_time=True)
 """

@@ -55,7 +55,7 @@ def refuse(self, settings, context):
     raise OSError("no port")
 
 
-@labseq.hookimpl
+@labseq.plugin.hookimpl
 def labseq_register(registry):
     registry.device("fine", Fine, DeviceSettings)
     registry.device("refusing", type("Refusing", (Fine,), {"__init__": refuse}), DeviceSettings)

@@ -12,7 +12,7 @@ import pytest
 PLUGIN = """
 import sys
 import threading
-from labseq import hookimpl
+from labseq.plugin import hookimpl
 
 LABSEQ_API = 1
 threading.Thread(target={target}, name="labseq test poller", daemon={daemon}).start()

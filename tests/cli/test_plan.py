@@ -139,7 +139,7 @@ class Lazy:
         return labseq.Plan.from_batches([])
 
 
-@labseq.hookimpl
+@labseq.plugin.hookimpl
 def labseq_register(registry):
     registry.planner("lazy", Lazy)
 """

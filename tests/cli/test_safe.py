@@ -34,7 +34,7 @@ class Jammed(VirtualDevice):
         raise OSError("jammed")
 
 
-@labseq.hookimpl
+@labseq.plugin.hookimpl
 def labseq_register(registry):
     registry.device("jammed", Jammed, DeviceSettings)
 """

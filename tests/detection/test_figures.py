@@ -12,10 +12,10 @@ import pytest
 from labseq_virtual.settings import SimulationSettings
 from labseq_virtual.simulation import VirtualSimulation
 
-from labseq import Context, DepthRamp, RandomStream, SiteGrid
 from labseq.calibration.lattice import find_lattice
 from labseq.calibration.spots import FrameAverage
 from labseq.detection.drift import measure_shift
+from labseq.plugin import Context, DepthRamp, RandomStream, SiteGrid
 
 from .drawn import drawn, seen_sites
 

@@ -48,7 +48,7 @@ class Scans:
         return Scanned(self.plan(occupancy, target))
 
 
-@labseq.hookimpl
+@labseq.plugin.hookimpl
 def labseq_register(registry):
     registry.planner("scans", Scans)
 """

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from labseq import CameraDriver, CameraFacts, Context, ExposureResult, Frame, Series
+from labseq.plugin import CameraDriver, CameraFacts, Context, ExposureResult, Frame, Series
 from labseq.testing.fakes import FakeClock
 
 SHAPE = (3, 4)

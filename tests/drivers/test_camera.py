@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from hypothesis import given, strategies as st
 
-from labseq import CameraFacts, Context, DeviceError, DeviceTimeoutError, Frame, LimitError
+from labseq.plugin import CameraFacts, Context, DeviceError, DeviceTimeoutError, Frame, LimitError
 from labseq.roles import Trigger, offers
 from labseq.testing import CameraContract
 

@@ -9,7 +9,7 @@ from hypothesis import given, strategies as st
 from labseq_virtual.settings import SimulationSettings
 from labseq_virtual.simulation import VirtualSimulation
 
-from labseq import Context, SensorMode, Series, SimulatedSensor
+from labseq.plugin import Context, SensorMode, Series, SimulatedSensor
 from labseq.roles import WHOLE_SENSOR
 from labseq.testing.fakes import Calls, FakeClock, RecordingSimulation
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, strategies as st
 from pydantic import ValidationError
 
-from labseq import CameraSettings, Cooling, CoolingSettings, SensorMode
+from labseq.plugin import CameraSettings, Cooling, CoolingSettings, SensorMode
 
 sizes = st.integers(1, 600)
 corners = st.integers(0, 600)

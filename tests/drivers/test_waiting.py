@@ -6,9 +6,9 @@ import threading
 
 import pytest
 
-from labseq import StopRequested, wait_for
 from labseq.drivers.serial_port import SLICE_S
 from labseq.guard import StopFlag
+from labseq.plugin import StopRequested, wait_for
 from labseq.roles import NeverStopped
 from labseq.sequencer.clock import RealClock
 from labseq.testing.fakes import FakeClock

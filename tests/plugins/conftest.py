@@ -15,8 +15,8 @@ from labseq_spcm.settings import SpcmSettings
 from labseq_spcm_sim import M4I6631, CardModel, SampleSpan, SimulatedCard, installed
 from numpy.typing import NDArray
 
-from labseq import Context, MotionSpec, Plan, ToneProgram
 from labseq.motion import tone_program
+from labseq.plugin import Context, MotionSpec, Plan, ToneProgram
 from labseq.testing.fakes import FakeClock
 
 

@@ -12,8 +12,8 @@ from labseq_andor.settings import AndorSettings
 from labseq_andor_sim import SimulatedAndorLibrary, SimulatedCamera
 from numpy.typing import NDArray
 
-from labseq import Clock, Context, Frame, SensorMode
 from labseq.model import SiteGrid
+from labseq.plugin import Clock, Context, Frame, SensorMode
 from labseq.roles import WHOLE_SENSOR, Trigger
 from labseq.testing.fakes import Calls, FakeClock, RecordingSimulation
 

@@ -14,7 +14,7 @@ from typing import Any
 from labseq_follow.leader import LeaderDevice, tcp_leader
 from labseq_follow.settings import TcpLeaderSettings
 
-from labseq import Context
+from labseq.plugin import Context
 from labseq.roles import NeverStopped
 
 MAX_WAIT_S = 60.0

@@ -14,8 +14,8 @@ from labseq_genicam_sim.fake import FakeCamera
 from labseq_genicam_sim.messages import Exposure, Faults
 from numpy.typing import NDArray
 
-from labseq import Clock, Context, Frame, LineSpec, SensorMode
 from labseq.model import SiteGrid
+from labseq.plugin import Clock, Context, Frame, LineSpec, SensorMode
 from labseq.roles import WHOLE_SENSOR
 from labseq.testing.fakes import Calls, FakeClock, RecordingSimulation
 

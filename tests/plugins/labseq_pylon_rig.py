@@ -12,8 +12,8 @@ from labseq_pylon.library import load_pypylon
 from labseq_pylon.settings import PylonSettings
 from numpy.typing import NDArray
 
-from labseq import Context, Frame, SensorMode
 from labseq.model import SiteGrid
+from labseq.plugin import Context, Frame, SensorMode
 from labseq.roles import WHOLE_SENSOR
 from labseq.testing.fakes import Calls, FakeClock, RecordingSimulation
 

@@ -11,15 +11,7 @@ from labseq_single.planner import (
 )
 from numpy.typing import NDArray
 
-from labseq import (
-    Context,
-    MotionSpec,
-    Occupancy,
-    Plan,
-    PlanReport,
-    TargetPattern,
-    check_plan,
-)
+from labseq.plugin import Context, MotionSpec, Occupancy, Plan, PlanReport, TargetPattern, check_plan
 
 Bools = NDArray[np.bool_]
 Site = tuple[int, int]

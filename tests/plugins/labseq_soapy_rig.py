@@ -17,7 +17,7 @@ from labseq_soapy.static_tweezers import SoapyStaticTweezers
 from labseq_soapy_sim import Ring, SimulatedRadio, build_module
 from numpy.typing import NDArray
 
-from labseq import Clock, Context, Simulation, SiteGrid, wait_for
+from labseq.plugin import Clock, Context, Simulation, SiteGrid, wait_for
 from labseq.roles import NeverStopped
 from labseq.testing.fakes import FakeClock
 
@@ -118,7 +118,7 @@ def depth(samples: NDArray[np.complex64], n_loop: int, full: slice) -> NDArray[n
 
 LABSEQ = """
 import sys, time
-from labseq import Context, SiteGrid
+from labseq.plugin import Context, SiteGrid
 from labseq_soapy.settings import SoapySettings
 from labseq_soapy.static_tweezers import SoapyStaticTweezers
 context = Context("static_tweezers", SiteGrid(3, 4))

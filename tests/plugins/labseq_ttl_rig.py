@@ -14,7 +14,7 @@ from labseq_ttl.protocol import framed, unframed
 from labseq_ttl.settings import TtlSettings
 from labseq_ttl_sim.simavr import SimavrBox, runner
 
-from labseq import Context, LineProgram, LineSpec
+from labseq.plugin import Context, LineProgram, LineSpec
 from labseq.roles.shot import NeverStopped
 from labseq.sequencer.lines import line_program
 from labseq.testing.contracts.lines import SPECS

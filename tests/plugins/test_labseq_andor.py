@@ -17,7 +17,8 @@ from labseq_andor.codes import Code
 from labseq_andor.library import load_pylablib
 from labseq_andor.settings import AndorSettings
 
-from labseq import Context, DeviceError, DeviceTimeoutError, LimitError, Run, Session
+from labseq import DeviceError, DeviceTimeoutError, LimitError, Run, Session
+from labseq.plugin import Context
 from labseq.roles import NeverStopped, Trigger, offers
 from labseq.testing import CameraContract
 

@@ -15,8 +15,8 @@ from labseq_andor.library import load_pylablib
 from labseq_andor.settings import AndorSettings
 from labseq_andor_sim import SimulatedCamera
 
-from labseq import ConfigError, Context, DeviceError, DeviceTimeoutError, TransientError
 from labseq.errors import StopRequested
+from labseq.plugin import ConfigError, Context, DeviceError, DeviceTimeoutError, TransientError
 
 from .labseq_andor_rig import Rig, rig
 from .needs import need_library

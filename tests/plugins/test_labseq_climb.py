@@ -7,7 +7,7 @@ from functools import partial
 import pytest
 from labseq_climb.scanner import Climb, ClimbSettings
 
-from labseq import ScanRange, ScanSpace, VisitedPoint
+from labseq.plugin import ScanRange, ScanSpace, VisitedPoint
 from labseq.testing import ScannerContract
 from labseq.testing.contracts.scanner import Factory
 

@@ -15,9 +15,9 @@ from labseq_follow.leader import serial_leader, tcp_leader
 from labseq_follow.protocol import Dialogue, Splitter
 from labseq_follow.settings import SerialLeaderSettings, TcpLeaderSettings
 
-from labseq import ConfigError, Context, Device, DeviceError, DeviceTimeoutError, StopRequested
 from labseq.config import Document
 from labseq.guard import StopFlag
+from labseq.plugin import ConfigError, Context, Device, DeviceError, DeviceTimeoutError, StopRequested
 from labseq.roles import LeaderLink, offers
 from labseq.sequencer import RealClock
 from labseq.testing import DeviceContract

@@ -13,7 +13,7 @@ import pytest
 from labseq_follow.leader import LeaderDevice, serial_leader
 from labseq_follow.settings import SerialLeaderSettings
 
-from labseq import Context, DeviceError
+from labseq.plugin import Context, DeviceError
 
 from .labseq_follow_rig import PtyPeer, TcpPeer, led, listening
 
@@ -143,7 +143,7 @@ def test_a_fault_of_its_own_is_told_to_the_step_that_waits(monkeypatch: pytest.M
 
 
 KILLED = """
-from labseq import Context
+from labseq.plugin import Context
 from labseq_follow.leader import tcp_leader
 from labseq_follow.settings import TcpLeaderSettings
 device = tcp_leader(TcpLeaderSettings(port=0), Context("leader"))

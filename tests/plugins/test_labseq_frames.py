@@ -13,8 +13,8 @@ import pytest
 from labseq_frames.camera import FramesCamera, FramesSettings
 from numpy.typing import NDArray
 
-from labseq import ConfigError, Context, DeviceError, DeviceTimeoutError, Frame, LimitError
 from labseq.model import ImageRecord, RunRecord, ShotRecord, TargetPattern
+from labseq.plugin import ConfigError, Context, DeviceError, DeviceTimeoutError, Frame, LimitError
 from labseq.recording import RunWriter
 from labseq.testing import CameraContract
 from labseq.testing.fakes import FakeClock

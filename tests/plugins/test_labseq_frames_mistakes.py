@@ -14,7 +14,7 @@ from hypothesis import given, strategies as st
 from labseq_frames.camera import FramesCamera, FramesSettings
 from labseq_frames.files import natural
 
-from labseq import ConfigError, Context, DeviceError
+from labseq.plugin import ConfigError, Context, DeviceError
 from labseq.testing.fakes import FakeClock
 
 from .test_labseq_frames import stack_of, write_run

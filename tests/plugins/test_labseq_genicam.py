@@ -17,8 +17,8 @@ from labseq_genicam.settings import FORMATS, GenicamSettings
 from labseq_genicam_sim.messages import Exposure
 from numpy.typing import NDArray
 
-from labseq import ConfigError, Context, Frame, SensorMode
 from labseq.errors import DeviceTimeoutError, StopRequested
+from labseq.plugin import ConfigError, Context, Frame, SensorMode
 from labseq.roles import NeverStopped
 from labseq.testing import CameraContract
 from labseq.testing.fakes import FakeClock

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import pytest
 from labseq_optuna.scanner import OptunaScanner, OptunaSettings
 
-from labseq import ConfigError, ScanRange, ScanSpace, VisitedPoint
+from labseq.plugin import ConfigError, ScanRange, ScanSpace, VisitedPoint
 from labseq.testing import ScannerContract
 from labseq.testing.contracts.scanner import Factory
 

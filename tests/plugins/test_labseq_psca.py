@@ -21,19 +21,18 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import maximum_bipartite_matching
 
 from labseq import (
-    Context,
     LimitError,
     MotionSpec,
     Occupancy,
     Plan,
     PlanError,
     PlanReport,
-    Registry,
     SiteGrid,
     TargetPattern,
     check_plan,
     make_target,
 )
+from labseq.plugin import Context, Registry
 from labseq.roles import NeedsWarmUp
 from labseq.testing import PlannerContract
 from labseq.testing.strategies import cases

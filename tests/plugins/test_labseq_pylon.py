@@ -18,8 +18,9 @@ from labseq_pylon.camera import PylonCamera
 from labseq_pylon.library import load_pypylon
 from labseq_pylon.settings import BITS, PylonSettings
 
-from labseq import ConfigError, Context, Run, Session
+from labseq import ConfigError, Run, Session
 from labseq.errors import DeviceTimeoutError, StopRequested
+from labseq.plugin import Context
 from labseq.session.profile import DryRun
 from labseq.testing import CameraContract
 

@@ -15,7 +15,7 @@ from labseq_scans.planners import Mta1Planner, Mta1Settings, ScannedPlan, Tetris
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from labseq import (
+from labseq.plugin import (
     Context,
     LimitError,
     MotionSpec,

@@ -17,9 +17,10 @@ from typing import Any, ClassVar
 import pytest
 from labseq_serial.device import SerialDevice
 
-from labseq import ConfigError, Context, DeviceError, LimitError, Session, TransientError
+from labseq import ConfigError, DeviceError, LimitError, Session, TransientError
 from labseq.config import find_profile
 from labseq.config.yaml_nodes import compose
+from labseq.plugin import Context
 from labseq.recording import Run
 from labseq.roles import offers
 from labseq.session import check_devices
@@ -359,9 +360,7 @@ def test_a_simulated_port_takes_no_real_time(tmp_path: Path) -> None:
 
 
 @on_a_pty
-def test_values_are_kept_with_each_shot(
-    tmp_path: Path, session_counterpart: Counterpart
-) -> None:
+def test_values_are_kept_with_each_shot(tmp_path: Path, session_counterpart: Counterpart) -> None:
     done = run(lab(tmp_path, session_counterpart.port))
     assert [shot.readings["synth.frequency"] for shot in done.shots] == [100e6, 80e6]
     assert session_counterpart.log[-2:] == ["FREQ 1.000000", "CLOSE"], "it was made safe"
@@ -371,9 +370,7 @@ def test_values_are_kept_with_each_shot(
 def test_the_first_command_of_the_day_names_the_instrument(
     tmp_path: Path, session_counterpart: Counterpart
 ) -> None:
-    report = check_devices(
-        str(lab(tmp_path, session_counterpart.port).with_name("lab.yaml"))
-    )
+    report = check_devices(str(lab(tmp_path, session_counterpart.port).with_name("lab.yaml")))
     (synth,) = [found for found in report.devices if found.name == "synth"]
     assert synth.ok
     assert synth.tested

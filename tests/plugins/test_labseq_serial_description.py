@@ -17,9 +17,9 @@ from labseq_serial.settings import CommandSettings, SerialSettings
 from labseq_serial.values import Unit
 from pydantic import ValidationError
 
-from labseq import ConfigError, Context, DeviceError
 from labseq.config import Document
 from labseq.config.yaml_nodes import compose
+from labseq.plugin import ConfigError, Context, DeviceError
 from labseq.testing.fakes import FakeClock
 
 from .labseq_serial_rig import settings

@@ -13,8 +13,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings as hypothesis_settings, strategies as st
 from labseq_serial.device import SerialDevice
 
-from labseq import Context, DeviceError, DeviceTimeoutError, LabseqError, StopRequested, TransientError
 from labseq.guard import StopFlag
+from labseq.plugin import Context, DeviceError, DeviceTimeoutError, LabseqError, StopRequested, TransientError
 from labseq.sequencer import RealClock
 
 from .labseq_serial_rig import Counterpart, opened, settings

@@ -23,15 +23,7 @@ from labseq_single.planner import (
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from labseq import (
-    Context,
-    Occupancy,
-    PlanError,
-    Registry,
-    SiteGrid,
-    TargetPattern,
-    check_plan,
-)
+from labseq.plugin import Context, Occupancy, PlanError, Registry, SiteGrid, TargetPattern, check_plan
 from labseq.roles import NeedsWarmUp
 from labseq.testing import PlannerContract
 from labseq.testing.strategies import cases

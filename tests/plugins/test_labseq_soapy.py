@@ -17,8 +17,8 @@ from labseq_soapy.settings import SoapySettings
 from labseq_soapy.static_tweezers import SoapyStaticTweezers
 from labseq_soapy.streamer import repeated
 
-from labseq import Context, LimitError, SiteGrid
 from labseq.model.grid import centred_comb
+from labseq.plugin import Context, LimitError, SiteGrid
 from labseq.roles import offers
 from labseq.testing import StaticTweezersContract
 

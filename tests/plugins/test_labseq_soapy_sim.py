@@ -13,7 +13,7 @@ from labseq_soapy_sim import Fault
 from labseq_virtual.settings import SimulationSettings
 from labseq_virtual.simulation import VirtualSimulation
 
-from labseq import Context, DeviceError, RandomStream, TransientError, TweezerAmplitudes
+from labseq.plugin import Context, DeviceError, RandomStream, TransientError, TweezerAmplitudes
 from labseq.roles import RfSource, ToneSource
 from labseq.testing.fakes import FakeClock, RecordingSimulation
 

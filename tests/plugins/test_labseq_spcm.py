@@ -19,7 +19,8 @@ from labseq_spcm.settings import SpcmSettings
 from labseq_spcm_sim import M4I6631, SimulatedLibrary, Span, Tone, ToneSpan
 from numpy.typing import NDArray
 
-from labseq import (
+from labseq.motion import render, tone_program
+from labseq.plugin import (
     ConfigError,
     Context,
     DeviceError,
@@ -29,7 +30,6 @@ from labseq import (
     RfSpec,
     TransientError,
 )
-from labseq.motion import render, tone_program
 from labseq.roles import offers
 from labseq.testing import MobileTweezersContract
 from labseq.testing.fakes import FakeClock

@@ -28,7 +28,8 @@ from labseq_spcm.settings import SpcmSettings
 from labseq_spcm_sim import M4I6631, vendor_library_found
 
 import labseq
-from labseq import (
+from labseq.motion import tone_program
+from labseq.plugin import (
     Context,
     DeviceError,
     DeviceTimeoutError,
@@ -39,7 +40,6 @@ from labseq import (
     RfSpec,
     ToneProgram,
 )
-from labseq.motion import tone_program
 from labseq.testing.fakes import FakeClock
 
 MODES = ["replay", "fifo", "dds"]
@@ -272,7 +272,7 @@ class TestFaultsOfThePackage:
     def test_it_is_imported_when_warming_and_prints_nothing(self) -> None:
         code = """
 import sys
-from labseq import Context, MotionSpec
+from labseq.plugin import Context, MotionSpec
 from labseq_spcm.mobile_tweezers import SpcmMobileTweezers
 from labseq_spcm.settings import SpcmSettings
 motion = MotionSpec(max_row_tones=16, max_column_tones=4)
@@ -338,7 +338,7 @@ class TestWithoutTheLibrary:
     def test_opening_names_the_package_and_the_simulated_card(self, after_a_simulated_card: bool) -> None:
         code = (
             "import sys\n"
-            "from labseq import Context, LabseqError\n"
+            "from labseq.plugin import Context, LabseqError\n"
             "from labseq_spcm.mobile_tweezers import SpcmMobileTweezers\n"
             "from labseq_spcm.settings import SpcmSettings\n"
             "for card in sys.argv[1:]:\n"

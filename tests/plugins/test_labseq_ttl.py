@@ -19,8 +19,9 @@ from labseq_ttl.protocol import CHANNELS, SHORTEST, SLOTS, TICK_S, unframed
 from labseq_ttl.settings import TtlSettings
 from pydantic import ValidationError
 
-from labseq import ConfigError, Context, LineProgram, LineSpec, Run, Session
+from labseq import ConfigError, LineProgram, LineSpec, Run, Session
 from labseq.errors import DeviceError, DeviceTimeoutError, LimitError, StopRequested
+from labseq.plugin import Context
 from labseq.testing import LinesContract
 
 from .labseq_ttl_rig import make_rig, need_simavr, rig

@@ -13,8 +13,8 @@ from labseq_ttl.settings import GoSettings, TtlSettings
 from pydantic import ValidationError
 
 import labseq
-from labseq import ConfigError, Context, DeviceError, DeviceTimeoutError, LeaderLink, LineSpec
 from labseq.errors import StopRequested
+from labseq.plugin import ConfigError, Context, DeviceError, DeviceTimeoutError, LeaderLink, LineSpec
 from labseq.sequencer.lines import line_program
 from labseq.testing.contracts.lines import SPECS
 from labseq.testing.fakes import Calls, FakeClock, RecordingSimulation

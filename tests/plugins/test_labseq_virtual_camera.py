@@ -13,7 +13,7 @@ from labseq_virtual.simulation import VirtualSimulation
 from numpy.typing import NDArray
 
 import labseq
-from labseq import (
+from labseq.plugin import (
     ConfigError,
     Context,
     DepthRamp,

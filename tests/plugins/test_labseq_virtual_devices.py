@@ -27,7 +27,8 @@ from labseq_virtual.simulation import Lights, VirtualSimulation
 from labseq_virtual.tweezers import VirtualMobileTweezers, VirtualStaticTweezers
 
 import labseq
-from labseq import (
+from labseq.model import AxisTones, LineProgram, LineSpec
+from labseq.plugin import (
     ConfigError,
     Context,
     DepthRamp,
@@ -40,7 +41,6 @@ from labseq import (
     ToneProgram,
     TweezerAmplitudes,
 )
-from labseq.model import AxisTones, LineProgram, LineSpec
 from labseq.sequencer.lines import line_program
 from labseq.testing import (
     CameraContract,
@@ -462,7 +462,7 @@ class LabWithLines:
         )
         self.simulation = VirtualSimulation(SimulationSettings(lights=NEEDS, **settings), self.context)
         self.simulation.open()
-        self.simulation.play("static_tweezers", labseq.DepthRamp(0.0, 1.0), 0.0)
+        self.simulation.play("static_tweezers", labseq.plugin.DepthRamp(0.0, 1.0), 0.0)
         self.context.random.begin_shot(0, 0)
         self.simulation.begin_shot()
         self.t_s = 0.0

@@ -15,8 +15,8 @@ from labseq_virtual.simulation import VirtualSimulation
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from labseq import Context, DepthRamp, LimitError, RandomStream, SensorMode, SiteGrid
 from labseq.detection.sites import site_pixels
+from labseq.plugin import Context, DepthRamp, LimitError, RandomStream, SensorMode, SiteGrid
 from labseq.roles import WHOLE_SENSOR
 
 GRID = SiteGrid()

@@ -18,10 +18,10 @@ from labseq_virtual.settings import (
     StaticTweezersSettings,
 )
 
-from labseq import MotionSpec, Registry, RfSpec, Settings, SiteGrid
 from labseq.builtin.patterns import BitmapSettings, CompactSettings
 from labseq.config import MOTION_KEYS, load_profile
 from labseq.detection.threshold import ThresholdSettings
+from labseq.plugin import MotionSpec, Registry, RfSpec, Settings, SiteGrid
 
 MODELS: Mapping[str, type[Settings]] = {
     "camera": CameraSettings,

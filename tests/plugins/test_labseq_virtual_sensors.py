@@ -13,9 +13,9 @@ from labseq_virtual.settings import ImageSettings, SimulationSettings
 from labseq_virtual.simulation import VirtualSimulation
 from numpy.typing import NDArray
 
-from labseq import Context, DepthRamp, RandomStream, SensorMode
 from labseq.detection.threshold import ThresholdDetector, ThresholdSettings
 from labseq.detection.weighted import WeightedDetector, WeightedSettings
+from labseq.plugin import Context, DepthRamp, RandomStream, SensorMode
 from labseq.roles import WHOLE_SENSOR
 
 EXPOSURE_S = 45e-3

@@ -12,7 +12,9 @@ from labseq_virtual.settings import SimulationSettings
 from labseq_virtual.simulation import StaticArray, VirtualSimulation
 from labseq_virtual.tweezers import SILENCE
 
-from labseq import (
+from labseq.model import AxisTones
+from labseq.motion import tone_program
+from labseq.plugin import (
     Context,
     DepthRamp,
     DeviceError,
@@ -24,8 +26,6 @@ from labseq import (
     ToneProgram,
     TweezerAmplitudes,
 )
-from labseq.model import AxisTones
-from labseq.motion import tone_program
 from labseq.roles import offers
 from labseq.testing.fakes import FakeClock
 from labseq.testing.rf import GRID as RF_GRID, START_S, PlayedRfSource, played, program_of, spec

@@ -243,14 +243,14 @@ def test_a_quantity_is_a_number_or_text_with_a_unit(dimension: str) -> None:
     assert not any(schema.is_valid(value) for value in (None, True, [3.5]))
 
 
-class Odd(labseq.Settings):
+class Odd(labseq.plugin.Settings):
     """What no schema can tell of."""
 
     of_the_plugin: Annotated[complex, PlainValidator(complex)] = Field(
         default=1j, description="a number of its own"
     )
     inner: Odd | None = Field(default=None, description="itself")
-    pair: tuple[labseq.Duration, Literal["a", "b"]] = Field(default=(0.1, "a"), description="two")
+    pair: tuple[labseq.plugin.Duration, Literal["a", "b"]] = Field(default=(0.1, "a"), description="two")
 
 
 def test_a_model_that_is_hard_to_describe_still_reports_its_keys() -> None:

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from labseq import Context
 from labseq.builtin.equalise import EqualiseSettings, EqualiseStep
 from labseq.builtin.probes import (
     CheckOverlaySettings,
@@ -32,6 +31,7 @@ from labseq.builtin.steps import (
 )
 from labseq.detection.threshold import ThresholdDetector, ThresholdSettings
 from labseq.model import SiteGrid
+from labseq.plugin import Context
 from labseq.testing import (
     StepContract,
 )

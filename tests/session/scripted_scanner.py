@@ -31,7 +31,7 @@ BAD = {
 }
 
 
-class Settings(labseq.Settings):
+class Settings(labseq.plugin.Settings):
     dops: list[int] = Field(default=[], description="what it gives")
     then: str = Field(default="end", description="what it does after that")
 
@@ -58,7 +58,7 @@ class Scripted:
         return BAD[self.settings.then]
 
 
-@labseq.hookimpl
+@labseq.plugin.hookimpl
 def labseq_register(registry):
     registry.scanner("scripted", Scripted, Settings)
 '''

@@ -48,7 +48,7 @@ class NoMapping(Mean):
     def shot(self, shot):
         return 5
 
-@labseq.hookimpl
+@labseq.plugin.hookimpl
 def labseq_register(registry):
     for made in (Mean, Fails, Dies, Hangs, NoMapping):
         registry.analysis(made.__name__.lower(), made)

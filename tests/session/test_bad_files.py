@@ -210,7 +210,7 @@ def test_thresholds_are_looked_for_beside_the_profile() -> None:
 
 
 PLUGIN = """
-from labseq import hookimpl
+from labseq.plugin import hookimpl
 LABSEQ_API = 1
 
 class Mine:

@@ -106,7 +106,7 @@ def test_a_planner_that_fails_is_a_warning(tmp_path: Path):
         "class Broken:\n"
         "    def __init__(self, settings, context): pass\n"
         "    def plan(self, occupancy, target): raise KeyError('typo')\n"
-        "@labseq.hookimpl\n"
+        "@labseq.plugin.hookimpl\n"
         "def labseq_register(registry): registry.planner('broken', Broken)\n",
         encoding="utf-8",
     )

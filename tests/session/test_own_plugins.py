@@ -34,7 +34,7 @@ class OneByOne:
         return labseq.Plan.from_batches(batches)
 
 
-@labseq.hookimpl
+@labseq.plugin.hookimpl
 def labseq_register(registry):
     registry.planner("mine", OneByOne)
 """
@@ -78,7 +78,7 @@ import labseq
 LABSEQ_API = 1
 
 
-class Settings(labseq.Settings):
+class Settings(labseq.plugin.Settings):
     damage: str
 
 
@@ -150,7 +150,7 @@ class Damaged:
         return [first, again]
 
 
-@labseq.hookimpl
+@labseq.plugin.hookimpl
 def labseq_register(registry):
     registry.planner("damaged", Damaged, Settings)
 '''
@@ -239,7 +239,7 @@ def test_a_plugin_that_fails_is_named(tmp_path, old, new, kind, message):
 
 
 def test_a_plugin_that_changes_the_folder_does_no_harm(tmp_path, monkeypatch):
-    code = "\n\n@labseq.hookimpl\ndef labseq_run_started(run):\n    __import__('os').chdir('/')\n"
+    code = "\n\n@labseq.plugin.hookimpl\ndef labseq_run_started(run):\n    __import__('os').chdir('/')\n"
     path = with_plugin(tmp_path, THIRD_PARTY + code)
     (tmp_path / "own.yaml").write_text(
         (ROOT / "hardware_profiles" / "virtual.yaml").read_text("utf-8"), "utf-8"
@@ -262,7 +262,7 @@ class Wrong:
     def detect(self, frame):
         return np.zeros((3, 3), bool), np.zeros((3, 3), np.float32)
 
-@labseq.hookimpl
+@labseq.plugin.hookimpl
 def labseq_register(registry):
     registry.detector("wrong", Wrong)
 """

@@ -64,7 +64,7 @@ class Fails(Planner):
         raise OSError("no licence")
 
 
-@labseq.hookimpl
+@labseq.plugin.hookimpl
 def labseq_register(registry):
     for planner in (Raises, Refuses, Lies, Breaks, Writes, Draws, Fails):
         registry.planner(planner.__name__.lower(), planner)

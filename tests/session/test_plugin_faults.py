@@ -42,7 +42,7 @@ import labseq
 LABSEQ_API = 1
 
 
-class Settings(labseq.Settings):
+class Settings(labseq.plugin.Settings):
     size: int
 
     @pydantic.field_validator("size")
@@ -77,7 +77,7 @@ def square(settings, grid):
     return labseq.TargetPattern(fill, ~fill)
 
 
-@labseq.hookimpl
+@labseq.plugin.hookimpl
 def labseq_register(registry):
     registry.step("mine", Look, Settings)
     registry.pattern("mine", square)
@@ -160,7 +160,7 @@ def test_a_dry_run_tells_of_a_plugin_that_is_not_there() -> None:
 
 
 def test_a_dry_run_does_not_choose_between_two_plugins_of_one_name() -> None:
-    register = "import labseq\nLABSEQ_API = 1\n@labseq.hookimpl\ndef labseq_register(registry):\n"
+    register = "import labseq\nLABSEQ_API = 1\n@labseq.plugin.hookimpl\ndef labseq_register(registry):\n"
     for name in ("one", "two"):
         Path(f"plugins/{name}.py").write_text(f"{register}    registry.camera('ixon', print)\n", "utf-8")
     with pytest.raises((ConfigError, PluginLoadError), match="is offered by 'one' already"):
@@ -210,7 +210,7 @@ class Writes:
         return labseq.Plan.from_batches([])
 
 
-@labseq.hookimpl
+@labseq.plugin.hookimpl
 def labseq_register(registry):
     registry.planner("writes", Writes)
 """

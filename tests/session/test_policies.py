@@ -22,7 +22,7 @@ __all__ = ["no_git"]
 PLUGIN = '''
 """A step that fails at some shots."""
 
-from labseq import DeviceError, Duration, Settings, hookimpl
+from labseq.plugin import DeviceError, Duration, Settings, hookimpl
 
 LABSEQ_API = 1
 

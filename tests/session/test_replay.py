@@ -36,7 +36,7 @@ class Blinking:
     def detect(self, frame):
         raise RuntimeError("closed")
 
-@labseq.hookimpl
+@labseq.plugin.hookimpl
 def labseq_register(registry):
     registry.planner("lazy", Lazy)
     registry.detector("blinking", Blinking)

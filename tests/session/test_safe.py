@@ -43,7 +43,7 @@ class Mine:
     def read(self, name): pass
 
 
-@labseq.hookimpl
+@labseq.plugin.hookimpl
 def labseq_register(registry):
     registry.device("mine", Mine)
 """

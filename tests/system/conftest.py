@@ -20,7 +20,7 @@ WATCHED = '''
 import os
 import pathlib
 
-from labseq import Context, Settings, hookimpl
+from labseq.plugin import Context, Settings, hookimpl
 from labseq_virtual import camera, devices, settings, tweezers
 
 LABSEQ_API = 1

@@ -9,7 +9,7 @@ PLUGIN = '''
 
 import numpy as np
 
-from labseq import Frame, hookimpl
+from labseq.plugin import Frame, hookimpl
 
 LABSEQ_API = 1
 

@@ -41,7 +41,7 @@ class Stuck:
         return labseq.Plan.from_batches([])
 
 
-@labseq.hookimpl
+@labseq.plugin.hookimpl
 def labseq_register(registry):
     registry.planner("stuck", Stuck)
 """
