@@ -66,7 +66,7 @@ NOT_RUN = {
     "docs/how-to/install.md": [
         "tests/system/test_wheel.py builds one",
         "tests/system/test_wheel.py installs it",
-        "tests/cli/test_demo.py copies them",
+        "tests/cli/test_run_demo.py copies them",
     ],
     "docs/how-to/new-plugin.md": ["a list of files"],
     "docs/how-to/plugin-trouble.md": ["an example; tests/test_plugin_troubles.py has them all"],
