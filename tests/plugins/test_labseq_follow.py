@@ -208,7 +208,7 @@ def test_a_serial_port_is_opened_alone() -> None:
             second.open()
 
 
-def test_a_port_that_is_taken_is_told() -> None:
+def test_a_port_that_is_taken_is_reported() -> None:
     with listening() as first:
         port = int(first.describe()["address"].rpartition(":")[2])
         second = tcp_leader(TcpLeaderSettings(port=port), Context("leader"))

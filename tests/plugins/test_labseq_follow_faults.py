@@ -135,7 +135,7 @@ def test_one_that_reads_nothing_counts_as_gone() -> None:
         again.leave()
 
 
-def test_a_fault_of_its_own_is_told_to_the_step_that_waits(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_fault_of_its_own_is_reported_to_the_step_that_waits(monkeypatch: pytest.MonkeyPatch) -> None:
     with listening() as device:
         monkeypatch.setattr(device._link, "poll", lambda: 1 / 0)
         with pytest.raises(DeviceError, match=r"it does not listen any more: ZeroDivisionError"):
@@ -167,7 +167,7 @@ def test_if_labseq_is_killed_the_connection_closes() -> None:
 
 
 @on_a_pty
-def test_a_serial_line_that_breaks_is_told_and_the_shot_goes_on() -> None:
+def test_a_serial_line_that_breaks_is_reported_and_the_shot_goes_on() -> None:
     peer = PtyPeer()
     device = serial_leader(SerialLeaderSettings(port=peer.port), Context("leader"))
     device.open()

@@ -175,7 +175,7 @@ def test_a_second_wait_does_not_load_again(tmp_path: Path) -> None:
         (["shot.0.wait.device=artiq"], "off", "has no device 'artiq'; expected one of 'leader', 'shutter'"),
     ],
 )
-def test_who_cannot_lead_is_told_before_anything_is_opened(
+def test_who_cannot_lead_is_reported_before_anything_is_opened(
     overrides: list[str], dry_run: Any, message: str, tmp_path: Path
 ) -> None:
     with pytest.raises(ConfigError, match=re.escape(message)):

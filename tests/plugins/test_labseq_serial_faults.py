@@ -95,7 +95,7 @@ def test_a_command_is_sent_again_only_if_the_profile_allows_it(
     assert counterpart.log.count("OPEN") == 3
 
 
-def test_an_error_of_the_instrument_is_told_and_not_repeated(
+def test_an_error_of_the_instrument_is_reported_and_not_repeated(
     counterpart: Counterpart, synth: SerialDevice
 ) -> None:
     with pytest.raises(DeviceError, match="synth: 'NONSENSE' was refused: 'ERR -113,undefined header'"):
@@ -123,7 +123,9 @@ def test_another_instrument_is_refused(counterpart: Counterpart) -> None:
     assert {*counterpart.log} == {"*IDN?"}, "it was sent nothing else"
 
 
-def test_a_second_user_is_told_that_the_port_is_taken(counterpart: Counterpart, synth: SerialDevice) -> None:
+def test_a_second_user_is_reported_that_the_port_is_taken(
+    counterpart: Counterpart, synth: SerialDevice
+) -> None:
     del synth
     second = SerialDevice(settings(port=counterpart.port), Context("laser"))
     text = f"laser: cannot open {counterpart.port}: another program has it open, or another device"

@@ -373,14 +373,6 @@ def test_a_list_does_what_its_writes_do_one_by_one(
     assert seen[0] == seen[1]
 
 
-def test_a_list_is_kept_waiting_as_its_writes_are() -> None:
-    card, clock = synthesizer()
-    start_s = clock.now()
-    writes: list[Write] = [(603000, 80e6)] * 400 + [(r.SPC_DDS_CMD, 2), (r.SPC_DDS_CMD, 8)]
-    assert card.write_list(entries(writes)) == r.ERR_OK
-    assert clock.now() - start_s == pytest.approx(1e-3)  # 400,000 commands a second
-
-
 def test_a_block_waits_for_its_trigger_only_when_all_of_it_has_arrived() -> None:
     card, clock = synthesizer(by_dma=True)
     writes: list[Write] = [(603000, 80e6)] * 1000 + [(605000, 0.5), (r.SPC_DDS_CMD, 2), (r.SPC_DDS_CMD, 8)]
@@ -391,15 +383,6 @@ def test_a_block_waits_for_its_trigger_only_when_all_of_it_has_arrived() -> None
     assert card.read(r.SPC_DDS_STATUS) == (r.ERR_OK, 0)
     clock.sleep(2e-6)
     assert card.read(r.SPC_DDS_STATUS) == (r.ERR_OK, r.SPCM_DDS_STAT_WAITING_FOR_TRG)
-
-
-def test_a_trigger_before_the_block_has_arrived_is_an_underrun() -> None:
-    card, clock = synthesizer(by_dma=True)
-    card.write_list(entries([(603000, 80e6), (605000, 0.5), (r.SPC_DDS_CMD, 2), (r.SPC_DDS_CMD, 8)]))
-    card.write(r.SPC_M2CMD, r.M2CMD_CARD_START | r.M2CMD_CARD_ENABLETRIGGER | r.M2CMD_CARD_FORCETRIGGER)
-    assert card.read(r.SPC_DDS_STATUS) == (r.ERR_OK, r.SPCM_DDS_STAT_QUEUE_UNDERRUN)
-    clock.sleep(1e-3)
-    assert card.played(0) == []
 
 
 def test_cards_with_fewer_cores_play_what_they_have() -> None:

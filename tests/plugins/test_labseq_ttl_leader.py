@@ -75,7 +75,7 @@ class Pins:
         return course
 
 
-def test_the_box_raises_busy_at_the_edge_and_what_it_is_reported_afterwards(running: Firmware) -> None:
+def test_the_box_raises_busy_at_the_edge_and_the_answer_afterwards(running: Firmware) -> None:
     pins = Pins(running)
     assert pins.go().split()[2] == "0001"
     assert pins.state() == ["02", "0001", "00", "01"]
@@ -308,7 +308,7 @@ def test_a_word_of_the_box_that_got_lost_is_asked_for() -> None:
     made.lines.close()
 
 
-def test_a_reset_in_a_shot_is_an_error_and_the_leader_is_reported_of_it() -> None:
+def test_a_reset_in_a_shot_is_an_error_and_the_leader_receives_failed() -> None:
     made = NoLeader()
     made.box.start()
     made.leader.wait_for("go", 1.0)
