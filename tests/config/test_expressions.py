@@ -148,6 +148,11 @@ def test_a_circle_and_what_hangs_on_it_is_told_once() -> None:
     assert told.endswith("this goes round in a circle: a -> b -> c -> a")
 
 
+@pytest.mark.parametrize("wrong", ["= b +", "= nothing", "= 1 s + 1"])
+def test_an_expression_that_refers_to_a_wrong_one_is_not_reported_as_well(wrong: str) -> None:
+    assert len(refused("= 2 * a", f"a: {wrong}\n").splitlines()) == 1
+
+
 def test_a_long_chain_ends() -> None:
     chain = "".join(f"v{i}: = v{i + 1}\n" for i in range(40)) + "v40: 7\n"
     assert value("= v0", chain) == 7
