@@ -28,8 +28,7 @@ from labseq.sequencer.lab import Timeouts
 from labseq.sequencer.policies import RunPolicy, StepPolicy, may_be_retried
 from labseq.testing.fakes import RecordingCamera, RecordingDevice
 from labseq.testing.fakes.devices import RecordingMobileTweezers
-
-from .rig import IMAGE, LOAD, SAFE_ORDER, Rig, given
+from tests.sequencer.rig import IMAGE, LOAD, SAFE_ORDER, Rig, given
 
 LOST = DeviceTimeoutError("camera", "the frame did not come", 1.0)
 SHORT = Timeouts(call_s=0.05)

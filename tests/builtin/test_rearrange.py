@@ -11,8 +11,7 @@ from labseq.errors import DeviceError, InvalidPlanError, PlanError
 from labseq.model import Plan
 from labseq.sequencer.lab import Timeouts
 from labseq.testing.fakes import ScriptedPlanner
-
-from .rig import IMAGE, LOAD, SAFE_ORDER, Rig, given
+from tests.sequencer.rig import IMAGE, LOAD, SAFE_ORDER, Rig, given
 
 HALF = np.array([[1, 0, 1], [0, 0, 0]], bool)
 FILL = np.array([[1, 1, 0], [0, 0, 0]], bool)
