@@ -25,7 +25,7 @@ from labseq.testing.contracts.promises import (
 )
 from labseq.testing.fakes import FakeShot, fake_shot
 
-Factory: TypeAlias = Callable[[Context], Analysis]
+AnalysisFactory: TypeAlias = Callable[[Context], Analysis]
 
 GIVES_RESULTS: Final = "shot() gives names and numbers, texts, arrays, or lists and mappings of them"
 
@@ -34,7 +34,7 @@ class AnalysisContract:
     """Promises of an analysis; provide the fixture ``factory``."""
 
     @pytest.fixture
-    def factory(self) -> Factory:
+    def factory(self) -> AnalysisFactory:
         """Constructs the analysis, given a context; provided by the plugin's test."""
         no_factory(self, "context -> analysis")
 
@@ -61,35 +61,35 @@ class AnalysisContract:
         }
 
     @promise(GIVES_RESULTS)
-    def test_gives_results(self, factory: Factory) -> None:
+    def test_gives_results(self, factory: AnalysisFactory) -> None:
         """They are written as a line of JSON; "shot" and "error" are no names of results."""
         analysis = factory(self.context())
         for what, shot in self.shots().items():
             with doing(what):
-                _check(ResultsLog.checked(_shot(analysis, shot)), "the result")
+                _check_value(ResultsLog.checked(_result_of(analysis, shot)), "the result")
 
     @promise("the same shot gives the same result, whatever came before it")
-    def test_same_shot_same_result(self, factory: Factory) -> None:
+    def test_same_shot_same_result(self, factory: AnalysisFactory) -> None:
         """Shots are analysed in another order when a run is resumed or analysed again."""
         analysis, shots = factory(self.context()), self.shots()
-        first = {what: dumps(_shot(analysis, shot)) for what, shot in shots.items()}
+        first = {what: dumps(_result_of(analysis, shot)) for what, shot in shots.items()}
         for what, shot in reversed([*shots.items()]):
-            assert dumps(_shot(analysis, shot)) == first[what], f"{what} gives another one the second time"
-            fresh = _shot(factory(self.context()), shot)
+            assert dumps(_result_of(analysis, shot)) == first[what], f"{what} gives another one the second time"
+            fresh = _result_of(factory(self.context()), shot)
             assert dumps(fresh) == first[what], f"{what} gives another one from a fresh instance"
 
     @promise("the shot is left untouched")
-    def test_leaves_the_shot_untouched(self, factory: Factory) -> None:
+    def test_leaves_the_shot_untouched(self, factory: AnalysisFactory) -> None:
         """Other analyses, and the shot's file, have the same arrays."""
         analysis = factory(self.context())
         for what, shot in self.shots().items():
             before = copy.deepcopy(_arrays(shot))
-            _shot(analysis, shot)
+            _result_of(analysis, shot)
             for name, array in _arrays(shot).items():
                 assert np.array_equal(before[name], array), f"of {what} it changed {name}"
 
     @promise("a shot that lacks something gives a result, or raises LabseqError")
-    def test_takes_odd_shots(self, factory: Factory) -> None:
+    def test_takes_odd_shots(self, factory: AnalysisFactory) -> None:
         """Without images, without frames, without atoms."""
         analysis = factory(self.context())
         for what, shot in self.odd_shots().items():
@@ -99,34 +99,34 @@ class AnalysisContract:
                 except LabseqError:
                     continue
                 with promised(GIVES_RESULTS):
-                    _check(ResultsLog.checked(result), "the result")
+                    _check_value(ResultsLog.checked(result), "the result")
 
     @promise("shot() is pure: no I/O, nothing changed that all code shares")
-    def test_is_pure(self, factory: Factory) -> None:
+    def test_is_pure(self, factory: AnalysisFactory) -> None:
         """What it works out is kept by labseq."""
         analysis = factory(self.context())
         for shot in self.shots().values():
-            _shot(analysis, shot)  # may compile
+            _result_of(analysis, shot)  # may compile
             with quietly():
-                _shot(analysis, shot)
+                _result_of(analysis, shot)
 
 
-def _shot(analysis: Analysis, shot: RecordedShot) -> Any:
+def _result_of(analysis: Analysis, shot: RecordedShot) -> Any:
     try:
         return analysis.shot(shot)
     except Exception as error:
         raise ContractViolation(GIVES_RESULTS, f"it {format_error(error)}") from error
 
 
-def _check(value: Any, what: str) -> None:
+def _check_value(value: Any, what: str) -> None:
     """Refuse what a line of results could not hold but as its ``repr``."""
     if isinstance(value, Mapping):
         for name, one in cast("Mapping[Any, Any]", value).items():
             assert isinstance(name, str), f"{what} has the name {name!r}; expected text"
-            _check(one, f"'{name}'")
+            _check_value(one, f"'{name}'")
     elif isinstance(value, list | tuple):
         for one in cast("Sequence[Any]", value):
-            _check(one, f"an element of {what}")
+            _check_value(one, f"an element of {what}")
     else:
         is_plain = value is None or isinstance(value, bool | int | float | str | np.generic)
         is_array = isinstance(value, np.ndarray) and value.dtype.kind in "biufSU"

@@ -15,7 +15,7 @@ from labseq.roles import Context, Detector
 from labseq.testing.contracts.process import quietly
 from labseq.testing.contracts.promises import doing, no_factory, promise, refusal
 
-Factory: TypeAlias = Callable[[Context], Detector]
+DetectorFactory: TypeAlias = Callable[[Context], Detector]
 
 
 class DetectorContract:
@@ -28,7 +28,7 @@ class DetectorContract:
     frame_shape: ClassVar[tuple[int, int]] = (512, 512)
 
     @pytest.fixture
-    def factory(self) -> Factory:
+    def factory(self) -> DetectorFactory:
         """Constructs the detector, given a context; provided by the plugin's test."""
         no_factory(self, "context -> detector")
 
@@ -40,13 +40,13 @@ class DetectorContract:
         """Frames of the right size: description -> frame."""
         noise = np.random.default_rng(7).integers(0, 2000, self.frame_shape, np.uint16)
         return {
-            "a noisy frame": _frame(noise),
-            "a black frame": _frame(np.zeros(self.frame_shape, np.uint16)),
-            "a saturated frame": _frame(np.full(self.frame_shape, 65535, np.uint16)),
+            "a noisy frame": _frame_of(noise),
+            "a black frame": _frame_of(np.zeros(self.frame_shape, np.uint16)),
+            "a saturated frame": _frame_of(np.full(self.frame_shape, 65535, np.uint16)),
         }
 
     @promise("detect() gives bool (n_rows, n_cols) and float32 (n_rows, n_cols) between 0 and 1")
-    def test_gives_occupancy_and_confidence(self, factory: Factory) -> None:
+    def test_gives_occupancy_and_confidence(self, factory: DetectorFactory) -> None:
         """On frames of every kind."""
         context = self.context()
         detector = factory(context)
@@ -54,14 +54,14 @@ class DetectorContract:
             answer: Any = detector.detect(frame)
             assert isinstance(answer, tuple), f"detect() gave a {type(answer).__name__}"
             occupancy, confidence = answer
-            _require(f"on {what} the occupancy", occupancy, np.bool_, context.grid.shape)
-            _require(f"on {what} the confidence", confidence, np.float32, context.grid.shape)
+            _require_array(f"on {what} the occupancy", occupancy, np.bool_, context.grid.shape)
+            _require_array(f"on {what} the confidence", confidence, np.float32, context.grid.shape)
             assert np.all((confidence >= 0) & (confidence <= 1)), (
                 f"on {what} the confidence reaches from {confidence.min()} to {confidence.max()}"
             )
 
     @promise("the same frame gives the same answer")
-    def test_same_frame_same_answer(self, factory: Factory) -> None:
+    def test_same_frame_same_answer(self, factory: DetectorFactory) -> None:
         """Again, after other frames, and from a fresh instance."""
         detector = factory(self.context())
 
@@ -79,7 +79,7 @@ class DetectorContract:
                 assert np.array_equal(was, now), f"the {name} is another {when}"
 
     @promise("an answer does not change after it was given")
-    def test_answers_do_not_change(self, factory: Factory) -> None:
+    def test_answers_do_not_change(self, factory: DetectorFactory) -> None:
         """A detector that hands out its own arrays would overwrite the last answer with the next."""
         detector = factory(self.context())
         frames = self.frames()
@@ -91,7 +91,7 @@ class DetectorContract:
             assert np.array_equal(was, now), f"the next frame overwrote the {name}"
 
     @promise("the frame is left untouched")
-    def test_leaves_the_frame_untouched(self, factory: Factory) -> None:
+    def test_leaves_the_frame_untouched(self, factory: DetectorFactory) -> None:
         """It is written to disk afterwards."""
         detector = factory(self.context())
         frame = self.frames()["a noisy frame"]
@@ -100,17 +100,17 @@ class DetectorContract:
         assert np.array_equal(before, frame.image), "detect() changed the image"
 
     @promise("a frame of the wrong size raises LabseqError")
-    def test_refuses_other_sizes(self, factory: Factory) -> None:
+    def test_refuses_other_sizes(self, factory: DetectorFactory) -> None:
         """Smaller, larger, turned."""
         height, width = self.frame_shape
         detector = factory(self.context())
         for shape in {(height - 1, width), (height, width + 1), (2 * height, 2 * width), (1, 1)}:
             if shape != self.frame_shape:
-                frame = _frame(np.zeros(shape, np.uint16))
+                frame = _frame_of(np.zeros(shape, np.uint16))
                 refusal(LabseqError, f"a frame of {shape}", detector.detect, frame)
 
     @promise("detect() is pure: no I/O, nothing changed that all code shares")
-    def test_does_no_io(self, factory: Factory) -> None:
+    def test_does_no_io(self, factory: DetectorFactory) -> None:
         """It runs between the exposure and the moves."""
         detector = factory(self.context())
         frame = self.frames()["a noisy frame"]
@@ -120,12 +120,12 @@ class DetectorContract:
             detector.detect(frame)
 
 
-def _require(what: str, array: Any, dtype: type[np.generic], shape: tuple[int, int]) -> None:
+def _require_array(what: str, array: Any, dtype: type[np.generic], shape: tuple[int, int]) -> None:
     assert isinstance(array, np.ndarray), f"{what} is a {type(array).__name__}"
     came = f"{what} is {array.dtype} {array.shape}; expected {np.dtype(dtype)} {shape}"
     assert array.dtype == dtype, came
     assert array.shape == shape, came
 
 
-def _frame(image: NDArray[np.uint16]) -> Frame:
+def _frame_of(image: NDArray[np.uint16]) -> Frame:
     return Frame(image, 0.045, 0.0)

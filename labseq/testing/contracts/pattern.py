@@ -20,7 +20,7 @@ from labseq.testing.contracts.promises import (
     refusal,
 )
 
-Factory: TypeAlias = Callable[[SiteGrid], TargetPattern]
+PatternFactory: TypeAlias = Callable[[SiteGrid], TargetPattern]
 
 FITS: Final = "it makes a TargetPattern of the grid's shape"
 
@@ -37,41 +37,41 @@ class PatternContract:
     too_small: ClassVar[SiteGrid | None] = SiteGrid(1, 1)
 
     @pytest.fixture
-    def factory(self) -> Factory:
+    def factory(self) -> PatternFactory:
         """Makes the target, given a grid; provided by the plugin's test."""
         no_factory(self, "grid -> target")
 
     @promise(FITS)
-    def test_fits_the_grid(self, factory: Factory) -> None:
+    def test_fits_the_grid(self, factory: PatternFactory) -> None:
         """On each of ``grids``."""
         for grid in self.grids:
-            _made(factory, grid)
+            _target_of(factory, grid)
 
     @promise("at least one site must hold an atom")
-    def test_wants_atoms(self, factory: Factory) -> None:
+    def test_wants_atoms(self, factory: PatternFactory) -> None:
         """A pattern without atoms is met by doing nothing."""
         for grid in self.grids:
-            assert _made(factory, grid).n_atoms > 0, f"on {_called(grid)} it wants none"
+            assert _target_of(factory, grid).n_atoms > 0, f"on {_called(grid)} it wants none"
 
     @promise("the same grid gives the same target")
-    def test_same_grid_same_target(self, factory: Factory) -> None:
+    def test_same_grid_same_target(self, factory: PatternFactory) -> None:
         """Again, and after other grids: a run that is resumed fills the same target."""
-        first = [_made(factory, grid) for grid in self.grids]
+        first = [_target_of(factory, grid) for grid in self.grids]
         for grid, target in zip(self.grids, first, strict=True):
-            again = _made(factory, grid)
+            again = _target_of(factory, grid)
             for name in ("fill", "clear"):
                 same = np.array_equal(getattr(target, name), getattr(again, name))
                 assert same, f"on {_called(grid)} {name} is another the second time"
             assert target.name == again.name, f"it is called '{target.name}', then '{again.name}'"
 
     @promise("a grid that it does not fit on raises LabseqError")
-    def test_refuses_small_grids(self, factory: Factory) -> None:
+    def test_refuses_small_grids(self, factory: PatternFactory) -> None:
         """``labseq check`` says so beforehand; a target that is cut off is another one."""
         if self.too_small is not None:
             refusal(LabseqError, _called(self.too_small), factory, self.too_small)
 
     @promise("it is pure: no I/O, nothing changed that all code shares")
-    def test_is_pure(self, factory: Factory) -> None:
+    def test_is_pure(self, factory: PatternFactory) -> None:
         """``labseq check`` makes it too; other plugins draw from the global random numbers."""
         with doing("the first target"):
             factory(self.grids[0])  # may compile
@@ -79,7 +79,7 @@ class PatternContract:
             factory(self.grids[0])
 
 
-def _made(factory: Factory, grid: SiteGrid) -> TargetPattern:
+def _target_of(factory: PatternFactory, grid: SiteGrid) -> TargetPattern:
     try:
         target: Any = factory(grid)
     except Exception as error:

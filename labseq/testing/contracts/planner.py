@@ -144,7 +144,7 @@ def same(target: TargetPattern) -> TargetPattern:
     return TargetPattern(target.fill.copy(), target.clear.copy(), target.name)
 
 
-Factory: TypeAlias = Callable[[Context], Planner]
+PlannerFactory: TypeAlias = Callable[[Context], Planner]
 Check: TypeAlias = Callable[[TargetPattern, Occupancy], None]
 
 PASSES_THE_CHECK = "the plan passes labseq.check_plan at the planner's degree of parallelism"
@@ -169,7 +169,7 @@ class PlannerContract:
     n_examples: ClassVar[int] = 60
 
     @pytest.fixture
-    def factory(self) -> Factory:
+    def factory(self) -> PlannerFactory:
         """Constructs the planner, given a context; provided by the plugin's test."""
         no_factory(self, "context -> planner")
 
@@ -186,13 +186,13 @@ class PlannerContract:
         return time.perf_counter()
 
     @promise(RETURNS_A_PLAN)
-    def test_returns_a_plan(self, factory: Factory) -> None:
+    def test_returns_a_plan(self, factory: PlannerFactory) -> None:
         """Not a list of batches, not None."""
         for target, atoms in self.large_cases():
             self.planned(factory, target, atoms)
 
     @promise(NO_ATOM_CREATED)
-    def test_creates_no_atom(self, factory: Factory) -> None:
+    def test_creates_no_atom(self, factory: PlannerFactory) -> None:
         """Random small arrays, on any target."""
 
         def check(target: TargetPattern, atoms: Occupancy) -> None:
@@ -203,7 +203,7 @@ class PlannerContract:
         self.on_examples(check)
 
     @promise(PASSES_THE_CHECK)
-    def test_plans_are_legal(self, factory: Factory) -> None:
+    def test_plans_are_legal(self, factory: PlannerFactory) -> None:
         """Random small arrays with any number of atoms, and one of full size."""
 
         def check(target: TargetPattern, atoms: Occupancy) -> None:
@@ -214,7 +214,7 @@ class PlannerContract:
             check(*case)
 
     @promise("the target is filled, and clear sites are emptied, when there are enough atoms")
-    def test_fills_the_target(self, factory: Factory) -> None:
+    def test_fills_the_target(self, factory: PlannerFactory) -> None:
         """Random small arrays with enough atoms, and one of full size."""
 
         def check(target: TargetPattern, atoms: Occupancy) -> None:
@@ -229,7 +229,7 @@ class PlannerContract:
             check(*case)
 
     @promise("with too few atoms the plan leaves no more defects than it found")
-    def test_does_what_it_can_with_too_few_atoms(self, factory: Factory) -> None:
+    def test_does_what_it_can_with_too_few_atoms(self, factory: PlannerFactory) -> None:
         """Random small arrays."""
 
         def check(target: TargetPattern, atoms: Occupancy) -> None:
@@ -242,13 +242,13 @@ class PlannerContract:
         self.on_examples(check, served=True)
 
     @promise(RETURNS_A_PLAN)
-    def test_plans_for_extremes(self, factory: Factory) -> None:
+    def test_plans_for_extremes(self, factory: PlannerFactory) -> None:
         """Single sites and lines, empty and full loadings, targets without atoms."""
         for case in self.extreme_cases():
             self.checked(factory, *case)
 
     @promise("the same input gives the same plan")
-    def test_same_input_same_plan(self, factory: Factory) -> None:
+    def test_same_input_same_plan(self, factory: PlannerFactory) -> None:
         """Again, after other calls, and from a fresh instance."""
         for target, atoms in self.large_cases():
             planner = factory(self.context(target.shape))
@@ -261,7 +261,7 @@ class PlannerContract:
                 assert equal(first, plan), f"the plan is another {when}"
 
     @promise("the input is left untouched")
-    def test_leaves_the_input_untouched(self, factory: Factory) -> None:
+    def test_leaves_the_input_untouched(self, factory: PlannerFactory) -> None:
         """The occupancy belongs to the shot's record."""
         for target, atoms in self.large_cases():
             given_atoms = atoms.copy()
@@ -272,7 +272,7 @@ class PlannerContract:
             assert np.array_equal(target.clear, clear), "plan() changed the target's clear"
 
     @promise("read-only and non-contiguous occupancies are planned for like others")
-    def test_takes_any_memory_layout(self, factory: Factory) -> None:
+    def test_takes_any_memory_layout(self, factory: PlannerFactory) -> None:
         """Recorded occupancies are read-only; a view of a larger array is not contiguous."""
         for target, atoms in self.large_cases():
             expected = target.n_defects(replay(self.planned(factory, target, atoms.copy()), atoms))
@@ -288,7 +288,7 @@ class PlannerContract:
                     assert left == expected, f"the plan leaves {left} defects, not {expected}"
 
     @promise("what is no occupancy of the target's shape raises LabseqError or ValueError")
-    def test_refuses_wrong_input(self, factory: Factory) -> None:
+    def test_refuses_wrong_input(self, factory: PlannerFactory) -> None:
         """Rather than a wrong plan, or an error from somewhere inside."""
         target, atoms = self.large_cases()[0]
         planner = factory(self.context(target.shape))
@@ -304,7 +304,7 @@ class PlannerContract:
             refusal((LabseqError, ValueError), what, planner.plan, values, target)
 
     @promise("a plan is made within the time limit")
-    def test_plans_in_time(self, factory: Factory) -> None:
+    def test_plans_in_time(self, factory: PlannerFactory) -> None:
         """The best of three, after compiling."""
         for target, atoms in self.large_cases():
             planner = self.warmed(factory, target)
@@ -319,7 +319,7 @@ class PlannerContract:
             assert min(taken_s) <= self.time_limit_s, text
 
     @promise("plan() is pure: no I/O, nothing changed that all code shares")
-    def test_is_pure(self, factory: Factory) -> None:
+    def test_is_pure(self, factory: PlannerFactory) -> None:
         """Other plugins draw from the global random numbers too."""
         for target, atoms in self.large_cases():
             planner = self.warmed(factory, target)
@@ -327,7 +327,7 @@ class PlannerContract:
             with quietly():
                 planner.plan(atoms.copy(), target)
 
-    def planned(self, factory: Factory, target: TargetPattern, atoms: Occupancy) -> Plan:
+    def planned(self, factory: PlannerFactory, target: TargetPattern, atoms: Occupancy) -> Plan:
         """What a fresh planner plans; it is given the array itself, not a copy."""
         return plan_of(factory(self.context(target.shape)), target, atoms)
 
@@ -341,7 +341,7 @@ class PlannerContract:
                 raise ContractViolation(RETURNS_A_PLAN, detail) from error
             return None
 
-    def checked(self, factory: Factory, target: TargetPattern, atoms: Occupancy) -> PlanReport | None:
+    def checked(self, factory: PlannerFactory, target: TargetPattern, atoms: Occupancy) -> PlanReport | None:
         """The check's report on a fresh planner's plan; None if it rightly refuses the target."""
         context = self.context(target.shape)
         planner = factory(context)
@@ -353,7 +353,7 @@ class PlannerContract:
         with promised(PASSES_THE_CHECK):
             return check_plan(plan, atoms, target, dop, grid=context.grid, motion=context.motion)
 
-    def warmed(self, factory: Factory, target: TargetPattern) -> Planner:
+    def warmed(self, factory: PlannerFactory, target: TargetPattern) -> Planner:
         """A fresh planner, compiled."""
         planner = factory(self.context(target.shape))
         if isinstance(planner, NeedsWarmUp):

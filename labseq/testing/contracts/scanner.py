@@ -13,7 +13,7 @@ from labseq.roles import Scanner
 from labseq.testing.contracts.process import quietly
 from labseq.testing.contracts.promises import doing, in_time, no_factory, promise, promised
 
-Factory: TypeAlias = Callable[[ScanSpace], Scanner]
+ScannerFactory: TypeAlias = Callable[[ScanSpace], Scanner]
 Scores: TypeAlias = Callable[[ScanSpace, Mapping[str, float]], float]
 
 GIVES_POINTS: Final = "next_point() soon gives an allowed value for each address, or later None"
@@ -31,7 +31,7 @@ class ScannerContract:
     time_limit_s: ClassVar[float] = 5.0
 
     @pytest.fixture
-    def factory(self) -> Factory:
+    def factory(self) -> ScannerFactory:
         """Constructs the scanner, given a space; provided by the plugin's test."""
         no_factory(self, "space -> scanner")
 
@@ -45,7 +45,7 @@ class ScannerContract:
         return {what: ScanSpace(of, self.n_points, 2, seed=5) for what, of in ranges.items()}
 
     @promise(GIVES_POINTS)
-    def test_points_are_in_their_ranges(self, factory: Factory) -> None:
+    def test_points_are_in_their_ranges(self, factory: ScannerFactory) -> None:
         """Whatever comes of the points: better and better, all the same, nothing at all."""
         for what, space in self.spaces().items():
             for kind, scores in _SCORES.items():
@@ -53,7 +53,7 @@ class ScannerContract:
                     self.visited(factory(space), space, scores)
 
     @promise("the same space and the same results give the same point")
-    def test_same_results_same_point(self, factory: Factory) -> None:
+    def test_same_results_same_point(self, factory: ScannerFactory) -> None:
         """Asked again, and from a fresh instance that is shown all at once, as in a run that is resumed."""
         for what, space in self.spaces().items():
             scanner = factory(space)
@@ -64,7 +64,7 @@ class ScannerContract:
                 assert answers == known * 2, f"on {what}, point {n + 1} was {known[0]}, and is {answers}"
 
     @promise("what it is given is left untouched")
-    def test_leaves_its_input_untouched(self, factory: Factory) -> None:
+    def test_leaves_its_input_untouched(self, factory: ScannerFactory) -> None:
         """The points visited so far are everybody's."""
         space = self.spaces()["all kinds of range"]
         scanner = factory(space)
@@ -74,7 +74,7 @@ class ScannerContract:
         assert given == visited, "it changed the points"
 
     @promise("it is pure: no I/O, nothing changed that all code shares")
-    def test_is_pure(self, factory: Factory) -> None:
+    def test_is_pure(self, factory: ScannerFactory) -> None:
         """What it chose could otherwise depend on something that a resumed run does not have."""
         space = self.spaces()["all kinds of range"]
         visited = self.visited(factory(space), space, _hill)  # may compile
@@ -91,12 +91,12 @@ class ScannerContract:
                 if point is None:
                     assert visited, "next_point() gave no point at all"
                     break
-                _check(point, space)
+                _check_point(point, space)
                 visited.append(VisitedPoint(dict(point), scores(space, point)))
         return visited
 
 
-def _check(point: Any, space: ScanSpace) -> None:
+def _check_point(point: Any, space: ScanSpace) -> None:
     """Refuse what is no point of the space."""
     assert isinstance(point, Mapping), f"next_point() gave a {type(point).__name__}"
     values = cast("Mapping[str, Any]", point)
@@ -116,7 +116,7 @@ def _hill(space: ScanSpace, point: Mapping[str, float]) -> float:
     return -sum((one.fraction(point[one.address]) - 0.3) ** 2 for one in space.ranges)
 
 
-def _constant(score: float) -> Scores:
+def _constant_score(score: float) -> Scores:
     def scores(space: ScanSpace, point: Mapping[str, float]) -> float:
         del space, point
         return score
@@ -126,8 +126,8 @@ def _constant(score: float) -> Scores:
 
 _SCORES: dict[str, Scores] = {
     "on a hill": _hill,
-    "on a plain": _constant(0.0),
-    "without a single score": _constant(math.nan),
+    "on a plain": _constant_score(0.0),
+    "without a single score": _constant_score(math.nan),
 }
 
 
