@@ -1,4 +1,4 @@
-"""For everyone who writes a plugin: contract suites, hypothesis strategies, fakes.
+"""For plugin authors: contract suites, hypothesis strategies, fakes.
 
 A plugin's test inherits the suite of its role and provides one fixture::
 
@@ -11,8 +11,8 @@ A plugin's test inherits the suite of its role and provides one fixture::
         def factory(self):
             return partial(MyCamera, MySettings(port="simulated"))
 
-``factory(context)`` constructs what is tested, as labseq itself does after it
-has read the settings. Each failure names the promise that was broken.
+``factory(context)`` constructs the plugin, as labseq does after it has read the
+settings. Each failure names the promise that was broken.
 
 ``SUITES`` has the suite of each kind of plugin; ``docs/reference/testing.md`` lists all promises.
 

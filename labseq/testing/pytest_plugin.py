@@ -1,4 +1,4 @@
-"""Fixtures for everyone who tests a plugin; pytest finds them by itself.
+"""Fixtures for tests of plugins; pytest finds them automatically.
 
 Loaded into every pytest of the environment, so labseq is imported only inside
 the fixtures.
@@ -28,7 +28,7 @@ def paper_grid() -> SiteGrid:
 
 @pytest.fixture
 def virtual_clock() -> FakeClock:
-    """A clock whose time passes only when somebody waits; it notes every wait."""
+    """A clock whose time passes only during waits; it records every wait."""
     from labseq.testing.fakes import FakeClock
 
     return FakeClock()
@@ -36,7 +36,7 @@ def virtual_clock() -> FakeClock:
 
 @pytest.fixture
 def labseq_context(paper_grid: SiteGrid, virtual_clock: FakeClock) -> Context:
-    """What a plugin's factory is given: the paper's grid, virtual time, a simulation that notes all calls."""
+    """A context for a plugin's factory: the paper's grid, virtual time, a recording simulation."""
     from labseq.roles import Context
     from labseq.testing.fakes import Calls, RecordingSimulation
 

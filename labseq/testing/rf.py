@@ -42,16 +42,16 @@ def played(program: ToneProgram, start_s: float = START_S) -> tuple[list[RfSampl
 
 
 class PlayedRfSource:
-    """An ``RfSource`` that has played everything already; each span is told once."""
+    """An ``RfSource`` that has played everything already; it returns each span once."""
 
     def __init__(self, spans: tuple[list[RfSamples], list[RfSamples]]) -> None:
         self._spans = spans
 
     def played(self, until_s: float) -> tuple[list[RfSamples], list[RfSamples]]:
         """All spans, at the first call."""
-        told, self._spans = self._spans, ([], [])
-        assert all(span.end_s <= until_s + 1e-9 for spans in told for span in spans)
-        return told
+        spans_played, self._spans = self._spans, ([], [])
+        assert all(span.end_s <= until_s + 1e-9 for spans in spans_played for span in spans)
+        return spans_played
 
 
 def with_phase_jump(program: ToneProgram, segment: int, size_rad: float) -> ToneProgram:

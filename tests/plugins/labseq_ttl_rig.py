@@ -17,7 +17,7 @@ from labseq_ttl_sim.simavr import SimavrBox, runner
 from labseq.plugin import Context, LineProgram, LineSpec
 from labseq.roles.shot import NeverStopped
 from labseq.sequencer.lines import line_program
-from labseq.testing.contracts.lines import SPECS
+from labseq.testing.contracts.instruments import SPECS
 from labseq.testing.fakes import Calls, FakeClock, RecordingSimulation
 
 from .needs import need_library

@@ -9,7 +9,7 @@ from labseq_climb.scanner import Climb, ClimbSettings
 
 from labseq.plugin import ScanRange, ScanSpace, VisitedPoint
 from labseq.testing import ScannerContract
-from labseq.testing.contracts.scanner import Factory
+from labseq.testing.contracts.deciders import Factory
 
 DOP = ScanRange("planner.degree_of_parallelism", 2, 15, is_whole=True, start=3)
 RAMP = ScanRange("profile.mobile_tweezers.pick_up", 20e-6, 400e-6)

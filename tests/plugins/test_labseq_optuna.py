@@ -12,7 +12,7 @@ from labseq_optuna.scanner import OptunaScanner, OptunaSettings
 
 from labseq.plugin import ConfigError, ScanRange, ScanSpace, VisitedPoint
 from labseq.testing import ScannerContract
-from labseq.testing.contracts.scanner import Factory
+from labseq.testing.contracts.deciders import Factory
 
 SPEED = ScanRange("profile.mobile_tweezers.speed", 0.05, 0.2)
 CYCLES = ScanRange("shot.2.rearrange.cycles", 1, 40, is_whole=True)

@@ -16,7 +16,7 @@ import labseq
 from labseq.errors import StopRequested
 from labseq.plugin import ConfigError, Context, DeviceError, DeviceTimeoutError, LeaderLink, LineSpec
 from labseq.sequencer.lines import line_program
-from labseq.testing.contracts.lines import SPECS
+from labseq.testing.contracts.instruments import SPECS
 from labseq.testing.fakes import Calls, FakeClock, RecordingSimulation
 
 from .labseq_ttl_rig import Firmware, need_simavr

@@ -3,20 +3,15 @@
 from collections.abc import Mapping
 from typing import Any, Final
 
-from labseq.testing.contracts.analysis import AnalysisContract
 from labseq.testing.contracts.camera import CameraContract
-from labseq.testing.contracts.detector import DetectorContract
-from labseq.testing.contracts.device import DeviceContract
+from labseq.testing.contracts.deciders import AnalysisContract, DetectorContract, ScannerContract
 from labseq.testing.contracts.hardware import HardwareContract, Wait
-from labseq.testing.contracts.lines import LinesContract
-from labseq.testing.contracts.mobile_tweezers import MobileTweezersContract
-from labseq.testing.contracts.pattern import PatternContract
-from labseq.testing.contracts.planner import PlannerContract
+from labseq.testing.contracts.instruments import DeviceContract, LinesContract
+from labseq.testing.contracts.planner import PatternContract, PlannerContract
 from labseq.testing.contracts.promises import ContractViolation
-from labseq.testing.contracts.scanner import ScannerContract
 from labseq.testing.contracts.simulation import SimulationContract
-from labseq.testing.contracts.static_tweezers import StaticTweezersContract
 from labseq.testing.contracts.step import StepContract
+from labseq.testing.contracts.tweezers import MobileTweezersContract, StaticTweezersContract
 
 SUITES: Final[Mapping[str, type[Any]]] = {
     "planner": PlannerContract,
@@ -37,8 +32,8 @@ SUITES: Final[Mapping[str, type[Any]]] = {
 __all__ = [
     "SUITES",
     "AnalysisContract",
-    "ContractViolation",
     "CameraContract",
+    "ContractViolation",
     "DetectorContract",
     "DeviceContract",
     "HardwareContract",

@@ -1,4 +1,4 @@
-"""What a camera promises."""
+"""Promises of a camera."""
 
 from __future__ import annotations
 
@@ -17,12 +17,11 @@ from labseq.testing.contracts.promises import promise, refusal
 
 
 class CameraContract(HardwareContract[Camera]):
-    """Promises of a camera that takes software triggers, and of its other triggers where it has them.
+    """Promises of a camera with software triggers, and of its other triggers if it has them.
 
     Attributes:
         exposure_s: Exposure of the test frames, in seconds.
-        exposure_tolerance: Greatest relative deviation of the exposure that a frame
-            tells from the one that was asked for.
+        exposure_tolerance: Greatest relative deviation of a frame's exposure from the requested one.
         timeout_s: Timeout for a frame beyond its exposure, in seconds.
     """
 
@@ -44,7 +43,7 @@ class CameraContract(HardwareContract[Camera]):
         }
 
     def states(self) -> Mapping[str, Action[Camera]]:
-        """Armed, exposing, and with a frame that nobody reads."""
+        """Armed, exposing, and with a frame that has not been read."""
 
         def expose(camera: Camera) -> None:
             camera.arm(2, self.exposure_s, "software")
@@ -75,7 +74,7 @@ class CameraContract(HardwareContract[Camera]):
         }
 
     def waits(self) -> Mapping[str, Wait[Camera]]:
-        """For a frame that was never triggered, by nobody or by no wire."""
+        """For a frame without a software trigger, and without an external one."""
 
         def arm(trigger: Trigger) -> Action[Camera]:
             def enter(camera: Camera) -> None:
@@ -99,7 +98,7 @@ class CameraContract(HardwareContract[Camera]):
             frames.append(camera.read(self.exposure_s + self.timeout_s))
         return frames
 
-    @promise("arm, trigger, read gives a Frame: uint16 (height, width), with the exposure asked for")
+    @promise("arm, trigger, read gives a Frame: uint16 (height, width), with the requested exposure")
     def test_gives_a_frame(self, factory: Factory[Camera]) -> None:
         """One image, as the ``image`` step takes it."""
         with self.opened(factory) as (camera, _):
@@ -109,12 +108,12 @@ class CameraContract(HardwareContract[Camera]):
             assert frame.image.ndim == 2, f"the image has shape {frame.image.shape}"
             assert frame.image.size > 0, f"the image has shape {frame.image.shape}"
             deviation = abs(frame.exposure_s / self.exposure_s - 1.0)
-            told = f"the frame tells {frame.exposure_s} s; asked for {self.exposure_s} s"
-            assert deviation <= self.exposure_tolerance, told
+            text = f"the frame's exposure is {frame.exposure_s} s; expected {self.exposure_s} s"
+            assert deviation <= self.exposure_tolerance, text
 
     @promise("after arm(n) come n frames, the oldest first, and no more")
     def test_gives_as_many_frames_as_armed_for(self, factory: Factory[Camera]) -> None:
-        """And the next series begins anew."""
+        """And the next series starts from the beginning."""
         with self.opened(factory) as (camera, _):
             shapes = {np.shape(frame.image) for frame in self.take(camera, 3)}
             assert len(shapes) == 1, f"the frames of a series have the shapes {sorted(shapes)}"
@@ -127,11 +126,11 @@ class CameraContract(HardwareContract[Camera]):
 
     @promise("frames are numbered from 0 in each series, and later ones have later time stamps")
     def test_numbers_its_frames(self, factory: Factory[Camera]) -> None:
-        """A gap tells that a frame was lost; time stamps are the camera's own, and it need not give any."""
+        """A gap shows that a frame was lost; time stamps are the camera's own, and optional."""
         with self.opened(factory) as (camera, _):
             for _ in range(2):
                 frames = [frame for frame in self.take(camera, 3) if isinstance(frame, Frame)]
-                if len(frames) < 3:  # what a frame is has a test of its own
+                if len(frames) < 3:  # the type of a frame has its own test
                     return
                 numbers = [frame.number for frame in frames]
                 assert numbers == [0, 1, 2], f"the frames of a series of 3 have the numbers {numbers}"
@@ -139,9 +138,9 @@ class CameraContract(HardwareContract[Camera]):
                 rising = all(b > a for a, b in pairwise(stamps) if not np.isnan([a, b]).any())
                 assert rising, f"the time stamps are {stamps}"
 
-    @promise("arm() refuses a trigger that the camera does not tell of in its facts")
+    @promise("arm() refuses a trigger that the camera's facts do not list")
     def test_refuses_unknown_triggers(self, factory: Factory[Camera]) -> None:
-        """Else the run would wait for an edge that no wire brings."""
+        """Otherwise the run would wait for an edge that never comes."""
         with self.opened(factory) as (camera, _):
             for trigger in get_args(Trigger):
                 if trigger not in triggers_of(camera):
@@ -149,9 +148,9 @@ class CameraContract(HardwareContract[Camera]):
                     refusal(DeviceError, f"arm() for the {trigger} trigger", arm)
             self.take(camera)
 
-    @promise("with the internal trigger the frames of a series come by themselves")
+    @promise("with the internal trigger the frames of a series come without trigger()")
     def test_exposes_by_itself(self, factory: Factory[Camera]) -> None:
-        """For a camera that has it: n frames, and none of them by trigger()."""
+        """For a camera that has it."""
         with self.opened(factory) as (camera, _):
             if "internal" not in triggers_of(camera):
                 return
@@ -164,7 +163,7 @@ class CameraContract(HardwareContract[Camera]):
 
     @promise("t_start_s is the start of the exposure on the session's clock")
     def test_tells_when_it_exposed(self, factory: Factory[Camera]) -> None:
-        """Later frames start later, and each between its trigger and its reading."""
+        """Later frames start later, each between its trigger and its read()."""
         with self.opened(factory) as (camera, context):
             camera.arm(3, self.exposure_s, "software")
             last_s = -np.inf
@@ -174,14 +173,16 @@ class CameraContract(HardwareContract[Camera]):
                 camera.trigger()
                 t_start_s = camera.read(self.exposure_s + self.timeout_s).t_start_s
                 after_s = context.clock.now()
-                told = f"a frame triggered at {before_s} s and read at {after_s} s tells {t_start_s} s"
-                assert before_s - 1e-9 <= t_start_s <= after_s + 1e-9, told
-                assert t_start_s > last_s, f"it tells {t_start_s} s after {last_s} s"
+                text = (
+                    f"a frame triggered at {before_s} s and read at {after_s} s has t_start_s {t_start_s} s"
+                )
+                assert before_s - 1e-9 <= t_start_s <= after_s + 1e-9, text
+                assert t_start_s > last_s, f"t_start_s {t_start_s} s comes after {last_s} s"
                 last_s = t_start_s
 
     @promise("a frame does not change after it was read")
     def test_frames_do_not_change(self, factory: Factory[Camera]) -> None:
-        """A driver that hands out its own buffer would overwrite the last image with the next."""
+        """A driver that returns its own buffer would overwrite the last image with the next."""
         with self.opened(factory) as (camera, _):
             frame = self.take(camera)[0]
             before = np.array(frame.image)
@@ -190,7 +191,7 @@ class CameraContract(HardwareContract[Camera]):
 
     @promise("trigger() without arm() raises DeviceError")
     def test_refuses_trigger_without_arm(self, factory: Factory[Camera]) -> None:
-        """Nor after safe_state(): the camera has forgotten the series."""
+        """Also after safe_state(), which ends the series."""
         with self.opened(factory) as (camera, _):
             refusal(DeviceError, "trigger() after open()", camera.trigger)
             camera.arm(1, self.exposure_s, "software")
@@ -199,5 +200,5 @@ class CameraContract(HardwareContract[Camera]):
 
 
 def triggers_of(camera: Camera) -> tuple[str, ...]:
-    """What may start its exposures: what it tells, or software triggers."""
+    """The camera's triggers: those of its facts, or software triggers alone."""
     return camera.facts.triggers if offers(camera, "facts") else ("software",)

@@ -1,4 +1,4 @@
-"""What all hardware roles promise."""
+"""Promises of all hardware roles."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ import pytest
 from labseq.errors import DeviceError, DeviceTimeoutError, LimitError
 from labseq.model import SiteGrid
 from labseq.roles import Context, Hardware
-from labseq.testing.contracts.process import quietly
 from labseq.testing.contracts.promises import (
     CallHungError,
     doing,
@@ -21,6 +20,7 @@ from labseq.testing.contracts.promises import (
     no_factory,
     promise,
     promised,
+    quietly,
     refusal,
 )
 from labseq.testing.fakes import Calls, FakeClock, RecordingSimulation
@@ -32,11 +32,11 @@ Action: TypeAlias = Callable[[D], object]
 
 @dataclass(frozen=True, slots=True)
 class Wait(Generic[D]):
-    """A wait for something that does not come within its timeout.
+    """A wait that must end in a timeout.
 
     Attributes:
         timeout_s: The timeout, in seconds.
-        enter: Brings an open device to where it can wait.
+        enter: Brings an open device into the state in which it waits.
         wait: The call, with that timeout.
     """
 
@@ -46,7 +46,7 @@ class Wait(Generic[D]):
 
 
 class HardwareContractBase(Generic[D]):
-    """What the suites of all hardware roles are told by the suite of one, and where they put a device.
+    """The calls, states and waits of a role, as the promises of all roles use them.
 
     Attributes:
         role: Name that the device has in the profile.
@@ -62,18 +62,18 @@ class HardwareContractBase(Generic[D]):
         no_factory(self, "context -> device")
 
     def context(self) -> Context:
-        """What the device is constructed with; override it for another grid or simulation.
+        """The context that the device is constructed with; override it for another grid or simulation.
 
-        Keep the clock virtual: then waiting for a timeout costs no time.
+        Keep the clock virtual, so that waiting for a timeout costs no time.
         """
         clock = FakeClock()
         return Context(self.role, SiteGrid(), clock=clock, simulation=RecordingSimulation(Calls(clock)))
 
     def work(self, device: D) -> None:
-        """What the role does in a shot, once; the device is open."""
+        """Do once what the role does in a shot; the device is open."""
 
     def ready(self, device: D) -> None:
-        """What comes before any work; the device is open."""
+        """Do what is needed before any work; the device is open."""
 
     def uses(self) -> Mapping[str, Action[D]]:
         """Calls of the role that need an open device: description -> call."""
@@ -88,12 +88,12 @@ class HardwareContractBase(Generic[D]):
         return {}
 
     def waits(self) -> Mapping[str, Wait[D]]:
-        """Waits in vain: description -> wait."""
+        """Waits that must time out: description -> wait."""
         return {}
 
     @contextmanager
     def made(self, factory: Factory[D]) -> Generator[tuple[D, Context]]:
-        """A new device, not opened, with its context; closed at the end, whatever has become of it."""
+        """A new device, not opened, with its context; closed at the end in any case."""
         context = self.context()
         device = factory(context)
         try:
@@ -115,7 +115,7 @@ class HardwareContractBase(Generic[D]):
     def each_state(self, factory: Factory[D]) -> Generator[Iterator[tuple[str, D, Context]]]:
         """A device in each of its states: (state, device, context).
 
-        It is one device from state to state, and a new one only where that cannot get there.
+        The same device goes from state to state; a new one is made if it cannot.
         """
         with ExitStack() as stack:
 
@@ -124,7 +124,7 @@ class HardwareContractBase(Generic[D]):
                 for state, enter in {"after open()": _stay, **self.states()}.items():
                     try:
                         enter(device)
-                    except Exception:  # noqa: BLE001 - that the last state is left rightly has tests of its own
+                    except Exception:  # noqa: BLE001 - leaving a state is tested elsewhere
                         stack.close()
                         device, context = stack.enter_context(self.opened(factory))
                         enter(device)
@@ -133,7 +133,7 @@ class HardwareContractBase(Generic[D]):
             yield states()
 
     def failures(self) -> Iterator[Mapping[str, Action[D]]]:
-        """Every way in which the suite makes an open device fail, in groups for one device each."""
+        """Every way in which the suite makes an open device fail, in groups that share a device."""
 
         def waiting(wait: Wait[D]) -> Action[D]:
             return lambda device: (wait.enter(device), wait.wait(device))
@@ -143,7 +143,7 @@ class HardwareContractBase(Generic[D]):
             yield {what: waiting(wait)}
 
     def call_in_time(self, context: Context, what: str, call: Callable[..., object], *args: object) -> None:
-        """A call that must come back; one that polls the clock for ever is ended by it."""
+        """Make a call that must return; one that polls the clock for ever is ended through the clock."""
         try:
             in_time(self.max_wait_s, what, call, *args)
         except CallHungError:
@@ -153,24 +153,24 @@ class HardwareContractBase(Generic[D]):
 
 
 def close_quietly(device: Hardware) -> None:
-    """Whatever the test has found; what close() promises has tests of its own."""
+    """Close a device and ignore errors; the promises of close() have their own tests."""
     with suppress(Exception):
         device.close()
 
 
 def _stay(device: object) -> None:
-    """A device that was opened is in that state already."""
+    """Do nothing: the device has been opened already."""
     del device
 
 
 def begin_shot(context: Context) -> None:
-    """As the sequencer begins one, where there is a simulated world."""
+    """Begin a shot of the simulation, if there is one, as the sequencer does."""
     if context.simulation is not None:
         context.simulation.begin_shot()
 
 
 def n_calls(context: Context) -> int:
-    """How often the simulation was called; 0 for one that does not note it."""
+    """Number of calls of the simulation; 0 for one that does not record them."""
     simulation = context.simulation
     return len(simulation.calls) if isinstance(simulation, RecordingSimulation) else 0
 
@@ -190,7 +190,7 @@ class HardwareContract(HardwareContractBase[D]):
         max_wait_s: Real time after which a call counts as hung, in seconds.
     """
 
-    @promise("the constructor does no I/O, and changes nothing that all code shares")
+    @promise("the constructor does no I/O and changes no shared state")
     def test_constructor_does_no_io(self, factory: Factory[D]) -> None:
         """Nothing is opened, connected or started before open()."""
         context = self.context()
@@ -303,7 +303,7 @@ class HardwareContract(HardwareContractBase[D]):
 
     @promise("a DeviceError names the device as the profile does")
     def test_errors_name_the_device(self, factory: Factory[D]) -> None:
-        """Else nobody knows which of the instruments failed."""
+        """So that the message shows which instrument failed."""
         for what, use in self.uses().items():
             with self.made(factory) as (device, context):
                 self._named(context, what, use, device)

@@ -1,4 +1,4 @@
-"""What a planner promises."""
+"""What target patterns and planners promise."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from labseq.errors import LabseqError
 from labseq.model import Occupancy, Plan, PlanReport, SiteGrid, TargetPattern
 from labseq.motion import check_plan
 from labseq.roles import Context, NeedsWarmUp, Planner
-from labseq.testing.contracts.process import quietly
 from labseq.testing.contracts.promises import (
     ContractViolation,
     as_this_promise,
@@ -26,9 +25,85 @@ from labseq.testing.contracts.promises import (
     no_factory,
     promise,
     promised,
+    quietly,
     refusal,
 )
 from labseq.testing.strategies import cases, drawn, occupancies
+
+PatternFactory: TypeAlias = Callable[[SiteGrid], TargetPattern]
+
+FITS: Final = "it makes a TargetPattern of the grid's shape"
+
+
+class PatternContract:
+    """Promises of a target pattern; provide the fixture ``factory``, a function of the grid.
+
+    Attributes:
+        grids: Grids that it fits on with the settings of the test.
+        too_small: A grid that it does not fit on; None if it fits on any.
+    """
+
+    grids: ClassVar[Sequence[SiteGrid]] = (SiteGrid(), SiteGrid(17, 23, shear=-1))
+    too_small: ClassVar[SiteGrid | None] = SiteGrid(1, 1)
+
+    @pytest.fixture
+    def factory(self) -> PatternFactory:
+        """Makes the target, given a grid; provided by the plugin's test."""
+        no_factory(self, "grid -> target")
+
+    @promise(FITS)
+    def test_fits_the_grid(self, factory: PatternFactory) -> None:
+        """On each of ``grids``."""
+        for grid in self.grids:
+            _target_of(factory, grid)
+
+    @promise("at least one site must hold an atom")
+    def test_wants_atoms(self, factory: PatternFactory) -> None:
+        """A pattern without atoms would be met without any move."""
+        for grid in self.grids:
+            assert _target_of(factory, grid).n_atoms > 0, f"on {_called(grid)} it wants none"
+
+    @promise("the same grid gives the same target")
+    def test_same_grid_same_target(self, factory: PatternFactory) -> None:
+        """A second time, and after other grids: a resumed run fills the same target."""
+        first = [_target_of(factory, grid) for grid in self.grids]
+        for grid, target in zip(self.grids, first, strict=True):
+            again = _target_of(factory, grid)
+            for name in ("fill", "clear"):
+                same = np.array_equal(getattr(target, name), getattr(again, name))
+                assert same, f"on {_called(grid)} {name} is another the second time"
+            assert target.name == again.name, f"it is called '{target.name}', then '{again.name}'"
+
+    @promise("a grid that is too small for it raises LabseqError")
+    def test_refuses_small_grids(self, factory: PatternFactory) -> None:
+        """``labseq check`` reports it before the run; a truncated target would be a different one."""
+        if self.too_small is not None:
+            refusal(LabseqError, _called(self.too_small), factory, self.too_small)
+
+    @promise("it is pure: no I/O, no change of shared state")
+    def test_is_pure(self, factory: PatternFactory) -> None:
+        """``labseq check`` makes it too; other plugins draw from the global random numbers."""
+        with doing("the first target"):
+            factory(self.grids[0])  # the first call may compile
+        with quietly():
+            factory(self.grids[0])
+
+
+def _target_of(factory: PatternFactory, grid: SiteGrid) -> TargetPattern:
+    try:
+        target: Any = factory(grid)
+    except Exception as error:
+        raise ContractViolation(FITS, f"on {_called(grid)} it {format_error(error)}") from error
+    if not isinstance(target, TargetPattern):
+        raise ContractViolation(FITS, f"it made a {type(target).__name__}")
+    if target.shape != grid.shape:
+        raise ContractViolation(FITS, f"on {_called(grid)} it made one of {target.shape}")
+    return target
+
+
+def _called(grid: SiteGrid) -> str:
+    return f"a {grid.lattice} grid of {grid.n_rows} x {grid.n_cols}"
+
 
 Case: TypeAlias = tuple[TargetPattern, Occupancy]
 
@@ -51,7 +126,7 @@ def paper_cases() -> list[Case]:
 
 
 def loaded(target: TargetPattern, filling: float = 0.75) -> Case:
-    """The target with a random loading, always the same, that has enough atoms for it."""
+    """The target with a reproducible random loading that has enough atoms for it."""
     order = np.random.default_rng(225).permutation(target.fill.size)
     n_atoms = max(target.n_atoms, round(filling * target.fill.size))
     atoms = np.zeros(target.fill.size, np.bool_)
@@ -60,7 +135,7 @@ def loaded(target: TargetPattern, filling: float = 0.75) -> Case:
 
 
 def small_targets() -> list[TargetPattern]:
-    """On the smallest grids: all sites, none, every other one, and none with all to be empty."""
+    """Targets on the smallest grids: all sites, none, every other one, and all to be empty."""
     made: list[TargetPattern] = []
     for shape in ((1, 1), (1, 2), (1, 9), (9, 1), (2, 2), (3, 3)):
         none, every = np.zeros(shape, np.bool_), np.ones(shape, np.bool_)
@@ -88,14 +163,14 @@ def _every_other(shape: tuple[int, int]) -> NDArray[np.bool_]:
 
 
 RETURNS_A_PLAN: Final = "plan() returns a Plan, whatever the grid, the loading and the target"
-NO_ATOM_CREATED: Final = "no atom is created: every move starts with an atom of its own"
+NO_ATOM_CREATED: Final = "no atom is created: every move takes an atom that is there"
 
 
 def plan_of(planner: Planner, target: TargetPattern, atoms: Occupancy) -> Plan:
-    """What a planner plans.
+    """The plan of a planner.
 
     Raises:
-        ContractViolation: It is no Plan, or the planner raises what is no LabseqError.
+        ContractViolation: It is not a Plan, or the planner raises anything but a LabseqError.
     """
     try:
         plan: Any = planner.plan(atoms, target)
@@ -110,13 +185,13 @@ def plan_of(planner: Planner, target: TargetPattern, atoms: Occupancy) -> Plan:
 
 
 def replay(plan: Plan, atoms: Occupancy) -> Occupancy:
-    """Follow every atom, however illegal its way may be.
+    """Follow every atom, even on illegal paths.
 
     Returns:
         Where the atoms end, bool (n_rows, n_cols).
 
     Raises:
-        ContractViolation: A move starts where no atom is.
+        ContractViolation: A move starts on a site without an atom.
     """
     held = {(int(row), int(col)) for row, col in np.argwhere(atoms)}
     for index, batch in enumerate(plan.batches):
@@ -140,7 +215,7 @@ def equal(plan: Plan, other: Plan) -> bool:
 
 
 def same(target: TargetPattern) -> TargetPattern:
-    """A copy, for a planner that may write into what it is given."""
+    """A copy, for a planner that may write into its input."""
     return TargetPattern(target.fill.copy(), target.clear.copy(), target.name)
 
 
@@ -155,12 +230,12 @@ class PlannerContract:
 
     Attributes:
         fills_any_target: Whether it fills every target that the atoms suffice for.
-            If not, it fills ``targets``, and for any other target its plan is
-            legal or it raises a LabseqError.
+            If not, it fills ``targets``; for any other target its plan is
+            legal, or it raises a LabseqError.
         targets: Targets that it fills; only needed without ``fills_any_target``.
         time_limit_s: Longest time for one plan of the paper's size (15 x 15 out of
             20 x 20 sites at 75 % filling) or the largest of ``targets``, in seconds.
-        n_examples: Number of random cases for each promise that is tested on them.
+        n_examples: Number of random cases per promise.
     """
 
     fills_any_target: ClassVar[bool] = True
@@ -174,15 +249,15 @@ class PlannerContract:
         no_factory(self, "context -> planner")
 
     def context(self, shape: tuple[int, int]) -> Context:
-        """What the planner is constructed with; override it for other limits of motion."""
+        """The context that the planner is constructed with; override it for other limits of motion."""
         return Context("planner", SiteGrid(*shape))
 
     def trials(self) -> settings:
-        """How hypothesis tries random cases: always the same ones, without a deadline for each."""
+        """Settings of hypothesis: always the same random cases, without a deadline."""
         return settings(max_examples=self.n_examples, deadline=None, database=None, derandomize=True)
 
     def stopwatch(self) -> float:
-        """The time that plans are held against, in seconds."""
+        """The clock that times plans, in seconds."""
         return time.perf_counter()
 
     @promise(RETURNS_A_PLAN)
@@ -204,7 +279,7 @@ class PlannerContract:
 
     @promise(PASSES_THE_CHECK)
     def test_plans_are_legal(self, factory: PlannerFactory) -> None:
-        """Random small arrays with any number of atoms, and one of full size."""
+        """Small random arrays with any number of atoms, and one of full size."""
 
         def check(target: TargetPattern, atoms: Occupancy) -> None:
             self.checked(factory, target, atoms)
@@ -249,7 +324,7 @@ class PlannerContract:
 
     @promise("the same input gives the same plan")
     def test_same_input_same_plan(self, factory: PlannerFactory) -> None:
-        """Again, after other calls, and from a fresh instance."""
+        """A second time, after other calls, and from a new instance."""
         for target, atoms in self.large_cases():
             planner = factory(self.context(target.shape))
             first = planner.plan(atoms.copy(), same(target))
@@ -271,7 +346,7 @@ class PlannerContract:
             assert np.array_equal(target.fill, fill), "plan() changed the target's fill"
             assert np.array_equal(target.clear, clear), "plan() changed the target's clear"
 
-    @promise("read-only and non-contiguous occupancies are planned for like others")
+    @promise("read-only and non-contiguous occupancies are planned like others")
     def test_takes_any_memory_layout(self, factory: PlannerFactory) -> None:
         """Recorded occupancies are read-only; a view of a larger array is not contiguous."""
         for target, atoms in self.large_cases():
@@ -287,9 +362,9 @@ class PlannerContract:
                         left = target.n_defects(replay(plan, atoms))
                     assert left == expected, f"the plan leaves {left} defects, not {expected}"
 
-    @promise("what is no occupancy of the target's shape raises LabseqError or ValueError")
+    @promise("an array that is not an occupancy of the target's shape raises LabseqError or ValueError")
     def test_refuses_wrong_input(self, factory: PlannerFactory) -> None:
-        """Rather than a wrong plan, or an error from somewhere inside."""
+        """Not a wrong plan, and not an error from deep inside."""
         target, atoms = self.large_cases()[0]
         planner = factory(self.context(target.shape))
         wrong: dict[str, NDArray[Any]] = {
@@ -318,7 +393,7 @@ class PlannerContract:
             text = f"plan() took {min(taken_s):.3g} s; the limit is {self.time_limit_s:g} s"
             assert min(taken_s) <= self.time_limit_s, text
 
-    @promise("plan() is pure: no I/O, nothing changed that all code shares")
+    @promise("plan() is pure: no I/O, no change of shared state")
     def test_is_pure(self, factory: PlannerFactory) -> None:
         """Other plugins draw from the global random numbers too."""
         for target, atoms in self.large_cases():
@@ -328,11 +403,11 @@ class PlannerContract:
                 planner.plan(atoms.copy(), target)
 
     def planned(self, factory: PlannerFactory, target: TargetPattern, atoms: Occupancy) -> Plan:
-        """What a fresh planner plans; it is given the array itself, not a copy."""
+        """The plan of a new planner; it receives the array itself, not a copy."""
         return plan_of(factory(self.context(target.shape)), target, atoms)
 
     def answered(self, planner: Planner, target: TargetPattern, atoms: Occupancy) -> Plan | None:
-        """What a planner plans; None if it rightly refuses the target."""
+        """The plan of a planner; None if it refuses a target that it need not fill."""
         try:
             return plan_of(planner, target, atoms.copy())
         except LabseqError as error:
@@ -342,7 +417,7 @@ class PlannerContract:
             return None
 
     def checked(self, factory: PlannerFactory, target: TargetPattern, atoms: Occupancy) -> PlanReport | None:
-        """The check's report on a fresh planner's plan; None if it rightly refuses the target."""
+        """The check's report on a new planner's plan; None if it refuses a target that it need not fill."""
         context = self.context(target.shape)
         planner = factory(context)
         plan = self.answered(planner, target, atoms)
@@ -354,18 +429,18 @@ class PlannerContract:
             return check_plan(plan, atoms, target, dop, grid=context.grid, motion=context.motion)
 
     def warmed(self, factory: PlannerFactory, target: TargetPattern) -> Planner:
-        """A fresh planner, compiled."""
+        """A new planner, with its kernels compiled."""
         planner = factory(self.context(target.shape))
         if isinstance(planner, NeedsWarmUp):
             planner.warm()
         return planner
 
     def on_examples(self, check: Check, *, served: bool = False) -> None:
-        """Check random cases; the smallest one that fails is reported.
+        """Check random cases; the smallest failing one is reported.
 
         Args:
             check: Given a target and an occupancy.
-            served: Whether the target must be one that the planner fills.
+            served: Whether the planner must be able to fill the target.
         """
         of_any = cases() if self.fills_any_target or not served else cases_of(self.targets)
 
@@ -381,5 +456,5 @@ class PlannerContract:
         return paper_cases() if self.fills_any_target else [loaded(target) for target in self.targets]
 
     def extreme_cases(self) -> list[Case]:
-        """Cases at the edge of what there is."""
+        """Cases at the extremes of size and loading."""
         return extreme_cases(self.targets if not self.fills_any_target else small_targets())

@@ -1,13 +1,19 @@
-"""How a contract says which promise was broken."""
+"""Helpers of the contracts: name the broken promise, and watch what a call does to the process."""
 
 from __future__ import annotations
 
+import inspect
+import os
+import random
+import sys
 import threading
-from collections.abc import Callable, Generator
+import warnings
+from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from functools import wraps
 from typing import Any, Final, NoReturn, ParamSpec, TypeVar
 
+import numpy as np
 import pytest
 
 P = ParamSpec("P")
@@ -32,12 +38,12 @@ class ContractViolation(AssertionError):  # noqa: N818 - reads as what it is in 
 
 
 class CallHungError(AssertionError):
-    """A call has not come back; the thread that made it is left to itself."""
+    """A call has not returned; its thread is abandoned."""
 
 
 @contextmanager
 def promised(promise: str) -> Generator[None]:
-    """Whatever fails inside breaks this promise, unless it broke one of its own."""
+    """Report any failure inside as a breach of this promise, unless it already names another one."""
     __tracebackhide__ = True
     try:
         yield
@@ -48,10 +54,10 @@ def promised(promise: str) -> Generator[None]:
 
 
 def promise(text: str) -> Callable[[Callable[P, None]], Callable[P, None]]:
-    """Make a test of a contract say which promise it holds a plugin to.
+    """Decorate a test of a contract with the promise that it tests.
 
-    The sentence is kept as the test's attribute ``promise``. A test that cannot go on because
-    another promise is broken is skipped, if a test of that promise fails: so a fault is told once.
+    The sentence is kept as the test's attribute ``promise``. A test that cannot continue because
+    another promise is broken is skipped if a test of that promise fails, so that a fault is reported once.
     """
 
     def decorate(test: Callable[P, None]) -> Callable[P, None]:
@@ -61,8 +67,8 @@ def promise(text: str) -> Callable[[Callable[P, None]], Callable[P, None]]:
             try:
                 test(*args, **kwargs)
             except ContractViolation as error:
-                if error.promise != text and _is_told_elsewhere(error.promise, *args, *kwargs.values()):
-                    pytest.skip(f"cannot go on: {error}")
+                if error.promise != text and _is_reported_elsewhere(error.promise, *args, *kwargs.values()):
+                    pytest.skip(f"cannot continue: {error}")
                 raise
             except _FAILURES as error:
                 raise ContractViolation(text, format_error(error)) from error
@@ -73,8 +79,8 @@ def promise(text: str) -> Callable[[Callable[P, None]], Callable[P, None]]:
     return decorate
 
 
-def _is_told_elsewhere(promise: str, *args: Any) -> bool:
-    """Whether a test of that promise fails too; the suite comes first, and then what its tests are given."""
+def _is_reported_elsewhere(promise: str, *args: Any) -> bool:
+    """Whether a test of that promise fails too; ``args`` are the suite and its tests' arguments."""
     suite = args[0]
     tests = (getattr(type(suite), name) for name in dir(suite) if name.startswith("test_"))
     for test in tests:
@@ -88,7 +94,7 @@ def _is_told_elsewhere(promise: str, *args: Any) -> bool:
 
 @contextmanager
 def doing(what: str) -> Generator[None]:
-    """Say what was being done when something inside fails."""
+    """Add what was being done to the message of a failure inside."""
     __tracebackhide__ = True
     try:
         yield
@@ -100,7 +106,7 @@ def doing(what: str) -> Generator[None]:
 
 @contextmanager
 def as_this_promise() -> Generator[None]:
-    """Count a broken promise as one of the promise that is being tested."""
+    """Report any broken promise inside as a breach of the promise being tested."""
     __tracebackhide__ = True
     try:
         yield
@@ -118,7 +124,7 @@ def refusal(
     """Make a call that must be refused.
 
     Returns:
-        The error that it was refused with.
+        The error that was raised.
     """
     __tracebackhide__ = True
     wanted = " or ".join(k.__name__ for k in (kind if isinstance(kind, tuple) else (kind,)))
@@ -132,10 +138,10 @@ def refusal(
 
 
 def in_time(limit_s: float, what: str, call: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-    """Make a call that must come back.
+    """Make a call that must return.
 
     Raises:
-        CallHungError: It has not come back after ``limit_s`` of real time.
+        CallHungError: It has not returned after ``limit_s`` of real time.
     """
     __tracebackhide__ = True
     results: list[T] = []
@@ -158,13 +164,132 @@ def in_time(limit_s: float, what: str, call: Callable[P, T], *args: P.args, **kw
 
 
 def no_factory(suite: object, signature: str) -> NoReturn:
-    """Say what a test class that inherits a contract must provide."""
+    """Fail with the fixture that a test class must provide when it inherits a contract."""
     name = type(suite).__name__
     pytest.fail(f"{name} needs a fixture 'factory' that returns a callable: {signature}", pytrace=False)
 
 
 def format_error(error: BaseException) -> str:
-    """An error in words, as the end of a sentence."""
+    """An error as the end of a sentence."""
     if isinstance(error, AssertionError | pytest.fail.Exception) and str(error):
-        return str(error).split("\nassert ")[0]  # without what pytest says of the values
+        return str(error).split("\nassert ")[0]  # without pytest's explanation of the values
     return f"raised {type(error).__name__}: {error}" if str(error) else f"raised {type(error).__name__}"
+
+
+_EVENTS: Final = frozenset(
+    {
+        "ctypes.dlopen",
+        "glob.glob",
+        "open",
+        "os.exec",
+        "os.listdir",
+        "os.posix_spawn",
+        "os.scandir",
+        "os.startfile",
+        "os.system",
+        "socket.bind",
+        "socket.connect",
+        "socket.getaddrinfo",
+        "subprocess.Popen",
+        "urllib.Request",
+        "winreg.OpenKey",
+    }
+)
+
+
+class _Watcher:
+    """One audit hook for the whole process, because Python cannot remove one."""
+
+    def __init__(self) -> None:
+        self._installed = False
+        self._local = threading.local()
+
+    @contextmanager
+    def watching(self) -> Generator[list[str]]:
+        if not self._installed:
+            sys.addaudithook(self._hook)
+            self._installed = True
+        seen: list[str] = []
+        self._local.seen = seen
+        try:
+            yield seen
+        finally:
+            self._local.seen = None
+
+    def _hook(self, event: str, args: tuple[Any, ...]) -> None:
+        if event not in _EVENTS:
+            return
+        seen: list[str] | None = getattr(self._local, "seen", None)
+        if seen is not None and not _is_importing():
+            seen.append(f"{event}({', '.join(repr(value) for value in args[:2])})")
+
+
+def _is_importing() -> bool:
+    """Whether the event comes from an import statement, which may read files at any time."""
+    frame = inspect.currentframe()
+    while frame is not None:
+        if frame.f_code.co_filename.startswith("<frozen importlib"):
+            return True
+        frame = frame.f_back
+    return False
+
+
+_WATCHER: Final = _Watcher()
+
+
+def watch_io() -> Any:
+    """Context manager: a list of everything that this thread opens inside it; imports do not count.
+
+    Example:
+        >>> with watch_io() as seen:
+        ...     _ = open(__import__("os").devnull).close()
+        >>> len(seen)
+        1
+    """
+    return _WATCHER.watching()
+
+
+def _numpy_state() -> tuple[object, ...]:
+    name, keys, *rest = np.random.get_state()  # noqa: NPY002 - the global one is what is watched
+    return (name, np.asarray(keys).tobytes(), *rest)
+
+
+_STATES: Final[Mapping[str, Callable[[], object]]] = {
+    "it drew from random; create your own numpy Generator": random.getstate,
+    "it drew from numpy.random; create your own Generator": _numpy_state,
+    "it changed numpy's error state; use `with numpy.errstate(...)`": np.geterr,
+    "it changed the warnings' filters; use `with warnings.catch_warnings()`": lambda: tuple(warnings.filters),
+    "it changed the working folder": os.getcwd,
+    "it changed the environment's variables": lambda: dict(os.environ),
+}
+
+
+def process_state() -> list[object]:
+    """The state that all code of this process shares."""
+    return [state() for state in _STATES.values()]
+
+
+def changes_since(before: list[object]) -> list[str]:
+    """The changes since an earlier :func:`process_state`, as sentences."""
+    return [what for what, was, now in zip(_STATES, before, process_state(), strict=True) if was != now]
+
+
+@contextmanager
+def quietly(advice: str = "") -> Generator[None]:
+    """Check that the code inside does no I/O and leaves the process unchanged.
+
+    Args:
+        advice: Added to the message if it does not.
+
+    Raises:
+        AssertionError: It did I/O or changed something; the message says what.
+    """
+    __tracebackhide__ = True
+    random.random()  # so that the state is not what a fixed seed leaves behind
+    np.random.random()  # noqa: NPY002 - the global one is what is watched
+    before = process_state()
+    with watch_io() as seen:
+        yield
+    did = [f"it did {', '.join(seen)}"] if seen else []
+    did += changes_since(before)
+    assert not did, "; ".join([*did, advice] if advice else did)

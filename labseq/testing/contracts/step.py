@@ -1,4 +1,4 @@
-"""What a step of a shot promises."""
+"""Promises of a step of a shot."""
 
 from __future__ import annotations
 
@@ -14,8 +14,7 @@ from labseq.guard import Guard
 from labseq.model import ShotRecord, TimelineEntry
 from labseq.roles import Step, StepContext
 from labseq.sequencer.shot import RunningShot
-from labseq.testing.contracts.process import quietly
-from labseq.testing.contracts.promises import ContractViolation, doing, no_factory, promise, refusal
+from labseq.testing.contracts.promises import ContractViolation, doing, no_factory, promise, quietly, refusal
 from labseq.testing.fakes import FakeLab, fake_lab
 
 Factory: TypeAlias = Callable[[], Step]
@@ -26,7 +25,7 @@ TIMELINE: Final = "the timeline is known beforehand: labelled bars with 0 <= lea
 _MOVE_ATOMS: Final = frozenset(
     {"mobile_tweezers.play", "static_tweezers.load", "static_tweezers.ramp", "simulation.load"}
 )
-"""Calls after which atoms may be elsewhere, lost, or more."""
+"""Calls that may move atoms, lose them or load more."""
 
 
 class StepContract:
@@ -75,7 +74,7 @@ class StepContract:
 
     @promise("it takes no longer, and no more images, than its timeline says")
     def test_keeps_its_timeline(self, factory: Factory) -> None:
-        """On the virtual clock; a step whose bars have no length does not know it."""
+        """Measured on the virtual clock; a timeline without lengths promises none."""
         step = factory()
         bars = self._timeline(step)
         with self.shot() as (shot, _):
@@ -86,9 +85,9 @@ class StepContract:
         assert taken_s <= planned_s + 1e-6 or not planned_s, f"it took {taken_s} s; planned {planned_s} s"
         assert n_taken <= n_planned, f"it took {n_taken} images; planned {n_planned}"
 
-    @promise("a step that is `repeatable` leaves the atoms alone, and runs again in the same shot")
+    @promise("a `repeatable` step leaves the atoms alone, and can run again in the same shot")
     def test_runs_again(self, factory: Factory) -> None:
-        """So that a failed try can be followed by another one; steps that say nothing are not repeatable."""
+        """So that a failed attempt can be repeated; by default a step is not repeatable."""
         step = factory()
         repeatable: Any = getattr(step, "repeatable", False)
         assert isinstance(repeatable, bool), f"repeatable is {repeatable!r}"
@@ -104,7 +103,7 @@ class StepContract:
 
     @promise("a stop request ends it with StopRequested")
     def test_hears_a_stop_request(self, factory: Factory) -> None:
-        """It waits and calls devices through the shot, which looks for the request."""
+        """It waits and calls devices through the shot, which checks for stop requests."""
         step = factory()
         with self.shot() as (shot, lab):
             lab.stop.request()

@@ -1,4 +1,4 @@
-"""Stand-ins for tests: a clock, devices that note every call, deciders that follow a script."""
+"""Fakes for tests: a clock, devices that record every call, scripted planners, detectors and scanners."""
 
 from labseq.testing.fakes.devices import (
     Call,
@@ -24,8 +24,7 @@ from labseq.testing.fakes.lab import (
     ScriptedScanner,
     fake_lab,
 )
-from labseq.testing.fakes.records import FakeShot, fake_calibration, fake_shot
-from labseq.testing.planner import OneByOnePlanner
+from labseq.testing.fakes.records import FakeShot, OneByOnePlanner, fake_calibration, fake_shot
 
 __all__ = [
     "Call",

@@ -19,21 +19,21 @@ from labseq.sequencer.clock import VirtualClock
 from labseq.sequencer.lines import idle_program, off_program
 
 Failure: TypeAlias = BaseException | Sequence[BaseException | None]
-"""Raised at every call; or one after the other, where None lets the call pass, and then no more."""
+"""An error raised at every call; or a sequence of errors for successive calls, None for a call that works."""
 
 TEST_IS_OVER_S: Final = 30.0
-"""A call that hangs goes on after this time, so that a test that forgot it still ends."""
+"""A hanging call continues after this time, in seconds, so that every test ends."""
 
 
 class Call(NamedTuple):
     """One call.
 
     Attributes:
-        device: Whose method it was.
-        method: Its name.
+        device: Name of the device.
+        method: Name of the method.
         args: Its positional arguments.
         kwargs: Its keyword arguments.
-        t_s: When, on the clock that the calls are noted with.
+        t_s: Time on the clock of the list of calls, in seconds.
     """
 
     device: str
@@ -54,7 +54,7 @@ class Call(NamedTuple):
 
 
 class Calls(list[Call]):
-    """The list that all fakes of a test share.
+    """A list of calls that all fakes of a test share.
 
     Args:
         clock: Gives each call its time; without one all times are 0.
@@ -79,7 +79,7 @@ class Calls(list[Call]):
         self.append(Call(device, method, args, kwargs, t_s))
 
     def names(self, *devices: str) -> list[str]:
-        """The calls in short, "camera.arm"; of some devices, or of all."""
+        """Names of the calls, such as "camera.arm"; of the given devices, or of all."""
         return [call.name for call in self if not devices or call.device in devices]
 
     def of(self, name: str) -> list[Call]:
@@ -88,11 +88,11 @@ class Calls(list[Call]):
 
 
 class Hang:
-    """A call that does not come back until the test lets it.
+    """A call that does not return until the test releases it.
 
     Attributes:
         reached: Set when the call has begun to hang; wait for it in the test.
-        release: Set it to let the call go on.
+        release: Set it to let the call continue.
     """
 
     def __init__(self) -> None:
@@ -106,7 +106,7 @@ class Hang:
 
 
 class Faults:
-    """The failures and hangs that a test has planned for one device, by method."""
+    """The planned failures and hangs of one device, by method."""
 
     def __init__(self, fail_on: Mapping[str, Failure], hang_on: Mapping[str, Hang]) -> None:
         self._failures = {method: _in_turn(failure) for method, failure in fail_on.items()}
@@ -130,10 +130,10 @@ def _in_turn(failure: Failure) -> Iterator[BaseException | None]:
 
 
 class FakeClock(VirtualClock):
-    """Virtual time that notes every wait.
+    """Virtual time that records every wait.
 
     Attributes:
-        stop: The request to stop that its waits look for.
+        stop: The stop request that its waits check.
         sleeps: Every wait in seconds, in order.
 
     Example:
@@ -149,18 +149,18 @@ class FakeClock(VirtualClock):
         super().__init__(self.stop)
 
     def sleep(self, duration_s: float) -> None:
-        """Let time pass and note it."""
+        """Let time pass and record it."""
         super().sleep(duration_s)
         self.sleeps.append(duration_s)
 
 
 class RecordingHardware:
-    """Notes every call in a list and keeps the promises of its role, in memory only.
+    """A device in memory that keeps the promises of its role and records every call.
 
     Args:
-        context: As a plugin's factory is given it; by default the role's name and
+        context: As passed to a plugin's factory; by default the role's name and
             a :class:`FakeClock`.
-        calls: Where calls are noted; share one list between the devices of a test.
+        calls: The list for the calls; share one list between the devices of a test.
         fail_on: Method -> what it raises, for example ``{"play": DeviceError(...)}``.
         hang_on: Method -> the :class:`Hang` that it waits for.
 
@@ -189,43 +189,43 @@ class RecordingHardware:
         self._faults = Faults(fail_on or {}, hang_on or {})
 
     def open(self) -> None:
-        """Note it."""
+        """Record the call."""
         self.note("open")
         self.is_open = True
 
     def close(self) -> None:
-        """Note it and forget the state."""
+        """Record the call and reset the state."""
         self.note("close")
         self.is_open = False
         self.reset()
 
     def safe_state(self) -> None:
-        """Note it and forget the state."""
+        """Record the call and reset the state."""
         self.note("safe_state")
         self.reset()
 
     def describe(self) -> Mapping[str, Any]:
-        """Say that it is a fake."""
+        """A description that names the fake."""
         self.note("describe")
         return {"model": type(self).__name__, "serial_number": "fake"}
 
     def reset(self) -> None:
-        """Forget what the role's methods have left; roles with a state do more."""
+        """Reset the state of the role; overridden by roles that have one."""
 
     def note(self, method: str, *args: Any, **kwargs: Any) -> None:
-        """Note a call, then hang or fail if the test has planned it."""
+        """Record a call, then hang or fail if the test has planned it."""
         self.calls.note(self.name, method, *args, **kwargs)
         self._faults.inject_fault(method)
 
     def use(self, method: str, *args: Any, **kwargs: Any) -> None:
-        """Note a call that needs the device to be open."""
+        """Record a call that needs an open device."""
         self.note(method, *args, **kwargs)
         if not self.is_open:
             raise DeviceError(self.name, f"{method}() was called while it is not open")
 
 
 def require_within(what: str, value: float, lowest: float, highest: float) -> None:
-    """Refuse a number outside of its limits, nan included.
+    """Refuse a number outside its limits, nan included.
 
     Raises:
         LimitError: It is outside.
@@ -388,7 +388,7 @@ class RecordingMobileTweezers(RecordingHardware):
 
 
 class RecordingLines(RecordingHardware):
-    """A timing box whose programs take their time, and that tells the simulation of them.
+    """A timing box whose programs take their time and act on the simulation.
 
     Attributes:
         programs: Every program that was fired, in order.
@@ -495,12 +495,12 @@ class RecordingDevice(RecordingHardware):
 
 
 class RecordingLeader(RecordingDevice):
-    """Says `go` by itself, some time after it is waited for, and notes the answers.
+    """An external control system that sends `go` some time after wait_for(), and records the answers.
 
     Attributes:
         goes_after_s: That time, in seconds.
-        answers: State and what was told with it, for each `go`.
-        noted: What it tells as news, once.
+        answers: The state reported for each `go`, with its details.
+        noted: Events that new_events() returns, once.
     """
 
     role: ClassVar[str] = "leader"
@@ -512,7 +512,7 @@ class RecordingLeader(RecordingDevice):
         self.answers: list[tuple[str, dict[str, Any]]] = []
         self.noted: list[str] = []
         self._n_gos = 0
-        self._is_owed = False
+        self._answer_due = False
 
     def wait_for(self, signal: str, timeout_s: float) -> str:
         """Wait, then count the signals: "1", "2", ..."""
@@ -520,20 +520,20 @@ class RecordingLeader(RecordingDevice):
         self.clock.sleep(min(self.goes_after_s, timeout_s))
         if self.goes_after_s > timeout_s:
             raise DeviceTimeoutError(self.name, f"no '{signal}' within {timeout_s} s", timeout_s)
-        self._is_owed = True
+        self._answer_due = True
         self._n_gos += 1
         return str(self._n_gos)
 
     def report(self, state: Literal["ready", "failed"], about: Mapping[str, bool | int | float | str]) -> str:
-        """Note the answer, if one is owed."""
+        """Record the answer, if one is due."""
         self.use("report", state)
-        if not self._is_owed:
+        if not self._answer_due:
             return ""
-        self._is_owed = False
+        self._answer_due = False
         self.answers.append((state, dict(about)))
         return state
 
     def new_events(self) -> Sequence[str]:
-        """What was noted."""
+        """The events since the last call."""
         noted, self.noted = self.noted, []
         return noted

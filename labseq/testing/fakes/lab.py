@@ -38,18 +38,18 @@ from labseq.testing.fakes.devices import (
     RecordingMobileTweezers,
     RecordingStaticTweezers,
 )
-from labseq.testing.planner import OneByOnePlanner
+from labseq.testing.fakes.records import OneByOnePlanner
 
 
 class ScriptedDetector:
-    """Sees the given occupancies, one after another, whatever is on the frame.
+    """Returns the given occupancies, one after another, whatever the frame shows.
 
     Args:
-        occupancies: What it sees, in order; the last one again and again.
-        frame_shape: The only shape of frames that it takes; None takes any.
+        occupancies: The occupancies in order; the last one is repeated.
+        frame_shape: The only accepted shape of frames; None accepts any.
 
     Attributes:
-        frames: The frames that it was given.
+        frames: The frames received.
 
     Example:
         >>> detector = ScriptedDetector([[[0, 1]], [[1, 1]]])
@@ -76,20 +76,20 @@ class ScriptedDetector:
 
 
 class FixedDetector(ScriptedDetector):
-    """Sees the same occupancy on every frame."""
+    """Returns the same occupancy for every frame."""
 
     def __init__(self, occupancy: ArrayLike, frame_shape: tuple[int, int] | None = None) -> None:
         super().__init__([occupancy], frame_shape)
 
 
 class ScriptedPlanner:
-    """Returns the given plans, one after another; the last one again and again.
+    """Returns the given plans, one after another; the last one is repeated.
 
     Args:
-        plans: :class:`labseq.Plan`, or anything else that a bad planner may return.
+        plans: :class:`labseq.Plan`, or anything else that a faulty planner may return.
 
     Attributes:
-        occupancies: What it was asked to plan for.
+        occupancies: The occupancies received.
     """
 
     def __init__(self, plans: Sequence[Any]) -> None:
@@ -106,14 +106,14 @@ class ScriptedPlanner:
 class ScriptedScanner:
     """Gives the given points, one after another, then None.
 
-    It counts the points it is shown, not its calls; so it can be asked again.
+    It counts the points visited, not its calls, so it can be called again.
 
     Args:
-        points: Address -> value each, or anything else that a bad scanner may return; what is an
-            exception is raised.
+        points: Address -> value each, or anything else that a faulty scanner may return; exceptions
+            are raised.
 
     Attributes:
-        shown: What it was shown, at each call.
+        shown: The visited points passed at each call.
     """
 
     def __init__(self, points: Sequence[Any]) -> None:
@@ -130,10 +130,10 @@ class ScriptedScanner:
 
 
 class RecordingSimulation(Simulation):
-    """A world without atoms that notes what devices do to it; it exposes black frames.
+    """A simulation without atoms that records what devices play; it exposes black frames.
 
     Args:
-        calls: Where calls are noted.
+        calls: The list for the calls.
         frame_shape: (height, width) of its frames.
     """
 
@@ -142,23 +142,23 @@ class RecordingSimulation(Simulation):
         self._frame_shape = frame_shape
 
     def open(self) -> None:
-        """Note it."""
+        """Record the call."""
         self.calls.note("simulation", "open")
 
     def close(self) -> None:
-        """Note it."""
+        """Record the call."""
         self.calls.note("simulation", "close")
 
     def begin_shot(self) -> None:
-        """Note it."""
+        """Record the call."""
         self.calls.note("simulation", "begin_shot")
 
     def load(self, t_start_s: float, duration_s: float) -> None:
-        """Note it."""
+        """Record the call."""
         self.calls.note("simulation", "load", t_start_s, duration_s)
 
     def play(self, role: str, signal: Signal, t_start_s: float) -> None:
-        """Note it."""
+        """Record the call."""
         self.calls.note("simulation", "play", role, signal, t_start_s)
 
     @property
@@ -172,7 +172,7 @@ class RecordingSimulation(Simulation):
         return 1.0
 
     def prepare_sensor(self, mode: SensorMode) -> None:
-        """Nothing to work out."""
+        """Nothing to compute."""
 
     def expose(self, t_start_s: float, exposure_s: float, mode: SensorMode = WHOLE_SENSOR) -> Frame:
         """A black frame."""
@@ -180,7 +180,7 @@ class RecordingSimulation(Simulation):
         return Frame(np.zeros(mode.frame_shape(self._frame_shape), np.uint16), exposure_s, t_start_s)
 
     def describe(self) -> Mapping[str, Any]:
-        """Say that it is a fake."""
+        """A description that names the fake."""
         return {"model": "RecordingSimulation"}
 
 
@@ -199,11 +199,11 @@ _ALWAYS: Final = ("camera", "static_tweezers", "mobile_tweezers")
 
 @dataclass(frozen=True, slots=True)
 class FakeLab(Lab):
-    """A lab of fakes, with what a test wants to look at.
+    """A lab of fakes, with access for tests.
 
     Attributes:
         calls: Every call of every fake device, in order.
-        stop: The request to stop; the clock and the guard look for it.
+        stop: The stop request that the clock and the guard check.
         hangs: "camera.read" -> the :class:`Hang`, for each call named in ``hang_on``.
     """
 
@@ -229,8 +229,8 @@ def fake_lab(
     """Build a lab of fakes; the devices are not open yet.
 
     Args:
-        occupancies: What the detector sees, image after image, the last one again
-            and again; by default every site holds an atom.
+        occupancies: The detector's answers, image after image, the last one repeated;
+            by default every site holds an atom.
         grid: The grid of sites; by default as large as the occupancies, or 4 x 4.
         fill: Sites that must hold an atom, of the grid's shape; by default all.
             The other sites are reservoir. For more, give ``target``.
@@ -238,11 +238,11 @@ def fake_lab(
         fail_on: Call -> what it raises, for example ``{"camera.read": DeviceError(...)}``.
         hang_on: Calls that hang, for example ``{"mobile_tweezers.wait"}``; see
             :attr:`FakeLab.hangs`.
-        line_specs: What is wired to a timing box; none: there is no box.
+        line_specs: The lines of a timing box; none: there is no box.
         simulated: Whether there is a :class:`RecordingSimulation`.
-        clock: By default a :class:`FakeClock` that looks for ``stop``.
-        stop: The request to stop; by default one of its own.
-        **parts: Any field of ``labseq.sequencer.Lab`` that the test brings itself.
+        clock: By default a :class:`FakeClock` that checks ``stop``.
+        stop: The stop request; by default a new one.
+        **parts: Fields of ``labseq.sequencer.Lab`` that replace the fakes.
 
     Raises:
         ValueError: A call in ``fail_on`` or ``hang_on`` does not exist.
@@ -297,7 +297,7 @@ def _make_hardware(
         fake = _FAKE_OF_ROLE.get(name, RecordingDevice)
         failures, hangs = _of_device(name, fail_on), _of_device(name, hang_on)
         made[name] = fake(replace(context, name=name), calls, fail_on=failures, hang_on=hangs)
-    for call in (*fail_on, *hang_on):  # a misspelt call would never fail, and the test would prove nothing
+    for call in (*fail_on, *hang_on):  # a misspelt call would never fail
         device, _, method = call.rpartition(".")
         if not hasattr(made.get(device), method):
             raise ValueError(f"no fake has the call '{call}'; expected 'camera.read' or the like")
@@ -310,7 +310,7 @@ def _of_device(name: str, by_call: Mapping[str, T]) -> dict[str, T]:
 
 
 class ListSink:
-    """Keeps the shots that a sequencer writes; stands in for the recorder.
+    """Keeps the shots that a sequencer writes, in place of the recorder.
 
     Attributes:
         shots: The records, in the order they were written.

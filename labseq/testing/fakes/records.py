@@ -1,26 +1,136 @@
-"""Calibrations and shots made up for tests."""
+"""Calibrations, shots and plans made for tests, without devices."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from itertools import pairwise
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from labseq.model import (
+    Batch,
     CalibrationEntry,
     CalibrationKind,
     CycleRecord,
     ImageRecord,
+    Occupancy,
+    Plan,
     SiteGrid,
     StageTiming,
     TargetPattern,
+    as_occupancy,
     grid_facts,
 )
 from labseq.motion import check_plan
-from labseq.testing.planner import OneByOnePlanner
+from labseq.roles import Context
+
+Site: TypeAlias = tuple[int, int]
+_STEPS: Final = ((-1, 0), (0, -1), (0, 1), (1, 0))
+
+
+class OneByOnePlanner:
+    """Moves one atom at a time, along shortest paths; fills any target and clears it.
+
+    It is slow and simple, a reference for tests. Each defect, starting at the target's centre, pulls the
+    nearest atom that the target does not need: every atom on the path between them moves to the next free
+    site. Atoms on clear sites are then pushed to the nearest free reservoir site, or over the edge, in the
+    same way.
+
+    Args:
+        settings: Not used.
+        context: Not used.
+    """
+
+    degree_of_parallelism: Final = 1
+
+    def __init__(self, settings: None = None, context: Context | None = None) -> None:
+        del settings, context  # the signature of every factory
+
+    def plan(self, occupancy: Occupancy, target: TargetPattern) -> Plan:
+        """Plan the moves that fill the target, or as much of it as the atoms suffice for.
+
+        Raises:
+            ValueError: The array is not an occupancy of the target's shape.
+        """
+        atoms = as_occupancy(occupancy, target.shape).copy()
+        fill, clear = target.fill, target.clear
+        batches: list[Batch] = []
+        for hole in _from_the_centre(np.argwhere(fill & ~atoms)):
+            path = _path(atoms.shape, hole, lambda site: bool(atoms[site] and not fill[site]))
+            if path is not None:
+                batches += _shift(atoms, path)
+        for row, col in np.argwhere(clear & atoms):
+
+            def is_sink(site: Site) -> bool:
+                return not _inside(site, atoms.shape) or not (atoms[site] or fill[site] or clear[site])
+
+            path = _path(atoms.shape, (int(row), int(col)), is_sink, may_leave=True)
+            if path is not None:
+                batches += _shift(atoms, path[::-1])
+        return Plan.from_batches(batches)
+
+
+def _from_the_centre(sites: np.ndarray) -> Iterator[Site]:
+    if len(sites) == 0:
+        return
+    distances = np.hypot(*(sites - sites.mean(axis=0)).T)
+    for index in np.argsort(distances, kind="stable"):
+        yield int(sites[index, 0]), int(sites[index, 1])
+
+
+def _path(
+    shape: tuple[int, ...], start: Site, is_end: Callable[[Site], bool], *, may_leave: bool = False
+) -> list[Site] | None:
+    """The shortest path of neighbouring sites to the nearest end; None if there is none."""
+    came_from: dict[Site, Site] = {start: start}
+    queue = deque([start])
+    while queue:
+        site = queue.popleft()
+        if site != start and is_end(site):
+            path = [site]
+            while path[-1] != start:
+                path.append(came_from[path[-1]])
+            return path[::-1]
+        for d_row, d_col in _STEPS:
+            neighbour = site[0] + d_row, site[1] + d_col
+            may_go = _inside(neighbour, shape) or (may_leave and _inside(site, shape))
+            if may_go and neighbour not in came_from:
+                came_from[neighbour] = site
+                queue.append(neighbour)
+    return None
+
+
+def _shift(atoms: Occupancy, path: Sequence[Site]) -> Iterator[Batch]:
+    """Move every atom of a path on by one free place, towards its first site, which is free."""
+    free = 0
+    for place in range(1, len(path)):
+        if not atoms[path[place]]:
+            continue
+        yield from _straight_moves(path[free : place + 1][::-1])
+        atoms[path[place]] = False
+        if _inside(path[free], atoms.shape):
+            atoms[path[free]] = True
+        free = place
+
+
+def _straight_moves(path: Sequence[Site]) -> Iterator[Batch]:
+    """One batch for each straight piece of a path."""
+    corners = [path[0]]
+    for before, site, after in zip(path, path[1:], path[2:], strict=False):
+        if (site[0] - before[0], site[1] - before[1]) != (after[0] - site[0], after[1] - site[1]):
+            corners.append(site)
+    corners.append(path[-1])
+    for start, end in pairwise(corners):
+        yield Batch(np.array([start], np.int16), np.array([end], np.int16))
+
+
+def _inside(site: Site, shape: tuple[int, ...]) -> bool:
+    return 0 <= site[0] < shape[0] and 0 <= site[1] < shape[1]
+
 
 _FIGURES = {
     "sites": {"residual_px": 0.02, "n_sites_found": 0.0},
@@ -40,14 +150,14 @@ def fake_calibration(
     origin: Mapping[str, Any] | None = None,
     taken_utc: str = "2026-11-20T08:00:00+00:00",
 ) -> CalibrationEntry:
-    """Make a calibration of any kind, with sites 10 px apart and tones as the grid has them.
+    """Make a calibration of any kind, with sites 10 px apart and the tones of the grid.
 
     Args:
         kind: Its kind.
         grid: The grid of sites; by default the paper's.
-        values: Values in place of its own.
-        quality: Figures of merit in place of its own.
-        origin: Where it comes from.
+        values: Values that replace the default ones.
+        quality: Figures of merit that replace the default ones.
+        origin: Provenance of the calibration.
         taken_utc: When it was made.
 
     Example:
@@ -56,7 +166,7 @@ def fake_calibration(
     """
     grid = grid or SiteGrid()
     figures = _FIGURES[kind] | ({"n_sites_found": float(np.prod(grid.shape))} if kind == "sites" else {})
-    merged: Any = {**_values(kind, grid), **(values or {})}  # whatever a test wants to see refused
+    merged: Any = {**_values(kind, grid), **(values or {})}  # may be invalid, for tests of error messages
     return CalibrationEntry(
         kind,
         merged,
@@ -88,7 +198,7 @@ def _values(kind: CalibrationKind, grid: SiteGrid) -> Mapping[str, ArrayLike]:
 
 @dataclass(frozen=True)
 class FakeShot:
-    """What an analysis is given of a shot; implements ``RecordedShot``."""
+    """A recorded shot as passed to an analysis; implements ``RecordedShot``."""
 
     index: int
     target: TargetPattern
@@ -129,14 +239,14 @@ def fake_shot(
     filling: float = 0.75,
     frame_shape: tuple[int, int] | None = (32, 32),
 ) -> FakeShot:
-    """Make a shot, always the same one: atoms load, each cycle moves some, each image loses some.
+    """Make a reproducible shot: atoms load, each cycle moves some, each image loses some.
 
     Args:
         shape: (n_rows, n_cols).
         index: Index of the shot in the run.
-        n_images: How many images were taken.
-        n_cycles: How many of them ended a cycle; they come after the first.
-        filling: Fraction of sites that are loaded.
+        n_images: Number of images.
+        n_cycles: Number of images that end a cycle; they come after the first image.
+        filling: Fraction of loaded sites.
         frame_shape: (height, width) of the frames; None if none were kept.
 
     Example:

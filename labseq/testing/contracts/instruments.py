@@ -1,20 +1,89 @@
-"""What a timing box promises."""
+"""What instruments with commands and values promise, and timing boxes that switch lines."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import ClassVar, Final
+from typing import Any, ClassVar, Final
 
 import numpy as np
 
 from labseq.errors import DeviceError
 from labseq.model import LineProgram, LineSpec
-from labseq.roles import Context, Lines
+from labseq.roles import Context, Device, Lines
 from labseq.sequencer.lines import line_program
 from labseq.testing.contracts.hardware import Action, Factory, HardwareContract, Wait
 from labseq.testing.contracts.promises import doing, promise, refusal
 from labseq.testing.fakes import RecordingSimulation
+
+
+class DeviceContract(HardwareContract[Device]):
+    """Promises of an instrument with commands and values.
+
+    Attributes:
+        commands: Every command of the device, with arguments that it accepts.
+        excessive_commands: Commands with arguments beyond a limit of the device:
+            description -> (command, arguments).
+        values: Every value that it can be asked for.
+    """
+
+    role: ClassVar[str] = "instrument_7"
+    commands: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
+    excessive_commands: ClassVar[Mapping[str, tuple[str, Mapping[str, Any]]]] = {}
+    values: ClassVar[Sequence[str]] = ()
+
+    def work(self, device: Device) -> None:
+        """Every command."""
+        for name, arguments in self.commands.items():
+            device.command(name, **arguments)
+
+    def uses(self) -> Mapping[str, Action[Device]]:
+        """Every command and every value."""
+        commands = {f"command('{name}')": self._command(name, given) for name, given in self.commands.items()}
+        return {**commands, **{f"read('{name}')": _read(name) for name in self.values}}
+
+    def states(self) -> Mapping[str, Action[Device]]:
+        """After each command."""
+        return {f"after '{name}'": self._command(name, given) for name, given in self.commands.items()}
+
+    def excesses(self) -> Mapping[str, Action[Device]]:
+        """The commands in ``excessive_commands``."""
+        return {what: self._command(*command) for what, command in self.excessive_commands.items()}
+
+    @promise("every command and value that the device declares works")
+    def test_does_what_it_declares(self, factory: Factory[Device]) -> None:
+        """In the order in which the test lists them."""
+        with self.opened(factory) as (device, _):
+            for name, arguments in self.commands.items():
+                with doing(f"command('{name}')"):
+                    device.command(name, **arguments)
+            for name in self.values:
+                with doing(f"read('{name}')"):
+                    device.read(name)
+
+    @promise("an unknown command raises a DeviceError that names the known ones")
+    def test_refuses_unknown_commands(self, factory: Factory[Device]) -> None:
+        """A user who mistypes a command sees the known ones."""
+        with self.opened(factory) as (device, _):
+            error = refusal(DeviceError, "an unknown command", device.command, "no_such_command")
+            missing = [name for name in self.commands if name not in str(error)]
+            assert not missing, f"'{error}' does not name {', '.join(missing)}"
+
+    @promise("an unknown value raises a DeviceError that names the known ones")
+    def test_refuses_unknown_values(self, factory: Factory[Device]) -> None:
+        """As with commands."""
+        with self.opened(factory) as (device, _):
+            error = refusal(DeviceError, "an unknown value", device.read, "no_such_value")
+            missing = [name for name in self.values if name not in str(error)]
+            assert not missing, f"'{error}' does not name {', '.join(missing)}"
+
+    def _command(self, name: str, arguments: Mapping[str, Any]) -> Action[Device]:
+        return lambda device: device.command(name, **arguments)
+
+
+def _read(name: str) -> Action[Device]:
+    return lambda device: device.read(name)
+
 
 SPECS: Final = (
     LineSpec("cooling", 2, frozenset({"load", "rearrange", "idle"})),
@@ -42,7 +111,7 @@ class LinesContract(HardwareContract[Lines]):
         return replace(super().context(), lines=self.specs)
 
     def program(self, kind: str = "image", duration_s: float = 10e-3) -> LineProgram:
-        """What the lines do around a step."""
+        """The program of the lines during a step."""
         return line_program(self.specs, kind, duration_s)
 
     def ready(self, device: Lines) -> None:
@@ -50,7 +119,7 @@ class LinesContract(HardwareContract[Lines]):
         device.compile(self.program())
 
     def work(self, device: Lines) -> None:
-        """One step, as the sequencer lets the lines go with it."""
+        """Play the lines of one step, as the sequencer does."""
         device.compile(self.program())
         device.arm()
         device.fire()
@@ -79,7 +148,7 @@ class LinesContract(HardwareContract[Lines]):
         return {"with a program": self.ready, "while armed": arm, "while a program runs": fire}
 
     def excesses(self) -> Mapping[str, Action[Lines]]:
-        """More edges, and nearer to one another, than any box can make."""
+        """More edges, and edges closer to one another, than any box can play."""
         return {
             "a program of 1 000 000 edges": lambda lines: lines.compile(self._many(1_000_000, 1e-3)),
             "edges a picosecond apart": lambda lines: lines.compile(self._many(3, 1e-12)),
@@ -95,9 +164,9 @@ class LinesContract(HardwareContract[Lines]):
 
         return {"wait() for a program of 20 s": Wait(0.1, enter, lambda lines: lines.wait(0.1))}
 
-    @promise("what is compiled, armed and fired is what the lines do")
+    @promise("the lines play exactly the program that was compiled, armed and fired")
     def test_does_what_was_compiled(self, factory: Factory[Lines]) -> None:
-        """Step after step; programs come back, and change their length."""
+        """Step after step, with programs that repeat and change their length."""
         steps = (("load", 20e-3), ("image", 5e-3), ("rearrange", 8e-3), ("image", 5e-3), ("image", 7e-3))
         with self.opened(factory) as (lines, context):
             for kind, duration_s in steps:
@@ -110,9 +179,9 @@ class LinesContract(HardwareContract[Lines]):
                 for played in _played(context)[n_before:]:
                     self._compare(played, program)
 
-    @promise("fire() returns at once, and wait() comes back at the end of the program")
+    @promise("fire() returns at once, and wait() returns at the end of the program")
     def test_waits_for_the_end(self, factory: Factory[Lines]) -> None:
-        """So that the next step does not begin before the lags are over."""
+        """So that the next step begins after the lags."""
         with self.opened(factory) as (lines, context):
             program = self.program("load", 30e-3)
             lines.compile(program)
@@ -124,9 +193,9 @@ class LinesContract(HardwareContract[Lines]):
             waited_s = context.clock.now() - fired_s
             assert waited_s >= program.duration_s - 1e-6, f"wait() came back after {waited_s} s of 32 ms"
 
-    @promise("a firing needs an arm() of its own")
+    @promise("each fire() needs its own arm()")
     def test_refuses_fire_without_arm(self, factory: Factory[Lines]) -> None:
-        """Nothing is fired twice by mistake, nor after safe_state()."""
+        """So that nothing is fired twice by mistake, or after safe_state()."""
         with self.opened(factory) as (lines, _):
             refusal(DeviceError, "arm() before compile()", lines.arm)
             lines.compile(self.program())
@@ -139,7 +208,7 @@ class LinesContract(HardwareContract[Lines]):
 
     @promise("lines are idle after open(), and all off after safe_state()")
     def test_rests(self, factory: Factory[Lines]) -> None:
-        """Where the context has a simulation that notes it."""
+        """Tested if the context's simulation records the programs."""
         idle = line_program(self.specs, "idle", 0.0).on[-1]
         with self.opened(factory) as (lines, context):
             for state, wanted in (("open()", idle), ("safe_state()", np.zeros_like(idle))):
@@ -157,16 +226,16 @@ class LinesContract(HardwareContract[Lines]):
         )
 
     def _compare(self, played: LineProgram, wanted: LineProgram) -> None:
-        told = f"`{wanted.kind}`: edges at {played.t_s} s; expected {wanted.t_s} s"
-        assert played.t_s.shape == wanted.t_s.shape, told
-        assert np.abs(played.t_s - wanted.t_s).max() <= self.tolerance_s, told
+        text = f"`{wanted.kind}`: edges at {played.t_s} s; expected {wanted.t_s} s"
+        assert played.t_s.shape == wanted.t_s.shape, text
+        assert np.abs(played.t_s - wanted.t_s).max() <= self.tolerance_s, text
         assert np.array_equal(played.on, wanted.on), (
             f"`{wanted.kind}`: states {played.on}; expected {wanted.on}"
         )
 
 
 def _played(context: Context) -> Sequence[LineProgram]:
-    """What the simulation was told of the lines; nothing for one that does not note it."""
+    """The line programs that the simulation received; empty for one that does not record them."""
     simulation = context.simulation
     if not isinstance(simulation, RecordingSimulation):
         return []

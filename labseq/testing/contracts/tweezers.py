@@ -1,0 +1,288 @@
+"""What static and mobile tweezers promise."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from time import perf_counter
+from typing import Any, ClassVar, Final, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq.errors import DeviceError, LimitError
+from labseq.model import Plan, SiteGrid, ToneProgram
+from labseq.motion import tone_program
+from labseq.roles import Context, MobileTweezers, StaticTweezers, offers
+from labseq.testing.contracts.hardware import Action, Factory, HardwareContract, Wait, n_calls
+from labseq.testing.contracts.promises import doing, promise, quietly, refusal
+from labseq.testing.fakes.lab import RecordingSimulation
+
+
+class StaticTweezersContract(HardwareContract[StaticTweezers]):
+    """Promises of the static array.
+
+    Attributes:
+        ramp_s: Duration of the test ramps, in seconds.
+        too_deep: A depth, as a fraction of the nominal depth, that the device cannot reach.
+    """
+
+    role: ClassVar[str] = "static_tweezers"
+    ramp_s: ClassVar[float] = 0.01
+    too_deep: ClassVar[float] = 10.0
+
+    def work(self, device: StaticTweezers) -> None:
+        """Turn on, lower, raise."""
+        device.load(None)
+        device.start()
+        device.ramp(0.5, self.ramp_s)
+        device.ramp(1.0, self.ramp_s)
+
+    def ready(self, device: StaticTweezers) -> None:
+        """Turn on."""
+        device.start()
+
+    def uses(self) -> Mapping[str, Action[StaticTweezers]]:
+        """Load, start, ramp."""
+        return {
+            "load()": lambda tweezers: tweezers.load(None),
+            "start()": lambda tweezers: tweezers.start(),
+            "ramp()": lambda tweezers: tweezers.ramp(0.5, self.ramp_s),
+        }
+
+    def states(self) -> Mapping[str, Action[StaticTweezers]]:
+        """Loaded, on, lowered."""
+
+        def lower(tweezers: StaticTweezers) -> None:
+            tweezers.start()
+            tweezers.ramp(0.2, self.ramp_s)
+
+        return {
+            "with amplitudes loaded": lambda tweezers: tweezers.load(None),
+            "while on": lambda tweezers: tweezers.start(),
+            "while lowered": lower,
+        }
+
+    def excesses(self) -> Mapping[str, Action[StaticTweezers]]:
+        """Depths, durations and amplitudes outside every array's limits."""
+        grid = self.context().grid
+        rows, cols = amplitudes_of(grid)
+
+        def ramp(depth: float, duration_s: float) -> Action[StaticTweezers]:
+            return lambda tweezers: tweezers.ramp(depth, duration_s)
+
+        return {
+            "ramp() too deep": ramp(self.too_deep, self.ramp_s),
+            "ramp() to a negative depth": ramp(-0.1, self.ramp_s),
+            "ramp() to a depth of nan": ramp(float("nan"), self.ramp_s),
+            "ramp() in a negative time": ramp(0.5, -self.ramp_s),
+            "load() of amplitudes beyond full scale": lambda tweezers: tweezers.load((rows * 0 + 10.0, cols)),
+            "load() of a negative amplitude": lambda tweezers: tweezers.load((rows, -cols)),
+            "load() of one amplitude too few": lambda tweezers: tweezers.load((rows[:-1], cols)),
+        }
+
+    @promise("start() turns the array on, and does nothing if it is on")
+    def test_starts_twice(self, factory: Factory[StaticTweezers]) -> None:
+        """Every shot starts it."""
+        with self.opened(factory) as (tweezers, context):
+            tweezers.start()
+            before = n_calls(context)
+            with doing("start() while on"):
+                tweezers.start()
+            assert n_calls(context) == before, "start() while on was played again"
+
+    @promise("start() brings the array back to its nominal depth after a ramp")
+    def test_starts_after_a_ramp(self, factory: Factory[StaticTweezers]) -> None:
+        """Each shot begins at full depth, whatever happened in the last one."""
+        with self.opened(factory) as (tweezers, context):
+            tweezers.start()
+            tweezers.ramp(0.5, self.ramp_s)
+            before = _n_played(context)
+            with doing("start() after a ramp to half the depth"):
+                tweezers.start()
+            depth = tweezers.describe().get("depth", 1.0)
+            assert depth == 1.0, f"the depth is {depth} after start(); expected 1"
+            assert not before or _n_played(context) > before, "start() after a ramp played nothing"
+
+    @promise("ramp() takes every depth from 0 to 1, and a duration of 0")
+    def test_ramps(self, factory: Factory[StaticTweezers]) -> None:
+        """Down to 0 and back."""
+        with self.opened(factory) as (tweezers, _):
+            tweezers.start()
+            for depth, duration_s in ((0.5, self.ramp_s), (0.0, self.ramp_s), (1.0, self.ramp_s), (0.3, 0.0)):
+                with doing(f"ramp({depth}, {duration_s})"):
+                    tweezers.ramp(depth, duration_s)
+
+    @promise("load() takes None, or one amplitude for each row and column, and leaves them untouched")
+    def test_loads_amplitudes(self, factory: Factory[StaticTweezers]) -> None:
+        """Calibrated ones, then given ones."""
+        with self.opened(factory) as (tweezers, context):
+            with doing("load(None)"):
+                tweezers.load(None)
+            amplitudes = amplitudes_of(context.grid)
+            before = [values.copy() for values in amplitudes]
+            with doing("load((rows, columns))"):
+                tweezers.load(amplitudes)
+            untouched = all(np.array_equal(a, b) for a, b in zip(before, amplitudes, strict=True))
+            assert untouched, "load() changed the caller's arrays"
+
+
+def _n_played(context: Context) -> int:
+    """Number of signals that the array played to the simulation."""
+    simulation = context.simulation
+    calls = simulation.calls if isinstance(simulation, RecordingSimulation) else ()
+    return sum(call.method == "play" for call in calls)
+
+
+def amplitudes_of(grid: SiteGrid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Equal amplitudes that together reach half of full scale: rows (n_rows,), columns (n_cols,)."""
+    return np.full(grid.n_rows, 0.5 / grid.n_rows), np.full(grid.n_cols, 0.5 / grid.n_cols)
+
+
+CLOCK_S: Final = 0.05
+"""Largest difference between two clocks of a computer, in seconds (ours)."""
+
+
+class MobileTweezersContract(HardwareContract[MobileTweezers]):
+    """Promises of the mobile tweezers.
+
+    Attributes:
+        timeout_s: Timeout for the end of a program beyond its duration, in seconds.
+    """
+
+    role: ClassVar[str] = "mobile_tweezers"
+    timeout_s: ClassVar[float] = 2.0
+
+    def program(self) -> ToneProgram:
+        """The program to play: one atom moves along a row of the grid, then another down a column."""
+        context = self.context()
+        n_rows, n_cols = context.grid.shape
+        there, below = min(2, n_cols - 1), min(2, n_rows - 1)
+        plan = Plan.from_batches([([(0, 0)], [(0, there)]), ([(0, 0)], [(below, 0)])])
+        return tone_program(plan, grid=context.grid, motion=context.motion)
+
+    def work(self, device: MobileTweezers) -> None:
+        """Prepare, play, wait."""
+        duration_s = device.prepare(self.program())
+        device.play()
+        device.wait(duration_s + self.timeout_s)
+
+    def uses(self) -> Mapping[str, Action[MobileTweezers]]:
+        """Prepare, play, wait."""
+        return {
+            "prepare()": lambda tweezers: tweezers.prepare(self.program()),
+            "play()": lambda tweezers: tweezers.play(),
+            "wait()": lambda tweezers: tweezers.wait(0.1),
+        }
+
+    def states(self) -> Mapping[str, Action[MobileTweezers]]:
+        """Prepared, playing, played."""
+        return {
+            "while prepared": lambda tweezers: tweezers.prepare(self.program()),
+            "while playing": self.begin,
+            "after playing": self.work,
+        }
+
+    def begin(self, tweezers: MobileTweezers) -> None:
+        """Prepare and play."""
+        tweezers.prepare(self.program())
+        tweezers.play()
+
+    def excesses(self) -> Mapping[str, Action[MobileTweezers]]:
+        """Programs outside every AOD's limits."""
+        program = self.program()
+        row, column = program.row, program.column
+
+        def prepare(excessive: ToneProgram) -> Action[MobileTweezers]:
+            return lambda tweezers: tweezers.prepare(excessive)
+
+        far, loud = np.full_like(row.end_hz, 1e11), np.full_like(column.start_amplitude, 3.0)
+        return {
+            "prepare() of tones at 100 GHz": prepare(replace(program, row=replace(row, end_hz=far))),
+            "prepare() of tones at a frequency of nan": prepare(
+                replace(program, column=replace(column, start_hz=column.start_hz * math.nan))
+            ),
+            "prepare() of amplitudes beyond full scale": prepare(
+                replace(program, column=replace(column, start_amplitude=loud))
+            ),
+        }
+
+    def waits(self) -> Mapping[str, Wait[MobileTweezers]]:
+        """For a program longer than the timeout."""
+        timeout_s = 0.1 * self.program().total_duration_s
+        return {
+            "wait() shorter than the program": Wait(
+                timeout_s, self.begin, lambda tweezers: tweezers.wait(timeout_s)
+            )
+        }
+
+    @promise("prepare() returns the playing time, not less than the program's")
+    def test_tells_the_playing_time(self, factory: Factory[MobileTweezers]) -> None:
+        """The sequencer waits that long."""
+        with self.opened(factory) as (tweezers, _):
+            wanted_s = self.program().total_duration_s
+            duration_s = tweezers.prepare(self.program())
+            text = f"prepare() returned {duration_s!r}; the program takes {wanted_s} s"
+            assert math.isfinite(duration_s), text
+            assert duration_s >= wanted_s - 1e-9, text
+
+    @promise("prepare, play, wait can be repeated")
+    def test_plays_programs(self, factory: Factory[MobileTweezers]) -> None:
+        """One program per cycle."""
+        with self.opened(factory) as (tweezers, _):
+            for count in ("first", "second", "third"):
+                with doing(f"the {count} program"):
+                    self.work(tweezers)
+
+    @promise("play() returns at once")
+    def test_play_returns_at_once(self, factory: Factory[MobileTweezers]) -> None:
+        """Only wait() waits, so that a stop request takes effect."""
+        with self.opened(factory) as (tweezers, context):
+            duration_s = tweezers.prepare(self.program())
+            before_s = context.clock.now()
+            tweezers.play()
+            passed_s = context.clock.now() - before_s
+            assert passed_s < 0.5 * duration_s, f"play() took {passed_s} s of the program's {duration_s} s"
+
+    @promise("play() without prepare() raises DeviceError")
+    def test_refuses_play_without_prepare(self, factory: Factory[MobileTweezers]) -> None:
+        """Also after safe_state(), which drops the prepared program."""
+        with self.opened(factory) as (tweezers, _):
+            refusal(DeviceError, "play() after open()", tweezers.play)
+            tweezers.prepare(self.program())
+            tweezers.safe_state()
+            refusal(DeviceError, "play() after safe_state()", tweezers.play)
+
+    @promise(
+        "timings(), if there is one, gives the seconds that parts of the last prepare() took, without I/O"
+    )
+    def test_tells_its_timings(self, factory: Factory[MobileTweezers]) -> None:
+        """They are recorded for every cycle, in the middle of a shot."""
+        with self.opened(factory) as (tweezers, _):
+            if not offers(tweezers, "timings"):
+                return
+            start_s = perf_counter()
+            tweezers.prepare(self.program())
+            limit_s = perf_counter() - start_s + CLOCK_S
+            with quietly():
+                timings: Any = tweezers.timings()
+            assert isinstance(timings, Mapping), f"timings() gave a {type(timings).__name__}"
+            for part, taken_s in cast("Mapping[Any, Any]", timings).items():
+                assert isinstance(part, str), f"timings() names a part {part!r}; expected text"
+                text = f"timings() gives {taken_s!r} s for '{part}'; prepare() took {limit_s:.2g} s at most"
+                assert 0.0 <= taken_s <= limit_s, text
+
+    @promise("an empty program is played, or refused with LimitError")
+    def test_takes_an_empty_program(self, factory: Factory[MobileTweezers]) -> None:
+        """A plan without batches has no segments."""
+        context = self.context()
+        empty = tone_program(Plan.from_batches([]), grid=context.grid, motion=context.motion)
+        with self.opened(factory) as (tweezers, _):
+            try:
+                duration_s = tweezers.prepare(empty)
+            except LimitError:
+                return
+            assert duration_s >= 0.0, f"prepare() returned {duration_s}"
+            tweezers.play()
+            tweezers.wait(duration_s + self.timeout_s)
