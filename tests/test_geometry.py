@@ -1,6 +1,8 @@
-"""Target patterns on the grid."""
+"""Sites of the grid, shapes and targets on it."""
 
 from __future__ import annotations
+
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -9,7 +11,7 @@ from pydantic import ValidationError
 
 from labseq.builtin.patterns import BitmapSettings, CompactSettings, bitmap, compact
 from labseq.errors import LimitError
-from labseq.geometry import pattern, place, read_bitmap
+from labseq.geometry import from_the_centre, nearest_to_centre, pattern, place, read_bitmap
 from labseq.model import SiteGrid
 
 SIZES = st.integers(1, 12)
@@ -122,3 +124,25 @@ def test_a_wrong_drawing_is_a_settings_error(text: str, what: str) -> None:
 def test_wrong_settings_of_a_block_are_refused(values: dict[str, object]) -> None:
     with pytest.raises(ValidationError):
         CompactSettings.model_validate(values)
+
+
+SQUARE = SiteGrid(lattice="square")
+
+
+def test_sites_equally_far_are_listed_by_row_and_column() -> None:
+    assert from_the_centre(np.ones((2, 2), np.bool_), SQUARE).tolist() == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize("shear", [1, -1])
+def test_distances_are_those_on_the_lattice(shear: Literal[1, -1]) -> None:
+    fill = np.ones((3, 3), np.bool_)
+    kept = nearest_to_centre(fill, 7, SiteGrid(3, 3, shear=shear))
+    far = np.eye(3, dtype=np.bool_)  # the acute corners of the rhombus
+    far[1, 1] = False
+    assert np.array_equal(~kept, far if shear > 0 else far[:, ::-1])
+
+
+def test_no_sites_and_enough_atoms() -> None:
+    nothing = np.zeros((2, 2), np.bool_)
+    assert from_the_centre(nothing, SQUARE).tolist() == []
+    assert nearest_to_centre(nothing, 3, SQUARE) is nothing

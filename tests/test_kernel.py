@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 import textwrap
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import labseq.kernel
 from labseq.kernel import announcing, const, kernel
 
 MAX_LACK = 3
@@ -205,13 +207,37 @@ def run_python(code: str, **environment: str) -> str:
     return done.stdout.strip()
 
 
-def test_numba_is_imported_only_with_a_kernel() -> None:
+def test_interpreted_kernels_never_load_numba() -> None:
     code = """
-        import sys
-        import labseq.motion, labseq.kernel, labseq_psca
+        import sys, types
+        import labseq.motion, labseq_psca
+        from labseq.kernel import announcing, interpret
         print("numba" in sys.modules)
+        interpret()
+        with announcing(print):
+            from labseq.motion.check_kernels import longest_move
+        print(isinstance(longest_move, types.FunctionType), "numba" in sys.modules)
     """
-    assert run_python(code) == "False"
+    assert run_python(code).split() == ["False", "True", "False"]
+
+
+@pytest.mark.parametrize(
+    ("is_loaded", "disable_jit", "interpreted"),
+    [(False, None, True), (True, None, False), (False, "0", False), (False, "1", False)],
+)
+def test_kernels_are_interpreted_unless_numba_is_loaded_or_the_user_decides(
+    monkeypatch: pytest.MonkeyPatch, is_loaded: bool, disable_jit: str | None, interpreted: bool
+) -> None:
+    switch = threading.Event()
+    monkeypatch.setattr(labseq.kernel, "_INTERPRETED", switch)
+    monkeypatch.setitem(sys.modules, "numba", ModuleType("numba"))
+    if not is_loaded:
+        monkeypatch.delitem(sys.modules, "numba")
+    monkeypatch.delenv("NUMBA_DISABLE_JIT", raising=False)
+    if disable_jit is not None:
+        monkeypatch.setenv("NUMBA_DISABLE_JIT", disable_jit)
+    labseq.kernel.interpret()
+    assert switch.is_set() == interpreted
 
 
 def test_kernels_are_plain_python_without_the_compiler() -> None:
