@@ -112,7 +112,7 @@ def draw_array(
         lines = [_site_line(row, scale.cell, glyphs) for row in rows]
     else:
         rows.append([EMPTY] * len(rows[0]))
-        lines = [_half_line(*rows[i : i + 2], glyphs) for i in range(0, n_rows, 2)]
+        lines = [_half_line(rows[i], rows[i + 1], glyphs) for i in range(0, n_rows, 2)]
     for i, line in enumerate(lines):
         line.pad_left(scale.indent(i * scale.rows, n_rows, shear))
     return lines

@@ -200,8 +200,9 @@ def _array(tally: Tally, width: int, height: int, glyphs: Glyphs) -> list[Text]:
     if tally.image is None or tally.record is None:
         return []
     occupancy, shear = tally.image.occupancy, shear_of(tally.record)
+    n_rows, n_cols = occupancy.shape
     for scale in scales(glyphs):
-        array_width, array_height = scale.size(*occupancy.shape, shear)
+        array_width, array_height = scale.size(n_rows, n_cols, shear)
         if array_width <= width and array_height <= height:
             return draw_array(occupancy, tally.record.target, shear, scale, glyphs)
     return []
