@@ -106,11 +106,15 @@ def make_plugin(kind: str, name: str, folder: Path, *, package: bool = False) ->
     with _reporting(path):
         made = _write_folder(path, {fill(file, words): fill(text, words) for file, text in texts.items()})
         schemas = refresh_schemas(folder, _plugins_of(folder).registry)
-    if (folder / f"{FIRST}.yaml").exists():
-        commands.remove(f"labseq new sequence {FIRST}")
-    if any(find_spec(module) is None for module in ("pytest", "hypothesis")):
-        commands.insert(0, 'pip install "labseq[testing]"')
-    return CreatedFiles(path, (*made, *schemas), tuple(commands))
+    return CreatedFiles(path, (*made, *schemas), _needed(commands, folder))
+
+
+def _needed(commands: list[str], folder: Path) -> tuple[str, ...]:
+    """The commands without the one that makes the sequence, if it exists, and with what tests still need."""
+    has_sequence = (folder / f"{FIRST}.yaml").exists()
+    can_test = all(find_spec(module) is not None for module in ("pytest", "hypothesis"))
+    install = () if can_test else ('pip install "labseq[testing]"',)
+    return (*install, *(c for c in commands if not (has_sequence and c == f"labseq new sequence {FIRST}")))
 
 
 def make_file(kind: FileKind, name: str, folder: Path, *, profile: str = "virtual") -> CreatedFiles:
