@@ -189,6 +189,18 @@ def test_what_is_the_same_in_all_shots_stands_in_an_archive_once(run: Run, tmp_p
         assert first == last
 
 
+def test_an_archive_keeps_what_differs_after_a_resume(
+    tmp_path: Path, make_run: MakeRun, make_shot: MakeShot
+) -> None:
+    run_dir = (writer := RunWriter.create(tmp_path, make_run())).run_dir
+    writer.write_shot(make_shot(0))
+    later = RunWriter.reopen(run_dir, make_run(provenance={"labseq": "later"}), n_written=1)
+    later.write_shot(make_shot(1))
+    with h5py.File(exported(open_run(run_dir), "archive", tmp_path)) as archive:
+        texts: list[Any] = [archive[f"shots/shot_{i:06d}/run/provenance"] for i in (0, 1)]
+        assert [json.loads(text[()])["labseq"] for text in texts] == ["0.1.0", "later"]
+
+
 def test_an_archive_of_compressed_frames_is_plain(
     tmp_path: Path, make_run: MakeRun, make_shot: MakeShot
 ) -> None:

@@ -18,6 +18,7 @@ import pytest
 
 from labseq.errors import RecordingError
 from labseq.model import Frame, RunRecord, ShotRecord
+from labseq.recording import schema
 from labseq.recording.schema import FORMAT_VERSION
 from labseq.recording.shot_file import ShotEncoder, read_content
 
@@ -207,6 +208,17 @@ def test_frames_of_several_cameras_and_sizes_have_groups_of_their_own(
         }
         assert cameras["a_b_2"].attrs["name"] == "a/b"
         assert default_plot(file)["images"].shape == (2, 6, 8)
+
+
+def test_a_file_of_an_older_minor_format_reads_with_defaults(
+    make_run: MakeRun, make_shot: MakeShot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown = tuple(field for field in schema.SHOT if field.name != "n_missing_atoms")
+    monkeypatch.setattr(schema, "SHOT", shown)
+    path = tmp_path / "shot.h5"
+    path.write_bytes(ShotEncoder(make_run(), "day/run").encode(make_shot()))
+    monkeypatch.undo()
+    assert read_content(path).record.n_missing_atoms == 0
 
 
 def test_compressed_frames_are_smaller_and_the_same(make_run: MakeRun, make_shot: MakeShot) -> None:
