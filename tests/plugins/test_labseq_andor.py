@@ -3,27 +3,27 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import pytest
-import yaml
 from hypothesis import given, settings, strategies as st
 from labseq_andor.camera import AndorCamera
 from labseq_andor.codes import Code
 from labseq_andor.library import load_pylablib
 from labseq_andor.settings import AndorSettings
 
-from labseq import DeviceError, DeviceTimeoutError, LimitError, Run, Session
+from labseq import DeviceError, DeviceTimeoutError, LimitError
 from labseq.plugin import Context
 from labseq.roles import NeverStopped, Trigger, offers
-from labseq.testing import CameraContract
 
-from .labseq_andor_rig import Rig, rig
+from .labseq_camera_rig import Rig, opened_rig
 from .needs import need_library
+
+unopened = partial(Rig, "andor")
+rig = partial(opened_rig, "andor")
 
 COLD: Final[dict[str, Any]] = {"temperature": "-70 degC"}
 ROOT: Final = Path(__file__).parents[2]
@@ -32,21 +32,6 @@ ROOT: Final = Path(__file__).parents[2]
 @pytest.fixture(autouse=True, scope="module")
 def pylablib() -> None:
     need_library(lambda: load_pylablib("camera"))
-
-
-class TestAndorCamera(CameraContract):
-    @pytest.fixture
-    def factory(self) -> Callable[[Context], AndorCamera]:
-        return partial(AndorCamera, AndorSettings(camera="simulated", em_gain=300))
-
-
-class TestAndorCameraWithFrameTransfer(CameraContract):
-    exposure_s = 0.02
-
-    @pytest.fixture
-    def factory(self) -> Callable[[Context], AndorCamera]:
-        given: Any = {"camera": "simulated", "frame_transfer": True, "binning": 2, "shutter": "auto"}
-        return partial(AndorCamera, AndorSettings.model_validate(given))
 
 
 @pytest.mark.parametrize("trigger", ["software", "internal", "external"])
@@ -84,7 +69,7 @@ def test_the_read_out_time_before_opening_is_that_of_the_simulated_camera(
 ) -> None:
     chosen: dict[str, Any] = {"readout_rate": rate, "vertical_shift_speed": shift, "binning": binning}
     region = {"y": 8, "x": 16, "height": 64, "width": 64}
-    lab = Rig(region=region, isolated_crop=isolated, frame_transfer=isolated, **chosen)
+    lab = unopened(region=region, isolated_crop=isolated, frame_transfer=isolated, **chosen)
     estimate = lab.camera.facts.readout_s
     lab.camera.open()
     try:
@@ -99,8 +84,8 @@ def test_the_read_out_time_before_opening_is_that_of_the_simulated_camera(
 
 def test_smaller_regions_and_isolated_crop_are_read_faster() -> None:
     region = {"y": 0, "x": 0, "height": 32, "width": 32}
-    whole, part = Rig((512, 512)), Rig((512, 512), region=region)
-    crop = Rig((512, 512), region=region, isolated_crop=True, frame_transfer=True)
+    whole, part = unopened(sensor_shape=(512, 512)), unopened(sensor_shape=(512, 512), region=region)
+    crop = unopened(sensor_shape=(512, 512), region=region, isolated_crop=True, frame_transfer=True)
     times = [lab.camera.facts.readout_s for lab in (whole, part, crop)]
     assert times[0] > 5 * times[1] > 25 * times[2]
 
@@ -161,16 +146,6 @@ def test_the_automatic_shutter_needs_no_wait() -> None:
         assert lab.world.modes[0].shutter_open
 
 
-def test_with_the_internal_trigger_the_camera_keeps_the_time() -> None:
-    with rig() as lab:
-        lab.clock.sleep(1.0)
-        frames = lab.take(4, 0.02, "internal")
-        period_s = 0.02 + lab.camera.facts.readout_s
-        starts = [frame.t_start_s for frame in frames]
-        assert starts == pytest.approx([1.0 + k * period_s for k in range(4)])
-        assert [frame.device_time_s for frame in frames] == pytest.approx([k * period_s for k in range(4)])
-
-
 def test_frame_transfer_exposes_while_it_reads() -> None:
     with rig(frame_transfer=True) as lab:
         lab.clock.sleep(1.0)
@@ -180,7 +155,7 @@ def test_frame_transfer_exposes_while_it_reads() -> None:
 
 
 def test_an_exposure_shorter_than_frame_transfer_allows_is_refused() -> None:
-    with rig((512, 512), frame_transfer=True) as lab:
+    with rig(sensor_shape=(512, 512), frame_transfer=True) as lab:
         with pytest.raises(LimitError, match=r"1 ms.*at least 17.5 ms.*read-out"):
             lab.camera.arm(1, 1e-3, "software")
         assert lab.take(1, 0.02)
@@ -188,7 +163,7 @@ def test_an_exposure_shorter_than_frame_transfer_allows_is_refused() -> None:
 
 @pytest.mark.parametrize("frame_transfer", [False, True])
 def test_the_self_test_takes_a_frame(frame_transfer: bool) -> None:
-    with rig((512, 512), frame_transfer=frame_transfer, em_gain=300) as lab:
+    with rig(sensor_shape=(512, 512), frame_transfer=frame_transfer, em_gain=300) as lab:
         lab.camera.self_test()
     assert [mode.em_gain for mode in lab.world.modes] == [1.0]
 
@@ -234,14 +209,6 @@ def test_it_describes_the_camera_also_while_it_acquires() -> None:
         assert described["temperature_k"] is None
         lab.camera.safe_state()
         assert lab.camera.describe()["temperature_k"] == pytest.approx(293.15)
-
-
-def test_two_simulated_cameras_work_side_by_side() -> None:
-    with rig() as one, rig((64, 64), model="DU-888") as other:
-        for _ in range(2):
-            assert one.take(1)[0].image.shape == (96, 128)
-            assert other.take(1)[0].image.shape == (64, 64)
-        assert (one.camera.describe()["model"], other.camera.describe()["model"]) == ("DU-897", "DU-888")
 
 
 # cooling
@@ -324,58 +291,13 @@ def test_a_camera_that_stayed_cold_is_ready_at_once_when_it_is_opened_again() ->
 
 def test_a_closed_camera_does_not_settle() -> None:
     with pytest.raises(DeviceError, match="not open"):
-        Rig(cooling=COLD).camera.settle()
+        unopened(cooling=COLD).camera.settle()
 
 
 def test_looking_for_a_serial_number_leaves_other_cameras_cold() -> None:
-    lab = Rig(serial=4711)
+    lab = unopened(serial=4711)
     lab.sim.cooler.set_temperature(-70)
     lab.sim.cooler.switch_on()
     with pytest.raises(DeviceError, match="expected 4711"):
         lab.camera.open()
     assert lab.sim.cooler.is_on
-
-
-# whole runs
-
-
-def profile(folder: Path, **camera: Any) -> str:
-    """``virtual`` with another camera."""
-    parts = yaml.safe_load((ROOT / "hardware_profiles" / "virtual.yaml").read_text())
-    parts["camera"] = {"use": "andor", "em_gain": 300, **camera}
-    path = folder / "bench_andor.yaml"
-    path.write_text(yaml.safe_dump(parts))
-    return str(path)
-
-
-def run(output: Path, profile: str, *overrides: str, dry_run: Any = "off") -> Run:
-    with Session.open(
-        ROOT / "sequences" / "compact_225.yaml",
-        profile=profile,
-        shots=2,
-        seed=1,
-        output=output,
-        overrides=overrides,
-        dry_run=dry_run,
-    ) as session:
-        return session.run()
-
-
-def assert_equal(one: Run, other: Run) -> None:
-    for a, b in zip(one.shots, other.shots, strict=True):
-        np.testing.assert_array_equal(a.occupancies, b.occupancies)
-
-
-def test_the_whole_experiment_sees_what_the_virtual_camera_sees(tmp_path: Path) -> None:
-    readout_s = AndorSettings().readout_s(None, (512, 512))
-    andor = run(tmp_path, profile(tmp_path, camera="simulated"))
-    assert andor.simulated
-    assert_equal(andor, run(tmp_path, "virtual", f"profile.camera.readout={readout_s}"))
-
-
-def test_a_dry_run_with_a_real_cameras_profile_takes_the_simulated_one(tmp_path: Path) -> None:
-    real = profile(tmp_path, serial=4711, model="DU-897", cooling={"temperature": "-70 degC"})
-    done = run(tmp_path, real, dry_run="full")
-    assert done.simulated
-    described = done.record["devices"]["camera"]
-    assert (described["serial_number"], described["setpoint_k"]) == ("10001", pytest.approx(203.15))

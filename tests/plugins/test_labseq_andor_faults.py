@@ -1,10 +1,11 @@
-"""What a user reads when something is wrong with an Andor camera; each fault is made by the stand-in."""
+"""What a user reads when something is wrong with an Andor camera; the simulator produces each fault."""
 
 from __future__ import annotations
 
 import builtins
 import sys
 import threading
+from functools import partial
 from typing import Any
 
 import pytest
@@ -15,11 +16,14 @@ from labseq_andor.library import load_pylablib
 from labseq_andor.settings import AndorSettings
 from labseq_andor_sim import SimulatedCamera
 
-from labseq.errors import StopRequested
-from labseq.plugin import ConfigError, Context, DeviceError, DeviceTimeoutError, TransientError
+from labseq import ConfigError, DeviceError, DeviceTimeoutError, TransientError
+from labseq.plugin import Context
 
-from .labseq_andor_rig import Rig, rig
+from .labseq_camera_rig import Rig, opened_rig
 from .needs import need_library
+
+unopened = partial(Rig, "andor")
+rig = partial(opened_rig, "andor")
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -35,7 +39,7 @@ def refusal(lab: Rig) -> str:
 
 
 def test_no_camera_is_connected() -> None:
-    lab = Rig()
+    lab = unopened()
     lab.sim.faults.not_connected = True
     assert "no Andor camera is connected; look at its power and its cable" in refusal(lab)
     lab.sim.faults.not_connected = False
@@ -45,7 +49,7 @@ def test_no_camera_is_connected() -> None:
 
 
 def test_another_program_holds_the_camera() -> None:
-    lab = Rig()
+    lab = unopened()
     lab.sim.faults.held = True
     text = refusal(lab)
     assert "close Solis and every other program" in text
@@ -53,19 +57,19 @@ def test_another_program_holds_the_camera() -> None:
 
 
 def test_another_model_answers() -> None:
-    lab = Rig(model="DU-888")
+    lab = unopened(model="DU-888")
     lab.sim.head = IXON_897
     assert "connected camera is a DU-897; expected a model that begins with DU-888" in refusal(lab)
 
 
 def test_another_serial_number_answers() -> None:
-    assert "has the serial number 10001; expected 4711" in refusal(Rig(serial=4711))
+    assert "has the serial number 10001; expected 4711" in refusal(unopened(serial=4711))
 
 
 def two_cameras(**settings: Any) -> tuple[Rig, SimulatedCamera]:
-    lab = Rig(**settings)
+    lab = unopened(**settings)
     other = SimulatedCamera(lab.world, lab.clock, IXON_888, (96, 128), serial=10002)
-    lab.library.others.append(other)
+    lab.camera.library.others.append(other)
     return lab, other
 
 
@@ -82,7 +86,7 @@ def test_with_two_cameras_the_serial_number_decides() -> None:
 
 def test_a_camera_that_pylablib_cannot_open(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("labseq_andor_sim.camera.READ_MODES", 3)
-    assert "pylablib cannot open this camera: invalid value None for the read_mode" in refusal(Rig())
+    assert "pylablib cannot open this camera: invalid value None for the read_mode" in refusal(unopened())
 
 
 def test_unplugged_in_a_series() -> None:
@@ -119,15 +123,6 @@ def test_a_frame_later_than_the_timeout() -> None:
             lab.camera.read(0.2)
         assert lab.clock.now() == pytest.approx(0.027 + 0.2)
         assert lab.camera.read(0.5).number == 0
-
-
-def test_an_external_trigger_that_never_comes() -> None:
-    with rig() as lab:
-        lab.camera.arm(2, 0.01, "external")
-        with pytest.raises(DeviceTimeoutError, match="frame 1 of 2 waits for its external trigger"):
-            lab.camera.read(0.1)
-        assert lab.sim.trigger()
-        assert lab.camera.read(0.1).number == 0
 
 
 def test_a_trigger_that_the_camera_does_not_see() -> None:
@@ -195,7 +190,7 @@ def test_frames_overwritten_in_the_ring_buffer() -> None:
 )
 def test_a_setting_that_the_camera_does_not_have(chosen: dict[str, Any], text: str) -> None:
     with pytest.raises(DeviceError, match=text):
-        Rig(**chosen).camera.open()
+        unopened(**chosen).camera.open()
 
 
 @pytest.mark.parametrize(
@@ -220,20 +215,15 @@ def test_a_region_outside_of_the_sensor_is_found_before_anything_is_opened(camer
     region = {"y": 500, "x": 0, "height": 64, "width": 64}
     settings = AndorSettings.model_validate({**camera, "region": region})
     with pytest.raises(ConfigError, match="`region` ends at row 564 and column 64, beyond the sensor"):
-        AndorCamera(settings, Rig((512, 512)).context)
+        AndorCamera(settings, Context("camera", simulation=unopened(sensor_shape=(512, 512)).world))
 
 
 def test_a_region_outside_of_a_sensor_that_is_known_only_when_it_is_open() -> None:
-    lab = Rig()
+    lab = unopened()
     lab.sim.optics.sensor_shape = (48, 48)
     lab.camera._settings = AndorSettings.model_validate({"region": {"height": 64, "width": 64}})
     with pytest.raises(ConfigError, match="beyond the sensor of 48 x 48 pixels"):
         lab.camera.open()
-
-
-def test_the_simulated_camera_needs_a_simulated_world() -> None:
-    with pytest.raises(ConfigError, match=r"add `simulation: \{use: virtual\}` to the profile"):
-        AndorCamera(AndorSettings(camera="simulated"), Context("camera"))
 
 
 def test_the_safe_state_comes_through_while_a_call_hangs() -> None:
@@ -260,18 +250,11 @@ def test_the_safe_state_comes_through_while_a_call_hangs() -> None:
         assert not reader.is_alive()
 
 
-def test_a_stop_request_ends_the_wait() -> None:
-    with rig() as lab:
-        lab.camera.arm(1, 0.01, "external")
-        lab.clock.stop.request()  # type: ignore[attr-defined]
-        with pytest.raises(StopRequested):
-            lab.camera.read(60.0)
-        lab.clock.stop = type(lab.clock.stop)()  # type: ignore[attr-defined]
-
-
 def test_without_pylablib_the_error_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pylablib.devices.Andor.AndorSDK2", None)
-    assert 'install it with `pip install "labseq[andor]"`; to try things without a camera' in refusal(Rig())
+    assert 'install it with `pip install "labseq[andor]"`; to try things without a camera' in refusal(
+        unopened()
+    )
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="there Andor's library may be installed")

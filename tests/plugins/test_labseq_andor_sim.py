@@ -1,4 +1,4 @@
-"""The stand-in of Andor's SDK, called as pylablib calls it: through C, with the SDK's codes."""
+"""The simulator of Andor's SDK, called as pylablib calls it: through C, with the SDK's codes."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from labseq_andor.library import load_pylablib
 from labseq_andor_sim import SimulatedCamera, SimulatedSdk
 from labseq_andor_sim.library import FUNCTIONS
 
-from labseq.testing.fakes import Calls, FakeClock
+from labseq.testing.fakes import FakeClock
 
-from .labseq_andor_rig import NoisyWorld
+from .labseq_camera_rig import NoisyWorld
 from .needs import need_library
 
 SHAPE = (32, 48)
@@ -28,11 +28,11 @@ def pylablib() -> None:
 
 
 class Wire:
-    """The stand-in's C functions, with a camera attached."""
+    """The simulator's C functions, with a camera attached."""
 
     def __init__(self) -> None:
         self.clock = FakeClock()
-        self.world = NoisyWorld(Calls(self.clock), SHAPE)
+        self.world = NoisyWorld(self.clock, SHAPE)
         self.camera = SimulatedCamera(self.world, self.clock, IXON_897, SHAPE)
         define_functions = load_pylablib("camera").atmcd32d_lib.define_functions
         self.sdk = SimulatedSdk(define_functions)
@@ -146,7 +146,7 @@ def test_cancel_wait_lets_the_waiting_go(wire: Wire) -> None:
 
 @given(st.integers(-2, 50), st.integers(-2, 50), st.integers(-2, 34), st.integers(-2, 34), st.integers(0, 5))
 def test_an_image_is_taken_exactly_if_it_fits(left: int, right: int, bottom: int, top: int, b: int) -> None:
-    camera = SimulatedCamera(NoisyWorld(Calls(clock := FakeClock()), SHAPE), clock, IXON_897, SHAPE)
+    camera = SimulatedCamera(NoisyWorld(clock := FakeClock(), SHAPE), clock, IXON_897, SHAPE)
     code = camera.optics.set_image(b, b, left, right, bottom, top)
     fits = b > 0 and 1 <= left <= right <= 48 and 1 <= bottom <= top <= 32
     fits = fits and (right - left + 1) % b == 0 and (top - bottom + 1) % b == 0

@@ -1,9 +1,8 @@
-"""The GenICam camera: what the simulated world shows comes through GigE Vision, every pixel of it."""
+"""The GenICam camera: what the simulation shows comes through GigE Vision, every pixel of it."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -12,48 +11,25 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from labseq_aravis import load_library
 from labseq_genicam.acquisition import LAST_ID, FrameCounter
-from labseq_genicam.camera import GenicamCamera
 from labseq_genicam.settings import FORMATS, GenicamSettings
 from labseq_genicam_sim.messages import Exposure
 from numpy.typing import NDArray
 
-from labseq.errors import DeviceTimeoutError, StopRequested
-from labseq.plugin import ConfigError, Context, Frame, SensorMode
+from labseq import Frame
+from labseq.errors import DeviceTimeoutError
+from labseq.plugin import SensorMode
 from labseq.roles import NeverStopped
-from labseq.testing import CameraContract
-from labseq.testing.fakes import FakeClock
 
-from .labseq_genicam_rig import PACKET_SIZE, WAIT_S, Rig, assert_shown, plugged_in, rig
+from .labseq_camera_rig import assert_shown, opened_rig
+from .labseq_genicam_rig import PACKET_SIZE, WAIT_S, plugged_in
 from .needs import need_library
+
+rig = partial(opened_rig, "genicam")
 
 
 @pytest.fixture(autouse=True, scope="module")
 def aravis() -> None:
     need_library(load_library)
-
-
-class TestGenicamCamera(CameraContract):
-    @pytest.fixture
-    def factory(self) -> Callable[[Context], GenicamCamera]:
-        return partial(GenicamCamera, GenicamSettings(camera="simulated"))
-
-
-def test_frames_come_in_order_and_pixel_for_pixel() -> None:
-    with rig(sensor_shape=(512, 512)) as lab:
-        frames = lab.take(20)
-        assert_shown(frames, lab)
-    assert [frame.number for frame in frames] == list(range(20))
-
-
-def test_frames_that_wait_to_be_read_do_not_change_places() -> None:
-    with rig() as lab:
-        lab.camera.arm(12, 1e-3, "software")
-        for _ in range(12):
-            lab.camera.trigger()
-            lab.clock.sleep(1e-3)
-        frames = [lab.camera.read(1.0) for _ in range(12)]
-        assert_shown(frames, lab)
-    assert [frame.t_start_s for frame in frames] == pytest.approx([k * 1e-3 for k in range(12)])
 
 
 def test_the_camera_goes_on_waiting_from_one_series_to_the_next() -> None:
@@ -69,16 +45,6 @@ def test_the_camera_goes_on_waiting_from_one_series_to_the_next() -> None:
         assert_shown(frames, lab)
 
 
-def test_frames_that_nobody_read_are_dropped() -> None:
-    with rig() as lab:
-        lab.camera.arm(3, 0.01, "software")
-        for _ in range(3):
-            lab.camera.trigger()
-            lab.clock.sleep(0.01)
-        del lab.world.shown[:]
-        assert_shown(lab.take(2), lab)
-
-
 def test_a_series_that_is_broken_off_costs_the_next_one_no_packet() -> None:
     """The first frame of a stream must fit into the buffer that a socket has by default."""
     with rig(sensor_shape=(512, 512)) as lab:
@@ -89,14 +55,6 @@ def test_a_series_that_is_broken_off_costs_the_next_one_no_packet() -> None:
             lab.camera.safe_state()
             del lab.world.shown[:]
             assert_shown(lab.take(1), lab)
-
-
-def test_the_simulated_camera_runs_by_itself_too() -> None:
-    with rig(readout="5 ms") as lab:
-        lab.camera.arm(3, 0.01, "internal")
-        frames = [lab.camera.read(1.0) for _ in range(3)]
-        assert_shown(frames, lab)
-    assert [frame.t_start_s for frame in frames] == pytest.approx([0.0, 0.015, 0.03])
 
 
 def test_exposures_may_follow_one_another_at_a_rate() -> None:
@@ -166,19 +124,6 @@ def test_the_world_shows_the_region_that_the_camera_reads(sensor: dict[str, Any]
     np.testing.assert_array_equal(frame.image, np.minimum(lab.world.shown[0], largest))
 
 
-def test_a_frame_is_due_when_a_real_camera_would_have_it() -> None:
-    with rig(readout="5 ms") as lab:
-        lab.camera.arm(1, 0.045, "software")
-        lab.camera.trigger()
-        with pytest.raises(DeviceTimeoutError, match="frame 1 of 1 is not ready"):
-            lab.camera.read(0.04)
-        assert lab.clock.now() == pytest.approx(0.04)
-        frame = lab.camera.read(0.02)
-        assert lab.clock.now() == pytest.approx(0.05)
-    assert frame.exposure_s == pytest.approx(0.045)
-    assert frame.t_start_s == 0.0
-
-
 def test_a_computer_that_is_slow_costs_no_time_on_a_virtual_clock(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("labseq_genicam.camera.CHECK_PERIOD_S", 1e-3)
     with rig(readout="5 ms") as lab:
@@ -226,7 +171,7 @@ def test_it_says_what_it_is_and_what_it_took() -> None:
 
 
 def test_a_camera_with_an_address_is_used_as_a_real_one() -> None:
-    """No simulated world: region, all triggers, a rate, frame numbers that begin anew after 65535."""
+    """No simulation: region, all triggers, a rate, frame numbers that restart after 65535."""
     region = {"y": 8, "x": 16, "height": 24, "width": 32}
     settings = {"region": region, "packet_size": PACKET_SIZE, "readout": "1 ms", "frame_rate": "500 Hz"}
 
@@ -248,25 +193,6 @@ def test_a_camera_with_an_address_is_used_as_a_real_one() -> None:
         with pytest.raises(DeviceTimeoutError, match="waits for its external trigger"):
             lab.camera.read(0.05)
         assert [frame.number for frame in lab.take(1)] == [0]
-
-
-def test_a_stop_request_ends_a_wait_for_a_wire() -> None:
-    with rig() as lab:
-        lab.camera.arm(1, 0.01, "external")
-        assert isinstance(lab.clock, FakeClock)
-        lab.clock.stop.request()
-        with pytest.raises(StopRequested):
-            lab.camera.read(60.0)
-
-
-def test_a_simulated_camera_needs_a_simulated_world() -> None:
-    with pytest.raises(ConfigError, match=r"add `simulation: \{use: virtual\}`"):
-        GenicamCamera(GenicamSettings(camera="simulated"), Context("camera"))
-
-
-def test_a_region_beyond_the_simulated_sensor_is_refused_before_anything_is_opened() -> None:
-    with pytest.raises(ConfigError, match="beyond the sensor of 96 x 128 pixels"):
-        Rig(region={"y": 60, "x": 0, "height": 48, "width": 64})
 
 
 @given(

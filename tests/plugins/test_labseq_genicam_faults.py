@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import labseq_aravis.library as aravis_library
-import numpy as np
 import pytest
 import yaml
 from labseq_aravis import load_library
@@ -19,8 +19,12 @@ from labseq import DeviceError, LimitError, Run, Session, TransientError
 from labseq.cli import main
 from labseq.errors import DeviceTimeoutError
 
-from .labseq_genicam_rig import WAIT_S, Rig, assert_shown, plugged_in, rig
+from .labseq_camera_rig import Rig, assert_shown, opened_rig
+from .labseq_genicam_rig import WAIT_S, plugged_in
 from .needs import need_library
+
+unopened = partial(Rig, "genicam")
+rig = partial(opened_rig, "genicam")
 
 SEQUENCE = Path(__file__).parents[2] / "sequences" / "compact_225.yaml"
 VIRTUAL = Path(__file__).parents[2] / "hardware_profiles" / "virtual.yaml"
@@ -35,7 +39,7 @@ def aravis() -> None:
 
 
 def opening(**settings: Any) -> DeviceError | LimitError:
-    made = Rig(**settings)
+    made = unopened(**settings)
     with pytest.raises((DeviceError, LimitError)) as caught:
         made.camera.open()
     made.camera.close()
@@ -141,7 +145,7 @@ def test_a_frame_that_comes_too_late_is_a_timeout_and_does_not_turn_up_in_the_ne
 
 
 def test_an_unplugged_camera_is_told_once_and_nothing_waits_for_it_again() -> None:
-    made = Rig(faults={"unplugged_at": 1})
+    made = unopened(faults={"unplugged_at": 1})
     made.camera.open()
     made.camera.arm(3, 0.01, "software")
     made.camera.trigger()
@@ -172,14 +176,6 @@ def test_a_loss_that_the_library_notices_ends_a_wait() -> None:
         lab.camera._link.camera._lost.set()
         with pytest.raises(DeviceError, match=GONE):
             lab.camera.read(60.0)
-
-
-def test_a_wire_that_never_comes_is_a_timeout() -> None:
-    with rig() as lab:
-        lab.camera.arm(2, 0.01, "external")
-        with pytest.raises(DeviceTimeoutError, match="frame 1 of 2 waits for its external trigger; check"):
-            lab.camera.read(0.05)
-        assert len(lab.take(1)) == 1
 
 
 def test_a_software_trigger_that_is_not_seen_is_a_timeout(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -272,22 +268,6 @@ def of(events: list[dict[str, Any]], name: str) -> list[dict[str, Any]]:
     return [event["values"] for event in events if event["event"] == name]
 
 
-def test_a_dry_run_with_a_real_cameras_profile_takes_the_simulated_one(tmp_path: Path) -> None:
-    cut = (
-        "profile.camera.region={y: 20, x: 6, height: 472, width: 500}",
-        "profile.camera.readout=0 ms",
-        "profile.detector.frame=[472, 500]",
-        "profile.detector.centre_px=[235.5, 249.5]",
-    )
-    real = profile(tmp_path, camera="192.168.7.2", model="BFS-PGE-50S5M", serial="23456789")
-    done = run(tmp_path, str(real), *cut, dry_run="full")
-    assert done.simulated
-    assert done.record["devices"]["camera"]["serial_number"] == "SIM1"
-    virtual = run(tmp_path, "virtual", *cut)
-    for shot, expected in zip(done.shots, virtual.shots, strict=True):
-        np.testing.assert_array_equal(shot.occupancies, expected.occupancies)
-
-
 def test_a_shot_with_a_lost_frame_is_repeated(tmp_path: Path) -> None:
     done = run(tmp_path, str(profile(tmp_path, faults={"failed_frames": [1]})))
     assert done.status == "complete"
@@ -318,19 +298,3 @@ def test_a_camera_unplugged_in_a_shot_ends_the_run_safely(
     assert "camera: the camera is gone: it does not answer; check its cable and power" in said
     assert "camera is gone" in str(of(events, "shot_finished"))
     assert all(event["ok"] for event in of(events, "safe_state"))
-
-
-def test_a_region_beyond_the_sensor_is_shown_in_the_profile(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
-    region = {"y": 500, "x": 0, "height": 100, "width": 512}
-    code, said, _ = failing(tmp_path, capfd, region=region)
-    assert code == 2
-    assert "cameras.yaml:" in said
-    assert "`region` ends at row 600 and column 512, beyond the sensor of 512 x 512 pixels" in said
-
-
-def test_the_only_camera_may_be_the_wrong_one(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    code, said, _ = failing(tmp_path, capfd, model="BFS-PGE-50S5M")
-    assert code == 3
-    assert "camera: the camera SIM1 (Simulated) has the model Simulated; expected BFS-PGE-50S5M" in said

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import tempfile
 from collections.abc import Callable
 from functools import partial
@@ -14,18 +13,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 from labseq_pylon import connection
-from labseq_pylon.camera import PylonCamera
 from labseq_pylon.library import load_pypylon
 from labseq_pylon.settings import BITS, PylonSettings
 
-from labseq import ConfigError, Run, Session
-from labseq.errors import DeviceTimeoutError, StopRequested
-from labseq.plugin import Context
-from labseq.session.profile import DryRun
-from labseq.testing import CameraContract
-
-from .labseq_pylon_rig import Rig, rig, serial_numbers
+from .labseq_camera_rig import opened_rig
 from .needs import need_library
+
+rig = partial(opened_rig, "pylon")
 
 ROOT = Path(__file__).parents[2]
 SEQUENCE = ROOT / "sequences" / "compact_225.yaml"
@@ -35,49 +29,6 @@ VIRTUAL = ROOT / "hardware_profiles" / "virtual.yaml"
 @pytest.fixture(autouse=True, scope="module")
 def pypylon() -> None:
     need_library(lambda: load_pypylon("camera"))
-
-
-class TestPylonCamera(CameraContract):
-    @pytest.fixture
-    def factory(self) -> Callable[[Context], PylonCamera]:
-        return partial(PylonCamera, PylonSettings(camera="simulated"))
-
-
-def test_fifty_frames_come_in_order_and_pixel_for_pixel() -> None:
-    with rig(sensor_shape=(512, 512)) as lab:
-        frames = lab.take(50)
-    assert [frame.number for frame in frames] == list(range(50))
-    for frame, shown in zip(frames, lab.world.shown, strict=True):
-        np.testing.assert_array_equal(frame.image, shown)
-
-
-def test_frames_that_wait_to_be_read_do_not_change_places() -> None:
-    with rig() as lab:
-        lab.camera.arm(20, 1e-3, "software")
-        for _ in range(20):
-            lab.camera.trigger()
-            lab.clock.sleep(1e-3)
-        frames = [lab.camera.read(1.0) for _ in range(20)]
-        starts = [frame.t_start_s for frame in frames]
-    assert starts == pytest.approx([k * 1e-3 for k in range(20)])
-    assert all(np.array_equal(a.image, b) for a, b in zip(frames, lab.world.shown, strict=True))
-
-
-def test_every_series_begins_with_its_own_frames() -> None:
-    with rig() as lab:
-        for n_frames in (3, 1, 12, 2):
-            del lab.world.shown[:]
-            frames = lab.take(n_frames)
-            assert [frame.number for frame in frames] == list(range(n_frames))
-            assert all(np.array_equal(a.image, b) for a, b in zip(frames, lab.world.shown, strict=True))
-
-
-def test_the_simulated_camera_runs_by_itself_too() -> None:
-    with rig(readout="5 ms") as lab:
-        lab.camera.arm(3, 0.01, "internal")
-        frames = [lab.camera.read(1.0) for _ in range(3)]
-    assert [frame.t_start_s for frame in frames] == pytest.approx([0.0, 0.015, 0.03])
-    assert all(np.array_equal(a.image, b) for a, b in zip(frames, lab.world.shown, strict=True))
 
 
 @st.composite
@@ -109,20 +60,6 @@ def test_the_camera_cuts_its_region_and_saturates_as_its_pixel_format_does(senso
     for frame, shown in zip(frames, lab.world.shown, strict=True):
         assert frame.image.dtype == np.uint16
         np.testing.assert_array_equal(frame.image, np.minimum(shown, 2 ** BITS[sensor["pixel_format"]] - 1))
-
-
-def test_a_frame_is_due_when_a_real_camera_would_have_it() -> None:
-    with rig(readout="5 ms") as lab:
-        lab.camera.arm(1, 0.045, "software")
-        lab.camera.trigger()
-        with pytest.raises(DeviceTimeoutError, match="frame 1 of 1 is not ready"):
-            lab.camera.read(0.04)
-        assert lab.clock.now() == pytest.approx(0.04)
-        frame = lab.camera.read(0.02)
-        assert lab.clock.now() == pytest.approx(0.05)
-    assert frame.exposure_s == pytest.approx(0.045)
-    assert frame.t_start_s == 0.0
-    assert math.isnan(frame.device_time_s)  # the emulated camera has no clock
 
 
 def test_a_computer_that_is_slow_fails_no_trigger_and_costs_no_time_on_a_virtual_clock(
@@ -164,16 +101,16 @@ def test_it_says_what_it_is_and_what_it_took() -> None:
     assert told["frame_shape"] == [48, 64]
 
 
+def serial_numbers() -> list[str]:
+    """Serial numbers of the cameras that pylon lists."""
+    infos: Any = load_pypylon("test").pylon.TlFactory.GetInstance().EnumerateDevices()
+    return [info.GetSerialNumber() for info in infos]
+
+
 def test_emulated_cameras_never_stand_among_real_ones(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("PYLON_CAMEMU", raising=False)
     with rig():
         assert "0815-0000" not in serial_numbers()
-
-
-def test_several_simulated_cameras_do_not_disturb_each_other() -> None:
-    with rig(sensor_shape=(64, 64)) as one, rig(sensor_shape=(32, 96)) as other:
-        for lab in (one, other, one):
-            np.testing.assert_array_equal(lab.take(1)[0].image, lab.world.shown[-1])
 
 
 def test_no_files_stay_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -185,16 +122,8 @@ def test_no_files_stay_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     assert not list(tmp_path.iterdir())
 
 
-def test_a_stop_request_ends_a_wait_for_a_wire() -> None:
-    with rig() as lab:
-        lab.camera.arm(1, 0.01, "external")
-        lab.clock.stop.request()
-        with pytest.raises(StopRequested):
-            lab.camera.read(60.0)
-
-
 def test_the_camera_reads_its_own_pictures_where_it_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The way of a real camera: found by its number, whole sensor, all triggers, no simulated world."""
+    """As with a real camera: found by its number, whole sensor, all triggers, no simulation."""
     monkeypatch.setenv("PYLON_CAMEMU", "2")
     with rig("0815-0001", pixel_format="Mono8", gain_raw=200) as lab:
         assert lab.camera.describe()["serial_number"] == "0815-0001"
@@ -210,16 +139,6 @@ def test_the_camera_reads_its_own_pictures_where_it_is_named(monkeypatch: pytest
     assert not lab.world.shown
 
 
-def test_a_simulated_camera_needs_a_simulated_world() -> None:
-    with pytest.raises(ConfigError, match=r"add `simulation: \{use: virtual\}`"):
-        PylonCamera(PylonSettings(camera="simulated"), Context("camera"))
-
-
-def test_a_region_beyond_the_simulated_sensor_is_refused_before_anything_is_opened() -> None:
-    with pytest.raises(ConfigError, match="beyond the sensor of 96 x 128 pixels"):
-        Rig(region={"y": 60, "x": 0, "height": 48, "width": 64})
-
-
 def test_a_serial_number_may_be_written_as_a_number() -> None:
     assert PylonSettings.model_validate({"camera": 22345678}).camera == "22345678"
 
@@ -227,60 +146,3 @@ def test_a_serial_number_may_be_written_as_a_number() -> None:
 def test_one_gain_is_enough() -> None:
     with pytest.raises(ValueError, match="set one of them"):
         PylonSettings(gain=3.0, gain_raw=200)
-
-
-# whole runs
-
-
-def profile(folder: Path, camera: str) -> str:
-    """``virtual`` with another camera."""
-    text = (
-        (ROOT / "hardware_profiles" / "virtual.yaml")
-        .read_text()
-        .replace("camera:\n  use: virtual\n", f"camera:\n  use: pylon\n{camera}", 1)
-    )
-    assert "use: pylon" in text
-    plugins = folder / "plugins"
-    plugins.mkdir()
-    (plugins / "labseq_pylon").symlink_to(ROOT / "plugins" / "labseq_pylon")
-    path = folder / "bench_pylon.yaml"
-    path.write_text(text.replace("plugin_folders: []", f"plugin_folders: [{plugins}]"))
-    return str(path)
-
-
-def run(tmp_path: Path, profile: str, *overrides: str, dry_run: DryRun = "off") -> Run:
-    with Session.open(
-        SEQUENCE,
-        profile=profile,
-        shots=2,
-        seed=1,
-        output=tmp_path,
-        overrides=overrides,
-        dry_run=dry_run,
-    ) as session:
-        return session.run()
-
-
-def assert_equal(one: Run, other: Run) -> None:
-    for a, b in zip(one.shots, other.shots, strict=True):
-        np.testing.assert_array_equal(a.occupancies, b.occupancies)
-
-
-def test_the_whole_experiment_sees_what_the_virtual_camera_sees(tmp_path: Path) -> None:
-    virtual = run(tmp_path, "virtual")
-    emulated = run(tmp_path, profile(tmp_path, "  camera: simulated\n"))
-    assert emulated.simulated
-    assert_equal(emulated, virtual)
-
-
-def test_a_dry_run_with_a_real_cameras_profile_takes_the_emulated_one(tmp_path: Path) -> None:
-    cut = (
-        "profile.camera.region={y: 20, x: 6, height: 472, width: 500}",
-        "profile.camera.readout=0 ms",
-        "profile.detector.frame=[472, 500]",
-        "profile.detector.centre_px=[235.5, 249.5]",
-    )
-    real = profile(tmp_path, "  camera: 22345678\n  model: acA1920-40um\n")
-    done = run(tmp_path, real, *cut, dry_run="full")
-    assert done.simulated
-    assert_equal(done, run(tmp_path, "virtual", *cut))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -15,8 +16,11 @@ from labseq_pylon.settings import PylonSettings
 from labseq import DeviceError, LimitError, TransientError
 from labseq.errors import DeviceTimeoutError
 
-from .labseq_pylon_rig import Rig, rig
+from .labseq_camera_rig import Rig, opened_rig
 from .needs import need_library
+
+unopened = partial(Rig, "pylon")
+rig = partial(opened_rig, "pylon")
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -30,7 +34,7 @@ def fail_buffers(lab: Rig, n_buffers: int) -> None:
 
 
 def opening(**settings: Any) -> DeviceError | LimitError:
-    made = Rig(**settings)
+    made = unopened(**settings)
     with pytest.raises((DeviceError, LimitError)) as caught:
         made.camera.open()
     made.camera.close()
@@ -55,7 +59,7 @@ def test_a_failed_buffer_is_a_lost_frame_and_the_series_goes_on() -> None:
 
 
 def test_an_unplugged_camera_is_told_and_can_be_opened_again() -> None:
-    made = Rig()
+    made = unopened()
     made.camera.open()
     made.camera.arm(3, 0.01, "software")
     made.camera.trigger()
@@ -186,7 +190,7 @@ def test_of_two_cameras_one_must_be_named(emulated_only: Any, monkeypatch: pytes
 
 
 def test_a_camera_that_another_program_has_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A stand-in: several programs may open an emulated camera, so it is never busy."""
+    """``Open`` is replaced: several programs may open an emulated camera, so it is never busy."""
     sdk = load_pypylon("camera")
 
     def refuse(_camera: Any) -> None:

@@ -1,0 +1,129 @@
+"""For the tests of the camera drivers: a simulation that keeps its frames, and a driver that sees it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+from labseq_andor.camera import AndorCamera
+from labseq_andor.library import load_pylablib
+from labseq_andor.settings import AndorSettings
+from labseq_aravis import load_library
+from labseq_genicam.camera import GenicamCamera
+from labseq_genicam.settings import GenicamSettings
+from labseq_pylon.camera import PylonCamera
+from labseq_pylon.library import load_pypylon
+from labseq_pylon.settings import PylonSettings
+from numpy.typing import NDArray
+
+from labseq import Frame, LineSpec
+from labseq.model import SiteGrid
+from labseq.plugin import Clock, Context, SensorMode
+from labseq.roles import WHOLE_SENSOR, Trigger
+from labseq.testing.fakes import Calls, FakeClock, RecordingSimulation
+
+DRIVERS: dict[str, tuple[Any, Any, Callable[[], object]]] = {
+    "andor": (AndorCamera, AndorSettings, lambda: load_pylablib("camera")),
+    "genicam": (GenicamCamera, GenicamSettings, load_library),
+    "pylon": (PylonCamera, PylonSettings, lambda: load_pypylon("camera")),
+}
+"""Driver, settings, and what loads the library that it needs."""
+
+
+class NoisyWorld(RecordingSimulation):
+    """Every frame is noise over the whole range of 16 bits; a line can be connected to the camera.
+
+    Attributes:
+        shown: The frames, in order.
+        modes: How the sensor was exposed for each.
+        edge: Sends an edge of the camera's line, at a time.
+    """
+
+    def __init__(self, clock: Clock, sensor_shape: tuple[int, int]) -> None:
+        super().__init__(Calls(clock), sensor_shape)
+        self._rng = np.random.default_rng(1)
+        self.shown: list[NDArray[np.uint16]] = []
+        self.modes: list[SensorMode] = []
+        self.edge: Callable[[float], object] = lambda _: None
+
+    def wire(self, role: str, on_edge: Callable[[float], object]) -> None:
+        assert role == "camera"
+        self.edge = on_edge
+
+    def expose(self, t_start_s: float, exposure_s: float, mode: SensorMode = WHOLE_SENSOR) -> Frame:
+        frame = super().expose(t_start_s, exposure_s, mode)
+        self.shown.append(self._rng.integers(0, 2**16, frame.image.shape).astype(np.uint16))
+        self.modes.append(mode)
+        return Frame(self.shown[-1], exposure_s, t_start_s)
+
+
+class Rig:
+    """A driver in a noisy simulation; not open.
+
+    Args:
+        driver: One of :data:`DRIVERS`.
+        camera: The setting `camera`.
+        sensor_shape: (height, width) of the simulated sensor.
+        clock: The session's clock; None for a virtual one.
+        is_wired: Whether a line is connected to the camera's trigger input.
+        settings: Further settings of the camera.
+    """
+
+    def __init__(
+        self,
+        driver: str,
+        camera: str | None = "simulated",
+        sensor_shape: tuple[int, int] = (96, 128),
+        clock: Clock | None = None,
+        is_wired: bool = False,
+        **settings: Any,
+    ) -> None:
+        make, model, _ = DRIVERS[driver]
+        self.clock: Any = clock or FakeClock()
+        self.world = NoisyWorld(self.clock, sensor_shape)
+        lines = (LineSpec("shutter", 0, frozenset({"image"}), triggers="camera"),) if is_wired else ()
+        context = Context("camera", SiteGrid(), clock=self.clock, simulation=self.world, lines=lines)
+        given = settings if camera is None else {"camera": camera, **settings}
+        self.camera: Any = make(model.model_validate(given), context)
+
+    @property
+    def sim(self) -> Any:
+        """The simulated Andor camera."""
+        return self.camera.library.camera
+
+    @property
+    def pylon(self) -> Any:
+        """pylon's own camera."""
+        return self.camera._camera
+
+    def take(self, n_frames: int, exposure_s: float = 0.01, trigger: Trigger = "software") -> list[Frame]:
+        """Trigger and read, one frame after the other."""
+        self.camera.arm(n_frames, exposure_s, trigger)
+        frames: list[Frame] = []
+        for _ in range(n_frames):
+            if trigger == "software":
+                self.camera.trigger()
+            elif trigger == "external":
+                assert self.sim.trigger()
+            frames.append(self.camera.read(2.0))
+        return frames
+
+
+@contextmanager
+def opened_rig(driver: str, camera: str | None = "simulated", **settings: Any) -> Generator[Rig]:
+    """A driver in a noisy simulation, open."""
+    made = Rig(driver, camera, **settings)
+    made.camera.open()
+    try:
+        yield made
+    finally:
+        made.camera.close()
+
+
+def assert_shown(frames: list[Frame], lab: Rig) -> None:
+    """Each frame is what the simulation showed, pixel for pixel, and nothing else was shown."""
+    assert len(frames) == len(lab.world.shown)
+    for frame, shown in zip(frames, lab.world.shown, strict=True):
+        np.testing.assert_array_equal(frame.image, shown)

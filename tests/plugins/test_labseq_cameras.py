@@ -1,0 +1,180 @@
+"""What all camera drivers have in common: every simulated pixel comes through the vendor's library."""
+
+from __future__ import annotations
+
+import json
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from labseq import ConfigError, Run, Session
+from labseq.errors import DeviceTimeoutError, StopRequested
+from labseq.plugin import Context
+from labseq.roles import Trigger
+from labseq.testing import CameraContract
+
+from .labseq_camera_rig import DRIVERS, Rig, assert_shown, opened_rig
+from .needs import need_library
+
+ROOT = Path(__file__).parents[2]
+SETTINGS: dict[str, list[dict[str, Any]]] = {
+    "andor": [{"em_gain": 300}, {"frame_transfer": True, "binning": 2, "shutter": "auto"}],
+    "genicam": [{}],
+    "pylon": [{}],
+}
+
+
+@pytest.fixture(params=DRIVERS)
+def driver(request: pytest.FixtureRequest) -> str:
+    name: str = request.param
+    need_library(DRIVERS[name][2])
+    return name
+
+
+@pytest.mark.parametrize(
+    ("name", "settings"), [(name, one) for name, some in SETTINGS.items() for one in some]
+)
+class TestCameraDrivers(CameraContract):
+    exposure_s = 0.02
+
+    @pytest.fixture
+    def factory(self, name: str, settings: dict[str, Any]) -> Any:
+        make, model, load = DRIVERS[name]
+        need_library(load)
+        return partial(make, model.model_validate({"camera": "simulated", **settings}))
+
+
+@pytest.mark.parametrize("trigger", ["software", "internal"])
+def test_frames_come_in_order_and_pixel_for_pixel(driver: str, trigger: Trigger) -> None:
+    with opened_rig(driver, sensor_shape=(512, 512)) as lab:
+        frames = lab.take(20, 0.01, trigger)
+        period_s = 0.01 + lab.camera.facts.readout_s
+        assert [frame.number for frame in frames] == list(range(20))
+        assert np.diff([frame.t_start_s for frame in frames]) == pytest.approx(period_s)
+        assert_shown(frames, lab)
+
+
+def test_frames_that_wait_to_be_read_keep_their_order(driver: str) -> None:
+    with opened_rig(driver) as lab:
+        lab.camera.arm(12, 1e-3, "software")
+        starts_s: list[float] = []
+        for _ in range(12):
+            starts_s.append(lab.clock.now())
+            lab.camera.trigger()
+            lab.clock.sleep(0.02)
+        frames = [lab.camera.read(1.0) for _ in range(12)]
+        assert [frame.t_start_s for frame in frames] == pytest.approx(starts_s)
+        assert_shown(frames, lab)
+
+
+def test_every_series_begins_with_its_own_frames(driver: str) -> None:
+    with opened_rig(driver) as lab:
+        for n_frames in (3, 1, 12, 2):
+            lab.camera.arm(2, 0.01, "software")
+            lab.camera.trigger()
+            lab.clock.sleep(0.05)
+            del lab.world.shown[:]  # nobody read it
+            frames = lab.take(n_frames)
+            assert [frame.number for frame in frames] == list(range(n_frames))
+            assert_shown(frames, lab)
+
+
+def test_a_frame_is_due_when_a_real_camera_would_have_it(driver: str) -> None:
+    with opened_rig(driver) as lab:
+        lab.camera.arm(1, 0.045, "software")
+        start_s = lab.clock.now()
+        lab.camera.trigger()
+        with pytest.raises(DeviceTimeoutError, match="frame 1 of 1 is not ready"):
+            lab.camera.read(0.045)
+        assert lab.clock.now() - start_s == pytest.approx(0.045)
+        frame = lab.camera.read(0.1)
+        assert lab.clock.now() - start_s == pytest.approx(0.045 + lab.camera.facts.readout_s)
+    assert frame.exposure_s == pytest.approx(0.045)
+    assert frame.t_start_s == pytest.approx(start_s)
+
+
+def test_an_external_trigger_that_never_comes_is_a_timeout(driver: str) -> None:
+    with opened_rig(driver) as lab:
+        lab.camera.arm(2, 0.01, "external")
+        with pytest.raises(DeviceTimeoutError, match="frame 1 of 2 waits for its external trigger; check"):
+            lab.camera.read(0.05)
+        assert len(lab.take(1)) == 1
+        lab.camera.arm(1, 0.01, "external")
+        lab.clock.stop.request()
+        with pytest.raises(StopRequested):
+            lab.camera.read(60.0)
+        lab.clock.stop = type(lab.clock.stop)()
+
+
+def test_two_simulated_cameras_work_side_by_side(driver: str) -> None:
+    with opened_rig(driver, sensor_shape=(64, 64)) as one, opened_rig(driver, sensor_shape=(32, 96)) as other:
+        for lab in (one, other, one):
+            np.testing.assert_array_equal(lab.take(1)[0].image, lab.world.shown[-1])
+
+
+def test_it_describes_itself_also_while_it_acquires(driver: str) -> None:
+    with opened_rig(driver, binning=2) as lab:
+        lab.camera.arm(1, 0.01, "software")
+        described = json.loads(json.dumps(dict(lab.camera.describe()), allow_nan=False))
+    assert (described["frame_shape"], described["firmware"] != "") == ([48, 64], True)
+    models = {
+        "andor": ("DU-897", "10001"),
+        "genicam": ("Simulated", "SIM1"),
+        "pylon": ("Emulation", "0815-0000"),
+    }
+    assert (described["model"], described["serial_number"]) == models[driver]
+
+
+def test_a_simulated_camera_needs_a_simulation_and_a_region_on_its_sensor(driver: str) -> None:
+    make, model, _ = DRIVERS[driver]
+    with pytest.raises(ConfigError, match=r"add `simulation: \{use: virtual\}`"):
+        make(model(camera="simulated"), Context("camera"))
+    with pytest.raises(ConfigError, match="beyond the sensor of 96 x 128 pixels"):
+        Rig(driver, region={"y": 60, "x": 0, "height": 48, "width": 64})
+
+
+REAL: dict[str, dict[str, Any]] = {
+    "andor": {"serial": 4711, "em_gain": 300, "model": "DU-897", "cooling": {"temperature": "-70 degC"}},
+    "genicam": {"camera": "192.168.7.2", "model": "BFS-PGE-50S5M", "serial": "23456789"},
+    "pylon": {"camera": 22345678, "model": "acA1920-40um"},
+}
+"""Profiles of real cameras."""
+
+
+def test_a_dry_run_with_a_real_cameras_profile_sees_what_the_virtual_camera_sees(
+    tmp_path: Path, driver: str
+) -> None:
+    parts = yaml.safe_load((ROOT / "hardware_profiles" / "virtual.yaml").read_text())
+    parts["camera"] = {"use": driver, **REAL[driver]}
+    profile = tmp_path / "bench.yaml"
+    profile.write_text(yaml.safe_dump(parts))
+
+    def run(profile: str, *overrides: str, **options: Any) -> Run:
+        sequence = ROOT / "sequences" / "compact_225.yaml"
+        cut = (
+            "profile.camera.region={y: 20, x: 6, height: 472, width: 500}",
+            "profile.detector.frame=[472, 500]",
+            "profile.detector.centre_px=[235.5, 249.5]",
+        )
+        with Session.open(
+            sequence,
+            profile=profile,
+            shots=1,
+            seed=1,
+            output=tmp_path,
+            overrides=(*cut, *overrides),
+            **options,
+        ) as session:
+            return session.run()
+
+    done = run(str(profile), dry_run="full")
+    assert done.simulated
+    virtual = run(
+        "virtual", f"profile.camera.readout={done.record['devices']['camera'].get('readout_s', 5e-3)}"
+    )
+    for shot, expected in zip(done.shots, virtual.shots, strict=True):
+        np.testing.assert_array_equal(shot.occupancies, expected.occupancies)
