@@ -9,7 +9,7 @@ import threading
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Final, Protocol
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,40 +17,15 @@ from numpy.typing import NDArray
 from labseq.plugin import Clock, Context, DeviceError, Process, state_root, wait_for
 from labseq_soapy.settings import SoapySettings
 
+if TYPE_CHECKING:
+    from labseq_soapy_sim import SimulatedRadio
+
 END_S: Final = 10.0
 """How long a process that was left behind may take to ramp down and close its radio."""
 
 
-class RadioAccess(Protocol):
-    """How the streaming process gets to a radio."""
-
-    def warm(self) -> None:
-        """Do what takes long before the first shot."""
-        ...
-
-    def connect(self) -> tuple[str, Mapping[str, str], Path]:
-        """Make the radio available.
-
-        Returns:
-            The arguments that open it, the environment of the streaming process, and a folder for logs.
-        """
-        ...
-
-    def started(self, tones_hz: tuple[NDArray[np.float64], NDArray[np.float64]]) -> None:
-        """The radio streams; its amplitudes are those of these tones of rows and columns."""
-        ...
-
-    def changed(self) -> None:
-        """The amplitudes of the tones have changed."""
-        ...
-
-    def disconnect(self) -> None:
-        """The radio was closed; no effect if it is not connected."""
-        ...
-
-
 class RealRadio:
-    """A radio that is connected to the computer.
+    """A radio that is connected to the computer. A ``SimulatedRadio`` has the same methods.
 
     Args:
         device: Arguments that open it.
@@ -60,23 +35,27 @@ class RealRadio:
         self._device = device
 
     def warm(self) -> None:
-        """Nothing to do."""
+        """Do what takes long before the first shot: nothing."""
 
     def connect(self) -> tuple[str, Mapping[str, str], Path]:
-        """The radio is always available."""
+        """Make the radio available.
+
+        Returns:
+            The arguments that open it, the environment of the streaming process, and a folder for logs.
+        """
         return self._device, os.environ, state_folder()
 
     def started(self, tones_hz: tuple[NDArray[np.float64], NDArray[np.float64]]) -> None:
-        """Nothing to do."""
+        """The radio streams these tones of rows and columns."""
 
     def changed(self) -> None:
-        """Nothing to do."""
+        """The amplitudes of the tones have changed."""
 
     def disconnect(self) -> None:
-        """Nothing to do."""
+        """The radio was closed; no effect if it is not connected."""
 
 
-def choose_radio(name: str, settings: SoapySettings, context: Context) -> RadioAccess:
+def choose_radio(name: str, settings: SoapySettings, context: Context) -> RealRadio | SimulatedRadio:
     """The radio that the setting ``device`` names."""
     if not settings.is_simulated:
         return RealRadio(settings.device)

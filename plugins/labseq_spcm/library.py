@@ -5,38 +5,21 @@ from __future__ import annotations
 import contextlib
 import importlib
 import io
-from typing import Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from labseq.plugin import Context, DeviceError
 from labseq_spcm.settings import SpcmSettings
+
+if TYPE_CHECKING:
+    from labseq_spcm_sim import SimulatedLibrary
 
 SIMULATED: Final = "simulated"
 """Device names that begin like this belong to simulated cards; the vendor's never do."""
 WITHOUT_A_CARD: Final = "to try things without a card, set `card: simulated`"
 
 
-class Library(Protocol):
-    """Where the package ``spcm`` and a card for it come from."""
-
-    def load(self) -> Any:
-        """Import the package ``spcm``, which loads the driver library."""
-        ...
-
-    def warm(self) -> None:
-        """Do what takes long before the first shot."""
-        ...
-
-    def connect(self) -> str:
-        """Make the card available; returns its device name in ``spcm``."""
-        ...
-
-    def disconnect(self) -> None:
-        """Release the card; no effect if it is not connected."""
-        ...
-
-
 class VendorLibrary:
-    """Spectrum's own driver library, which must be installed.
+    """Spectrum's own driver library, which must be installed. A ``SimulatedLibrary`` has the same methods.
 
     Args:
         device_name: The card's name in Spectrum's Control Center.
@@ -46,18 +29,21 @@ class VendorLibrary:
         self._device_name = device_name
 
     def load(self) -> Any:
-        """Import the package ``spcm``."""
+        """Import the package ``spcm``, which loads the library."""
         return importlib.import_module("spcm")
 
     def warm(self) -> None:
-        """Nothing to do."""
+        """Do what takes long before the first shot: nothing."""
 
     def connect(self) -> str:
-        """The card is always available."""
+        """Make the card available; returns its device name in ``spcm``."""
         return self._device_name
 
     def disconnect(self) -> None:
-        """Nothing to do."""
+        """Release the card; no effect if it is not connected."""
+
+
+Library: TypeAlias = "VendorLibrary | SimulatedLibrary"
 
 
 def choose_library(settings: SpcmSettings, context: Context) -> Library:

@@ -2,66 +2,29 @@
 
 from __future__ import annotations
 
-from typing import Final, Protocol
+from typing import TYPE_CHECKING, Final
 
 from labseq.plugin import Context, LineProgram, Port
 from labseq_ttl.box import open_box
 from labseq_ttl.settings import TtlSettings
 
+if TYPE_CHECKING:
+    from labseq_ttl_sim import SimulatedAccess
+
 MAX_WAIT_S: Final = 1.0
 """How long an answer of a real box may take, in seconds."""
 
 
-class BoxAccess(Protocol):
-    """A box that the driver can connect to.
-
-    Attributes:
-        max_wait_s: How long an answer may take, in seconds.
-        real_time: Whether the box takes as long as a program lasts, and keeps time limits itself.
-    """
-
-    max_wait_s: float
-    real_time: bool
-
-    def warm(self) -> None:
-        """Do what takes long before the first shot."""
-        ...
-
-    def connect(self) -> Port:
-        """Open the serial port of the box."""
-        ...
-
-    def disconnect(self) -> None:
-        """The port was closed; no effect if it is not connected."""
-        ...
-
-    def lines_set(self, program: LineProgram) -> None:
-        """The lines were set to the state of this program, at once."""
-        ...
-
-    def fired(self, program: LineProgram | None) -> None:
-        """A program was fired; None: one that changes no line."""
-        ...
-
-    def is_over(self, end_s: float) -> bool:
-        """Whether a program is over that the box has played, and that ends at this time."""
-        ...
-
-    def wait_until(self, end_s: float, timeout_s: float) -> float:
-        """Wait for the end of a program; returns how long to wait for the box's message."""
-        ...
-
-    def raise_go(self, timeout_s: float) -> float:
-        """Wait for a leader's `go`; returns how long to wait for the box's message."""
-        ...
-
-
 class RealBox:
-    """A box at a serial port.
+    """A box at a serial port. A ``SimulatedAccess`` has the same methods.
 
     Args:
         port: Name of the port.
         device: Name of the box, for messages.
+
+    Attributes:
+        max_wait_s: How long an answer may take, in seconds.
+        real_time: Whether the box takes as long as a program lasts, and keeps time limits itself.
     """
 
     max_wait_s = MAX_WAIT_S
@@ -72,35 +35,35 @@ class RealBox:
         self._device = device
 
     def warm(self) -> None:
-        """Nothing to do."""
+        """Do what takes long before the first shot: nothing."""
 
     def connect(self) -> Port:
-        """Open the port."""
+        """Open the serial port of the box."""
         return open_box(self._port, self._device)
 
     def disconnect(self) -> None:
-        """Nothing to do."""
+        """The port was closed; no effect if it is not connected."""
 
     def lines_set(self, program: LineProgram) -> None:
-        """Nothing to do."""
+        """The lines were set to the state of this program, at once."""
 
     def fired(self, program: LineProgram | None) -> None:
-        """Nothing to do."""
+        """A program was fired; None: one that changes no line."""
 
     def is_over(self, end_s: float) -> bool:  # noqa: ARG002 - the box itself has reported it
-        """A program that the box has played is over."""
+        """Whether a program is over that the box has played, and that ends at this time."""
         return True
 
     def wait_until(self, end_s: float, timeout_s: float) -> float:  # noqa: ARG002 - the box reports the end
-        """The box reports the end itself."""
+        """Wait for the end of a program; returns how long to wait for the box's message."""
         return timeout_s
 
     def raise_go(self, timeout_s: float) -> float:
-        """The leader raises it."""
+        """Wait for a leader's `go`; returns how long to wait for the box's message."""
         return timeout_s
 
 
-def choose_box(settings: TtlSettings, context: Context, polarity: int) -> BoxAccess:
+def choose_box(settings: TtlSettings, context: Context, polarity: int) -> RealBox | SimulatedAccess:
     """The box that the setting ``port`` names.
 
     Args:
