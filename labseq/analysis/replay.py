@@ -63,7 +63,7 @@ class ReplayedImage:
         n_vanished: Sites where the run alone saw one.
         confidence: Mean confidence in the run.
         confidence_replayed: That of the detector.
-        n_atoms_true: How many there really are after the shot's last image; None if nobody knows.
+        n_atoms_true: How many there really are after the shot's last image; None if unknown.
     """
 
     shot: int
@@ -123,13 +123,13 @@ class ReplayedImages:
             try:
                 occupancy, confidence = detector.detect(image.frame)
                 seen = np.asarray(occupancy, np.bool_).reshape(image.occupancy.shape)
-                told = float(np.mean(confidence))
+                certainty = float(np.mean(confidence))
             except (Exception, SystemExit) as error:  # noqa: BLE001 - a plugin may raise anything
                 self.failures[shot.index, i] = f"{type(error).__name__}: {error}"
                 continue
             is_last = i == len(images) - 1
             self._note(
-                shot.index, i, image, seen, told, int(truth) if is_last and truth is not None else None
+                shot.index, i, image, seen, certainty, int(truth) if is_last and truth is not None else None
             )
 
     def _note(
@@ -291,7 +291,7 @@ def is_same(one: Plan, other: Plan) -> bool:
 
 
 def _planning_s(timing: Sequence[StageTiming], cycle: CycleRecord) -> float:
-    """How long it took to plan, on the run's computer; nan if nobody wrote that down."""
+    """How long it took to plan, on the run's computer; nan if it was not recorded."""
     place = ("plan", cycle.step, cycle.cycle)
     return next((one.host_s for one in timing if (one.stage, one.step, one.cycle) == place), math.nan)
 
@@ -345,7 +345,7 @@ class ReplayRequest:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Replay:
-    """What came of a run's images.
+    """Results of replaying a run's images.
 
     Attributes:
         run: The run.

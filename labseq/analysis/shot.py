@@ -55,7 +55,7 @@ ON_FRAME: Final = (
     MarkerStyle("surplus atom", "s", 0.8, "none", "#f0e442"),
     MarkerStyle("atom in the reservoir", "o", 0.86, "none", "0.62"),
 )
-"""Rings around sites, in the colours of Okabe and Ito, that stand out from grey for all eyes."""
+"""Rings around sites, in colours of Okabe and Ito that contrast with grey for all colour vision."""
 OUTLINE: Final = "#c8102e"
 OUTLINE_LABEL: Final = "border of the target"
 COLOURS: Final = ("plasma", 0.25, 0.95)
@@ -93,7 +93,7 @@ class ShotDrawing:
         title: Stands at the top.
         note: Stands below it.
         grid: The grid of sites.
-        target: What the array shall look like.
+        target: The target pattern.
         sites_px: float64 (n_rows, n_cols, 2), (y, x) of each site on the frames; None if that is not known:
             then no frames are shown.
         panels: The images, in order; at least one.
@@ -217,7 +217,7 @@ def _colour(index: int, n_batches: int) -> Any:
 
 
 def _write_head(figure: Figure, sheet: Sheet, drawing: ShotDrawing, looks: list[MarkerStyle]) -> None:
-    """The title, and what the marks stand for."""
+    """Write the title, and the meaning of the marks."""
     from matplotlib.lines import Line2D
 
     across, down = sheet.width_in, sheet.height_in
@@ -326,8 +326,8 @@ def _panel(image: ImageRecord, title: str, cycle: CycleRecord | None) -> ShotPan
     batches = (
         f"{played} of {planned} batches" if played < planned else f"{played} batch{'es' * (played != 1)}"
     )
-    told = f"{title}; then {len(moves)} move{'s' * (len(moves) != 1)} in {batches}"
-    return ShotPanel(told, image.occupancy, pixels, moves, batch)
+    title = f"{title}; then {len(moves)} move{'s' * (len(moves) != 1)} in {batches}"
+    return ShotPanel(title, image.occupancy, pixels, moves, batch)
 
 
 def _of_cycle(

@@ -169,7 +169,7 @@ def statistics_of(shots: Iterable[Shot], target: TargetPattern) -> Statistics:
     judged = [(shot, of) for shot, of in read if _has_filling(shot) and of.is_judged]
     rated = [shot for shot, _ in judged] + [shot for shot in unreadable if _has_filling(shot)]
     summaries = [summary for _, summary in read]
-    told = [of for of in summaries if "n_defects_true" in of.simulation and len(of.images)]
+    with_truth = [of for of in summaries if "n_defects_true" in of.simulation and len(of.images)]
     return Statistics(
         n_shots=len(all_shots),
         unreadable=tuple(shot.index for shot in unreadable),
@@ -180,8 +180,8 @@ def statistics_of(shots: Iterable[Shot], target: TargetPattern) -> Statistics:
         defects=_histogram([of.images.n_defects[-1] for _, of in judged if len(of.images)]),
         too_short=Rate(sum(of.cycles.n_batches_played != of.cycles.n_batches for of in summaries), len(read)),
         losses=_losses(summaries),
-        defects_true=mean([of.simulation["n_defects_true"] for of in told]),
-        defects_seen=mean([of.images.n_defects[-1] for of in told]),
+        defects_true=mean([of.simulation["n_defects_true"] for of in with_truth]),
+        defects_seen=mean([of.images.n_defects[-1] for of in with_truth]),
     )
 
 

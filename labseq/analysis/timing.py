@@ -21,7 +21,7 @@ ORDER: Final = (
     *("load", "expose", "read_out", "detect", "plan", "check"),
     *("tones", "render", "upload", "prepare", "play", "move", "write"),
 )
-"""The stages of a shot as they come; others stand between the last two."""
+"""The stages of a shot in order; unknown ones come last."""
 WRITE: Final = "write"
 """Writing a shot to the disk: from its end to the line of the event log that says that it is written."""
 STEP: Final = "step "

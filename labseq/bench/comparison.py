@@ -224,7 +224,7 @@ class PreparedCondition:
     Attributes:
         grid: The grid of sites.
         motion: How the mobile tweezers move.
-        target: What the array shall look like.
+        target: The target pattern.
         loading: Probability that a site is loaded.
         runners: A planner per entrant.
     """
@@ -418,7 +418,7 @@ class Failure:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Done:
-    """What came of a job.
+    """The results of a job.
 
     Attributes:
         job: The job.

@@ -226,7 +226,7 @@ class _Watch:
 
 
 class _Timed:
-    """Detector and planner, which note how long they take by themselves, their threads aside."""
+    """Measures how long detector and planner take, without the time for their threads."""
 
     def __init__(self, detector: Detector, planner: Planner) -> None:
         self._detector = detector

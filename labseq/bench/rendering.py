@@ -1,4 +1,4 @@
-"""How fast tone programs become samples, beside the paper's way and plain numpy."""
+"""How fast tone programs are rendered, compared with the paper's method and with plain numpy."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ NUMPY_20: Final = "numpy, 20 tones"
 
 SITE_S: Final = 4.49e-6 / 0.130
 SITES: Final = 5
-"""Sites per transport of the programs that stand for one kind of segment: about a plan's mean."""
+"""Sites per transport of the programs that represent one kind of segment: about a plan's mean."""
 
 
 PLAN: Final = PlanRequest("random:20x20@75%", "compact:15x15", "psca", 7, seed=1)
@@ -73,7 +73,7 @@ class Ratio:
 
 @dataclass(frozen=True, slots=True)
 class WaveformReport:
-    """What came of it.
+    """The results.
 
     Attributes:
         rows: A row for each kind of segment and for a plan; the stored-waveform way and numpy last.
@@ -145,7 +145,7 @@ def _other_ways(grid: SiteGrid, rate_hz: float, repeats: int) -> Generator[Row]:
 def uniform_program(
     grid: SiteGrid, n_tones: int, directions: tuple[int, ...], course: int = FrequencyCourse.LINEAR
 ) -> ToneProgram:
-    """A program of 100 transports: column tones that move in given directions, a row tone that stands.
+    """A program of 100 transports: column tones that move in given directions, a fixed row tone.
 
     They go there and back, so that the tones stay in the band.
     """

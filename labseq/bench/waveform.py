@@ -35,7 +35,7 @@ from labseq.text_files import is_folder, read_bytes, something_else
 from labseq.units import format_quantity, parse_quantity
 
 DEFAULT_RATE_HZ: Final = 625e6
-"""Where nobody names a sample rate: that of the paper's AWG."""
+"""Default sample rate: that of the paper's AWG."""
 
 MAX_RATE_HZ: Final = 10e9
 """Far more than any AWG has."""
@@ -53,7 +53,7 @@ class SampleRate:
 
     Attributes:
         hz: Samples per second and channel.
-        source: Who, for messages; "" for nobody.
+        source: Where it comes from, for messages; "" for the default.
         warning: What the user should know, or "".
     """
 
@@ -522,7 +522,7 @@ def _tones(moves: PlannedMoves, request: PlanRequest) -> ToneProgram:
 
 
 def _refuse_slow(rate: SampleRate, program: ToneProgram) -> None:
-    """Refuse a sample rate that tones cannot be told apart at."""
+    """Refuse a sample rate at which tones cannot be distinguished."""
     highest_hz = max(
         hz.max() for axis in (program.row, program.column) for hz in (axis.start_hz, axis.end_hz)
     )
@@ -582,7 +582,7 @@ def save_samples(path: Path, waveform: PlannedWaveform) -> None:
 
 
 def arrays_of(waveform: PlannedWaveform) -> Mapping[str, NDArray[Any]]:
-    """Everything beside the samples; indices of batches count from 0.
+    """Everything except the samples; indices of batches count from 0.
 
     Returns:
         Name -> array: ``sample_rate_hz``; ``volts_per_sample``, float64 (2,), volts across 50 Ohm of

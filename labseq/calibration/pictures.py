@@ -27,7 +27,7 @@ SITE, ARROW = "#e8a33d", "#c8102e"
 
 
 def draw_sites(mean: Floats, positions_px: Floats, residuals_px: Floats) -> Figure:
-    """Draw an averaged frame with the sites on it, and how far each spot lies beside its site.
+    """Draw an averaged frame with the sites on it, and the distance of each spot from its site.
 
     Args:
         mean: float64 (height, width), the averaged frame, in counts.
@@ -57,7 +57,7 @@ def draw_sites(mean: Floats, positions_px: Floats, residuals_px: Floats) -> Figu
             axes.plot(x[here], y[here], marker, label=label, **look)
     axes.plot(x[:1], y[:1], "s", color=SITE, markersize=1.4 * size, fillstyle="none", label="row 0, column 0")
     longest = _draw_arrows(axes, x[found], y[found], residuals_px.reshape(-1, 2)[found], spacing)
-    axes.set_title(f"arrows: spots beside their sites, {longest:.2g} px at most")
+    axes.set_title(f"arrows: distance of spots from their sites, {longest:.2g} px at most")
     axes.set_xlabel("x (px)")
     axes.set_ylabel("y (px)")
     axes.legend(loc="upper right", fontsize="small", markerscale=0.5)
@@ -65,7 +65,7 @@ def draw_sites(mean: Floats, positions_px: Floats, residuals_px: Floats) -> Figu
 
 
 def _draw_arrows(axes: Axes, x: Floats, y: Floats, off_px: Floats, spacing_px: float) -> float:
-    """Draw how far spots lie beside their sites, enlarged; the longest distance, in pixels."""
+    """Draw the distances of spots from their sites, enlarged; return the longest, in pixels."""
     longest = float(np.hypot(*off_px.T).max(initial=0.0))
     if longest > 0:
         along_y, along_x = ARROW_SPACINGS * spacing_px / longest * off_px.T
@@ -156,7 +156,7 @@ def draw_survival(
 
 
 def draw_tone_offsets(rows: tuple[Floats, Floats], columns: tuple[Floats, Floats]) -> Figure:
-    """Draw how far the tweezers of each row and column stood beside their sites.
+    """Draw the distances of the tweezers of each row and column from their sites.
 
     Args:
         rows: Offset from row to row and its standard error, each float64 (n_rows,), in metres.
@@ -200,7 +200,7 @@ def draw_powers(before: Floats, after: Floats, rows: Floats, cols: Floats) -> Fi
         _count(axes.xaxis)
         _count(axes.yaxis)
     bar = figure.colorbar(panels[0][0].images[0], ax=panels[0], shrink=0.9)
-    _label(bar.ax, "", "power beside the mean (%)")
+    _label(bar.ax, "", "deviation from the mean (%)")
     for axes, amplitudes, name in zip(panels[1], (rows, cols), ("row", "column"), strict=True):
         axes.bar(np.arange(len(amplitudes)), 100 * amplitudes, color="#1f4e8c")
         axes.set_ylim(0, 115 * float(amplitudes.max()))

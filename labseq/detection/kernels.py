@@ -1,4 +1,4 @@
-"""Kernels of the weighted detector: one pass over the pixels, one over the neighbours."""
+"""Kernels of the weighted detector: a pass over the pixels, and one over the neighbours."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def weigh_sites(
         corners: int64 (n_sites, 2), (y, x) of the first pixel of each region; no
             region reaches over the edge.
         weights: float32 (n_sites, region, region), weight of each pixel.
-        curve: float32 (65536,), what a pixel of so many counts is worth.
+        curve: float32 (65536,), value of a pixel, by its counts.
         constant: float64 (n_sites,), added to each sum.
         odds: Result, float64 (n_sites,): the constant and the weighted sum.
     """
@@ -50,7 +50,7 @@ def weigh_sites(
 
 @kernel(f"void({INDICES}, {INDICES}, {VALUES}, {VALUES}, float64[::1])")
 def undo_neighbours(starts: Ints, neighbours: Ints, effects: Floats, odds: Floats, undone: Floats) -> None:
-    """Take off what the light of the neighbours that hold atoms adds.
+    """Subtract the effect of the light of neighbours with atoms.
 
     Args:
         starts: int64 (n_sites + 1,), where each site's neighbours start in the lists.

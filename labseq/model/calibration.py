@@ -1,4 +1,4 @@
-"""What a calibration found: the values that the machine uses, how good they are, and where they come from."""
+"""A calibration: the values that the machine uses, their quality, and where they come from."""
 
 from __future__ import annotations
 
@@ -39,32 +39,32 @@ _SPACING_TOLERANCE: Final = 1e-6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibrationEntry:
-    """One calibration, as it is kept. It never changes; a better one is another entry.
+    """One calibration, as it is stored. It never changes; a new one is another entry.
 
     Values by kind, float64, (y, x) for pixels:
 
     - sites: ``positions_px`` (n_rows, n_cols, 2), ``frame`` (2,) height and width of the frames.
-    - thresholds: ``thresholds`` (n_rows, n_cols), in what the detector in use compares: counts over the
+    - thresholds: ``thresholds`` (n_rows, n_cols), in the unit of the detector: counts over the
       offset, or log-odds.
     - tweezers: ``row_amplitudes`` (n_rows,), ``column_amplitudes`` (n_cols,) of the static tweezers' tones,
       fractions of full scale.
     - frequencies: ``row_hz`` (n_rows,), ``column_hz`` (n_cols,): the mobile tweezers' tones at the sites.
-    - overlay: ``offset_m`` (2,): how far the mobile tweezers stand beside the sites, along a1 (along a
+    - overlay: ``offset_m`` (2,): offset of the mobile tweezers from the sites, along a1 (along a
       row) and a2 (from row to row).
 
     Attributes:
         kind: One of :data:`CALIBRATION_KINDS`.
-        values: What the machine uses; further values than those above may stand beside them.
-        quality: Figures of merit, in SI units and pixels; nan for one that is not known.
+        values: What the machine uses; may contain more than those above.
+        quality: Figures of merit, in SI units and pixels; nan for unknown ones.
         grid: ``rows``, ``cols``, ``spacing_m``, ``lattice`` and ``shear`` of the grid that it was made for.
         origin: Where it comes from, JSON-ready: command, run, number of shots, profile, version of labseq,
             ids of the other calibrations in use.
         taken_utc: When it was made, ISO 8601, UTC.
         id: From kind, grid and values alone: the digits of their SHA-256 in hexadecimal from the first
-            letter on, twelve of them. YAML would take digits without a letter before them for a number.
+            letter on, twelve of them. YAML would read digits without a letter before them as a number.
 
     Raises:
-        ValueError: A value is missing, of another shape, not finite, or makes no sense.
+        ValueError: A value is missing, of another shape, not finite, or out of range.
 
     Example:
         >>> entry = CalibrationEntry("overlay", {"offset_m": [3e-8, 0.0]}, {"error_m": 1e-8},
@@ -84,19 +84,19 @@ class CalibrationEntry:
     def __post_init__(self) -> None:
         set_field = object.__setattr__
         if self.kind not in CALIBRATION_KINDS:
-            raise ValueError(f"'{self.kind}' is no kind of calibration")
+            raise ValueError(f"'{self.kind}' is not a kind of calibration")
         set_field(self, "grid", _facts(self.grid))
         set_field(self, "values", {name: _finite(name, value) for name, value in self.values.items()})
         set_field(self, "quality", {name: float(value) for name, value in self.quality.items()})
         set_field(self, "origin", dict(self.origin))
         self._check_shapes()
-        self._check_sense()
+        self._check_range()
         if datetime.fromisoformat(self.taken_utc).tzinfo is None:
             raise ValueError(f"taken_utc is {self.taken_utc}, without a time zone")
         set_field(self, "id", _content_id(self.kind, self.grid, self.values))
 
     def is_for(self, grid: SiteGrid) -> bool:
-        """Whether it was made for a grid of these sites; the tones of rows and columns do not count."""
+        """Whether it was made for a grid of these sites; the tones of rows and columns are ignored."""
         return same_grid(self.grid, grid_facts(grid))
 
     def _check_shapes(self) -> None:
@@ -107,7 +107,7 @@ class CalibrationEntry:
             if self.values[name].shape != shape:
                 raise ValueError(f"'{name}' has shape {self.values[name].shape}; expected {shape}")
 
-    def _check_sense(self) -> None:
+    def _check_range(self) -> None:
         for name, value in self.values.items():
             if name.endswith("_amplitudes") and not np.all((value >= 0) & (value <= 1)):
                 raise ValueError(f"'{name}' has values outside of 0 to 1")
@@ -117,11 +117,11 @@ class CalibrationEntry:
                 if not np.all(self.values[name] > 0):
                     raise ValueError(f"'{name}' has frequencies that are not above 0 Hz")
                 if not (np.all(steps > 0) or np.all(steps < 0)):
-                    raise ValueError(f"'{name}' neither rises nor falls all along")
+                    raise ValueError(f"'{name}' neither rises nor falls monotonically")
 
 
 def grid_facts(grid: SiteGrid) -> dict[str, Any]:
-    """What a calibration keeps of its grid.
+    """The properties of a grid that a calibration stores.
 
     Example:
         >>> grid_facts(SiteGrid(2, 3))
@@ -137,11 +137,11 @@ def grid_facts(grid: SiteGrid) -> dict[str, Any]:
 
 
 def same_grid(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
-    """Whether two grids have the same sites; the shear of a square lattice does not count.
+    """Whether two grids have the same sites; the shear of a square lattice is ignored.
 
     Args:
-        one: As :func:`grid_facts` gives it.
-        other: Likewise.
+        one: From :func:`grid_facts`.
+        other: From :func:`grid_facts`.
     """
     keys = ("rows", "cols", "lattice", *(("shear",) if one["lattice"] == "triangular" else ()))
     is_alike = math.isclose(one["spacing_m"], other["spacing_m"], rel_tol=_SPACING_TOLERANCE)

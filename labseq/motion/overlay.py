@@ -1,8 +1,9 @@
-"""Where the mobile tweezers stand on the sites, from the survival of pick-up, hold and drop.
+"""The offset of the mobile tweezers from the sites, from the survival of pick-up, hold and drop.
 
-A probe at a commanded offset puts a tweezer at that offset and the unknown one. So atoms survive
-best at the *centre*, where both cancel: the mobile tweezers stand beside the sites by minus the
-centre, which is what :func:`overlay_offset` tells.
+A probe commands an offset, to which the unknown offset of the tweezers adds. Atoms survive best at
+the *centre*, where both cancel: so the tweezers are away from the sites by minus the centre
+(:func:`overlay_offset`). Around a site, the *survival peak* is surrounded by a ring of loss, beyond
+which the tweezer does not capture the atom and it survives again.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ Floats = NDArray[np.float64]
 Counts = NDArray[np.int64]
 
 MIN_P: Final = 1e-4
-"""Probabilities this near to 0 or 1 are not told apart: a single false detection in so many atoms."""
+"""Probabilities are clipped this near to 0 and 1: the rate of false detections."""
 
 
 REACH: Final = 1.5
@@ -32,14 +33,14 @@ REACH: Final = 1.5
 
 @dataclass(frozen=True, slots=True)
 class SurvivalShape:
-    """The bump of survival around a site.
+    """The survival peak around a site.
 
     An atom picked up and dropped near its site survives; one that is dropped on the slope of
-    the site's light is lost. Far beside the site the mobile tweezer does not take the atom at all,
-    and it survives again: the bump stands in a ring of loss, whose far side is not described here.
+    the site's light is lost. Far away from the site the mobile tweezer does not capture the atom,
+    which survives again; this outer side of the ring of loss is not described here.
 
     Attributes:
-        half_width_m: Distance at which half of the atoms that the bump makes a difference to survive.
+        half_width_m: Distance at which survival is half way between floor and ceiling.
         edge_m: Width of its edge, 1 sigma of the error function.
         floor: Survival in the ring.
         ceiling: Survival at the centre.
@@ -52,7 +53,7 @@ class SurvivalShape:
 
     @property
     def reach_m(self) -> float:
-        """Distance up to which the shape holds: short of the far side of the ring."""
+        """Distance up to which the shape is valid, inside of the ring's outer side."""
         return REACH * self.half_width_m
 
     def survival(self, distance_m: ArrayLike) -> Floats:
@@ -65,11 +66,11 @@ class SurvivalShape:
         """
         from scipy.special import ndtr
 
-        bump = ndtr((self.half_width_m - np.asarray(distance_m, np.float64)) / self.edge_m)
-        return self.floor + (self.ceiling - self.floor) * bump
+        peak = ndtr((self.half_width_m - np.asarray(distance_m, np.float64)) / self.edge_m)
+        return self.floor + (self.ceiling - self.floor) * peak
 
     def values(self) -> dict[str, float]:
-        """What a calibration keeps of it."""
+        """The values that a calibration stores."""
         return {
             "half_width_m": self.half_width_m,
             "edge_m": self.edge_m,
@@ -79,7 +80,7 @@ class SurvivalShape:
 
     @classmethod
     def from_values(cls, values: Mapping[str, ArrayLike]) -> SurvivalShape | None:
-        """The shape that a calibration kept; None if it kept none."""
+        """The shape stored in a calibration; None if there is none."""
         names = ("half_width_m", "edge_m", "floor", "ceiling")
         if any(name not in values for name in names):
             return None
@@ -87,7 +88,7 @@ class SurvivalShape:
 
 
 def unit_axes(grid: SiteGrid) -> Floats:
-    """Directions of a1 and a2, float64 (2, 2): an offset times them is the place beside the site.
+    """Directions of a1 and a2, float64 (2, 2): an offset times them is the displacement from the site.
 
     Example:
         >>> unit_axes(SiteGrid(2, 2)).round(3).tolist()
@@ -108,7 +109,7 @@ def distance_m(offset_m: Floats, axes: Floats) -> Floats:
 
 
 def deviance_residuals(n_survived: Floats, n_before: Floats, p: Floats) -> Floats:
-    """Signed roots of the binomial deviance; their sum of squares is least at the greatest likelihood."""
+    """Signed roots of the binomial deviance; the sum of squares is minimal at the maximum likelihood."""
     from scipy.special import xlog1py
 
     p = np.clip(p, MIN_P, 1 - MIN_P)
@@ -125,8 +126,8 @@ def covariance(theta: Floats, n_before: Floats, model: Callable[[Floats], Floats
         theta: float64 (n,), the parameters.
         n_before: float64 (n_points,), atoms that were probed.
         model: Parameters -> probability of survival, float64 (n_points,).
-        prior: float64 (n,), how well each parameter was known before, 1 sigma; it keeps
-            those that the counts say nothing about from spoiling the inverse.
+        prior: float64 (n,), prior uncertainty of each parameter, 1 sigma; it keeps the
+            inverse finite for parameters that the counts do not determine.
     """
     jacobian = slopes(theta, model, 1e-4 * prior)
     p = np.clip(model(theta), MIN_P, 1 - MIN_P)
@@ -143,22 +144,22 @@ def slopes(theta: Floats, model: Callable[[Floats], Floats], step: Floats) -> Fl
 
 
 def dispersion(n_survived: Floats, n_before: Floats, p: Floats, n_parameters: int) -> float:
-    """How much more counts scatter than binomial ones: Pearson's chi squared over its degrees, at least 1.
+    """Scatter of counts over that of binomial ones: Pearson's chi squared per degree of freedom, at least 1.
 
-    Losses that are common to the atoms of a shot make it greater.
+    Losses common to the atoms of a shot increase it.
     """
-    asked = n_before > 0
-    n, k = n_before[asked], n_survived[asked]
-    p = np.clip(p[asked], np.minimum(0.5, 0.5 / n), 1 - np.minimum(0.5, 0.5 / n))
+    probed = n_before > 0
+    n, k = n_before[probed], n_survived[probed]
+    p = np.clip(p[probed], np.minimum(0.5, 0.5 / n), 1 - np.minimum(0.5, 0.5 / n))
     chi_squared = float((((k - n * p) ** 2) / (n * p * (1 - p))).sum())
     return max(1.0, chi_squared / max(1, len(n) - n_parameters))
 
 
 WORST_ERROR_M: Final = 50e-9
-"""A centre that is known less well is no calibration."""
+"""Maximum error of the centre."""
 MIN_ATOMS: Final = 100
 MIN_GAIN: Final = 30.0
-"""By how much the deviance must fall, over the dispersion, for a bump to be believed."""
+"""Minimum decrease of the deviance by a survival peak, relative to the dispersion."""
 ROUNDS: Final = 6
 MIN_CONTRAST: Final = 0.2
 UM: Final = 1e-6
@@ -173,13 +174,13 @@ DIRECTIONS: Final = ("along a row", "from row to row")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OverlayFit:
-    """What a scan of the probe's offset found.
+    """The result of a scan of the probe's offset.
 
     Attributes:
         centre_m: float64 (2,), commanded offset at which survival is best, along a1 and a2.
-        error_m: float64 (2,), its standard errors, the scatter of the counts included.
-        shape: The bump around it.
-        dispersion: Scatter of the counts over that of a binomial law, at least 1.
+        error_m: float64 (2,), its standard errors, including the scatter of the counts.
+        shape: The survival peak around it.
+        dispersion: Scatter of the counts over that of a binomial distribution, at least 1.
         n_atoms: Atoms that were probed.
     """
 
@@ -191,11 +192,11 @@ class OverlayFit:
 
 
 def overlay_offset(centre_m: ArrayLike, in_use_m: ArrayLike = (0.0, 0.0)) -> Floats:
-    """How far the mobile tweezers stand beside the sites: the ``offset_m`` of an overlay calibration.
+    """The offset of the mobile tweezers from the sites: ``offset_m`` of an overlay calibration.
 
     Args:
         centre_m: float64 (2,), the commanded offset that puts them onto the sites.
-        in_use_m: The ``offset_m`` that was already made up for when it was measured.
+        in_use_m: The ``offset_m`` that was corrected in the measurement.
 
     Example:
         >>> overlay_offset([-0.25, 0.125]).tolist(), overlay_offset([0.125, 0.0], [0.25, 0.0]).tolist()
@@ -211,23 +212,23 @@ def fit_overlay(
     grid: SiteGrid,
     worst_error_m: float = WORST_ERROR_M,
 ) -> OverlayFit:
-    """Find the centre of the bump of survival, by maximum likelihood of binomial counts.
+    """Find the centre of the survival peak, by maximum likelihood of binomial counts.
 
-    The bump is round and has a flat top and an edge; see :class:`SurvivalShape`. On the triangular
-    lattice the axes are not at right angles: what is off along one moves the best place along the
+    The peak is round and has a flat top and an edge; see :class:`SurvivalShape`. On the triangular
+    lattice the axes are not at right angles: an offset along one moves the best place along the
     other, so both are fitted together.
 
     Args:
         offset_m: float64 (n_points, 2), commanded offsets along a1 and a2.
-        n_before: int (n_points, ...), atoms that were probed at each; per row or site, if you like.
+        n_before: int (n_points, ...), atoms that were probed at each; perhaps per row or site.
         n_survived: int, of the same shape: how many of them were seen afterwards.
         grid: The grid of sites, for its axes.
-        worst_error_m: Refuse a centre that is known less well.
+        worst_error_m: Maximum error of the centre.
 
     Raises:
-        DeviceError: There is no bump, one of its edges is not in range (it says in which
+        DeviceError: There is no survival peak, one of its edges is not in range (it says in which
             direction to scan on), or there are too few atoms.
-        ValueError: The arrays do not belong together.
+        ValueError: The arrays have different shapes.
     """
     offset, n, k = checked_counts(offset_m, n_before, n_survived)
     n, k = n.reshape(len(n), -1).sum(axis=1), k.reshape(len(k), -1).sum(axis=1)
@@ -265,7 +266,7 @@ def checked_counts(
 
 
 def _best_fit(offset: Floats, n: Floats, k: Floats, axes: Floats) -> OverlayFit:
-    """Fit the bump to the points in its reach; offsets are in micrometres."""
+    """Fit the peak to the points in its reach; offsets are in micrometres."""
     n_atoms, share = int(n.sum()), format_quantity(k.sum() / n.sum(), "fraction")
     theta, within = _start(offset, n, k, axes), np.empty(0, np.bool_)
     for _ in range(ROUNDS):
@@ -279,15 +280,15 @@ def _best_fit(offset: Floats, n: Floats, k: Floats, axes: Floats) -> OverlayFit:
     excess = dispersion(k, n, p, len(theta))
     if gain < MIN_GAIN * excess or theta[5] - theta[4] < MIN_CONTRAST:
         _refuse(
-            f"no bump: at no offset in range clearly more atoms survive than around it ({share} in all); "
-            "scan further, and see whether the mobile tweezers are on"
+            f"no survival peak: at no offset do clearly more atoms survive than around it ({share} in all); "
+            "scan further, and check whether the mobile tweezers are on"
         )
     spread = covariance(theta, n, lambda t: _survival(t, offset, axes), _KNOWN_BEFORE) * excess
     return OverlayFit(theta[:2] * UM, np.sqrt(np.diag(spread)[:2]) * UM, _shape(theta, UM), excess, n_atoms)
 
 
 def _fitted(start: Floats, offset: Floats, n: Floats, k: Floats, axes: Floats) -> Floats:
-    """The parameters of the greatest likelihood."""
+    """The parameters of maximum likelihood."""
     from scipy.optimize import least_squares
 
     def residuals(theta: Floats) -> Floats:
@@ -308,7 +309,7 @@ def _survival(theta: Floats, offset: Floats, axes: Floats) -> Floats:
 
 
 def _start(offset: Floats, n: Floats, k: Floats, axes: Floats) -> Floats:
-    """Where the fit begins: the best of many bumps, with and without the far side of the ring of loss."""
+    """Start of the fit: the best of many peaks, with and without the outer side of the ring of loss."""
     low, high = offset.min(axis=0), offset.max(axis=0)
     span = float((high - low).max())
     centres = np.stack(np.meshgrid(*np.linspace(low, high, 17).T), axis=-1).reshape(-1, 2)
@@ -318,9 +319,9 @@ def _start(offset: Floats, n: Floats, k: Floats, axes: Floats) -> Floats:
     best, start = -math.inf, np.zeros(0)
     for half_width in span * np.array([0.12, 0.2, 0.28, 0.36, 0.44]):
         for outer in half_width * np.array([1.5, 1.8, 2.2, math.inf]):
-            bump = ((distance < half_width) | (distance > outer)).astype(np.float64)
-            bump -= (bump @ n / n.sum())[:, None]
-            gain = np.maximum(bump @ surplus, 0.0) ** 2 / np.maximum(bump**2 @ n, 1e-12)
+            peak = ((distance < half_width) | (distance > outer)).astype(np.float64)
+            peak -= (peak @ n / n.sum())[:, None]
+            gain = np.maximum(peak @ surplus, 0.0) ** 2 / np.maximum(peak**2 @ n, 1e-12)
             i = int(gain.argmax())
             if gain[i] > best:
                 best = float(gain[i])
@@ -329,7 +330,7 @@ def _start(offset: Floats, n: Floats, k: Floats, axes: Floats) -> Floats:
 
 
 def _refuse_open_ends(fit: OverlayFit, offset: Floats, axes: Floats) -> None:
-    """Refuse a bump whose edges are not both in range, on the lines that were scanned."""
+    """Refuse a peak whose edges are not both in range, on the scanned lines."""
     cosine = float(axes[0] @ axes[1])
     middle = np.median(offset, axis=0)
     about = np.clip(fit.centre_m, offset.min(axis=0), offset.max(axis=0))
@@ -341,13 +342,13 @@ def _refuse_open_ends(fit: OverlayFit, offset: Floats, axes: Floats) -> None:
             for at, name in zip(about, DIRECTIONS, strict=True)
         )
         if squared <= 0:
-            _refuse(f"the scan {direction} passes beside the bump; scan about {where}")
+            _refuse(f"the scan {direction} misses the survival peak; scan about {where}")
         best, half = fit.centre_m[axis] - aside * cosine, math.sqrt(squared)
         low, high = offset[:, axis].min(), offset[:, axis].max()
         if best - half < low or best + half > high:
             end, sign = (low, "-") if best - half < low else (high, "+")
             _refuse(
-                f"only one edge of the bump is in range {direction}: survival has not fallen at "
+                f"only one edge of the survival peak is in range {direction}: survival has not fallen at "
                 f"{format_quantity(float(end), 'length')}; scan on in the direction {sign}, or about {where}"
             )
 
@@ -357,20 +358,20 @@ def _refuse(why: str) -> NoReturn:
 
 
 DRIFT: Final = 0.1
-"""How far the half-width may have changed since it was measured, relative, 1 sigma: with temperature."""
+"""Relative change of the half-width since it was measured, 1 sigma, for example by temperature."""
 WORST_DEVIANCE: Final = 25.0
-"""With four groups and three parameters, one in a million is greater; but a common loss adds to it."""
+"""With four groups and three parameters, one in a million is larger; common losses increase it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FastOffset:
-    """How far the mobile tweezers stand beside the sites.
+    """The offset of the mobile tweezers from the sites, from a few groups of atoms.
 
     Attributes:
-        offset_m: float64 (2,), beside what is already made up for, along a1 and a2.
+        offset_m: float64 (2,), in addition to the active correction, along a1 and a2.
         error_m: float64 (2,), its standard errors.
         n_atoms: Atoms that were probed.
-        deviance: How badly the counts go with the bump at the best offset; about 1 if they do.
+        deviance: Deviance of the counts from the peak at the best offset; about 1 if they agree.
     """
 
     offset_m: Floats
@@ -380,12 +381,12 @@ class FastOffset:
 
     @property
     def fits(self) -> bool:
-        """Whether the counts go with the bump at all."""
+        """Whether the counts agree with the survival peak."""
         return self.deviance < WORST_DEVIANCE
 
     @property
     def length_m(self) -> float:
-        """The greater of both parts, in metres; nan if they are not known."""
+        """The larger of both components, in metres; nan if they are not known."""
         return float(np.abs(self.offset_m).max())
 
 
@@ -396,23 +397,22 @@ def fast_offset(
     shape: SurvivalShape,
     grid: SiteGrid,
 ) -> FastOffset:
-    """Find where the mobile tweezers stand from a few offsets on the edge of a known bump.
+    """Find the offset of the mobile tweezers from a few probes on the edge of a known survival peak.
 
-    The likelihood is greatest at the answer; the half-width may have drifted by :data:`DRIFT`.
-    With offsets of +x and -x, +y and -y on the edge, a shift by a small part of its width makes one
-    group of each pair survive more often and the other less. A shift by half the half-width and
-    more cannot be measured in this way: it comes out wrong, but not small, or as one that does not
-    fit.
+    By maximum likelihood; the half-width may have drifted by :data:`DRIFT`. With offsets of +x and
+    -x, +y and -y on the edge, a shift by a small fraction of its width makes one group of each
+    pair survive more often and the other less. A shift by half the half-width and more cannot be
+    measured in this way: the result is then wrong but not small, or does not fit.
 
     Args:
         offset_m: float64 (n_groups, 2), commanded offsets along a1 and a2.
         n_before: int (n_groups,), atoms that were probed.
         n_survived: int (n_groups,), how many of them were seen afterwards.
-        shape: The bump, from the last overlay calibration.
+        shape: The survival peak, from the last overlay calibration.
         grid: The grid of sites, for its axes.
 
     Raises:
-        ValueError: The arrays do not belong together.
+        ValueError: The arrays have different shapes.
     """
     offset, n, k = checked_counts(offset_m, n_before, n_survived)
     if not n.any():
@@ -422,8 +422,8 @@ def fast_offset(
     in_um = replace(shape, half_width_m=half_width, edge_m=shape.edge_m / UM)
 
     def survival(theta: Floats) -> Floats:
-        bump = replace(in_um, half_width_m=half_width * float(np.exp(theta[2])))
-        return bump.survival(distance_m(offset - theta[:2], axes))
+        peak = replace(in_um, half_width_m=half_width * float(np.exp(theta[2])))
+        return peak.survival(distance_m(offset - theta[:2], axes))
 
     def residuals(theta: Floats) -> Floats:
         return np.append(deviance_residuals(k, n, survival(theta)), theta[2] / DRIFT)
@@ -460,10 +460,10 @@ def group_counts(
 
 
 def _least(residuals: Callable[[Floats], Floats], reach: float) -> Floats:
-    """Centre and drift with the least sum of squares; begun at the best of a grid of centres."""
+    """Centre and drift with the least sum of squares, starting at the best of a grid of centres."""
     from scipy.optimize import least_squares
 
-    places = reach * np.arange(-7, 8) / 7  # 0 is exact: from a dust of it the first step would be as small
+    places = reach * np.arange(-7, 8) / 7  # exactly 0: rounding errors would make the first step tiny
     starts = [np.array([along, across, 0.0]) for along in places for across in places]
     start = min(starts, key=lambda theta: float((residuals(theta) ** 2).sum()))
     bounds = np.array([1.5 * reach, 1.5 * reach, 5 * DRIFT])

@@ -32,11 +32,11 @@ _UNDATED: Final = {".png": {"Software": None}, ".svg": {"Date": None}, ".pdf": {
 
 
 def check_place(path: Path, endings: Sequence[str] = ENDINGS) -> None:
-    """Find out whether a picture can be drawn and where it is to go, before anything is worked out.
+    """Check that a picture can be drawn and written, before any other work.
 
     Args:
         path: The file.
-        endings: Those that its name may have.
+        endings: Allowed endings of its name.
 
     Raises:
         ConfigError: The file has another ending, its folder does not exist, or matplotlib is not installed.
@@ -77,7 +77,7 @@ def make_figure(width_in: float, height_in: float, **options: Any) -> Figure:
 
 
 def encode_figure(draw: Callable[[], Figure], kind: str = ".png", **options: Any) -> bytes:
-    """Draw a picture, whatever the user's matplotlibrc says: the same picture, the same bytes.
+    """Draw a picture independently of the user's matplotlibrc: the same picture gives the same bytes.
 
     Args:
         draw: Makes the figure.
@@ -99,12 +99,12 @@ def can_draw() -> bool:
 
 
 def save_figure(path: Path, draw: Callable[[], Figure], **options: Any) -> None:
-    """Draw a picture and save it, whatever the user's matplotlibrc says.
+    """Draw a picture independently of the user's matplotlibrc, and save it.
 
-    The file is there whole or not at all, and an older one stays until then.
+    The file is written as a whole; an older one stays until then.
 
     Args:
-        path: The file; its ending says of which kind it is, PNG where that is none of them.
+        path: The file; its ending gives its kind, PNG for other endings.
         draw: Makes the figure.
         options: Of matplotlib's ``savefig``.
 
@@ -124,7 +124,7 @@ def save_figure(path: Path, draw: Callable[[], Figure], **options: Any) -> None:
 Floats = NDArray[np.float64]
 
 PANEL_IN: Final = 4.4
-"""Width of a panel, in inches, as long as its sites are neither too small nor too large in it."""
+"""Width of a panel, in inches, unless its sites become too small or too large."""
 SITE_IN: Final = (0.05, 0.3)
 """Least and largest distance between neighbours, in inches."""
 MARGIN: Final = 1.4
@@ -134,7 +134,7 @@ TITLE_IN: Final = 0.3
 HEAD_IN: Final = 0.9
 """Room at the top of the sheet for its title and key, in inches."""
 MIN_WIDTH_IN: Final = 9.0
-"""So wide are a sheet's title and key."""
+"""Width of a sheet's title and key."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,7 +162,7 @@ class Sheet:
     """The sheet.
 
     Attributes:
-        n_cols: Panels beside one another.
+        n_cols: Panels next to one another.
         n_rows: Panels below one another.
         site_in: Distance between neighbours, in inches.
         width_in: Width, in inches.
@@ -211,12 +211,12 @@ def place_sites(sites: NDArray[np.generic], grid: SiteGrid) -> NDArray[np.float6
 
 
 def extent_of(plan: Plan, grid: SiteGrid) -> Extent:
-    """What has to be seen of a plan: all sites, and where atoms are ejected to."""
+    """The extent of a plan: all sites, and the places to which atoms are ejected."""
     return extent_of_sites(plan.moves[:, 2:], grid)
 
 
 def extent_of_sites(others: NDArray[np.integer], grid: SiteGrid) -> Extent:
-    """What has to be seen: all sites of the grid, and others, int (n, 2), that may lie beside it."""
+    """The extent of all sites of the grid, and of others, int (n, 2), that may be outside of it."""
     rows, cols = np.mgrid[: grid.n_rows : max(1, grid.n_rows - 1), : grid.n_cols : max(1, grid.n_cols - 1)]
     corners = np.stack([rows.ravel(), cols.ravel()], axis=1)
     places = place_sites(np.concatenate([corners, others]), grid)
@@ -225,14 +225,14 @@ def extent_of_sites(others: NDArray[np.integer], grid: SiteGrid) -> Extent:
 
 
 def lay_out(extent: Extent, n_panels: int, panel_in: float = PANEL_IN) -> Sheet:
-    """Choose the size of the panels, and how many stand side by side.
+    """Choose the size of the panels, and their number in a row.
 
-    The sheet shall be somewhat wider than high, and few of its places empty.
+    The sheet is to be somewhat wider than high, with few empty places.
 
     Args:
         extent: What each panel shows.
         n_panels: How many there are.
-        panel_in: Width of a panel, in inches, as long as its sites are neither too small nor too large in it.
+        panel_in: Width of a panel, in inches, unless its sites become too small or too large.
 
     Example:
         >>> sheet = lay_out(Extent(-1, 11, -1, 11), 6)

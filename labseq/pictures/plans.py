@@ -41,7 +41,7 @@ N_POINTS: Final = 16
 
 
 def lanes(moves: NDArray[np.integer]) -> NDArray[np.intp]:
-    """Part the ways that share a stretch of a line, so that they can be drawn beside one another.
+    """Separate moves that share a part of a line, so that they can be drawn next to one another.
 
     Short ways get the low lanes. Opposite ways along a line need not be parted:
     they are drawn on opposite sides of it.
@@ -230,7 +230,7 @@ class MarkerStyle:
     """A marker and how it is painted.
 
     Attributes:
-        label: What it stands for, in the key.
+        label: Its meaning, in the key.
         marker: matplotlib's name of the shape.
         size: Diameter, in units of the spacing.
         face: Colour inside; "none" for a ring.
@@ -244,7 +244,7 @@ class MarkerStyle:
     edge: str
 
     def keywords(self, site_in: float) -> dict[str, Any]:
-        """How matplotlib is told, for neighbours so far apart."""
+        """Keywords for matplotlib, for a distance of neighbours in inches."""
         points = site_in * POINTS_PER_INCH
         return {
             "linestyle": "none",
@@ -275,7 +275,7 @@ def paint_sites(
         sheet: Its size.
         grid: The grid of sites.
         occupancy: bool (n_rows, n_cols).
-        target: What the array shall look like.
+        target: The target pattern.
         final: Whether target sites that are empty now stay so.
 
     Returns:
@@ -351,7 +351,7 @@ def frame(axes: Axes, sheet: Sheet, title: str, edge: NDArray[np.float64]) -> No
     Args:
         axes: The panel.
         sheet: Its size.
-        title: What stands above it.
+        title: Its title.
         edge: float64 (n, 2), corners of the array.
     """
     extent = sheet.extent
@@ -474,10 +474,10 @@ class PlanDrawing:
 
     Attributes:
         title: Stands at the top.
-        source: Where the occupancy comes from; stands below it.
+        source: Where the occupancy comes from; the line below the title.
         grid: The grid of sites.
         occupancy: bool (n_rows, n_cols), before.
-        target: What the array shall look like.
+        target: The target pattern.
         plan: The plan, checked.
         report: What the check says of it.
     """
@@ -518,8 +518,8 @@ def save_plan(path: Path, drawing: PlanDrawing) -> None:
     Raises:
         ConfigError: The file cannot be written.
     """
-    told = {"Title": drawing.title, "Software": None}
-    save_figure(path, lambda: _draw(drawing), dpi=DPI, metadata=told)
+    metadata = {"Title": drawing.title, "Software": None}
+    save_figure(path, lambda: _draw(drawing), dpi=DPI, metadata=metadata)
 
 
 def _draw(drawing: PlanDrawing) -> Figure:
@@ -537,7 +537,7 @@ def _draw(drawing: PlanDrawing) -> Figure:
 
 
 def _fill(figure: Figure, sheet: Sheet, drawing: PlanDrawing, panels: list[Panel]) -> list[MarkerStyle]:
-    """Paint all panels; return what the key has to explain."""
+    """Paint all panels; return the marks that the key explains."""
     plan, grid, target = drawing.plan, drawing.grid, drawing.target
     n_rows, n_cols = grid.shape
     edge = place_sites(np.array([[0, 0], [0, n_cols], [n_rows, n_cols], [n_rows, 0]]) - 0.5, grid)
@@ -602,7 +602,7 @@ def _scale_bar(axes: Axes, sheet: Sheet, grid: SiteGrid) -> None:
 
 
 def _write_head(figure: Figure, sheet: Sheet, drawing: PlanDrawing, looks: list[MarkerStyle]) -> None:
-    """The title, and what the markers stand for."""
+    """Write the title, and the meaning of the markers."""
     from matplotlib.lines import Line2D
 
     across, down = sheet.width_in, sheet.height_in
@@ -622,7 +622,7 @@ def _write_head(figure: Figure, sheet: Sheet, drawing: PlanDrawing, looks: list[
 
 
 def _colour_bar(figure: Figure, sheet: Sheet, title: str, ends: tuple[str, str]) -> None:
-    """What the colours of arrows stand for."""
+    """Explain the colours of arrows."""
     across, down = sheet.width_in, sheet.height_in
     axes = figure.add_axes((1 - 1.9 / across, 1 - 0.7 / down, 1.0 / across, 0.1 / down))
     axes.imshow([[colour_of(i, 100) for i in range(100)]], aspect="auto")
@@ -646,7 +646,7 @@ def draw_target(axes: Axes, target: TargetPattern, grid: SiteGrid, site_in: floa
 
     Args:
         axes: Where; gets limits that show the whole grid, and no axes.
-        target: What the array shall look like.
+        target: The target pattern.
         grid: The grid that it lies on.
         site_in: Distance between neighbours in the finished picture, in inches.
 
@@ -674,18 +674,18 @@ def save_target(path: Path, target: TargetPattern, grid: SiteGrid) -> None:
 
     Args:
         path: The file.
-        target: What the array shall look like.
+        target: The target pattern.
         grid: The grid that it lies on.
 
     Raises:
         ConfigError: The file cannot be written.
     """
-    told = {"Title": target.name, "Description": target_text(target), "Software": None}
+    metadata = {"Title": target.name, "Description": target_text(target), "Software": None}
     save_figure(
         path,
         lambda: _targets_draw(target, grid),
         dpi=TARGETS_DPI,
-        metadata=told,
+        metadata=metadata,
         pil_kwargs={"optimize": True},
     )
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 WINDOW_S: Final = 6e-6
-"""Length of a Hann window: tones 0.5 MHz apart are told from one another, and a chirp of 1.6 MHz
+"""Length of a Hann window: it separates tones 0.5 MHz apart, and a chirp of 1.6 MHz
 per site, of about 35 us, moves by less than that."""
 
 MAX_WINDOWS: Final = 8
@@ -85,7 +85,7 @@ def spectrogram(
         channel: 0 for the row tones, 1 for the column tones.
         stretches: What is shown.
         n_columns: How many columns.
-        band_hz: Lowest and highest frequency that are asked for.
+        band_hz: Lowest and highest frequency of the result.
 
     Returns:
         float32 (n_bins, n_columns), in dB relative to a tone at full scale, low frequencies first,
@@ -168,14 +168,14 @@ KINDS: Final = {
 }
 INTENDED, PEAK, CUT = "#c8102e", "#4e79a7", "0.35"
 SHADES: Final = ("white", "0.75", "0.4")
-"""From the weakest level to the strongest; the intended tones must stand out."""
+"""From the weakest level to the strongest; the intended tones are drawn on top."""
 N_SHADES: Final = 25
 """One per 2 dB: steps that the eye hardly sees halve the file."""
 DASHES: Final = (0, (4, 3))
 LABELS: Final = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
 """Every how many batches one is numbered."""
 LABEL_PART: Final = (0.008, 0.0067)
-"""The space beside a number, and the width of a digit, as parts of the picture's width."""
+"""The space next to a number, and the width of a digit, as parts of the picture's width."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -184,8 +184,8 @@ class WaveformDrawing:
 
     Attributes:
         title: Stands at the top.
-        source: Where the plan comes from; stands below it.
-        notes: What stands above the row axis and above the column axis.
+        source: Where the plan comes from; the line below the title.
+        notes: Titles of the row axis and of the column axis.
         program: The tones that are intended.
         renderer: Makes the samples.
         segments: The segments of the program that are drawn; at least one has tones.
@@ -226,8 +226,8 @@ def save_waveform(path: Path, drawing: WaveformDrawing) -> None:
     Raises:
         ConfigError: The file cannot be written.
     """
-    told = {"Title": drawing.title, "Software": None}
-    save_figure(path, lambda: _draw(drawing), dpi=DPI, metadata=told)
+    metadata = {"Title": drawing.title, "Software": None}
+    save_figure(path, lambda: _draw(drawing), dpi=DPI, metadata=metadata)
 
 
 def _draw(drawing: WaveformDrawing) -> Figure:
@@ -260,7 +260,7 @@ def _draw(drawing: WaveformDrawing) -> Figure:
 
 
 def _write_head(figure: Figure, drawing: WaveformDrawing) -> None:
-    """The title, and what lines and colours stand for."""
+    """Write the title, and the meaning of lines and colours."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 

@@ -62,7 +62,7 @@ def test_what_makes_no_sense_is_refused(kind: CalibrationKind, values: Any, mess
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"kind": "site"}, "no kind"),
+        ({"kind": "site"}, "not a kind"),
         ({"values": {}}, "'offset_m' is missing"),
         ({"grid": {}}, "the grid has no 'rows'"),
         ({"grid": {**grid_facts(GRID), "rows": 0}}, "no sites"),

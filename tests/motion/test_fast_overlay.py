@@ -45,7 +45,7 @@ def test_a_large_shift_is_never_found_small(atoms: Any, far: float, angle: float
 
 
 def test_another_temperature_is_no_shift(atoms: Any) -> None:
-    """A bump that is wider on all sides leaves the centre where it is."""
+    """A peak that is wider on all sides leaves the centre where it is."""
     kinds, n, _ = group_counts(OFFSETS, ALL, ALL)
     k = np.rint(n * atoms.survival_at(kinds * 0.9, np.zeros(2), GRID)).astype(np.int64)
     assert np.abs(fast_offset(kinds, n, k, SHAPE, GRID).offset_m).max() < 5e-9

@@ -99,11 +99,11 @@ def test_counts_of_each_site_are_added_up(atoms: Any) -> None:
 
 
 @pytest.mark.parametrize("share", [0.0, 0.02, 0.5, 0.97, 1.0])
-def test_without_a_bump_there_is_no_overlay(atoms: Any, share: float) -> None:
+def test_without_a_peak_there_is_no_overlay(atoms: Any, share: float) -> None:
     offset = atoms.scan()
     n = np.full(len(offset), 200)
     k = np.random.default_rng(1).binomial(n, share)
-    with pytest.raises(DeviceError, match=r"no bump: at no offset in range .* \(.*% in all\); scan further"):
+    with pytest.raises(DeviceError, match=r"no survival peak: at no offset .* \(.*% in all\); scan further"):
         fit_overlay(offset, n, k, GRID)
 
 
@@ -114,10 +114,10 @@ def test_without_a_bump_there_is_no_overlay(atoms: Any, share: float) -> None:
         ((-0.6e-6, 0.0), r"only one edge .* in range along a row: .* at 1.4 um; scan on in the direction \+"),
         ((0.0, 0.6e-6), r"only one edge .* from row to row: .* at -1.4 um; scan on in the direction -"),
         ((1.0e-6, 0.0), r"only one edge .* in range along a row: .* scan on in the direction -"),
-        ((0.5e-6, 1.1e-6), r"passes beside the bump; scan about -.* along a row and -1.* from row to row"),
+        ((0.5e-6, 1.1e-6), r"misses the survival peak; scan about -.* along a row and -1.* from row to row"),
     ],
 )
-def test_a_bump_out_of_range_says_where_to_scan(atoms: Any, hidden: Any, message: str) -> None:
+def test_a_peak_out_of_range_says_where_to_scan(atoms: Any, hidden: Any, message: str) -> None:
     offset = atoms.scan()
     grid = GRIDS["square"]
     with pytest.raises(DeviceError, match=message):

@@ -17,7 +17,7 @@ from labseq.motion.overlay import (
 SHAPE = SurvivalShape(0.95e-6, 0.12e-6, floor=0.02, ceiling=0.97)
 
 
-def test_a_bump_has_a_flat_top_and_an_edge() -> None:
+def test_a_peak_has_a_flat_top_and_an_edge() -> None:
     assert SHAPE.survival([0.0, 0.95e-6, 1.4e-6]) == pytest.approx([0.97, 0.495, 0.02], abs=1e-3)
 
 
