@@ -405,15 +405,15 @@ class Panel:
 
 
 def make_panels(summaries: Sequence[BatchSummary], max_panels: int = MAX_PANELS) -> list[Panel]:
-    """Share out batches among panels, in order.
+    """Distribute batches among panels, in order.
 
-    A batch has a panel of its own if there are enough. If not, successive batches
-    along the same lines share one; then as many successive batches along the same
-    axis as it takes, evenly; and only if the axis changes too often, any.
+    Each batch has its own panel if there are enough. If not, successive batches along
+    the same lines share one, then successive batches along the same axis, evenly, and
+    if the axis changes too often, any successive batches.
 
     Args:
-        stories: The batches.
-        max_panels: Most panels, at least 1.
+        summaries: The batches.
+        max_panels: Maximum number of panels, at least 1.
 
     Example:
         >>> rows = [BatchSummary("row", (i // 2,), 3, 0, 5) for i in range(8)]
