@@ -29,8 +29,8 @@ from labseq.pictures.figures import can_draw, encode_figure
 from labseq.recording import Run, open_run
 from labseq.roles import RunObserver
 from labseq.session.calibrations import store_of, why_left_out
-from labseq.session.planning import recorded_machine
 from labseq.session.profile import DryRun, ResolvedProfile, resolve_profile
+from labseq.session.recorded import recorded_machine
 from labseq.session.session import Session
 
 PICTURE_DPI: Final = 110

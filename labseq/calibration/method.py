@@ -19,8 +19,8 @@ from labseq.recording.shot_file import read_frames
 from labseq.roles import Detector
 from labseq.sequencer import VirtualClock
 from labseq.session.construct import construct
-from labseq.session.planning import recorded_machine
 from labseq.session.profile import ResolvedProfile
+from labseq.session.recorded import recorded_machine
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -20,7 +20,8 @@ from typing import Final
 from labseq.errors import LabseqError
 from labseq.recording import Shot, open_run
 from labseq.recording.reader import Follower
-from labseq.session.analyses import FAILED, USE, analyse, analyses_of, prepare, results_of
+from labseq.session.analyses import analyse, analyses_of, prepare, results_of
+from labseq.session.observers import FAILED, USE
 
 LOOK_S: Final = 0.1
 """How often it looks for new shots."""

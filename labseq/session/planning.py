@@ -12,18 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.config import (
-    MOTION_KEYS,
     Document,
-    MotionSettings,
     Override,
     load_profile,
     load_sequence,
     plugin_paths,
     split_overrides,
-    validate_values,
 )
 from labseq.config.plan_file import PlanFile, parse_plan
-from labseq.config.profile import GridSettings
 from labseq.config.sequence import DEFAULT_PLANNER
 from labseq.errors import ConfigError, LabseqError, LimitError, PlanError, Problem
 from labseq.messages import clean, visible
@@ -36,6 +32,7 @@ from labseq.session.construct import construct, construct_target
 from labseq.session.lab import parallelism_of
 from labseq.session.occupancies import Source, read_source
 from labseq.session.profile import ChosenPlugin, load_plugins, resolve
+from labseq.session.recorded import Machine, recorded_machine
 from labseq.settings import Choice, PatternChoice, Settings
 from labseq.text_files import YAML_SUFFIXES
 
@@ -74,14 +71,6 @@ class PlanRequest:
     seed: int | None = None
     origin: str | None = None
     profile: str | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Machine:
-    """What a plan has to fit: the sites, and how atoms move between them."""
-
-    grid: SiteGrid
-    motion: MotionSpec
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,24 +135,6 @@ def _default_machine(source: Source) -> Machine:
         n_rows, n_cols = source.occupancy.shape
         return Machine(SiteGrid(n_rows, n_cols), MotionSpec())
     return recorded_machine(source.machine, "the profile in the shot's file")
-
-
-def recorded_machine(machine: Mapping[str, Any], called: str) -> Machine:
-    """What a run was taken with, the tones of calibrations included.
-
-    Args:
-        machine: The profile, as the run has it.
-        called: What to call it in messages.
-
-    Raises:
-        ConfigError: It makes no sense.
-    """
-    tweezers = machine.get("mobile_tweezers", {})
-    motion = {key: tweezers[key] for key in MOTION_KEYS if key in tweezers}
-    return Machine(
-        validate_values(GridSettings, machine.get("grid", {}), called).model(),
-        validate_values(MotionSettings, motion, called).spec(),
-    )
 
 
 def _target_choice(request: PlanRequest, source: Source) -> tuple[Document, PatternChoice | None, list[Path]]:

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
 from labseq.calibration.store import read_entry
-from labseq.config import StoredText
+from labseq.config import MOTION_KEYS, MotionSettings, StoredText, validate_values
+from labseq.config.profile import GridSettings
 from labseq.errors import RecordingError
 from labseq.files import read_file
-from labseq.model import CalibrationEntry, RandomStream
+from labseq.model import CalibrationEntry, MotionSpec, RandomStream, SiteGrid
 from labseq.plugins import PluginHost
 from labseq.recording import Run
 from labseq.recording.folders import RUN_FILE
 from labseq.recording.run_file import sha256_of_text
 from labseq.roles import Context
-from labseq.session.planning import Machine, recorded_machine
 from labseq.session.profile import load_plugins
 from labseq.text_files import beside
 
@@ -82,6 +83,32 @@ def calibrations_of(run: Run) -> dict[str, CalibrationEntry]:
             text = f"is calibration {entries[kind].id}, but the run was taken with {own}"
             raise RecordingError(path, f"{text}; take that from a backup")
     return entries
+
+
+@dataclass(frozen=True, slots=True)
+class Machine:
+    """The sites, and how atoms move between them."""
+
+    grid: SiteGrid
+    motion: MotionSpec
+
+
+def recorded_machine(machine: Mapping[str, Any], called: str) -> Machine:
+    """The machine that a run was taken with, the tones of calibrations included.
+
+    Args:
+        machine: The profile, as the run has it.
+        called: Its name in messages.
+
+    Raises:
+        ConfigError: It makes no sense.
+    """
+    tweezers = machine.get("mobile_tweezers", {})
+    motion = {key: tweezers[key] for key in MOTION_KEYS if key in tweezers}
+    return Machine(
+        validate_values(GridSettings, machine.get("grid", {}), called).model(),
+        validate_values(MotionSettings, motion, called).spec(),
+    )
 
 
 def machine_of(run: Run) -> Machine:

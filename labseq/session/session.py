@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
-from typing import Any, ParamSpec, Self
+from typing import TYPE_CHECKING, Any, ParamSpec, Self
 
 from labseq.errors import ConfigError, DeviceError, LabseqError, Loc, Problem
 from labseq.guard import Guard, StopFlag, stop_on_signals
@@ -27,10 +27,12 @@ from labseq.session.options import Options, path_of
 from labseq.session.policies import Checks, ShotHooks
 from labseq.session.profile import DryRun
 from labseq.session.provenance import copies, ending, run_record
-from labseq.session.resume import ResumableRun, reopened
 from labseq.session.safe import lock_devices, make_safe_after_crash
 from labseq.session.scan import Point
 from labseq.session.scan_run import scan_run_of
+
+if TYPE_CHECKING:
+    from labseq.session.resume import ResumableRun
 
 
 def check_commands(assembly: Assembly, points: Iterable[Point], build: Callable[[Point], Lab]) -> None:
@@ -197,6 +199,8 @@ class Session:
             ConfigError: The run is complete or in progress, or something differs from then.
             RecordingError: It is no run, is damaged, of a newer labseq, or cannot be written to.
         """
+        from labseq.session.resume import reopened
+
         path = path_of(run, "run")
         assembly, options, earlier = reopened(path, accept_changes=accept_changes, realtime=realtime)
         return cls(assembly, options, observer, earlier)
