@@ -62,7 +62,7 @@ def nearest_to_centre(fill: NDArray[np.bool_], n_sites: int, grid: SiteGrid) -> 
 
 
 class DrawingError(ValueError):
-    """A drawing is wrong.
+    """An error in a drawing.
 
     Attributes:
         line: The line of the text that is wrong, from 1; 0 if it is the whole.
@@ -109,7 +109,7 @@ def read_bitmap(text: str, fill: str = "#") -> NDArray[np.bool_]:
 
 
 def check_size(shape: tuple[int, int], grid_shape: tuple[int, int]) -> None:
-    """Refuse a target that is larger than the grid, before anything of its size is made.
+    """Refuse a target that is larger than the grid, before arrays of its size are made.
 
     Args:
         shape: (rows, cols) of the target's block.
@@ -130,7 +130,7 @@ def check_size(shape: tuple[int, int], grid_shape: tuple[int, int]) -> None:
 
 
 def block(rows: int, cols: int, grid_shape: tuple[int, int]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Row and column of every site of a block: what the rule of a pattern is written in.
+    """Row and column of every site of a block, for the rule of a pattern.
 
     Args:
         rows: Rows of the block.
@@ -156,7 +156,7 @@ def block(rows: int, cols: int, grid_shape: tuple[int, int]) -> tuple[NDArray[np
 def place(
     mask: NDArray[np.bool_], grid_shape: tuple[int, int], origin: tuple[int, int] | None = None
 ) -> NDArray[np.bool_]:
-    """Put a small mask onto the grid.
+    """Place a small mask on the grid.
 
     Args:
         mask: bool (rows, cols).
@@ -208,7 +208,7 @@ def pattern(
     clear: Clear = "bounding_box",
     name: str = "target",
 ) -> TargetPattern:
-    """Make a target of a mask; what a plugin's own pattern ends with.
+    """Make a target from a mask; the last step of a plugin's pattern.
 
     Args:
         mask: bool (rows, cols), True where an atom must be.

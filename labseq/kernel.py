@@ -4,12 +4,12 @@ numba compiles when a decorated function is defined, because every kernel has
 explicit signatures: no new dtype or layout can cost a compile in the middle of
 a shot. Later processes load the machine code from the user's cache.
 
-numba's own cache notices an edit of the file that a kernel stands in, but not of
-a kernel or constant that it takes from another file: it would go on using the
-old machine code. So each kernel is kept in a folder named after everything that
-it is compiled from: its file, the kernels that its module takes from other files
-(and theirs), the constants that it names, numba's settings, and the versions of
-Python, numba and numpy. An edit anywhere therefore leads to a new folder.
+numba's own cache notices an edit of a kernel's file, but not of a kernel or constant
+imported from another file: it would continue to use the old machine code. So each
+kernel is kept in a folder named after everything that it is compiled from: its file,
+the kernels that its module imports from other files (and theirs), the constants that
+it names, numba's settings, and the versions of Python, numba and numpy. An edit
+anywhere therefore leads to a new folder.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from labseq.files import cache_root
 F = TypeVar("F", bound=Callable[..., Any])
 
 UNUSED_DAYS: Final = 30
-"""Compiled kernels that no process has loaded for so long are deleted."""
+"""Compiled kernels that no process has loaded for this many days are deleted."""
 
 _FOLDER_NAME = re.compile(r"[0-9a-f]{24}")
 _LOCK = threading.RLock()
@@ -78,10 +78,10 @@ def kernel(signature: str | Sequence[str], *, fused: bool = False) -> Callable[[
 
 
 def interpret() -> None:
-    """Leave all kernels from now on plain Python: for a process that calls them only a few times.
+    """Use plain Python for all kernels from now on, for a process that calls them only a few times.
 
-    To load numba takes longer than that. Does nothing where numba is loaded
-    already, or where ``NUMBA_DISABLE_JIT`` is set, to 0 as well as to 1.
+    Loading numba would take longer. Does nothing if numba is already loaded, or if
+    ``NUMBA_DISABLE_JIT`` is set, to 0 as well as to 1.
     """
     if "numba" not in sys.modules and "NUMBA_DISABLE_JIT" not in os.environ:
         _INTERPRETED.set()
@@ -136,7 +136,7 @@ def _compile(function: FunctionType, signatures: list[str], fused: bool) -> Any:
         try:
             compiled = _jit(function, signatures, folder, fused)
         except (OSError, EOFError, pickle.UnpicklingError):
-            # a full disk, or files that a crash cut short: do without the cache
+            # a full disk, or files truncated by a crash: compile without the cache
             if folder is not None:
                 shutil.rmtree(folder, ignore_errors=True)
             compiled = _jit(function, signatures, None, fused)
@@ -148,7 +148,9 @@ def _jit(function: FunctionType, signatures: list[str], folder: Path | None, fus
     """Compile, keeping the machine code in a folder (None: nowhere)."""
     numba = _numba()
     before = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = "" if folder is None else str(folder)  # others' kernels stay where they are
+    numba.config.CACHE_DIR = (
+        "" if folder is None else str(folder)
+    )  # kernels of other packages stay where they are
     try:
         return numba.njit(
             signatures,
@@ -163,7 +165,7 @@ def _jit(function: FunctionType, signatures: list[str], folder: Path | None, fus
 
 
 def _digest(function: FunctionType) -> str:
-    """Name of everything that a kernel is compiled from."""
+    """Digest of everything that a kernel is compiled from."""
     parts: list[object] = [sys.version, _numba().__version__, np.__version__]
     parts += sorted(item for item in os.environ.items() if item[0].startswith("NUMBA_"))
     parts.append(_source(function))
@@ -191,7 +193,7 @@ def _source(function: FunctionType) -> bytes:
 
 
 def _folder(digest: str) -> Path | None:
-    """Make and mark as used the folder of a digest; None where nothing can be written."""
+    """Create the folder of a digest and mark it as used; None if nothing can be written."""
     try:
         root = cache_root() / "kernels"
         folder = root / digest

@@ -36,7 +36,7 @@ class SensorMode:
 
 @dataclass(frozen=True, slots=True)
 class CameraFacts:
-    """What a camera can say of itself before it is opened, from its settings.
+    """Facts about a camera that are known from its settings, before it is opened.
 
     Attributes:
         readout_s: From the end of an exposure until the frame can be read, in seconds.

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 _ROUNDING: Final = 1e-12
-"""Relative error below which equal numbers were only added up."""
+"""Relative error below which a scatter is only rounding."""
 
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """A value with its standard error; NaN for what could not be determined."""
+    """A value with its standard error; NaN if one could not be determined."""
 
     value: float
     error: float
@@ -54,7 +54,7 @@ class Estimate:
 
 
 def mean(values: ArrayLike) -> Estimate:
-    """The mean and its standard error, that of one value unknown.
+    """The mean and its standard error, which is NaN for a single value.
 
     Example:
         >>> mean([1.0, 3.0])

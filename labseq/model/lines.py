@@ -1,4 +1,4 @@
-"""Digital lines: what switches light and sends triggers."""
+"""Digital lines, which switch light and send triggers."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from labseq.model.arrays import read_only
 
 IDLE: Final = "idle"
-"""The kind of step that is none: between steps, and before and after a shot."""
+"""The kind of the time between steps, and before and after a shot."""
 
 
 @dataclass(frozen=True, slots=True)
 class LineSpec:
-    """One line, and when it is on.
+    """A line, and when it is on.
 
     Attributes:
         name: Its name, "cooling".
@@ -49,7 +49,7 @@ def lines_of(specs: Iterable[LineSpec], kind: str) -> list[LineSpec]:
 
 
 def margin_s(specs: Iterable[LineSpec], kind: str) -> float:
-    """How much longer a step takes for the leads and lags of its lines, in seconds."""
+    """Time by which the leads and lags of its lines prolong a step, in seconds."""
     taking_part = lines_of(specs, kind)
     lead_s = max((spec.lead_s for spec in taking_part), default=0.0)
     return lead_s + max((spec.lag_s for spec in taking_part if not spec.pulse_s), default=0.0)
@@ -57,7 +57,7 @@ def margin_s(specs: Iterable[LineSpec], kind: str) -> float:
 
 @dataclass(frozen=True, slots=True)
 class LinesFacts:
-    """What a timing box can say of itself before it is opened.
+    """Facts about a timing box that are known before it is opened.
 
     Attributes:
         channels: Numbers of its outputs.
@@ -76,7 +76,7 @@ class LinesFacts:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LineProgram:
-    """What all lines do around one step.
+    """The states of all lines during one step.
 
     Attributes:
         kind: Kind of the step, "image".
@@ -103,7 +103,7 @@ class LineProgram:
         object.__setattr__(self, "on", on)
 
     def spans(self, line: str) -> list[tuple[float, float]]:
-        """When a line is on, as (start, end) in seconds from the firing on.
+        """Intervals in which a line is on, as (start, end) in seconds from the start of the program.
 
         The last state is counted until the end of the program.
         """
@@ -118,5 +118,5 @@ class LineProgram:
         return found
 
     def rising(self, line: str) -> list[float]:
-        """When a line goes on, in seconds from the firing on; one that is on from the start counts as 0."""
+        """Times at which a line switches on, in seconds from the start of the program; 0 if it starts on."""
         return [start for start, _ in self.spans(line)]

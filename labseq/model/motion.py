@@ -1,4 +1,4 @@
-"""Limits and settings of the moves and of the tones that make them."""
+"""Limits and settings of moves and of their tones."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ SpeedProfile = Literal["constant", "minimum_jerk", "constant_jerk"]
 PhaseChoice = Literal["random", "low_crest"]
 
 LOAD_OHM = 50.0
-"""What the output drives; full scale is given across it."""
+"""Load of an output in ohms; full scale is the voltage across it."""
 
 
 @dataclass(frozen=True, slots=True)
 class RfSpec:
-    """What drives the two AODs of the mobile tweezers: bands, amplitudes, phases, limits.
+    """The RF chain of the two AODs of the mobile tweezers: bands, amplitudes, phases, limits.
 
     Random phases and amplitudes preassigned per tone are the paper's ("RF
     intermodulation"). All numbers are ours, because the paper is silent. Amplifiers of this kind
@@ -131,7 +131,7 @@ class MotionSpec:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RfSamples:
-    """Samples that an output played without a break.
+    """Samples that an output played without interruption.
 
     Attributes:
         start_s: When the first sample was at the output, on the session's clock.
@@ -147,13 +147,13 @@ class RfSamples:
 
     @property
     def end_s(self) -> float:
-        """When the last sample ended."""
+        """End of the last sample."""
         return self.start_s + len(self.samples) / self.sample_rate_hz
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RfTones:
-    """Tones that an output made by itself, without a break.
+    """Tones that an output generated itself, without interruption.
 
     At the time t after the start, tone i is
     ``(amplitude_v + amplitude_slope t) cos(phase_rad + 2 pi (frequency_hz t + frequency_slope t^2 / 2))``.
@@ -184,4 +184,4 @@ class RfTones:
 
 
 RfSpan: TypeAlias = RfSamples | RfTones
-"""A stretch of an output; between two of them it is silent."""
+"""A part of an output; between two of them it is silent."""

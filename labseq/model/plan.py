@@ -14,7 +14,7 @@ from labseq.model.arrays import read_only
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Batch:
-    """Atom moves that are made at the same time.
+    """Atom moves that are carried out at the same time.
 
     Attributes:
         from_sites: int16 (n, 2), (row, col) of each atom before.
@@ -113,7 +113,7 @@ class Plan:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlanReport:
-    """What a checked plan will do.
+    """The effect of a checked plan.
 
     Attributes:
         predicted: bool (n_rows, n_cols), occupancy after the plan if no atom is lost.

@@ -1,4 +1,4 @@
-"""What a scanner chooses from, and the random numbers of one consumer."""
+"""The space of an adaptive scan and its points, and streams of random numbers."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from typing import Any, Final
 
 import numpy as np
 
-_DUST: Final = 1e-9  # of a range or step
-_KEY: Final = 0x0ADA  # apart from every shot's own random numbers
+_ROUNDING: Final = 1e-9  # of a range or step
+_KEY: Final = 0x0ADA  # separates these from the random numbers of shots
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +51,7 @@ class ScanRange:
         return round(value) if self.is_whole else value
 
     def allowed(self, value: object) -> float | None:
-        """A number without the dust of rounding, if it is one of the range's values; else None.
+        """A number without rounding error, if it is one of the range's values; otherwise None.
 
         Example:
             >>> dop = ScanRange("planner.degree_of_parallelism", 2, 15, is_whole=True)
@@ -67,7 +67,7 @@ class ScanRange:
         if not self.low - self.high <= number - self.low <= 2 * (self.high - self.low):  # nan is not, either
             return None
         near = self.at(self.fraction(number))
-        dust = _DUST * (self.high - self.low) / (self.n_steps or 1)
+        dust = _ROUNDING * (self.high - self.low) / (self.n_steps or 1)
         return near if abs(near - number) <= dust else None
 
     def fraction(self, value: float) -> float:
@@ -77,7 +77,7 @@ class ScanRange:
 
 @dataclass(frozen=True, slots=True)
 class ScanSpace:
-    """What a scanner may choose from.
+    """The space of points of a scanner.
 
     Attributes:
         ranges: A range for each address.
@@ -102,7 +102,7 @@ class ScanSpace:
 
 @dataclass(frozen=True, slots=True)
 class VisitedPoint:
-    """A point of an adaptive scan, and what came of it.
+    """A point of an adaptive scan and its result.
 
     Attributes:
         values: Address -> value, SI.
@@ -136,7 +136,7 @@ class RandomStream:
         self._shot = self.machine()
 
     def machine(self) -> np.random.Generator:
-        """A fresh generator for what does not change from shot to shot."""
+        """A new generator for everything that stays the same from shot to shot."""
         return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=self._key))
 
     def begin_shot(self, shot_index: int, attempt: int) -> None:

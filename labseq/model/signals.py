@@ -1,4 +1,4 @@
-"""What the devices play: tones, ramps of depth, samples."""
+"""Signals that devices play: tones, ramps of depth, samples."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from labseq.model.arrays import read_only
 
 
 class SegmentKind(IntEnum):
-    """What a segment of a tone program is there for."""
+    """Purpose of a segment of a tone program."""
 
     IDLE = 0
     PICK_UP = 1
@@ -22,7 +22,7 @@ class SegmentKind(IntEnum):
 
 
 class FrequencyCourse(IntEnum):
-    """How the frequencies go from start to end within a segment, the same way for all its tones.
+    """Course of the frequencies from start to end of a segment, the same for all its tones.
 
     In a segment of duration T a tone is at
     ``f(t) = start_hz + (end_hz - start_hz) s(t / T)``, and its phase is
@@ -50,11 +50,11 @@ class FrequencyCourse(IntEnum):
 
     @property
     def fastest(self) -> float:
-        """Greatest speed over the mean speed: the greatest slope of s(u)."""
+        """Greatest speed relative to the mean speed: the greatest slope of s(u)."""
         return (1.0, 15 / 8, 2.0)[self]
 
     def fraction(self, u: float) -> float:
-        """The course s(u): the fraction of its way that a tone has made.
+        """The course s(u): the fraction of its path that a tone has completed.
 
         Args:
             u: Fraction of the segment's duration that has passed, 0 to 1.
@@ -162,7 +162,7 @@ class TonesAt:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ToneProgram:
-    """What the mobile tweezers shall play in one cycle, independent of the hardware.
+    """The tones of the mobile tweezers in one cycle, independent of the hardware.
 
     A tweezer exists at every crossing of a row tone and a column tone.
 
@@ -205,11 +205,11 @@ class ToneProgram:
 
     @property
     def joint_s(self) -> NDArray[np.float64]:
-        """float64 (n_segments + 1,): when each segment starts, and when the last one ends."""
+        """float64 (n_segments + 1,): start of each segment, and end of the last one."""
         return np.concatenate([[0.0], np.cumsum(self.duration_s)])
 
     def tones_at(self, t_s: float) -> TonesAt:
-        """What shall be played at a time.
+        """The tones at a time.
 
         At a joint it is the start of the segment that begins there. Before the
         program and from its end on there are no tones.

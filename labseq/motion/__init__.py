@@ -1,4 +1,4 @@
-"""From a plan to what the mobile tweezers play.
+"""From a plan to the tones and samples of the mobile tweezers.
 
 Importing this package imports no numba: the kernels come with the first call, or
 with :func:`warm` and :func:`warm_rendering`.
@@ -71,7 +71,7 @@ def warm() -> None:
 
 
 def warm_rendering() -> None:
-    """The same for those of rendering, which only drivers need that play samples."""
+    """Compile or load the kernels of rendering, for drivers that play samples."""
     _load("render_direct_kernels", "render_comb_kernels")
 
 

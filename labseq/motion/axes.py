@@ -19,18 +19,18 @@ from labseq.model import MotionSpec, RfSpec, SiteGrid, read_only
 Floats = NDArray[np.float64]
 
 ON_THE_COMB_HZ = 1e-6
-"""Distance from the comb below which frequencies are left as they are: rounding."""
+"""Distance from the comb below which frequencies stay as they are, in Hz: rounding."""
 
 
 class Calibration(Protocol):
     """Position <-> frequency along one axis; both ways, and beyond the grid too."""
 
     def frequency_hz(self, position_m: ArrayLike) -> Floats:
-        """Frequencies of the tones that put tweezers at some positions."""
+        """Frequencies of the tones for tweezers at the given positions."""
         ...
 
     def position_m(self, frequency_hz: ArrayLike) -> Floats:
-        """Positions at which tones of some frequencies put their tweezers."""
+        """Positions of the tweezers of tones with the given frequencies."""
         ...
 
 
@@ -56,11 +56,11 @@ class AffineCalibration:
             raise ValueError("a calibration has a finite centre and a finite slope other than 0")
 
     def frequency_hz(self, position_m: ArrayLike) -> Floats:
-        """Frequencies of the tones that put tweezers at some positions."""
+        """Frequencies of the tones for tweezers at the given positions."""
         return self.centre_hz + self.slope_hz_per_m * np.asarray(position_m, np.float64)
 
     def position_m(self, frequency_hz: ArrayLike) -> Floats:
-        """Positions at which tones of some frequencies put their tweezers."""
+        """Positions of the tweezers of tones with the given frequencies."""
         return (np.asarray(frequency_hz, np.float64) - self.centre_hz) / self.slope_hz_per_m
 
 
@@ -88,11 +88,11 @@ class TableCalibration:
         object.__setattr__(self, "site_hz", site_hz)
 
     def frequency_hz(self, position_m: ArrayLike) -> Floats:
-        """Frequencies of the tones that put tweezers at some positions."""
+        """Frequencies of the tones for tweezers at the given positions."""
         return _along(np.asarray(position_m, np.float64), self.site_m, self.site_hz)
 
     def position_m(self, frequency_hz: ArrayLike) -> Floats:
-        """Positions at which tones of some frequencies put their tweezers."""
+        """Positions of the tweezers of tones with the given frequencies."""
         rising = 1 if self.site_hz[-1] > self.site_hz[0] else -1
         return _along(np.asarray(frequency_hz, np.float64), self.site_hz[::rising], self.site_m[::rising])
 
@@ -210,7 +210,7 @@ def axis_positions_m(n_sites: int, spacing_m: float) -> Floats:
 
 
 def _along(x: Floats, knots: Floats, values: Floats) -> Floats:
-    """Interpolate linearly; beyond the ends go on by the outermost step. ``knots`` rise."""
+    """Interpolate linearly; extrapolate beyond the ends with the outermost step. ``knots`` rise."""
     i = np.clip(np.searchsorted(knots, x) - 1, 0, len(knots) - 2)
     slope = np.diff(values) / np.diff(knots)
     return values[i] + slope[i] * (x - knots[i])
@@ -221,15 +221,15 @@ AxisIndex = Literal[0, 1]
 AXES: Final = ("row", "column")
 
 SINGLE_SITE_STEP_HZ: Final = 1.6e6
-"""Step from the only site of a 1 x 1 grid to an ejection slot."""
+"""Step from the only site of a 1 x 1 grid to an ejection slot, in Hz (the paper's step)."""
 
 ROUNDING: Final = 1e-9
-"""By how much of itself a value may exceed its limit: what rounding of sums can do, and no more."""
+"""Relative excess over a limit that rounding of sums can cause."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drive:
-    """What an axis plays at its sites, and how far it may go.
+    """Frequencies and amplitudes of an axis at its sites, and its limits.
 
     Attributes:
         site_hz: float64 (n_sites,), frequency of each site; on a comb if that is near enough.
@@ -253,7 +253,7 @@ class Drive:
 
 @lru_cache(maxsize=16)
 def drive(grid: SiteGrid, motion: MotionSpec, axis: AxisIndex) -> Drive:
-    """Work out what an axis is driven with.
+    """Compute the frequencies, amplitudes and limits of an axis.
 
     Args:
         grid: The grid of sites.

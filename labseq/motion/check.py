@@ -1,4 +1,4 @@
-"""Whether a plan can be played: every rule, whoever made the plan."""
+"""The check of a plan: every rule that it must keep before it is played."""
 
 from __future__ import annotations
 
@@ -157,7 +157,7 @@ def check_plan(
 
 
 def _check_types(plan: Any, target: Any, dop: Any, grid: Any, motion: Any, planner: str) -> None:
-    """Refuse what a script may mix up, before anything is asked of it."""
+    """Refuse arguments that a script may mix up, before they are used."""
     if not isinstance(dop, _INTEGERS):
         raise LimitError("the degree of parallelism", repr(dop), "a whole number, at least 1")
     if not isinstance(plan, Plan):
@@ -182,12 +182,12 @@ def _raise_plan_error(
     slots: int,
     planner: str,
 ) -> NoReturn:
-    """Put a fault into words."""
+    """Raise the error for a fault."""
     from labseq.motion import check_kernels
 
     batch, move, a, b = (int(number) for number in where)
     rule, wording = next(FAULTS[name] for name in FAULTS if getattr(check_kernels, name) == fault)
-    row = col = to_row = to_col = -1  # only worded where an atom move is at fault
+    row = col = to_row = to_col = -1  # only used in messages about an atom move
     if move >= 0:
         row, col, to_row, to_col = plan.moves[plan.batch_offsets[batch] + move].tolist()
     detail = wording.format(

@@ -18,7 +18,7 @@ Ints = NDArray[np.int64]
 Moves = NDArray[np.int16]
 Stamps = NDArray[np.int32]
 Fault = tuple[int, int, int, int]
-"""What is wrong, the atom move in the batch (-1: none in particular), and two numbers that belong to it."""
+"""Number of the fault, atom move in the batch (-1: no particular one), two numbers for the message."""
 
 RIGHT: Final = 0
 EMPTY_BATCH: Final = 1

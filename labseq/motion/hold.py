@@ -1,4 +1,4 @@
-"""Tweezers that pick atoms up, hold them beside their sites and drop them, to probe the overlay."""
+"""Programs that pick atoms up, hold them displaced from their sites and drop them, to probe the overlay."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def hold_program(
     hold_s: float,
     drop_off_s: float | None = None,
 ) -> ToneProgram:
-    """Pick atoms up, hold them and set them down, all beside their sites by an offset.
+    """Pick atoms up, hold them and drop them, all displaced from their sites by an offset.
 
     Nothing is moved: the tones of a batch stand still, at the frequencies of their sites and an
     offset more. Amplitudes, phases and, but for the drop-off, times are those of
@@ -82,7 +82,7 @@ def hold_time_s(
     hold_s: float,
     drop_off_s: float | None = None,
 ) -> float:
-    """Playing time of a :func:`hold_program` for every site of the grid: the most that it may be.
+    """Longest playing time of a :func:`hold_program`: that for every site of the grid.
 
     Raises:
         LimitError: The tone of a site leaves its band at its offset.
@@ -117,7 +117,7 @@ def cross_offsets_m(shape: tuple[int, int], offset_m: ArrayLike) -> Floats:
 
 
 def _check_band(grid: SiteGrid, motion: MotionSpec, sites: Mask, offset_m: ArrayLike) -> None:
-    """Refuse an offset at which the tone of a site leaves its band; no kernel is needed for that."""
+    """Refuse an offset at which the tone of a site leaves its band; needs no kernel."""
     if np.shape(sites) != grid.shape:
         raise ValueError(f"sites has shape {np.shape(sites)}; expected {grid.shape}")
     offsets = np.broadcast_to(np.asarray(offset_m, np.float64), (*grid.shape, 2))
@@ -156,7 +156,7 @@ def _batches(grid: SiteGrid, motion: MotionSpec, sites: Mask, offset_m: ArrayLik
 def _phase_times_s(
     motion: MotionSpec, hold_s: float, drop_off_s: float | None
 ) -> list[tuple[SegmentKind, float]]:
-    """The segments of a batch and how long each takes."""
+    """The segments of a batch and their durations."""
     drop_off_s = motion.drop_off_s if drop_off_s is None else drop_off_s
     for name, time_s in (("hold", hold_s), ("drop off", drop_off_s)):
         if not 0 <= time_s < float("inf"):
@@ -180,7 +180,7 @@ def _axis(
     times_s: Floats,
     batch: NDArray[np.int32],
 ) -> AxisTones:
-    """The tones of an axis over all batches, held against its limits."""
+    """The tones of an axis over all batches, checked against its limits."""
     starts_off = (axis == 1) & (kinds == SegmentKind.PICK_UP)
     ends_off = (axis == 1) & (kinds == SegmentKind.DROP_OFF)
     sounding = kinds != SegmentKind.IDLE
@@ -205,7 +205,7 @@ def _axis(
 
 
 def _first_phases(tones: Ints, driven: Drive, motion: MotionSpec) -> Floats:
-    """Phases of the tones of a batch when they come on, in cycles."""
+    """Phases of the tones of a batch when they switch on, in cycles."""
     from labseq.motion.tone_kernels import first_phases
 
     phase = np.empty(len(tones))

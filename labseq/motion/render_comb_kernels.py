@@ -43,15 +43,15 @@ from labseq.motion.render_kernels import (
     N_COEFFICIENTS,
     ON_TOOTH,
     PHASE,
-    ROOM,
     SAMPLES,
     START,
     START_AMPLITUDE,
     TONES,
     V_ROW,
     WITHIN,
+    WORKSPACE,
     Axis,
-    Room,
+    Workspace,
     add_tooth,
     apply_envelope,
     envelope,
@@ -99,7 +99,7 @@ def enter_block(state: Floats, lanes: Floats, x: float, length: float) -> None:
 
 @kernel(f"void({F32}, int64, int64, {F32}, {F32}, {F64})", fused=True)
 def add_parked(acc: Singles, n: int, block: int, re: Singles, im: Singles, state: Floats) -> None:
-    """Add a group that stands still to ``n`` samples, and bring its state to the block after.
+    """Add a group at rest to ``n`` samples, and advance its state to the next block.
 
     Args:
         acc: float32 (>= n,), from the start of a block; updated.
@@ -132,7 +132,7 @@ def add_block(
     v_re: Singles,
     v_im: Singles,
 ) -> None:
-    """Add a group that moves to ``n`` samples of one block; see :func:`add_moving`."""
+    """Add a moving group to ``n`` samples of one block; see :func:`add_moving`."""
     for q in range(n // LANES):
         at = q * LANES
         now_re, now_im = np.float32(x), np.float32(y)
@@ -166,7 +166,7 @@ def add_moving(
     v_re: Singles,
     v_im: Singles,
 ) -> None:
-    """Add a group that moves to ``n`` samples, and bring its state to the block after.
+    """Add a moving group to ``n`` samples, and advance its state to the next block.
 
     Args:
         acc: See :func:`add_parked`.
@@ -258,11 +258,11 @@ def add_to_sums(
         )
 
 
-@kernel(f"void({AXIS}, int64, int64, boolean, boolean, {ROOM})")
-def fill_group(axis: Axis, i: int, g: int, shared: bool, blended: bool, room: Room) -> None:
+@kernel(f"void({AXIS}, int64, int64, boolean, boolean, {WORKSPACE})")
+def fill_group(axis: Axis, i: int, g: int, shared: bool, blended: bool, workspace: Workspace) -> None:
     """Fill the tables of a group of segment ``i``."""
     tones, tooth, group, teeth, step, block = axis[0], axis[4], axis[5], axis[6], axis[10], axis[11]
-    sums, tables, state = room[0], room[2], room[4]
+    sums, tables, state = workspace[0], workspace[2], workspace[4]
     length, period, n_tables = axis[9][i], teeth.shape[1], N_COEFFICIENTS if blended else 1
     sums[: 2 * n_tables, :period] = 0.0
     anchor = -1
@@ -272,16 +272,16 @@ def fill_group(axis: Axis, i: int, g: int, shared: bool, blended: bool, room: Ro
             add_to_sums(tones, tooth, teeth, k, anchor, axis[8][i], length, step, shared, n_tables, sums)
     state[g, FREQUENCY] = tones[START, anchor] - step * tooth[anchor]
     state[g, CHIRP] = (tones[END, anchor] - tones[START, anchor]) / length
-    at = find_chirp(state[g, FREQUENCY], state[g, CHIRP], block, room[5], room[6], room[3][g])
-    re, im = room[5][at, 0], room[5][at, 1]
+    at = find_chirp(state[g, FREQUENCY], state[g, CHIRP], block, workspace[5], workspace[6], workspace[3][g])
+    re, im = workspace[5][at, 0], workspace[5][at, 1]
     for row in range(0, 2 * n_tables, 2):
         fill_table(sums[row], sums[row + 1], period, re, im, block, tables[g, row], tables[g, row + 1])
 
 
-@kernel(f"void({ROOM}, int64, int64, int64)", fused=True)
-def add_group(room: Room, g: int, n: int, block: int) -> None:
+@kernel(f"void({WORKSPACE}, int64, int64, int64)", fused=True)
+def add_group(workspace: Workspace, g: int, n: int, block: int) -> None:
     """Add a group to the first ``n`` samples of a strip."""
-    work, tables, lanes, state = room[1], room[2], room[3], room[4]
+    work, tables, lanes, state = workspace[1], workspace[2], workspace[3], workspace[4]
     re, im = tables[g, 0], tables[g, 1]
     if state[g, CHIRP] == 0.0:
         add_parked(work[SAMPLES], n, block, re, im, state[g])
@@ -292,10 +292,10 @@ def add_group(room: Room, g: int, n: int, block: int) -> None:
         )  # fmt: skip
 
 
-@kernel(f"void({ROOM}, int64, int64, int64, float64, float64)")
-def add_blended_group(room: Room, g: int, n: int, block: int, u: float, per_block: float) -> None:
+@kernel(f"void({WORKSPACE}, int64, int64, int64, float64, float64)")
+def add_blended_group(workspace: Workspace, g: int, n: int, block: int, u: float, per_block: float) -> None:
     """Add a blended group to the first ``n`` samples of a strip, which starts ``u`` into the segment."""
-    work, tables, lanes, state = room[1], room[2], room[3], room[4]
+    work, tables, lanes, state = workspace[1], workspace[2], workspace[3], workspace[4]
     re, im = work[BLENDED_ROW], work[BLENDED_ROW + 1]
     for b in range((n + block - 1) // block):
         length = min(block, n - b * block)
@@ -310,19 +310,19 @@ def add_blended_group(room: Room, g: int, n: int, block: int, u: float, per_bloc
             )  # fmt: skip
 
 
-@kernel(f"boolean(int64, int64, float64, {ROOM})")
-def has_period(n_groups: int, block: int, length: float, room: Room) -> bool:
-    """Whether all blocks of a segment are the same: its tones are parked, on whole cycles per block."""
+@kernel(f"boolean(int64, int64, float64, {WORKSPACE})")
+def has_period(n_groups: int, block: int, length: float, workspace: Workspace) -> bool:
+    """Whether all blocks of a segment are equal: its tones are parked, with whole cycles per block."""
     for g in range(n_groups):
-        cycles = room[4][g, FREQUENCY] * block
-        if room[4][g, CHIRP] != 0.0 or abs(cycles - np.rint(cycles)) * length > ON_TOOTH * block:
+        cycles = workspace[4][g, FREQUENCY] * block
+        if workspace[4][g, CHIRP] != 0.0 or abs(cycles - np.rint(cycles)) * length > ON_TOOTH * block:
             return False
     return True
 
 
-@kernel(f"void({AXIS}, int64, int64, int16[::1], {ROOM})")
-def render_comb(axis: Axis, i: int, skip: int, out: NDArray[np.int16], room: Room) -> None:
-    """Render a stretch of segment ``i``.
+@kernel(f"void({AXIS}, int64, int64, int16[::1], {WORKSPACE})")
+def render_comb(axis: Axis, i: int, skip: int, out: NDArray[np.int16], workspace: Workspace) -> None:
+    """Render a part of segment ``i``.
 
     It is worked out strip by strip, each from its start, so that a sample does not depend
     on the stretch.
@@ -332,26 +332,26 @@ def render_comb(axis: Axis, i: int, skip: int, out: NDArray[np.int16], room: Roo
         i: The segment, on the comb or blended.
         skip: Samples of the segment before the stretch.
         out: Result, int16 (n,).
-        room: Room to work in.
+        workspace: Workspace to work in.
     """
     _, offsets, _, path, _, _, _, _, delta, lengths, _, block = axis
-    work, lanes, state = room[1], room[3], room[4]
+    work, lanes, state = workspace[1], workspace[3], workspace[4]
     shared, first, last = envelope(axis[0], offsets[i], offsets[i + 1])
     blended, length = path[i] == BLENDED, lengths[i]
     slope = (last - first) / length
     n_groups = axis[5][offsets[i] : offsets[i + 1]].max() + 1
     for g in range(n_groups):
-        fill_group(axis, i, g, shared, blended, room)
+        fill_group(axis, i, g, shared, blended, workspace)
     if blended:
         for j in range(block):
             work[WITHIN, j] = np.float32(j / length)
-    if first == last and not blended and has_period(n_groups, block, length, room):
+    if first == last and not blended and has_period(n_groups, block, length, workspace):
         work[SAMPLES, :block] = np.float32(0.0)
         for g in range(n_groups):
             enter_block(state[g], lanes[g], delta[i], float(block))
-            add_group(room, g, block, block)
-        store(room[8], block, work[SAMPLES], 0)
-        repeat(out, skip, room[8], block)
+            add_group(workspace, g, block, block)
+        store(workspace[8], block, work[SAMPLES], 0)
+        repeat(out, skip, workspace[8], block)
         return
     strip = strip_samples(block)
     for s in range(skip // strip, (skip + len(out) - 1) // strip + 1):
@@ -361,9 +361,9 @@ def render_comb(axis: Axis, i: int, skip: int, out: NDArray[np.int16], room: Roo
         for g in range(n_groups):
             enter_block(state[g], lanes[g], x, float(block))
             if blended:
-                add_blended_group(room, g, stop, block, x / length, block / length)
+                add_blended_group(workspace, g, stop, block, x / length, block / length)
             else:
-                add_group(room, g, stop, block)
+                add_group(workspace, g, stop, block)
         if first != last:
             apply_envelope(work[SAMPLES], stop, first + slope * x, slope)
         store(out[s * strip + start - skip :], stop - start, work[SAMPLES], start)
@@ -372,21 +372,21 @@ def render_comb(axis: Axis, i: int, skip: int, out: NDArray[np.int16], room: Roo
 MAX_TEETH: Final = 64
 
 MAX_TONES: Final = 4 * MAX_TEETH
-"""Most frequencies among which a comb is looked for."""
+"""Maximum number of frequencies in the search for a comb."""
 
 TOLERANCE_HZ: Final = 100.0
-"""Tones nearer than this to a tooth count as standing on it when the comb is looked for."""
+"""Tones closer than this to a tooth count as on it in the search for a comb, in Hz."""
 
 GRAIN_HZ: Final = 10.0
-"""Spacings are tried out in steps of this."""
+"""Step of the spacings tried in the search, in Hz."""
 
-RENDER_TEETH_F64: Final = "float64[::1]"
+TEETH: Final = "float64[::1]"
 CONST: Final = const("float64", 1)
 
 
-@kernel(f"int64({CONST}, {RENDER_TEETH_F64})")
+@kernel(f"int64({CONST}, {TEETH})")
 def distinct_tones(start_hz: Floats, distinct_hz: Floats) -> int:
-    """Collect the frequencies of some tones, each once, to 1 Hz, in rising order.
+    """Collect the different frequencies of some tones, to 1 Hz, in rising order.
 
     Args:
         start_hz: float64 (n_tones,).

@@ -23,13 +23,13 @@ from labseq.motion.render_kernels import (
     FULL_SCALE,
     LANES,
     PHASE,
-    ROOM,
     SAMPLES,
     SILENT,
     START,
     START_AMPLITUDE,
+    WORKSPACE,
     Axis,
-    Room,
+    Workspace,
     apply_envelope,
     envelope,
     store,
@@ -48,13 +48,13 @@ MIDDLE: Final = LANES // 2
 TURN: Final = 2.0**32
 MOST: Final = 2.0**31 - 1.0
 BEND_BITS: Final = 8
-"""How much finer than the phase its second derivative is held."""
+"""Extra bits of the second derivative of the phase."""
 
 MAX_CHIRP: Final = 2.0**-17
-"""Chirp, in cycles per sample squared, beyond which a tone is steep: left to :func:`add_steep`."""
+"""Chirp above which a tone is steep, in cycles per sample squared; see :func:`add_steep`."""
 
 MAX_JERK: Final = 5e-11
-"""Change of the chirp, in cycles per sample cubed, beyond which it is: worth 1e-8 cycles at most."""
+"""Change of the chirp above which a tone is steep, in cycles per sample cubed: an error of 1e-8 cycles."""
 
 QUARTER: Final = np.int32(1 << 30)
 PER_UNIT: Final = np.float32(2.0**-32)
@@ -95,7 +95,7 @@ def constant_jerk(u: float) -> tuple[float, float, float, float]:
 
 @kernel("UniTuple(float64, 4)(int64, float64)")
 def course(kind: int, u: float) -> tuple[float, float, float, float]:
-    """How far a frequency has come at a fraction ``u`` of the segment.
+    """Part of its change that a frequency has completed at a fraction ``u`` of the segment.
 
     Returns:
         Integral of that from 0 to u; itself, from 0 to 1; its first and second derivative.
@@ -124,7 +124,7 @@ def is_steep(kind: int, sweep: float, length: float) -> bool:
 
 @kernel("int32(float64)")
 def as_int32(cycles: float) -> int:
-    """A phase in 2^-32 cycles, whole cycles left out."""
+    """A phase in 2^-32 cycles, without whole cycles."""
     return np.int32(min(np.rint((cycles - np.rint(cycles)) * TURN), MOST))  # pyright: ignore[reportReturnType]
 
 
@@ -141,7 +141,7 @@ def fill_course(
     frequencies: Nodes,
     bends: Nodes,
 ) -> None:
-    """Do the work of :func:`fill_nodes`, for a course that is known when it is compiled."""
+    """Body of :func:`fill_nodes` for a course known at compile time."""
     per_length = 1.0 / length
     third = 0.125 * MIDDLE * MIDDLE * sweep * per_length * per_length
     for q in range(n):
@@ -165,7 +165,7 @@ def fill_linear(
     frequencies: Nodes,
     bends: Nodes,
 ) -> None:
-    """Do the work of :func:`fill_nodes` for constant speed."""
+    """Body of :func:`fill_nodes` for constant speed."""
     for q in range(n):
         at = x + MIDDLE + q * LANES
         phases[q] = as_int32(phase + at * (frequency + 0.5 * chirp * at))
@@ -184,7 +184,7 @@ def fill_nodes(
     n: int,
     nodes: Nodes,
 ) -> None:
-    """Work out phase, frequency and chirp of a tone in the middle of every LANES samples.
+    """Compute phase, frequency and chirp of a tone in the middle of every LANES samples.
 
     The third derivative is made part of the frequency such that its error is least.
 
@@ -266,11 +266,11 @@ def add_steep(
         acc[j] += np.float32(amplitude * math.cos(2.0 * math.pi * (cycles - np.rint(cycles))))
 
 
-@kernel(f"void({AXIS}, int64, int64, float64, int64, boolean, {ROOM})")
-def add_direct(axis: Axis, i: int, k: int, x: float, n: int, shared: bool, room: Room) -> None:
+@kernel(f"void({AXIS}, int64, int64, float64, int64, boolean, {WORKSPACE})")
+def add_direct(axis: Axis, i: int, k: int, x: float, n: int, shared: bool, workspace: Workspace) -> None:
     """Add tone ``k`` of segment ``i`` to ``n`` samples, the first of them ``x`` samples after its start."""
     tones, _, course, _, _, _, _, _, _, length, _, _ = axis
-    work, nodes = room[1], room[7]
+    work, nodes = workspace[1], workspace[7]
     a, b = tones[START_AMPLITUDE, k], tones[END_AMPLITUDE, k]
     if shared:
         a = b = max(a, b)
@@ -288,11 +288,11 @@ def add_direct(axis: Axis, i: int, k: int, x: float, n: int, shared: bool, room:
         add_ramped_tone(work[SAMPLES], n_nodes, nodes, start, slope)
 
 
-@kernel(f"void({AXIS}, int64, int64, int16[::1], {ROOM})")
-def render_direct(axis: Axis, i: int, skip: int, out: NDArray[np.int16], room: Room) -> None:
-    """Render a stretch of segment ``i`` tone by tone; see :func:`render_comb`."""
+@kernel(f"void({AXIS}, int64, int64, int16[::1], {WORKSPACE})")
+def render_direct(axis: Axis, i: int, skip: int, out: NDArray[np.int16], workspace: Workspace) -> None:
+    """Render a part of segment ``i`` tone by tone; see :func:`render_comb`."""
     tones, offsets, _, _, _, _, _, _, delta, length, _, block = axis
-    work = room[1]
+    work = workspace[1]
     shared, first, last = envelope(tones, offsets[i], offsets[i + 1])
     slope = (last - first) / length[i]
     strip = strip_samples(block)
@@ -301,21 +301,21 @@ def render_direct(axis: Axis, i: int, skip: int, out: NDArray[np.int16], room: R
         start, stop = max(0, skip - s * strip), min(strip, skip + len(out) - s * strip)
         work[SAMPLES, :stop] = np.float32(0.0)
         for k in range(offsets[i], offsets[i + 1]):
-            add_direct(axis, i, k, x, stop, shared, room)
+            add_direct(axis, i, k, x, stop, shared, workspace)
         if first != last:
             apply_envelope(work[SAMPLES], stop, first + slope * x, slope)
         store(out[s * strip + start - skip :], stop - start, work[SAMPLES], start)
 
 
-@kernel(f"void({AXIS}, int64, int16[::1], {ROOM})")
-def render(axis: Axis, start: int, out: NDArray[np.int16], room: Room) -> None:
-    """Render a stretch of an axis; what lies after its end is silent.
+@kernel(f"void({AXIS}, int64, int16[::1], {WORKSPACE})")
+def render(axis: Axis, start: int, out: NDArray[np.int16], workspace: Workspace) -> None:
+    """Render a part of an axis; beyond its end the samples are 0.
 
     Args:
         axis: The axis.
         start: First sample, counted from the start of the program.
         out: Result, int16 (n,).
-        room: Room to work in, for this thread alone.
+        workspace: Workspace to work in, for this thread alone.
     """
     path, first = axis[3], axis[7]
     stop = start + len(out)
@@ -328,9 +328,9 @@ def render(axis: Axis, start: int, out: NDArray[np.int16], room: Room) -> None:
             if path[i] == SILENT:
                 piece[:] = 0
             elif path[i] == DIRECT:
-                render_direct(axis, i, at - first[i], piece, room)
+                render_direct(axis, i, at - first[i], piece, workspace)
             else:
-                render_comb(axis, i, at - first[i], piece, room)
+                render_comb(axis, i, at - first[i], piece, workspace)
             at = until
         i += 1
     out[at - start :] = 0

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from labseq.kernel import const, kernel
 
 N_STATE: Final = 8
-"""Numbers that describe the state of a group of tones in a block."""
+"""Numbers in the state of a group of tones in a block."""
 
 
 Floats = NDArray[np.float64]
@@ -24,10 +24,10 @@ Singles = NDArray[np.float32]
 Complex = tuple[float, float]
 
 LANES: Final = 32
-"""Samples that are worked on together."""
+"""Samples computed together."""
 
 N_CHIRPS: Final = 8
-"""Chirps that are kept: to the right, to the left and parked, on two axes, and two to spare."""
+"""Number of cached chirps: to the right, to the left and parked, on two axes, and two spare ones."""
 
 FREQUENCY_GRID: Final = 2.0**44
 CHIRP_GRID: Final = 2.0**62
@@ -182,28 +182,28 @@ MAX_GROUPS: Final = 3
 """Tones that move left, that move right, and that are parked."""
 
 ON_TOOTH: Final = 2e-9
-"""Cycles by which a tone may leave its tooth in a segment: 0.0004 of the last digit at full scale."""
+"""Phase by which a tone may leave its tooth in a segment, in cycles: 0.0004 digits at full scale."""
 
 NEAR_TOOTH: Final = 0.05
-"""Cycles beyond which no cubic follows it."""
+"""Phase beyond which no cubic follows a tone, in cycles."""
 
 BLENDING: Final = 1e-7
-"""Error of all cubics together, in fractions of full scale: 0.003 of the last digit."""
+"""Allowed error of all cubics together, as a fraction of full scale: 0.003 of the last digit."""
 
 N_COEFFICIENTS: Final = 4
 NODES: Final = 0.5 - 0.5 * np.cos(np.pi * (np.arange(N_COEFFICIENTS) + 0.5) / N_COEFFICIENTS)
-"""Where in a segment a cubic agrees with what it stands for: Chebyshev's nodes."""
+"""Points of a segment at which a cubic equals the function that it approximates: Chebyshev nodes."""
 
 TO_CUBIC: Final = np.linalg.inv(np.vander(NODES, increasing=True))
 EXTREMES: Final = 0.5 - 0.5 * np.cos(np.pi * np.arange(N_COEFFICIENTS + 1) / N_COEFFICIENTS)
-"""Where its error is largest."""
+"""Points at which the error of a cubic is largest."""
 
 TONES: Final = const("float64", 2)
 
 
 @kernel(f"Tuple((boolean, float64, float64))({TONES}, int64, int64)")
 def envelope(tones: Floats, start: int, stop: int) -> tuple[bool, float, float]:
-    """Find the course of the squared amplitude that all tones of a segment share.
+    """Find the common course of the squared amplitudes of a segment's tones.
 
     Returns:
         Whether they share one; its value at the start and at the end, the larger being 1.
@@ -224,7 +224,7 @@ def envelope(tones: Floats, start: int, stop: int) -> tuple[bool, float, float]:
 
 @kernel("UniTuple(float64, 2)(float64, float64, float64, float64, float64)")
 def slow_part(u: float, a: float, b: float, drift: float, bend: float) -> tuple[float, float]:
-    """Amplitude and phase of a tone beside its tooth at a fraction ``u`` of the segment.
+    """Amplitude and phase of a tone relative to its tooth at a fraction ``u`` of the segment.
 
     Args:
         u: From 0 to 1.
@@ -273,7 +273,7 @@ def fit_cubic(a: float, b: float, drift: float, bend: float, re: Floats, im: Flo
 def off_tooth(
     tones: Floats, k: int, anchor: int, tooth: int, anchor_tooth: int, step: float, length: float
 ) -> tuple[float, float]:
-    """How far tone ``k`` leaves its tooth of its group's comb, in cycles: by its frequency, by its chirp.
+    """Phase by which tone ``k`` leaves its tooth of the group's comb, in cycles: by frequency, by chirp.
 
     Args:
         tones: float64 (5, n_tones).
@@ -333,7 +333,7 @@ def find_groups(
 def choose(
     tones: Floats, start: int, stop: int, length: float, step: float, tooth: Ints, group: Bytes
 ) -> int:
-    """Choose between COMB, BLENDED and DIRECT for a segment whose tones have all found a group."""
+    """Choose between COMB, BLENDED and DIRECT for a segment whose tones all have a group."""
     anchors = np.full(MAX_GROUPS, -1, np.int64)
     for k in range(stop - 1, start - 1, -1):
         anchors[group[k]] = k
@@ -407,7 +407,7 @@ Samples = NDArray[np.int16]
 
 FULL_SCALE: Final = 32767.0
 
-N_SUMS: Final = 2 * N_COEFFICIENTS  # rows of the first array of Room
+N_SUMS: Final = 2 * N_COEFFICIENTS  # rows of the first array of Workspace
 CUBIC_ROW: Final = N_SUMS
 N_ROWS64: Final = N_SUMS + 2
 
@@ -418,7 +418,7 @@ V_ROW: Final = 4
 N_ROWS32: Final = 6
 
 STRIP: Final = 8192
-"""Most samples of a strip that has several blocks."""
+"""Maximum number of samples of a strip of several blocks."""
 
 Axis: TypeAlias = tuple[
     Floats, Ints, Bytes, Bytes, Ints, Bytes, Floats, NDArray[np.int64], Floats, Floats, float, int
@@ -428,15 +428,15 @@ cosine and sine of each tooth over a period, each segment's first sample (and th
 the time from its start to there and its length, both in samples, the spacing of the teeth in cycles
 per sample, and the samples of a block."""
 
-Room: TypeAlias = tuple[Floats, Singles, Singles, Floats, Floats, Singles, Floats, Ints, Samples]
-"""Room for one thread to work in, see :func:`new_room`."""
+Workspace: TypeAlias = tuple[Floats, Singles, Singles, Floats, Floats, Singles, Floats, Ints, Samples]
+"""The workspace of one thread, see :func:`new_workspace`."""
 
 AXIS: Final = (
     f"Tuple(({const('float64', 2)}, {const('int32', 1)}, {const('int8', 1)}, {const('int8', 1)},"
     f" {const('int32', 1)}, {const('int8', 1)}, {const('float64', 2)}, {const('int64', 1)},"
     f" {const('float64', 1)}, {const('float64', 1)}, float64, int64))"
 )
-ROOM: Final = (
+WORKSPACE: Final = (
     "Tuple((float64[:, ::1], float32[:, ::1], float32[:, :, ::1], float64[:, :, ::1], float64[:, ::1],"
     " float32[:, :, ::1], float64[::1], int32[:, ::1], int16[::1]))"
 )
@@ -444,12 +444,12 @@ ROOM: Final = (
 
 @kernel("int64(int64)")
 def strip_samples(block: int) -> int:
-    """Samples that are worked out together: some blocks, as many as stay in the fastest cache."""
+    """Number of samples computed together: as many blocks as fit into the fastest cache."""
     return max(1, STRIP // block) * block
 
 
-def new_room(block: int) -> Room:
-    """Make room for one thread to work in, for blocks of so many samples.
+def new_workspace(block: int) -> Workspace:
+    """Allocate the workspace of one thread, for blocks of ``block`` samples.
 
     Returns:
         float64 (N_ROWS64, width): sums over a period, coefficients of a cubic.
@@ -477,7 +477,7 @@ def new_room(block: int) -> Room:
 
 @kernel("void(int16[::1], int64, float32[::1], int64)")
 def store(out: NDArray[np.int16], n: int, values: Singles, skip: int) -> None:
-    """Round ``values[skip:skip + n]`` to integers; by way of int32, which is four times faster."""
+    """Round ``values[skip:skip + n]`` to integers, through int32, which is four times faster."""
     most = np.float32(FULL_SCALE)
     kept = values[skip:]
     for j in range(n):
@@ -486,7 +486,7 @@ def store(out: NDArray[np.int16], n: int, values: Singles, skip: int) -> None:
 
 @kernel("void(int16[::1], int64, int16[::1], int64)")
 def repeat(out: NDArray[np.int16], skip: int, block: NDArray[np.int16], n: int) -> None:
-    """Fill ``out`` with the ``n`` samples of a block again and again, from sample ``skip`` on."""
+    """Fill ``out`` by repeating the ``n`` samples of a block, from sample ``skip`` on."""
     at = skip % n
     done = 0
     while done < len(out):
@@ -522,7 +522,7 @@ SUM: Final = 5
 FINE: Final = -1
 
 ROUNDING: Final = 1e-9
-"""By how much amplitudes may exceed full scale."""
+"""Excess over full scale that rounding of amplitudes may cause."""
 
 VALUES: Final = const("float64", 1)
 
@@ -541,7 +541,7 @@ def take_tones(
     sample_rate_hz: float,
     tones: Floats,
 ) -> tuple[int, int]:
-    """Bring the tones of an axis into the units of rendering.
+    """Convert the tones of an axis to the units of rendering.
 
     Args:
         start_hz: See :class:`labseq.model.AxisTones`, as for the next five.

@@ -1,4 +1,4 @@
-"""What the samples of a tone program are, in a few lines of numpy.
+"""The definition of the samples of a tone program, in a few lines of numpy.
 
 Slow; the yardstick for :func:`labseq.render`, in its tests and its benchmark.
 """
@@ -14,7 +14,7 @@ from labseq.model import AxisTones, FrequencyCourse, ToneProgram
 def render_reference(
     program: ToneProgram, sample_rate_hz: float, start: int = 0, stop: int | None = None
 ) -> NDArray[np.float64]:
-    """Work out samples in float64, before they are rounded.
+    """Compute samples in float64, before rounding.
 
     Args:
         program: The tone program.

@@ -1,4 +1,4 @@
-"""From a tone program to samples."""
+"""Rendering: the samples of a tone program."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from labseq.errors import LimitError
 from labseq.model import AxisTones, SiteGrid, ToneProgram, Waveform
 
 if TYPE_CHECKING:
-    from labseq.motion.render_kernels import Axis, Room
+    from labseq.motion.render_kernels import Axis, Workspace
 
 CLOCK_STEP_HZ: Final = 8
 """Sample rates of the AWG are multiples of this (Spectrum M4i.66xx)."""
 
 MAX_PERIOD: Final = 4096
-"""Longest period of a comb, in samples, that is worth its tables."""
+"""Longest period of a comb that is worth its tables, in samples."""
 
 BLOCK: Final = 1536
-"""Blocks have at least so many samples."""
+"""Smallest size of a block, in samples."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,7 +102,7 @@ def comb_sample_rate(
 
 
 def find_comb(axis: AxisTones, sample_rate_hz: float) -> Comb:
-    """Find the comb that most tones of an axis stand on, if there is one that suits the sample rate."""
+    """Find the comb that contains most tones of an axis, if one matches the sample rate."""
     from labseq.motion.render_comb_kernels import (
         MAX_TEETH,
         MAX_TONES,
@@ -132,7 +132,7 @@ def find_comb(axis: AxisTones, sample_rate_hz: float) -> Comb:
 
 @lru_cache(maxsize=8)
 def _teeth(numerator: int, period: int, n_teeth: int) -> NDArray[np.float64]:
-    """What :attr:`Comb.teeth` holds, kept for the next program."""
+    """The array :attr:`Comb.teeth`, cached for the next program."""
     from labseq.motion.render_comb_kernels import fill_teeth
 
     angles = 2 * np.pi / period * np.arange(period)
@@ -156,10 +156,10 @@ N_CHANNELS: Final = 2
 """Channel 0 plays the row tones, channel 1 the column tones."""
 
 MAX_SAMPLES: Final = 2**53
-"""So many can be counted in float64."""
+"""Largest number of samples that float64 counts exactly."""
 
-MAX_ROOMS: Final = 8
-"""Rooms that are kept for threads to render in, of 2 MB each."""
+MAX_WORKSPACES: Final = 8
+"""Number of workspaces kept for rendering threads, 2 MB each."""
 
 
 class RenderPath(IntEnum):
@@ -184,7 +184,7 @@ class RenderPath(IntEnum):
 
 
 class Renderer:
-    """Renders any stretch of a tone program into buffers of the caller.
+    """Renders any part of a tone program into the caller's buffers.
 
     Sample n is what the program says at the time n / fs. Segment i owns the samples from
     round(t_i fs) to round(t_(i+1) fs), where t_i is the sum of the durations before it: a
@@ -203,7 +203,7 @@ class Renderer:
     """
 
     def __init__(self, program: ToneProgram, sample_rate_hz: float = 625e6) -> None:
-        """Look at a program and choose how to render each of its segments.
+        """Analyse a program and choose how to render each of its segments.
 
         Args:
             program: The tone program.
@@ -232,7 +232,7 @@ class Renderer:
         self.path.flags.writeable = False
 
     def write(self, channel: int, start: int, out: NDArray[np.int16]) -> None:
-        """Render samples ``start`` to ``start + len(out)`` of a channel; after the end there is silence.
+        """Render samples ``start`` to ``start + len(out)`` of a channel; beyond the end they are 0.
 
         Holds no lock of Python, and any number of threads can render at the same time.
         The samples do not depend on where a stretch starts.
@@ -243,22 +243,22 @@ class Renderer:
             out: Result, int16 (n,), contiguous.
         """
         from labseq.motion.render_direct_kernels import render
-        from labseq.motion.render_kernels import new_room
+        from labseq.motion.render_kernels import new_workspace
 
         axis = self._axes[channel]
-        free = _free_rooms(axis[-1])
+        free = _free_workspaces(axis[-1])
         try:
-            room = free.pop()
+            workspace = free.pop()
         except IndexError:
-            room = new_room(axis[-1])
-        render(axis, start, out, room)
-        free.append(room)
+            workspace = new_workspace(axis[-1])
+        render(axis, start, out, workspace)
+        free.append(workspace)
 
 
 @lru_cache(maxsize=4)
-def _free_rooms(block: int) -> deque[Room]:  # noqa: ARG001 - the key of the cache
-    """Rooms for blocks of so many samples that no thread works in; fresh memory would cost a millisecond."""
-    return deque(maxlen=MAX_ROOMS)
+def _free_workspaces(block: int) -> deque[Workspace]:  # noqa: ARG001 - the key of the cache
+    """Unused workspaces for blocks of ``block`` samples; new memory would cost a millisecond."""
+    return deque(maxlen=MAX_WORKSPACES)
 
 
 def render(program: ToneProgram, sample_rate_hz: float = 625e6) -> Waveform:
@@ -335,7 +335,7 @@ def _prepare(
     times: tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]],
     sample_rate_hz: float,
 ) -> Axis:
-    """Bring an axis into the kernels' units, and choose the path of each segment.
+    """Convert an axis to the kernels' units, and choose how each segment is rendered.
 
     Raises:
         LimitError: See :class:`Renderer`.
@@ -383,7 +383,7 @@ def _check_durations(program: ToneProgram, sample_rate_hz: float) -> None:
 
 
 def _refuse(fault: int, where: int, program: ToneProgram, channel: int, sample_rate_hz: float) -> NoReturn:
-    """Put into words what cannot be played."""
+    """Raise the error for a tone that cannot be played."""
     from labseq.motion.render_kernels import SUM
 
     axis, name = ((program.row, "row"), (program.column, "column"))[channel]

@@ -65,7 +65,7 @@ def next_arrival(tones: Ints, n_tones: int, travelled: int) -> int:
 
 @kernel(f"int64({TONES}, int64)")
 def last_arrival(tones: Ints, n_tones: int) -> int:
-    """The longest way of all tones, in sites."""
+    """Longest displacement of all tones, in sites."""
     longest = 0
     for k in range(n_tones):
         longest = max(longest, abs(tones[1, k] - tones[0, k]))
@@ -90,7 +90,7 @@ def frequency(site_hz: Floats, step_hz: float, site: int) -> float:
 
 @kernel(f"float64({SITES}, int64, int64, int64)")
 def amplitude(site_amplitude: Floats, site: int, goal: int, travelled: int) -> float:
-    """Amplitude of a tone on its way: its square changes evenly from that of the site to that of the goal.
+    """Amplitude of a tone in motion: its square changes linearly from that of the site to that of the goal.
 
     Beyond the grid it is that of the outermost site.
 
@@ -210,7 +210,7 @@ def add_tones(
         values[START_AMPLITUDE, n + k] = on_start * amplitude(site_amplitude, site, goal, travelled)
         values[END_AMPLITUDE, n + k] = on_end * amplitude(site_amplitude, site, goal, arriving)
         values[PHASE, n + k] = phase[k]
-        phase[k] = (phase[k] + 0.5 * (start_hz + end_hz) * duration_s) % 1.0  # right for every course
+        phase[k] = (phase[k] + 0.5 * (start_hz + end_hz) * duration_s) % 1.0  # holds for every course
     return n + n_tones
 
 
@@ -229,7 +229,7 @@ def add_segment(
     its_duration_s: float,
     n_tones: int,
 ) -> int:
-    """Write down a segment that ends with ``n_tones`` tones in all; return how many segments there are."""
+    """Record a segment that ends with ``n_tones`` tones in all; return the number of segments."""
     labels[0, n] = kind
     labels[1, n] = course
     batch_of[n] = batch
@@ -279,7 +279,7 @@ def build_axis(
     offsets: Offsets,
     values: Floats,
 ) -> tuple[int, int]:
-    """Write down all segments of a plan, and the tones that one axis plays in them.
+    """Build all segments of a plan, and the tones of one axis in them.
 
     At constant speed, tones with a shorter way arrive earlier; the transport is cut
     there, so that each tone's frequency changes linearly, or not at all, within a
@@ -369,7 +369,7 @@ VALUES: Final = "float64[:, ::1]"
 
 @kernel(f"UniTuple(float64, 2)({VALUES}, int64, int64, float64)")
 def amplitudes_at(values: Floats, first: int, last: int, u: float) -> tuple[float, float]:
-    """Sum of the amplitudes of some tones at a fraction of their segment, and the sign of its slope."""
+    """Sum of the amplitudes of tones at a fraction of their segment, and the sign of its slope."""
     total = slope = 0.0
     for i in range(first, last):
         start, end = values[START_AMPLITUDE, i] ** 2, values[END_AMPLITUDE, i] ** 2
@@ -382,7 +382,7 @@ def amplitudes_at(values: Floats, first: int, last: int, u: float) -> tuple[floa
 
 @kernel(f"float64({VALUES}, int64, int64, float64)")
 def greatest_sum(values: Floats, first: int, last: int, limit: float) -> float:
-    """The greatest sum that amplitudes reach in a segment; exact only where it exceeds ``limit``.
+    """The largest sum of the amplitudes in a segment; exact only if it exceeds ``limit``.
 
     Amplitudes squared are linear in time, so the sum is concave: where some rise and others
     fall, it may be greatest in between, where its slope is 0.

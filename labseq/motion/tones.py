@@ -15,13 +15,13 @@ from labseq.motion.axes import AXES, AxisIndex, Drive, drive
 from labseq.units import format_quantity
 
 AXIS_INDICES: Final[tuple[AxisIndex, AxisIndex]] = (0, 1)
-"""The rows' tones, the columns' tones."""
+"""Index of the row tones, index of the column tones."""
 
 SPEED_PROFILES: Final[tuple[SpeedProfile, ...]] = get_args(SpeedProfile)
-"""Every course of the speed; the index is the course's :class:`labseq.model.FrequencyCourse`."""
+"""The speed profiles; the index is the :class:`labseq.model.FrequencyCourse`."""
 
 WINDOW_TOLERANCE_S = 1e-9
-"""A batch may end later than its window by this much: what rounding of sums can do, and no more."""
+"""Excess over the time window that rounding of sums can cause, in seconds."""
 
 
 def site_time_s(grid: SiteGrid, motion: MotionSpec) -> float:
@@ -173,7 +173,7 @@ def check_limits(
     offsets: NDArray[np.int32],
     values: NDArray[np.float64],
 ) -> None:
-    """Refuse the tones of an axis that break a limit.
+    """Raise an error if the tones of an axis break a limit.
 
     Args:
         axis: 0 for the rows' tones, 1 for the columns'.
@@ -205,7 +205,7 @@ def check_limits(
 def _raise_limit_error(
     fault: int, value: float, axis: AxisIndex, tone: int, n_tones: int, batch: int, rf: RfSpec
 ) -> NoReturn:
-    """Put an excess into words."""
+    """Raise the error for an exceeded limit."""
     from labseq.motion.tone_kernels import AMPLITUDES, BAND, SPACING
 
     name = AXES[axis]

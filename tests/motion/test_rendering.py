@@ -12,7 +12,7 @@ import labseq
 from labseq.model import Batch, FrequencyCourse, MotionSpec, Plan, SiteGrid, ToneProgram
 from labseq.motion import Renderer, RenderPath, comb_sample_rate, render, render_chunks, tone_program
 from labseq.motion.render_reference import render_reference
-from labseq.motion.rendering import MAX_ROOMS
+from labseq.motion.rendering import MAX_WORKSPACES
 
 from .programs import STEP_HZ, Segment, program_of, site
 
@@ -224,7 +224,7 @@ def test_many_threads_render_at_the_same_time_into_the_callers_buffers() -> None
     renderer = Renderer(program, COMB_HZ)
     out, n = np.empty_like(whole), 40_000
     stretches = [(channel, start) for channel in (0, 1) for start in range(0, renderer.n_samples, n)]
-    assert len(stretches) > 2 * MAX_ROOMS
+    assert len(stretches) > 2 * MAX_WORKSPACES
     with ThreadPoolExecutor(len(stretches)) as workers:
         for channel, start in stretches:
             workers.submit(renderer.write, channel, start, out[channel, start : start + n])
