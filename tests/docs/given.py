@@ -18,6 +18,7 @@ from labseq_virtual.settings import SimulationSettings
 from labseq_virtual.simulation import VirtualSimulation
 
 import labseq as api
+from labseq.plugin import Context
 from tests.plugins.needs import need_library
 
 from .blocks import ROOT, Block, blocks_of
@@ -125,8 +126,8 @@ def prepare(page: str, blocks: list[Block], to: Path, store: Store) -> Given:
 
 
 def _andor(to: Path) -> Given:
-    world = VirtualSimulation(SimulationSettings(), api.Context("simulation"))
-    return Given(names={"context": api.Context("camera", simulation=world)})
+    world = VirtualSimulation(SimulationSettings(), Context("simulation"))
+    return Given(names={"context": Context("camera", simulation=world)})
 
 
 def _calibrations(to: Path) -> Given:
