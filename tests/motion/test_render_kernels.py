@@ -1,3 +1,5 @@
+"""The kernels of rendering: phases, combs, groups, units."""
+
 from __future__ import annotations
 
 import math
@@ -5,9 +7,22 @@ import math
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st
+from numpy.typing import NDArray
 
-from labseq.model import FrequencyCourse
-from labseq.motion import render_comb_kernels, render_direct_kernels, render_kernels
+from labseq.errors import LimitError
+from labseq.model import FrequencyCourse, SiteGrid
+from labseq.motion import comb_sample_rate, render_comb_kernels, render_direct_kernels, render_kernels
+from labseq.motion.render_kernels import (
+    END,
+    END_AMPLITUDE,
+    FINE,
+    N_FIELDS,
+    PHASE,
+    START,
+    START_AMPLITUDE,
+    SUM,
+    take_tones,
+)
 
 
 @given(st.integers(-(2**31), 2**31 - 1))
@@ -95,3 +110,151 @@ def test_stored_waveforms_are_summed() -> None:
     out = np.empty(8000, np.int16)
     render_direct_kernels.sum_stored(stored, np.array([1, 4, 5]), 700, out)
     assert np.array_equal(out, stored[[1, 4, 5], 700:8700].sum(axis=0))
+
+
+def comb(n: int, start_hz: float, step_hz: float) -> NDArray[np.float64]:
+    return (start_hz + step_hz * np.arange(n)).astype(np.float64)
+
+
+def test_the_sample_rate_suits_both_axes() -> None:
+    assert comb_sample_rate(SiteGrid()) == 624e6
+    rows, columns = comb(5, 90e6, 1.5e6), comb(5, 90e6, 1.0e6)
+    grid = SiteGrid(5, 5, row_frequency_hz=rows, column_frequency_hz=columns)
+    assert comb_sample_rate(grid) == 624e6
+    assert comb_sample_rate(SiteGrid(1, 1)) == 625e6
+    rows = comb(5, 90e6, 1.6180339e6)
+    with pytest.raises(LimitError, match=r"1618033\.9 Hz and 1000000 Hz"):
+        comb_sample_rate(SiteGrid(5, 5, row_frequency_hz=rows, column_frequency_hz=columns))
+
+
+SPACING_HZ = 1.6e6
+
+
+def spacing_of(tones_hz: NDArray[np.float64]) -> float:
+    """The same by numpy, for a few tones."""
+    gaps = np.diff(tones_hz)
+    gaps = gaps[gaps > render_comb_kernels.TOLERANCE_HZ]
+    apart = np.abs(gaps[:, None] - gaps[None, :]).ravel()
+    candidates = np.unique(
+        np.round(np.concatenate([gaps, apart[apart > render_comb_kernels.TOLERANCE_HZ]]), -1)
+    )
+    multiples = np.round(gaps[None, :] / candidates[:, None])
+    fits = (np.abs(gaps[None, :] - multiples * candidates[:, None]) <= render_comb_kernels.TOLERANCE_HZ) & (
+        multiples > 0
+    )
+    n_fitting = fits.sum(axis=1)
+    best = int(np.flatnonzero(n_fitting == n_fitting.max())[-1])
+    held = fits[best]
+    return float(gaps[held].sum() / multiples[best, held].sum())
+
+
+@given(st.lists(st.floats(80e6, 80e6 + 50), max_size=100))
+def test_frequencies_are_collected_once_each_and_in_order(hz: list[float]) -> None:
+    found = np.empty(render_comb_kernels.MAX_TONES, np.float64)
+    n = render_comb_kernels.distinct_tones(np.array(hz), found)
+    assert found[:n].tolist() == np.unique(np.round(hz)).tolist()
+
+
+def test_more_frequencies_than_a_comb_can_have_are_told() -> None:
+    hz = 1e6 + np.arange(render_comb_kernels.MAX_TONES + 1.0)
+    assert (
+        render_comb_kernels.distinct_tones(hz[:-1], np.empty(render_comb_kernels.MAX_TONES))
+        == render_comb_kernels.MAX_TONES
+    )
+    assert render_comb_kernels.distinct_tones(hz, np.empty(render_comb_kernels.MAX_TONES)) == -1
+
+
+@given(
+    st.lists(st.integers(0, 40), min_size=2, max_size=20, unique=True),
+    st.lists(st.floats(-1e5, 1e5), max_size=4),
+    st.floats(-50, 50),
+)
+def test_the_spacing_is_what_numpy_finds(sites: list[int], strays: list[float], noise_hz: float) -> None:
+    on_comb = 80e6 + SPACING_HZ * np.array(sites) + noise_hz * (np.array(sites) % 2)
+    hz = np.unique(np.round(np.concatenate([on_comb, 120e6 + np.array(strays)])))
+    assert render_comb_kernels.common_spacing(hz) == pytest.approx(spacing_of(hz), rel=1e-12)
+
+
+@pytest.mark.parametrize(("sites", "steps"), [([0, 1, 2, 5], 1), ([0, 2, 5], 1), ([3, 7, 11], 4)])
+def test_the_spacing_is_the_largest_that_suits(sites: list[int], steps: int) -> None:
+    hz = 80e6 + SPACING_HZ * np.array(sites, np.float64)
+    assert render_comb_kernels.common_spacing(hz) == steps * SPACING_HZ
+
+
+def test_one_tone_has_no_spacing_and_too_many_have_none_in_common() -> None:
+    assert render_comb_kernels.common_spacing(np.array([80e6])) == 0.0
+    assert render_comb_kernels.common_spacing(np.array([80e6, 80e6 + 50])) == 0.0
+    hz = 80e6 + SPACING_HZ * np.arange(render_comb_kernels.MAX_TEETH + 1, dtype=np.float64)
+    assert render_comb_kernels.common_spacing(hz[:-1]) == SPACING_HZ
+    assert render_comb_kernels.common_spacing(hz) == -1.0
+
+
+@pytest.mark.parametrize(("numerator", "period"), [(1, 390), (2, 625), (0, 1), (7, 12)])
+def test_teeth_turn_by_their_distance_from_the_first(numerator: int, period: int) -> None:
+    angles = 2 * np.pi / period * np.arange(period)
+    filled = np.empty((10, period))
+    render_comb_kernels.fill_teeth(np.cos(angles), np.sin(angles), numerator, filled)
+    turns = np.outer(np.arange(5), numerator / period * np.arange(period))
+    assert np.allclose(filled[::2] + 1j * filled[1::2], np.exp(2j * np.pi * turns), atol=1e-11)
+
+
+RATE_HZ = 625e6
+OFFSETS = np.array([0, 2, 2, 5], np.int32)
+
+
+def take(**changes: tuple[int, float]) -> tuple[tuple[int, int], NDArray[np.float64]]:
+    """Five tones, of which some values are changed: field -> (tone, value)."""
+    names = ("start_hz", "end_hz", "start_amplitude", "end_amplitude", "phase_rad")
+    fields = [np.full(5, value) for value in (90e6, 91e6, 0.3, 0.1, 2.0)]
+    for name, (tone, value) in changes.items():
+        fields[names.index(name)][tone] = value
+    start_hz, end_hz, start, end, phase = fields
+    tones = np.empty((N_FIELDS, 5))
+    return take_tones(start_hz, end_hz, start, end, phase, OFFSETS, RATE_HZ, tones), tones
+
+
+def test_tones_are_brought_into_cycles_and_samples() -> None:
+    fault, tones = take()
+    assert fault == (FINE, -1)
+    assert tones[START].tolist() == [90e6 / RATE_HZ] * 5
+    assert tones[END].tolist() == [91e6 / RATE_HZ] * 5
+    assert tones[START_AMPLITUDE].tolist() == [0.3] * 5
+    assert tones[END_AMPLITUDE].tolist() == [0.1] * 5
+    assert tones[PHASE].tolist() == [2.0 / (2 * np.pi)] * 5
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+@pytest.mark.parametrize(
+    ("name", "field"),
+    [
+        ("start_hz", START),
+        ("end_hz", END),
+        ("start_amplitude", START_AMPLITUDE),
+        ("end_amplitude", END_AMPLITUDE),
+        ("phase_rad", PHASE),
+    ],
+)
+def test_what_is_not_finite_is_found(name: str, field: int, value: float) -> None:
+    assert take(**{name: (3, value)})[0] == (field, 3)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "fault"),
+    [
+        ("start_hz", -1.0, (START, 1)),
+        ("end_hz", RATE_HZ / 2 + 1.0, (END, 1)),
+        ("end_hz", RATE_HZ / 2, (FINE, -1)),
+        ("start_amplitude", -0.1, (START_AMPLITUDE, 1)),
+        ("end_amplitude", 1.1, (END_AMPLITUDE, 1)),
+        ("start_amplitude", 0.8, (SUM, 0)),
+        ("end_amplitude", 0.9 + render_kernels.ROUNDING / 2, (FINE, -1)),
+        ("end_amplitude", 0.9 + 2 * render_kernels.ROUNDING, (SUM, 0)),
+        ("phase_rad", -700.0, (FINE, -1)),
+    ],
+)
+def test_limits_are_kept(name: str, value: float, fault: tuple[int, int]) -> None:
+    assert take(**{name: (1, value)})[0] == fault
+
+
+def test_a_sum_is_blamed_on_its_segment() -> None:
+    assert take(start_amplitude=(4, 0.5))[0] == (SUM, 2)

@@ -1,5 +1,10 @@
+"""Tone programs of plans: segments, courses, phases, limits."""
+
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -12,18 +17,85 @@ from labseq.errors import LimitError, PlanError
 from labseq.model import (
     AxisTones,
     Batch,
+    FrequencyCourse,
     MotionSpec,
     Occupancy,
     Plan,
+    PlanReport,
+    RfSpec,
     SegmentKind,
     SiteGrid,
     TargetPattern,
     ToneProgram,
+    TonesNow,
 )
-from labseq.motion import check_plan, tone_program
+from labseq.model.motion import SpeedProfile
+from labseq.motion import check_plan, fitting_batches, tone_program
 from labseq.motion.axes import preassigned_phases
+from labseq.motion.tone_kernels import (
+    AMPLITUDES,
+    BAND,
+    END_AMPLITUDE,
+    END_HZ,
+    N_FIELDS,
+    POWER,
+    SPACING,
+    START_AMPLITUDE,
+    START_HZ,
+    WITHIN,
+    first_excess,
+    greatest_sum,
+)
+from labseq.motion.tones import SPEED_PROFILES, default_grid
 from labseq.roles import Context
-from labseq.testing.strategies import cases
+from labseq.testing.strategies import cases, tone_programs
+
+
+def report(ends: list[float]) -> PlanReport:
+    return PlanReport(np.zeros((1, 1), np.bool_), np.array(ends), np.ones(len(ends), np.int32), 0, 0)
+
+
+def plan(linked: list[bool]) -> Plan:
+    n = len(linked)
+    return Plan(np.zeros((n, 4), np.int16), np.arange(n + 1, dtype=np.int32), np.array(linked, np.bool_))
+
+
+@pytest.mark.parametrize(
+    ("window_s", "expected"), [(0.0, 0), (0.9, 0), (1.0, 1), (2.5, 2), (3.0, 3), (9.0, 3)]
+)
+def test_batches_that_end_within_the_window(window_s: float, expected: int) -> None:
+    assert fitting_batches(report([1.0, 2.0, 3.0]), plan([False] * 3), window_s) == expected
+
+
+@pytest.mark.parametrize(("window_s", "expected"), [(1.0, 1), (2.0, 1), (3.0, 1), (4.0, 4), (5.0, 5)])
+def test_a_chain_is_never_cut(window_s: float, expected: int) -> None:
+    linked = [False, False, True, True, False]
+    assert fitting_batches(report([1.0, 2.0, 3.0, 4.0, 5.0]), plan(linked), window_s) == expected
+
+
+def test_rounding_of_sums_does_not_cost_a_batch() -> None:
+    assert fitting_batches(report([0.1 + 0.2]), plan([False]), 0.3) == 1
+
+
+def test_an_empty_plan() -> None:
+    assert fitting_batches(report([]), plan([]), 1.0) == 0
+
+
+@given(st.lists(st.booleans(), max_size=8), st.floats(0, 10))
+def test_as_many_as_possible(linked: list[bool], window_s: float) -> None:
+    linked = [False, *linked]
+    ends = [float(i + 1) for i in range(len(linked))]
+    n = fitting_batches(report(ends), plan(linked), window_s)
+    cuts = [k for k in range(1, len(linked) + 1) if k == len(linked) or not linked[k]]
+    assert n == max([0, *(k for k in cuts if ends[k - 1] <= window_s)])
+
+
+def test_default_grids_have_the_papers_spacing() -> None:
+    grid = default_grid(3, 5)
+    assert grid.shape == (3, 5)
+    assert grid.spacing_m == 4.49e-6
+    assert default_grid(3, 5) is grid
+
 
 Move = tuple[int, int, int, int]
 IDLE, PICK_UP, TRANSPORT, DROP_OFF = SegmentKind
@@ -275,3 +347,215 @@ def test_what_cannot_be_played() -> None:
     for move in ((4, 0, 4, 1), (0, 6, 0, 5), (-1, 0, -1, 1)):
         with pytest.raises(PlanError, match="does not fit onto the grid of 4 x 6 sites; check it first"):
             program_of(batch(move))
+
+
+UNEVEN = RfSpec(row_amplitudes=(0.1, 0.2, 0.05, 0.1), column_amplitudes=(0.1, 0.05, 0.2, 0.15, 0.1, 0.12))
+MOTIONS = st.builds(
+    MotionSpec,
+    speed_profile=st.sampled_from(SPEED_PROFILES),
+    rf=st.sampled_from([UNEVEN, replace(UNEVEN, phases="low_crest"), RfSpec()]),
+)
+
+PROGRAMS = MOTIONS.flatmap(lambda motion: tone_programs(grid=GRID, motion=motion))
+
+
+def axes_at(program: ToneProgram, t_s: float) -> tuple[TonesNow, TonesNow]:
+    tones = program.tones_at(t_s)
+    return tones.row, tones.column
+
+
+@given(PROGRAMS)
+@settings(max_examples=60, deadline=None)
+def test_frequency_amplitude_and_phase_go_on_at_every_joint_within_a_batch(program: ToneProgram) -> None:
+    just_before_s = 1e-12
+    for i in range(1, program.n_segments):
+        if SegmentKind.IDLE in (program.kind[i - 1], program.kind[i]):
+            continue
+        joint_s = float(program.joint_s[i])
+        befores, afters = axes_at(program, joint_s - just_before_s), axes_at(program, joint_s)
+        for before, after in zip(befores, afters, strict=True):
+            assert after.frequency_hz == pytest.approx(before.frequency_hz, abs=1.0)
+            assert after.amplitude**2 == pytest.approx(before.amplitude**2, abs=1e-8)
+            jump = np.exp(1j * (after.phase_rad - before.phase_rad))
+            assert jump == pytest.approx(np.exp(2j * np.pi * after.frequency_hz * just_before_s), abs=1e-5)
+
+
+def integrated_cycles(program: ToneProgram, start_s: float, end_s: float) -> list[NDArray[np.float64]]:
+    """Cycles of each axis' tones between two times of a segment, by Gauss and Legendre."""
+    nodes, weights = np.polynomial.legendre.leggauss(6)
+    edges = np.linspace(start_s, end_s, 9)
+    cycles: list[Any] = [0.0, 0.0]
+    for low, high in pairwise(edges):
+        for node, weight in zip(nodes, weights, strict=True):
+            at = axes_at(program, 0.5 * (low + high) + 0.5 * (high - low) * node)
+            for axis in (0, 1):
+                cycles[axis] = cycles[axis] + 0.5 * (high - low) * weight * at[axis].frequency_hz
+    return cycles
+
+
+@given(PROGRAMS.filter(lambda program: program.n_segments > 0), st.data())
+@settings(max_examples=60, deadline=None)
+def test_the_phase_is_the_integral_of_the_frequency(program: ToneProgram, data: st.DataObject) -> None:
+    i = data.draw(st.integers(0, program.n_segments - 1))
+    start_s, duration_s = float(program.joint_s[i]), float(program.duration_s[i])
+    t_s = start_s + duration_s * data.draw(st.floats(0.01, 0.99))
+    cycles = integrated_cycles(program, start_s, t_s)
+    for axis, passed, start in zip((0, 1), cycles, axes_at(program, start_s), strict=True):
+        expected = np.exp(1j * (start.phase_rad + 2 * np.pi * passed))
+        assert np.exp(1j * axes_at(program, t_s)[axis].phase_rad) == pytest.approx(expected, abs=1e-4)
+
+
+@given(PROGRAMS, st.floats(0, 1, exclude_max=True))
+@settings(max_examples=60, deadline=None)
+def test_frequencies_and_amplitudes_stay_within_limits(program: ToneProgram, part: float) -> None:
+    for now in axes_at(program, part * program.total_duration_s):
+        assert np.all((now.frequency_hz >= 82e6) & (now.frequency_hz <= 118e6))
+        assert np.all(np.diff(now.frequency_hz) >= 1.6e6 * (1 - 1e-9))
+        assert np.all((now.amplitude >= 0) & (now.amplitude <= 0.2))
+        assert now.amplitude.sum() <= 1.0 + 1e-9
+
+
+@pytest.mark.parametrize("profile", SPEED_PROFILES)
+@given(case=cases((6, 6)), dop=st.integers(1, 6))
+@settings(max_examples=40, deadline=None)
+def test_a_program_lasts_as_long_as_the_check_says(
+    profile: SpeedProfile, case: tuple[TargetPattern, Occupancy], dop: int
+) -> None:
+    target, atoms = case
+    grid, motion = SiteGrid(*target.shape), MotionSpec(speed_profile=profile)
+    context = Context(grid=grid, motion=motion)
+    plan = PscaPlanner(PscaSettings(degree_of_parallelism=dop), context).plan(atoms, target)
+    report = check_plan(plan, atoms, target, dop, grid, motion)
+    program = tone_program(plan, grid, motion)
+    ends = [program.duration_s[program.batch <= i].sum() for i in range(plan.n_batches)]
+    assert report.batch_end_s == pytest.approx(motion.overhead_per_cycle_s + np.array(ends))
+
+
+@pytest.mark.parametrize("profile", ["minimum_jerk", "constant_jerk"])
+def test_with_a_jerk_profile_all_tones_start_and_arrive_together(profile: SpeedProfile) -> None:
+    program = program_of(batch((1, 0, 1, 1), (1, 2, 1, 5)), speed_profile=profile)
+    course = FrequencyCourse[profile.upper()]
+    assert program.kind.tolist() == [*SegmentKind]
+    assert program.course.tolist() == [0, 0, course, 0]
+    assert program.duration_s[2] == pytest.approx(3 * SITE_S)
+    middle_s = float(program.joint_s[2] + 1.5 * SITE_S)
+    first = GRID.column_frequency_hz[0]
+    for t_s, made in ((middle_s, 0.5), (middle_s - 0.75 * SITE_S, course.fraction(0.25))):
+        sites = (program.tones_at(t_s).column.frequency_hz - first) / 1.6e6
+        assert sites == pytest.approx([made, 2 + 3 * made])
+
+
+def test_at_constant_speed_every_segment_is_linear() -> None:
+    program = program_of(batch((1, 0, 1, 1), (1, 2, 1, 5)))
+    assert program.course.tolist() == [FrequencyCourse.LINEAR] * 5
+
+
+def test_depth_goes_evenly_from_source_to_goal_through_all_cuts() -> None:
+    program = program_of(batch((1, 0, 1, 1), (1, 2, 1, 5)), rf=UNEVEN)
+    start_s = float(program.joint_s[2])
+    for sites in (0.0, 0.5, 1.0, 1.7, 2.999):
+        depth = program.tones_at(start_s + sites * SITE_S).column.amplitude ** 2
+        early, late = min(sites, 1.0), sites / 3
+        assert depth[0] == pytest.approx(0.1**2 + early * (0.05**2 - 0.1**2))
+        assert depth[1] == pytest.approx(0.2**2 + late * (0.12**2 - 0.2**2))
+    assert program.tones_at(start_s).row.amplitude.tolist() == [0.2]
+
+
+def test_an_ejected_atom_keeps_the_amplitude_of_the_edge() -> None:
+    program = program_of(batch((0, 1, 0, -1)), rf=UNEVEN)
+    assert program.column.end_amplitude[-2] == 0.1
+
+
+def crest(program: ToneProgram) -> float:
+    """Peak over r.m.s. of the envelope of the column tones at the start of the transport."""
+    tones = program.tones_at(float(program.joint_s[2])).column
+    t_s = np.linspace(0.0, 1 / 1.6e6, 2000)[:, None]
+    turns = 2j * np.pi * (tones.frequency_hz - tones.frequency_hz[0]) * t_s
+    envelope = np.abs((tones.amplitude * np.exp(turns + 1j * tones.phase_rad)).sum(axis=1))
+    return float(envelope.max() / np.sqrt((envelope**2).mean()))
+
+
+@pytest.mark.parametrize("n", [4, 8, 19])
+def test_phases_of_low_crest_beat_random_ones(n: int) -> None:
+    plan = Plan.from_batches([([(0, i) for i in range(n)], [(0, i + 1) for i in range(n)])])
+    chosen = tone_program(plan, motion=MotionSpec(rf=RfSpec(phases="low_crest")))
+    drawn = [tone_program(plan, motion=MotionSpec(rf=RfSpec(phase_seed=seed))) for seed in range(20)]
+    assert crest(chosen) < 1.5
+    assert crest(chosen) < np.median([crest(program) for program in drawn])
+
+
+def test_phases_of_low_crest_follow_schroeder_s_rule() -> None:
+    rf = replace(UNEVEN, phases="low_crest")
+    program = program_of(batch((1, 0, 1, 1), (1, 2, 1, 3), (1, 5, 1, 6)), rf=rf)
+    sites, power = np.array([0, 2, 5]), np.array([0.1, 0.2, 0.12]) ** 2
+    ways = np.maximum(sites[:, None] - sites, 0)
+    expected = -2 * np.pi * ways @ power / power.sum()
+    phases = program.column.phase_rad[:3]
+    assert np.exp(1j * phases) == pytest.approx(np.exp(1j * expected))
+
+
+def test_the_seed_decides_on_the_random_phases() -> None:
+    one, same, other = (
+        program_of(batch((0, 0, 0, 1)), rf=RfSpec(phase_seed=seed)).column.phase_rad[0] for seed in (1, 1, 2)
+    )
+    assert one == same
+    assert one != other
+
+
+LIMITS = np.array([80.0, 120.0, 2.0, 1.0, 1.0, 0.3])
+AMPLITUDE = st.floats(0, 0.5)
+
+
+def tones(*each: tuple[float, float, float, float]) -> NDArray[np.float64]:
+    """Tones of one segment: frequency and amplitude at its start, and at its end."""
+    values = np.zeros((N_FIELDS, len(each)))
+    values[[START_HZ, START_AMPLITUDE, END_HZ, END_AMPLITUDE]] = np.array(each).reshape(-1, 4).T
+    return values
+
+
+def excess(*each: tuple[float, float, float, float]) -> tuple[int, int, float]:
+    return first_excess(np.array([0, len(each)], np.int32), tones(*each), LIMITS)
+
+
+@given(st.lists(st.tuples(AMPLITUDE, AMPLITUDE), max_size=6))
+def test_the_greatest_sum_of_amplitudes_is_that_of_a_close_look(pairs: list[tuple[float, float]]) -> None:
+    values = tones(*((0.0, start, 0.0, end) for start, end in pairs))
+    u = np.linspace(0.0, 1.0, 2001)[:, None]
+    start, end = values[START_AMPLITUDE] ** 2, values[END_AMPLITUDE] ** 2
+    seen = float(np.sqrt(start + (end - start) * u).sum(axis=1).max())
+    assert greatest_sum(values, 0, len(pairs), 0.0) == pytest.approx(seen, abs=2e-3)
+    assert greatest_sum(values, 0, len(pairs), 0.0) >= seen - 1e-9
+    assert greatest_sum(values, 0, len(pairs), 9.0) >= seen - 1e-9
+
+
+def test_one_tone_that_fades_into_another_is_louder_in_between() -> None:
+    assert greatest_sum(tones((0, 1, 0, 0), (0, 0, 0, 1)), 0, 2, 1.0) == pytest.approx(math.sqrt(2))
+
+
+@pytest.mark.parametrize(
+    ("each", "expected"),
+    [
+        ([], (WITHIN, -1, 0.0)),
+        ([(80, 0.3, 120, 0.3), (100, 0.3, 122, 0.3)], (BAND, 1, 122.0)),
+        ([(80, 0.3, 118, 0.3), (100, 0.3, 120, 0.3)], (WITHIN, -1, 0.0)),
+        ([(79, 0.3, 90, 0.3)], (BAND, 0, 79.0)),
+        ([(math.nan, 0.3, 90, 0.3)], (BAND, 0, math.nan)),
+        ([(90, 0.3, 90, 0.3), (91, 0.3, 100, 0.3)], (SPACING, 1, 1.0)),
+        ([(90, 0.3, 100, 0.3), (100, 0.3, 90, 0.3)], (SPACING, 1, -10.0)),
+        ([(90, 0.1, 90, 0.7), (100, 0.1, 100, 0.4)], (AMPLITUDES, 0, 1.1)),
+        ([(90, math.nan, 90, 0.7)], (AMPLITUDES, 0, math.nan)),
+        ([(90, 0.1, 90, 0.6)], (POWER, 0, 0.36)),
+    ],
+)
+def test_the_first_excess(
+    each: list[tuple[float, float, float, float]], expected: tuple[int, int, float]
+) -> None:
+    assert excess(*each) == pytest.approx(expected, nan_ok=True)
+
+
+def test_frequencies_may_fall_from_tone_to_tone() -> None:
+    values, falling = tones((100, 0.1, 100, 0.1), (90, 0.1, 90, 0.1)), LIMITS.copy()
+    falling[3] = -1.0
+    offsets = np.array([0, 2], np.int32)
+    assert first_excess(offsets, values, falling)[0] == WITHIN
+    assert first_excess(offsets, values, LIMITS)[0] == SPACING
