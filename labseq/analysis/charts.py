@@ -43,7 +43,7 @@ HIDDEN_S: Final = 1e-6
 """Shorter times are those of models that neglect a stage."""
 
 
-STYLE: Final[dict[str, Any]] = {
+STYLE: Final[dict[Any, Any]] = {
     "axes.axisbelow": True,
     "axes.edgecolor": "0.35",
     "axes.grid": True,

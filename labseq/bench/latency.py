@@ -248,8 +248,8 @@ class _Timed:
         return answer
 
 
-class _Measured:
-    """The step that does what a rearrangement does, and the first chunk of a stream by itself."""
+class _Measured(Step):
+    """A step that does the work of a rearrangement, and times the first chunk of a stream separately."""
 
     needs_image = True
     takes_image = False
@@ -264,8 +264,8 @@ class _Measured:
         self._samples = np.empty((2, CHUNK), np.int16)
         self._frames = np.empty((CHUNK, 2), np.int16)
 
-    def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:  # noqa: ARG002 - Protocol
-        """It takes the time that it takes."""
+    def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:  # noqa: ARG002
+        """Empty: its duration is not planned."""
         return []
 
     def run(self, shot: Shot) -> None:

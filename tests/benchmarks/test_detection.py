@@ -1,6 +1,6 @@
 """Benchmark: from a frame of 512 x 512 pixels to the occupancy of 400 sites. Goal: under 100 us.
 
-How many errors are made: ``tests/imaging/test_fidelity.py``.
+How many errors are made: ``tests/detection/test_fidelity.py``.
 """
 
 from __future__ import annotations

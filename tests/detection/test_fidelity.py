@@ -1,6 +1,6 @@
 """How many errors the detectors make on the virtual lab's frames, beside the least that anyone could make.
 
-``LABSEQ_FRAMES=2500 pytest -s tests/imaging/test_fidelity.py --numprocesses=0`` prints the figures of
+``LABSEQ_FRAMES=2500 pytest -s tests/detection/test_fidelity.py --numprocesses=0`` prints the figures of
 ``docs/explanation/detection.md``. Each detector has the threshold of fewest errors: the least mean of
 the fractions of atoms missed and of empty sites taken for full. Atoms lost during the exposure do not count.
 """
