@@ -30,7 +30,7 @@ class Climb:
         self._ranges = space.ranges
 
     def next_point(self, visited: Sequence[VisitedPoint]) -> Mapping[str, float] | None:
-        """The first neighbour of the best point that has not been visited; at first, what the files have."""
+        """The first unvisited neighbour of the best point; the first point is that of the files."""
         if not visited:
             return {r.address: r.at(0.5 if isnan(r.start) else r.fraction(r.start)) for r in self._ranges}
         scores: dict[tuple[float, ...], list[float]] = defaultdict(list)

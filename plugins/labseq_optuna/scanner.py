@@ -1,4 +1,4 @@
-"""Points by a sampler of Optuna, as a pure function of what has been visited.
+"""Points by a sampler of Optuna, as a pure function of the visited points.
 
 Optuna's own samplers go on drawing from where they stand. Here each point has a sampler of its
 own, seeded by the run's seed and the number of points before it, and a study that is told
@@ -44,7 +44,7 @@ class OptunaScanner:
         self._distributions = {one.address: self._distribution(one) for one in space.ranges}
 
     def next_point(self, visited: Sequence[VisitedPoint]) -> Mapping[str, float]:
-        """At first what the files have, if that is known; then what the sampler chooses."""
+        """The point of the files first, if known; then the points of the sampler."""
         if not visited and all(not math.isnan(one.start) for one in self._space.ranges):
             return {one.address: one.at(one.fraction(one.start)) for one in self._space.ranges}
         optuna = self._optuna
@@ -63,7 +63,7 @@ class OptunaScanner:
             return samplers.TPESampler(seed=seed, n_startup_trials=self._settings.n_random, multivariate=True)
 
     def _distribution(self, one: ScanRange) -> Any:
-        """Steps of a range that has them are counted; any other goes from 0 to 1."""
+        """A range with steps counts them; any other goes from 0 to 1."""
         if one.is_whole or one.n_steps:
             return self._optuna.distributions.IntDistribution(0, _n_steps(one))
         return self._optuna.distributions.FloatDistribution(0.0, 1.0)

@@ -25,7 +25,7 @@ Clear: TypeAlias = Annotated[
 
 
 class BlockSettings(Settings):
-    """A pattern that goes on and on, cut to a block."""
+    """A periodic pattern, cut to a block."""
 
     rows: int = Field(ge=1, description="rows of the block")
     cols: int = Field(ge=1, description="columns of the block")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable
 from typing import Annotated, Final, Literal
 
@@ -28,13 +27,15 @@ _ORDERS: Final[dict[RowOrder, int]] = {"half_filled": 0, "fullest": -1, "empties
 
 
 class ToneLimits(Settings):
-    """Most tones on at once on each axis."""
+    """Maximum number of simultaneous tones on each axis."""
 
     row: Annotated[int, Field(ge=1)] | None = Field(
-        default=None, description="most tones of the row axis, so most atoms that move along a column at once"
+        default=None,
+        description="maximum number of row tones, and so of atoms that move along a column at once",
     )
     col: Annotated[int, Field(ge=1)] | None = Field(
-        default=None, description="most tones of the column axis: most atoms that move along a row together"
+        default=None,
+        description="maximum number of column tones, and so of atoms that move along a row at once",
     )
 
 
@@ -42,11 +43,13 @@ class PscaSettings(Settings):
     """Settings of the planner ``psca``."""
 
     degree_of_parallelism: int = Field(
-        default=7, ge=1, description="most mobile tweezers on at once; the profile's limits hold besides"
+        default=7,
+        ge=1,
+        description="maximum number of mobile tweezers on at once; the profile's limits hold too",
     )
     max_tones: ToneLimits = Field(
         default=ToneLimits(),
-        description="most tones on each axis, for cards with fewer tones than the degree of parallelism",
+        description="maximum number of tones on each axis, for cards with few tones",
     )
     variant: Literal["fewest", "paper"] = Field(
         default="fewest",
@@ -54,28 +57,27 @@ class PscaSettings(Settings):
     )
     row_order: RowOrder = Field(
         default="half_filled",
-        description="which row is sorted first: of equally helpful ones, or of all with variant paper",
+        description="which row is sorted first: among equally useful ones, or among all with variant paper",
     )
     repair_below: float = Field(
         default=0.1,
         ge=0,
         le=1,
-        description="fraction of defects up to which few atom moves count more than few batches",
+        description="fraction of defects up to which repair with few atom moves is considered too",
     )
 
 
 class PscaPlanner:
-    """Row sorting, then column compression, or the other way round where that takes fewer batches.
+    """Row sorting, then column compression, or the reverse if that takes fewer batches.
 
     Args:
         settings: The planner's settings.
-        context: Its grid settles which sites are nearest to the target's centre,
-            its motion how many tweezers and tones there may be and how far out
-            atoms can be ejected.
+        context: Its grid determines which sites are nearest to the target's centre;
+            its motion limits tweezers and tones, and how far out atoms can be ejected.
 
     Attributes:
-        degree_of_parallelism: Most atoms that a batch moves; the tone limits of
-            the moving axis may lower it further.
+        degree_of_parallelism: Maximum number of atoms that a batch moves; the tone
+            limits of the moving axis may lower it further.
 
     Example:
         >>> target = TargetPattern(fill=[[True, True, False]], clear=[[False, False, False]])
@@ -103,20 +105,18 @@ class PscaPlanner:
             from labseq_psca.kernels_paper import plan_as_in_paper as kernel
         else:
             from labseq_psca.kernels import plan_best_way as kernel
-
-            importlib.import_module("labseq_psca.kernels")  # so that it is ready too
         self._kernel = kernel
 
     def plan(self, occupancy: ArrayLike, target: TargetPattern) -> Plan:
         """Plan the moves that fill the target and clear what must be empty.
 
         With too few atoms, the fill sites nearest to the target's centre are
-        filled. Surplus atoms go to the reservoir, or are ejected where there is no
+        filled. Surplus atoms go to the reservoir, or are ejected if there is no
         room in their line.
 
         Args:
             occupancy: bool (n_rows, n_cols), as detected.
-            target: What to end with, of the same shape.
+            target: The wanted pattern, of the same shape.
 
         Returns:
             Batches of one line each, of at most ``degree_of_parallelism`` atoms.
@@ -136,7 +136,7 @@ class PscaPlanner:
             if 0 < n_defects <= self._settings.repair_below * target.n_atoms:
                 repaired = self._repair(occupied, fill, target.clear)
                 moves, offsets = min((moves, offsets), repaired, key=_cost)
-        moves.flags.writeable = offsets.flags.writeable = False  # else Plan would copy them
+        moves.flags.writeable = offsets.flags.writeable = False  # otherwise Plan would copy them
         return Plan(moves, offsets)
 
     def _sort_and_compress(
@@ -150,7 +150,7 @@ class PscaPlanner:
     def _repair(
         self, occupied: Occupancy, fill: NDArray[np.bool_], clear: NDArray[np.bool_]
     ) -> tuple[NDArray[np.int16], NDArray[np.int32]]:
-        """Fill each defect from the side that takes fewest atoms; sort and compress what that leaves."""
+        """Fill each defect from the side that takes fewest atoms; sort and compress for the rest."""
         from labseq_psca.kernels import plan_repair
 
         moves, offsets, atoms = plan_repair(occupied, fill, *self._limits)
@@ -159,7 +159,7 @@ class PscaPlanner:
 
 
 def _cost(plan: tuple[NDArray[np.int16], NDArray[np.int32]]) -> int:
-    """What a plan of few moves loses."""
+    """Expected loss of a plan, in the units of the kernels' weights of moves and batches."""
     from labseq_psca.kernels import ATOM_MOVE, BATCH
 
     moves, offsets = plan

@@ -30,14 +30,16 @@ class LineSettings(Settings):
     """Settings of a planner that moves atoms of one line at a time."""
 
     degree_of_parallelism: int = Field(
-        default=7, ge=1, description="most mobile tweezers on at once; the profile's limits hold besides"
+        default=7,
+        ge=1,
+        description="maximum number of mobile tweezers on at once; the profile's limits apply too",
     )
 
 
 def read_task(
     occupancy: ArrayLike, target: TargetPattern, grid: SiteGrid, planner: str
 ) -> tuple[Bools, Bools]:
-    """Read an occupancy, and choose what can be filled with so many atoms.
+    """Read an occupancy, and choose the fill sites that its atoms suffice for.
 
     Args:
         occupancy: bool (n_rows, n_cols), as detected.
@@ -60,7 +62,7 @@ def read_task(
 
 
 def as_plan(log: NDArray[np.int32], n_moves: int, n_batches: int) -> Plan:
-    """Make a plan of what the kernels have logged.
+    """Make a plan from the log of the kernels.
 
     Args:
         log: int32 (>= n_moves, 5): batch, from row, from column, to row, to column.
@@ -160,7 +162,7 @@ class ScannedPlan:
 
     @property
     def n_scans(self) -> int:
-        """Number of scans: what the source counts as moves."""
+        """Number of scans, which the source counts as moves."""
         return len(self.lines_passed)
 
     def duration_s(self, grid: SiteGrid, motion: MotionSpec) -> float:

@@ -18,7 +18,7 @@ Moves = tuple[NDArray[np.int16], Bools, int]
 
 
 class SingleTweezerPlanner(ABC):
-    """What the planners with one mobile tweezer share: they differ in how the fill sites get their atoms.
+    """Base of the planners with one mobile tweezer; they differ in which atom goes to which fill site.
 
     Args:
         settings: None; there is nothing to set.

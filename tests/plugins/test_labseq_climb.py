@@ -9,7 +9,7 @@ from labseq_climb.scanner import Climb, ClimbSettings
 
 from labseq.plugin import ScanRange, ScanSpace, VisitedPoint
 from labseq.testing import ScannerContract
-from labseq.testing.contracts.deciders import Factory
+from labseq.testing.contracts.deciders import ScannerFactory
 
 DOP = ScanRange("planner.degree_of_parallelism", 2, 15, is_whole=True, start=3)
 RAMP = ScanRange("profile.mobile_tweezers.pick_up", 20e-6, 400e-6)
@@ -17,7 +17,7 @@ RAMP = ScanRange("profile.mobile_tweezers.pick_up", 20e-6, 400e-6)
 
 class TestClimb(ScannerContract):
     @pytest.fixture
-    def factory(self) -> Factory:
+    def factory(self) -> ScannerFactory:
         return partial(Climb, ClimbSettings())
 
 

@@ -12,7 +12,7 @@ from labseq_optuna.scanner import OptunaScanner, OptunaSettings
 
 from labseq.plugin import ConfigError, ScanRange, ScanSpace, VisitedPoint
 from labseq.testing import ScannerContract
-from labseq.testing.contracts.deciders import Factory
+from labseq.testing.contracts.deciders import ScannerFactory
 
 SPEED = ScanRange("profile.mobile_tweezers.speed", 0.05, 0.2)
 CYCLES = ScanRange("shot.2.rearrange.cycles", 1, 40, is_whole=True)
@@ -22,7 +22,7 @@ class TestTpe(ScannerContract):
     n_points: ClassVar[int] = 12
 
     @pytest.fixture
-    def factory(self) -> Factory:
+    def factory(self) -> ScannerFactory:
         return partial(OptunaScanner, OptunaSettings(n_random=4))
 
 
@@ -30,7 +30,7 @@ class TestRandom(ScannerContract):
     n_points: ClassVar[int] = 6
 
     @pytest.fixture
-    def factory(self) -> Factory:
+    def factory(self) -> ScannerFactory:
         return partial(OptunaScanner, OptunaSettings(sampler="random"))
 
 
