@@ -7,7 +7,7 @@ LABSEQ_API = 1
 
 @hookimpl
 def labseq_register(registry: Registry) -> None:
-    """Offer the camera ``andor``; in a dry run it is a camera that exists only in software."""
+    """Register the camera ``andor``; in a dry run the simulated camera is used."""
     from labseq_andor.camera import AndorCamera
     from labseq_andor.settings import SIMULATED, AndorSettings
 

@@ -1,4 +1,4 @@
-"""Cameras that speak GenICam: GigE Vision and USB3 Vision, through Aravis."""
+"""GenICam cameras: GigE Vision and USB3 Vision, through Aravis."""
 
 from labseq.plugin import Registry, hookimpl
 
@@ -7,7 +7,7 @@ LABSEQ_API = 1
 
 @hookimpl
 def labseq_register(registry: Registry) -> None:
-    """Offer the camera ``genicam``; in a dry run a simulated GigE Vision camera shows the simulated atoms."""
+    """Register the camera ``genicam``; in a dry run a simulated GigE Vision camera sees the simulated atoms."""
     from labseq_genicam.camera import GenicamCamera
     from labseq_genicam.settings import SIMULATED, GenicamSettings
 

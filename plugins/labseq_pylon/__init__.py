@@ -1,4 +1,4 @@
-"""Basler cameras, by pylon."""
+"""Basler cameras, through pylon."""
 
 from labseq.plugin import Registry, hookimpl
 
@@ -7,7 +7,7 @@ LABSEQ_API = 1
 
 @hookimpl
 def labseq_register(registry: Registry) -> None:
-    """Offer the camera ``pylon``; in a dry run pylon's emulated camera shows the simulated atoms."""
+    """Register the camera ``pylon``; in a dry run pylon's emulated camera sees the simulated atoms."""
     from labseq_pylon.camera import PylonCamera
     from labseq_pylon.settings import SIMULATED, PylonSettings
 
