@@ -7,7 +7,7 @@ LABSEQ_API = 1
 
 @hookimpl
 def labseq_register(registry: Registry) -> None:
-    """Register the camera ``genicam``; in a dry run a simulated GigE Vision camera sees the simulated atoms."""
+    """Register the camera ``genicam``; in a dry run a simulated GigE camera sees the simulated atoms."""
     from labseq_genicam.camera import GenicamCamera
     from labseq_genicam.settings import SIMULATED, GenicamSettings
 
