@@ -8,9 +8,8 @@ takes little time.
 from __future__ import annotations
 
 import importlib
-from typing import Any, Final
 
-_HOMES: Final = {
+_HOMES = {
     "labseq.api": (
         "make_planner",
         "make_target",
@@ -60,12 +59,12 @@ _HOMES: Final = {
     ),
     "labseq.session": ("Session",),
 }
-_HOME_OF: Final = {name: home for home, names in _HOMES.items() for name in names}
+_HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 
-__version__: Final = "0.2.0"
+__version__ = "0.2.0"
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> object:
     if name == "plugin":
         return importlib.import_module("labseq.plugin")
     home = _HOME_OF.get(name)
