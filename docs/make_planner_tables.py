@@ -353,7 +353,8 @@ def draw_curves(axes: Axes, curves: Sequence[Points], figure: Figure) -> None:
         if points.law is not None and len(x):
             along = np.geomspace(x[0], x[-1], 50)
             law = unit * points.law.factor * along**points.law.exponent.value
-            axes.plot(along, law, linestyle=line, **{**look, "marker": ""})
+            style: Any = {**look, "linestyle": line, "marker": ""}
+            axes.plot(along, law, **style)
     if figure.paper_points:
         x, y = zip(*figure.paper_points, strict=True)
         axes.errorbar(x, y, fmt="*", color="0.2", markersize=9, label="the paper", zorder=4)
@@ -447,9 +448,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description="Measure the planners, and draw the paper's figures.")
     parser.add_argument("--loadings", type=int, default=10_000)
     parser.add_argument("--figure", choices=[*FIGURES], help="draw this figure of the paper only")
-    parser.add_argument(
-        "--set", action="append", default=[], help="such as speed='130 um/ms'"
-    )
+    parser.add_argument("--set", action="append", default=[], help="such as speed='130 um/ms'")
     parser.add_argument("--output", type=Path, help="picture of --figure; by default figure-2b.png, ...")
     given = parser.parse_args(arguments)
     if given.figure is not None:

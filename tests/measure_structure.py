@@ -99,11 +99,11 @@ def main(root: Path) -> None:
     print(f"\n{'plugin':24}{'driver':>8}{'simulator':>11}")
     totals = [0, 0]
     for folder in sorted(path for path in (root / "plugins").iterdir() if (path / "__init__.py").exists()):
-        parts: list[list[Path]] = [[], []]
+        groups: list[list[Path]] = [[], []]
         for path in folder.rglob("*.py"):
             inside = str(path.relative_to(root / "plugins"))
-            parts[any(mark in inside for mark in SIMULATORS)].append(path)
-        lines = [count_lines(paths) for paths in parts]
+            groups[any(mark in inside for mark in SIMULATORS)].append(path)
+        lines = [count_lines(paths) for paths in groups]
         totals = [total + n for total, n in zip(totals, lines, strict=True)]
         print(f"{folder.name:24}{lines[0]:8}{lines[1]:11}")
     print(f"{'plugins':24}{totals[0]:8}{totals[1]:11}")

@@ -20,7 +20,7 @@ from labseq.errors import LabseqError
 from labseq.model import ScanSpace
 from labseq.pictures.figures import check_place
 from labseq.recording.export import check_export
-from labseq.recording.shot_file import _bitshuffle
+from labseq.recording.hdf5 import bitshuffle
 
 ROOT = Path(__file__).parents[1]
 EXTRAS: dict[str, list[str]] = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"][
@@ -33,7 +33,7 @@ NEEDS: dict[tuple[str, str, str], Callable[[], object]] = {
     ("analysis", "xarray", "xarray"): lambda: check_export("netcdf", Path("a.nc")),
     ("analysis", "h5netcdf", "h5netcdf"): lambda: check_export("netcdf", Path("a.nc")),
     ("andor", "pylablib", "pylablib.devices.Andor.AndorSDK2"): lambda: load_pylablib("camera"),
-    ("compress", "hdf5plugin", "hdf5plugin"): _bitshuffle,
+    ("compress", "hdf5plugin", "hdf5plugin"): bitshuffle,
     ("frames", "tifffile", "tifffile"): lambda: load("tifffile", "tifffile", Path("a.tif")),
     ("frames", "pillow", "PIL.Image"): lambda: load("PIL.Image", "Pillow", Path("a.png")),
     ("optuna", "optuna", "optuna"): lambda: OptunaScanner(OptunaSettings(), ScanSpace((), 1)),

@@ -85,7 +85,8 @@ class RunPicture:
         """Draw all panels."""
         from matplotlib import rc_context
 
-        with rc_context(STYLE):
+        style: Any = STYLE
+        with rc_context(style):
             return self._draw()
 
     def _draw(self) -> Figure:

@@ -182,7 +182,7 @@ def measure_latency(
     lab = session.build_lab()
     timed = _Timed(lab.detector, lab.planner)
     measured = _Measured(_sample_rate_hz(session, lab), watch, timed)
-    steps = [*_up_to_the_image(session), ("latency", measured)]
+    steps: list[tuple[str, Any]] = [*_up_to_the_image(session), ("latency", measured)]
     with stop_on_signals(session.stop_flag):
         session.warm(lab)
         lab = replace(lab, detector=timed, planner=timed)

@@ -97,7 +97,7 @@ class Simulation(ABC):
 
     @property
     def loading_probability(self) -> float | None:
-        """Probability that a site holds an atom after loading, for estimates before a run; None if unknown."""
+        """Probability that a site holds an atom after loading, for estimates; None if unknown."""
         return None
 
     def truth(self) -> Occupancy | None:
@@ -149,7 +149,7 @@ class ToneSource(Protocol):
 
 @runtime_checkable
 class ReceivesOutput(Protocol):
-    """A simulation that acts on the samples that a device outputs, rather than on the program it was given."""
+    """A simulation that acts on the samples that a device outputs, not on the program it was given."""
 
     def warm(self) -> None:
         """Compile the kernels for that; a driver with such outputs calls it in its own ``warm``."""

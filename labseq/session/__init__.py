@@ -18,10 +18,10 @@ from labseq.session.session import Session
 
 __all__ = [
     "Assembly",
-    "ResolvedProfile",
     "CheckedDevice",
     "DevicesReport",
     "Options",
+    "ResolvedProfile",
     "SafeStateReport",
     "Session",
     "assemble",

@@ -141,7 +141,7 @@ class Camera:
             self.close()
             raise AravisError(f"the camera {id_} is controlled by another program", "not controller")
         lib.arv_camera_set_range_check_policy(self._handle, CHECK_RANGES)
-        callback = _ControlLost(lambda _device, _data: self._lost.set())
+        callback = _ControlLost(self._note_lost_control)
         signal = lib.g_signal_connect_data(device, b"control-lost", callback, None, None, 0)
         self._signal = (device, signal, callback)
 
@@ -162,6 +162,9 @@ class Camera:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    def _note_lost_control(self, _device: Any, _data: Any) -> None:
+        self._lost.set()
 
     @property
     def is_lost(self) -> bool:

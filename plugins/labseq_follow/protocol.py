@@ -104,7 +104,7 @@ class Dialogue:
         return self._go.text, ["busy"]
 
     def report(self, state: str, about: About, now_s: float) -> tuple[str, list[str]]:
-        """The shot of a `go` is over: the answer, see ``labseq.plugin.LeaderLink.report``, and lines to send."""
+        """The shot of a `go` is over: the answer (``labseq.plugin.LeaderLink.report``) and lines to send."""
         if self._go is None or not self._go.taken:
             return "", []
         late = self.overdue(now_s)

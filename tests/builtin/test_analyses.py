@@ -41,7 +41,8 @@ def cycle_of(plan: Plan, cycle: int, n_played: int | None = None) -> CycleRecord
 def analysed(images: list[ImageRecord], cycles: list[CycleRecord], atoms: str = "all") -> dict[str, Any]:
     settings: Any = SimpleNamespace(atoms=atoms)
     shot: Any = SimpleNamespace(images=images, cycles=cycles)
-    return SurvivalAnalysis(settings, None).shot(shot)
+    context: Any = None
+    return SurvivalAnalysis(settings, context).shot(shot)
 
 
 STEP_RIGHT = Plan.from_batches([([(0, 0), (0, 1)], [(0, 1), (0, 2)])])

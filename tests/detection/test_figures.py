@@ -1,6 +1,6 @@
 """How well sites, thresholds and shifts are found: the figures of ``docs/explanation/finding-sites.md``.
 
-``LABSEQ_FRAMES=40 pytest -s tests/detection/test_figures.py --numprocesses=0`` prints them, from so many draws.
+``LABSEQ_FRAMES=40 pytest -s tests/detection/test_figures.py --numprocesses=0`` prints them.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 The frames (5,000 of 3 x 3 pixels at three gains, from github.com/fatmac78/EMCCD-calibration) are not part of
 this repository; the tests read them from the folder LABSEQ_EMCCD_DATA, else from ``shared/data/emccd``
-next to the checkout. Offset, read noise, light and counts per electron of that camera are not known, so the compared
-figures do not depend on them. ``-s`` prints the figures of ``docs/explanation/virtual-images.md``.
+next to the checkout. Offset, read noise, light and counts per electron of that camera are not known, so the
+compared figures do not depend on them. ``-s`` prints the figures of ``docs/explanation/virtual-images.md``.
 """
 
 from __future__ import annotations

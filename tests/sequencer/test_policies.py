@@ -103,7 +103,9 @@ def test_the_run_speaks_for_what_is_outside_of_steps() -> None:
             return {"power_w": 1.0}
 
     made = Rig(policy=again)
-    made.lab.devices["shutter"].__class__ = Polled  # fakes are made by their role, with its methods
+    object.__setattr__(
+        made.lab.devices["shutter"], "__class__", Polled
+    )  # fakes are made by their role, with its methods
     made.run()
     assert [shot.status for shot in made.sink.shots] == ["failed", "complete"]
 
@@ -167,7 +169,7 @@ def test_no_policy_goes_on_past_an_interlock(then: Any) -> None:
             raise DeviceError("shutter", "power is 2 W, above its limit of 1 W")
 
     made = Rig(policy=RunPolicy(otherwise=StepPolicy(on_failure=then)))
-    made.lab.devices["shutter"].__class__ = Watching
+    object.__setattr__(made.lab.devices["shutter"], "__class__", Watching)
     with pytest.raises(InterlockError, match=r"^shutter: power is 2 W, above its limit of 1 W$") as caught:
         made.run()
     assert caught.value.device == "shutter"
@@ -306,7 +308,7 @@ def test_mobile_tweezers_may_tell_what_their_time_goes_into() -> None:
     ways = {"stop_when": "never", "window_mode": "early", "window_of": lambda _: 1.0}
     step = RearrangeStep(given(cycles=1, exposure=0.02, **ways))
     made = Rig((LOAD, IMAGE, ("rearrange", step)), occupancies=[[[1, 0]], [[0, 1]]], fill=[[0, 1]])
-    made.lab.mobile_tweezers.__class__ = Telling
+    object.__setattr__(made.lab.mobile_tweezers, "__class__", Telling)
     made.run()
     stages = {timing.stage: timing for timing in made.record().timing}
     assert (stages["render"].host_s, stages["upload"].host_s) == (1e-3, 2e-3)

@@ -34,7 +34,8 @@ def make(name: str, calls: Calls, kind: type[RecordingDevice] = SelfTested, **fa
 def tried(
     *devices: RecordingDevice, timeouts: Timeouts = TIMEOUTS, stop: StopFlag | None = None
 ) -> list[CheckedDevice]:
-    return check_each_device([(device.name, device) for device in devices], timeouts, stop or StopFlag())
+    named: Any = [(device.name, device) for device in devices]
+    return check_each_device(named, timeouts, stop or StopFlag())
 
 
 def test_a_device_is_opened_identified_tested_read_made_safe_and_closed() -> None:
@@ -125,7 +126,8 @@ def test_the_simulation_is_opened_first_and_closed_last() -> None:
     calls = Calls()
     simulation = RecordingSimulation(calls)
     devices = [("one", make("one", calls, fail_on={"open": OSError("gone")}))]
-    world, one = check_each_device(devices, TIMEOUTS, StopFlag(), simulation)
+    named: Any = devices
+    world, one = check_each_device(named, TIMEOUTS, StopFlag(), simulation)
     assert (calls.names()[0], calls.names()[-1]) == ("simulation.open", "simulation.close")
     assert (world.name, world.ok, one.ok) == ("simulation", True, False)
 

@@ -256,7 +256,9 @@ def test_a_run_that_may_be_in_progress_elsewhere_is_a_change(stopped: Path) -> N
 
 def test_one_resumes_at_a_time(stopped: Path) -> None:
     with labseq.Session.resume(stopped) as session:
-        with pytest.raises(ConfigError, match=r"another process resumes it already: labseq resume \(process \d+ on "):
+        with pytest.raises(
+            ConfigError, match=r"another process resumes it already: labseq resume \(process \d+ on "
+        ):
             labseq.Session.resume(stopped)
         session.run()
     assert labseq.open_run(stopped).status == "complete"
