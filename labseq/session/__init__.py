@@ -1,4 +1,4 @@
-"""Puts a run together from a sequence, a profile and plugins; opens the devices, runs and records it.
+"""Builds a run from a sequence, a profile and plugins; opens the devices, takes the shots and records them.
 
 ``labseq check`` is in ``check``; planning without a run in ``planning``, with its ``occupancies``.
 """

@@ -1,4 +1,4 @@
-"""Adaptive scans: a scanner chooses each point from the results of the points before."""
+"""Adaptive scans: a scanner chooses each point from the results of the earlier points."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ Steps = Sequence[tuple[str, Step]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Search:
-    """The scanner of an adaptive scan, and the ranges that it chooses from.
+    """The scanner of an adaptive scan, and the range of values of each scanned address.
 
     Attributes:
         scanned: The scan; its points are the corners of the ranges.
@@ -48,12 +48,12 @@ class Search:
 
     @property
     def name(self) -> str:
-        """The scanner as messages name it."""
+        """Name of the scanner in messages."""
         return f"scanner '{self.chosen.entry.name}'"
 
     @property
     def units(self) -> list[str]:
-        """The unit that the values of each address are written in."""
+        """Unit in which the sequence writes the values of each address."""
         return [ends.unit for ends in self.adaptive.ends]
 
     def space(self, seed: int) -> ScanSpace:
@@ -74,7 +74,7 @@ class Search:
             raise alone.scan.explained(error) from None
 
     def written(self, values: Mapping[str, Any]) -> dict[str, str]:
-        """The values of a point as they are written: address -> text."""
+        """The values of a point as text in the units of the sequence: address -> text."""
         pairs = zip(self.ranges, self.units, strict=True)
         return {one.address: written(values[one.address], unit) for one, unit in pairs}
 
@@ -93,7 +93,7 @@ class Search:
 
 
 def make_search(scanned: ScanPoints, steps: Steps, found: ProblemCollector) -> Search | None:
-    """The scanner of a scan, checked; None if the scan is not adaptive, or something is wrong.
+    """Make and check the scanner of a scan; None if the scan is not adaptive, or if there is a problem.
 
     The scanner is constructed once, to check that its constructor accepts the settings.
 
@@ -127,7 +127,7 @@ def make_search(scanned: ScanPoints, steps: Steps, found: ProblemCollector) -> S
 
 
 def _range(axis: Axis, ends: Ends, resolved: tuple[Any, Any], present: Any, name: str) -> ScanRange:
-    """A range, if its ends are numbers and the settings model leaves them as they are written."""
+    """The range of an axis, if its ends are numbers that the settings model accepts unchanged."""
     low, high = ends.low.si, ends.high.si
     if not all(map(_is_number, resolved)) or not all(map(math.isclose, resolved, (low, high))):
         what = f"'{clean(axis.address)}' is no number, or not the one that is written"
@@ -155,7 +155,7 @@ class PointScore:
         first: Its first visit.
         values: Address -> value, SI.
         total: Sum of the scores of its visits.
-        n_scores: How many of them have one.
+        n_scores: Number of visits that have a score.
     """
 
     first: int
@@ -174,7 +174,7 @@ class Results:
     """The results of the points of an adaptive scan.
 
     Attributes:
-        search: What chooses the points.
+        search: The scanner and its ranges.
         shots: The shots that count: index -> shot.
     """
 
@@ -196,12 +196,12 @@ class Results:
         self.shots[shot.index] = shot
 
     def add_skipped(self, shot: int, parameters: Mapping[str, Any]) -> None:
-        """Remember the point of a skipped shot: the scanner receives it without a score."""
+        """Remember the point of a skipped shot: the scanner receives the point without a score."""
         visit = shot // self.search.scanned.scan.repeats
         self._skipped[visit] = self._values_in(parameters)
 
     def values(self, visit: int) -> dict[str, float] | None:
-        """The values of a point; None if no shot was tried at it."""
+        """The values of a point; None if no shot was attempted there."""
         shots = self._shots_of(visit)
         return self._values_in(shots[0].row["parameters"]) if shots else self._skipped.get(visit)
 
@@ -209,13 +209,13 @@ class Results:
         return {one.address: parameters[one.address] for one in self.search.ranges}
 
     def before(self, visit: int) -> list[VisitedPoint]:
-        """The results of the points before one, as the scanner receives them."""
+        """The results of all points before the given one, as the scanner receives them."""
         while len(self._visited) < visit:
             self._visited.append(self._visit(len(self._visited)))
         return [one for one in self._visited[:visit] if one.values]
 
     def missing_figure(self, shot: int) -> str:
-        """A warning, given once, that a shot does not have the scan's figure; "" if it has."""
+        """A warning, given once, that a shot lacks the figure that the scan optimises; else ""."""
         figure, figures = self.search.adaptive.figure, figures_in(self.shots[shot].row)
         if self._warned or figure in figures:
             return ""
@@ -242,7 +242,7 @@ class Results:
         }
 
     def _count(self, visit: int) -> None:
-        """Add a visit to those of its point: all of them count together."""
+        """Add a visit to its point; the score of a point is the mean over all its visits."""
         one = self._visit(visit)
         point = self._point_scores.setdefault(dumps(dict(one.values)), PointScore(visit, one.values))
         if not math.isnan(one.score):
@@ -283,10 +283,10 @@ class ScannerCall:
         self._scanner: Scanner = construct_one(search.chosen, search.space(seed))
 
     def choose(self, visited: Sequence[VisitedPoint]) -> dict[str, float] | None:
-        """The next point, address -> value; None if the scanner wants no more.
+        """The next point, address -> value; None if the scanner has finished.
 
         Raises:
-            DeviceError: It raised, or returned something else than a point of its ranges; names it.
+            DeviceError: The scanner raised, or returned no point of its ranges; names the scanner.
             DeviceTimeoutError: It did not answer in time.
             StopRequested: The operator asked to stop.
         """
@@ -297,7 +297,7 @@ class ScannerCall:
             guard.end()
 
     def next_point(self, visited: Sequence[VisitedPoint]) -> dict[str, float] | None:
-        """The scanner's answer, checked; for a guarded call, which names this function."""
+        """The scanner's answer, checked. Error messages of a guarded call name this function."""
         try:
             answer: Any = self._scanner.next_point(visited)
             given = dict(cast("Mapping[Any, Any]", answer)) if isinstance(answer, Mapping) else None
@@ -314,7 +314,7 @@ class ScannerCall:
         return {address: self._value(one, given[address], units[address]) for address, one in ranges.items()}
 
     def _value(self, range_: ScanRange, value: object, unit: str) -> float:
-        """A value that its range allows, without rounding errors."""
+        """A value snapped to its range, without rounding errors."""
         what = "a whole number" if range_.is_whole else "a number"
         expected = f"{what} from {written(range_.low, unit)} to {written(range_.high, unit)}"
         expected += f" on one of its {range_.n_steps} steps" if range_.n_steps else ""

@@ -1,4 +1,4 @@
-"""Analyses of a run's shots: made from its settings, applied to shots, and their results."""
+"""Constructs the analyses of a run from its settings, applies them to its shots and stores the results."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from labseq.session.recorded import context_of, plugins_of, resolved_of
 
 @dataclass(frozen=True, slots=True)
 class PreparedAnalysis:
-    """An analysis that is ready for the shots of a run.
+    """An analysis, constructed and ready for the shots of a run.
 
     Attributes:
         name: Its name.
         analysis: The analysis itself.
-        about: Its description in the file of the results.
+        about: Plugin, version and settings, as the file of the results has them.
     """
 
     name: str
@@ -39,13 +39,13 @@ class PreparedAnalysis:
 
 @dataclass(frozen=True, slots=True)
 class AnalysisOutcome:
-    """The result of an analysis.
+    """What an analysis has done: number of shots analysed, failures, and the file of the results.
 
     Attributes:
         name: Its name.
-        n_done: Shots that were analysed now.
-        n_before: Shots of which there was a result already.
-        failures: Index of a shot -> why there is no result of it.
+        n_done: Number of shots analysed by this call.
+        n_before: Number of shots that already had a result.
+        failures: Index of a shot -> why it has no result.
         path: The file of the results.
     """
 
@@ -57,27 +57,27 @@ class AnalysisOutcome:
 
 
 def analyses_of(run: Run) -> list[dict[str, Any]]:
-    """The analyses that a run's sequence asks for, with their settings.
+    """The analyses listed in a run's sequence, with their settings.
 
     Raises:
-        RecordingError: The run does not say what it was taken with.
+        RecordingError: run.json lacks the settings of the run.
     """
     found: Any = resolved_of(run).get("analysis") or []
     return [dict(one) for one in cast("list[dict[str, Any]]", found)]
 
 
 def prepare(run: Run, settings: Mapping[str, Any]) -> PreparedAnalysis:
-    """Make an analysis for the shots of a run.
+    """Construct an analysis for the shots of a run.
 
     Args:
         run: The run.
         settings: "use" and its settings.
 
     Raises:
-        UnknownPluginError: No plugin offers it.
-        PluginLoadError: Its plugin failed to load, or is at fault.
+        UnknownPluginError: No plugin offers this analysis.
+        PluginLoadError: Its plugin failed to load, or its constructor failed.
         ConfigError: A setting is wrong.
-        RecordingError: The run does not say enough of itself.
+        RecordingError: run.json lacks settings of the run.
     """
     name = str(settings[USE])
     host = plugins_of(run)
@@ -100,20 +100,20 @@ def prepare(run: Run, settings: Mapping[str, Any]) -> PreparedAnalysis:
 def results_of(
     run_dir: Path, prepared: PreparedAnalysis, *, anew: bool = False
 ) -> Generator[tuple[ResultsLog, set[int]]]:
-    """The results of an analysis, for writing by this process alone.
+    """Open the results of an analysis for writing, locked against other processes.
 
-    Results of other settings are not mixed with new ones: all shots are analysed again then.
+    If the settings of the analysis have changed, all shots are analysed again, so that results never mix.
 
     Args:
         run_dir: The run's folder.
         prepared: The analysis.
-        anew: Whether to begin again in any case.
+        anew: Whether to analyse all shots again even if the settings are unchanged.
 
     Yields:
-        Where results go, and the shots that have one already.
+        The file of the results, and the shots that already have one.
 
     Raises:
-        ConfigError: Another process writes them.
+        ConfigError: Another process is writing them.
         RecordingError: They cannot be written.
     """
     path = results_file(run_dir, prepared.name)
@@ -129,16 +129,16 @@ def analyse(
     log: ResultsLog,
     failed: Callable[[int, BaseException], None],
 ) -> int:
-    """Analyse shots; one that fails is recorded and reported, and the next one follows.
+    """Analyse shots; a failure is recorded and reported, and the next shot follows.
 
     Args:
         prepared: The analysis.
         shots: The shots.
-        log: Where the results go.
+        log: The file of the results.
         failed: Receives the index of a failed shot, and the error.
 
     Returns:
-        How many have a result.
+        Number of shots that now have a result.
 
     Raises:
         RecordingError: The disk is full.
@@ -181,10 +181,10 @@ def analyse_missing(run: Run, settings: Mapping[str, Any], *, anew: bool = False
 
 @contextlib.contextmanager
 def _alone(path: Path, name: str) -> Generator[None]:
-    """Keep other processes from writing the same results at the same time.
+    """Lock the results against other processes within the block.
 
     Raises:
-        ConfigError: One does already.
+        ConfigError: Another process is writing them.
         RecordingError: The folder cannot be written to.
     """
     lock = Lock(path.with_name(f".{path.stem}.lock"), f"the analysis '{name}'")

@@ -2,7 +2,7 @@
 
 It reads the run's index, which lists a shot as soon as it is complete on disk: the index is the queue. So
 the run never waits for an analysis, an analysis that falls behind takes no memory, and one that is
-started again continues where it was. The end of standard input signals the end of the run.
+restarted continues where it was. The end of standard input signals the end of the run.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from labseq.session.analyses import analyse, analyses_of, prepare, results_of
 from labseq.session.observers import FAILED, USE
 
 LOOK_S: Final = 0.1
-"""How often it looks for new shots."""
+"""Interval between two readings of the index, in seconds."""
 
 
 class _End:
-    """The end of the run, and of the time after it."""
+    """Detects the end of the run, and the end of the time allowed after it."""
 
     def __init__(self, finish_within_s: float) -> None:
         self._within_s = finish_within_s
@@ -43,7 +43,7 @@ class _End:
 
     @property
     def time_is_up(self) -> bool:
-        """Whether no further shot is to be begun."""
+        """Whether the time after the run is used up: no further shot is analysed."""
         return time.monotonic() > self._deadline_s
 
     def wait(self) -> None:
@@ -63,7 +63,7 @@ def main(run_dir: Path, name: str, finish_within_s: float) -> None:
     Args:
         run_dir: The run's folder.
         name: One of the analyses of its sequence.
-        finish_within_s: How long to go on after its end.
+        finish_within_s: Time allowed after the end of the run, in seconds.
     """
     end = _End(finish_within_s)
     if hasattr(os, "nice"):
@@ -75,10 +75,10 @@ def main(run_dir: Path, name: str, finish_within_s: float) -> None:
 
 
 def _as_they_come(run_dir: Path, before: set[int], end: _End) -> Generator[Shot]:
-    """The shots that have no result yet, until the run is over and there are no more."""
+    """Yield the shots without a result as they are recorded, until the run is over."""
     follower = Follower(run_dir)
     while True:
-        over = end.came  # before the index is read: what was written by then is in it
+        over = end.came  # before the index is read, so that it contains every shot written before the end
         for shot in follower.new():
             if end.time_is_up:
                 return

@@ -1,4 +1,4 @@
-"""Assembles a run from its files: plugins, settings and objects; nothing is opened."""
+"""Builds a run from its files: chooses plugins, validates settings; no device is opened."""
 
 from __future__ import annotations
 
@@ -52,12 +52,12 @@ class Assembly:
         document: The sequence's file.
         sequence: Its content.
         bench: The profile.
-        target: The pattern of atoms to end with.
-        planner: What plans the moves.
+        target: The target pattern.
+        planner: The planner and its settings.
         steps: Name and step, in order.
         dry_run: "off", "full" or "fast".
-        resolved: Every setting after defaults and overrides, SI, JSON-ready; of a scan, at its first
-            point, as everything else here.
+        resolved: Every setting after defaults and overrides, SI, JSON-ready; for a scan, at its first
+            point, like all other attributes.
         scanned: The points of the scan; None without one.
         policy: Reactions to failures and exceeded budgets.
         search: The scanner, if it chooses the points during the run.
@@ -114,7 +114,7 @@ def assemble(
     Args:
         sequence_path: The sequence file, or the name of one; see :func:`labseq.config.find_sequence`.
         profile: Name or path of the profile, instead of the sequence's own.
-        overrides: ``"address=value"`` strings, as given to ``--set``; they win.
+        overrides: ``"address=value"`` strings, as given to ``--set``; they take precedence.
         given: Overrides from other options.
         dry_run: "full": every device by its simulator if its plugin has one, else by its virtual
             twin; "fast": virtual twins only.
@@ -122,9 +122,9 @@ def assemble(
         again: Profile and calibrations when the run began, if it is resumed.
 
     Raises:
-        ConfigError: The sequence, the profile or an override is wrong.
-        UnknownPluginError: A plugin that is named does not exist.
-        PluginLoadError: A plugin that is named failed to load.
+        ConfigError: The sequence, the profile or an override has an error.
+        UnknownPluginError: A named plugin does not exist.
+        PluginLoadError: A named plugin failed to load.
     """
     check_dry_run(dry_run)
     sequence_path = sequence_path if kept is not None else find_sequence(sequence_path)
@@ -206,7 +206,7 @@ def _explained(error: ConfigError, scan: Scan | None) -> ConfigError:
 
 
 def _check_alone(document: Document, sequence: SequenceSpec, found: ProblemCollector) -> None:
-    """Check a sequence whose profile is wrong: the settings of all plugins that need no plugin folder."""
+    """Check the settings in a sequence whose profile has errors, except for plugins from plugin folders."""
     host = PluginHost()
     host.load_builtin(builtins)
     host.load_entry_points()
@@ -223,7 +223,7 @@ def _check_alone(document: Document, sequence: SequenceSpec, found: ProblemColle
 
 
 def _expressions(sequence: Document, profile: Document) -> dict[str, str]:
-    """Address -> text of each expression; the record has their values among the settings."""
+    """Address -> text of each expression; the record of the run has its value among the settings."""
     texts: dict[str, str] = {}
     for prefix, document in (("", sequence), ("profile.", profile)):
         for loc, text in ({} if document.expressions is None else document.expressions.texts).items():

@@ -1,4 +1,4 @@
-"""The calibrations that a profile uses, and what they change in it."""
+"""Reads the calibrations that a profile uses and applies them to its settings."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from labseq.registry import VIRTUAL_TWIN
 
 FOLDER: Final = "calibrations"
 DRY_RUN_FOLDER: Final = "dry-run"
-"""Within a store: that of dry runs, because measurements on virtual atoms do not hold for real ones."""
+"""Folder of dry runs in a store: calibrations measured on simulated atoms are not valid for real ones."""
 
 BASIS: Final[Mapping[CalibrationKind, CalibrationKind]] = {"overlay": "frequencies", "thresholds": "sites"}
-"""Kind -> the kind that it was measured on top of, and is only valid together with."""
+"""Kind -> the kind of calibration that it was measured with and is only valid together with."""
 
 
 PLACES: Final = frozenset({"threshold", "width", "sites", "frame", "centre_px", "angle"})
-"""Settings of detectors that do not change what is compared with a threshold, where sites are calibrated."""
+"""Detector settings that do not change the signals compared with thresholds if sites are calibrated."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,8 +33,8 @@ class ActiveCalibrations:
     """A profile's calibrations in use.
 
     Attributes:
-        entries: Kind -> entry.
-        grid: The grid, with the tones that they give.
+        entries: Kind of calibration -> entry.
+        grid: The grid with calibrated tones.
         warnings: Notes for the user that are not errors.
     """
 
@@ -46,12 +46,13 @@ class ActiveCalibrations:
 def store_of(
     document: Document, profile: ProfileSpec, dry_run: Literal["off", "full", "fast"] = "off"
 ) -> Store:
-    """The store of a profile.
+    """The folder of calibrations of a profile.
 
     Args:
         document: The profile's file.
         profile: What it says.
-        dry_run: "off", "full" or "fast"; a profile of virtual devices alone is the same lab in a dry run.
+        dry_run: "off", "full" or "fast"; a profile with only virtual devices uses
+            the same store in a dry run.
     """
     folder = profile.calibrations.folder or profile_dir(document.path) / FOLDER / document.path.stem
     choices = [profile.camera, profile.static_tweezers, profile.mobile_tweezers, *profile.devices.values()]
@@ -60,7 +61,7 @@ def store_of(
 
 
 def open_store(profile: str, dry_run: Literal["off", "full", "fast"] = "off") -> tuple[Store, ProfileSpec]:
-    """The store of a profile, and what the profile says.
+    """The folder of calibrations of a profile, and the content of the profile.
 
     Args:
         profile: Name or path of the profile.
@@ -86,7 +87,7 @@ def calibrated(
     Args:
         document: The profile's file.
         profile: What it says.
-        found: Where the problems go; a calibration that has one is not used.
+        found: Receives the problems; a calibration that has one is not used.
         dry_run: "off", "full" or "fast".
         detector: Settings of the detector in use, for the record; None where they do not matter.
         pins: Kind -> id of the only calibrations to use; None for those of profile and store.

@@ -62,8 +62,8 @@ class Rehearsal:
     """The planner's results for random loadings.
 
     Attributes:
-        n_loadings: How many were tried.
-        n_filled: How many had enough atoms and a plan that meets the target.
+        n_loadings: Number of loadings.
+        n_filled: Number of loadings with enough atoms and a plan that fills the target.
         duration_s: float64 (n_loadings,), from the start of a cycle to the end of its last batch.
         first_batch_s: float64 (n_loadings,), the same for its first batch.
     """
@@ -76,14 +76,14 @@ class Rehearsal:
 
 @dataclass(frozen=True, slots=True)
 class CheckReport:
-    """What a run will do and need.
+    """Timeline, duration, disk space and warnings of a run, before it starts.
 
     Attributes:
-        timeline: Name of each step and its bars; of a scan, as all else but ``run_s``, at its first point.
+        timeline: Name of each step and its bars; for a scan, like all but ``run_s``, at its first point.
         n_shots: Shots of the run.
         n_points: Points of the scan that these shots are at; None without a scan.
-        run_s: Duration of the run, at least and at most.
-        warnings: What is allowed but probably not intended, with its place in the files.
+        run_s: Minimum and maximum duration of the run, in seconds.
+        warnings: Settings that are allowed but probably not intended, with their place in the files.
         rehearsal: The planner's results for random loadings; None without a rearrangement.
         shot_bytes: Size of a shot on disk at most; None if the camera does not report its frame shape.
         lines: Name of each line -> when it is on in the longest shot, as (start, end) in seconds.
@@ -110,17 +110,17 @@ class CheckReport:
 
     @property
     def shortest_shot_s(self) -> float:
-        """Duration of a shot that leaves out what it may leave out."""
+        """Duration of a shot that skips every optional cycle and window."""
         return sum(bar.min_duration_s for bar in self.bars)
 
     @property
     def n_images(self) -> int:
-        """Images of a shot at most."""
+        """Maximum number of images of a shot."""
         return sum(bar.n_images for bar in self.bars)
 
 
 def check(session: Session) -> CheckReport:
-    """Find out what a run will do and need; nothing is opened.
+    """Compute timeline, duration, disk space and warnings of a run; no device is opened.
 
     Args:
         session: An opened session; its sequence and profile have no errors.
@@ -163,7 +163,7 @@ def check(session: Session) -> CheckReport:
 
 
 def _run_s(session: Session, lab: Lab) -> tuple[float, float]:
-    """Least and most duration of the run, each shot at its own point of the scan, or at any corner of it."""
+    """Minimum and maximum duration of the run, with each shot at its scan point, or at any corner of it."""
     guard = Guard()
     min_duration_s, most_s = list[float](), list[float]()
     for point, n in session.scan_run.counted():
@@ -180,7 +180,7 @@ def _run_s(session: Session, lab: Lab) -> tuple[float, float]:
 
 
 def _windows(steps: Sequence[tuple[str, Step]]) -> list[tuple[int, list[float]]]:
-    """Step number and window per cycle, of each rearrangement."""
+    """Step number and window per cycle of each rearrangement step."""
     found: list[tuple[int, list[float]]] = []
     for number, (_, step) in enumerate(steps):
         settings: Any = getattr(step, "settings", None)
@@ -258,7 +258,7 @@ def _exposure_warnings(
 
 
 def _judgement_warnings(session: Session, rearrangements: Sequence[int]) -> list[Problem]:
-    """Success is judged on an ``image`` step at the end; cycles that are all made are judged on their own."""
+    """Warn if no ``image`` step judges the shots; a fixed number of cycles is judged by its own images."""
     assembly = session.assembly
     images = [n for n, (_, step) in enumerate(assembly.steps) if step.takes_image and n not in rearrangements]
     if not rearrangements or max(images, default=-1) > rearrangements[-1]:

@@ -157,10 +157,10 @@ def construct_target(chosen: ChosenPlugin, grid: SiteGrid) -> TargetPattern:
 
 
 def check_role(entry: Entry, made: object) -> None:
-    """Refuse an object that lacks a method or attribute of its role.
+    """Raise if an object lacks a method or attribute of its role.
 
     Raises:
-        PluginLoadError: With what is missing.
+        PluginLoadError: A method or attribute is missing; names it.
     """
     role = _ROLES[entry.kind]
     called, see = f"{entry.kind} '{entry.name}'", f"see labseq.plugin.{role.__name__}"
@@ -187,7 +187,7 @@ def _called(made: object) -> str:
 
 
 DEVICE_KEYS: Final = {"device": "name", "equalise": "device", "wait": "device"}
-"""Step that uses a device of the profile -> the setting that names it, which is optional for a wait."""
+"""Step that uses a device of the profile -> the setting with the device's name (optional for a wait)."""
 
 
 def make_target(
@@ -234,7 +234,7 @@ def make_steps(
             if step.needs_image and not image_seen:
                 what = f"'{spec.kind}' needs an image before it in the shot"
                 raise document.error(spec.loc, what, "an 'image' step before it", key=True)
-        # A wrong step counts as one that takes an image: it might be meant as one.
+        # A wrong step counts as one that takes an image: the user may have intended one.
         image_seen = image_seen or step is None or step.takes_image
     return steps, dumps
 

@@ -1,4 +1,4 @@
-"""From an assembled run to the devices that the sequencer works on, and from one scan point to the next."""
+"""Constructs the devices of a run, and those that differ at the next point of its scan."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from labseq.session.profile import ChosenPlugin, ResolvedProfile, refuse_wrong_w
 from labseq.session.scan import Point
 
 DRIVERS_MOTION: Final = frozenset({"rf", "max_row_tones", "max_column_tones", "eject_slots"})
-"""Keys of the motion that the mobile tweezers are opened with; all others are the core's alone."""
+"""Keys of the motion that mobile tweezers need when they are opened; only the core uses the others."""
 
 
 def clock_for(stop: StopFlag, *, virtual: bool, paced: bool = False) -> Clock:
-    """The clock that a run keeps to.
+    """The clock of a run.
 
     Args:
         stop: The request to stop.
         virtual: Whether time passes only in waits.
-        paced: Whether virtual time takes as long as it says.
+        paced: Whether virtual time passes at the speed of real time.
     """
     if not virtual:
         return RealClock(stop)
@@ -38,10 +38,10 @@ def clock_for(stop: StopFlag, *, virtual: bool, paced: bool = False) -> Clock:
 
 
 def build_lab(point: Point, target: TargetPattern, clock: Clock, seed: int) -> Lab:
-    """Construct every role's object; nothing is opened.
+    """Construct the object of every role; no device is opened.
 
     Raises:
-        ConfigError: A constructor refuses its settings, or the lines do not go with the devices.
+        ConfigError: A constructor refuses its settings, or the lines conflict with the devices.
     """
     bench = point.bench
     profile, motion = bench.profile, bench.profile.motion
@@ -83,7 +83,7 @@ def build_lab(point: Point, target: TargetPattern, clock: Clock, seed: int) -> L
 
 
 def rebuild_lab(lab: Lab, before: Point, after: Point, seed: int) -> tuple[Lab, frozenset[str]]:
-    """Construct again what differs between two points; everything else stays open as it is.
+    """Construct the objects whose settings differ between two points; all others stay open.
 
     A device of which a setting differs must be closed before and opened after. The mobile
     tweezers stay open if the motion differs only in what each program contains. A
@@ -91,7 +91,7 @@ def rebuild_lab(lab: Lab, before: Point, after: Point, seed: int) -> tuple[Lab, 
     on to the simulation, and that to the motion.
 
     Args:
-        lab: As it is at the point before.
+        lab: The lab at the previous point.
         before: The point that the lab is at.
         after: The next point.
         seed: The run's seed.
@@ -149,7 +149,7 @@ def _changed_motion(before: MotionSettings, after: MotionSettings) -> set[str]:
 
 
 def _streams(old: tuple[RandomStream, ...], new: tuple[RandomStream, ...]) -> tuple[RandomStream, ...]:
-    """The streams of a lab: the new ones, and the old ones of what stays."""
+    """Random streams of a lab: those of new objects, and the earlier ones of objects that stay."""
     names = {stream.name for stream in new}
     return (*(stream for stream in old if stream.name not in names), *new)
 
@@ -160,7 +160,7 @@ def _blinding(profile: ProfileSpec) -> dict[str, Blinding]:
 
 
 def parallelism_of(planner: ChosenPlugin, made: Any, motion: MotionSpec) -> int:
-    """Most mobile tweezers that a batch of a planner may use, as it says, else what the motion bears."""
+    """Maximum number of mobile tweezers in a batch: the planner's own limit, else that of the motion."""
     dop = call_plugin(
         planner.entry.owner,
         "its degree_of_parallelism",
@@ -180,18 +180,18 @@ WARM_S: Final = 300.0
 
 
 def warm(lab: Lab, stop_flag: StopFlag, observer: RunObserver, *, devices: bool = True) -> None:
-    """Compile before the first shot: a compile in mid-shot would cost the atoms.
+    """Compile all kernels before the first shot, because compiling during a shot would lose the atoms.
 
     Args:
-        lab: What will need kernels.
-        stop_flag: Looked at before each compile.
-        observer: Receives which modules are compiled, and how long it took.
-        devices: Whether the devices will need theirs, too; else only what plans and detects.
+        lab: The lab whose objects need kernels.
+        stop_flag: Checked before each compile.
+        observer: Receives the names of the compiled modules and the time each took.
+        devices: Whether to compile the kernels of devices as well as those of planner and detector.
 
     Raises:
         StopRequested: The operator asked to stop.
         PlanError: The planner's kernels failed.
-        DeviceError: Those of a device or the detector did.
+        DeviceError: The kernels of a device or the detector failed.
     """
     start_s, compiled = time.monotonic(), list[str]()
 

@@ -22,11 +22,11 @@ from labseq.units import format_quantity
 USE: Final = "use"
 FINISH_WITHIN: Final = "finish_within"
 FAILED: Final = "failed: "
-"""Prefix of the lines of a process's log that the run shows as a warning."""
+"""Lines of an analysis's log with this prefix are shown as warnings of the run."""
 
 _QUIET: Final = frozenset({"image", "cycle", "state", "compiling", "compiled", "run_finished"})
 """Events that are not logged: the shot files hold them, or the writer logs them itself."""
-_HOOKS: Final = {  # event -> hook of plugins, and its arguments from the event's values
+_HOOKS: Final = {  # event -> observer hook of plugins, and the event's values that are its arguments
     "run_started": ("labseq_run_started", {"run": "record"}),
     "shot_finished": ("labseq_shot_finished", {"shot": "shot"}),
     "run_finished": ("labseq_run_finished", {"run": "record"}),
@@ -59,7 +59,7 @@ class Observers:
             self._analyses.look()
 
     def report_prints(self) -> None:
-        """Warn of what the plugins in use printed while they were loaded and constructed."""
+        """Show as warnings the text that plugins in use printed while they were loaded and constructed."""
         for text in self._host.notes:
             self.event("warning", {"text": text})
 
@@ -70,7 +70,7 @@ class Observers:
         )
 
     def finish_analyses(self) -> None:
-        """Let the analyses finish, once the devices are safe."""
+        """Wait for the analyses to finish, after the devices are safe."""
         if self._analyses is not None:
             self._analyses.finish()
 
@@ -130,16 +130,16 @@ def _plain(value: Any) -> Any:
 
 
 GRACE_S: Final = 2.0
-"""How much longer than its time a process may take to end by itself."""
+"""Extra time for a process to exit before it is killed, in seconds."""
 MAX_READ: Final = 1 << 16
-"""Bytes of a log that are looked at, from its end."""
+"""Number of bytes that are read from the end of a log."""
 _MODULE: Final = "labseq.session.analysis_process"
 
 Warn = Callable[[str], None]
 
 
 class AnalysisProcesses:
-    """A process for each analysis of a run; nothing that they do stops or slows the run.
+    """The processes of a run's analyses, one each; they neither stop nor slow the run.
 
     Args:
         run_dir: The run's folder.
@@ -159,12 +159,12 @@ class AnalysisProcesses:
                 warn(f"the process of analysis '{name}' could not be started: {error.strerror}")
 
     def look(self) -> None:
-        """Warn once of each analysis that has failed; quick, for use between shots."""
+        """Warn once about each analysis that has failed; fast enough to call between shots."""
         for one in self._processes:
             one.look(self._report)
 
     def finish(self) -> None:
-        """After the run: give each analysis time for the remaining shots, then report what is missing."""
+        """After the run: give each analysis time for the remaining shots, then report missing results."""
         for one in self._processes:
             one.end_of_run()
         end_s = time.monotonic()
@@ -205,7 +205,7 @@ class _AnalysisProcess:
             )
 
     def look(self, warn: Warn) -> None:
-        """Report the first failure; its log has all of them."""
+        """Report the first failure; the log of the analysis lists all of them."""
         if self._has_warned:
             return
         code = self._process.poll()
@@ -219,13 +219,13 @@ class _AnalysisProcess:
                 self._has_warned = True
 
     def end_of_run(self) -> None:
-        """Signal that no more shots come."""
+        """Tell the process that no more shots follow."""
         assert self._process.stdin is not None
-        with suppress(OSError):  # it is gone
+        with suppress(OSError):  # it has exited
             self._process.stdin.close()
 
     def wait(self, end_s: float, warn: Warn) -> None:
-        """Wait until it has ended, and end it if its time is up.
+        """Wait until the process has ended, and kill it if its time is up.
 
         Args:
             end_s: When the run ended, on this computer's monotonic clock.
@@ -246,7 +246,7 @@ class _AnalysisProcess:
                 self._log.unlink()
 
     def _new_lines(self) -> list[str]:
-        """The last lines of its log that are new since the last call."""
+        """Lines added to the end of its log since the last call."""
         if self._log.stat().st_size == self._seen:
             return []
         with self._log.open("rb") as log:

@@ -1,4 +1,4 @@
-"""An occupancy as it is named on the command line: a file, standard input, a shot, or a draw."""
+"""Reads an occupancy given on the command line: a file, standard input, a shot, or a random draw."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from labseq.text_files import decode, files_in, is_file, something_else
 from labseq.units import parse_quantity
 
 MAX_SITES: Final = 1000
-"""Most rows, and most columns, as in a hardware profile."""
+"""Maximum number of rows and of columns, as in a hardware profile."""
 MAX_BYTES: Final = 4 << 20
-"""Largest text, in bytes."""
+"""Maximum size of a text, in bytes."""
 MAX_NPY_BYTES: Final = 32 << 20
-"""Largest .npy file, in bytes."""
+"""Maximum size of a .npy file, in bytes."""
 FORMS: Final = (
     "a .npy file, a text file of 0 and 1, '-' for standard input, a shot file such as "
     "shots/shot_000003.h5#2, or random:20x20@0.75"
@@ -44,10 +44,10 @@ class Source:
 
     Attributes:
         occupancy: bool (n_rows, n_cols).
-        label: Where it comes from, for people.
-        seed: Seed that it was drawn with; None if nothing was drawn.
-        target: The target that it was seen with; None but for shots.
-        machine: The resolved profile that it was seen with; None but for shots.
+        label: Its origin, for messages.
+        seed: Seed of the random draw; None if it was not drawn.
+        target: Target of the shot; None if it is not from a shot.
+        machine: Resolved profile of the shot; None if it is not from a shot.
     """
 
     occupancy: Occupancy
@@ -58,7 +58,7 @@ class Source:
 
 
 def read_source(text: str, seed: int | None = None, stdin: BinaryIO | None = None) -> Source:
-    """Read what a user gives as an occupancy.
+    """Read an occupancy in any of the forms that a user may give.
 
     ``random:ROWSxCOLS@P`` is ``numpy.random.default_rng(seed).random((rows, cols)) < P``.
 
@@ -68,7 +68,7 @@ def read_source(text: str, seed: int | None = None, stdin: BinaryIO | None = Non
         stdin: What "-" reads; standard input if None.
 
     Raises:
-        ConfigError: It is none of these, or cannot be read; says what was expected.
+        ConfigError: The text has none of these forms, or cannot be read; names the forms.
     """
     if text == "-":
         data = (stdin or sys.stdin.buffer).read(MAX_BYTES + 1)
@@ -97,7 +97,7 @@ def parse_text(data: bytes, name: str) -> Occupancy:
 
     Args:
         data: UTF-8.
-        name: What messages call it.
+        name: Its name in messages.
 
     Raises:
         ConfigError: With line and column.
@@ -205,7 +205,7 @@ def _shot(path: Path, cycle: str | None) -> Source:
 
 
 def image_before(cycle: CycleRecord, images: Sequence[ImageRecord]) -> ImageRecord | None:
-    """The image that a cycle was planned on: cycle k ends with its own."""
+    """The image that a cycle was planned on: the last one before the cycle's own; None if there is none."""
     before = [image for image in images if (image.step, image.cycle) < (cycle.step, cycle.cycle)]
     return before[-1] if before else None
 

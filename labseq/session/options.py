@@ -13,14 +13,14 @@ from labseq.messages import clean
 from labseq.session.profile import DryRun
 
 _NOT_SET: Final = ("profile", "dry_run")
-"""Options that are not values of the sequence."""
+"""Options that do not replace a value of the sequence."""
 
 
 def path_of(value: Any, name: str) -> Path:
-    """A path given by a caller.
+    """Convert a caller's argument to a path.
 
     Raises:
-        ConfigError: It is not a path.
+        ConfigError: The argument is not a path.
     """
     try:
         return Path(value)
@@ -30,13 +30,13 @@ def path_of(value: Any, name: str) -> Path:
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """The options of a session: what differs from its files.
+    """The options of a session, which replace values of its files.
 
     Attributes:
         profile: Name or path of the profile, instead of the sequence's own.
         shots: Number of shots, instead of the sequence's own.
         seed: Seed, instead of the sequence's own or a fresh one.
-        overrides: ``"address=value"`` strings, as given to ``--set``; they win.
+        overrides: ``"address=value"`` strings, as given to ``--set``; they take precedence.
         output: Folder for the data, instead of LABSEQ_DATA or ``./data``.
         dry_run: "off", "full" or "fast".
         realtime: Let virtual time pass at the speed of real time.
@@ -57,7 +57,7 @@ class Options:
 
     @classmethod
     def of(cls, changes: Mapping[str, Any], *, realtime: bool = False) -> Self:
-        """The options that make these changes; the opposite of :meth:`changes`."""
+        """Options from recorded changes; the inverse of :meth:`changes`."""
         own = {key: int(changes[key]) for key in ("shots", "seed") if str(changes.get(key)).isdecimal()}
         return cls(
             profile=changes.get("profile"),
@@ -69,7 +69,7 @@ class Options:
         )
 
     def own(self) -> list[Override]:
-        """``shots`` and ``seed`` as overrides that know which option they came from."""
+        """``shots`` and ``seed`` as overrides that carry the name of their option."""
         given = {"shots": self.shots, "seed": self.seed}
         return [
             Override(key, str(value), f"--{key} {value}") for key, value in given.items() if value is not None

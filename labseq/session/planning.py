@@ -1,4 +1,4 @@
-"""One plan without a run: what a planner does with an occupancy."""
+"""Plans the moves for one occupancy without a run."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ _TARGET_FORMS: Final = (
 
 @dataclass(frozen=True, slots=True)
 class PlanRequest:
-    """What is to be planned, in the words of the command line.
+    """The arguments of ``labseq plan``, as text.
 
     Attributes:
         occupancy: See :func:`labseq.session.occupancies.read_source`.
@@ -75,7 +75,7 @@ class PlanRequest:
 
 @dataclass(frozen=True, slots=True)
 class PlanInputs:
-    """What a plan is made from, the occupancy aside."""
+    """Everything that a plan depends on, except the occupancy."""
 
     machine: Machine
     target: TargetPattern
@@ -83,14 +83,14 @@ class PlanInputs:
 
 
 def read_inputs(request: PlanRequest, source: Source) -> PlanInputs:
-    """Read and validate all that a request names.
+    """Read and validate all files and settings that a request names.
 
     Args:
         request: The request.
         source: Its occupancy.
 
     Raises:
-        ConfigError: Something is wrong; says what was expected.
+        ConfigError: An argument is invalid; says what was expected.
         PluginLoadError: A plugin that is named failed to load.
     """
     for_planner, for_profile = split_overrides(request.overrides)
@@ -110,7 +110,7 @@ def read_machine(
     Args:
         request: Names the profile, if there is one.
         overrides: Values that replace those of the profile.
-        source: The occupancy; without a profile it brings its machine.
+        source: The occupancy; without a profile, the profile of its shot is used.
 
     Raises:
         ConfigError: Something is wrong with the profile, or its grid is of another shape.
@@ -130,7 +130,7 @@ def read_machine(
 
 
 def _default_machine(source: Source) -> Machine:
-    """What a shot was taken with; else the paper's spacing and motion."""
+    """Grid and motion of the shot that the occupancy is from; else the paper's spacing and motion."""
     if source.machine is None:
         n_rows, n_cols = source.occupancy.shape
         return Machine(SiteGrid(n_rows, n_cols), MotionSpec())
@@ -140,7 +140,7 @@ def _default_machine(source: Source) -> Machine:
 def _target_choice(request: PlanRequest, source: Source) -> tuple[Document, PatternChoice | None, list[Path]]:
     """The target's pattern, the document that names it, and that document's plugin folders.
 
-    The pattern is None where the target is the one that a shot was taken with.
+    The pattern is None if the target is that of a recorded shot.
     """
     text, origin = request.target, _origin(request.origin)
     empty = Document.parse("{}", "the command line")
@@ -163,7 +163,7 @@ def _target_choice(request: PlanRequest, source: Source) -> tuple[Document, Patt
 
 
 def parse_target(text: str) -> tuple[str, dict[str, str]]:
-    """Part "pattern:settings" into the name and the settings as written.
+    """Split "pattern:settings" into the name of the pattern and its settings as text.
 
     Raises:
         ConfigError: It is not of this form.
@@ -234,17 +234,17 @@ class PlannedMoves:
     """A checked plan and everything it was made from.
 
     Attributes:
-        source: Where the occupancy comes from, for people.
+        source: Origin of the occupancy, for messages.
         occupancy: bool (n_rows, n_cols), before.
         target: The target pattern.
         grid: The grid of sites.
         motion: How the mobile tweezers move.
         planner: Name of the planner.
         settings: Those of its settings that are not the defaults, SI, JSON-ready.
-        degree_of_parallelism: Most tweezers on at once that the plan was checked for.
+        degree_of_parallelism: Maximum number of tweezers on at once, which the plan was checked for.
         seed: Seed of all random numbers, drawn or given; None if there is none.
         plan: The plan.
-        report: What the check says of it.
+        report: Result of the check.
     """
 
     source: str
@@ -261,7 +261,7 @@ class PlannedMoves:
 
     @property
     def n_missing_atoms(self) -> int:
-        """How many atoms are too few to fill the target."""
+        """Number of atoms missing to fill the target."""
         return max(0, self.target.n_atoms - int(self.occupancy.sum()))
 
     @property
@@ -276,7 +276,7 @@ class PlannedMoves:
 
     @property
     def max_tweezers(self) -> int:
-        """Most mobile tweezers on at once."""
+        """Maximum number of mobile tweezers on at once."""
         return int(self.report.n_tweezers.max(initial=0))
 
     def as_dict(self) -> dict[str, Any]:
@@ -315,7 +315,7 @@ def plan_moves(
     """Plan once, and check the plan as a run does.
 
     Args:
-        request: What is to be planned.
+        request: The arguments.
         source: Its occupancy, if it has been read already.
         announce: Called with the name of a module before its kernels are compiled.
 
@@ -352,10 +352,10 @@ def plan_moves(
 
 
 def call_planner(planner: Planner, name: str, occupancy: Occupancy, target: TargetPattern) -> Plan:
-    """Call a planner with a copy, so that one that writes into its input harms only itself.
+    """Call a planner with a copy of the occupancy, in case the planner changes its input.
 
     Raises:
-        PlanError: It raised; with its name.
+        PlanError: The planner raised; names the planner.
     """
     try:
         return planner.plan(occupancy.copy(), target)
@@ -368,7 +368,7 @@ def call_planner(planner: Planner, name: str, occupancy: Occupancy, target: Targ
 
 
 def changed_settings(settings: Settings | None) -> dict[str, Any]:
-    """Those settings that are not the defaults, SI, JSON-ready."""
+    """The settings that differ from the defaults, SI, JSON-ready."""
     return {} if settings is None else settings.model_dump(mode="json", exclude_defaults=True)
 
 
@@ -380,7 +380,7 @@ _OPTIONS = {"target": "--target", "planner": "--planner", "degree_of_parallelism
     "seed": "--seed",
     "origin": "--origin",
 }
-"""Field of a request -> the option that only planning takes."""
+"""Field of a request -> its command line option, which only planning accepts."""
 
 
 def read_plan(

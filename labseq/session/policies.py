@@ -22,7 +22,7 @@ from labseq.session.stopping import check_stop_file
 _JUDGED: Final = frozenset(
     {"success", "filling_fraction", "n_defects", "n_surplus", "seen_defect_free_cycle"}
 )
-"""Figures that only shots with an image have."""
+"""Figures (results of a shot) that only shots with an image have."""
 _UNFORESEEN: Final = ("reading.", "stage.")
 """Prefixes of figures that depend on the shot."""
 
@@ -30,7 +30,7 @@ _UNFORESEEN: Final = ("reading.", "stage.")
 def check_figure(
     document: Document, place: Loc, figure: str, purpose: str, steps: Sequence[tuple[str, Step]] | None
 ) -> None:
-    """Check that shots may have a figure.
+    """Check that the shots of a sequence can have a figure (a numerical result of a shot).
 
     Args:
         document: The sequence.
@@ -52,7 +52,7 @@ def check_figure(
 
 
 def missing_figure(shot: int, figure: str, purpose: str, figures: Iterable[str]) -> str:
-    """A warning that a shot does not have a figure.
+    """The warning that a shot lacks a figure.
 
     Args:
         shot: Its index.
@@ -104,7 +104,7 @@ def make_policy(
 def with_policies(
     document: Document, sequence: SequenceSpec, dumps: Sequence[Mapping[str, Any]]
 ) -> list[dict[str, Any]]:
-    """The settings of the steps for the record, with their own policies."""
+    """The settings of the steps for the record, each with its policy."""
     return [
         {
             **dumped,
@@ -139,7 +139,7 @@ def _is_repeatable(step: Step) -> bool:
 
 
 class Checks:
-    """Checks figures of the last shots, between two shots.
+    """Checks the figures of the most recent shots against their limits, between two shots.
 
     Args:
         checks: The checks of the sequence.
@@ -163,7 +163,7 @@ class Checks:
         for row in rows:
             skipping = [message for check, message in self._look(row) if check.then == "skip_point"]
             self.left_open = row["shot"], skipping[0] if skipping else ""  # earlier skips are recorded
-            self._unseen.clear()  # warned then
+            self._unseen.clear()  # the warning was given then
 
     def after(self, row: Mapping[str, Any]) -> str:
         """Check a shot that was taken.
@@ -196,7 +196,7 @@ class Checks:
         self._unseen.clear()
 
     def _look(self, row: Mapping[str, Any]) -> list[tuple[CheckSettings, str]]:
-        """The checks that fail with a shot, each with a message."""
+        """The checks that fail after a shot, each with a message."""
         broken: list[tuple[CheckSettings, str]] = []
         figures = figures_in(row) if self._checks else {}
         for check, values in self._checks:
@@ -222,7 +222,7 @@ def _failure(check: CheckSettings, values: deque[float]) -> str:
 
 
 class ShotHooks:
-    """What happens before and after each shot: stop requests, checks of results, skipped shots.
+    """Called before and after each shot: obeys stop requests, checks results, records skipped shots.
 
     Args:
         writer: The run's folder.
@@ -239,7 +239,7 @@ class ShotHooks:
 
     @property
     def left_open(self) -> tuple[int, str]:
-        """The last shot of an interrupted run, and why the others of its point are to be skipped; or "".
+        """The last shot of an interrupted run, and why the remaining shots of its point are skipped, or "".
 
         The skip may have been recorded before the interruption, or not.
         """
@@ -263,7 +263,7 @@ class ShotHooks:
             Why the other shots of its point are to be skipped, or "".
 
         Raises:
-            CheckFailedError: A value is beyond the limits of a check that stops the run.
+            CheckFailedError: A value is outside the limits of a check that stops the run.
         """
         return failed[0] if failed else self._checks.after(self._writer.last_row)
 

@@ -49,7 +49,7 @@ _CORE_KEYS: Final = {
     "device": frozenset(DEVICE_KEYS),
     "lines": frozenset(LINES_KEYS),
 }
-"""Keys next to a plugin's own that belong to the core."""
+"""Keys of the core that appear next to a plugin's settings."""
 
 HARDWARE_KINDS: Final = frozenset({"camera", "static_tweezers", "mobile_tweezers", "device", "lines"})
 
@@ -59,7 +59,7 @@ class ChosenPlugin:
     """A registry entry and the settings it will be constructed with.
 
     Attributes:
-        entry: What was chosen.
+        entry: Entry of the plugin in the registry.
         settings: Its settings; None if it takes none.
         document: The file that chose it; None if no file did.
         loc: Where its settings are in that file.
@@ -72,7 +72,7 @@ class ChosenPlugin:
 
     @property
     def virtual_time(self) -> bool:
-        """Whether it uses only the session's clock: always, or with the settings of a dry run."""
+        """Whether the plugin needs no real time: always, or with its present settings."""
         simulated = self.entry.simulated
         if self.entry.virtual_time or simulated is None or self.settings is None:
             return self.entry.virtual_time
@@ -83,7 +83,7 @@ class ChosenPlugin:
         return {"use": self.entry.name, **dump(self.entry, self.settings)}
 
     def placed(self, error: LabseqError) -> LabseqError:
-        """The error of its constructor, with the place of its settings."""
+        """An error of its constructor, completed with the file, line and column of its settings."""
         is_placed = isinstance(error, ConfigError) and any(problem.source for problem in error.problems)
         if self.document is None or is_placed:
             return error
@@ -128,7 +128,7 @@ class ResolvedProfile:
 def resolve(
     host: PluginHost, document: Document, kind: str, choice: Choice, drop: frozenset[str] = frozenset()
 ) -> ChosenPlugin:
-    """Find the plugin that a file names, and validate the settings given there.
+    """Find the plugin named in a file, and validate its settings.
 
     Args:
         host: The plugins.
@@ -149,7 +149,7 @@ def resolve(
 def named(
     host: PluginHost, document: Document, kind: str, name: str, loc: Loc, *, key: bool = False
 ) -> Entry:
-    """Find the entry that a file names.
+    """Find the registry entry of a plugin named in a file.
 
     Args:
         host: The plugins.
@@ -224,7 +224,7 @@ def choose(
 
 
 def _absence(host: PluginHost, kind: str, name: str) -> str:
-    """Why no plugin offers a name: it failed to load, or there is none; "" if one does."""
+    """The reason why no plugin offers a name (it failed to load, or does not exist); "" if one does."""
     if host.registry.find(kind, name) is not None:
         return ""
     try:
@@ -238,7 +238,7 @@ def _absence(host: PluginHost, kind: str, name: str) -> str:
 
 
 def check_dry_run(dry_run: object) -> None:
-    """Refuse an unknown kind of dry run: a misspelt word must not open hardware.
+    """Raise for an unknown kind of dry run, so that a typing error cannot open hardware.
 
     Raises:
         ConfigError: It is unknown.
@@ -266,7 +266,7 @@ def _defaults(entry: Entry) -> Settings | None:
 
 
 _LINELESS: Final = frozenset({"device", "check_sites", "check_overlay", "equalise"})
-"""Steps during which no line can be on: they take no time of their own."""
+"""Steps during which no line can be on, because they take no time themselves."""
 
 
 def check_kinds(document: Document, spec: ProfileSpec, host: PluginHost, found: ProblemCollector) -> None:
@@ -322,10 +322,10 @@ def wiring_problems(document: Document, lab: Lab) -> list[Problem]:
 
 
 def refuse_wrong_wiring(document: Document, lab: Lab) -> None:
-    """The same, raised.
+    """Raise the problems found by :func:`wiring_problems`.
 
     Raises:
-        ConfigError: There are any.
+        ConfigError: There is at least one problem.
     """
     problems = wiring_problems(document, lab)
     if problems:
@@ -437,7 +437,7 @@ def choose_plugins(
 
 
 def _is_fallback(document: Document, choice: Choice) -> bool:
-    """Whether a choice is a fallback for a wrong value: then it has the place of its parent."""
+    """Whether a choice replaces an invalid value; it then has the place of its parent in the file."""
     here, around = document.locate(choice.loc), document.locate(choice.loc[:-1])
     return choice.use == VIRTUAL_TWIN and here == around
 

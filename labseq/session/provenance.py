@@ -1,4 +1,4 @@
-"""The record of a run when it starts, with the code, host and packages that make the data."""
+"""The record that a run starts with: settings, code versions, host and installed packages."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ _GIT_TIMEOUT_S: Final = 5.0
 
 
 def gather_provenance(sequence_folder: Path) -> dict[str, Any]:
-    """Collect what identifies, years later, the code that made the data.
+    """Collect versions, git commits, host and packages, which identify the code that made the data.
 
     Args:
-        sequence_folder: Folder of the sequence; its repository is recorded beside
+        sequence_folder: Folder of the sequence; its repository is recorded in addition to
             that of labseq's own code.
 
     Returns:
@@ -62,7 +62,7 @@ def git_state(folder: Path, of: str = "") -> dict[str, Any] | None:
     Returns:
         ``{"commit": str, "dirty": bool, "code_sha256": str}``, or None outside of a repository or
         where git is not installed. ``dirty`` is whether any tracked file differs; ``code_sha256``
-        is the digest of what differs in Python files, "" for nothing.
+        is the digest of the changes to Python files, "" if there are none.
     """
     if of and _git(folder, "ls-files", "--error-unmatch", of) is None:
         return None
@@ -91,7 +91,7 @@ def _git(folder: Path, *arguments: str) -> str | None:
 
 @functools.cache
 def _packages() -> dict[str, str]:
-    """Name -> version of each installed package; read once because that takes as long as a quick shot."""
+    """Name -> version of each installed package; read only once, because it takes as long as a short shot."""
     about = [distribution.metadata for distribution in importlib.metadata.distributions()]
     return {name: one["Version"] for one in about if (name := one["Name"])}
 
@@ -141,12 +141,12 @@ def run_record(
 
 
 def copies(calibrations: Mapping[str, CalibrationEntry]) -> dict[str, bytes | str]:
-    """The calibrations in use as files for the run's folder: name -> content."""
+    """The active calibrations as files for the run's folder: file name -> content."""
     return {f"calibration_{kind}.json": encode_entry(entry) for kind, entry in calibrations.items()}
 
 
 def ending(error: BaseException | None) -> tuple[RunStatus, str]:
-    """How a run ended, and why."""
+    """The status in which a run ended, and the reason."""
     if error is None:
         return "complete", ""
     if isinstance(error, StopRequested):

@@ -1,4 +1,4 @@
-"""What a run was taken with, from its own folder: settings, plugins, calibrations, grid."""
+"""Reads settings, plugins, calibrations and grid of a recorded run from its folder."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from labseq.text_files import beside
 
 
 def resolved_of(run: Run) -> dict[str, Any]:
-    """Every setting of a run, SI; of a scan, at its first point.
+    """Every setting of a run, SI; for a scan, at its first point.
 
     Raises:
         RecordingError: run.json lacks them.
@@ -55,7 +55,7 @@ def plugins_of(run: Run) -> PluginHost:
 
     Raises:
         ConfigError: A folder no longer exists.
-        RecordingError: The run does not say where they are.
+        RecordingError: run.json lacks the plugin folders.
     """
     resolved = resolved_of(run)
     named = (("profile_path", resolved["profile"]), ("sequence_path", resolved))
@@ -87,21 +87,21 @@ def calibrations_of(run: Run) -> dict[str, CalibrationEntry]:
 
 @dataclass(frozen=True, slots=True)
 class Machine:
-    """The sites, and how atoms move between them."""
+    """The grid of sites and the motion of the mobile tweezers."""
 
     grid: SiteGrid
     motion: MotionSpec
 
 
 def recorded_machine(machine: Mapping[str, Any], called: str) -> Machine:
-    """The machine that a run was taken with, the tones of calibrations included.
+    """Grid and motion of a recorded run, with calibrated tones.
 
     Args:
-        machine: The profile, as the run has it.
-        called: Its name in messages.
+        machine: The profile recorded in the run.
+        called: Name of the profile in messages.
 
     Raises:
-        ConfigError: It makes no sense.
+        ConfigError: The recorded profile is invalid.
     """
     tweezers = machine.get("mobile_tweezers", {})
     motion = {key: tweezers[key] for key in MOTION_KEYS if key in tweezers}
@@ -112,7 +112,7 @@ def recorded_machine(machine: Mapping[str, Any], called: str) -> Machine:
 
 
 def machine_of(run: Run) -> Machine:
-    """The grid of a run, with the tones of its calibrations, and its motion; of a scan, at its first point.
+    """The grid of a run, with the tones of its calibrations, and its motion; for a scan, at its first point.
 
     Raises:
         ConfigError: The recorded settings are invalid.

@@ -44,10 +44,10 @@ class ResumableRun:
     """A run on disk that is being resumed; no other process can resume it until it is released.
 
     Attributes:
-        run: As it was when it was opened.
-        done: Shots that are on disk, or were skipped.
-        changes: What has changed since it was begun, and was accepted.
-        warnings: Messages for the user that are no errors.
+        run: The run as it was when it was opened for resuming.
+        done: Shots that are on disk or were skipped.
+        changes: Accepted changes since the run began.
+        warnings: Warnings for the user.
     """
 
     run: Run
@@ -58,7 +58,7 @@ class ResumableRun:
 
     @classmethod
     def open(cls, path: Path) -> Self:
-        """Take a run over.
+        """Open a run for resuming, and lock it.
 
         Args:
             path: The run's folder or any file in it.
@@ -99,7 +99,7 @@ class ResumableRun:
         done = frozenset(shot.index for shot in run.shots).difference(gone).union(run.skipped)
         ended = (
             SCANNER in (run.record.get("scan") or {}) and not gone
-        )  # by the scanner, before all shots were taken
+        )  # the scanner ended the run before all shots were taken
         if run.status == "complete" and (ended or len(done) >= run.n_shots):
             raise _refused(folder, "it is complete: no shot is missing")
         if gone:
@@ -124,10 +124,10 @@ class ResumableRun:
         self._lock.release()
 
     def assemble(self, *, realtime: bool) -> tuple[Assembly, Options]:
-        """Put the run together from its own files, calibrations and options.
+        """Assemble the run from its recorded files, calibrations and options.
 
         Raises:
-            ConfigError: That is no longer possible: a calibration is missing, a plugin, ...
+            ConfigError: That is no longer possible, for example because a calibration or plugin is missing.
             RecordingError: The run's own files have been changed.
         """
         record, options = self.run.record, Options.of(self.run.record["overrides"], realtime=realtime)
@@ -153,15 +153,15 @@ class ResumableRun:
         return assembly, options
 
     def compare(self, assembly: Assembly, options: Options, *, accept: bool) -> None:
-        """Compare the run as it was begun with the run as it is put together today.
+        """Compare the run as it began with the run as it would continue today.
 
         Args:
-            assembly: The run, put together today.
+            assembly: The run, assembled today.
             options: Its options.
             accept: Whether differences are accepted.
 
         Raises:
-            ConfigError: Something has changed and is not accepted; or the shots themselves would be others.
+            ConfigError: A change is not accepted, or the remaining shots would be different ones.
         """
         record, folder = self.run.record, self.run.path
         scan_run = scan_run_of(assembly, self.run.seed, StopFlag())
@@ -180,7 +180,7 @@ class ResumableRun:
         """Open its folder for writing.
 
         Args:
-            record: What is known of the run now.
+            record: The current record of the run.
             first_shot: The first shot that is taken; None if none is.
 
         Raises:
@@ -201,7 +201,7 @@ def _refused(folder: Path, why: str) -> ConfigError:
 
 
 def _check(folder: Path) -> None:
-    """Refuse a run whose run.json lacks what resuming needs.
+    """Raise if run.json lacks entries that are needed for resuming.
 
     Raises:
         RecordingError: run.json is damaged, or has another format.
@@ -214,7 +214,7 @@ def _check(folder: Path) -> None:
 
 
 def _has_changed(path: Path, text: str) -> bool:
-    """Whether a file can be read and has another text."""
+    """Whether a file can be read and its text has changed."""
     try:
         return decode(read_bytes(path), visible(str(path))) != text
     except ConfigError:

@@ -47,7 +47,7 @@ def lock_devices(
     *,
     in_spite: bool = False,
 ) -> Generator[Callable[[str], None]]:
-    """Keep other processes from a profile's devices within the block.
+    """Lock a profile's devices against other processes within the block.
 
     A lock ends with its process, also if that is killed. Locks are in the data root and in the user's
     state folder, like the markers of runs, so that they hold whatever ``--output`` says.
@@ -58,7 +58,7 @@ def lock_devices(
             the user's own.
         what: What the devices are used for, shown to others who find them locked.
         warn: Receives a warning if nothing keeps others from the devices.
-        in_spite: Whether to continue with a warning if another process holds them.
+        in_spite: Whether to continue, with a warning, if another process has locked them.
 
     Yields:
         A function that changes the description of what the devices are used for.
@@ -110,8 +110,8 @@ class SafeStateReport:
 
     Attributes:
         tried: Name of each device that could be constructed -> why it is not safe, or None.
-        refused: Name of each other -> why not, with its place in the profile.
-        problems: What else is wrong with the profile, or None.
+        refused: Name of each other device -> why it was not constructed, with its place in the profile.
+        problems: Other errors in the profile, or None.
     """
 
     attempted: Mapping[str, LabseqError | None]
@@ -162,7 +162,7 @@ def make_each_safe(
 
 
 def attempt(guard: Guard, name: str, timeout_s: float, method: Callable[[], None]) -> LabseqError | None:
-    """Call a device to the end, stop request or not; returns why it failed, or None."""
+    """Call a device without interruption by a stop request; returns why the call failed, or None."""
     try:
         guard.call_to_the_end(name, timeout_s, method)
     except LabseqError as failure:
@@ -175,10 +175,10 @@ def construct_hardware(bench: ResolvedProfile, clock: Clock) -> tuple[dict[str, 
 
     Args:
         bench: The profile.
-        clock: What they keep to.
+        clock: The clock that they use.
 
     Returns:
-        Role or device name -> object, and -> why it could not be constructed, with its place.
+        Role or device name -> object; and name -> why it could not be constructed, with its place.
     """
     chosen = {role: c for role, c in bench.chosen.items() if c.entry.kind in _NEEDED_KINDS}
     failures: dict[str, LabseqError] = {}
@@ -224,7 +224,7 @@ def make_profile_devices_safe(
 def make_safe_after_crash(
     bench: ResolvedProfile, roots: Sequence[Path], key: str, stop: StopFlag, observer: RunObserver
 ) -> None:
-    """If the last run on a profile died, its devices may still be on: make them safe.
+    """Make the devices of a profile safe if the process of its last run died, because they may still be on.
 
     This comes first, because constructing and compiling may fail.
 
@@ -299,7 +299,7 @@ def make_profile_safe(
 
 
 def _read(profile: str, overrides: Sequence[str], found: ProblemCollector) -> ResolvedProfile:
-    """Read a profile and choose its devices, in spite of any mistake that leaves some of them usable."""
+    """Read a profile and choose its devices; errors are tolerated as long as some devices are usable."""
     for_profile = profile_overrides(overrides)
     document, spec = load_profile(profile, beside=Path(), overrides=for_profile, found=found)
     with found:
@@ -312,10 +312,10 @@ def _read(profile: str, overrides: Sequence[str], found: ProblemCollector) -> Re
 
 
 N_READINGS: Final = 5
-"""How often a device is read for its latency, which is their median."""
+"""Number of ``describe()`` calls for the latency of a device, which is the median of their times."""
 
 _OPENING: Final = {"static_tweezers": 0, "camera": 1, "mobile_tweezers": 3}
-"""Place in the order of opening; further devices have 2."""
+"""Place in the order of opening; devices that are not listed have 2."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -324,10 +324,10 @@ class CheckedDevice:
 
     Attributes:
         name: Its role, or its name in the profile.
-        described: Its own description; empty if it did not get so far.
+        described: The device's own description; empty if the check failed before it.
         tested: Whether it passed its self test; False also if it has none.
-        latency_s: Time of a ``describe()``, from the call to the answer; None if it did not get so far.
-        constructed: Whether its plugin made it at all; if not, ``failure`` says why.
+        latency_s: Time of a ``describe()``, from the call to the answer; None if the check failed before it.
+        constructed: Whether its plugin could construct it; if not, ``failure`` says why.
         failure: Why it could not be opened, identified or tested, or what interrupted that; or None.
         unsafe: Why it is not in its safe state, or None.
         unclosed: Why it could not be closed, or None.
@@ -353,8 +353,8 @@ class DevicesReport:
     """The result of checking the devices of a profile.
 
     Attributes:
-        devices: Each that was tried, in order, then those that could not be constructed.
-        plugins: Name of a device -> what plays it, as after ``use:`` in the profile.
+        devices: The checked devices in order, then those that could not be constructed.
+        plugins: Name of a device -> its plugin, as after ``use:`` in the profile.
         warnings: Notes for the user that are not errors.
         stopped: The request to stop that ended the check, or None.
     """
@@ -369,7 +369,7 @@ def check_devices(profile: str, overrides: Sequence[str] = (), dry_run: DryRun =
     """Open each device of a profile in turn, identify and test it, make it safe and close it.
 
     One that fails or hangs never keeps the others from being tried. After Ctrl-C the
-    device at hand is made safe and closed, and no other is opened.
+    current device is made safe and closed, and no other is opened.
 
     Args:
         profile: Name or path of the profile.
@@ -378,7 +378,7 @@ def check_devices(profile: str, overrides: Sequence[str] = (), dry_run: DryRun =
 
     Raises:
         ConfigError: The profile is wrong; no device was touched.
-        DeviceError: Somebody else uses the same devices, real ones; none was touched.
+        DeviceError: Another process uses the same real devices; none was touched.
     """
     check_dry_run(dry_run)
     roots = marker_roots(data_root())
@@ -412,7 +412,7 @@ def check_each_device(
     Args:
         devices: Name and device, in the order of opening.
         timeouts: How long each call may take.
-        stop: The request to stop: the device at hand is made safe and closed, the rest left alone.
+        stop: The request to stop: the current device is made safe and closed, the others are not opened.
         simulation: The simulation that virtual devices act on: opened before them, closed after them.
 
     Returns:
@@ -443,7 +443,7 @@ def check_each_device(
 
 
 def _examined(guard: Guard, name: str, device: Any, timeouts: Timeouts) -> CheckedDevice:
-    """Open, identify and test a device, up to the first failure."""
+    """Open, identify and test a device; stops at the first failure."""
     found = CheckedDevice(name)
     try:
         if name != "simulation" and offers(device, "warm"):

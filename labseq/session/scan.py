@@ -1,8 +1,8 @@
-"""The points of a scan: each is a set of overrides, assembled by the same functions as the files.
+"""The points of a scan: each is a set of overrides, validated by the same functions as the files.
 
 A scan has many points, but few different settings: a *part* is the settings of one plugin (the planner,
 a step, a role or a device of the profile). A part is validated once for each content that the points
-give it. Constructors are called later, when the run opens or ``labseq check`` asks them.
+give it. Constructors are called later, when the run opens or by ``labseq check``.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ MAX_PROBLEMS: Final = 20
 """The check of a scan stops after this number of wrong values."""
 
 Part = tuple[bool, Loc]
-"""Whether the part is in the profile, and where its settings are."""
+"""Key of a part: whether it is in the profile, and the place of its settings."""
 
 
 @dataclass(frozen=True, slots=True)
 class PartSettings:
-    """A part with the values of a point.
+    """The settings of a part at one point.
 
     Attributes:
         chosen: The plugin; None for a step.
         step: The step; None for everything else.
-        choice: What the profile says of a role; None for planner and steps.
+        choice: The entry of a role in the profile; None for planner and steps.
         dump: The settings after defaults, SI, JSON-ready.
     """
 
@@ -55,7 +55,7 @@ class Point:
     """A run's settings at one point.
 
     Attributes:
-        planner: What plans the moves.
+        planner: The planner and its settings.
         steps: Name and step, in order.
         bench: The profile.
         parameters: Scanned address -> value, SI, JSON-ready.
@@ -77,7 +77,7 @@ class ScanPoints:
         sequence: Its content.
         bench: The profile.
         dry_run: "off", "full" or "fast".
-        planner: The planner if no axis changes it; None if it is wrong.
+        planner: The planner if no axis changes it; None if it has an error.
         steps: Name and step, in order, if no axis changes them.
     """
 
@@ -144,7 +144,7 @@ class ScanPoints:
         return replace(self, scan=scan, _documents={})
 
     def present(self, axis: Axis) -> Any:
-        """The value of an axis in the files, SI; None if there is none, or it is wrong."""
+        """The value of an axis in the files, SI; None if it is missing or invalid."""
         document = self.bench.document if axis.of_profile else self.document
         if axis.loc[0] == VARIABLES:
             return _si(document.get(axis.loc))
@@ -163,7 +163,7 @@ class ScanPoints:
         return [int(np.ravel_multi_index(positions, shape)) for positions in np.ndindex(*sizes)]
 
     def _parts(self) -> list[Part]:
-        """The parts that the scan changes: those of its axes, and of expressions that depend on them."""
+        """The parts that the scan changes, directly or through expressions."""
         places = [
             (axis.of_profile, loc) for axis in self.scan.axes for loc in (axis.loc, *self._dependents(axis))
         ]
@@ -176,7 +176,7 @@ class ScanPoints:
         return [loc for loc in found if loc[0] != VARIABLES]
 
     def _check_dependents(self) -> None:
-        """Refuse an axis on which no setting depends, or a setting that a run has only one of."""
+        """Raise for an axis that changes no setting, or a setting that must be the same in the whole run."""
         for axis in self.scan.axes:
             dependents, own, name = self._dependents(axis), clean(axis.address), self.scan.name
             if axis.loc[0] == VARIABLES and not dependents:
@@ -234,7 +234,7 @@ class ScanPoints:
         return PartSettings(chosen, None, choice, dumped)
 
     def _bench_at(self, parts: Mapping[Part, PartSettings]) -> ResolvedProfile:
-        """The profile at a point; the same object wherever its parts are the same."""
+        """The profile at a point; points with equal parts share one object."""
         changed = {str(loc[-1]): made for (in_profile, loc), made in parts.items() if in_profile}
         key = tuple(map(id, changed.values()))
         if key not in self._benches:
@@ -267,7 +267,7 @@ def _address(in_profile: bool, loc: Loc) -> str:
 
 
 def _value_of(axis: Axis, node: Node, parts: Mapping[Part, PartSettings]) -> Any:
-    """A scanned value as the plugin understood it, in SI; a mapping as it is written."""
+    """A scanned value after the plugin's validation, in SI; a mapping as it is written."""
     if axis.loc[0] == VARIABLES:
         return _si(node.plain())
     part = _part_of(axis.of_profile, axis.loc)
@@ -276,7 +276,7 @@ def _value_of(axis: Axis, node: Node, parts: Mapping[Part, PartSettings]) -> Any
 
 
 def _value_in(made: PartSettings, part: Part, loc: Loc) -> Any:
-    """A value among the settings of its part; None if there is none."""
+    """The value of an address in the settings of its part; None if it is missing."""
     value: Any = made.dump
     for step in loc[len(part[1]) :]:
         try:
@@ -287,5 +287,5 @@ def _value_in(made: PartSettings, part: Part, loc: Loc) -> Any:
 
 
 def _si(value: Any) -> Any:
-    """A variable in SI."""
+    """The value of a variable in SI."""
     return parse_any(value)[0] if isinstance(value, str) else value

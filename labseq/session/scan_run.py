@@ -24,7 +24,7 @@ from labseq.session.scan import Point
 
 
 class ScanRun:
-    """The shots of a run whose points are known in advance; without a scan all shots are at one point.
+    """The shots of a run whose points are known in advance; without a scan, all shots are at one point.
 
     Args:
         assembly: The run.
@@ -58,7 +58,7 @@ class ScanRun:
 
     @property
     def n_points(self) -> int:
-        """Number of points that the run's shots are at."""
+        """Number of points of the run."""
         return len({*self.points})
 
     @property
@@ -73,7 +73,7 @@ class ScanRun:
         return map(self.assembly.at, dict.fromkeys(self.points[shot] for shot in self.shots))
 
     def representative_labs(self) -> Iterator[Point]:
-        """One point for each combination of planner and profile, the first shot's first."""
+        """One point for each combination of planner and profile; that of the first shot comes first."""
         seen: set[tuple[int, int]] = set()
         for point in self.each():
             key = id(point.planner), id(point.bench)
@@ -89,7 +89,7 @@ class ScanRun:
         """Connect the recorded results and the observer of events; called before :meth:`run`."""
 
     def run(self, sequencer: Sequencer, lab: Lab, changes: Mapping[str, Any], shot_hooks: ShotHooks) -> None:
-        """Take all shots; an adaptive scan ends earlier if the scanner wants no more points.
+        """Take all shots; an adaptive scan ends earlier if the scanner has finished.
 
         Args:
             sequencer: Open, at the point of the first shot.
@@ -122,7 +122,7 @@ class ScanRun:
         """The scan for the run's record, JSON-ready; empty without one.
 
         ``addresses``: the scanned addresses; ``points``: the values of each point, SI; ``written``: the
-        same as the sequence has them; ``point_of_shot``: the point of each shot, counted from 0.
+        same in the units of the sequence; ``point_of_shot``: the point of each shot, counted from 0.
         """
         scanned = self.assembly.scanned
         if scanned is None:
@@ -141,11 +141,11 @@ class ScanRun:
         }
 
     def _place(self, shot: int) -> int:
-        """The index of the point that a shot is at."""
+        """Index of the point of a shot."""
         return self.points[shot]
 
     def _settings(self, place: int) -> Point | None:
-        """The settings of a point; None if the scanner wants no more."""
+        """The settings of a point; None if the scanner has finished."""
         return self.assembly.at(place)
 
     def _point_of(self, shot: int) -> Point | None:
@@ -177,13 +177,13 @@ class ScanRun:
         return left
 
     def _scanner_ended(self, shot: int) -> None:
-        """Report that the scanner wants no more; only of adaptive scans."""
+        """Report that the scanner has finished; adaptive scans only."""
 
     def _add_result(self, shot: int) -> None:
-        """Read the result of a shot; only of adaptive scans."""
+        """Read the result of a shot; adaptive scans only."""
 
     def _report_point(self, shot: int, skipped: Collection[int]) -> None:
-        """Report the result of a point after its last shot; only of adaptive scans."""
+        """Report the result of a point after its last shot; adaptive scans only."""
 
 
 class AdaptiveScanRun(ScanRun):
@@ -228,7 +228,7 @@ class AdaptiveScanRun(ScanRun):
 
     @cached_property
     def shots(self) -> list[int]:
-        """Indices of the shots to take at most; none if the scanner wants no more."""
+        """Indices of the shots to take, at most; none if the scanner has finished."""
         if not self._missing or self._point_of(self._missing[0]) is not None:
             return self._missing
         if self._results.is_empty:

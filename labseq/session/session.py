@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 
 def check_commands(assembly: Assembly, points: Iterable[Point], build: Callable[[Point], Lab]) -> None:
-    """Check the commands of ``device`` steps, and that ``wait`` steps find the device with their signal.
+    """Check the commands of ``device`` steps, and that the devices of ``wait`` steps exist.
 
     Nothing is opened.
 
@@ -120,8 +120,8 @@ class Session:
         seed = assembly.sequence.seed if earlier is None else earlier.run.seed
         self.seed = secrets.randbits(63) if seed is None else seed
         self.run_dir: Path | None = None
-        self._folder = Path.cwd()  # now: some vendors' libraries change it
-        # Identifies the hardware; a dry run touches none, so it has a key of its own.
+        self._folder = Path.cwd()  # before devices are opened: some vendors' libraries change it
+        # Identifies the hardware; a dry run touches none, so it has a separate key.
         profile = assembly.bench.hardware_key
         self._profile_key = profile if options.dry_run == "off" else f"{profile} (dry run)"
         self.stop_flag = StopFlag()
@@ -186,7 +186,7 @@ class Session:
         """Read back a run that ended before its last shot, in order to take the missing shots.
 
         It uses the sequence, the profile, the calibrations and the options that the run began with,
-        whatever the files say today. Until the session is closed, no other process can resume the run.
+        even if the files have changed. Until the session is closed, no other process can resume the run.
 
         Args:
             run: The run's folder or any file in it.
@@ -196,7 +196,7 @@ class Session:
             observer: Receives every event.
 
         Raises:
-            ConfigError: The run is complete or in progress, or something differs from then.
+            ConfigError: The run is complete or in progress, or something has changed since it began.
             RecordingError: It is no run, is damaged, of a newer labseq, or cannot be written to.
         """
         from labseq.session.resume import reopened
@@ -238,7 +238,7 @@ class Session:
         Raises:
             ConfigError: A step sends a command that its device does not know; nothing was opened.
             StopRequested: Ctrl-C or SIGTERM; devices are safe, the data is on disk.
-            LabseqError: Whatever ended the run; devices are safe, the data is on disk.
+            LabseqError: The error that ended the run; devices are safe, the data is on disk.
         """
         if self.run_dir is not None:
             raise ConfigError("a session runs once; open another for the next run")
@@ -268,10 +268,10 @@ class Session:
             return self._run(lab, roots)
 
     def build_lab(self, point: Point | None = None) -> Lab:
-        """Construct the object of every role on the run's clock; nothing is opened.
+        """Construct the object of every role with the run's clock; no device is opened.
 
         Args:
-            point: Of the scan; None for the first one.
+            point: Point of the scan; None for the first one.
         """
         clock = clock_for(self.stop_flag, virtual=self.assembly.virtual_time, paced=self.options.realtime)
         return build_lab(point or self.assembly.begun, self.assembly.target, clock, self.seed)
@@ -350,7 +350,7 @@ class Session:
         self._observers.event("run_finished", {"record": record, "status": status, "error": text})
 
     def _try(self, act: Callable[P, None], *args: P.args, **kwargs: P.kwargs) -> None:
-        """Do something that a full disk may prevent, which must not hide how the run ended."""
+        """Write to disk at the end of a run; a full disk must not hide the error that ended the run."""
         try:
             act(*args, **kwargs)
         except LabseqError as failure:

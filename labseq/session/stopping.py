@@ -16,10 +16,10 @@ from labseq.recording.run_file import read_owner, read_state
 
 
 def check_stop_file(run_dir: Path) -> None:
-    """Check whether another process asked a run to end.
+    """Raise if another process has asked a run to end.
 
     Raises:
-        StopRequested: One did.
+        StopRequested: Another process has.
     """
     if (run_dir / STOP_FILE).exists():
         raise StopRequested(signal.SIGTERM, after_shot=True)
@@ -35,7 +35,7 @@ def ask_to_stop(run_dir: Path) -> None:
 
 
 def is_running(run_dir: Path) -> bool:
-    """Whether a run is in progress, if that can be known on this computer."""
+    """Whether a run is in progress; for a run on another computer, as its folder says."""
     return read_state(run_dir)[0] == "running"
 
 
@@ -43,7 +43,7 @@ def running_here(profile: str | None = None) -> list[Path]:
     """The folders of the runs in progress on this computer.
 
     Args:
-        profile: Name or path of a profile: only those on it.
+        profile: Name or path of a profile; only runs on it are returned.
 
     Raises:
         ConfigError: There is no such profile.
@@ -56,7 +56,7 @@ def running_here(profile: str | None = None) -> list[Path]:
 
 
 def find_running(run: Path | None = None, profile: str | None = None) -> Path:
-    """The folder of the run in progress that a user refers to.
+    """Find the folder of the run in progress that a user names by its path or profile.
 
     Args:
         run: Its folder, or any file in it.
@@ -66,7 +66,7 @@ def find_running(run: Path | None = None, profile: str | None = None) -> Path:
         Its folder.
 
     Raises:
-        ConfigError: It is not in progress; or there is none, or several.
+        ConfigError: The run is not in progress; or no run is in progress, or several are.
         RecordingError: There is no such run.
     """
     if run is not None:
@@ -85,6 +85,6 @@ def find_running(run: Path | None = None, profile: str | None = None) -> Path:
 
 
 def owner_text(run_dir: Path) -> str:
-    """The process that takes a run, as text."""
+    """Process and computer of a run, as text."""
     owner = read_owner(run_dir)
     return "unknown process" if owner is None else f"process {owner.pid} on {owner.host}"
