@@ -1,6 +1,6 @@
-"""Runs shots: steps, declared states, retries, and the safe state on every way out.
+"""Runs shots: steps, declared states, retries, and the safe state however a run ends.
 
-Knows roles; knows nothing of plugins, files, YAML or numba.
+Depends on the roles only, not on plugins, files, YAML or numba.
 """
 
 from labseq.sequencer.clock import PacedClock, RealClock, VirtualClock

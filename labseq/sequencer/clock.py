@@ -42,7 +42,7 @@ class VirtualClock:
         return self._now_s
 
     def sleep(self, duration_s: float) -> None:
-        """Let time pass; raises ``StopRequested`` if the run was asked to stop."""
+        """Advance virtual time; raises ``StopRequested`` if the run was asked to stop."""
         self._stop.check()
         self._now_s += max(0.0, duration_s)
 
@@ -52,9 +52,9 @@ class VirtualClock:
 
 
 class PacedClock(VirtualClock):
-    """Virtual time at the speed of real time: a dry run to watch."""
+    """Virtual time at the speed of real time, for dry runs that a user watches."""
 
     def sleep(self, duration_s: float) -> None:
-        """Wait really, then let the same time pass."""
+        """Wait in real time, then advance virtual time by the same amount."""
         self._stop.wait(duration_s)
         super().sleep(duration_s)

@@ -1,4 +1,4 @@
-"""The devices of a run, their safe state and their end."""
+"""The devices of a run: their order, their safe state and how they are closed."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ from labseq.sequencer.lines import blinding_lines
 
 @dataclass(frozen=True, slots=True)
 class Blinding:
-    """When a device's light would damage a camera with EM gain: while one of its values is one of these.
+    """Condition under which a device's light would damage a camera with EM gain.
 
     Attributes:
-        value: Name of the value, as ``Device.read`` takes it.
-        when: What it is while the light is on.
+        value: Name of the device's value, as passed to ``Device.read``.
+        when: The readings that mean that the light is on.
     """
 
     value: str
@@ -48,7 +48,7 @@ class Blinding:
 
 
 def check_blinding(lab: Lab, guard: Guard) -> None:
-    """Refuse an exposure with EM gain while light is on that would age or destroy the EM register.
+    """Raise before an exposure with EM gain if light is on that would age or destroy the EM register.
 
     Raises:
         DeviceError: Such a light is on; nothing was exposed.
@@ -77,7 +77,7 @@ def _on(lab: Lab, marks: Mapping[str, Blinding], guard: Guard) -> dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class Timeouts:
-    """How long labseq waits before a device or plugin counts as hung.
+    """Times after which a device or plugin counts as hung, in seconds.
 
     Attributes:
         call_s: Longest time a call may take beyond its own duration.
@@ -92,7 +92,7 @@ class Timeouts:
 
 @dataclass(frozen=True, slots=True)
 class Lab:
-    """Everything that a shot is made with.
+    """Devices, planner, detector, clock and settings that a shot uses.
 
     Attributes:
         budgets: Budgets of stages that do not have their own: stage -> seconds.
@@ -123,7 +123,7 @@ class Lab:
 
     @property
     def step_context(self) -> StepContext:
-        """What steps need to lay out their timelines."""
+        """The context from which steps lay out their timelines."""
         facts = self.camera.facts if offers(self.camera, "facts") else CameraFacts()
         return StepContext(self.grid, self.motion, self.target, facts, self.line_specs)
 
@@ -159,7 +159,7 @@ Outcome = dict[str, LabseqError | None]
 
 
 def make_safe(lab: Lab, guard: Guard) -> Outcome:
-    """Bring every device to its safe state; one that fails never stops the others.
+    """Bring every device to its safe state; the failure of one never stops the others.
 
     Each device has its own timeout.
     """

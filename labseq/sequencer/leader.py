@@ -1,4 +1,4 @@
-"""Runs led by another control system: waiting for its start signal, and answering with the outcome."""
+"""Runs started by another control system: wait for its start signal, and answer with the outcome."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Emit = Callable[[str, Mapping[str, Any]], None]
 
 
 def leaders(devices: Mapping[str, object]) -> Iterator[tuple[str, LeaderLink]]:
-    """Name and device, of the devices or lines through which another control system can lead."""
+    """Name and device, of the devices or lines that can receive the signals of another control system."""
     for name, device in devices.items():
         if isinstance(device, LeaderLink):
             yield name, device
@@ -28,7 +28,7 @@ def find_leader(devices: Mapping[str, object], name: str = "") -> tuple[str, Lea
 
     Args:
         devices: All hardware of the profile.
-        name: Name of the device; "" for the only one that can.
+        name: Name of the device; "" for the only one that can receive signals.
 
     Raises:
         ConfigError: It cannot receive one, no device can, or several can.
@@ -49,7 +49,7 @@ def find_leader(devices: Mapping[str, object], name: str = "") -> tuple[str, Lea
 class LeaderAnswers:
     """Waits for the start signals of one attempt at a shot, and answers each of them.
 
-    A device knows whether it owes an answer, and answers each signal once; so all devices are called at
+    A device answers each signal once and ignores further answers, so all devices can be called at
     the end of a shot.
 
     Attributes:
@@ -67,7 +67,7 @@ class LeaderAnswers:
     def follow(self, signal: str, timeout_s: float, device: str) -> None:
         """Wait for a signal; see ``labseq.plugin.Shot.follow``."""
         name, leader = find_leader(dict(self.lab.hardware()), device)
-        self._answer(name, leader, "ready", self.guard.call)  # to an earlier signal in this shot
+        self._answer(name, leader, "ready", self.guard.call)  # the answer to an earlier signal in this shot
         awaited = {"shot": self.record.shot_index, "device": name, "signal": signal, "timeout_s": timeout_s}
         self.emit("leader_awaited", awaited)
         try:

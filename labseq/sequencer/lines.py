@@ -10,7 +10,7 @@ from labseq.model import TimelineEntry
 from labseq.model.lines import IDLE, LineProgram, LineSpec, lines_of, margin_s
 
 TIMES_APART_S = 1e-9
-"""Edges nearer to one another than this are one edge."""
+"""Edges closer together than this count as one edge, in seconds."""
 
 
 def line_program(specs: Sequence[LineSpec], kind: str, duration_s: float) -> LineProgram:
@@ -23,7 +23,7 @@ def line_program(specs: Sequence[LineSpec], kind: str, duration_s: float) -> Lin
     Args:
         specs: The lines.
         kind: Kind of the step.
-        duration_s: How long the step itself takes, in seconds.
+        duration_s: Duration of the step itself, in seconds.
 
     Example:
         >>> light = LineSpec("imaging", 4, frozenset({"image"}), lead_s=1e-3, lag_s=2e-3)
@@ -51,7 +51,7 @@ def idle_program(specs: Sequence[LineSpec]) -> LineProgram:
 
 
 def off_program(specs: Sequence[LineSpec]) -> LineProgram:
-    """All lines off, at once."""
+    """A program that switches all lines off at once."""
     names = tuple(spec.name for spec in specs)
     return LineProgram("off", names, np.zeros(1), np.zeros((1, len(specs)), np.bool_), 0.0, 0.0)
 
@@ -123,7 +123,7 @@ def _is_on(
 
 
 def _apart(times: Sequence[float]) -> list[float]:
-    """Sorted, without times that are hardly apart; 0 stays 0."""
+    """Sorted times, without any that are too close to the one before; 0 stays 0."""
     found: list[float] = []
     for t in sorted(times):
         if not found or t - found[-1] > TIMES_APART_S:

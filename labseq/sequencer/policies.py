@@ -1,4 +1,4 @@
-"""What follows when a step fails, takes too long or exceeds a budget."""
+"""Reactions to steps that fail, take too long or exceed a budget."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from labseq.errors import (
 )
 
 Then = Literal["repeat_shot", "skip_point", "stop"]
-"""What follows a failure."""
+"""Reaction to a failure."""
 OverBudget = Literal["record", "warn", "repeat_shot", "skip_point", "stop"]
-"""What follows a stage that took longer than its budget."""
+"""Reaction to a stage that took longer than its budget."""
 WhenExhausted = Literal["skip_point", "stop"]
-"""What follows when a shot has been repeated as often as it may be."""
+"""Reaction to a shot that has failed in its last attempt."""
 
 _ENDING: Final = (
     StopRequested,
@@ -46,10 +46,10 @@ class StepPolicy:
     """The policy of a step.
 
     Attributes:
-        timeout_s: How long an attempt may take, on the session's clock; one that takes longer has failed.
-        retries: How often it is retried before it counts as failed.
-        on_failure: What follows then; None: a transient failure repeats the shot, others stop the run.
-        over_budget: What follows a stage of it that exceeds its budget.
+        timeout_s: How long an attempt may take, on the session's clock; a longer one fails.
+        retries: Number of retries before the step counts as failed.
+        on_failure: Reaction to its failure; None: a transient failure repeats the shot, others stop the run.
+        over_budget: Reaction to a stage of the step that exceeds its budget.
     """
 
     timeout_s: float = math.inf
@@ -64,8 +64,8 @@ class RunPolicy:
 
     Attributes:
         attempts: Maximum number of attempts at a shot.
-        when_exhausted: What follows when it has failed that often.
-        otherwise: The policy between the steps, and for the steps that are not in ``steps``.
+        when_exhausted: Reaction when the last attempt has failed.
+        otherwise: The policy between steps, and of steps that are not in ``steps``.
         steps: The policy of each step, in order.
     """
 
@@ -81,12 +81,12 @@ class RunPolicy:
         return self.steps[number]
 
     def after(self, error: LabseqError, step: int | None, attempt: int) -> Then:
-        """What follows a failure.
+        """The reaction to a failure.
 
         Args:
             error: The failure.
             step: Index of the step that failed; None outside of all steps.
-            attempt: Which attempt at the shot it was, from 0.
+            attempt: Number of the attempt at the shot, from 0.
         """
         if isinstance(error, _ENDING):
             return "stop"
@@ -97,7 +97,7 @@ class RunPolicy:
 
 
 def may_be_retried(error: LabseqError) -> bool:
-    """Whether a step that failed like this may succeed if it is retried in the same shot."""
+    """Whether a step that failed with this error may succeed if it is retried in the same shot."""
     if isinstance(error, (*_ENDING, OverBudgetError)):
         return False
     return isinstance(error, DeviceError | TransientError)

@@ -1,4 +1,4 @@
-"""The sequencer: shot after shot, its states, and every way out of them."""
+"""The sequencer: takes the shots, tracks the state of the run, and makes the devices safe at its end."""
 
 from __future__ import annotations
 
@@ -58,12 +58,12 @@ TRANSITIONS: Final = MappingProxyType(
 )
 """The state table: state -> states that may follow.
 
-Every state in which a device may be on leads to MAKING_SAFE; an ending that was interrupted begins again.
+Every state in which a device may be on leads to MAKING_SAFE; making safe begins again if it was interrupted.
 """
 
 
 class StateTable:
-    """Holds the state and refuses a change that the table does not declare."""
+    """Holds the state of the run, and raises on a transition that the state table does not contain."""
 
     def __init__(self, changed: Callable[[State], None]) -> None:
         self.state = State.CLOSED
@@ -126,7 +126,7 @@ def lay_out(
         lab: The devices.
         guard: Runs the calls.
         steps: The steps with their names.
-        context: What the steps lay out their timelines by; by default the lab's.
+        context: The context for the timelines; by default that of the lab.
 
     Raises:
         LabseqError: A step fails; the error names it.
@@ -153,7 +153,7 @@ def _run_step(step: Step, number: int, name: str, shot: RunningShot) -> None:
 
 @contextmanager
 def _named(number: int, name: str) -> Generator[None]:
-    """Name the step in whatever it raises that is not one of labseq's own errors."""
+    """Add the name of the step to errors that are not labseq's own."""
     try:
         yield
     except LabseqError:
@@ -163,15 +163,15 @@ def _named(number: int, name: str) -> Generator[None]:
 
 
 class ShotSink(Protocol):
-    """Where finished shots go."""
+    """Receives finished shots, to write them to disk."""
 
     def write_shot(self, shot: ShotRecord) -> object:
-        """Make a shot durable."""
+        """Write a shot to disk."""
         ...
 
 
 class Sequencer:
-    """Runs shots on open devices and brings the devices to safety on every way out.
+    """Runs shots on open devices and makes the devices safe however the run ends.
 
     Args:
         lab: The devices.
@@ -180,8 +180,8 @@ class Sequencer:
         sink: Where shots are written.
         observer: Receives every event.
         seed: The run's seed.
-        policy: What follows failures and exceeded budgets.
-        parameters: What differs from the files, kept with each shot: address -> value.
+        policy: Reactions to failures and exceeded budgets.
+        parameters: Settings that differ from the files, recorded with each shot: address -> value.
 
     Raises:
         LabseqError: A step fails to lay out its timeline.
@@ -235,7 +235,7 @@ class Sequencer:
         Args:
             lab: The lab of the next shots; devices that are not reopened are the same objects.
             steps: Their steps, with their names.
-            parameters: What differs from the files in them: address -> value.
+            parameters: Their settings that differ from the files: address -> value.
             reopened: Devices, or "simulation", that are new in ``lab``: the present ones are made safe
                 and closed, then the new ones opened.
 
@@ -268,8 +268,8 @@ class Sequencer:
             Shots that failed for good, and why; the points of the scan that they belong to are to be skipped.
 
         Raises:
-            LabseqError: Whatever ended the run before its last shot. The caller
-                must call :meth:`shut_down` on this way out too.
+            LabseqError: The error that ended the run before its last shot. The caller
+                must call :meth:`shut_down` in this case too.
         """
         failed = dict[int, str]()
         for index in shot_indices:
@@ -308,7 +308,7 @@ class Sequencer:
         self._states.to(State.SAFE)
 
     def _take(self, index: int, attempt: int) -> tuple[Then | None, str]:
-        """Take one attempt at a shot and write it; returns what follows and why, if it failed."""
+        """Make one attempt at a shot and write it; returns the reaction and the reason if it failed."""
         self._states.to(State.SHOT)
         record = ShotRecord(index, attempt, self._seed, _utc_now(), parameters=self._parameters)
         record.calibrations = {kind: entry.id for kind, entry in self.lab.calibrations.items()}
@@ -356,7 +356,7 @@ class Sequencer:
         if self.lab.simulation is not None:
             self.guard.call("simulation", self.lab.timeouts.call_s, self.lab.simulation.begin_shot)
         self._emit("shot_started", {"shot": record.shot_index, "attempt": record.attempt})
-        # the shot before may have ramped them
+        # the previous shot may have ramped them
         shot.call("static_tweezers", shot.call_timeout_s, shot.static_tweezers.start)
         shot.poll()
         shot.check_interlocks()
@@ -364,7 +364,7 @@ class Sequencer:
             self._stop.check()
             with shot.of_step(number, name, self._policy.of_step(number), self._budgets[number]):
                 self._run_step(shot, number, name, step)
-        shot.leaders.ready()  # before the shot is written: atoms do not wait for a disk
+        shot.leaders.ready()  # before the shot is written, because atoms are lost while the disk writes
         shot.record_truth()
 
     def _run_step(self, shot: RunningShot, number: int, name: str, step: Step) -> None:

@@ -1,4 +1,4 @@
-"""One attempt at a shot: what the steps work with, the time of each stage, and its record."""
+"""One attempt at a shot: the interface for steps, the time of each stage, and its record."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Stages:
 
     Args:
         lab: The clock, and budgets of stages that do not have their own.
-        record: Where the timings go.
+        record: Receives the timings.
         emit: Receives every event: name and values.
 
     Attributes:
@@ -60,7 +60,7 @@ class Stages:
         """Check the timeout of the step.
 
         Raises:
-            StepTimeoutError: It has passed.
+            StepTimeoutError: The timeout has passed.
         """
         limit_s = self.policy.timeout_s
         if self._clock.now() - self._attempt_start_s > limit_s + OVERSHOOT_S:
@@ -69,7 +69,7 @@ class Stages:
 
     @contextmanager
     def around(self, name: str, budget_s: float, cycle: int) -> Generator[None]:
-        """Time a stage against its budget; it is recorded however it ends.
+        """Time a stage against its budget; it is recorded even if it fails.
 
         Raises:
             OverBudgetError: It took longer, and the policy of the step does not allow that.
@@ -222,7 +222,7 @@ class RunningShot:
         self.leaders.follow(signal, timeout_s, device)
 
     def margin_s(self, kind: str) -> float:
-        """How much longer a kind of step takes for its lines."""
+        """Extra time that a kind of step takes for its lines, in seconds."""
         return margin_s(self.lab.line_specs, kind)
 
     @contextmanager
@@ -320,7 +320,7 @@ class RunningShot:
         self._emit(event, {"shot": self.index, **values})
 
     def record_truth(self) -> None:
-        """Record what the simulation knows: the true occupancy, the losses, the events of the atoms."""
+        """Record the simulation's true occupancy, losses and events of the atoms."""
         simulation, readings, timeout_s = self.simulation, self.record.readings, self.call_timeout_s
         if simulation is None:
             return
