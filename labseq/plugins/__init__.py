@@ -1,7 +1,7 @@
 """Finds and loads plugins, reports those that fail, and calls their code with a time limit.
 
 Entry points of the group ``labseq`` come first, then folders. A plugin that fails to load does not affect
-the others: it is reported, and it is an error only where a sequence or profile names what it would offer.
+the others: it is reported, and is an error only if a sequence or profile uses it.
 """
 
 from labseq.plugins.calls import LOCAL_PACKAGE, call_plugin

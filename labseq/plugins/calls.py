@@ -1,4 +1,4 @@
-"""Code of plugins that runs outside of a run: importing, registering, validating settings, constructing."""
+"""Calls of plugin code outside of a run: importing, registering, validating settings, constructing."""
 
 from __future__ import annotations
 
@@ -19,31 +19,31 @@ from labseq.registry import Owner
 T = TypeVar("T")
 
 MAX_PRINTED: Final = 60
-"""Characters of what a plugin printed that are quoted."""
+"""Maximum number of characters of a plugin's printed text that are quoted."""
 MAX_ERROR: Final = 500
-"""Characters of a plugin's own error that are quoted."""
+"""Maximum number of characters of a plugin's own error that are quoted."""
 LOCAL_PACKAGE: Final = "labseq_local"
-"""Package in which the plugins of folders are modules."""
+"""Package of the modules of plugins from folders."""
 
 
 def call_plugin(owner: Owner, what: str, work: Callable[[], T]) -> T:
-    """Run code of a plugin, and name the plugin in whatever goes wrong.
+    """Run code of a plugin, and name the plugin in any error.
 
-    The code runs in a thread of its own: if it hangs it is abandoned after ``owner.max_wait_s``, and a
+    The code runs in a separate thread: if it hangs it is abandoned after ``owner.max_wait_s``, and a
     ``SystemExit`` or ``KeyboardInterrupt`` that it raises ends nothing else. What it prints goes to stderr,
-    because a program may read JSON from stdout, and is noted with the owner.
+    because a program may read JSON from stdout, and is recorded with the owner.
 
     Args:
-        owner: Whose code it is.
-        what: What runs, for messages; "" for the loading of the plugin.
+        owner: The plugin.
+        what: Name of the code for messages; "" for the loading of the plugin.
         work: The code.
 
     Returns:
         What the code returned.
 
     Raises:
-        PluginLoadError: It raised, or did not return in time.
-        LabseqError: It raised this one of labseq's own.
+        PluginLoadError: The code raised, or did not return in time.
+        LabseqError: The code raised one of labseq's own errors.
     """
     guard, printed = Guard(), _PrintsToStderr(sys.stdout)
     try:
@@ -81,7 +81,7 @@ class _PrintsToStderr:
         return len(text) if self._stream is None else self._stream.write(text)
 
     def end(self) -> str:
-        """Lead to the real stdout from now on; returns the beginning of what was printed, on one line."""
+        """Restore the real stdout; returns the beginning of the printed text, on one line."""
         self._is_over = True
         return " ".join(self._text.split())
 
@@ -144,7 +144,7 @@ def import_file(name: str, path: Path) -> ModuleType:
     spec = importlib.util.spec_from_file_location(full_name, path, submodule_search_locations=inside)
     if spec is None or spec.loader is None:
         raise PluginLoadError(name, f"{path} is not a Python module")
-    forget(name)  # one of another folder, or as it was before it was edited
+    forget(name)  # a module from another folder, or of an earlier version of the file
     module = importlib.util.module_from_spec(spec)
     sys.modules[full_name] = module  # before execution, as dataclasses and relative imports need it
     spec.loader.exec_module(module)

@@ -28,7 +28,7 @@ from labseq.plugins.calls import (
 )
 from labseq.registry import LOAD_S, Entry, Owner, Registry
 
-_MARK: Final = "labseq_impl"  # what ``hookimpl`` puts on a function
+_MARK: Final = "labseq_impl"  # the attribute that ``hookimpl`` adds to a function
 _HOOKS: Final = [key for key, value in vars(hookspecs).items() if hasattr(value, "labseq_spec")]
 _NO_FUNCTION: Final = (
     (inspect.iscoroutinefunction, "an 'async' function"),
@@ -40,10 +40,10 @@ Hooks = dict[str, Callable[..., object]]
 
 
 def check_api(module: ModuleType, owner: Owner) -> None:
-    """Refuse a plugin that was written for another labseq.
+    """Raise for a plugin that was written for another plugin API version.
 
     Raises:
-        PluginLoadError: With what to do.
+        PluginLoadError: The versions differ; says what to do.
     """
     written_for: object = getattr(module, "LABSEQ_API", None)
     if type(written_for) is int and written_for == LABSEQ_API:
@@ -65,7 +65,7 @@ def hooks_of(module: ModuleType, owner: Owner) -> Hooks:
     """The hooks that a plugin implements.
 
     Raises:
-        PluginLoadError: It implements none, or one that labseq could not call; with what to change.
+        PluginLoadError: It implements none, or one that labseq cannot call; says what to change.
     """
     hooks: Hooks = {}
     unmarked: list[str] = []
@@ -110,13 +110,13 @@ class PluginInfo:
     """A plugin, and whether it was loaded.
 
     Attributes:
-        name: Import name, for a folder plugin without the ``labseq_local.`` prefix.
+        name: Import name; without the prefix ``labseq_local.`` if the plugin is from a folder.
         origin: "built in", "installed" or the file it came from.
         version: Version of its distribution, or "".
         state: "loaded" or "failed".
         reason: Why it failed, or "".
         source: Its file or its distribution, as text; "" for labseq's own.
-        notes: What it printed when it was loaded, or in a constructor: a sentence each.
+        notes: Text that it printed when it was loaded or in a constructor, a sentence each.
     """
 
     name: str
@@ -129,13 +129,13 @@ class PluginInfo:
 
 
 class PluginHost:
-    """The plugins of one session, with a plugin manager of their own.
+    """The plugins of one session, in a separate plugin manager.
 
     Args:
         max_wait_s: How long a plugin may take to load, and a constructor to return.
 
     Attributes:
-        registry: What the loaded plugins offer.
+        registry: The planners, drivers, steps, ... of the loaded plugins.
     """
 
     def __init__(self, max_wait_s: float = LOAD_S) -> None:
@@ -153,7 +153,7 @@ class PluginHost:
 
     @property
     def notes(self) -> list[str]:
-        """What the plugins in use printed when they were loaded and constructed, a sentence each."""
+        """Text that the plugins in use printed when they were loaded and constructed, a sentence each."""
         used = [info for info in self._infos.values() if info.name in self._used]
         return [f"plugin '{info.name}' ({info.source}): {note}" for info in used for note in info.notes]
 
@@ -220,12 +220,12 @@ class PluginHost:
             reason = f"{where} is called '{info.name}' already; rename one of them"
             failed = replace(info, name=f"{info.name} ({info.source})", state="failed", reason=reason)
             self._infos[failed.name] = failed
-            return True  # the modules of that name are the other's
+            return True  # the modules of that name belong to the other plugin
         try:
             self._register(info, home, importing)
         except PluginLoadError as error:
             info = replace(info, state="failed", reason=error.reason)
-        except Exception as error:  # noqa: BLE001 - pluggy may say more than we asked
+        except Exception as error:  # noqa: BLE001 - pluggy has further checks of its own
             info = replace(info, state="failed", reason=format_error(error))
         self._infos[info.name] = info
         return info.state == "loaded"
@@ -249,12 +249,12 @@ class PluginHost:
                 raise
 
     def get(self, kind: str, name: str) -> Entry:
-        """Find what a sequence or profile names.
+        """Find the registry entry of a name in a sequence or profile.
 
         Raises:
             PluginLoadError: The plugin of that name was found but did not load, or two plugins
                 offer the name.
-            UnknownPluginError: Nothing offers it.
+            UnknownPluginError: No plugin offers it.
         """
         if (kind, name) in self.registry.contested:
             raise self.registry.contested[kind, name]
@@ -286,7 +286,7 @@ class PluginHost:
 
 
 def _prepare(importing: Callable[[], ModuleType], owner: Owner, registry: Registry) -> ModuleType:
-    """Everything of a plugin's that runs when it is loaded."""
+    """Run all code of a plugin that runs when it is loaded."""
     module = importing()
     check_api(module, owner)
     hooks = hooks_of(module, owner)
