@@ -1,4 +1,4 @@
-"""The roles that plugins play, and what they work with.
+"""The roles that plugins implement, and the objects that labseq passes to them.
 
 Roles are synchronous. A constructor does no I/O; ``open()`` does. Hardware roles
 share ``open``, ``close``, ``safe_state`` (legal in any state, also before

@@ -1,7 +1,7 @@
 """The roles that decide, and those that analyse the result: planner, detector, scanner, analysis.
 
-All are pure functions of their inputs, so a class with the methods of the role plays it; it need not be
-derived from it.
+All are pure functions of their inputs. A class needs only the methods of its role; it need not be
+derived from the role's class.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ class Planner(Protocol):
     def plan(self, occupancy: Occupancy, target: TargetPattern) -> Plan:
         """Plan the moves that fill the target.
 
-        With too few atoms it fills what it can, from the centre of the target.
+        With too few atoms it fills as many sites as possible, from the centre of the target.
 
         Args:
             occupancy: bool (n_rows, n_cols), as detected; of any memory layout, and
                 perhaps read-only.
-            target: The pattern to end with.
+            target: The target pattern.
         """
         ...
 
@@ -56,9 +56,9 @@ class Detector(Protocol):
 class Scanner(Protocol):
     """Chooses the points of an adaptive scan, one after another.
 
-    Pure: the choice follows from its settings, the space (its seed included) and the points visited so
-    far, and from nothing else; it does no I/O. So a resumed run continues as it would have. It may cache
-    results as long as they change no choice.
+    Pure: the choice depends only on its settings, the space (its seed included) and the points visited
+    so far; it does no I/O. So a resumed run continues like an uninterrupted one. It may cache results
+    as long as they change no choice.
     """
 
     def next_point(self, visited: Sequence[VisitedPoint]) -> Mapping[str, float] | None:
@@ -70,7 +70,7 @@ class Scanner(Protocol):
 
         Returns:
             A value for each address, SI, within its range (:meth:`labseq.plugin.ScanRange.at` gives such
-            values); or None if there is nothing more to find out: the run ends then.
+            values); or None to end the run.
         """
         ...
 
@@ -105,7 +105,7 @@ class RecordedShot(Protocol):
 
     @property
     def occupancies(self) -> NDArray[np.bool_]:
-        """As detected, bool (n_images, n_rows, n_cols)."""
+        """The detected occupancies, bool (n_images, n_rows, n_cols)."""
         ...
 
     @property
@@ -135,12 +135,12 @@ class RecordedShot(Protocol):
 
     @property
     def parameters(self) -> Mapping[str, Any]:
-        """What differs from the files in this shot: address -> value; those of a scan in SI."""
+        """Settings of this shot that differ from the files: address -> value; scanned ones in SI."""
         ...
 
 
 class Analysis(Protocol):
-    """Computes results from each shot, in a process of its own next to the run."""
+    """Computes results from each shot, in a separate process next to the run."""
 
     def shot(self, shot: RecordedShot) -> Mapping[str, Any]:
         """Analyse a shot.
@@ -175,7 +175,7 @@ class ReportsSignals(Protocol):
 
     @property
     def sites_px(self) -> NDArray[np.float64]:
-        """Where it looks for the atoms, float64 (n_rows, n_cols, 2), (y, x) in pixels."""
+        """Positions of the sites on the frame, float64 (n_rows, n_cols, 2), (y, x) in pixels."""
         ...
 
     def signals(self, frame: Frame) -> NDArray[np.float64]:

@@ -1,6 +1,6 @@
 """The roles of hardware: base classes of drivers.
 
-An abstract method is what every driver must do. The others are optional abilities: their defaults do
+Every driver implements the abstract methods. The others are optional abilities: their defaults do
 nothing, and the core calls them only where a driver has its own version (see :func:`labseq.roles.offers`).
 """
 
@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from labseq.model import CameraFacts, Frame, LineProgram, LinesFacts, ToneProgram
 
 Trigger = Literal["software", "internal", "external"]
-"""What starts an exposure."""
+"""The trigger that starts an exposure."""
 
 
 class Hardware(ABC):
-    """What all hardware roles share."""
+    """Base class of all hardware roles."""
 
     @abstractmethod
     def open(self) -> None:
@@ -57,18 +57,18 @@ class Hardware(ABC):
         """Check the open device without light and without moving anything; for ``labseq devices``.
 
         Raises:
-            DeviceError: With what is wrong.
+            DeviceError: The device does not work; says why.
         """
 
     def poll(self) -> Mapping[str, bool | int | float | str]:
-        """Values to record with each shot, read at its start; each becomes the reading "device.name"."""
+        """Read the values to record at the start of each shot; each becomes the reading "device.name"."""
         return {}
 
     def check_interlocks(self) -> None:
         """Read the watched values; called at the start of each shot and before each pick-up of atoms.
 
         Raises:
-            DeviceError: A value is past its limit; the run ends safely.
+            DeviceError: A value exceeds its limit; the run ends safely.
         """
 
 
@@ -102,7 +102,7 @@ class Camera(Hardware):
 
 
 class StaticTweezers(Hardware):
-    """The static array."""
+    """The static tweezer array."""
 
     @abstractmethod
     def load(self, amplitudes: tuple[NDArray[np.float64], NDArray[np.float64]] | None) -> None:
@@ -124,7 +124,7 @@ class StaticTweezers(Hardware):
 
 
 class MobileTweezers(Hardware):
-    """The moving tweezers."""
+    """The mobile tweezers."""
 
     @abstractmethod
     def prepare(self, program: ToneProgram) -> float:
@@ -134,7 +134,7 @@ class MobileTweezers(Hardware):
             Playing time in seconds.
 
         Raises:
-            LimitError: The program asks for more than the device can do.
+            LimitError: The program exceeds a limit of the device.
         """
 
     @abstractmethod
@@ -150,7 +150,7 @@ class MobileTweezers(Hardware):
         """
 
     def timings(self) -> Mapping[str, float]:
-        """Parts of the last ``prepare()``, such as "render" or "upload" -> seconds on this computer's clock.
+        """Durations of the parts of the last ``prepare()``, such as "render": name -> seconds of real time.
 
         No I/O.
         """
@@ -172,8 +172,8 @@ class Device(Hardware):
         """Check a command and its arguments before the device is opened; nothing is sent.
 
         Raises:
-            DeviceError: It has no such command, or other arguments.
-            LimitError: An argument is past its limit.
+            DeviceError: The device has no such command, or the arguments differ.
+            LimitError: An argument exceeds its limit.
         """
 
 
@@ -191,7 +191,7 @@ class Lines(Hardware):
 
     @abstractmethod
     def compile(self, program: LineProgram) -> None:
-        """Take a program for the next firing; a program that was compiled before costs no time.
+        """Compile a program for the next firing; a program that was compiled before takes no time.
 
         Raises:
             LimitError: The program has more edges, or edges closer together, than the box can make.
@@ -211,7 +211,7 @@ class Lines(Hardware):
 
         Raises:
             DeviceTimeoutError: It did not end within ``timeout_s``.
-            DeviceError: The box did something else, for example a reset.
+            DeviceError: The box failed, for example because it was reset.
         """
 
 
@@ -220,7 +220,7 @@ class LeaderLink(Protocol):
     """A device or timing box through which another control system starts the shots of this run.
 
     The other system sends the signal `go` and gets exactly one answer to it, `ready` or `failed`, within
-    the device's deadline. The device answers by itself if labseq does not in time.
+    the device's deadline. The device answers `failed` itself if labseq does not answer in time.
     """
 
     @property
@@ -231,7 +231,7 @@ class LeaderLink(Protocol):
     def wait_for(self, signal: str, timeout_s: float) -> str:
         """Wait for a signal on the session's clock, then report to the other system that labseq is busy.
 
-        A signal that came since the last answer counts. Checks for a stop request at least every 50 ms.
+        A signal that arrived since the last answer counts. Checks for a stop request at least every 50 ms.
 
         Args:
             signal: "go".
@@ -247,11 +247,11 @@ class LeaderLink(Protocol):
         ...
 
     def report(self, state: Literal["ready", "failed"], about: Mapping[str, bool | int | float | str]) -> str:
-        """Answer the signal that was waited for; without one, nothing is sent.
+        """Answer the start signal; nothing is sent if there was none.
 
         Args:
             state: The outcome.
-            about: "shot"; for a shot that is ready and was judged, "success" and "filling" (of the target,
+            about: Details: "shot"; for a ready shot that was judged, "success" and "filling" (of the target,
                 0 to 1); for a failure its "reason".
 
         Returns:
@@ -266,7 +266,7 @@ class LeaderLink(Protocol):
 
 
 def offers(part: object, ability: str) -> bool:
-    """Whether a driver or simulation has its own version of an optional ability.
+    """Whether a driver or simulation implements an optional ability.
 
     Args:
         part: The driver or simulation; it need not be derived from its role's base class.

@@ -1,4 +1,4 @@
-"""What a step works with: the clock, the shot, and the step itself."""
+"""The interfaces for steps: the clock, the shot, and the step itself."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Clock(Protocol):
         ...
 
     def check(self) -> None:
-        """Raise ``StopRequested`` if the operator asked the run to stop; else return at once."""
+        """Raise ``StopRequested`` if the operator asked the run to stop; returns at once otherwise."""
         ...
 
 
@@ -79,14 +79,14 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class Context:
-    """What a plugin's factory receives besides its settings.
+    """The argument of a plugin's factory next to its settings: grid, clock, random numbers, ...
 
     Attributes:
         name: Role or device name in the profile: "camera", "planner", "shutter".
         grid: The grid of sites.
         motion: How the mobile tweezers move.
-        clock: The session's time; drivers wait by ``clock.sleep``.
-        random: The plugin's own random numbers.
+        clock: The session's time; drivers wait with ``clock.sleep``.
+        random: The plugin's own random number generator.
         calibrations: Calibrations in use: kind -> entry.
         simulation: The simulation; None if the profile has none.
         lines: The lines of the timing box.
@@ -103,7 +103,7 @@ class Context:
 
 
 class Shot(Protocol):
-    """What a step works with: the devices and the state of the shot."""
+    """The devices and the state of the shot, for steps."""
 
     @property
     def index(self) -> int:
@@ -137,12 +137,12 @@ class Shot(Protocol):
 
     @property
     def static_tweezers(self) -> StaticTweezers:
-        """The static array."""
+        """The static tweezers."""
         ...
 
     @property
     def mobile_tweezers(self) -> MobileTweezers:
-        """The moving tweezers."""
+        """The mobile tweezers."""
         ...
 
     @property
@@ -211,7 +211,7 @@ class Shot(Protocol):
     def call(
         self, owner: str, timeout_s: float, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs
     ) -> T:
-        """Call a device or plugin with a time limit, and obey stop requests meanwhile.
+        """Call a device or plugin with a time limit; obeys stop requests during the call.
 
         Args:
             owner: Role or device name, for the error message.
@@ -231,19 +231,19 @@ class Shot(Protocol):
         """Check the interlocks of every device; before atoms are picked up.
 
         Raises:
-            DeviceError: A value is past its limit.
+            DeviceError: A value exceeds its limit.
         """
         ...
 
     def follow(self, signal: str, timeout_s: float, device: str = "") -> None:
         """Wait for the start signal of another control system, which will receive the outcome of this shot.
 
-        At a second wait in a shot, labseq first reports that it is ready.
+        At a second wait in a shot, labseq first answers `ready` to the signal before.
 
         Args:
             signal: "go".
             timeout_s: How long to wait, in seconds.
-            device: Name of the device that it uses; "" for the only one there is.
+            device: Name of the device that receives the signal; "" for the only one there is.
 
         Raises:
             ConfigError: There is no such device.
@@ -253,7 +253,7 @@ class Shot(Protocol):
         ...
 
     def margin_s(self, kind: str) -> float:
-        """How much longer a kind of step takes for the leads and lags of its lines, in seconds."""
+        """Extra time that a kind of step takes for the leads and lags of its lines, in seconds."""
         ...
 
     def lines_on(self, kind: str, duration_s: float) -> AbstractContextManager[None]:
@@ -302,13 +302,13 @@ class Shot(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class StepContext:
-    """What a step lays out its timeline with, before anything is opened.
+    """The grid, motion, target and camera facts from which a step lays out its timeline before devices open.
 
     Attributes:
         grid: The grid of sites.
         motion: How the mobile tweezers move.
         target: The target pattern.
-        camera: What the camera says of itself before it is opened.
+        camera: The camera's facts, which are known before it is opened.
         lines: The lines of the timing box.
     """
 
@@ -319,7 +319,7 @@ class StepContext:
     lines: tuple[LineSpec, ...] = ()
 
     def margin_s(self, kind: str) -> float:
-        """How much longer a kind of step takes for the leads and lags of its lines, in seconds."""
+        """Extra time that a kind of step takes for the leads and lags of its lines, in seconds."""
         return margin_s(self.lines, kind)
 
 
@@ -339,11 +339,11 @@ class Step(ABC):
 
     @abstractmethod
     def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:
-        """What the step will do, and how long each part takes at most; for ``labseq check`` and budgets."""
+        """The parts of the step with their maximum durations, for ``labseq check`` and budgets."""
 
     @abstractmethod
     def run(self, shot: Shot) -> None:
-        """Do it."""
+        """Carry out the step."""
 
 
 class RunObserver(Protocol):

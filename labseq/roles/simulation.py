@@ -20,10 +20,10 @@ from labseq.model import (
 )
 
 Signal: TypeAlias = ToneProgram | DepthRamp | TweezerAmplitudes | LineProgram
-"""What a device plays in a simulation."""
+"""The output of a device that the simulation acts on."""
 
 WHOLE_SENSOR: Final = SensorMode()
-"""The whole sensor with the simulation's own gain, for a camera that sets nothing."""
+"""Default mode: the whole sensor with the simulation's own gain."""
 
 
 class Simulation(ABC):
@@ -34,11 +34,11 @@ class Simulation(ABC):
 
     @abstractmethod
     def open(self) -> None:
-        """Draw the machine's own disorder."""
+        """Draw the static disorder of the machine, such as unequal tweezer depths."""
 
     @abstractmethod
     def close(self) -> None:
-        """Forget everything."""
+        """Discard the state of the simulation."""
 
     @abstractmethod
     def begin_shot(self) -> None:
@@ -50,7 +50,7 @@ class Simulation(ABC):
 
     @abstractmethod
     def play(self, role: str, signal: Signal, t_start_s: float) -> None:
-        """Take a device's output, from ``t_start_s`` on.
+        """Receive the output of a device that begins at ``t_start_s``.
 
         Args:
             role: "mobile_tweezers", which plays a ``ToneProgram``; "static_tweezers": ``DepthRamp`` or
@@ -61,7 +61,7 @@ class Simulation(ABC):
 
     @abstractmethod
     def expose(self, t_start_s: float, exposure_s: float, mode: SensorMode = WHOLE_SENSOR) -> Frame:
-        """The frame that a camera sees; imaging light is on.
+        """The frame of a camera exposed while imaging light is on.
 
         Args:
             t_start_s: Start of the exposure on the session's clock.
@@ -84,7 +84,7 @@ class Simulation(ABC):
         return 1.0
 
     def prepare_sensor(self, mode: SensorMode) -> None:
-        """Compute, before a run, what all frames of a mode have in common."""
+        """Compute, before a run, the values that all frames of a mode share."""
 
     def wire(self, role: str, on_edge: Callable[[float], object]) -> None:
         """Pass the edges of the line that triggers a role to its simulated device, from now on.
@@ -101,7 +101,7 @@ class Simulation(ABC):
         return None
 
     def truth(self) -> Occupancy | None:
-        """The true occupancy now, bool (n_rows, n_cols), for the record; None if unknown."""
+        """The current true occupancy, bool (n_rows, n_cols), for the record; None if unknown."""
         return None
 
     def losses(self) -> Mapping[str, int]:
@@ -111,7 +111,7 @@ class Simulation(ABC):
     def atom_events(self, since_s: float) -> Mapping[str, NDArray[Any]]:
         """Events of the shot, for the record: name -> structured array with a field for each column.
 
-        A dtype with ``metadata={"descriptions": {column: text}}`` takes its texts into the shot's file.
+        Texts in a dtype's ``metadata={"descriptions": {column: text}}`` are written to the shot's file.
 
         Args:
             since_s: Time on the session's clock from which times are counted.
@@ -138,7 +138,7 @@ class ToneSource(Protocol):
     def played(self, until_s: float) -> Sequence[TweezerAmplitudes]:
         """The amplitudes of the tones since the last call, in order of time; empty if unchanged.
 
-        A depth is part of them: at half the depth the amplitudes of rows and columns are lower. They are 0
+        Depth ramps are included: at half the depth the amplitudes of rows and columns are lower. They are 0
         before the first call.
 
         Args:
@@ -152,11 +152,11 @@ class ReceivesOutput(Protocol):
     """A simulation that acts on the samples that a device outputs, not on the program it was given."""
 
     def warm(self) -> None:
-        """Compile the kernels for that; a driver with such outputs calls it in its own ``warm``."""
+        """Compile the kernels for output samples; a driver with such outputs calls it in its own ``warm``."""
         ...
 
     def connect_outputs(self, role: str, source: RfSource | ToneSource) -> None:
-        """Receive these outputs of a role from now on, in place of earlier ones.
+        """Receive these outputs of a role from now on, instead of earlier ones.
 
         Args:
             role: "mobile_tweezers", with an ``RfSource``, or "static_tweezers", with a ``ToneSource``.
