@@ -86,7 +86,7 @@ class Comparison:
     """Planners on the same loadings.
 
     Attributes:
-        entrants: The planners.
+        planner_entries: The planners.
         conditions: What they are given.
         n_loadings: How many loadings of each condition.
         seed: What all loadings are drawn from.
@@ -404,7 +404,7 @@ class Failure:
     """A planner raised, or its plan breaks a rule.
 
     Attributes:
-        entrant: Index of the planner.
+        planner_entry: Index of the planner.
         condition: Index of the condition.
         loading: Index of the loading.
         message: What went wrong.

@@ -68,7 +68,7 @@ class Row:
     The means are over the loadings with a valid plan.
 
     Attributes:
-        entrant: The planner.
+        planner_entry: The planner.
         condition: Grid, target, loading and motion.
         settings: All its settings, JSON-ready.
         degree_of_parallelism: Maximum number of tweezers on at once for which its plans were checked.

@@ -239,7 +239,7 @@ class TimelineEntry:
     Attributes:
         label: What happens, for example "image" or "cycle 3: move".
         duration_s: How long it takes at most, in seconds.
-        least_s: How long it takes at least; 0 if it may be left out.
+        min_duration_s: How long it takes at least; 0 if it may be left out.
         n_images: Images that it takes at most.
         exposure_s: Exposure of each image, in seconds.
         kind: Kind of step that the profile's lines know it by, "image"; "" for one that they do not go with.

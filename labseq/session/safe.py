@@ -109,7 +109,7 @@ class SafeStateReport:
     """The outcome of making the devices of a profile safe.
 
     Attributes:
-        tried: Name of each device that could be constructed -> why it is not safe, or None.
+        attempted: Name of each device that could be constructed -> why it is not safe, or None.
         refused: Name of each other device -> why it was not constructed, with its place in the profile.
         problems: Other errors in the profile, or None.
     """

@@ -19,7 +19,7 @@ from labseq.testing.fakes import FakeLab, fake_lab
 
 Factory: TypeAlias = Callable[[], Step]
 
-TIMELINE: Final = "the timeline is known beforehand: labelled bars with 0 <= least_s <= duration_s"
+TIMELINE: Final = "the timeline is known beforehand: labelled bars with 0 <= min_duration_s <= duration_s"
 
 
 _MOVE_ATOMS: Final = frozenset(
