@@ -1,4 +1,4 @@
-"""Runs on disk: a folder per run, one HDF5 file per shot, and reading them back."""
+"""Recorded runs: writes and reads a folder per run with one HDF5 file per shot."""
 
 from labseq.files import data_root
 from labseq.recording.active import (

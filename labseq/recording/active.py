@@ -39,7 +39,7 @@ class Marker:
 
     @property
     def is_active(self) -> bool:
-        """Whether its process is known to run; one on another computer cannot be looked up."""
+        """Whether its process is known to run; false for a process on another computer."""
         return self.owner is not None and self.owner.is_here and self.owner.is_running
 
 
@@ -56,7 +56,7 @@ def mark_active(roots: Sequence[Path], profile_key: str, run_dir: Path) -> None:
     """Mark that this process has a run in progress on a profile's hardware.
 
     Args:
-        roots: See :func:`marker_roots`; the first must take the marker, the others need not.
+        roots: See :func:`marker_roots`; only the first must be writable.
         profile_key: Key of the profile, for example its absolute path.
         run_dir: The run's folder.
 
@@ -92,7 +92,7 @@ def clear_active(roots: Sequence[Path], profile_key: str) -> None:
 
 
 def find_dead_run(roots: Sequence[Path], profile_key: str) -> Path | None:
-    """A run that died on a profile's hardware without making it safe, if there is one.
+    """Find a run whose process died before it made a profile's hardware safe; None if there is none.
 
     Returns:
         Its folder, or the marker itself if that cannot be read. A run on another

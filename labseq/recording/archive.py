@@ -1,4 +1,4 @@
-"""A run as one HDF5 file.
+"""Exports a run to one HDF5 file.
 
 The tree::
 
@@ -35,12 +35,12 @@ FORMAT_VERSION: Final = "2.0"
 
 _SHARED: Final = ("target", "run")
 _WORTH_PACKING: Final = 1024
-"""Bytes from which compressing an array makes it smaller."""
+"""Arrays of at least this size are compressed, in bytes; smaller ones would grow."""
 _PACKED: Final = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
 
 
 def write_archive(run: Run, path: Path, *, frames: bool) -> list[str]:
-    """Write the archive of a run, whole or not at all.
+    """Write the archive of a run; the file appears only when it is complete.
 
     Args:
         run: The run.
@@ -52,7 +52,7 @@ def write_archive(run: Run, path: Path, *, frames: bool) -> list[str]:
 
     Raises:
         OSError: It cannot be written.
-        RuntimeError: Likewise; HDF5 raises either.
+        RuntimeError: It cannot be written; HDF5 raises either error.
     """
     left_out: list[str] = []
     with whole_file(path) as part, h5py.File(Path(part.name), "w", libver=schema.LIBRARY_VERSIONS) as file:
@@ -85,7 +85,7 @@ def _write_table(group: h5py.Group, run: Run) -> None:
 
 
 def _write_files(group: h5py.Group, run_dir: Path) -> None:
-    """The files of the run's folder as they are: texts as text, others as bytes."""
+    """Copy the files of the run's folder unchanged: texts as text, others as bytes."""
     results = group.create_group(folders.RESULTS_FOLDER)
     for goal, folder in ((group, run_dir), (results, run_dir / folders.RESULTS_FOLDER)):
         for path in sorted(folder.iterdir()) if folder.is_dir() else ():
@@ -146,7 +146,7 @@ class _Shots:
 
 
 def _copy(source: Any, made: Any, name: str, *, frames: bool) -> None:
-    """Copy what a group has under a name; large arrays are compressed, frames left out if unwanted."""
+    """Copy one item of a group; large arrays are compressed, and frames left out if not requested."""
     link = source.get(name, getlink=True)
     if isinstance(link, h5py.SoftLink):
         shot = "/".join(made.name.split("/")[:3])
@@ -156,7 +156,7 @@ def _copy(source: Any, made: Any, name: str, *, frames: bool) -> None:
     if isinstance(node, h5py.Group):
         group = made.create_group(name)
         group.attrs.update(node.attrs)
-        for inner in node.keys():  # noqa: SIM118 - names of the group's own, all text
+        for inner in node.keys():  # noqa: SIM118 - the names in this group, all text
             _copy(node, group, inner, frames=frames)
         return
     is_image = name == "images" and node.ndim == 3

@@ -35,7 +35,7 @@ _DERIVED: Final[Mapping[str, tuple[str, Callable[[_Row], Any]]]] = {
     ),
     "file": ("the shot's file, from the run's folder", lambda row: row.get("file")),
 }
-"""Columns that are worked out from a line of the index: description, value."""
+"""Columns that are computed from a line of the index: description, function."""
 
 _FIELDS: Final = tuple(field for field in schema.SHOT if field.in_index and field.name != "error")
 _DESCRIPTIONS: Final = {field.name: field.description for field in _FIELDS} | {
@@ -44,7 +44,7 @@ _DESCRIPTIONS: Final = {field.name: field.description for field in _FIELDS} | {
 _TEXTS: Final = frozenset({"file", *(field.name for field in _FIELDS if field.dtype == "text")})
 
 FIGURES: Final = tuple(name for name in _DESCRIPTIONS if name not in {*_TEXTS, "shot", "attempt"})
-"""Columns that every run has and that are numbers that a shot gave."""
+"""Columns of every run that are numerical results of a shot."""
 
 
 def _readings(row: _Row) -> dict[str, Any]:
@@ -58,7 +58,7 @@ _GROUPS: Final[Mapping[str, Callable[[_Row], Mapping[str, Any]]]] = {
     "reading.": _readings,
     "calibration.": lambda row: row["calibrations"],
 }
-"""Prefix of the names -> values of a line of the index that differ from run to run."""
+"""Prefix of the columns that differ from run to run -> their values in a line of the index."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,7 +83,7 @@ def columns_of(run: Run, shots: Sequence[Shot] | None = None) -> list[Column]:
 
     Args:
         run: The run.
-        shots: Those that make the rows; by default those that count.
+        shots: The shots of the rows; by default those that count.
     """
     rows = [shot.row for shot in (run.shots if shots is None else shots)]
     fixed = [_fixed(row) for row in rows]
@@ -118,7 +118,7 @@ def _description(prefix: str, name: str, *, scanned: bool) -> str:
 
 
 def figures_in(row: Mapping[str, Any]) -> dict[str, float]:
-    """The numbers that a shot gave.
+    """The figures (numerical results) of a shot.
 
     Args:
         row: The shot's line in the index.
@@ -138,7 +138,7 @@ def figures_in(row: Mapping[str, Any]) -> dict[str, float]:
 
 
 def _fixed(row: _Row) -> dict[str, Any]:
-    """The values that every run has."""
+    """The values of the columns that every run has."""
     found = {field.name: row.get(field.name) for field in _FIELDS}
     return found | {name: value(row) for name, (_, value) in _DERIVED.items()}
 
@@ -162,7 +162,7 @@ def _units_of_scan(scan: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _array(values: Sequence[Any], *, text: bool = False) -> NDArray[Any]:
-    """Values as one array, of the narrowest kind that takes all of them."""
+    """Convert values to one array of the narrowest type that can hold all of them."""
     kinds = {*map(type, values)}
     if not text and kinds <= {bool, int, float, type(None)} and all(map(_fits, values)):
         if kinds == {bool}:

@@ -1,7 +1,7 @@
 """`labseq doctor`: finds and repairs damage in recorded data.
 
-Nothing is deleted: what does not belong goes to the folder ``quarantine`` of its run, and ``doctor.jsonl``
-there says when, why and from where.
+Nothing is deleted: files that do not belong are moved to the folder ``quarantine`` of their run, and
+``doctor.jsonl`` there records when, why and from where.
 """
 
 from __future__ import annotations
@@ -50,18 +50,18 @@ _SHOT_NAME: Final = re.compile(r"shot_\d{6,}(\.attempt_\d+)?(\.take_(\d+))?\.h5"
 _RUN_NAME: Final = re.compile(r"\d{4,}_.*", re.DOTALL)
 _CLAIM: Final = re.compile(r"\.\d{4,}\.claim")
 _YOUNG_S: Final = 60.0
-"""What is younger may belong to a run that is just being made."""
+"""Minimum age of leftovers, in seconds: younger ones may belong to a run that is just being created."""
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """Something that is wrong.
+    """A defect that was found, and what was done about it.
 
     Attributes:
         what: What is wrong.
-        where: The file or folder.
-        done: What was done about it, or would be done without a dry run; or why nothing can be done.
-        left: Whether it stays as it is.
+        where: The damaged file or folder.
+        done: The repair, or in a dry run the intended repair; or why it cannot be repaired.
+        left: Whether the defect remains.
     """
 
     what: str
@@ -77,7 +77,7 @@ class Report:
     Attributes:
         findings: In the order they were found.
         n_runs: Runs that were checked.
-        n_shots: Their shots that are whole.
+        n_shots: Number of their intact shots.
         in_progress: Runs that were left alone because they are in progress, here or on another computer.
     """
 
@@ -143,7 +143,7 @@ def _examine_run(run_dir: Path, report: Report, *, dry_run: bool) -> None:
 
 
 def _is_in_progress(run_dir: Path) -> bool:
-    """Whether a process works on a run; one on another computer is believed."""
+    """Whether a process works on a run; for a run on another computer, as its folder says."""
     state = read_state_file(run_dir)
     process = Process.from_plain(state)
     return (
@@ -161,10 +161,10 @@ class _LineFile:
 
     Attributes:
         path: The file.
-        rows: The lines that are JSON objects, with what they say.
+        rows: The lines that are JSON objects, with their content.
         kept: The lines that stay.
         removed: The lines that go to quarantine.
-        problems: What is wrong, where, and what saving the file does about it.
+        problems: Each problem, its place, and its repair when the file is saved.
     """
 
     def __init__(self, path: Path) -> None:
@@ -187,7 +187,7 @@ class _LineFile:
                 self.rows.append((line, row))
 
     def remove(self, line: bytes, what: str = "") -> None:
-        """Take out the first such line, because of ``what`` unless another finding says why."""
+        """Remove the first such line; ``what`` is the reason, unless another finding reports it."""
         self.kept.remove(line)
         self.removed.append(line)
         if what:
@@ -197,7 +197,7 @@ class _LineFile:
         """Write the file if it has changed.
 
         Raises:
-            RecordingError: It cannot be written; it is as it was.
+            RecordingError: It cannot be written; the old file is unchanged.
         """
         data = b"".join(line + b"\n" for line in self.kept)
         if data == self._before:
@@ -216,9 +216,9 @@ class _Check:
     """Checks one folder, and repairs it right away unless it is a dry run.
 
     Attributes:
-        folder: The folder; what does not belong goes to its quarantine.
+        folder: The folder; files that do not belong are moved to its quarantine.
         findings: In the order they were found.
-        n_whole: Shots that are whole.
+        n_whole: Number of intact shots.
     """
 
     def __init__(self, folder: Path, *, dry_run: bool) -> None:
@@ -228,7 +228,7 @@ class _Check:
         self._dry_run = dry_run
 
     def check_run(self) -> None:
-        """Check everything in a run's folder; a part that cannot be read is left."""
+        """Check everything in a run's folder; an unreadable part is left unchanged."""
         shots, results = self.folder / folders.SHOTS_FOLDER, self.folder / folders.RESULTS_FOLDER
         try:
             if not (self.folder / folders.RUN_FILE).exists():
@@ -256,7 +256,7 @@ class _Check:
             self.report_unreadable(error)
 
     def check_holders(self, folder: Path) -> None:
-        """Notes about who holds a lock, left by processes of this computer that are gone."""
+        """Check for notes on lock holders that were left by ended processes of this computer."""
         with suppress(RecordingError):  # of a folder that cannot be read, which other checks report
             for name in names_in(folder):
                 if not name.endswith(".lock.holder"):
@@ -264,12 +264,12 @@ class _Check:
                 try:
                     process = Process.from_plain(json.loads((folder / name).read_bytes()))
                 except (OSError, ValueError, AttributeError):
-                    continue  # it is just being written or deleted
+                    continue  # the file is just being written or deleted
                 if process is not None and process.is_here and not process.is_running:
                     self._quarantine("a lock whose holder is gone", folder / name, folder)
 
     def check_data_folder(self, stale: list[Marker]) -> None:
-        """What is left in a data folder beside its runs.
+        """Check for leftovers in a data folder next to its runs.
 
         Args:
             stale: Markers of runs that are no longer in progress.
@@ -290,7 +290,7 @@ class _Check:
                 self._quarantine("half-written", active / name, active)
 
     def report_unreadable(self, error: RecordingError) -> None:
-        """What cannot be read, which only the user can repair."""
+        """Report unreadable files and folders, which only the user can repair."""
         what, _, advice = str(error).removeprefix(f"{error.path}: ").partition("; ")
         self._add(what, Path(error.path), f"left: {advice or what}")
 
@@ -345,7 +345,7 @@ class _Check:
         self._save(index)
 
     def _check_file(self, path: Path, lines: list[_Line], index: _LineFile) -> bool:
-        """Whether the file of a shot is there as it was written; one line for it is enough."""
+        """Whether the file of a shot exists unchanged; further lines of the index for it are removed."""
         try:
             data = path.read_bytes()
         except FileNotFoundError:
@@ -416,7 +416,7 @@ class _Check:
         self._add(what, path, _TO_QUARANTINE, lambda: _move_away(what, path, goal))
 
     def _add(self, what: str, where: Path, done: str, repair: Callable[[], None] | None = None) -> bool:
-        """Report a finding and repair it; whether it is repaired, or would be without a dry run."""
+        """Report a finding and repair it; returns whether it is repaired, or would be without a dry run."""
         if repair is not None and not self._dry_run:
             try:
                 repair()
@@ -516,7 +516,7 @@ def _is_run(folder: Path) -> bool:
 
 
 def _may_exist(path: Path) -> bool:
-    """Whether a file exists, or might: its folder may not allow to look."""
+    """Whether a file exists, or may exist because its folder cannot be read."""
     try:
         return path.exists()
     except OSError:

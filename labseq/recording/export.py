@@ -1,4 +1,4 @@
-"""A run as CSV, Parquet, netCDF or one HDF5 file."""
+"""Exports a run to CSV, Parquet, netCDF or one HDF5 file."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from labseq.recording.reader import Run
 from labseq.recording.tables import check_installed, dataframe_of, dataset_of, facts_of
 
 ENDINGS: Final = {"csv": ".csv", "parquet": ".parquet", "netcdf": ".nc", "archive": ".h5"}
-"""Kind of export -> how its file's name ends."""
+"""Kind of export -> suffix of its file."""
 
 
 def files_of(kind: str, path: Path) -> tuple[Path, ...]:
-    """The files that an export writes; a table of units goes beside a CSV file.
+    """The files that an export writes; a table of units is written next to a CSV file.
 
     Example:
         >>> [file.name for file in files_of("csv", Path("run.csv"))]
@@ -36,10 +36,10 @@ def check_export(kind: str, path: Path, *, frames: bool = False, replace: bool =
         kind: One of :data:`ENDINGS`.
         path: The file.
         frames: Whether to export frames; only the archive has them.
-        replace: Whether files that are there may be replaced.
+        replace: Whether existing files may be replaced.
 
     Raises:
-        ConfigError: It cannot; says what would be right.
+        ConfigError: It cannot be exported; says what was expected.
     """
     if kind not in ENDINGS:
         raise ConfigError(
@@ -52,7 +52,7 @@ def check_export(kind: str, path: Path, *, frames: bool = False, replace: bool =
         raise ConfigError(Problem(f"this is no name of a {kind} file", str(path), expected=wanted))
     try:
         has_folder, there = path.parent.is_dir(), [one for one in files_of(kind, path) if one.exists()]
-    except OSError as error:  # a name that is too long
+    except OSError as error:  # for a name that is too long
         raise ConfigError(Problem(f"this is no name of a file: {error.strerror}", str(path))) from error
     if not has_folder:
         raise ConfigError(Problem("there is no such folder", str(path.parent), expected="one that exists"))
@@ -67,10 +67,10 @@ def check_export(kind: str, path: Path, *, frames: bool = False, replace: bool =
 
 
 def export_run(run: Run, kind: str, path: Path, *, frames: bool = False) -> list[str]:
-    """Write a run to a file, whole or not at all; :func:`check_export` comes first.
+    """Write a run to a file, which appears only when it is complete; call :func:`check_export` first.
 
     Args:
-        run: The run; if it is still in progress, the shots that it had when it was opened.
+        run: The run; if it is still in progress, the shots up to when it was opened are exported.
         kind: One of :data:`ENDINGS`.
         path: The file; an older one is replaced.
         frames: Whether an archive holds the frames.
@@ -111,7 +111,7 @@ def _write_rows(path: Path, rows: Sequence[Sequence[str]]) -> None:
 
 
 def _cell(value: Any) -> str:
-    """A value as text that every program reads; nothing for nan."""
+    """A value as text that every program can read; empty for nan."""
     if isinstance(value, bool):
         return "true" if value else "false"
     return "" if value != value else str(value)

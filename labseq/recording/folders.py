@@ -1,4 +1,4 @@
-"""A run's folder: the names of its files, making it, and finding it."""
+"""Creates and finds a run's folder; names of the files in it."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ STATE_FILE: Final = "STATE"
 INDEX_FILE: Final = "index.jsonl"
 EVENTS_FILE: Final = "events.jsonl"
 SKIPPED_FILE: Final = "skipped.jsonl"
-"""Shots that will not be taken, and why; only where there are any."""
+"""Lists skipped shots with the reason; exists only if there are any."""
 SEQUENCE_FILE: Final = "sequence.yaml"
 PROFILE_FILE: Final = "profile.yaml"
 SHOTS_FOLDER: Final = "shots"
 RESULTS_FOLDER: Final = "analysis"
 """Results of analyses: a file of lines for each."""
 STOP_FILE: Final = "STOP"
-"""There while the run is requested to end after the current shot."""
+"""Exists while a request to end the run after the current shot is pending."""
 LOCK_FILE: Final = ".lock"
 """Locked by the process that resumes or repairs the run."""
 OWN_NAMES: Final = frozenset(
@@ -38,7 +38,7 @@ _MAX_SLUG: Final = 60
 
 
 def slug(name: str) -> str:
-    """A name that every file system accepts.
+    """Convert a text to a name that every file system accepts.
 
     Example:
         >>> slug("20 x 20: to/from µ")
@@ -55,7 +55,7 @@ def shot_file_name(shot_index: int, attempt: int, *, counts: bool, take: int = 1
 
     Args:
         shot_index: Index of the shot, from 0.
-        attempt: Which attempt it is, from 0.
+        attempt: Number of the attempt, from 0.
         counts: Whether the attempt completed the shot.
         take: Counted up from 1 in a resumed run that keeps the file of an earlier take.
 
@@ -71,13 +71,13 @@ def shot_file_name(shot_index: int, attempt: int, *, counts: bool, take: int = 1
 
 
 def make_run_folder(root: Path, name: str, started: datetime) -> Path:
-    """Make ``<root>/<local date>/<counter>_<slug>``; no two runs of a day share a counter.
+    """Create ``<root>/<local date>/<counter>_<slug>``; no two runs of a day share a counter.
 
     A counter is claimed by making the folder ``.<counter>.claim``, which succeeds
     for one process only. When the claim is gone again, the run's folder is there.
 
     Raises:
-        RecordingError: The place cannot be written to.
+        RecordingError: The folder cannot be created.
     """
     day = root / started.astimezone().date().isoformat()
     with explained(day):
@@ -111,13 +111,13 @@ def _counters(day: Path, *, claims: bool = True) -> list[int]:
 
 
 def find_run(path: Path) -> Path:
-    """The folder of the run that a path belongs to.
+    """Find the folder of the run that a path belongs to.
 
     Args:
         path: A run's folder or any file or folder in it.
 
     Raises:
-        RecordingError: It is no part of a run; the message says what to give instead.
+        RecordingError: The path is not part of a run; the message says what to give instead.
     """
     path = Path(path).expanduser().resolve()
     if not path.exists():

@@ -1,4 +1,4 @@
-"""Writing HDF5: attributes, arrays, tables and texts that say what they are and in what unit."""
+"""Reads and writes HDF5: attributes, arrays, tables and texts with their descriptions and units."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _SCALAR: Final = h5s.create(h5s.SCALAR)
 
 
 def set_attributes(node: Any, values: Mapping[str, Any]) -> None:
-    """Add attributes to a group or dataset that has none of these names; text is made fit for HDF5."""
+    """Add new attributes to a group or dataset; characters that HDF5 cannot store are replaced."""
     for name, value in values.items():  # node.attrs[name] = value takes twice the time
         if isinstance(value, str):
             _add_text(node, name, np.array(plain_text(value), _STRING), _SCALAR)
@@ -50,7 +50,7 @@ def _attribute(field: Field, value: Any) -> Any:
 
 
 def read_fields(node: Any, fields: Sequence[Field]) -> dict[str, Any]:
-    """Attributes as plain values: attribute of the record -> value; without those of a newer minor format."""
+    """Read attributes: attribute of the record -> plain value; those of a newer minor format are ignored."""
     found: dict[str, Any] = {}
     for field in (field for field in fields if field.name in node.attrs):
         value = node.attrs[field.name]
@@ -70,7 +70,7 @@ def write_texts(group: Any, fields: Sequence[Field], record: Any) -> None:
 
 
 def read_texts(group: Any, fields: Sequence[Field]) -> dict[str, Any]:
-    """Texts and JSON values: attribute of the record -> value; without those of a newer minor format."""
+    """Read texts and JSON: attribute of the record -> value; those of a newer minor format are ignored."""
     texts = {field: group[field.name][()].decode() for field in fields if field.name in group}
     return {
         field.attribute: json.loads(text) if field.dtype == "json" else text for field, text in texts.items()
@@ -86,7 +86,7 @@ def write_array(group: Any, path: str, values: Any) -> Any:
 
 
 def describe(dataset: Any, what: Dataset) -> None:
-    """Say in its attributes what a dataset is, and in what unit."""
+    """Add the attributes for the description and the unit of a dataset."""
     set_attributes(dataset, {"units": what.units, "description": what.description})
 
 
@@ -114,7 +114,7 @@ def _of_columns(dtype: np.dtype[Any], table: Table) -> tuple[Any, Any, Any]:
 
 
 def link_name(name: str, taken: Container[str]) -> str:
-    """A name that HDF5 accepts and that is not taken yet.
+    """Convert a text to a name that HDF5 accepts and that is still free.
 
     Example:
         >>> link_name("laser/780", ()), link_name(".", {"_"})
@@ -131,7 +131,7 @@ def link_name(name: str, taken: Container[str]) -> str:
 
 
 def load_filter(path: Path, dataset: Any) -> None:
-    """Load what is needed to read a dataset that may be compressed.
+    """Load the HDF5 filter for a dataset if it is compressed.
 
     Raises:
         RecordingError: It is compressed, and the package for it is missing.

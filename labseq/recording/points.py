@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from labseq.recording.shot import Shot
 
 SCANNER: Final = "scanner"
-"""Key that only the record of an adaptive scan has: the scanner and its settings."""
+"""Key in the record of an adaptive scan (and no other): the scanner and its settings."""
 
 
 class ChosenPoints:
@@ -41,7 +41,7 @@ class ChosenPoints:
         """The number of a shot's point, counted from 0.
 
         Args:
-            parameters: Address -> value, as the shot's line of the index has it.
+            parameters: Address -> value, from the shot's line of the index.
         """
         values = [parameters[address] for address in self._addresses]
         number = self._numbers.setdefault(dumps(values), len(self.points))
@@ -72,7 +72,7 @@ class ScanPoint:
 
     Attributes:
         parameters: Scanned address -> value, SI.
-        written: The same as the sequence has it: "60 ms".
+        written: The same in the units of the sequence: "60 ms".
         shots: The shots there that count, in order.
     """
 
@@ -82,7 +82,7 @@ class ScanPoint:
 
 
 def scan_points(run: Run) -> list[ScanPoint]:
-    """The points of a run's scan that have a shot, in the scan's own order; none without a scan.
+    """The points of a run's scan that have a shot, in the order of the scan; empty without one.
 
     Raises:
         RecordingError: The scan's record in run.json is damaged.

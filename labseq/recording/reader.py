@@ -1,4 +1,4 @@
-"""A recorded run, read back."""
+"""Reads a recorded run."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 def open_run(path: str | Path) -> Run:
-    """Open a run that is finished, still running, or was killed.
+    """Open a recorded run, which may be finished, still running or killed.
 
     Only the index is read. A shot's file is read when one of its values is needed.
 
@@ -49,7 +49,7 @@ def open_run(path: str | Path) -> Run:
     load = lru_cache(maxsize=8)(load_content)  # several values of a shot read its file once
     counted = {
         row["shot"]: row for row in usable if row["counts"]
-    }  # of a shot that was written twice, the last
+    }  # the last line counts if a shot was written twice
     return Run(
         path=folder,
         record=record,
@@ -78,11 +78,11 @@ class Run:
         path: The run's folder.
         record: The content of run.json: settings, devices, versions, ...
         status: "running", "complete", "stopped" or "failed"; a run whose process is gone has failed.
-        error: Why it did not complete, or "".
+        error: The error that ended it, or "".
         shots: The shots that count, in order.
         attempts: Attempts at shots that failed or were interrupted, in the order they were made.
         n_damaged_lines: Lines of the index that cannot be read; 0 unless the file was damaged.
-        skipped: Shots that a policy left out: index -> why.
+        skipped: Shots that were skipped: index -> reason.
     """
 
     path: Path
@@ -104,7 +104,7 @@ class Run:
 
     @property
     def n_shots(self) -> int:
-        """Number of shots that the sequence asks for."""
+        """Number of shots that the sequence requests."""
         return int(self.record["n_shots"])
 
     @property
@@ -126,7 +126,7 @@ class Run:
     def scan(self) -> Mapping[str, Any]:
         """The scan: addresses, points and the point of each shot; empty without one.
 
-        For an adaptive scan, the points are those chosen so far; they are worked out at each call.
+        For an adaptive scan, the points are those chosen so far; they are computed at each call.
 
         Raises:
             RecordingError: Its record in run.json or the index is damaged.
@@ -160,9 +160,9 @@ class Run:
         return tuple(read_lines(self.path / folders.EVENTS_FILE)[0])
 
     def analysis(self, name: str) -> list[dict[str, Any]]:
-        """The results of an analysis: a row per shot, with its index as "shot" beside the results.
+        """The results of an analysis: a row per shot, with its index as "shot" and the results.
 
-        A row with "error" says why the shot has no result.
+        A row with "error" contains the reason why the shot has no result.
 
         Raises:
             RecordingError: There are no results of that name, or they cannot be read.
@@ -170,7 +170,7 @@ class Run:
         return rows_of(self.path, name)
 
     def summary(self) -> dict[str, Any]:
-        """The run in a few JSON-ready numbers; None for a missing one."""
+        """The main results of the run, JSON-ready; None for a missing number."""
         return {
             "run_dir": str(self.path),
             "shots": len(self.shots),
@@ -187,10 +187,10 @@ class Run:
         batches, atom moves and defects, ``duration_s``; what was scanned or set, by its address; ``stage.*``,
         how long each stage took; ``reading.*``, values read from devices; ``calibration.*``, ids. Numbers
         are SI, and nan where they are missing. ``attrs`` has ``units`` and ``descriptions`` by column,
-        and what is true of the whole run.
+        and the values that hold for the whole run.
 
         Args:
-            attempts: Whether attempts that failed or were interrupted have rows, too.
+            attempts: Whether to include failed and interrupted attempts.
 
         Raises:
             ConfigError: pandas is not installed.
@@ -220,7 +220,7 @@ class Run:
 
 
 class Follower:
-    """Follows the index of a run: gives each shot that counts once, when its line is there.
+    """Follows the index of a run in progress: returns each shot that counts once.
 
     Args:
         run_dir: The run's folder.

@@ -1,8 +1,8 @@
 """Results of analyses: a file of JSON lines for each analysis, in the run's folder.
 
 A line with "shot" is the result of a shot; of several lines for the same shot the last one counts. Any
-other line says what made the results that follow it: plugin, version, settings. If "anew" in it is true,
-the lines before it no longer count.
+other line describes the analysis of the results that follow it: plugin, version, settings. If "anew" in
+it is true, the lines before it no longer count.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class ResultsLog:
 
     Args:
         path: The file; its folder is made if it does not exist.
-        about: What makes the results; if "anew" is true in it, earlier results no longer count.
+        about: Plugin, version and settings; if "anew" is true in it, earlier results no longer count.
 
     Raises:
         RecordingError: The file cannot be written.
@@ -77,10 +77,10 @@ class ResultsLog:
 
 
 def read_results(path: Path) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """Read the file of an analysis, whatever state it is in.
+    """Read the file of an analysis, even if it is incomplete or damaged.
 
     Returns:
-        The row of each shot, in the order of the shots; and what made the last of them, {} if unknown.
+        The row of each shot, in order; and plugin, version and settings of the last one, {} if unknown.
 
     Raises:
         RecordingError: The file exists but cannot be read.

@@ -1,4 +1,4 @@
-"""run.json, STATE and the lines of a run's index: what they hold, written and read back.
+"""Writes and reads run.json, STATE and the lines of a run's index.
 
 A shot's line in the index also sums up its images and cycles, so that a run of many thousand shots is
 evaluated without opening their files.
@@ -37,11 +37,11 @@ _MAX_DEPTH: Final = 4
 
 
 class OtherFormatError(RecordingError):
-    """A file was written by a labseq with another format than this one's."""
+    """A file was written in a format that this version of labseq cannot read."""
 
 
 def check_version(path: Path, found: str, known: str) -> None:
-    """Refuse files of another major version of the format.
+    """Raise for a file whose format has another major version.
 
     Args:
         path: The file.
@@ -50,7 +50,7 @@ def check_version(path: Path, found: str, known: str) -> None:
 
     Raises:
         OtherFormatError: The major version is another one.
-        RecordingError: There is no version.
+        RecordingError: The version is missing.
     """
     major = found.partition(".")[0]
     if not major.isdecimal():
@@ -72,7 +72,7 @@ def sha256_of_text(text: str) -> str:
 
 
 def encode_text(text: str) -> bytes:
-    """The exact bytes that a text was decoded from."""
+    """Encode a text to exactly the bytes that it was decoded from."""
     return text.encode("utf-8", "surrogateescape")
 
 
@@ -132,7 +132,7 @@ def _grid(rows: list[str]) -> NDArray[np.bool_]:
 
 
 def encode_state(status: RunStatus, error: str = "") -> bytes:
-    """The content of STATE: one line, with the process that the run belongs to."""
+    """The content of STATE: one line with the status, and the process that runs the run."""
     return dumps({"state": status, **asdict(Process.current()), "error": error}).encode() + b"\n"
 
 
@@ -147,8 +147,8 @@ def read_state_file(folder: Path) -> dict[str, Any]:
 def read_state(folder: Path) -> tuple[RunStatus, str]:
     """Status of a run, and the error that ended it.
 
-    A run that is "running" while its process is gone has failed. A run on another computer is believed,
-    because its process cannot be looked up.
+    A "running" run whose process has ended counts as failed. For a run on another computer, whose
+    process cannot be checked, the recorded status is returned.
     """
     state = read_state_file(folder)
     if state.get("state") not in STATUSES:
@@ -163,7 +163,7 @@ def read_state(folder: Path) -> tuple[RunStatus, str]:
 
 
 def read_owner(folder: Path) -> Process | None:
-    """The process that runs or ran a run; None if that is not known."""
+    """The process that runs or ran a run; None if unknown."""
     return Process.from_plain(read_state_file(folder))
 
 
@@ -209,7 +209,7 @@ class Cycles:
 
 @dataclass(frozen=True, slots=True)
 class ShotSummary:
-    """A shot in a few numbers, as its line in the index has them.
+    """The main results of a shot, from its line in the index.
 
     Attributes:
         images: Its images.
@@ -223,7 +223,7 @@ class ShotSummary:
 
     @property
     def is_judged(self) -> bool:
-        """Whether no cycle ended with the last image: that one may have been chosen for being good."""
+        """Whether the last image is not that of a cycle, whose result may have ended the rearrangement."""
         return not any(self.images.cycle[-1:])
 
 
@@ -310,7 +310,7 @@ def index_row(
 
 
 def flat_readings(readings: Mapping[str, Any]) -> dict[str, Any]:
-    """The readings that are single values, by dotted names, without those of a simulation.
+    """The readings that are single values, by dotted name, except those of a simulation.
 
     Example:
         >>> flat_readings({"laser": {"power_w": 0.1, "trace": [1, 2]}, "simulation.lost.vacuum": 2.0})
@@ -341,7 +341,7 @@ _NOTHING: Final = object()
 
 
 def is_index_row(row: Mapping[str, Any]) -> bool:
-    """Whether a line of the index is whole; a value that an older minor format lacks may be missing."""
+    """Whether a line of the index is complete; values that an older minor format lacks may be missing."""
     if not all(isinstance(row.get(name, _NOTHING), kind) for name, kind in _NEEDED_IN_INDEX):
         return False
     if not all(isinstance(row.get(name), kind) for name, kind in _KINDS_IN_INDEX if name in row):
@@ -354,7 +354,7 @@ def is_index_row(row: Mapping[str, Any]) -> bool:
 
 
 def is_skip_row(row: Mapping[str, Any], n_shots: int) -> bool:
-    """Whether a line of skipped.jsonl names shots of a run, and says why they were left out."""
+    """Whether a line of skipped.jsonl has valid shot indices and a reason."""
     shots, why = row.get("shots"), row.get("why")
     if not isinstance(shots, list) or not isinstance(why, str):
         return False

@@ -44,11 +44,11 @@ _UNITS: Final = {
     **{unit: unit for unit in ("s", "m", "K", "Hz", "rad", "V", "W", "A", "px")},
     **{unit.lower(): unit for unit in ("K", "Hz", "V", "W", "A")},
 }
-"""Last word of a name -> unit."""
+"""Suffix of a name (after the last "_") -> unit."""
 
 
 def unit_of(name: str) -> str:
-    """Unit of a value, read from the last word of its name; "" if that is no unit.
+    """Unit of a value, from the suffix of its name; "" if that is no unit.
 
     Example:
         >>> unit_of("laser.power_w"), unit_of("spacing_m"), unit_of("seen"), unit_of("beat_hz")
@@ -65,9 +65,9 @@ class Field:
         name: Name of the attribute, dataset or column in the file.
         dtype: numpy's name of its type, "text" (UTF-8), "json", or "integer" (text beyond 64 bits).
         description: What it is.
-        source: Attribute of the record that it is read from, dotted, if that is not called ``name``; or a
+        source: Attribute of the record that it is read from, dotted, if it is not ``name``; or a
             function of the record.
-        in_index: Whether a shot's line in the index has it too. It is then a column of the exports.
+        in_index: Whether the value is also in a shot's line of the index, and so a column of the exports.
     """
 
     name: str
@@ -97,8 +97,8 @@ class Table:
 
     Attributes:
         path: Where it is, below ``/entry``.
-        row: What a row is.
-        description: What the table is.
+        row: Meaning of a row.
+        description: Meaning of the table.
         columns: Its columns.
     """
 
@@ -138,9 +138,9 @@ class Table:
         return table
 
     def arguments(self, kind: type, table: NDArray[Any]) -> list[dict[str, Any]]:
-        """Rows that were read, as arguments for the constructor of a record.
+        """Convert rows that were read to arguments for the constructor of a record.
 
-        Values that its constructor does not take are left out; a column that an older file lacks is too.
+        Values that its constructor does not take are left out, as are columns that an older file lacks.
 
         Args:
             kind: The record's class, a dataclass.
@@ -467,7 +467,7 @@ def describe_columns(table: np.dtype[Any], known: Table) -> tuple[list[str], lis
 
     Args:
         table: Its dtype; a simulation describes columns by ``metadata={"descriptions": {column: text}}``.
-        known: What the schema has of it.
+        known: The columns in the schema.
 
     Example:
         >>> jumps = np.dtype([("t_s", "f8")], metadata={"descriptions": {"t_s": "when"}})

@@ -1,4 +1,4 @@
-"""A recorded shot, read back."""
+"""Reads a recorded shot."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def load_content(path: Path) -> ShotContent:
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Shot:
-    """A shot on disk. What the index holds costs nothing; the rest reads the shot's file.
+    """A recorded shot. Values in the index are read at once, all others from the shot's file when needed.
 
     Every property from ``occupancies`` on raises ``RecordingError`` if the file is missing or damaged.
 
@@ -54,7 +54,7 @@ class Shot:
 
     @property
     def attempt(self) -> int:
-        """Which attempt this is, from 0."""
+        """Number of the attempt, from 0."""
         return int(self.row["attempt"])
 
     @property
@@ -80,12 +80,12 @@ class Shot:
 
     @property
     def occupancies(self) -> NDArray[np.bool_]:
-        """As detected, bool (n_images, n_rows, n_cols)."""
+        """The detected occupancies, bool (n_images, n_rows, n_cols)."""
         return self._of_each_image("occupancy", np.bool_)
 
     @property
     def summary(self) -> ShotSummary:
-        """Its images and cycles in a few numbers, from the index."""
+        """Summary of its images and cycles, from the index."""
         return summary_of(self.row)
 
     @property
@@ -120,7 +120,7 @@ class Shot:
 
     @property
     def parameters(self) -> dict[str, Any]:
-        """What differs from the files in this shot: address -> value; those of a scan in SI."""
+        """Settings of this shot that differ from the files: address -> value; scanned ones in SI."""
         return dict(self.row["parameters"])
 
     @property
@@ -140,7 +140,7 @@ class Shot:
 
     @property
     def provenance(self) -> dict[str, Any]:
-        """Seed, versions, texts and settings, as the shot's file has them."""
+        """Seed, versions, texts and settings from the shot's file."""
         run = self._content.run
         texts = {name: run[f"{name}_text"] for name in ("sequence", "profile")}
         rest = {name: run[name] for name in ("resolved", "overrides", "plugins")}
@@ -153,7 +153,7 @@ class Shot:
 
     @property
     def frames(self) -> NDArray[np.uint16]:
-        """The frames that were kept, uint16 (n_frames, height, width); read from the file each time.
+        """The recorded frames, uint16 (n_frames, height, width); read from the file each time.
 
         Raises:
             RecordingError: The frames differ in size; :meth:`record` gives them one by one.

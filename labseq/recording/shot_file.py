@@ -1,4 +1,4 @@
-"""A shot's HDF5 file, written and read as the schema says."""
+"""Writes and reads a shot's HDF5 file according to the schema."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ _AXES: Final = ("t_s", ".", ".")
 class ShotEncoder:
     """Turns the shots of one run into the bytes of HDF5 files.
 
-    The file is built in memory, so that HDF5 never meets a full disk, and so that the bytes that are hashed
-    are the bytes that are written.
+    The file is built in memory, so that a full disk cannot interrupt HDF5, and so that the hashed bytes
+    are exactly the written ones.
 
     Args:
         run: The run that the shots belong to.
@@ -49,7 +49,7 @@ class ShotEncoder:
         compress: Whether frames are compressed (bitshuffle and LZ4).
 
     Raises:
-        RecordingError: ``compress``, and the package for it is missing.
+        RecordingError: The package for compression is missing.
     """
 
     def __init__(self, run: RunRecord, run_id: str, *, compress: bool = False) -> None:
@@ -90,7 +90,7 @@ class ShotEncoder:
                 write_table(events, schema.ATOM_EVENTS, table, names[-1])
 
     def _frames_to_keep(self, images: Sequence[ImageRecord]) -> list[int]:
-        """Indices of the images whose frames go into the file."""
+        """Indices of the images whose frames are recorded."""
         indices = range(len(images))
         wanted = {"all": indices, "last": indices[-1:], "none": range(0)}[self._run.record_frames]
         return [i for i in wanted if images[i].frame is not None]
@@ -130,7 +130,7 @@ class ShotEncoder:
 
 
 def _encode_common(run: RunRecord, run_id: str) -> bytes:
-    """A file with what is the same in all shots; completing it takes half the time of writing all of it."""
+    """A file with the values that all shots share; completing it takes half the time of writing it all."""
     buffer = io.BytesIO()
     values = {field.name: getattr(run, field.name) for field in fields(run)}
     hashes = {f"{name}_sha256": sha256_of_text(values[f"{name}_text"]) for name in ("sequence", "profile")}
@@ -179,7 +179,7 @@ class ShotContent:
 
     Attributes:
         record: The shot's record; its images have no frames.
-        run: What all shots of the run share: attribute of :class:`RunRecord` -> value.
+        run: Values that all shots of the run share: attribute of :class:`RunRecord` -> value.
         target: The target of the run.
     """
 
@@ -235,7 +235,7 @@ def read_frames(path: Path) -> dict[int, Frame]:
 
 
 def with_frames(record: ShotRecord, frames: dict[int, Frame]) -> ShotRecord:
-    """A record whose images have their frames again."""
+    """A copy of a record with the frames added to its images."""
     images = [replace(image, frame=frames.get(i)) for i, image in enumerate(record.images)]
     return replace(record, images=images)
 

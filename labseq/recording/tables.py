@@ -1,4 +1,4 @@
-"""The shots of a run as a table of pandas and as a dataset of xarray; both need the extra ``analysis``."""
+"""Converts the shots of a run to a pandas table or an xarray dataset; needs the extra ``analysis``."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ if TYPE_CHECKING:
     import xarray as xr
 
 NO_IMAGE: Final = -1
-"""Value of occupancies where a shot has no such image, or where there is no such shot."""
+"""Occupancy where an image or a shot is missing."""
 
 
 def check_installed(*packages: str) -> None:
-    """Refuse to go on without packages of the extra ``analysis``.
+    """Raise if packages of the extra ``analysis`` are missing.
 
     Raises:
         ConfigError: One is missing; says how to install it.
@@ -39,7 +39,7 @@ def check_installed(*packages: str) -> None:
 
 
 def facts_of(run: Run) -> dict[str, Any]:
-    """What is true of the whole run, as plain values."""
+    """The values that hold for the whole run, as plain Python values."""
     return {
         "run_id": str(run.record.get("run_id") or run.path.name),
         "name": run.name,
@@ -147,7 +147,7 @@ def _grid_of(run: Run) -> _Grid | None:
     """The axes of a run's scan; None without one.
 
     Raises:
-        RecordingError: What run.json says of the scan is damaged.
+        RecordingError: The scan's record in run.json is damaged.
     """
     scan: Mapping[str, Any] = run.scan
     if not scan:
@@ -185,12 +185,12 @@ def _grid(addresses: list[str], points: list[list[Any]], point_of_shot: list[int
 
 
 def _by_axis(keys: Sequence[tuple[str, ...]], points: Sequence[list[Any]]) -> list[tuple[Any, Any]]:
-    """The keys and the values along each axis."""
+    """The addresses and the values along each axis."""
     return list(zip(zip(*keys, strict=True), zip(*points, strict=True), strict=True))
 
 
 def _values(values: Sequence[Any]) -> NDArray[Any]:
-    """The values along an axis: numbers, else text."""
+    """The values along an axis, as numbers if possible, else as text."""
     if all(type(value) in (int, float) for value in values):
         return np.array(values)
     return np.array([value if isinstance(value, str) else dumps(value) for value in values], object)

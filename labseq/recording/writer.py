@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 class RunWriter:
     """The folder of a run in progress; made by :meth:`create` or :meth:`reopen`, used by one process.
 
-    A shot is whole and on the disk before its line is in the index. Whatever
-    happens, be it a kill or a full disk, the shots in the index stay whole.
+    A shot is complete on the disk before its line is in the index. So the shots
+    in the index are intact even after a kill or a full disk.
 
     Attributes:
         run_dir: The run's folder.
@@ -61,18 +61,18 @@ class RunWriter:
         *,
         compress: bool = False,
     ) -> RunWriter:
-        """Make ``<root>/<local date>/<counter>_<name>/`` and write what is known at the start.
+        """Create ``<root>/<local date>/<counter>_<name>/`` and write the files that a run starts with.
 
-        Other processes may do the same at the same time.
+        Several processes may call it at the same time.
 
         Args:
-            root: Data root; made if it does not exist.
-            run: What is known of the run.
+            root: Data root; created if it does not exist.
+            run: The record of the run before its devices are open.
             extra_files: Further files for the folder: name -> content.
             compress: Whether frames are compressed; needs ``labseq[compress]``.
 
         Raises:
-            RecordingError: The place cannot be written to, the disk is full, or
+            RecordingError: The folder cannot be written to, the disk is full, or
                 the package for compression is missing.
         """
         started = datetime.fromisoformat(run.t_start_utc)
@@ -108,8 +108,8 @@ class RunWriter:
 
         Args:
             run_dir: Its folder.
-            run: What is known of it now, for the next shots' files; only its ``resumed`` goes into run.json.
-            n_written: Shots that count and were written before.
+            run: Its current record, for the files of the next shots; only ``resumed`` is written to run.json.
+            n_written: Number of shots written before that count.
             compress: Whether frames are compressed; needs ``labseq[compress]``.
 
         Raises:
@@ -126,7 +126,7 @@ class RunWriter:
         return writer
 
     def set_devices(self, devices: Mapping[str, Mapping[str, Any]]) -> None:
-        """Add what the devices report about themselves; before the first shot, once they are open.
+        """Add the descriptions of the devices; called before the first shot, when they are open.
 
         Args:
             devices: Role or device name -> its ``describe()``.
@@ -155,7 +155,7 @@ class RunWriter:
 
         Raises:
             RecordingError: The disk is full, or the record contradicts itself.
-                The shots written before are whole, and this one may be written again.
+                The shots written before are intact, and this one may be written again.
         """
         counts = shot.status == "complete"
         file = self._free_name(shot, counts=counts)
@@ -185,7 +185,7 @@ class RunWriter:
         log = LineLog(self.run_dir / folders.SKIPPED_FILE)
         log.append({"shots": list(shots), "why": why, "t_utc": t_utc}, sync=True)
         with explained(self.run_dir):
-            sync_folder(self.run_dir)  # it may be the first
+            sync_folder(self.run_dir)  # the file may not exist yet
 
     def _free_name(self, shot: ShotRecord, *, counts: bool) -> str:
         """The name of a shot's file, different from those that the run had before it was resumed."""
@@ -215,11 +215,11 @@ class RunWriter:
                 self._n_events_lost += 1
 
     def finish(self, status: RunStatus, error: str = "") -> None:
-        """Mark how the run ended.
+        """Record how the run ended.
 
         Raises:
-            RecordingError: The disk is full. The run counts as failed as soon as
-                this process is gone.
+            RecordingError: The disk is full. The run counts as failed once this
+                process has ended.
         """
         with suppress(OSError):
             (self.run_dir / folders.STOP_FILE).unlink(missing_ok=True)
