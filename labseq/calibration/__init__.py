@@ -1,1 +1,1 @@
-"""Everything about calibrations: their store, how each is measured, their pictures and commands."""
+"""Calibrations: their measurement, analysis, store, pictures and commands."""

@@ -1,4 +1,4 @@
-"""What changed between two calibrations of a kind."""
+"""Compares two calibrations of the same kind."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ _UNITS: Final = ("hz", "m", "px", "rad", "s")
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """How a value or a figure differs.
+    """The difference of a value or a figure of merit between two calibrations.
 
     Attributes:
         name: Its name.
         unit: "Hz", "m", "px", "rad", "s" or "".
-        before: Of a figure; None of a value with many numbers.
-        after: Likewise.
-        greatest: Greatest change of any of its numbers, positive; nan if the shapes differ.
+        before: The earlier figure; None for a value with many numbers.
+        after: The later figure; None for a value with many numbers.
+        greatest: Largest absolute change of any of its numbers; nan if the shapes differ.
         rms: Root mean square of the changes.
         mean: Mean change of each column of the last axis where that has two, such as (y, x); else of all.
     """
@@ -63,7 +63,7 @@ def compare(before: CalibrationEntry, after: CalibrationEntry) -> tuple[list[Dif
 
 
 def unit_of(name: str) -> str:
-    """The unit that a name ends with.
+    """The unit in the suffix of a name.
 
     Example:
         >>> unit_of("row_hz"), unit_of("error_m"), unit_of("error")

@@ -1,4 +1,4 @@
-"""The tone of each row and column, measured by a run of probes."""
+"""Calibration of the tone frequency of each row and column, from a run of probes."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ SLOPE_STEP_M: Final = 1e-9
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrequenciesFit:
-    """Tones that put the mobile tweezers onto the sites.
+    """Tone frequencies at which the mobile tweezers are centred on the sites.
 
     Attributes:
         row_hz: float64 (n_rows,), frequency of each row's tone.
@@ -71,11 +71,11 @@ def fit_frequencies(
     motion: MotionSpec,
     worst_error_m: float = WORST_ERROR_M,
 ) -> FrequenciesFit:
-    """Find the position of each row's and column's tweezers, and the tones that put them onto the sites.
+    """Find the position of each row's and column's tweezers, and the tones that centre them on the sites.
 
     All sites have the same survival peak (:func:`labseq.motion.fit_overlay`). Its centre on the
     site (i, j) is that of column j along a1 and of row i along a2; all are fitted together by maximum
-    likelihood. Each is then shrunk towards a parabola through the others of its axis, by as much as
+    likelihood. Each is then shrunk towards a parabola through the others of its axis, as much as
     its error and the scatter of all about the parabola require: one with few atoms takes the value
     of its neighbours. The tones include the common shift, so that the overlay that was corrected
     in the measurement is no longer needed.
@@ -86,11 +86,11 @@ def fit_frequencies(
         n_survived: int, of the same shape: how many of them were seen afterwards.
         grid: The grid of sites, with the tones that were played.
         motion: How the tweezers move.
-        worst_error_m: Maximum r.m.s. error of rows and columns.
+        worst_error_m: Maximum allowed r.m.s. error of rows and columns, in metres.
 
     Raises:
         DeviceError: As :func:`labseq.motion.fit_overlay`, or there are too few atoms for a fit by rows.
-        ValueError: The arrays do not belong together.
+        ValueError: The shapes of the arrays do not match.
     """
     offset, n, k = checked_counts(offset_m, n_before, n_survived)
     if n.shape[1:] != grid.shape:
@@ -115,7 +115,7 @@ def fit_frequencies(
 def smoothed(values: Floats, errors: Floats) -> tuple[Floats, Floats]:
     """Shrink measured values towards the parabola through all of them, according to their errors.
 
-    The scatter about the parabola beyond the errors is found so that chi squared equals its degrees of
+    The scatter about the parabola in excess of the errors is chosen so that chi squared equals its degrees of
     freedom (Paule and Mandel, J. Res. Natl. Bur. Stand. 87, 377, 1982). Each value becomes the mean of itself
     and the parabola, weighted by the inverse of its error and of that scatter, squared. One that is
     further than three times both from the parabola is not changed.
@@ -196,9 +196,9 @@ def _slopes(offset: Floats, shape: SurvivalShape, grid: SiteGrid) -> tuple[Float
 
 
 def analyse_frequencies(data: CalibrationData) -> AnalysisResult:
-    """Find the tones that put the tweezers of each row and column onto the sites.
+    """Find the tones that centre the tweezers of each row and column on the sites.
 
-    They include the correction of the overlay in use.
+    They include the correction of the active overlay calibration.
 
     Raises:
         DeviceError: There are too few atoms, or no offset at which most survive; says why.

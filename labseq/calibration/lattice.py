@@ -1,4 +1,4 @@
-"""The lattice of the sites on an averaged frame."""
+"""Finds the lattice of the sites on an averaged frame."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ SHORTEST_PX: Final = 3.5
 LONGEST_PX: Final = 55.0
 ROW_SLANT_RAD: Final = np.deg2rad(17)
 SCALES_PX: Final = (0.7, 1.2, 2.0, 3.3)
-"""Widths of the filters that are tried."""
+"""Widths of the filters that are tried, in pixels."""
 
 ALIKE: Final = 0.4
 """Minimum height of a peak of the autocorrelation, relative to the highest."""
@@ -61,8 +61,8 @@ class Vectors:
 def find_vectors(flat: Floats, grid: SiteGrid) -> Vectors | None:
     """Find the lattice's vectors in the autocorrelation of a frame.
 
-    Shifted by a vector of the lattice, the frame resembles itself, whatever the
-    offset and whichever sites are dark. The shortest such vector within 17 degrees of
+    Shifted by a vector of the lattice, the frame resembles itself, independent of
+    its offset and of dark sites. The shortest such vector within 17 degrees of
     the image's x axis points along a row; the one nearest to the second axis of
     ``grid`` points from row to row.
 
@@ -147,7 +147,7 @@ class Surface:
     Attributes:
         powers: int64 (n_terms, 2), powers of row and column in each term.
         centre: float64 (2,), (row, column) that is subtracted first.
-        scale: Divisor of the rest.
+        scale: Divisor after the centre is subtracted.
         coefficients: float64 (n_terms, 2), for y and for x, in pixels.
     """
 
@@ -157,11 +157,11 @@ class Surface:
     coefficients: Floats
 
     def at(self, indices: Floats | NDArray[np.int64]) -> Floats:
-        """(y, x) in pixels at some (row, column), float64 (..., 2)."""
+        """(y, x) in pixels at each (row, column), float64 (..., 2)."""
         return _terms((indices - self.centre) / self.scale, self.powers) @ self.coefficients
 
     def axes(self, index: Floats) -> Floats:
-        """(y, x) to the next row and to the next column, at some (row, column), float64 (2, 2)."""
+        """(y, x) from a (row, column) to the next row and to the next column, float64 (2, 2), in pixels."""
         steps = np.array([[0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5]])
         down, up, right, left = self.at(index + steps)
         return np.stack([down - up, right - left])
@@ -225,13 +225,13 @@ NEAR: Final = 0.3
 """Maximum distance of a spot from its site, in spacings."""
 
 LIT: Final = 0.3
-"""Minimum light of a lit site, relative to the usual light."""
+"""Minimum light of a bright site, relative to the usual light."""
 
 BRIGHT: Final = 0.5
 """Minimum light of a spot from which the lattice is found, relative to the usual light."""
 
 LINE_LIT: Final = 0.25
-"""Minimum fraction of lit sites in a row or column of the array, of all or of those in the fullest."""
+"""Minimum fraction of bright sites in a row or column of the array, of all or of those in the fullest."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -239,7 +239,7 @@ class Indexed:
     """Spots with their rows and columns, counted from an arbitrary spot.
 
     Attributes:
-        spots: int64 (n,), which spots.
+        spots: int64 (n,), indices of the spots.
         indices: int64 (n, 2), row and column of each.
         surface: The places of all rows and columns.
     """
@@ -250,16 +250,16 @@ class Indexed:
 
 
 def index_spots(spots: Spots, vectors: Vectors, n_sites: int, reach: int) -> Indexed | None:
-    """Give spots their rows and columns.
+    """Assign a row and a column to each spot.
 
-    It starts at a bright spot whose neighbours are in their places, and continues
+    It starts at a bright spot with neighbours at the expected places, and continues
     outwards a few sites at a time. The places are fitted again after each step, so
     that distortions do not add up.
 
     Args:
         spots: From :func:`find_spots`.
         vectors: From :func:`labseq.calibration.lattice.find_vectors`.
-        n_sites: How many spots are expected.
+        n_sites: Number of expected spots.
         reach: Maximum number of rows or columns from the start.
 
     Returns:
@@ -292,7 +292,7 @@ def index_spots(spots: Spots, vectors: Vectors, n_sites: int, reach: int) -> Ind
 
 
 def _in_full_lines(square: Ints, near: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Which places are in rows and columns with many spots: noise outside of the array has few."""
+    """Which spots are in rows and columns with many spots; noise outside of the array is not."""
     full = np.ones(len(square), np.bool_)
     for values in square.T:
         _, line = np.unique(values, return_inverse=True)
@@ -312,7 +312,7 @@ def find_window(
         shape: (n_rows, n_cols) of the grid.
 
     Returns:
-        Row and column of site (0, 0), and how many rows and columns of the array are lit.
+        Row and column of site (0, 0), and the number of bright rows and columns of the array.
     """
     from scipy.ndimage import map_coordinates
 
@@ -340,7 +340,7 @@ def _extent(lit: Floats) -> int:
 
 
 def _best_place(places: Floats, tree: object, vectors: Vectors, shortest: float) -> Floats:
-    """The spot with the most of its eight neighbours in their places."""
+    """The spot with the largest number of its eight neighbours at the expected places."""
     from scipy.spatial import KDTree
 
     assert isinstance(tree, KDTree)
@@ -353,7 +353,7 @@ def _best_place(places: Floats, tree: object, vectors: Vectors, shortest: float)
 
 
 MIN_FOUND: Final = 0.5
-"""Minimum fraction of the sites that must be lit."""
+"""Minimum fraction of bright sites."""
 
 MAX_RESIDUAL: Final = 0.08
 """Maximum r.m.s. distance of the spots from the smooth lattice, in spacings."""
@@ -390,37 +390,37 @@ class FoundLattice:
 
     @property
     def found(self) -> NDArray[np.bool_]:
-        """Which sites have a spot, bool (n_rows, n_cols)."""
+        """The sites with a spot, bool (n_rows, n_cols)."""
         return np.isfinite(self.residuals_px[..., 0])
 
     @property
     def n_sites_found(self) -> int:
-        """How many sites have a spot."""
+        """Number of sites with a spot."""
         return int(self.found.sum())
 
 
 def find_lattice(
     image: NDArray[Any], grid: SiteGrid, *, saturated: float = 65535.0, camera: str = "camera"
 ) -> FoundLattice:
-    """Find where the sites of a grid are on an averaged frame.
+    """Find the positions of a grid's sites on an averaged frame.
 
     Rows run along the image's x axis within 15 degrees, from left to right;
     ``grid.shear`` says which of the other directions is the second axis, and it
     leads downwards. So row 0 is at the top and column 0 at the left, and the
-    six-fold symmetry of the triangular lattice leaves no choice. All sites must be
+    six-fold symmetry of the triangular lattice causes no ambiguity. All sites must be
     on the frame; spacings of 5 to 40 pixels, spots of 0.5 to 4 pixels (1 sigma) with at
     least 2.5 of their widths between them.
 
     The steps are described in ``docs/explanation/finding-sites.md``.
 
     Args:
-        image: (height, width), mean of frames on which each site is often lit.
+        image: (height, width), mean of frames on which each site often holds an atom.
         grid: The grid of sites: its size, lattice and shear; its spacing is not used.
         saturated: Counts of a saturated pixel.
         camera: Name of the camera, for messages.
 
     Raises:
-        DeviceError: No such lattice is on the frame; it says why.
+        DeviceError: No such lattice is on the frame; says why.
     """
     counts = _checked(image, grid, saturated, camera)
     flat = flattened(counts, grid.n_rows * grid.n_cols)
@@ -472,7 +472,7 @@ def _fail(camera: str, message: str) -> NoReturn:
 
 
 def _indexed(spots: Spots, vectors: Vectors, grid: SiteGrid, camera: str) -> tuple[Surface, tuple[int, int]]:
-    """The places of all rows and columns, and which of them are row 0 and column 0."""
+    """The fitted places of all rows and columns, and the indices of row 0 and column 0."""
     n_sites = grid.n_rows * grid.n_cols
     indexed = index_spots(spots, vectors, n_sites, max(grid.shape) + 2)
     bright = int(np.count_nonzero(spots.light > 0.3 * usual_light(spots.light, n_sites)))

@@ -1,4 +1,4 @@
-"""Making a calibration: measure, analyse, store, compare, use."""
+"""Makes a calibration: measures, analyses, stores, compares, and uses it unless it is worse."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ METHODS: Final[Mapping[str, Method]] = {
         Method("overlay", analyse_overlay),
     )
 }
-"""Kind of calibration -> how it is made."""
+"""Kind of calibration -> its sequence and analysis."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,11 +82,11 @@ class Outcome:
     Attributes:
         stored: The entry, stored whether it is in use or not.
         summary_lines: Lines that summarise the result for the user.
-        before: The entry that was in use; None if there was none, or none to compare with.
-        changes: How far the values have moved since then.
+        before: The entry that was in use; None if there was none that can be compared.
+        changes: Change of each value from that entry.
         run: The run that was analysed; None for a file.
-        refused: Why it is not in use; "" if it is.
-        warnings: What the user should know although it is no error.
+        refused: Why the result was not put to use; "" if it is in use.
+        warnings: Warnings for the user.
     """
 
     stored: Stored
@@ -107,8 +107,8 @@ def calibrate(method: Method, request: CalibrationRequest, observer: RunObserver
         observer: Receives the events of the run.
 
     Raises:
-        ConfigError: Something in the request is wrong, or the folder cannot be written to.
-        DeviceError: A device failed, or the frames do not show what is searched for. The calibration
+        ConfigError: The request has an error, or the folder cannot be written to.
+        DeviceError: A device failed, or the frames do not show the expected signal. The calibration
             in use stays in use.
         LabseqError: Another error ended the run.
     """
@@ -245,7 +245,7 @@ def _origin(
 
 
 def _in_use(store: Store, entry: CalibrationEntry) -> CalibrationEntry | None:
-    """The entry that it would replace, if the two can be compared."""
+    """The entry that the new one would replace, if the two can be compared."""
     try:
         stored = store.entry_in_use(entry.kind)
     except ConfigError:
@@ -254,7 +254,7 @@ def _in_use(store: Store, entry: CalibrationEntry) -> CalibrationEntry | None:
 
 
 def _picture(result: AnalysisResult) -> tuple[bytes | None, tuple[str, ...]]:
-    """The picture as PNG, and a warning if it cannot be drawn."""
+    """The picture as PNG; a warning instead if it cannot be drawn."""
     if result.draw is None:
         return None, ()
     if not can_draw():

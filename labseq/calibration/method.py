@@ -1,4 +1,4 @@
-"""What a kind of calibration defines, and the data that its analysis receives."""
+"""The definition of a kind of calibration, and the input and result of its analysis."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ MIN_SATURATED: Final = 20
 """Saturated pixels that are allowed in any frame: hot pixels and cosmic rays."""
 
 PROBE_ADDRESS: Final = ".probe.offset"
-"""End of the address of a probe's offset among the parameters of a shot."""
+"""Suffix of the address of a probe's offset among the parameters of a shot."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +37,7 @@ class AnalysisResult:
     """The result of analysing a run or a file.
 
     Attributes:
-        values: The values that the machine will use; see :class:`labseq.CalibrationEntry`.
+        values: The calibrated values; see :class:`labseq.CalibrationEntry`.
         quality: Figures of merit.
         summary_lines: Lines that summarise the result for the user.
         origin: Additions to the entry's ``origin``, JSON-ready.
@@ -53,7 +53,7 @@ class AnalysisResult:
 
 @dataclass(frozen=True, slots=True)
 class CalibrationData:
-    """A run, and the profile that it is analysed for.
+    """A run and the profile for its analysis.
 
     Attributes:
         run: The run.
@@ -107,13 +107,13 @@ class CalibrationData:
 
 @dataclass(frozen=True, slots=True)
 class Method:
-    """How calibrations of one kind are made.
+    """The sequence and the analysis for one kind of calibration.
 
     Attributes:
         kind: The kind.
         analyse: Makes a calibration from a run; raises a ``LabseqError`` that says why if it cannot.
         read: Makes a calibration from a file of values; None if this kind needs a run.
-        ignored: Kinds that are not used, neither in the run nor in the analysis.
+        ignored: Kinds of calibration that are used neither in the run nor in the analysis.
         uses_detector: Whether the run detects atoms. The others run before the detector is calibrated.
     """
 
@@ -125,7 +125,7 @@ class Method:
 
     @property
     def sequence(self) -> Path:
-        """The sequence that is run; it comes with labseq."""
+        """Name of the sequence to run, which comes with labseq."""
         return Path(__file__).with_name(f"{self.kind}.yaml")
 
 
@@ -136,11 +136,11 @@ class ProbeCounts:
     Attributes:
         offset_m: float64 (n_points, 2), commanded offsets along a1 and a2.
         n_before: int64 (n_points, n_rows, n_cols), atoms that were probed on each site.
-        n_survived: int64, likewise: how many of them were seen afterwards.
+        n_survived: int64, of the same shape: number of these atoms seen afterwards.
         grid: The grid, with the tones that were played.
         motion: How the tweezers moved.
         in_use_m: float64 (2,), the offset that the overlay calibration of the run corrected.
-        calibrations: Those in use in the run: kind -> id.
+        calibrations: The calibrations in use in the run: kind -> id.
     """
 
     offset_m: NDArray[np.float64]

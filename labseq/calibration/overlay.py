@@ -1,4 +1,4 @@
-"""The overlay of mobile and static tweezers, measured by a run of probes."""
+"""Calibration of the overlay of mobile and static tweezers, from a run of probes."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def analyse_overlay(data: CalibrationData) -> AnalysisResult:
 
 
 def offset_text(fit: OverlayFit, probed: ProbeCounts) -> str:
-    """Where the mobile tweezers were in the run, as text."""
+    """The position of the mobile tweezers in the run, as text."""
     along, across = (format_quantity(float(-centre), "length") for centre in fit.centre_m)
     use = " beyond the correction of the overlay in use" if np.any(probed.in_use_m) else ""
     where = f"{along} along a row and {across} from row to row away from the sites{use}"

@@ -22,7 +22,7 @@ N_BINS: Final = 120
 ARROW_SPACINGS: Final = 0.5
 """Length of the longest arrow, in spacings."""
 MARGIN_SPACINGS: Final = 2.0
-"""Room around the outermost sites, in spacings."""
+"""Margin around the outermost sites, in spacings."""
 SITE, ARROW = "#e8a33d", "#c8102e"
 
 
@@ -32,7 +32,7 @@ def draw_sites(mean: Floats, positions_px: Floats, residuals_px: Floats) -> Figu
     Args:
         mean: float64 (height, width), the averaged frame, in counts.
         positions_px: float64 (n_rows, n_cols, 2), (y, x) of each site in pixels.
-        residuals_px: float64 (n_rows, n_cols, 2), (y, x) of each spot less that; NaN where none was found.
+        residuals_px: float64 (n_rows, n_cols, 2), (y, x) of each spot minus its site; NaN if not found.
     """
     spacing = _spacing_px(positions_px)
     y, x = positions_px.reshape(-1, 2).T
@@ -84,9 +84,9 @@ def draw_thresholds(signals: Floats, thresholds: Floats, unit: str) -> Figure:
     """Draw the histogram of all signals, and each site's signals with its threshold.
 
     Args:
-        signals: float64 (n_frames, n_rows, n_cols), what the detector compares.
+        signals: float64 (n_frames, n_rows, n_cols), the detector's signals.
         thresholds: float64 (n_rows, n_cols).
-        unit: Of both: "counts", "log-odds".
+        unit: Unit of signals and thresholds: "counts", "log-odds".
     """
     figure = make_figure(WIDTH_IN, 7.0, layout="constrained")
     above, below = figure.subplots(2, 1, height_ratios=[2, 3])
@@ -113,7 +113,7 @@ def _draw_each(axes: Axes, by_site: Floats, thresholds: Floats, edges: Floats) -
 
 
 def _spacing_px(positions_px: Floats) -> float:
-    """Least distance of neighbours along rows and columns; that of a single site is a guess."""
+    """Smallest distance of neighbours along rows and columns, in pixels; a guess for a single site."""
     steps = [np.diff(positions_px, axis=axis).reshape(-1, 2) for axis in (0, 1)]
     lengths = np.hypot(*np.concatenate(steps).T)
     return float(np.median(lengths)) if len(lengths) else 10.0
@@ -135,8 +135,8 @@ def draw_survival(
     Args:
         offset_m: float64 (n_points, 2), commanded offsets along a1 and a2.
         n_before: int64 (n_points,), atoms that were probed.
-        n_survived: int64 (n_points,), how many of them survived.
-        survival: What was fitted: offsets (n, 2) -> probabilities (n,).
+        n_survived: int64 (n_points,), number of them that survived.
+        survival: The fitted function: offsets (n, 2) -> probabilities (n,).
     """
     figure = make_figure(8.0, 4.0, layout="constrained")
     middle = np.median(offset_m, axis=0)
@@ -174,18 +174,18 @@ def draw_tone_offsets(rows: tuple[Floats, Floats], columns: tuple[Floats, Floats
 
 SIZE_IN: Final = (8.4, 5.6)
 MIN_RANGE: Final = 0.05
-"""Least deviation from the mean that the colours go to."""
+"""Minimum range of the colour scale, as deviation from the mean."""
 TITLE_PT: Final = 10
 LABEL_PT: Final = 9
 TICK_PT: Final = 8
 
 
 def draw_powers(before: Floats, after: Floats, rows: Floats, cols: Floats) -> Figure:
-    """Draw maps of the powers, relative to their means, and the amplitudes that were found.
+    """Draw maps of the powers, relative to their means, and the resulting amplitudes.
 
     Args:
-        before: float64 (n_rows, n_cols), powers at first; nan where they are not known.
-        after: float64 (n_rows, n_cols), powers in the end.
+        before: float64 (n_rows, n_cols), powers at the start; nan if unknown.
+        after: float64 (n_rows, n_cols), powers at the end.
         rows: float64 (n_rows,), amplitudes of the rows' tones, fractions of full scale.
         cols: float64 (n_cols,), amplitudes of the columns' tones.
     """
@@ -216,7 +216,7 @@ def _label(axes: Axes, x: str, y: str) -> None:
 
 
 def _count(axis: Axis) -> None:
-    """Let an axis tick at whole numbers only."""
+    """Put ticks of an axis at whole numbers only."""
     from matplotlib.ticker import MaxNLocator
 
     axis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))

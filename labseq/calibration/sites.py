@@ -1,4 +1,4 @@
-"""Site positions: the lattice found on an averaged frame, or read from a file."""
+"""Calibration of the site positions, from the lattice on an averaged frame or from a file."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def analyse_sites(data: CalibrationData) -> AnalysisResult:
     """Find the lattice on the mean of the run's frames.
 
     Raises:
-        DeviceError: There is none; says why.
+        DeviceError: No lattice was found; says why.
         ConfigError: The run has no frames.
     """
     average = FrameAverage()
@@ -50,7 +50,7 @@ def read_site_file(path: Path, bench: ResolvedProfile) -> AnalysisResult:
     """Read the positions of the sites from a file, on frames of the size in the detector's settings.
 
     Raises:
-        ConfigError: The file is wrong, or the detector has no setting for the size of its frames.
+        ConfigError: The file has an error, or the detector has no setting for the size of its frames.
     """
     settings: Any = bench.chosen["detector"].settings
     frame = getattr(settings, "frame", None)

@@ -18,7 +18,7 @@ Ints = NDArray[np.int64]
 TILE_PX: Final = 48
 DARK_QUANTILE: Final = 0.3
 HOT: Final = 6.0
-"""Factor over the second brightest neighbour from which a pixel is hot: spots of 0.45 px stay below."""
+"""A pixel this many times brighter than its second brightest neighbour is hot; spots of 0.45 px are not."""
 
 
 class FrameAverage:
@@ -83,7 +83,7 @@ def flattened(image: NDArray[Any], n_sites: int) -> Floats:
         n_sites: Expected number of spots.
 
     Returns:
-        float64 (height, width), counts over the stray light.
+        float64 (height, width), counts above the stray light.
     """
     counts = without_hot_pixels(image)
     flat = counts - stray_light(counts)
@@ -145,7 +145,7 @@ def _tiles(counts: Floats) -> list[list[Floats]]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Spots:
-    """Bright places on a frame.
+    """Bright spots on a frame.
 
     Attributes:
         places: float64 (n, 2), (y, x) of each, brightest first.
@@ -159,7 +159,7 @@ class Spots:
 
 
 def find_spots(flat: Floats, spacing_px: float, width_px: float, noise: float) -> Spots:
-    """Find the maxima after a filter as wide as the spots, minus one twice as wide.
+    """Find the maxima after a Gaussian filter as wide as the spots, minus one twice as wide.
 
     Args:
         flat: float64 (height, width), see :func:`flattened`.
@@ -179,7 +179,7 @@ def find_spots(flat: Floats, spacing_px: float, width_px: float, noise: float) -
 
 
 def filtered_by_width(flat: Floats, width_px: float) -> Floats:
-    """A frame after a Gaussian filter of a width, minus one of twice the width."""
+    """The difference of a frame after Gaussian filters of the given width and of twice the width."""
     from scipy.ndimage import gaussian_filter
 
     narrow, wide = (gaussian_filter(flat, width, mode="nearest") for width in (width_px, 2 * width_px))
@@ -208,10 +208,10 @@ REACH: Final = 2.7
 """Distance from a spot to the last pixel that is fitted, in widths of the spot."""
 
 KNOT_PX: Final = 64
-"""Distance of the knots between which stray light changes linearly."""
+"""Distance of the knots of stray light, in pixels; it changes linearly between them."""
 
 DIM: Final = 0.25
-"""A spot with less than this fraction of the usual light does not affect the width, and moves little."""
+"""Spots with less than this fraction of the usual light do not affect the width, and move little."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -220,7 +220,7 @@ class FittedSpots:
 
     Attributes:
         places: float64 (n, 2), (y, x) of each, in pixels.
-        light: float64 (n,), counts of each in all.
+        light: float64 (n,), total counts of each.
         width_px: Width of all (1 sigma).
     """
 
@@ -241,7 +241,7 @@ def fit_spots(flat: Floats, places: Floats, width_px: float, furthest_px: float,
         flat: float64 (height, width).
         places: float64 (n, 2), (y, x) of each spot, roughly.
         width_px: Their width (1 sigma), roughly.
-        furthest_px: How far a place may move.
+        furthest_px: Maximum distance that a place may move in the fit.
         noise: Noise of a dark pixel (1 sigma).
     """
     from scipy.sparse import csr_array, hstack

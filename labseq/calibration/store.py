@@ -1,4 +1,4 @@
-"""The calibrations on disk: entries, which of them are in use, and when one is worse than another."""
+"""Stores calibrations on disk, records which are in use, and judges whether one is worse than another."""
 
 from __future__ import annotations
 
@@ -128,11 +128,11 @@ ACTIVE_FORMAT: Final = "labseq-active-calibrations"
 
 @dataclass(frozen=True, slots=True)
 class Activation:
-    """A change of the calibration in use.
+    """A change of the active calibration of a kind.
 
     Attributes:
         kind: Its kind.
-        id: Its id; "" if no calibration of this kind was used from then on.
+        id: Id of the new calibration; "" for none from then on.
         file: Name of its file in the store; "" for none.
         since_utc: ISO 8601, UTC.
     """
@@ -151,7 +151,7 @@ def encode_history(history: list[Activation]) -> bytes:
 
 
 WORSE_FACTOR: Final = 1.5
-"""A quality figure that is larger by less than this factor may differ by chance."""
+"""Quality figures whose ratio is below this factor may differ by chance."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,7 +180,7 @@ DECIDING: Final[Mapping[str, QualityFigure]] = {
     "frequencies": QualityFigure("error_m", 50e-9, "error"),
     "overlay": QualityFigure("error_m", 50e-9, "error"),
 }
-"""Kind -> the figure that decides."""
+"""Kind -> the quality figure by which its calibrations are compared."""
 
 
 def figure_of(entry: CalibrationEntry) -> float:
@@ -189,14 +189,14 @@ def figure_of(entry: CalibrationEntry) -> float:
 
 
 def why_worse(new: CalibrationEntry, old: CalibrationEntry | None) -> str:
-    """Why a calibration must not replace another one of its kind; "" if it may.
+    """The reason why a calibration is worse than another of its kind and must not replace it; "" if it may.
 
     It is worse if its deciding figure is more than :data:`WORSE_FACTOR` times the other's and more
     than good enough, if only the other has such a figure, or if it found fewer sites.
 
     Args:
         new: The new calibration.
-        old: The one in use; None for none. One of another grid is never better.
+        old: The one in use, or None. One of another grid may always be replaced.
     """
     if old is None or not same_grid(new.grid, old.grid):
         return ""
@@ -212,7 +212,7 @@ def why_worse(new: CalibrationEntry, old: CalibrationEntry | None) -> str:
 
 
 def check_grid(entry: CalibrationEntry, grid: SiteGrid, source: str) -> None:
-    """Refuse an entry of another grid.
+    """Raise if an entry is for another grid.
 
     Args:
         entry: The entry.
@@ -242,7 +242,7 @@ def grid_text(grid: Mapping[str, Any]) -> str:
 
 
 MAX_WAIT_S: Final = 2.0
-"""How long to wait for another process that writes ``active.json``."""
+"""Maximum time to wait for another process that writes ``active.json``, in seconds."""
 
 MAX_LISTED: Final = 8
 
@@ -258,14 +258,14 @@ class Stored:
 
     @property
     def picture(self) -> Path | None:
-        """The picture of it, if there is one."""
+        """Path of its picture; None if there is none."""
         path = self.path.with_suffix(PICTURE_SUFFIX)
         return path if path.is_file() else None
 
 
 @dataclass(frozen=True, slots=True)
 class Damaged:
-    """A file of a store that cannot be read: kind and id by its name, and what is wrong with it."""
+    """A file of a store that cannot be read: kind and id from its name, and the error."""
 
     path: Path
     kind: str
@@ -274,10 +274,10 @@ class Damaged:
 
 
 class Store:
-    """A folder of calibrations; the first one that is added creates it.
+    """A folder of calibrations, which is created with the first entry.
 
     An entry is a JSON file, and a picture of the same name. They never change. The same values
-    measured again make another entry with the same id; the id then means the newest. Several
+    measured again make another entry with the same id; the id then refers to the newest. Several
     processes may use a store at the same time.
 
     Args:
@@ -299,7 +299,7 @@ class Store:
         """Find an entry.
 
         Args:
-            wanted: Its id, a beginning of the id that no other entry has, or the name of its file.
+            wanted: Its id, a unique beginning of the id, or the name of its file.
             kind: Only entries of this kind.
 
         Raises:
@@ -373,7 +373,7 @@ class Store:
         return {kind: one for kind, one in last.items() if one.id}
 
     def entry_in_use(self, kind: str) -> Stored | None:
-        """The entry of a kind that is in use; None for none.
+        """The entry of a kind that is in use; None if there is none.
 
         Raises:
             ConfigError: It is missing or damaged, or ``active.json`` is damaged.
@@ -422,7 +422,7 @@ class Store:
         return why_worse(entry, None if stored is None else stored.entry)
 
     def _activate(self, activation: Activation) -> None:
-        """Add to the history, unless nothing changes."""
+        """Add an activation to the history, unless nothing changes."""
         path, deadline = self.folder / ACTIVE_FILE, time.monotonic() + MAX_WAIT_S
         with self._write_errors():
             self.folder.mkdir(parents=True, exist_ok=True)

@@ -29,7 +29,7 @@ from labseq.session.profile import DryRun
 from labseq.units import format_quantity
 
 MAX_LISTED: Final = 4
-"""Up to this many numbers of a value are printed; of more, only lowest, highest and mean."""
+"""Maximum number of numbers that are printed of a value; for more, lowest, highest and mean are printed."""
 
 _DIMENSIONS: Final = {"m": "length", "Hz": "frequency", "rad": "angle", "s": "time"}
 
@@ -43,7 +43,7 @@ def list_calibrations(profile: str, dry_run: str, *, as_json: bool) -> None:
         as_json: Whether to print one line of JSON instead.
 
     Raises:
-        ConfigError: The profile is wrong, or the folder of its calibrations cannot be read.
+        ConfigError: The profile has an error, or the folder of its calibrations cannot be read.
     """
     store, spec = open_store(profile, cast("DryRun", dry_run))
     found, problems = store.entries(), list[str]()
@@ -68,7 +68,7 @@ def show_calibration(wanted: str, profile: str, dry_run: str, *, as_json: bool) 
     """Print one calibration.
 
     Raises:
-        ConfigError: There is none, there are several, or it is damaged.
+        ConfigError: There is no such calibration, there are several, or it is damaged.
     """
     store, spec = open_store(profile, cast("DryRun", dry_run))
     stored, used = store.find(wanted), in_use(store, spec.calibrations.use)
@@ -172,7 +172,7 @@ def age_s(entry: CalibrationEntry) -> float:
 
 
 def quantity(value: float | None, name: str) -> str:
-    """A value with the unit that its name ends with.
+    """A value with the unit in the suffix of its name, as text.
 
     Example:
         >>> quantity(2.5e-8, "error_m"), quantity(84.8e6, "row_hz"), quantity(0.031, "residual_px")
@@ -272,12 +272,12 @@ def calibrate_kind(kind: str, request: CalibrationRequest, *, as_json: bool) -> 
     """Make a calibration, store it, and use it unless it is worse.
 
     Args:
-        kind: What to calibrate.
+        kind: Kind of calibration.
         request: The profile and the run.
         as_json: Whether to print the result as one line of JSON, alone on stdout.
 
     Raises:
-        ConfigError: The request is wrong; or the calibration is worse than the one in use, and was
+        ConfigError: The request has an error; or the calibration is worse than the one in use, and was
             only stored.
         LabseqError: The calibration failed.
     """

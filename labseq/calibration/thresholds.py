@@ -1,4 +1,4 @@
-"""Thresholds of the detector, from the two peaks of each site's signals."""
+"""Calibration of the detector's thresholds, from the two peaks of each site's signals."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ Floats = NDArray[np.float64]
 
 N_BINS: Final = 1000
 OUTER: Final = 0.5
-"""Distance from a peak, on its outer side, beyond which signals are only counted; in its widths."""
+"""Signals further than this on the outer side of a peak are only counted; in widths of the peak."""
 
 FLATTEST: Final = 1e-5
-"""Skewness below which a peak is a Gaussian."""
+"""Skewness below which a peak is treated as a Gaussian."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +97,7 @@ class Shapes:
 def fit_shapes(signals: Floats, loading: float, width_empty: float, width_full: float) -> Shapes:
     """Fit two peaks and a constant between them by maximum likelihood.
 
-    Atoms lost during the exposure shine for a part of it. The constant describes them;
+    Atoms lost during the exposure fluoresce for a part of it. The constant describes them;
     without it they would lengthen the tails of the peaks. On the outer side of each
     peak signals are only counted, because the errors depend on the inner sides.
 
@@ -172,7 +172,7 @@ FAINT: Final = 0.4
 """Minimum distance of a site's peaks, relative to the usual distance."""
 
 MAX_ONE_PEAK: Final = 0.2
-"""Maximum fraction of sites with one peak."""
+"""Maximum fraction of sites with a single peak."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -201,13 +201,13 @@ class FittedThresholds:
 
     @property
     def error(self) -> float:
-        """Mean of both kinds of errors and of all sites."""
+        """Mean of both error probabilities over all sites."""
         return float((self.false_negative.mean() + self.false_positive.mean()) / 2)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _SitePeaks:
-    """The peaks of each site, float64 (n_sites,); ``two``: whether it has both, bool (n_sites,)."""
+    """The two peaks of each site, float64 (n_sites,); ``two``: sites with both peaks, bool (n_sites,)."""
 
     empty: Floats
     full: Floats
@@ -219,19 +219,19 @@ class _SitePeaks:
 
 
 def fit_thresholds(signals: Floats, miss_cost: float = 3.0, detector: str = "detector") -> FittedThresholds:
-    """Fit the two peaks of each site and put the threshold where errors cost least.
+    """Fit the two peaks of each site and choose the threshold with the lowest cost of errors.
 
     All sites share the shape of the peaks, because the errors are in tails that a site
     shows once in thousands of frames. Each site has its own positions and widths, shrunk
-    towards the mean of all sites by as much as chance explains (James and Stein, Proc. 4th
+    towards the mean of all sites as far as chance explains (James and Stein, Proc. 4th
     Berkeley Symp. 1, 361, 1961).
 
     Args:
-        signals: float64 (n_frames, n_rows, n_cols), what the detector compares, from
+        signals: float64 (n_frames, n_rows, n_cols), the detector's signals, from
             frames of randomly loaded atoms.
-        miss_cost: Cost of a missed atom, relative to an imagined one. A second atom is moved onto
-            a missed one and both are lost; an imagined atom leaves its site empty.
-        detector: Its name, for messages.
+        miss_cost: Cost of a missed atom, relative to a false detection. A second atom is moved onto
+            a missed one and both are lost; a false detection leaves a site empty.
+        detector: Name of the detector, for messages.
 
     Raises:
         LimitError: Fewer than 30 frames, or a cost that is not above 0.
@@ -267,7 +267,7 @@ def fit_thresholds(signals: Floats, miss_cost: float = 3.0, detector: str = "det
 
 
 def _site_peaks(by_site: Floats) -> _SitePeaks:
-    """Divide each site's signals in two; repeatedly, midway between the medians of both parts."""
+    """Divide each site's signals in two, iteratively, midway between the medians of both parts."""
     low, high = np.quantile(by_site, [0.02, 0.98], axis=1)
     cut = (low + high) / 2
     for _ in range(12):
@@ -334,7 +334,7 @@ def _with_single_peaks(peaks: _SitePeaks, by_site: Floats) -> tuple[_SitePeaks, 
 
 
 def _shrunk(values: Floats, chance: Floats, known: Bools) -> Floats:
-    """Shrink values towards their median by as much as chance explains, by 1.5 standard errors at most."""
+    """Shrink values towards their median as far as chance explains, by 1.5 standard errors at most."""
     mean = float(np.median(values[known]))
     spread = 1.4826 * float(np.median(np.abs(values[known] - mean)))
     real = max(0.0, spread**2 - float(np.median(chance[known] ** 2)))
@@ -352,7 +352,7 @@ def _common_shapes(by_site: Floats, places: _SitePeaks, two: Bools) -> Shapes:
 def _cheapest(
     shapes: Shapes, ratio_empty: Floats, ratio_full: Floats, miss_cost: float
 ) -> tuple[Floats, Floats, Floats]:
-    """Threshold of each site between 0 and 1, and the probabilities of a missed and of an imagined atom."""
+    """Threshold of each site between 0 and 1, and probabilities of a missed atom and a false detection."""
     at = np.linspace(0.02, 0.98, 1921)
     steps = np.exp(np.linspace(np.log(0.5), np.log(2.0), 57))
     imagined = np.stack([shapes.empty.widened(step).above(at) for step in steps])
@@ -368,11 +368,11 @@ def _cheapest(
 
 
 MAX_NAMED: Final = 8
-"""Sites that a message names; of more it gives the number only."""
+"""Maximum number of sites that a message lists; for more, it gives only their number."""
 
 
 def analyse_thresholds(data: CalibrationData) -> AnalysisResult:
-    """Fit the signals that the profile's detector computes from the run's frames.
+    """Find the thresholds from the signals that the profile's detector computes from the run's frames.
 
     Raises:
         DeviceError: The frames are of another size than those of the sites, or too many sites

@@ -1,4 +1,4 @@
-"""Amplitudes that make the static tweezers equal, found in a closed loop."""
+"""Calibration of the tone amplitudes at which all static tweezers have equal power, from a closed loop."""
 
 from __future__ import annotations
 
