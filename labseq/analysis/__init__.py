@@ -1,1 +1,1 @@
-"""What runs have recorded, worked out and drawn: statistics, plots, replay."""
+"""Evaluates recorded runs: statistics, plots, replay."""

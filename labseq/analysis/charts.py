@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 Panel = Callable[["Axes"], None]
-"""Draws on axes."""
+"""A function that draws on axes."""
 
 COLOURS: Final = "cividis"
 """Colour map of fractions: its lightness rises evenly, for every kind of colour vision and in print."""
@@ -31,16 +31,16 @@ BARS: Final[dict[str, Any]] = {"ecolor": DARK, "capsize": 2, "error_kw": {"eline
 MIN_DEFECTS: Final = 4
 """The histogram of defects has at least this range."""
 MANY: Final = 500
-"""From this number on, points are smaller."""
+"""Minimum number of points at which they are drawn smaller."""
 PIXELS: Final = 2000
-"""From this number on, points are pixels in vector graphics too."""
+"""Minimum number of points at which they are drawn as pixels even in vector graphics."""
 MIN_RANGE_PERCENT: Final = 1.0
 MIN_GAP: Final = 0.09
-"""Values get a tick each if they are this far apart, relative to their range."""
+"""Minimum distance of values, relative to their range, at which each has a tick."""
 MAX_CELLS_WITH_TEXT: Final = 6
 MAX_TICKS: Final = 10
 HIDDEN_S: Final = 1e-6
-"""Shorter times are those of models that neglect a stage."""
+"""Times below this, in seconds, come from models that neglect a stage, and are not drawn."""
 
 
 STYLE: Final[dict[Any, Any]] = {
@@ -73,7 +73,7 @@ def points_of(x: Sequence[float], values: Sequence[Estimated]) -> Floats:
     """Means with the ends of their 1 sigma intervals; unknown means are left out.
 
     Args:
-        x: Their places.
+        x: The x value of each.
         values: Means with standard errors, or rates with Jeffreys intervals.
 
     Returns:
@@ -93,10 +93,10 @@ def draw_trend(
     """Draw a fraction for each shot, and its running mean with the error.
 
     Args:
-        axes: Where to draw.
+        axes: Axes to draw on.
         title: Title.
         label: Label of the y axis.
-        shots: float64 (n,), numbers of the shots.
+        shots: float64 (n,), numbers of the shots, from 1.
         values: float64 (n,), a fraction for each.
         running: The running mean, see :func:`points_of`.
         is_rate: Whether each value is 0 or 1; the scale is then 0 to 100 %.
@@ -130,7 +130,7 @@ def draw_curves(
     """Draw fractions with error bars.
 
     Args:
-        axes: Where to draw.
+        axes: Axes to draw on.
         title: Title.
         x_label: Label of the x axis.
         y_label: Label of the y axis.
@@ -179,13 +179,13 @@ def draw_map(
     """Draw a fraction against two scanned values, a cell for each pair.
 
     Args:
-        axes: Where to draw.
+        axes: Axes to draw on.
         title: Title.
         x_label: The address along x.
         y_label: The address along y.
         x_ticks: Its values, as written.
-        y_ticks: Likewise.
-        values: float64 (len(y_ticks), len(x_ticks)), fractions; NaN where there is none.
+        y_ticks: Values of the other address, as written.
+        values: float64 (len(y_ticks), len(x_ticks)), fractions; NaN if unknown.
         label: Label of the colour bar.
         limits: Range of the colours.
     """
@@ -219,11 +219,11 @@ def draw_sites(
     """Draw a fraction for each site, in its cell.
 
     Args:
-        axes: Where to draw.
+        axes: Axes to draw on.
         title: Title.
         label: Label of the colour bar.
         grid: The grid of sites.
-        values: float64 (n_rows, n_cols), fractions; NaN where there is none.
+        values: float64 (n_rows, n_cols), fractions; NaN if unknown.
         outlined: bool (n_rows, n_cols), the target, around which a line is drawn.
     """
     from matplotlib import colormaps
@@ -236,7 +236,7 @@ def draw_sites(
     filled.set_array(np.ma.masked_invalid(100 * values.ravel()))
     known = values[np.isfinite(values)]
     low, high = 0.0, 1.0
-    if len(known):  # a site of few atoms must not take up all of the range
+    if len(known):  # a site with few atoms must not stretch the range
         high = float(known.max())
         low = min(float(np.quantile(known, 0.02)), high - 0.01)
     filled.set_clim(100 * low, 100 * high)
@@ -256,7 +256,7 @@ def draw_defects(axes: Axes, *, title: str, x_label: str, shares: Floats, expect
     """Draw the share of the shots with each number of defects.
 
     Args:
-        axes: Where to draw.
+        axes: Axes to draw on.
         title: Title.
         x_label: Label of the x axis.
         shares: Share of the shots at 0, 1, 2, ... defects, see :func:`points_of`.
@@ -297,10 +297,10 @@ def draw_stages(
 ) -> None:
     """Draw the times of a shot's stages below one another, on a logarithmic scale.
 
-    A point is the median, a line leads to the 99th percentile, a mark is the budget.
+    A point shows the median, a line reaches to the 99th percentile, a mark shows the budget.
 
     Args:
-        axes: Where to draw.
+        axes: Axes to draw on.
         title: Title.
         stages: The stages, in order.
         clocks: "session_s" and perhaps "host_s" -> name of the clock.
@@ -345,7 +345,7 @@ def _time_text(time_s: float, _: object) -> str:
 
 
 def _with_room(fractions: Floats, room: float, min_range: float) -> tuple[float, float]:
-    """Limits of an axis in per cent, with room above and below, relative to the range."""
+    """Limits of an axis in per cent, with a margin above and below that is relative to the range."""
     low, high = 100 * float(np.nanmin(fractions)), 100 * float(np.nanmax(fractions))
     room *= max(high - low, min_range)
     return low - room, high + room
@@ -357,7 +357,7 @@ def _vertical_grid(axes: Axes) -> None:
 
 
 def _plain_logarithmic(axes: Axes) -> None:
-    """A logarithmic x axis with plain numbers, as many as there is room for."""
+    """Make an x axis logarithmic, with as many plain numbers as fit."""
     from matplotlib.ticker import LogFormatter
 
     axes.set_xscale("log")

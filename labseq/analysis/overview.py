@@ -1,4 +1,4 @@
-"""A run at a glance: filling, survival, losses, times and scans."""
+"""Draws the overview of a run: filling, survival, losses, times and scans."""
 
 from __future__ import annotations
 
@@ -49,13 +49,13 @@ Row = tuple[Panel, ...]
 MIN_WINDOW: Final = 10
 """Minimum number of shots in a running mean."""
 N_WINDOWS: Final = 10
-"""Number of its windows in a long run."""
+"""Number of windows of a running mean in a long run."""
 MAX_POINTS: Final = 200
-"""Maximum number of points of its line."""
+"""Maximum number of points of the line of a running mean."""
 OVERVIEW_SHOTS: Final = 60
-"""Shots whose files are read for the overview: about half a second."""
+"""Maximum number of shot files read for the overview, which takes about half a second."""
 PART_SHOTS: Final = 500
-"""Shots whose files are read for one part of it, or for a table."""
+"""Maximum number of shot files read for one part of the overview, or for a table."""
 MAX_MAPS: Final = 6
 """Maximum number of maps in a row."""
 MIN_FULL: Final = 0.5
@@ -103,7 +103,7 @@ class RunPicture:
         return figure
 
     def save(self, path: Path) -> None:
-        """Draw it into a PNG, SVG or PDF file.
+        """Save the picture as a PNG, SVG or PDF file.
 
         Raises:
             ConfigError: The file cannot be written.
@@ -112,7 +112,7 @@ class RunPicture:
 
 
 def overview(run: Run) -> RunPicture:
-    """All panels of a run. Those that need the shots' files use some of the shots, and their titles say so.
+    """All panels of a run. Those that need shot files may use part of the shots, as their titles then say.
 
     Args:
         run: The run, finished or not.
@@ -143,7 +143,7 @@ def picture_of(run: Run, what: str) -> RunPicture:
         what: One of :data:`CHOICES`.
 
     Raises:
-        ConfigError: There is no such part, or the run has nothing to show in it; says what it needs.
+        ConfigError: There is no such part, or the run lacks the data for it; says which.
         RecordingError: It is damaged.
     """
     if what not in CHOICES:
@@ -176,12 +176,12 @@ class Measure:
         return self.name == "success"
 
     def of_shot(self, shot: Shot, target: TargetPattern) -> float:
-        """On the image that the shot is judged on, else on the last one after a cycle; NaN without."""
+        """Its value on the image that judges the shot, else on that of the last cycle; NaN without one."""
         if not math.isnan(shot.filling_fraction):
             return float(shot.success) if self.is_rate else shot.filling_fraction
         try:
             images = shot.summary.images
-        except RecordingError:  # an old index, and the file is damaged
+        except RecordingError:  # for an old index with a damaged shot file
             return math.nan
         if not len(images) or not images.cycle[-1] or not target.n_atoms:
             return math.nan
@@ -189,11 +189,11 @@ class Measure:
         return float(not n_defects and not n_surplus) if self.is_rate else 1.0 - n_defects / target.n_atoms
 
     def of_many(self, statistics: Statistics | CycleStatistics) -> Estimated:
-        """The mean over some shots."""
+        """The mean over the given shots."""
         return statistics.defect_free if self.is_rate else statistics.filling
 
     def over(self, values: Sequence[float]) -> Estimated:
-        """The mean of some shots' values."""
+        """The mean of the values of the given shots."""
         return Rate(round(math.fsum(values)), len(values)) if self.is_rate else mean(values)
 
 
@@ -202,7 +202,7 @@ SUCCESS: Final = Measure("success", "defect-free", "defect-free (%)")
 
 
 def trend_panel(run: Run, measure: Measure) -> Panel | None:
-    """A measure against the shot, with its running mean; None if it is known of no shot."""
+    """A measure against the shot, with its running mean; None if no shot has a value."""
     values = np.array([measure.of_shot(shot, run.target) for shot in run.shots])
     known = np.isfinite(values)
     if not known.any():
@@ -225,7 +225,7 @@ def trend_panel(run: Run, measure: Measure) -> Panel | None:
 
 
 def cycles_panel(measure: Measure, statistics: Statistics) -> Panel | None:
-    """A measure against the cycle, each on the image that ends it; None without cycles."""
+    """A measure against the cycle, from the image at the end of each cycle; None without cycles."""
     cycles = statistics.cycles
     if not cycles:
         return None
@@ -280,7 +280,7 @@ def _lost(rate: Rate) -> Rate:
 
 
 def causes_panel(statistics: Statistics) -> Panel | None:
-    """The causes of losses in a simulation, worst first; None if they are not known, or nothing was lost."""
+    """The causes of losses in a simulation, worst first; None if they are unknown, or nothing was lost."""
     worst = sorted(statistics.losses.items(), key=lambda item: -item[1].value)
     losses = {cause.replace("_", " "): loss for cause, loss in worst if loss.value > 0}
     if not losses:
@@ -290,7 +290,7 @@ def causes_panel(statistics: Statistics) -> Panel | None:
 
 
 def defects_panel(run: Run, statistics: Statistics) -> Panel | None:
-    """How many shots have how many defects at the end, compared with independent sites."""
+    """Histogram of the defects at the end of the shots, compared with independent sites."""
     cycles, n_sites = statistics.cycles, run.target.n_atoms
     counts = statistics.defects or (cycles[-1].defects if cycles else ())
     n_shots = sum(counts)
@@ -310,7 +310,7 @@ def defects_panel(run: Run, statistics: Statistics) -> Panel | None:
 def binomial(n: int, p: float, n_least: int) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
     """Probabilities of 0, 1, 2, ... of n independent events of probability p.
 
-    At least ``n_least`` of them, and those up to the last above 0.1 %.
+    The result ends at the last probability above 0.1 %, but has at least ``n_least`` values.
 
     Example:
         >>> binomial(2, 0.5, 1).round(6).tolist()
@@ -324,7 +324,7 @@ def binomial(n: int, p: float, n_least: int) -> np.ndarray[tuple[int], np.dtype[
 
 
 def stages_panel(run: Run, timing: RunTiming) -> Panel | None:
-    """The stages of a shot against their budgets; None if there are none."""
+    """The durations of a shot's stages and their budgets; None without stages."""
     stages = [stage for stage in timing.stages if not stage.stage.startswith(STEP)]
     if not stages:
         return None
@@ -338,7 +338,7 @@ def stages_panel(run: Run, timing: RunTiming) -> Panel | None:
 
 
 def scan_panels(found: Scanned, measure: Measure) -> Row:
-    """A measure against the scanned values: a curve for one axis, maps for more; none if it is not known."""
+    """A measure against the scanned values: a curve for one axis, maps for more; empty if it is unknown."""
     means = found.means(measure.of_many)
     if all(math.isnan(one.value) for one in means):
         return ()
@@ -347,7 +347,7 @@ def scan_panels(found: Scanned, measure: Measure) -> Row:
     n_cells = math.prod(len(axis.words) for axis in found.axes)
     if len({*found.places}) >= MIN_FULL * n_cells:
         return _scan_maps(found, means, measure)
-    return (  # few points share a value, as those of an optimiser
+    return (  # few points share a value, for example those of an optimiser
         partial(
             draw_curves,
             title=f"{measure.title} by point of {len(found.axes)} values",
@@ -503,11 +503,11 @@ CHOICES: Final[Mapping[str, tuple[str, Callable[[_Summary], list[Row]], str]]] =
         ),
     }
 )
-"""Part of the overview -> its title, its panels, and what a run needs for it."""
+"""Part of the overview -> its title, its panels, and the data that it needs."""
 
 
 def evenly(shots: Sequence[T], n_most: int) -> list[T]:
-    """At most ``n_most`` of the shots, evenly distributed over the run.
+    """Select at most ``n_most`` shots, evenly distributed over the run.
 
     Example:
         >>> evenly(range(10), 4)
@@ -518,13 +518,13 @@ def evenly(shots: Sequence[T], n_most: int) -> list[T]:
 
 
 def part_text(n_read: int, run: Run) -> str:
-    """How many of the shots were read; "" for all."""
+    """The number of shots that were read, as text; "" for all."""
     n = len(run.shots)
     return "" if n_read == n else f", {n_read} of {n} shots"
 
 
 def note_of(run: Run) -> str:
-    """The line below a picture's title: the run, how it ended, its target and seed."""
+    """The line below a picture's title: the run, its status, target and seed."""
     ended = "" if run.status == "complete" else f" ({run.status}, {len(run.shots)} of {run.n_shots} shots)"
     atoms = f"{clean(run.target.name)}, {run.target.n_atoms} atoms"
     kind = "simulated" if run.simulated else "measured"
@@ -536,7 +536,7 @@ def cannot_draw(run: Run, what: str, expected: str) -> ConfigError:
 
     Args:
         run: The run.
-        what: Why not.
+        what: The reason.
         expected: What the picture needs.
     """
     text = f"the picture cannot be drawn from this run: {what}"
@@ -544,7 +544,7 @@ def cannot_draw(run: Run, what: str, expected: str) -> ConfigError:
 
 
 def grid_of(run: Run) -> SiteGrid:
-    """The grid of a run's sites, as the recorded profile has it."""
+    """The grid of sites in the recorded profile of a run."""
     n_rows, n_cols = run.target.shape
     grid = _mapping(_profile(run).get("grid"))
     spacing: Any = run.record.get("grid_spacing_m")
@@ -555,13 +555,13 @@ def grid_of(run: Run) -> SiteGrid:
 
 
 def sites_of(run: Run) -> KnownSites | None:
-    """The positions of a run's sites on its frames, as the detector knew them.
+    """The positions of a run's sites on its frames, which the detector used.
 
     They come from the file in the detector's settings, from the calibration in the run's folder, or
     from the settings.
 
     Returns:
-        None if the run does not contain them, or the file is gone.
+        None if the run does not contain them, or the file is missing.
     """
     detector = _mapping(_profile(run).get("detector"))
     names = ("frame", "centre_px", "pixel_size", "angle")

@@ -1,4 +1,4 @@
-"""A run's images again: through another planner or detector, or the same ones."""
+"""Passes a run's images to a planner or detector again, and compares the results with the recorded ones."""
 
 from __future__ import annotations
 
@@ -47,23 +47,23 @@ from labseq.session.scan_run import point_of, scan_run_of
 from labseq.settings import Choice
 
 N_ATOMS_TRUE = "simulation.n_atoms_true"
-"""Reading of a simulated shot: how many atoms there really are at its end."""
+"""Reading of a simulated shot: true number of atoms at its end."""
 
 
 @dataclass(frozen=True, slots=True)
 class ReplayedImage:
-    """An image whose frame was kept, and what a detector makes of it.
+    """An image whose frame was recorded, and the result of a detector on this frame.
 
     Attributes:
         shot: Index of the shot, from 0.
         image: Index of the image in the shot, from 0.
-        n_atoms: Atoms that were seen in the run.
-        n_atoms_replayed: Atoms that the detector sees.
-        n_appeared: Sites where the detector alone sees an atom.
-        n_vanished: Sites where the run alone saw one.
+        n_atoms: Number of atoms detected in the run.
+        n_atoms_replayed: Number of atoms detected in the replay.
+        n_appeared: Number of sites with an atom in the replay only.
+        n_vanished: Number of sites with an atom in the run only.
         confidence: Mean confidence in the run.
-        confidence_replayed: That of the detector.
-        n_atoms_true: How many there really are after the shot's last image; None if unknown.
+        confidence_replayed: Mean confidence in the replay.
+        n_atoms_true: True number of atoms after the shot's last image; None if unknown.
     """
 
     shot: int
@@ -79,14 +79,14 @@ class ReplayedImage:
 
 @dataclass(slots=True, eq=False)
 class ReplayedImages:
-    """What a detector sees on the frames of a run.
+    """Results of a detector on the frames of a run.
 
     Attributes:
-        images: Each image whose frame was kept.
-        appeared: On how many of them the detector alone sees an atom, int64 (n_rows, n_cols).
-        vanished: On how many of them the run alone saw one, int64 (n_rows, n_cols).
-        n_without_frame: Images whose frame was not kept.
-        failures: Index of a shot, of an image -> what the detector raised.
+        images: Each image whose frame was recorded.
+        appeared: Number of images with an atom in the replay only, int64 (n_rows, n_cols).
+        vanished: Number of images with an atom in the run only, int64 (n_rows, n_cols).
+        n_without_frame: Number of images whose frame was not recorded.
+        failures: Index of a shot and of an image -> the detector's error.
     """
 
     images: list[ReplayedImage]
@@ -97,7 +97,7 @@ class ReplayedImages:
 
     @classmethod
     def none(cls, shape: tuple[int, int]) -> ReplayedImages:
-        """To begin with.
+        """Empty results, to which shots are added.
 
         Args:
             shape: n_rows and n_cols of the grid.
@@ -106,11 +106,11 @@ class ReplayedImages:
 
     @property
     def n_differing(self) -> int:
-        """Sites that differ, over all images."""
+        """Number of differing sites, summed over all images."""
         return int(self.appeared.sum() + self.vanished.sum())
 
     def add(self, shot: Shot, detector: Detector) -> None:
-        """Let the frames of a shot go through a detector.
+        """Apply a detector to the frames of a shot, and add the results.
 
         Raises:
             RecordingError: The shot cannot be read.
@@ -161,15 +161,15 @@ class ReplayedImages:
 
 @dataclass(frozen=True, slots=True)
 class PlanCounts:
-    """A plan in numbers.
+    """Number of moves, durations and filling of a plan.
 
     Attributes:
-        n_batches: Its batches.
-        n_atom_moves: Its atom moves.
+        n_batches: Number of batches.
+        n_atom_moves: Number of atom moves.
         duration_s: From the start of the cycle to the end of its last batch.
-        planning_s: Time that it took to plan on this computer, or then on that of the run; nan if unknown.
+        planning_s: Planning time, on this computer or, if recorded, on that of the run; nan if unknown.
         filling: Filling of the target after it, if no atom is lost.
-        meets_target: Whether the target is then met.
+        meets_target: Whether the target is met after the plan, if no atom is lost.
     """
 
     n_batches: int
@@ -181,7 +181,7 @@ class PlanCounts:
 
     @classmethod
     def of(cls, plan: Plan, report: PlanReport, target: TargetPattern, planning_s: float) -> PlanCounts:
-        """Count a plan that was checked."""
+        """The numbers of a checked plan."""
         filling = 1.0 - report.n_defects / target.n_atoms if target.n_atoms else 1.0
         return cls(
             plan.n_batches, plan.n_atom_moves, report.duration_s, planning_s, filling, report.meets_target
@@ -190,16 +190,16 @@ class PlanCounts:
 
 @dataclass(frozen=True, slots=True)
 class ReplayedPlan:
-    """A plan that was recorded, and what a planner plans on the same image.
+    """A recorded plan, and the plan of a planner for the same image.
 
     Attributes:
         shot: Index of the shot, from 0.
         step: Index of the step in the shot.
         cycle: Counted from 1.
         recorded: The plan of the run.
-        replayed: The planner's; None if it failed, or its plan breaks a rule.
+        replayed: The plan of the replay; None if the planner failed, or its plan breaks a rule.
         same: Whether both are the same, move by move.
-        failure: Why there is none, or "".
+        failure: Why there is no plan of the replay, or "".
     """
 
     shot: int
@@ -213,11 +213,11 @@ class ReplayedPlan:
 
 @dataclass(frozen=True, slots=True)
 class MeanCounts:
-    """Plans, summed up.
+    """Means over several plans.
 
     Attributes:
-        n_plans: How many.
-        n_met: How many of them meet the target, if no atom is lost.
+        n_plans: Number of plans.
+        n_met: Number of plans that meet the target, if no atom is lost.
         n_batches: Batches.
         n_atom_moves: Atom moves.
         duration_s: From the start of the cycle to the end of the last batch.
@@ -235,7 +235,7 @@ class MeanCounts:
 
     @classmethod
     def over(cls, plans: Sequence[PlanCounts]) -> MeanCounts:
-        """Sum up plans; times that are not known are left out."""
+        """Average over plans; unknown times are left out."""
         return cls(
             n_plans=len(plans),
             n_met=sum(plan.meets_target for plan in plans),
@@ -250,13 +250,13 @@ class MeanCounts:
 def replay_plans(
     shot: Shot, planner: Planner, name: str, degree_of_parallelism: int, grid: SiteGrid, motion: MotionSpec
 ) -> list[ReplayedPlan]:
-    """Plan again on every image of a shot that was planned on.
+    """Plan again for every image of a shot for which a plan was recorded.
 
     Args:
         shot: The shot.
-        planner: What plans.
+        planner: The planner.
         name: Its name, for messages.
-        degree_of_parallelism: Most tweezers on at once that its plans are checked for.
+        degree_of_parallelism: Maximum number of tweezers on at once, for the check of its plans.
         grid: The grid of sites.
         motion: How the mobile tweezers move.
 
@@ -291,7 +291,7 @@ def is_same(one: Plan, other: Plan) -> bool:
 
 
 def _planning_s(timing: Sequence[StageTiming], cycle: CycleRecord) -> float:
-    """How long it took to plan, on the run's computer; nan if it was not recorded."""
+    """The planning time on the run's computer, in seconds; nan if not recorded."""
     place = ("plan", cycle.step, cycle.cycle)
     return next((one.host_s for one in timing if (one.stage, one.step, one.cycle) == place), math.nan)
 
@@ -301,16 +301,16 @@ _RANGE: Final = re.compile(r"\s*(\d{1,9})\s*(?:-\s*(\d{1,9})\s*)?")
 
 @dataclass(frozen=True, slots=True)
 class ReplayRequest:
-    """What is to be tried, in the words of the command line.
+    """The planner and detector to replay, from the command line.
 
-    If that is nothing, the run's own planner and detector are.
+    If neither is given, the run's own planner and detector are replayed.
 
     Attributes:
         planner: Another planner, with its default settings; None for the run's own.
         degree_of_parallelism: The planner's setting of that name.
         detector: Another detector, with its default settings; None for the run's own.
         overrides: ``"planner.key=value"`` and ``"profile.detector.key=value"`` strings.
-        shots: Which shots, counted from 1: "3,5-9"; None for all.
+        shots: The shots to replay, counted from 1: "3,5-9"; None for all.
     """
 
     planner: str | None = None
@@ -320,10 +320,10 @@ class ReplayRequest:
     shots: str | None = None
 
     def changes(self) -> dict[str, list[Override]]:
-        """What differs from the run: "planner" and "detector" -> overrides; neither where it is the same.
+        """The changes to the run: "planner" and "detector" -> overrides; unchanged ones are missing.
 
         Raises:
-            ConfigError: An override is of something else.
+            ConfigError: An override changes something else.
         """
         found: dict[str, list[Override]] = {"planner": [], "detector": []}
         for kind, name in (("planner", self.planner), ("detector", self.detector)):
@@ -349,13 +349,13 @@ class Replay:
 
     Attributes:
         run: The run.
-        is_own: Whether its own planner and detector were tried: all must come out the same.
-        used: "planner" or "detector" -> what was tried; of a scan, at its first point.
-        changed: Those of its settings that are not the defaults.
+        is_own: Whether the run's own planner and detector were replayed, so that all results must agree.
+        used: "planner" or "detector" -> the replayed plugin; for a scan, at its first point.
+        changed: Its settings that differ from the defaults.
         n_shots: Shots that were read.
-        plans: Each recorded plan, and what the planner plans on the same image.
-        images: What the detector sees on the frames that were kept.
-        unreadable: Index of a shot -> why it was left out.
+        plans: Each recorded plan, and the replayed plan for the same image.
+        images: Results of the detector on the recorded frames.
+        unreadable: Index of a shot -> why it could not be read.
     """
 
     run: Run
@@ -369,14 +369,14 @@ class Replay:
 
     @property
     def is_reproduced(self) -> bool:
-        """Whether everything came out as it was recorded."""
+        """Whether all results agree with the recorded ones."""
         plans_same = all(plan.same for plan in self.plans)
         return plans_same and not self.images.n_differing and not self.images.failures and not self.unreadable
 
 
 @dataclass(slots=True)
 class _Pipeline:
-    """What images go through at a point of the scan."""
+    """The planner and detector for the images of a point of the scan."""
 
     planner: Planner | None
     planner_name: str
@@ -389,7 +389,7 @@ class _Pipeline:
 
 @dataclass(slots=True)
 class _Replayer:
-    """Makes what images go through, once for each kind of point."""
+    """Constructs planner and detector once for each set of settings."""
 
     run: Run
     assembly: Assembly
@@ -397,7 +397,7 @@ class _Replayer:
     calibrations: dict[str, CalibrationEntry]
     changes: dict[str, list[Override]]
     _crews: dict[tuple[int, int], _Pipeline] = field(default_factory=dict[tuple[int, int], _Pipeline])
-    _points: list[Point] = field(default_factory=list[Point])  # alive, so that no id is given twice
+    _points: list[Point] = field(default_factory=list[Point])  # kept alive, so that no id is used twice
 
     def at(self, point: Point) -> _Pipeline:
         key = id(point.planner), id(point.bench)
@@ -431,7 +431,7 @@ class _Replayer:
         )
 
     def _changed(self, kind: str, own: ChosenPlugin) -> ChosenPlugin:
-        """The run's own planner or detector, or what is tried in place of it."""
+        """The run's own planner or detector, or its replacement."""
         options = self.changes.get(kind)
         if not options:
             return own
@@ -442,19 +442,19 @@ class _Replayer:
 
 
 def replay(run: Run, request: ReplayRequest, *, announce: Callable[[str], None] = lambda _: None) -> Replay:
-    """Let a run's images go through a planner or detector, and compare with what was done.
+    """Pass a run's images to a planner or detector, and compare the results with the recorded ones.
 
     Settings, calibrations and motion are the run's own, from its folder.
 
     Args:
         run: The run, finished or not.
-        request: What is to be tried.
+        request: The planner and detector to replay.
         announce: Called with the name of a module before its kernels are compiled.
 
     Raises:
-        ConfigError: Something in the request is wrong, or the run cannot be put together today.
-        PluginLoadError: A plugin that is named failed to load.
-        RecordingError: The run does not say what it was taken with.
+        ConfigError: The request has an error, or the run can no longer be assembled.
+        PluginLoadError: A named plugin failed to load.
+        RecordingError: run.json lacks the settings of the run.
     """
     from labseq.kernel import announcing
 
@@ -492,11 +492,11 @@ def replay(run: Run, request: ReplayRequest, *, announce: Callable[[str], None] 
 
 
 def assembly_of(run: Run) -> Assembly:
-    """A run put together of its own texts and options, without its hardware and its calibrations.
+    """Assemble a run from its recorded files and options, without hardware and calibrations.
 
     Raises:
-        ConfigError: That cannot be done today.
-        RecordingError: Its texts are gone.
+        ConfigError: The run can no longer be assembled.
+        RecordingError: Its recorded files are missing.
     """
     record = run.record
     options = Options.of(record["overrides"])
@@ -512,10 +512,10 @@ def assembly_of(run: Run) -> Assembly:
 
 
 def shots_of(run: Run, text: str | None) -> list[Shot]:
-    """The shots that are meant by "3,5-9", counted from 1.
+    """The shots of a selection such as "3,5-9", counted from 1.
 
     Raises:
-        ConfigError: It is no such text, or one of them is not there.
+        ConfigError: The text is no such selection, or a shot does not exist.
     """
     if text is None:
         return list(run.shots)

@@ -1,4 +1,4 @@
-"""The points of a scan: what was scanned, and the statistics at each point."""
+"""The points of a scan: the scanned values, and the statistics at each point."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from labseq.recording import Run
 from labseq.recording.points import scan_points
 
 GEOMETRIC_RATIO: Final = 20.0
-"""From this ratio of the largest value to the smallest, equal ratios get a logarithmic axis."""
+"""Minimum ratio of largest to smallest value for a logarithmic axis."""
 EQUAL: Final = 0.25
-"""Relative difference of ratios that count as equal: "1, 2, 5, 10" does."""
+"""Maximum relative difference of ratios that count as equal, as those of "1, 2, 5, 10" do."""
 
 _NUMBER: Final = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(\S*)\Z")
 _MICRO: Final = re.compile(r"\bu(?=[msVWK]\b)")
@@ -51,7 +51,7 @@ class Scanned:
     statistics: tuple[Statistics, ...]
 
     def means(self, mean_of: Callable[[Statistics | CycleStatistics], Estimated]) -> list[Estimated]:
-        """A mean at each point; if no shot is judged, of the images that end the last cycles.
+        """A mean at each point; if no shot is judged, over the images at the end of the last cycles.
 
         Args:
             mean_of: Takes the mean from the statistics.
@@ -89,9 +89,9 @@ def scanned(run: Run) -> Scanned | None:
 
 
 def _follows(values: Sequence[str], others: Sequence[str]) -> bool:
-    """Whether each of the others belongs to one value only, and not by chance.
+    """Whether other addresses change together with this one, and not by chance.
 
-    No two points of an optimiser share a value; then numbers must rise or fall together.
+    No two points of an optimiser share a value; numbers must then rise or fall together.
     """
     if len({*zip(values, others, strict=True)}) > len({*others}):
         return False
@@ -103,7 +103,7 @@ def _follows(values: Sequence[str], others: Sequence[str]) -> bool:
 
 
 def numbers_of(words: Sequence[str]) -> tuple[list[float], str] | None:
-    """Words as numbers and their common unit; None if they are not."""
+    """Values as numbers and their common unit; None if they are not numbers of one unit."""
     found = [match for word in words if (match := _NUMBER.match(word.strip()))]
     units = {match[2] for match in found}
     if len(found) < len(words) or len(units) != 1:

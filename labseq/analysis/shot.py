@@ -1,4 +1,4 @@
-"""Pictures of one shot: frames, occupancies and moves."""
+"""Draws one shot: frames, occupancies and moves."""
 
 from __future__ import annotations
 
@@ -48,32 +48,32 @@ Moves = NDArray[np.int16]
 
 DPI: Final = 150
 LARGE_IN: Final = 6.5
-"""Width of a panel where there are two at most, in inches."""
+"""Width of a panel if there are at most two, in inches."""
 ON_FRAME: Final = (
     MarkerStyle("atom on a target site", "o", 0.86, "none", "#56b4e9"),
     MarkerStyle("empty target site", "o", 0.86, "none", "#ff7f0e"),
     MarkerStyle("surplus atom", "s", 0.8, "none", "#f0e442"),
     MarkerStyle("atom in the reservoir", "o", 0.86, "none", "0.62"),
 )
-"""Rings around sites, in colours of Okabe and Ito that contrast with grey for all colour vision."""
+"""Colours of the rings around sites, from Okabe and Ito, visible on grey for all colour vision."""
 OUTLINE: Final = "#c8102e"
 OUTLINE_LABEL: Final = "border of the target"
 COLOURS: Final = ("plasma", 0.25, 0.95)
-"""Colour map of the order of batches, and the part of it that can be seen on black and on white."""
+"""Colour map of the order of batches, and the part of it that is visible on black and on white."""
 RIM_PT: Final = 6
-"""White rim of a frame, which keeps it apart from others; half of it is seen."""
+"""Width of the white rim that separates frames; half of it is visible."""
 RANGE: Final = (0.01, 0.998)
-"""Quantiles of the pixels that are shown black and white."""
+"""Quantiles of the pixel values that are drawn black and white."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ShotPanel:
-    """An image, and what was moved next.
+    """An image and the moves that followed it.
 
     Attributes:
-        title: Stands above it.
+        title: Title above the panel.
         occupancy: bool (n_rows, n_cols), as detected.
-        image: uint16 (height, width); None if the frame was not kept.
+        image: uint16 (height, width); None if the frame was not recorded.
         moves: int16 (n, 4), the atom moves that followed: from row, from column, to row, to column.
         batch: int64 (n,), the batch of each, from 0.
     """
@@ -90,12 +90,12 @@ class ShotDrawing:
     """What is drawn.
 
     Attributes:
-        title: Stands at the top.
-        note: Stands below it.
+        title: Title at the top.
+        note: Line below the title.
         grid: The grid of sites.
         target: The target pattern.
-        sites_px: float64 (n_rows, n_cols, 2), (y, x) of each site on the frames; None if that is not known:
-            then no frames are shown.
+        sites_px: float64 (n_rows, n_cols, 2), (y, x) of each site on the frames; None if unknown;
+            then no frames are drawn.
         panels: The images, in order; at least one.
     """
 
@@ -108,7 +108,7 @@ class ShotDrawing:
 
 
 def save_shot(path: Path, drawing: ShotDrawing) -> None:
-    """Draw the images of a shot, each laid under the lattice.
+    """Draw the images of a shot, each aligned with the lattice.
 
     Args:
         path: The PNG, SVG or PDF file.
@@ -201,7 +201,7 @@ def _mark(
 
 
 def _limits(drawing: ShotDrawing) -> tuple[float, float]:
-    """Counts that are black and white, the same in all panels."""
+    """The counts that are drawn black and white, the same in all panels."""
     images = [panel.image for panel in drawing.panels if panel.image is not None]
     if not images:
         return 0.0, 1.0
@@ -243,11 +243,11 @@ def _write_head(figure: Figure, sheet: Sheet, drawing: ShotDrawing, looks: list[
 
 
 MAX_SITES = 128
-"""Most rows, and most columns, of an array that can be made out in a picture."""
+"""Maximum number of rows and of columns of an array that is drawn."""
 
 
 def shot_picture(run: Run, number: int, cycle: int | None = None) -> ShotDrawing:
-    """The images of a shot with what was seen on them and the moves that followed.
+    """The images of a shot with the detected atoms and the moves that followed.
 
     Args:
         run: The run.

@@ -23,7 +23,7 @@ ONE_SIGMA: Final = math.erf(math.sqrt(0.5))
 
 @dataclass(frozen=True, slots=True)
 class Rate:
-    """``n`` of ``n_trials``."""
+    """A rate: ``n`` events in ``n_trials`` trials."""
 
     n: int
     n_trials: int
@@ -47,11 +47,11 @@ def jeffreys(n: int, n_trials: int, level: float = ONE_SIGMA) -> tuple[float, fl
     """The equal-tailed interval of a probability, with Jeffreys' prior.
 
     Between the quantiles of the beta distribution with ``n + 1/2`` and ``n_trials - n + 1/2``. The
-    lower end is 0 if it never happened, and the upper end 1 if it always did (Brown, Cai, DasGupta,
+    lower end is 0 without any event, and the upper end is 1 if every trial is one (Brown, Cai, DasGupta,
     Statist. Sci. 16, 101, 2001).
 
     Args:
-        n: How often it happened.
+        n: Number of events.
         n_trials: Number of trials.
         level: Probability of the interval, between 0 and 1.
 
@@ -93,12 +93,12 @@ class CycleStatistics:
         cycle: Its number, counted from 1 over all rearrangements of the shot.
         n_shots: Number of shots that made it.
         defect_free: Shots in which the image that ends it is defect-free.
-        seen: Shots, of all, in which that image or one that ends an earlier cycle is defect-free.
+        seen: Shots in which that image, or one at the end of an earlier cycle, is defect-free.
         filling: Filling of the target on that image.
         n_atom_moves: Atom moves that were played.
         n_batches: Batches that were played.
-        n_left_out: Batches that did not fit into the window.
-        period_s: From the start of the exposure before it to the start of its own.
+        n_left_out: Number of batches that did not fit into the window.
+        period_s: Time from the start of the exposure before it to the start of its own.
         defects: Number of shots with 0, 1, 2, ... empty target sites on its image.
     """
 
@@ -116,7 +116,7 @@ class CycleStatistics:
 
 @dataclass(frozen=True, slots=True)
 class Statistics:
-    """Statistics of some shots.
+    """Statistics of several shots.
 
     Attributes:
         n_shots: Number of shots.
@@ -131,7 +131,7 @@ class Statistics:
         too_short: Shots in which the plan of a cycle did not fit into its window.
         losses: Cause -> atoms lost in a shot, known in simulations; empty on real hardware.
         defects_true: Empty target sites at the end of a shot, known in simulations.
-        defects_seen: Those on the last image of the same shots.
+        defects_seen: Empty target sites on the last image of the same shots.
     """
 
     n_shots: int
@@ -147,12 +147,12 @@ class Statistics:
     defects_seen: Estimate
 
     def as_dict(self) -> dict[str, Any]:
-        """All of it, JSON-ready: rates and means with their errors; None for unknown values."""
+        """All statistics, JSON-ready: rates and means with their errors; None for unknown values."""
         return to_plain(_named(self))
 
 
 def statistics_of(shots: Iterable[Shot], target: TargetPattern) -> Statistics:
-    """Sum up shots, from the index of their run where it contains them; no frames are read.
+    """Compute the statistics of shots from the index, or from their files if needed; no frames are read.
 
     Args:
         shots: The shots.
@@ -206,7 +206,7 @@ class _ShotCycle:
 
 
 def _made(summary: ShotSummary) -> list[_ShotCycle]:
-    """The cycles of a shot that have an image at their end."""
+    """The cycles of a shot that end with an image."""
     images, cycles = summary.images, summary.cycles
     ends = [i for i, cycle in enumerate(images.cycle) if cycle > 0]
     return [
@@ -266,7 +266,7 @@ def _losses(summaries: Sequence[ShotSummary]) -> dict[str, Estimate]:
 
 
 def _named(value: Any) -> Any:
-    """Dataclasses as mappings, each rate with its interval."""
+    """Convert dataclasses to mappings, each rate with its interval."""
     match value:
         case Rate():
             return {

@@ -24,7 +24,7 @@ class SurvivalCounts:
 
     Attributes:
         n_expected: int64 (n_rows, n_cols).
-        n_seen: int64 (n_rows, n_cols), those of them on the next image.
+        n_seen: int64 (n_rows, n_cols), number of these detected on the next image.
     """
 
     n_expected: Counts
@@ -70,7 +70,7 @@ class Survival:
 
     @classmethod
     def empty(cls, shape: tuple[int, int]) -> Survival:
-        """Without any shot, on a grid of this shape."""
+        """Empty counts for a grid of this shape."""
         return cls(_nothing(shape), _nothing(shape))
 
     def add(self, shot: Shot, loads: frozenset[int]) -> None:
@@ -116,7 +116,7 @@ def steps_that_load(run: Run) -> frozenset[int]:
 
 
 def expected(before: Occupancy, cycle: CycleRecord | None) -> tuple[Occupancy, Occupancy]:
-    """Sites with atoms after a cycle without losses: those that were moved, and those that stayed.
+    """Sites that hold an atom after a cycle without losses: moved atoms, and atoms that stayed.
 
     Args:
         before: bool (n_rows, n_cols), the image that the cycle was planned on.

@@ -39,7 +39,7 @@ def replay_run(path: Path | None, request: ReplayRequest, output: Path | None, *
 
     Args:
         path: The run's folder or any file in it; None for the newest run.
-        request: What to try.
+        request: The planner and detector to replay.
         output: File for all results as JSON, or None.
         as_json: Whether to print them as one line of JSON instead.
 
@@ -47,7 +47,7 @@ def replay_run(path: Path | None, request: ReplayRequest, output: Path | None, *
         The exit code: 1 if the run's own planner or detector did not reproduce the recorded results.
 
     Raises:
-        LabseqError: The request is wrong, or the run cannot be replayed.
+        LabseqError: The request has an error, or the run cannot be replayed.
     """
     run = chosen_run(path)
     write = json_writer(None if output is None else str(output))
@@ -110,7 +110,7 @@ def _plan_lines(found: Replay) -> list[str]:
 
 
 def _groups(plans: Sequence[ReplayedPlan]) -> Iterator[tuple[str, list[ReplayedPlan]]]:
-    """The plans of each cycle, then all; cycles are counted from 1 over all rearrangements of a shot."""
+    """The plans of each cycle, then of all; cycles are counted from 1 over all rearrangements of a shot."""
     by_cycle: dict[int, list[ReplayedPlan]] = {}
     numbers: dict[int, int] = {}
     for plan in plans:
@@ -179,7 +179,7 @@ def _mean(images: ReplayedImages, name: str) -> str:
 
 
 def _map(images: ReplayedImages) -> list[str]:
-    """A map of the sites that differ: + a new atom, - a missing atom, * both."""
+    """Draw the differing sites: + a new atom, - a missing atom, * both."""
     if not images.n_differing or images.appeared.shape[1] > WIDEST:
         return []
     kinds = np.array([".", "+", "-", "*"])[(images.appeared > 0) + 2 * (images.vanished > 0)]
@@ -252,15 +252,15 @@ def analyse_run(path: Path | None, use: str | None, overrides: Sequence[str], *,
 
     Args:
         path: The run's folder or any file in it; None for the newest run.
-        use: One analysis; None for those of the run's sequence.
-        overrides: ``"key=value"`` strings: settings of that one.
+        use: Name of an analysis; None for those of the run's sequence.
+        overrides: ``"key=value"`` strings: settings of that analysis.
         again: Whether to analyse all shots again.
 
     Returns:
         The exit code: 1 if the analysis of a shot failed.
 
     Raises:
-        LabseqError: An option is wrong, or the results cannot be written.
+        LabseqError: An option has an error, or the results cannot be written.
     """
     run = chosen_run(path)
     failed = False
@@ -275,7 +275,7 @@ def _wanted(run: Run, use: str | None, overrides: Sequence[str]) -> list[dict[st
     """The settings of each analysis to run.
 
     Raises:
-        ConfigError: There is none, or an option is wrong.
+        ConfigError: There is no analysis, or an option has an error.
     """
     own = analyses_of(run)
     if use is not None:
@@ -314,7 +314,7 @@ def _report(done: AnalysisOutcome) -> None:
 
 @dataclass(frozen=True, slots=True)
 class PlotRequest:
-    """What to draw of a run; at most one of ``what`` and ``shot`` is given.
+    """The part or the shot of a run to draw; at most one of ``what`` and ``shot`` is given.
 
     Attributes:
         what: A part of the overview; None for all of it.
@@ -330,7 +330,7 @@ class PlotRequest:
         """Check that the options are compatible.
 
         Raises:
-            ConfigError: They are not, or there is no such picture.
+            ConfigError: Options conflict, or there is no such picture.
         """
         if self.what is not None and self.shot is not None:
             what = "these are different pictures"

@@ -1,4 +1,4 @@
-"""How long the stages of a run's shots took, against their budgets."""
+"""Durations of the stages of a run's shots, compared with their budgets."""
 
 from __future__ import annotations
 
@@ -23,26 +23,26 @@ ORDER: Final = (
 )
 """The stages of a shot in order; unknown ones come last."""
 WRITE: Final = "write"
-"""Writing a shot to the disk: from its end to the line of the event log that says that it is written."""
+"""Name of the stage of writing: from the end of a shot to the event that reports it as written."""
 STEP: Final = "step "
-"""What the names of whole steps begin with."""
+"""Prefix of the names of whole steps."""
 
 Quantiles = tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True)
 class StageStatistics:
-    """A stage over many shots.
+    """Durations of a stage over many shots.
 
     Attributes:
         stage: Its name: "expose", "plan", ..., "write", or "step 2 rearrange" for a whole step.
-        n: How often it came.
-        n_per_shot: The same in a shot, a mean.
-        budget_s: What it may take, a median: the budget of "play" is the length of each program; NaN without.
+        n: Number of times that it was recorded.
+        n_per_shot: Mean number of times in a shot.
+        budget_s: Median budget; that of "play" is the length of each program; NaN without one.
         session_s: Median and 99th percentile on the session's clock: modelled in a simulated run.
         host_s: The same on this computer's clock.
-        share: Its part of the time of a shot, on the session's clock; that of writing comes on top.
-        n_over: How often it went over its budget.
+        share: Its share of the time of a shot, on the session's clock; writing is in addition to this time.
+        n_over: Number of times that it exceeded its budget.
     """
 
     stage: str
@@ -106,10 +106,10 @@ class StageTotals:
         self._shot_s.append(math.fsum(one.duration_s for one in timing if one.stage.startswith(STEP)))
 
     def sum_up(self, run: Run) -> RunTiming:
-        """What the stages came to.
+        """The statistics of all stages added so far.
 
         Args:
-            run: The run; its index and event log tell how long writing took, of all its shots.
+            run: The run; the time for writing is taken from its index and event log, for all its shots.
         """
         n_read, total_s = len(self._shot_s), math.fsum(self._shot_s)
         names = sorted(self._found, key=_place)
@@ -120,7 +120,7 @@ class StageTotals:
 
 
 def timing_of(run: Run, shots: Iterable[Shot]) -> RunTiming:
-    """Sum up the stages of some shots; those whose files cannot be read are left out.
+    """Durations of the stages of the given shots; those whose files cannot be read are left out.
 
     Args:
         run: Their run.
@@ -134,7 +134,7 @@ def timing_of(run: Run, shots: Iterable[Shot]) -> RunTiming:
 
 
 def _place(name: str) -> tuple[bool, int, str]:
-    """Known stages in their order, then others, then whole steps."""
+    """Sorting key: known stages in their order, then others, then whole steps."""
     return name.startswith(STEP), ORDER.index(name) if name in ORDER else len(ORDER), name
 
 
@@ -157,7 +157,7 @@ def _writing(run: Run, shot_s: float) -> list[StageStatistics]:
     if not times_s:
         return []
     host_s = quantiles(times_s)
-    session_s = (math.nan, math.nan) if run.simulated else host_s  # a model knows of no disk
+    session_s = (math.nan, math.nan) if run.simulated else host_s  # models have no disk
     share = float(np.mean(times_s)) / shot_s if shot_s and not run.simulated else math.nan
     budget_s = _writing_budget_s(run)
     n_over = 0 if run.simulated else sum(one > budget_s + OVERSHOOT_S for one in times_s)
@@ -167,14 +167,14 @@ def _writing(run: Run, shot_s: float) -> list[StageStatistics]:
 def _writing_budget_s(run: Run) -> float:
     try:
         return float(run.record["resolved"]["profile"]["budgets"][WRITE])
-    except (LookupError, TypeError, ValueError):  # of a run before there were any
+    except (LookupError, TypeError, ValueError):  # a run from before this was recorded
         return math.nan
 
 
 def writing_s(run: Run) -> list[float]:
-    """How long it took to write each attempt at a shot, in seconds, by the clock on the wall.
+    """The time to write each attempt at a shot, in seconds of wall time.
 
-    Those that the clock was set back in are left out, and those that the event log does not tell of.
+    Attempts during which the clock was set back, or that are not in the event log, are left out.
     """
     ends = {(shot.index, shot.attempt): shot.row.get("t_end_utc") for shot in (*run.shots, *run.attempts)}
     found: list[float] = []
@@ -188,7 +188,7 @@ def writing_s(run: Run) -> list[float]:
 
 
 def quantiles(values: Sequence[float] | NDArray[np.float64]) -> Quantiles:
-    """Median and 99th percentile, between the nearest values; NaN of nothing.
+    """Median and 99th percentile, interpolated; NaN without values.
 
     Example:
         >>> quantiles([1.0, 2.0, 3.0])[0]
