@@ -89,7 +89,7 @@ def scanned(run: Run) -> Scanned | None:
 
 
 def _follows(values: Sequence[str], others: Sequence[str]) -> bool:
-    """Whether other addresses change together with this one, and not by chance.
+    """Whether the values of an address change together with those of another, and not by chance.
 
     No two points of an optimiser share a value; numbers must then rise or fall together.
     """

@@ -87,7 +87,7 @@ class ShotPanel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ShotDrawing:
-    """What is drawn.
+    """The content of a picture of a shot.
 
     Attributes:
         title: Title at the top.
@@ -112,7 +112,7 @@ def save_shot(path: Path, drawing: ShotDrawing) -> None:
 
     Args:
         path: The PNG, SVG or PDF file.
-        drawing: What is drawn.
+        drawing: The content of the picture.
 
     Raises:
         ConfigError: The file cannot be written.
