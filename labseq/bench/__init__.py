@@ -1,1 +1,1 @@
-"""Planners, rendering and latency compared without a run."""
+"""Benchmarks of planners, rendering and latency, without a run."""

@@ -1,4 +1,4 @@
-"""A comparison of planners: its conditions, and the planning, checking and counting of its processes."""
+"""A comparison of planners: its conditions, and the work of its processes (plan, check, count)."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ from labseq.settings import Choice, PatternChoice
 from labseq.units import parse_quantity
 
 Words = tuple[tuple[str, str], ...]
-"""Key and value, as typed, of some settings."""
+"""Settings as key and value, as typed."""
 
 BARE_MOTION: Final[Words] = (("overhead_per_batch", "0"), ("overhead_per_cycle", "0"))
-"""What is compared is the motion itself: ramps and transport."""
+"""Overheads that are set to 0, because only ramps and transport are compared."""
 
 _BETWEEN_ENTRANTS: Final = re.compile(r",(?=\s*[^\W\d][\w.-]*\s*(?:,|\Z|:\s*[^\W\d]\w*\s*=))")
 _BETWEEN_SETTINGS: Final = re.compile(r",(?=\s*[^\W\d]\w*\s*=)")
@@ -41,7 +41,7 @@ _GRID: Final = re.compile(r"\s*(\d{1,6})\s*[xX]\s*(\d{1,6})\s*")
 
 @dataclass(frozen=True, slots=True)
 class PlannerEntry:
-    """A planner as it enters a comparison.
+    """A planner in a comparison, with its settings.
 
     Attributes:
         planner: Its name.
@@ -53,7 +53,7 @@ class PlannerEntry:
 
     @property
     def label(self) -> str:
-        """What tables call it.
+        """Its name in tables.
 
         Example:
             >>> PlannerEntry("psca", (("variant", "paper"),)).label
@@ -64,13 +64,13 @@ class PlannerEntry:
 
 @dataclass(frozen=True, slots=True)
 class Condition:
-    """What the planners are given: random loadings of a grid, and what to make of them.
+    """A grid, its loading probability, target and motion, for which all planners plan.
 
     Attributes:
         shape: Rows and columns of the grid.
         target: A pattern, as after ``--target``.
         loading: Probability that a site is loaded.
-        degree_of_parallelism: For every planner that has such a setting; None for its own.
+        degree_of_parallelism: For every planner with such a setting; None for the planner's default.
         motion: Settings of the motion that differ from the defaults, as typed.
     """
 
@@ -87,11 +87,11 @@ class Comparison:
 
     Attributes:
         planner_entries: The planners.
-        conditions: What they are given.
-        n_loadings: How many loadings of each condition.
-        seed: What all loadings are drawn from.
-        settings: What ``--set`` changes in every planner, as typed.
-        called: What messages name as the place of anything wrong: an option or a figure.
+        conditions: Grids, loadings, targets and motions.
+        n_loadings: Number of loadings of each condition.
+        seed: Seed of all loadings.
+        settings: Settings from ``--set`` for every planner, as typed.
+        called: The place of errors for messages: an option or a figure.
     """
 
     planner_entries: tuple[PlannerEntry, ...]
@@ -103,10 +103,10 @@ class Comparison:
 
 
 def parse_entrants(text: str) -> tuple[PlannerEntry, ...]:
-    """Read a list of planners, each with the settings that only it has.
+    """Read a list of planners, each with its individual settings.
 
     Raises:
-        ConfigError: It is no such list, or names something twice.
+        ConfigError: The text is no such list, or names a planner or setting twice.
 
     Example:
         >>> [entrant.label for entrant in parse_entrants("psca,psca:variant=paper,lsap")]
@@ -169,13 +169,13 @@ def parse_loading(text: str) -> float:
 
 
 def parse_overrides(texts: Sequence[str]) -> tuple[Words, Words]:
-    """Part what ``--set`` changes in every planner from what it changes in the motion.
+    """Separate the settings of planners from those of the motion in the values of ``--set``.
 
     Returns:
         Settings of the planners, and settings of ``profile.mobile_tweezers``.
 
     Raises:
-        ConfigError: One is not of the form ``address=value``, or its address leads elsewhere.
+        ConfigError: A value is not of the form ``address=value``, or has another address.
 
     Example:
         >>> parse_overrides(["planner.row_order=fullest", "profile.mobile_tweezers.speed=75 um/ms"])
@@ -202,13 +202,13 @@ _MOTION_ADDRESS: Final = "profile.mobile_tweezers"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Runner:
-    """A planner, ready to plan.
+    """A constructed planner.
 
     Attributes:
         planner: The planner.
         name: Its name.
         settings: All its settings, JSON-ready.
-        degree_of_parallelism: Most tweezers on at once that its plans are checked for.
+        degree_of_parallelism: Maximum number of tweezers on at once, for the check of its plans.
     """
 
     planner: Planner
@@ -237,11 +237,11 @@ class PreparedCondition:
 
 
 def set_up(comparison: Comparison) -> list[PreparedCondition]:
-    """Read and validate a comparison, one course per condition.
+    """Read and validate a comparison; returns one prepared condition for each.
 
     Raises:
-        ConfigError: Something in it is wrong; says what was expected.
-        PluginLoadError: A plugin that is named failed to load.
+        ConfigError: The comparison has an error; says what was expected.
+        PluginLoadError: A named plugin failed to load.
     """
     host = load_plugins()
     return [_course(host, comparison, condition) for condition in comparison.conditions]
@@ -251,7 +251,7 @@ def warm(courses: list[PreparedCondition]) -> None:
     """Compile all kernels that will be needed, or load them from the cache.
 
     Raises:
-        PlanError: A planner failed in it; names the planner.
+        PlanError: A planner failed; names the planner.
     """
     importlib.import_module("labseq.motion.check_kernels")
     for runner in [runner for course in courses for runner in course.runners]:
@@ -354,26 +354,26 @@ RESULT: Final = np.dtype(
         ("failed", np.bool_),
     ]
 )
-"""What is counted of one plan; linked batches, the way of one pick-up, count as one. NaN for no scans."""
+"""Results of one plan; linked batches, which share one pick-up, count as one. NaN without scans."""
 
 LOADING: Final = np.dtype([("n_atoms", np.int32), ("n_lines", np.int32)])
-"""What is counted of one loading; ``n_lines`` as in :func:`lines_to_cover`."""
+"""Results of one loading; ``n_lines`` as in :func:`lines_to_cover`."""
 
 _NO_SCANS: Final = (math.nan, math.nan)
 _FAILED: Final = (0, 0, 0.0, 0.0, *_NO_SCANS, 0.0, 0, 0, True)
 
 
 class Scanned(Protocol):
-    """A plan that was made of scans: tweezers that pick up and drop atoms in passing."""
+    """A plan made of scans, in which moving tweezers pick up and drop atoms without stopping."""
 
     @property
     def plan(self) -> Plan:
-        """The batches that do the same."""
+        """The equivalent batches."""
         ...
 
     @property
     def n_scans(self) -> int:
-        """Number of scans: what the algorithm's source counts as moves."""
+        """Number of scans, which the paper of the algorithm counts as moves."""
         ...
 
     def duration_s(self, grid: SiteGrid, motion: MotionSpec) -> float:
@@ -383,10 +383,10 @@ class Scanned(Protocol):
 
 @runtime_checkable
 class ScanningPlanner(Protocol):
-    """A planner whose source counts scans, not batches; an optional capability."""
+    """A planner whose paper counts scans instead of batches; an optional capability."""
 
     def scan(self, occupancy: Occupancy, target: TargetPattern) -> Scanned:
-        """Plan as ``plan()`` does, and tell the scans."""
+        """Plan as ``plan()`` does, and return the scans too."""
         ...
 
 
@@ -407,7 +407,7 @@ class Failure:
         planner_entry: Index of the planner.
         condition: Index of the condition.
         loading: Index of the loading.
-        message: What went wrong.
+        message: The error.
     """
 
     planner_entry: int
@@ -437,7 +437,7 @@ Scan = Callable[[Occupancy, TargetPattern], Scanned]
 
 
 def loading_seed(seed: int, index: int) -> int:
-    """The seed that loading ``index`` is drawn with: the first word of what the seed's index-th child gives.
+    """The seed of loading ``index``: the first word of the state of the seed's index-th child.
 
     A loading is ``numpy.random.default_rng(loading_seed).random((rows, cols)) <
     loading``, as for ``labseq plan random:ROWSxCOLS@LOADING --seed LOADING_SEED``.
@@ -456,7 +456,7 @@ def draw(shape: tuple[int, int], loading: float, seed: int, index: int) -> Occup
 
 
 def lines_to_cover(vacancies: NDArray[np.bool_]) -> NDArray[np.int32]:
-    """Count the rows and columns that it takes to cover all vacancies.
+    """The smallest number of rows and columns that together cover all vacancies.
 
     Every vacancy is filled by a batch that moves along its row or its column, so
     no planner that moves one line at a time needs fewer batches. Vacancies as
@@ -479,19 +479,19 @@ def lines_to_cover(vacancies: NDArray[np.bool_]) -> NDArray[np.int32]:
     n_loadings, n_rows, n_cols = vacancies.shape
     loading, row, col = np.nonzero(vacancies)
     ones = np.ones(len(loading), np.bool_)
-    shape = (n_loadings * n_rows, n_loadings * n_cols)  # one graph of parts that do not touch: one call
+    shape = (n_loadings * n_rows, n_loadings * n_cols)  # one call for all loadings: one graph
     graph = csr_array((ones, (loading * n_rows + row, loading * n_cols + col)), shape=shape)
     matched = maximum_bipartite_matching(graph, perm_type="column")
     return np.count_nonzero(matched.reshape(n_loadings, n_rows) >= 0, axis=1).astype(np.int32)
 
 
 def work(courses: list[PreparedCondition], seed: int, job: Job) -> Done:
-    """Let every planner plan the loadings of a job, and check and count its plans.
+    """Run every planner on the loadings of a job, and check and count its plans.
 
     Args:
-        courses: One per condition.
-        seed: What all loadings are drawn from.
-        job: Which loadings.
+        courses: The prepared conditions.
+        seed: Seed of all loadings.
+        job: The loadings.
     """
     course = courses[job.condition]
     indices = range(job.start, job.stop)
@@ -517,7 +517,7 @@ def work(courses: list[PreparedCondition], seed: int, job: Job) -> Done:
 
 
 def prepare(comparison: Comparison) -> Callable[[Job], Done]:
-    """Make ready for jobs; every planner is called once, so that no time that counts is a first time's."""
+    """Prepare for jobs; every planner is called once, so that no measured call is the first one."""
     courses = set_up(comparison)
     warm(courses)
     for i in range(len(courses)):
@@ -528,7 +528,7 @@ def prepare(comparison: Comparison) -> Callable[[Job], Done]:
 def _run(
     course: PreparedCondition, runner: Runner, scan: Scan | None, occupancy: Occupancy
 ) -> tuple[Any, ...]:
-    own = occupancy.copy()  # so that a planner that writes into its input harms only itself
+    own = occupancy.copy()  # a copy, in case a planner changes its input
     scanned: Scanned | None = None
     start_s = perf_counter()
     if scan is None:
@@ -555,7 +555,7 @@ def _run(
 
 
 def _batches_and_atoms(plan: Plan) -> tuple[int, int]:
-    """Number of batches, and atoms that they move, with linked ones counted as one."""
+    """Number of batches and of atoms moved, with linked batches counted as one."""
     if not plan.linked.any():
         return plan.n_batches, plan.n_atom_moves
     starts = ~plan.linked
@@ -563,7 +563,7 @@ def _batches_and_atoms(plan: Plan) -> tuple[int, int]:
 
 
 def _n_sites(plan: Plan) -> int:
-    """How far all atoms move together, in sites."""
+    """Total distance of all atom moves, in sites."""
     return int(np.abs(plan.moves[:, 2:] - plan.moves[:, :2]).sum())
 
 

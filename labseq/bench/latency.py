@@ -1,4 +1,4 @@
-"""How long it takes from the end of the exposure to the first light of the mobile tweezers."""
+"""Measures the time from the end of the exposure to the first light of the mobile tweezers."""
 
 from __future__ import annotations
 
@@ -23,27 +23,27 @@ from labseq.sequencer.policies import RunPolicy
 from labseq.session.session import Session
 
 HOST_STAGES: Final = ("detect", "plan", "check", "tone program", "renderer", "first chunk")
-"""What happens between a frame in memory and the first chunk of samples."""
+"""The stages between a frame in memory and the first chunk of samples."""
 
 HAND_OVER: Final = "hand-over"
-"""The way to the threads in which detector and planner are called, and back: a core has to wake for each."""
+"""Switching to the threads of detector and planner, and back; a core has to wake for each switch."""
 
 BETWEEN: Final = "in between"
-"""What else passes: the shot's record, and the way from step to step."""
+"""The remaining time, for the shot's record and between steps."""
 
 GOAL_S: Final = 2e-3
-"""From a frame in memory to the first chunk of samples."""
+"""The total time from a frame in memory to the first chunk of samples."""
 
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """How long something takes.
+    """Durations of a stage over all loadings.
 
     Attributes:
-        name: What.
+        name: Its name.
         median_s: Median on this computer's clock.
-        p99_s: Time within which 99 % are done.
-        modelled_s: Median of what passes on the session's clock besides: what the hardware takes.
+        p99_s: The 99th percentile on this computer's clock.
+        modelled_s: Median of the additional time of the hardware, modelled on the session's clock.
     """
 
     name: str
@@ -55,7 +55,7 @@ class Stage:
     def of(
         cls, name: str, host_s: NDArray[np.float64], modelled_s: NDArray[np.float64] | None = None
     ) -> Stage:
-        """Sum up durations, float64 (n,)."""
+        """Statistics of durations in seconds, float64 (n,)."""
         modelled = 0.0 if modelled_s is None else float(np.median(modelled_s))
         return cls(name, float(np.median(host_s)), float(np.quantile(host_s, 0.99)), modelled)
 
@@ -65,26 +65,26 @@ class LatencyReport:
     """The times of a profile and a sequence, on this computer.
 
     Attributes:
-        n_loadings: Random loadings.
-        seed: What they were drawn from.
+        n_loadings: Number of random loadings.
+        seed: Seed of the loadings.
         profile: Name of the profile.
         planner: Name of the planner.
-        degree_of_parallelism: Most tweezers on at once.
+        degree_of_parallelism: Maximum number of tweezers on at once.
         n_batches: Median number of batches of a plan.
         playing_s: Median playing time of its tone program.
-        sample_rate_hz: What the first chunk was rendered at.
-        stages: From the frame to the first chunk, in order; they add up to the total, medians about.
+        sample_rate_hz: Sample rate of the first chunk.
+        stages: From the frame to the first chunk, in order; they add up to the total.
         total: From a frame in memory to the first chunk.
         planned: From a frame in memory to the tone program.
-        device: Model of the mobile tweezers, as they say.
+        device: Model of the mobile tweezers, from their description.
         mode: Their mode, if they have one.
-        readout_s: The camera's read-out time, as it says.
-        prepare: ``prepare()`` of the mobile tweezers: all that has to be done before they can start.
-        start: ``play()``.
-        trigger_s: From the trigger to the output, as the device says.
+        readout_s: The camera's read-out time, from its facts.
+        prepare: Duration of ``prepare()`` of the mobile tweezers, which must end before they can start.
+        start: Duration of ``play()``.
+        trigger_s: Time from the trigger to the output, from the description of the device.
         n_cores: Processor cores.
-        load: Mean number of busy processes in the last minute; None where that is not known.
-        warnings: What the user should know of the profile although it is no error.
+        load: Mean number of busy processes in the last minute; None if unknown.
+        warnings: Warnings about the profile.
     """
 
     n_loadings: int
@@ -110,7 +110,7 @@ class LatencyReport:
 
     @property
     def to_light_s(self) -> float:
-        """From the end of the exposure to the start of the program at the output, medians added up."""
+        """Time from the end of the exposure to the start of the program at the output: a sum of medians."""
         device_s = sum(stage.median_s + stage.modelled_s for stage in (self.prepare, self.start))
         return self.readout_s + self.planned.median_s + device_s + self.trigger_s
 
@@ -123,22 +123,22 @@ CHUNK: Final = 1 << 17
 """Samples per channel that a streaming driver hands over at a time: 0.2 ms at 625 MS/s."""
 
 N_WARM: Final = 5
-"""Loadings at the start that do not count: caches are cold, and memory is fresh."""
+"""Number of initial loadings that are not counted, because caches are cold."""
 
 FALLBACK_RATE_HZ: Final = 625e6
-"""Sample rate where neither the profile has one nor the tones make a comb."""
+"""Sample rate if the profile has none and the tones form no comb."""
 
 
 @dataclass(frozen=True, slots=True)
 class LatencyRequest:
-    """What is to be measured.
+    """The sequence, profile and loadings of a measurement.
 
     Attributes:
         sequence: The sequence file: its target, its planner, and how its first image is taken.
         profile: Name or path of the profile, instead of the sequence's own.
         overrides: ``"address=value"`` strings, as given to ``--set``.
-        n_loadings: Random loadings.
-        seed: What all of them are drawn from.
+        n_loadings: Number of random loadings.
+        seed: Seed of all loadings.
     """
 
     sequence: Path
@@ -154,21 +154,21 @@ def measure_latency(
     announce: Callable[[str], None] = lambda _: None,
     progress: Callable[[int, int], None] = lambda _done, _wanted: None,
 ) -> LatencyReport:
-    """Take shots in a dry run up to the first image, and time what follows it.
+    """Take shots in a dry run up to the first image, and time the following stages.
 
-    Frames, detector, planner and driver are those of a run, and are called as in a run. Nothing
+    Frames, detector, planner and driver are those of a run, and are called as in a run. No program
     is played to its end.
 
     Args:
-        request: What is to be measured.
+        request: Sequence, profile and loadings.
         announce: Called with the name of a module before its kernels are compiled.
         progress: Called with the numbers of loadings that are done and wanted.
 
     Raises:
-        ConfigError: Something in the request, the sequence or the profile is wrong.
+        ConfigError: The request, the sequence or the profile has an error.
         PluginLoadError: A plugin that is named failed to load.
         StopRequested: Ctrl-C or SIGTERM.
-        LabseqError: Whatever ended a shot.
+        LabseqError: The error that ended a shot.
     """
     watch = _Watch(announce, progress, request.n_loadings)
     session = Session.open(
@@ -199,7 +199,7 @@ def measure_latency(
 
 
 class _Watch:
-    """Observer and sink of the shots: keeps the times, and lets the rest go."""
+    """Observer and sink of the shots that keeps only the times."""
 
     def __init__(
         self, announce: Callable[[str], None], progress: Callable[[int, int], None], n_loadings: int
@@ -211,7 +211,7 @@ class _Watch:
         self.shots: list[dict[str, tuple[float, float]]] = []
 
     def event(self, name: str, values: Mapping[str, Any]) -> None:
-        """Note when a frame is in memory."""
+        """Record when a frame is in memory."""
         timing = values.get("timing")
         if isinstance(timing, StageTiming) and timing.stage == "expose":
             self.frame_s = time.perf_counter()
@@ -226,7 +226,7 @@ class _Watch:
 
 
 class _Timed:
-    """Measures how long detector and planner take, without the time for their threads."""
+    """Measures the time of detector and planner, without that for switching threads."""
 
     def __init__(self, detector: Detector, planner: Planner) -> None:
         self._detector = detector
@@ -269,7 +269,7 @@ class _Measured(Step):
         return []
 
     def run(self, shot: Shot) -> None:
-        """From the occupancy to a card that plays; then the card is stopped."""
+        """Plan, prepare and start playing; then stop the device."""
         occupancy = shot.occupancy
         assert occupancy is not None
         mobile, limit_s = shot.mobile_tweezers, shot.call_timeout_s
@@ -298,7 +298,7 @@ class _Measured(Step):
         shot.call("mobile_tweezers", limit_s, mobile.safe_state)
 
     def _render_first(self, renderer: Renderer) -> None:
-        """A chunk from the first tones on, both channels side by side; before it there is only silence."""
+        """Render a chunk that begins with the first tones, for both channels in parallel."""
         loud = (renderer.path != RenderPath.SILENT).any(axis=0)
         start = int(renderer.first_sample[loud.argmax()])
         for channel, samples in enumerate(self._samples):
@@ -310,7 +310,7 @@ def _up_to_the_image(session: Session) -> list[tuple[str, Step]]:
     """The sequence's steps before its first rearrangement.
 
     Raises:
-        ConfigError: There is no image among them.
+        ConfigError: None of these steps takes an image.
     """
     steps = list(takewhile(lambda named: not named[1].needs_image, session.assembly.steps))
     if not any(step.takes_image for _, step in steps):
@@ -320,7 +320,7 @@ def _up_to_the_image(session: Session) -> list[tuple[str, Step]]:
 
 
 def _sample_rate_hz(session: Session, lab: Lab) -> float:
-    """The sample rate that the profile sets, if its device has one, else the one that suits its tones."""
+    """The sample rate that the profile sets, if its device has one, else one that suits its tones."""
     settings = session.assembly.bench.chosen["mobile_tweezers"].settings
     given = getattr(settings, "sample_rate", None)
     if isinstance(given, float):
@@ -347,7 +347,7 @@ def _report(
     between_s = total_s - sum(here_s.values())
     handed_s = here_s["detect"] + here_s["plan"] - own_s.sum(axis=0)
     here_s |= {"detect": own_s[0], "plan": own_s[1], HAND_OVER: handed_s, BETWEEN: between_s}
-    rendered_s = here_s["renderer"] + here_s["first chunk"]  # which prepare() does again
+    rendered_s = here_s["renderer"] + here_s["first chunk"]  # prepare() does this again
     n_batches, playing_s = np.median(np.array(measured.plans[N_WARM:]), axis=0)
     return LatencyReport(
         n_loadings=request.n_loadings,
@@ -374,5 +374,5 @@ def _report(
 
 
 def _both(name: str, times: NDArray[np.float64]) -> Stage:
-    """A stage with the time that it took here, and the one that it took on the session's clock."""
+    """A stage with its time on this computer's clock and on the session's clock."""
     return Stage.of(name, times[0], times[1])

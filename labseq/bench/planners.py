@@ -1,4 +1,4 @@
-"""Planners compared on the same random loadings."""
+"""Compares planners on the same random loadings, in several processes."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ from labseq.bench.report import Report, Tally
 from labseq.errors import LabseqError, StopRequested
 
 _LOOK_S: Final = 0.1
-"""How often waiting for results is interrupted: on Windows, Ctrl-C does not end it."""
+"""Interval at which waiting for results is interrupted, in seconds: on Windows, Ctrl-C does not end it."""
 _FAREWELL_S: Final = 1.0
 
 
 def run_jobs(comparison: Comparison, jobs: Iterable[Job], n_workers: int) -> Generator[Done]:
-    """Do all jobs; with one worker, in this process.
+    """Run all jobs; one worker runs them in this process.
 
     Args:
         comparison: The comparison of the jobs, valid.
@@ -76,7 +76,7 @@ def _start(comparison: Comparison) -> tuple[Connection, BaseProcess]:
 
 
 def _hand_out(workers: dict[Connection, BaseProcess], jobs: Iterator[Job]) -> Generator[Done]:
-    """Keep every process busy with one job until there are no more."""
+    """Give every process one job at a time until all are done."""
     idle = list(workers)
     busy: list[Connection] = []
     connection = idle[0]
@@ -114,10 +114,10 @@ def _stop_workers(workers: dict[Connection, BaseProcess]) -> None:
 
 
 def _serve(connection: Connection, comparison: Comparison) -> None:
-    """Do jobs until the connection is closed."""
+    """Run jobs in a worker process until the connection is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches every process; the first one decides
     do: Callable[[Job], Done] = prepare(comparison)
-    with suppress(EOFError, OSError):  # the first process is gone
+    with suppress(EOFError, OSError):  # the first process has ended
         while True:
             connection.send(do(connection.recv()))
 
@@ -135,14 +135,14 @@ def _interrupts_ignored() -> Generator[None]:
 
 
 MAX_AT_ONCE: Final = 50
-"""Maximum number of loadings of a job: those of each process are lost when a comparison is stopped."""
+"""Maximum number of loadings of a job; each process loses its current job when a comparison is stopped."""
 ALONE_S: Final = 2.0
-"""How long one process works before others start: about the time that their start takes."""
+"""Minimum work for a second process, in seconds: about the time to start one."""
 
 
 @dataclass(frozen=True, slots=True)
 class BenchRequest:
-    """What to compare, as on the command line.
+    """The comparison, as text from the command line.
 
     Attributes:
         planners: See :func:`labseq.bench.comparison.parse_entrants`.
@@ -168,10 +168,10 @@ class BenchRequest:
 
 
 def read_request(request: BenchRequest) -> Comparison:
-    """Read what to compare.
+    """Convert a request to a comparison.
 
     Raises:
-        ConfigError: Something in it is wrong; says what was expected.
+        ConfigError: The request has an error; says what was expected.
     """
     settings, motion = parse_overrides(request.overrides)
     shape, loading = parse_grid(request.grid), parse_loading(request.loading)
@@ -189,19 +189,19 @@ def compare(
     announce: Callable[[str], None] = lambda _: None,
     progress: Callable[[int, int], None] = lambda _done, _wanted: None,
 ) -> Report:
-    """Let all planners plan all loadings, check every plan, and sum up.
+    """Run all planners on all loadings, check every plan, and summarise the results.
 
     The same comparison gives the same report, except for times, with any number of
-    processes. Ctrl-C or SIGTERM ends it early with what is done until then.
+    processes. Ctrl-C or SIGTERM ends it early with the results so far.
 
     Args:
-        comparison: What to compare.
+        comparison: Planners, conditions and loadings.
         n_workers: Number of processes; None for one per core, if there is enough work.
         announce: Called with the name of a module before its kernels are compiled.
         progress: Called with the numbers of loadings that are done and wanted.
 
     Raises:
-        ConfigError: Something in the comparison is wrong; says what was expected.
+        ConfigError: The comparison has an error; says what was expected.
         PluginLoadError: A named plugin failed to load.
     """
     from labseq.kernel import announcing
@@ -245,10 +245,10 @@ def _results(comparison: Comparison, n_workers: int | None) -> Generator[Done]:
 
 
 def _jobs(comparison: Comparison, n_workers: int) -> list[Job]:
-    """The work in pieces, some for every process.
+    """Divide the work into jobs, several for every process.
 
-    The first loadings of all conditions come first, so that what is done at any
-    time is about the same share of each.
+    The first loadings of all conditions come first, so that about the same share
+    of each condition is done at any time.
     """
     n_loadings, n_conditions = comparison.n_loadings, len(comparison.conditions)
     size = min(MAX_AT_ONCE, n_loadings, -(-n_loadings * n_conditions // (4 * n_workers)))
@@ -260,14 +260,14 @@ def _jobs(comparison: Comparison, n_workers: int) -> list[Job]:
 
 
 def _n_cores() -> int:
-    if hasattr(os, "sched_getaffinity"):  # not on Windows or macOS
+    if hasattr(os, "sched_getaffinity"):  # unavailable on Windows and macOS
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
 @contextmanager
 def _interrupted_by_signals(received: list[int]) -> Generator[None]:
-    """Let SIGTERM interrupt as Ctrl-C does, and record which it was."""
+    """Make SIGTERM interrupt like Ctrl-C, and record which signal came."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

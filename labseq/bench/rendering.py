@@ -1,4 +1,4 @@
-"""How fast tone programs are rendered, compared with the paper's method and with plain numpy."""
+"""Measures the speed of rendering tone programs, compared with the paper's method and with plain numpy."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from labseq.session.planning import PlannedMoves, PlanRequest, plan_moves
 
 N_CHANNELS: Final = 2
 CHUNK: Final = 1 << 18
-"""Samples that are rendered into the same buffer again and again, as a streaming driver does."""
+"""Samples per chunk; all chunks are rendered into the same buffer, as by a streaming driver."""
 
 STORED: Final = 1 << 21
 """Samples of each stored waveform: 84 MB in all."""
@@ -30,11 +30,11 @@ NUMPY_20: Final = "numpy, 20 tones"
 
 SITE_S: Final = 4.49e-6 / 0.130
 SITES: Final = 5
-"""Sites per transport of the programs that represent one kind of segment: about a plan's mean."""
+"""Distance of each transport, in sites, about the mean of a plan."""
 
 
 PLAN: Final = PlanRequest("random:20x20@75%", "compact:15x15", "psca", 7, seed=1)
-"""A plan as it is played: 225 atoms out of 20 x 20 sites, seven at a time."""
+"""A typical plan: 225 atoms in 20 x 20 sites, moved seven at a time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,10 +42,10 @@ class Row:
     """One measurement.
 
     Attributes:
-        name: What was rendered, and how.
+        name: The rendered program and the method.
         gigasamples_per_s: Samples of both channels per second, in 1e9.
         playing_over_rendering: Playing time over rendering time.
-        goal: Least value of that; None if there is none.
+        goal: Minimum of ``playing_over_rendering``; None if there is none.
     """
 
     name: str
@@ -56,13 +56,13 @@ class Row:
 
 @dataclass(frozen=True, slots=True)
 class Ratio:
-    """Two rendering times in relation.
+    """The ratio of two rendering times.
 
     Attributes:
-        name: Which.
+        name: Its name.
         value: The ratio.
-        goal: What it should be, at most or at least.
-        at_most: Which of both.
+        goal: Its maximum or minimum.
+        at_most: Whether ``goal`` is a maximum.
     """
 
     name: str
@@ -73,13 +73,13 @@ class Ratio:
 
 @dataclass(frozen=True, slots=True)
 class WaveformReport:
-    """The results.
+    """The results of the measurement.
 
     Attributes:
-        rows: A row for each kind of segment and for a plan; the stored-waveform way and numpy last.
-        ratios: Those that there are goals for.
+        rows: A row for each kind of segment and for a plan; stored waveforms and numpy last.
+        ratios: The ratios with goals.
         sample_rate_hz: Sample rate of all rows.
-        repeats: How often everything was rendered; the best one counts.
+        repeats: Number of repetitions; the fastest one counts.
     """
 
     rows: tuple[Row, ...]
@@ -93,10 +93,10 @@ class WaveformReport:
 
 
 def bench_waveform(repeats: int = 5, *, announce: Callable[[str], None] = lambda _: None) -> WaveformReport:
-    """Measure rendering into buffers that are used again, in two threads, the best of some repeats.
+    """Measure rendering in two threads into reused buffers; the fastest of several repetitions counts.
 
     Args:
-        repeats: How often everything is rendered.
+        repeats: Number of repetitions.
         announce: Called with the name of a module before its kernels are compiled.
     """
     from labseq.kernel import announcing
@@ -147,7 +147,7 @@ def uniform_program(
 ) -> ToneProgram:
     """A program of 100 transports: column tones that move in given directions, a fixed row tone.
 
-    They go there and back, so that the tones stay in the band.
+    They move back and forth, so that the tones stay in the band.
     """
     n_segments = 100
     hz = grid.column_frequency_hz[:n_tones]
@@ -169,7 +169,7 @@ def uniform_program(
 
 
 def render_all(renderer: Renderer) -> None:
-    """Render a whole program in two threads, each into a buffer of its own, half of the time each."""
+    """Render a whole program in two threads, each into its own buffer and half of the time."""
 
     def work(start: int, stop: int) -> None:
         out = np.empty(CHUNK, np.int16)
@@ -185,10 +185,10 @@ def render_all(renderer: Renderer) -> None:
 
 
 def stored_waveforms(grid: SiteGrid, sample_rate_hz: float) -> NDArray[np.int16]:
-    """The paper's store: waveforms of each tone, at a twentieth of full scale.
+    """The stored waveforms of the paper's method, one for each tone, at a twentieth of full scale.
 
     A waveform for each tone, each kind of segment and each distance does not fit into the
-    processor's caches; nor does this.
+    processor's caches, and neither do these.
 
     Returns:
         int16 (n_sites, STORED).
@@ -200,7 +200,7 @@ def stored_waveforms(grid: SiteGrid, sample_rate_hz: float) -> NDArray[np.int16]
 
 
 def sum_all_stored(stored: NDArray[np.int16], n_tones: int) -> None:
-    """The paper's way: pick ``n_tones`` waveforms and sum them, and one for the other channel.
+    """The paper's method: sum ``n_tones`` stored waveforms for one channel, and take one for the other.
 
     As in :func:`render_all`, two threads do half of the time each, into the same buffers.
     """

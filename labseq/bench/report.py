@@ -74,12 +74,12 @@ class Row:
         degree_of_parallelism: Maximum number of tweezers on at once for which its plans were checked.
         n_target_atoms: Atoms in the target.
         n_loadings: Number of loadings.
-        n_short: How many of them hold fewer atoms than the target.
+        n_short: Number of loadings with fewer atoms than the target.
         n_failed: Loadings for which the planner failed or its plan broke a rule.
         first_failure: The first of these, or None.
         n_batches: Mean number of batches, linked ones counted as one.
         n_atoms_moved: Mean number of atoms moved; one that is picked up again counts again.
-        distance_m: Mean of the distances of all atom moves together, in metres.
+        distance_m: Mean total distance of all atom moves, in metres.
         motion_s: Mean time of ramps and transport, in seconds, with the overheads
             that the condition names.
         n_scans: Mean number of scans, which the papers of some planners count

@@ -38,7 +38,7 @@ DEFAULT_RATE_HZ: Final = 625e6
 """Default sample rate: that of the paper's AWG."""
 
 MAX_RATE_HZ: Final = 10e9
-"""Far more than any AWG has."""
+"""Maximum accepted sample rate, far above that of any AWG."""
 
 PLAN_SUFFIX: Final = ".json"
 
@@ -49,12 +49,12 @@ _BATCHES: Final = re.compile(r"\s*(\d{1,6})\s*(?:-\s*(\d{1,6})\s*)?")
 
 @dataclass(frozen=True, slots=True)
 class SampleRate:
-    """A sample rate and who asks for it.
+    """A sample rate and its origin.
 
     Attributes:
         hz: Samples per second and channel.
-        source: Where it comes from, for messages; "" for the default.
-        warning: What the user should know, or "".
+        source: Its origin, for messages; "" for the default.
+        warning: A warning for the user, or "".
     """
 
     hz: float
@@ -65,7 +65,7 @@ class SampleRate:
 def read_moves(
     request: PlanRequest, stdin: BinaryIO | None, announce: Callable[[str], None]
 ) -> tuple[PlannedMoves, dict[str, Any]]:
-    """Read a plan, or an occupancy that is then planned for.
+    """Read a plan, or read an occupancy and plan for it.
 
     Args:
         request: Its occupancy may be a plan: a file that ends in .json, or JSON on "-".
@@ -73,10 +73,10 @@ def read_moves(
         announce: Called with the name of a module before its kernels are compiled.
 
     Returns:
-        The checked plan, and the profile that a shot was taken with; empty where there is none.
+        The checked plan, and the profile that a shot was taken with; empty if there is none.
 
     Raises:
-        ConfigError: Something in the request is wrong.
+        ConfigError: The request has an error.
         PluginLoadError: A plugin that is named failed to load.
         PlanError: The planner failed, or its plan breaks a rule.
     """
@@ -95,17 +95,17 @@ def read_moves(
 
 
 def read_sample_rate(text: str | None, request: PlanRequest, machine: dict[str, Any]) -> SampleRate:
-    """Find the sample rate: the one given, else the profile's, else the paper's.
+    """Find the sample rate: the given one, else the profile's, else the paper's.
 
     A profile has one if the plugin of its mobile tweezers has a setting ``sample_rate``.
 
     Args:
-        text: The one given, such as "625 MHz"; None if there is none.
+        text: The given one, such as "625 MHz"; None if there is none.
         request: Names the profile, if there is one.
         machine: The profile that a shot was taken with; may be empty.
 
     Raises:
-        ConfigError: It is no frequency, not above 0, or more than any AWG has; or the profile is wrong.
+        ConfigError: It is no frequency, not above 0, or far too high; or the profile has an error.
     """
     if text is not None:
         return _parse(text)
@@ -130,7 +130,7 @@ def _parse(text: str) -> SampleRate:
 
 
 def _of_profile(profile: str, overrides: Sequence[str]) -> SampleRate:
-    """The setting ``sample_rate`` of whatever drives the mobile tweezers, if it has one."""
+    """The setting ``sample_rate`` of the mobile tweezers' plugin, if it has one."""
     _, for_profile = split_overrides(overrides)
     document, spec = load_profile(profile, beside=Path(), overrides=for_profile)
     host = load_plugins(plugin_paths(document, spec.plugin_folders), max_wait_s=spec.timeouts.load)
@@ -143,7 +143,7 @@ def _of_profile(profile: str, overrides: Sequence[str]) -> SampleRate:
 
 
 def read_batches(text: str | None, plan: Plan) -> range:
-    """Read which batches are meant; a chain of linked ones is never cut.
+    """Read a selection of batches; a chain of linked batches must not be cut.
 
     Args:
         text: "2" or "1-3", counted from 1; None for all.
@@ -153,7 +153,7 @@ def read_batches(text: str | None, plan: Plan) -> range:
         Their indices, from 0.
 
     Raises:
-        ConfigError: It is no such thing, there are no such batches, or it cuts a chain.
+        ConfigError: It is no selection, there are no such batches, or it cuts a chain.
 
     Example:
         >>> read_batches("1-2", Plan.from_batches([([(0, 0)], [(0, 3)])] * 3))
@@ -182,7 +182,7 @@ def read_batches(text: str | None, plan: Plan) -> range:
 
 
 CHUNK: Final = 1 << 18
-"""Samples that are looked at together: 2 MB in float64."""
+"""Samples per chunk of the analysis: 2 MB in float64."""
 
 BOTH: Final[tuple[AxisIndex, AxisIndex]] = (0, 1)
 PATHS: Final = (RenderPath.COMB, RenderPath.BLENDED, RenderPath.DIRECT)
@@ -190,25 +190,25 @@ PATHS: Final = (RenderPath.COMB, RenderPath.BLENDED, RenderPath.DIRECT)
 
 @dataclass(frozen=True, slots=True)
 class AxisStatistics:
-    """What one axis plays.
+    """Tones, voltages and powers of one axis.
 
     Attributes:
         name: "row" or "column".
-        max_tones: Most tones at once.
+        max_tones: Maximum number of tones at once.
         lowest_hz: Lowest frequency of a tone.
         highest_hz: Highest frequency of a tone.
         band_hz: Lowest and highest frequency of the AOD.
         amplitude_sum: Highest sum of amplitudes, as a fraction of full scale.
-        snapped_m: How far, at most, a tone was moved to be on a comb, in the atom plane.
+        snapped_m: Maximum distance by which a tone was moved onto a comb, in the atom plane.
         peak_v: Highest voltage of a sample, across 50 Ohm, as full scale is given.
-        peak_batch: Index of the batch that has it.
+        peak_batch: Index of the batch with this sample.
         crest_factor: Highest peak over r.m.s. of the samples of a segment of transport, where
             nothing is ramped; None if all are 0.
-        crest_batch: Index of the batch that has it.
+        crest_batch: Index of the batch with this crest factor.
         mean_power_w: Mean power into 50 Ohm while tones are on.
-        highest_power_w: Mean power when it is highest, from the tones' amplitudes.
+        highest_power_w: Highest short-term mean power, from the tones' amplitudes.
         gain_db: Power gain of the amplifier between output and AOD.
-        path_share: Name of each render path -> the part of the samples with tones on that it makes.
+        path_share: Name of each render path -> its share of the samples with tones on.
     """
 
     name: str
@@ -244,7 +244,7 @@ class AxisStatistics:
 
     @property
     def aod_highest_power_w(self) -> float:
-        """Mean power at the AOD when it is highest."""
+        """Highest short-term mean power at the AOD."""
         return self.highest_power_w * self.gain
 
     def as_dict(self) -> dict[str, Any]:
@@ -271,13 +271,13 @@ class AxisStatistics:
 def measure(
     program: ToneProgram, renderer: Renderer, segments: range, grid: SiteGrid, motion: MotionSpec
 ) -> tuple[AxisStatistics, AxisStatistics]:
-    """Look at the samples of some segments, chunk by chunk, one thread per axis.
+    """Compute the statistics of the samples of some segments, chunk by chunk, one thread per axis.
 
     Args:
         program: The tone program.
-        renderer: Renders it.
-        segments: Which of its segments; at least one has tones.
-        grid: The grid of sites that it was made for.
+        renderer: The renderer.
+        segments: Indices of its segments; at least one has tones.
+        grid: The grid of sites of the program.
         motion: How the tweezers move.
 
     Returns:
@@ -372,15 +372,15 @@ FRAME_BYTES: Final = 4
 """Size of a sample of both channels."""
 
 MAX_DURATION_S: Final = 60.0
-"""Far longer than any cycle; more is a mistake that would take hours to render."""
+"""Maximum playing time, far longer than any cycle; a longer one is a mistake and would take hours."""
 
 
 @dataclass(frozen=True, slots=True)
 class WaveformRequest:
-    """Which waveform, in the words of the command line.
+    """The arguments of ``labseq waveform``, as text.
 
     Attributes:
-        plan: What is to be planned; or a plan: its occupancy then is a file that ends in
+        plan: The request for a plan; or a plan, if its occupancy is a file that ends in
             .json, or "-" for standard input.
         batches: "2" or "1-3", from 1; None for all.
         sample_rate: A frequency; None for the profile's.
@@ -398,10 +398,10 @@ class PlannedWaveform:
     Attributes:
         moves: The plan.
         program: Its tones.
-        renderer: Makes samples of them.
-        batches: The batches that are looked at, indices from 0.
+        renderer: Renders the samples.
+        batches: The selected batches, indices from 0.
         segments: Their segments, with the pause before each batch.
-        warnings: What the user should know although nothing is wrong.
+        warnings: Warnings for the user.
     """
 
     moves: PlannedMoves
@@ -413,7 +413,7 @@ class PlannedWaveform:
 
     @property
     def samples(self) -> range:
-        """The samples that are looked at, counted from the start of the program."""
+        """The selected samples, counted from the start of the program."""
         first, stop = self.renderer.first_sample[[self.segments.start, self.segments.stop]]
         return range(int(first), int(stop))
 
@@ -438,11 +438,11 @@ class PlannedWaveform:
         return slice(self.segments.start, self.segments.stop)
 
     def statistics(self) -> tuple[AxisStatistics, AxisStatistics]:
-        """Render everything once, and say in numbers what the row and the column axis play."""
+        """Render everything once, and return the statistics of the row and the column axis."""
         return measure(self.program, self.renderer, self.segments, self.moves.grid, self.moves.motion)
 
     def as_dict(self) -> dict[str, Any]:
-        """What it is, but for its statistics, SI, JSON-ready; indices of batches count from 0."""
+        """Everything except the statistics, SI, JSON-ready; indices of batches count from 0."""
         return {
             "source": self.moves.source,
             "planner": self.moves.planner,
@@ -464,15 +464,15 @@ def plan_waveform(
     *,
     announce: Callable[[str], None] = lambda _: None,
 ) -> PlannedWaveform:
-    """Read or make a plan, check it as a run does, and turn it into tones.
+    """Read or make a plan, check it as a run does, and convert it to tones.
 
     Args:
-        request: Which waveform.
+        request: The arguments.
         stdin: What "-" reads; standard input if None.
         announce: Called with the name of a module before its kernels are compiled.
 
     Raises:
-        ConfigError: Something in the request is wrong, or there is nothing to play.
+        ConfigError: The request has an error, or there is nothing to play.
         PluginLoadError: A plugin that is named failed to load.
         PlanError: The planner failed, or its plan breaks a rule.
         LimitError: The tones break a limit of AOD or amplifier.
@@ -522,7 +522,7 @@ def _tones(moves: PlannedMoves, request: PlanRequest) -> ToneProgram:
 
 
 def _refuse_slow(rate: SampleRate, program: ToneProgram) -> None:
-    """Refuse a sample rate at which tones cannot be distinguished."""
+    """Raise for a sample rate at which tones cannot be distinguished."""
     highest_hz = max(
         hz.max() for axis in (program.row, program.column) for hz in (axis.start_hz, axis.end_hz)
     )
@@ -536,15 +536,15 @@ def _refuse_slow(rate: SampleRate, program: ToneProgram) -> None:
 
 SUFFIX: Final = ".npz"
 WAVEFORM_FILE_CHUNK: Final = 1 << 20
-"""Samples that are rendered and written together."""
+"""Number of samples that are rendered and written together."""
 
 
 def check_samples_file(path: Path) -> None:
-    """Find out whether a file of samples has a name and a place, before anything is planned.
+    """Check name and folder of a file of samples before anything is planned.
 
     Raises:
-        ConfigError: It has another ending than .npz, its folder does not exist, or there is
-            something else than an ordinary file in its place.
+        ConfigError: It has another ending than .npz, its folder does not exist, or the path
+            is not an ordinary file.
     """
     name, expected = visible(str(path)), f"a file that ends in {SUFFIX}"
     if path.suffix.lower() != SUFFIX:
@@ -557,7 +557,7 @@ def check_samples_file(path: Path) -> None:
 
 
 def save_samples(path: Path, waveform: PlannedWaveform) -> None:
-    """Write the samples so that the file is either there and whole, or not there at all.
+    """Write the samples to a file, which appears only when it is complete.
 
     ``numpy.load`` then gives ``samples``, int16 (2, n), channel 0 for the row axis, and, counted
     in samples, where its batches and segments start; see :func:`arrays_of`. The samples are
@@ -565,7 +565,7 @@ def save_samples(path: Path, waveform: PlannedWaveform) -> None:
 
     Args:
         path: The file; an older one of that name is replaced.
-        waveform: What is written.
+        waveform: The waveform.
 
     Raises:
         ConfigError: It cannot be written, for example to a full disk; or :func:`check_samples_file`
