@@ -1,7 +1,7 @@
 """The error tree of labseq.
 
 Every error that labseq raises on purpose is a :class:`LabseqError`. It carries
-its values as attributes, and its message says what came, what was expected and
+its values as attributes, and its message says what was found, what was expected and
 what to do. ``exit_code`` is the exit code of the command line.
 """
 
@@ -13,7 +13,7 @@ from types import TracebackType
 from typing import ClassVar, Literal, TypeAlias
 
 Loc: TypeAlias = tuple[str | int, ...]
-"""Where a value is in a document: keys and list indices from the top, ("shot", 2, "rearrange")."""
+"""Location of a value in a document: keys and list indices from the top, ("shot", 2, "rearrange")."""
 
 
 class LabseqError(Exception):
@@ -31,7 +31,7 @@ class Problem:
         source: File name, or the option it came from (``--set a.b=c``).
         line: Line in ``source``, counted from 1; 0 if the source has no lines.
         column: Column in ``source``, counted from 1; 0 if there is none.
-        expected: What would be right, or "".
+        expected: The expected value, or "".
         hint: What to do, for example "did you mean 'rows'?", or "".
         notes: Other places to look at: the value that this one conflicts with, or a default.
     """
@@ -57,7 +57,7 @@ class Problem:
 
 
 class ConfigError(LabseqError, ValueError):
-    """A sequence, a profile or an option is wrong.
+    """A sequence, a profile or an option has an error.
 
     Attributes:
         problems: All problems that were found, in file order.
@@ -109,15 +109,15 @@ class ProblemCollector:
         self.problems += error.problems
 
     def stop(self, error: ConfigError) -> ConfigError:
-        """An error after which nothing else can be checked, together with all collected problems."""
+        """Combine an error after which nothing else can be checked with all collected problems."""
         self.add(error)
         return self._joined()
 
     def raise_any(self) -> None:
-        """Raise the collected problems, those of each file in its order.
+        """Raise the collected problems, sorted by their place in each file.
 
         Raises:
-            ConfigError: There are any.
+            ConfigError: There is at least one problem.
         """
         if self.problems:
             raise self._joined()
@@ -128,7 +128,7 @@ class ProblemCollector:
 
 
 class PluginLoadError(LabseqError):
-    """A plugin that is needed could not be loaded.
+    """A required plugin could not be loaded.
 
     Attributes:
         plugin: Name of the plugin.
@@ -147,7 +147,7 @@ class PluginLoadError(LabseqError):
 
 
 class UnknownPluginError(LabseqError, LookupError):
-    """No installed plugin offers something of this name.
+    """No installed plugin offers the named planner, driver, step or other object.
 
     Attributes:
         kind: "planner", "camera", "pattern", ...
@@ -225,7 +225,7 @@ class LimitError(LabseqError, ValueError):
 
 
 class PlanError(LabseqError):
-    """A planner failed, or what it returned is not a plan.
+    """A planner failed, or its result is not a plan.
 
     Attributes:
         planner: Name of the planner, or "".
@@ -303,7 +303,7 @@ class OverBudgetError(TransientError):
     """A stage took longer than its budget, and the policy of its step does not allow that.
 
     Attributes:
-        then: The reaction that the policy sets: "repeat_shot", "skip_point" or "stop".
+        then: The reaction set by the policy: "repeat_shot", "skip_point" or "stop".
     """
 
     def __init__(self, message: str, then: Literal["repeat_shot", "skip_point", "stop"]) -> None:

@@ -76,14 +76,14 @@ def write_file(path: Path, data: bytes | memoryview) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Flush a folder's list of files to the disk, where the system can (Windows cannot)."""
+    """Flush a folder's list of files to the disk, if the system supports it (Windows does not)."""
     if os.name == "nt":
         return
     handle = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(handle)
     except OSError as error:
-        if error.errno not in {errno.EINVAL, errno.ENOTSUP}:  # some network folders cannot either
+        if error.errno not in {errno.EINVAL, errno.ENOTSUP}:  # nor do some network folders
             raise
     finally:
         os.close(handle)
@@ -131,9 +131,9 @@ def read_file(path: Path) -> bytes:
 
 
 class LineLog:
-    """An append-only file of JSON lines. Only what ends with a newline counts.
+    """An append-only file of JSON lines. Only lines that end with a newline count.
 
-    A line that a killed process left unfinished is kept as a line of its own. An append that failed in this
+    A line that a killed process left unfinished is kept as a separate line. An append that failed in this
     process leaves nothing: the next one overwrites it.
 
     Args:
@@ -155,7 +155,7 @@ class LineLog:
         """Add a line; ``sync`` waits until it is on the disk.
 
         Raises:
-            RecordingError: It could not be written; the file is as it was before.
+            RecordingError: It could not be written; the file is unchanged.
         """
         line = dumps(values).encode() + b"\n"
         with explained(self.path), self.path.open("r+b", buffering=0) as file:
@@ -190,10 +190,10 @@ def whole_lines(data: bytes) -> bytes:
 
 
 def read_lines(path: Path) -> tuple[list[dict[str, Any]], list[int]]:
-    """Read a file of JSON lines, whatever state it is in.
+    """Read a file of JSON lines, even if it is damaged.
 
     Returns:
-        The lines that are whole, and the numbers (from 1) of damaged lines. An unfinished last line is
+        The complete lines, and the numbers (from 1) of damaged lines. An unfinished last line is
         neither: it was never reported as written. Both are empty if there is no file.
 
     Raises:
@@ -233,7 +233,7 @@ def packaged_sequences_dir() -> Path:
 
 
 def profile_dir(profile: Path) -> Path:
-    """The folder for what belongs to a profile, such as its calibrations: the profile's own folder.
+    """The folder for data of a profile, such as its calibrations: the folder of the profile's file.
 
     For a profile that is installed with labseq it is ./hardware_profiles, where a copy of the profile would
     be. The installed folder is shared by all users, may be read-only, and is replaced by the next version.
@@ -249,7 +249,7 @@ def data_root() -> Path:
 
 
 def state_root() -> Path | None:
-    """Folder where labseq keeps what it must remember for this user between runs.
+    """Folder of the data that labseq keeps for this user between runs.
 
     ``LABSEQ_STATE`` if set, else the platform's folder for state; None for a user without a home.
     """
@@ -282,7 +282,7 @@ def cache_root() -> Path:
 
 @dataclass(frozen=True, slots=True)
 class Process:
-    """A process; a later one that was given the same number is another.
+    """A process, identified by its id and its start, because ids are used again.
 
     Attributes:
         pid: Process id.
@@ -301,7 +301,7 @@ class Process:
 
     @classmethod
     def from_plain(cls, values: Mapping[str, Any]) -> Process | None:
-        """Read back what ``dataclasses.asdict`` made; None if it is something else."""
+        """A process from the result of ``dataclasses.asdict``; None for any other value."""
         pid, started = values.get("pid"), values.get("started", 0.0)
         if type(pid) is not int or pid <= 0 or type(started) not in (int, float):
             return None
@@ -314,7 +314,7 @@ class Process:
 
     @property
     def is_running(self) -> bool:
-        """Whether it still runs; meaningful on its own computer only."""
+        """Whether it still runs; only known on its own computer."""
         started = _start_time(self.pid)
         if started is None:
             return False
@@ -345,10 +345,10 @@ _FOR_ALL: Final = 0o666
 
 @dataclass(frozen=True, slots=True)
 class Holder:
-    """Who holds a lock.
+    """The process that holds a lock.
 
     Attributes:
-        what: What it does, for example "the run data/2026-01-02/0001_compact"; "" if unknown.
+        what: Its purpose, for example "the run data/2026-01-02/0001_compact"; "" if unknown.
         pid: Its process; 0 if unknown.
         host: Its computer.
         since_utc: Since when, ISO 8601, UTC.
@@ -366,13 +366,13 @@ class Holder:
 
 
 class Lock:
-    """A lock of the operating system on a file; it is released when its process ends, however it ends.
+    """A lock of the operating system on a file; it is released when its process ends, even if killed.
 
-    ``<file>.holder`` beside the file says who holds it.
+    ``<file>.holder`` next to the file describes the process that holds it.
 
     Args:
         path: The file; it and its folder are made if they do not exist, and stay.
-        what: What the holder does.
+        what: Purpose of the lock, shown to other processes.
     """
 
     def __init__(self, path: Path, what: str) -> None:
@@ -412,7 +412,7 @@ class Lock:
         return None
 
     def describe(self, what: str) -> None:
-        """Write what the holder does beside the lock, if that can be written."""
+        """Write the purpose of the lock to the file of its holder, if possible."""
         self._holder = replace(self._holder, what=what)
         with suppress(OSError), whole_file(self._about) as file:
             file.write(json.dumps(asdict(self._holder)).encode())

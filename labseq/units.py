@@ -16,7 +16,7 @@ _MICRO = ("u", "µ", "μ")  # ASCII, MICRO SIGN, GREEK SMALL LETTER MU
 
 
 def _with_micro(units: dict[str, float]) -> Mapping[str, float]:
-    """Accept both micro signs in every unit with "u"."""
+    """Add the variants with both micro signs for every unit with "u"."""
     spelled = dict(units)
     for unit, factor in units.items():
         if unit.startswith("u"):
@@ -57,7 +57,7 @@ EXAMPLES: Final[Mapping[str, str]] = MappingProxyType(
 """Dimension -> an example of a quantity."""
 
 _READABLE: Final = 1e9
-"""Numbers from here on are written with an exponent."""
+"""Numbers of at least this size are written with an exponent."""
 
 ZERO_CELSIUS_K: Final = 273.15
 """0 degC in kelvins; degC is the only unit with a different zero."""
@@ -104,7 +104,7 @@ def parse_quantity(text: str, dimension: str) -> float:
 
 
 def split_quantity(text: str) -> tuple[float, str]:
-    """The number and the unit of a quantity as they are written; nan and "" for other text.
+    """Split a quantity into its number and unit as written; nan and "" for other text.
 
     Example:
         >>> split_quantity("45 ms")
@@ -176,7 +176,7 @@ def written(value: float, unit: str) -> str:
 
 
 def scaled(number: float, factor: float) -> float:
-    """Multiply so that powers of ten come out exact: 4.49 um is 4.49e-06, not 4.4899...e-06.
+    """Multiply without rounding errors for powers of ten: 4.49 um is 4.49e-06, not 4.4899...e-06.
 
     Example:
         >>> scaled(4.49, 1e-6)
