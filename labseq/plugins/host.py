@@ -199,8 +199,8 @@ class PluginHost:
             path = path / "__init__.py"
         if path.suffix != ".py" or not path.is_file() or self._is_loaded(path):
             return
-        if module_location(name) == plugin_location(path):
-            return  # a library of an installed distribution, such as a simulator
+        if module_location(name) == plugin_location(path) and not _states_api(path):
+            return  # an installed library, such as a simulator
         info = PluginInfo(name, str(path), source=str(path))
         if not name.isidentifier():
             reason = "its name is no Python name: letters, digits and '_' only; rename it"
@@ -293,6 +293,10 @@ def _prepare(importing: Callable[[], ModuleType], owner: Owner, registry: Regist
     if "labseq_register" in hooks:
         hooks["labseq_register"](registry=registry)
     return module
+
+
+def _states_api(path: Path) -> bool:
+    return b"LABSEQ_API" in path.read_bytes()
 
 
 def _version(distribution: str) -> str:

@@ -16,7 +16,7 @@ from pydantic import BaseModel, create_model
 from pydantic.fields import FieldInfo
 
 import labseq
-from labseq import errors, hookspecs, roles, testing
+from labseq import errors, hookspecs, plugin, roles, testing
 from labseq.builtin import labseq_register
 from labseq.cli.app import app
 from labseq.config import (
@@ -224,7 +224,7 @@ def test_every_hook_is_in_the_reference(pages: Pages) -> None:
 
 
 def test_every_role_and_method_is_in_the_reference(pages: Pages) -> None:
-    every = [one for name, one in vars(roles).items() if name in dir(labseq) and isinstance(one, type)]
+    every = [one for name, one in vars(roles).items() if name in plugin.__all__ and isinstance(one, type)]
     assert {*KINDS} - {"pattern"} <= {snake_case(role.__name__) for role in every}
     shown = {re.split(r"[(:]", term)[0] for term in terms_of(pages, "plugin-api")}
     for role in every:

@@ -72,7 +72,7 @@ def test_a_check_of_the_overlay_tells_one_that_stands_from_one_that_does_not(
 
 def test_a_check_that_stops_ends_the_run_with_the_shift(tmp_path: Path) -> None:
     text = f"shots: 2\n{SHOT}  - check_overlay: {{every: 1, exceeded: stop}}\n"
-    with pytest.raises(DeviceError, match=r"the mobile tweezers stand .* run `labseq calibrate overlay`"):
+    with pytest.raises(DeviceError, match=r"the mobile tweezers are .* run `labseq calibrate overlay`"):
         run(tmp_path, text, (0.0, -0.3))
 
 
