@@ -26,13 +26,13 @@ HOST_STAGES: Final = ("detect", "plan", "check", "tone program", "renderer", "fi
 """The stages between a frame in memory and the first chunk of samples."""
 
 HAND_OVER: Final = "hand-over"
-"""Switching to the threads of detector and planner, and back; a core has to wake for each switch."""
+"""Stage of switching to the threads of detector and planner, and back; each switch wakes a core."""
 
 BETWEEN: Final = "in between"
-"""The remaining time, for the shot's record and between steps."""
+"""Stage of the remaining time, for the shot's record and between steps."""
 
 GOAL_S: Final = 2e-3
-"""The total time from a frame in memory to the first chunk of samples."""
+"""Goal for the total time from a frame in memory to the first chunk of samples, in seconds."""
 
 
 @dataclass(frozen=True, slots=True)
