@@ -1,4 +1,4 @@
-"""YAML to frozen, validated specs, with errors that name file, line and column."""
+"""Reads YAML files into frozen, validated settings; errors name file, line and column."""
 
 from labseq.config.addresses import ROLES, Override, profile_overrides, split_overrides
 from labseq.config.document import Document, StoredText, plugin_paths

@@ -10,11 +10,11 @@ from labseq.errors import ConfigError, Loc, Problem
 from labseq.messages import clean, did_you_mean, listing, shown, visible
 
 PROFILE: Final = "profile."
-"""Prefix of the addresses of profile values."""
+"""Prefix of addresses in the profile."""
 VARIABLES: Final = "variables"
-"""Key of the values that only expressions use."""
+"""Key of the variables, which only expressions use."""
 ROLES: Final = ("camera", "static_tweezers", "mobile_tweezers", "detector", "lines", "simulation")
-"""The roles of a profile that are one plugin each."""
+"""The roles of a profile that are each played by one plugin."""
 MAY_ADD: Final = (
     "timeouts",
     "budgets",
@@ -24,7 +24,7 @@ MAY_ADD: Final = (
     "calibrations",
     "calibrations.use",
 )
-"""Addresses of profile mappings that an override may add."""
+"""Addresses of mappings in the profile that an override may add."""
 _SHOWN: Final = 80
 
 
@@ -43,7 +43,7 @@ class Override(NamedTuple):
 
     @property
     def source(self) -> str:
-        """The place that messages name."""
+        """The place of the value, for messages."""
         text = self.origin or f"--set {self.address}={self.value}"
         return visible(text if len(text) <= _SHOWN else text[: _SHOWN - 3] + "...")
 
@@ -88,7 +88,7 @@ def split_overrides(options: Sequence[str]) -> tuple[list[Override], list[Overri
 
 
 def profile_overrides(options: Sequence[str]) -> list[Override]:
-    """Read the values of ``--set`` of a command that knows a profile and no sequence.
+    """Read the values of ``--set`` of a command that uses a profile but no sequence.
 
     Returns:
         Those of the profile, without "profile.".
@@ -115,13 +115,13 @@ def profile_overrides(options: Sequence[str]) -> list[Override]:
 
 
 def find(root: Node, address: str, name: str, source: str, may_add: Collection[str] = ()) -> Loc:
-    """Turn an address into a location; the last key of a mapping need not exist yet.
+    """Convert an address to a location in a file; the last key of a mapping need not exist yet.
 
     A list item with a ``name`` is addressed by it, and the address continues in its
     settings: ``shot.sort.window`` for ``shot.2.rearrange.window``.
 
     Raises:
-        ConfigError: A part of the address leads nowhere.
+        ConfigError: A part of the address does not exist.
     """
     parts = address.split(".")
     loc: Loc = ()
@@ -142,7 +142,7 @@ def find(root: Node, address: str, name: str, source: str, may_add: Collection[s
 
 
 def _steps(node: Node, part: str) -> Loc:
-    """The keys and indices of one part of an address; () if it leads nowhere."""
+    """The keys and indices of one part of an address; () if it does not exist."""
     if isinstance(node.value, dict):
         return (part,) if part in node.value else ()
     if not isinstance(node.value, list):
@@ -157,7 +157,7 @@ def _steps(node: Node, part: str) -> Loc:
 
 
 def _lost(node: Node, part: str, here: str, name: str, source: str) -> Problem:
-    """Say why an address leads nowhere."""
+    """Explain why an address does not exist."""
     where = f"'{here}'" if here else clean(name)
     if isinstance(node.value, dict):
         known = list(node.value)

@@ -22,7 +22,7 @@ M = TypeVar("M", bound=BaseModel)
 
 FileKind = Literal["sequence", "hardware profile"]
 _KINDS: Final[Mapping[FileKind, str]] = {"sequence": "shot", "hardware profile": "grid"}
-"""Kind of file -> a key that only this kind has."""
+"""Kind of file -> a key that occurs only in this kind."""
 
 
 class StoredText(NamedTuple):
@@ -30,7 +30,7 @@ class StoredText(NamedTuple):
 
     Attributes:
         text: The text.
-        name: What messages call it, for example the path of the copy.
+        name: Its name in messages, for example the path of the copy.
     """
 
     text: str
@@ -39,7 +39,7 @@ class StoredText(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Document:
-    r"""A sequence or a profile as it was written, with its overrides. Immutable.
+    r"""The content of a sequence or profile file, with its overrides. Immutable.
 
     Example:
         >>> document = Document.parse("shots: 20\nshot:\n  - load: {}\n", "mine.yaml")
@@ -78,7 +78,7 @@ class Document:
 
     @classmethod
     def parse(cls, text: str | bytes, name: str) -> Document:
-        """Read the content of a file called ``name``.
+        """Parse the content of a file; ``name`` is its name in messages.
 
         Raises:
             ConfigError: It is no strict YAML 1.2 with a mapping at the top.
@@ -100,14 +100,14 @@ class Document:
 
     @property
     def written(self) -> Node:
-        """The top mapping with its expressions, whether or not they are computed."""
+        """The top mapping with its expressions instead of their results."""
         return self.root if self.expressions is None else self.expressions.written
 
     def evaluated(self) -> Document:
         """A copy with the results of its expressions.
 
         Raises:
-            ConfigError: Everything that is wrong with them.
+            ConfigError: All errors in them.
         """
         expressions = evaluate(self.written, self.name, self.text)
         return replace(self, root=expressions.root, expressions=expressions)
@@ -118,7 +118,7 @@ class Document:
         return default if node is None else node.plain()
 
     def locate(self, loc: Loc, key: bool = False) -> tuple[int, int]:
-        """Line and column, from 1, of the value at a location, or of its key.
+        """Line and column, counted from 1, of the value at a location, or of its key.
 
         If it does not exist, those of its nearest parent; (0, 0) for the value of an option.
         """
@@ -126,20 +126,20 @@ class Document:
         return mark.line, mark.column
 
     def problem(self, loc: Loc, what: str, expected: str = "", hint: str = "", key: bool = False) -> Problem:
-        """A problem at a location: in the file, or in the option that set the value."""
+        """Create a problem at a location: in the file, or in the option that set the value."""
         return self.root.mark_at(loc, key).problem(self.name, what, expected, hint)
 
     def error(
         self, loc: Loc, what: str, expected: str = "", hint: str = "", key: bool = False
     ) -> ConfigError:
-        """The same as an error to raise."""
+        """Create an error for a problem at a location; see :meth:`problem`."""
         return ConfigError(self.problem(loc, what, expected, hint, key))
 
     def with_values(self, values: Iterable[tuple[Loc, Node]]) -> Document:
         """A copy with other values at some locations, and its expressions computed again.
 
         Raises:
-            ConfigError: An expression has no value any more.
+            ConfigError: An expression can no longer be computed.
         """
         root = self.written
         for loc, node in values:
@@ -154,11 +154,11 @@ class Document:
             address: Keys, list indices and names of list items: "shot.2.rearrange.window"
                 or "shot.sort.window".
             value: YAML for one value: ``5``, ``45 ms``, ``[60 ms, 40 ms]``, ``{use: psca}``.
-            origin: The option, named as the place of anything wrong with the value.
+            origin: The option, which messages name as the place of errors in the value.
             may_add: Addresses of mappings that are added if the file has none.
 
         Raises:
-            ConfigError: The address leads nowhere, or the value is no YAML.
+            ConfigError: The address does not exist, or the value is no YAML.
         """
         loc = find(self.root, address, self.name, origin, may_add)
         return self.with_values([(loc, compose(value, self.name, origin) or Node(None, Mark(0, 0, origin)))])
@@ -221,17 +221,17 @@ class Document:
         other_keys: Collection[str] = (),
         called: str = "",
     ) -> M | None:
-        """Make settings of the mapping at a location; an empty or missing one counts as {}.
+        """Validate the mapping at a location against a settings model; an empty or missing one counts as {}.
 
         Args:
             model: The settings model; None for a plugin that takes no settings.
-            loc: Where the mapping is.
+            loc: Location of the mapping.
             drop: Keys that belong to another model and are left out.
-            other_keys: Keys to name as known when one is misspelt.
-            called: What messages call the mapping: "camera 'andor'"; "" for its key.
+            other_keys: Further known keys, for messages about misspelt ones.
+            called: Name of the mapping in messages: "camera 'andor'"; "" for its key.
 
         Raises:
-            ConfigError: Everything that is wrong in the mapping, in file order.
+            ConfigError: All errors in the mapping, in file order.
         """
         name = next((step for step in reversed(loc) if isinstance(step, str)), "")
         context = ValidationContext(name, called, drop, other_keys, self.path.parent)
@@ -241,7 +241,7 @@ class Document:
 
 
 def check_kind(document: Document, kind: FileKind) -> None:
-    """Refuse a file of another kind, or of a newer format, before any other check.
+    """Raise for a file of another kind or of a newer format, before any other check.
 
     Raises:
         ConfigError: It is for a newer labseq, or it is not a sequence or a profile.
@@ -277,17 +277,17 @@ def plugin_paths(document: Document, folders: Sequence[str]) -> list[Path]:
     return paths
 
 
-# Without these, known plugins would count as unknown, and a target would meet another grid.
+# Without them, known plugins would count as unknown, and the target would not match the grid.
 _NEEDED: Final = ("plugin_folders", "profile")
 _MAX_PASSES: Final = 5
 
 
 @dataclass(frozen=True, slots=True)
 class FallbackValues:
-    """Valid values that replace wrong ones, so that the rest of a file can still be checked.
+    """Valid values that replace invalid ones, so that the rest of a file can still be checked.
 
     Attributes:
-        values: Every key that a file must have -> a value.
+        values: Every required key -> a value.
         items: Key of a list or mapping -> an item of it.
     """
 
@@ -303,12 +303,12 @@ def load_checked(
     Args:
         document: The file.
         model: The settings model of the whole file.
-        called: What messages call it.
-        fallbacks: Replace the wrong values.
+        called: Its name in messages.
+        fallbacks: Values that replace invalid ones.
         found: Receives the problems; without it they are raised.
 
     Raises:
-        ConfigError: The file is wrong, and its other values cannot be checked.
+        ConfigError: The file has errors, and its other values cannot be checked.
     """
     try:
         return document, document.validate(model, called=called)
@@ -324,7 +324,7 @@ def load_checked(
 
 
 def _without_wrong_values(document: Document, model: type[BaseModel], fallbacks: FallbackValues) -> Document:
-    """A copy whose wrong values are replaced by fallbacks, or removed if they have none."""
+    """A copy whose invalid values are replaced by fallbacks, or removed if there is no fallback."""
     root, seen = document.root, set[Loc]()
     for _ in range(_MAX_PASSES):  # validators of a whole list run once all its items are right
         found = check(model, root, ValidationContext(""))

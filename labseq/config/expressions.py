@@ -1,7 +1,7 @@
 """Expressions in files: ``window: = variables.hold + 5 ms``.
 
 A scalar that begins with "=" is an expression; "==" is text that begins with "=". Numbers, quantities
-and addresses are cut out and replaced by a name of one letter. Python's ``ast`` parses what is left, of
+and addresses are cut out and replaced by a name of one letter. Python's ``ast`` parses the rest, in
 which a few kinds of node are allowed: operators, brackets and calls of the functions listed here.
 """
 
@@ -25,7 +25,7 @@ from labseq.units import UNITS, ZERO_CELSIUS_K, dimension_of, parse_any, scaled,
 
 Number = int | float
 Powers = tuple[int, ...]
-"""Powers of s, m, V, W, K and rad."""
+"""Exponents of the units s, m, V, W, K and rad."""
 
 NONE: Final[Powers] = (0, 0, 0, 0, 0, 0)
 POWERS: Final[dict[str, Powers]] = {
@@ -39,25 +39,25 @@ POWERS: Final[dict[str, Powers]] = {
     "angle": (0, 0, 0, 0, 0, 1),
     "fraction": NONE,
 }
-"""Dimension, a key of :data:`labseq.units.UNITS` -> its powers."""
+"""Dimension, a key of :data:`labseq.units.UNITS` -> its exponents."""
 _BASES: Final = ("s", "m", "V", "W", "K", "rad")
 _DIMENSIONS: Final = {powers: name for name, powers in POWERS.items()} | {NONE: "number"}
 
 MAX_LENGTH: Final = 500
-"""Longest expression, in characters."""
+"""Maximum length of an expression, in characters."""
 MAX_PARTS: Final = 200
-"""Largest number of values, operators and functions in an expression."""
+"""Maximum number of values, operators and functions in an expression."""
 _MAX_POWER: Final = 12
 _MAX_EXPONENT: Final = 1000
 _EXACT: Final = 2**53  # from here on, whole numbers are kept as floats
 
 
 class ExpressionError(ValueError):
-    """An expression that is wrong.
+    """An error in an expression.
 
     Attributes:
         at: Index of the character; None until it is known.
-        problem: What is wrong, what was expected and what to do.
+        problem: The error, what was expected and what to do.
     """
 
     def __init__(self, what: str, expected: str = "", hint: str = "", at: int | None = None) -> None:
@@ -66,7 +66,7 @@ class ExpressionError(ValueError):
 
 
 class Quantity(NamedTuple):
-    """A number in SI, and the powers of its units."""
+    """A number in SI, and the exponents of its units."""
 
     amount: Number
     powers: Powers = NONE
@@ -203,8 +203,8 @@ class _Parsed:
     """An expression, parsed.
 
     Attributes:
-        tree: What is left when every number, quantity and name is replaced by "x".
-        text: The text of that.
+        tree: The expression after every number, quantity and name is replaced by "x".
+        text: The text of ``tree``.
         shift: Index of its first character in the expression.
         values: Index of each "x" in ``text`` -> the quantity, or the name.
     """
@@ -220,7 +220,7 @@ def _parse(text: str) -> _Parsed:
     """Parse an expression with its "=".
 
     Raises:
-        ExpressionError: Not an expression, or too long.
+        ExpressionError: The text is no expression, or too long.
     """
     if len(text) > MAX_LENGTH:
         raise ExpressionError(f"the expression has {len(text)} characters", f"at most {MAX_LENGTH}", at=0)
@@ -289,7 +289,7 @@ class _Evaluation:
         """The value of a part.
 
         Raises:
-            ExpressionError: It has none; with the place.
+            ExpressionError: It has no value; with the place.
         """
         at = node.col_offset
         try:
@@ -414,7 +414,7 @@ class _Evaluator:
     results: dict[Loc, Quantity] = field(default_factory=dict[Loc, Quantity])
 
     def compute(self) -> None:
-        """Compute all expressions whose references are right."""
+        """Compute all expressions with valid references."""
         references: dict[Loc, dict[str, Loc]] = {}
         for loc, node in self.nodes.items():
             try:
@@ -437,7 +437,7 @@ class _Evaluator:
             sorter.done(*ready)
 
     def _references(self, text: str) -> dict[str, Loc]:
-        """The addresses in an expression, and where they lead."""
+        """The addresses in an expression, and their locations."""
         parsed = _parse(text)
         functions = {node.func.col_offset for node in ast.walk(parsed.tree) if isinstance(node, ast.Call)}
         return {
@@ -462,7 +462,7 @@ class _Evaluator:
     def _compute_one(self, loc: Loc, named: Mapping[str, Loc]) -> None:
         node, others = self.nodes[loc], [*named.values()]
         if any(other in self.nodes and other not in self.results for other in others):
-            return  # that one is wrong, and reported
+            return  # the other expression has an error that is reported
         text = str(node.value)
         parsed = _parse(text)
         try:
@@ -481,7 +481,7 @@ class _Evaluator:
         self.reads[loc] = frozenset(others).union(*(self.reads.get(other, ()) for other in others))
 
     def _written(self, loc: Loc, address: str, at: int) -> Quantity:
-        """A value that is written as a number or a quantity."""
+        """The value of a number or a quantity in the file."""
         node = self.root.at(loc)
         assert node is not None
         value = node.value
@@ -504,7 +504,7 @@ class _Evaluator:
         self.report(self.nodes[ring[0]], ExpressionError(f"this goes round in a circle: {clean(way)}", at=at))
 
     def report(self, node: Node, error: ExpressionError) -> None:
-        """Note a problem; its column is that of the character if the text is on a line of the file."""
+        """Record a problem; its column is that of the character if the text is on a line of the file."""
         mark, text, at, problem = node.mark, str(node.value), error.at or 0, error.problem
         what = problem.what
         line = self.lines[mark.line - 1][mark.column - 1 :] if 0 < mark.line <= len(self.lines) else ""

@@ -21,7 +21,7 @@ from labseq.text_files import (
 
 
 def is_path(name: str) -> bool:
-    """Whether a text is a path, not the name of a profile or sequence.
+    """Whether a text is a path instead of the name of a profile or sequence.
 
     Example:
         >>> is_path("virtual"), is_path("mine.yaml"), is_path("../mine")
@@ -101,7 +101,7 @@ def _hint_at(packaged: Path) -> str:
 
 
 def _named(name: str, folders: Sequence[Path]) -> Path | None:
-    """The first file of a name in the folders, with either YAML ending."""
+    """The first file with a name in the folders, with the suffix .yaml or .yml."""
     paths = (folder / f"{name}{suffix}" for folder in folders for suffix in YAML_SUFFIXES)
     return next((path for path in paths if is_file(path)), None)
 

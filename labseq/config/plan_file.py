@@ -20,14 +20,14 @@ from labseq.settings import Name, Settings, setting_error
 from labseq.text_files import decode
 
 MAX_BYTES: Final = 4 << 20
-"""Largest plan, in bytes: one for 500 x 500 sites."""
+"""Maximum size of a plan, in bytes: that of one for 500 x 500 sites."""
 
 _EXPECTED: Final = "what 'labseq plan --json' writes"
 
 Bit: TypeAlias = Annotated[int, Field(ge=0, le=1)]
 Rows: TypeAlias = tuple[tuple[Bit, ...], ...]
 Index: TypeAlias = Annotated[int, Field(ge=-1000, le=2000)]
-"""Of a row or column; an ejection ends off the grid."""
+"""Index of a row or column; an ejected atom ends off the grid."""
 
 
 class GridFile(Settings):
@@ -98,7 +98,7 @@ class PlanFile:
 
     Attributes:
         planner: Name of the planner.
-        degree_of_parallelism: Most tweezers on at once that the planner was allowed.
+        degree_of_parallelism: Maximum number of tweezers on at once that the planner was allowed.
         seed: Seed of all random numbers; None if there were none.
         grid: The grid of sites, with the tones that a grid of its size has by default.
         occupancy: bool (n_rows, n_cols), before the plan.
@@ -120,10 +120,10 @@ def parse_plan(data: bytes, name: str) -> PlanFile:
 
     Args:
         data: UTF-8.
-        name: What messages call it.
+        name: Its name in messages.
 
     Raises:
-        ConfigError: It is no JSON, no plan, or a value in it is wrong; says what was expected.
+        ConfigError: It is no JSON, no plan, or a value in it is invalid; says what was expected.
     """
     if len(data) > MAX_BYTES:
         raise ConfigError(Problem(f"it is larger than {MAX_BYTES >> 20} MiB", name, expected=_EXPECTED))
@@ -167,13 +167,13 @@ def _parse_json(text: str, name: str) -> object:
         what = f"this is no plan: {error}"
     except RecursionError:
         what = "this is no plan: it is nested too deeply"
-    except ValueError:  # Python reads no number of thousands of digits
+    except ValueError:  # Python refuses numbers with thousands of digits
         what = "this is no plan: a number in it has too many digits"
     raise ConfigError(Problem(what, name, expected=_EXPECTED))
 
 
 class _NoPlanError(Exception):
-    """JSON that a plan does not consist of."""
+    """The JSON is not that of a plan."""
 
 
 def _refuse_constant(constant: str) -> NoReturn:

@@ -1,4 +1,4 @@
-"""The hardware profile."""
+"""Settings of a hardware profile file."""
 
 from __future__ import annotations
 
@@ -72,14 +72,14 @@ DEVICE_KEYS: Final = ("blinding",)
 
 
 def device_name(name: str, what: str) -> None:
-    """Refuse a name that cannot be used in an address or a file."""
+    """Raise for a name that cannot be used in an address or a file."""
     if not _DEVICE_NAME.fullmatch(name):
         expected = "a word of letters, digits, '_' and '-' that begins with a letter"
         raise setting_error(f"{what} is called '{clean(name)}'", expected, at=(name,), key=True)
 
 
 def named(devices: dict[str, DeviceChoice]) -> dict[str, DeviceChoice]:
-    """Refuse names that a device cannot have, and give each choice its place."""
+    """Raise for invalid device names, and add to each choice its place in the file."""
     for name in devices:
         if name in (*ROLES, "planner"):
             raise setting_error(
@@ -90,7 +90,7 @@ def named(devices: dict[str, DeviceChoice]) -> dict[str, DeviceChoice]:
 
 
 OFF: Final = "off"
-"""Instead of an id or of a folder: no calibration."""
+"""Value in place of an id or a folder that means no calibration."""
 
 
 class CalibrationChoices(Settings):
@@ -111,7 +111,7 @@ class CalibrationChoices(Settings):
     )
 
     def of(self, kind: str) -> str | None:
-        """The choice for a kind: an id, "off", or None for the active one."""
+        """The choice for a kind of calibration: an id, "off", or None for the active one."""
         return cast("str | None", getattr(self, kind))
 
 
@@ -190,7 +190,7 @@ class ChannelSettings(Settings):
         return self
 
     def spec(self, name: str) -> LineSpec:
-        """The settings as the core's type."""
+        """Convert the settings to the core's type."""
         return LineSpec(
             name,
             self.channel,
@@ -313,7 +313,7 @@ class RfSettings(Settings):
     )
 
     def spec(self) -> RfSpec:
-        """The settings as the core's type."""
+        """Convert the settings to the core's type."""
         return RfSpec(
             row_band_hz=self.row_band,
             column_band_hz=self.column_band,
@@ -373,7 +373,7 @@ class MotionSettings(Settings):
     )
 
     def spec(self) -> MotionSpec:
-        """The settings as the core's type."""
+        """Convert the settings to the core's type."""
         return MotionSpec(
             pick_up_s=self.pick_up,
             drop_off_s=self.drop_off,
@@ -496,7 +496,7 @@ class ProfileSpec(Settings):
 
     @property
     def choices(self) -> dict[str, Choice]:
-        """The plugins chosen in this file, by role; lines and simulation only if there are any."""
+        """The plugins chosen in this file, by role; lines and simulation only if they are given."""
         chosen = {role: getattr(self, role) for role in ROLES}
         return {role: choice for role, choice in chosen.items() if choice is not None}
 
@@ -562,7 +562,7 @@ def load_profile(
         The document, overrides included, and its content, with fallbacks for wrong values.
 
     Raises:
-        ConfigError: Everything that is wrong, except for settings of plugins.
+        ConfigError: All errors, except in settings of plugins.
     """
     document = Document.read(find_profile(name_or_path, beside, named_in=named_in), kept)
     check_kind(document, "hardware profile")

@@ -28,7 +28,7 @@ from labseq.units import factor_of, scaled, written
 ScanOrder = Literal["sequential", "shuffled"]
 
 MAX_RANGES: Final = 6
-"""Largest number of addresses of an adaptive scan: all combinations of their ends are checked."""
+"""Maximum number of addresses of an adaptive scan, since all combinations of their ends are checked."""
 
 _ORDER_KEY: Final = 0x5CA4  # separate from every shot's random numbers, whose keys have two parts
 
@@ -39,9 +39,9 @@ class Axis:
 
     Attributes:
         address: As written: "planner.degree_of_parallelism", "profile.mobile_tweezers.speed".
-        loc: Where its value is, in the sequence or in the profile.
-        values: One per position of its group.
-        key: Where the address is written.
+        loc: Location of its value in the sequence or the profile.
+        values: Its values, one per position of its group.
+        key: Place of the address in the file.
     """
 
     address: str
@@ -55,7 +55,7 @@ class Axis:
         return self.address.startswith(PROFILE)
 
     def error(self, what: str, expected: str = "", hint: str = "") -> ConfigError:
-        """An error at the place of the address."""
+        """Create an error at the place of the address."""
         return ConfigError(self.key.problem("", what, expected, hint))
 
 
@@ -65,15 +65,15 @@ Group = tuple[Axis, ...]
 
 @dataclass(frozen=True, slots=True)
 class Scan:
-    """The points of a scan: the outer product of its groups, the first changes most slowly.
+    """The points of a scan: the outer product of its groups, of which the first changes most slowly.
 
     Attributes:
         name: The sequence's name in messages.
         groups: The groups, in the order written; without any there is one point.
-        repeats: Shots of each point.
+        repeats: Number of shots at each point.
         order: "sequential" or "shuffled".
         notes: Warnings, for example that ``--set`` replaced an axis.
-        adaptive: What chooses the points, if they are not known in advance: then each group is one
+        adaptive: The scanner, if it chooses the points during the run: each group is then one
             axis, whose two values are the ends of its range.
     """
 
@@ -91,7 +91,7 @@ class Scan:
 
     @property
     def n_points(self) -> int:
-        """Number of points; of an adaptive scan, the largest possible number."""
+        """Number of points; for an adaptive scan, the largest possible number."""
         return math.prod(self.shape) if self.adaptive is None else self.adaptive.n_points
 
     @property
@@ -128,7 +128,7 @@ class Scan:
         return np.concatenate([rng.permutation(points) for _ in range(self.repeats)])
 
     def at(self, values: Sequence[float]) -> Scan:
-        """A point of an adaptive scan, as a scan of that point alone; ``values`` of the axes in SI."""
+        """A point of an adaptive scan, as a scan with only this point; ``values`` of the axes in SI."""
         assert self.adaptive is not None
         pairs = zip(self.axes, self.adaptive.ends, values, strict=True)
         groups = tuple((replace(axis, values=(ends.node(value),)),) for axis, ends, value in pairs)
@@ -142,12 +142,12 @@ class Scan:
     def begun(self, document: Document, *, profile: bool) -> Document:
         """A copy of the sequence or of the profile with the values of the first point.
 
-        The first point of an adaptive scan is not known yet; then the values of the file stay.
+        The first point of an adaptive scan is not known yet; the values of the file are then kept.
         """
         return document if self.adaptive is not None else self.put(document, 0, profile=profile)
 
     def explained(self, error: ConfigError) -> ConfigError:
-        """An error that adds to each wrong value the address that the scan puts it into."""
+        """A copy of an error that adds to each invalid value its scanned address."""
         places = {
             (mark.line, mark.column): axis.address
             for axis in self.axes
@@ -173,7 +173,7 @@ def _marks(node: Node) -> Iterator[Mark]:
             yield from _marks(child)
 
 
-_DIGITS: Final = 4  # of a range: finer than any setting of a machine needs
+_DIGITS: Final = 4  # below the range of an axis: finer than any setting needs
 
 End: TypeAlias = Annotated[Any, WithJsonSchema({"type": ["number", "string"]})]
 """A number or quantity; which one depends on the address."""
@@ -216,13 +216,13 @@ SCANNER_KEYS: Final = frozenset({"over", "maximise", "minimise", "points"})
 
 @dataclass(frozen=True, slots=True)
 class Ends:
-    """The range of an address as it is written.
+    """The range of an address as written.
 
     Attributes:
-        low: The least value.
-        high: The greatest value, in the unit of the least.
+        low: The lowest value.
+        high: The highest value, in the unit of the lowest.
         n_steps: Number of equal steps; 0 if any value between the ends is allowed.
-        mark: Where it is written.
+        mark: Its place in the file.
     """
 
     low: Number
@@ -248,14 +248,14 @@ class Ends:
 
 @dataclass(frozen=True, slots=True)
 class Adaptive:
-    """What chooses the points of a scan, and its aim.
+    """The scanner of a scan, the ranges, and the figure to optimise.
 
     Attributes:
         choice: The scanner's name and place.
         ends: The range of each axis.
-        n_points: Largest number of points.
+        n_points: Maximum number of points.
         figure: The figure to maximise or minimise.
-        maximise: Whether more of it is better.
+        maximise: Whether the figure is maximised.
     """
 
     choice: Choice
@@ -266,7 +266,7 @@ class Adaptive:
 
     @property
     def aim(self) -> Loc:
-        """Where the figure is named."""
+        """Location of the name of the figure."""
         return (*self.choice.loc, "maximise" if self.maximise else "minimise")
 
 
@@ -276,13 +276,13 @@ def read_scan(document: Document, fixed: Sequence[Override] = ()) -> Scan | None
     Args:
         document: The sequence, overrides included.
         fixed: The overrides, those of the profile with their "profile."; an axis that one of
-            them sets is left out, since ``--set`` wins.
+            them sets is left out, since ``--set`` takes precedence.
 
     Returns:
         The scan, its profile axes not yet bound; None if the sequence has none.
 
     Raises:
-        ConfigError: Everything that is wrong with its form.
+        ConfigError: All errors in its form.
     """
     found = ProblemCollector()
     node = document.root.child("scan")
@@ -324,7 +324,7 @@ _Written = Mapping[str, tuple[Mark, Node]]
 
 
 def _mappings(node: Node, name: str, found: ProblemCollector) -> list[_Written]:
-    """In a mapping each address is a group of its own; in a list each mapping is a group."""
+    """In a mapping each address is a separate group; in a list each mapping is a group."""
     expected = "a mapping of addresses and their values, or a list of such mappings"
     items = node.value if isinstance(node.value, list) else [node]
     groups: list[_Written] = []
@@ -342,14 +342,14 @@ def _mappings(node: Node, name: str, found: ProblemCollector) -> list[_Written]:
 
 
 def _axis(document: Document, address: str, key: Mark, node: Node, found: ProblemCollector) -> Axis | None:
-    """The axis of an address; None if it is wrong."""
+    """The axis of an address; None if it has an error."""
     with found:
         return placed_axis(address, key, values_of(node, address, document.name), document)
     return None
 
 
 def _check_together(group: Group, name: str) -> None:
-    """Refuse a group whose axes differ in length, and a combination of values that occurs twice in it."""
+    """Raise for a group whose axes differ in length, or in which a combination of values occurs twice."""
     for axis in group[1:]:
         n, n_first = len(axis.values), len(group[0].values)
         if n != n_first:
@@ -366,7 +366,7 @@ def _check_together(group: Group, name: str) -> None:
 
 
 def _refuse_twice(groups: Sequence[Group], *, in_profile: bool | None = None) -> None:
-    """Refuse two addresses of which one contains the other."""
+    """Raise for two addresses of which one contains the other."""
     axes = [axis for group in groups for axis in group if in_profile in (None, axis.of_profile)]
     for i, axis in enumerate(axes):
         for other in axes[:i]:
@@ -402,7 +402,7 @@ def _read_adaptive(
     """Read an adaptive scan; each axis has two values, the ends of its range.
 
     Raises:
-        ConfigError: Everything that is wrong with its form.
+        ConfigError: All errors in its form.
     """
     choice = document.validate(AdaptiveChoice, ("scan",), called="an adaptive scan").placed("scan")
     if document.get(("order",)) is not None:
@@ -449,7 +449,7 @@ def _range_of(document: Document, address: str, n_steps: int) -> tuple[Axis, End
 
 
 def placed_axis(address: str, key: Mark, values: Sequence[Node], document: Document) -> Axis:
-    """An axis with its place in the sequence; one of the profile is bound to the profile later.
+    """An axis with its location in the sequence; an axis of the profile is located later.
 
     Args:
         address: The address.
@@ -458,7 +458,7 @@ def placed_axis(address: str, key: Mark, values: Sequence[Node], document: Docum
         document: The sequence.
 
     Raises:
-        ConfigError: The address leads nowhere, or to a setting that a scan cannot change.
+        ConfigError: The address does not exist, or a scan cannot change its setting.
     """
     name = document.name
     nodes = tuple(_node_with_file(value, name) for value in values)
@@ -474,14 +474,14 @@ def placed_axis(address: str, key: Mark, values: Sequence[Node], document: Docum
 
 
 def bind_scan(scan: Scan, document: Document) -> Scan:
-    """A copy whose profile axes know their places in the profile.
+    """A copy in which the axes of the profile have their locations in the profile.
 
     Args:
         scan: The scan as it was read.
         document: The profile's file.
 
     Raises:
-        ConfigError: Addresses that lead nowhere in it, or to settings that a scan cannot change.
+        ConfigError: Addresses that do not exist in it, or whose settings a scan cannot change.
     """
     found = ProblemCollector()
 
@@ -501,7 +501,7 @@ def bind_scan(scan: Scan, document: Document) -> Scan:
 
 
 def _found(axis: Axis, document: Document) -> Axis:
-    """An axis with the place that its address leads to; a variable must exist."""
+    """An axis with the location of its address; a variable must exist."""
     try:
         loc = find(document.root, axis.address.removeprefix(PROFILE), document.name, "", MAY_ADD)
     except ConfigError as error:
@@ -520,7 +520,7 @@ def _unscannable(axis: Axis) -> ConfigError:
 
 
 def _with_file(mark: Mark, name: str) -> Mark:
-    """A mark that keeps its file when its value is put into another document."""
+    """A mark that still refers to its file when its value is put into another document."""
     return mark if mark.origin else mark._replace(origin=name)
 
 

@@ -14,7 +14,7 @@ from labseq.messages import clean, did_you_mean, listing, shown
 from labseq.units import UNITS, dimension_of, factor_of, scaled, split_quantity
 
 MAX_POINTS: Final = 10_000
-"""Largest number of points of a scan, and of values of an address."""
+"""Maximum number of points of a scan, and of values of an address."""
 
 
 class Number(NamedTuple):
@@ -31,7 +31,7 @@ class Number(NamedTuple):
 
 
 def numbers_of(nodes: Sequence[Node], name: str) -> list[Number]:
-    """Numbers of one dimension, all in the unit of the first.
+    """Read numbers of one dimension, all in the unit of the first.
 
     Raises:
         ConfigError: One is no number, or is of another dimension than the first.
@@ -73,7 +73,7 @@ def values_of(node: Node, address: str, name: str) -> list[Node]:
     """The values that an address takes, each with its place.
 
     Args:
-        node: What the scan gives for the address.
+        node: The values in the scan.
         address: The address, for messages.
         name: The sequence's name in messages.
 
@@ -100,7 +100,7 @@ def values_of(node: Node, address: str, name: str) -> list[Node]:
 
 
 def _linspace(limits: list[Node], name: str) -> tuple[list[float], Number]:
-    """The values of a linspace, in the unit of the first; whole if both ends are."""
+    """The values of a ``linspace``, in the unit of the first; integers if both ends are integers."""
     (first, last), count = numbers_of(limits[:2], name), limits[2]
     if type(count.value) is not int or not 2 <= count.value <= MAX_POINTS:
         what = f"the number of values is {shown(count.plain(), count.raw)}"
@@ -110,7 +110,7 @@ def _linspace(limits: list[Node], name: str) -> tuple[list[float], Number]:
 
 
 def _range(mark: Mark, limits: list[Node], name: str) -> tuple[list[float], Number]:
-    """The values of a range, in the unit of its start; whole if start and step are."""
+    """The values of a ``range``, in the unit of its start; integers if start and step are integers."""
     start, stop, step = numbers_of(limits, name)
     n_steps = (stop.amount - start.amount) / step.amount if step.amount else math.nan
     if not n_steps >= 0:
@@ -132,5 +132,5 @@ def _written_node(amount: float, like: Number, mark: Mark) -> Node:
 
 
 def scan_error(mark: Mark, name: str, what: str, expected: str, hint: str = "") -> ConfigError:
-    """An error at a place in the sequence called ``name``."""
+    """Create an error at a place in the sequence; ``name`` is that of the sequence in messages."""
     return ConfigError(mark.problem(name, what, expected, hint))

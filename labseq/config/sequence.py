@@ -1,4 +1,4 @@
-"""The sequence file."""
+"""Settings of a sequence file."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ class AnalysisChoice(Choice):
 
 
 def _listed(choices: tuple[AnalysisChoice, ...]) -> tuple[AnalysisChoice, ...]:
-    """Give each its location; refuse a name that is given twice: it names the file of the results."""
+    """Add to each analysis its location; raise for duplicate names, which are also names of files."""
     first: dict[str, int] = {}
     for i, choice in enumerate(choices):
         if first.setdefault(choice.use, i) != i:
@@ -190,7 +190,7 @@ def _step(value: Any) -> StepSpec:
 
 
 def _numbered(steps: tuple[StepSpec, ...]) -> tuple[StepSpec, ...]:
-    """Give each step its location, and each name to one step only."""
+    """Add to each step its location, and raise for duplicate names."""
     first: dict[str, int] = {}
     for i, step in enumerate(steps):
         if step.name and first.setdefault(step.name, i) != i:
@@ -273,7 +273,7 @@ def load_sequence(
         content, with fallbacks for wrong values.
 
     Raises:
-        ConfigError: Everything that is wrong, except for settings of plugins.
+        ConfigError: All errors, except in settings of plugins.
     """
     document = Document.read(path, kept)
     check_kind(document, "sequence")
@@ -294,11 +294,11 @@ def _at_first_point(
     profile_set: Sequence[Override],
     found: ProblemCollector,
 ) -> Document:
-    """The first point's values in their places, and ``shots`` as the scan has them."""
+    """A copy with the values of the first point, and with ``shots`` from the scan."""
     scan: Scan | None = None
     with found:
         scan = read_scan(document, [*overrides, *profile_set])
-    if scan is None:  # there is none, or it is wrong
+    if scan is None:  # there is no scan, or it has an error
         return document if document.data.get("scan") is None else _without_scan(document)
     n_shots, shots = scan.n_points * scan.repeats, document.data.get("shots")
     is_option = any(override.address == "shots" for override in overrides)

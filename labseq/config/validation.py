@@ -1,4 +1,4 @@
-"""Values checked against a settings model: pydantic's errors become problems with line and column."""
+"""Validates values with a settings model, and converts pydantic's errors to problems with line and column."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ M = TypeVar("M", bound=BaseModel)
 
 MAX_HINTS: Final = 50
 """Number of unknown keys of a mapping that are compared with the known ones, which takes time. A file with
-more of them is probably not what it was taken for."""
+more of them is probably of another kind."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +32,7 @@ class Finding:
 
     Attributes:
         loc: The location, from the mapping that is validated.
-        problem: What is wrong.
+        problem: The problem.
         key: Whether the problem is about the key at that location, not its value.
     """
 
@@ -43,11 +43,11 @@ class Finding:
 
 @dataclass(frozen=True, slots=True)
 class ValidationContext:
-    """What messages about a mapping need to know.
+    """Names and keys of a mapping, for messages.
 
     Attributes:
         name: Name of the mapping in messages; "" at the top of a file.
-        called: What messages call it; "" for its name.
+        called: Its description in messages; "" for its name.
         drop: Keys that are left out.
         other_keys: Keys that belong to another model: messages list them as known.
         folder: Folder that the paths in it are relative to.
@@ -66,28 +66,28 @@ class ValidationContext:
         return list(dict.fromkeys(own))
 
     def mapping(self, loc: Loc) -> str:
-        """What messages call the mapping at a location."""
+        """The description of the mapping at a location, for messages."""
         if loc:
             return f"'{self.value(loc)}'"
         return self.called or (f"'{self.name}'" if self.name else "this file")
 
     def value(self, loc: Loc) -> str:
-        """What messages call the value at a location: its key, and the list indices after it."""
+        """The name of the value at a location, for messages: its key, and the list indices after it."""
         last = next((i for i in reversed(range(len(loc))) if isinstance(loc[i], str)), 0)
         return ".".join(map(str, loc[last:])) if loc else self.name
 
 
 def validate(model: type[M], node: Node, context: ValidationContext, file: str) -> M:
-    """Make settings of a mapping; an empty value counts as {}.
+    """Validate a mapping with a settings model; an empty value counts as {}.
 
     Args:
         model: The settings model.
         node: The mapping.
-        context: How messages call it.
+        context: Its names in messages.
         file: Name of the file for the messages.
 
     Raises:
-        ConfigError: Everything that is wrong in the mapping, in file order.
+        ConfigError: All errors in the mapping, in file order.
     """
     result = check(model, node, context)
     if not isinstance(result, list):
@@ -98,7 +98,7 @@ def validate(model: type[M], node: Node, context: ValidationContext, file: str) 
 
 
 def check(model: type[M], node: Node, context: ValidationContext) -> M | list[Finding]:
-    """Make settings of a mapping, or list everything that is wrong with it."""
+    """Validate a mapping with a settings model; returns the settings, or all errors."""
     data = {} if node.value is None else node.plain()
     if not isinstance(data, dict):
         what = f"{context.name} is {shown(data, node.raw)}"
@@ -135,13 +135,13 @@ def _is_long_enough(error: Mapping[str, Any]) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class _Placed:
-    """An error of pydantic with the location in the file that it is about.
+    """An error of pydantic with its location in the file.
 
     Attributes:
         error: pydantic's error.
         loc: Location below the mapping; it may end with a missing key.
-        union: Location of the union that it comes out of, or None.
-        branch: Which branch of the union.
+        union: Location of the union type in which it occurred, or None.
+        branch: The branch of the union.
     """
 
     error: Mapping[str, Any]
@@ -156,7 +156,7 @@ class _Placed:
 
     @property
     def is_wrong_type(self) -> bool:
-        """Whether it only says that the value is of another type."""
+        """Whether the error only means that the value is of another type."""
         return self.kind in _TYPES and self.loc == self.union
 
 
@@ -194,7 +194,7 @@ def _findings(
 
 
 def _place(error: Mapping[str, Any], top: Node) -> _Placed:
-    """Follow pydantic's location through the file; what is no key or index names a union's branch."""
+    """Follow pydantic's location through the file; parts that are no key or index name a union's branch."""
     steps: tuple[str | int, ...] = error["loc"]
     loc: Loc = ()
     union: Loc | None = None
@@ -212,7 +212,7 @@ def _place(error: Mapping[str, Any], top: Node) -> _Placed:
 
 
 def _best_branch(union: list[_Placed]) -> list[_Placed]:
-    """The errors of the branch that the writer most likely meant: the one that fits furthest."""
+    """The errors of the most likely branch: the one in which the longest part is valid."""
     branches: dict[str, list[_Placed]] = {}
     for one in union:
         branches.setdefault(one.branch, []).append(one)
@@ -279,7 +279,7 @@ def _missing_item(loc: Loc, index: int, top: Node, context: ValidationContext) -
 
 
 def _key(name: str, field: FieldInfo) -> str:
-    """What a field is called in the file."""
+    """The name of a field in the file."""
     return field.validation_alias if isinstance(field.validation_alias, str) else name
 
 
@@ -353,7 +353,7 @@ _LENGTHS: Final[Mapping[str, tuple[str, str, str, str]]] = {
 
 
 def explain(error: Mapping[str, Any], name: str, value: Any, raw: str) -> Problem:
-    """Explain an error of pydantic to a physicist.
+    """Translate an error of pydantic for a physicist.
 
     Args:
         error: One of ``ValidationError.errors()``, neither "missing" nor "extra_forbidden".
@@ -407,7 +407,7 @@ def _of_validator(text: str, name: str, plain: str) -> Problem:
 
 
 def _type_hint(kind: str, value: Any) -> str:
-    """What the writer probably meant by a text in the place of a number or a switch, or vice versa."""
+    """A hint for a text in the place of a number or a switch, or vice versa."""
     if not isinstance(value, str):
         is_word = isinstance(value, bool | int | float) and kind == "string_type"
         return "put it in quotes" if is_word else ""
@@ -431,15 +431,15 @@ def validate_values(model: type[M], values: Mapping[str, Any], called: str) -> M
 @overload
 def validate_values(model: None, values: Mapping[str, Any], called: str) -> None: ...
 def validate_values(model: type[M] | None, values: Mapping[str, Any], called: str) -> M | None:
-    """Make settings of Python values, by the same rules as those of a file.
+    """Validate Python values with a settings model, by the same rules as for a file.
 
     Args:
         model: The settings model; None for a plugin that takes no settings.
         values: Setting -> value; numpy's numbers and arrays count as plain ones.
-        called: What the settings belong to, for messages: "planner 'psca'".
+        called: Owner of the settings, for messages: "planner 'psca'".
 
     Raises:
-        ConfigError: Everything that is wrong with them.
+        ConfigError: All errors in them.
     """
     root = node_of(dict(values), Mark(0, 0, called))
     made = validate(model or NoSettings, root, ValidationContext("", "it"), "")
@@ -447,10 +447,10 @@ def validate_values(model: type[M] | None, values: Mapping[str, Any], called: st
 
 
 def node_of(value: Any, mark: Mark) -> Node:
-    """Plain values as nodes with one common place.
+    """Convert plain values to nodes with one common place.
 
     Raises:
-        ConfigError: A value that no file could hold.
+        ConfigError: A value cannot occur in a file.
     """
     if isinstance(value, np.ndarray | np.generic):
         value = value.tolist()

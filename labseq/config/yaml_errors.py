@@ -1,4 +1,4 @@
-"""PyYAML's syntax errors, explained to somebody who writes a sequence: what is wrong, and where."""
+"""Explains PyYAML's syntax errors to the author of a sequence, with line and column."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _CLOSER: Final = {"[": "]", "{": "}"}
 
 
 class _Rule(NamedTuple):
-    """What to say if PyYAML's problem and context match; ``{0}`` is the first group of ``problem``."""
+    """The message if PyYAML's problem and context match; ``{0}`` is the first group of ``problem``."""
 
     problem: str
     what: str
@@ -95,7 +95,7 @@ _TOKENS: Final = {
 
 
 def explain(error: MarkedYAMLError, text: str, last: Event | None, opened: Mark | None) -> Problem:
-    """Say where a syntax error is and what it is.
+    """Explain a syntax error, with its place.
 
     Args:
         error: The error.
@@ -142,7 +142,7 @@ def _at(mark: Mark, what: str, expected: str = "", hint: str = "") -> Problem:
 
 
 def _stray_colon(text: str, at: Mark) -> Problem:
-    """A second colon on a line, or on a line that is indented so that it continues the text above."""
+    """Explain a second colon on a line, or a line that is indented so that it continues the text above."""
     before = text[at.index - at.column : at.index]
     spaces = len(before) - len(before.lstrip())
     above, line = _line_above(text, at)
@@ -163,7 +163,7 @@ def _line_above(text: str, at: Mark) -> tuple[int, int]:
 
 
 def _wrong_in_brackets(closer: str, since: Mark, at: Mark) -> Problem:
-    """A list or mapping in brackets with an error on its first line, or only on a later one."""
+    """Explain an error in a list or mapping in brackets, on its first line or a later one."""
     pair = "[...]" if closer == "]" else "{...}"
     if at.line == since.line:
         what = f"the {pair} that opens in column {since.column + 1} goes wrong here"
@@ -173,7 +173,7 @@ def _wrong_in_brackets(closer: str, since: Mark, at: Mark) -> Problem:
 
 
 def _late_quote(last: Event | None, at: Mark) -> Problem | None:
-    """A quoted text that ends lines too late, at the next quotation mark; None if it is something else."""
+    """Explain a quoted text that ends lines too late, at the next quotation mark; None for other errors."""
     if not isinstance(last, ScalarEvent) or last.style not in ("'", '"'):
         return None
     start, end = cast("Mark", last.start_mark), cast("Mark", last.end_mark)
@@ -184,7 +184,7 @@ def _late_quote(last: Event | None, at: Mark) -> Problem | None:
 
 
 def _out_of_place(found: str, context: str, text: str, since: Mark, at: Mark) -> Problem:
-    """A line that belongs neither to the block that is open nor to one around it."""
+    """Explain a line whose indentation matches neither the current block nor one around it."""
     is_item = found in ("-", "<block sequence start>")
     is_aligned = at.column == since.column
     if is_item and is_aligned:

@@ -1,4 +1,4 @@
-"""YAML text read into nodes that know their line and column.
+"""Reads YAML text into nodes that carry their line and column.
 
 PyYAML composes its node graph; here it is checked while it grows and converted to :class:`Node`.
 PyYAML's constructor is not used, so no tag can run code. Scalars follow the core rules of YAML 1.2.
@@ -27,13 +27,13 @@ from labseq.text_files import line_and_column
 Scalar: TypeAlias = str | int | float | bool | None
 
 MAX_VALUES: Final = 10_000
-"""Largest number of values (scalars, lists and mappings, aliases expanded) in one document."""
+"""Maximum number of values (scalars, lists and mappings, aliases expanded) in one document."""
 
 MAX_DEPTH: Final = 32
-"""Deepest nesting of lists and mappings."""
+"""Maximum depth of nested lists and mappings."""
 
 MAX_DIGITS: Final = 100
-"""Longest number, in characters; Python refuses to convert much longer ones, or takes long."""
+"""Maximum length of a number, in characters; Python refuses much longer ones, or takes long."""
 
 
 class Mark(NamedTuple):
@@ -47,7 +47,7 @@ class Mark(NamedTuple):
     origin: str = ""
 
     def problem(self, name: str, what: str, expected: str = "", hint: str = "") -> Problem:
-        """A problem at this place, in the file called ``name`` or in the origin.
+        """Create a problem at this place, in the file called ``name`` or in the origin.
 
         Unprintable characters are escaped: validators, those of plugins too, quote values unchanged.
         """
@@ -62,12 +62,12 @@ class Mark(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Node:
-    """One value. Immutable: copies share what they have in common.
+    """One value of a YAML file. Immutable: copies share their common parts.
 
     Attributes:
         value: A scalar, or the nodes of a list or mapping.
-        mark: Where the value begins.
-        keys: Where each key of a mapping begins.
+        mark: Start of the value.
+        keys: Start of each key of a mapping.
         raw: An unquoted scalar as it is written; "" for everything else.
     """
 
@@ -126,7 +126,7 @@ class Node:
         The parents must exist; an empty parent becomes a mapping.
 
         Args:
-            loc: Where.
+            loc: The location.
             new: The new value.
             same_key: Whether problems of its key still belong to the place where the key is; otherwise they
                 belong to the new value's place: an option that replaces a value gives its key too.
@@ -159,7 +159,7 @@ def compose(text: str, name: str, origin: str = "") -> Node | None:
         The top node, or None for an empty text.
 
     Raises:
-        ConfigError: Everything that was found before reading had to stop.
+        ConfigError: All errors up to the one at which reading had to stop.
     """
     _check_characters(text, name, origin)
     composer = _Composer(text, name, origin)
@@ -201,11 +201,11 @@ class _Composer(yaml.SafeLoader):
         self._keys: dict[int, dict[str, YamlMark]] = {}  # of each mapping
 
     def report(self, mark: Mark | YamlMark, what: str, expected: str = "", hint: str = "") -> None:
-        """Note a problem, and continue."""
+        """Record a problem, and continue."""
         self.problems.append(self._mark(mark).problem(self._name, what, expected, hint))
 
     def stop(self, mark: Mark | YamlMark, what: str, expected: str = "", hint: str = "") -> NoReturn:
-        """Note a problem after which nothing else can be read, and raise all of them."""
+        """Record a problem after which nothing else can be read, and raise all problems."""
         self.report(mark, what, expected, hint)
         raise ConfigError(self.problems)
 
@@ -228,7 +228,7 @@ class _Composer(yaml.SafeLoader):
         return node
 
     def converted(self, node: yaml.Node, depth: int = 0, via: YamlMark | None = None) -> Node:
-        """A node of PyYAML as a :class:`Node`; ``via`` is the alias that it is reached through."""
+        """Convert a node of PyYAML to a :class:`Node`; ``via`` is the alias that refers to it."""
         mark = node.start_mark
         if isinstance(node, _Alias):
             via, node = via or mark, node.value
@@ -255,7 +255,7 @@ class _Composer(yaml.SafeLoader):
             self.stop(event.start_mark, what, "a smaller file")
 
     def _check(self, event: Any) -> None:
-        """Refuse tags, deep nesting, an anchor that is given twice, and blocks in an option."""
+        """Report tags, deep nesting, duplicate anchors, and blocks in an option."""
         if event.tag is not None:
             tag = clean(event.tag.replace("tag:yaml.org,2002:", "!!"))
             what = f"'{tag}' is a YAML tag, which is not allowed"
@@ -282,7 +282,7 @@ class _Composer(yaml.SafeLoader):
         return _Alias(self.anchors[name], event.start_mark)
 
     def _check_key(self, keys: dict[str, YamlMark], node: yaml.Node, value: yaml.Node) -> None:
-        """Refuse a key that is no text, a merge key, and a key that is given twice."""
+        """Report keys that are no text, merge keys, and duplicate keys."""
         key, mark, n_before = self.converted(node), node.start_mark, len(self.problems)
         if not isinstance(key.value, str):
             hint = f"write '{clean(key.raw)}' in quotes" if key.raw else ""
@@ -316,7 +316,7 @@ def _key_text(node: yaml.Node) -> str:
 
 
 def comma_hint(key: str, value: Any) -> str:
-    """What to do about a key such as "5 ms" without a value, out of ``{exposure: 4,5 ms}``, or ""."""
+    """A hint for a key such as "5 ms" without a value, from ``{exposure: 4,5 ms}``; else ""."""
     if value is None and key[:1].isdigit():
         return "a ',' begins another key: write 4.5 for 4,5 and [4, 5] for a list"
     return ""
@@ -366,10 +366,10 @@ _ODD_INDENT: Final = re.compile("^[ \t-]*([\u00a0\u1680\u2000-\u200a\u202f\u205f
 
 
 def _check_characters(text: str, name: str, origin: str) -> None:
-    """Refuse control characters, unusual line breaks and spaces, and halves of characters.
+    """Raise for control characters, unusual line breaks and spaces, and incomplete characters.
 
     Raises:
-        ConfigError: With the place of the first one.
+        ConfigError: The text has such a character; names the place of the first one.
     """
     match, group, expected, hint = _FORBIDDEN.search(text), 0, "plain text", "delete it"
     if match is None:
