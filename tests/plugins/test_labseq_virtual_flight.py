@@ -432,9 +432,12 @@ CASES = [
     Broken("nothing"),
     Broken("150 nm beside the sites", offset_m=150e-9),
     Broken("900 nm beside the sites", offset_m=900e-9),
+    Broken("10 % less depth", depth_k=0.9 * 2.1e-3),
     Broken("65 % less depth", depth_k=0.35 * 2.1e-3),
     Broken("a phase jump of 1 rad at the start", change=lambda p: with_phase_jump(p, 2, 1.0)),
+    Broken("a phase jump of 2 rad at the start", change=lambda p: with_phase_jump(p, 2, 2.0)),
     Broken("a pick-up of no length", motion={"pick_up_s": 1e-9}),
+    Broken("a drop-off of no length", motion={"drop_off_s": 1e-9}),
     Broken("twice the speed", motion={"speed_m_s": 0.26}),
 ]
 
@@ -561,7 +564,7 @@ def test_the_loss_is_the_predicted_one(case: Broken) -> None:
         assert float(np.median(held["offset_m"])) == pytest.approx(case.offset_m, abs=5e-9)
     if case.name.startswith("a phase jump of 1 rad"):
         assert np.unique(jumps["kind"]).tolist() == [b"phase"]
-    if "pick_up_s" in case.motion:
+    if {"pick_up_s", "drop_off_s"} & {*case.motion}:
         assert np.unique(jumps["kind"]).tolist() == [b"depth"]
-    if case.name in ("nothing", "150 nm beside the sites", "twice the speed"):
+    if case.name in ("nothing", "150 nm beside the sites", "10 % less depth", "twice the speed"):
         assert len(jumps) == 0
