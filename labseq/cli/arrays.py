@@ -16,8 +16,8 @@ from labseq.console.text import encodes
 from labseq.model import Occupancy, TargetPattern
 
 EMPTY, RESERVOIR, SURPLUS, ATOM, DEFECT = range(5)
-"""What is on a site: nothing, or an atom that is outside the target, where it must not be, or on a target
-site; or no atom on a target site."""
+"""State of a site: empty; an atom outside of the target, where none is allowed, or on a target site; or a
+target site without an atom."""
 
 _COLOURS: Final = ("default", "bright_black", "yellow", "green", "red")
 _STYLES: Final = tuple(Style(color=colour, bold=i == DEFECT) for i, colour in enumerate(_COLOURS))
@@ -28,9 +28,9 @@ class Glyphs:
     """The characters to draw with.
 
     Attributes:
-        sites: One for each of EMPTY, RESERVOIR, SURPLUS, ATOM and DEFECT.
-        levels: A cell that is filled from below, from the least to the whole.
-        blocks: Upper half, lower half and whole cell; "" where there are no half blocks.
+        sites: One character for each of EMPTY, RESERVOIR, SURPLUS, ATOM and DEFECT.
+        levels: A cell that is filled from below, from the lowest level to the whole cell.
+        blocks: Upper half, lower half and whole cell; "" without half blocks.
     """
 
     sites: str
@@ -43,7 +43,7 @@ ASCII: Final = Glyphs(" .x@o", ".:#")
 
 
 def glyphs_for(encoding: str | None) -> Glyphs:
-    """The characters for a terminal with this encoding.
+    """The characters that a terminal with this encoding can show.
 
     Example:
         >>> glyphs_for("cp1252").sites
@@ -54,7 +54,7 @@ def glyphs_for(encoding: str | None) -> Glyphs:
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """How large sites are drawn.
+    """Size of a site in the drawing, in characters.
 
     Attributes:
         cell: Characters per site along a row.
@@ -71,7 +71,7 @@ class Scale:
         )
 
     def indent(self, row: int, n_rows: int, shear: int) -> int:
-        """How many characters a row is moved to the right: half a site per row."""
+        """Number of characters by which a row is shifted to the right: half a site per row."""
         last = n_rows - 1
         return abs(shear) * (
             row * self.cell // 2 if shear > 0 else last * self.cell // 2 - row * self.cell // 2
@@ -84,12 +84,12 @@ HALF_BLOCKS: Final = Scale(cell=1, rows=2)
 
 
 def scales(glyphs: Glyphs) -> tuple[Scale, ...]:
-    """The scales that these characters allow, largest first."""
+    """The possible scales with these characters, largest first."""
     return (ROOMY, DENSE, HALF_BLOCKS) if glyphs.blocks else (ROOMY, DENSE)
 
 
 def site_kinds(occupancy: Occupancy, target: TargetPattern) -> NDArray[np.int8]:
-    """What is on each site, int8 (n_rows, n_cols): EMPTY, RESERVOIR, SURPLUS, ATOM or DEFECT."""
+    """The state of each site, int8 (n_rows, n_cols): EMPTY, RESERVOIR, SURPLUS, ATOM or DEFECT."""
     atoms = np.where(target.fill, ATOM, np.where(target.clear, SURPLUS, RESERVOIR))
     return np.where(occupancy, atoms, np.where(target.fill, DEFECT, EMPTY)).astype(np.int8)
 
@@ -103,7 +103,7 @@ def draw_array(
         occupancy: bool (n_rows, n_cols).
         target: The target.
         shear: +1 if rows shift to the right on the way down, -1 to the left, 0 on a square lattice.
-        scale: How large.
+        scale: Size of the sites.
         glyphs: The characters to draw with.
     """
     rows: list[list[int]] = site_kinds(occupancy, target).tolist()
@@ -139,7 +139,7 @@ def _half_line(upper: list[int], lower: list[int], glyphs: Glyphs) -> Text:
 _GAP: Final = 4
 """Characters between two arrays."""
 _MIN_WIDTH: Final = len("before")
-"""Least width of an array in characters."""
+"""Minimum width of an array in characters."""
 
 Sites = NDArray[np.int16]
 _NOWHERE: Final[Sites] = np.empty((0, 2), np.int16)
@@ -174,12 +174,12 @@ class ArrayPair:
         arrays: Sequence[Occupancy],
         marked: Sequence[Sites] = (_NOWHERE, _NOWHERE),
     ) -> list[Text]:
-        """Draw two arrays as large as they fit; only a note if they do not fit.
+        """Draw two arrays as large as possible; returns only a note if there is no room.
 
         Args:
-            titles: The title above each.
+            titles: The titles above the arrays.
             arrays: Both occupancies, bool (n_rows, n_cols).
-            marked: Sites of each that are shown inverted, int16 (n, 2).
+            marked: Sites of each array that are shown inverted, int16 (n, 2).
         """
         beside, scale = self._arrangement
         if scale is None:

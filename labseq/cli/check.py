@@ -1,4 +1,4 @@
-"""`labseq check`: the timeline and limits of a sequence, and every error in it."""
+"""`labseq check`: prints the timeline and limits of a sequence, and all its errors."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def _bar(start_s: float, duration_s: float, total_s: float, block: str, width: i
 def lines_table(
     lines: Mapping[str, Sequence[tuple[float, float]]], total_s: float, block: str, width: int = BAR_WIDTH
 ) -> list[str]:
-    """A row per line: for how long it is on, and a bar for when.
+    """A row per line: the time that it is on, and a bar that shows when.
 
     Args:
         lines: Name -> (start, end) of each time that the line is on, in seconds.
@@ -90,7 +90,7 @@ _THEN = {"repeat_shot": "repeats the shot", "skip_point": "skips its point", "st
 
 
 def policy_texts(assembly: Assembly) -> list[str]:
-    """How the policies differ from the defaults: a line for the run, each step and each check."""
+    """The policies that differ from the defaults: a line for the run, each step and each check."""
     policy, spec = assembly.policy, assembly.sequence
     texts = [text for text in [_differing(policy.otherwise, StepPolicy())] if text]
     if policy.when_exhausted == "skip_point":
@@ -126,13 +126,13 @@ def _check(check: CheckSettings) -> str:
     return f"{check.value} of {of} {' and '.join(limits)}; otherwise {then[check.then]}"
 
 
-_TEXT_WIDTH: Final = 48  # of the timeline without its bars
+_TEXT_WIDTH: Final = 48  # width of the timeline without its bars
 
 
 def check_sequence(
     sequence: Path, profile: str | None, overrides: Sequence[str], dry_run: DryRun, *, as_json: bool
 ) -> None:
-    """Check a sequence and print what is known about it without opening a device.
+    """Check a sequence, and print its timeline, limits and errors; no device is opened.
 
     Args:
         sequence: The sequence file.
@@ -142,9 +142,9 @@ def check_sequence(
         as_json: Whether to print all of it as one line of JSON, alone on stdout.
 
     Raises:
-        ConfigError: Sequence, profile or an override is wrong.
-        UnknownPluginError: A plugin that is named does not exist.
-        PluginLoadError: A plugin that is named failed to load.
+        ConfigError: Sequence, profile or an override has an error.
+        UnknownPluginError: A named plugin does not exist.
+        PluginLoadError: A named plugin failed to load.
     """
     answer = stdout_to_stderr() if as_json else None
     observer = LogLines(sys.stderr)
@@ -258,7 +258,7 @@ def _scanned(assembly: Assembly) -> list[str]:
 
 
 def _chosen(search: Search) -> list[str]:
-    """A line for each range of an adaptive scan, and one about the choice of points."""
+    """A line for each range of an adaptive scan, and one for the scanner."""
     scan, adaptive = search.scanned.scan, search.adaptive
     lines: list[str] = []
     for axis, ends in zip(scan.axes, adaptive.ends, strict=True):

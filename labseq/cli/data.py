@@ -20,7 +20,7 @@ MAX_ROWS: Final = 200
 
 
 def examine(data: Path | None, *, dry_run: bool, as_json: bool) -> int:
-    """Find damage, repair it where possible, and print what was found.
+    """Find damage, repair it where possible, and print the findings.
 
     Args:
         data: A data folder or a run's; None for LABSEQ_DATA or ./data.
@@ -60,7 +60,7 @@ def table(report: Report, root: Path, *, dry_run: bool) -> list[str]:
 
 
 def summary(report: Report, *, dry_run: bool) -> list[str]:
-    """How much was checked, and the result."""
+    """The number of runs and shots checked, and the result."""
     lines = [f"{plural(report.n_runs, 'run')} checked, {plural(report.n_shots, 'shot')} intact"]
     if report.in_progress:
         lines.append(f"{plural(len(report.in_progress), 'run')} in progress not checked")
@@ -103,7 +103,7 @@ def export_to(run: Path | None, kind: str, output: Path | None, *, frames: bool,
         kind: One of :data:`labseq.recording.export.ENDINGS`.
         output: The file; None for one named after the run, in the current folder.
         frames: Whether an archive holds the frames.
-        replace: Whether files that are there may be replaced.
+        replace: Whether existing files may be replaced.
 
     Returns:
         The exit code: 1 if shots are missing in the file.
@@ -126,7 +126,7 @@ def export_to(run: Path | None, kind: str, output: Path | None, *, frames: bool,
 
 
 def state_lines(run: Run) -> list[str]:
-    """What the user should know about a run that did not complete."""
+    """Notes for the user about a run that did not complete."""
     shots = f"{plural(len(run.shots), 'shot')} of {run.n_shots}"
     if run.status == "running":
         return [f"the run is still in progress; exported are the {shots} taken so far"]

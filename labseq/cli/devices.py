@@ -38,7 +38,7 @@ def show_devices(profile: str, overrides: Sequence[str], dry_run: DryRun, *, as_
         The exit code: 0 if all devices work, 3 if one failed, else 2 if one could not be constructed.
 
     Raises:
-        ConfigError: The profile is wrong; no device was opened.
+        ConfigError: The profile has an error; no device was opened.
         DeviceError: Another process uses the same devices; none was opened.
         StopRequested: It was stopped by Ctrl-C or SIGTERM; the devices tested so far were printed.
     """
@@ -116,7 +116,7 @@ def secure_profile(profile: str, overrides: Sequence[str]) -> int:
         overrides: ``"address=value"`` strings.
 
     Returns:
-        The exit code: 0 if every device is safe and the profile right, 3 if a device
+        The exit code: 0 if every device is safe and the profile has no error, 3 if a device
         failed, else 2.
 
     Raises:
@@ -147,12 +147,12 @@ def list_plugins(profile: str | None, *, as_json: bool = False) -> None:
     """Print a table of the plugins.
 
     Args:
-        profile: Name or path of a profile whose plugin folders are searched too; without one, it is the
-            folder ``plugins``, if there is one.
+        profile: Name or path of a profile whose plugin folders are searched too; without a profile, the
+            folder ``plugins`` is searched, if it exists.
         as_json: Whether to print one line of JSON instead.
 
     Raises:
-        ConfigError: The profile is wrong, or one of its folders does not exist.
+        ConfigError: The profile has an error, or one of its folders does not exist.
     """
     answer = stdout_to_stderr() if as_json else None
     folders, max_wait_s = _folders(profile)
@@ -164,7 +164,7 @@ def list_plugins(profile: str | None, *, as_json: bool = False) -> None:
 
 
 def plugins_table(host: PluginHost) -> list[str]:
-    """A row per plugin; below them why plugins failed to load, and notes."""
+    """A row per plugin; below the table the reasons why plugins failed to load, and notes."""
     rows = [("plugin", "state", "version", "origin", "offers")]
     remarks: list[str] = []
     for info in host.infos:
@@ -186,7 +186,7 @@ def _values(host: PluginHost, info: PluginInfo) -> dict[str, Any]:
 
 
 def _folders(profile: str | None) -> tuple[list[Path], float]:
-    """The profile's plugin folders and its load timeout; the plugins that it names need not exist."""
+    """The profile's plugin folders and its load timeout; its plugins need not exist."""
     if profile is None:
         return [path for path in (Path(PLUGINS),) if path.is_dir()], LOAD_S
     document, spec = load_profile(profile, beside=Path())

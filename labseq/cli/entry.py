@@ -1,4 +1,4 @@
-"""The entry point of the command line: arguments, usage errors, and leaving with the right exit code."""
+"""The entry point of the command line: arguments, usage errors, and the exit code."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from labseq.console.output import discard_unwritten, replace_unencodable, say
 from labseq.errors import ConfigError, RecordingError
 
 MAX_WAIT_S: Final = 1.0
-"""How long the threads of plugins may take to end."""
+"""Maximum time for the threads of plugins to end, in seconds."""
 _PLAIN_DRY_RUN: Final = frozenset({"doctor"})
-"""Commands whose ``--dry-run`` has no value."""
+"""Commands with a ``--dry-run`` option that takes no value."""
 
 
 def main(arguments: Sequence[str] | None = None) -> NoReturn:
@@ -34,7 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     from labseq.console.errors import report
 
     arranged = arrange(sys.argv[1:] if arguments is None else arguments)
-    usage_error: type[Exception] = typer.BadParameter.__mro__[1]  # it has no public name
+    usage_error: type[Exception] = typer.BadParameter.__mro__[1]  # this class has no public name
     replace_unencodable()
     try:
         code = app(args=arranged, prog_name="labseq", standalone_mode=False) or 0
@@ -53,8 +53,8 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
 def arrange(arguments: Sequence[str]) -> list[str]:
     """Give ``--dry-run`` its value and move ``--debug`` to the front.
 
-    typer knows no options whose value may be left out, and takes global options only before
-    the command. What follows ``--`` is left alone.
+    typer has no options with an optional value, and accepts global options only before
+    the command. Arguments after ``--`` are unchanged.
 
     Example:
         >>> arrange(["run", "--dry-run", "a.yaml", "--debug"])
@@ -99,15 +99,15 @@ def _usage_json(error: Any) -> str:
 
 
 def _end_process(code: Any) -> NoReturn:
-    """Leave with an exit code, even if a plugin left a thread that Python would wait for.
+    """End the process with an exit code, even if a plugin left a thread that Python would wait for.
 
-    All data are on disk by now and every device is safe, so nothing is lost with such a thread.
+    At this point all data are on disk and every device is safe, so such a thread can be ended.
 
     Args:
         code: As for ``sys.exit``.
     """
     deadline = time.monotonic() + MAX_WAIT_S
-    with suppress(KeyboardInterrupt):  # Ctrl-C: wait no longer
+    with suppress(KeyboardInterrupt):  # on Ctrl-C, stop waiting
         for thread in _plugin_threads():
             thread.join(max(0.0, deadline - time.monotonic()))
     names = sorted(thread.name for thread in _plugin_threads())

@@ -26,7 +26,7 @@ from labseq.model import RunRecord
 from labseq.units import format_quantity
 
 REDRAW_S: Final = 0.25
-"""The view is drawn at most this often."""
+"""Minimum time between two drawings of the view, in seconds."""
 _BETWEEN_SHOTS: Final = frozenset(
     {"run_started", "leader_awaited", "shot_finished", "shot_repeated", "run_finished"}
 )
@@ -36,8 +36,8 @@ def observer_for(stream: TextIO, run_now: Callable[[], float] | None = None) -> 
     """The live view if the stream is a terminal that can show it, else plain lines.
 
     Args:
-        stream: Where it is shown.
-        run_now: The run's time in seconds, if it is not that of this process.
+        stream: The stream for the view.
+        run_now: Clock of the run in seconds, if it is not that of this process.
     """
     if stream.isatty() and os.environ.get("TERM", "") not in {"dumb", "unknown"}:
         return LiveView(Console(file=stream), run_now=run_now)
@@ -53,8 +53,8 @@ class LiveView:
 
     Args:
         console: The terminal.
-        now: Monotonic time in seconds.
-        run_now: The run's time in seconds; by default the same.
+        now: Monotonic clock in seconds.
+        run_now: Clock of the run in seconds; by default ``now``.
     """
 
     def __init__(
@@ -72,7 +72,7 @@ class LiveView:
         self._drawn_s = -math.inf
 
     def event(self, name: str, values: Mapping[str, Any]) -> None:
-        """Take an event into account, and draw if it is time."""
+        """Add an event to the numbers, and draw if the last drawing is old enough."""
         self._tally.add(name, values)
         text = event_text(name, values, self._tally.record)
         if text and name in LASTING:
@@ -88,12 +88,12 @@ class LiveView:
             self._draw()
 
     def refresh(self) -> None:
-        """Draw now, if the view is on."""
+        """Draw immediately, if the view is on."""
         if self._live.is_started:
             self._draw()
 
     def close(self) -> None:
-        """Draw a last time and give the terminal back; may be called again."""
+        """Draw a last time and release the terminal; may be called several times."""
         if self._live.is_started:
             try:
                 self._draw()
@@ -119,8 +119,8 @@ _SCAN_HEIGHT: Final = 8
 class Picture:
     """The view as rich prints it: progress, array and numbers side by side, latest events.
 
-    What does not fit is left out: the array is first drawn smaller, then dropped, and the latest
-    events go next.
+    Parts that do not fit are left out: the array is drawn smaller, then dropped, and then the
+    latest events are dropped.
 
     Args:
         tally: The numbers of the run.
@@ -196,7 +196,7 @@ def _progress(tally: Tally, width: int) -> Table:
 
 
 def _array(tally: Tally, width: int, height: int, glyphs: Glyphs) -> list[Text]:
-    """The array of the last image as large as it fits; nothing if it does not."""
+    """The array of the last image as large as possible; empty if there is no room."""
     if tally.image is None or tally.record is None:
         return []
     occupancy, shear = tally.image.occupancy, shear_of(tally.record)
@@ -258,7 +258,7 @@ def _stages(tally: Tally) -> Table:
 
 
 def _caption(tally: Tally) -> list[Text]:
-    """What the array shows."""
+    """The caption of the array."""
     if tally.image is None or tally.record is None:
         return []
     image, target = tally.image, tally.record.target
@@ -274,17 +274,17 @@ def _caption(tally: Tally) -> list[Text]:
 
 MIN_WIDTH: Final = 16
 MIN_HEIGHT: Final = 4
-"""Least number of lines of a plot, its title and the line below it included."""
+"""Minimum number of lines of a plot, including its title and the line below it."""
 _BAR: Final = 5
 """Maximum width of the bar of a point."""
 _LABEL: Final = 7
 """Width of the numbers on the left."""
 _FILLING_RANGE: Final = 0.01
-"""Least range of filling that is shown."""
+"""Minimum range of filling in the plot."""
 
 
 def draw_scan(tally: ScanTally, width: int, height: int, glyphs: Glyphs) -> list[Text]:
-    """Draw the share of defect-free shots at each point, or the filling as long as there are none.
+    """Draw the share of defect-free shots at each point, or the filling while no shot is defect-free.
 
     Args:
         tally: The scan.
@@ -293,7 +293,7 @@ def draw_scan(tally: ScanTally, width: int, height: int, glyphs: Glyphs) -> list
         glyphs: The characters to draw with.
 
     Returns:
-        Nothing if there is no room, or no shot yet.
+        The lines; empty if there is no room, or no shot yet.
     """
     points = tally.points()
     shown = _merged([point for _, point in points], width - _LABEL)
@@ -323,7 +323,7 @@ def draw_scan(tally: ScanTally, width: int, height: int, glyphs: Glyphs) -> list
 
 
 def _merged(points: Sequence[PointTally], room: int) -> list[PointTally]:
-    """As many points as there is room for; neighbours are added up if there are more."""
+    """The points, with neighbours added up if there is no room for all."""
     n = min(len(points), max(1, room))
     ends = [round(i * len(points) / n) for i in range(n + 1)] if n else []
     merged: list[PointTally] = []
@@ -338,7 +338,7 @@ def _merged(points: Sequence[PointTally], room: int) -> list[PointTally]:
 def _bars(
     values: Sequence[float | None], low: float, high: float, height: int, bar: int, glyphs: Glyphs
 ) -> list[str]:
-    """Vertical bars, a line of text per row, the highest first; the least value is still a thin line."""
+    """Vertical bars, a line of text per row, the highest first; the lowest value is still a thin line."""
     steps = len(glyphs.levels)
     filled = [0 if v is None else max(1, round((v - low) / (high - low) * height * steps)) for v in values]
     gap = " " if bar > 1 else ""

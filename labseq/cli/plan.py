@@ -1,4 +1,4 @@
-"""`labseq plan`: the moves for one occupancy, printed or drawn."""
+"""`labseq plan`: prints or draws the moves for one occupancy."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from labseq.session.planning import PlannedMoves, PlanRequest, plan_moves
 from labseq.units import format_quantity
 
 INTERPRETED_SITES: Final = 64 * 64
-"""Up to this size, planning in plain Python is faster than loading numba."""
+"""Maximum number of sites up to which planning in plain Python is faster than loading numba."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlanOutput:
-    """Which output is printed and written.
+    """The output to print and write.
 
     Attributes:
         step: Whether to print the plan batch by batch.
@@ -45,12 +45,12 @@ def plan_once(request: PlanRequest, output: PlanOutput) -> None:
     """Plan the moves for one occupancy, and print or write them.
 
     Args:
-        request: What to plan.
-        output: What to print and write.
+        request: The arguments of the plan.
+        output: The output to print and write.
 
     Raises:
-        ConfigError: Something in the request is wrong, or a file cannot be written.
-        PluginLoadError: A plugin that is named failed to load.
+        ConfigError: The request has an error, or a file cannot be written.
+        PluginLoadError: A named plugin failed to load.
         PlanError: The planner failed, or its plan breaks a rule.
     """
     check_different(request.occupancy, output.json, output.png)
@@ -75,7 +75,7 @@ def plan_once(request: PlanRequest, output: PlanOutput) -> None:
 
 
 def warnings(moves: PlannedMoves, request: PlanRequest) -> list[str]:
-    """What the user should know about a plan that is valid."""
+    """Warnings for the user about a valid plan."""
     texts: list[str] = []
     asked, used = request.degree_of_parallelism, moves.degree_of_parallelism
     if asked is not None and asked != used:
@@ -177,7 +177,7 @@ def print_plan(moves: PlannedMoves, stream: TextIO, *, step: bool) -> None:
 
     Args:
         moves: The plan.
-        stream: Where to print. If it is a terminal, and stdin too, each batch waits for Enter.
+        stream: Output stream. If it and stdin are terminals, each batch waits for Enter.
         step: Whether to print the plan batch by batch first.
 
     Raises:

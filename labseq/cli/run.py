@@ -33,7 +33,7 @@ def run_sequence(sequence: Path, options: Options, *, as_json: bool) -> None:
 
     Args:
         sequence: The sequence file.
-        options: What the user changed.
+        options: The options of the session.
         as_json: Whether to print the result as JSON, last and alone on stdout.
 
     Raises:
@@ -103,19 +103,19 @@ def json_result(session: Session | None, run: Run | None, failure: BaseException
     Args:
         session: The session, if it could be opened.
         run: The run as it is on disk, if it can be read.
-        failure: What ended the run, or None.
+        failure: The error that ended the run, or None.
     """
     values = json_summary(run)
     if run is None and session is not None and session.run_dir is not None:
         values["run_dir"] = str(session.run_dir)
-    if failure is not None:  # a full disk may not have taken the status
+    if failure is not None:  # the status may be missing if the disk is full
         values["status"] = "stopped" if isinstance(failure, StopRequested | KeyboardInterrupt) else "failed"
         values["error"] = "\n".join(lines_of(failure))
     return as_line(values)
 
 
 def _report(run: Run) -> None:
-    """Print the summary; a full disk behind stdout does not affect the run."""
+    """Print the summary; an error of stdout, such as a full disk, does not affect the run."""
     lines = summary_lines(run)
     try:
         say(*lines)
@@ -125,7 +125,7 @@ def _report(run: Run) -> None:
 
 
 def _answer(answer: Callable[[str], None], line: str, failure: BaseException | None) -> None:
-    """Print the result; if that fails, the error that ended the run is still the one that is reported."""
+    """Print the result; if that fails, the error that ended the run is still reported."""
     try:
         answer(line)
     except RecordingError:
@@ -143,11 +143,11 @@ def _read_back(session: Session | None) -> Run | None:
 
 
 POLL_S: Final = 0.1
-"""How often ``--wait`` checks whether the run has ended."""
+"""Interval at which ``--wait`` checks whether the run has ended, in seconds."""
 
 
 def stop_run(run: Path | None, profile: str | None, *, queue: bool, wait: bool) -> None:
-    """Ask a run in progress to end after its current shot, and say what will happen.
+    """Ask a run in progress to end after its current shot, and print a confirmation.
 
     Args:
         run: Its folder; None if it is the only one in progress.
@@ -206,7 +206,7 @@ def run_demo(shots: int | None, output: Path | None) -> None:
 
 
 def beginning(session: Session) -> list[str]:
-    """What the run will do."""
+    """The explanation printed before the run."""
     assembly = session.assembly
     target, grid = assembly.target.fill, assembly.bench.grid
     steps: list[Any] = [step for _, step in assembly.steps]
@@ -223,7 +223,7 @@ def beginning(session: Session) -> list[str]:
 
 
 def ending(run_dir: Path) -> list[str]:
-    """What to type next."""
+    """The commands suggested after the run."""
     run = f'"{run_dir}"' if " " in str(run_dir) else str(run_dir)
     has_matplotlib = importlib.util.find_spec("matplotlib") is not None
     needs = "" if has_matplotlib else '; first: pip install "labseq[plot]"'

@@ -1,4 +1,4 @@
-"""`labseq show`: what a run has recorded, as a summary or in tables."""
+"""`labseq show`: prints the data of a run, as a summary or in tables."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ SHOT_KEYS: Final = (
     *("attempt", "status", "error", "success", "filling_fraction", "seen_defect_free_cycle", "n_cycles"),
     *("n_batches", "n_atom_moves", "n_missing_atoms", "stage_s", "parameters", "file"),
 )
-"""What ``--json`` prints of each shot, from its line of the index."""
+"""Keys of a shot's line in the index that ``--json`` prints."""
 
 
 @dataclass(frozen=True, slots=True)
 class Tables:
-    """Which tables to print; the summary if none."""
+    """The tables to print; the summary if none is chosen."""
 
     shots: bool = False
     timing: bool = False
@@ -43,17 +43,17 @@ class Tables:
 
     @property
     def any(self) -> bool:
-        """Whether there is one."""
+        """Whether at least one table is chosen."""
         return self.shots or self.timing or self.scan or self.devices
 
 
 def show_run(path: Path | None, *, as_json: bool, tables: Tables | None = None) -> None:
-    """Print what a run has recorded.
+    """Print the summary or tables of a run.
 
     Args:
         path: The run's folder or any file in it; None for the newest run.
         as_json: Whether to print one line of JSON instead.
-        tables: Which tables to print instead of the summary.
+        tables: The tables to print instead of the summary.
 
     Raises:
         ConfigError: There is no such run, or it has no data for a table.
@@ -143,7 +143,7 @@ def _shot_row(shot: Shot, run: Run, *, details: bool) -> tuple[str, ...]:
 
 
 def _scanned_values(shot: Shot, scan: Mapping[str, Any]) -> list[str]:
-    """The scanned values of a shot, as the sequence writes them."""
+    """The scanned values of a shot, in the units of the sequence."""
     try:
         return [clean(str(word)) for word in scan["written"][scan["point_of_shot"][shot.index]]]
     except (KeyError, IndexError, TypeError):  # run.json is damaged
@@ -151,7 +151,7 @@ def _scanned_values(shot: Shot, scan: Mapping[str, Any]) -> list[str]:
 
 
 def shot_time_s(shot: Shot) -> float:
-    """How long the steps of a shot took, in seconds; 0 if its line of the index is damaged."""
+    """Duration of the steps of a shot, in seconds; 0 if its line of the index is damaged."""
     found = shot.row.get("stage_s")
     stages = cast("Mapping[str, object]", found) if isinstance(found, dict) else {}
     steps_s = [s for name, s in stages.items() if name.startswith("step ")]
@@ -175,7 +175,7 @@ def scan_table(run: Run) -> list[str]:
 
 
 def timing_table(run: Run) -> list[str]:
-    """A row per stage: its budget, and how long it took."""
+    """A row per stage: its budget and its durations."""
     timing = _read_timing(run)
     clocks = ("modelled", "host") if run.simulated else ("measured",)
     heads = [head for clock in clocks for head in (f"{clock} p50", "p99")]
@@ -187,7 +187,7 @@ def timing_table(run: Run) -> list[str]:
 
 
 def _read_timing(run: Run) -> RunTiming:
-    """The stages of a run's shots; of a long run, of some of them.
+    """The durations of the stages of a run's shots; for a long run, of a selection of shots.
 
     Raises:
         ConfigError: It has no shots that can be read.
@@ -240,7 +240,7 @@ def _json_timing(run: Run) -> dict[str, Any]:
 
 
 def devices_table(run: Run) -> list[str]:
-    """How each device described itself when the run began."""
+    """The description of each device at the start of the run."""
     width = max(20, shutil.get_terminal_size().columns - 2)
     lines: list[str] = []
     for name, described in _devices(run).items():

@@ -1,4 +1,4 @@
-"""The summary of a run: its points or cycles in a table, and all of it in a few lines."""
+"""The summary of a run: a table of its points or cycles, and a few lines of statistics."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from labseq.recording.points import scan_points
 from labseq.units import format_quantity
 
 MAX_ROWS: Final = 40
-"""Rows of a table; of a longer one the first and the last are shown."""
+"""Maximum number of rows of a table; of a longer one the first and the last are shown."""
 MAX_LISTED: Final = 5
-"""Reasons, and shots of each, that are listed one by one."""
+"""Maximum number of reasons, and of shots for each, that are listed one by one."""
 MAX_DEFECTS: Final = 6
 """Shots with at least this many defects are counted together."""
 NOT_JUDGED: Final = "not judged: no image step after the last rearrangement"
@@ -73,7 +73,7 @@ def json_points(run: Run) -> list[dict[str, Any]]:
 
 
 def shortened(table: list[str]) -> list[str]:
-    """The header, the first and the last rows of a long table."""
+    """Shorten a long table to its header, first and last rows."""
     if len(table) - 1 <= MAX_ROWS:
         return table
     half = MAX_ROWS // 2
@@ -81,9 +81,9 @@ def shortened(table: list[str]) -> list[str]:
 
 
 def point_table(run: Run) -> list[str]:
-    """A row per point of the scan; nothing without a scan.
+    """A row per point of the scan; empty without a scan.
 
-    If no shot is judged, the images that ended the last cycles are.
+    If no shot is judged, the images at the end of the last cycles are used.
     """
     points = [(point, statistics_of(point.shots, run.target)) for point in scan_points(run)]
     if not points:
@@ -102,7 +102,7 @@ def point_table(run: Run) -> list[str]:
 
 
 def cycle_table(statistics: Statistics) -> list[str]:
-    """A row per cycle, judged on the image that ended it; nothing without cycles."""
+    """A row per cycle, judged on the image at its end; empty without cycles."""
     if not statistics.cycles:
         return []
     header = ("cycle", "shots", "defect-free", "filling", "atom moves", "batches", "left out")
@@ -189,7 +189,7 @@ def share_text(fraction: Estimate) -> str:
 
 
 def histogram_text(counts: Sequence[int]) -> str:
-    """How many shots have how many defects; the highest numbers together if there are many.
+    """The number of shots with each number of defects, as text; high numbers are counted together.
 
     Example:
         >>> histogram_text((7, 5, 0, 2))

@@ -15,9 +15,9 @@ from labseq.model.estimate import Estimate, mean
 from labseq.recording.points import SCANNER, ChosenPoints
 
 STAGES: Final = ("expose", "read_out", "detect", "plan", "check", "prepare", "play", "move", "write")
-"""The stages that are shown; a shot has others."""
+"""The stages that are shown, in order; a shot may have others."""
 _KEPT: Final = 200
-"""The median of a stage is taken over this many of its latest durations."""
+"""Number of latest durations of a stage for its median."""
 
 
 @dataclass(slots=True)
@@ -25,10 +25,10 @@ class StageTally:
     """The durations of one stage.
 
     Attributes:
-        host_s: The latest ones, on this computer's clock.
-        duration_s: The latest ones, on the session's clock.
+        host_s: The latest durations, on this computer's clock.
+        duration_s: The latest durations, on the session's clock.
         budget_s: The latest budget; nan if it has none.
-        n_over: How often it took longer than its budget.
+        n_over: Number of times that it exceeded its budget.
     """
 
     host_s: deque[float] = field(default_factory=lambda: deque[float](maxlen=_KEPT))
@@ -59,7 +59,7 @@ class PointTally:
 
     Attributes:
         n_shots: Number of shots that are complete and judged.
-        n_defect_free: How many of them met the target.
+        n_defect_free: Number of them that met the target.
         filling: Sum of their filling fractions.
     """
 
@@ -88,7 +88,7 @@ class ScanTally:
 
     @property
     def name(self) -> str:
-        """The addresses that are scanned."""
+        """The scanned addresses, as text."""
         return ", ".join(self._scan.get("addresses", ()))
 
     def add(self, shot: ShotRecord) -> None:
@@ -107,7 +107,7 @@ class ScanTally:
             return None
 
     def points(self) -> list[tuple[str, PointTally]]:
-        """The value of each point as text, and its shots; by value if one number is scanned."""
+        """The value of each point as text, and its shots; sorted by value if one number is scanned."""
         chosen = self._chosen
         written: list[list[str]] = self._scan.get("written", []) if chosen is None else chosen.written
         values: list[list[Any]] = self._scan.get("points", []) if chosen is None else chosen.points
@@ -127,11 +127,11 @@ class Tally:
         record: The run, from "run_starting" on.
         n_before: Number of shots that were complete when the run was resumed.
         n_done: Number of shots completed since then.
-        n_defect_free: How many of them met the target.
-        n_seen: How many of them met it in some image.
+        n_defect_free: Number of them that met the target.
+        n_seen: Number of them that met it in at least one image.
         n_repeated: Number of attempts that had to be repeated.
         image: The last image.
-        image_shot: The shot that it belongs to, counted from 0.
+        image_shot: The shot of the last image, counted from 0.
         shot: The current shot, counted from 0.
         stages: Stage -> its durations.
         scan: The points of the scan; None without one.
@@ -154,7 +154,7 @@ class Tally:
 
     @property
     def n_shots(self) -> int:
-        """Number of shots that the run is to have."""
+        """Planned number of shots of the run."""
         return self.record.n_shots if self.record is not None else 0
 
     @property
@@ -164,13 +164,13 @@ class Tally:
 
     @property
     def time_left_s(self) -> float:
-        """Expected time to the end of the run, from the shots so far; nan before the first is done."""
+        """Expected time to the end of the run, from the shots so far; nan before the first complete shot."""
         if not self.n_done:
             return math.nan
         return (self._now() - self._first_shot_s) / self.n_done * (self.n_shots - self.n_before - self.n_done)
 
     def add(self, name: str, values: Mapping[str, Any]) -> None:
-        """Take an event into account."""
+        """Add an event to the numbers."""
         match name:
             case "stage":
                 timing: StageTiming = values["timing"]
@@ -189,7 +189,7 @@ class Tally:
             case "run_starting":
                 self.record, self.n_before = values["record"], values.get("n_before", 0)
                 self.status = ""
-                if self.scan is None and values["record"].scan:  # a resumed run keeps its points
+                if self.scan is None and values["record"].scan:  # the points of a resumed run are kept
                     self.scan = ScanTally(values["record"].scan)
             case "scan_point":
                 self.best = best_text(values)

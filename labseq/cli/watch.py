@@ -26,9 +26,9 @@ from labseq.recording.run_file import is_index_row, read_state
 from labseq.roles import RunObserver
 
 POLL_S: Final = 0.5
-"""How often the run's files are read."""
+"""Interval at which the run's files are read, in seconds."""
 _MAX_OPENED: Final = 20
-"""Of the shots that are new, only this many, the latest, are opened for their stages and images."""
+"""Maximum number of new shots that are opened for their stages and images; older ones are not."""
 _OF_SHOTS: Final = frozenset({"shot_finished", "shot_repeated"})
 
 Event = tuple[str, Mapping[str, Any]]
@@ -37,12 +37,12 @@ Event = tuple[str, Mapping[str, Any]]
 def watch_run(
     path: Path | None, stream: TextIO | None = None, wait: Callable[[float], None] = time.sleep
 ) -> None:
-    """Show a run until it ends, then its summary; only its files are read.
+    """Show a run until it ends, then print its summary; only its files are read.
 
     Args:
         path: The run's folder or any file in it; None for the newest run.
-        stream: Where it is shown; stdout by default.
-        wait: Waits for a time in seconds.
+        stream: The stream for the view; stdout by default.
+        wait: Function that waits for a time in seconds.
 
     Raises:
         ConfigError: There is no such run.
@@ -68,7 +68,7 @@ def _follow(reader: EventReader, view: Any, wait: Callable[[float], None]) -> No
     """Pass a run's events to a view until the run is over."""
     observer: RunObserver = view
     while True:
-        is_over = reader.is_over()  # asked first, so that the last events are read
+        is_over = reader.is_over()  # checked first, so that the last events are read
         for name, values in reader.read():
             with suppress(KeyError, TypeError, ValueError):  # an event of another version of labseq
                 observer.event(name, values)
@@ -79,7 +79,7 @@ def _follow(reader: EventReader, view: Any, wait: Callable[[float], None]) -> No
 
 
 class EventReader:
-    """Reads a run's events from its files, as its own process passes them to its live view.
+    """Reads the events of a run from its files, in the form that the run passes to its live view.
 
     Args:
         run: The run, as it was when it was opened.
@@ -95,18 +95,18 @@ class EventReader:
         self._event_s = math.nan
 
     def now(self) -> float:
-        """Time of the run in seconds: that of the event being read, else that of the clock."""
+        """Time of the run in seconds: that of the current event, else that of the clock."""
         return self._clock() if math.isnan(self._event_s) else self._event_s
 
     def is_over(self) -> bool:
-        """Whether the run has ended, or its process is gone."""
+        """Whether the run or its process has ended."""
         return read_state(self._folder)[0] != "running"
 
     def read(self) -> Iterator[Event]:
         """The events since the last call.
 
         Raises:
-            RecordingError: The run cannot be read any more.
+            RecordingError: The run can no longer be read.
         """
         lines = self._events.read()
         for row in filter(is_index_row, self._index.read()):  # a shot is in the index before its event
@@ -163,7 +163,7 @@ class NewLines:
 
 
 def record_of(run: Run) -> RunRecord:
-    """What the view needs of a run's record, from run.json."""
+    """The part of a run's record that the view needs, from run.json."""
     values = run.record
     return RunRecord(
         name=run.name,
@@ -189,7 +189,7 @@ def record_of(run: Run) -> RunRecord:
 
 
 def _stages_and_image(shot: Shot) -> Iterator[Event]:
-    """The stages of a shot and its last image; nothing if its file cannot be read."""
+    """The stages of a shot and its last image; empty if its file cannot be read."""
     with suppress(RecordingError):
         timing = shot.timing
         for one in timing:

@@ -1,4 +1,4 @@
-"""`labseq waveform`: what the AWG would play, as numbers, picture and samples."""
+"""`labseq waveform`: the output of the AWG for a plan, as numbers, picture and samples."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Both = tuple[AxisStatistics, AxisStatistics]
 
 @dataclass(frozen=True, slots=True)
 class WaveformOutput:
-    """What is written in addition to the report.
+    """The files to write in addition to the report.
 
     Attributes:
         json: Name of the file for the numbers as JSON; "-" for stdout, which then holds nothing else.
@@ -35,13 +35,13 @@ def show_waveform(request: WaveformRequest, output: WaveformOutput) -> None:
     """Render the waveform of a plan, print its numbers, and write the output files.
 
     Args:
-        request: Which waveform.
-        output: What to write.
+        request: The arguments.
+        output: The files to write.
 
     Raises:
-        ConfigError: Something in the request is wrong, there is nothing to play, or a file
+        ConfigError: The request has an error, there is nothing to play, or a file
             cannot be written.
-        PluginLoadError: A plugin that is named failed to load.
+        PluginLoadError: A named plugin failed to load.
         PlanError: The planner failed, or its plan breaks a rule.
         LimitError: The tones break a limit of AOD or amplifier.
     """
