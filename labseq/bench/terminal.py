@@ -38,10 +38,10 @@ _STEPS: Final = 10
 
 @contextmanager
 def progress_of(what: str) -> Generator[Callable[[int, int], None]]:
-    """A progress bar on stderr if it is a terminal, else a line for every tenth.
+    """A progress bar on stderr if that is a terminal, else a line for every tenth.
 
     Args:
-        what: What is counted, in the plural.
+        what: Noun for the counted items, in the plural.
     """
     if not sys.stderr.isatty():
         reported = 0
@@ -169,7 +169,7 @@ def _again(report: Report, row: Row, loading: int) -> str:
 
 @dataclass(frozen=True, slots=True)
 class BenchOutput:
-    """What is written in addition to the table.
+    """The files to write in addition to the table.
 
     Attributes:
         json: Name of the file for everything as JSON; "-" for stdout, which then holds nothing else.
@@ -186,12 +186,12 @@ def bench_planners(request: BenchRequest, output: BenchOutput) -> None:
     """Compare planners and print the result, also if it was stopped.
 
     Args:
-        request: What to compare.
-        output: What to write in addition to the table.
+        request: The comparison.
+        output: The files to write in addition to the table.
 
     Raises:
-        ConfigError: Something in the request is wrong, or a file cannot be written.
-        PluginLoadError: A plugin that is named failed to load.
+        ConfigError: The request has an error, or a file cannot be written.
+        PluginLoadError: A named plugin failed to load.
         PlanError: A planner failed, or a plan breaks a rule, for some loadings.
         StopRequested: It was stopped; the results so far were printed.
     """
@@ -244,12 +244,12 @@ def bench_latency(request: LatencyRequest, json: str | None = None) -> None:
     """Measure the latency from a frame to the first light, and print it.
 
     Args:
-        request: What to measure.
+        request: The measurement.
         json: Name of the file for everything as JSON; "-" for stdout, which then holds nothing else.
 
     Raises:
-        ConfigError: Something in the request is wrong, or the file cannot be written.
-        PluginLoadError: A plugin that is named failed to load.
+        ConfigError: The request has an error, or the file cannot be written.
+        PluginLoadError: A named plugin failed to load.
         LabseqError: The error that ended a shot.
     """
     write = json_writer(json)
@@ -315,7 +315,7 @@ def bench_rendering(repeats: int, json: str | None = None) -> None:
     """Measure the speed of rendering, and print it.
 
     Args:
-        repeats: How often everything is rendered.
+        repeats: Number of repetitions.
         json: Name of the file for everything as JSON; "-" for stdout, which then holds nothing else.
 
     Raises:
