@@ -76,7 +76,7 @@ def prepare(run: Run, settings: Mapping[str, Any]) -> PreparedAnalysis:
     Raises:
         UnknownPluginError: No plugin offers this analysis.
         PluginLoadError: Its plugin failed to load, or its constructor failed.
-        ConfigError: A setting is wrong.
+        ConfigError: A setting is invalid.
         RecordingError: run.json lacks settings of the run.
     """
     name = str(settings[USE])
@@ -165,7 +165,7 @@ def analyse_missing(run: Run, settings: Mapping[str, Any], *, anew: bool = False
         anew: Whether to analyse all shots again.
 
     Raises:
-        ConfigError: A setting is wrong, or another process writes the same results.
+        ConfigError: A setting is invalid, or another process writes the same results.
         LabseqError: See :func:`prepare`; or the disk is full.
     """
     prepared = prepare(run, settings)

@@ -50,7 +50,7 @@ def store_of(
 
     Args:
         document: The profile's file.
-        profile: What it says.
+        profile: Content of the file.
         dry_run: "off", "full" or "fast"; a profile with only virtual devices uses
             the same store in a dry run.
     """
@@ -68,7 +68,7 @@ def open_store(profile: str, dry_run: Literal["off", "full", "fast"] = "off") ->
         dry_run: "off", "full" or "fast".
 
     Raises:
-        ConfigError: The profile is wrong, or does not exist.
+        ConfigError: The profile has an error, or does not exist.
     """
     document, spec = load_profile(profile, beside=Path())
     return store_of(document, spec, dry_run), spec
@@ -86,10 +86,10 @@ def calibrated(
 
     Args:
         document: The profile's file.
-        profile: What it says.
+        profile: Content of the file.
         found: Receives the problems; a calibration that has one is not used.
         dry_run: "off", "full" or "fast".
-        detector: Settings of the detector in use, for the record; None where they do not matter.
+        detector: Settings of the detector in use, for the record; None if they do not matter.
         pins: Kind -> id of the only calibrations to use; None for those of profile and store.
     """
     grid, store = profile.grid_model(), store_of(document, profile, dry_run)
@@ -117,10 +117,10 @@ def calibrated(
 
 
 def calibrated_grid(document: Document, profile: ProfileSpec) -> SiteGrid:
-    """The grid of a profile, with the tones that its calibrations give.
+    """The grid of a profile with calibrated tones.
 
     Raises:
-        ConfigError: A calibration that it uses is missing or damaged.
+        ConfigError: A calibration in use is missing or damaged.
     """
     found = ProblemCollector()
     grid = calibrated(document, profile, found).grid
@@ -129,10 +129,10 @@ def calibrated_grid(document: Document, profile: ProfileSpec) -> SiteGrid:
 
 
 def with_tones(resolved: dict[str, Any], grid: SiteGrid, own: SiteGrid) -> dict[str, Any]:
-    """The ``grid`` of a profile for the record, with the tones in use where calibrations changed them.
+    """The ``grid`` of a profile for the record, with the tones in use if calibrations changed them.
 
     Args:
-        resolved: As the profile has it.
+        resolved: The ``grid`` in the profile.
         grid: The grid in use.
         own: The profile's own grid.
     """
@@ -171,7 +171,7 @@ def _chosen(document: Document, profile: ProfileSpec, store: Store, kind: Calibr
 
 
 def why_left_out(entry: CalibrationEntry, entries: Mapping[str, CalibrationEntry]) -> str:
-    """Why runs leave out a calibration although it is in use; "" if they do not.
+    """The reason why runs ignore a calibration although it is in use; "" if they do not.
 
     Args:
         entry: The calibration.
@@ -183,7 +183,7 @@ def why_left_out(entry: CalibrationEntry, entries: Mapping[str, CalibrationEntry
 
 
 def _dropped(entries: dict[str, CalibrationEntry]) -> list[str]:
-    """Leave out an overlay that was measured with other frequencies: it depends on their tones."""
+    """Leave out an overlay calibration that was measured with other tone frequencies."""
     overlay = entries.get("overlay")
     if overlay is None or not (reason := why_left_out(overlay, entries)):
         return []
@@ -192,7 +192,7 @@ def _dropped(entries: dict[str, CalibrationEntry]) -> list[str]:
 
 
 def _doubtful(entries: Mapping[str, CalibrationEntry], detector: Mapping[str, Any]) -> list[str]:
-    """Calibrations that are used although they should be measured again."""
+    """Warnings about calibrations in use that should be measured again."""
     thresholds = entries.get("thresholds")
     if thresholds is None:
         return []
@@ -209,7 +209,7 @@ def _doubtful(entries: Mapping[str, CalibrationEntry], detector: Mapping[str, An
 
 
 def _has_basis(entry: CalibrationEntry, entries: Mapping[str, CalibrationEntry]) -> bool:
-    """Whether the calibration that an entry was measured on top of is in use."""
+    """Whether the calibration that an entry was measured with is in use."""
     basis = BASIS[entry.kind]
     now = entries[basis].id if basis in entries else None
     then = entry.origin.get("calibrations")
@@ -217,10 +217,10 @@ def _has_basis(entry: CalibrationEntry, entries: Mapping[str, CalibrationEntry])
 
 
 def _with_tones(document: Document, grid: SiteGrid, entries: Mapping[str, CalibrationEntry]) -> SiteGrid:
-    """Apply frequencies, then overlay.
+    """Apply the frequencies to a grid, then the overlay.
 
     Raises:
-        ConfigError: A tone makes no sense.
+        ConfigError: A tone is invalid.
     """
     if (frequencies := entries.get("frequencies")) is not None:
         row_hz, column_hz = frequencies.values["row_hz"], frequencies.values["column_hz"]

@@ -1,4 +1,4 @@
-"""What has changed since a run was begun: code, plugins, calibrations and settings."""
+"""Compares a run with its state at the start: code, plugins, calibrations and settings."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ _MAX_TEXT: Final = 60
 
 
 class Change(NamedTuple):
-    """One thing that differs.
+    """A difference between the run at its start and today.
 
     Attributes:
-        what: What it is, for example an address.
+        what: The changed item, for example an address.
         was: Its value when the run was begun.
         now: Its value today.
     """
@@ -33,11 +33,11 @@ class Change(NamedTuple):
 
 
 def changes_between(then: Mapping[str, Any], today: RunRecord) -> list[Change]:
-    """What of the code, the plugins, the calibrations and the settings differs.
+    """The changes in code, plugins, calibrations and settings between two records of a run.
 
     Args:
         then: The run's run.json.
-        today: The same run, put together today.
+        today: The same run, assembled today.
     """
     folder, now = then["provenance"].get("folder"), _plain(today)
     return [
@@ -47,7 +47,7 @@ def changes_between(then: Mapping[str, Any], today: RunRecord) -> list[Change]:
 
 
 def differences(then: Mapping[str, Any], today: RunRecord, name: str) -> list[Change]:
-    """What differs in one value of run.json, address by address."""
+    """The changes in one value of run.json, address by address."""
     before, after = (
         {address or name: value for address, value in _leaves(record.get(name, {}), "")}
         for record in (then, _plain(today))
@@ -60,7 +60,7 @@ def _plain(record: RunRecord) -> dict[str, Any]:
 
 
 def _made_with(record: Mapping[str, Any]) -> dict[str, Any]:
-    """The versions, the state of the code, the plugins and the calibrations of a run: name -> value."""
+    """Versions, code state, plugins and calibrations of a run: name -> value."""
     provenance = record["provenance"]
     code = (provenance.get("git") or {}).get("code") or {}
     found = {"labseq": provenance.get("labseq"), "labseq's commit": code.get("commit")}
@@ -101,7 +101,7 @@ def _shown(values: Mapping[str, Any], name: str) -> str:
 
 
 def _same(was: Any, now: Any, folder: Any) -> bool:
-    """Whether two values are the same; paths are relative to the working folder of their time."""
+    """Whether two values are the same; each path is relative to the working folder of its record."""
     if was == now:
         return True
     if not (isinstance(was, str) and isinstance(now, str) and isinstance(folder, str)):

@@ -1,4 +1,4 @@
-"""`labseq check`: what a run will do and need, without opening a device."""
+"""`labseq check`: computes timeline, duration, disk space and warnings of a run, without opening a device."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from labseq.units import format_quantity
 def timeout_warnings(
     assembly: Assembly, timeline: Sequence[tuple[str, Sequence[TimelineEntry]]]
 ) -> list[Problem]:
-    """Steps that may need longer than the timeout of their policy.
+    """Warnings about steps that may take longer than the timeout of their policy.
 
     Args:
         assembly: The run.
@@ -48,13 +48,13 @@ def timeout_warnings(
 
 
 N_LOADINGS: Final = 200
-"""Random loadings that the planner is tried on."""
+"""Maximum number of random loadings for which the planner is run."""
 MAX_WAIT_S: Final = 5.0
-"""Host time after which no further loading is tried."""
+"""Time after which no further loading is tried, in seconds of real time."""
 PAPERS_LOADING: Final = 0.75
 """Loading probability if the profile has no simulation that reports it."""
 SHOT_OVERHEAD_BYTES: Final = 60_000
-"""Size of a shot file without frames, roughly."""
+"""Approximate size of a shot file without frames, in bytes."""
 
 
 @dataclass(frozen=True, slots=True)

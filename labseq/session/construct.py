@@ -196,7 +196,7 @@ def make_target(
     """The target of a sequence, and its settings for the record.
 
     Raises:
-        ConfigError: The pattern is unknown, its settings are wrong, or it does not fit on the grid.
+        ConfigError: The pattern is unknown, its settings are invalid, or it does not fit on the grid.
         PluginLoadError: The pattern's plugin failed; names it.
     """
     choice, grid = sequence.target, bench.grid
@@ -243,7 +243,7 @@ def make_step(bench: ResolvedProfile, document: Document, spec: StepSpec) -> tup
     """A step of a sequence, and its settings for the record.
 
     Raises:
-        ConfigError: The step is unknown, or its settings are wrong; with their place.
+        ConfigError: The step is unknown, or its settings are invalid; with their place.
     """
     entry = named(bench.host, document, "step", spec.kind, spec.loc, key=True)
     settings = validate(document, entry, spec.loc)

@@ -176,7 +176,7 @@ def timeouts_of(profile: ProfileSpec) -> Timeouts:
 
 
 WARM_S: Final = 300.0
-"""How long a plugin may compile; a slow computer needs half a minute."""
+"""Maximum time for a plugin to compile, in seconds; a slow computer needs half a minute."""
 
 
 def warm(lab: Lab, stop_flag: StopFlag, observer: RunObserver, *, devices: bool = True) -> None:

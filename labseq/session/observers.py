@@ -32,7 +32,7 @@ _HOOKS: Final = {  # event -> observer hook of plugins, and the event's values t
     "run_finished": ("labseq_run_finished", {"run": "record"}),
 }
 MAX_WAIT_S: Final = 5.0
-"""How long a plugin's observer hook may take; one that takes longer is not called again in the run."""
+"""Maximum time for a plugin's observer hook, in seconds; a slower one is not called again in the run."""
 
 
 class Observers:

@@ -65,7 +65,7 @@ def read_source(text: str, seed: int | None = None, stdin: BinaryIO | None = Non
     Args:
         text: See :data:`FORMS`.
         seed: Seed for ``random:``; a fresh one if None.
-        stdin: What "-" reads; standard input if None.
+        stdin: The stream for "-"; standard input if None.
 
     Raises:
         ConfigError: The text has none of these forms, or cannot be read; names the forms.

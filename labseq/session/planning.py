@@ -113,7 +113,7 @@ def read_machine(
         source: The occupancy; without a profile, the profile of its shot is used.
 
     Raises:
-        ConfigError: Something is wrong with the profile, or its grid is of another shape.
+        ConfigError: The profile has an error, or its grid has another shape.
     """
     shape = source.occupancy.shape
     if request.profile is None:
@@ -240,7 +240,7 @@ class PlannedMoves:
         grid: The grid of sites.
         motion: How the mobile tweezers move.
         planner: Name of the planner.
-        settings: Those of its settings that are not the defaults, SI, JSON-ready.
+        settings: Its settings that differ from the defaults, SI, JSON-ready.
         degree_of_parallelism: Maximum number of tweezers on at once, which the plan was checked for.
         seed: Seed of all random numbers, drawn or given; None if there is none.
         plan: The plan.
@@ -320,7 +320,7 @@ def plan_moves(
         announce: Called with the name of a module before its kernels are compiled.
 
     Raises:
-        ConfigError: Something in the request is wrong; says what was expected.
+        ConfigError: The request has an error; says what was expected.
         PluginLoadError: A plugin that is named failed to load.
         PlanError: The planner failed, or its plan breaks a rule.
     """
@@ -390,7 +390,7 @@ def read_plan(
 
     Args:
         data: UTF-8, what ``labseq plan --json`` writes.
-        name: What messages call it.
+        name: Its name in messages.
         request: Names the profile with grid and motion; without one the grid is that of
             the file, and the motion the paper's. Nothing is planned.
         announce: Called with the name of a module before its kernels are compiled.

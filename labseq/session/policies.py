@@ -34,10 +34,10 @@ def check_figure(
 
     Args:
         document: The sequence.
-        place: Where it is named.
+        place: Place of its name in the file.
         figure: Its name.
         purpose: Its use: "to climb on".
-        steps: The steps of a shot, or None if some are wrong.
+        steps: The steps of a shot, or None if some have errors.
 
     Raises:
         ConfigError: No shot can have it.

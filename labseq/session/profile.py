@@ -62,7 +62,7 @@ class ChosenPlugin:
         entry: Entry of the plugin in the registry.
         settings: Its settings; None if it takes none.
         document: The file that chose it; None if no file did.
-        loc: Where its settings are in that file.
+        loc: Location of its settings in that file.
     """
 
     entry: Entry
@@ -156,7 +156,7 @@ def named(
         document: The file.
         kind: Kind of plugin.
         name: Its name.
-        loc: Where the name is in the file.
+        loc: Location of the name in the file.
         key: Whether the name is the key there.
 
     Raises:
@@ -177,7 +177,7 @@ def validate(
     """Validate the settings of an entry; None if it takes none.
 
     Raises:
-        ConfigError: They are wrong, or the plugin's own validators fail; with their place.
+        ConfigError: They are invalid, or the plugin's own validators fail; with their place.
     """
     other_keys = sorted(drop - {"use", "pattern"})
     called = f"{entry.kind.replace('_', ' ')} '{entry.name}'"
@@ -370,7 +370,7 @@ def resolve_profile(
         again: The profile's text and calibrations, if a run is resumed.
 
     Raises:
-        ConfigError: The profile is wrong.
+        ConfigError: The profile has an error.
         PluginLoadError: A plugin that it names failed to load.
     """
     document, spec = load_profile(
@@ -450,7 +450,7 @@ def load_plugins(
     Args:
         folders: Folders with plugins, in addition to those of LABSEQ_PLUGIN_PATH.
         found: Receives the problem of an unreadable folder; without it, it is raised.
-        max_wait_s: How long a plugin may take to load, and a constructor to return.
+        max_wait_s: Maximum time for a plugin to load, and for a constructor, in seconds.
 
     Raises:
         ConfigError: A folder does not exist, or cannot be read.

@@ -111,7 +111,7 @@ def run_record(
     Args:
         assembly: The run.
         seed: Its seed.
-        changes: What options changed: address -> value.
+        changes: Changes by options: address -> value.
         scan: Its scan, see :meth:`labseq.session.scan_run.ScanRun.record`.
         folder: The working folder, absolute: relative paths in the settings are relative to it.
     """

@@ -56,12 +56,12 @@ def lock_devices(
         bench: The profile.
         roots: See :func:`labseq.recording.marker_roots`; those that do not exist are skipped, except
             the user's own.
-        what: What the devices are used for, shown to others who find them locked.
+        what: The use of the devices, shown to other users while they are locked.
         warn: Receives a warning if nothing keeps others from the devices.
         in_spite: Whether to continue, with a warning, if another process has locked them.
 
     Yields:
-        A function that changes the description of what the devices are used for.
+        A function that changes this description of their use.
 
     Raises:
         DeviceError: Another process holds them; names it.
@@ -377,7 +377,7 @@ def check_devices(profile: str, overrides: Sequence[str] = (), dry_run: DryRun =
         dry_run: "off", "full" or "fast".
 
     Raises:
-        ConfigError: The profile is wrong; no device was touched.
+        ConfigError: The profile has an error; no device was touched.
         DeviceError: Another process uses the same real devices; none was touched.
     """
     check_dry_run(dry_run)

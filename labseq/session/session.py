@@ -159,7 +159,7 @@ class Session:
             observer: Receives every event.
 
         Raises:
-            ConfigError: Sequence, profile or an option is wrong; names file, line and column.
+            ConfigError: Sequence, profile or an option has an error; names file, line and column.
             UnknownPluginError: A plugin that is named does not exist.
             PluginLoadError: A plugin that is named failed to load.
         """
