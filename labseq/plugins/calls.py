@@ -30,7 +30,7 @@ def call_plugin(owner: Owner, what: str, work: Callable[[], T]) -> T:
     """Run code of a plugin, and name the plugin in any error.
 
     The code runs in a separate thread: if it hangs it is abandoned after ``owner.max_wait_s``, and a
-    ``SystemExit`` or ``KeyboardInterrupt`` that it raises ends nothing else. What it prints goes to stderr,
+    ``SystemExit`` or ``KeyboardInterrupt`` that it raises ends nothing else. Its prints go to stderr,
     because a program may read JSON from stdout, and is recorded with the owner.
 
     Args:

@@ -132,7 +132,7 @@ class PluginHost:
     """The plugins of one session, in a separate plugin manager.
 
     Args:
-        max_wait_s: How long a plugin may take to load, and a constructor to return.
+        max_wait_s: Maximum time for a plugin to load, and for a constructor, in seconds.
 
     Attributes:
         registry: The planners, drivers, steps, ... of the loaded plugins.
@@ -225,7 +225,7 @@ class PluginHost:
             self._register(info, home, importing)
         except PluginLoadError as error:
             info = replace(info, state="failed", reason=error.reason)
-        except Exception as error:  # noqa: BLE001 - pluggy has further checks of its own
+        except Exception as error:  # noqa: BLE001 - pluggy has further checks
             info = replace(info, state="failed", reason=format_error(error))
         self._infos[info.name] = info
         return info.state == "loaded"

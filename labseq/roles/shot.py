@@ -192,12 +192,12 @@ class Shot(Protocol):
 
     @property
     def call_timeout_s(self) -> float:
-        """How long a device call may take beyond its own duration, from the profile."""
+        """Maximum time of a device call beyond its own duration, in seconds, from the profile."""
         ...
 
     @property
     def plan_timeout_s(self) -> float:
-        """How long one plan may take, from the profile."""
+        """Maximum time of one plan, in seconds, from the profile."""
         ...
 
     def device(self, name: str) -> Device:
@@ -215,7 +215,7 @@ class Shot(Protocol):
 
         Args:
             owner: Role or device name, for the error message.
-            timeout_s: How long the call may take before the device counts as hung.
+            timeout_s: Maximum time of the call in seconds; after it, the device counts as hung.
             function: For example ``shot.mobile_tweezers.play``.
             *args: Passed on to it.
             **kwargs: Passed on to it.
@@ -261,7 +261,7 @@ class Shot(Protocol):
 
         Args:
             kind: Kind of the step, as the profile's lines name it: "image".
-            duration_s: How long the step takes, in seconds.
+            duration_s: Duration of the step, in seconds.
         """
         ...
 

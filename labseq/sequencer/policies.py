@@ -46,7 +46,7 @@ class StepPolicy:
     """The policy of a step.
 
     Attributes:
-        timeout_s: How long an attempt may take, on the session's clock; a longer one fails.
+        timeout_s: Maximum time of an attempt, on the session's clock; a longer one fails.
         retries: Number of retries before the step counts as failed.
         on_failure: Reaction to its failure; None: a transient failure repeats the shot, others stop the run.
         over_budget: Reaction to a stage of the step that exceeds its budget.

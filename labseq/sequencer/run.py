@@ -177,7 +177,7 @@ class Sequencer:
         lab: The devices.
         steps: The steps of a shot, with their names.
         stop: The request to stop.
-        sink: Where shots are written.
+        sink: Writes the shots.
         observer: Receives every event.
         seed: The run's seed.
         policy: Reactions to failures and exceeded budgets.
