@@ -2,10 +2,10 @@
 
 The tree::
 
-    /                        what is true of the whole run, as attributes
+    /                        values that hold for the whole run, as attributes
       table                  NXdata: a column for each value of the shots, as in ``Run.to_dataframe``
       run/<file>             the files of the run's folder: run.json, sequence.yaml, calibrations, ...
-      shots/shot_000000      what the shot's file has under /entry; attempts that failed, likewise
+      shots/shot_000000      the content of /entry in the shot's file; also for failed attempts
 
 Settings, devices and target are the same in all shots and are in the file once: the shots have hard links
 to them.

@@ -69,7 +69,7 @@ class Column:
         name: Its name.
         values: (n_shots,): bool, int64, float64 with nan for a missing value, or str objects with "".
         units: SI unit; "" for none.
-        description: What it is.
+        description: Its description.
     """
 
     name: str

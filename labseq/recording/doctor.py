@@ -58,7 +58,7 @@ class Finding:
     """A defect that was found, and what was done about it.
 
     Attributes:
-        what: What is wrong.
+        what: The defect.
         where: The damaged file or folder.
         done: The repair, or in a dry run the intended repair; or why it cannot be repaired.
         left: Whether the defect remains.
@@ -399,7 +399,7 @@ class _Check:
         return index_row(record, content.target, file=file, sha256=sha256, n_bytes=len(data))
 
     def _save(self, lines: _LineFile) -> None:
-        """Save a file of lines, and report what was wrong with it."""
+        """Save a file of lines, and report its defects."""
         error = ""
         if not self._dry_run:
             try:

@@ -74,7 +74,7 @@ def make_run_folder(root: Path, name: str, started: datetime) -> Path:
     """Create ``<root>/<local date>/<counter>_<slug>``; no two runs of a day share a counter.
 
     A counter is claimed by making the folder ``.<counter>.claim``, which succeeds
-    for one process only. When the claim is gone again, the run's folder is there.
+    for one process only. When the claim is removed, the run's folder exists.
 
     Raises:
         RecordingError: The folder cannot be created.

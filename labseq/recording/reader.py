@@ -77,7 +77,7 @@ class Run:
     Attributes:
         path: The run's folder.
         record: The content of run.json: settings, devices, versions, ...
-        status: "running", "complete", "stopped" or "failed"; a run whose process is gone has failed.
+        status: "running", "complete", "stopped" or "failed"; a run whose process died has failed.
         error: The error that ended it, or "".
         shots: The shots that count, in order.
         attempts: Attempts at shots that failed or were interrupted, in the order they were made.
@@ -184,7 +184,7 @@ class Run:
         """The shots as a table of pandas: a row for each, from the index alone.
 
         The columns: ``attempt``, ``status``, times, ``success``, ``filling_fraction``, counts of cycles,
-        batches, atom moves and defects, ``duration_s``; what was scanned or set, by its address; ``stage.*``,
+        batches, atom moves and defects, ``duration_s``; scanned and set values, by address; ``stage.*``,
         how long each stage took; ``reading.*``, values read from devices; ``calibration.*``, ids. Numbers
         are SI, and nan where they are missing. ``attrs`` has ``units`` and ``descriptions`` by column,
         and the values that hold for the whole run.

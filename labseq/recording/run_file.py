@@ -195,7 +195,7 @@ class Cycles:
 
     Attributes:
         n_batches: Batches of each plan.
-        n_batches_played: How many of them fitted into the window.
+        n_batches_played: Number of them that fitted into the window.
         n_atom_moves: Atom moves in those that were played.
     """
 

@@ -10,7 +10,7 @@ The tree of a shot file, with n images, a grid of (row, col) sites and frames of
       detection                 occupancy (n, row, col), confidence, t_s and the table of images
       rearrangement             tables of moves, batches and cycles; predicted (cycle, row, col)
       timing                    table of the stages
-      atom_events               tables of what a simulation did to the atoms
+      atom_events               tables of the events of the atoms in a simulation
 
 To record a new value, add an attribute to the record in :mod:`labseq.model.records` and a row here. The
 writer, the reader, the index, the exports and the reference page follow. A table is one compound dataset:

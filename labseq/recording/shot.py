@@ -135,7 +135,7 @@ class Shot:
 
     @property
     def atom_events(self) -> dict[str, NDArray[Any]]:
-        """What the simulation reported about the atoms: name -> structured array; empty on real hardware."""
+        """Events of the atoms in the simulation: name -> structured array; empty on real hardware."""
         return dict(self._content.record.atom_events)
 
     @property
@@ -148,7 +148,7 @@ class Shot:
 
     @property
     def devices(self) -> dict[str, Any]:
-        """What each device reported about itself."""
+        """The description of each device."""
         return dict(self._content.run["devices"])
 
     @property
