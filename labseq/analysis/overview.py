@@ -537,7 +537,7 @@ def cannot_draw(run: Run, what: str, expected: str) -> ConfigError:
     Args:
         run: The run.
         what: The reason.
-        expected: What the picture needs.
+        expected: The data that the picture needs.
     """
     text = f"the picture cannot be drawn from this run: {what}"
     return ConfigError(Problem(text, clean(str(run.path)), expected=expected))

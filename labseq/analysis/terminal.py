@@ -359,7 +359,7 @@ def plot_run(run: Path | None, request: PlotRequest, output: Path | None) -> Non
 
     Args:
         run: The run's folder or any file in it; None for the newest run.
-        request: What to draw.
+        request: The part or shot to draw.
         output: The picture; None for its default name in the current folder.
 
     Raises:

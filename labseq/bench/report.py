@@ -155,7 +155,7 @@ class Report:
         comparison: The comparison.
         rows: A row per condition and planner; none for a condition without any loading done.
         n_done: Loadings that were done, over all conditions.
-        duration_s: How long it took, in seconds.
+        duration_s: Duration of the comparison, in seconds.
         ended_by: The error that ended it early, or None.
     """
 
@@ -325,7 +325,7 @@ def draw_histogram(axes: Axes, counts: NDArray[np.int64], colour: str, label: st
     """Draw the share of each number of batches.
 
     Args:
-        axes: Where to draw.
+        axes: Axes to draw on.
         counts: int64 (n,), how often 0, 1, 2, ... batches were needed.
         colour: Colour of the bars.
         label: Name in the legend.

@@ -296,7 +296,7 @@ def light_table(report: LatencyReport) -> list[str]:
 
 
 def latency_notes(report: LatencyReport) -> list[str]:
-    """Notes below the tables: what was measured, and on which computer."""
+    """Notes below the tables: the measured stages, and the computer."""
     device = f"{report.device}, mode {report.mode}" if report.mode else report.device
     load = "" if report.load is None else f", load {report.load:.2g}"
     playing, rate = format_quantity(report.playing_s, "time"), report.sample_rate_hz

@@ -292,7 +292,7 @@ def index_spots(spots: Spots, vectors: Vectors, n_sites: int, reach: int) -> Ind
 
 
 def _in_full_lines(square: Ints, near: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Which spots are in rows and columns with many spots; noise outside of the array is not."""
+    """Whether each spot is in a row and a column with many spots; noise outside of the array is not."""
     full = np.ones(len(square), np.bool_)
     for values in square.T:
         _, line = np.unique(values, return_inverse=True)

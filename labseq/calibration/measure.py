@@ -52,7 +52,7 @@ METHODS: Final[Mapping[str, Method]] = {
 
 @dataclass(frozen=True, slots=True)
 class CalibrationRequest:
-    """What to calibrate, and how to measure it.
+    """The profile, run and options of a calibration.
 
     Attributes:
         profile: Name or path of the profile.
@@ -103,7 +103,7 @@ def calibrate(method: Method, request: CalibrationRequest, observer: RunObserver
 
     Args:
         method: One of :data:`METHODS`.
-        request: What to calibrate, and how to measure it.
+        request: Profile, run and options.
         observer: Receives the events of the run.
 
     Raises:

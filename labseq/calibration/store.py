@@ -217,7 +217,7 @@ def check_grid(entry: CalibrationEntry, grid: SiteGrid, source: str) -> None:
     Args:
         entry: The entry.
         grid: The grid of the profile.
-        source: Where the entry comes from, for the message.
+        source: Origin of the entry, for the message.
 
     Raises:
         ConfigError: It is of another grid; the message names both.
