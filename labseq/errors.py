@@ -27,12 +27,12 @@ class Problem:
     """One problem in a configuration file.
 
     Attributes:
-        what: What is wrong, naming the offending key or value.
+        what: The error, naming the offending key or value.
         source: File name, or the option it came from (``--set a.b=c``).
         line: Line in ``source``, counted from 1; 0 if the source has no lines.
         column: Column in ``source``, counted from 1; 0 if there is none.
         expected: The expected value, or "".
-        hint: What to do, for example "did you mean 'rows'?", or "".
+        hint: A remedy, for example "did you mean 'rows'?", or "".
         notes: Other places to look at: the value that this one conflicts with, or a default.
     """
 
@@ -153,7 +153,7 @@ class UnknownPluginError(LabseqError, LookupError):
         kind: "planner", "camera", "pattern", ...
         name: The unknown name.
         known: The names that exist.
-        hint: What to do, or "".
+        hint: A remedy, or "".
     """
 
     exit_code: ClassVar[int] = 2
@@ -189,7 +189,7 @@ class DeviceTimeoutError(DeviceError, TimeoutError):
 
     Attributes:
         device: Role or device name in the profile.
-        timeout_s: How long labseq waited, in seconds.
+        timeout_s: Time that labseq waited, in seconds.
     """
 
     def __init__(self, device: str, message: str, timeout_s: float) -> None:
@@ -245,7 +245,7 @@ class InvalidPlanError(PlanError):
         rule: The rule that was broken, one of :data:`labseq.motion.RULES`.
         batch: Index of the batch, from 0; -1 if the plan as a whole is wrong. The message counts from 1.
         move: Index of the atom move within the batch, from 0, or -1. The message counts from 1.
-        detail: What is wrong, with the sites.
+        detail: The error, with the sites.
     """
 
     def __init__(self, rule: str, detail: str, *, batch: int = -1, move: int = -1, planner: str = "") -> None:

@@ -35,8 +35,8 @@ def whole_file(path: Path, *, alone: bool = False) -> Generator[IO[bytes]]:
 
     Args:
         path: The file.
-        alone: Refuse while another process writes the same file in this way; what is read
-            in the block is then still true when the file gets its name.
+        alone: Refuse while another process writes the same file in this way; values read
+            in the block are then still valid when the file gets its name.
 
     Raises:
         FileExistsError: ``alone``, and another process writes it; ``filename`` is the ``.part`` file, which

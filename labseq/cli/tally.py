@@ -136,7 +136,7 @@ class Tally:
         stages: Stage -> its durations.
         scan: The points of the scan; None without one.
         best: The best point of an adaptive scan so far, as text, or "".
-        status: How the run ended, or "".
+        status: Final status of the run, or "".
     """
 
     def __init__(self, now: Callable[[], float]) -> None:

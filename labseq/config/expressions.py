@@ -377,7 +377,7 @@ def evaluate(root: Node, name: str, text: str) -> Expressions:
         text: Its text, for places within expressions.
 
     Raises:
-        ConfigError: Everything that is wrong with them.
+        ConfigError: All errors in them.
     """
     evaluator = _Evaluator(root, name, _LINE_BREAK.split(text))
     result = root

@@ -453,7 +453,7 @@ def placed_axis(address: str, key: Mark, values: Sequence[Node], document: Docum
 
     Args:
         address: The address.
-        key: Where it is written.
+        key: Its place in the file.
         values: Its values.
         document: The sequence.
 

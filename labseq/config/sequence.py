@@ -150,7 +150,7 @@ class StepSpec:
     Attributes:
         kind: Name of the step in the registry: "load", "image", ...
         name: The step's own name, for addresses; "" if it has none.
-        loc: Where the mapping of its settings is in the document.
+        loc: Location of the mapping of its settings in the document.
     """
 
     kind: str
@@ -159,7 +159,7 @@ class StepSpec:
 
     @property
     def policy_loc(self) -> Loc:
-        """Where the mapping of its policy is, if it has one."""
+        """Location of the mapping of its policy, which need not exist."""
         return (*self.loc[:-1], "policy")
 
 

@@ -129,7 +129,7 @@ def _is_list_for_tuple(error: Mapping[str, Any]) -> bool:
 
 
 def _is_long_enough(error: Mapping[str, Any]) -> bool:
-    """Whether a list is only "too short" because items with errors of their own are not counted."""
+    """Whether a list is only "too short" because items with errors are not counted."""
     return error["type"] == "too_short" and len(error["input"]) >= error["ctx"]["min_length"]
 
 

@@ -109,7 +109,7 @@ class Node:
         return node
 
     def mark_at(self, loc: Loc, key: bool = False) -> Mark:
-        """Where the value at ``loc`` (or its key) begins; if it is missing, its nearest parent."""
+        """Start of the value at ``loc`` (or of its key); if it is missing, that of its nearest parent."""
         node = self
         for i, step in enumerate(loc):
             child = node.child(step)
