@@ -67,7 +67,8 @@ def test_a_signal_in_any_step_ends_safely(bench, step, number, code):
     assert run.status == "stopped"
     (attempt,) = run.attempts
     assert attempt.status == "interrupted"
-    assert attempt.timing  # what the shot has is written
+    if step != "load":  # which calls no device: the signal may come just before it
+        assert attempt.timing  # what the shot has is written
 
 
 def test_a_signal_before_the_run_has_begun_ends_it(bench):
