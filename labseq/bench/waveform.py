@@ -535,7 +535,7 @@ def _refuse_slow(rate: SampleRate, program: ToneProgram) -> None:
 
 
 SUFFIX: Final = ".npz"
-WAVEFORM_FILE_CHUNK: Final = 1 << 20
+FILE_CHUNK: Final = 1 << 20
 """Number of samples that are rendered and written together."""
 
 
@@ -620,9 +620,9 @@ def _write_samples(member: IO[bytes], waveform: PlannedWaveform) -> None:
     samples = waveform.samples
     shape = N_CHANNELS, len(samples)
     npy.write_array_header_1_0(member, {"descr": "<i2", "fortran_order": False, "shape": shape})
-    out = np.empty(WAVEFORM_FILE_CHUNK, np.int16)
+    out = np.empty(FILE_CHUNK, np.int16)
     for channel in range(N_CHANNELS):
-        for start in range(samples.start, samples.stop, WAVEFORM_FILE_CHUNK):
-            piece = out[: min(WAVEFORM_FILE_CHUNK, samples.stop - start)]
+        for start in range(samples.start, samples.stop, FILE_CHUNK):
+            piece = out[: min(FILE_CHUNK, samples.stop - start)]
             waveform.renderer.write(channel, start, piece)
             member.write(piece.astype("<i2", copy=False).data)

@@ -290,7 +290,7 @@ def calibrate_kind(kind: str, request: CalibrationRequest, *, as_json: bool) -> 
     if answer is None:
         say(*summary_lines(outcome))
     else:
-        answer(as_line(_calibrate_values_of(outcome)))
+        answer(as_line(_outcome_values(outcome)))
     if outcome.refused:
         entry = outcome.stored.entry
         what = f"{entry.kind} {entry.id} is stored but not in use: {outcome.refused}"
@@ -317,7 +317,7 @@ def summary_lines(outcome: Outcome) -> list[str]:
     return [*lines, *(f"warning: {text}" for text in outcome.warnings)]
 
 
-def _calibrate_values_of(outcome: Outcome) -> dict[str, Any]:
+def _outcome_values(outcome: Outcome) -> dict[str, Any]:
     entry, picture = outcome.stored.entry, outcome.stored.picture
     return {
         "kind": entry.kind,

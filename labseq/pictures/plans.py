@@ -632,7 +632,7 @@ def _colour_bar(figure: Figure, sheet: Sheet, title: str, ends: tuple[str, str])
     axes.text(104, 0, ends[1], fontsize=7, ha="left", va="center")
 
 
-TARGETS_DPI: Final = 100
+TARGET_DPI: Final = 100
 SITE_IN: Final = 0.18
 """Distance between neighbours in a picture of :func:`save_target`, in inches."""
 
@@ -683,14 +683,14 @@ def save_target(path: Path, target: TargetPattern, grid: SiteGrid) -> None:
     metadata = {"Title": target.name, "Description": target_text(target), "Software": None}
     save_figure(
         path,
-        lambda: _targets_draw(target, grid),
-        dpi=TARGETS_DPI,
+        lambda: _draw_target(target, grid),
+        dpi=TARGET_DPI,
         metadata=metadata,
         pil_kwargs={"optimize": True},
     )
 
 
-def _targets_draw(target: TargetPattern, grid: SiteGrid) -> Figure:
+def _draw_target(target: TargetPattern, grid: SiteGrid) -> Figure:
     left, right, top, bottom = _extent(grid)
     figure = make_figure((right - left) * SITE_IN, (bottom - top) * SITE_IN)
     draw_target(figure.add_axes((0.0, 0.0, 1.0, 1.0)), target, grid)

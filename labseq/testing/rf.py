@@ -72,7 +72,7 @@ def with_phase_jump(program: ToneProgram, segment: int, size_rad: float) -> Tone
     )
 
 
-TAPE_GRID = SiteGrid(5, 6)
+PROGRAM_GRID = SiteGrid(5, 6)
 ON = 1 / MotionSpec().max_row_tones
 """Amplitude of a tone at full depth."""
 
@@ -84,7 +84,7 @@ Tone = tuple[float, float, float, float]
 class ToneProgramBuilder:
     """A tone program in the making, in sites instead of hertz."""
 
-    grid: SiteGrid = TAPE_GRID
+    grid: SiteGrid = PROGRAM_GRID
     segments: list[tuple[Sequence[Tone], Sequence[Tone]]] = field(default_factory=list[Any])
 
     def add(self, rows: Sequence[Tone], cols: Sequence[Tone]) -> ToneProgramBuilder:

@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from labseq import ConfigError, SiteGrid, TargetPattern
-from labseq.pictures.plans import FILL_LOOK, SITE_IN, TARGETS_DPI as DPI, save_target, target_text
+from labseq.pictures.plans import FILL_LOOK, SITE_IN, TARGET_DPI as DPI, save_target, target_text
 
 SITE_PX = SITE_IN * DPI
 WHITE = (255, 255, 255)
