@@ -99,7 +99,7 @@ class TinyCamera(CameraDriver):
             self.coming.append((due_s, ExposureResult(number, None, fault)))
 
 
-class ResolvedProfile:
+class Bench:
     """A tiny camera on a clock that costs no time; it is open."""
 
     def __init__(self, lose: Mapping[int, str] | None = None, **facts: Any) -> None:

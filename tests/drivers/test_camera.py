@@ -9,11 +9,11 @@ from typing import Any
 import pytest
 from hypothesis import given, strategies as st
 
-from labseq.plugin import CameraFacts, Context, DeviceError, DeviceTimeoutError, Frame, LimitError
+from labseq.plugin import CameraFacts, Context, DeviceError, DeviceTimeoutError, LimitError
 from labseq.roles import Trigger, offers
 from labseq.testing import CameraContract
 
-from .cameras import SHAPE, ResolvedProfile, TinyCamera
+from .cameras import SHAPE, Bench, TinyCamera
 
 
 class TestTinyCamera(CameraContract):
@@ -23,26 +23,22 @@ class TestTinyCamera(CameraContract):
 
 
 @pytest.fixture
-def bench() -> ResolvedProfile:
-    return ResolvedProfile()
+def bench() -> Bench:
+    return Bench()
 
 
 def test_a_subclass_is_called_in_order() -> None:
-    bench = ResolvedProfile()
+    bench = Bench()
     camera = bench.camera
     camera.close()
     camera.log.clear()
+    camera.open()
     camera.open()
     bench.fire(2)
     bench.read()
     bench.read()
     camera.close()
     assert camera.log == ["connect", "start", "fire", "fire", "take", "take", "stop", "disconnect"]
-
-
-def test_a_camera_that_is_open_is_not_connected_again(bench: ResolvedProfile) -> None:
-    bench.camera.open()
-    assert bench.camera.log == []
 
 
 def test_a_connection_that_failed_is_undone_and_may_be_tried_again() -> None:
@@ -66,20 +62,7 @@ def test_a_camera_that_was_never_open_is_disconnected_but_not_stopped() -> None:
     assert camera.log == ["disconnect"]
 
 
-@pytest.mark.parametrize("state", ["idle", "armed", "exposing", "unread"])
-def test_closing_stops_and_disconnects_in_every_state(bench: ResolvedProfile, state: str) -> None:
-    if state == "armed":
-        bench.camera.arm(1, 0.01, "software")
-    elif state != "idle":
-        bench.fire(1)
-        bench.clock.sleep(1.0 if state == "unread" else 0.0)
-    bench.camera.close()
-    assert bench.camera.log[-2:] == ["stop", "disconnect"]
-    with pytest.raises(DeviceError, match="not open"):
-        bench.read()
-
-
-def test_a_stop_that_fails_does_not_keep_the_camera_connected(bench: ResolvedProfile) -> None:
+def test_a_stop_that_fails_does_not_keep_the_camera_connected(bench: Bench) -> None:
     bench.camera.broken = {"stop"}
     with pytest.raises(RuntimeError, match="stop is broken"):
         bench.camera.close()
@@ -88,22 +71,9 @@ def test_a_stop_that_fails_does_not_keep_the_camera_connected(bench: ResolvedPro
         bench.camera.trigger()
 
 
-def test_nothing_works_before_it_is_open() -> None:
-    camera = TinyCamera(Context("cam"), CameraFacts())
-    for use in (
-        lambda: camera.arm(1, 0.01, "software"),
-        camera.trigger,
-        lambda: camera.read(1.0),
-        camera.self_test,
-    ):
-        with pytest.raises(DeviceError, match=r"^cam: not open; call open\(\) first$"):
-            use()
-    assert camera.log == []
-
-
 @given(st.floats() | st.sampled_from([0.0, -0.0, math.nan, math.inf, 10.0, 10.000001]))
 def test_only_exposures_that_the_camera_can_make_reach_it(exposure_s: float) -> None:
-    bench = ResolvedProfile()
+    bench = Bench()
     if 0 < exposure_s <= 10.0:
         bench.camera.arm(1, exposure_s, "software")
         assert bench.camera.series[-1].exposure_s == exposure_s
@@ -113,29 +83,25 @@ def test_only_exposures_that_the_camera_can_make_reach_it(exposure_s: float) -> 
         assert bench.camera.log == []
 
 
-@pytest.mark.parametrize("n_frames", [0, -1])
-def test_a_series_has_at_least_one_frame(bench: ResolvedProfile, n_frames: int) -> None:
-    with pytest.raises(LimitError, match=r"^cam: number of frames is .*; the limit is at least 1"):
-        bench.camera.arm(n_frames, 0.01, "software")
-    assert bench.camera.log == []
-
-
 def test_a_trigger_that_the_camera_does_not_have_is_refused() -> None:
-    bench = ResolvedProfile(triggers=("software", "external"))
+    bench = Bench(triggers=("software", "external"))
     with pytest.raises(DeviceError, match="no internal trigger; expected one of 'software', 'external'"):
         bench.camera.arm(1, 0.01, "internal")
     assert bench.camera.log == []
 
 
-def test_a_refusal_leaves_the_series_as_it_was(bench: ResolvedProfile) -> None:
+def test_a_refusal_leaves_the_series_as_it_was(bench: Bench) -> None:
     bench.camera.arm(1, 0.01, "software")
-    with pytest.raises(LimitError):
+    with pytest.raises(LimitError, match=r"^cam: number of frames is 0; the limit is at least 1"):
         bench.camera.arm(0, 0.01, "software")
     bench.camera.trigger()
     assert bench.read().image.shape == SHAPE
+    bench.camera.safe_state()
+    with pytest.raises(DeviceTimeoutError, match="the camera is not armed"):
+        bench.read()
 
 
-def test_arming_again_ends_the_series_before_and_drops_its_frames(bench: ResolvedProfile) -> None:
+def test_arming_again_ends_the_series_before_and_drops_its_frames(bench: Bench) -> None:
     bench.fire(3)
     bench.camera.arm(2, 0.02, "software")
     assert bench.camera.log == ["start", "fire", "fire", "fire", "stop", "start"]
@@ -145,7 +111,7 @@ def test_arming_again_ends_the_series_before_and_drops_its_frames(bench: Resolve
     assert bench.read().number == 0
 
 
-def test_a_start_that_fails_is_undone_and_leaves_the_camera_unarmed(bench: ResolvedProfile) -> None:
+def test_a_start_that_fails_is_undone_and_leaves_the_camera_unarmed(bench: Bench) -> None:
     bench.camera.arm(1, 0.01, "software")
     bench.camera.broken = {"start"}
     with pytest.raises(RuntimeError, match="start is broken"):
@@ -155,25 +121,7 @@ def test_a_start_that_fails_is_undone_and_leaves_the_camera_unarmed(bench: Resol
         bench.camera.trigger()
 
 
-def test_the_safe_state_stops_and_drops_all_frames(bench: ResolvedProfile) -> None:
-    bench.fire(2)
-    bench.camera.safe_state()
-    bench.camera.safe_state()
-    assert bench.camera.log[-2:] == ["stop", "stop"]
-    with pytest.raises(DeviceTimeoutError, match="the camera is not armed"):
-        bench.read()
-
-
-def test_no_more_triggers_than_armed_for(bench: ResolvedProfile) -> None:
-    with pytest.raises(DeviceError, match=r"not armed for another frame; call arm\(\) first"):
-        bench.camera.trigger()
-    bench.fire(2)
-    with pytest.raises(DeviceError, match="not armed for another frame"):
-        bench.camera.trigger()
-    assert bench.camera.log.count("fire") == 2
-
-
-def test_a_trigger_during_an_exposure_is_refused(bench: ResolvedProfile) -> None:
+def test_a_trigger_during_an_exposure_is_refused(bench: Bench) -> None:
     bench.camera.arm(2, 0.5, "software")
     bench.camera.trigger()
     bench.clock.sleep(0.25)
@@ -183,12 +131,14 @@ def test_a_trigger_during_an_exposure_is_refused(bench: ResolvedProfile) -> None
     bench.camera.trigger()
 
 
-@pytest.mark.parametrize("trigger", ["internal", "external"])
-def test_a_software_trigger_belongs_to_a_series_with_one(trigger: Trigger) -> None:
-    bench = ResolvedProfile(triggers=("software", "internal", "external"))
-    bench.camera.arm(1, 0.01, trigger)
-    with pytest.raises(DeviceError, match=f"triggered, but armed for the {trigger} trigger"):
+def test_a_software_trigger_belongs_to_a_series_with_one() -> None:
+    bench = Bench(triggers=("external",))
+    bench.camera.arm(1, 0.01, "external")
+    with pytest.raises(DeviceError, match="triggered, but armed for the external trigger"):
         bench.camera.trigger()
+    bench.camera.log.clear()
+    bench.camera.self_test()
+    assert bench.camera.log == []  # it cannot be triggered
 
 
 @pytest.mark.parametrize(
@@ -204,7 +154,7 @@ def test_a_software_trigger_belongs_to_a_series_with_one(trigger: Trigger) -> No
 def test_a_timeout_says_why_and_takes_its_time(
     trigger: Trigger, n_triggered: int, n_read: int, reason: str
 ) -> None:
-    bench = ResolvedProfile(triggers=("software", "internal", "external"))
+    bench = Bench(triggers=("software", "internal", "external"))
     bench.camera.arm(3, 1.0, trigger)
     for _ in range(n_triggered):
         bench.camera.trigger()
@@ -221,17 +171,9 @@ def test_a_timeout_says_why_and_takes_its_time(
     assert bench.clock.now() - start_s == pytest.approx(0.5)
 
 
-def test_a_frame_that_came_too_late_is_read_next(bench: ResolvedProfile) -> None:
-    bench.camera.arm(1, 1.0, "software")
-    bench.camera.trigger()
-    with pytest.raises(DeviceTimeoutError):
-        bench.read(0.5)
-    assert bench.read(0.6).number == 0
-
-
 @given(st.integers(1, 5), st.floats(1e-3, 1.0))
 def test_a_frame_tells_what_is_known_of_it(n_frames: int, exposure_s: float) -> None:
-    bench = ResolvedProfile()
+    bench = Bench()
     bench.clock.sleep(2.0)
     bench.fire(n_frames, exposure_s)
     frames = [bench.read() for _ in range(n_frames)]
@@ -243,7 +185,7 @@ def test_a_frame_tells_what_is_known_of_it(n_frames: int, exposure_s: float) -> 
         assert math.isnan(frame.device_time_s)
 
 
-def test_what_the_camera_tells_goes_before_what_it_was_told(bench: ResolvedProfile) -> None:
+def test_what_the_camera_tells_goes_before_what_it_was_told(bench: Bench) -> None:
     bench.camera.tells = {"exposure_s": 0.011, "t_start_s": 7.0, "device_time_s": 1e6}
     bench.fire(1)
     frame = bench.read()
@@ -251,13 +193,13 @@ def test_what_the_camera_tells_goes_before_what_it_was_told(bench: ResolvedProfi
 
 
 def test_a_frame_of_its_own_accord_began_an_exposure_and_a_read_out_before_it_came() -> None:
-    bench = ResolvedProfile(triggers=("internal",))
+    bench = Bench(triggers=("internal",))
     bench.camera.arm(1, 0.25, "internal")
     assert bench.read().t_start_s == pytest.approx(0.0)
 
 
 def test_the_em_gain_is_on_in_a_series_and_1_in_the_self_test() -> None:
-    bench = ResolvedProfile(em_gain=300.0)
+    bench = Bench(em_gain=300.0)
     bench.camera.self_test()
     bench.fire(1)
     assert [series.em_gain for series in bench.camera.series] == [1.0, 300.0]
@@ -267,7 +209,7 @@ def test_the_em_gain_is_on_in_a_series_and_1_in_the_self_test() -> None:
     ("facts", "exposure_s"), [({}, 10e-3), ({"max_exposure_s": 1e-3}, 1e-3), ({"frame_shape": None}, 10e-3)]
 )
 def test_the_self_test_takes_a_short_frame(facts: Mapping[str, Any], exposure_s: float) -> None:
-    bench = ResolvedProfile(**facts)
+    bench = Bench(**facts)
     assert offers(bench.camera, "self_test")
     bench.camera.self_test()
     assert bench.camera.log == ["start", "fire", "take"]
@@ -275,20 +217,7 @@ def test_the_self_test_takes_a_short_frame(facts: Mapping[str, Any], exposure_s:
     assert bench.clock.now() == pytest.approx(exposure_s + 5e-3)
 
 
-def test_a_camera_without_software_trigger_is_not_tested() -> None:
-    bench = ResolvedProfile(triggers=("external",))
-    bench.camera.self_test()
-    assert bench.camera.log == []
-
-
-def test_the_self_test_finds_a_frame_of_another_shape(bench: ResolvedProfile) -> None:
+def test_the_self_test_finds_a_frame_of_another_shape(bench: Bench) -> None:
     bench.camera.shape = (3, 5)
     with pytest.raises(DeviceError, match=r"a frame has the shape \(3, 5\); expected \(3, 4\)"):
         bench.camera.self_test()
-
-
-def test_frames_are_frames(bench: ResolvedProfile) -> None:
-    bench.fire(1)
-    frame = bench.read()
-    assert isinstance(frame, Frame)
-    assert not frame.image.flags.writeable

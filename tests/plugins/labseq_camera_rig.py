@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
+from hypothesis import strategies as st
 from labseq_andor.camera import AndorCamera
 from labseq_andor.library import load_pylablib
 from labseq_andor.settings import AndorSettings
@@ -127,3 +128,17 @@ def assert_shown(frames: list[Frame], lab: Rig) -> None:
     assert len(frames) == len(lab.world.shown)
     for frame, shown in zip(frames, lab.world.shown, strict=True):
         np.testing.assert_array_equal(frame.image, shown)
+
+
+@st.composite
+def sensors(draw: st.DrawFn, pixel_formats: tuple[str, ...]) -> dict[str, Any]:
+    """Region, binning and pixel format that go with a sensor of 96 x 128 pixels."""
+    binning = draw(st.integers(1, 4))
+    region: dict[str, int] = {}
+    for start, extent, size in (("y", "height", 96), ("x", "width", 128)):
+        n_before = draw(st.integers(0, size // binning - 1))
+        region[start] = binning * n_before
+        region[extent] = binning * draw(st.integers(1, size // binning - n_before))
+    made: dict[str, Any] = {"pixel_format": draw(st.sampled_from(pixel_formats)), "binning": binning}
+    is_whole = binning != 3 and draw(st.booleans())
+    return made if is_whole else made | {"region": region}

@@ -50,34 +50,34 @@ class TestCameraDrivers(CameraContract):
 
 @pytest.mark.parametrize("trigger", ["software", "internal"])
 def test_frames_come_in_order_and_pixel_for_pixel(driver: str, trigger: Trigger) -> None:
-    with opened_rig(driver, sensor_shape=(512, 512)) as lab:
-        frames = lab.take(20, 0.01, trigger)
+    with opened_rig(driver, sensor_shape=(256, 512)) as lab:
+        frames = lab.take(8, 0.01, trigger)
         period_s = 0.01 + lab.camera.facts.readout_s
-        assert [frame.number for frame in frames] == list(range(20))
+        assert [frame.number for frame in frames] == list(range(8))
         assert np.diff([frame.t_start_s for frame in frames]) == pytest.approx(period_s)
         assert_shown(frames, lab)
 
 
 def test_frames_that_wait_to_be_read_keep_their_order(driver: str) -> None:
     with opened_rig(driver) as lab:
-        lab.camera.arm(12, 1e-3, "software")
+        lab.camera.arm(6, 1e-3, "software")
         starts_s: list[float] = []
-        for _ in range(12):
+        for _ in range(6):
             starts_s.append(lab.clock.now())
             lab.camera.trigger()
             lab.clock.sleep(0.02)
-        frames = [lab.camera.read(1.0) for _ in range(12)]
+        frames = [lab.camera.read(1.0) for _ in range(6)]
         assert [frame.t_start_s for frame in frames] == pytest.approx(starts_s)
         assert_shown(frames, lab)
 
 
 def test_every_series_begins_with_its_own_frames(driver: str) -> None:
     with opened_rig(driver) as lab:
-        for n_frames in (3, 1, 12, 2):
+        for n_frames in (3, 7, 1):
             lab.camera.arm(2, 0.01, "software")
             lab.camera.trigger()
             lab.clock.sleep(0.05)
-            del lab.world.shown[:]  # nobody read it
+            del lab.world.shown[:]  # it was not read
             frames = lab.take(n_frames)
             assert [frame.number for frame in frames] == list(range(n_frames))
             assert_shown(frames, lab)
