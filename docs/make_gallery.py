@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from labseq import SiteGrid, TargetPattern
-from labseq.config import Document
+from labseq.config.document import Document
 from labseq.pictures.plans import save_target
 from labseq.session import load_plugins
 from labseq.session.construct import construct_target

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Final, TypeAlias
 
 from labseq import motion as _motion
-from labseq.config import load_profile
+from labseq.config.profile import load_profile
 from labseq.config.validation import validate_values
 from labseq.errors import ConfigError, Problem
 from labseq.model import MotionSpec, Plan, SiteGrid, TargetPattern, ToneProgram

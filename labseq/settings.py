@@ -170,6 +170,11 @@ class Choice(Settings):
         """Where its mapping is in the document."""
         return self._loc
 
+    @property
+    def core_keys(self) -> frozenset[str]:
+        """Keys of the mapping that labseq reads itself; all others are the plugin's settings."""
+        return frozenset({self.key, *(name for name in type(self).model_fields if name != "use")})
+
     def placed(self, *loc: str | int) -> Self:
         """A copy that knows where its mapping is."""
         copy = self.model_copy()

@@ -20,7 +20,7 @@ import pytest
 import labseq
 from labseq.cli import main
 from labseq.cli.devices import plugins_table as table
-from labseq.config import Document
+from labseq.config.document import Document
 from labseq.errors import LabseqError, PluginLoadError
 from labseq.plugins import LOCAL_PACKAGE, PluginHost, PluginInfo, call_plugin
 from labseq.registry import Entry, Owner

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from labseq.config import Document
+from labseq.config.document import Document
 from labseq.errors import ConfigError
 from labseq.text_files import MAX_BYTES
 

@@ -13,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.config import Override, split_overrides
+from labseq.config.addresses import Override, split_overrides
 from labseq.errors import ConfigError, LabseqError, Problem, RecordingError
 from labseq.guard import StopFlag
 from labseq.messages import clean

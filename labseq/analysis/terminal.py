@@ -14,7 +14,8 @@ import numpy as np
 from labseq.analysis.overview import CHOICES, overview, picture_of
 from labseq.analysis.replay import MeanCounts, Replay, ReplayedImages, ReplayedPlan, ReplayRequest, replay
 from labseq.analysis.shot import save_shot, shot_picture
-from labseq.config import Document, split_overrides
+from labseq.config.addresses import split_overrides
+from labseq.config.document import Document
 from labseq.console.output import as_line, json_writer, report_compiling, say, stdout_to_stderr
 from labseq.console.runs import chosen_run
 from labseq.console.text import columns, count_of, percent, plural, settings_text

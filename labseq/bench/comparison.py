@@ -13,7 +13,9 @@ from typing import Any, Final, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.config import Document, MotionSettings, Override
+from labseq.config.addresses import Override
+from labseq.config.document import Document
+from labseq.config.profile import MotionSettings
 from labseq.errors import ConfigError, LimitError, PlanError, Problem, ProblemCollector
 from labseq.messages import clean
 from labseq.model import MotionSpec, Occupancy, Plan, SiteGrid, TargetPattern

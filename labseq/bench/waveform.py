@@ -18,8 +18,10 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-from labseq.config import load_profile, plugin_paths, split_overrides
+from labseq.config.addresses import split_overrides
+from labseq.config.document import plugin_paths
 from labseq.config.plan_file import MAX_BYTES
+from labseq.config.profile import load_profile
 from labseq.errors import ConfigError, LimitError, Problem
 from labseq.files import whole_file
 from labseq.messages import clean, visible

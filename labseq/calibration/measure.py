@@ -20,8 +20,8 @@ from labseq.calibration.sites import analyse_sites, read_site_file
 from labseq.calibration.store import Store, Stored, grid_text
 from labseq.calibration.thresholds import analyse_thresholds
 from labseq.calibration.tweezers import analyse_tweezers
-from labseq.config import Override, ProfileSpec, load_profile, split_overrides
-from labseq.config.profile import OFF
+from labseq.config.addresses import Override, split_overrides
+from labseq.config.profile import OFF, ProfileSpec, load_profile
 from labseq.errors import ConfigError, LabseqError, Problem, RecordingError
 from labseq.messages import clean
 from labseq.model import CALIBRATION_KINDS, CalibrationEntry, grid_facts, same_grid

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from labseq.calibration.compare import Difference, compare, unit_of
 from labseq.calibration.measure import METHODS, CalibrationRequest, Outcome, calibrate
 from labseq.calibration.store import DECIDING, Damaged, Store, Stored, figure_of, grid_text
-from labseq.config import CalibrationChoices
-from labseq.config.profile import OFF
+from labseq.config.profile import OFF, CalibrationChoices
 from labseq.console.events import LASTING, LogLines
 from labseq.console.output import as_line, say, stdout_to_stderr
 from labseq.console.text import age_text, columns

@@ -13,7 +13,8 @@ from typing import Any, Final, cast
 import numpy as np
 
 from labseq.calibration.terminal import age_s, quality_text
-from labseq.config import Axis, CheckSettings
+from labseq.config.scan import Axis
+from labseq.config.sequence import CheckSettings
 from labseq.console.errors import json_errors, warning_lines
 from labseq.console.events import LogLines
 from labseq.console.output import as_line, say, stdout_to_stderr

@@ -7,7 +7,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from labseq.config import load_profile, plugin_paths
+from labseq.config.document import plugin_paths
+from labseq.config.profile import load_profile
 from labseq.console.errors import json_errors, report
 from labseq.console.output import as_line, report_compiling, say, stdout_to_stderr
 from labseq.console.text import columns

@@ -14,12 +14,12 @@ from typing import Any, Final
 
 from labseq.cli.live import observer_for
 from labseq.cli.summary import json_summary, summary_lines
-from labseq.config import packaged_profiles_dir, packaged_sequences_dir
 from labseq.console.errors import lines_of
 from labseq.console.output import as_line, say, stdout_to_stderr
 from labseq.console.runs import existing_run
 from labseq.console.text import plural
 from labseq.errors import ConfigError, LabseqError, Problem, RecordingError, StopRequested
+from labseq.files import packaged_profiles_dir, packaged_sequences_dir
 from labseq.messages import visible
 from labseq.queue.queue import Queue
 from labseq.recording import Run, data_root, open_run

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from labseq.config.document import Document
 from labseq.errors import ConfigError, Problem
 from labseq.files import PROFILES, SEQUENCES, packaged_profiles_dir, packaged_sequences_dir
 from labseq.messages import clean, did_you_mean, listing, visible
@@ -18,6 +18,9 @@ from labseq.text_files import (
     is_folder,
     something_else,
 )
+
+if TYPE_CHECKING:
+    from labseq.config.document import Document
 
 
 def is_path(name: str) -> bool:

@@ -6,15 +6,13 @@ import re
 from collections.abc import Sequence
 from itertools import combinations
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, Self, TypeAlias, cast
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self, TypeAlias, cast
 
 from pydantic import AfterValidator, Field, NonNegativeInt, model_validator
 
 from labseq.config.addresses import MAY_ADD, ROLES, Override
 from labseq.config.document import Document, FallbackValues, StoredText, check_kind, load_checked
 from labseq.config.find import find_profile
-from labseq.config.scan import Scan, bind_scan
-from labseq.config.sequence import BudgetSettings
 from labseq.errors import ProblemCollector
 from labseq.messages import clean
 from labseq.model import CALIBRATION_KINDS, MotionSpec, RfSpec, SiteGrid
@@ -44,6 +42,9 @@ from labseq.settings import (
 )
 from labseq.units import format_quantity
 
+if TYPE_CHECKING:
+    from labseq.config.scan import Scan
+
 _DEVICE_NAME: Final = re.compile(r"[^\W\d][\w-]*")
 
 
@@ -65,10 +66,6 @@ class DeviceChoice(Choice):
         default=None,
         description="no exposure with EM gain while its light is on: `{value: state, when: [on]}`",
     )
-
-
-DEVICE_KEYS: Final = ("blinding",)
-"""Keys of a device that belong to the core, not to the plugin."""
 
 
 def device_name(name: str, what: str) -> None:
@@ -138,9 +135,6 @@ class CalibrationSettings(Settings):
             return {"use": dict.fromkeys(CALIBRATION_KINDS, OFF)}
         return {"folder": value} if isinstance(value, str) else value
 
-
-LINES_KEYS: Final = ("channels", "mutually_exclusive")
-"""Keys of ``lines`` that belong to the core, not to the plugin."""
 
 MAX_PULSE_S: Final = 1.0
 
@@ -459,6 +453,16 @@ class GridSettings(Settings):
         )
 
 
+class BudgetSettings(Settings):
+    """Time budgets of the computer for the stages of a shot."""
+
+    detect: Duration = Field(default=5e-3, description="finding the atoms on a frame")
+    plan: Duration = Field(default=5e-3, description="planning a cycle")
+    check: Duration = Field(default=2e-3, description="checking a plan")
+    tones: Duration = Field(default=2e-3, description="making the tone program of a plan")
+    write: Duration = Field(default=50e-3, description="writing a shot to the disk")
+
+
 class ProfileSpec(Settings):
     """A hardware profile; the settings of its plugins are checked later."""
 
@@ -568,7 +572,7 @@ def load_profile(
     check_kind(document, "hardware profile")
     placed = [_of_profile(Override(*override)) for override in overrides]
     document = document.override_all(placed, may_add=MAY_ADD, found=found).evaluated()
-    document = document if scan is None else bind_scan(scan, document).begun(document, profile=True)
+    document = document if scan is None else scan.bound(document).begun(document, profile=True)
     return load_checked(document, ProfileSpec, "a hardware profile", _FALLBACKS, found)
 
 

@@ -134,6 +134,26 @@ class Scan:
         groups = tuple((replace(axis, values=(ends.node(value),)),) for axis, ends, value in pairs)
         return replace(self, groups=groups)
 
+    def bound(self, document: Document) -> Scan:
+        """A copy in which the axes of the profile have their locations in the profile.
+
+        Args:
+            document: The profile's file.
+
+        Raises:
+            ConfigError: Addresses that do not exist in it, or whose settings a scan cannot change.
+        """
+        found, groups = ProblemCollector(), list[Group]()
+        for group in self.groups:
+            axes: list[Axis] = []
+            for axis in group:
+                with found:
+                    axes.append(_placed_in_profile(axis, document) if axis.of_profile else axis)
+            groups.append(tuple(axes))
+        found.raise_any()
+        _refuse_twice(groups, in_profile=True)
+        return replace(self, groups=tuple(groups))
+
     def put(self, document: Document, point: int, *, profile: bool) -> Document:
         """A copy of the sequence or of the profile with the values of a point."""
         pairs = self.values(point)
@@ -208,10 +228,6 @@ class AdaptiveChoice(Choice):
             what = "'maximise' and 'minimise' stand together"
             raise setting_error(what, "one of them", at=("minimise",), key=True)
         return self
-
-
-SCANNER_KEYS: Final = frozenset({"over", "maximise", "minimise", "points"})
-"""Keys of an adaptive scan that belong to the core, not to the scanner."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -473,31 +489,11 @@ def placed_axis(address: str, key: Mark, values: Sequence[Node], document: Docum
     raise _unscannable(axis)
 
 
-def bind_scan(scan: Scan, document: Document) -> Scan:
-    """A copy in which the axes of the profile have their locations in the profile.
-
-    Args:
-        scan: The scan as it was read.
-        document: The profile's file.
-
-    Raises:
-        ConfigError: Addresses that do not exist in it, or whose settings a scan cannot change.
-    """
-    found = ProblemCollector()
-
-    def bound(axis: Axis) -> Axis:
-        with found:
-            axis = _found(axis, document) if axis.of_profile else axis
-            top = axis.loc[0]
-            is_device = top == "devices" and len(axis.loc) > 1
-            if axis.of_profile and not (top in (*ROLES, VARIABLES) or is_device):
-                raise _unscannable(axis)
+def _placed_in_profile(axis: Axis, document: Document) -> Axis:
+    axis = _found(axis, document)
+    if axis.loc[0] in (*ROLES, VARIABLES) or (axis.loc[0] == "devices" and len(axis.loc) > 1):
         return axis
-
-    groups = tuple(tuple(bound(axis) for axis in group) for group in scan.groups)
-    found.raise_any()
-    _refuse_twice(groups, in_profile=True)
-    return replace(scan, groups=groups)
+    raise _unscannable(axis)
 
 
 def _found(axis: Axis, document: Document) -> Axis:

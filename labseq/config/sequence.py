@@ -100,20 +100,6 @@ class PolicySettings(Settings):
     )
 
 
-class BudgetSettings(Settings):
-    """Time budgets of the computer for the stages of a shot."""
-
-    detect: Duration = Field(default=5e-3, description="finding the atoms on a frame")
-    plan: Duration = Field(default=5e-3, description="planning a cycle")
-    check: Duration = Field(default=2e-3, description="checking a plan")
-    tones: Duration = Field(default=2e-3, description="making the tone program of a plan")
-    write: Duration = Field(default=50e-3, description="writing a shot to the disk")
-
-
-ANALYSIS_KEYS: Final = frozenset({"finish_within"})
-"""Keys of an analysis that belong to the core, not to the plugin."""
-
-
 class AnalysisChoice(Choice):
     """An analysis chosen by name, with the plugin's settings as further keys of the same mapping."""
 
@@ -258,7 +244,7 @@ def load_sequence(
     profile_set: Sequence[Override] = (),
     found: ProblemCollector | None = None,
     kept: StoredText | None = None,
-) -> tuple[Document, SequenceSpec]:
+) -> tuple[Document, SequenceSpec, Scan | None]:
     """Read a sequence file.
 
     Args:
@@ -269,8 +255,8 @@ def load_sequence(
         found: Receives the problems of a readable file; without it they are raised.
 
     Returns:
-        The document, with overrides, the default planner and the first point of its scan; and its
-        content, with fallbacks for wrong values.
+        The document, with overrides, the default planner and the first point of its scan; its content, with
+        fallbacks for wrong values; and the scan, its profile axes not yet bound.
 
     Raises:
         ConfigError: All errors, except in settings of plugins.
@@ -282,10 +268,10 @@ def load_sequence(
     document = document.override_all(overrides, may_add=("policy",), found=found)
     problems = ProblemCollector() if found is None else found
     document = document.evaluated()
-    document = _at_first_point(document, [Override(*one) for one in overrides], profile_set, problems)
+    document, scan = _at_first_point(document, [Override(*one) for one in overrides], profile_set, problems)
     if found is None:
         problems.raise_any()
-    return load_checked(document, SequenceSpec, "a sequence", _FALLBACKS, found)
+    return *load_checked(document, SequenceSpec, "a sequence", _FALLBACKS, found), scan
 
 
 def _at_first_point(
@@ -293,13 +279,13 @@ def _at_first_point(
     overrides: Sequence[Override],
     profile_set: Sequence[Override],
     found: ProblemCollector,
-) -> Document:
-    """A copy with the values of the first point, and with ``shots`` from the scan."""
+) -> tuple[Document, Scan | None]:
+    """A copy with the values of the first point and with ``shots`` from the scan; and the scan."""
     scan: Scan | None = None
     with found:
         scan = read_scan(document, [*overrides, *profile_set])
     if scan is None:  # there is no scan, or it has an error
-        return document if document.data.get("scan") is None else _without_scan(document)
+        return document if document.data.get("scan") is None else _without_scan(document), None
     n_shots, shots = scan.n_points * scan.repeats, document.data.get("shots")
     is_option = any(override.address == "shots" for override in overrides)
     if shots is None:
@@ -309,7 +295,7 @@ def _at_first_point(
         expected = f"at most {n_shots}" if is_option else ""
         hint = "write 'repeats' for more" if is_option else "leave 'shots' out, it follows from the scan"
         found.add(document.error(("shots",), what + " (points x repeats)", expected, hint))
-    return scan.begun(document, profile=False)
+    return scan.begun(document, profile=False), scan
 
 
 def _without_scan(document: Document) -> Document:

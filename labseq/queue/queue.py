@@ -15,7 +15,8 @@ from typing import Any, Final, Literal
 
 from pydantic import TypeAdapter, ValidationError
 
-from labseq.config import StoredText, find_profile
+from labseq.config.document import StoredText
+from labseq.config.find import find_profile
 from labseq.errors import ConfigError, LabseqError, Problem, RecordingError, StopRequested
 from labseq.files import Holder, Lock, Process, explained, write_file
 from labseq.messages import visible

@@ -21,8 +21,9 @@ from string import Template
 from typing import Final
 
 from labseq import __version__
-from labseq.config import find_profile, packaged_profiles_dir
+from labseq.config.find import find_profile
 from labseq.errors import ConfigError, Problem
+from labseq.files import packaged_profiles_dir
 from labseq.messages import clean, visible
 from labseq.plugins import PluginHost
 from labseq.scaffold.schemas import FileKind, refresh_schemas, schema_path, write_schema

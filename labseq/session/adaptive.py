@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field
 from types import MappingProxyType
 from typing import Any, Final, cast
 
-from labseq.config.scan import SCANNER_KEYS, Adaptive, Axis, Ends
+from labseq.config.scan import Adaptive, Axis, Ends
 from labseq.errors import ConfigError, DeviceError, ProblemCollector
 from labseq.guard import Guard, StopFlag
 from labseq.messages import clean
@@ -110,7 +110,7 @@ def make_search(scanned: ScanPoints, steps: Steps, found: ProblemCollector) -> S
         check_figure(document, adaptive.aim, adaptive.figure, CLIMBED, steps)
     chosen: ChosenPlugin | None = None
     with found:
-        chosen = resolve(scanned.bench.host, document, "scanner", adaptive.choice, SCANNER_KEYS)
+        chosen = resolve(scanned.bench.host, document, "scanner", adaptive.choice)
     low = scanned.at(0).parameters
     high = scanned.at(math.prod(scanned.scan.shape) - 1).parameters
     ranges: list[ScanRange] = []

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import labseq
-from labseq.config import validate_values
+from labseq.config.validation import validate_values
 from labseq.errors import ConfigError, Problem, RecordingError
 from labseq.files import Lock, knows_no_locks
 from labseq.recording import Run

@@ -8,20 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from labseq import builtin as builtins
-from labseq.config import (
-    ROLES,
-    Document,
-    Override,
-    Scan,
-    SequenceSpec,
-    StoredText,
-    bind_scan,
-    find_sequence,
-    load_sequence,
-    plugin_paths,
-    read_scan,
-    split_overrides,
-)
+from labseq.config.addresses import ROLES, Override, split_overrides
+from labseq.config.document import Document, StoredText, plugin_paths
+from labseq.config.find import find_sequence
+from labseq.config.scan import Scan
+from labseq.config.sequence import SequenceSpec, load_sequence
 from labseq.errors import ConfigError, ProblemCollector
 from labseq.model import TargetPattern
 from labseq.plugins import PluginHost
@@ -112,7 +103,7 @@ def assemble(
     """Read and validate everything that can be validated without opening a device.
 
     Args:
-        sequence_path: The sequence file, or the name of one; see :func:`labseq.config.find_sequence`.
+        sequence_path: The sequence file, or the name of one; see :func:`labseq.config.find.find_sequence`.
         profile: Name or path of the profile, instead of the sequence's own.
         overrides: ``"address=value"`` strings, as given to ``--set``; they take precedence.
         given: Overrides from other options.
@@ -132,12 +123,12 @@ def assemble(
     profile_set = [one._replace(address=f"profile.{one.address}") for one in for_profile]
     found = ProblemCollector()
     try:
-        document, sequence = load_sequence(
+        document, sequence, scan = load_sequence(
             sequence_path, [*given, *for_sequence], profile_set=profile_set, found=found, kept=kept
         )
     except ConfigError as error:
         raise found.stop(error) from None
-    scan = None if found.problems else read_scan(document, [*given, *for_sequence, *profile_set])
+    scan = None if found.problems else scan
     try:
         bench = resolve_profile(
             sequence.profile if profile is None else profile,
@@ -178,7 +169,7 @@ def _assembled(
     search: Search | None = None
     try:
         if scan is not None and is_whole:
-            bound, planner = bind_scan(scan, bench.document), made.get("planner")
+            bound, planner = scan.bound(bench.document), made.get("planner")
             scanned = ScanPoints(bound, document, sequence, bench, dry_run, planner, tuple(steps))
             scanned.check(found)
             if not found.problems:

@@ -9,9 +9,10 @@ from shlex import quote
 from typing import Any, Final, Literal
 
 from labseq.calibration.store import Store, Stored, check_grid
-from labseq.config import Document, ProfileSpec, load_profile, profile_dir
-from labseq.config.profile import OFF
+from labseq.config.document import Document
+from labseq.config.profile import OFF, ProfileSpec, load_profile
 from labseq.errors import ConfigError, LimitError, ProblemCollector
+from labseq.files import profile_dir
 from labseq.model import CALIBRATION_KINDS, CalibrationEntry, CalibrationKind, SiteGrid
 from labseq.motion import standing_on_sites
 from labseq.registry import VIRTUAL_TWIN

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, Final
 
-from labseq.config import Document, SequenceSpec, StepSpec
-from labseq.config.sequence import ANALYSIS_KEYS
+from labseq.config.document import Document
+from labseq.config.sequence import SequenceSpec, StepSpec
 from labseq.errors import ConfigError, LabseqError, LimitError, PluginLoadError, ProblemCollector, one_of
 from labseq.model import (
     CalibrationEntry,
@@ -271,7 +271,7 @@ def make_analyses(
     dumps: list[dict[str, Any]] = []
     for choice in sequence.analysis:
         with found:
-            chosen = resolve(bench.host, document, "analysis", choice, ANALYSIS_KEYS)
+            chosen = resolve(bench.host, document, "analysis", choice)
             context = Context(choice.use, bench.grid, bench.profile.motion, calibrations=bench.calibrations)
             construct_one(chosen, context)
             dumps.append({**chosen.dump(), "finish_within": choice.finish_within})

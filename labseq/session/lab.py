@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Any, Final
 
 from labseq import motion
-from labseq.config import MotionSettings, ProfileSpec
+from labseq.config.profile import MotionSettings, ProfileSpec
 from labseq.errors import PlanError
 from labseq.guard import Guard, StopFlag
 from labseq.kernel import announcing

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Self
 
-from labseq.config import Override
+from labseq.config.addresses import Override
 from labseq.errors import ConfigError, Problem
 from labseq.messages import clean
 from labseq.session.profile import DryRun

@@ -11,16 +11,11 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.config import (
-    Document,
-    Override,
-    load_profile,
-    load_sequence,
-    plugin_paths,
-    split_overrides,
-)
+from labseq.config.addresses import Override, split_overrides
+from labseq.config.document import Document, plugin_paths
 from labseq.config.plan_file import PlanFile, parse_plan
-from labseq.config.sequence import DEFAULT_PLANNER
+from labseq.config.profile import load_profile
+from labseq.config.sequence import DEFAULT_PLANNER, load_sequence
 from labseq.errors import ConfigError, LabseqError, LimitError, PlanError, Problem
 from labseq.messages import clean, visible
 from labseq.model import MotionSpec, Occupancy, Plan, PlanReport, SiteGrid, TargetPattern
@@ -151,7 +146,7 @@ def _target_choice(request: PlanRequest, source: Source) -> tuple[Document, Patt
             raise ConfigError(Problem("there is no --target to move", origin[0].source))
         return empty, None, []
     if text.lower().endswith(YAML_SUFFIXES):
-        document, sequence = load_sequence(Path(text), origin)
+        document, sequence, _ = load_sequence(Path(text), origin)
         return document, sequence.target, plugin_paths(document, sequence.plugin_folders)
     name, settings = parse_target(text)
     option = f"--target {text}"

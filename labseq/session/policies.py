@@ -10,7 +10,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from labseq.config import CheckSettings, Document, SequenceSpec, StepPolicySettings, StepSpec
+from labseq.config.document import Document
+from labseq.config.sequence import CheckSettings, SequenceSpec, StepPolicySettings, StepSpec
 from labseq.errors import CheckFailedError, Loc, ProblemCollector
 from labseq.messages import clean, did_you_mean, listing
 from labseq.recording import RunWriter, figures_in

@@ -8,19 +8,10 @@ from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple, get_args
 
 from labseq import builtin as builtins
-from labseq.config import (
-    DEVICE_KEYS,
-    LINES_KEYS,
-    MOTION_KEYS,
-    ROLES,
-    Document,
-    Override,
-    ProfileSpec,
-    Scan,
-    StoredText,
-    load_profile,
-    plugin_paths,
-)
+from labseq.config.addresses import ROLES, Override
+from labseq.config.document import Document, StoredText, plugin_paths
+from labseq.config.profile import ProfileSpec, load_profile
+from labseq.config.scan import Scan
 from labseq.errors import (
     ConfigError,
     LabseqError,
@@ -43,13 +34,6 @@ from labseq.session.calibrations import ActiveCalibrations, calibrated
 from labseq.settings import Choice, Settings
 
 DryRun = Literal["off", "full", "fast"]
-
-_CORE_KEYS: Final = {
-    "mobile_tweezers": frozenset(MOTION_KEYS),
-    "device": frozenset(DEVICE_KEYS),
-    "lines": frozenset(LINES_KEYS),
-}
-"""Keys of the core that appear next to a plugin's settings."""
 
 HARDWARE_KINDS: Final = frozenset({"camera", "static_tweezers", "mobile_tweezers", "device", "lines"})
 
@@ -125,9 +109,7 @@ class ResolvedProfile:
         return all(c.virtual_time for c in self.chosen.values() if c.entry.kind in HARDWARE_KINDS)
 
 
-def resolve(
-    host: PluginHost, document: Document, kind: str, choice: Choice, drop: frozenset[str] = frozenset()
-) -> ChosenPlugin:
+def resolve(host: PluginHost, document: Document, kind: str, choice: Choice) -> ChosenPlugin:
     """Find the plugin named in a file, and validate its settings.
 
     Args:
@@ -135,14 +117,13 @@ def resolve(
         document: The file.
         kind: Kind of plugin.
         choice: Name, and place in the file.
-        drop: Keys at that place that belong to the core.
 
     Raises:
         ConfigError: Unknown name, a plugin that failed to load, or wrong settings, with file, line
             and column.
     """
     entry = named(host, document, kind, choice.use, (*choice.loc, choice.key))
-    settings = validate(document, entry, choice.loc, drop | {choice.key})
+    settings = validate(document, entry, choice.loc, choice.core_keys)
     return ChosenPlugin(entry, settings, document, choice.loc)
 
 
@@ -205,16 +186,15 @@ def choose(
     Returns:
         The choice, and a warning for the user or "".
     """
-    drop = _CORE_KEYS.get(kind, frozenset[str]())
     if dry_run == "off" or kind not in HARDWARE_KINDS or choice.use == VIRTUAL_TWIN:
-        return resolve(host, document, kind, choice, drop), ""
+        return resolve(host, document, kind, choice), ""
     entry = host.registry.get(kind, VIRTUAL_TWIN)
     twin = ChosenPlugin(entry, _defaults(entry), document, choice.loc)
     if dry_run == "fast":
         return twin, ""
     if absence := _absence(host, kind, choice.use):
         return twin, f"{absence}; its virtual twin takes its place and its settings were not checked"
-    chosen = resolve(host, document, kind, choice, drop)
+    chosen = resolve(host, document, kind, choice)
     if chosen.entry.virtual_time:
         return chosen, ""
     if chosen.entry.simulated is not None and chosen.settings is not None:

@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any, cast
 
 from labseq.calibration.store import read_entry
-from labseq.config import MOTION_KEYS, MotionSettings, StoredText, validate_values
-from labseq.config.profile import GridSettings
+from labseq.config.document import StoredText
+from labseq.config.profile import MOTION_KEYS, GridSettings, MotionSettings
+from labseq.config.validation import validate_values
 from labseq.errors import RecordingError
 from labseq.files import read_file
 from labseq.model import CalibrationEntry, MotionSpec, RandomStream, SiteGrid

@@ -10,7 +10,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
-from labseq.config import load_profile, plugin_paths, profile_overrides
+from labseq.config.addresses import profile_overrides
+from labseq.config.document import plugin_paths
+from labseq.config.profile import load_profile
 from labseq.errors import (
     ConfigError,
     DeviceError,

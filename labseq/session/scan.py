@@ -14,9 +14,11 @@ from typing import Any, Final
 
 import numpy as np
 
-from labseq.config import ROLES, Axis, Document, Scan, SequenceSpec
-from labseq.config.addresses import PROFILE, VARIABLES
+from labseq.config.addresses import PROFILE, ROLES, VARIABLES
+from labseq.config.document import Document
 from labseq.config.profile import MobileTweezersChoice
+from labseq.config.scan import Axis, Scan
+from labseq.config.sequence import SequenceSpec
 from labseq.config.yaml_nodes import Node
 from labseq.errors import ConfigError, Loc, ProblemCollector
 from labseq.messages import clean
@@ -219,8 +221,8 @@ class ScanPoints:
     def _make_role(self, document: Document, loc: Loc) -> PartSettings:
         role = str(loc[-1])
         kind = role if loc[0] in ROLES else "device"
-        model = MobileTweezersChoice if role == "mobile_tweezers" else Choice
-        choice = document.validate(model, loc).placed(*map(str, loc))
+        own = {**self.bench.profile.choices, **self.bench.profile.devices}[role]
+        choice = document.validate(type(own), loc).placed(*map(str, loc))
         if kind in HARDWARE_KINDS and choice.use != self.bench.document.get((*loc, "use")):
             what = f"a scan cannot change the driver of {role}"
             raise document.error((*loc, "use"), what, "one driver for the whole run")

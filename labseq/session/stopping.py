@@ -6,7 +6,7 @@ import signal
 from dataclasses import asdict
 from pathlib import Path
 
-from labseq.config import find_profile
+from labseq.config.find import find_profile
 from labseq.errors import ConfigError, Problem, StopRequested
 from labseq.files import Process, write_file
 from labseq.plain import dumps

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 import labseq
 from labseq.builtin.equalise import factors
 from labseq.calibration.measure import METHODS, CalibrationRequest, calibrate
-from labseq.config import load_profile
+from labseq.config.profile import load_profile
 from labseq.detection.sites import known_sites, region_corners, spot_light
 from labseq.detection.threshold import ThresholdDetector, ThresholdSettings
 from labseq.model import CalibrationEntry

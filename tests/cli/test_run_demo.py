@@ -10,8 +10,8 @@ import pytest
 
 import labseq
 from labseq.cli import main, run as demo
-from labseq.config import packaged_profiles_dir, packaged_sequences_dir
 from labseq.errors import ConfigError
+from labseq.files import packaged_profiles_dir, packaged_sequences_dir
 from labseq.session import Session
 
 

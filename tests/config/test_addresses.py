@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from labseq.config import Document, Override, profile_overrides, split_overrides
-from labseq.config.addresses import find
+from labseq.config.addresses import Override, find, profile_overrides, split_overrides
+from labseq.config.document import Document
 from labseq.errors import ConfigError, Loc
 
 DOCUMENT = Document.parse(

@@ -11,7 +11,7 @@ import pytest
 from labseq.builtin.probes import CheckOverlaySettings, CheckSitesSettings, ProbeSettings
 from labseq.builtin.rearrange import RearrangeSettings
 from labseq.builtin.steps import DeviceSettings, ImageSettings, LoadSettings, RampSettings, WaitSettings
-from labseq.config import load_sequence
+from labseq.config.sequence import load_sequence
 from labseq.errors import ConfigError, ProblemCollector
 from labseq.settings import Settings
 
@@ -325,7 +325,7 @@ CASES = [
 
 
 def check(path: Path) -> None:
-    document, spec = load_sequence(path)
+    document, spec, _ = load_sequence(path)
     found = ProblemCollector()
     for step in spec.shot:
         with found:

@@ -9,8 +9,9 @@ from typing import Any
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from labseq.config import Document, SequenceSpec, StoredText, load_profile, load_sequence
-from labseq.config.document import FallbackValues, load_checked
+from labseq.config.document import Document, FallbackValues, StoredText, load_checked
+from labseq.config.profile import load_profile
+from labseq.config.sequence import SequenceSpec, load_sequence
 from labseq.config.validation import node_of
 from labseq.errors import ConfigError, ProblemCollector
 
@@ -199,7 +200,7 @@ def test_a_wrong_step_leaves_the_others_in_their_places(tmp_path: Path):
         "labseq: 1\nname: x\nshots: 1\ntarget: {pattern: compact}\nshot: [load, {wait: {}}, 5, {load: {}}]\n"
     )
     found = ProblemCollector()
-    _, spec = load_sequence(path, found=found)
+    _, spec, _ = load_sequence(path, found=found)
     assert [step.loc for step in spec.shot] == [
         ("shot", 0, "image"),
         ("shot", 1, "wait"),

@@ -9,8 +9,9 @@ from typing import Any
 import pytest
 from hypothesis import given, strategies as st
 
-from labseq.config import Document, load_sequence
+from labseq.config.document import Document
 from labseq.config.expressions import MAX_LENGTH, MAX_PARTS, POWERS
+from labseq.config.sequence import load_sequence
 from labseq.errors import ConfigError
 from labseq.units import UNITS, parse_any
 

@@ -5,8 +5,11 @@ from pathlib import Path
 import pytest
 
 from labseq import files as places
-from labseq.config import Document, find, find_profile, find_sequence, packaged_profiles_dir, profile_dir
+from labseq.config import find
+from labseq.config.document import Document
+from labseq.config.find import find_profile, find_sequence
 from labseq.errors import ConfigError
+from labseq.files import packaged_profiles_dir, profile_dir
 
 
 @pytest.fixture(autouse=True)

@@ -10,7 +10,9 @@ from hypothesis import given, settings, strategies as st
 
 from labseq.builtin.rearrange import RearrangeSettings
 from labseq.builtin.steps import DeviceSettings, ImageSettings, LoadSettings, WaitSettings
-from labseq.config import Override, load_profile, load_sequence, split_overrides
+from labseq.config.addresses import Override, split_overrides
+from labseq.config.profile import load_profile
+from labseq.config.sequence import load_sequence
 from labseq.errors import ConfigError, ProblemCollector
 from labseq.settings import Settings
 
@@ -98,7 +100,7 @@ def test_sequences(path: Path, data: bytes) -> None:
     path.write_bytes(data)
 
     def load() -> None:
-        document, spec = load_sequence(path)
+        document, spec, _ = load_sequence(path)
         found = ProblemCollector()
         for step in spec.shot:
             with found:

@@ -12,18 +12,20 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from labseq.config import (
+from labseq.config.document import Document
+from labseq.config.profile import (
     MOTION_KEYS,
     CalibrationSettings,
-    Document,
+    ChannelSettings,
+    GridSettings,
     MotionSettings,
     ProfileSpec,
-    bind_scan,
+    RfSettings,
+    TimeoutSettings,
     load_profile,
-    load_sequence,
-    read_scan,
 )
-from labseq.config.profile import ChannelSettings, GridSettings, RfSettings, TimeoutSettings
+from labseq.config.scan import read_scan
+from labseq.config.sequence import load_sequence
 from labseq.errors import ConfigError
 from labseq.model import CALIBRATION_KINDS, MotionSpec, RfSpec, SiteGrid
 from labseq.settings import Settings
@@ -491,9 +493,9 @@ def test_calibrations_are_not_scanned(tmp_path: Path) -> None:
         "planner: {use: psca}\nscan: {profile.calibrations.use.sites: [abc, def]}\nshot: [{image: {}}]\n",
         "utf-8",
     )
-    document, _ = load_sequence(sequence)
+    document, *_ = load_sequence(sequence)
     scan = read_scan(document, [])
     assert scan is not None
     profile, _ = load_profile(tmp_path / "bench.yaml", beside=tmp_path)
     with pytest.raises(ConfigError, match="a scan cannot change"):
-        bind_scan(scan, profile)
+        scan.bound(profile)

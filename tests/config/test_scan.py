@@ -9,8 +9,11 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
-from labseq.config import Document, Override, Scan, load_sequence, read_scan
+from labseq.config.addresses import Override
+from labseq.config.document import Document
+from labseq.config.scan import Scan, read_scan
 from labseq.config.scan_values import MAX_POINTS, values_of
+from labseq.config.sequence import load_sequence
 from labseq.errors import ConfigError
 
 REST = """labseq: 1
@@ -91,7 +94,7 @@ def test_addresses_of_one_mapping_of_a_list_go_together() -> None:
 def test_the_first_point_stands_in_the_document_and_shots_follow_from_the_scan(tmp_path: Path) -> None:
     path = tmp_path / "s.yaml"
     path.write_text(REST + "scan: {shot.sort.window: [1 ms, 2 ms]}\nrepeats: 3\n")
-    document, spec = load_sequence(path)
+    document, spec, _ = load_sequence(path)
     assert spec.shots == 6
     assert document.get(("shot", 2, "rearrange", "window")) == "1 ms"
     path.write_text(path.read_text() + "shots: 6\n")

@@ -9,7 +9,9 @@ from pathlib import Path
 import pytest
 
 import labseq
-from labseq.config import Override, SequenceSpec, StepSpec, load_sequence, plugin_paths
+from labseq.config.addresses import Override
+from labseq.config.document import plugin_paths
+from labseq.config.sequence import SequenceSpec, StepSpec, load_sequence
 from labseq.errors import ConfigError
 from labseq.settings import PatternChoice
 
@@ -30,7 +32,7 @@ def refusal(folder: Path, text: str, *overrides: Override | tuple[str, str]) -> 
 
 
 def test_everything_in_it() -> None:
-    document, spec = load_sequence(DATA / "sequence.yaml")
+    document, spec, _ = load_sequence(DATA / "sequence.yaml")
     assert spec.name == "compact-225"
     assert spec.profile == "virtual"
     assert spec.shots == 20
@@ -61,7 +63,7 @@ def test_defaults(tmp_path: Path) -> None:
 def test_default_planner_can_be_set(tmp_path: Path, planner: str) -> None:
     path = tmp_path / "s.yaml"
     path.write_text(SMALL + planner, encoding="utf-8")
-    document, spec = load_sequence(path, [("planner.degree_of_parallelism", "3")])
+    document, spec, _ = load_sequence(path, [("planner.degree_of_parallelism", "3")])
     assert document.get(spec.planner.loc) == {"use": "psca", "degree_of_parallelism": 3}
 
 
@@ -120,7 +122,7 @@ def test_plugin_folders_are_beside_the_file(tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
     path = tmp_path / "s.yaml"
     path.write_text(SMALL + "plugin_folders: [mine, ~nobody-of-this-name, yours]\n", encoding="utf-8")
-    document, spec = load_sequence(path)
+    document, spec, _ = load_sequence(path)
     assert plugin_paths(document, ["mine"]) == [tmp_path / "mine"]
     with pytest.raises(ConfigError) as caught:
         plugin_paths(document, spec.plugin_folders)

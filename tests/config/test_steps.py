@@ -6,7 +6,7 @@ from pydantic import BaseModel
 from labseq.builtin.probes import CheckOverlaySettings, CheckSitesSettings, ProbeSettings
 from labseq.builtin.rearrange import RearrangeSettings
 from labseq.builtin.steps import DeviceSettings, ImageSettings, LoadSettings, RampSettings, WaitSettings
-from labseq.config import Document
+from labseq.config.document import Document
 
 STEPS: list[type[BaseModel]] = [
     LoadSettings,

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from pydantic import Field, field_validator, model_validator
 
-from labseq.config import Document, validate_values
-from labseq.config.validation import MAX_HINTS
+from labseq.config.document import Document
+from labseq.config.validation import MAX_HINTS, validate_values
 from labseq.errors import ConfigError
 from labseq.settings import Duration, Fraction, Length, Settings
 

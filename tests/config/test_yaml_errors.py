@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from labseq.config import Document
+from labseq.config.document import Document
 from labseq.errors import ConfigError
 
 GOOD = (Path(__file__).parent / "data" / "sequence.yaml").read_text(encoding="utf-8")

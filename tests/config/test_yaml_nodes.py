@@ -10,7 +10,7 @@ from typing import Any, cast
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from labseq.config import Document
+from labseq.config.document import Document
 from labseq.config.yaml_nodes import MAX_DEPTH, MAX_DIGITS, MAX_VALUES, compose, resolve
 from labseq.errors import ConfigError, Loc
 

@@ -13,7 +13,7 @@ from hypothesis import given, settings, strategies as st
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from labseq.config import load_profile
+from labseq.config.profile import load_profile
 from labseq.detection.sites import site_pixels
 from labseq.detection.weighted import WeightedDetector, WeightedSettings
 from labseq.errors import ConfigError, DeviceError, LimitError

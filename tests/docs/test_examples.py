@@ -15,7 +15,8 @@ from markdown_it import MarkdownIt
 import labseq
 from labseq.cli.app import app
 from labseq.cli.entry import arrange
-from labseq.config import ProfileSpec, SequenceSpec
+from labseq.config.profile import ProfileSpec
+from labseq.config.sequence import SequenceSpec
 from labseq.config.yaml_nodes import compose
 from labseq.console.errors import format_config_error
 

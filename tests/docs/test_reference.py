@@ -19,16 +19,16 @@ import labseq
 from labseq import errors, hookspecs, plugin, roles, testing
 from labseq.builtin import labseq_register
 from labseq.cli.app import app
-from labseq.config import (
+from labseq.config.profile import (
+    BudgetSettings,
     CalibrationSettings,
+    GridSettings,
+    MobileTweezersChoice,
     ProfileSpec,
-    SequenceSpec,
     TimeoutSettings,
     load_profile,
-    load_sequence,
 )
-from labseq.config.profile import GridSettings, MobileTweezersChoice
-from labseq.config.sequence import BudgetSettings, PolicySettings, StepPolicySettings
+from labseq.config.sequence import PolicySettings, SequenceSpec, StepPolicySettings, load_sequence
 from labseq.config.yaml_nodes import compose
 from labseq.console.errors import exit_code_of
 from labseq.registry import KINDS, Entry, Registry

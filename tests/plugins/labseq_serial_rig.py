@@ -13,7 +13,7 @@ from typing import Any, Self
 from labseq_serial.device import SerialDevice
 from labseq_serial.settings import SerialSettings
 
-from labseq.config import Document
+from labseq.config.document import Document
 from labseq.config.yaml_nodes import compose
 from labseq.plugin import Clock, Context
 from labseq.testing.fakes import FakeClock

@@ -15,7 +15,7 @@ from labseq_follow.leader import serial_leader, tcp_leader
 from labseq_follow.protocol import Dialogue, Splitter
 from labseq_follow.settings import SerialLeaderSettings, TcpLeaderSettings
 
-from labseq.config import Document
+from labseq.config.document import Document
 from labseq.guard import StopFlag
 from labseq.plugin import ConfigError, Context, Device, DeviceError, DeviceTimeoutError, StopRequested
 from labseq.roles import LeaderLink, offers

@@ -18,7 +18,7 @@ import pytest
 from labseq_serial.device import SerialDevice
 
 from labseq import ConfigError, DeviceError, LimitError, Session, TransientError
-from labseq.config import find_profile
+from labseq.config.find import find_profile
 from labseq.config.yaml_nodes import compose
 from labseq.plugin import Context
 from labseq.recording import Run

@@ -17,7 +17,7 @@ from labseq_serial.settings import CommandSettings, SerialSettings
 from labseq_serial.values import Unit
 from pydantic import ValidationError
 
-from labseq.config import Document
+from labseq.config.document import Document
 from labseq.config.yaml_nodes import compose
 from labseq.plugin import ConfigError, Context, DeviceError
 from labseq.testing.fakes import FakeClock

@@ -19,7 +19,7 @@ from labseq_virtual.settings import (
 )
 
 from labseq.builtin.patterns import BitmapSettings, CompactSettings
-from labseq.config import MOTION_KEYS, load_profile
+from labseq.config.profile import MOTION_KEYS, load_profile
 from labseq.detection.threshold import ThresholdSettings
 from labseq.plugin import MotionSpec, Registry, RfSpec, Settings, SiteGrid
 

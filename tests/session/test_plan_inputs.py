@@ -170,7 +170,7 @@ def test_a_shot_brings_its_target_and_its_machine() -> None:
 
 
 def inputs_motion(**changes: Any) -> dict[str, Any]:
-    from labseq.config import MOTION_KEYS, MotionSettings
+    from labseq.config.profile import MOTION_KEYS, MotionSettings
 
     values = MotionSettings().model_dump(mode="json", include=set(MOTION_KEYS))
     return values | changes

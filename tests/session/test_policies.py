@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 import labseq
-from labseq.config import CheckSettings
+from labseq.config.sequence import CheckSettings
 from labseq.errors import CheckFailedError, ConfigError, DeviceError
 from labseq.session.check import check
 from labseq.session.policies import Checks

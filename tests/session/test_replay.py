@@ -12,8 +12,8 @@ from hypothesis import given, strategies as st
 import labseq
 from labseq.analysis.replay import ReplayRequest, replay, shots_of
 from labseq.calibration.store import Store
-from labseq.config import packaged_profiles_dir
 from labseq.errors import ConfigError, RecordingError
+from labseq.files import packaged_profiles_dir
 from labseq.model import SiteGrid
 from labseq.recording import open_run
 from labseq.recording.folders import INDEX_FILE, STATE_FILE

@@ -11,7 +11,8 @@ from typing import Final
 from pydantic import BaseModel
 
 from labseq import builtin as builtins
-from labseq.config import ProfileSpec, SequenceSpec, StepPolicySettings
+from labseq.config.profile import ProfileSpec
+from labseq.config.sequence import SequenceSpec, StepPolicySettings
 from labseq.config.validation import keys_of, models_at
 from labseq.errors import UnknownPluginError
 from labseq.plugins import ENTRY_POINT_GROUP, PluginHost

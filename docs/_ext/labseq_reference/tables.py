@@ -9,8 +9,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from labseq import builtin as builtins
-from labseq.config import SequenceSpec
-from labseq.config.sequence import DEFAULT_PLANNER
+from labseq.config.sequence import DEFAULT_PLANNER, SequenceSpec
 from labseq.registry import Entry
 from labseq.settings import Choice
 from labseq.units import EXAMPLES, UNITS, unit_names
