@@ -31,37 +31,13 @@ def document() -> Document:
     return Document.parse(TEXT, "f.yaml")
 
 
-def said(error: pytest.ExceptionInfo[ConfigError]) -> str:
-    return str(error.value)
-
-
-def test_fields(document: Document) -> None:
-    assert document.path == Path("f.yaml")
-    assert document.name == "f.yaml"
-    assert document.text == TEXT
-    assert document.data["planner"] == {"use": "psca"}
-    assert document.get(("shot", 1, "rearrange", "window", 1)) == 2
-    assert document.get(("shot", 2), "none") == "none"
-
-
-def test_problem_and_error(document: Document) -> None:
-    problem = document.problem(
-        ("planner", "use"), "no such planner", "another", "did you mean 'lsap'?", key=True
-    )
-    assert str(problem) == "f.yaml:2:11: no such planner; expected another; did you mean 'lsap'?"
-    assert str(document.error(("planner", "use"), "no such planner")) == "f.yaml:2:16: no such planner"
-
-
 @pytest.mark.parametrize(
     ("address", "value", "expected"),
     [
         ("shots", "5", {"shots": 5}),
-        ("shots", "'5'", {"shots": "5"}),
         ("shots", "", {"shots": None}),
-        ("shots", "45 ms", {"shots": "45 ms"}),
         ("new", "[1, {a: b}]", {"new": [1, {"a": "b"}]}),
         ("planner.degree_of_parallelism", "7", {"planner": {"use": "psca", "degree_of_parallelism": 7}}),
-        ("planner", "{use: lsap}", {"planner": {"use": "lsap"}}),
         ("empty.within", "1", {"empty": {"within": 1}}),
     ],
 )
@@ -72,18 +48,13 @@ def test_override(document: Document, address: str, value: str, expected: dict[s
     assert document.data == Document.parse(TEXT, "f.yaml").data
 
 
-@pytest.mark.parametrize("address", ["shot.1.rearrange.window", "shot.sort.window"])
-def test_override_of_a_step(document: Document, address: str) -> None:
-    changed = document.override(address, "40 ms", "--set")
-    assert changed.get(("shot", 1)) == {"name": "sort", "rearrange": {"cycles": 2, "window": "40 ms"}}
-
-
-def test_override_of_an_empty_step_and_of_a_list_item(document: Document) -> None:
-    changed = document.override("shot.0.load.duration", "1 s", "--set").override(
-        "shot.sort.window.1", "9", "--set"
-    )
-    assert changed.get(("shot", 0)) == {"load": {"duration": "1 s"}}
-    assert changed.get(("shot", 1, "rearrange", "window")) == [1, 9]
+def test_overrides_of_a_step_of_an_empty_step_and_of_a_list_item(document: Document) -> None:
+    options = [("shot.sort.cycles", "3"), ("shot.0.load.duration", "1 s"), ("shot.1.rearrange.window.1", "9")]
+    changed = document.override_all(options)
+    assert changed.data["shot"] == [
+        {"load": {"duration": "1 s"}},
+        {"name": "sort", "rearrange": {"cycles": 3, "window": [1, 9]}},
+    ]
 
 
 def test_problems_of_an_override_name_the_option(document: Document) -> None:
@@ -96,7 +67,7 @@ def test_problems_of_an_override_name_the_option(document: Document) -> None:
     assert str(changed.problem(("shot", 1, "name"), "wrong")) == "f.yaml:5:11: wrong"
 
 
-def test_key_that_an_option_adds_is_the_option_s(document: Document) -> None:
+def test_a_problem_of_a_key_that_an_option_adds_names_the_option(document: Document) -> None:
     changed = document.override("empty.a", "{b: 1}", "--set empty.a={b: 1}")
     assert str(changed.problem(("empty", "a"), "unknown", key=True)) == "--set empty.a={b: 1}: unknown"
     assert str(changed.problem(("empty", "a", "b"), "unknown", key=True)) == "--set empty.a={b: 1}: unknown"
@@ -115,22 +86,20 @@ def test_missing_parents_are_made_where_allowed(document: Document) -> None:
     [
         ("[1", "o: the '[' that opens here is never closed; expected ',' or ']'"),
         ("a: b", "o: this is YAML of several lines; expected one value: 5, '45 ms', [a, b] or {key: value}"),
-        ("- a", "o: this is YAML of several lines; expected one value: 5, '45 ms', [a, b] or {key: value}"),
         ("{a: 1, a: 2}", "o: 'a' is given twice; remove one of them"),
-        ("!!str x", "o: '!!str' is a YAML tag, which is not allowed; expected a plain value; "),
         ("\udcb5", "o: a byte that is not UTF-8; expected plain text; delete it"),
     ],
 )
 def test_override_that_is_no_value(document: Document, value: str, message: str) -> None:
     with pytest.raises(ConfigError) as caught:
         document.override("shots", value, "o")
-    assert said(caught).startswith(message)
+    assert str(caught.value).startswith(message)
 
 
 def test_all_wrong_overrides_are_reported(document: Document) -> None:
     with pytest.raises(ConfigError) as caught:
         document.override_all([("a.b", "1"), ("shots", "5"), ("shots", "{")])
-    assert said(caught).split("\n") == [
+    assert str(caught.value).split("\n") == [
         "--set a.b=1: there is no 'a' in f.yaml; expected one of shots, planner, shot, empty",
         "--set shots={: the '{' that opens here is never closed; expected ',' or '}'",
     ]
@@ -144,6 +113,7 @@ json_values = st.recursive(
 )
 
 
+@settings(max_examples=40)
 @given(st.dictionaries(plain_text, json_values, max_size=4))
 def test_json_is_yaml(data: dict[str, Any]) -> None:
     text = json.dumps(data, ensure_ascii=False)
@@ -162,7 +132,7 @@ def test_a_kept_text_stands_for_a_file_that_may_be_gone(tmp_path: Path) -> None:
         load_profile(path, beside=Path(), kept=kept)
 
 
-STAND_INS = FallbackValues(
+FALLBACKS = FallbackValues(
     values={
         "labseq": 1,
         "name": "x",
@@ -173,20 +143,20 @@ STAND_INS = FallbackValues(
     },
     items={"shot": {"image": {}}},
 )
-GOOD = {**STAND_INS.values, "name": "mine", "shots": 7}
+GOOD = {**FALLBACKS.values, "name": "mine", "shots": 7}
 SCALARS = st.none() | st.booleans() | st.integers(-9, 9) | st.sampled_from(["", "mine", "45 ms"])
 VALUES = st.recursive(SCALARS, lambda inner: st.lists(inner) | st.dictionaries(st.text("abc"), inner))
 KEYS = st.sampled_from([*GOOD, "seed", "attempts", "record_frames", "unknown"])
 
 
-@settings(max_examples=40)
+@settings(max_examples=20)
 @given(st.dictionaries(KEYS, VALUES))
-def test_whatever_is_wrong_the_rest_is_kept(changes: dict[str, Any]):
+def test_what_is_right_beside_something_wrong_is_kept(changes: dict[str, Any]):
     base = Document.parse("labseq: 1\n", "s.yaml")
     root = node_of({**GOOD, **changes}, base.root.mark)
     found = ProblemCollector()
     document, spec = load_checked(
-        Document(Path("s.yaml"), "s.yaml", "", root), SequenceSpec, "a sequence", STAND_INS, found
+        Document(Path("s.yaml"), "s.yaml", "", root), SequenceSpec, "a sequence", FALLBACKS, found
     )
     assert document.validate(SequenceSpec) == spec
     for key in GOOD.keys() - changes.keys():

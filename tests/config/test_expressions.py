@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given, strategies as st
+from hypothesis import given, settings, strategies as st
 
 from labseq.config.document import Document
 from labseq.config.expressions import MAX_LENGTH, MAX_PARTS, POWERS
 from labseq.config.sequence import load_sequence
 from labseq.errors import ConfigError
-from labseq.units import UNITS, parse_any
+from labseq.units import parse_any
 
 VALUES = """variables: {hold: 20 ms, n: 3, way: 4.49 um, half: 50 %, turn: 90 deg, warm: 25 degC, zero: 0}
 shot:
@@ -40,39 +40,26 @@ def refused(text: str, more: str = "") -> str:
     [
         ("= 2 * shot.0.image.exposure", "0.09 s"),
         ("= variables.hold + 5 ms", "0.025 s"),
-        ("= variables.hold+5ms", "0.025 s"),
         ('"= min(variables.hold, 5 ms)"', "0.005 s"),
-        ("'= max(variables.n, 5)'", 5),
         ("= shot.sort.window.0 / 3", "0.02 s"),
         ("= shot.sort.window.1", 0.04),
         ("= 2 * variables.n", 6),
-        ("= 6 / variables.n", 2),
         ("= 7 / 2", 3.5),
         ("= 2 ** 3 ** 2", 512),
         ("= -2 ** 2", -4),
-        ("= 2 ** -1", 0.5),
         ("= --3 - -2", 5),
-        ("= (1 + 2) * 3", 9),
         ("= variables.way / variables.hold", "0.0002245 m/s"),
-        ("= 130 um/ms * 2 ms", "0.00026 m"),
         ("= 1 / variables.hold", "50.0 Hz"),
         ("= 2 MHz * 3 us", 6.0),
         ("= sqrt(4 um * 9 um)", "6e-06 m"),
         ("= (2 ms) ** 2 / 1 ms", "0.004 s"),
         ("= sin(variables.turn) + cos(0) + tan(0)", 2.0),
-        ("= variables.half * 3", 1.5),
         ("= 75 % * 2", 1.5),
         ("= variables.warm - 5 K", "293.15 K"),
-        ("= 20 degC", "293.15 K"),
         ("= exp(log(3))", 3.0),
         ("= floor(2.7) + ceil(2.1) + round(2.6)", 8),
-        ("= abs(-3 ms)", "0.003 s"),
-        ("= 2 * pi", 2 * math.pi),
-        ("= 5 m/shot.0.image.exposure", f"{float(f'{5 / 0.045:.15g}')!r} m/s"),
-        ("= 1e-3 s + .5 ms + 1. ms", "0.0025 s"),
         ("= 0.1 + 0.2", 0.3),
         ("== 2 + 3", "= 2 + 3"),
-        ("'=='", "="),
     ],
 )
 def test_what_comes_out(text: str, expected: Any) -> None:
@@ -81,69 +68,50 @@ def test_what_comes_out(text: str, expected: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         ("= 2 * (3 + 4", "11: the '(' that opens here is never closed; expected ')'"),
         ("=", "5: the expression ends too early; expected a number, an address or '('"),
-        ("= 2 *", "9: the expression ends too early"),
         (
             "= 2 3",
             "9: '3' cannot stand here; expected numbers, addresses, functions, brackets and + - * / **",
         ),
-        ("= 2 ms 3", "12: '3' cannot stand here"),
         ("= 2 + 3)", "12: ')' cannot stand here"),
         ("= variables.hold + 5", "22: a time and a number cannot be added; give the number its unit"),
-        ("= variables.hold - variables.way", "22: a time and a length cannot be subtracted"),
         ('"= min(2 ms, 3)"', "8: a time and a number cannot be compared"),
         ("= variables.hodl", "7: there is no 'variables.hodl' in this file; did you mean 'hold'?"),
         ("= shot.0.image.gain", "7: there is no 'shot.0.image.gain' in this file; an expression knows what"),
-        ("= shot.7.image.gain", "7: 'shot' has no item '7'"),
-        ("= nothing", "7: there is no 'nothing' in this file"),
         ("= shot.0.image", "7: 'shot.0.image' is a mapping"),
         ("= shot.0.image.name", "7: 'shot.0.image.name' is 'x'; expected a number or a quantity"),
         ("= 1 / variables.zero", "9: this divides by zero"),
-        ("= variables.zero ** -1", "22: this divides by zero"),
-        ("= 10 ** 400", "10: this is too large a number"),
-        ("= 1e308 * 1e308", "13: this is too large a number"),
         ("= exp(1e9)", "7: this is too large a number"),
         ("= 2 ** 1e6", "9: the exponent is 1e+06; expected a number from -1000 to 1000"),
-        ("= 2 ** 1 s", "9: the exponent is a time; expected"),
         ("= (1 s) ** 0.5", "13: a time has whole powers only"),
         ("= (-2) ** 0.5", "12: a negative number has no such power"),
         ("= sqrt(-1)", "7: this function has no value there"),
-        ("= log(0)", "7: this function has no value there"),
         ("= sqrt(2 s)", "7: sqrt() of a time has no unit"),
         ("= exp(2 s)", "7: exp() of a time; expected a number"),
-        ("= sin(2 s)", "7: sin() of a time; expected a number or an angle"),
         ("= sin(1, 2)", "sin() takes 1 value, not 2"),
         ("= min(1)", "7: min() takes 2 values or more, not 1"),
         ("= sni(1)", "7: there is no function 'sni'; expected one of"),
         ("= __import__('os')", "18: ''' cannot stand here"),
         ("= variables.n.real", "has no 'real' in it"),
-        ("= variables.n.__class__", "has no '__class__' in it"),
         ("= 1 s * 1 s", "5: the result is in s^2, which is no unit of any setting"),
         ("= (1 m) ** 13", "13: powers of units go up to 12"),
         ("= it", "7: this goes round in a circle: it -> it"),
-        ("= 2 if 1 else 3", "9: 'i' cannot stand here"),
-        ("= [1, 2]", "7: '[' cannot stand here"),
-        ("= 1; 2", "8: ';' cannot stand here"),
         (f"= {'-' * 300}1", f"the expression has more than {MAX_PARTS} parts"),
         (f"= {'(' * 240}1{')' * 240}", "'(' cannot stand here"),
         (f"= {'1 + ' * 200}1", f"the expression has 803 characters; expected at most {MAX_LENGTH}"),
-        ("= " + "9" * 400, "this is too large a number"),
     ],
 )
-def test_what_is_wrong_is_told_with_its_place(text: str, told: str) -> None:
-    text = f"'{text}'" if ", " in text and not text.startswith('"') else text
-    said = refused(text)
-    if ", " not in text or text.startswith('"'):
-        assert said.startswith(told) or told in said.partition(": ")[2], said
-    else:
-        assert told.partition(": ")[2] in said or told in said, said
-    assert "\n" not in said
+def test_a_wrong_expression_is_reported_with_its_place(text: str, message: str) -> None:
+    in_quotes = ", " in text and not text.startswith('"')  # the place is then counted from the quotes
+    found = refused(f"'{text}'" if in_quotes else text)
+    assert (message.partition(": ")[2] if in_quotes else message) in found
+    assert "\n" not in found
 
 
-def test_a_circle_and_what_hangs_on_it_is_told_once() -> None:
+def test_a_circle_and_what_depends_on_it_is_reported_once() -> None:
     more = "a: = b + 1\nb: = c\nc: = 2 * a\n"
     (told,) = refused("= a", more).splitlines()
     assert told.endswith("this goes round in a circle: a -> b -> c -> a")
@@ -155,13 +123,11 @@ def test_an_expression_that_refers_to_a_wrong_one_is_not_reported_as_well(wrong:
 
 
 def test_a_long_chain_ends() -> None:
-    chain = "".join(f"v{i}: = v{i + 1}\n" for i in range(40)) + "v40: 7\n"
-    assert value("= v0", chain) == 7
-    chain = "".join(f"v{i}: = v{i + 1}\n" for i in range(3000)) + "v3000: 7\n"
+    chain = "".join(f"v{i}: = v{i + 1}\n" for i in range(1500)) + "v1500: 7\n"
     assert value("= v0", chain) == 7
 
 
-def test_the_place_in_an_option_is_told_by_its_character() -> None:
+def test_the_place_in_an_option_is_its_character() -> None:
     document = Document.parse(VALUES, "s.yaml").override(
         "variables.n", "= 2 + x", "--set variables.n== 2 + x"
     )
@@ -171,7 +137,7 @@ def test_the_place_in_an_option_is_told_by_its_character() -> None:
         document.evaluated()
 
 
-def test_an_override_is_worked_out_anew() -> None:
+def test_what_depends_on_an_override_is_worked_out_again() -> None:
     document = Document.parse(VALUES + "it: = 2 * variables.hold\n", "s.yaml").evaluated()
     assert document.override("variables.hold", "30 ms", "--set").data["it"] == "0.06 s"
     assert document.override("it", "5", "--set").data["it"] == 5
@@ -188,21 +154,19 @@ def test_a_field_says_what_it_makes_of_the_result(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         ("{hold: text}", "a variable is 'text'; expected a number, or a number with a unit"),
-        ("{hold: true}", "a variable is true"),
         ("{hold: [1]}", "a variable is a list"),
         ("{a b: 1}", "a variable is called 'a b'; expected letters, digits and '_', a letter first"),
-        ("[1]", "variables is a list"),
     ],
 )
-def test_wrong_variables(tmp_path: Path, text: str, told: str) -> None:
+def test_wrong_variables(tmp_path: Path, text: str, message: str) -> None:
     rest = "labseq: 1\nname: s\nshots: 1\ntarget: {pattern: compact}\nshot:\n  - image: {}\n"
     (tmp_path / "s.yaml").write_text(f"{rest}variables: {text}\n")
     with pytest.raises(ConfigError) as caught:
         load_sequence(tmp_path / "s.yaml")
-    assert told in str(caught.value)
+    assert message in str(caught.value)
     assert caught.value.problems[0].line == 7
 
 
@@ -255,6 +219,7 @@ def si_of(result: Any) -> tuple[float, tuple[int, ...]]:
     return result, POWERS["fraction"]
 
 
+@settings(max_examples=60)
 @given(TREES)
 def test_expressions_come_out_as_the_reference_works_them_out(tree: Worked) -> None:
     if tree is None:  # the reference could not work it out, and the text is gone with it
@@ -273,12 +238,7 @@ def test_expressions_come_out_as_the_reference_works_them_out(tree: Worked) -> N
     assert math.isclose(amount, expected, rel_tol=1e-9, abs_tol=1e-12)
 
 
-@given(st.sampled_from(["time", "length"]), st.sampled_from(["voltage", "fraction"]), st.sampled_from("+-"))
-def test_sums_of_different_dimensions_are_refused(one: str, other: str, sign: str) -> None:
-    a, b = (next(iter(UNITS[dimension])) for dimension in (one, other))
-    assert "cannot be" in refused(f"= 2 {a} {sign} 3 {b}")
-
-
+@settings(max_examples=60)
 @given(st.text("0123456789.+-*/() eamsn%,=xX_", max_size=40))
 def test_any_text_is_worked_out_or_refused(text: str) -> None:
     quoted = f'"= {text}"'

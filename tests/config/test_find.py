@@ -30,27 +30,18 @@ def refusal(name: str, named_in: Document | None = None) -> str:
 
 
 def test_order_of_the_places(shelves: Path) -> None:
-    places = [shelves / "packaged", Path("hardware_profiles"), Path("sequences")]
-    for place in places:
-        (place / "lab.yaml").touch()
-        assert find_profile("lab", Path("sequences")) == place / "lab.yaml"
+    files = [shelves / "packaged/lab.yaml", Path("hardware_profiles/lab.yml"), Path("sequences/lab.yaml")]
+    for file in files:
+        file.touch()
+        assert find_profile("lab", Path("sequences")) == file
 
 
-def test_both_endings() -> None:
-    Path("hardware_profiles/lab.yml").touch()
-    assert find_profile("lab", Path("sequences")) == Path("hardware_profiles/lab.yml")
-
-
-@pytest.mark.parametrize("name", ["../mine/lab.yaml", "lab.yaml", "sub/lab.YML", "./lab.yaml"])
+@pytest.mark.parametrize("name", ["../mine/lab.yaml", "sub/lab.YML"])
 def test_paths_are_relative_to_the_file_that_names_them(name: str) -> None:
     path = Path("sequences") / name
     path.parent.mkdir(exist_ok=True)
     path.touch()
     assert find_profile(name, Path("sequences")) == path
-
-
-def test_a_path_object_is_taken_as_it_is() -> None:
-    assert find_profile(Path("anything"), Path("sequences")) == Path("anything")
 
 
 def test_unknown_name(shelves: Path) -> None:
@@ -63,7 +54,7 @@ def test_unknown_name(shelves: Path) -> None:
     assert refusal("virtul") == f"there is no hardware profile 'virtul' in {places}; {expected}"
 
 
-def test_place_of_the_name_is_told() -> None:
+def test_the_place_of_the_name_is_named() -> None:
     document = Document.parse("labseq: 1\nprofile: virtul\n", "s.yaml")
     assert refusal("virtul", document).startswith("s.yaml:2:10: there is no hardware profile 'virtul' in ")
     document = document.override("profile", "lab_onn.yaml", "--set profile=lab_onn.yaml")
@@ -79,15 +70,10 @@ def test_a_file_that_only_ends_alike_is_not_meant() -> None:
     assert refusal("./").startswith("there is a folder, not a hardware profile, at ")
 
 
-@pytest.mark.parametrize("name", ["", "..", "a\0b", "x" * 5000, "~nobody-of-this-name/x.yaml", "\0/x.yaml"])
+@pytest.mark.parametrize("name", ["", "..", "a\0b", "x" * 5000, "~nobody-of-this-name/x.yaml"])
 def test_odd_names(name: str) -> None:
     assert refusal(name).startswith("there is no hardware profile ")
     assert refusal(name).isprintable()
-
-
-def test_folder_is_no_profile() -> None:
-    Path("sequences/lalab_onn.yaml").mkdir()
-    assert refusal("lab").startswith("there is no hardware profile 'lab'")
 
 
 def test_what_belongs_to_a_profile_is_not_kept_inside_of_a_wheel(
@@ -118,9 +104,7 @@ def test_order_of_the_places_of_a_sequence(shelves: Path) -> None:
     assert find_sequence(Path("kagome")) == Path("kagome")
 
 
-@pytest.mark.parametrize(
-    "path", ["kagome.yaml", "gone.json", "sequences/gone.YML", "..", ".", "sequences", "a/b"]
-)
+@pytest.mark.parametrize("path", ["kagome.yaml", "sequences/gone.YML", "..", "sequences", "a/b"])
 def test_a_path_of_a_sequence_is_taken_as_it_is(path: str) -> None:
     assert find_sequence(Path(path)) == Path(path)
 
@@ -144,9 +128,3 @@ def test_unknown_name_of_a_sequence(shelves: Path) -> None:
     )
     Path("my_scan.yaml").touch()
     assert refused_sequence("my_scann").endswith("; did you mean 'my_scan.yaml'?")
-
-
-@pytest.mark.parametrize("name", ["a\0b", "x" * 5000, "yes no"])
-def test_odd_names_of_sequences(name: str) -> None:
-    assert refused_sequence(name).startswith("there is no sequence '")
-    assert refused_sequence(name).isprintable()

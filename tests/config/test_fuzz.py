@@ -1,4 +1,4 @@
-"""Whatever a file holds: a spec, or a ConfigError that can be printed. Nothing else."""
+"""Any file gives a spec, or a ConfigError that can be printed. Nothing else."""
 
 from __future__ import annotations
 
@@ -81,8 +81,8 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("fuzz") / "f.yaml"
 
 
-def tell(load: Callable[[], None], n_lines: int) -> None:
-    """Load; what is said must be readable, and its places must be in the file."""
+def load_or_report(load: Callable[[], None], n_lines: int) -> None:
+    """Load; messages must be readable, and their places in the file."""
     try:
         load()
     except ConfigError as error:
@@ -94,7 +94,7 @@ def tell(load: Callable[[], None], n_lines: int) -> None:
             assert 0 <= problem.line <= n_lines + 1
 
 
-@settings(max_examples=250, deadline=None)
+@settings(max_examples=100)
 @given(data=mutated(SEQUENCE))
 def test_sequences(path: Path, data: bytes) -> None:
     path.write_bytes(data)
@@ -107,10 +107,10 @@ def test_sequences(path: Path, data: bytes) -> None:
                 document.validate(MODELS.get(step.kind), step.loc)
         found.raise_any()
 
-    tell(load, data.count(b"\n") + data.count(b"\r"))
+    load_or_report(load, data.count(b"\n") + data.count(b"\r"))
 
 
-@settings(max_examples=250, deadline=None)
+@settings(max_examples=100)
 @given(data=mutated(PROFILE))
 def test_profiles(path: Path, data: bytes) -> None:
     path.write_bytes(data)
@@ -121,7 +121,7 @@ def test_profiles(path: Path, data: bytes) -> None:
         for choice in spec.choices.values():
             document.validate(None, choice.loc, drop=document.get(choice.loc))
 
-    tell(load, data.count(b"\n") + data.count(b"\r"))
+    load_or_report(load, data.count(b"\n") + data.count(b"\r"))
 
 
 addresses = st.lists(
@@ -135,7 +135,7 @@ addresses = st.lists(
 values = st.sampled_from([piece.decode(errors="surrogateescape") for piece in PIECES]) | st.text(max_size=8)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60)
 @given(address=addresses, value=values)
 def test_options(path: Path, address: str, value: str) -> None:
     path.write_bytes(SEQUENCE)
@@ -145,4 +145,4 @@ def test_options(path: Path, address: str, value: str) -> None:
         assert all(isinstance(one, Override) for one in for_profile)
         load_sequence(path, for_sequence)
 
-    tell(load, 30)
+    load_or_report(load, 30)

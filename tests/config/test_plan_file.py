@@ -51,9 +51,7 @@ BAD: list[tuple[Callable[[dict[str, Any]], object], str]] = [
     (lambda v: v.pop("grid"), "plan.json: 'grid' is missing (the sites that it is for)"),
     (lambda v: v.update(batches=7), "plan.json: 'batches' is no list"),
     (lambda v: v["batches"].append(7), "plan.json, batch 3: this is no batch"),
-    (lambda v: v["batches"][1].pop("to"), "plan.json, batch 2: 'to' is missing"),
     (lambda v: v["batches"][1]["to"].append([0, 0]), "batch 2: 'from' has 1 sites, 'to' has 2"),
-    (lambda v: v["batches"][0]["to"][0].pop(), "plan.json, batch 1: to.0 has 1 entry; expected at least 2"),
     (lambda v: v["batches"][0].update(to=[[0, 1.5]]), "batch 1: to.0.1 is 1.5; expected a whole number"),
     (lambda v: v["batches"][0].update(to=[[0, 99999]]), "batch 1: to.0.1 is 99999; expected at most 2000"),
     (lambda v: v["batches"][0].update(form=[]), "'form' is not a setting of it"),
@@ -61,21 +59,15 @@ BAD: list[tuple[Callable[[dict[str, Any]], object], str]] = [
     (lambda v: v["target"].update(fill=[[0, 1], [0]]), "'fill' is not of the grid's shape; expected 2 rows"),
     (lambda v: v["target"].update(clear=v["target"]["fill"]), "a site cannot be in both fill and clear"),
     (lambda v: v["occupancy"][0].__setitem__(0, 2), "occupancy.0.0 is 2; expected at most 1"),
-    (lambda v: v["occupancy"][0].__setitem__(0, True), "occupancy.0.0 is true; expected a whole number"),
-    (lambda v: v["grid"].update(lattice="cubic"), "lattice is 'cubic'; expected 'triangular' or 'square'"),
-    (lambda v: v["grid"].update(spacing_m=0), "spacing_m is 0; expected more than 0"),
     (lambda v: v["grid"].update(spacing_m=float("nan")), "plan.json: this is no plan: NaN stands in it"),
-    (lambda v: v["grid"].update(spacing_m=float("-inf")), "this is no plan: -Infinity stands in it"),
     (lambda v: v["grid"].update(spacing_m=4.49), "spacing_m is 4.49; expected at most 0.001"),
     (lambda v: v.update(planner="\x1b[31mred"), "name is '\\x1b[31mred', with '\\x1b' in it"),
-    (lambda v: v.update(planner="x" * 1000), "planner has 1000 characters; expected at most 80"),
-    (lambda v: v.update(degree_of_parallelism=10**30), "expected at most 1000000"),
     (lambda v: v.update(degree_of_parallelism=0), "degree_of_parallelism is 0; expected at least 1"),
 ]
 
 
 @pytest.mark.parametrize(("change", "words"), BAD, ids=[words for _, words in BAD])
-def test_what_is_wrong_in_a_plan_is_told_with_its_batch(
+def test_a_wrong_plan_is_refused_with_its_batch(
     change: Callable[[dict[str, Any]], object], words: str
 ) -> None:
     with pytest.raises(ConfigError) as caught:
@@ -88,15 +80,15 @@ def test_what_is_wrong_in_a_plan_is_told_with_its_batch(
     [
         (b"", "plan.json:1:1: this is no JSON: expecting value"),
         (b'{\n"batches": [1,\n', "plan.json:3:1: this is no JSON: expecting value"),
-        (b"[]", "this is no plan"),
+        (b'{"batches": [], "batches": []}', "this is no plan: 'batches' stands in it twice"),
+        (b'{"batches": ' + b"9" * 5000 + b"}", "a number in it has too many digits"),
+        (b"[" * 100_000, "this is no plan: it is nested too deeply; expected what 'labseq plan --json'"),
         (b"\xff", "byte 0xFF at offset 0 is not UTF-8"),
-        (b"[" * 100_000, "this is no plan"),
-        (b"1" * 10_000, "this is no plan"),
         (b" " * (MAX_BYTES + 1), "it is larger than 4 MiB"),
         (json.dumps(document()).replace("4.49e-06", "1e999").encode(), "expected a finite number"),
     ],
 )
-def test_what_is_no_plan_at_all_is_told(data: bytes, words: str) -> None:
+def test_a_file_without_a_plan_is_refused(data: bytes, words: str) -> None:
     with pytest.raises(ConfigError) as caught:
         parse_plan(data, "plan.json")
     assert words in str(caught.value)
@@ -107,23 +99,9 @@ VALUES = st.recursive(SCALARS, lambda inner: st.lists(inner, max_size=3), max_le
 
 
 @given(st.sampled_from([*document()]), VALUES)
-def test_no_value_makes_it_fail_otherwise(key: str, value: object) -> None:
+def test_any_value_is_read_or_refused(key: str, value: object) -> None:
     values = document() | {key: value}
     try:
         parse_plan(json.dumps(values).encode("utf-8", "backslashreplace"), "plan.json")
     except ConfigError as error:
         assert str(error)
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ('{"batches": [], "batches": []}', "this is no plan: 'batches' stands in it twice"),
-        ('{"batches": ' + "9" * 5000 + "}", "this is no plan: a number in it has too many digits"),
-        ("[" * 100_000, "this is no plan: it is nested too deeply"),
-    ],
-)
-def test_json_that_is_no_plan_is_told_in_our_words(text: str, words: str) -> None:
-    with pytest.raises(ConfigError) as caught:
-        parse_plan(text.encode(), "plan.json")
-    assert str(caught.value) == f"plan.json: {words}; expected what 'labseq plan --json' writes"

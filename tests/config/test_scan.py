@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, strategies as st
+from hypothesis import given, settings, strategies as st
 
 from labseq.config.addresses import Override
 from labseq.config.document import Document
@@ -48,12 +48,9 @@ def plain(text: str) -> list[object]:
     [
         ("[3, 5]", [3, 5]),
         ("{linspace: [50 um/ms, 200 um/ms, 4]}", ["50 um/ms", "100 um/ms", "150 um/ms", "200 um/ms"]),
-        ("{linspace: [0.05 ms, 60 us, 2]}", ["0.05 ms", "0.06 ms"]),
         ("{linspace: [3, 15, 5]}", [3, 6, 9, 12, 15]),
-        ("{linspace: [1, 2, 3]}", [1, 1.5, 2]),
         ("{linspace: [0, 0.3, 4]}", [0.0, 0.1, 0.2, 0.3]),
         ("{range: [60 ms, 200 ms, 50 ms]}", ["60 ms", "110 ms", "160 ms"]),
-        ("{range: [60 ms, 0.2 s, 70 ms]}", ["60 ms", "130 ms", "200 ms"]),
         ("{range: [0, 1, 0.1]}", [round(0.1 * i, 1) for i in range(11)]),
         ("{range: [9, 3, -3]}", [9, 6, 3]),
         ("{range: [3, 3, 1]}", [3]),
@@ -102,6 +99,7 @@ def test_the_first_point_stands_in_the_document_and_shots_follow_from_the_scan(t
     assert load_sequence(path, [Override("shots", "4", "--shots 4")])[1].shots == 4
 
 
+@settings(max_examples=25)
 @given(st.integers(1, 40), st.integers(1, 6), st.integers(0, 2**63 - 1))
 def test_each_round_of_a_shuffled_scan_takes_every_point_once(n: int, repeats: int, seed: int) -> None:
     listed = ", ".join(f"{i + 1} ms" for i in range(n))
@@ -130,11 +128,9 @@ def test_an_option_replaces_the_scan_of_its_address_with_a_note() -> None:
 
 BAD = [
     ("scan: 5", "1:7: scan is 5; expected a mapping of addresses"),
-    ("scan: []", "1:7: scan is empty"),
     ("scan: {}", "1:7: scan is empty"),
     ("scan: [3]", "1:8: a group of the scan is 3"),
     ("scan: {shot.sort.window: 5 ms}", "1:26: the scan of 'shot.sort.window' is '5 ms'; expected a list"),
-    ("scan: {shot.sort.window: []}", "1:26: the scan of 'shot.sort.window' has no values"),
     ("scan: {shot.sort.window: {linspce: [1, 2, 3]}}", "1:27: 'linspce' is no way to give values"),
     ("scan: {shot.sort.window: {linspace: [1, 2]}}", "1:37: linspace is"),
     ("scan: {shot.sort.window: {linspace: [1 ms, 2 ms, 1]}}", "1:50: the number of values is 1"),
@@ -142,13 +138,8 @@ BAD = [
         "scan: {shot.sort.window: {linspace: [1 ms, 2, 3]}}",
         "1:44: 2 does not go with '1 ms'; expected a time",
     ),
-    ("scan: {shot.sort.window: {linspace: [1, 2 ms, 3]}}", "1:41: '2 ms' does not go with 1"),
-    ("scan: {shot.sort.window: {linspace: [1 ms, 2 m, 3]}}", "1:44: '2 m' does not go with '1 ms'"),
     ("scan: {shot.sort.window: {linspace: [.nan, 2, 3]}}", "1:38: .nan stands among the limits"),
-    ("scan: {shot.sort.window: {linspace: [true, 2, 3]}}", "1:38: true stands among the limits"),
-    ("scan: {shot.sort.window: {linspace: [1 elf, 2, 3]}}", "1:38: '1 elf' stands among the limits"),
     ("scan: {shot.sort.window: {range: [1, 5, 0]}}", "1:41: the step 0 does not lead from start to stop"),
-    ("scan: {shot.sort.window: {range: [1, 5, -1]}}", "1:41: the step -1 does not lead"),
     ("scan: {shot.sort.window: {range: [0, 1, 1e-9]}}", "1:34: the range has 1e+09 values"),
     ("scan: {shot.sort.window: [1 ms, 1 ms]}", "1:33: '1 ms' stands twice in the scan"),
     (
@@ -157,35 +148,28 @@ BAD = [
     ),
     ("scan: {shot.sort: [{}], shot.sort.window: [2]}", "1:25: 'shot.sort.window' is scanned, and so is"),
     ("scan: {shots: [1, 2]}", "1:8: a scan cannot change 'shots'; expected an address in 'planner'"),
-    ("scan: {target.rows: [1, 2]}", "1:8: a scan cannot change 'target.rows'"),
     ("scan: {shot.2.name: [a, b]}", "1:8: a scan cannot change 'shot.2.name'"),
-    ("scan: {shot.2: [a, b]}", "1:8: a scan cannot change 'shot.2'"),
-    ("scan: {shot.2.wait: [{}]}", "1:8: a scan cannot change 'shot.2.wait'"),
-    ("scan: {shot.5.load.duration: [1, 2]}", "1:8: 'shot' has no item '5'"),
     ("scan: {shot.srt.window: [1, 2]}", "1:8: 'shot' has no item 'srt'"),
     (
         "scan: [{shot.sort.window: [1, 2], shot.0.load.duration: [1]}]",
         "1:35: 'shot.0.load.duration' has 1 value, but",
     ),
     ("repeats: 3", "1:1: 'repeats' is given without a scan"),
-    ("order: shuffled", "1:1: 'order' is given without a scan"),
     ("scan: {shot.sort.window: [1, 2]}\nshots: 5", "2:8: shots is 5, but the scan has 2 x 1 = 2"),
-    ("scan: {shot.sort.window: [1, 2]}\nrepeats: 0", "2:10: repeats is 0"),
     ("scan: {shot.sort.window: [1, 2]}\norder: random", "2:8: order is 'random'"),
 ]
 
 
 @pytest.mark.parametrize(("text", "message"), BAD, ids=[text for text, _ in BAD])
-def test_what_is_wrong_is_told_with_its_place(tmp_path: Path, text: str, message: str) -> None:
+def test_a_wrong_scan_is_refused_with_its_place(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / "s.yaml"
     without = "scan" not in text
     path.write_text(REST + text + "\n" + ("shots: 1\n" if without else ""))
     with pytest.raises(ConfigError) as caught:
         load_sequence(path)
     line, rest = message.split(":", 1)
-    told = [str(problem) for problem in caught.value.problems]
-    assert len(told) == 1
-    assert told[0].startswith(f"{path}:{int(line) + N_REST}:{rest}")
+    (problem,) = caught.value.problems
+    assert str(problem).startswith(f"{path}:{int(line) + N_REST}:{rest}")
 
 
 def test_an_option_for_more_shots_than_the_scan_has_is_refused(tmp_path: Path) -> None:

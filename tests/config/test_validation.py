@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-from datetime import date
 from enum import Enum
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -60,7 +59,6 @@ class Model(Settings):
     window: Duration | tuple[Duration, ...] = 1.0
     shape: Inner | Literal["none"] = "none"
     pet: Annotated[Cat | Dog, Field(discriminator="kind")] | None = None
-    day: date | None = None
     other: int = Field(default=0, alias="else", multiple_of=3, lt=10)
 
 
@@ -75,114 +73,94 @@ def problems(text: str, **options: Any) -> list[str]:
     return [str(problem).removeprefix("f.yaml:") for problem in caught.value.problems]
 
 
-def test_good_settings() -> None:
+def test_right_settings() -> None:
     model = validate(
         "  fraction: 75 %\n  exposure: 3\n  pair: [1, 2]\n  files: [a]\n  path: x/y\n  colour: blue\n"
         "  inner: {width: 4.49 um}\n  many: [{}, {count: 2}]\n  named: {a: {count: 3}}\n  either: [1]\n"
         "  window: [60 ms, 0.1]\n  shape: none\n  pet: {kind: dog, tricks: [sit]}\n  else: 9\n  by_number: {'1': 2}"
     )
-    assert model == Model.model_construct(
-        rows=1,
-        fraction=0.75,
-        exposure=3.0,
-        pair=(1, 2),
-        files={"a"},
-        path=Path("x/y"),
-        colour=Colour.BLUE,
-        inner=Inner(width=4.49e-6),
-        many=[Inner(), Inner(count=2)],
-        named={"a": Inner(count=3)},
-        by_number={1: 2},
-        either=[1],
-        window=(0.06, 0.1),
-        pet=Dog(kind="dog", tricks=["sit"]),
-        other=9,
-    )
+    assert model.model_dump(exclude_defaults=True) == {
+        "rows": 1,
+        "fraction": 0.75,
+        "exposure": 3.0,
+        "pair": (1, 2),
+        "files": {"a"},
+        "path": Path("x/y"),
+        "colour": Colour.BLUE,
+        "inner": {"width": 4.49e-6},
+        "many": [{}, {"count": 2}],
+        "named": {"a": {"count": 3}},
+        "by_number": {1: 2},
+        "either": [1],
+        "window": (0.06, 0.1),
+        "pet": {"kind": "dog", "tricks": ["sit"]},
+        "other": 9,
+    }
 
 
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("  on: yes", ["3:7: on is 'yes'; expected true or false; did you mean true?"]),
-        ("  on: Off", ["3:7: on is 'Off'; expected true or false; did you mean false?"]),
-        ("  on: 1", ["3:7: on is 1; expected true or false"]),
-        ("  text: 2026", ["3:9: text is 2026; expected text; put it in quotes"]),
-        ("  text: [a]", ["3:9: text is a list; expected text"]),
-        ("  colour: rde", ["3:11: colour is 'rde'; expected 'red' or 'blue'; did you mean 'red'?"]),
-        ("  pair: [1]", ["3:9: pair has 1 entry; expected at least 2"]),
-        ("  pair: []", ["3:9: pair has 0 entries; expected at least 2"]),
-        ("  pair: [1, 2, 3]", ["3:9: pair has 3 entries; expected at most 2"]),
-        ("  pair: [1, x]", ["3:13: pair.1 is 'x'; expected a whole number"]),
-        ("  files: a", ["3:10: files is 'a'; expected a list ([a, b], or lines that begin with '- ')"]),
-        ("  fraction: 120 %", ["3:13: fraction is '120 %'; expected at most 1 (in SI units)"]),
-        ("  exposure: 1 h", ["3:13: exposure is '1 h'; expected at most 10 (in SI units)"]),
-        ("  exposure: 11", ["3:13: exposure is 11; expected at most 10"]),
-        ("  inner: {count: 0}", ["3:18: count is 0; expected at least 1"]),
-        ("  inner: [1]", ["3:10: inner is a list; expected a mapping (key: value)"]),
-        (
-            "  inner: {cuont: 1}",
-            [
-                "3:11: 'cuont' is not a setting of 'inner'; expected one of width, count; did you mean 'count'?"
-            ],
-        ),
-        ("  many: [{}, {count: 0x0}]", ["3:22: count is 0x0; expected at least 1"]),
-        ("  many: [{}, 5]", ["3:14: many.1 is 5; expected a mapping (key: value)"]),
-        (
-            "  many: [{COUNT: 1}]",
-            [
-                "3:11: 'COUNT' is not a setting of 'many.0'; expected one of width, count; did you mean 'count'?"
-            ],
-        ),
-        ("  named: {a: {width: 1 s}}", [f"3:22: width: '1 s' is a time, not a length; expected {LENGTH}"]),
-        (
-            "  named: {a: {wdth: 1}}",
-            ["3:15: 'wdth' is not a setting of 'a'; expected one of width, count; did you mean 'width'?"],
-        ),
-        ("  by_number: {x: 1}", ["3:15: the key 'x' is 'x'; expected a whole number"]),
-        ("  else: 4", ["3:9: else is 4; expected a multiple of 3"]),
-        ("  else: 12", ["3:9: else is 12; expected less than 10"]),
-    ],
-)
-def test_one_problem(text: str, expected: list[str]) -> None:
-    assert problems(text) == expected
+MISTAKES = f"""
+on: yes
+  3:7: on is 'yes'; expected true or false; did you mean true?
+on: 1
+  3:7: on is 1; expected true or false
+text: 2026
+  3:9: text is 2026; expected text; put it in quotes
+colour: rde
+  3:11: colour is 'rde'; expected 'red' or 'blue'; did you mean 'red'?
+pair: [1]
+  3:9: pair has 1 entry; expected at least 2
+pair: [1, 2, 3]
+  3:9: pair has 3 entries; expected at most 2
+pair: [1, x]
+  3:13: pair.1 is 'x'; expected a whole number
+files: a
+  3:10: files is 'a'; expected a list ([a, b], or lines that begin with '- ')
+fraction: 120 %
+  3:13: fraction is '120 %'; expected at most 1 (in SI units)
+exposure: 11
+  3:13: exposure is 11; expected at most 10
+inner: [1]
+  3:10: inner is a list; expected a mapping (key: value)
+inner: {{cuont: 1}}
+  3:11: 'cuont' is not a setting of 'inner'; expected one of width, count; did you mean 'count'?
+many: [{{}}, {{count: 0x0}}]
+  3:22: count is 0x0; expected at least 1
+many: [{{COUNT: 1}}]
+  3:11: 'COUNT' is not a setting of 'many.0'; expected one of width, count; did you mean 'count'?
+named: {{a: {{width: 1 s}}}}
+  3:22: width: '1 s' is a time, not a length; expected {LENGTH}
+by_number: {{x: 1}}
+  3:15: the key 'x' is 'x'; expected a whole number
+else: 4
+  3:9: else is 4; expected a multiple of 3
+else: '{"1" * 150}'
+  3:9: else is '{"1" * 57}...'; expected a whole number
+either: x
+  3:11: either is 'x'; expected a whole number or a list ([a, b], or lines that begin with '- ')
+either: [1, x]
+  3:15: either.1 is 'x'; expected a whole number
+window: 1 K
+  3:11: window: '1 K' is a temperature, not a time; expected {TIME}
+window: {{}}
+  3:11: window is a mapping; expected {TIME}
+window: [1, -2]
+  3:15: window.1 is -2; expected at least 0
+shape: noen
+  3:10: shape is 'noen'; expected 'none'
+shape: {{count: 0}}
+  3:18: count is 0; expected at least 1
+pet: {{kind: cow}}
+  3:15: kind is 'cow'; expected 'cat', 'dog'
+pet: {{lives: 1}}
+  3:8: 'kind' is missing from 'pet'
+pet: {{kind: cat, live: 1}}
+  3:20: 'live' is not a setting of 'pet'; expected one of kind, lives, tricks; did you mean 'lives'?
+""".strip().splitlines()
 
 
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        (
-            "  either: x",
-            "3:11: either is 'x'; expected a whole number or a list ([a, b], or lines that begin with '- ')",
-        ),
-        ("  either: [1, x]", "3:15: either.1 is 'x'; expected a whole number"),
-        ("  window: 1 K", f"3:11: window: '1 K' is a temperature, not a time; expected {TIME}"),
-        ("  window: -1", "3:11: window is -1; expected at least 0"),
-        ("  window: {}", f"3:11: window is a mapping; expected {TIME}"),
-        ("  window: [1, 2 K]", f"3:15: window.1: '2 K' is a temperature, not a time; expected {TIME}"),
-        ("  window: [1, -2]", "3:15: window.1 is -2; expected at least 0"),
-        ("  shape: noen", "3:10: shape is 'noen'; expected 'none'"),
-        ("  shape: {count: 0}", "3:18: count is 0; expected at least 1"),
-        ("  pet: {kind: cow}", "3:15: kind is 'cow'; expected 'cat', 'dog'"),
-        ("  pet: {lives: 1}", "3:8: 'kind' is missing from 'pet'"),
-        ("  pet: {kind: cat, lives: many}", "3:27: lives is 'many'; expected a whole number"),
-        (
-            "  pet: {kind: cat, live: 1}",
-            "3:20: 'live' is not a setting of 'pet'; expected one of kind, lives, tricks; did you mean 'lives'?",
-        ),
-    ],
-)
-def test_union_gives_one_sensible_problem(text: str, expected: str) -> None:
-    assert problems(text) == [expected]
-
-
-def test_words_of_pydantic_where_there_are_no_better() -> None:
-    (problem,) = problems("  day: today")
-    assert problem.startswith("3:8: day is 'today'; expected a valid date")
-
-
-def test_endless_digits_in_quotes() -> None:
-    (problem,) = problems(f"  else: '{'1' * 150}'")
-    assert problem == f"3:9: else is '{'1' * 57}...'; expected a whole number"
+@pytest.mark.parametrize(("text", "message"), [*zip(MISTAKES[::2], MISTAKES[1::2], strict=True)])
+def test_a_mistake_gives_one_message(text: str, message: str) -> None:
+    assert problems(f"  {text}") == [message.strip()]
 
 
 def test_all_problems_in_file_order() -> None:
@@ -208,27 +186,12 @@ def test_empty_and_missing_mappings_count_as_empty(text: str) -> None:
         document.validate(Model, ("plan",))
 
 
-def test_missing_keys_are_at_their_mapping() -> None:
-    document = Document.parse("plan:\n  on: true\n", "f.yaml")
-    with pytest.raises(ConfigError) as caught:
-        document.validate(Model, ("plan",))
-    assert str(caught.value).startswith("f.yaml:2:3: 'rows' is missing")
-
-
 def test_misspelt_key_is_not_missing_as_well() -> None:
     document = Document.parse("plan: {row: 1}", "f.yaml")
     with pytest.raises(ConfigError) as caught:
         document.validate(Model, ("plan",))
     (problem,) = caught.value.problems
     assert problem.hint == "did you mean 'rows'?"
-
-
-@pytest.mark.parametrize("value", ["5", "[1]", "text"])
-def test_no_mapping(value: str) -> None:
-    document = Document.parse(f"plan: {value}", "f.yaml")
-    with pytest.raises(ConfigError) as caught:
-        document.validate(Inner, ("plan",))
-    assert str(caught.value).endswith("expected a mapping of settings such as {key: value}")
 
 
 def test_dropped_keys_are_left_out_and_not_offered() -> None:
@@ -239,29 +202,12 @@ def test_dropped_keys_are_left_out_and_not_offered() -> None:
     assert "use," not in problem
 
 
-def test_keys_of_others_are_suggested() -> None:
-    (problem,) = problems("  spede: 1", other_keys=["speed"])
-    assert problem.endswith("did you mean 'speed'?")
-
-
-def test_what_the_mapping_is_called() -> None:
-    (problem,) = problems("  zzz: 1", called="camera 'andor'")
-    assert problem.startswith("3:3: 'zzz' is not a setting of camera 'andor'; expected one of rows,")
-
-
 def test_nothing_to_set() -> None:
     document = Document.parse("camera: {use: x, gain: 3}", "f.yaml")
     assert document.validate(None, ("camera",), drop={"use", "gain"}) is None
     with pytest.raises(ConfigError) as caught:
         document.validate(None, ("camera",), drop={"use"})
     assert str(caught.value) == "f.yaml:1:18: 'camera' takes no settings, but 'gain' is given; remove it"
-
-
-def test_thousands_of_problems() -> None:
-    text = "".join(f"k{i}: 1\n" for i in range(3000))
-    with pytest.raises(ConfigError) as caught:
-        Document.parse(text, "f.yaml").validate(Inner)
-    assert len(caught.value.problems) == 3000
 
 
 def test_of_very_many_unknown_keys_only_the_first_are_compared_with_the_known_ones() -> None:
@@ -272,67 +218,34 @@ def test_of_very_many_unknown_keys_only_the_first_are_compared_with_the_known_on
     assert hints == ["did you mean 'width'?"] * MAX_HINTS + ["", ""]
 
 
-class Shade(Enum):
-    RED = "red"
-
-
-class Values(Settings):
-    rows: int = 1
-    sizes: tuple[float, ...] = ()
-    path: Path = Path()
-    colour: Shade | None = None
-    window: Duration = 0.06
-    nested: dict[str, int] = {}
-
-
 def test_python_and_numpy_values() -> None:
-    values = {
-        "rows": np.int64(3),
-        "sizes": np.array([1.0, 2.0]),
-        "path": Path("a") / "b",
-        "colour": Shade.RED,
-        "window": "45 ms",
-        "nested": {"a": 1},
-    }
-    made = validate_values(Values, values, "planner 'x'")
-    assert made.model_dump() == {
+    values = {"rows": np.int64(3), "pair": np.array([1, 2]), "path": Path("a") / "b", "colour": Colour.BLUE}
+    made = validate_values(Model, {**values, "exposure": "45 ms"}, "planner 'x'")
+    assert made.model_dump(exclude_defaults=True) == {
         "rows": 3,
-        "sizes": (1.0, 2.0),
+        "pair": (1, 2),
         "path": Path("a") / "b",
-        "colour": Shade.RED,
-        "window": 0.045,
-        "nested": {"a": 1},
+        "colour": Colour.BLUE,
+        "exposure": 0.045,
     }
 
 
 @pytest.mark.parametrize(
-    ("values", "message"),
+    ("model", "values", "message"),
     [
-        ({"rows": "3"}, "rows is '3'; expected a whole number; write 3 without quotes"),
-        (
-            {"row": 3},
-            "'row' is not a setting of it; expected one of rows, sizes, path, colour, window, nested; ",
-        ),
-        ({"sizes": (1, None)}, "sizes.1 is empty; expected a number"),
-        ({"sizes": [float("nan")]}, "sizes.0 is nan; expected a finite number"),
-        ({"rows": object()}, "a value of type object is no setting; expected a number, text, list or dict"),
-        ({"window": 1e300}, "window is 1e+300; expected at most 720 h, which is 30 days"),
-        ({"window": "721 h"}, "window is '721 h'; expected at most 720 h, which is 30 days"),
-        ({"window": "1 K"}, "window: '1 K' is a temperature, not a time"),
+        (Model, {"rows": "3"}, "rows is '3'; expected a whole number; write 3 without quotes"),
+        (Model, {"rows": 1, "rwos": 3}, "'rwos' is not a setting of it; expected one of rows, fraction, "),
+        (Model, {"rows": 1, "pair": (1, None)}, "pair.1 is empty; expected a whole number"),
+        (Model, {"rows": 1, "fraction": float("nan")}, "fraction is nan; expected a finite number"),
+        (Model, {"rows": object()}, "a value of type object is no setting; expected a number, text, list or"),
+        (Model, {"rows": 1, "window": 1e300}, "window is 1e+300; expected at most 720 h, which is 30 days"),
+        (None, {"a": 1}, "it takes no settings, but 'a' is given; remove it"),
     ],
 )
-def test_refusals(values: dict[str, Any], message: str) -> None:
+def test_wrong_python_values_name_what_they_are_for(model: Any, values: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError) as caught:
-        validate_values(Values, values, "planner 'x'")
+        validate_values(model, values, "planner 'x'")
     assert str(caught.value).startswith(f"planner 'x': {message}")
-
-
-def test_values_for_a_plugin_without_settings() -> None:
-    assert validate_values(None, {}, "planner 'x'") is None
-    with pytest.raises(
-        ConfigError, match=r"^planner 'x': it takes no settings, but 'a' is given; remove it$"
-    ):
-        validate_values(None, {"a": 1}, "planner 'x'")
 
 
 class Custom(Settings):
