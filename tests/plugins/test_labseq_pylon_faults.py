@@ -86,9 +86,7 @@ def test_the_trigger_line_is_that_of_the_settings() -> None:
         chosen = [lab.pylon.TriggerSource.Value, lab.pylon.TriggerActivation.Value]
         assert chosen == ["Line2", "FallingEdge"]
     with rig(trigger_line="Line9") as lab:
-        with pytest.raises(
-            DeviceError, match=r"source cannot be Line9; expected one of .*'Line1'"
-        ):
+        with pytest.raises(DeviceError, match=r"source cannot be Line9; expected one of .*'Line1'"):
             lab.camera.arm(1, 0.01, "external")
         assert len(lab.take(1)) == 1
 
