@@ -26,16 +26,6 @@ def test_sites_that_drifted() -> None:
     assert [(one.name, one.before, one.after) for one in figures] == [("residual_px", 0.02, 0.05)]
 
 
-def test_tones_that_moved() -> None:
-    before = fake_calibration("frequencies", GRID)
-    after = fake_calibration(
-        "frequencies", GRID, values={"row_hz": GRID.row_frequency_hz + np.array([0, 0, 3e3])}
-    )
-    values, _ = compare(before, after)
-    rows = next(one for one in values if one.name == "row_hz")
-    assert (rows.unit, rows.greatest, rows.mean) == ("Hz", 3e3, (1e3,))
-
-
 def test_values_of_other_shapes_have_no_difference() -> None:
     values, _ = compare(fake_calibration("tweezers", GRID), fake_calibration("tweezers", SiteGrid(4, 4)))
     assert [math.isnan(one.greatest) for one in values] == [True, False]

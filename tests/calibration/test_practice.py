@@ -25,9 +25,9 @@ from labseq.plugin import Context, DepthRamp, RandomStream, Run, TweezerAmplitud
 Floats = NDArray[np.float64]
 
 ROOT = Path(__file__).parents[2]
-SHOTS = {"tweezers": 1, "sites": 25, "thresholds": 120, "frequencies": 58, "overlay": 29}
-"""Kinds in the order of the morning, and half of the usual shots or more."""
-N_FRESH = 150
+SHOTS = {"tweezers": 1, "sites": 25, "thresholds": 80, "frequencies": 58, "overlay": 29}
+"""Kinds in the order of the morning, and fewer shots than usual."""
+N_FRESH = 100
 COSTS = np.array([3.0, 1.0])
 """Of an atom that is missed and of one that is imagined, as thresholds are fitted."""
 LADDER = np.arange(-2000.0, 14_384.0, 2.0)
@@ -153,6 +153,6 @@ def test_a_morning_of_calibration_finds_all_that_the_practice_lab_hides(tmp_path
     assert (np.abs(errors - cases * ours) < 4 * chance + 1).all(), "the law is not that of the frames"
     assert COSTS @ (errors / cases) < 1.2 * COSTS @ best + 3 * np.linalg.norm(COSTS * chance / cases)
 
-    run = lab.run(8)
+    run = lab.run(4)
     assert {*run.shots[0].calibrations} == {*SHOTS}
     assert run.filling_fraction > 0.98
