@@ -103,7 +103,6 @@ class Instrument:
             "garbage": NOISE + b"\n",
             "partial": reply[: len(reply) // 2],
             "other": b"WHAT\n",
-            "wrong_end": reply + b"\r",
             "echo": text.encode() + b"\n" + reply + b"\n",
             "two": reply + b"\n" + b"LATER\n",
             "endless": b"x" * 5_000,

@@ -25,12 +25,12 @@ PROFILE = r"""
   retries: 1
   identify: {ask: "*IDN?", reply: "LAB,(?P<model>[^,]+),(?P<serial_number>[^,]+),(?P<firmware>.+)"}
   commands:
-    open: {send: OPEN, reply: OK, repeatable: true, timeout: 400 ms}
+    open: {send: OPEN, reply: OK, repeatable: true, timeout: 250 ms}
     close: {send: CLOSE, reply: OK, repeatable: true}
-    once: {send: OPEN, reply: OK, timeout: 400 ms}
+    once: {send: OPEN, reply: OK, timeout: 250 ms}
     toggle_on: {send: TOGGLE, reply: OK, makes: {is_open: true}}
     toggle_off: {send: TOGGLE, reply: OK, makes: {is_open: false}}
-    never: {send: OPEN, reply: OK, makes: {is_open: false}, timeout: 400 ms}
+    never: {send: OPEN, reply: OK, makes: {is_open: false}, timeout: 250 ms}
     set:
       send: "FREQ {frequency:.6f}"
       arguments: {frequency: {unit: MHz, min: 1 MHz, max: 200 MHz}}
@@ -40,7 +40,7 @@ PROFILE = r"""
     frequency: {ask: "FREQ?", unit: MHz, poll: true}
     temperature:
       ask: "TEMP?"
-      timeout: 400 ms
+      timeout: 250 ms
       unit: degC
       min: -50 degC
       max: 100 degC

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from labseq_ttl.box import Box
+from labseq_ttl.go_lines import ttl_lines
 from labseq_ttl.lines import TtlLines
 from labseq_ttl.protocol import framed, unframed
 from labseq_ttl.settings import TtlSettings
@@ -32,14 +33,7 @@ def need_simavr() -> None:
 
 @dataclass
 class Rig:
-    """A driver in a world that notes everything, on a virtual clock.
-
-    Attributes:
-        lines: The driver.
-        clock: The clock.
-        world: The world.
-        specs: What is wired to the box.
-    """
+    """A driver in a simulation that records everything, on a virtual clock; the box has these lines."""
 
     lines: TtlLines
     clock: FakeClock
@@ -79,7 +73,7 @@ def make_rig(specs: tuple[LineSpec, ...] = SPECS, **settings: Any) -> Rig:
     clock = FakeClock()
     world = RecordingSimulation(Calls(clock))
     context = Context("lines", clock=clock, simulation=world, lines=specs)
-    return Rig(TtlLines(TtlSettings.model_validate(settings), context), clock, world, specs)
+    return Rig(ttl_lines(TtlSettings.model_validate(settings), context), clock, world, specs)
 
 
 @contextmanager
@@ -102,11 +96,7 @@ def works(lab: Rig) -> None:
 
 
 class Firmware:
-    """The firmware on its simulated processor, spoken to line by line.
-
-    Attributes:
-        simavr: The simulator.
-    """
+    """The firmware on its simulated processor, spoken to line by line."""
 
     def __init__(self) -> None:
         self.simavr = SimavrBox("lines", NeverStopped())

@@ -86,26 +86,21 @@ def test_a_path_that_does_not_exist_is_named_with_one_like_it(tmp_path: Path) ->
     assert "is no pattern" in refusal(tmp_path / "**x" / "*.png") or sys.version_info >= (3, 13)
 
 
-def test_an_empty_folder_holds_no_frames(tmp_path: Path) -> None:
-    (tmp_path / "notes.txt").touch()
-    text = refusal(tmp_path)
-    assert "holds no PNG or TIFF files, and is not a run: it has no run.json; give a run's folder" in text
-
-
-def test_a_folder_of_runs_names_one_of_them(tmp_path: Path) -> None:
+def test_folders_and_files_that_hold_no_frames_are_refused(tmp_path: Path) -> None:
     run = recorded(tmp_path)
     assert f"holds 1 run and is none itself; give one of them, for example {run}" in refusal(tmp_path)
-
-
-def test_files_of_another_kind_are_refused(tmp_path: Path) -> None:
-    (tmp_path / "x.sif").touch()
-    IMAGE.fromarray(pixels()).save(tmp_path / "x.png")
-    TIFFFILE.imwrite(tmp_path / "x.tif", pixels())
-    assert "x.sif: is neither a TIFF nor a PNG" in refusal(tmp_path / "x.sif")
-    assert "contains 1 PNG and 1 TIFF files; expected files of one kind" in refusal(tmp_path)
-    assert "x.tif: is no run, so that `images: first` has no meaning" in refusal(
-        tmp_path / "x.tif", images="first"
-    )
+    (folder := tmp_path / "x").mkdir()
+    (folder / "notes.txt").touch()
+    assert "holds no PNG or TIFF files, and is not a run: it has no run.json; give a" in refusal(folder)
+    (folder / "x.sif").touch()
+    assert "x.sif: is neither a TIFF nor a PNG" in refusal(folder / "x.sif")
+    (folder / "x.tif").write_text("version https://git-lfs.github.com/spec/v1")
+    assert "x.tif: cannot be read as a TIFF: not a TIFF file" in refusal(folder / "x.tif")
+    text = "x.tif: is no run, so that `images: first` has no meaning"
+    TIFFFILE.imwrite(folder / "x.tif", pixels())
+    assert text in refusal(folder / "x.tif", images="first")
+    IMAGE.fromarray(pixels()).save(folder / "x.png")
+    assert "contains 1 PNG and 1 TIFF files; expected files of one kind" in refusal(folder)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no named pipes in folders")
@@ -118,10 +113,7 @@ def test_what_is_no_ordinary_file_is_not_read(tmp_path: Path) -> None:
     ("mode", "told"),
     [
         ("RGB", "8 bit colour;"),
-        ("L", "8 bit gray;"),
         ("RGBA", "8 bit colour with transparency;"),
-        ("P", " bit palette colour;"),
-        ("LA", "8 bit gray with transparency;"),
         ("1", "1 bit gray;"),
     ],
 )
@@ -130,12 +122,6 @@ def test_a_png_that_is_not_16_bit_gray_is_refused(tmp_path: Path, mode: str, tol
     text = refusal(tmp_path)
     assert "x.png: the picture is " in text
     assert f"{told} expected 16 bit gray; save the camera's own counts" in text
-
-
-def test_a_png_of_another_size_is_found_before_anything_is_played(tmp_path: Path) -> None:
-    for i, height in enumerate((4, 4, 5)):
-        IMAGE.fromarray(pixels(height)).save(tmp_path / f"x{i}.png")
-    assert "x2.png: its frames have 5 x 6 pixels, those of x0.png 4 x 6" in refusal(tmp_path)
 
 
 def test_a_damaged_png_is_named(tmp_path: Path) -> None:
@@ -153,19 +139,23 @@ def test_a_damaged_png_is_named(tmp_path: Path) -> None:
     assert "x1.png: is damaged: " in refusal(tmp_path / "x1.png")
 
 
-@pytest.mark.parametrize("dtype", ["u1", "i2", "u4", "f4"])
-def test_a_stack_of_other_numbers_is_refused(tmp_path: Path, dtype: str) -> None:
-    TIFFFILE.imwrite(tmp_path / "x.tif", pixels(dtype=dtype))
-    name = np.dtype(dtype).name
-    assert f"page 0 is {name}, 4 x 6; expected uint16, height x width" in refusal(tmp_path / "x.tif")
+@pytest.mark.parametrize(("dtype", "shape"), [("i2", (4, 6)), ("f4", (4, 6)), ("u2", (4, 6, 3))])
+def test_a_stack_of_other_numbers_is_refused(tmp_path: Path, dtype: str, shape: tuple[int, ...]) -> None:
+    TIFFFILE.imwrite(tmp_path / "x.tif", np.zeros(shape, dtype), photometric="rgb" if shape[2:] else None)
+    came = f"{np.dtype(dtype).name}, {' x '.join(map(str, shape))}"
+    assert f"page 0 is {came}; expected uint16, height x width" in refusal(tmp_path / "x.tif")
 
 
-def test_a_coloured_stack_is_refused(tmp_path: Path) -> None:
-    TIFFFILE.imwrite(tmp_path / "x.tif", np.zeros((4, 6, 3), "u2"), photometric="rgb")
-    assert "page 0 is uint16, 4 x 6 x 3; expected uint16, height x width" in refusal(tmp_path)
+def test_files_of_another_size_are_found_before_anything_is_played(tmp_path: Path) -> None:
+    for i, height in enumerate((4, 4, 5)):
+        IMAGE.fromarray(pixels(height)).save(tmp_path / f"x{i}.png")
+        TIFFFILE.imwrite(tmp_path / f"x{i}.tif", pixels(height))
+    for kind in ("png", "tif"):
+        text = f"x2.{kind}: its frames have 5 x 6 pixels, those of x0.{kind} 4 x 6"
+        assert text in refusal(tmp_path / f"*.{kind}")
 
 
-def test_what_is_wrong_with_a_later_page_is_told_when_it_comes(tmp_path: Path) -> None:
+def test_what_is_wrong_with_a_later_page_is_reported_when_it_comes(tmp_path: Path) -> None:
     for file, later, told in (
         ("size.tif", pixels(5), "page 2: the frame has 5 x 6 pixels, the first one 4 x 6"),
         ("dtype.tif", pixels(dtype="f4"), "page 2 is float32, 4 x 6; expected uint16"),
@@ -176,17 +166,11 @@ def test_what_is_wrong_with_a_later_page_is_told_when_it_comes(tmp_path: Path) -
         assert told in failure(tmp_path / file, 2)
 
 
-def test_stacks_of_different_sizes_are_found_before_anything_is_played(tmp_path: Path) -> None:
-    TIFFFILE.imwrite(tmp_path / "a.tif", pixels(4))
-    TIFFFILE.imwrite(tmp_path / "b.tif", pixels(5))
-    assert "b.tif: its frames have 5 x 6 pixels, those of a.tif 4 x 6" in refusal(tmp_path)
-
-
 def test_a_stack_that_is_cut_off_never_counts_as_a_shorter_one(tmp_path: Path) -> None:
     file = tmp_path / "x.tif"
     TIFFFILE.imwrite(file, np.stack([pixels(20, 20)] * 6), photometric="minisblack")
     whole = file.read_bytes()
-    for length in range(0, len(whole), 97):
+    for length in range(0, len(whole), 193):
         file.write_bytes(whole[:length])
         camera = camera_of(file)
         with pytest.raises((ConfigError, DeviceError), match=r"x\.tif: (is cut off|cannot be read|holds)"):
@@ -202,25 +186,14 @@ def test_a_stack_that_hides_its_frames_behind_one_page_is_refused(tmp_path: Path
     assert text.endswith("save it as BigTIFF, or in several files")
 
 
-def test_what_is_no_tiff_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "x.tif").write_text("version https://git-lfs.github.com/spec/v1")
-    assert "x.tif: cannot be read as a TIFF: not a TIFF file" in refusal(tmp_path / "x.tif")
-
-
-def test_a_run_that_is_being_written_is_refused(tmp_path: Path) -> None:
-    assert "the run is still being written; wait until it has ended" in refusal(
-        recorded(tmp_path, ends=False)
-    )
-
-
-def test_a_run_without_frames_is_refused(tmp_path: Path) -> None:
-    text = refusal(recorded(tmp_path / "none", record_frames="none"))
-    assert "the run holds no frames; expected one that was made with `record_frames: all`" in text
-    assert "the run holds no complete shot" in refusal(recorded(tmp_path / "empty", n_shots=0))
-    assert "holds no frames; expected at least one" in refusal(recorded(tmp_path / "dark", n_images=0))
-
-
-def test_a_first_image_that_was_not_kept_is_not_replaced_by_another(tmp_path: Path) -> None:
+def test_a_run_without_its_frames_is_refused(tmp_path: Path) -> None:
+    for record_frames, n_shots, n_images, ends, told in (
+        ("all", 2, 2, False, "the run is still being written; wait until it has ended"),
+        ("none", 2, 2, True, "the run holds no frames; expected one that was made with `record_frames: all`"),
+        ("all", 0, 2, True, "the run holds no complete shot"),
+        ("all", 2, 0, True, "holds no frames; expected at least one"),
+    ):
+        assert told in refusal(recorded(tmp_path, record_frames, n_shots, n_images, ends=ends))
     run = recorded(tmp_path, record_frames="last")
     assert "the first image of the shot was not kept; record with" in refusal(run, images="first")
     camera_of(run).open()

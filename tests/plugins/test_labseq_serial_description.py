@@ -47,185 +47,91 @@ a:
 """
 
 
-def mistakes(wrong: str, right: str) -> str:
-    """What is said of the description with one part replaced."""
-    text = GOOD.replace(right, wrong, 1)
-    assert text != GOOD
-    with pytest.raises(ConfigError) as caught:
-        Document.parse(text, "p.yaml").validate(SerialSettings, ("a",))
-    return str(caught.value).removeprefix("p.yaml:")
-
-
-def test_a_good_description_is_accepted() -> None:
-    settings = Document.parse(GOOD, "p.yaml").validate(SerialSettings, ("a",))
-    assert settings.values["t"].limits == (273.15, 323.15)
-
-
 @pytest.mark.parametrize(
     ("right", "wrong", "message"),
     [
+        # the port and the characters
         ("port: COM3", "usb: {}", "3:8: this fits every adapter; expected vid, pid or serial"),
         ("port: COM3", "timeout: 1 s", "3:3: it has no port; expected 'port' or 'usb'"),
         ("COM3", "COM3\n  usb: {serial: A5}", "4:3: it has both 'port' and 'usb'; expected one of them"),
-        (
-            "COM3",
-            "spy://COM3",
-            "3:9: 'spy://COM3' is no port; expected socket://host:port or rfc2217://host:port",
-        ),
-        ("COM3", "socket://localhost", "3:9: 'socket://localhost' is no port; expected socket://host:port"),
+        ("COM3", "spy://COM3", "3:9: 'spy://COM3' is no port; expected socket://host:port or rfc2217://host"),
         ("COM3", "socket://localhost:99999", "3:9: 'socket://localhost:99999' is no port; expected"),
-        ("COM3", "rfc2217://:7000", "3:9: 'rfc2217://:7000' is no port; expected socket://host:port"),
         ('"\\r"', "'\\r'", "4:20: '\\r' holds a backslash; expected control characters"),
-        ('"\\r"', '"ü"', "'ü' is not ascii; expected another encoding"),
         ("OUT 0,", "ÖUT 0,", "8:17: 'ÖUT 0' is not ascii; expected another 'encoding', or other characters"),
         ("OUT 0,", '"OUT 0\\r",', "8:17: 'OUT 0\\r' holds what ends a command; expected it without"),
-    ],
-)
-def test_mistakes_about_the_line(right: str, wrong: str, message: str) -> None:
-    assert message in mistakes(wrong, right)
-
-
-@pytest.mark.parametrize(
-    ("right", "wrong", "message"),
-    [
-        ("{f:.1f}", "{freq:.1f}", "10:13: '{freq}' is not an argument; expected one of f, n, wave"),
+        # templates and their arguments
         (
             "{f:.1f}",
             "{F:.1f}",
-            "10:13: '{F}' is not an argument; expected one of f, n, wave; did you mean 'f'?",
+            "10:13: '{F}' is not an argument; expected one of f, n, wave; did you mean",
         ),
-        (
-            "{f:.1f},",
-            "",
-            "12:9: the argument 'f' has no place in 'FREQ {n:02d},{wave}'; expected a placeholder {f}",
-        ),
+        ("{f:.1f},", "", "12:9: the argument 'f' has no place in 'FREQ {n:02d},{wave}'; expected a placeho"),
         ("{f:.1f}", "{f:.1q}", "10:13: '{f:.1q}' is no format of a float"),
-        ("{n:02d}", "{n:.}", "10:13: '{n:.}' is no format of a whole number"),
-        (
-            "{n:02d}",
-            "{n:.1f}",
-            "10:13: '0.0' cannot be read back; expected a format of plain numbers",
-        ),
+        ("{n:02d}", "{n:.1f}", "10:13: '0.0' cannot be read back; expected a format of plain numbers"),
         ("{f:.1f}", "{f", "10:13: 'FREQ {f,{n:02d},{wave}' is no template"),
-        ("{f:.1f}", "{}", "10:13: the placeholder '{}' is not the name of an argument"),
         ("{f:.1f}", "{f.real}", "10:13: the placeholder '{f.real}' is not the name"),
         (",{n:02d},{wave}", "{n}{wave}", "10:13: the arguments cannot be separated in 'FREQ 200.015SQU'"),
         (
             "min: 1 MHz",
             "min: 1.04 MHz",
-            "12:29: as 'FREQ 1.0,00,SIN' it would be 1 MHz, beyond the limit; expected a",
+            "12:29: as 'FREQ 1.0,00,SIN' it would be 1 MHz, beyond the limit",
         ),
-        ("max: 200 MHz", "max: 200.06 MHz", "as 'FREQ 200.1,15,SQU' it would be 200.1 MHz, beyond the limit"),
-        (
-            "min: 1 MHz",
-            "min: 300 MHz",
-            "12:29: min is 300 MHz, more than max, 200 MHz; expected min below max",
-        ),
+        ("min: 1 MHz", "min: 300 MHz", "12:29: min is 300 MHz, more than max, 200 MHz; expected min below"),
         (
             "min: 1 MHz",
             "min: 1 mm",
-            "12:29: '1 mm' is a length, not a frequency; expected a frequency such as",
+            "12:29: '1 mm' is a length, not a frequency; expected a frequency",
         ),
         (", max: 200 MHz", "", "12:12: 'max' is missing; expected both limits of a number that is sent"),
-        (
-            "unit: MHz",
-            "unit: Mhz",
-            "12:19: labseq knows no unit 'Mhz'; expected another one; did you mean 'MHz'?",
-        ),
+        ("unit: MHz", "unit: Mhz", "12:19: labseq knows no unit 'Mhz'; expected another one; did you mean"),
         ("min: 0, max: 15", "min: 0.2, max: 0.7", "13:29: there is no whole number within the limits"),
-        (
-            "type: int, min: 0, max: 15",
-            "type: bool, max: 3",
-            "13:25: 'max' does not go with type bool; expected type",
-        ),
-        (
-            "choices: [SIN, SQU]",
-            "words: [a, b]",
-            "14:28: 'words' does not go with type text; expected type bool",
-        ),
-        ("type: text, ", "", "14:16: 'choices' do not go with type float; expected type text"),
+        ("type: int, min: 0, max: 15", "type: bool, max: 3", "13:25: 'max' does not go with type bool; exp"),
+        ("choices: [SIN, SQU]", "words: [a, b]", "14:28: 'words' does not go with type text; expected type"),
         ("        n:", "        name:", "an argument is called 'name'; expected a word of letters"),
-        (
-            "reply: OK",
-            "reply: '(OK'",
-            "8:31: '(OK' is no regular expression: missing ), unterminated subpattern",
-        ),
-        ('error: "E.*"', "error: '['", "8:42: '[' is no regular expression"),
+        # replies and effects
+        ("reply: OK", "reply: '(OK'", "8:31: '(OK' is no regular expression: missing ), unterminated"),
         (
             "reply: OK, ",
             "",
-            "8:24: 'error' is about a reply, but no 'reply' is waited for; expected a 'reply'",
+            "8:24: 'error' is about a reply, but no 'reply' is waited for; expected a",
         ),
-        (
-            "reply: OK",
-            "reply: '(?=x)x'",
-            "8:31: labseq cannot generate a reply like '(?=x)x'; expected an example",
-        ),
-        (
-            "reply: OK",
-            "reply: OK, example: NO",
-            "8:44: the reply 'NO' does not match; expected one like 'OK'",
-        ),
+        ("reply: OK", "reply: '(?=x)x'", "8:31: labseq cannot generate a reply like '(?=x)x'; expected an"),
+        ("reply: OK", "reply: OK, example: NO", "8:44: the reply 'NO' does not match; expected one like"),
         (
             "is_on: true",
             "is_onn: true",
-            "7:31: there is no value 'is_onn'; expected one of 'is_on', 't', 'n'",
+            "7:31: there is no value 'is_onn'; expected one of 'is_on', 't'",
         ),
         ("is_on: true", "is_on: 1", "7:38: the value 'is_on' is of type bool; expected true or false"),
         ("is_on: true", "t: 1", "7:34: the value 't' is of type float; expected a value of another type"),
-    ],
-)
-def test_mistakes_in_commands(right: str, wrong: str, message: str) -> None:
-    assert message in mistakes(wrong, right)
-
-
-@pytest.mark.parametrize(
-    ("right", "wrong", "message"),
-    [
-        (
-            "(?P<value>[0-9]+)",
-            "([0-9]+)",
-            "18:38: 'N=([0-9]+)' has no group 'value'; expected the value in brackets",
-        ),
-        ("(?P<value>[0-9]+)", "(?P<value>[0-9+)", "18:38: 'N=(?P<value>[0-9+)' is no regular expression"),
+        # values and interlocks
+        ("(?P<value>[0-9]+)", "([0-9]+)", "18:38: 'N=([0-9]+)' has no group 'value'; expected the value in"),
         ("(?P<value>[0-9]+)", "(?P<value>[a-f]+)", "18:38: labseq cannot generate a reply like"),
         ('[0-9]+)"', '[0-9]+)", example: N=x', "the reply 'N=x' does not match: expected a reply like"),
         ("words: [OFF, ON]", "words: [ON, ON]", "16:45: false and true are both 'ON'; expected two words"),
         ("one_of: [true]", "max: 3", "'max' does not go with a value of type bool; expected one_of"),
         ("one_of: [true]", "one_of: [ON]", "the value is of type bool; expected true or false"),
         ("{max: 30 degC}", "{}", "the interlock allows everything; expected min, max or one_of"),
-        ("{max: 30 degC}", "{max: 30 V}", "'30 V' is a voltage, not a temperature"),
         ("{max: 30 degC}", "{min: 40 degC, max: 30 degC}", "min is 40 degC, more than max, 30 degC"),
-        ("min: 0 degC", "min: 60 degC", "17:37: min is 60 degC, more than max, 50 degC"),
-        ('ask: "T?", ', "", "'ask' is missing"),
-    ],
-)
-def test_mistakes_in_values(right: str, wrong: str, message: str) -> None:
-    assert message in mistakes(wrong, right)
-
-
-@pytest.mark.parametrize(
-    ("calls", "message"),
-    [
-        ("[of]", "19:16: there is no command 'of'; expected one of 'on', 'off', 'set'; did you mean 'off'?"),
-        ("[set]", "19:16: 'set' needs f, n, wave; expected {do: set, arguments: {f: ...}}"),
-        ("[{do: set, arguments: {f: 2 MHz}}]", "19:21: 'set' needs n, wave"),
-        ("[{do: sett}]", "19:21: there is no command 'sett'"),
-        ("[{do: off, arguments: {f: 1}}]", "19:38: 'off' has no argument 'f'; expected none"),
-        ("[{do: set, arguments: {f: 1 GHz}}]", "19:41: f is 1 GHz; expected 1 MHz to 200 MHz"),
-        ("[{do: set, arguments: {n: 1.5}}]", "19:41: n: 1.5 is not accepted; expected a whole number"),
+        # the safe state
         (
-            "[{do: set, arguments: {wave: SAW}}]",
-            "19:44: wave: 'SAW' is not accepted; expected one of SIN, SQU",
+            "[off, ",
+            "[of, ",
+            "19:16: there is no command 'of'; expected one of 'on', 'off', 'set'; did",
         ),
-        ("[{}]", "19:16: 'do' is missing from 'safe_state.0'"),
-        ("[3]", "19:16: safe_state.0 is 3; expected text or a mapping"),
+        ("[off, ", "[set, ", "19:16: 'set' needs f, n, wave; expected {do: set, arguments: {f: ...}}"),
+        ("[off, ", "[{do: off, arguments: {f: 1}}, ", "19:38: 'off' has no argument 'f'; expected none"),
+        ("{f: 1 MHz,", "{f: 1 GHz,", "f is 1 GHz; expected 1 MHz to 200 MHz"),
+        (", n: 0,", ", n: 1.5,", "n: 1.5 is not accepted; expected a whole number"),
+        ("wave: SIN}", "wave: SAW}", "wave: 'SAW' is not accepted; expected one of SIN, SQU"),
     ],
 )
-def test_mistakes_in_the_safe_state(calls: str, message: str) -> None:
-    assert message in mistakes(
-        f"safe_state: {calls}", "safe_state: [off, {do: set, arguments: {f: 1 MHz, n: 0, wave: SIN}}]"
-    )
+def test_mistakes_in_a_description(right: str, wrong: str, message: str) -> None:
+    text = GOOD.replace(right, wrong, 1)
+    assert text != GOOD
+    with pytest.raises(ConfigError) as caught:
+        Document.parse(text, "p.yaml").validate(SerialSettings, ("a",))
+    assert message in str(caught.value)
 
 
 WORDS = st.text(string.ascii_letters, min_size=1, max_size=6)
@@ -269,19 +175,9 @@ def test_what_is_formatted_is_read_again_by_the_simulated_instrument(word: str, 
         assert low - slack <= value <= high + slack, "rounding leads beyond no limit"
 
 
-@given(st.floats(-1e3, 1e3), st.sampled_from(["MHz", "ms", "degC", "mA", "um", "%", "W"]))
-def test_units_are_converted_there_and_back(number: float, name: str) -> None:
-    unit = Unit.of(name)
-    assert unit.to_line(unit.from_line(number)) == pytest.approx(number, rel=1e-12, abs=1e-8)
-
-
-@pytest.mark.parametrize("given_as", ["120 mA", "120mA", 120, 120.0])
-def test_a_unit_that_labseq_does_not_know_is_taken_as_it_is(given_as: object) -> None:
-    assert Unit.of("mA").read(given_as) == 120.0
-
-
 @pytest.mark.parametrize("given_as", ["120 A", "mA", True, None, [1], float("inf")])
 def test_what_is_no_number_in_the_unit_is_refused(given_as: object) -> None:
+    assert Unit.of("mA").read("120 mA") == Unit.of("mA").read(120) == 120.0
     with pytest.raises(ValueError, match="expected"):
         Unit.of("mA").read(given_as)
 

@@ -30,7 +30,7 @@ programs = st.lists(
     max_size=EDGES - 1,
 )
 any_bytes = st.binary(max_size=200)
-few = settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
+few = settings(max_examples=8, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 @pytest.fixture(scope="module")
@@ -128,7 +128,7 @@ def test_the_latency_is_as_the_driver_says(firmware: Firmware) -> None:
 
 def test_a_program_begins_a_fixed_time_after_the_start_input(firmware: Firmware) -> None:
     latencies: list[int] = []
-    for _ in range(10):
+    for _ in range(5):
         firmware.put(0, [(0, 4), (100, 0)])
         firmware.ask("a arm 0 2")
         assert firmware.ask("a await") == "a ok"
@@ -162,15 +162,6 @@ def test_the_stop_byte_ends_a_program_in_its_middle(firmware: Firmware) -> None:
     assert int(after[1], 16) & OUTPUTS == 0x10 or int(firmware.simavr._next_line()[1], 16) & OUTPUTS == 0x10
     assert firmware.ask("a state").split()[2:] == ["idle", *firmware.ask("a state").split()[3:]]
     assert firmware.ask("a fire") == "a no unarmed"
-
-
-def test_the_stop_byte_ends_the_wait_for_a_start(firmware: Firmware) -> None:
-    firmware.put(0, [(0, 4), (100, 0)])
-    firmware.ask("a arm 0 2")
-    firmware.ask("a await")
-    firmware.write(b"!")
-    assert (firmware.line() or "").startswith("!off")
-    assert firmware.ask("a state").split()[2] == "idle"
 
 
 def test_all_lines_are_at_their_off_levels_from_a_reset_on(firmware: Firmware) -> None:
@@ -233,7 +224,7 @@ sensible = st.one_of(
 questions = st.one_of(sensible, st.tuples(names, arguments).map(" ".join).map(str.strip))
 
 
-@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(asked=st.lists(questions, max_size=12))
 def test_the_model_answers_as_the_firmware_does(running: Firmware, asked: list[str]) -> None:
     model = ModelBox()
