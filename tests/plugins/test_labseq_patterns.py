@@ -8,69 +8,60 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
+import labseq_patterns
+import labseq_scans
 import numpy as np
 import pytest
-from hypothesis import given, settings as hypothesis_settings, strategies as st
-from labseq_patterns import (
-    patterns as checkerboard,
-    patterns as honeycomb,
-    patterns as kagome,
-    patterns as ring,
-    patterns as settings,
-    patterns as sierpinski,
-)
+from labseq_patterns import patterns
 from labseq_patterns.patterns import BlockSettings, RingSettings, SierpinskiSettings
 from labseq_scans.pattern import InterleavedSettings, interleaved
 from numpy.typing import NDArray
 from pydantic import BaseModel, ValidationError
 
 import labseq
-from labseq import ConfigError, LimitError, SiteGrid, TargetPattern, make_target
+import labseq.builtin
+from labseq import ConfigError, LimitError, SiteGrid, TargetPattern
 from labseq.builtin.patterns import BitmapSettings, CompactSettings, bitmap, compact
+from labseq.registry import Registry
 from labseq.testing import PatternContract
 
-BLOCK = settings.BlockSettings(rows=7, cols=8)
-
-PATTERNS: dict[str, Callable[[SiteGrid], TargetPattern]] = {
-    "compact": partial(compact, CompactSettings(rows=5, cols=6)),
-    "bitmap": partial(bitmap, BitmapSettings(sites=".#.\n###")),
-    "kagome": partial(kagome.kagome, BLOCK),
-    "link_kagome": partial(kagome.link_kagome, BLOCK),
-    "honeycomb": partial(honeycomb.honeycomb, BLOCK),
-    "checkerboard": partial(checkerboard.checkerboard, BLOCK),
-    "sierpinski": partial(sierpinski.sierpinski, settings.SierpinskiSettings(order=3)),
-    "ring": partial(ring.ring, settings.RingSettings(radius=4)),
-    "interleaved": partial(interleaved, InterleavedSettings(rows=6, cols=6)),
+MADE: dict[str, tuple[Callable[[Any, SiteGrid], TargetPattern], type[BaseModel], dict[str, Any]]] = {
+    "compact": (compact, CompactSettings, {"rows": 5, "cols": 6}),
+    "bitmap": (bitmap, BitmapSettings, {"sites": ".#.\n###"}),
+    "kagome": (patterns.kagome, BlockSettings, {"rows": 7, "cols": 8}),
+    "link_kagome": (patterns.link_kagome, BlockSettings, {"rows": 7, "cols": 8}),
+    "honeycomb": (patterns.honeycomb, BlockSettings, {"rows": 7, "cols": 8}),
+    "checkerboard": (patterns.checkerboard, BlockSettings, {"rows": 7, "cols": 8}),
+    "sierpinski": (patterns.sierpinski, SierpinskiSettings, {"order": 3}),
+    "ring": (patterns.ring, RingSettings, {"radius": 4}),
+    "interleaved": (interleaved, InterleavedSettings, {"rows": 6, "cols": 6}),
 }
+"""Each pattern's function, its settings, and values for the contract."""
 
 
-@pytest.mark.parametrize("name", PATTERNS)
+def make(name: str, grid: SiteGrid | None = None, **values: Any) -> TargetPattern:
+    function, model, _ = MADE[name]
+    return function(model.model_validate(values), grid or SiteGrid())
+
+
+@pytest.mark.parametrize("name", MADE)
 class TestPatterns(PatternContract):
     @pytest.fixture
     def factory(self, name: str) -> Callable[[SiteGrid], TargetPattern]:
-        return PATTERNS[name]
+        return partial(make, name, **MADE[name][2])
 
 
-def test_every_pattern_is_held_to_them() -> None:
-    import labseq_patterns
-    import labseq_scans
-
-    import labseq.builtin
-    from labseq.registry import Registry
-
-    registry, modules = Registry(), (labseq.builtin, labseq_patterns, labseq_scans)
+def test_every_pattern_is_tested() -> None:
+    registry = Registry()
+    modules: tuple[Any, ...] = (labseq.builtin, labseq_patterns, labseq_scans)
     for module in modules:
-        plugin: Any = module
-        plugin.labseq_register(registry)
-    assert {*registry.names("pattern")} == {*PATTERNS}
+        module.labseq_register(registry)
+    assert {*registry.names("pattern")} == {*MADE}
 
 
 TRIANGULAR = ("honeycomb", "kagome", "link_kagome")
-
 ANYWHERE = ("checkerboard", "ring", "sierpinski")
-
 BOTH_SHEARS = pytest.mark.parametrize("shear", [1, -1])
-
 A_BLOCK: dict[str, Any] = {"rows": 16, "cols": 16}
 
 
@@ -108,7 +99,7 @@ def turned(places: NDArray[np.float64], angle_deg: float) -> NDArray[np.float64]
 @pytest.mark.parametrize(("name", "expected"), [("compact", 6), ("kagome", 4), ("honeycomb", 3)])
 def test_nearest_neighbours_in_the_bulk(name: str, expected: int, shear: Literal[1, -1]) -> None:
     grid = SiteGrid(shear=shear)
-    target = make_target(name, grid=grid, **A_BLOCK)
+    target = make(name, grid, **A_BLOCK)
     bulk = in_bulk(target, 1)
     assert np.count_nonzero(bulk) > 100
     assert (neighbours(target, grid, 1)[bulk] == expected).all()
@@ -117,7 +108,7 @@ def test_nearest_neighbours_in_the_bulk(name: str, expected: int, shear: Literal
 @BOTH_SHEARS
 def test_a_link_of_the_kagome_lattice_has_six_links_at_its_ends(shear: Literal[1, -1]) -> None:
     grid = SiteGrid(shear=shear)
-    target = make_target("link_kagome", grid=grid, **A_BLOCK)
+    target = make("link_kagome", grid, **A_BLOCK)
     bulk = in_bulk(target, 2)
     for distance in (1, np.sqrt(3), 2):
         assert (neighbours(target, grid, distance)[bulk] == 2).all()
@@ -126,9 +117,9 @@ def test_a_link_of_the_kagome_lattice_has_six_links_at_its_ends(shear: Literal[1
 @BOTH_SHEARS
 def test_links_lie_halfway_between_neighbours_of_a_kagome_lattice(shear: Literal[1, -1]) -> None:
     grid = SiteGrid(17, 17, shear=shear)
-    links = positions(make_target("link_kagome", grid=grid, rows=17, cols=17), grid)
+    links = positions(make("link_kagome", grid, rows=17, cols=17), grid)
     coarse = SiteGrid(9, 9, shear=shear)
-    ends = 2 * positions(make_target("kagome", grid=coarse, rows=9, cols=9), coarse)
+    ends = 2 * positions(make("kagome", coarse, rows=9, cols=9), coarse)
     pairs = [(a, b) for i, a in enumerate(ends) for b in ends[:i] if np.isclose(np.linalg.norm(a - b), 2)]
     assert as_points(links) == as_points(np.array([(a + b) / 2 for a, b in pairs]))
 
@@ -152,7 +143,7 @@ def test_links_lie_halfway_between_neighbours_of_a_kagome_lattice(shear: Literal
 )
 @BOTH_SHEARS
 def test_numbers_of_atoms(name: str, settings: dict[str, Any], n_atoms: int, shear: Literal[1, -1]) -> None:
-    assert make_target(name, grid=SiteGrid(shear=shear), **settings).n_atoms == n_atoms
+    assert make(name, SiteGrid(shear=shear), **settings).n_atoms == n_atoms
 
 
 @pytest.mark.parametrize(
@@ -164,34 +155,31 @@ def test_numbers_of_atoms(name: str, settings: dict[str, Any], n_atoms: int, she
     ],
 )
 def test_numbers_of_atoms_on_a_square_grid(name: str, settings: dict[str, Any], n_atoms: int) -> None:
-    target = make_target(name, grid=SiteGrid(lattice="square"), **settings)
+    target = make(name, SiteGrid(lattice="square"), **settings)
     assert target.n_atoms == n_atoms
 
 
 @pytest.mark.parametrize("name", [*TRIANGULAR, "sierpinski", "ring"])
-@given(rows=st.integers(3, 16), cols=st.integers(3, 16))
-@hypothesis_settings(max_examples=6, deadline=None)
+@pytest.mark.parametrize(("rows", "cols"), [(3, 16), (8, 9), (16, 5)])
 def test_the_other_shear_makes_the_mirror_image(name: str, rows: int, cols: int) -> None:
     there, here = (SiteGrid(16, 16, shear=shear) for shear in (1, -1))
-    settings: dict[str, Any] = {"rows": rows, "cols": cols, "origin": (0, 0)}
-    mirrored: dict[str, Any] = settings | {"origin": (0, 16 - cols)}
-    left = positions(make_target(name, grid=there, **settings), there) * (-1, 1)
-    assert as_points(left) == as_points(positions(make_target(name, grid=here, **mirrored), here))
+    left = positions(make(name, there, rows=rows, cols=cols, origin=(0, 0)), there) * (-1, 1)
+    right = positions(make(name, here, rows=rows, cols=cols, origin=(0, 16 - cols)), here)
+    assert as_points(left) == as_points(right)
 
 
-@pytest.mark.parametrize("size", [n for n in range(3, 20) if n % 3 < 2])
 @BOTH_SHEARS
-def test_no_atom_of_a_honeycomb_hangs_on_by_one_neighbour(size: int, shear: Literal[1, -1]) -> None:
+def test_no_atom_of_a_honeycomb_has_only_one_neighbour(shear: Literal[1, -1]) -> None:
     grid = SiteGrid(shear=shear)
-    target = make_target("honeycomb", grid=grid, rows=size, cols=size)
-    assert neighbours(target, grid, 1).min() == 2
+    for size in [n for n in range(3, 20) if n % 3 < 2]:
+        assert neighbours(make("honeycomb", grid, rows=size, cols=size), grid, 1).min() == 2
 
 
-@pytest.mark.parametrize("order", range(5))
+@pytest.mark.parametrize("order", [0, 1, 4])
 @BOTH_SHEARS
 def test_a_sierpinski_triangle_looks_the_same_from_each_corner(order: int, shear: Literal[1, -1]) -> None:
     grid = SiteGrid(shear=shear)
-    places = positions(make_target("sierpinski", grid=grid, order=order), grid)
+    places = positions(make("sierpinski", grid, order=order), grid)
     assert as_points(turned(places, 120)) == as_points(places)
     assert np.count_nonzero(places[:, 1] == places[:, 1].min()) == 1
     assert np.count_nonzero(places[:, 1] == places[:, 1].max()) == 2**order
@@ -199,21 +187,20 @@ def test_a_sierpinski_triangle_looks_the_same_from_each_corner(order: int, shear
 
 def test_a_sierpinski_triangle_holds_three_of_the_order_below() -> None:
     grid = SiteGrid(lattice="square")
-    large, small = (make_target("sierpinski", grid=grid, order=n, origin=(0, 0)).fill for n in (4, 3))
+    large, small = (make("sierpinski", grid, order=n, origin=(0, 0)).fill for n in (4, 3))
     for row, col in ((0, 0), (8, 0), (8, 8)):
         assert (large[row : row + 8, col : col + 8] == small[:8, :8]).all()
     assert not large[:8, 8:].any()
 
 
 @pytest.mark.parametrize("lattice", ["triangular", "square"])
-@pytest.mark.parametrize("radius", [1.0, 2.5, 4.0, 6.9, 7.0])
-@pytest.mark.parametrize("width", [1.0, 2.0, 30.0])
+@pytest.mark.parametrize(("radius", "width"), [(1.0, 1.0), (2.5, 2.0), (6.9, 1.0), (7.0, 30.0)])
 @BOTH_SHEARS
 def test_a_ring_is_round_and_whole(
     lattice: Literal["triangular", "square"], radius: float, width: float, shear: Literal[1, -1]
 ) -> None:
     grid = SiteGrid(19, 19, lattice=lattice, shear=shear)
-    target = make_target("ring", grid=grid, radius=radius, width=width)
+    target = make("ring", grid, radius=radius, width=width)
     distance = np.linalg.norm(grid.positions_m / grid.spacing_m, axis=-1)
     assert (target.fill == ((distance <= radius + 1e-9) & (distance > radius - width + 1e-9))).all()
     places = positions(target, grid)
@@ -223,53 +210,41 @@ def test_a_ring_is_round_and_whole(
 @pytest.mark.parametrize(("rows", "cols"), [(15, 15), (12, 15), (15, 12)])
 def test_a_ring_fills_its_block(rows: int, cols: int) -> None:
     grid = SiteGrid(lattice="square")
-    sites = np.argwhere(make_target("ring", grid=grid, rows=rows, cols=cols).fill)
+    sites = np.argwhere(make("ring", grid, rows=rows, cols=cols).fill)
     height, width = np.ptp(sites, axis=0) + 1
     assert max(height, width) == min(rows, cols)
 
 
 @pytest.mark.parametrize("name", [*TRIANGULAR, *ANYWHERE])
 def test_the_rest_of_the_block_is_cleared_or_left_to_the_reservoir(name: str) -> None:
-    target = make_target(name, rows=9, cols=7, origin=(3, 4))
+    target = make(name, rows=9, cols=7, origin=(3, 4))
     block = np.zeros((20, 20), np.bool_)
     block[3:12, 4:11] = True
     assert ((target.fill | target.clear) == block).all()
-    left = make_target(name, rows=9, cols=7, origin=(3, 4), clear="none")
+    left = make(name, rows=9, cols=7, origin=(3, 4), clear="none")
     assert (left.fill == target.fill).all()
     assert not left.clear.any()
 
 
 @pytest.mark.parametrize("name", [*TRIANGULAR, *ANYWHERE])
-@given(row=st.integers(0, 11), col=st.integers(0, 13))
-@hypothesis_settings(max_examples=6, deadline=None)
-def test_an_origin_only_shifts_the_pattern(name: str, row: int, col: int) -> None:
-    centred = make_target(name, rows=9, cols=7)
-    moved = make_target(name, rows=9, cols=7, origin=(row, col))
-    shift = (row - 5, col - 6)
-    assert (np.roll(centred.fill, shift, (0, 1)) == moved.fill).all()
-    assert (np.roll(centred.clear, shift, (0, 1)) == moved.clear).all()
-
-
-@pytest.mark.parametrize("name", [*TRIANGULAR, *ANYWHERE])
-def test_what_does_not_fit_is_refused(name: str) -> None:
-    with pytest.raises(
-        LimitError, match=r"21 rows x 9 columns; the limit is the grid of 20 rows x 20 columns"
-    ):
-        make_target(name, rows=21, cols=9)
-    with pytest.raises(LimitError, match=r"rows 0 to 11 and columns 0 to 13 on a grid of 20 x 20"):
-        make_target(name, rows=9, cols=7, origin=(12, 0))
+def test_an_origin_only_shifts_the_pattern(name: str) -> None:
+    centred = make(name, rows=9, cols=7)
+    for row, col in ((0, 0), (11, 13), (6, 2)):
+        moved = make(name, rows=9, cols=7, origin=(row, col))
+        shift = (row - 5, col - 6)
+        assert (np.roll(centred.fill, shift, (0, 1)) == moved.fill).all()
+        assert (np.roll(centred.clear, shift, (0, 1)) == moved.clear).all()
 
 
 @pytest.mark.parametrize(("name", "settings"), [("sierpinski", {"order": 5}), ("ring", {"radius": 10})])
 def test_a_size_in_one_number_must_fit_too(name: str, settings: dict[str, Any]) -> None:
     with pytest.raises(LimitError, match="the size of the target"):
-        make_target(name, **settings)
+        make(name, **settings)
 
 
-@pytest.mark.parametrize("name", ["honeycomb", "link_kagome"])
-def test_a_block_too_small_for_an_atom_is_refused(name: str) -> None:
+def test_a_block_too_small_for_an_atom_is_refused() -> None:
     with pytest.raises(LimitError, match="choose a larger target"):
-        make_target(name, rows=1, cols=1)
+        make("honeycomb", rows=1, cols=1)
 
 
 @pytest.mark.parametrize("name", TRIANGULAR)
@@ -277,26 +252,19 @@ def test_a_diluted_triangular_lattice_needs_a_triangular_grid(name: str) -> None
     with pytest.raises(
         ConfigError, match=f"'{name}' dilutes a triangular lattice, and the grid is square"
     ) as no:
-        make_target(name, grid=SiteGrid(lattice="square"), rows=9, cols=9)
+        make(name, SiteGrid(lattice="square"), rows=9, cols=9)
     assert "lattice: triangular" in str(no.value)
 
 
 @pytest.mark.parametrize(
     ("model", "values", "message"),
     [
-        (BlockSettings, {"rows": 3}, "cols"),
-        (BlockSettings, {"rows": 0, "cols": 3}, "greater than or equal to 1"),
         (BlockSettings, {"rows": 3, "cols": 3, "origin": (-1, 0)}, "greater than or equal to 0"),
-        (BlockSettings, {"rows": 3, "cols": 3, "clear": "all"}, "bounding_box"),
-        (BlockSettings, {"rows": 3, "cols": 3, "size": 3}, "Extra inputs"),
         (SierpinskiSettings, {}, "the size is missing, or half of it; expected either 'order'"),
         (SierpinskiSettings, {"rows": 3}, "the size is missing, or half of it"),
         (SierpinskiSettings, {"order": 3, "rows": 3}, "two sizes are given"),
-        (SierpinskiSettings, {"order": 13}, "less than or equal to 12"),
         (RingSettings, {"width": 2}, "expected either 'radius', or 'rows' and 'cols'"),
         (RingSettings, {"radius": 3, "rows": 5, "cols": 5}, "two sizes are given"),
-        (RingSettings, {"radius": -1}, "greater than or equal to 0"),
-        (RingSettings, {"radius": 3, "width": 0.5}, "greater than or equal to 1"),
     ],
 )
 def test_wrong_settings_are_refused(model: type[BaseModel], values: dict[str, Any], message: str) -> None:
@@ -316,13 +284,12 @@ shot:
 """
 
 
-@pytest.mark.parametrize("name", [*TRIANGULAR, *ANYWHERE])
-def test_a_sequence_names_a_pattern(name: str, tmp_path: Path) -> None:
+def test_a_sequence_names_a_pattern(tmp_path: Path) -> None:
     sequence = tmp_path / "sequence.yaml"
-    sequence.write_text(SEQUENCE.format(target=f"{{pattern: {name}, rows: 9, cols: 7, origin: [2, 3]}}"))
+    sequence.write_text(SEQUENCE.format(target="{pattern: link_kagome, rows: 9, cols: 7, origin: [2, 3]}"))
     target = labseq.Session.open(sequence).assembly.target
-    expected = make_target(name, rows=9, cols=7, origin=(2, 3))
-    assert (target.name, expected.name) == (f"{name.replace('_', '-')} 9 x 7",) * 2
+    expected = make("link_kagome", rows=9, cols=7, origin=(2, 3))
+    assert target.name == expected.name == "link-kagome 9 x 7"
     assert (target.fill == expected.fill).all()
     assert (target.clear == expected.clear).all()
 

@@ -50,7 +50,7 @@ class TestCompress:
         return not_cleared, low + high, moved + limit * waiting, distance
 
     @given(st.data())
-    @settings(max_examples=300, deadline=None)
+    @settings(max_examples=100, deadline=None)
     def test_finds_the_cheapest_goals(self, data: st.DataObject) -> None:
         n = data.draw(st.integers(1, 6), "sites")
         wish = data.draw(st.lists(st.integers(0, 2), min_size=n, max_size=n), "1 fill, 2 clear")
@@ -83,7 +83,7 @@ class TestFillBatch:
     """Which atoms of a line go together."""
 
     @given(st.data())
-    @settings(max_examples=300, deadline=None)
+    @settings(max_examples=100, deadline=None)
     def test_the_way_is_free_and_no_batch_is_wasted(self, data: st.DataObject) -> None:
         n = data.draw(st.integers(1, 8), "sites")
         source = sorted(data.draw(st.sets(st.integers(0, n - 1), min_size=1), "atoms"))
@@ -138,7 +138,7 @@ class TestBestExchange:
         return total
 
     @given(st.data())
-    @settings(max_examples=200, deadline=None)
+    @settings(max_examples=80, deadline=None)
     def test_finds_the_exchange_worth_most(self, data: st.DataObject) -> None:
         n = data.draw(st.integers(1, 7), "columns")
         atoms = data.draw(st.lists(st.booleans(), min_size=n, max_size=n), "atoms")

@@ -52,7 +52,7 @@ class TestSettle:
     """The arrangement of a line, against trying all there are."""
 
     @given(lines(), st.booleans(), st.booleans())
-    @settings(max_examples=300, deadline=None)
+    @settings(max_examples=100, deadline=None)
     def test_finds_the_cheapest_arrangement(
         self, line: tuple[Line, Line, Line], low: bool, high: bool
     ) -> None:
@@ -83,7 +83,7 @@ class TestAddLine:
     """The batches of a line, as the check sees them."""
 
     @given(lines(), st.integers(1, 4), st.integers(1, 2), st.booleans())
-    @settings(max_examples=300, deadline=None)
+    @settings(max_examples=100, deadline=None)
     def test_batches_are_legal_and_as_few_as_the_limit_allows(
         self, line: tuple[Line, Line, Line], limit: int, slots: int, is_row: bool
     ) -> None:
@@ -119,7 +119,7 @@ class TestAddLine:
 
 class TestSupplyColumns:
     @given(occupancies(max_shape=(5, 5)), st.data())
-    @settings(max_examples=200, deadline=None)
+    @settings(max_examples=80, deadline=None)
     def test_every_column_gets_what_it_needs(self, atoms: NDArray[np.bool_], data: st.DataObject) -> None:
         n_rows, n_cols = atoms.shape
         needs = st.lists(st.integers(0, n_rows), min_size=n_cols, max_size=n_cols)

@@ -57,7 +57,7 @@ def test_the_margin_is_empty_and_outside(shape: tuple[int, int]) -> None:
 
 
 @given(st.data())
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 def test_the_cheapest_path_is_found(data: st.DataObject) -> None:
     shape = data.draw(shapes((3, 4)), "shape")
     atoms, starts, ends = (padded(data.draw(masks(shape), name)) for name in ("atoms", "starts", "ends"))
@@ -75,7 +75,7 @@ def test_the_cheapest_path_is_found(data: st.DataObject) -> None:
 
 
 @given(st.data())
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=40, deadline=None)
 def test_distances_in_the_open_are_those_of_paths_over_free_sites(data: st.DataObject) -> None:
     shape = data.draw(shapes((4, 4)), "shape")
     atoms = padded(data.draw(masks(shape), "atoms"))
@@ -88,13 +88,6 @@ def test_distances_in_the_open_are_those_of_paths_over_free_sites(data: st.DataO
                 expected[site] = length
     distance = kernels.distance_in_the_open(starts, atoms, inside, width)
     assert distance.tolist() == expected.tolist()
-
-
-def test_the_farthest_site_is_the_first_of_equals() -> None:
-    distance = np.array([0, 3, 1, 3, -1], np.int64)
-    assert kernels.farthest(distance, np.ones(5, np.bool_)) == 1
-    assert kernels.farthest(distance, np.array([True, False, True, False, True])) == 2
-    assert kernels.farthest(distance, np.array([True, False, False, False, True])) == -1
 
 
 @pytest.mark.parametrize(
@@ -137,7 +130,7 @@ def test_an_atom_carried_off_the_grid_is_gone_and_its_turns_are_linked() -> None
 
 
 @given(st.data())
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=60, deadline=None)
 def test_any_assignment_can_be_carried_out(data: st.DataObject) -> None:
     shape = data.draw(shapes((5, 5)), "shape")
     atoms = data.draw(masks(shape), "atoms")

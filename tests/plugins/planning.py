@@ -1,0 +1,75 @@
+"""Planners, loadings and targets for the tests of the planners."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from labseq_psca.planner import PscaPlanner, PscaSettings
+from labseq_scans.planners import Mta1Planner, Mta1Settings, TetrisPlanner, TetrisSettings
+from labseq_single.planner import CompressionPlanner, HcaPlanner, LsapPlanner, LsapSquaredPlanner
+from numpy.typing import NDArray
+
+from labseq.plugin import (
+    Context,
+    MotionSpec,
+    Occupancy,
+    Plan,
+    PlanReport,
+    SiteGrid,
+    TargetPattern,
+    check_plan,
+)
+
+Bools = NDArray[np.bool_]
+MakePlanner = Callable[[Context, int], Any]
+"""Makes a planner for a context and a degree of parallelism."""
+
+
+def psca(**settings: Any) -> MakePlanner:
+    return lambda context, dop: PscaPlanner(PscaSettings(degree_of_parallelism=dop, **settings), context)
+
+
+def mta1(context: Context, dop: int) -> Mta1Planner:
+    return Mta1Planner(Mta1Settings(degree_of_parallelism=dop), context)
+
+
+def tetris(context: Context, dop: int) -> TetrisPlanner:
+    return TetrisPlanner(TetrisSettings(degree_of_parallelism=dop), context)
+
+
+def single(planner: type[Any]) -> MakePlanner:
+    return lambda context, dop: planner(None, context)
+
+
+SINGLE = {cls.name: single(cls) for cls in (LsapPlanner, LsapSquaredPlanner, CompressionPlanner, HcaPlanner)}
+"""Planners with one mobile tweezer: name -> how to make them."""
+PLANNERS: dict[str, MakePlanner] = {"psca": psca(), "mta1": mta1, "tetris": tetris, **SINGLE}
+VARIANTS = {"psca, as in the paper": psca(variant="paper"), "psca, repair": psca(repair_below=1)}
+
+
+def plan_and_check(
+    make: MakePlanner, atoms: Occupancy, target: TargetPattern, dop: int = 7, **motion: Any
+) -> tuple[Plan, PlanReport]:
+    spec = MotionSpec(**motion)
+    planner = make(Context(grid=SiteGrid(), motion=spec), dop)
+    plan = planner.plan(atoms, target)
+    return plan, check_plan(plan, atoms, target, planner.degree_of_parallelism, motion=spec)
+
+
+def loadings(n: int, shape: tuple[int, int] = (20, 20), filling: float = 0.75, seed: int = 1) -> Bools:
+    return np.random.default_rng(seed).random((n, *shape)) < filling
+
+
+def in_the_middle(pattern: Any, shape: tuple[int, int] = (20, 20)) -> TargetPattern:
+    """A pattern in the middle of the grid; the other sites of its bounding box are to be empty."""
+    small = np.asarray(pattern, np.bool_)
+    top, left = (shape[0] - small.shape[0]) // 2, (shape[1] - small.shape[1]) // 2
+    box = (slice(top, top + small.shape[0]), slice(left, left + small.shape[1]))
+    fill, empty = np.zeros(shape, np.bool_), np.zeros(shape, np.bool_)
+    fill[box], empty[box] = small, ~small
+    return TargetPattern(fill, empty)
+
+
+COMPACT = in_the_middle(np.ones((15, 15)))
