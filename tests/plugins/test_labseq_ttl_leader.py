@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 from labseq_ttl.go_lines import HIGH, MORE, GoLines
-from labseq_ttl.protocol import CHANNELS
+from labseq_ttl.protocol import CHANNELS, OUTPUTS
 from labseq_ttl.settings import GoSettings, TtlSettings
 from pydantic import ValidationError
 
@@ -182,7 +182,7 @@ class Led:
     """The driver on a simulated box, with a leader that raises `go` by itself."""
 
     def __init__(self, **settings: Any) -> None:
-        rig = make_rig(**{"go": GO, **settings})
+        rig = make_rig(go=settings.pop("go", GO), **settings)
         assert isinstance(rig.lines, GoLines)
         assert isinstance(rig.lines, LeaderLink)
         self.lines, self.clock, self._rig = rig.lines, rig.clock, rig
