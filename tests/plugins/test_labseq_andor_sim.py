@@ -137,13 +137,6 @@ def test_a_frame_goes_into_a_buffer_of_its_size_only(wire: Wire) -> None:
     assert wire(*new) == Code.NO_NEW_DATA
 
 
-def test_cancel_wait_lets_the_waiting_go(wire: Wire) -> None:
-    wire("Initialize", b"")
-    wire.start()
-    assert wire("CancelWait") == Code.SUCCESS
-    assert wire("WaitForAcquisitionByHandleTimeOut", wire.handle, 600_000) == Code.NO_NEW_DATA
-
-
 @given(st.integers(-2, 50), st.integers(-2, 50), st.integers(-2, 34), st.integers(-2, 34), st.integers(0, 5))
 def test_an_image_is_taken_exactly_if_it_fits(left: int, right: int, bottom: int, top: int, b: int) -> None:
     camera = SimulatedCamera(NoisyWorld(clock := FakeClock(), SHAPE), clock, IXON_897, SHAPE)

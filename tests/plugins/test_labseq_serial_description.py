@@ -203,12 +203,6 @@ def test_a_reply_is_made_up_for_a_pattern(pattern: str) -> None:
     assert re.fullmatch(pattern, reply, re.DOTALL)
 
 
-@pytest.mark.parametrize("pattern", [r"(?=x)x", r"(a)\1", "(?i:x)y(?!z)"])
-def test_patterns_that_are_too_much_are_left_to_the_user(pattern: str) -> None:
-    reply = example_of(pattern)
-    assert reply is None or re.fullmatch(pattern, reply)
-
-
 @pytest.mark.filterwarnings("ignore:Possible")  # a set that Python will once read differently
 @given(
     st.from_regex(r"[A-Za-z0-9 .,=+*?\[\](){}|\\-]{0,12}", fullmatch=True), st.text(string.digits, max_size=3)
