@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from labseq_soapy_stream.messages import Facts, Setup, received, send
+from labseq_soapy_stream.output import Samples
 
 from labseq.plugin import Clock, DeviceError, wait_for
-from labseq_soapy.messages import Facts, Setup, received, send
-from labseq_soapy.output import Samples
 
 OPEN_S: Final = 60.0
 """How long a radio may take to open: some load their firmware."""
@@ -59,7 +59,7 @@ class Link:
         self.facts: Facts | None = None
         with log.open("wb") as file:
             self._process = subprocess.Popen(
-                [sys.executable, "-P", "-m", "labseq_soapy.streamer"],
+                [sys.executable, "-P", "-m", "labseq_soapy_stream.streamer"],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=file,
@@ -107,11 +107,7 @@ class Link:
         return self.facts
 
     def load(self, loop: Samples, fade_s: float) -> None:
-        """Play another loop, and wait until it is at the connectors.
-
-        Args:
-            loop: float32 (2, 2 n), I and Q in turn, by the channels' numbers.
-            fade_s: Duration of the transition from the loop before.
+        """Play another loop, float32 (2, 2 n) by the channels' numbers; wait until it is at the connectors.
 
         Raises:
             DeviceError: The stream is dead.
@@ -169,16 +165,11 @@ class Link:
         self._wait(lambda: self._n_done >= task, float("inf"), what)
 
     def _wait(self, is_done: Callable[[], bool], timeout_s: float, what: str) -> None:
-        """Wait for something while the process lives.
-
-        Raises:
-            DeviceError: It has ended, or hangs, or it takes too long.
-        """
+        """Wait for something; raises DeviceError if the process ends or hangs, or it takes too long."""
 
         def poll(longest_s: float) -> bool | None:
             with self._news:
-                self._news.wait_for(lambda: is_done() or self._ended, longest_s)
-                if is_done():
+                if self._news.wait_for(lambda: is_done() or self._ended, longest_s) and is_done():
                     return True
             self.check()
             return None
@@ -203,11 +194,11 @@ class Link:
             self._news.notify_all()
 
     def _last_line(self) -> str:
-        with contextlib.suppress(OSError):
-            lines = [line.strip() for line in self._log.read_text("utf-8", "replace").split("\n")]
-            lines = [line for line in lines if line]
-            return f", its last message: {lines[-1][:200]}" if lines else ""
-        return ""
+        try:
+            lines = self._log.read_text("utf-8", "replace").strip().splitlines()
+        except OSError:
+            return ""
+        return f", its last message: {lines[-1].strip()[:200]}" if lines else ""
 
     def _beat(self) -> None:
         while not self._closing.wait(self._setup.max_wait_s / 8):

@@ -8,11 +8,11 @@ from dataclasses import asdict
 from typing import Any
 
 import numpy as np
+from labseq_soapy_stream.messages import Facts, Setup
 
 from labseq.plugin import Context, DeviceError, LimitError, StaticTweezers, TransientError
 from labseq_soapy.access import choose_radio, end_stale_process, marker_of
 from labseq_soapy.link import Link
-from labseq_soapy.messages import Facts, Setup
 from labseq_soapy.settings import SoapySettings
 from labseq_soapy.tones import Amplitudes, ArrayTones
 

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from labseq_soapy_stream.messages import Facts
+from labseq_soapy_stream.output import Samples
 from numpy.typing import NDArray
 
 from labseq.plugin import DeviceError, LimitError, format_quantity
-from labseq_soapy.messages import Facts
-from labseq_soapy.output import Samples
 from labseq_soapy.settings import SoapySettings
 
 Floats = NDArray[np.float64]
@@ -134,12 +134,12 @@ def shortest_loop(what: str, offsets_hz: Floats, rate_hz: float, tolerance_hz: f
             lengths = lengths[np.abs(cycles - np.rint(cycles)) * rate_hz < tolerance_hz * lengths]
         if len(lengths):
             return int(lengths[0])
-    step_hz = 10 ** np.ceil(np.log10(rate_hz / LONGEST))
+    step = format_quantity(10 ** np.ceil(np.log10(rate_hz / LONGEST)), "frequency")
     raise LimitError(
-        f"{what}: the loop that holds all tones to within {_hz(tolerance_hz)}",
+        f"{what}: the loop that holds all tones to within {format_quantity(tolerance_hz, 'frequency')}",
         f"longer than {LONGEST} samples",
         f"{LONGEST} samples",
-        f"round tones, local_oscillator and sample_rate to multiples of {_hz(step_hz)}",
+        f"round tones, local_oscillator and sample_rate to multiples of {step}",
     )
 
 
@@ -202,10 +202,6 @@ def _least_spacing_hz(axes: Sequence[Floats]) -> float:
 
 def _mhz(value: float) -> str:
     return f"{value / 1e6:.7g} MHz"
-
-
-def _hz(value: float) -> str:
-    return format_quantity(value, "frequency")
 
 
 class ArrayTones:

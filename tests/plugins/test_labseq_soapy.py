@@ -10,16 +10,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, strategies as st
+from hypothesis import given, settings, strategies as st
 from labseq_soapy import tones
-from labseq_soapy.output import BLOCK, Output, Samples
 from labseq_soapy.settings import SoapySettings
 from labseq_soapy.static_tweezers import SoapyStaticTweezers
-from labseq_soapy.streamer import repeated
+from labseq_soapy_stream.output import BLOCK, Output, Samples
+from labseq_soapy_stream.streamer import repeated
 
 from labseq.model.grid import centred_comb
 from labseq.plugin import Context, LimitError, SiteGrid
-from labseq.roles import offers
 from labseq.testing import StaticTweezersContract
 
 from .labseq_soapy_rig import GRID, SMALL, depth, made, need_radio, opened, recorded
@@ -34,43 +33,32 @@ class TestSoapyStaticTweezers(StaticTweezersContract):
     @pytest.fixture
     def factory(self) -> Callable[[Context], SoapyStaticTweezers]:
         need_radio()
-        settings = SoapySettings.model_validate({**SMALL, "switch": 1e-3})
-        return partial(SoapyStaticTweezers, settings)
+        chosen = SoapySettings.model_validate({**SMALL, "switch": 1e-3})
+        return partial(SoapyStaticTweezers, chosen)
 
 
-def test_it_tests_itself_in_the_dark() -> None:
-    with opened() as rig:
-        assert offers(rig.tweezers, "self_test")
+def test_it_tests_itself_in_the_dark_and_describes_the_radio_and_the_tones() -> None:
+    with opened(row_gain=12.0) as rig:
         rig.tweezers.self_test()
         rig.tweezers.check_interlocks()
         assert not rig.ring.latest(1000).any()
-
-
-def test_it_describes_what_the_radio_read_back_and_how_the_tones_are_made() -> None:
-    with opened(row_gain=12.0, column_gain=99.0 / 8) as rig:
         rig.tweezers.start()
         described = rig.tweezers.describe()
-    assert described["radio"]["driver"] == "capture"
-    assert described["gain_db"] == [12.0, 12.375]
-    assert described["loop_samples"] == 80
-    assert all(1.0 < crest < 1.5 for crest in described["crest_factor"])
-    assert described["underflows"] == 0
-
-
-def test_a_session_that_turns_it_on_in_real_time_waits_as_long_as_the_ramp() -> None:
-    with opened() as rig:
-        rig.tweezers.start()
         before_s = rig.clock.now()
         rig.tweezers.ramp(0.5, 0.01)
         assert rig.clock.now() == pytest.approx(before_s + 0.01)
+    assert described["radio"]["driver"] == "capture"
+    assert described["gain_db"] == [12.0, 0.0], "the lowest where none is given"
+    assert (described["loop_samples"], described["underflows"]) == (80, 0)
+    assert all(1.0 < crest < 1.5 for crest in described["crest_factor"])
 
 
 @pytest.mark.parametrize(
-    ("settings", "text"),
+    ("chosen", "text"),
     [
         (
             {"sample_rate": 200e3},
-            r"column tones: the outermost tone is .* from the local oscillator at 100.015 MHz",
+            r"column tones: the outermost tone is .* the local oscillator at 100.015 MHz",
         ),
         ({"local_oscillator": 99.3e6}, r"the limit is 0.48 MHz, half of 80% of the sample rate of 1.2 MHz"),
         (
@@ -80,13 +68,14 @@ def test_a_session_that_turns_it_on_in_real_time_waits_as_long_as_the_ramp() -> 
     ],
 )
 def test_tones_that_the_radio_cannot_make_are_refused_before_it_is_opened(
-    settings: dict[str, Any], text: str
+    chosen: dict[str, Any], text: str
 ) -> None:
     with pytest.raises(LimitError, match=text):
-        made(**settings)
+        made(**chosen)
 
 
-PAPER = centred_comb(20)
+TONES_HZ = centred_comb(20)
+RATE_HZ = 40e6
 COMBS = st.builds(
     centred_comb,
     st.integers(1, 30),
@@ -95,77 +84,55 @@ COMBS = st.builds(
 )
 
 
-class TestLocalOscillator:
-    def test_leaks_no_nearer_than_a_quarter_of_a_site_to_a_tone_of_the_paper_and_nor_do_images(self) -> None:
-        oscillator_hz = tones.local_oscillator((PAPER, PAPER))
-        spots = np.append(2 * oscillator_hz - PAPER, oscillator_hz)
-        assert np.abs(spots[:, None] - PAPER).min() > 1.6e6 / 4
-        assert abs(oscillator_hz - 100e6) < 1.6e6
-
-    @given(COMBS)
-    def test_stays_a_third_of_a_site_off_on_every_comb(self, comb: np.ndarray) -> None:
-        spacing_hz = comb[1] - comb[0] if len(comb) > 1 else 1e6
-        clear_hz = tones.clearance(comb, tones.local_oscillator((comb, comb)))
-        assert clear_hz >= spacing_hz / 3 - 1e-3
-
-    @given(COMBS, COMBS)
-    def test_is_shared_by_two_axes(self, rows: np.ndarray, columns: np.ndarray) -> None:
-        oscillator_hz = tones.local_oscillator((rows, columns))
-        low, high = min(rows.min(), columns.min()), max(rows.max(), columns.max())
-        assert abs(oscillator_hz - (low + high) / 2) <= 2e6
+@given(COMBS)
+def test_the_oscillator_and_images_stay_a_third_of_a_site_off_every_comb(comb: np.ndarray) -> None:
+    spacing_hz = comb[1] - comb[0] if len(comb) > 1 else 1e6
+    assert tones.clearance(comb, tones.local_oscillator((comb, comb))) >= spacing_hz / 3 - 1e-3
 
 
-class TestLoop:
-    @given(COMBS, st.sampled_from([40e6, 50e6, 61.44e6]))
-    def test_is_the_shortest_that_holds_all_tones_to_within_a_hertz(
-        self, comb: np.ndarray, rate_hz: float
-    ) -> None:
-        offsets_hz = comb - tones.local_oscillator((comb, comb))
-        n = tones.shortest_loop("x", offsets_hz, rate_hz, 1.0)
-        errors_hz = [
-            np.abs(np.rint(offsets_hz * m / rate_hz) * rate_hz / m - offsets_hz).max()
-            for m in (n, n - 1)
-            if m
-        ]
-        assert errors_hz[0] < 1.0
-        assert n == 1 or errors_hz[1] >= 1.0
-
-    def test_that_would_be_too_long_is_refused_with_what_to_round_to(self) -> None:
-        crooked = PAPER + np.random.default_rng(1).normal(0.0, 3e4, 20)
-        with pytest.raises(
-            LimitError, match="round tones, local_oscillator and sample_rate to multiples of 10 Hz"
-        ):
-            tones.shortest_loop("array", crooked - 100e6, 40e6, 1.0)
-
-    def test_plays_each_tone_with_its_amplitude_without_a_seam(self) -> None:
-        offsets_hz = PAPER - tones.local_oscillator((PAPER, PAPER))
-        loop = tones.axis_loop(offsets_hz, tones.shortest_loop("x", offsets_hz, 40e6, 1.0), 40e6)
-        amplitudes = np.linspace(0.01, 0.05, 20)
-        samples = np.tile(loop.samples(amplitudes), 40)
-        t_s = np.arange(len(samples)) / 40e6
-        expected = np.exp(1j * (2 * np.pi * np.outer(t_s, offsets_hz) + loop.phase_rad)) @ amplitudes
-        assert np.abs(samples - expected).max() < 1e-5
-
-    @pytest.mark.parametrize("side", [-1, 1])
-    def test_tones_beyond_four_fifths_of_the_rate_are_refused(self, side: int) -> None:
-        edge = np.array([side * 16.0e6])
-        tones.check_span("rows", 100e6 + edge, 100e6, 40e6)
-        with pytest.raises(
-            LimitError,
-            match=r"rows: the outermost tone is 16.01 MHz from .*choose a sample_rate above 40.025 MHz",
-        ):
-            tones.check_span("rows", 100e6 + edge + side * 1e4, 100e6, 40e6)
+@given(COMBS, COMBS)
+def test_two_axes_share_the_oscillator_in_their_middle(rows: np.ndarray, columns: np.ndarray) -> None:
+    low, high = min(rows.min(), columns.min()), max(rows.max(), columns.max())
+    assert abs(tones.local_oscillator((rows, columns)) - (low + high) / 2) <= 2e6
 
 
-class TestPhases:
-    @pytest.mark.parametrize(
-        ("n_tones", "crest"), [(1, 1.0), (2, 1.4143), (3, 1.3), (10, 1.2), (20, 1.21), (21, 1.2)]
+@given(COMBS, st.sampled_from([40e6, 50e6, 61.44e6]))
+def test_the_loop_is_the_shortest_that_holds_all_tones_to_within_a_hertz(
+    comb: np.ndarray, rate_hz: float
+) -> None:
+    offsets_hz = comb - tones.local_oscillator((comb, comb))
+    n = tones.shortest_loop("x", offsets_hz, rate_hz, 1.0)
+    error_hz, shorter_hz = (
+        np.abs(np.rint(offsets_hz * m / rate_hz) * rate_hz / m - offsets_hz).max() for m in (n, max(1, n - 1))
     )
-    def test_make_a_low_crest_factor(self, n_tones: int, crest: float) -> None:
-        cycles = 16 * np.arange(n_tones)
-        phases = tones.low_crest_phases(1e6 * np.arange(float(n_tones)))
-        loop = tones.AxisLoop(512 * n_tones, cycles, phases)
-        assert tones.crest_factor(loop.samples(np.ones(n_tones))) <= crest + 1e-3
+    assert error_hz < 1.0
+    assert n == 1 or shorter_hz >= 1.0
+
+
+def test_a_loop_plays_each_tone_with_its_amplitude_without_a_seam() -> None:
+    offsets_hz = TONES_HZ - tones.local_oscillator((TONES_HZ, TONES_HZ))
+    loop = tones.axis_loop(offsets_hz, tones.shortest_loop("x", offsets_hz, RATE_HZ, 1.0), RATE_HZ)
+    amplitudes = np.linspace(0.01, 0.05, 20)
+    samples = np.tile(loop.samples(amplitudes), 40)
+    t_s = np.arange(len(samples)) / RATE_HZ
+    expected = np.exp(1j * (2 * np.pi * np.outer(t_s, offsets_hz) + loop.phase_rad)) @ amplitudes
+    assert np.abs(samples - expected).max() < 1e-5
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_tones_beyond_four_fifths_of_the_rate_are_refused(side: int) -> None:
+    edge = np.array([side * 16.0e6])
+    tones.check_span("rows", 100e6 + edge, 100e6, RATE_HZ)
+    text = r"rows: the outermost tone is 16.01 MHz from .*choose a sample_rate above 40.025 MHz"
+    with pytest.raises(LimitError, match=text):
+        tones.check_span("rows", 100e6 + edge + side * 1e4, 100e6, RATE_HZ)
+
+
+@pytest.mark.parametrize(("n_tones", "crest"), [(1, 1.0), (2, 1.4143), (3, 1.3), (10, 1.2), (20, 1.21)])
+def test_phases_make_a_low_crest_factor(n_tones: int, crest: float) -> None:
+    phases = tones.low_crest_phases(1e6 * np.arange(float(n_tones)))
+    loop = tones.AxisLoop(512 * n_tones, 16 * np.arange(n_tones), phases)
+    assert tones.crest_factor(loop.samples(np.ones(n_tones))) <= crest + 1e-3
 
 
 N_LOOP = 96
@@ -184,42 +151,32 @@ def played(output: Output, n: int) -> np.ndarray:
     return np.concatenate(blocks, axis=1)
 
 
-def on(output: Output) -> np.ndarray:
-    """One loop's worth at full depth, from the loop's start."""
+def switched_on() -> Output:
+    """At full depth, at the loop's start."""
+    output = Output()
     output.load(loop(), 1)
     output.ramp(1.0, 1)
-    return played(output, 1)
+    played(output, 1)
+    return output
 
 
-def test_nothing_but_silence_comes_before_a_loop_is_on() -> None:
-    output = Output()
+def test_there_is_silence_before_a_loop_is_on_and_then_the_loop_itself_without_a_copy() -> None:
+    output, own = Output(), loop()
     assert not played(output, 10).any()
-    output.load(loop(), 100)
+    output.load(own, 100)
     assert not played(output, 10).any()
     assert output.steady
-
-
-def test_a_loop_at_full_depth_is_sent_as_it_is_without_a_copy() -> None:
-    output = Output()
-    mine = loop()
-    output.load(mine, 1)
     output.ramp(1.0, 1)
     output.block()
-    assert np.shares_memory(output.block(), mine)
+    assert np.shares_memory(output.block(), own)
 
 
-@given(
-    st.lists(
-        st.tuples(st.floats(0.0, 1.0), st.integers(1, 3 * BLOCK)),
-        min_size=1,
-        max_size=4,
-    )
-)
+@settings(max_examples=40)
+@given(st.lists(st.tuples(st.floats(0.0, 1.0), st.integers(1, 3 * BLOCK)), min_size=1, max_size=4))
 def test_the_depth_is_linear_to_the_sample_and_phases_run_on(ramps: list[tuple[float, int]]) -> None:
-    output = Output()
+    output, wave = Output(), loop().view(np.complex64)
     output.load(loop(), 1)
     start, at = 0.0, 0
-    wave = loop().view(np.complex64)
     for end, n in ramps:
         output.ramp(end, n)
         samples = played(output, n)
@@ -237,16 +194,14 @@ def test_a_ramp_that_comes_during_a_ramp_goes_on_from_where_it_is() -> None:
     output.ramp(1.0, 4 * BLOCK)
     first = played(output, BLOCK)
     output.ramp(0.0, BLOCK)
-    second = played(output, BLOCK)
-    depth = np.abs(np.concatenate([first, second], axis=1)[0]) ** 4
-    assert depth.max() == pytest.approx(0.25, abs=1e-3)
-    assert np.abs(np.diff(depth)).max() < 1.01 / BLOCK
-    assert depth[-1] < 1e-9
+    course = np.abs(np.concatenate([first, played(output, BLOCK)], axis=1)[0]) ** 4
+    assert course.max() == pytest.approx(0.25, abs=1e-3)
+    assert np.abs(np.diff(course)).max() < 1.01 / BLOCK
+    assert course[-1] < 1e-9
 
 
 def test_a_fade_that_is_cut_short_by_another_one_goes_on_from_where_it_is() -> None:
-    output = Output()
-    on(output)
+    output = switched_on()
     output.load(loop(0.5), 4 * BLOCK)
     first = played(output, BLOCK)
     output.load(loop(0.25), BLOCK)
@@ -256,8 +211,7 @@ def test_a_fade_that_is_cut_short_by_another_one_goes_on_from_where_it_is() -> N
 
 
 def test_a_ramp_and_a_fade_may_come_together() -> None:
-    output = Output()
-    on(output)
+    output = switched_on()
     output.load(loop(0.5), 2 * BLOCK)
     output.ramp(0.0, BLOCK)
     size = np.abs(played(output, BLOCK)[0])
@@ -266,8 +220,6 @@ def test_a_ramp_and_a_fade_may_come_together() -> None:
     assert np.abs(played(output, 2 * BLOCK))[0, -1] == pytest.approx(0.5, abs=1e-5)
 
 
-RATE_HZ = 40e6
-TONES_HZ = centred_comb(20)
 FULL: dict[str, Any] = {
     "grid": SiteGrid(20, 20),
     "device": "simulated",
@@ -276,126 +228,83 @@ FULL: dict[str, Any] = {
     "column_frequency": {},
 }
 """The paper's array, on a radio whose clock goes at a tenth of real time."""
+
+
+def test_two_times_twenty_tones_are_as_requested_on_their_outputs_and_too_much_changes_nothing() -> None:
+    rows, columns = 0.03 + 0.02 * np.sin(np.arange(20.0)), 0.04 + 0.01 * np.cos(np.arange(20.0))
+    with opened(**FULL, row_channel=1, column_channel=0) as rig:
+        rig.tweezers.load((rows, columns))
+        rig.tweezers.start()
+        with pytest.raises(LimitError, match=r"peak of the row tones is 1.0\d of full scale; the limit is 1"):
+            rig.tweezers.load((np.full(20, 0.2), columns))
+        offsets_hz = TONES_HZ - rig.described("local_oscillator")
+        n = 75 * 1000  # whole loops, so that a seam would show
+        samples = rig.ring.latest(n)
+    for axis, amplitudes in zip(samples, (columns, rows), strict=True):
+        spectrum = np.abs(np.fft.fft(axis)) / n
+        bins = np.rint(offsets_hz * n / RATE_HZ).astype(int) % n
+        assert np.abs(spectrum[bins] / amplitudes - 1.0).max() < 1e-5  # no more than float32 rounds
+        spectrum[bins] = 0.0
+        assert 20 * np.log10(spectrum.max() / amplitudes.min()) < -100.0  # in dBc
+        halves = axis.reshape(2, -1)
+        waves = np.exp(-2j * np.pi * np.outer(offsets_hz, np.arange(n // 2) / RATE_HZ))
+        turned = np.angle((waves @ halves[1]) / (waves @ halves[0]))
+        expected = 2 * np.pi * offsets_hz * (n // 2) / RATE_HZ
+        turn = np.angle(np.exp(1j * (turned - expected)))
+        assert np.abs(turn / (2 * np.pi) * RATE_HZ / (n // 2)).max() < 1.0, "a tone is off by 1 Hz"
+
+
 SMALL_LOOP = 80
-"""Of the small array."""
+"""Samples of the small array's loop."""
 
 
-def amplitudes_in(samples: np.ndarray, oscillator_hz: float) -> np.ndarray:
-    waves = np.exp(2j * np.pi * np.outer(np.arange(samples.shape[-1]) / RATE_HZ, TONES_HZ - oscillator_hz))
-    return np.abs(np.linalg.lstsq(waves, samples, rcond=None)[0])
+def at_full_depth(samples: np.ndarray) -> slice:
+    """A stretch in which the power of a loop does not change and is highest."""
+    n = len(samples) // SMALL_LOOP
+    power = np.mean(np.abs(samples[: n * SMALL_LOOP].reshape(n, SMALL_LOOP)) ** 2, axis=1)
+    highest = np.flatnonzero(power > power.max() * (1 - 1e-5))
+    return slice(int(highest[1]) * SMALL_LOOP, int(highest[-1]) * SMALL_LOOP)
 
 
-class TestFullSpan:
-    def test_of_two_times_twenty_tones_is_as_it_was_asked_for(self) -> None:
-        asked = 0.03 + 0.02 * np.sin(np.arange(20.0)), 0.04 + 0.01 * np.cos(np.arange(20.0))
-        with opened(**FULL) as rig:
-            rig.tweezers.load(asked)
-            rig.tweezers.start()
-            oscillator_hz = rig.described("local_oscillator")
-            n = 75 * 1000  # whole loops, so that a seam would show
-            samples = rig.ring.latest(n)
-        for axis, amplitudes in zip(samples, asked, strict=True):
-            spectrum = np.abs(np.fft.fft(axis)) / n
-            bins = np.rint((TONES_HZ - oscillator_hz) * n / RATE_HZ).astype(int) % n
-            assert np.abs(spectrum[bins] / amplitudes - 1.0).max() < 0.01
-            assert np.abs(spectrum[bins] / amplitudes - 1.0).max() < 1e-5  # no more than float32 rounds
-            spectrum[bins] = 0.0
-            assert 20 * np.log10(spectrum.max() / amplitudes.min()) < -100.0  # asked for: -50 dBc
-            halves = axis.reshape(2, -1)
-            waves = np.exp(-2j * np.pi * np.outer(TONES_HZ - oscillator_hz, np.arange(n // 2) / RATE_HZ))
-            turned = np.angle((waves @ halves[1]) / (waves @ halves[0]))
-            expected = 2 * np.pi * (TONES_HZ - oscillator_hz) * (n // 2) / RATE_HZ
-            turn = np.angle(np.exp(1j * (turned - expected)))
-            assert np.abs(turn / (2 * np.pi) * RATE_HZ / (n // 2)).max() < 1.0  # Hz
-
-    def test_of_calibrated_rows_and_columns_goes_to_their_own_outputs(self) -> None:
-        rows, columns = np.full(20, 0.02), np.linspace(0.01, 0.04, 20)
-        with opened(**FULL, row_channel=1, column_channel=0) as rig:
-            rig.tweezers.load((rows, columns))
-            rig.tweezers.start()
-            samples = rig.ring.latest(7500)
-            oscillator_hz = rig.described("local_oscillator")
-        assert amplitudes_in(samples[1], oscillator_hz) == pytest.approx(rows, rel=1e-3)
-        assert amplitudes_in(samples[0], oscillator_hz) == pytest.approx(columns, rel=1e-3)
-
-    def test_is_refused_beyond_full_scale_and_nothing_changes(self) -> None:
-        with opened(**FULL) as rig:
-            rig.tweezers.start()
-            too_much, columns = np.full(20, 0.2), np.full(20, 0.05)
-            with pytest.raises(
-                LimitError, match=r"peak of the row tones is 1.0\d of full scale; the limit is 1"
-            ):
-                rig.tweezers.load((too_much, columns))
-            oscillator_hz = rig.described("local_oscillator")
-            heard = amplitudes_in(rig.ring.latest(7500)[0], oscillator_hz)
-        assert heard == pytest.approx(np.full(20, 0.05), rel=1e-3)
-
-
-class TestRamps:
-    def test_are_linear_in_depth_from_where_it_is_without_a_jump(self, tmp_path: Path) -> None:
-        with opened(arguments=f"folder={tmp_path},record=10000000") as rig:
-            rig.tweezers.start()
-            rig.tweezers.ramp(0.3, 0.02)
-            rig.tweezers.ramp(0.3, 0.005)
-            rig.tweezers.ramp(1.0, 0.03)
-            rig.tweezers.safe_state()
-        for channel in (0, 1):
-            samples = recorded(tmp_path, channel)
-            course = depth(samples, SMALL_LOOP, _full(samples))
-            assert not np.isnan(course).any(), "a phase jumped"
-            known = course[np.abs(samples) > 0.02]
-            jumps = np.abs(np.diff(known))
-            steepest = 1.0 / (0.01 * 1.2e6)  # of start and safe_state: from 0 to 1 in 10 ms
-            assert jumps.max() < 20 * steepest  # where samples between were too small to judge by
-            assert np.quantile(jumps, 0.99) < 2.1 * steepest
-            assert np.abs(samples[-100:]).max() == 0.0
-
-    def test_turn_the_light_up_and_down_in_the_time_that_is_asked_for(self, tmp_path: Path) -> None:
-        with opened(arguments=f"folder={tmp_path},record=10000000") as rig:
-            rig.tweezers.start()
-            rig.tweezers.ramp(0.5, 0.01)
-        samples = recorded(tmp_path)
-        course = depth(samples, SMALL_LOOP, _full(samples))
-        between = np.flatnonzero(
-            (course > 0.5005) & (course < 0.9995) & (np.arange(len(course)) > _full(samples).start)
-        )
-        assert np.ptp(between) == pytest.approx(0.01 * 1.2e6, rel=0.02)
-
-    def test_of_no_duration_switch_from_one_sample_to_the_next(self, tmp_path: Path) -> None:
-        with opened(arguments=f"folder={tmp_path},record=10000000") as rig:
-            rig.tweezers.start()
-            rig.tweezers.ramp(0.5, 0.0)
-            rig.tweezers.ramp(1.0, 0.0)
-        samples = recorded(tmp_path)
-        course = depth(samples, SMALL_LOOP, _full(samples))
-        lowered = np.flatnonzero(np.abs(course - 0.5) < 1e-3)
-        assert len(lowered) > 1000
+def test_ramps_are_linear_in_depth_and_last_as_long_as_requested(tmp_path: Path) -> None:
+    with opened(arguments=f"folder={tmp_path},record=10000000") as rig:
+        rig.tweezers.start()
+        rig.tweezers.ramp(0.3, 0.02)
+        rig.tweezers.ramp(0.3, 0.005)
+        rig.tweezers.ramp(1.0, 0.03)
+        rig.tweezers.safe_state()
+    for channel in (0, 1):
+        samples = recorded(tmp_path, channel)
+        course = depth(samples, SMALL_LOOP, at_full_depth(samples))
         assert not np.isnan(course).any(), "a phase jumped"
+        jumps = np.abs(np.diff(course[np.abs(samples) > 0.02]))
+        steepest = 1.0 / (0.01 * 1.2e6)  # of start and safe_state: from 0 to 1 in 10 ms
+        assert jumps.max() < 20 * steepest  # where samples between were too small to judge by
+        assert np.quantile(jumps, 0.99) < 2.1 * steepest
+        assert np.abs(samples[-100:]).max() == 0.0
+        lit = np.flatnonzero((course > 0.3005) & (course < 0.9995))
+        ramps = np.split(lit, np.flatnonzero(np.diff(lit) > 1000) + 1)  # start, down, up, safe state
+        assert [np.ptp(ramp) / 1.2e6 for ramp in ramps[1:3]] == pytest.approx([0.02, 0.03], rel=0.02)
 
 
-def test_new_amplitudes_take_the_place_of_old_ones_without_a_jump(tmp_path: Path) -> None:
+def test_ramps_of_no_duration_switch_from_one_sample_to_the_next(tmp_path: Path) -> None:
+    with opened(arguments=f"folder={tmp_path},record=10000000") as rig:
+        rig.tweezers.start()
+        rig.tweezers.ramp(0.5, 0.0)
+        rig.tweezers.ramp(1.0, 0.0)
+    samples = recorded(tmp_path)
+    course = depth(samples, SMALL_LOOP, at_full_depth(samples))
+    assert np.count_nonzero(np.abs(course - 0.5) < 1e-3) > 1000
+    assert not np.isnan(course).any(), "a phase jumped"
+
+
+def test_new_amplitudes_are_faded_in(tmp_path: Path) -> None:
     with opened(arguments=f"folder={tmp_path},record=10000000", fade=0.005) as rig:
         rig.tweezers.start()
         rig.tweezers.load((np.full(3, 0.1), np.full(4, 0.1)))
         latest = rig.ring.latest(800)
     samples = recorded(tmp_path)
     assert np.mean(np.abs(latest) ** 2, axis=1) == pytest.approx([0.03, 0.04], rel=1e-4)
-    full = _full(samples)
+    full = at_full_depth(samples)
     change = np.abs(samples[full.start + SMALL_LOOP :] - samples[full.start : -SMALL_LOOP])
     assert change[: 30 * SMALL_LOOP].max() < 1.01 * SMALL_LOOP / (0.005 * 1.2e6)
-
-
-def test_the_gain_that_is_not_given_is_the_lowest() -> None:
-    with opened(row_gain=30.0) as rig:
-        assert rig.ring["gain_db"].tolist() == [30.0, 0.0]
-
-
-def _full(samples: np.ndarray) -> slice:
-    """A stretch at full depth: where the power of a loop does not change and is highest."""
-    n = len(samples) // SMALL_LOOP
-    power = np.mean(
-        np.abs(samples[: n * SMALL_LOOP].reshape(n, SMALL_LOOP)) ** 2,
-        axis=1,
-    )
-    highest = np.flatnonzero(power > power.max() * (1 - 1e-5))
-    return slice(int(highest[1]) * SMALL_LOOP, int(highest[-1]) * SMALL_LOOP)

@@ -1,23 +1,27 @@
-"""The amplitudes that the simulated radio plays, as the simulation receives them."""
+"""The simulated radio: the amplitudes that the simulation receives, whole runs, mistakes in profiles."""
 
 from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Callable
+from pathlib import Path
 from typing import cast
 
 import numpy as np
 import pytest
-from labseq_soapy_sim import Fault
+from labseq_soapy import labseq_register
+from labseq_soapy_sim import Fault, build
 from labseq_virtual.settings import SimulationSettings
 from labseq_virtual.simulation import VirtualSimulation
 
+import labseq
+from labseq.errors import LabseqError
 from labseq.plugin import Context, DeviceError, RandomStream, TransientError, TweezerAmplitudes
+from labseq.registry import Registry
 from labseq.roles import RfSource, ToneSource
 from labseq.testing.fakes import FakeClock, RecordingSimulation
 
-from .labseq_soapy_rig import GRID, Rig, opened, until
+from .labseq_soapy_rig import GRID, Rig, need_radio, opened, until
 
 ROWS, COLUMNS = np.array([0.1, 0.2, 0.15]), np.array([0.1, 0.05, 0.2, 0.1])
 
@@ -41,16 +45,9 @@ class ReceivingSimulation(RecordingSimulation):
         return list(self.source.played(0.0))
 
 
-def depths(found: list[TweezerAmplitudes]) -> list[float]:
-    """Depth of the first tweezer over that with the amplitudes of ROWS and COLUMNS."""
-    nominal = (ROWS[0] * COLUMNS[0]) ** 2
-    return [float((one.row[0] * one.column[0]) ** 2 / nominal) for one in found]
-
-
-def test_each_change_of_the_amplitudes_is_reported_once() -> None:
+def test_each_change_of_the_amplitudes_is_reported_once_also_a_dip_that_is_over() -> None:
     simulation = ReceivingSimulation()
     with opened(simulation=simulation) as rig:
-        assert simulation.changes() == []
         rig.tweezers.load((ROWS, COLUMNS))
         assert simulation.changes() == []
         rig.tweezers.start()
@@ -58,18 +55,13 @@ def test_each_change_of_the_amplitudes_is_reported_once() -> None:
         assert found.row == pytest.approx(ROWS, abs=1e-6)
         assert found.column == pytest.approx(COLUMNS, abs=1e-6)
         assert simulation.changes() == []
-        rig.tweezers.load((ROWS / 2, COLUMNS))
-        assert simulation.changes()[0].row == pytest.approx(ROWS / 2, abs=1e-6)
-
-
-def test_a_dip_that_was_over_before_the_simulation_asks_is_reported() -> None:
-    simulation = ReceivingSimulation()
-    with opened(simulation=simulation) as rig:
-        rig.tweezers.load((ROWS, COLUMNS))
-        rig.tweezers.start()
         rig.tweezers.ramp(0.25, 0.001)
         rig.tweezers.ramp(1.0, 0.001)
-        assert depths(simulation.changes()) == pytest.approx([1.0, 0.25, 1.0], abs=1e-4)
+        nominal = (ROWS[0] * COLUMNS[0]) ** 2
+        depths = [(one.row[0] * one.column[0]) ** 2 / nominal for one in simulation.changes()]
+        assert depths == pytest.approx([0.25, 1.0], abs=1e-4)
+        rig.tweezers.load((ROWS / 2, COLUMNS))
+        assert simulation.changes()[0].row == pytest.approx(ROWS / 2, abs=1e-6)
 
 
 def test_equal_runs_are_equal_to_the_last_digit() -> None:
@@ -78,11 +70,11 @@ def test_equal_runs_are_equal_to_the_last_digit() -> None:
         simulation = ReceivingSimulation()
         with opened(simulation=simulation) as rig:
             rig.tweezers.start()
-            for depth in (0.3, 0.7, 1.0):
+            for depth in (0.3, 1.0):
                 rig.tweezers.ramp(depth, 0.001)
             found.append([(one.row.tobytes(), one.column.tobytes()) for one in simulation.changes()])
     assert found[0] == found[1]
-    assert len(found[0]) == 4
+    assert len(found[0]) == 3
 
 
 def kill(rig: Rig) -> None:
@@ -90,50 +82,33 @@ def kill(rig: Rig) -> None:
     until(lambda: not rig.ring.is_playing)
 
 
-def tune_away(rig: Rig) -> None:
-    rig.ring["frequency_hz"][0] += 20e3
-
-
-@pytest.mark.parametrize(
-    "fail",
-    [
-        kill,
-        lambda rig: rig.ring.set_fault(Fault.MUTE_0),
-        lambda rig: rig.ring.set_fault(Fault.MUTE_1),
-        tune_away,
-    ],
-    ids=["the process is killed", "rows mute", "columns mute", "oscillator off"],
-)
-def test_a_radio_that_fails_makes_no_tweezers(fail: Callable[[Rig], None]) -> None:
+def test_a_radio_that_fails_makes_no_tweezers() -> None:
     simulation = ReceivingSimulation()
     with opened(simulation=simulation) as rig:
         rig.tweezers.start()
-        assert depths(simulation.changes())[0] > 0.0
-        fail(rig)
+        nominal = simulation.changes()[-1]
 
-        def is_dark() -> bool:
-            found = simulation.changes()
-            return bool(found) and (found[-1].row.max() < 0.01 or found[-1].column.max() < 0.01)
+        def is_lit(row: bool, column: bool) -> bool:
+            rig.tweezers.radio.changed()
+            found = simulation.source._last  # pyright: ignore[reportAttributeAccessIssue, reportOptionalMemberAccess]
+            return [bool(axis.max() > 0.01) for axis in found] == [row, column]
 
-        until(is_dark)
-
-
-def test_an_underflow_is_a_dark_moment_and_then_light_again() -> None:
-    simulation = ReceivingSimulation()
-    with opened(simulation=simulation) as rig:
-        rig.tweezers.start()
-        before = simulation.changes()[-1]
+        for fault, row, column in ((Fault.MUTE_0, False, True), (Fault.MUTE_1, True, False)):
+            rig.ring.set_fault(fault)
+            until(lambda row=row, column=column: is_lit(row, column))
+        rig.ring.set_fault(Fault.NONE)
+        rig.ring["frequency_hz"][0] += 20e3
+        until(lambda: is_lit(False, True))
+        rig.ring["frequency_hz"][0] -= 20e3
+        until(lambda: is_lit(True, True))
+        simulation.changes()
         rig.ring.set_fault(Fault.UNDERFLOW)
         until(lambda: int(rig.ring["underflows"]) == 1)
         dark, light = simulation.changes()
         assert not dark.row.any()
-        assert np.array_equal(light.row, before.row)
-
-
-def test_a_ramp_on_a_dead_stream_is_no_light() -> None:
-    simulation = ReceivingSimulation()
-    with opened(simulation=simulation) as rig:
+        assert light.row == pytest.approx(nominal.row)
         kill(rig)
+        assert not simulation.changes()[-1].row.any()
         with pytest.raises(DeviceError):
             rig.tweezers.start()
         assert simulation.changes() == []
@@ -142,71 +117,131 @@ def test_a_ramp_on_a_dead_stream_is_no_light() -> None:
 class Lab:
     """Atoms in tweezers made by a simulated radio; nothing but the light loses them."""
 
-    def __init__(self, **physics: float) -> None:
+    def __init__(self) -> None:
         self.clock = FakeClock()
-        settings = {"loading": 1.0, "lifetime": 2e6, "imaging_loss": 0.0, **physics}
+        settings = {"loading": 1.0, "lifetime": 2e6, "imaging_loss": 0.0}
         context = Context("simulation", GRID, clock=self.clock, random=RandomStream(0))
-        self.world = VirtualSimulation(SimulationSettings.model_validate(settings), context)
-        self.world.open()
-        self.world.begin_shot()
+        self.simulation = VirtualSimulation(SimulationSettings.model_validate(settings), context)
+        self.simulation.open()
 
     def load(self, rig: Rig) -> None:
+        self.simulation.begin_shot()
         rig.tweezers.start()
-        self.world.load(self.clock.now(), 0.5)
+        self.simulation.load(self.clock.now(), 0.5)
         self.clock.sleep(0.5)
 
     @property
     def n_atoms(self) -> int:
-        return int(np.count_nonzero(self.world.truth()))
+        return int(np.count_nonzero(self.simulation.truth()))
 
 
-class TestAtoms:
-    def test_are_loaded_only_where_the_radio_makes_tweezers(self) -> None:
-        lab = Lab()
-        with opened(simulation=lab.world, clock=lab.clock) as rig:
-            rig.tweezers.load((np.array([1.0, 0.0, 1.0]) / 3, np.full(4, 1 / 4)))
-            lab.load(rig)
-            assert lab.world.truth().any(axis=1).tolist() == [True, False, True]
+def test_atoms_are_loaded_where_there_are_tweezers_and_stay_in_a_ramp_that_holds_them() -> None:
+    lab = Lab()
+    with opened(simulation=lab.simulation, clock=lab.clock) as rig:
+        rig.tweezers.load((np.array([1.0, 0.0, 1.0]) / 3, np.full(4, 1 / 4)))
+        lab.load(rig)
+        assert lab.simulation.truth().any(axis=1).tolist() == [True, False, True]
+        rig.tweezers.ramp(0.5, 0.001)
+        assert lab.n_atoms == 8
+        assert lab.simulation.spot_powers()[[0, 2]].mean() == pytest.approx(0.5, rel=0.05)
 
-    def test_stay_in_a_ramp_that_holds_them_and_are_lost_in_one_that_does_not(self) -> None:
-        lab = Lab()
-        with opened(simulation=lab.world, clock=lab.clock) as rig:
-            lab.load(rig)
-            rig.tweezers.ramp(0.5, 0.001)
-            assert lab.n_atoms == GRID.n_rows * GRID.n_cols
-            assert lab.world.spot_powers().mean() == pytest.approx(0.5, rel=0.05)
-            rig.tweezers.ramp(0.0, 0.001)
-            rig.tweezers.ramp(1.0, 0.001)
-            assert lab.n_atoms == 0
-            assert lab.world.losses()["light"] == 12
 
-    def test_are_lost_when_the_streaming_process_is_killed(self) -> None:
-        lab = Lab()
-        with opened(simulation=lab.world, clock=lab.clock) as rig:
-            lab.load(rig)
-            kill(rig)
-            assert lab.n_atoms == 0
+def test_atoms_are_lost_when_the_light_goes_off() -> None:
+    lab = Lab()
+    with opened(simulation=lab.simulation, clock=lab.clock) as rig:
+        lab.load(rig)
+        assert lab.n_atoms == 12
+        rig.tweezers.ramp(0.0, 0.001)
+        rig.tweezers.ramp(1.0, 0.001)
+        assert (lab.n_atoms, lab.simulation.losses()["light"]) == (0, 12)
+        lab.load(rig)
+        rig.ring.set_fault(Fault.UNDERFLOW)
+        until(lambda: rig.described("underflows") == 1)
+        assert lab.n_atoms == 0
+        with pytest.raises(TransientError):
+            rig.tweezers.start()
+        lab.load(rig)
+        assert lab.n_atoms == 12
+        kill(rig)
+        assert lab.n_atoms == 0
 
-    def test_are_lost_in_an_underflow_which_asks_for_the_shot_again(self) -> None:
-        lab = Lab()
-        with opened(simulation=lab.world, clock=lab.clock) as rig:
-            lab.load(rig)
-            rig.ring.set_fault(Fault.UNDERFLOW)
-            until(lambda: rig.described("underflows") == 1)
-            assert lab.n_atoms == 0
-            with pytest.raises(TransientError):
-                rig.tweezers.start()
-            lab.world.begin_shot()
-            lab.load(rig)
-            assert lab.n_atoms == 12
 
-    def test_are_the_same_in_equal_runs(self) -> None:
-        runs: list[bytes] = []
-        for _ in range(2):
-            lab = Lab(loading=0.6, depth_disorder=0.3, lifetime=1.0)
-            with opened(simulation=lab.world, clock=lab.clock) as rig:
-                lab.load(rig)
-                rig.tweezers.ramp(0.3, 0.002)
-                runs.append(lab.world.truth().tobytes())
-        assert runs[0] == runs[1]
-        assert 0 < sum(runs[0]) < 12
+PROFILE = """labseq: 1
+name: bench
+grid: {rows: 5, cols: 6, spacing: 4.49 um}
+camera: {use: virtual}
+static_tweezers: STATIC
+mobile_tweezers: {use: virtual}
+detector: {use: threshold, frame: [128, 128], centre_px: [63.5, 63.5], pixel_size: 0.35 um}
+simulation: {use: virtual, image: {frame: [128, 128], centre_px: [63.5, 63.5]}}
+"""
+SEQUENCE = """labseq: 1
+name: small
+profile: p.yaml
+target: {pattern: compact, rows: 2, cols: 2}
+planner: {use: psca, degree_of_parallelism: 2}
+shot:
+  - load: {duration: 500 ms}
+  - image: {exposure: 45 ms}
+  - rearrange: {cycles: 1, window: 60 ms}
+  - image: {exposure: 45 ms}
+"""
+SIMULATED = "{use: soapy, device: simulated, sample_rate: 12.5 MHz, row_gain: 3, column_gain: 3}"
+
+
+def run(folder: Path, static: str) -> labseq.Run:
+    folder.mkdir(exist_ok=True)
+    (folder / "p.yaml").write_text(PROFILE.replace("STATIC", static), encoding="utf-8")
+    (folder / "s.yaml").write_text(SEQUENCE, encoding="utf-8")
+    with labseq.Session.open(folder / "s.yaml", shots=1, seed=1, output=folder / "runs") as session:
+        return session.run()
+
+
+def test_a_simulated_radio_gives_the_same_atoms_as_the_virtual_tweezers(tmp_path: Path) -> None:
+    need_radio()
+    radio, virtual = run(tmp_path / "radio", SIMULATED), run(tmp_path / "virtual", "{use: virtual}")
+    assert (radio.status, radio.simulated, len(radio.shots)) == ("complete", True, 1)
+    for one, other in zip(radio.shots, virtual.shots, strict=True):
+        assert np.array_equal(one.occupancies, other.occupancies)
+
+
+@pytest.mark.parametrize(
+    ("static", "exit_code", "text"),
+    [
+        (
+            "device: simulated, sample_rate: 8 MHz",
+            2,
+            "p.yaml:5:18: static_tweezers: row tones: the outermost tone is 3.6 MHz",
+        ),
+        ("row_channel: 1", 2, "row_channel and column_channel are both 1"),
+        (
+            "device: 'simulated,sped=1'",
+            2,
+            "p.yaml:5:39: the simulated radio has no argument 'sped'; expected one of",
+        ),
+        (
+            "device: 'simulated, speed=0'",
+            2,
+            "p.yaml:5:39: speed of the simulated radio is '0'; expected a number, at least 0.0001",
+        ),
+        ("device: 'simulated,fault=fire'", 2, "fault of the simulated radio is 'fire'; expected"),
+        ("device: 'driver=none'", 3, "'driver=none' cannot be opened"),
+    ],
+)
+def test_mistakes_are_reported_with_their_place(
+    tmp_path: Path, static: str, exit_code: int, text: str
+) -> None:
+    need_radio()
+    with pytest.raises(LabseqError) as caught:
+        run(tmp_path, f"{{use: soapy, {static}}}")
+    assert caught.value.exit_code == exit_code
+    assert text in str(caught.value)
+
+
+def test_where_it_cannot_be_compiled_a_dry_run_takes_the_virtual_tweezers(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(build, "_INCLUDES", ())
+    registry = Registry()
+    labseq_register(registry)
+    assert registry.get("static_tweezers", "soapy").simulated is None

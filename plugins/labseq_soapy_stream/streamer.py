@@ -1,7 +1,7 @@
-"""The process that keeps the radio supplied: ``python -m labseq_soapy.streamer``.
+"""The process that keeps the radio supplied: ``python -m labseq_soapy_stream.streamer``.
 
 It is a separate process so that nothing that labseq does can make the stream run dry, and so that the light
-is ramped down when labseq is killed or hangs. :mod:`labseq_soapy.messages` describes what the two exchange.
+is ramped down when labseq is killed or hangs. :mod:`labseq_soapy_stream.messages` describes the messages.
 """
 
 from __future__ import annotations
@@ -21,15 +21,17 @@ from typing import Any, Final
 
 import numpy as np
 
-from labseq_soapy.messages import Setup, received, send
-from labseq_soapy.output import BLOCK, Output, Samples
-from labseq_soapy.soapysdr import SoapyError, Stream, open_radio, set_up
+from labseq_soapy_stream.messages import Setup, received, send
+from labseq_soapy_stream.output import BLOCK, Output, Samples
+from labseq_soapy_stream.soapysdr import SoapyError, Stream, open_radio, set_up
 
 STALL_S: Final = 2.0
 """A stream that takes no samples for so long is dead."""
 STATUS_S: Final = 0.2
 WRITE_S: Final = 0.1
 MARKER_S: Final = 0.1
+
+Message = Mapping[str, Any]
 
 
 class CommandReader:
@@ -60,10 +62,10 @@ class StatusWriter:
 
     def __init__(self, pipe: int) -> None:
         self._pipe = pipe
-        self._outbox: queue.SimpleQueue[Mapping[str, Any] | threading.Event] = queue.SimpleQueue()
+        self._outbox: queue.SimpleQueue[Message | threading.Event] = queue.SimpleQueue()
         threading.Thread(target=self._write, daemon=True).start()
 
-    def post(self, message: Mapping[str, Any]) -> None:
+    def post(self, message: Message) -> None:
         """Send a message soon."""
         self._outbox.put(message)
 
@@ -84,25 +86,12 @@ class StatusWriter:
 
 
 class Streamer:
-    """Keeps a stream supplied until labseq ends it or is gone.
-
-    Args:
-        stream: The stream, active.
-        setup: labseq's first message.
-        rate_hz: Samples per second.
-        commands: labseq's commands.
-        post: Sends a message to labseq.
-    """
+    """Keeps an active stream supplied until labseq ends it or is gone."""
 
     def __init__(
-        self,
-        stream: Stream,
-        setup: Setup,
-        rate_hz: float,
-        commands: CommandReader,
-        post: Callable[[Mapping[str, Any]], None],
+        self, stream: Stream, rate_hz: float, commands: CommandReader, post: Callable[[Message], None]
     ) -> None:
-        self._stream, self._setup, self._rate_hz = stream, setup, rate_hz
+        self._stream, self._setup, self._rate_hz = stream, commands.setup, rate_hz
         self._commands, self._post = commands, post
         self._output = Output()
         self._written = self._buffered = self._due = 0
@@ -126,11 +115,7 @@ class Streamer:
         return self._buffered
 
     def run(self) -> None:
-        """Stream until the end, when the light is off.
-
-        Raises:
-            SoapyError: The stream is broken.
-        """
+        """Stream until the end, when the light is off."""
         while not (self._leaving and self._task is None):
             while not self._commands.inbox.empty():
                 self._execute(self._commands.inbox.get())
@@ -155,8 +140,8 @@ class Streamer:
                 self._leave("")
             case "fail":
                 self._leave(message["why"])
-            case _:  # a beat
-                pass
+            case _:
+                pass  # a beat
 
     def _begin(self, task: int) -> None:
         self._task, self._settling = task, True
@@ -191,7 +176,10 @@ class Streamer:
         if self._terminated:
             self._leave("it was asked to end by a signal")
         elif self._alone:
-            self._check_marker(now_s)
+            if now_s - self._marker_s > MARKER_S:
+                self._marker_s = now_s
+                if not Path(self._setup.marker).exists():
+                    self._leave("")
         elif self._commands.closed:
             self._continue_alone("labseq is gone")
         elif not self._setup.hold and now_s - self._commands.last_s > self._setup.max_wait_s:
@@ -205,12 +193,6 @@ class Streamer:
             marker.write_text(str(os.getpid()), "ascii")
         if not self._setup.hold:
             self._leave(why)
-
-    def _check_marker(self, now_s: float) -> None:
-        if now_s - self._marker_s > MARKER_S:
-            self._marker_s = now_s
-            if not Path(self._setup.marker).exists():
-                self._leave("")
 
     def _leave(self, why: str) -> None:
         self._leaving = True
@@ -238,7 +220,7 @@ def stream(commands: CommandReader, messages: StatusWriter) -> None:
         facts = set_up(radio, setup)
         samples = radio.stream(sorted(setup.channels), setup.stream)
         samples.activate()
-        streamer = Streamer(samples, setup, facts.rate_hz, commands, messages.post)
+        streamer = Streamer(samples, facts.rate_hz, commands, messages.post)
         signal.signal(signal.SIGTERM, streamer.terminate)
         messages.post({"facts": asdict(replace(facts, buffered=streamer.fill()))})
         try:

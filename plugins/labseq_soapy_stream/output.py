@@ -30,7 +30,8 @@ class Output:
         self._loop = self._silence
         self._next: Samples | None = None
         self._n_fade = self._n_faded = 0
-        self._ramp = _LinearChange(0.0, 0.0, 0)
+        self._slope = self._goal = 0.0  # of the ramp: change of the depth per sample, and its end
+        self._n_ramp = 0
         self._at = 0
         self._steps = np.arange(1, BLOCK + 1, dtype=np.float32).repeat(2)
         self._factor = np.empty(2 * BLOCK, np.float32)
@@ -45,37 +46,43 @@ class Output:
         """
         if self._loop is self._silence:
             self._loop, self._at = loop, 0
-        elif self.depth == 0.0 and not self._ramp.left:
+        elif self.depth == 0.0 and not self._n_ramp:
             self._loop, self._next = loop, None
         else:
             if self._next is not None:  # the earlier fade stops where it is
-                self._loop = self._mixed_loop(self._next)
+                weight = np.float32(self._n_faded / self._n_fade)
+                mixed = self._loop + weight * (self._next - self._loop)
+                self._loop = mixed.astype(np.float32, copy=False)
             self._next, self._n_fade, self._n_faded = loop, max(1, n_fade), 0
 
     def ramp(self, depth: float, n_samples: int) -> None:
         """Change the depth linearly from its present value; the last sample has the new depth."""
-        self._ramp = _LinearChange(self.depth, depth, max(1, n_samples))
+        self._n_ramp = max(1, n_samples)
+        self._slope, self._goal = (depth - self.depth) / self._n_ramp, depth
 
     @property
     def steady(self) -> bool:
         """Whether no ramp or fade is under way."""
-        return self._ramp.left == 0 and self._next is None
+        return self._n_ramp == 0 and self._next is None
 
     def block(self) -> Samples:
         """The next samples, float32 (2, 2 n) with n from 1 to :data:`BLOCK`; valid until the next call."""
         n = min(BLOCK, self._loop.shape[1] // 2 - self._at)
-        if self._ramp.left:
-            n = min(n, self._ramp.left)
+        if self._n_ramp:
+            n = min(n, self._n_ramp)
         if self._next is not None:
             n = min(n, self._n_fade - self._n_faded)
         samples = self._shaped(n)
         self._at = (self._at + n) % (self._loop.shape[1] // 2)
-        self._finish_fade(n)
+        if self._next is not None:
+            self._n_faded += n
+            if self._n_faded >= self._n_fade:
+                self._loop, self._next = self._next, None
         return samples
 
     def _shaped(self, n: int) -> Samples:
         part = slice(2 * self._at, 2 * (self._at + n))
-        if self.depth == 0.0 and not self._ramp.left:
+        if self.depth == 0.0 and not self._n_ramp:
             return self._silence[:, : 2 * n]
         samples = self._loop[:, part]
         made = self._made[:, : 2 * n]
@@ -86,48 +93,16 @@ class Output:
             made *= weight
             made += samples
             samples = made
-        if self._ramp.left:
+        if self._n_ramp:
             factor = self._factor[: 2 * n]
-            np.multiply(self._steps[: 2 * n], np.float32(self._ramp.slope), out=factor)
-            factor += np.float32(self._ramp.now)
+            np.multiply(self._steps[: 2 * n], np.float32(self._slope), out=factor)
+            factor += np.float32(self.depth)
             np.maximum(factor, 0.0, out=factor)
             np.sqrt(factor, out=factor)
             np.sqrt(factor, out=factor)
-            self.depth = self._ramp.advance(n)
+            self._n_ramp -= n
+            self.depth = self.depth + n * self._slope if self._n_ramp else self._goal
             return np.multiply(samples, factor, out=made)
         if self.depth != 1.0:
             return np.multiply(samples, np.float32(self.depth**0.25), out=made)
         return samples
-
-    def _finish_fade(self, n: int) -> None:
-        if self._next is None:
-            return
-        self._n_faded += n
-        if self._n_faded >= self._n_fade:
-            self._loop, self._next = self._next, None
-
-    def _mixed_loop(self, coming: Samples) -> Samples:
-        weight = np.float32(self._n_faded / self._n_fade)
-        return (self._loop + weight * (coming - self._loop)).astype(np.float32, copy=False)
-
-
-class _LinearChange:
-    """A linear change of the depth, sample by sample."""
-
-    def __init__(self, start: float, end: float, n_samples: int) -> None:
-        self._start, self._end, self._n_samples = start, end, n_samples
-        self.left = n_samples
-
-    @property
-    def now(self) -> float:
-        done = self._n_samples - self.left
-        return self._start + self.slope * done
-
-    @property
-    def slope(self) -> float:
-        return (self._end - self._start) / max(1, self._n_samples)
-
-    def advance(self, n: int) -> float:
-        """Continue by n samples; returns the depth there."""
-        self.left -= n
-        return self.now if self.left else self._end

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from ctypes import POINTER, byref, c_char_p, c_double, c_int, c_long, c_longlong, c_size_t, c_void_p
 from functools import cache
 from typing import Any, Final
@@ -12,30 +12,13 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq_soapy.messages import Facts, Setup
+from labseq_soapy_stream.messages import Facts, Setup
 
 TX: Final = 0
 FORMAT: Final = b"CF32"
 TIMEOUT: Final = -1
 NOT_SUPPORTED: Final = -5
 UNDERFLOW: Final = -7
-
-STREAM_ERRORS: Final[Mapping[int, str]] = {
-    TIMEOUT: "it took no samples in time",
-    -2: "the stream failed",
-    -3: "samples were corrupted on the way",
-    -4: "a buffer overflowed",
-    NOT_SUPPORTED: "it does not support this",
-    -6: "a sample came too late for its time",
-    UNDERFLOW: "it ran out of samples",
-}
-
-INSTALL: Final = {
-    "linux": "install it with `apt-get install libsoapysdr0.8` and the module of your radio, for example "
-    "soapysdr-module-uhd",
-    "darwin": "install it with `brew install soapysdr` and the module of your radio",
-    "win32": "install PothosSDR, which has it and the modules of many radios, and add its bin folder to PATH",
-}
 
 _NAMES: Final = {
     "linux": ("libSoapySDR.so.0.8", "libSoapySDR.so"),
@@ -46,6 +29,12 @@ _NAMES: Final = {
         "/usr/local/lib/libSoapySDR.dylib",
     ),
     "win32": ("SoapySDR.dll",),
+}
+_INSTALL: Final = {
+    "linux": "install it with `apt-get install libsoapysdr0.8` and the module of your radio, for example "
+    "soapysdr-module-uhd",
+    "darwin": "install it with `brew install soapysdr` and the module of your radio",
+    "win32": "install PothosSDR, which has it and the modules of many radios, and add its bin folder to PATH",
 }
 
 
@@ -65,44 +54,46 @@ _DEVICE: Final = (c_void_p,)
 _CHANNEL: Final = (c_void_p, c_int, c_size_t)
 _STREAM: Final = (c_void_p, c_void_p)
 
-_SIGNATURES: Final[Mapping[str, tuple[Any, tuple[Any, ...]]]] = {
-    "SoapySDRDevice_lastStatus": (c_int, ()),
-    "SoapySDRDevice_lastError": (c_char_p, ()),
-    "SoapySDRDevice_makeStrArgs": (c_void_p, (c_char_p,)),
-    "SoapySDRDevice_unmake": (c_int, _DEVICE),
-    "SoapySDRDevice_getDriverKey": (c_void_p, _DEVICE),
-    "SoapySDRDevice_getHardwareKey": (c_void_p, _DEVICE),
-    "SoapySDRDevice_getHardwareInfo": (_Kwargs, _DEVICE),
-    "SoapySDRDevice_getNumChannels": (c_size_t, (c_void_p, c_int)),
-    "SoapySDRDevice_setClockSource": (c_int, (c_void_p, c_char_p)),
-    "SoapySDRDevice_setAntenna": (c_int, (*_CHANNEL, c_char_p)),
-    "SoapySDRDevice_setSampleRate": (c_int, (*_CHANNEL, c_double)),
-    "SoapySDRDevice_getSampleRate": (c_double, _CHANNEL),
-    "SoapySDRDevice_setBandwidth": (c_int, (*_CHANNEL, c_double)),
-    "SoapySDRDevice_setFrequency": (c_int, (*_CHANNEL, c_double, POINTER(_Kwargs))),
-    "SoapySDRDevice_getFrequency": (c_double, _CHANNEL),
-    "SoapySDRDevice_setGain": (c_int, (*_CHANNEL, c_double)),
-    "SoapySDRDevice_getGain": (c_double, _CHANNEL),
-    "SoapySDRDevice_getGainRange": (_Range, _CHANNEL),
-    "SoapySDRDevice_setupStream": (
+_SIGNATURES: Final[dict[str, tuple[Any, tuple[Any, ...]]]] = {
+    "Device_lastStatus": (c_int, ()),
+    "Device_lastError": (c_char_p, ()),
+    "Device_makeStrArgs": (c_void_p, (c_char_p,)),
+    "Device_unmake": (c_int, _DEVICE),
+    "Device_getDriverKey": (c_void_p, _DEVICE),
+    "Device_getHardwareKey": (c_void_p, _DEVICE),
+    "Device_getHardwareInfo": (_Kwargs, _DEVICE),
+    "Device_getNumChannels": (c_size_t, (c_void_p, c_int)),
+    "Device_setClockSource": (c_int, (c_void_p, c_char_p)),
+    "Device_setAntenna": (c_int, (*_CHANNEL, c_char_p)),
+    "Device_setSampleRate": (c_int, (*_CHANNEL, c_double)),
+    "Device_getSampleRate": (c_double, _CHANNEL),
+    "Device_setBandwidth": (c_int, (*_CHANNEL, c_double)),
+    "Device_setFrequency": (c_int, (*_CHANNEL, c_double, POINTER(_Kwargs))),
+    "Device_getFrequency": (c_double, _CHANNEL),
+    "Device_setGain": (c_int, (*_CHANNEL, c_double)),
+    "Device_getGain": (c_double, _CHANNEL),
+    "Device_getGainRange": (_Range, _CHANNEL),
+    "Device_setupStream": (
         c_void_p,
         (c_void_p, c_int, c_char_p, POINTER(c_size_t), c_size_t, POINTER(_Kwargs)),
     ),
-    "SoapySDRDevice_closeStream": (c_int, _STREAM),
-    "SoapySDRDevice_activateStream": (c_int, (*_STREAM, c_int, c_longlong, c_size_t)),
-    "SoapySDRDevice_deactivateStream": (c_int, (*_STREAM, c_int, c_longlong)),
-    "SoapySDRDevice_writeStream": (
+    "Device_closeStream": (c_int, _STREAM),
+    "Device_activateStream": (c_int, (*_STREAM, c_int, c_longlong, c_size_t)),
+    "Device_deactivateStream": (c_int, (*_STREAM, c_int, c_longlong)),
+    "Device_writeStream": (
         c_int,
         (*_STREAM, POINTER(c_void_p), c_size_t, POINTER(c_int), c_longlong, c_long),
     ),
-    "SoapySDRDevice_readStreamStatus": (
+    "Device_readStreamStatus": (
         c_int,
         (*_STREAM, POINTER(c_size_t), POINTER(c_int), POINTER(c_longlong), c_long),
     ),
-    "SoapySDRKwargs_fromString": (_Kwargs, (c_char_p,)),
-    "SoapySDRKwargs_clear": (None, (POINTER(_Kwargs),)),
-    "SoapySDR_free": (None, (c_void_p,)),
+    "Kwargs_fromString": (_Kwargs, (c_char_p,)),
+    "Kwargs_clear": (None, (POINTER(_Kwargs),)),
+    "_errToStr": (c_char_p, (c_int,)),
+    "_free": (None, (c_void_p,)),
 }
+"""Name after "SoapySDR" -> type of the result, types of the arguments."""
 
 
 @cache
@@ -120,11 +111,24 @@ def library() -> Any:
             reason = reason or str(error)
             continue
         for function, (result, arguments) in _SIGNATURES.items():
-            getattr(found, function).restype = result
-            getattr(found, function).argtypes = arguments
+            getattr(found, f"SoapySDR{function}").restype = result
+            getattr(found, f"SoapySDR{function}").argtypes = arguments
         return found
-    advice = INSTALL.get(sys.platform, INSTALL["linux"])
+    advice = _INSTALL.get(sys.platform, _INSTALL["linux"])
     raise SoapyError(f"the library SoapySDR cannot be loaded ({reason}); {advice}")
+
+
+def _call(name: str, *arguments: Any) -> Any:
+    """Call a function of a radio; raises SoapyError with the library's message if it fails."""
+    result = getattr(library(), f"SoapySDRDevice_{name}")(*arguments)
+    if library().SoapySDRDevice_lastStatus() != 0:
+        text = (library().SoapySDRDevice_lastError() or b"").decode(errors="replace")
+        raise SoapyError(f"{name}: {text or 'it failed without a message'}")
+    return result
+
+
+def _stream_error(action: str, code: int) -> SoapyError:
+    return SoapyError(f"{action}: {library().SoapySDR_errToStr(code).decode()} ({code})")
 
 
 class Radio:
@@ -138,86 +142,74 @@ class Radio:
     """
 
     def __init__(self, arguments: str) -> None:
-        self._library = library()
-        self._device = self._call("makeStrArgs", arguments.encode())
+        self._device = _call("makeStrArgs", arguments.encode())
         if not self._device:
             raise SoapyError(f"there is no radio '{arguments}'")
 
     def identify(self) -> dict[str, str]:
         """Driver, hardware, serial number and the like."""
-        info = self._call("getHardwareInfo", self._device)
+        info = _call("getHardwareInfo", self._device)
         details = {info.keys[i].decode(): info.vals[i].decode() for i in range(info.size)}
-        self._library.SoapySDRKwargs_clear(byref(info))
+        library().SoapySDRKwargs_clear(byref(info))
         return {"driver": self._text("getDriverKey"), "hardware": self._text("getHardwareKey"), **details}
 
     @property
     def n_channels(self) -> int:
         """Number of channels that transmit."""
-        return int(self._call("getNumChannels", self._device, TX))
+        return int(_call("getNumChannels", self._device, TX))
 
     def gain_range(self, channel: int) -> tuple[float, float]:
         """Lowest and highest gain in dB."""
-        gains = self._call("getGainRange", self._device, TX, channel)
+        gains = _call("getGainRange", self._device, TX, channel)
         return gains.minimum, gains.maximum
 
     def set(self, what: str, channel: int, value: float | str) -> None:
-        """Set a value of a channel.
-
-        Args:
-            what: "Antenna", "SampleRate", "Bandwidth", "Frequency" or "Gain".
-            channel: The channel.
-            value: In Hz, or dB.
-        """
+        """Set "Antenna", "SampleRate", "Bandwidth", "Frequency" or "Gain" of a channel, in Hz or dB."""
         plain = value.encode() if isinstance(value, str) else value
         extra = (None,) if what == "Frequency" else ()
-        self._call(f"set{what}", self._device, TX, channel, plain, *extra)
+        _call(f"set{what}", self._device, TX, channel, plain, *extra)
 
     def get(self, what: str, channel: int) -> float:
         """Read a value of a channel back: "SampleRate", "Frequency" or "Gain"."""
-        return float(self._call(f"get{what}", self._device, TX, channel))
+        return float(_call(f"get{what}", self._device, TX, channel))
 
     def set_clock_source(self, source: str) -> None:
         """Choose the reference of its clocks."""
-        self._call("setClockSource", self._device, source.encode())
+        _call("setClockSource", self._device, source.encode())
 
     def stream(self, channels: Sequence[int], arguments: str = "") -> Stream:
         """Set up a stream to these channels, in rising order."""
-        kwargs = self._library.SoapySDRKwargs_fromString(arguments.encode())
+        kwargs = library().SoapySDRKwargs_fromString(arguments.encode())
         numbers = (c_size_t * len(channels))(*channels)
         try:
-            handle = self._call(
-                "setupStream", self._device, TX, FORMAT, numbers, len(channels), byref(kwargs)
-            )
+            handle = _call("setupStream", self._device, TX, FORMAT, numbers, len(channels), byref(kwargs))
         finally:
-            self._library.SoapySDRKwargs_clear(byref(kwargs))
-        return Stream(self._library, self._device, handle, len(channels))
+            library().SoapySDRKwargs_clear(byref(kwargs))
+        return Stream(self._device, handle, len(channels))
 
     def close(self) -> None:
         """Close the radio."""
-        self._call("unmake", self._device)
+        _call("unmake", self._device)
 
     def _text(self, getter: str) -> str:
-        place = self._call(getter, self._device)
+        place = _call(getter, self._device)
         text = ctypes.string_at(place).decode() if place else ""
-        self._library.SoapySDR_free(place)
+        library().SoapySDR_free(place)
         return text
-
-    def _call(self, name: str, *arguments: Any) -> Any:
-        return call(self._library, name, *arguments)
 
 
 class Stream:
     """A stream of complex samples to all channels at once."""
 
-    def __init__(self, found: Any, device: Any, handle: Any, n_channels: int) -> None:
-        self._library, self._device, self._handle = found, device, handle
+    def __init__(self, device: Any, handle: Any, n_channels: int) -> None:
+        self._library, self._place = library(), (device, handle)
         self._buffers = (c_void_p * n_channels)()
         self._flags, self._mask, self._time = c_int(0), c_size_t(0), c_longlong(0)
         self._knows_status = True
 
     def activate(self) -> None:
         """Start to play."""
-        call(self._library, "activateStream", self._device, self._handle, 0, 0, 0)
+        _call("activateStream", *self._place, 0, 0, 0)
 
     def write(self, samples: NDArray[np.float32], start: int, timeout_s: float) -> int:
         """Write samples to the stream.
@@ -238,17 +230,11 @@ class Stream:
             self._buffers[i] = row.ctypes.data + 8 * start
         self._flags.value = 0
         n_taken = self._library.SoapySDRDevice_writeStream(
-            self._device,
-            self._handle,
-            self._buffers,
-            n_samples,
-            byref(self._flags),
-            0,
-            round(timeout_s * 1e6),
+            *self._place, self._buffers, n_samples, byref(self._flags), 0, round(timeout_s * 1e6)
         )
         if n_taken >= 0 or n_taken in {TIMEOUT, UNDERFLOW}:
             return max(0, n_taken)
-        raise SoapyError(f"writing to the stream: {stream_error(n_taken)}")
+        raise _stream_error("writing to the stream", n_taken)
 
     def underflows(self) -> int:
         """How often the radio reported since the last call that it ran out of samples.
@@ -259,7 +245,7 @@ class Stream:
         count = 0
         while self._knows_status:
             code = self._library.SoapySDRDevice_readStreamStatus(
-                self._device, self._handle, byref(self._mask), byref(self._flags), byref(self._time), 0
+                *self._place, byref(self._mask), byref(self._flags), byref(self._time), 0
             )
             if code == UNDERFLOW:
                 count += 1
@@ -267,37 +253,14 @@ class Stream:
             if code == NOT_SUPPORTED:
                 self._knows_status = False
             elif code < 0 and code != TIMEOUT:
-                raise SoapyError(f"the stream's status: {stream_error(code)}")
+                raise _stream_error("the stream's status", code)
             break
         return count
 
     def close(self) -> None:
         """Stop playing and close the stream."""
-        call(self._library, "deactivateStream", self._device, self._handle, 0, 0)
-        call(self._library, "closeStream", self._device, self._handle)
-
-
-def call(found: Any, name: str, *arguments: Any) -> Any:
-    """Call a function of a radio.
-
-    Raises:
-        SoapyError: It failed, with the library's message.
-    """
-    result = getattr(found, f"SoapySDRDevice_{name}")(*arguments)
-    if found.SoapySDRDevice_lastStatus() != 0:
-        text = (found.SoapySDRDevice_lastError() or b"").decode(errors="replace")
-        raise SoapyError(f"{name}: {text or 'it failed without a message'}")
-    return result
-
-
-def stream_error(code: int) -> str:
-    """The meaning of a negative result of a stream.
-
-    Example:
-        >>> stream_error(-7)
-        'it ran out of samples (-7)'
-    """
-    return f"{STREAM_ERRORS.get(code, 'an unknown error')} ({code})"
+        _call("deactivateStream", *self._place, 0, 0)
+        _call("closeStream", *self._place)
 
 
 def open_radio(setup: Setup) -> Radio:
@@ -306,15 +269,14 @@ def open_radio(setup: Setup) -> Radio:
     Raises:
         SoapyError: There is none, another program has it, or it has too few channels.
     """
+    library()
     try:
         radio = Radio(setup.device)
     except SoapyError as error:
-        text = f"'{setup.device}' cannot be opened: {error}"
         hint = "`SoapySDRUtil --find` lists the radios that are connected"
-        raise SoapyError(text if "library" in str(error) else f"{text}; {hint}") from error
-    needed = max(setup.channels) + 1
-    if radio.n_channels < needed:
-        n_channels = radio.n_channels
+        raise SoapyError(f"'{setup.device}' cannot be opened: {error}; {hint}") from error
+    n_channels, needed = radio.n_channels, max(setup.channels) + 1
+    if n_channels < needed:
         radio.close()
         text = f"it has {n_channels} channel(s) that transmit; expected {needed}, one for each AOD"
         raise SoapyError(text)
