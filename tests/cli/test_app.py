@@ -8,17 +8,10 @@ from typing import Any
 import pytest
 
 import labseq
-from labseq.cli import main
 from labseq.errors import ConfigError, DeviceError, PlanError, Problem, StopRequested
 
 SEQUENCE = Path(__file__).parents[2] / "sequences" / "compact_225.yaml"
 HEAVY = ("numpy", "pydantic", "yaml", "rich", "h5py", "numba", "scipy", "pluggy")
-
-
-def code_of(*arguments: str) -> Any:
-    with pytest.raises(SystemExit) as leaving:
-        main(arguments)
-    return leaving.value.code
 
 
 def test_help_imports_nothing_heavy() -> None:
@@ -29,17 +22,16 @@ def test_help_imports_nothing_heavy() -> None:
     assert imported.isdisjoint(HEAVY)
 
 
-def test_version(capsys: pytest.CaptureFixture[str]) -> None:
-    assert code_of("--version") == 0
-    assert capsys.readouterr().out == f"labseq {labseq.__version__}\n"
+def test_version(call: Any) -> None:
+    assert call("--version") == (0, f"labseq {labseq.__version__}\n", "")
 
 
-def test_help_names_every_command_and_option(capsys: pytest.CaptureFixture[str]) -> None:
-    assert code_of("--help") == 0
-    out = capsys.readouterr().out
+def test_help_names_every_command_and_option(call: Any) -> None:
+    code, out, _ = call("--help")
+    assert code == 0
     assert all(f"\n  {command} " in out for command in ("run", "check", "show", "plugins", "safe"))
-    assert code_of("run", "--help") == 0
-    out = capsys.readouterr().out
+    code, out, _ = call("run", "--help")
+    assert code == 0
     options = ("--profile", "--dry-run", "--shots", "--seed", "--set", "--output", "--json", "--realtime")
     assert all(option in out for option in options)
     assert "labseq run sequences/compact_225.yaml --shots 5 --seed 1 --json\n" in out
@@ -50,16 +42,14 @@ def test_help_names_every_command_and_option(capsys: pytest.CaptureFixture[str])
     [
         (["run", "a.yaml", "--shots", "x"], "--shots"),
         (["run", "a.yaml", "--dry-run=quick"], "--dry-run"),
-        (["run", "a.yaml", "--shot", "3"], "--shot"),
         (["run"], "SEQUENCE"),
-        (["safe"], "PROFILE"),
+        (["plan", "random:3x3@1", "--seed", "-1"], "--seed"),
         (["fly"], "fly"),
     ],
 )
-def test_wrong_usage(arguments: list[str], named: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert code_of(*arguments) == 2
-    out, err = capsys.readouterr()
-    assert out == ""
+def test_wrong_usage(arguments: list[str], named: str, call: Any) -> None:
+    code, out, err = call(*arguments)
+    assert (code, out) == (2, "")
     assert named in err
     assert "Traceback" not in err
 
@@ -82,49 +72,43 @@ def test_a_failing_command(
     message: str,
     debug: bool,
     monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    call: Any,
 ) -> None:
     def fail(*_: Any, **__: Any) -> None:
         raise error
 
     monkeypatch.setattr("labseq.cli.show.show_run", fail)
-    assert code_of("show", "x", *(["--debug"] if debug else [])) == code
-    out, err = capsys.readouterr()
-    assert out == ""
+    got, out, err = call("show", "x", *(["--debug"] if debug else []))
+    assert (got, out) == (code, "")
     assert message in err
     assert err.startswith(message) or debug
     assert ("Traceback" in err) is debug
 
 
-def test_ctrl_c_outside_of_a_run(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ctrl_c_outside_of_a_run(monkeypatch: pytest.MonkeyPatch, call: Any) -> None:
     def interrupt(*_: Any, **__: Any) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr("labseq.cli.show.show_run", interrupt)
-    assert code_of("show", "x") == 130
+    assert call("show", "x")[0] == 130
 
 
-def test_wrong_numbers_of_shots_and_seeds_are_reported_as_all_other_settings(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    assert code_of("run", str(SEQUENCE), "--shots", "0", "--seed", "-1") == 2
-    assert capsys.readouterr().err == (
-        "--shots 0: shots is 0; expected at least 1\n--seed -1: seed is -1; expected at least 0\n"
-    )
+def test_wrong_numbers_of_shots_and_seeds_are_reported_as_all_other_settings(call: Any) -> None:
+    code, _, err = call("run", str(SEQUENCE), "--shots", "0", "--seed", "-1")
+    assert code == 2
+    assert err == "--shots 0: shots is 0; expected at least 1\n--seed -1: seed is -1; expected at least 0\n"
 
 
-def test_safe_changes_no_sequence(capsys: pytest.CaptureFixture[str]) -> None:
-    assert code_of("safe", "virtual", "--set", "camera.gain=1") == 2
-    out, err = capsys.readouterr()
-    assert out == ""
+def test_safe_changes_no_sequence(call: Any) -> None:
+    code, out, err = call("safe", "virtual", "--set", "camera.gain=1")
+    assert (code, out) == (2, "")
     assert err.startswith("--set camera.gain=1: there is no sequence here")
 
 
 @pytest.mark.parametrize(
     ("path", "said"), [("nope", "nope: no such file or folder"), ("x" * 5000, "xxx...: the folder cannot be")]
 )
-def test_a_run_that_is_not_there_is_a_mistake_of_the_user(
-    path: str, said: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert code_of("show", path) == 2
-    assert said in capsys.readouterr().err
+def test_a_run_that_does_not_exist_is_a_mistake_of_the_user(path: str, said: str, call: Any) -> None:
+    code, _, err = call("show", path)
+    assert code == 2
+    assert said in err

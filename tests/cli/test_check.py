@@ -64,17 +64,6 @@ def test_a_narrow_terminal_gets_no_bars() -> None:
     )
 
 
-def test_a_timeline_of_no_length() -> None:
-    assert timeline_table([("x", [TimelineEntry("x", 0.0, 0.0)])], "#")[1].split() == [
-        "0",
-        "x",
-        "0",
-        "s",
-        "0",
-        "s",
-    ]
-
-
 @pytest.mark.parametrize(
     "arguments", [["missing.yaml"], [SEQUENCE, "--set", "planner.speed=1"], [SEQUENCE, "-p", "x"]]
 )

@@ -6,7 +6,6 @@ from typing import Any
 
 import pytest
 
-from labseq.cli import main
 from labseq.cli.data import MAX_ROWS
 from labseq.recording import RunWriter
 
@@ -21,57 +20,53 @@ def run_dir(fake: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return writer.run_dir
 
 
-def called(*arguments: str) -> int:
-    with pytest.raises(SystemExit) as ended:
-        main(["doctor", *arguments])
-    return int(str(ended.value.code or 0))
+def test_an_intact_run_takes_two_lines(run_dir: Path, call: Any) -> None:
+    intact = (0, "1 run checked, 2 shots intact\nno damage found\n", "")
+    assert call("doctor") == call("doctor", str(run_dir)) == intact
 
 
-def test_an_intact_run_takes_two_lines(run_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert called() == called(str(run_dir)) == 0
-    assert capsys.readouterr().out == "1 run checked, 2 shots intact\nno damage found\n" * 2
-
-
-def test_a_dry_run_only_reports(run_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    part = run_dir / "shots" / "shot_000002.h5.part"
-    part.touch()
-    assert called("--dry-run") == 1
-    lines = capsys.readouterr().out.splitlines()
+def test_a_dry_run_only_reports_and_the_next_repairs(run_dir: Path, call: Any) -> None:
+    parts = [run_dir / "shots" / f"{number}.part" for number in range(MAX_ROWS + 5)]
+    for part in parts:
+        part.touch()
+    code, out, _ = call("doctor", "--dry-run")
+    lines = out.splitlines()
+    assert code == 1
     assert lines[0].split() == ["what", "where", "to", "do"]
-    where = part.relative_to(run_dir.parents[1])
-    assert lines[1].split("  ") == ["half-written", str(where), "moved to quarantine"]
-    assert lines[-1] == "1 defect found; nothing was changed"
-    assert part.exists()
-
-
-def test_what_is_repaired_is_reported(run_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (run_dir / "shots" / "shot_000002.h5.part").touch()
-    (run_dir / "run.json.part").touch()
-    assert called(str(run_dir)) == 0
-    lines = capsys.readouterr().out.splitlines()
+    where = parts[0].relative_to(run_dir.parents[1])
+    assert lines[1].split("  ")[0] == "half-written"
+    assert str(where) in out
+    assert "and 5 more" in lines
+    assert lines[-1] == f"{MAX_ROWS + 5} defects found; nothing was changed"
+    assert all(part.exists() for part in parts)
+    code, out, _ = call("doctor", str(run_dir))
+    lines = out.splitlines()
+    assert code == 0
     assert lines[0].split() == ["what", "where", "done"]
     assert lines[1].split("  ")[-1] == "moved to quarantine"
-    assert lines[-1] == "2 defects found: 2 repaired, 0 left"
+    assert lines[-1] == f"{MAX_ROWS + 5} defects found: {MAX_ROWS + 5} repaired, 0 left"
 
 
-def test_what_is_left_makes_the_exit_code(run_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_left_makes_the_exit_code(run_dir: Path, call: Any) -> None:
     (run_dir / "run.json").write_bytes(b"")
-    assert called() == 1
-    out = capsys.readouterr().out
+    code, out, _ = call("doctor")
+    assert code == 1
     assert "take it from a backup" in out
     assert out.endswith("1 defect found: 0 repaired, 1 left\n")
 
 
-def test_runs_in_progress_are_reported(run_dir: Path, fake: Any, capsys: pytest.CaptureFixture[str]) -> None:
+def test_runs_in_progress_are_counted(run_dir: Path, fake: Any, call: Any) -> None:
     RunWriter.create(run_dir.parents[1], fake.run())
-    assert called() == 0
-    assert "1 run in progress not checked" in capsys.readouterr().out
+    code, out, _ = call("doctor")
+    assert code == 0
+    assert "1 run in progress not checked" in out
 
 
-def test_findings_are_reported_as_json(run_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_findings_as_json(run_dir: Path, call: Any) -> None:
     (run_dir / "run.json.part").touch()
-    assert called("--json") == 0
-    (found,) = json.loads(capsys.readouterr().out)["findings"]
+    code, out, _ = call("doctor", "--json")
+    (found,) = json.loads(out)["findings"]
+    assert code == 0
     assert found == {
         "what": "half-written",
         "where": str(run_dir / "run.json.part"),
@@ -80,15 +75,7 @@ def test_findings_are_reported_as_json(run_dir: Path, capsys: pytest.CaptureFixt
     }
 
 
-def test_of_very_many_findings_the_first_are_reported(
-    run_dir: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    for number in range(MAX_ROWS + 5):
-        (run_dir / "shots" / f"{number}.part").touch()
-    assert called("--dry-run") == 1
-    assert "and 5 more" in capsys.readouterr().out.splitlines()
-
-
-def test_a_folder_that_is_not_there_is_a_mistake(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert called(str(tmp_path / "no")) == 2
-    assert "no: there is no such folder; give a data folder" in capsys.readouterr().err
+def test_a_folder_that_does_not_exist_is_a_mistake(tmp_path: Path, call: Any) -> None:
+    code, _, err = call("doctor", str(tmp_path / "no"))
+    assert code == 2
+    assert "no: there is no such folder; give a data folder" in err

@@ -6,7 +6,6 @@ from typing import Any
 import h5py
 import pytest
 
-from labseq.cli import main
 from labseq.recording import RunWriter
 
 
@@ -23,29 +22,19 @@ def run_dir(fake: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return writer.run_dir
 
 
-def called(*arguments: str) -> int:
-    with pytest.raises(SystemExit) as ended:
-        main(["export", *arguments])
-    return int(str(ended.value.code or 0))
-
-
-def test_the_newest_run_is_exported_under_its_own_name(
-    run_dir: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert called() == 0
+def test_the_newest_run_is_exported_under_its_own_name(run_dir: Path, call: Any) -> None:
     name = f"{run_dir.parent.name}_{run_dir.name}"
-    assert capsys.readouterr().out.splitlines() == [f"written: {name}.csv", f"written: {name}.units.csv"]
+    assert call("export") == (0, f"written: {name}.csv\nwritten: {name}.units.csv\n", "")
     assert Path(f"{name}.csv").read_text("utf-8").startswith("shot,attempt,status,")
 
 
-def test_a_file_that_is_there_is_replaced_by_force_only(
-    run_dir: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_existing_file_is_replaced_by_force_only(run_dir: Path, call: Any) -> None:
     Path("a.csv").write_text("old")
-    assert called(str(run_dir), "-o", "a.csv") == 2
-    assert "a.csv: this file is there already" in capsys.readouterr().err
+    code, _, err = call("export", str(run_dir), "-o", "a.csv")
+    assert code == 2
+    assert "a.csv: this file is there already" in err
     assert Path("a.csv").read_text() == "old"
-    assert called(str(run_dir), "-o", "a.csv", "--force") == 0
+    assert call("export", str(run_dir), "-o", "a.csv", "--force")[0] == 0
     assert Path("a.csv").read_text() != "old"
 
 
@@ -54,15 +43,15 @@ def test_a_file_that_is_there_is_replaced_by_force_only(
     [
         (("--to", "xls"), "--to: a run cannot be exported as 'xls'"),
         (("--frames",), "--frames: a csv file holds no frames; use --to archive"),
-        (("no/run",), "no/run"),
         (("-o", "no/a.csv"), "there is no such folder"),
     ],
 )
 def test_what_cannot_be_exported_is_reported(
-    run_dir: Path, arguments: tuple[str, ...], message: str, capsys: pytest.CaptureFixture[str]
+    run_dir: Path, arguments: tuple[str, ...], message: str, call: Any
 ) -> None:
-    assert called(*arguments) == 2
-    assert message in capsys.readouterr().err
+    code, _, err = call("export", *arguments)
+    assert code == 2
+    assert message in err
     assert not list(Path().iterdir())
 
 
@@ -74,23 +63,22 @@ def test_what_cannot_be_exported_is_reported(
     ],
 )
 def test_a_run_that_did_not_complete_is_exported_as_far_as_it_came(
-    run_dir: Path, fake: Any, status: Any, printed: str, capsys: pytest.CaptureFixture[str]
+    run_dir: Path, fake: Any, status: Any, printed: str, call: Any
 ) -> None:
     writer = RunWriter.create(run_dir.parents[1], fake.run(n_shots=2))
     writer.write_shot(fake.shot(0))
     if status is not None:
         writer.finish(status)
-    assert called("-o", "a.csv") == 0
-    assert capsys.readouterr().err == printed
+    code, _, err = call("export", "-o", "a.csv")
+    assert (code, err) == (0, printed)
     assert len(Path("a.csv").read_text("utf-8").splitlines()) == 2
 
 
-def test_shots_left_out_of_an_archive_are_reported(run_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_shots_left_out_of_an_archive_are_reported(run_dir: Path, call: Any) -> None:
     (run_dir / "shots" / "shot_000001.h5").unlink()
-    assert called("--to", "archive", "-o", "a.h5") == 1
-    captured = capsys.readouterr()
-    assert "warning: left out: " in captured.err
-    assert "shot_000001.h5: cannot be read" in captured.err
-    assert captured.out == "written: a.h5\n"
+    code, out, err = call("export", "--to", "archive", "-o", "a.h5")
+    assert (code, out) == (1, "written: a.h5\n")
+    assert "warning: left out: " in err
+    assert "shot_000001.h5: cannot be read" in err
     with h5py.File("a.h5") as file:
         assert list(file["shots"]) == ["shot_000000"]  # pyright: ignore[reportArgumentType]

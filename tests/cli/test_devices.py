@@ -1,18 +1,14 @@
-"""``labseq devices`` on profiles with broken parts: the table, the JSON, and the exit code."""
+"""``labseq devices`` and ``labseq safe`` on profiles with broken parts: output and exit code."""
 
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from labseq.cli import main
-from labseq.cli.devices import show_devices
-from labseq.errors import ConfigError, StopRequested
+from labseq.errors import StopRequested
 from labseq.session import CheckedDevice, DevicesReport
 
 PROFILE = """labseq: 1
@@ -82,12 +78,10 @@ def rows(out: str) -> dict[str, str]:
     return {line.split()[0]: line for line in out.splitlines()[1:]}
 
 
-def test_a_device_that_is_fine_is_reported_with_model_serial_number_and_firmware(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_device_that_works_is_reported_with_model_serial_number_and_firmware(call: Any) -> None:
     write("fine")
-    assert show_devices("./p.yaml", (), "off", as_json=False) == 0
-    out = capsys.readouterr().out
+    code, out, _ = call("devices", "./p.yaml")
+    assert code == 0
     header = ["device", "plugin", "model", "serial", "number", "firmware", "latency", "state"]
     assert out.splitlines()[0].split() == header
     shutter = rows(out)["shutter"].split()
@@ -96,63 +90,54 @@ def test_a_device_that_is_fine_is_reported_with_model_serial_number_and_firmware
 
 
 @pytest.mark.parametrize(
-    ("method", "says"),
-    [("open", ""), ("describe", ""), ("self_test", ""), ("safe_state", "NOT SAFE: "), ("close", "closed: ")],
+    ("method", "says"), [("open", ""), ("self_test", ""), ("safe_state", "NOT SAFE: "), ("close", "closed: ")]
 )
-def test_a_device_that_fails_is_reported_with_its_reason_and_the_others_are_fine(
-    method: str, says: str, capsys: pytest.CaptureFixture[str]
+def test_a_device_that_fails_is_reported_with_its_reason_and_the_others_work(
+    method: str, says: str, call: Any
 ) -> None:
     write(f"no_{method}")
-    assert show_devices("./p.yaml", (), "off", as_json=False) == 3
-    printed = rows(capsys.readouterr().out)
+    code, out, _ = call("devices", "./p.yaml")
+    printed = rows(out)
+    assert code == 3
     assert f"{says}shutter: " in printed["shutter"]
     assert printed["shutter"].endswith("raised OSError: jammed")
     assert all(" ok" in printed[name] for name in OTHERS)
 
 
-def test_a_device_that_cannot_be_constructed_is_a_fault_of_the_profile(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_device_that_cannot_be_constructed_is_a_fault_of_the_profile(call: Any) -> None:
     write("refusing")
-    assert show_devices("./p.yaml", (), "off", as_json=False) == 2
-    printed = rows(capsys.readouterr().out)
+    code, out, _ = call("devices", "./p.yaml")
+    printed = rows(out)
+    assert code == 2
     assert "p.yaml:10:12: " in printed["shutter"]
     assert "raised OSError: no port" in printed["shutter"]
     assert all(" ok" in printed[name] for name in OTHERS)
 
 
 def test_after_a_stop_the_devices_that_were_tried_are_reported(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    monkeypatch: pytest.MonkeyPatch, call: Any
 ) -> None:
     stopped = StopRequested(2)
     report = DevicesReport([CheckedDevice("camera", failure=stopped)], {"camera": "ixon"}, stopped=stopped)
     monkeypatch.setattr("labseq.cli.devices.check_devices", lambda *_: report)
-    with pytest.raises(StopRequested):
-        show_devices("./p.yaml", (), "off", as_json=False)
-    assert rows(capsys.readouterr().out)["camera"].endswith("stopped by Ctrl-C")
-
-
-def as_json(*arguments: str) -> tuple[int, dict[str, Any]]:
-    command = [sys.executable, "-m", "labseq", "devices", *arguments, "--json"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.stdout.count("\n") == 1, done.stderr
-    return done.returncode, json.loads(done.stdout)
-
-
-@pytest.mark.system
-def test_json_reports_all_that_a_device_says_of_itself() -> None:
     write("fine")
-    code, answer = as_json("./p.yaml", "--dry-run")
-    assert code == 0
+    code, out, _ = call("devices", "./p.yaml")
+    assert code == 130
+    assert rows(out)["camera"].endswith("stopped by Ctrl-C")
+
+
+def test_json_holds_all_that_a_device_says_of_itself(call: Any) -> None:
     write("no_self_test")
-    code, answer = as_json("./p.yaml")
+    code, out, err = call("devices", "./p.yaml", "--json")
+    assert out.count("\n") == 1, err
+    answer = json.loads(out)
     assert (code, answer["problems"], answer["warnings"]) == (3, [], [])
     (shutter,) = [one for one in answer["devices"] if one["name"] == "shutter"]
+    assert "OSError: jammed" in shutter.pop("reason")
     assert shutter == {
         "name": "shutter",
         "plugin": "no_self_test",
         "ok": False,
-        "reason": shutter["reason"],
         "model": "SH-1",
         "serial_number": 17,
         "firmware": "2.4",
@@ -160,22 +145,46 @@ def test_json_reports_all_that_a_device_says_of_itself() -> None:
         "self_test": False,
         "described": {"model": "SH-1", "serial_number": 17, "firmware": "2.4", "odd": None},
     }
-    assert "OSError: jammed" in shutter["reason"]
 
 
-@pytest.mark.system
-def test_json_reports_what_is_wrong_with_a_profile() -> None:
+def test_a_profile_with_an_error_ends_with_its_place(call: Any) -> None:
     write("gone")
-    code, answer = as_json("./p.yaml")
-    assert (code, answer["problems"][0]["what"]) == (2, "unknown device 'gone'")
-
-
-def test_a_wrong_profile_ends_with_its_place(capsys: pytest.CaptureFixture[str]) -> None:
-    write("gone")
-    with pytest.raises(ConfigError):
-        show_devices("./p.yaml", (), "off", as_json=False)
-    with pytest.raises(SystemExit) as leaving:
-        main(["devices", "./p.yaml"])
-    out, err = capsys.readouterr()
-    assert (leaving.value.code, out) == (2, "")
+    code, out, err = call("devices", "./p.yaml")
+    assert (code, out) == (2, "")
     assert err.startswith("p.yaml:10:18: unknown device 'gone'")
+    code, out, _ = call("devices", "./p.yaml", "--json")
+    assert (code, json.loads(out)["problems"][0]["what"]) == (2, "unknown device 'gone'")
+
+
+MOBILE, SHUTTER, CAMERA, STATIC = (
+    f"{device:<20} safe" for device in ("mobile_tweezers", "shutter", "camera", "static_tweezers")
+)
+CAMERAS = "'andor', 'frames', 'genicam', 'pylon', 'virtual'"
+NO_CAMERA = f"camera               NOT SAFE: p.yaml:4:15: unknown camera 'ixon'; expected one of {CAMERAS}"
+JAM = "shutter              NOT SAFE: shutter: jam() raised OSError: jammed"
+TO_IXON = {"camera: {use: virtual": "camera: {use: ixon"}
+TO_JAMMED = {"use: fine": "use: no_safe_state"}
+
+
+@pytest.mark.parametrize(
+    ("changes", "code", "lines"),
+    [
+        ({}, 0, [MOBILE, SHUTTER, CAMERA, STATIC]),
+        (TO_IXON, 2, [MOBILE, SHUTTER, STATIC, NO_CAMERA]),
+        (TO_JAMMED, 3, [MOBILE, JAM, CAMERA, STATIC]),
+        (TO_IXON | TO_JAMMED, 3, [MOBILE, JAM, STATIC, NO_CAMERA]),
+        ({"name: bench": "name: 5"}, 2, [MOBILE, SHUTTER, CAMERA, STATIC]),
+    ],
+)
+def test_safe_reports_every_device_and_the_exit_code_is_that_of_the_worst(
+    changes: dict[str, str], code: int, lines: list[str], call: Any
+) -> None:
+    write("fine")
+    text = Path("p.yaml").read_text("utf-8")
+    for old, new in changes.items():
+        assert old in text
+        text = text.replace(old, new)
+    Path("p.yaml").write_text(text, "utf-8")
+    got, out, err = call("safe", "./p.yaml")
+    assert (got, out.splitlines()) == (code, lines)
+    assert ("p.yaml:2:7: name is 5" in err) == ("name: bench" in changes)

@@ -71,12 +71,6 @@ def test_a_shot_that_was_interrupted_needs_no_reason(fake: Any) -> None:
     assert event_text("shot_finished", {"shot": shot}, fake.run()) == "shot 1/20  interrupted"
 
 
-def test_missing_atoms_are_reported(fake: Any) -> None:
-    shot = fake.shot(0, success=False, seen=0, filling=0.9)
-    shot.n_missing_atoms = 3
-    assert "3 atoms too few loaded" in event_text("shot_finished", {"shot": shot}, fake.run())
-
-
 def test_a_window_that_was_too_short(fake: Any) -> None:
     values = {"shot": 0, "cycle": 2, "n_batches": 40, "n_batches_played": 12}
     assert (
@@ -89,14 +83,3 @@ def test_whom_a_run_waits_for(fake: Any) -> None:
     values = {"shot": 0, "device": "leader", "signal": "go", "timeout_s": 60.0}
     text = "shot 1: waiting for 'go' from leader, at most 60 s"
     assert event_text("leader_awaited", values, fake.run()) == text
-
-
-def test_compiling_is_announced_module_by_module() -> None:
-    stream = io.StringIO()
-    log = LogLines(stream)
-    log.event("compiling", {"module": "labseq.motion.check_kernels"})
-    log.event("compiled", {"duration_s": 7.25})
-    assert stream.getvalue().splitlines() == [
-        "compiling labseq.motion.check_kernels; later runs find it in the cache",
-        "compiled in 7.25 s",
-    ]

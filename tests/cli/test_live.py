@@ -57,8 +57,8 @@ class Terminal:
         return self.screen.text.count("shots") - before
 
 
-@pytest.mark.parametrize("encoding", ["utf-8", "cp1252", "ascii", "cp437"])
-@pytest.mark.parametrize("size", [(110, 26), (80, 24), (40, 8)])
+@pytest.mark.parametrize("encoding", ["utf-8", "cp1252", "ascii"])
+@pytest.mark.parametrize("size", [(110, 26), (40, 8)])
 def test_a_run_is_shown_on_any_screen(fake: Any, encoding: str, size: tuple[int, int]) -> None:
     terminal = Terminal(encoding, size)
     terminal.play(fake.script(fake.run()))
@@ -159,12 +159,9 @@ def picture(tally: Tally, width: int, height: int, glyphs: Any = UNICODE, recent
     return [line.rstrip() for line in console.file.getvalue().splitlines()]  # type: ignore[attr-defined]
 
 
-@pytest.mark.parametrize(
-    "size", [(200, 60), (110, 26), (107, 24), (80, 24), (80, 20), (60, 24), (40, 10), (20, 5), (8, 2)]
-)
-@pytest.mark.parametrize("glyphs", [UNICODE, ASCII])
-@pytest.mark.parametrize("n", [20, 60])
-def test_a_picture_never_exceeds_the_terminal(fake: Any, size: tuple[int, int], glyphs: Any, n: int) -> None:
+@pytest.mark.parametrize("size", [(200, 60), (107, 24), (80, 20), (60, 24), (20, 5), (8, 2)])
+@pytest.mark.parametrize(("n", "glyphs"), [(20, UNICODE), (60, UNICODE), (20, ASCII)])
+def test_a_picture_never_exceeds_the_terminal(fake: Any, size: tuple[int, int], n: int, glyphs: Any) -> None:
     lines = picture(tally_of(fake, fake.run(target=fake.target(n))), *size, glyphs)
     assert len(lines) < size[1]
     assert max(map(len, lines)) <= size[0]
@@ -211,16 +208,6 @@ def test_on_real_hardware_there_is_one_clock(fake: Any) -> None:
     ):
         lines = picture(tally_of(fake, fake.run(simulated=simulated)), 120, 30)
         assert [line for line in lines if heads in " ".join(line.split())]
-
-
-def test_stage_table_shows_budgets(fake: Any) -> None:
-    rows = {
-        line.split()[0]: line.split()[1:]
-        for line in picture(tally_of(fake, fake.run(lattice="square")), 60, 30)
-        if line[:5] in {"plan ", "move "}
-    }
-    times = ["800", "us", "800", "us", "7.5", "ms"]
-    assert rows == {"plan": [*times, "-"], "move": [*times, "60", "ms"]}
 
 
 def test_before_the_first_image_there_is_no_array(fake: Any) -> None:
@@ -299,11 +286,6 @@ def test_without_a_defect_free_shot_the_filling_is_drawn() -> None:
     assert drawn[0] == "filling by planner.dop"
     assert (drawn[1][:7], drawn[-2][:7]) == ("  99 % ", "  98 % ")
     assert drawn[-2][7:] == "....      #### "
-
-
-@pytest.mark.parametrize(("width", "height"), [(15, 6), (40, 3)])
-def test_where_there_is_no_room_there_is_no_plot(width: int, height: int) -> None:
-    assert plot(scan_tally([1], [(0, True, 1.0)]), width, height) == []
 
 
 def test_before_the_first_shot_there_is_no_plot() -> None:

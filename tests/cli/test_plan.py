@@ -10,9 +10,7 @@ import numpy as np
 import pytest
 from rich.text import Text
 
-from labseq.cli import main
 from labseq.cli.plan import PlanOutput, moves_text, plan_once, print_plan, title, totals, warnings
-from labseq.errors import ConfigError
 from labseq.model import Batch
 from labseq.session.planning import PlannedMoves, PlanRequest, plan_moves
 
@@ -65,9 +63,7 @@ def test_each_batch_is_reported_on_request(moves: PlannedMoves) -> None:
     assert "Enter" not in text
 
 
-@pytest.mark.parametrize(
-    ("keys", "n_shown"), [("\n\nq\n", 3), ("\n", 2), ("", 1), ("q\n", 1), ("\n" * 99, 99)]
-)
+@pytest.mark.parametrize(("keys", "n_shown"), [("\n\nq\n", 3), ("", 1), ("\n" * 99, 99)])
 def test_in_a_terminal_each_batch_waits_for_enter(
     moves: PlannedMoves, monkeypatch: pytest.MonkeyPatch, keys: str, n_shown: int
 ) -> None:
@@ -87,7 +83,7 @@ def test_a_pipe_as_keyboard_does_not_wait(moves: PlannedMoves, monkeypatch: pyte
     assert f"batch {moves.plan.n_batches} of {moves.plan.n_batches}" in text
 
 
-@pytest.mark.parametrize("width", ["16", "40", "80", "200"])
+@pytest.mark.parametrize("width", ["16", "80", "200"])
 def test_a_plan_fits_the_terminal(moves: PlannedMoves, monkeypatch: pytest.MonkeyPatch, width: str) -> None:
     monkeypatch.setenv("COLUMNS", width)
     monkeypatch.setenv("TERM", "xterm")
@@ -171,32 +167,12 @@ def test_json_in_a_file_is_printed_with_the_report(
     assert path.read_text("utf-8").count("\n") == 1
 
 
-@pytest.mark.parametrize(("name", "reason"), [("", "Is a directory"), ("gone/plan.json", "No such file")])
-def test_json_that_cannot_be_written_is_reported(tmp_path: Path, name: str, reason: str) -> None:
-    with pytest.raises(ConfigError, match=f"it cannot be written: {reason}"):
-        plan_once(REQUEST, PlanOutput(json=str(tmp_path / name)))
-
-
-def code_of(*arguments: str) -> Any:
-    with pytest.raises(SystemExit) as leaving:
-        main(arguments)
-    return leaving.value.code
-
-
-def test_the_command_passes_every_option_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_the_command_passes_every_option_on(monkeypatch: pytest.MonkeyPatch, call: Any) -> None:
     got: list[Any] = []
     monkeypatch.setattr("labseq.cli.plan.plan_once", lambda *arguments: got.extend(arguments))
     target = ["--target", "a:3x3", "--origin", "-1,2"]
     planner = ["--planner", "p", "--dop", "4", "--set", "a=1", "--set", "b=2"]
     output = ["--step", "--json", "-", "--png", "x.png"]
-    assert code_of("plan", "-", *target, *planner, "--seed", "5", "-p", "lab", *output) == 0
+    assert call("plan", "-", *target, *planner, "--seed", "5", "-p", "lab", *output)[0] == 0
     request = PlanRequest("-", "a:3x3", "p", 4, ("a=1", "b=2"), 5, "-1,2", "lab")
     assert got == [request, PlanOutput(step=True, json="-", png=Path("x.png"))]
-
-
-@pytest.mark.parametrize("wrong", [["--seed", "-1"], ["--seed", "x"], ["--dop", "x"], ["--tagret", "a"], []])
-def test_wrong_usage(wrong: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert code_of("plan", *(["random:3x3@1"] if wrong else []), *wrong) == 2
-    out, err = capsys.readouterr()
-    assert out == ""
-    assert "Traceback" not in err

@@ -102,7 +102,6 @@ def test_json_is_alone_on_stdout(perform: Any) -> None:
     ("error", "status", "text"),
     [
         (StopRequested(15), "stopped", "stopped by SIGTERM"),
-        (KeyboardInterrupt(), "stopped", "stopped by Ctrl-C"),
         (DeviceError("camera", "mute"), "failed", "error: camera: mute"),
         (
             MemoryError(),

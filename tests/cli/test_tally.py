@@ -42,13 +42,6 @@ def test_only_complete_shots_count(fake: Any) -> None:
     assert math.isnan(tally.filling.error)
 
 
-def test_unknown_events_and_stages_are_ignored() -> None:
-    tally = Tally(lambda: 0.0)
-    tally.add("something_new", {"a": 1})
-    tally.add("stage", {"timing": StageTiming("step 0 load", 0, 0, 0.0, 0.5, 0.5)})
-    assert not any(stage.host_s for stage in tally.stages.values())
-
-
 def test_over_budget_is_counted() -> None:
     tally = Tally(lambda: 0.0)
     for duration_s in (59e-3, 60e-3, 62e-3):

@@ -11,8 +11,7 @@ from typing import Any
 import pytest
 
 from labseq.cli.tally import Tally
-from labseq.cli.watch import POLL_S, EventReader, NewLines, record_of, watch_run
-from labseq.errors import ConfigError
+from labseq.cli.watch import POLL_S, EventReader, NewLines, watch_run
 from labseq.recording import RunWriter, open_run
 
 
@@ -127,14 +126,3 @@ def test_only_whole_lines_are_read_and_each_once(tmp_path: Path) -> None:
         file.write(": 2}\n[]\n")
     assert tail.read() == [{"a": 2}]
     assert tail.read() == []
-
-
-def test_a_record_knows_the_scan(watched: WatchedRun) -> None:
-    run = open_run(watched.writer.run_dir)
-    run.record["scan"] = {"addresses": ["a"]}
-    assert record_of(run).scan == {"addresses": ["a"]}
-
-
-def test_a_missing_run_is_reported(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="no such file or folder"):
-        watch_run(tmp_path / "x")

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import csv
 import io
 import json
-from pathlib import Path
 
 import pytest
 from rich.console import Console
@@ -17,7 +15,6 @@ from labseq.cli.show import Tables, show_run
 from labseq.cli.tally import Tally
 from labseq.cli.watch import EventReader
 from labseq.console.events import LogLines, event_text
-from labseq.recording.export import export_run
 from tests.session.small_runs import PROFILE
 
 DOP = "planner.degree_of_parallelism"
@@ -98,13 +95,3 @@ def test_a_view_in_another_process_learns_the_points_and_the_best(
         console.print(Picture(tally, [], UNICODE))
     assert f"best so far       {tally.best}" in shown.get()
     assert ", point " in tally.best
-
-
-def test_a_run_that_is_exported_has_its_points(printed: tuple[labseq.Run, list[str]], tmp_path: Path) -> None:
-    export_run(printed[0], "csv", tmp_path / "t.csv")
-    with (tmp_path / "t.csv").open(encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-    assert [int(row[DOP]) for row in rows] == [shot.parameters[DOP] for shot in printed[0].shots]
-    with (tmp_path / "t.units.csv").open(encoding="utf-8") as file:
-        units = {row[0]: row[1] for row in csv.reader(file)}
-    assert units["shot.2.rearrange.window"] == "s"

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from labseq.bench.waveform import PlannedWaveform, WaveformRequest, plan_waveform
-from labseq.cli import main
 from labseq.cli.waveform import WaveformOutput, note, report, show_waveform, title
 from labseq.session.planning import PlanRequest
 
@@ -22,12 +21,6 @@ WORDS = ["random:6x6@0.7", "--seed", "3", "--target", "checkerboard:4x4", "--sam
 @pytest.fixture(scope="module")
 def made() -> PlannedWaveform:
     return plan_waveform(REQUEST)
-
-
-def code_of(*arguments: str) -> Any:
-    with pytest.raises(SystemExit) as leaving:
-        main(arguments)
-    return leaving.value.code
 
 
 def test_the_report_reports_what_is_played(made: PlannedWaveform) -> None:
@@ -53,25 +46,11 @@ def test_the_report_reports_what_is_played(made: PlannedWaveform) -> None:
     assert lines[-1].count("comb 100.0 %") == 2
 
 
-@pytest.mark.parametrize(
-    ("batches", "words", "printed"),
-    [
-        ("1", "batch 1 of 5, ", "batches    1 of 5"),
-        ("2-3", "batches 2 to 3 of 5, ", "batches    2 to 3 of 5"),
-    ],
-)
-def test_some_batches_are_named_in_report_and_title(batches: str, words: str, printed: str) -> None:
-    made = plan_waveform(WaveformRequest(REQUEST.plan, batches, REQUEST.sample_rate))
+def test_some_batches_are_named_in_report_and_title() -> None:
+    made = plan_waveform(WaveformRequest(REQUEST.plan, "2-3", REQUEST.sample_rate))
     n = made.moves.plan.n_batches
-    assert title(made).startswith(f"psca, degree of parallelism 7: {words.replace('of 5', f'of {n}')}")
-    assert printed.replace("of 5", f"of {n}") in report(made, made.statistics())
-
-
-def test_an_axis_in_a_line(made: PlannedWaveform) -> None:
-    row, _ = made.statistics()
-    assert note(row).startswith(f"row axis: at most {row.max_tones} tone")
-    assert " MHz, peak " in note(row)
-    assert note(row).endswith(" at the AOD")
+    assert title(made).startswith(f"psca, degree of parallelism 7: batches 2 to 3 of {n}, ")
+    assert f"batches    2 to 3 of {n}" in report(made, made.statistics())
 
 
 def test_samples_that_are_all_zero_have_no_crest_factor(tmp_path: Path) -> None:
@@ -104,19 +83,13 @@ def test_everything_can_be_written_at_once(tmp_path: Path, capsys: pytest.Captur
     assert largest.tolist() == pytest.approx([document["row"]["peak_v"], document["column"]["peak_v"]])
 
 
-def test_what_falls_short_is_reported_as_plan_reports_it(capsys: pytest.CaptureFixture[str]) -> None:
-    few = PlanRequest("random:6x6@0.2", "compact:4x4", seed=3)
-    show_waveform(WaveformRequest(few, None, "250 MHz"), WaveformOutput())
-    assert "warning: 7 atoms for 16 target sites, 9 too few; the plan fills 7" in capsys.readouterr().err
-
-
-def test_the_command_passes_every_option_on(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_command_passes_every_option_on(monkeypatch: pytest.MonkeyPatch, call: Any) -> None:
     got: list[Any] = []
     monkeypatch.setattr("labseq.cli.waveform.show_waveform", lambda *arguments: got.extend(arguments))
     planned = ["--target", "a:3x3", "--origin", "-1,2", "--planner", "p", "--dop", "4", "--set", "a=1"]
     rest = ["--seed", "5", "-p", "lab", "--batches", "1-3", "--sample-rate", "5 MHz"]
     files = ["--json", "-", "--png", "x.png", "--npz", "x.npz"]
-    assert code_of("waveform", "-", *planned, *rest, *files) == 0
+    assert call("waveform", "-", *planned, *rest, *files)[0] == 0
     request = PlanRequest("-", "a:3x3", "p", 4, ("a=1",), 5, "-1,2", "lab")
     output = WaveformOutput(json="-", png=Path("x.png"), npz=Path("x.npz"))
     assert got == [WaveformRequest(request, "1-3", "5 MHz"), output]
@@ -126,35 +99,14 @@ BAD = [
     (["gone.json"], "gone.json: there is no such file; did you mean 'one.json'?"),
     (["one.json"], "one.json: this is no plan; expected what 'labseq plan --json' writes"),
     (["half.json"], "half.json:1:13: this is no JSON: expecting value"),
-    (["folder.json"], "folder.json: this is a folder; expected a plan"),
-    (["gone.npy", "--target", "compact:3x3"], "gone.npy: there is no such file"),
     (["random:6x6@0.7"], "--target is missing"),
-    (
-        [*WORDS, "--batches", "9-99"],
-        "--batches 9-99: there are no such batches; expected a number from 1 to ",
-    ),
-    ([*WORDS, "--batches", "3-2"], "--batches 3-2: there are no such batches"),
+    ([*WORDS, "--batches", "9-99"], "there are no such batches; expected a number from 1 to "),
     ([*WORDS, "--batches", "first"], "--batches first: these are no batches"),
-    ([*WORDS, "--sample-rate", "."], "--sample-rate .: '.' is not a frequency"),
     ([*WORDS, "--sample-rate", "1"], "cannot be sampled at 1 Hz; expected more than 211.2 MHz"),
-    ([*WORDS, "--sample-rate", "5 s"], "--sample-rate 5 s: '5 s' is a time, not a frequency"),
-    ([*WORDS, "--png", "a.jpg"], "a.jpg: this is no name of a PNG file"),
     ([*WORDS, "--png", "gone/a.png"], "gone: there is no such folder; expected one that exists"),
     ([*WORDS, "--npz", "a.npy"], "a.npy: this is no name of an NPZ file"),
-    ([*WORDS, "--npz", "gone/a.npz"], "gone: there is no such folder; expected one that exists"),
-    ([*WORDS, "--png", f"{'a' * 300}.png"], "this is no name of a file: File name too long"),
-    ([*WORDS, "--npz", f"{'a' * 300}.npz"], "the samples cannot be written: File name too long"),
-    ([*WORDS, "--json", "a" * 300], "it cannot be written: File name too long"),
-    ([*WORDS, "--json", "a.png", "--png", "./a.png"], "a.png: this file is named twice, and one would"),
     (["one.json", "--json", "one.json"], "one.json: this file is named twice, and one would replace the"),
-    (
-        [*WORDS, "--json", "folder.json", "--npz", "a.npz"],
-        "folder.json: it cannot be written: Is a",
-    ),
-    (["/dev/null", "--target", "compact:3x3"], "/dev/null: this is not an ordinary file"),
-    ([*WORDS, "--json", "gone/a.json"], "gone/a.json: it cannot be written"),
-    ([*WORDS, "--profile", "virtul"], "did you mean 'virtual'?"),
-    ([*WORDS, "--planner", "pcsa"], "unknown planner 'pcsa'"),
+    ([*WORDS, "--json", "folder.json", "--npz", "a.npz"], "folder.json: it cannot be written: Is a"),
     (["random:3x3@1", "--seed", "1", "--target", "compact:3x3"], "there is nothing to play"),
 ]
 
@@ -165,16 +117,15 @@ def test_every_mistake_is_reported_as_text(
     arguments: list[str],
     words: str,
     monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    call: Any,
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "one.json").write_text("{}", "utf-8")
     (tmp_path / "half.json").write_text('{"batches": ', "utf-8")
     (tmp_path / "folder.json").mkdir()
     before = sorted(path.name for path in tmp_path.iterdir())
-    assert code_of("waveform", *arguments) == 2
-    out, err = capsys.readouterr()
-    assert out == ""
+    code, out, err = call("waveform", *arguments)
+    assert (code, out) == (2, "")
     assert words in err
     assert "Traceback" not in err
     assert "internal error" not in err
@@ -182,8 +133,9 @@ def test_every_mistake_is_reported_as_text(
 
 
 def test_a_picture_without_matplotlib_is_refused_before_anything_is_done(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+    monkeypatch: pytest.MonkeyPatch, call: Any, tmp_path: Path
 ) -> None:
     monkeypatch.setattr("labseq.pictures.figures.find_spec", lambda _: None)
-    assert code_of("waveform", *WORDS, "--png", str(tmp_path / "a.png")) == 2
-    assert "needs matplotlib, which is not installed; pip install 'labseq[plot]'" in capsys.readouterr().err
+    code, _, err = call("waveform", *WORDS, "--png", str(tmp_path / "a.png"))
+    assert code == 2
+    assert "needs matplotlib, which is not installed; pip install 'labseq[plot]'" in err

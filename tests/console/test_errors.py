@@ -49,30 +49,12 @@ def test_problems_start_with_their_place() -> None:
     ]
 
 
-def test_an_internal_error_says_how_to_report_it(capsys: pytest.CaptureFixture[str]) -> None:
-    assert report(KeyError("lost")) == 1
-    out, err = capsys.readouterr()
-    assert out == ""
-    assert err == "internal error: KeyError: 'lost'; please report it; run again with --debug to see where\n"
-
-
 def test_a_full_disk_is_no_internal_error() -> None:
     text = "cannot be written: No space left on device"
     full = OSError(errno.ENOSPC, "No space left on device")
     assert lines_of(full) == [f"error: output {text}"]
     full.filename = "a.npy"
     assert lines_of(full) == [f"error: a.npy {text}"]
-
-
-@pytest.mark.parametrize("debug", [False, True])
-def test_only_debug_shows_the_traceback(debug: bool, capsys: pytest.CaptureFixture[str]) -> None:
-    try:
-        raise PlanError("no plan")
-    except PlanError as error:
-        report(error, debug=debug)
-    err = capsys.readouterr().err
-    assert ("Traceback" in err) is debug
-    assert err.endswith("error: no plan\n")
 
 
 def test_of_very_many_problems_the_first_are_reported(capsys: pytest.CaptureFixture[str]) -> None:

@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 
 from labseq.cli import main
-from labseq.console.options import MAX_RUNS, file_kinds, new_kinds, profile_names, run_folders
-from labseq.registry import KINDS
+from labseq.console.options import MAX_RUNS, profile_names, run_folders
 
 
 def completed(line: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> list[str]:
@@ -42,7 +41,6 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("labseq schema p", ["profile"]),
         ("labseq run a.yaml --profile vir", ["virtual"]),
         ("labseq safe prac", ["practice"]),
-        ("labseq devices prac", ["practice"]),
         ("labseq plugins --profile prac", ["practice"]),
         ("labseq run a.yaml --shot", ["--shots"]),
         ("labseq nonsense x", []),
@@ -63,7 +61,7 @@ def test_runs_are_completed(
         (run / "run.json").touch()
     offered = [str(Path("data") / f"2026-11-0{day}" / "0001_x") for day in (3, 2, 1)]
     assert run_folders("") == offered
-    for command in ("show", "plot", "resume", "watch", "stop", "export"):
+    for command in ("show", "resume", "stop"):
         assert sorted(completed(f"labseq {command} data", monkeypatch, capsys)) == sorted(offered)
 
 
@@ -91,12 +89,7 @@ def test_own_profiles_are_offered_too(here: Path) -> None:
     assert "notes" not in profile_names("")
 
 
-def test_kinds() -> None:
-    assert new_kinds("") == ["sequence", "profile", *KINDS]
-    assert file_kinds("s") == ["sequence"]
-
-
-@pytest.mark.parametrize("shell", ["bash", "zsh", "fish", "powershell", "pwsh"])
+@pytest.mark.parametrize("shell", ["bash", "zsh", "pwsh"])
 def test_every_shell_gets_its_script(
     shell: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

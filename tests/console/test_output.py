@@ -12,9 +12,8 @@ from labseq.console.text import columns
 from labseq.errors import RecordingError
 
 FULL = Path("/dev/full")
-SEQUENCE = Path(__file__).parents[2] / "sequences" / "compact_225.yaml"
 PLAN = "plan random:8x8@0.75 --target compact:4x4 --step"
-COMMANDS = [("plugins", False), (f"check {SEQUENCE}", True), (f"{PLAN} --json -", True)]
+COMMANDS = [("plugins", False), (f"{PLAN} --json -", True)]
 """Each with whether Python buffers what it prints."""
 
 CELLS = st.text(st.characters(min_codepoint=33, max_codepoint=126), max_size=8)
@@ -60,9 +59,8 @@ def test_say_reports_when_nothing_can_be_written(tmp_path: Path) -> None:
         say("a", stream=stream)
 
 
-@pytest.mark.parametrize("closed", [">&-", "<&- >&- 2>&-", "--json >&- 2>&-"])
-def test_closed_streams_change_no_exit_code(tmp_path: Path, closed: str) -> None:
-    command = f'"$1" -m labseq check gone.yaml {closed}'
+def test_closed_streams_change_no_exit_code(tmp_path: Path) -> None:
+    command = '"$1" -m labseq check gone.yaml --json <&- >&- 2>&-'
     shell = ["/bin/sh", "-c", command, "sh", sys.executable]
     done = subprocess.run(shell, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 2
@@ -90,7 +88,7 @@ def test_a_reader_that_went_away_is_no_error(command: str, buffered: bool) -> No
 
 
 @pytest.mark.skipif(not FULL.exists(), reason="no full device")
-@pytest.mark.parametrize(("command", "buffered"), [*COMMANDS, ("--help", True)])
+@pytest.mark.parametrize(("command", "buffered"), [("plugins", False), ("--help", True)])
 def test_a_full_disk_is_reported_in_a_line(command: str, buffered: bool) -> None:
     with FULL.open("w", encoding="utf-8") as full:
         done = perform(command, full.fileno(), buffered)

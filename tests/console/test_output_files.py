@@ -20,11 +20,6 @@ def test_json_for_a_file_is_one_line(tmp_path: Path) -> None:
     assert json.loads(path.read_text("utf-8")) == {"a": [1, 2]}
 
 
-def test_without_a_name_there_is_no_json(capfd: pytest.CaptureFixture[str]) -> None:
-    json_writer(None)({"a": 1})
-    assert capfd.readouterr().out == ""
-
-
 @pytest.mark.parametrize("name", ["gone/a.json", ".", "a" * 300])
 def test_a_file_that_cannot_be_written_is_refused_at_once(tmp_path: Path, name: str) -> None:
     with pytest.raises(ConfigError, match="it cannot be written: "):
