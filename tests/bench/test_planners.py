@@ -18,6 +18,7 @@ from labseq.errors import ConfigError, PlanError
 
 SMALL = Comparison((PlannerEntry("psca"),), (Condition((8, 8), "compact:5x5", 0.75, 4),), 60, 5)
 TIMES = {"planning_s", "duration_s"}
+TWICE = (PlannerEntry("psca"), PlannerEntry("psca", (("degree_of_parallelism", "2"),)))
 
 PLUGIN = """
 import numpy as np
@@ -58,45 +59,40 @@ def plugins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("LABSEQ_PLUGIN_PATH", str(tmp_path))
 
 
+@pytest.fixture(scope="module")
+def report() -> Report:
+    return compare(replace(SMALL, planner_entries=TWICE), 1)
+
+
 def without_times(values: Any) -> Any:
     if isinstance(values, dict):
         return {key: without_times(value) for key, value in values.items() if key not in TIMES}
     return [without_times(value) for value in values] if isinstance(values, list) else values
 
 
-def told(report: Report) -> Any:
-    assert report.ended_by is None
-    return without_times(report.as_dict())
-
-
-def test_the_result_does_not_depend_on_the_number_of_processes() -> None:
-    comparison = replace(SMALL, conditions=(*SMALL.conditions, Condition((6, 7), "compact:3x3", 0.5)))
-    alone, together = compare(comparison, 1), compare(comparison, 2)
-    assert told(alone) == told(together)
-    assert all(np.array_equal(a.counts, b.counts) for a, b in zip(alone.rows, together.rows, strict=True))
-
-
-def test_long_work_is_shared_after_a_while(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.usefixtures("plugins")
+def test_several_processes_find_what_one_finds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Long work is shared after a while; two conditions, and a planner that fails."""
     monkeypatch.setattr(bench, "ALONE_S", 0.0)
-    assert told(compare(SMALL)) == told(compare(SMALL, 1))
+    monkeypatch.setattr(bench, "_n_cores", lambda: 2)
+    entries = (PlannerEntry("moody"), PlannerEntry("psca"))
+    conditions = (*SMALL.conditions, Condition((6, 7), "compact:3x3", 0.5))
+    comparison = replace(SMALL, planner_entries=entries, conditions=conditions)
+    alone, together = compare(comparison, 1), compare(comparison)
+    assert alone.ended_by is together.ended_by is None
+    assert without_times(alone.as_dict()) == without_times(together.as_dict())
+    assert all(np.array_equal(a.counts, b.counts) for a, b in zip(alone.rows, together.rows, strict=True))
+    in_the_corner = [index for index in range(60) if draw((8, 8), 0.75, SMALL.seed, index)[0, 0]]
+    for moody, psca, *_ in (alone.rows, together.rows):
+        assert psca.n_failed == 0
+        assert moody.n_failed == len(in_the_corner) == 60 - moody.counts.sum()
+        assert moody.first_failure is not None
+        assert moody.first_failure.loading == in_the_corner[0]
+        assert "there is an atom in the corner" in moody.first_failure.message
 
 
-def test_more_loadings_begin_with_the_fewer() -> None:
-    few, many = compare(replace(SMALL, n_loadings=1), 1), compare(replace(SMALL, n_loadings=2), 1)
-    assert many.rows[0].n_batches.value * 2 >= few.rows[0].n_batches.value
-    assert many.rows[0].counts.sum() == 2
-
-
-def test_progress_is_told_up_to_the_end() -> None:
-    seen: list[tuple[int, int]] = []
-    compare(SMALL, 1, progress=lambda done, wanted: seen.append((done, wanted)))
-    assert seen[0] == (0, 60)
-    assert seen[-1] == (60, 60)
-    assert seen == sorted(seen)
-
-
-def test_a_row_sums_up_what_the_planner_did() -> None:
-    row = compare(SMALL, 1).rows[0]
+def test_a_row_sums_up_what_the_planner_did(report: Report) -> None:
+    row = report.rows[0]
     assert (row.n_loadings, row.n_failed, row.n_short) == (60, 0, 0)
     assert row.filling_fraction.value == row.target_met.value == 1.0
     assert row.counts.sum() == 60
@@ -107,14 +103,21 @@ def test_a_row_sums_up_what_the_planner_did() -> None:
     assert (row.degree_of_parallelism, row.settings["degree_of_parallelism"]) == (4, 4)
 
 
-def test_overheads_count_only_where_they_are_asked_for() -> None:
-    bare = compare(SMALL, 1).rows[0]
-    condition = replace(
-        SMALL.conditions[0], motion=(("overhead_per_batch", "1 ms"), ("overhead_per_cycle", "0"))
-    )
-    loaded = compare(replace(SMALL, conditions=(condition,)), 1).rows[0]
-    more_s = loaded.motion_s.value - bare.motion_s.value
-    assert more_s == pytest.approx(1e-3 * bare.n_batches.value)
+def test_csv_and_json_hold_the_same(report: Report) -> None:
+    values = json.loads(json.dumps(report.as_dict(), allow_nan=False))
+    lines = list(csv.DictReader(io.StringIO(report.as_csv())))
+    assert [line["label"] for line in lines] == ["psca", "psca degree_of_parallelism=2"]
+    for line, row in zip(lines, values["rows"], strict=True):
+        assert float(line["n_batches_mean"]) == row["n_batches"]["mean"]
+        assert line["n_scans_mean"] == ""
+        assert row["n_scans"] == {"mean": None, "error": None}
+
+
+def test_overheads_count_only_where_they_are_set(report: Report) -> None:
+    motion = (("overhead_per_batch", "1 ms"), ("overhead_per_cycle", "0"))
+    loaded = compare(replace(SMALL, conditions=(replace(SMALL.conditions[0], motion=motion),)), 1).rows[0]
+    more_s = loaded.motion_s.value - report.rows[0].motion_s.value
+    assert more_s == pytest.approx(1e-3 * loaded.n_batches.value)
 
 
 def test_too_few_atoms_show_in_the_filling() -> None:
@@ -135,20 +138,6 @@ def test_empty_and_full_loadings() -> None:
 
 
 @pytest.mark.usefixtures("plugins")
-@pytest.mark.parametrize("n_workers", [1, 2])
-def test_wrong_plans_are_counted_and_the_first_one_named(n_workers: int) -> None:
-    comparison = replace(SMALL, planner_entries=(PlannerEntry("moody"), PlannerEntry("psca")))
-    moody, psca = compare(comparison, n_workers).rows
-    assert psca.n_failed == 0
-    assert moody.counts.sum() == 60 - moody.n_failed
-    assert moody.first_failure is not None
-    in_the_corner = [index for index in range(60) if draw((8, 8), 0.75, SMALL.seed, index)[0, 0]]
-    assert moody.n_failed == len(in_the_corner)
-    assert moody.first_failure.loading == in_the_corner[0]
-    assert "there is an atom in the corner" in moody.first_failure.message
-
-
-@pytest.mark.usefixtures("plugins")
 def test_a_planner_that_cannot_be_warmed_is_named() -> None:
     report = compare(replace(SMALL, planner_entries=(PlannerEntry("cold"),)), 1)
     assert isinstance(report.ended_by, PlanError)
@@ -156,56 +145,29 @@ def test_a_planner_that_cannot_be_warmed_is_named() -> None:
     assert report.rows == ()
 
 
-def test_csv_and_json_hold_the_same() -> None:
-    report = compare(
-        replace(
-            SMALL,
-            planner_entries=(PlannerEntry("psca"), PlannerEntry("psca", (("degree_of_parallelism", "2"),))),
-        ),
-        1,
-    )
-    values = json.loads(json.dumps(report.as_dict(), allow_nan=False))
-    lines = list(csv.DictReader(io.StringIO(report.as_csv())))
-    assert [line["label"] for line in lines] == ["psca", "psca degree_of_parallelism=2"]
-    for line, row in zip(lines, values["rows"], strict=True):
-        assert float(line["n_batches_mean"]) == row["n_batches"]["mean"]
-        assert line["n_scans_mean"] == ""
-        assert row["n_scans"] == {"mean": None, "error": None}
-
-
 @pytest.mark.parametrize(
     ("request_", "words"),
     [
         (BenchRequest(planners="psac"), "unknown planner 'psac'; expected .*; did you mean 'psca'?"),
-        (BenchRequest(target="compct:5x5"), "unknown pattern 'compct'; expected .*did you mean 'compact'?"),
         (BenchRequest(target="compact:30x30"), "--target compact:30x30: the size of the target is 30 rows"),
-        (BenchRequest(target="5x5"), "--target 5x5: this is no target"),
-        (BenchRequest(dop=0), "--dop 0: the degree of parallelism is 0; expected 1 to 20"),
         (BenchRequest(dop=21), "--dop 21: .*; expected 1 to 20, the most tweezers.*max_tweezers=21"),
+        (
+            BenchRequest(
+                dop=6, overrides=[f"profile.mobile_tweezers.max_{a}_tones=5" for a in ("row", "column")]
+            ),
+            "--dop 6: .*; expected at most 5, the most tones of an axis",
+        ),
         (BenchRequest(planners="psca:dop=3"), "psca:dop=3: 'dop' is not a setting of planner 'psca'"),
         (BenchRequest(overrides=["planner.dop=3"]), "--set planner.dop=3: 'dop' is not a setting"),
-        (BenchRequest(overrides=["profile.mobile_tweezers.sped=3"]), "'sped' is .*did you mean 'speed'?"),
         (BenchRequest(overrides=["profile.mobile_tweezers.speed=3 ms"]), "'3 ms' is a time, not a speed"),
     ],
-)  # fmt: skip
-def test_wrong_requests_are_refused_in_words(request_: BenchRequest, words: str) -> None:
+)
+def test_wrong_requests_are_refused(request_: BenchRequest, words: str) -> None:
     with pytest.raises(ConfigError, match=words):
         compare(read_request(request_), 1)
 
 
-def test_the_tone_limits_bound_the_degree_of_parallelism() -> None:
-    limits = [f"profile.mobile_tweezers.max_{axis}_tones=5" for axis in ("row", "column")]
-    with pytest.raises(ConfigError, match=r"--dop 6: .*; expected at most 5, the most tones of an axis"):
-        compare(read_request(BenchRequest(dop=6, overrides=limits)), 1)
-
-
-def test_a_request_without_anything_is_the_papers_array() -> None:
-    comparison = read_request(BenchRequest())
-    assert comparison.planner_entries == (PlannerEntry("psca"),)
-    assert comparison.conditions == (Condition((20, 20), "compact:15x15", 0.75),)
-
-
-def test_tweezers_can_move_at_another_speed() -> None:
+def test_the_tweezers_speed_can_be_set() -> None:
     request = BenchRequest(target="compact:2x2", overrides=["profile.mobile_tweezers.speed=130 um/ms"])
     (course,) = set_up(read_request(request))
     assert course.motion.speed_m_s == 0.13
