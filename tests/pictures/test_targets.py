@@ -1,21 +1,16 @@
-"""Pictures of targets."""
-
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 from typing import Literal
 
-import matplotlib as mpl
 import numpy as np
 import pytest
 from PIL import Image
 
-from labseq import ConfigError, SiteGrid, TargetPattern
-from labseq.pictures.plans import FILL_LOOK, SITE_IN, TARGET_DPI as DPI, save_target, target_text
+from labseq.model import SiteGrid, TargetPattern
+from labseq.pictures.plans import FILL_LOOK, SITE_IN, TARGET_DPI, save_target
 
-SITE_PX = SITE_IN * DPI
+SITE_PX = SITE_IN * TARGET_DPI
 WHITE = (255, 255, 255)
 
 
@@ -47,33 +42,9 @@ def test_atoms_are_where_the_camera_sees_them(
         assert (pixel == WHITE) == clear
 
 
-def test_a_picture_says_in_words_what_it_shows(tmp_path: Path) -> None:
+def test_a_file_holds_the_target_as_text(tmp_path: Path) -> None:
     save_target(tmp_path / "target.png", a_target(), SiteGrid(4, 6))
     with Image.open(tmp_path / "target.png") as picture:
         assert picture.info["Title"] == "odd one"
         assert picture.info["Description"] == "#.....\n.ooo..\n...#..\n.....#"
         assert "Software" not in picture.info
-    assert target_text(a_target()) == "#.....\n.ooo..\n...#..\n.....#"
-
-
-def test_the_users_own_style_does_not_matter(tmp_path: Path) -> None:
-    files = [tmp_path / "one.png", tmp_path / "two.png"]
-    save_target(files[0], a_target(), SiteGrid(4, 6))
-    with mpl.rc_context({"axes.facecolor": "black", "savefig.dpi": 30, "savefig.transparent": True}):
-        save_target(files[1], a_target(), SiteGrid(4, 6))
-    assert files[0].read_bytes() == files[1].read_bytes()
-
-
-def test_a_target_of_another_grid_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"the target has \(4, 6\) sites and the grid \(20, 20\)"):
-        save_target(tmp_path / "target.png", a_target(), SiteGrid())
-
-
-def test_a_picture_that_cannot_be_written_is_an_error_with_its_place(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"none.target\.png: the picture cannot be written: No such file"):
-        save_target(tmp_path / "none" / "target.png", a_target(), SiteGrid(4, 6))
-
-
-def test_matplotlib_is_imported_only_to_draw() -> None:
-    code = "import sys, labseq.pictures.plans; sys.exit('matplotlib' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
