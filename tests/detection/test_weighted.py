@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
-from pathlib import Path
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 from numpy.typing import NDArray
-from pydantic import ValidationError
 
-from labseq.config.profile import load_profile
 from labseq.detection.sites import site_pixels
 from labseq.detection.weighted import WeightedDetector, WeightedSettings
-from labseq.errors import ConfigError, DeviceError, LimitError
 from labseq.model import Frame, SiteGrid
 from labseq.roles import Context, NeedsWarmUp
 from labseq.testing import DetectorContract
@@ -27,6 +23,7 @@ Images = NDArray[np.uint16]
 GRID = SiteGrid(3, 4)
 SMALL: dict[str, Any] = {"frame": (60, 90), "centre_px": (29.5, 44.5)}
 CLOSE = SiteGrid(3, 4, spacing_m=1.9e-6)
+SQUARE = SiteGrid(3, 4, spacing_m=2.2e-6, lattice="square")
 LIGHT = 3600.0  # counts of 60 photoelectrons
 
 
@@ -36,7 +33,9 @@ class TestWeightedDetector(DetectorContract):
         return partial(WeightedDetector, WeightedSettings())
 
 
+@cache
 def detector(grid: SiteGrid = GRID, **settings: Any) -> WeightedDetector:
+    """One for equal arguments: the weights take a while."""
     return WeightedDetector(WeightedSettings(**SMALL | settings), Context("detector", grid))
 
 
@@ -76,8 +75,8 @@ def naive(known: WeightedDetector, image: Images) -> NDArray[np.float64]:
 PATTERNS = st.lists(st.booleans(), min_size=12, max_size=12).map(lambda x: np.array(x).reshape(3, 4))
 
 
-@settings(max_examples=30)
-@given(PATTERNS, st.sampled_from([GRID, CLOSE, SiteGrid(3, 4, spacing_m=2.2e-6, lattice="square")]))
+@settings(max_examples=10)
+@given(PATTERNS, st.sampled_from([GRID, CLOSE, SQUARE]))
 def test_bright_sites_hold_atoms(atoms: Bools, grid: SiteGrid) -> None:
     occupancy, confidence = detector(grid).detect(frame(mean_image(atoms, grid)))
     np.testing.assert_array_equal(occupancy, atoms)
@@ -85,7 +84,7 @@ def test_bright_sites_hold_atoms(atoms: Bools, grid: SiteGrid) -> None:
     assert (confidence > 0.99).all()
 
 
-@settings(max_examples=30)
+@settings(max_examples=10)
 @given(seed=st.integers(0, 2**32 - 1), brightest=st.integers(1, 65536), grid=st.sampled_from([GRID, CLOSE]))
 def test_the_log_odds_are_numpys(seed: int, brightest: int, grid: SiteGrid) -> None:
     image = np.random.default_rng(seed).integers(0, brightest, (60, 90), np.uint16)
@@ -99,17 +98,13 @@ def test_neighbours_light_is_undone() -> None:
     alone, among = np.zeros((3, 4), np.bool_), np.ones((3, 4), np.bool_)
     among[1, 1] = False
     few, many = (
-        np.mean([known.signals(frame(noisy(mean_image(atoms, CLOSE), rng)))[1, 1] for _ in range(300)])
+        np.mean([known.signals(frame(noisy(mean_image(atoms, CLOSE), rng)))[1, 1] for _ in range(100)])
         for atoms in (alone, among)
     )
     weights = known._ready()
     from_neighbours = weights.effects[weights.starts[5] : weights.starts[6]]
     assert len(from_neighbours) == 6
     assert abs(many - few) < from_neighbours.sum() / 4
-
-
-def test_far_neighbours_are_left_alone() -> None:
-    assert len(detector()._ready().neighbours) == 0
 
 
 def test_the_place_between_the_pixels_counts() -> None:
@@ -130,38 +125,9 @@ def test_the_confidence_is_the_probability_of_being_right() -> None:
 def test_log_odds_at_the_threshold_are_no_atom_and_no_confidence() -> None:
     image = mean_image(np.eye(3, 4, dtype=np.bool_))
     log_odds = detector().signals(frame(image))
-    occupancy, confidence = detector(threshold=log_odds.tolist()).detect(frame(image))
+    occupancy, confidence = detector(threshold=tuple(map(tuple, log_odds.tolist()))).detect(frame(image))
     assert not occupancy.any()
     assert (confidence == 0).all()
-
-
-def test_each_site_can_have_its_own_threshold(tmp_path: Path) -> None:
-    atoms = np.ones((3, 4), np.bool_)
-    odds = np.where(np.eye(3, 4), 1e6, 0.0)
-    np.save(tmp_path / "odds.npy", odds)
-    for threshold in (odds.tolist(), str(tmp_path / "odds.npy")):
-        occupancy, _ = detector(threshold=threshold).detect(frame(mean_image(atoms)))
-        np.testing.assert_array_equal(occupancy, odds == 0)
-
-
-def test_thresholds_of_another_grid_are_refused() -> None:
-    with pytest.raises(LimitError, match="3 x 4 sites"):
-        detector(threshold=[[1.0, 2.0]])
-
-
-def test_a_thresholds_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"odds\.npy"):
-        detector(threshold=str(tmp_path / "odds.npy"))
-
-
-def test_a_region_over_the_edge_of_the_frame_names_the_site() -> None:
-    with pytest.raises(LimitError, match=r"region of interest of site \(0, 0\)"):
-        detector(centre_px=(14.0, 44.5))
-
-
-def test_a_frame_of_another_size_names_both_sizes() -> None:
-    with pytest.raises(DeviceError, match=r"uint16 \(90, 60\).*\(60, 90\)"):
-        detector().detect(frame(np.zeros((90, 60), np.uint16)))
 
 
 def test_a_black_frame_has_no_atoms_and_a_saturated_one_has_all() -> None:
@@ -179,45 +145,9 @@ def test_one_saturated_pixel_at_the_edge_is_no_atom() -> None:
 
 
 def test_warming_leaves_nothing_for_the_first_frame() -> None:
-    known = detector()
+    known = detector(background=0.4)
     assert isinstance(known, NeedsWarmUp)
     known.warm()
     before = known._weights
     known.detect(frame(mean_image(np.zeros((3, 4), np.bool_))))
     assert known._weights is before is not None
-
-
-@pytest.mark.parametrize(
-    "settings",
-    [
-        {"region": 4},
-        {"spot": 0.0},
-        {"photoelectrons": 0.0},
-        {"background": 0.0},
-        {"filling": 1.2},
-        {"counts_per_photoelectron": 0.0},
-        {"read_noise": -1.0},
-        {"shape": "disc"},
-    ],
-)
-def test_wrong_settings_are_refused(settings: dict[str, Any]) -> None:
-    with pytest.raises(ValidationError):
-        WeightedSettings(**settings)
-
-
-def test_a_profile_can_name_it_and_mistakes_are_shown_with_their_lines(tmp_path: Path) -> None:
-    text = (
-        "labseq: 1\nname: x\ngrid: {rows: 3, cols: 4, spacing: 4 um}\ncamera: {use: virtual}\n"
-        "static_tweezers: {use: virtual}\nmobile_tweezers: {use: virtual}\n"
-        "detector:\n  use: weighted\n  spot: 400 nm\n  region: 8\n  threshold: odds.npy\n"
-    )
-    path = tmp_path / "x.yaml"
-    path.write_text(text)
-    document, profile = load_profile("x.yaml", beside=tmp_path)
-    assert profile.detector.use == "weighted"
-    with pytest.raises(ConfigError, match=r"x\.yaml:10:\d+.*8 is even"):
-        document.validate(WeightedSettings, ("detector",), drop={"use"})
-    path.write_text(text.replace("region: 8", "region: 7"))
-    document, _ = load_profile("x.yaml", beside=tmp_path)
-    read = document.validate(WeightedSettings, ("detector",), drop={"use"})
-    assert (read.spot, read.region, read.threshold) == (pytest.approx(4e-7), 7, tmp_path / "odds.npy")
