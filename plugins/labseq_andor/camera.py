@@ -63,10 +63,6 @@ class AndorCamera(CameraDriver):
     gain is on during a series only. The cooler stays on in the safe state, and by default when the camera is
     closed.
 
-    Args:
-        settings: The camera, and how it is used.
-        context: Name, clock, and for the simulated camera the simulation.
-
     Attributes:
         library: Andor's library, or the simulated one.
 

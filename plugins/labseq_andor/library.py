@@ -22,10 +22,6 @@ LINUX_FOLDER: Final = "/usr/local/etc/andor"
 class AndorLibrary:
     """Andor's library as the driver uses it; the simulated library overrides all of it.
 
-    Args:
-        settings: Settings of the driver.
-        context: Name of the device, and clock.
-
     Attributes:
         head: Head of the camera if it is known before the camera is opened.
         sensor_shape: (height, width) of its sensor, likewise.
@@ -46,14 +42,8 @@ class AndorLibrary:
     def connect(self, andor: Any) -> tuple[int, ...] | None:
         """Load the library and make pylablib call it.
 
-        Args:
-            andor: pylablib's module for SDK2.
-
         Returns:
             Places of the usable cameras in the SDK's list; None for all.
-
-        Raises:
-            DeviceError: The library is missing, or cameras of another library are open in this process.
         """
         path, library = self._path, None
         if not path and sys.platform != "win32":
@@ -71,21 +61,12 @@ class AndorLibrary:
         """Release what ``connect`` took; legal in any state. Andor's library stays loaded."""
 
     def wait(self, look: Callable[[float], ExposureResult | None], timeout_s: float) -> ExposureResult | None:
-        """Wait for a frame.
-
-        Args:
-            look: Waits for a frame for at most the given seconds of real time.
-            timeout_s: How long to wait in all, in seconds.
-        """
+        """Wait for a frame."""
         return wait_for(look, timeout_s, self._clock)
 
 
 def library_for(settings: AndorSettings, context: Context) -> AndorLibrary:
-    """The library that the settings choose.
-
-    Raises:
-        ConfigError: The simulated camera is chosen, but the profile has no simulation.
-    """
+    """The library that the settings choose."""
     if settings.camera == SIMULATED:
         from labseq_andor_sim import SimulatedAndorLibrary
 
@@ -94,14 +75,7 @@ def library_for(settings: AndorSettings, context: Context) -> AndorLibrary:
 
 
 def load_pylablib(name: str) -> Any:
-    """Import pylablib's module for SDK2, whose ``lib`` is the library that was bound last.
-
-    Args:
-        name: Name of the device, for the message.
-
-    Raises:
-        DeviceError: It is not installed.
-    """
+    """Import pylablib's module for SDK2, whose ``lib`` is the library that was bound last."""
     try:
         return importlib.import_module("pylablib.devices.Andor.AndorSDK2")
     except ModuleNotFoundError as error:
@@ -117,18 +91,9 @@ def load_file(path: str) -> Any:
 
 
 def bind(name: str, andor: Any, key: str, library: Any) -> None:
-    """Make pylablib call a library.
+    """Make pylablib call a library, or, with None, the one that it finds itself.
 
     pylablib has no option for this, but it uses whatever its loader returns.
-
-    Args:
-        name: Name of the device, for the message.
-        andor: pylablib's module for SDK2.
-        key: Identifies the library.
-        library: The library; None: pylablib looks for Andor's itself.
-
-    Raises:
-        DeviceError: Cameras of another library are open in this process.
     """
     control, declarations = andor.libctl, andor.atmcd32d_lib
     with control.lock:

@@ -20,11 +20,6 @@ MAX_CALL_S: Final = 2.0
 class Sdk:
     """pylablib's camera, and the SDK functions that pylablib does not wrap.
 
-    Args:
-        name: Name of the device, for errors.
-        andor: pylablib's module for SDK2, bound to a library.
-        folder: Folder for the SDK's function Initialize.
-
     Attributes:
         camera: pylablib's ``AndorSDK2Camera``; None unless it is open.
         capabilities: The SDK's structure of the camera's capabilities.
@@ -39,16 +34,7 @@ class Sdk:
         self.capabilities: Any = None
 
     def connect(self, indices: Sequence[int] | None, serial: int, fan: str) -> None:
-        """Open the camera with a serial number.
-
-        Args:
-            indices: Places of the usable cameras in the SDK's list; None for all.
-            serial: Serial number; 0: the only camera.
-            fan: Mode of the fan: "full", "low" or "off".
-
-        Raises:
-            DeviceError: No camera is connected, or none has this number.
-        """
+        """Open the camera with a serial number; 0: the only one. ``indices`` are places in the SDK's list."""
         with self._translated_errors():
             indices = range(int(self._andor.get_cameras_number())) if indices is None else indices
         if not indices:
@@ -92,11 +78,7 @@ class Sdk:
 
     @contextmanager
     def selected(self) -> Generator[Any]:
-        """Within the block, pylablib's SDK functions act on this camera.
-
-        Raises:
-            DeviceError: A function failed, or another thread hangs in one.
-        """
+        """Within the block, pylablib's SDK functions act on this camera."""
         if not self._lock.acquire(timeout=MAX_CALL_S):
             raise DeviceError(self._name, "a call to Andor's SDK does not return; restart labseq")
         try:

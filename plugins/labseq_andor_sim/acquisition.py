@@ -67,8 +67,6 @@ class Acquisition:
     Args:
         sensor: Source of the pixels.
         timing: Exposure, cycle times and trigger.
-        clock: The session's clock.
-        faults: Failures to simulate.
 
     Attributes:
         is_acquiring: Whether a series is running.

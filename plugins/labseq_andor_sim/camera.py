@@ -39,11 +39,7 @@ class SimulatedCamera:
     Initialize sets everything except the cooler to its defaults.
 
     Args:
-        world: The simulation.
-        clock: The session's clock.
-        head: Model, and the speeds and gains it has.
         sensor_shape: (height, width) of the simulation's sensor.
-        serial: Serial number.
 
     Attributes:
         faults: Failures to simulate.

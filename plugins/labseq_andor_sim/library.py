@@ -38,16 +38,9 @@ FUNCTIONS: Final = names_in(SimulatedCamera, Cooler, Amplifiers, Optics, Timing,
 class SimulatedAndorLibrary(AndorLibrary):
     """The simulated library with one camera, whose sensor is the simulation's.
 
-    Args:
-        settings: Settings of the driver.
-        context: Name, clock and simulation.
-
     Attributes:
         camera: The camera.
         others: Further cameras at the same computer.
-
-    Raises:
-        ConfigError: There is no simulation.
     """
 
     def __init__(self, settings: AndorSettings, context: Context) -> None:
@@ -126,9 +119,6 @@ class SimulatedSdk:
     pylablib uses an instance as the loaded library. Each simulated function is an attribute: a true C
     function pointer, so that arguments and buffers pass through ctypes as with Andor's library. Functions
     that are not simulated are missing, as in an older library.
-
-    Args:
-        define_functions: pylablib's declaration of the library's functions, made from Andor's header.
     """
 
     def __init__(self, define_functions: Callable[[Any], None]) -> None:

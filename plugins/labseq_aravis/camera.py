@@ -53,9 +53,6 @@ def find_cameras(interfaces: tuple[str, ...] = INTERFACES) -> tuple[FoundCamera,
 
     Args:
         interfaces: Interfaces to search.
-
-    Raises:
-        LibraryMissingError: There is no library.
     """
     lib = load_library()
     for index in range(lib.arv_get_n_interfaces()):
@@ -84,9 +81,6 @@ def camera_id(name: str | None) -> str:
 
     Args:
         name: IP address, id or serial number of the camera; None for the only one.
-
-    Raises:
-        AravisError: There is no such camera, or more than one; the message lists those that were found.
     """
     if name is not None and _is_address(name):
         return name  # opened without a search, which also reaches cameras behind a router
@@ -122,10 +116,6 @@ class Camera:
 
     Attributes:
         is_ethernet: Whether it is a GigE camera.
-
-    Raises:
-        LibraryMissingError: There is no library.
-        AravisError: There is no such camera, it does not answer, or another program controls it.
     """
 
     def __init__(self, name: str | None = None) -> None:
@@ -296,11 +286,7 @@ class Camera:
         return self._library.texts("arv_camera_dup_available_trigger_sources", self._open_handle())
 
     def set_trigger(self, source: str | None) -> None:
-        """Choose what starts a frame.
-
-        Args:
-            source: One of :attr:`trigger_sources`, on its rising edge; None to run without a trigger.
-        """
+        """Choose what starts a frame: a rising edge of one of :attr:`trigger_sources`; None: nothing."""
         if source is None:
             self._call("arv_camera_clear_triggers")
         else:

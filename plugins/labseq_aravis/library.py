@@ -254,9 +254,6 @@ class Library:
     """The functions of Aravis, GObject and GLib in :data:`SIGNATURES`, as typed attributes.
 
     ``library.arv_get_n_devices()`` calls one.
-
-    Raises:
-        LibraryMissingError: A library cannot be loaded.
     """
 
     def __init__(self) -> None:
@@ -272,15 +269,8 @@ class Library:
     def call(self, name: str, *arguments: Any) -> Any:
         """Call a function whose last argument is a GError.
 
-        Args:
-            name: Name of the function.
-            arguments: All arguments but the last.
-
         Returns:
             Its result.
-
-        Raises:
-            AravisError: The function reported an error.
         """
         place = ctypes.POINTER(GError)()
         result = getattr(self, name)(*arguments, ctypes.byref(place))
@@ -292,15 +282,7 @@ class Library:
         return result
 
     def texts(self, name: str, *arguments: Any) -> tuple[str, ...]:
-        """Call a function that returns an array of texts, and free the array.
-
-        Args:
-            name: Name of the function; before its GError comes the place for the number of texts.
-            arguments: All arguments before that.
-
-        Raises:
-            AravisError: The function reported an error.
-        """
+        """Call a function that returns an array of texts and their number; the array is freed."""
         n = ctypes.c_uint()
         array = self.call(name, *arguments, ctypes.byref(n))
         if not array:
@@ -313,14 +295,7 @@ class Library:
             self.g_free(array)
 
     def set_property(self, instance: int, name: str, value: float, type_: int) -> None:
-        """Set a property of an object.
-
-        Args:
-            instance: The object.
-            name: Name of the property.
-            value: The value.
-            type_: Its GType: G_TYPE_INT, G_TYPE_UINT, G_TYPE_DOUBLE, or that of an enumeration.
-        """
+        """Set a property of an object; of a type that is not one of the constants above, it is an enumeration."""
         box = GValue()
         self.g_value_init(ctypes.byref(box), type_)
         if type_ == G_TYPE_DOUBLE:
@@ -356,11 +331,7 @@ class Library:
 
 
 def load_library() -> Library:
-    """The library, loaded when this is first called.
-
-    Raises:
-        LibraryMissingError: It cannot be loaded; says how to install it.
-    """
+    """The library, loaded when this is first called."""
     global _library  # noqa: PLW0603 - a process has one
     with _lock:
         if _library is None:

@@ -178,14 +178,8 @@ class Stream:
     def pop(self, timeout_s: float) -> Buffer | None:
         """Wait for the next frame, complete or not.
 
-        Args:
-            timeout_s: How long to wait; other threads run meanwhile.
-
         Returns:
             The frame; None if none came in time.
-
-        Raises:
-            AravisError: Its pixels cannot be read, see :func:`unpacked`. The buffer is reused anyway.
         """
         handle = self._open_handle()
         buffer = self._library.arv_stream_timeout_pop_buffer(handle, max(0, round(timeout_s * 1e6)))

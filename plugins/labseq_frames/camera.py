@@ -61,10 +61,6 @@ class FramesCamera(CameraDriver):
     Each trigger takes the next frame, whatever the exposure; with the internal trigger each reading does. A
     frame can be read when exposure and read-out have passed on the clock. It has the exposure that it was
     recorded with if the file contains it, else the requested one.
-
-    Args:
-        settings: Which files, and what to do after the last frame.
-        context: Name and clock.
     """
 
     def __init__(self, settings: FramesSettings, context: Context) -> None:

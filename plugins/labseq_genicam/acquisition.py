@@ -34,10 +34,6 @@ class Acquisition:
 
     A camera that waits for software triggers continues to wait from one series to the next, since starting it
     again can take as long as an exposure. Late frames of an earlier series are recognised by their numbers.
-
-    Args:
-        link: The open camera, set up.
-        settings: The driver's settings.
     """
 
     def __init__(self, link: Link, settings: GenicamSettings) -> None:
@@ -59,10 +55,6 @@ class Acquisition:
 
         Returns:
             Time from one exposure to the next with the internal trigger, in seconds; else nan.
-
-        Raises:
-            LimitError: The exposure or the frame rate is out of the camera's range.
-            DeviceError: It has no such trigger, or is gone.
         """
         continues = start == self._start == "software" and self._has_all_frames()
         if not continues:
@@ -79,32 +71,20 @@ class Acquisition:
         return period_s
 
     def begin(self, start: Start) -> None:
-        """Start the prepared series, unless the camera is already waiting for triggers.
-
-        Raises:
-            DeviceError: The camera cannot start, or is gone.
-        """
+        """Start the prepared series, unless the camera is already waiting for triggers."""
         if self._start is None:
             with self._link.doing("start the series") as camera:
                 camera.start()
             self._start = start
 
     def fire(self) -> None:
-        """Start an exposure.
-
-        Raises:
-            DeviceError: The camera refuses, or is gone.
-        """
+        """Start an exposure."""
         with self._link.doing("trigger it") as camera:
             camera.trigger()
         self._n_triggered += 1
 
     def poll(self, seconds: float) -> ExposureResult | None:
-        """Wait for the next frame of the series, for at most ``seconds``; None if none came.
-
-        Raises:
-            DeviceError: The camera is gone, or the frame cannot be decoded.
-        """
+        """Wait for the next frame of the series, for at most ``seconds``; None if none came."""
         buffer = self._pop(seconds)
         if buffer is None:
             return None
@@ -118,19 +98,11 @@ class Acquisition:
         return ExposureResult(number, buffer.image, fault, self._exposure_s, device_time_s=time_s)
 
     def check_alive(self) -> None:
-        """Check that the camera still answers.
-
-        Raises:
-            DeviceError: It is gone.
-        """
+        """Check that the camera still answers."""
         self._link.check_alive()
 
     def stop(self) -> None:
-        """End the acquisition; frames that were not read are dropped, including those being transferred.
-
-        Raises:
-            DeviceError: The camera turns out to be gone.
-        """
+        """End the acquisition; frames that were not read are dropped, including those being transferred."""
         stream, start = self._stream, self._start
         self._stream = self._start = None
         if self._link.is_gone:
@@ -224,11 +196,7 @@ class FrameCounter:
         self._last: tuple[int, int] | None = None
 
     def number(self, frame_id: int | None) -> int:
-        """Number of the frame that has just come, from 0.
-
-        Args:
-            frame_id: The camera's number of it; None for an incomplete frame.
-        """
+        """Number, from 0, of the frame that has just come; its id is None if it is incomplete."""
         number = self.n_frames
         if frame_id is not None and self._last is not None:
             last_number, last_id = self._last

@@ -19,10 +19,6 @@ CHECK_PERIOD_S: Final = 0.5
 class GenicamCamera(CameraDriver):
     """A GigE Vision or USB3 Vision camera.
 
-    Args:
-        settings: Which camera, and how it is set up.
-        context: Clock; for the simulated camera, the simulation.
-
     Raises:
         ConfigError: The simulated camera is chosen, but there is no simulation, or its sensor has no such
             region.

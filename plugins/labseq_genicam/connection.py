@@ -35,10 +35,6 @@ STARTS: Final[dict[str, Start]] = {"software": "software", "internal": "free", "
 class CameraConnection:
     """Where the camera is, and how its exposures start. The simulated camera overrides all of it.
 
-    Args:
-        settings: Settings of the driver.
-        context: Name and clock.
-
     Attributes:
         sensor_shape: (height, width) of the sensor if it is known before the camera is opened.
         packet_size: Bytes of a network packet; None as the camera is set.
@@ -78,12 +74,7 @@ class CameraConnection:
         acquisition.fire()
 
     def wait(self, wait: Callable[[float], ExposureResult | None], timeout_s: float) -> ExposureResult | None:
-        """Wait for a frame on the session's clock.
-
-        Args:
-            wait: Waits for a frame for at most the given seconds of real time.
-            timeout_s: How long to wait, in seconds.
-        """
+        """Wait for a frame on the session's clock."""
         return wait(timeout_s)
 
     def clear(self) -> None:
@@ -91,12 +82,7 @@ class CameraConnection:
 
 
 def connection_for(settings: GenicamSettings, context: Context) -> CameraConnection:
-    """The connection that the settings choose.
-
-    Raises:
-        ConfigError: The simulated camera is chosen, but there is no simulation, or its sensor has no such
-            region.
-    """
+    """The connection that the settings choose."""
     if settings.camera == SIMULATED:
         from labseq_genicam_sim.connection import SimulatedConnection
 
@@ -110,16 +96,12 @@ class Link:
     Each command to a camera that is gone takes 2.5 s, so after the first failure none is sent any more.
 
     Args:
-        name: Name of the camera in the profile, for errors.
         camera: IP address, id or serial number; None for the only camera there is.
 
     Attributes:
         name: Name of the camera in the profile.
         camera: The camera.
         is_gone: Whether it has stopped answering.
-
-    Raises:
-        DeviceError: There is no library, no such camera, or another program controls it.
     """
 
     def __init__(self, name: str, camera: str | None) -> None:
@@ -130,11 +112,7 @@ class Link:
 
     @contextmanager
     def doing(self, what: str) -> Generator[Camera]:
-        """Use the camera within the block; ``what`` completes "cannot ..." in errors.
-
-        Raises:
-            DeviceError: The camera refused, or is gone.
-        """
+        """Use the camera within the block; ``what`` completes "cannot ..." in errors."""
         self.check()
         try:
             with translated_errors(self.name, what):
@@ -147,21 +125,13 @@ class Link:
             raise
 
     def check(self) -> None:
-        """Raise if the camera is known to be gone; sends nothing.
-
-        Raises:
-            DeviceError: It is gone.
-        """
+        """Raise if the camera is known to be gone; sends nothing."""
         self.is_gone = self.is_gone or self.camera.is_lost
         if self.is_gone:
             raise self._gone()
 
     def check_alive(self) -> None:
-        """Read a value from the camera, to find out whether it still answers.
-
-        Raises:
-            DeviceError: It is gone.
-        """
+        """Read a value from the camera, to find out whether it still answers."""
         with self.doing("reach the camera") as camera:
             _ = camera.exposure_s
 
@@ -178,15 +148,7 @@ class Link:
 
 @contextmanager
 def translated_errors(name: str, what: str) -> Generator[None]:
-    """Turn errors of the library into errors of labseq.
-
-    Args:
-        name: Name of the camera in the profile.
-        what: What is being done, to complete "cannot ...".
-
-    Raises:
-        DeviceError: The library raised an error, which is the cause.
-    """
+    """Turn errors of the library into errors of labseq."""
     try:
         yield
     except LibraryMissingError as error:

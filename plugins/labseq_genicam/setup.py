@@ -12,11 +12,7 @@ from labseq_genicam.settings import FORMATS, GenicamSettings, PixelFormat
 
 
 def identify(link: Link, settings: GenicamSettings) -> dict[str, Any]:
-    """Model, serial number and firmware of an open camera: JSON-ready.
-
-    Raises:
-        DeviceError: It is not the camera that the settings name.
-    """
+    """Model, serial number and firmware of an open camera: JSON-ready."""
     with link.doing("identify the camera") as camera:
         found = {
             "vendor": camera.vendor,
@@ -43,10 +39,6 @@ def set_up(link: Link, settings: GenicamSettings, packet_size: int | None) -> di
 
     Returns:
         The resulting settings: JSON-ready.
-
-    Raises:
-        LimitError: A setting is out of the camera's range.
-        DeviceError: The camera lacks a feature that is set.
     """
     with link.doing("set the camera up") as camera:
         camera.stop()

@@ -59,12 +59,8 @@ class SimulatedCamera:
     """A GigE Vision camera on loopback, as long as this process lives.
 
     Args:
-        setup: Serial number, sensor, failures to simulate.
         expose: Makes a frame's bytes, in its pixel format; None fails the frame. Called by the
             camera's own thread, which answers nothing meanwhile.
-
-    Raises:
-        AravisError: It cannot run.
     """
 
     def __init__(self, setup: Setup, expose: Callable[[Exposure], bytes | bytearray | None]) -> None:
@@ -163,11 +159,7 @@ def _start_camera(setup: Setup) -> int:
 
 
 class Process:
-    """The camera, and its communication with the parent.
-
-    Args:
-        channel: Messages from and to the parent.
-    """
+    """The camera, and its communication with the parent."""
 
     def __init__(self, channel: Channel) -> None:
         self._channel = channel

@@ -34,15 +34,7 @@ PACKET_SIZE: Final = 15800
 
 
 class SimulatedConnection(CameraConnection):
-    """A GigE Vision camera in a separate process that shows the simulation.
-
-    Args:
-        settings: Region, binning, read-out time, failures to simulate.
-        context: Clock, simulation, lines.
-
-    Raises:
-        ConfigError: There is no simulation, it does not describe its sensor, or the region is beyond it.
-    """
+    """A GigE Vision camera in a separate process that shows the simulation."""
 
     def __init__(self, settings: GenicamSettings, context: Context) -> None:
         super().__init__(settings, context)
@@ -114,9 +106,6 @@ class SimulatedConnection(CameraConnection):
 
         Its image is made before the trigger is sent: the camera answers nothing while it waits for an image,
         and on a busy computer it would seem to be gone.
-
-        Raises:
-            DeviceError: The camera is gone, or the simulation is already at a later time.
         """
         n = self._fake.n_begun
         if not self._ignores_triggers:

@@ -46,9 +46,7 @@ class FakeCamera:
     Args:
         expose: Makes the image of an exposure, uint16 (height, width). A thread of this object calls
             it, one exposure at a time.
-        serial: Its serial number, at most 15 characters.
         sensor_shape: Height and width of the sensor, in pixels.
-        faults: Failures to simulate.
 
     Attributes:
         address: IP address; empty before it has started.
@@ -74,12 +72,7 @@ class FakeCamera:
         self.address = ""
 
     def start(self) -> None:
-        """Start the process and wait until the camera answers.
-
-        Raises:
-            LibraryMissingError: There is no library.
-            AravisError: It cannot start; the message says why.
-        """
+        """Start the process and wait until the camera answers."""
         if self.is_running:
             return
         self.stop()
@@ -144,24 +137,11 @@ class FakeCamera:
             return self._n_begun
 
     def wait_for_exposure(self, n: int, timeout_s: float, *, answered: bool = False) -> bool:
-        """Wait until the camera has begun an exposure.
-
-        Args:
-            n: Number of the exposure, from 0.
-            timeout_s: How long to wait.
-            answered: Whether to wait until its image has been made, too.
-
-        Returns:
-            Whether it has.
-        """
+        """Wait until the camera has begun exposure ``n``, or its image was made; returns whether it is so."""
         return self._wait(lambda: n < (self._n_answered if answered else self._n_begun), timeout_s)
 
     def set_faults(self, faults: Faults) -> None:
-        """Change the failures to simulate, for frames that begin from now on.
-
-        Raises:
-            AravisError: The camera does not accept them.
-        """
+        """Change the failures to simulate, for frames that begin from now on."""
         self._faults = faults
         if not self.is_running:
             return

@@ -151,11 +151,7 @@ class Channel:
         self._sending = threading.Lock()
 
     def send(self, kind: bytes, data: Any = b"") -> None:
-        """Send a message; ``data`` is any object with contiguous bytes.
-
-        Raises:
-            OSError: The other side is gone.
-        """
+        """Send a message; ``data`` is any object with contiguous bytes."""
         view = memoryview(data).cast("B")
         with self._sending:
             self._write(memoryview(HEAD.pack(kind, len(view))))

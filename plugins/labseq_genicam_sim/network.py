@@ -39,9 +39,6 @@ def has_port() -> bool:
 def move(address: str) -> Cable | None:
     """Move the camera that was just started in this process to another address.
 
-    Args:
-        address: The new address, on loopback.
-
     Returns:
         The cable that transmits its frames from now on. None if the camera stays: the system has no other
         addresses on loopback, or another camera has this address.

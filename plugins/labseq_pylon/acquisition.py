@@ -36,10 +36,6 @@ class Acquisition:
     """The series of an open camera.
 
     Args:
-        sdk: pylon.
-        camera: pylon's ``InstantCamera``, open.
-        nodes: Its nodes.
-        clock: The session's clock, checked for stop requests.
         ready_s: How long the camera may take until it accepts a trigger, in seconds.
     """
 
@@ -54,12 +50,7 @@ class Acquisition:
         self._exposure_s = math.nan
 
     def set_exposure(self, exposure_s: float) -> None:
-        """Set the exposure time; frames carry the value that the camera accepted.
-
-        Raises:
-            LimitError: The exposure is out of the camera's range.
-            DeviceError: The camera is gone.
-        """
+        """Set the exposure time; frames carry the value that the camera accepted."""
         self._check_connected()
         node = self._nodes.get(EXPOSURE, "exposure time")
         taken_us = self._nodes.set_real(node, "exposure", 1e6 * exposure_s, _microseconds)
@@ -72,9 +63,6 @@ class Acquisition:
             trigger: The trigger.
             line: Input of the external one.
             edge: Its edge, "rising" or "falling".
-
-        Raises:
-            DeviceError: The camera has no such trigger.
         """
         choose = self._nodes.choose
         choose(("TriggerSelector",), "trigger", "FrameStart", if_there=True)
@@ -87,12 +75,7 @@ class Acquisition:
             choose(("TriggerActivation",), "trigger edge", activation)
 
     def start(self, n_frames: int) -> None:
-        """Queue the buffers and start; with the internal trigger the first exposure begins.
-
-        Raises:
-            LimitError: More frames than a GigE camera can number.
-            DeviceError: pylon cannot start.
-        """
+        """Queue the buffers and start; with the internal trigger the first exposure begins."""
         if self._is_gige and n_frames > MAX_GIGE_FRAMES:
             what = f"{self._sdk.name}: number of frames"
             raise LimitError(what, n_frames, f"{MAX_GIGE_FRAMES}, the highest frame number of GigE cameras")
@@ -102,12 +85,7 @@ class Acquisition:
             self._camera.StartGrabbingMax(n_frames, self._sdk.pylon.GrabStrategy_OneByOne)
 
     def wait_until_ready(self) -> None:
-        """Wait until the camera accepts a trigger.
-
-        Raises:
-            DeviceTimeoutError: It takes too long.
-            DeviceError: The camera is gone.
-        """
+        """Wait until the camera accepts a trigger."""
         camera, pylon = self._camera, self._sdk.pylon
 
         def ready(seconds: float) -> bool | None:
@@ -128,11 +106,7 @@ class Acquisition:
             self._camera.ExecuteSoftwareTrigger()
 
     def poll(self, seconds: float) -> ExposureResult | None:
-        """Wait for the next buffer, for at most ``seconds``; None if none came.
-
-        Raises:
-            DeviceError: The camera is gone, and no frame is left to be read.
-        """
+        """Wait for the next buffer, for at most ``seconds``; None if none came."""
         camera, pylon = self._camera, self._sdk.pylon
         with self._sdk.doing("read a frame"):
             result = camera.RetrieveResult(_milliseconds(seconds), pylon.TimeoutHandling_Return)

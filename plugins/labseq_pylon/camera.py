@@ -17,10 +17,6 @@ from labseq_pylon.setup import identify, set_up, temperature_k
 class PylonCamera(CameraDriver):
     """A Basler camera.
 
-    Args:
-        settings: Which camera, and how it is set up.
-        context: Clock, and the simulation for pylon's emulated camera.
-
     Raises:
         ConfigError: The simulated camera is chosen, but there is no simulation, or its sensor has no such
             region.

@@ -24,10 +24,6 @@ READY_S: Final = 1.0
 class CameraConnection:
     """A connected camera; pylon's emulated camera overrides all of it.
 
-    Args:
-        settings: Settings of the driver.
-        context: Name and clock.
-
     Attributes:
         sensor_shape: (height, width) of the sensor if it is known before the camera is opened.
         ready_s: How long the camera may take until it accepts a trigger, in seconds.
@@ -43,11 +39,7 @@ class CameraConnection:
         """Do slow work that can be done before the camera is opened."""
 
     def device(self, sdk: Sdk) -> Any:
-        """Pylon's device for the camera.
-
-        Raises:
-            DeviceError: There is no such camera.
-        """
+        """Pylon's device for the camera."""
         return find_camera(sdk, self._settings)
 
     def set_up(self, nodes: Nodes) -> tuple[int, int]:
@@ -83,12 +75,7 @@ class CameraConnection:
 
 
 def connection_for(settings: PylonSettings, context: Context) -> CameraConnection:
-    """The connection that the settings choose.
-
-    Raises:
-        ConfigError: The simulated camera is chosen, but there is no simulation, or its sensor has no such
-            region.
-    """
+    """The connection that the settings choose."""
     if settings.camera == SIMULATED:
         from labseq_pylon.emulation import EmulatedCamera
 
@@ -103,9 +90,6 @@ def find_camera(sdk: Sdk, settings: PylonSettings) -> Any:
 
     Returns:
         pylon's device.
-
-    Raises:
-        DeviceError: There is no such camera, or more than one.
     """
     with sdk.doing("search for cameras"):
         factory = sdk.pylon.TlFactory.GetInstance()
@@ -131,16 +115,8 @@ def find_camera(sdk: Sdk, settings: PylonSettings) -> Any:
 def open_camera(sdk: Sdk, device: Any, model: str | None) -> Any:
     """Open a camera, after checking that it is the right one.
 
-    Args:
-        sdk: pylon.
-        device: pylon's device.
-        model: Expected model; None: any.
-
     Returns:
         pylon's ``InstantCamera``, open.
-
-    Raises:
-        DeviceError: It is another model, or cannot be opened.
     """
     with sdk.doing("open the camera", IN_USE):
         camera = sdk.pylon.InstantCamera(device)

@@ -40,15 +40,7 @@ _LOCK: Final = threading.Lock()
 
 
 class EmulatedCamera(CameraConnection):
-    """Gives the exposures of the simulation to pylon's emulated camera.
-
-    Args:
-        settings: Region, binning, read-out time.
-        context: Clock and simulation.
-
-    Raises:
-        ConfigError: There is no simulation, it does not describe its sensor, or the region is beyond it.
-    """
+    """Gives the exposures of the simulation to pylon's emulated camera."""
 
     def __init__(self, settings: PylonSettings, context: Context) -> None:
         super().__init__(settings, context)
@@ -72,11 +64,7 @@ class EmulatedCamera(CameraConnection):
         self._world.prepare_sensor(self._mode)
 
     def device(self, sdk: Sdk) -> Any:
-        """Create an emulated camera; each driver gets its own.
-
-        Raises:
-            DeviceError: pylon has none.
-        """
+        """Create an emulated camera; each driver gets its own."""
         with sdk.doing("create an emulated camera"), listed():
             layer: Any = sdk.pylon.TlFactory.GetInstance().CreateTl(EMULATION)
             if layer is None or not (infos := layer.EnumerateDevices()):
@@ -118,11 +106,7 @@ class EmulatedCamera(CameraConnection):
         self._sensor.arm(series, self._mode, self._readout_s)
 
     def fire(self, acquisition: Acquisition) -> None:
-        """Expose on the session's clock, write what the sensor sees to the next file, and trigger the camera.
-
-        Raises:
-            DeviceError: The camera is gone, or the simulation is already at a later time.
-        """
+        """Expose on the session's clock, write the picture to the next file, and trigger the camera."""
         acquisition.wait_until_ready()
         frame = self._sensor.expose()
         if frame is not None:
@@ -176,11 +160,7 @@ class EmulatedCamera(CameraConnection):
 
 
 def tiff(image: NDArray[np.uint16]) -> bytes:
-    """An image as an uncompressed TIFF file with one strip.
-
-    Args:
-        image: uint16 (height, width).
-    """
+    """An image as an uncompressed TIFF file with one strip."""
     height, width = image.shape
     tags = {
         256: width,

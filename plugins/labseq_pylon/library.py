@@ -47,15 +47,7 @@ class Sdk:
 
     @contextmanager
     def doing(self, what: str, hint: str = "") -> Generator[None]:
-        """Turn errors of pylon into errors of labseq.
-
-        Args:
-            what: What is being done, to complete "cannot ...".
-            hint: What the user can do.
-
-        Raises:
-            DeviceError: pylon raised an error.
-        """
+        """Turn errors of pylon into errors of labseq."""
         try:
             yield
         except self.genicam.GenericException as error:
@@ -67,12 +59,6 @@ def load_pypylon(name: str) -> Sdk:
     """Import ``pypylon``.
 
     Its types make Python warn when they are created; as of 26.9 the process dies if warnings are errors.
-
-    Args:
-        name: Name of the camera, for the message.
-
-    Raises:
-        DeviceError: The package is missing.
     """
     try:
         with warnings.catch_warnings():
@@ -93,12 +79,7 @@ def _reason(error: Exception) -> str:
 
 
 class Nodes:
-    """The settings of an open camera, which GenICam calls nodes; their names differ between generations.
-
-    Args:
-        sdk: pylon.
-        node_map: pylon's map of nodes.
-    """
+    """The settings of an open camera, which GenICam calls nodes; their names differ between generations."""
 
     def __init__(self, sdk: Sdk, node_map: Any) -> None:
         self._sdk = sdk
@@ -113,11 +94,7 @@ class Nodes:
         return None
 
     def get(self, names: Names, what: str, hint: str = "") -> Any:
-        """The first of these nodes that the camera has now.
-
-        Raises:
-            DeviceError: It has none of them.
-        """
+        """The first of these nodes that the camera has now."""
         node = self.find(names)
         if node is None:
             text = f"the camera has no {what} (no node {one_of(names)})"
@@ -140,9 +117,6 @@ class Nodes:
             what: Its name in errors.
             value: The value to choose.
             if_there: Whether to do nothing if the camera does not have it, or does not allow changes.
-
-        Raises:
-            DeviceError: The camera has no such node, or not this value.
         """
         if if_there and not self._can_write(self.find(names)):
             return
@@ -173,9 +147,6 @@ class Nodes:
 
         Returns:
             The value that the camera accepted.
-
-        Raises:
-            LimitError: The value is out of the camera's range.
         """
         with self._sdk.doing(f"set its {what}"):
             low, high = node.Min, node.Max
@@ -193,9 +164,6 @@ class Nodes:
             what: Its name in errors.
             value: In the node's unit.
             unit: Of the node, for errors: pixels of the sensor per pixel of a frame.
-
-        Raises:
-            LimitError: The value is out of range, or not a valid step; the error names the nearest valid one.
         """
         with self._sdk.doing(f"set its {what}"):
             low, high, step = node.Min, node.Max, node.Inc

@@ -37,10 +37,6 @@ def set_up(sdk: Sdk, nodes: Nodes, settings: PylonSettings, sensor_shape: tuple[
 
     Returns:
         The resulting settings: JSON-ready.
-
-    Raises:
-        LimitError: A setting is out of the camera's range.
-        DeviceError: The camera lacks a feature that is set.
     """
     for auto in ("ExposureAuto", "GainAuto"):
         nodes.choose((auto,), auto, "Off", if_there=True)
@@ -120,11 +116,7 @@ def temperature_k(nodes: Nodes) -> float | None:
 
 
 def sensor_shape(nodes: Nodes) -> tuple[int, int]:
-    """(height, width) of the sensor in pixels, read without binning: some cameras report binned pixels.
-
-    Raises:
-        DeviceError: The camera does not report it.
-    """
+    """(height, width) of the sensor in pixels, read without binning: some cameras report binned pixels."""
     for axis in ("Vertical", "Horizontal"):
         _set_binning(nodes, axis, 1)
     height, width = (nodes.get(names, "size").GetValue() for names in (SENSOR_HEIGHT, SENSOR_WIDTH))
@@ -144,10 +136,6 @@ def set_sensor(
 
     Returns:
         (height, width) of the frames.
-
-    Raises:
-        LimitError: The region goes beyond the sensor, or the camera cannot read it.
-        DeviceError: The camera does not bin.
     """
     y, x, height, width = settings.mode.region or (0, 0, *sensor_shape)
     if y + height > sensor_shape[0] or x + width > sensor_shape[1]:

@@ -36,14 +36,7 @@ class RefusedError(DeviceError):
 
 
 class Instrument:
-    """The commands and values of an instrument on an open line.
-
-    Args:
-        line: The line.
-        settings: The description.
-        device: Its name, for messages.
-        clock: The session's clock.
-    """
+    """The commands and values of an instrument on an open line."""
 
     def __init__(self, line: Line, settings: SerialSettings, device: str, clock: Clock) -> None:
         self.line = line
@@ -52,11 +45,7 @@ class Instrument:
         self._clock = clock
 
     def identify(self) -> dict[str, str]:
-        """Ask the instrument what it is; empty if the profile has no ``identify``.
-
-        Raises:
-            DeviceError: It is another instrument, or does not answer.
-        """
+        """Ask the instrument what it is; empty if the profile has no ``identify``."""
         identify = self._settings.identify
         if identify is None:
             return {}
@@ -75,11 +64,7 @@ class Instrument:
         return self._retried(ask)
 
     def read(self, name: str) -> Scalar:
-        """Read a value, in SI.
-
-        Raises:
-            DeviceError: No reply, or one that the description does not have.
-        """
+        """Read a value, in SI."""
         value = self._settings.values[name]
 
         def ask() -> Scalar:
@@ -94,15 +79,7 @@ class Instrument:
         return self._retried(ask)
 
     def carry_out(self, name: str, values: Mapping[str, Scalar]) -> None:
-        """Send a command, wait for its reply, and until the values are as the command makes them.
-
-        Args:
-            name: Its name.
-            values: Its arguments, in SI, checked.
-
-        Raises:
-            DeviceError: No or a wrong reply.
-        """
+        """Send a command, wait for its reply, and until the values are as the command makes them."""
         command = self._settings.commands[name]
         timeout_s = command.timeout or self._settings.timeout
         text = command.text(values)
@@ -176,10 +153,6 @@ class SerialDevice(Device):
     A line that breaks in a shot fails the shot with ``TransientError``. The next call opens the port once
     more, checks that it is the same instrument, and sends ``on_open`` again; if that fails, it is a
     ``DeviceError``, which ends the run.
-
-    Args:
-        settings: The description.
-        context: Name and clock.
     """
 
     def __init__(self, settings: SerialSettings, context: Context) -> None:

@@ -32,12 +32,6 @@ MAX_REPLY: Final = 4096
 class Line:
     """An open port, and one exchange on it after the other.
 
-    Args:
-        port: The port, open.
-        settings: The description of the instrument.
-        device: Its name, for messages.
-        clock: The session's clock.
-
     Attributes:
         broken: Whether the port was lost; it must be opened again.
         aborted: Set by another thread to end a wait for a reply.
@@ -54,11 +48,6 @@ class Line:
 
     def exchange(self, text: str, timeout_s: float, *, answered: bool = True) -> str:
         """Send a text and wait for the reply; what came before is dropped.
-
-        Args:
-            text: The text to send, without its end.
-            timeout_s: How long the reply may take, in seconds.
-            answered: Whether a reply is expected.
 
         Returns:
             The reply without its end and surrounding spaces; "" if none is expected.
@@ -148,16 +137,7 @@ def _visible(came: bytes) -> str:
 
 
 def open_line(settings: SerialSettings, device: str, clock: Clock) -> Port:
-    """Open the port of a profile exclusively, or a simulated instrument.
-
-    Args:
-        settings: The port and its parameters.
-        device: Name of the instrument, for messages.
-        clock: The session's clock.
-
-    Raises:
-        DeviceError: There is no such port, or another program has it open.
-    """
+    """Open the port of a profile exclusively, or a simulated instrument."""
     if settings.port == SIMULATED:
         return SimulatedPort(settings, clock)
     port = settings.port if settings.usb is None else _find(settings.usb, device)

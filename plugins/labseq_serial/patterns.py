@@ -111,10 +111,6 @@ class Template:
     def read(self, text: str, types: Mapping[str, type[Sent]]) -> dict[str, Sent] | None:
         """Read the arguments from a text that was sent, as the instrument does.
 
-        Args:
-            text: The text.
-            types: Type of each argument.
-
         Returns:
             None if the text does not match the template.
 

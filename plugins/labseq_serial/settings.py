@@ -185,11 +185,7 @@ class CommandSettings(Settings):
 
 
 def check_pattern(pattern: str | None, key: str) -> re.Pattern[str] | None:
-    """Refuse a text that is not a pattern.
-
-    Raises:
-        PydanticCustomError: With its place.
-    """
+    """Refuse a text that is not a pattern."""
     try:
         return None if pattern is None else compiled(pattern)
     except ValueError as error:
@@ -197,11 +193,7 @@ def check_pattern(pattern: str | None, key: str) -> re.Pattern[str] | None:
 
 
 def check_reply(pattern: str, example: str | None) -> None:
-    """Refuse a pattern of replies for which there is no example.
-
-    Raises:
-        PydanticCustomError: With its place.
-    """
+    """Refuse a pattern of replies for which there is no example."""
     compiled_pattern = check_pattern(pattern, "reply")
     if example is None:
         what = f"labseq cannot generate a reply like '{clean(pattern)}'"

@@ -17,10 +17,6 @@ class SimulatedPort:
 
     A value that has the name of an argument is that argument's last value; a value that a command ``makes``
     is as the command made it; any other value is plausible. Bytes take the time that they take on a line.
-
-    Args:
-        settings: The description.
-        clock: The session's clock.
     """
 
     def __init__(self, settings: SerialSettings, clock: Clock) -> None:

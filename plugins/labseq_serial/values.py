@@ -281,9 +281,6 @@ def check_limits(unit: str | None, low: Number | None, high: Number | None, *at:
         low: The least.
         high: The most.
         *at: Where the limits are, below what is validated.
-
-    Raises:
-        PydanticCustomError: With its place.
     """
     try:
         quantity = Unit.of(unit or "")

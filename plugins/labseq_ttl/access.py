@@ -18,10 +18,6 @@ MAX_WAIT_S: Final = 1.0
 class RealBox:
     """A box at a serial port. A ``SimulatedAccess`` has the same methods.
 
-    Args:
-        port: Name of the port.
-        device: Name of the box, for messages.
-
     Attributes:
         max_wait_s: How long an answer may take, in seconds.
         real_time: Whether the box takes as long as a program lasts, and keeps time limits itself.

@@ -51,9 +51,6 @@ def open_box(name: str, device: str) -> Port:
     Args:
         name: Name of the port, as in the profile.
         device: Name of the box, for messages.
-
-    Raises:
-        DeviceError: There is no such port, or another program has it open.
     """
     return open_port(name, device, BAUD_RATE, write_timeout=WRITE_TIMEOUT_S)
 
@@ -64,12 +61,6 @@ class Conversation:
     Every line carries a tag, which the answer repeats, so that a late answer is not taken for that of
     another command. A damaged line is sent again, on either side. The box also sends messages without
     being asked, such as the end of a program.
-
-    Args:
-        port: The port, open.
-        device: Name of the box, for messages.
-        clock: The session's clock.
-        max_wait_s: How long an answer may take, in seconds.
     """
 
     def __init__(self, port: Port, device: str, clock: Clock, max_wait_s: float) -> None:
@@ -98,11 +89,6 @@ class Conversation:
 
         Returns:
             The words after "ok".
-
-        Raises:
-            DeviceTimeoutError: No answer.
-            DeviceError: The box refuses, or the line is broken.
-            StopRequested: The operator asked the run to stop.
         """
         max_wait_s = self._max_wait_s if max_wait_s is None else max_wait_s
         with self.lock:
@@ -125,12 +111,7 @@ class Conversation:
         raise DeviceTimeoutError(self._device, self._silence_text(question, max_wait_s), max_wait_s)
 
     def new_events(self, timeout_s: float = 0.0) -> list[str] | None:
-        """Wait for a message of the box that is no answer; returns its words, or None if none came.
-
-        Raises:
-            DeviceError: The line is broken.
-            StopRequested: The operator asked the run to stop.
-        """
+        """Wait for a message of the box that is no answer; returns its words, or None if none came."""
         return self._wait(lambda: self._news.popleft() if self._news else None, timeout_s)
 
     def drop_messages(self) -> None:
@@ -140,11 +121,7 @@ class Conversation:
             self._news.clear()
 
     def stop(self) -> None:
-        """Turn all lines off, whatever the box is doing, and end the waits of other threads.
-
-        Raises:
-            DeviceError: The box does not confirm it.
-        """
+        """Turn all lines off, whatever the box is doing, and end the waits of other threads."""
         self._aborted = True
         try:
             self.send(STOP)
@@ -160,11 +137,7 @@ class Conversation:
             self._port.close()
 
     def send(self, data: bytes) -> None:
-        """Send bytes as they are.
-
-        Raises:
-            DeviceError: The line is broken.
-        """
+        """Send bytes as they are."""
         with self._unbroken():
             self._port.write(data)
 
@@ -266,12 +239,6 @@ class BoxState:
 class Box:
     """A timing box on an open port.
 
-    Args:
-        port: The port.
-        device: Name of the box, for messages.
-        clock: The session's clock.
-        max_wait_s: How long an answer may take, in seconds.
-
     Attributes:
         line: The conversation with it.
     """
@@ -282,12 +249,7 @@ class Box:
         self._max_wait_s = max_wait_s
 
     def identify(self) -> Identity:
-        """Wait until the box answers, and check that it is one.
-
-        Raises:
-            DeviceTimeoutError: Nothing answers.
-            DeviceError: It is something else, or its firmware has another version of the protocol.
-        """
+        """Wait until the box answers, and check that it is one."""
         words = self._first_answer()
         if len(words) < 2 or words[0] != NAME:
             text = f"'{clean(' '.join(words))}' answers; expected '{NAME}'; is this the right port?"

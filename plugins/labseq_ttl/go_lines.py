@@ -21,11 +21,7 @@ MORE: Final = "`go` rose again while labseq was busy, and was refused"
 
 
 def ttl_lines(settings: TtlSettings, context: Context) -> TtlLines:
-    """The driver, with the start signal of an external control system if the profile has it.
-
-    Raises:
-        ConfigError: A line is on an output of the external control system.
-    """
+    """The driver, with the start signal of an external control system if the profile has it."""
     if settings.go is None:
         return TtlLines(settings, context)
     outputs = settings.go.outputs
@@ -42,9 +38,7 @@ class GoLines(TtlLines):
     The box itself detects the edge, raises `busy`, and keeps the deadline, also if labseq hangs or dies.
 
     Args:
-        settings: Of the box.
         go: What is wired to the external control system.
-        context: See :class:`~labseq_ttl.lines.TtlLines`.
     """
 
     def __init__(self, settings: TtlSettings, go: GoSettings, context: Context) -> None:
@@ -184,13 +178,7 @@ class Leader:
 
 
 class LeaderPins:
-    """The start input and the outputs of a leader.
-
-    Args:
-        box: The box.
-        settings: Which outputs they are.
-        deadline_s: Of an answer; 0 for none.
-    """
+    """The start input and the outputs of a leader; its deadline is 0 if it has none."""
 
     def __init__(self, box: Box, settings: GoSettings, deadline_s: float) -> None:
         self._box = box

@@ -52,10 +52,6 @@ TOO_FAST: Final = 0.95
 class TtlLines(Lines):
     """A timing box with labseq's firmware.
 
-    Args:
-        settings: Port, start, the kind of a simulated box.
-        context: Lines, clock and simulation.
-
     Attributes:
         access: How the driver gets to the box.
     """

@@ -19,14 +19,6 @@ def edges_of(program: LineProgram, specs: Sequence[LineSpec], device: str) -> tu
     """The edges of a program.
 
     An edge without a change marks its end, so that the box itself reports when it is over.
-
-    Args:
-        program: The program.
-        specs: The lines, in the program's order.
-        device: Name of the box, for messages.
-
-    Raises:
-        LimitError: More edges, or closer together, than the box can make.
     """
     what = f"{device}: `{program.kind}`"
     if len(program.t_s) > MAX_EDGES:
@@ -48,13 +40,7 @@ def edges_of(program: LineProgram, specs: Sequence[LineSpec], device: str) -> tu
 
 
 def as_played(edges: Sequence[Edge], program: LineProgram, specs: Sequence[LineSpec]) -> LineProgram:
-    """The played edges as a program; edges at which nothing changed are left out.
-
-    Args:
-        edges: Ticks since the first edge, and what was on from then on.
-        program: The program that was fired.
-        specs: The lines, in the program's order.
-    """
+    """The played edges as a program, in ticks since the first; those that changed nothing are left out."""
     ours = sum(1 << spec.channel for spec in specs)  # other outputs may belong to a leader
     edges = [(tick, mask & ours) for tick, mask in edges]
     changes = [edge for i, edge in enumerate(edges) if i == 0 or edge[1] != edges[i - 1][1]]

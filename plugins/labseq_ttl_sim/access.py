@@ -19,8 +19,6 @@ class SimulatedAccess:
     """A simulated box. It plays a program at once, while the session's clock decides how long that takes.
 
     Args:
-        settings: Of the driver.
-        context: Name, clock, lines and simulation.
         polarity: Outputs that are low when they are on: bit n is channel n.
 
     Attributes:
@@ -40,20 +38,12 @@ class SimulatedAccess:
         self.box: ModelBox | SimavrBox | None = None
 
     def warm(self) -> None:
-        """Compile what runs the firmware, unless the box is the model.
-
-        Raises:
-            DeviceError: It cannot be compiled.
-        """
+        """Compile what runs the firmware, unless the box is the model."""
         if self._settings.simulated_by == "simavr":
             runner(self._name)
 
     def connect(self) -> Port:
-        """Turn a new box on; returns its serial port, open.
-
-        Raises:
-            DeviceError: It cannot be compiled or started.
-        """
+        """Turn a new box on; returns its serial port, open."""
         self.box = self._new_box()
         return self.box.port
 
@@ -74,11 +64,7 @@ class SimulatedAccess:
             self._simulation.play("lines", program, self._clock.now())
 
     def fired(self, program: LineProgram | None) -> None:
-        """The driver has fired a program: pass what the outputs did to the simulation.
-
-        Args:
-            program: The program; None for one that changes no line.
-        """
+        """The driver has fired a program: pass what the outputs did to the simulation."""
         edges = self._connected().played(self._polarity)
         if program is not None:
             self.lines_set(as_played(edges, program, self._specs))
@@ -92,9 +78,6 @@ class SimulatedAccess:
 
         Returns:
             How long to wait for the box, in seconds.
-
-        Raises:
-            DeviceTimeoutError: It does not end within ``timeout_s``.
         """
         left_s = end_s - self._clock.now()
         self._clock.sleep(max(0.0, min(left_s, timeout_s)))
@@ -107,9 +90,6 @@ class SimulatedAccess:
 
         Returns:
             How long to wait for the box, in seconds.
-
-        Raises:
-            DeviceTimeoutError: It takes longer than ``timeout_s``.
         """
         assert self._settings.go is not None
         delay_s, simulation, start_s = (

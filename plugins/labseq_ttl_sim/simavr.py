@@ -37,16 +37,9 @@ MAX_WAIT_S: Final = 60.0
 class SimavrBox:
     """A box: the firmware run by simavr.
 
-    Args:
-        device: Name of the box, for messages.
-        clock: The session's clock, checked for a stop request.
-
     Attributes:
         name: Name of its serial port.
         port: The port.
-
-    Raises:
-        DeviceError: It cannot be built or started.
     """
 
     def __init__(self, device: str, clock: Clock) -> None:
@@ -124,9 +117,6 @@ class SimavrBox:
 
         Returns:
             Clock cycle, and the levels from then on; None after a reset.
-
-        Raises:
-            DeviceError: The simulator died.
         """
         course: list[tuple[int, int | None]] = []
         while True:
@@ -175,14 +165,7 @@ class SimavrBox:
 
 
 def runner(device: str) -> Path:
-    """The compiled program that runs the firmware, from labseq's cache.
-
-    Args:
-        device: Name of the box, for messages.
-
-    Raises:
-        DeviceError: It cannot be compiled; the text says what to install.
-    """
+    """The compiled program that runs the firmware, from labseq's cache."""
     digest = hashlib.sha256(SOURCE.read_bytes()).hexdigest()[:24]
     program = cache_root() / "ttl" / digest / "runner"
     if not program.is_file():
