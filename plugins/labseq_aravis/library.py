@@ -295,7 +295,7 @@ class Library:
             self.g_free(array)
 
     def set_property(self, instance: int, name: str, value: float, type_: int) -> None:
-        """Set a property of an object; of a type that is not one of the constants above, it is an enumeration."""
+        """Set a property of an object; a type other than the constants above is that of an enumeration."""
         box = GValue()
         self.g_value_init(ctypes.byref(box), type_)
         if type_ == G_TYPE_DOUBLE:
