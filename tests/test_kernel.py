@@ -49,7 +49,7 @@ TOP = """
 
 
 class Package:
-    """A package of kernels in a folder of its own, which can be edited and imported anew."""
+    """A package of kernels in a folder of its own, which can be edited and imported again."""
 
     def __init__(self, folder: Path, name: str) -> None:
         self.folder = folder / name
@@ -101,10 +101,6 @@ def test_an_edit_of_a_callee_in_another_file_is_seen(package: Package) -> None:
     assert package.result() == 104
     package.write("leaf", LEAF.format(step=1))
     assert package.result() == 102
-
-
-def test_an_edit_of_a_constant_in_another_file_is_seen(package: Package) -> None:
-    assert package.result() == 102
     package.write("constants", "OFFSET = 200")
     assert package.result() == 202
 
@@ -128,12 +124,12 @@ def test_a_cache_that_cannot_be_written_does_no_harm(
 
 
 @pytest.mark.parametrize("suffix", ["nbi", "nbc"])
-def test_files_cut_short_by_a_crash_are_replaced(package: Package, cache: Path, suffix: str) -> None:
+def test_files_truncated_by_a_crash_are_replaced(package: Package, cache: Path, suffix: str) -> None:
     package.load()
-    for file in cache.rglob(f"*.{suffix}"):
+    for file in cache.rglob(f"*leaf*.{suffix}"):
         file.write_bytes(file.read_bytes()[:7])
     assert package.result() == 102
-    assert compiled_modules(package.load) == ["leaf", "middle", "top"]
+    assert compiled_modules(package.load) == ["leaf"]
     assert compiled_modules(package.load) == []
 
 
@@ -177,6 +173,8 @@ def test_several_signatures_and_read_only_arrays(cache: Path) -> None:
             result += value
         return result + MAX_LACK
 
+    options: Any = total
+    assert options.targetoptions["nogil"]  # other threads run while a kernel does
     values = np.arange(4)
     assert total(values) == 9
     values.flags.writeable = False
@@ -184,15 +182,6 @@ def test_several_signatures_and_read_only_arrays(cache: Path) -> None:
     assert total(values / 2) == 6.0
     with pytest.raises(TypeError, match="No matching definition"):
         total(values.astype(np.int16))
-
-
-def test_the_lock_of_python_is_free_while_a_kernel_runs(cache: Path) -> None:
-    @kernel("int64(int64)")
-    def same(x: int) -> int:
-        return x
-
-    options: Any = same
-    assert options.targetoptions["nogil"]
 
 
 def run_python(code: str, **environment: str) -> str:
@@ -255,9 +244,11 @@ def test_kernels_are_plain_python_without_the_compiler() -> None:
         plan = PscaPlanner(PscaSettings(degree_of_parallelism=3), Context()).plan(atoms, target)
         report = check_plan(plan, atoms, target, 3)
         program = tone_program(plan, SiteGrid(8, 7))
-        print(plan.moves.tolist(), plan.batch_offsets.tolist(), report.meets_target)
-        print(report.batch_end_s.tolist(), program.column.end_hz.tolist(), program.row.phase_rad.tolist())
+        arrays = (plan.moves, report.batch_end_s, program.column.end_hz, program.row.phase_rad)
+        result = repr([bool(report.meets_target), *(array.tolist() for array in arrays)])
     """
-    plain = run_python(code, NUMBA_DISABLE_JIT="1")
-    assert plain == run_python(code)
-    assert "True" in plain
+    scope: dict[str, Any] = {}
+    exec(textwrap.dedent(code), scope)
+    plain = run_python(textwrap.dedent(code) + "print(result)", NUMBA_DISABLE_JIT="1")
+    assert plain == scope["result"]
+    assert plain.startswith("[True")

@@ -26,7 +26,7 @@ from labseq.roles import WHOLE_SENSOR, NeverStopped
 from labseq.testing.fakes import RecordingSimulation
 from tests.plugins.needs import need_library
 
-N_FRAMES: Final = int(os.environ.get("LABSEQ_FRAMES", "25"))
+N_FRAMES: Final = int(os.environ.get("LABSEQ_FRAMES", "5"))
 EXPOSURE_S: Final = 1e-3
 
 
@@ -56,7 +56,7 @@ def pylon(context: Context) -> CameraDriver:
     return PylonCamera(PylonSettings.model_validate({"camera": "simulated", "readout": "0 ms"}), context)
 
 
-@pytest.fixture(params=[andor, genicam, pylon], ids=lambda make: make.__name__)
+@pytest.fixture(scope="module", params=[andor, genicam, pylon], ids=lambda make: make.__name__)
 def camera(request: pytest.FixtureRequest) -> Generator[CameraDriver]:
     make: Callable[[Context], CameraDriver] = request.param
     context = Context("camera", SiteGrid(), clock=NeverStopped(), simulation=StillWorld())

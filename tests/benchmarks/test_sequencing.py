@@ -23,14 +23,14 @@ SHOTS = {"1 step": 1, "101 steps": 101}
 
 
 class Nowhere:
-    """Keeps nothing, and tells nobody."""
+    """Keeps nothing and reports nothing."""
 
     def write_shot(self, shot: ShotRecord) -> None:
-        """Forget it, but for how long its steps were said to take."""
+        """Keep only the number of its timed stages."""
         self.n_stages = len(shot.timing)
 
     def event(self, name: str, values: Mapping[str, Any]) -> None:
-        """Likewise."""
+        """Forget it."""
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, strategies as st
+from hypothesis import given, settings, strategies as st
 
 from labseq.model import AxisTones, FrequencyCourse, ToneProgram
 from labseq.testing.strategies import tone_programs
@@ -71,6 +71,7 @@ def test_a_ramp_is_linear_in_depth() -> None:
     assert depth == pytest.approx([0.0, 0.01, 0.02])
 
 
+@settings(max_examples=25)
 @given(tone_programs())
 def test_at_a_joint_the_next_segment_has_begun(program: ToneProgram) -> None:
     for i, t_s in enumerate(program.joint_s[:-1].tolist()):

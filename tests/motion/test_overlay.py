@@ -29,7 +29,7 @@ def probe(
     hidden=st.tuples(*[st.floats(-0.25e-6, 0.25e-6)] * 2),
     seed=st.integers(0, 2**32 - 1),
 )
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=8, deadline=None)
 def test_a_hidden_offset_is_found_to_a_few_of_its_errors(
     atoms: Any, lattice: str, hidden: tuple[float, float], seed: int
 ) -> None:
@@ -45,11 +45,11 @@ def test_a_hidden_offset_is_found_to_a_few_of_its_errors(
 def test_errors_cover_the_truth_as_often_as_they_should(atoms: Any) -> None:
     offset, hidden = atoms.scan(), np.array([0.12e-6, -0.07e-6])
     pulls = []
-    for seed in range(60):
+    for seed in range(30):
         fit = fit_overlay(offset, *probe(atoms, offset, hidden, 120, seed), GRID)
         pulls.append((fit.centre_m + hidden) / fit.error_m)
     within = np.abs(pulls) < 1
-    assert 0.55 < within.mean() < 0.85  # 120 values: 0.68 within 3 s.d.
+    assert 0.55 < within.mean() < 0.85  # 60 values: 0.68 within 3 s.d.
     assert abs(np.mean(pulls)) < 0.3
 
 
@@ -98,7 +98,7 @@ def test_counts_of_each_site_are_added_up(atoms: Any) -> None:
     assert split.n_atoms == whole.n_atoms == n.sum()
 
 
-@pytest.mark.parametrize("share", [0.0, 0.02, 0.5, 0.97, 1.0])
+@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
 def test_without_a_peak_there_is_no_overlay(atoms: Any, share: float) -> None:
     offset = atoms.scan()
     n = np.full(len(offset), 200)

@@ -43,11 +43,6 @@ def test_courses_and_their_derivatives_belong_together(kind: FrequencyCourse, u:
     assert bend == pytest.approx((after[2] - before[2]) / (2 * h), abs=1e-4)
 
 
-@pytest.mark.parametrize("kind", FrequencyCourse)
-def test_a_frequency_is_on_average_half_way(kind: FrequencyCourse) -> None:
-    assert render_direct_kernels.course(kind, 1.0)[0] == pytest.approx(0.5)
-
-
 @given(st.floats(0, 0.5), st.floats(-1e-6, 1e-6))
 def test_a_chirp_is_filled_in_right(frequency: float, chirp: float) -> None:
     n = 300
@@ -155,7 +150,7 @@ def test_frequencies_are_collected_once_each_and_in_order(hz: list[float]) -> No
     assert found[:n].tolist() == np.unique(np.round(hz)).tolist()
 
 
-def test_more_frequencies_than_a_comb_can_have_are_told() -> None:
+def test_more_frequencies_than_a_comb_can_have() -> None:
     hz = 1e6 + np.arange(render_comb_kernels.MAX_TONES + 1.0)
     assert (
         render_comb_kernels.distinct_tones(hz[:-1], np.empty(render_comb_kernels.MAX_TONES))
@@ -213,17 +208,6 @@ def take(**changes: tuple[int, float]) -> tuple[tuple[int, int], NDArray[np.floa
     return take_tones(start_hz, end_hz, start, end, phase, OFFSETS, RATE_HZ, tones), tones
 
 
-def test_tones_are_brought_into_cycles_and_samples() -> None:
-    fault, tones = take()
-    assert fault == (FINE, -1)
-    assert tones[START].tolist() == [90e6 / RATE_HZ] * 5
-    assert tones[END].tolist() == [91e6 / RATE_HZ] * 5
-    assert tones[START_AMPLITUDE].tolist() == [0.3] * 5
-    assert tones[END_AMPLITUDE].tolist() == [0.1] * 5
-    assert tones[PHASE].tolist() == [2.0 / (2 * np.pi)] * 5
-
-
-@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
 @pytest.mark.parametrize(
     ("name", "field"),
     [
@@ -234,8 +218,9 @@ def test_tones_are_brought_into_cycles_and_samples() -> None:
         ("phase_rad", PHASE),
     ],
 )
-def test_what_is_not_finite_is_found(name: str, field: int, value: float) -> None:
-    assert take(**{name: (3, value)})[0] == (field, 3)
+def test_what_is_not_finite_is_found(name: str, field: int) -> None:
+    assert take(**{name: (3, math.nan)})[0] == (field, 3)
+    assert take(**{name: (4, -math.inf)})[0] == (field, 4)
 
 
 @pytest.mark.parametrize(
@@ -254,7 +239,3 @@ def test_what_is_not_finite_is_found(name: str, field: int, value: float) -> Non
 )
 def test_limits_are_kept(name: str, value: float, fault: tuple[int, int]) -> None:
     assert take(**{name: (1, value)})[0] == fault
-
-
-def test_a_sum_is_blamed_on_its_segment() -> None:
-    assert take(start_amplitude=(4, 0.5))[0] == (SUM, 2)
