@@ -1,10 +1,10 @@
-"""Runs of the real command line in processes of its own, on devices that note every call."""
+"""Runs of the command line on devices that note every call, in processes of their own or in this one."""
 
 import json
 import os
-import signal
 import subprocess
 import sys
+import threading
 import time
 from contextlib import redirect_stderr, redirect_stdout
 from io import StringIO
@@ -19,6 +19,7 @@ WATCHED = '''
 """The virtual devices, noting every call in a file as it is entered."""
 import os
 import pathlib
+import threading
 
 from labseq.plugin import Context, Settings, hookimpl
 from labseq_virtual import camera, devices, settings, tweezers
@@ -36,12 +37,13 @@ def watched(cls, role):
                 log.write(f"{role}.{method}\\n")
             if f"{role}.{method}" == os.environ.get("WATCHED_FAILS"):
                 raise RuntimeError("rehearsed failure")
-            if f"{role}.{method}" == os.environ.get("WATCHED_HANGS"):
-                import threading
+            if f"{role}.{method}" in os.environ.get("WATCHED_HANGS", "").split():
                 threading.Event().wait()
-            slow, _, n = os.environ.get("WATCHED_SLOW", "").partition(":")
-            if f"{role}.{method}" == slow and LOG.read_text().split().count(slow) == int(n):
-                self._clock.sleep(3600.0)
+            stopping, n, number, slow = os.environ.get("WATCHED_SIGNAL", ":::").split(":")
+            if f"{role}.{method}" == stopping and LOG.read_text().split().count(stopping) == int(n):
+                threading.Timer(0.05, os.kill, (os.getpid(), int(number))).start()
+                if slow:
+                    self._clock.sleep(3600.0)
             self.__dict__["inside"] = True
             try:
                 return getattr(cls, method)(self, *args, **kwargs)
@@ -104,7 +106,7 @@ STEPS = """
 """
 
 
-class ResolvedProfile:
+class WatchedLab:
     """A folder with a sequence, a profile whose devices note their calls, and a place for data."""
 
     def __init__(self, folder: Path) -> None:
@@ -121,16 +123,14 @@ class ResolvedProfile:
         (self.folder / "sequence.yaml").write_text(SEQUENCE + steps, encoding="utf-8")
 
     def start(self, *arguments: str) -> subprocess.Popen[str]:
-        command = [sys.executable, "-m", "labseq", *arguments]
-        pipe = subprocess.PIPE
         return subprocess.Popen(
-            command,
+            [sys.executable, "-m", "labseq", *arguments],
             cwd=self.folder,
             env=self.environment,
             text=True,
-            stdout=pipe,
-            stderr=pipe,
             stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
         )
 
     def run_apart(self, *arguments: str, timeout: float = 120.0) -> subprocess.CompletedProcess[str]:
@@ -164,7 +164,7 @@ class ResolvedProfile:
             if time.monotonic() > deadline:
                 process.kill()
                 raise AssertionError(f"{call} was not called; calls so far: {self.calls()}")
-            select_pause()
+            threading.Event().wait(0.005)
 
     def run_dir(self) -> Path:
         (state,) = self.data.glob("*/*/STATE")
@@ -179,19 +179,7 @@ class ResolvedProfile:
         lines = [json.loads(line) for line in text.splitlines()]
         return [line for line in lines if line["event"] == name]
 
-    def interrupt(self, process: subprocess.Popen[str], number: int = signal.SIGINT) -> tuple[int, str, str]:
-        process.send_signal(number)
-        out, err = process.communicate(timeout=60.0)
-        return process.returncode, out, err
-
-
-def select_pause() -> None:
-    """Give way to the process that is waited for."""
-    import threading
-
-    threading.Event().wait(0.005)
-
 
 @pytest.fixture
 def bench(tmp_path):
-    return ResolvedProfile(tmp_path)
+    return WatchedLab(tmp_path)

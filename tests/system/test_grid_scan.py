@@ -1,4 +1,4 @@
-"""A scan of 3 x 4 points, 5 times each: plotted, exported, compared with the files read by plain h5py."""
+"""A scan of 3 x 4 points, twice each: exported, compared with the files read by plain h5py."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ planner: {use: psca}
 scan:
   planner.degree_of_parallelism: [1, 2, 4]
   shot.2.rearrange.window: [5 ms, 10 ms, 20 ms, 60 ms]
-repeats: 5
+repeats: 2
 order: shuffled
 record_frames: none
 shot:
@@ -52,23 +52,18 @@ def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
         return session.run().path
 
 
-def call(*arguments: str) -> str:
-    result = CliRunner().invoke(app, arguments)
-    assert result.exit_code == 0, result.output
-    return result.output
-
-
-def test_every_point_was_taken_as_often_as_asked(run_dir: Path) -> None:
+def test_every_point_was_taken_twice(run_dir: Path) -> None:
     taken = [tuple(shot.parameters.values()) for shot in labseq.open_run(run_dir).shots]
-    assert sorted(taken) == sorted([*itertools.product(DOPS, WINDOWS_S)] * 5)
+    assert sorted(taken) == sorted([*itertools.product(DOPS, WINDOWS_S)] * 2)
 
 
 def test_the_exported_table_agrees_with_the_files(run_dir: Path, tmp_path: Path) -> None:
     target = tmp_path / "table.csv"
-    call("export", str(run_dir), "--to", "csv", "--output", str(target))
+    result = CliRunner().invoke(app, ["export", str(run_dir), "--to", "csv", "--output", str(target)])
+    assert result.exit_code == 0, result.output
     with target.open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
-    assert len(rows) == 60
+    assert len(rows) == 24
     for row in rows:
         with h5py.File(run_dir / row["file"], "r") as file:
             shot = cast("Mapping[str, Any]", file)
@@ -81,9 +76,3 @@ def test_the_exported_table_agrees_with_the_files(run_dir: Path, tmp_path: Path)
         assert int(row["n_batches"]) == batches["n_batches_played"].sum()
         for address, value in changed.items():
             assert float(row[address]) == value
-
-
-def test_it_is_plotted(run_dir: Path, tmp_path: Path) -> None:
-    picture = tmp_path / "scan.png"
-    call("plot", str(run_dir), "--output", str(picture))
-    assert picture.stat().st_size > 5_000

@@ -27,7 +27,7 @@ sys.modules[spec.name] = script
 spec.loader.exec_module(script)
 
 SEQUENCES = Path(__file__).parents[2] / "sequences"
-N_SHOTS = int(os.environ.get("LABSEQ_FIGURE_SHOTS", "120"))
+N_SHOTS = int(os.environ.get("LABSEQ_FIGURE_SHOTS", "60"))
 MISSED = 5e-5
 """Atoms that the detector misses, as docs/explanation/virtual-images.md has them."""
 
