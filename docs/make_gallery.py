@@ -18,8 +18,7 @@ from labseq import SiteGrid, TargetPattern
 from labseq.config.document import Document
 from labseq.pictures.plans import save_target
 from labseq.session import load_plugins
-from labseq.session.construct import construct_target
-from labseq.session.profile import resolve
+from labseq.session.chosen import construct_target, resolve
 from labseq.settings import PatternChoice
 
 DOCS = Path(__file__).parent

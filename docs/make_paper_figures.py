@@ -30,8 +30,8 @@ from numpy.typing import NDArray
 from labseq import Run, Session, ShotRecord, open_run
 from labseq.analysis.statistics import Rate, Statistics, statistics_of
 from labseq.recording.points import scan_points
-from labseq.sequencer import Sequencer
 from labseq.sequencer.policies import RunPolicy
+from labseq.sequencer.run import Sequencer
 
 DOCS = Path(__file__).parent
 SEQUENCES = DOCS.parent / "sequences"

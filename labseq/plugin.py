@@ -112,6 +112,7 @@ from labseq.roles import (
     StepContext,
     ToneSource,
     Trigger,
+    find_leader,
     offers,
 )
 from labseq.roles.shot import NeverStopped
@@ -249,6 +250,7 @@ __all__ = [
     "const",
     "empty_is",
     "expected",
+    "find_leader",
     "fitting_batches",
     "format_quantity",
     "from_the_centre",

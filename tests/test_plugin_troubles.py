@@ -25,8 +25,7 @@ from labseq.errors import LabseqError, PluginLoadError
 from labseq.plugins import LOCAL_PACKAGE, PluginHost, PluginInfo, call_plugin
 from labseq.registry import Entry, Owner
 from labseq.roles import Context
-from labseq.session.construct import construct_one, construct_target
-from labseq.session.profile import ChosenPlugin, validate
+from labseq.session.chosen import ChosenPlugin, construct_one, construct_target, validate
 
 GOOD = '''
 from labseq.plugin import Settings, hookimpl

@@ -35,12 +35,12 @@ from labseq.recording import Run, Shot
 from labseq.recording.folders import PROFILE_FILE, SEQUENCE_FILE
 from labseq.roles import Detector, NeedsWarmUp, NeverStopped, Planner
 from labseq.session.assembly import Assembly, assemble
-from labseq.session.construct import construct
-from labseq.session.lab import parallelism_of
+from labseq.session.chosen import ChosenPlugin, resolve
+from labseq.session.lab import construct, parallelism_of
 from labseq.session.occupancies import image_before
 from labseq.session.options import Options
 from labseq.session.planning import call_planner, changed_settings
-from labseq.session.profile import ChosenPlugin, RecordedSetup, resolve
+from labseq.session.profile import RecordedSetup
 from labseq.session.recorded import calibrations_of, machine_of, stored_text
 from labseq.session.scan import Point
 from labseq.session.scan_run import point_of, scan_run_of

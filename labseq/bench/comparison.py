@@ -22,10 +22,10 @@ from labseq.model import MotionSpec, Occupancy, Plan, SiteGrid, TargetPattern
 from labseq.motion import check_plan
 from labseq.plugins import PluginHost
 from labseq.roles import NeedsWarmUp, NeverStopped, Planner
-from labseq.session.construct import construct, construct_target
+from labseq.session.chosen import ChosenPlugin, construct_target, dump, load_plugins, resolve
+from labseq.session.lab import construct
 from labseq.session.occupancies import MAX_SITES
 from labseq.session.planning import parse_target
-from labseq.session.profile import ChosenPlugin, dump, load_plugins, resolve
 from labseq.settings import Choice, PatternChoice
 from labseq.units import parse_quantity
 

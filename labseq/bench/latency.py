@@ -18,8 +18,9 @@ from labseq.guard import stop_on_signals
 from labseq.model import Frame, Occupancy, Plan, ShotRecord, StageTiming, TargetPattern, TimelineEntry
 from labseq.motion import Renderer, RenderPath, check_plan, comb_sample_rate, tone_program
 from labseq.roles import Detector, Planner, Shot, Step, StepContext
-from labseq.sequencer import Lab, Sequencer
+from labseq.sequencer.lab import Lab
 from labseq.sequencer.policies import RunPolicy
+from labseq.sequencer.run import Sequencer
 from labseq.session.session import Session
 
 HOST_STAGES: Final = ("detect", "plan", "check", "tone program", "renderer", "first chunk")

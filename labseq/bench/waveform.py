@@ -30,9 +30,9 @@ from labseq.model.motion import LOAD_OHM
 from labseq.motion import Renderer, RenderPath, drive, tone_program
 from labseq.motion.axes import AXES, AxisIndex
 from labseq.motion.rendering import FULL_SCALE, N_CHANNELS
+from labseq.session.chosen import choose, load_plugins
 from labseq.session.occupancies import read_source
 from labseq.session.planning import PlannedMoves, PlanRequest, plan_moves, read_plan
-from labseq.session.profile import choose, load_plugins
 from labseq.text_files import is_folder, read_bytes, something_else
 from labseq.units import format_quantity, parse_quantity
 

@@ -309,6 +309,9 @@ class EqualiseStep(Step):
     shifts, or anything else proportional to the depth; nan where it has no value.
     """
 
+    takes_time = False
+    device_setting = "device"
+
     def __init__(self, settings: EqualiseSettings) -> None:
         self.settings = settings
 

@@ -156,6 +156,7 @@ class CheckSitesStep(Step):
     """Checks on the last image whether the atoms are still where the detector looks for them."""
 
     needs_image = True
+    takes_time = False
     repeatable = True
 
     def __init__(self, settings: CheckSitesSettings) -> None:
@@ -242,6 +243,7 @@ class CheckOverlayStep(Step):
     """
 
     needs_image = True
+    takes_time = False
 
     def __init__(self, settings: CheckOverlaySettings) -> None:
         self.settings = settings

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Annotated, Literal, Self, TypeAlias
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, Literal, Self, TypeAlias
 
 from pydantic import Field, model_validator
 
 from labseq.plugin import (
+    ConfigError,
     Duration,
     Fraction,
+    LabseqError,
     Settings,
     Shot,
     Step,
@@ -17,7 +19,9 @@ from labseq.plugin import (
     Text,
     TimelineEntry,
     empty_is,
+    find_leader,
     format_quantity,
+    offers,
     setting_error,
 )
 
@@ -127,9 +131,21 @@ class DeviceStep(Step):
     """Sends a command to a named device of the profile."""
 
     repeatable = True
+    takes_time = False
+    device_setting = "name"
 
     def __init__(self, settings: DeviceSettings) -> None:
         self.settings = settings
+
+    def check_devices(self, devices: Mapping[str, object]) -> Mapping[str, str]:
+        """Have the device check the command, if its driver can."""
+        device: Any = devices.get(self.settings.name)
+        if offers(device, "check_command"):
+            try:
+                device.check_command(self.settings.do, **self.settings.arguments)
+            except LabseqError as error:
+                return {"do": str(error)}
+        return {}
 
     def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:  # noqa: ARG002 - of the role
         """One entry without a known length."""
@@ -194,10 +210,20 @@ class WaitStep(Step):
 class FollowStep(Step):
     """Waits for the start signal of another control system."""
 
+    device_setting = "device"
+
     def __init__(self, signal: str, timeout_s: float, device: str = "") -> None:
         self.signal = signal
         self.timeout_s = timeout_s
         self.device = device
+
+    def check_devices(self, devices: Mapping[str, object]) -> Mapping[str, str]:
+        """Find the device that receives the signal."""
+        try:
+            find_leader(devices, self.device)
+        except ConfigError as error:
+            return {"device" if self.device else "for": str(error)}
+        return {}
 
     def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:  # noqa: ARG002 - of the role
         """One entry, at most the timeout; the lines are idle, because the length of the wait is unknown."""

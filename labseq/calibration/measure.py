@@ -28,8 +28,8 @@ from labseq.model import CALIBRATION_KINDS, CalibrationEntry, grid_facts, same_g
 from labseq.pictures.figures import can_draw, encode_figure
 from labseq.recording import Run, open_run
 from labseq.roles import RunObserver
-from labseq.session.calibrations import store_of, why_left_out
-from labseq.session.profile import DryRun, ResolvedProfile, resolve_profile
+from labseq.session.chosen import DryRun
+from labseq.session.profile import ResolvedProfile, resolve_profile, store_of, why_left_out
 from labseq.session.recorded import recorded_machine
 from labseq.session.session import Session
 

@@ -17,8 +17,8 @@ from labseq.model import CalibrationKind, Frame, MotionSpec, SiteGrid
 from labseq.recording import Run
 from labseq.recording.shot_file import read_frames
 from labseq.roles import Detector
-from labseq.sequencer import VirtualClock
-from labseq.session.construct import construct
+from labseq.sequencer.clock import VirtualClock
+from labseq.session.lab import construct
 from labseq.session.profile import ResolvedProfile
 from labseq.session.recorded import recorded_machine
 

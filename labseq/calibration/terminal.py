@@ -23,8 +23,8 @@ from labseq.console.text import age_text, columns
 from labseq.errors import ConfigError, Problem
 from labseq.messages import clean, did_you_mean, listing
 from labseq.model import CALIBRATION_KINDS, CalibrationEntry, CalibrationKind
-from labseq.session.calibrations import open_store
-from labseq.session.profile import DryRun
+from labseq.session.chosen import DryRun
+from labseq.session.profile import open_store
 from labseq.units import format_quantity
 
 MAX_LISTED: Final = 4

@@ -23,9 +23,9 @@ from labseq.messages import clean
 from labseq.model import TimelineEntry
 from labseq.sequencer.policies import StepPolicy
 from labseq.session import Assembly, Session
-from labseq.session.adaptive import Search
+from labseq.session.assembly import Search
 from labseq.session.check import CheckReport, Rehearsal, check
-from labseq.session.profile import DryRun
+from labseq.session.chosen import DryRun
 from labseq.units import format_quantity
 
 BAR_WIDTH: Final = 30

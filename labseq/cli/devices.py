@@ -20,7 +20,7 @@ from labseq.plugins import PluginHost, PluginInfo
 from labseq.registry import LOAD_S
 from labseq.scaffold.new import PLUGINS
 from labseq.session import CheckedDevice, DevicesReport, check_devices, load_plugins, make_profile_safe
-from labseq.session.profile import DryRun
+from labseq.session.chosen import DryRun
 from labseq.units import format_quantity
 
 _HEADER = ("device", "plugin", "model", "serial number", "firmware", "latency", "state")

@@ -30,6 +30,8 @@ from labseq.roles.hardware import (
     MobileTweezers,
     StaticTweezers,
     Trigger,
+    find_leader,
+    leaders,
     offers,
 )
 from labseq.roles.shot import Clock, Context, NeverStopped, RunObserver, Shot, Step, StepContext
@@ -71,5 +73,7 @@ __all__ = [
     "StepContext",
     "ToneSource",
     "Trigger",
+    "find_leader",
+    "leaders",
     "offers",
 ]

@@ -7,12 +7,13 @@ nothing, and the core calls them only where a driver has its own version (see :f
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
+from labseq.errors import ConfigError, Problem, one_of
 from labseq.model import CameraFacts, Frame, LineProgram, LinesFacts, ToneProgram
 
 Trigger = Literal["software", "internal", "external"]
@@ -263,6 +264,37 @@ class LeaderLink(Protocol):
     def new_events(self) -> Sequence[str]:
         """Messages for the log since the last call: connections, and texts that were not understood."""
         ...
+
+
+def leaders(devices: Mapping[str, object]) -> Iterator[tuple[str, LeaderLink]]:
+    """Name and device, of the devices or lines that can receive the signals of another control system."""
+    for name, device in devices.items():
+        if isinstance(device, LeaderLink):
+            yield name, device
+
+
+def find_leader(devices: Mapping[str, object], name: str = "") -> tuple[str, LeaderLink]:
+    """The device that receives the signal that a step waits for.
+
+    Args:
+        devices: All hardware of the profile.
+        name: Name of the device; "" for the only one that can receive signals.
+
+    Raises:
+        ConfigError: It cannot receive one, no device can, or several can.
+    """
+    able = dict(leaders(devices))
+    if name in able:
+        return name, able[name]
+    if name:
+        raise ConfigError(f"no other control system leads through '{name}'")
+    if not able:
+        what = "the profile has no device through which another control system leads"
+        hint = "add one to its `devices`: `leader: {use: tcp_leader}`; virtual twins send no signal"
+        raise ConfigError(Problem(what, hint=hint))
+    if len(able) > 1:
+        raise ConfigError(f"several devices lead; set `device` to {one_of(list(able))}")
+    return next(iter(able.items()))
 
 
 def offers(part: object, ability: str) -> bool:

@@ -331,11 +331,24 @@ class Step(ABC):
         takes_image: Whether it leaves an image to the steps after it.
         repeatable: Whether it may be retried in the same shot when it fails, because it leaves the atoms
             where they are; other steps are only repeated with the whole shot.
+        takes_time: Whether a line can be on during it.
+        device_setting: Name of its setting that names a device of the profile; "" if it has none.
+        signal: Start signal of another control system that it waits for ("go"); "" if it waits for none.
+        device: Name of the device that receives the signal; "" for the only one there is.
+        windows_s: Longest time for the moves of each of its rearrangement cycles, in seconds; `labseq check`
+            compares the planner's moves with them.
+        judges_shot: Whether a shot whose last rearrangement it is needs no further image.
     """
 
     needs_image: bool = False
     takes_image: bool = False
     repeatable = False
+    takes_time = True
+    device_setting = ""
+    signal = ""
+    device = ""
+    windows_s: Sequence[float] = ()
+    judges_shot = False
 
     @abstractmethod
     def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:
@@ -344,6 +357,17 @@ class Step(ABC):
     @abstractmethod
     def run(self, shot: Shot) -> None:
         """Carry out the step."""
+
+    def check_devices(self, devices: Mapping[str, object]) -> Mapping[str, str]:  # noqa: ARG002 - overridden
+        """Check the settings against the devices, before any of them is opened.
+
+        Args:
+            devices: All hardware of the profile by its name, constructed.
+
+        Returns:
+            Setting -> what is wrong with it; empty if nothing is.
+        """
+        return {}
 
 
 class RunObserver(Protocol):

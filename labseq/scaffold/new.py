@@ -27,7 +27,7 @@ from labseq.files import packaged_profiles_dir
 from labseq.messages import clean, visible
 from labseq.plugins import PluginHost
 from labseq.scaffold.schemas import FileKind, refresh_schemas, schema_path, write_schema
-from labseq.session import load_plugins
+from labseq.session.chosen import load_plugins
 
 MAX_LENGTH: Final = 40
 """Maximum length of a name."""

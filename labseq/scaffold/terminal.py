@@ -12,7 +12,7 @@ from labseq.messages import clean, did_you_mean, listing
 from labseq.registry import KINDS
 from labseq.scaffold.new import PLUGINS, CreatedFiles, make_file, make_plugin
 from labseq.scaffold.schemas import KINDS as FILE_KINDS, SCHEMA_FOLDER, schema_text
-from labseq.session import load_plugins
+from labseq.session.chosen import load_plugins
 
 
 def make_new(kind: str, name: str, folder: Path, *, package: bool, profile: str | None) -> None:

@@ -3,46 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from labseq.errors import ConfigError, LabseqError, one_of
+from labseq.errors import LabseqError
 from labseq.guard import DRIVER_MARGIN_S, Guard
 from labseq.model import ShotRecord
-from labseq.roles import LeaderLink
+from labseq.roles import LeaderLink, find_leader, leaders
 from labseq.sequencer.lab import Lab
 
 Emit = Callable[[str, Mapping[str, Any]], None]
-
-
-def leaders(devices: Mapping[str, object]) -> Iterator[tuple[str, LeaderLink]]:
-    """Name and device, of the devices or lines that can receive the signals of another control system."""
-    for name, device in devices.items():
-        if isinstance(device, LeaderLink):
-            yield name, device
-
-
-def find_leader(devices: Mapping[str, object], name: str = "") -> tuple[str, LeaderLink]:
-    """The device that receives the signal that a step waits for.
-
-    Args:
-        devices: All hardware of the profile.
-        name: Name of the device; "" for the only one that can receive signals.
-
-    Raises:
-        ConfigError: It cannot receive one, no device can, or several can.
-    """
-    able = dict(leaders(devices))
-    if name in able:
-        return name, able[name]
-    if name:
-        raise ConfigError(f"no other control system leads through '{name}'")
-    if not able:
-        raise ConfigError("the profile has no device through which another control system leads")
-    if len(able) > 1:
-        raise ConfigError(f"several devices lead; set `device` to {one_of(list(able))}")
-    return next(iter(able.items()))
 
 
 @dataclass(frozen=True, slots=True)

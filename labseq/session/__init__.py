@@ -4,8 +4,9 @@
 """
 
 from labseq.session.assembly import Assembly, assemble
+from labseq.session.chosen import load_plugins
 from labseq.session.options import Options
-from labseq.session.profile import ResolvedProfile, load_plugins, resolve_profile
+from labseq.session.profile import ResolvedProfile, resolve_profile
 from labseq.session.provenance import gather_provenance
 from labseq.session.safe import (
     CheckedDevice,

@@ -16,9 +16,8 @@ from labseq.files import Lock, knows_no_locks
 from labseq.recording import Run
 from labseq.recording.results import ANEW, ResultsLog, done, read_results, results_file
 from labseq.roles import Analysis, RecordedShot
-from labseq.session.construct import construct_one
+from labseq.session.chosen import ChosenPlugin, construct_one
 from labseq.session.observers import FINISH_WITHIN, USE
-from labseq.session.profile import ChosenPlugin
 from labseq.session.recorded import context_of, plugins_of, resolved_of
 
 

@@ -2,37 +2,39 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from labseq import builtin as builtins
 from labseq.config.addresses import ROLES, Override, split_overrides
 from labseq.config.document import Document, StoredText, plugin_paths
 from labseq.config.find import find_sequence
-from labseq.config.scan import Scan
+from labseq.config.scan import Adaptive, Axis, Ends, Scan
 from labseq.config.sequence import SequenceSpec, load_sequence
-from labseq.errors import ConfigError, ProblemCollector
-from labseq.model import TargetPattern
+from labseq.errors import ConfigError, LabseqError, PluginLoadError, ProblemCollector
+from labseq.messages import clean
+from labseq.model import ScanRange, ScanSpace, TargetPattern
 from labseq.plugins import PluginHost
-from labseq.roles import Step
+from labseq.recording.points import SCANNER
+from labseq.roles import Context, Step
 from labseq.sequencer.policies import RunPolicy
-from labseq.session.adaptive import Search, make_search
-from labseq.session.calibrations import with_tones
-from labseq.session.construct import make_analyses, make_steps, make_target
-from labseq.session.policies import make_policy, with_policies
-from labseq.session.profile import (
+from labseq.session.chosen import (
     ChosenPlugin,
     DryRun,
-    RecordedSetup,
-    ResolvedProfile,
     check_dry_run,
+    construct_one,
+    construct_target,
+    dump,
     resolve,
-    resolve_profile,
     validate,
 )
-from labseq.session.scan import Point, ScanPoints
+from labseq.session.policies import check_figure, make_policy, with_policies
+from labseq.session.profile import RecordedSetup, ResolvedProfile, resolve_profile, with_tones
+from labseq.session.scan import Point, ScanPoints, make_step, place_note
+from labseq.units import written
 
 
 @dataclass(frozen=True, slots=True)
@@ -230,3 +232,204 @@ def _profile_dump(bench: ResolvedProfile) -> dict[str, Any]:
     devices = {name: bench.chosen[name].dump() for name in spec.devices}
     grid = with_tones(core["grid"], bench.grid, spec.grid_model())
     return {**core, "grid": grid, **roles, "devices": devices}
+
+
+def make_target(
+    bench: ResolvedProfile, document: Document, sequence: SequenceSpec
+) -> tuple[TargetPattern, dict[str, Any]]:
+    """The target of a sequence, and its settings for the record.
+
+    Raises:
+        ConfigError: The pattern is unknown, its settings are invalid, or it does not fit on the grid.
+        PluginLoadError: The pattern's plugin failed; names it.
+    """
+    choice, grid = sequence.target, bench.grid
+    chosen = resolve(bench.host, document, "pattern", choice)
+    try:
+        target = construct_target(chosen, grid)
+    except PluginLoadError:
+        raise
+    except LabseqError as error:
+        problem = document.problem(choice.loc, str(error))
+        raise ConfigError(replace(problem, notes=(_grid_note(bench),))) from error
+    return target, {"pattern": chosen.entry.name, **dump(chosen.entry, chosen.settings)}
+
+
+def make_steps(
+    bench: ResolvedProfile, document: Document, sequence: SequenceSpec, found: ProblemCollector
+) -> tuple[list[tuple[str, Step]], list[dict[str, Any]]]:
+    """Name and step, in order, and the settings of each for the record.
+
+    Args:
+        bench: The profile.
+        document: The sequence's file.
+        sequence: Its content.
+        found: Receives the problems.
+    """
+    steps: list[tuple[str, Step]] = []
+    dumps: list[dict[str, Any]] = []
+    image_seen = False
+    for spec in sequence.shot:
+        step: Step | None = None
+        with found:
+            step, dumped = make_step(bench, document, spec)
+            steps.append((spec.name or spec.kind, step))
+            dumps.append({spec.kind: dumped, **({"name": spec.name} if spec.name else {})})
+            if step.needs_image and not image_seen:
+                what = f"'{spec.kind}' needs an image before it in the shot"
+                raise document.error(spec.loc, what, "an 'image' step before it", key=True)
+        # A wrong step counts as one that takes an image: the user may have intended one.
+        image_seen = image_seen or step is None or step.takes_image
+    return steps, dumps
+
+
+def make_analyses(
+    bench: ResolvedProfile, document: Document, sequence: SequenceSpec, found: ProblemCollector
+) -> list[dict[str, Any]]:
+    """The settings of each analysis of the sequence, for the record.
+
+    Each is constructed once, to check that it can be; during the run they have their own processes.
+
+    Args:
+        bench: The profile.
+        document: The sequence's file.
+        sequence: Its content.
+        found: Receives the problems.
+    """
+    dumps: list[dict[str, Any]] = []
+    for choice in sequence.analysis:
+        with found:
+            chosen = resolve(bench.host, document, "analysis", choice)
+            context = Context(choice.use, bench.grid, bench.profile.motion, calibrations=bench.calibrations)
+            construct_one(chosen, context)
+            dumps.append({**chosen.dump(), "finish_within": choice.finish_within})
+    return dumps
+
+
+def _grid_note(bench: ResolvedProfile) -> str:
+    grid = bench.grid
+    return f"the grid has {grid.n_rows} x {grid.n_cols} sites: {place_note(bench.document, 'grid')}"
+
+
+CLIMBED: Final = "to climb on"
+"""The purpose of the figure, for messages."""
+
+
+Steps = Sequence[tuple[str, Step]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Search:
+    """The scanner of an adaptive scan, and the range of values of each scanned address.
+
+    Attributes:
+        scanned: The scan; its points are the corners of the ranges.
+        adaptive: The settings in the sequence.
+        chosen: The scanner.
+        ranges: The range of each address.
+    """
+
+    scanned: ScanPoints
+    adaptive: Adaptive
+    chosen: ChosenPlugin
+    ranges: tuple[ScanRange, ...]
+
+    @property
+    def name(self) -> str:
+        """Name of the scanner in messages."""
+        return f"scanner '{self.chosen.entry.name}'"
+
+    @property
+    def units(self) -> list[str]:
+        """Unit in which the sequence writes the values of each address."""
+        return [ends.unit for ends in self.adaptive.ends]
+
+    def space(self, seed: int) -> ScanSpace:
+        """The argument of the scanner's constructor."""
+        return ScanSpace(self.ranges, self.adaptive.n_points, self.scanned.scan.repeats, seed)
+
+    def at(self, values: Mapping[str, float]) -> Point:
+        """The settings of a point, from address -> value, SI.
+
+        Raises:
+            ConfigError: A plugin refuses these values.
+        """
+        chosen = [values[one.address] for one in self.ranges]
+        alone = self.scanned.of(self.scanned.scan.at(chosen))
+        try:
+            return alone.at(0)
+        except ConfigError as error:
+            raise alone.scan.explained(error) from None
+
+    def written(self, values: Mapping[str, Any]) -> dict[str, str]:
+        """The values of a point as text in the units of the sequence: address -> text."""
+        pairs = zip(self.ranges, self.units, strict=True)
+        return {one.address: written(values[one.address], unit) for one, unit in pairs}
+
+    def record(self) -> dict[str, Any]:
+        """The scan for the run's record, JSON-ready; the points are in the index."""
+        return {
+            "addresses": [one.address for one in self.ranges],
+            "units": self.units,
+            "ranges": [asdict(one) for one in self.ranges],
+            SCANNER: self.chosen.dump(),
+            "figure": self.adaptive.figure,
+            "maximise": self.adaptive.maximise,
+            "n_points": self.adaptive.n_points,
+            "repeats": self.scanned.scan.repeats,
+        }
+
+
+def make_search(scanned: ScanPoints, steps: Steps, found: ProblemCollector) -> Search | None:
+    """Make and check the scanner of a scan; None if the scan is not adaptive, or if there is a problem.
+
+    The scanner is constructed once, to check that its constructor accepts the settings.
+
+    Args:
+        scanned: The scan, its ends checked.
+        steps: Name and step, in order.
+        found: Receives the problems.
+    """
+    adaptive = scanned.scan.adaptive
+    if adaptive is None:
+        return None
+    n_before, document = len(found.problems), scanned.document
+    with found:
+        check_figure(document, adaptive.aim, adaptive.figure, CLIMBED, steps)
+    chosen: ChosenPlugin | None = None
+    with found:
+        chosen = resolve(scanned.bench.host, document, "scanner", adaptive.choice)
+    low = scanned.at(0).parameters
+    high = scanned.at(math.prod(scanned.scan.shape) - 1).parameters
+    ranges: list[ScanRange] = []
+    for axis, ends in zip(scanned.scan.axes, adaptive.ends, strict=True):
+        with found:
+            present = scanned.present(axis)
+            ranges.append(_range(axis, ends, (low[axis.address], high[axis.address]), present, document.name))
+    if chosen is None or len(found.problems) > n_before:
+        return None
+    search = Search(scanned, adaptive, chosen, tuple(ranges))
+    with found:
+        construct_one(chosen, search.space(0))
+    return search
+
+
+def _range(axis: Axis, ends: Ends, resolved: tuple[Any, Any], present: Any, name: str) -> ScanRange:
+    """The range of an axis, if its ends are numbers that the settings model accepts unchanged."""
+    low, high = ends.low.si, ends.high.si
+    if not all(map(_is_number, resolved)) or not all(map(math.isclose, resolved, (low, high))):
+        what = f"'{clean(axis.address)}' is no number, or not the one that is written"
+        raise ConfigError(axis.key.problem(name, what, "an address of a number or quantity"))
+    is_whole = all(type(value) is int for value in resolved)
+    if is_whole and ends.n_steps and (high - low) % ends.n_steps:
+        what = f"{ends.n_steps} equal steps from {low:g} to {high:g} are no whole ones"
+        raise ConfigError(
+            axis.key.problem(name, what, f"a number of steps that {high - low:g} is a multiple of")
+        )
+    low, high = resolved if is_whole else (float(resolved[0]), float(resolved[1]))
+    start = float(present) if _is_number(present) and low <= present <= high else math.nan
+    return ScanRange(axis.address, low, high, is_whole, ends.n_steps, start)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)

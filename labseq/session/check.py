@@ -4,26 +4,57 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.builtin.steps import FollowStep
-from labseq.errors import LabseqError, Problem
+from labseq.errors import ConfigError, LabseqError, Problem
 from labseq.guard import Guard
 from labseq.model import TimelineEntry
 from labseq.motion import check_plan
-from labseq.roles import Step, offers
+from labseq.roles import Step, find_leader, offers
 from labseq.sequencer.lab import Lab
-from labseq.sequencer.leader import find_leader
 from labseq.sequencer.lines import spans_on
 from labseq.sequencer.run import lay_out
 from labseq.session.assembly import Assembly
-from labseq.session.session import Session, check_commands
+from labseq.session.scan import Point
 from labseq.units import format_quantity
+
+if TYPE_CHECKING:
+    from labseq.session.session import Session
+
+
+def check_steps(assembly: Assembly, points: Iterable[Point], build: Callable[[Point], Lab]) -> None:
+    """Have every step check its settings against the devices; nothing is opened.
+
+    Args:
+        assembly: The run.
+        points: The points of its scan.
+        build: Constructs the devices of a point.
+
+    Raises:
+        ConfigError: All settings that do not fit the devices, with their place.
+    """
+    if not any(offers(step, "check_devices") for _, step in assembly.steps):
+        return
+    labs: dict[int, Lab] = {}
+    problems: dict[str, Problem] = {}
+    guard = Guard()
+    for point in points:
+        lab = labs.get(id(point.bench)) or labs.setdefault(id(point.bench), build(point))
+        devices = dict(lab.hardware())
+        for spec, (name, step) in zip(assembly.sequence.shot, point.steps, strict=True):
+            if offers(step, "check_devices"):
+                found = guard.call(f"step '{name}'", lab.timeouts.call_s, step.check_devices, devices)
+                for setting, what in found.items():
+                    problem = assembly.document.problem((*spec.loc, setting), what)
+                    problems[str(problem)] = problem
+    guard.end()
+    if problems:
+        raise ConfigError([*problems.values()])
 
 
 def timeout_warnings(
@@ -129,7 +160,7 @@ def check(session: Session) -> CheckReport:
         ConfigError: A step sends a command that its device does not know.
     """
     assembly = session.assembly
-    check_commands(assembly, session.scan_run.each(), session.build_lab)
+    check_steps(assembly, session.scan_run.each(), session.build_lab)
     lab = session.build_lab()
     timeline = session.timeline()
     windows = _windows(assembly.steps)
@@ -179,15 +210,10 @@ def _run_s(session: Session, lab: Lab) -> tuple[float, float]:
     )
 
 
-def _windows(steps: Sequence[tuple[str, Step]]) -> list[tuple[int, list[float]]]:
+def _windows(steps: Sequence[tuple[str, Step]]) -> list[tuple[int, Sequence[float]]]:
     """Step number and window per cycle of each rearrangement step."""
-    found: list[tuple[int, list[float]]] = []
-    for number, (_, step) in enumerate(steps):
-        settings: Any = getattr(step, "settings", None)
-        if hasattr(settings, "window_of"):
-            cycles = range(1, settings.cycles + 1)
-            found.append((number, [float(settings.window_of(cycle)) for cycle in cycles]))
-    return found
+    windows = ((number, getattr(step, "windows_s", ())) for number, (_, step) in enumerate(steps))
+    return [(number, windows_s) for number, windows_s in windows if windows_s]
 
 
 def _rehearse(lab: Lab) -> tuple[Rehearsal | None, str]:
@@ -218,7 +244,7 @@ def _rehearse(lab: Lab) -> tuple[Rehearsal | None, str]:
 
 
 def _window_warnings(
-    session: Session, windows: Sequence[tuple[int, list[float]]], rehearsal: Rehearsal
+    session: Session, windows: Sequence[tuple[int, Sequence[float]]], rehearsal: Rehearsal
 ) -> list[Problem]:
     document, sequence = session.assembly.document, session.assembly.sequence
     problems: list[Problem] = []
@@ -263,8 +289,7 @@ def _judgement_warnings(session: Session, rearrangements: Sequence[int]) -> list
     images = [n for n, (_, step) in enumerate(assembly.steps) if step.takes_image and n not in rearrangements]
     if not rearrangements or max(images, default=-1) > rearrangements[-1]:
         return []
-    settings: Any = getattr(assembly.steps[rearrangements[-1]][1], "settings", None)
-    if getattr(settings, "stop_when", "") == "never":
+    if getattr(assembly.steps[rearrangements[-1]][1], "judges_shot", False):
         return []
     loc = assembly.sequence.shot[rearrangements[-1]].loc
     what = "no image follows the last rearrangement, so the shots are not judged"
@@ -288,11 +313,12 @@ def _deadline_warnings(
     """The steps after a wait for a signal, up to the next wait or the end, must fit into its deadline."""
     problems: list[Problem] = []
     steps = [step for _, step in session.assembly.steps]
+    waits = [bool(getattr(step, "signal", "")) for step in steps]
     for number, step in enumerate(steps):
-        if not isinstance(step, FollowStep):
+        if not waits[number]:
             continue
         name, leader = find_leader(dict(lab.hardware()), step.device)
-        until = next((n for n in range(number + 1, len(steps)) if isinstance(steps[n], FollowStep)), None)
+        until = next((n for n in range(number + 1, len(steps)) if waits[n]), None)
         longest_s = sum(bar.duration_s for _, bars in timeline[number + 1 : until] for bar in bars)
         if longest_s > leader.deadline_s:
             longest = format_quantity(longest_s, "time")

@@ -3,22 +3,27 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from labseq import motion
+from labseq.config.document import Document
 from labseq.config.profile import MotionSettings, ProfileSpec
-from labseq.errors import PlanError
+from labseq.errors import ConfigError, LabseqError, PlanError, Problem, one_of
 from labseq.guard import Guard, StopFlag
 from labseq.kernel import announcing
-from labseq.model import MotionSpec, RandomStream, TargetPattern
+from labseq.model import CalibrationEntry, LineSpec, MotionSpec, RandomStream, SiteGrid, TargetPattern
 from labseq.plugins import call_plugin
-from labseq.roles import Clock, NeedsWarmUp, RunObserver
-from labseq.sequencer import PacedClock, RealClock, VirtualClock
+from labseq.roles import Clock, Context, NeedsWarmUp, RunObserver, Simulation, offers
+from labseq.sequencer.clock import PacedClock, RealClock, VirtualClock
 from labseq.sequencer.lab import Blinding, Lab, Timeouts
-from labseq.session.construct import construct
-from labseq.session.profile import ChosenPlugin, ResolvedProfile, refuse_wrong_wiring
-from labseq.session.scan import Point
+from labseq.sequencer.lines import blinding_lines, trigger_line
+from labseq.session.chosen import ChosenPlugin, construct_one
+from labseq.session.profile import ResolvedProfile
+
+if TYPE_CHECKING:
+    from labseq.session.scan import Point
 
 DRIVERS_MOTION: Final = frozenset({"rf", "max_row_tones", "max_column_tones", "eject_slots"})
 """Keys of the motion that mobile tweezers need when they are opened; only the core uses the others."""
@@ -80,6 +85,59 @@ def build_lab(point: Point, target: TargetPattern, clock: Clock, seed: int) -> L
     )
     refuse_wrong_wiring(bench.document, lab)
     return lab
+
+
+def construct(
+    chosen: Mapping[str, ChosenPlugin],
+    grid: SiteGrid,
+    motion: MotionSpec,
+    clock: Clock,
+    seed: int,
+    simulation: Simulation | None = None,
+    calibrations: Mapping[str, CalibrationEntry] | None = None,
+    true_grid: SiteGrid | None = None,
+    lines: tuple[LineSpec, ...] = (),
+    *,
+    refused: dict[str, LabseqError] | None = None,
+) -> tuple[dict[str, Any], tuple[RandomStream, ...]]:
+    """Construct the object of every role; constructors do no I/O, so nothing is open yet.
+
+    Args:
+        chosen: Role -> its plugin.
+        grid: The grid of sites, with calibrated tones.
+        motion: How the mobile tweezers move.
+        clock: The session's clock.
+        seed: The run's seed.
+        simulation: The simulation, if none is among the chosen.
+        calibrations: The active calibrations: kind -> entry.
+        true_grid: The grid without calibrations, for the simulation, in which they are measured; None
+            without calibrations.
+        lines: The lines connected to the timing box.
+        refused: Receives the errors, role -> error; without it they are raised.
+
+    Returns:
+        Role -> object, and the random streams that the objects received.
+
+    Raises:
+        ConfigError: A constructor refuses its settings; with their place.
+        PluginLoadError: A constructor raised, or made no object of that role; names the plugin.
+    """
+    made: dict[str, Any] = {}
+    streams: list[RandomStream] = []
+    for role in sorted(chosen, key=lambda role: role != "simulation"):  # the others receive the simulation
+        is_simulation = role == "simulation"
+        stream = RandomStream(seed, "" if is_simulation else role)
+        streams.append(stream)
+        sites = true_grid if is_simulation and true_grid is not None else grid
+        shared = made.get("simulation", simulation)
+        context = Context(role, sites, motion, clock, stream, calibrations or {}, shared, lines)
+        try:
+            made[role] = construct_one(chosen[role], context)
+        except LabseqError as error:
+            if refused is None:
+                raise
+            refused[role] = error
+    return made, tuple(streams)
 
 
 def rebuild_lab(lab: Lab, before: Point, after: Point, seed: int) -> tuple[Lab, frozenset[str]]:
@@ -157,6 +215,47 @@ def _streams(old: tuple[RandomStream, ...], new: tuple[RandomStream, ...]) -> tu
 def _blinding(profile: ProfileSpec) -> dict[str, Blinding]:
     marks = {name: device.blinding for name, device in profile.devices.items()}
     return {name: Blinding(mark.value, mark.when) for name, mark in marks.items() if mark is not None}
+
+
+def wiring_problems(document: Document, lab: Lab) -> list[Problem]:
+    """Lines that the timing box does not have, that would harm the camera, or that cannot trigger it.
+
+    Args:
+        document: The profile's file.
+        lab: Its devices; none is open.
+    """
+    problems: list[Problem] = []
+    camera = lab.step_context.camera
+    if lab.lines is not None and offers(lab.lines, "lines_facts"):
+        channels = lab.lines.lines_facts.channels
+        for spec in lab.line_specs:
+            if spec.channel not in channels:
+                loc = ("lines", "channels", spec.name, "channel")
+                expected = f"one of {', '.join(map(str, channels))}"
+                problems.append(document.problem(loc, f"the box has no channel {spec.channel}", expected))
+    if camera.em_gain > 1.0:
+        for name in blinding_lines(lab.line_specs, "image"):
+            what = f"'{name}' is blinding and on during `image`, with an EM gain of {camera.em_gain:g}"
+            loc = ("lines", "channels", name, "on")
+            problems.append(document.problem(loc, what, "a line that is off in an exposure"))
+    wired = trigger_line(lab.line_specs, "camera")
+    if wired is not None and "external" not in camera.triggers:
+        what = "the camera takes no external trigger"
+        loc = ("lines", "channels", wired.name, "triggers")
+        expected = f"a camera that does; this one takes {one_of(camera.triggers)}"
+        problems.append(document.problem(loc, what, expected))
+    return problems
+
+
+def refuse_wrong_wiring(document: Document, lab: Lab) -> None:
+    """Raise the problems found by :func:`wiring_problems`.
+
+    Raises:
+        ConfigError: There is at least one problem.
+    """
+    problems = wiring_problems(document, lab)
+    if problems:
+        raise ConfigError(problems)
 
 
 def parallelism_of(planner: ChosenPlugin, made: Any, motion: MotionSpec) -> int:

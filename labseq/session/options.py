@@ -10,7 +10,7 @@ from typing import Any, Final, Self
 from labseq.config.addresses import Override
 from labseq.errors import ConfigError, Problem
 from labseq.messages import clean
-from labseq.session.profile import DryRun
+from labseq.session.chosen import DryRun
 
 _NOT_SET: Final = ("profile", "dry_run")
 """Options that do not replace a value of the sequence."""

@@ -22,11 +22,10 @@ from labseq.model import MotionSpec, Occupancy, Plan, PlanReport, SiteGrid, Targ
 from labseq.motion import check_plan
 from labseq.plugins import PluginHost
 from labseq.roles import NeverStopped, Planner
-from labseq.session.calibrations import calibrated_grid
-from labseq.session.construct import construct, construct_target
-from labseq.session.lab import parallelism_of
+from labseq.session.chosen import ChosenPlugin, construct_target, load_plugins, resolve
+from labseq.session.lab import construct, parallelism_of
 from labseq.session.occupancies import Source, read_source
-from labseq.session.profile import ChosenPlugin, load_plugins, resolve
+from labseq.session.profile import calibrated_grid
 from labseq.session.recorded import Machine, recorded_machine
 from labseq.settings import Choice, PatternChoice, Settings
 from labseq.text_files import YAML_SUFFIXES

@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 import math
+import signal
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
 from labseq.config.document import Document
 from labseq.config.sequence import CheckSettings, SequenceSpec, StepPolicySettings, StepSpec
-from labseq.errors import CheckFailedError, Loc, ProblemCollector
+from labseq.errors import CheckFailedError, Loc, ProblemCollector, StopRequested
 from labseq.messages import clean, did_you_mean, listing
-from labseq.recording import RunWriter, figures_in
-from labseq.recording.columns import FIGURES
+from labseq.recording.columns import FIGURES, figures_in
+from labseq.recording.folders import STOP_FILE
+from labseq.recording.writer import RunWriter
 from labseq.roles import Step
 from labseq.sequencer.policies import RunPolicy, StepPolicy
-from labseq.session.stopping import check_stop_file
 
 _JUDGED: Final = frozenset(
     {"success", "filling_fraction", "n_defects", "n_surplus", "seen_defect_free_cycle"}
@@ -279,3 +281,13 @@ class ShotHooks:
             which = f"shot {shots[0] + 1} is" if len(shots) == 1 else f"{len(shots)} shots are"
             self._emit("warning", {"text": f"{which} skipped: {why}"})
             self._emit("shots_skipped", {"shots": list(shots), "why": why})
+
+
+def check_stop_file(run_dir: Path) -> None:
+    """Raise if another process has asked a run to end.
+
+    Raises:
+        StopRequested: Another process has.
+    """
+    if (run_dir / STOP_FILE).exists():
+        raise StopRequested(signal.SIGTERM, after_shot=True)

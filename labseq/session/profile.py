@@ -5,73 +5,29 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final, Literal, NamedTuple, get_args
+from shlex import quote
+from typing import Any, Final, Literal, NamedTuple
 
-from labseq import builtin as builtins
+from labseq.calibration.store import Store, Stored, check_grid
 from labseq.config.addresses import ROLES, Override
 from labseq.config.document import Document, StoredText, plugin_paths
-from labseq.config.profile import ProfileSpec, load_profile
+from labseq.config.profile import OFF, ProfileSpec, load_profile
 from labseq.config.scan import Scan
 from labseq.errors import (
     ConfigError,
-    LabseqError,
-    Loc,
-    PluginLoadError,
-    Problem,
+    LimitError,
     ProblemCollector,
-    UnknownPluginError,
     one_of,
 )
+from labseq.files import profile_dir
 from labseq.messages import clean, did_you_mean
-from labseq.model import CalibrationEntry, SiteGrid
+from labseq.model import CALIBRATION_KINDS, CalibrationEntry, CalibrationKind, SiteGrid
 from labseq.model.lines import IDLE
-from labseq.plugins import PluginHost, call_plugin
-from labseq.registry import LOAD_S, VIRTUAL_TWIN, Entry
-from labseq.roles import offers
-from labseq.sequencer.lab import Lab
-from labseq.sequencer.lines import blinding_lines, trigger_line
-from labseq.session.calibrations import ActiveCalibrations, calibrated
-from labseq.settings import Choice, Settings
-
-DryRun = Literal["off", "full", "fast"]
-
-HARDWARE_KINDS: Final = frozenset({"camera", "static_tweezers", "mobile_tweezers", "device", "lines"})
-
-
-@dataclass(frozen=True, slots=True)
-class ChosenPlugin:
-    """A registry entry and the settings it will be constructed with.
-
-    Attributes:
-        entry: Entry of the plugin in the registry.
-        settings: Its settings; None if it takes none.
-        document: The file that chose it; None if no file did.
-        loc: Location of its settings in that file.
-    """
-
-    entry: Entry
-    settings: Settings | None
-    document: Document | None = None
-    loc: Loc = ()
-
-    @property
-    def virtual_time(self) -> bool:
-        """Whether the plugin needs no real time: always, or with its present settings."""
-        simulated = self.entry.simulated
-        if self.entry.virtual_time or simulated is None or self.settings is None:
-            return self.entry.virtual_time
-        return self.settings.model_copy(update=dict(simulated)) == self.settings
-
-    def dump(self) -> dict[str, Any]:
-        """Settings for the record, SI, JSON-ready."""
-        return {"use": self.entry.name, **dump(self.entry, self.settings)}
-
-    def placed(self, error: LabseqError) -> LabseqError:
-        """An error of its constructor, completed with the file, line and column of its settings."""
-        is_placed = isinstance(error, ConfigError) and any(problem.source for problem in error.problems)
-        if self.document is None or is_placed:
-            return error
-        return self.document.error(self.loc, str(error))
+from labseq.motion import standing_on_sites
+from labseq.plugins import PluginHost
+from labseq.registry import VIRTUAL_TWIN
+from labseq.session.chosen import HARDWARE_KINDS, ChosenPlugin, DryRun, choose, load_plugins
+from labseq.settings import Choice
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,146 +65,6 @@ class ResolvedProfile:
         return all(c.virtual_time for c in self.chosen.values() if c.entry.kind in HARDWARE_KINDS)
 
 
-def resolve(host: PluginHost, document: Document, kind: str, choice: Choice) -> ChosenPlugin:
-    """Find the plugin named in a file, and validate its settings.
-
-    Args:
-        host: The plugins.
-        document: The file.
-        kind: Kind of plugin.
-        choice: Name, and place in the file.
-
-    Raises:
-        ConfigError: Unknown name, a plugin that failed to load, or wrong settings, with file, line
-            and column.
-    """
-    entry = named(host, document, kind, choice.use, (*choice.loc, choice.key))
-    settings = validate(document, entry, choice.loc, choice.core_keys)
-    return ChosenPlugin(entry, settings, document, choice.loc)
-
-
-def named(
-    host: PluginHost, document: Document, kind: str, name: str, loc: Loc, *, key: bool = False
-) -> Entry:
-    """Find the registry entry of a plugin named in a file.
-
-    Args:
-        host: The plugins.
-        document: The file.
-        kind: Kind of plugin.
-        name: Its name.
-        loc: Location of the name in the file.
-        key: Whether the name is the key there.
-
-    Raises:
-        ConfigError: No plugin offers it, or the one that does failed to load.
-    """
-    try:
-        return host.get(kind, name)
-    except UnknownPluginError as error:
-        what = f"unknown {kind.replace('_', ' ')} '{clean(name)}'"
-        raise document.error(loc, what, one_of(error.known), error.hint, key) from None
-    except PluginLoadError as error:
-        raise document.error(loc, str(error), key=key) from None
-
-
-def validate(
-    document: Document, entry: Entry, loc: tuple[str | int, ...], drop: frozenset[str] = frozenset()
-) -> Settings | None:
-    """Validate the settings of an entry; None if it takes none.
-
-    Raises:
-        ConfigError: They are invalid, or the plugin's own validators fail; with their place.
-    """
-    other_keys = sorted(drop - {"use", "pattern"})
-    called = f"{entry.kind.replace('_', ' ')} '{entry.name}'"
-    try:
-        return call_plugin(
-            entry.owner,
-            f"the settings model of {called}",
-            lambda: document.validate(
-                entry.settings_model, loc, drop=drop, other_keys=other_keys, called=called
-            ),
-        )
-    except PluginLoadError as error:
-        raise document.error(loc, str(error)) from error
-
-
-def choose(
-    host: PluginHost,
-    document: Document,
-    kind: str,
-    choice: Choice,
-    dry_run: DryRun = "off",
-) -> tuple[ChosenPlugin, str]:
-    """Choose the plugin of a role; in a dry run its simulator, or its virtual twin.
-
-    Returns:
-        The choice, and a warning for the user or "".
-    """
-    if dry_run == "off" or kind not in HARDWARE_KINDS or choice.use == VIRTUAL_TWIN:
-        return resolve(host, document, kind, choice), ""
-    entry = host.registry.get(kind, VIRTUAL_TWIN)
-    twin = ChosenPlugin(entry, _defaults(entry), document, choice.loc)
-    if dry_run == "fast":
-        return twin, ""
-    if absence := _absence(host, kind, choice.use):
-        return twin, f"{absence}; its virtual twin takes its place and its settings were not checked"
-    chosen = resolve(host, document, kind, choice)
-    if chosen.entry.virtual_time:
-        return chosen, ""
-    if chosen.entry.simulated is not None and chosen.settings is not None:
-        settings = chosen.settings.model_copy(update=dict(chosen.entry.simulated))
-        return replace(chosen, settings=settings), ""
-    return twin, ""
-
-
-def _absence(host: PluginHost, kind: str, name: str) -> str:
-    """The reason why no plugin offers a name (it failed to load, or does not exist); "" if one does."""
-    if host.registry.find(kind, name) is not None:
-        return ""
-    try:
-        host.get(kind, name)
-    except PluginLoadError as error:
-        return str(error)
-    except UnknownPluginError as error:
-        hint = f" ({error.hint})" if error.hint else ""
-        return f"plugin '{clean(name)}' is not installed{hint}"
-    return ""
-
-
-def check_dry_run(dry_run: object) -> None:
-    """Raise for an unknown kind of dry run, so that a typing error cannot open hardware.
-
-    Raises:
-        ConfigError: It is unknown.
-    """
-    if dry_run not in get_args(DryRun):
-        raise ConfigError(
-            Problem(f"dry_run is {dry_run!r}", expected=f"one of {', '.join(map(repr, get_args(DryRun)))}")
-        )
-
-
-def dump(entry: Entry, settings: Settings | None) -> dict[str, Any]:
-    """Settings for the record, SI, JSON-ready.
-
-    Raises:
-        PluginLoadError: The plugin's own serializers fail.
-    """
-    if settings is None:
-        return {}
-    what = f"the settings of {entry.kind} '{entry.name}'"
-    return call_plugin(entry.owner, what, lambda: settings.model_dump(mode="json", by_alias=True))
-
-
-def _defaults(entry: Entry) -> Settings | None:
-    return entry.settings_model() if entry.settings_model is not None else None
-
-
-_LINELESS: Final = frozenset({"device", "check_sites", "check_overlay", "equalise"})
-"""Steps during which no line can be on, because they take no time themselves."""
-
-
 def check_kinds(document: Document, spec: ProfileSpec, host: PluginHost, found: ProblemCollector) -> None:
     """Find lines that are on during unknown steps.
 
@@ -260,7 +76,8 @@ def check_kinds(document: Document, spec: ProfileSpec, host: PluginHost, found: 
     """
     if spec.lines is None:
         return
-    known = [IDLE, *(step for step in host.registry.names("step") if step not in _LINELESS)]
+    steps = [name for name in host.registry.names("step") if _takes_time(host, name)]
+    known = [IDLE, *steps]
     for name, channel in spec.lines.channels.items():
         for place, kind in enumerate(channel.on):
             if kind not in known:
@@ -271,45 +88,8 @@ def check_kinds(document: Document, spec: ProfileSpec, host: PluginHost, found: 
                 )
 
 
-def wiring_problems(document: Document, lab: Lab) -> list[Problem]:
-    """Lines that the timing box does not have, that would harm the camera, or that cannot trigger it.
-
-    Args:
-        document: The profile's file.
-        lab: Its devices; none is open.
-    """
-    problems: list[Problem] = []
-    camera = lab.step_context.camera
-    if lab.lines is not None and offers(lab.lines, "lines_facts"):
-        channels = lab.lines.lines_facts.channels
-        for spec in lab.line_specs:
-            if spec.channel not in channels:
-                loc = ("lines", "channels", spec.name, "channel")
-                expected = f"one of {', '.join(map(str, channels))}"
-                problems.append(document.problem(loc, f"the box has no channel {spec.channel}", expected))
-    if camera.em_gain > 1.0:
-        for name in blinding_lines(lab.line_specs, "image"):
-            what = f"'{name}' is blinding and on during `image`, with an EM gain of {camera.em_gain:g}"
-            loc = ("lines", "channels", name, "on")
-            problems.append(document.problem(loc, what, "a line that is off in an exposure"))
-    wired = trigger_line(lab.line_specs, "camera")
-    if wired is not None and "external" not in camera.triggers:
-        what = "the camera takes no external trigger"
-        loc = ("lines", "channels", wired.name, "triggers")
-        expected = f"a camera that does; this one takes {one_of(camera.triggers)}"
-        problems.append(document.problem(loc, what, expected))
-    return problems
-
-
-def refuse_wrong_wiring(document: Document, lab: Lab) -> None:
-    """Raise the problems found by :func:`wiring_problems`.
-
-    Raises:
-        ConfigError: There is at least one problem.
-    """
-    problems = wiring_problems(document, lab)
-    if problems:
-        raise ConfigError(problems)
+def _takes_time(host: PluginHost, step: str) -> bool:
+    return bool(getattr(host.registry.get("step", step).factory, "takes_time", True))
 
 
 class RecordedSetup(NamedTuple):
@@ -422,26 +202,221 @@ def _is_fallback(document: Document, choice: Choice) -> bool:
     return choice.use == VIRTUAL_TWIN and here == around
 
 
-def load_plugins(
-    folders: Sequence[Path] = (), found: ProblemCollector | None = None, max_wait_s: float = LOAD_S
-) -> PluginHost:
-    """Load labseq's own, the installed and the folders' plugins.
+FOLDER: Final = "calibrations"
+
+
+DRY_RUN_FOLDER: Final = "dry-run"
+"""Folder of dry runs in a store: calibrations measured on simulated atoms are not valid for real ones."""
+
+
+BASIS: Final[Mapping[CalibrationKind, CalibrationKind]] = {"overlay": "frequencies", "thresholds": "sites"}
+"""Kind -> the kind of calibration that it was measured with and is only valid together with."""
+
+
+PLACES: Final = frozenset({"threshold", "width", "sites", "frame", "centre_px", "angle"})
+"""Detector settings that do not change the signals compared with thresholds if sites are calibrated."""
+
+
+@dataclass(frozen=True, slots=True)
+class ActiveCalibrations:
+    """A profile's calibrations in use.
+
+    Attributes:
+        entries: Kind of calibration -> entry.
+        grid: The grid with calibrated tones.
+        warnings: Notes for the user that are not errors.
+    """
+
+    entries: Mapping[str, CalibrationEntry]
+    grid: SiteGrid
+    warnings: tuple[str, ...] = ()
+
+
+def store_of(
+    document: Document, profile: ProfileSpec, dry_run: Literal["off", "full", "fast"] = "off"
+) -> Store:
+    """The folder of calibrations of a profile.
 
     Args:
-        folders: Folders with plugins, in addition to those of LABSEQ_PLUGIN_PATH.
-        found: Receives the problem of an unreadable folder; without it, it is raised.
-        max_wait_s: Maximum time for a plugin to load, and for a constructor, in seconds.
+        document: The profile's file.
+        profile: Content of the file.
+        dry_run: "off", "full" or "fast"; a profile with only virtual devices uses
+            the same store in a dry run.
+    """
+    folder = profile.calibrations.folder or profile_dir(document.path) / FOLDER / document.path.stem
+    choices = [profile.camera, profile.static_tweezers, profile.mobile_tweezers, *profile.devices.values()]
+    is_other = dry_run != "off" and any(not choice.use.startswith(VIRTUAL_TWIN) for choice in choices)
+    return Store(Path(folder) / DRY_RUN_FOLDER if is_other else Path(folder))
+
+
+def open_store(profile: str, dry_run: Literal["off", "full", "fast"] = "off") -> tuple[Store, ProfileSpec]:
+    """The folder of calibrations of a profile, and the content of the profile.
+
+    Args:
+        profile: Name or path of the profile.
+        dry_run: "off", "full" or "fast".
 
     Raises:
-        ConfigError: A folder does not exist, or cannot be read.
+        ConfigError: The profile has an error, or does not exist.
     """
-    host = PluginHost(max_wait_s)
-    host.load_builtin(builtins)
-    host.load_entry_points()
+    document, spec = load_profile(profile, beside=Path())
+    return store_of(document, spec, dry_run), spec
+
+
+def calibrated(
+    document: Document,
+    profile: ProfileSpec,
+    found: ProblemCollector,
+    dry_run: Literal["off", "full", "fast"] = "off",
+    detector: Mapping[str, Any] | None = None,
+    pins: Mapping[str, str] | None = None,
+) -> ActiveCalibrations:
+    """Read the calibrations that a profile uses, and apply those of the tones.
+
+    Args:
+        document: The profile's file.
+        profile: Content of the file.
+        found: Receives the problems; a calibration that has one is not used.
+        dry_run: "off", "full" or "fast".
+        detector: Settings of the detector in use, for the record; None if they do not matter.
+        pins: Kind -> id of the only calibrations to use; None for those of profile and store.
+    """
+    grid, store = profile.grid_model(), store_of(document, profile, dry_run)
+    entries: dict[str, CalibrationEntry] = {}
+    if pins is None and any(profile.calibrations.use.of(kind) is None for kind in CALIBRATION_KINDS):
+        try:
+            store.active()
+        except ConfigError as error:  # reported once, not for each kind
+            found.add(error)
+            return ActiveCalibrations(entries, grid)
+    for kind in CALIBRATION_KINDS:
+        with found:
+            if pins is None:
+                stored = _chosen(document, profile, store, kind)
+            else:
+                stored = store.find(pins[kind], kind) if kind in pins else None
+            if stored is not None:
+                check_grid(stored.entry, grid, str(stored.path))
+                entries[kind] = stored.entry
+    warnings = [*_dropped(entries), *_doubtful(entries, detector or {})]
+    tones = grid
+    with found:
+        tones = _with_tones(document, grid, entries)
+    return ActiveCalibrations(entries, tones, tuple(warnings))
+
+
+def calibrated_grid(document: Document, profile: ProfileSpec) -> SiteGrid:
+    """The grid of a profile with calibrated tones.
+
+    Raises:
+        ConfigError: A calibration in use is missing or damaged.
+    """
+    found = ProblemCollector()
+    grid = calibrated(document, profile, found).grid
+    found.raise_any()
+    return grid
+
+
+def with_tones(resolved: dict[str, Any], grid: SiteGrid, own: SiteGrid) -> dict[str, Any]:
+    """The ``grid`` of a profile for the record, with the tones in use if calibrations changed them.
+
+    Args:
+        resolved: The ``grid`` in the profile.
+        grid: The grid in use.
+        own: The profile's own grid.
+    """
+    axes = (
+        ("row_frequency", grid.row_frequency_hz, own.row_frequency_hz),
+        ("column_frequency", grid.column_frequency_hz, own.column_frequency_hz),
+    )
+    changed = {
+        name: {**resolved[name], "table": tones.tolist()}
+        for name, tones, before in axes
+        if tones.tolist() != before.tolist()
+    }
+    return {**resolved, **changed}
+
+
+def _chosen(document: Document, profile: ProfileSpec, store: Store, kind: CalibrationKind) -> Stored | None:
+    """The entry of a kind that the profile uses.
+
+    Raises:
+        ConfigError: It is missing or damaged.
+    """
+    pin = profile.calibrations.use.of(kind)
+    if pin == OFF:
+        return None
     try:
-        host.load_folders(folders)
+        return store.entry_in_use(kind) if pin is None else store.find(pin, kind)
     except ConfigError as error:
-        if found is None:
-            raise
-        found.add(error)
-    return host
+        where = document.problem(("calibrations", "use", kind), "").source
+        note = (
+            f"it is in use as the calibration '{kind}'; "
+            f"'labseq calibration use {kind}=off --profile {quote(document.name)}' puts it aside"
+            if pin is None
+            else f"asked for by the key 'calibrations.use.{kind}' of {where or document.name}"
+        )
+        raise ConfigError([replace(one, notes=(*one.notes, note)) for one in error.problems]) from error
+
+
+def why_left_out(entry: CalibrationEntry, entries: Mapping[str, CalibrationEntry]) -> str:
+    """The reason why runs ignore a calibration although it is in use; "" if they do not.
+
+    Args:
+        entry: The calibration.
+        entries: Kind -> the other calibrations in use.
+    """
+    if entry.kind != "overlay" or _has_basis(entry, entries):
+        return ""
+    return "it was measured with other frequencies of the mobile tweezers"
+
+
+def _dropped(entries: dict[str, CalibrationEntry]) -> list[str]:
+    """Leave out an overlay calibration that was measured with other tone frequencies."""
+    overlay = entries.get("overlay")
+    if overlay is None or not (reason := why_left_out(overlay, entries)):
+        return []
+    del entries["overlay"]
+    return [f"calibration overlay {overlay.id} is not used: {reason}; measure it again"]
+
+
+def _doubtful(entries: Mapping[str, CalibrationEntry], detector: Mapping[str, Any]) -> list[str]:
+    """Warnings about calibrations in use that should be measured again."""
+    thresholds = entries.get("thresholds")
+    if thresholds is None:
+        return []
+    what = f"calibration thresholds {thresholds.id} was measured with"
+    doubts = [] if _has_basis(thresholds, entries) else [f"{what} other sites; measure it again"]
+    then = thresholds.origin.get("detector")
+    if isinstance(then, dict) and then.get("use") == detector.get("use"):
+        other = [
+            key for key, value in detector.items() if key not in PLACES and then.get(key, value) != value
+        ]
+        if other:
+            doubts.append(f"{what} another {', '.join(other)} of the detector; measure it again")
+    return doubts
+
+
+def _has_basis(entry: CalibrationEntry, entries: Mapping[str, CalibrationEntry]) -> bool:
+    """Whether the calibration that an entry was measured with is in use."""
+    basis = BASIS[entry.kind]
+    now = entries[basis].id if basis in entries else None
+    then = entry.origin.get("calibrations")
+    return (then.get(basis) if isinstance(then, dict) else None) == now
+
+
+def _with_tones(document: Document, grid: SiteGrid, entries: Mapping[str, CalibrationEntry]) -> SiteGrid:
+    """Apply the frequencies to a grid, then the overlay.
+
+    Raises:
+        ConfigError: A tone is invalid.
+    """
+    if (frequencies := entries.get("frequencies")) is not None:
+        row_hz, column_hz = frequencies.values["row_hz"], frequencies.values["column_hz"]
+        grid = replace(grid, row_frequency_hz=row_hz, column_frequency_hz=column_hz)
+    if (overlay := entries.get("overlay")) is not None:
+        try:
+            grid = standing_on_sites(grid, overlay.values["offset_m"])
+        except LimitError as error:
+            raise document.error(("calibrations",), f"calibration overlay {overlay.id}: {error}") from error
+    return grid

@@ -15,11 +15,11 @@ from labseq.errors import RecordingError
 from labseq.files import read_file
 from labseq.model import CalibrationEntry, MotionSpec, RandomStream, SiteGrid
 from labseq.plugins import PluginHost
-from labseq.recording import Run
 from labseq.recording.folders import RUN_FILE
+from labseq.recording.reader import Run
 from labseq.recording.run_file import sha256_of_text
 from labseq.roles import Context
-from labseq.session.profile import load_plugins
+from labseq.session.chosen import load_plugins
 from labseq.text_files import beside
 
 

@@ -25,19 +25,11 @@ from labseq.files import Holder, Lock, knows_no_locks
 from labseq.guard import Guard, StopFlag, stop_on_signals
 from labseq.recording import clear_active, data_root, find_dead_run, lock_files, marker_roots
 from labseq.roles import Clock, Hardware, RunObserver, Simulation, offers
-from labseq.sequencer import RealClock, VirtualClock
+from labseq.sequencer.clock import RealClock, VirtualClock
 from labseq.sequencer.lab import Timeouts, in_safe_order
-from labseq.session.construct import construct
-from labseq.session.lab import WARM_S, timeouts_of
-from labseq.session.profile import (
-    HARDWARE_KINDS,
-    DryRun,
-    ResolvedProfile,
-    check_dry_run,
-    choose_plugins,
-    load_plugins,
-    resolve_profile,
-)
+from labseq.session.chosen import HARDWARE_KINDS, DryRun, check_dry_run, load_plugins
+from labseq.session.lab import WARM_S, construct, timeouts_of
+from labseq.session.profile import ResolvedProfile, choose_plugins, resolve_profile
 
 
 @contextmanager

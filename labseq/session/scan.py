@@ -18,13 +18,23 @@ from labseq.config.addresses import PROFILE, ROLES, VARIABLES
 from labseq.config.document import Document
 from labseq.config.profile import MobileTweezersChoice
 from labseq.config.scan import Axis, Scan
-from labseq.config.sequence import SequenceSpec
+from labseq.config.sequence import SequenceSpec, StepSpec
 from labseq.config.yaml_nodes import Node
-from labseq.errors import ConfigError, Loc, ProblemCollector
+from labseq.errors import ConfigError, Loc, PluginLoadError, ProblemCollector, one_of
 from labseq.messages import clean
 from labseq.roles import Step
-from labseq.session.construct import make_step
-from labseq.session.profile import HARDWARE_KINDS, ChosenPlugin, DryRun, ResolvedProfile, choose, resolve
+from labseq.session.chosen import (
+    HARDWARE_KINDS,
+    ChosenPlugin,
+    DryRun,
+    choose,
+    construct_role,
+    dump,
+    named,
+    resolve,
+    validate,
+)
+from labseq.session.profile import ResolvedProfile
 from labseq.settings import Choice
 from labseq.units import parse_any
 
@@ -291,3 +301,31 @@ def _value_in(made: PartSettings, part: Part, loc: Loc) -> Any:
 def _si(value: Any) -> Any:
     """The value of a variable in SI."""
     return parse_any(value)[0] if isinstance(value, str) else value
+
+
+def make_step(bench: ResolvedProfile, document: Document, spec: StepSpec) -> tuple[Step, dict[str, Any]]:
+    """A step of a sequence, and its settings for the record.
+
+    Raises:
+        ConfigError: The step is unknown, its settings are invalid, or the profile lacks the device that it
+            names; with their place.
+    """
+    entry = named(bench.host, document, "step", spec.kind, spec.loc, key=True)
+    settings = validate(document, entry, spec.loc)
+    try:
+        step, dumped = construct_role(entry, settings), dump(entry, settings)
+    except (ConfigError, PluginLoadError) as error:
+        raise document.error(spec.loc, str(error)) from error
+    key, devices = getattr(step, "device_setting", ""), bench.profile.devices
+    name = getattr(settings, key, None) if key else None
+    if name is not None and name not in devices:
+        what = f"the profile '{bench.profile.name}' has no device '{name}'"
+        problem = document.problem((*spec.loc, key), what, one_of(sorted(devices)))
+        raise ConfigError(replace(problem, notes=(place_note(bench.document, "devices"),)))
+    return step, dumped
+
+
+def place_note(document: Document, key: str) -> str:
+    """The note of a problem that names the place of a key in the other file."""
+    line, column = document.locate((key,), key=True)
+    return f"see '{key}' at {document.path}:{line}:{column}"

@@ -5,22 +5,28 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from types import MappingProxyType
+from typing import Any, cast
 
 from labseq.errors import DeviceError
-from labseq.guard import StopFlag
+from labseq.guard import Guard, StopFlag
+from labseq.messages import clean
+from labseq.model import ScanRange, VisitedPoint
 from labseq.plain import dumps
 from labseq.recording import Run, RunWriter, Shot
-from labseq.roles import RunObserver
-from labseq.sequencer import Sequencer
+from labseq.recording.columns import figures_in
+from labseq.roles import RunObserver, Scanner
 from labseq.sequencer.lab import Lab
-from labseq.session.adaptive import Results, ScannerCall, Search
-from labseq.session.assembly import Assembly
+from labseq.sequencer.run import Sequencer
+from labseq.session.assembly import CLIMBED, Assembly, Search
+from labseq.session.chosen import construct_one
 from labseq.session.lab import rebuild_lab
-from labseq.session.policies import ShotHooks
+from labseq.session.policies import ShotHooks, missing_figure
 from labseq.session.scan import Point
+from labseq.units import written
 
 
 class ScanRun:
@@ -321,3 +327,188 @@ def point_of(assembly: Assembly, shot: Shot, scan_run: ScanRun) -> Point:
         return assembly.at(scan_run.points[shot.index])
     values = {one.address: shot.row["parameters"][one.address] for one in assembly.search.ranges}
     return assembly.search.at(values)
+
+
+@dataclass(slots=True)
+class PointScore:
+    """The scores of a point, over all its visits.
+
+    Attributes:
+        first: Its first visit.
+        values: Address -> value, SI.
+        total: Sum of the scores of its visits.
+        n_scores: Number of visits that have a score.
+    """
+
+    first: int
+    values: Mapping[str, Any]
+    total: float = 0.0
+    n_scores: int = 0
+
+    @property
+    def mean(self) -> float:
+        """Its mean score."""
+        return self.total / self.n_scores
+
+
+@dataclass(slots=True, eq=False)
+class Results:
+    """The results of the points of an adaptive scan.
+
+    Attributes:
+        search: The scanner and its ranges.
+        shots: The shots that count: index -> shot.
+    """
+
+    search: Search
+    shots: dict[int, Shot]
+    _visited: list[VisitedPoint] = field(default_factory=list[VisitedPoint])
+    _skipped: dict[int, dict[str, float]] = field(default_factory=dict[int, dict[str, float]])
+    _point_scores: dict[str, PointScore] = field(default_factory=dict[str, PointScore])
+    _n_counted: int = 0
+    _warned: bool = False
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether no shot has been taken."""
+        return not (self.shots or self._skipped)
+
+    def add(self, shot: Shot) -> None:
+        """Add a shot."""
+        self.shots[shot.index] = shot
+
+    def add_skipped(self, shot: int, parameters: Mapping[str, Any]) -> None:
+        """Remember the point of a skipped shot: the scanner receives the point without a score."""
+        visit = shot // self.search.scanned.scan.repeats
+        self._skipped[visit] = self._values_in(parameters)
+
+    def values(self, visit: int) -> dict[str, float] | None:
+        """The values of a point; None if no shot was attempted there."""
+        shots = self._shots_of(visit)
+        return self._values_in(shots[0].row["parameters"]) if shots else self._skipped.get(visit)
+
+    def _values_in(self, parameters: Mapping[str, Any]) -> dict[str, float]:
+        return {one.address: parameters[one.address] for one in self.search.ranges}
+
+    def before(self, visit: int) -> list[VisitedPoint]:
+        """The results of all points before the given one, as the scanner receives them."""
+        while len(self._visited) < visit:
+            self._visited.append(self._visit(len(self._visited)))
+        return [one for one in self._visited[:visit] if one.values]
+
+    def missing_figure(self, shot: int) -> str:
+        """A warning, given once, that a shot lacks the figure that the scan optimises; else ""."""
+        figure, figures = self.search.adaptive.figure, figures_in(self.shots[shot].row)
+        if self._warned or figure in figures:
+            return ""
+        self._warned = True
+        return missing_figure(shot, figure, CLIMBED, figures)
+
+    def progress(self, visit: int) -> dict[str, Any]:
+        """The score of a point and the best one so far, JSON-ready, for the run's events."""
+        own = self._visit(visit)
+        sign = 1.0 if self.search.adaptive.maximise else -1.0
+
+        def plain(number: int, values: Mapping[str, Any], score: float) -> dict[str, Any]:
+            value = None if math.isnan(score) else sign * score
+            return {"point": number, "written": self.search.written(values), "value": value}
+
+        while self._n_counted <= visit:
+            self._count(self._n_counted)
+        known = [one for one in self._point_scores.values() if one.n_scores]
+        best = max(known, key=lambda one: (one.mean, -one.first), default=None)
+        return {
+            "figure": self.search.adaptive.figure,
+            **plain(visit, own.values, own.score),
+            "best": None if best is None else plain(best.first, best.values, best.mean),
+        }
+
+    def _count(self, visit: int) -> None:
+        """Add a visit to its point; the score of a point is the mean over all its visits."""
+        one = self._visit(visit)
+        point = self._point_scores.setdefault(dumps(dict(one.values)), PointScore(visit, one.values))
+        if not math.isnan(one.score):
+            point.total += one.score
+            point.n_scores += 1
+        self._n_counted += 1
+
+    def _shots_of(self, visit: int) -> list[Shot]:
+        repeats = self.search.scanned.scan.repeats
+        indices = range(visit * repeats, (visit + 1) * repeats)
+        return [self.shots[index] for index in indices if index in self.shots]
+
+    def _visit(self, visit: int) -> VisitedPoint:
+        figures = [MappingProxyType(figures_in(shot.row)) for shot in self._shots_of(visit)]
+        name, sign = self.search.adaptive.figure, 1.0 if self.search.adaptive.maximise else -1.0
+        known = [sign * one[name] for one in figures if name in one]
+        score = math.fsum(known) / len(known) if known else math.nan
+        return VisitedPoint(MappingProxyType(self.values(visit) or {}), score, tuple(figures))
+
+
+class ScannerCall:
+    """Calls a scanner, with a timeout, and checks its answers.
+
+    Args:
+        search: The scanner and its ranges.
+        seed: The run's seed.
+        stop: The request to stop.
+
+    Raises:
+        ConfigError: The scanner refuses its settings; with their place.
+        PluginLoadError: Its constructor raised.
+    """
+
+    def __init__(self, search: Search, seed: int, stop: StopFlag) -> None:
+        self._search = search
+        self._stop = stop
+        self._timeout_s = search.scanned.bench.profile.timeouts.call
+        self._scanner: Scanner = construct_one(search.chosen, search.space(seed))
+
+    def choose(self, visited: Sequence[VisitedPoint]) -> dict[str, float] | None:
+        """The next point, address -> value; None if the scanner has finished.
+
+        Raises:
+            DeviceError: The scanner raised, or returned no point of its ranges; names the scanner.
+            DeviceTimeoutError: It did not answer in time.
+            StopRequested: The operator asked to stop.
+        """
+        guard = Guard(self._stop)
+        try:
+            return guard.call(self._search.name, self._timeout_s, self.next_point, tuple(visited))
+        finally:
+            guard.end()
+
+    def next_point(self, visited: Sequence[VisitedPoint]) -> dict[str, float] | None:
+        """The scanner's answer, checked. Error messages of a guarded call name this function."""
+        try:
+            answer: Any = self._scanner.next_point(visited)
+            given = dict(cast("Mapping[Any, Any]", answer)) if isinstance(answer, Mapping) else None
+        except Exception as error:
+            text = f"next_point() raised {type(error).__name__}"
+            raise self._error(f"{text}: {error}" if str(error) else text) from error
+        if answer is None:
+            return None
+        ranges = {one.address: one for one in self._search.ranges}
+        if given is None or {*given} != {*ranges}:
+            came = f"a {type(answer).__name__}" if given is None else f"values for {_names(given)}"
+            raise self._error(f"next_point() gave {came}; expected a value for each of {_names(ranges)}")
+        units = dict(zip(ranges, self._search.units, strict=True))
+        return {address: self._value(one, given[address], units[address]) for address, one in ranges.items()}
+
+    def _value(self, range_: ScanRange, value: object, unit: str) -> float:
+        """A value snapped to its range, without rounding errors."""
+        what = "a whole number" if range_.is_whole else "a number"
+        expected = f"{what} from {written(range_.low, unit)} to {written(range_.high, unit)}"
+        expected += f" on one of its {range_.n_steps} steps" if range_.n_steps else ""
+        near = range_.allowed(value)
+        if near is not None:
+            return near
+        came = f"{value:.12g} (SI)" if isinstance(value, float) and unit else clean(repr(value))
+        raise self._error(f"next_point() gave {came} for '{range_.address}'; expected {expected}")
+
+    def _error(self, text: str) -> DeviceError:
+        return DeviceError(self._search.name, text)
+
+
+def _names(addresses: Mapping[Any, Any]) -> str:
+    return ", ".join(f"'{clean(str(address))}'" for address in addresses) or "no address"

@@ -5,27 +5,26 @@ from __future__ import annotations
 import gc
 import itertools
 import secrets
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, ParamSpec, Self
+from typing import TYPE_CHECKING, ParamSpec, Self
 
-from labseq.errors import ConfigError, DeviceError, LabseqError, Loc, Problem
+from labseq.errors import ConfigError, DeviceError, LabseqError
 from labseq.guard import Guard, StopFlag, stop_on_signals
 from labseq.model import RunRecord, TimelineEntry
 from labseq.recording import Run, RunWriter, clear_active, data_root, mark_active, marker_roots, open_run
-from labseq.roles import RunObserver, offers
-from labseq.sequencer import Sequencer
+from labseq.roles import RunObserver
 from labseq.sequencer.lab import Lab, describe
-from labseq.sequencer.leader import find_leader, leaders
-from labseq.sequencer.run import lay_out
+from labseq.sequencer.run import Sequencer, lay_out
 from labseq.session.assembly import Assembly, assemble
+from labseq.session.check import check_steps
+from labseq.session.chosen import DryRun
 from labseq.session.lab import build_lab, clock_for, warm
 from labseq.session.observers import Observers
 from labseq.session.options import Options, path_of
 from labseq.session.policies import Checks, ShotHooks
-from labseq.session.profile import DryRun
 from labseq.session.provenance import copies, ending, run_record
 from labseq.session.safe import lock_devices, make_safe_after_crash
 from labseq.session.scan import Point
@@ -33,66 +32,6 @@ from labseq.session.scan_run import scan_run_of
 
 if TYPE_CHECKING:
     from labseq.session.resume import ResumableRun
-
-
-def check_commands(assembly: Assembly, points: Iterable[Point], build: Callable[[Point], Lab]) -> None:
-    """Check the commands of ``device`` steps, and that the devices of ``wait`` steps exist.
-
-    Nothing is opened.
-
-    Args:
-        assembly: The run.
-        points: The points of its scan.
-        build: Constructs the devices of a point.
-
-    Raises:
-        ConfigError: Every command that its device refuses or does not know, with its place.
-    """
-    if not any(spec.kind in ("device", "wait") for spec in assembly.sequence.shot):
-        return
-    labs: dict[int, Lab] = {}
-    problems: dict[str, Problem] = {}
-    guard = Guard()
-    for point in points:
-        lab = labs.get(id(point.bench)) or labs.setdefault(id(point.bench), build(point))
-        for spec, (_, step) in zip(assembly.sequence.shot, point.steps, strict=True):
-            problem: Problem | None = None
-            if spec.kind == "device":
-                problem = _refused_command(assembly, guard, lab, spec.loc, step)
-            elif spec.kind == "wait" and hasattr(step, "signal"):
-                problem = _missing_signal(assembly, lab, spec.loc, step)
-            if problem is not None:
-                problems[str(problem)] = problem
-    guard.end()
-    if problems:
-        raise ConfigError([*problems.values()])
-
-
-def _refused_command(assembly: Assembly, guard: Guard, lab: Lab, loc: Loc, step: Any) -> Problem | None:
-    settings = step.settings
-    device = lab.devices.get(settings.name)
-    if device is None or not offers(device, "check_command"):
-        return None
-    check, timeout_s = device.check_command, lab.timeouts.call_s
-    try:
-        guard.call(settings.name, timeout_s, check, settings.do, **settings.arguments)
-    except LabseqError as failure:
-        return assembly.document.problem((*loc, "do"), str(failure))
-    return None
-
-
-def _missing_signal(assembly: Assembly, lab: Lab, loc: Loc, step: Any) -> Problem | None:
-    try:
-        find_leader(dict(lab.hardware()), step.device)
-    except ConfigError as error:
-        hint = ""
-        if assembly.dry_run == "fast":
-            hint = "virtual twins send no signal: '--dry-run' without 'fast' has one that says `go` by itself"
-        elif not dict(leaders(dict(lab.hardware()))):
-            hint = "add one to its `devices`: `leader: {use: tcp_leader}`"
-        key = "device" if step.device else "for"
-        return assembly.document.problem((*loc, key), str(error), hint=hint)
-    return None
 
 
 P = ParamSpec("P")
@@ -246,7 +185,7 @@ class Session:
         roots = marker_roots(root if self.earlier is None else self.earlier.root)
         for text in (*self.assembly.warnings, *(() if self.earlier is None else self.earlier.warnings)):
             self._warn(text)
-        check_commands(self.assembly, self.scan_run.each(), self.build_lab)
+        check_steps(self.assembly, self.scan_run.each(), self.build_lab)
         with ExitStack() as stack:
             stack.enter_context(stop_on_signals(self.stop_flag))
             if not self.assembly.virtual_time:

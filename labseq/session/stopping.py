@@ -2,27 +2,16 @@
 
 from __future__ import annotations
 
-import signal
 from dataclasses import asdict
 from pathlib import Path
 
 from labseq.config.find import find_profile
-from labseq.errors import ConfigError, Problem, StopRequested
+from labseq.errors import ConfigError, Problem
 from labseq.files import Process, write_file
 from labseq.plain import dumps
 from labseq.recording import data_root, marker_roots, runs_in_progress
 from labseq.recording.folders import STOP_FILE, find_run
 from labseq.recording.run_file import read_owner, read_state
-
-
-def check_stop_file(run_dir: Path) -> None:
-    """Raise if another process has asked a run to end.
-
-    Raises:
-        StopRequested: Another process has.
-    """
-    if (run_dir / STOP_FILE).exists():
-        raise StopRequested(signal.SIGTERM, after_shot=True)
 
 
 def ask_to_stop(run_dir: Path) -> None:

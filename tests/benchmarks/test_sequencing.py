@@ -16,7 +16,7 @@ import labseq
 from labseq.guard import StopFlag
 from labseq.model import ShotRecord
 from labseq.roles import Step
-from labseq.sequencer import Sequencer
+from labseq.sequencer.run import Sequencer
 from tests.system.null_devices import write
 
 SHOTS = {"1 step": 1, "101 steps": 101}

@@ -21,7 +21,7 @@ from labseq.builtin.equalise import (
 )
 from labseq.errors import ConfigError, DeviceError, StopRequested
 from labseq.model import CalibrationEntry, ShotRecord, SiteGrid
-from labseq.sequencer import Sequencer
+from labseq.sequencer.run import Sequencer
 from labseq.testing.fakes import FakeLab, ListSink, RecordingObserver, fake_calibration, fake_lab
 
 Floats = NDArray[np.float64]

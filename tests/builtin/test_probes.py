@@ -13,7 +13,7 @@ from labseq.builtin.steps import ImageStep
 from labseq.errors import ConfigError, DeviceError, LimitError
 from labseq.model import MotionSpec, SegmentKind, SiteGrid, ToneProgram
 from labseq.roles import StepContext
-from labseq.sequencer import Sequencer
+from labseq.sequencer.run import Sequencer
 from labseq.testing.fakes import FakeLab, ListSink, RecordingObserver, fake_lab
 
 GRID = SiteGrid(4, 6)

@@ -16,7 +16,7 @@ from labseq.model import CalibrationEntry, Frame, SegmentKind, ShotRecord, SiteG
 from labseq.model.calibration import grid_facts
 from labseq.motion import SurvivalShape
 from labseq.roles import Context, Step
-from labseq.sequencer import Sequencer
+from labseq.sequencer.run import Sequencer
 from labseq.testing.fakes import FakeLab, ListSink, RecordingObserver, fake_lab
 
 GRID = SiteGrid(20, 20)

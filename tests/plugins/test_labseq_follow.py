@@ -19,7 +19,7 @@ from labseq.config.document import Document
 from labseq.guard import StopFlag
 from labseq.plugin import ConfigError, Context, Device, DeviceError, DeviceTimeoutError, StopRequested
 from labseq.roles import LeaderLink, offers
-from labseq.sequencer import RealClock
+from labseq.sequencer.clock import RealClock
 from labseq.testing import DeviceContract
 from labseq.testing.contracts.hardware import Factory, Wait
 from labseq.testing.fakes import FakeClock, RecordingSimulation

@@ -15,7 +15,7 @@ from labseq_serial.device import SerialDevice
 
 from labseq.guard import StopFlag
 from labseq.plugin import Context, DeviceError, DeviceTimeoutError, LabseqError, StopRequested, TransientError
-from labseq.sequencer import RealClock
+from labseq.sequencer.clock import RealClock
 
 from .labseq_serial_rig import Counterpart, opened, settings
 

@@ -5,7 +5,7 @@ import pytest
 
 from labseq.errors import StopRequested
 from labseq.guard import StopFlag
-from labseq.sequencer import PacedClock, RealClock, VirtualClock
+from labseq.sequencer.clock import PacedClock, RealClock, VirtualClock
 
 
 def test_virtual_time_passes_only_by_waiting():

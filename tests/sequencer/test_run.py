@@ -16,9 +16,8 @@ from labseq.errors import (
     TransientError,
 )
 from labseq.model import Frame
-from labseq.sequencer import State
 from labseq.sequencer.lab import Timeouts
-from labseq.sequencer.run import TRANSITIONS, StateTable
+from labseq.sequencer.run import TRANSITIONS, State, StateTable
 from labseq.testing.fakes import ListSink
 from tests.sequencer.rig import EMPTY, FULL, IMAGE, LOAD, SAFE_ORDER, Rig, given
 

@@ -15,7 +15,7 @@ from labseq.errors import ConfigError
 from labseq.model import CALIBRATION_KINDS, CalibrationEntry, CalibrationKind, SiteGrid
 from labseq.motion import standing_on_sites
 from labseq.session import assemble
-from labseq.session.calibrations import open_store
+from labseq.session.profile import open_store
 from labseq.testing.fakes import fake_calibration
 
 PROFILE = """labseq: 1

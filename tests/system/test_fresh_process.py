@@ -50,7 +50,7 @@ def test_no_kernel_is_loaded_in_a_shot_of_the_virtual_lab(tmp_path: Path) -> Non
     code = """
 import sys
 import labseq
-from labseq.sequencer import Sequencer
+from labseq.sequencer.run import Sequencer
 
 def kernels():
     return {name for name in sys.modules if "kernels" in name}

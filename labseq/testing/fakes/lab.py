@@ -242,7 +242,7 @@ def fake_lab(
         simulated: Whether there is a :class:`RecordingSimulation`.
         clock: By default a :class:`FakeClock` that checks ``stop``.
         stop: The stop request; by default a new one.
-        **parts: Fields of ``labseq.sequencer.Lab`` that replace the fakes.
+        **parts: Fields of ``labseq.sequencer.lab.Lab`` that replace the fakes.
 
     Raises:
         ValueError: A call in ``fail_on`` or ``hang_on`` does not exist.

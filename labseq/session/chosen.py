@@ -1,0 +1,338 @@
+"""A plugin that a file names: found in the registry, its settings validated, its object constructed."""
+
+from __future__ import annotations
+
+from abc import ABC
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final, Literal, get_args
+
+from labseq import builtin as builtins
+from labseq.config.document import Document
+from labseq.errors import (
+    ConfigError,
+    LabseqError,
+    LimitError,
+    Loc,
+    PluginLoadError,
+    Problem,
+    ProblemCollector,
+    UnknownPluginError,
+    one_of,
+)
+from labseq.messages import clean
+from labseq.model import ScanSpace, SiteGrid, TargetPattern
+from labseq.plugins import PluginHost, call_plugin
+from labseq.registry import LOAD_S, VIRTUAL_TWIN, Entry
+from labseq.roles import (
+    Analysis,
+    Camera,
+    Context,
+    Detector,
+    Device,
+    Lines,
+    MobileTweezers,
+    Planner,
+    Scanner,
+    Simulation,
+    StaticTweezers,
+    Step,
+)
+from labseq.settings import Choice, Settings
+
+DryRun = Literal["off", "full", "fast"]
+
+
+HARDWARE_KINDS: Final = frozenset({"camera", "static_tweezers", "mobile_tweezers", "device", "lines"})
+
+
+@dataclass(frozen=True, slots=True)
+class ChosenPlugin:
+    """A registry entry and the settings it will be constructed with.
+
+    Attributes:
+        entry: Entry of the plugin in the registry.
+        settings: Its settings; None if it takes none.
+        document: The file that chose it; None if no file did.
+        loc: Location of its settings in that file.
+    """
+
+    entry: Entry
+    settings: Settings | None
+    document: Document | None = None
+    loc: Loc = ()
+
+    @property
+    def virtual_time(self) -> bool:
+        """Whether the plugin needs no real time: always, or with its present settings."""
+        simulated = self.entry.simulated
+        if self.entry.virtual_time or simulated is None or self.settings is None:
+            return self.entry.virtual_time
+        return self.settings.model_copy(update=dict(simulated)) == self.settings
+
+    def dump(self) -> dict[str, Any]:
+        """Settings for the record, SI, JSON-ready."""
+        return {"use": self.entry.name, **dump(self.entry, self.settings)}
+
+    def placed(self, error: LabseqError) -> LabseqError:
+        """An error of its constructor, completed with the file, line and column of its settings."""
+        is_placed = isinstance(error, ConfigError) and any(problem.source for problem in error.problems)
+        if self.document is None or is_placed:
+            return error
+        return self.document.error(self.loc, str(error))
+
+
+def resolve(host: PluginHost, document: Document, kind: str, choice: Choice) -> ChosenPlugin:
+    """Find the plugin named in a file, and validate its settings.
+
+    Args:
+        host: The plugins.
+        document: The file.
+        kind: Kind of plugin.
+        choice: Name, and place in the file.
+
+    Raises:
+        ConfigError: Unknown name, a plugin that failed to load, or wrong settings, with file, line
+            and column.
+    """
+    entry = named(host, document, kind, choice.use, (*choice.loc, choice.key))
+    settings = validate(document, entry, choice.loc, choice.core_keys)
+    return ChosenPlugin(entry, settings, document, choice.loc)
+
+
+def named(
+    host: PluginHost, document: Document, kind: str, name: str, loc: Loc, *, key: bool = False
+) -> Entry:
+    """Find the registry entry of a plugin named in a file.
+
+    Args:
+        host: The plugins.
+        document: The file.
+        kind: Kind of plugin.
+        name: Its name.
+        loc: Location of the name in the file.
+        key: Whether the name is the key there.
+
+    Raises:
+        ConfigError: No plugin offers it, or the one that does failed to load.
+    """
+    try:
+        return host.get(kind, name)
+    except UnknownPluginError as error:
+        what = f"unknown {kind.replace('_', ' ')} '{clean(name)}'"
+        raise document.error(loc, what, one_of(error.known), error.hint, key) from None
+    except PluginLoadError as error:
+        raise document.error(loc, str(error), key=key) from None
+
+
+def validate(
+    document: Document, entry: Entry, loc: tuple[str | int, ...], drop: frozenset[str] = frozenset()
+) -> Settings | None:
+    """Validate the settings of an entry; None if it takes none.
+
+    Raises:
+        ConfigError: They are invalid, or the plugin's own validators fail; with their place.
+    """
+    other_keys = sorted(drop - {"use", "pattern"})
+    called = f"{entry.kind.replace('_', ' ')} '{entry.name}'"
+    try:
+        return call_plugin(
+            entry.owner,
+            f"the settings model of {called}",
+            lambda: document.validate(
+                entry.settings_model, loc, drop=drop, other_keys=other_keys, called=called
+            ),
+        )
+    except PluginLoadError as error:
+        raise document.error(loc, str(error)) from error
+
+
+def choose(
+    host: PluginHost,
+    document: Document,
+    kind: str,
+    choice: Choice,
+    dry_run: DryRun = "off",
+) -> tuple[ChosenPlugin, str]:
+    """Choose the plugin of a role; in a dry run its simulator, or its virtual twin.
+
+    Returns:
+        The choice, and a warning for the user or "".
+    """
+    if dry_run == "off" or kind not in HARDWARE_KINDS or choice.use == VIRTUAL_TWIN:
+        return resolve(host, document, kind, choice), ""
+    entry = host.registry.get(kind, VIRTUAL_TWIN)
+    twin = ChosenPlugin(entry, _defaults(entry), document, choice.loc)
+    if dry_run == "fast":
+        return twin, ""
+    if absence := _absence(host, kind, choice.use):
+        return twin, f"{absence}; its virtual twin takes its place and its settings were not checked"
+    chosen = resolve(host, document, kind, choice)
+    if chosen.entry.virtual_time:
+        return chosen, ""
+    if chosen.entry.simulated is not None and chosen.settings is not None:
+        settings = chosen.settings.model_copy(update=dict(chosen.entry.simulated))
+        return replace(chosen, settings=settings), ""
+    return twin, ""
+
+
+def _absence(host: PluginHost, kind: str, name: str) -> str:
+    """The reason why no plugin offers a name (it failed to load, or does not exist); "" if one does."""
+    if host.registry.find(kind, name) is not None:
+        return ""
+    try:
+        host.get(kind, name)
+    except PluginLoadError as error:
+        return str(error)
+    except UnknownPluginError as error:
+        hint = f" ({error.hint})" if error.hint else ""
+        return f"plugin '{clean(name)}' is not installed{hint}"
+    return ""
+
+
+def check_dry_run(dry_run: object) -> None:
+    """Raise for an unknown kind of dry run, so that a typing error cannot open hardware.
+
+    Raises:
+        ConfigError: It is unknown.
+    """
+    if dry_run not in get_args(DryRun):
+        raise ConfigError(
+            Problem(f"dry_run is {dry_run!r}", expected=f"one of {', '.join(map(repr, get_args(DryRun)))}")
+        )
+
+
+def dump(entry: Entry, settings: Settings | None) -> dict[str, Any]:
+    """Settings for the record, SI, JSON-ready.
+
+    Raises:
+        PluginLoadError: The plugin's own serializers fail.
+    """
+    if settings is None:
+        return {}
+    what = f"the settings of {entry.kind} '{entry.name}'"
+    return call_plugin(entry.owner, what, lambda: settings.model_dump(mode="json", by_alias=True))
+
+
+def _defaults(entry: Entry) -> Settings | None:
+    return entry.settings_model() if entry.settings_model is not None else None
+
+
+def load_plugins(
+    folders: Sequence[Path] = (), found: ProblemCollector | None = None, max_wait_s: float = LOAD_S
+) -> PluginHost:
+    """Load labseq's own, the installed and the folders' plugins.
+
+    Args:
+        folders: Folders with plugins, in addition to those of LABSEQ_PLUGIN_PATH.
+        found: Receives the problem of an unreadable folder; without it, it is raised.
+        max_wait_s: Maximum time for a plugin to load, and for a constructor, in seconds.
+
+    Raises:
+        ConfigError: A folder does not exist, or cannot be read.
+    """
+    host = PluginHost(max_wait_s)
+    host.load_builtin(builtins)
+    host.load_entry_points()
+    try:
+        host.load_folders(folders)
+    except ConfigError as error:
+        if found is None:
+            raise
+        found.add(error)
+    return host
+
+
+_ROLES: Final[Mapping[str, type]] = {
+    "camera": Camera,
+    "static_tweezers": StaticTweezers,
+    "mobile_tweezers": MobileTweezers,
+    "device": Device,
+    "lines": Lines,
+    "detector": Detector,
+    "planner": Planner,
+    "simulation": Simulation,
+    "step": Step,
+    "scanner": Scanner,
+    "analysis": Analysis,
+}
+
+
+def construct_one(chosen: ChosenPlugin, context: Context | ScanSpace) -> Any:
+    """Construct the object of one role; a scanner receives the ranges that it may choose from.
+
+    Raises:
+        ConfigError: Its constructor refuses its settings; with their place.
+        PluginLoadError: Its constructor raised, or made no object of that role; names the plugin.
+    """
+    entry = chosen.entry
+    try:
+        return construct_role(entry, chosen.settings, context)
+    except (ConfigError, LimitError) as error:
+        raise chosen.placed(error) from error
+
+
+def construct_role(entry: Entry, *arguments: Any) -> Any:
+    """Call a factory, and check that its object has the methods of its role.
+
+    Args:
+        entry: The entry with the factory.
+        *arguments: The factory's arguments.
+
+    Raises:
+        LabseqError: The factory raised this one.
+        PluginLoadError: It raised something else, did not return in time, or made no object of that role.
+    """
+
+    def make() -> Any:
+        made = entry.factory(*arguments)
+        check_role(entry, made)
+        return made
+
+    return call_plugin(entry.owner, f"the constructor of {entry.kind} '{entry.name}'", make)
+
+
+def construct_target(chosen: ChosenPlugin, grid: SiteGrid) -> TargetPattern:
+    """Make a target from its pattern.
+
+    Raises:
+        LabseqError: The pattern refuses, for example because it does not fit on the grid.
+        PluginLoadError: The pattern's plugin failed; names it.
+    """
+    entry = chosen.entry
+    target = call_plugin(entry.owner, f"pattern '{entry.name}'", lambda: entry.factory(chosen.settings, grid))
+    if not isinstance(target, TargetPattern) or target.shape != grid.shape:
+        came = "" if isinstance(target, TargetPattern) else f", but {_called(target)}"
+        raise entry.owner.fault(f"pattern '{entry.name}' made no TargetPattern of shape {grid.shape}{came}")
+    return target
+
+
+def check_role(entry: Entry, made: object) -> None:
+    """Raise if an object lacks a method or attribute of its role.
+
+    Raises:
+        PluginLoadError: A method or attribute is missing; names it.
+    """
+    role = _ROLES[entry.kind]
+    called, see = f"{entry.kind} '{entry.name}'", f"see labseq.plugin.{role.__name__}"
+    if made is None or isinstance(made, type):
+        raise entry.owner.fault(f"the factory of {called} made {_called(made)}; expected an object; {see}")
+    names = (
+        [*role.__annotations__, *getattr(role, "__abstractmethods__", ())]
+        if issubclass(role, ABC)
+        else dir(role)
+    )
+    names = sorted(name for name in names if not name.startswith("_"))
+    missing = [name for name in names if not hasattr(made, name)]
+    if missing:
+        raise entry.owner.fault(f"{called} has no {', '.join(missing)}; {see}")
+    methods = [name for name in names if callable(getattr(role, name, None))]
+    if wrong := [name for name in methods if not callable(getattr(made, name))]:
+        raise entry.owner.fault(f"{', '.join(wrong)} of {called} cannot be called; {see}")
+
+
+def _called(made: object) -> str:
+    if made is None:
+        return "None"
+    return f"the class {made.__name__} itself" if isinstance(made, type) else f"a {type(made).__name__}"
