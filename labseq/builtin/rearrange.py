@@ -80,7 +80,7 @@ class RearrangeStep(Step):
 
     def __init__(self, settings: RearrangeSettings) -> None:
         self.settings = settings
-        self.windows_s = [settings.window_of(cycle) for cycle in range(1, settings.cycles + 1)]
+        self.windows_s = tuple(settings.window_of(cycle) for cycle in range(1, settings.cycles + 1))
         self.judges_shot = settings.stop_when == "never"
 
     def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:

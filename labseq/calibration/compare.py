@@ -1,15 +1,19 @@
-"""Compares two calibrations of the same kind."""
+"""Compares two calibrations of the same kind; age and deciding figure of one as text."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from typing import Final
 
 import numpy as np
 
+from labseq.calibration.store import DECIDING, figure_of
 from labseq.errors import ConfigError, Problem
 from labseq.model import CalibrationEntry
+from labseq.units import format_quantity
 
 _UNITS: Final = ("hz", "m", "px", "rad", "s")
 
@@ -90,3 +94,32 @@ def _of_values(
 def _of_figure(name: str, before: float, after: float) -> Difference:
     change = after - before
     return Difference(name, unit_of(name), before, after, abs(change), abs(change), (change,))
+
+
+_DIMENSIONS: Final = {"m": "length", "Hz": "frequency", "rad": "angle", "s": "time"}
+
+
+def age_s(entry: CalibrationEntry) -> float:
+    """Time since a calibration was made, in seconds."""
+    return (datetime.now(UTC) - datetime.fromisoformat(entry.taken_utc)).total_seconds()
+
+
+def quantity(value: float | None, name: str) -> str:
+    """A value with the unit in the suffix of its name, as text.
+
+    Example:
+        >>> quantity(2.5e-8, "error_m"), quantity(84.8e6, "row_hz"), quantity(0.031, "residual_px")
+        ('25 nm', '84.8 MHz', '0.031 px')
+    """
+    if value is None or math.isnan(value):
+        return "-"
+    unit = unit_of(name)
+    if unit in _DIMENSIONS:
+        return format_quantity(value, _DIMENSIONS[unit], 7 if unit == "Hz" else 3)
+    return f"{value:.4g} {unit}".rstrip()
+
+
+def quality_text(entry: CalibrationEntry) -> str:
+    """The deciding figure of a calibration as text; "-" if it has none."""
+    deciding, figure = DECIDING[entry.kind], figure_of(entry)
+    return "-" if math.isnan(figure) else f"{deciding.label} {quantity(figure, deciding.figure)}"

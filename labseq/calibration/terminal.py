@@ -13,24 +13,21 @@ from typing import Any, Final, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.calibration.compare import Difference, compare, unit_of
+from labseq.calibration.compare import Difference, age_s, compare, quality_text, quantity
 from labseq.calibration.measure import METHODS, CalibrationRequest, Outcome, calibrate
-from labseq.calibration.store import DECIDING, Damaged, Store, Stored, figure_of, grid_text
+from labseq.calibration.store import Damaged, Store, Stored, grid_text
 from labseq.config.profile import OFF, CalibrationChoices
 from labseq.console.events import LASTING, LogLines
 from labseq.console.output import as_line, say, stdout_to_stderr
 from labseq.console.text import age_text, columns
 from labseq.errors import ConfigError, Problem
 from labseq.messages import clean, did_you_mean, listing
-from labseq.model import CALIBRATION_KINDS, CalibrationEntry, CalibrationKind
+from labseq.model import CALIBRATION_KINDS, CalibrationKind
 from labseq.session.chosen import DryRun
 from labseq.session.profile import open_store
-from labseq.units import format_quantity
 
 MAX_LISTED: Final = 4
 """Maximum number of numbers that are printed of a value; for more, lowest, highest and mean are printed."""
-
-_DIMENSIONS: Final = {"m": "length", "Hz": "frequency", "rad": "angle", "s": "time"}
 
 
 def list_calibrations(profile: str, dry_run: str, *, as_json: bool) -> None:
@@ -163,32 +160,6 @@ def in_use(store: Store, choices: CalibrationChoices) -> dict[str, str]:
         elif pin is not None:
             used[kind] = store.find(pin, kind).path.name
     return used
-
-
-def age_s(entry: CalibrationEntry) -> float:
-    """Time since a calibration was made, in seconds."""
-    return (datetime.now(UTC) - datetime.fromisoformat(entry.taken_utc)).total_seconds()
-
-
-def quantity(value: float | None, name: str) -> str:
-    """A value with the unit in the suffix of its name, as text.
-
-    Example:
-        >>> quantity(2.5e-8, "error_m"), quantity(84.8e6, "row_hz"), quantity(0.031, "residual_px")
-        ('25 nm', '84.8 MHz', '0.031 px')
-    """
-    if value is None or math.isnan(value):
-        return "-"
-    unit = unit_of(name)
-    if unit in _DIMENSIONS:
-        return format_quantity(value, _DIMENSIONS[unit], 7 if unit == "Hz" else 3)
-    return f"{value:.4g} {unit}".rstrip()
-
-
-def quality_text(entry: CalibrationEntry) -> str:
-    """The deciding figure of a calibration as text; "-" if it has none."""
-    deciding, figure = DECIDING[entry.kind], figure_of(entry)
-    return "-" if math.isnan(figure) else f"{deciding.label} {quantity(figure, deciding.figure)}"
 
 
 def _row(one: Stored | Damaged, used: Mapping[str, str]) -> tuple[str, ...]:

@@ -12,7 +12,7 @@ from typing import Any, Final, cast
 
 import numpy as np
 
-from labseq.calibration.terminal import age_s, quality_text
+from labseq.calibration.compare import age_s, quality_text
 from labseq.config.scan import Axis
 from labseq.config.sequence import CheckSettings
 from labseq.console.errors import json_errors, warning_lines

@@ -290,7 +290,10 @@ def find_leader(devices: Mapping[str, object], name: str = "") -> tuple[str, Lea
         raise ConfigError(f"no other control system leads through '{name}'")
     if not able:
         what = "the profile has no device through which another control system leads"
-        hint = "add one to its `devices`: `leader: {use: tcp_leader}`; virtual twins send no signal"
+        hint = (
+            "add one to its `devices`: `leader: {use: tcp_leader}`; in a full dry run it says `go` itself, "
+            "in a fast one it is missing"
+        )
         raise ConfigError(Problem(what, hint=hint))
     if len(able) > 1:
         raise ConfigError(f"several devices lead; set `device` to {one_of(list(able))}")

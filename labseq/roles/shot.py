@@ -347,7 +347,7 @@ class Step(ABC):
     device_setting = ""
     signal = ""
     device = ""
-    windows_s: Sequence[float] = ()
+    windows_s = tuple[float, ...]()
     judges_shot = False
 
     @abstractmethod

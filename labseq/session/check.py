@@ -210,7 +210,7 @@ def _run_s(session: Session, lab: Lab) -> tuple[float, float]:
     )
 
 
-def _windows(steps: Sequence[tuple[str, Step]]) -> list[tuple[int, Sequence[float]]]:
+def _windows(steps: Sequence[tuple[str, Step]]) -> list[tuple[int, tuple[float, ...]]]:
     """Step number and window per cycle of each rearrangement step."""
     windows = ((number, getattr(step, "windows_s", ())) for number, (_, step) in enumerate(steps))
     return [(number, windows_s) for number, windows_s in windows if windows_s]

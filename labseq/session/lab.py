@@ -1,4 +1,4 @@
-"""Constructs the devices of a run, and those that differ at the next point of its scan."""
+"""Constructs the devices of a run, checks their wiring, and rebuilds those that a scan changes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The profile with its plugins: found by name, settings validated; nothing is opened."""
+"""The profile with its plugins and calibrations: found, validated and applied; nothing is opened."""
 
 from __future__ import annotations
 
