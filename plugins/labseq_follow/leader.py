@@ -27,16 +27,12 @@ VALUES: Final = ("state", "is_connected")
 
 def tcp_leader(settings: TcpLeaderSettings, context: Context) -> LeaderDevice:
     """The device for an external control system that connects over TCP."""
-    simulated = settings.leader == SIMULATED
-    link = SimulatedLink(settings, context) if simulated else TcpLink(settings, context.name)
-    return LeaderDevice(settings, context, link)
+    return LeaderDevice(settings, context, TcpLink(settings, context.name))
 
 
 def serial_leader(settings: SerialLeaderSettings, context: Context) -> LeaderDevice:
     """The device for an external control system on a serial line."""
-    simulated = settings.leader == SIMULATED
-    link = SimulatedLink(settings, context) if simulated else SerialLink(settings, context.name)
-    return LeaderDevice(settings, context, link)
+    return LeaderDevice(settings, context, SerialLink(settings, context.name))
 
 
 class LeaderDevice(Device):
@@ -48,7 +44,7 @@ class LeaderDevice(Device):
     Args:
         settings: Deadline, and what a simulated lab does.
         context: Name, clock and simulation.
-        link: The connection.
+        link: The connection to a real control system.
 
     Raises:
         ConfigError: The settings load atoms, but no lab is simulated.
@@ -60,14 +56,18 @@ class LeaderDevice(Device):
         self._settings = settings
         self._context = context
         self._name = context.name or "leader"
-        self._link = link
+        self._link = SimulatedLink(settings, context) if settings.leader == SIMULATED else link
         self._changed = threading.Condition()  # its lock guards everything below
-        self._dialogue = Dialogue(settings.deadline)
-        self._splitter = Splitter()
         self._is_open = False
-        self._failure: BaseException | None = None
         self._ending = threading.Event()
         self._thread: threading.Thread | None = None
+        self._begin()
+
+    def _begin(self) -> None:
+        """Forget everything of the last connection."""
+        self._dialogue = Dialogue(self._settings.deadline)
+        self._splitter = Splitter()
+        self._failure: BaseException | None = None
 
     @property
     def deadline_s(self) -> float:
@@ -82,9 +82,7 @@ class LeaderDevice(Device):
         """
         if self._is_open:
             return
-        self._dialogue = Dialogue(self._settings.deadline)
-        self._splitter = Splitter()
-        self._failure = None
+        self._begin()
         self._link.open()
         self._ending.clear()
         if self._link.listens:
@@ -107,14 +105,6 @@ class LeaderDevice(Device):
     def safe_state(self) -> None:
         """Nothing to do: it switches nothing, and the answer is sent when all devices are safe."""
 
-    def command(self, name: str, **arguments: Any) -> None:
-        """Refuse: it has no commands.
-
-        Raises:
-            DeviceError: Always.
-        """
-        self.check_command(name, **arguments)
-
     def check_command(self, name: str, **arguments: Any) -> None:
         """Refuse: it has no commands.
 
@@ -124,6 +114,8 @@ class LeaderDevice(Device):
         del arguments
         hint = f"a step `wait: {{for: {GO}, timeout: 10 s}}` waits for the start signal"
         raise DeviceError(self._name, f"unknown command '{name}'; it has none: {hint}")
+
+    command = check_command
 
     def read(self, name: str) -> bool | str:
         """Read "state" or "is_connected".
@@ -155,11 +147,10 @@ class LeaderDevice(Device):
         finally:
             self._dialogue.is_waiting = False
         if text is None:
+            what = f"no '{GO}' within {format_quantity(timeout_s, 'time')} on {self._link.address}"
             connected = "the leader is connected" if self._dialogue.is_connected else "nobody has connected"
-            what = (
-                f"no '{GO}' within {format_quantity(timeout_s, 'time')} on {self._link.address}; {connected}"
-            )
-            raise DeviceTimeoutError(self._name, f"{what}; see 'timeout' of the wait", timeout_s)
+            text = f"{what}; {connected}; see 'timeout' of the wait"
+            raise DeviceTimeoutError(self._name, text, timeout_s)
         if self._settings.loads and not simulated:
             load_atoms(self._context, LOADING_S)
         return text
@@ -198,18 +189,19 @@ class LeaderDevice(Device):
 
     def _handle(self, event: Event) -> None:
         with self._changed:
-            if event[0] == "connected":
-                self._splitter = Splitter()
-                self._send(self._dialogue.connected(event[1]))
-            elif event[0] == "came":
-                self._receive(event[1])
-            elif event[0] == "lost":
-                if rest := self._splitter.rest():
-                    text = f"the leader's last line, '{rest[:40]!a}', did not end, and was dropped"
+            match event:
+                case "connected", who:
+                    self._splitter = Splitter()
+                    self._send(self._dialogue.connected(who))
+                case "came", data:
+                    self._receive(data)
+                case "lost", reason:
+                    if rest := self._splitter.rest():
+                        text = f"the leader's last line, '{rest[:40]!a}', did not end, and was dropped"
+                        self._dialogue.note(text)
+                    self._dialogue.lost(reason)
+                case "note", text:
                     self._dialogue.note(text)
-                self._dialogue.lost(event[1])
-            else:
-                self._dialogue.note(event[1])
 
     def _receive(self, data: bytes) -> None:
         for line in self._splitter.feed(data):
@@ -227,9 +219,7 @@ class LeaderDevice(Device):
                 raise DeviceError(self._name, f"it does not listen any more: {self._failure!r}")
             taken = self._dialogue.take(self._link.now())
             if taken is None:
-                self._changed.wait(longest_s)
-                taken = self._dialogue.take(self._link.now())
-            if taken is None:
+                self._changed.wait(longest_s)  # the caller looks again at once
                 return None
             text, lines = taken
             self._send(lines)

@@ -88,12 +88,7 @@ class Link:
 
 
 class SimulatedLink(Link):
-    """A simulated control system: it loads atoms and sends `go`, on the session's clock.
-
-    Args:
-        settings: Of the device.
-        context: Name, clock and simulation.
-    """
+    """A simulated control system: it loads atoms and sends `go`, on the session's clock."""
 
     address = "simulated"
     listens = False
@@ -128,12 +123,7 @@ def load_atoms(context: Context, duration_s: float) -> None:
 
 
 class TcpLink(Link):
-    """Listens on a port; the first control system that connects stays until it leaves.
-
-    Args:
-        settings: Where to listen.
-        device: Name of the device, for messages.
-    """
+    """Listens on a port; the first control system that connects stays until it leaves."""
 
     def __init__(self, settings: TcpLeaderSettings, device: str) -> None:
         self._host, self._port = settings.host, settings.port
@@ -145,11 +135,7 @@ class TcpLink(Link):
         self._sending = threading.Lock()
 
     def open(self) -> None:
-        """Listen.
-
-        Raises:
-            DeviceError: The port is taken, or the host is not an address of this computer.
-        """
+        """Listen; the port may be taken, or the host not an address of this computer."""
         host, port = self._host, self._port
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         try:
@@ -245,12 +231,7 @@ def _turn_away(leader: socket.socket) -> None:
 
 
 class SerialLink(Link):
-    """A serial port that is opened exclusively, and opened again if it was unplugged.
-
-    Args:
-        settings: The port.
-        device: Name of the device, for messages.
-    """
+    """A serial port that is opened exclusively, and opened again if it was unplugged."""
 
     def __init__(self, settings: SerialLeaderSettings, device: str) -> None:
         self.address = settings.port
@@ -262,11 +243,7 @@ class SerialLink(Link):
         self._sending = threading.Lock()
 
     def open(self) -> None:
-        """Open the port.
-
-        Raises:
-            DeviceError: There is no such port, or another program has it open.
-        """
+        """Open the port; there may be none, or another program may have it open."""
         self._port = open_port(self.address, self._device, self._baud_rate, write_timeout=SEND_S)
 
     def poll(self) -> list[Event]:

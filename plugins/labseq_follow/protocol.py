@@ -23,19 +23,15 @@ About = Mapping[str, bool | int | float | str]
 
 @dataclass(slots=True)
 class _Go:
-    """A `go` whose shot is not over.
-
-    Attributes:
-        text: The text after it.
-        due_s: When it must be answered.
-        taken: Whether a step has waited for it.
-        answered: "late" or "gone" if no answer follows any more; "" if one is still to come.
-    """
+    """A `go` whose shot is not over."""
 
     text: str
     due_s: float
+    """When it must be answered."""
     taken: bool = False
+    """Whether a step has waited for it."""
     answered: str = ""
+    """"late" or "gone" if no answer follows any more; "" if one is still to come."""
 
 
 class Dialogue:
@@ -156,34 +152,22 @@ class Splitter:
     """Splits the received bytes into lines."""
 
     def __init__(self) -> None:
-        self._begun = bytearray()
-        self._is_noise = False
+        self._begun = b""
 
     def feed(self, came: bytes) -> list[str | None]:
         """The lines that are complete; None for each that was too long."""
-        lines: list[str | None] = []
-        *ended, begun = came.split(b"\n")
-        for piece in ended:
-            self._add(piece)
-            lines.append(None if self._is_noise else self._begun.decode("utf-8", "backslashreplace"))
-            self._begun.clear()
-            self._is_noise = False
-        self._add(begun)
-        return lines
+        *lines, begun = (self._begun + came).split(b"\n")
+        self._begun = begun[: MAX_LINE + 1]  # enough to see that it is too long
+        return [_decoded(line) if len(line) <= MAX_LINE else None for line in lines]
 
     def rest(self) -> str:
         """The part of a line that has not ended; it is dropped."""
-        rest = self._begun.decode("utf-8", "backslashreplace")
-        self._begun.clear()
-        self._is_noise = False
-        return rest
+        rest, self._begun = self._begun, b""
+        return _decoded(rest)
 
-    def _add(self, piece: bytes) -> None:
-        self._is_noise = self._is_noise or len(self._begun) + len(piece) > MAX_LINE
-        if self._is_noise:
-            self._begun.clear()
-        else:
-            self._begun += piece
+
+def _decoded(line: bytes) -> str:
+    return line.decode("utf-8", "backslashreplace")
 
 
 def encoded(line: str) -> bytes:

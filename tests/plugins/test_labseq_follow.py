@@ -18,7 +18,6 @@ from labseq_follow.settings import SerialLeaderSettings, TcpLeaderSettings
 from labseq.config.document import Document
 from labseq.guard import StopFlag
 from labseq.plugin import ConfigError, Context, Device, DeviceError, DeviceTimeoutError, StopRequested
-from labseq.roles import LeaderLink, offers
 from labseq.sequencer.clock import RealClock
 from labseq.testing import DeviceContract
 from labseq.testing.contracts.hardware import Factory, Wait
@@ -60,44 +59,24 @@ class TestSimulated(LeaderContract):
         return partial(tcp_leader, TcpLeaderSettings(leader="simulated"))
 
 
-def test_both_lead_and_know_that_they_have_no_commands() -> None:
-    for leader in (
-        tcp_leader(TcpLeaderSettings(), Context("leader")),
-        serial_leader(SerialLeaderSettings(port="COM7"), Context("leader")),
-    ):
-        assert isinstance(leader, LeaderLink)
-        assert offers(leader, "check_command")
-        with pytest.raises(DeviceError, match="unknown command 'go'; it has none"):
-            leader.check_command("go")
-
-
-def test_go_is_answered_by_busy_and_then_by_what_came_of_it() -> None:
+def test_go_is_answered_by_busy_and_then_by_the_result() -> None:
     with led() as (device, peer):
+        assert device.report("ready", {"shot": 0}) == "", "there was no `go`"
         peer.say("go run 17")
+        assert peer.ask("state?") == "state busy"
+        assert device.report("ready", {"shot": 0}) == "", "no step has waited for it"
         assert device.wait_for("go", 20.0) == "run 17"
         assert peer.hear() == "busy"
         assert device.report("ready", {"shot": 12, "success": True, "filling": 0.98666}) == "ready"
         assert peer.hear() == "ready shot=12 success=1 filling=0.9867"
         peer.say("go")
         assert device.wait_for("go", 20.0) == ""
-        assert peer.hear() == "busy"
+        assert [peer.hear(), peer.ask("go")] == ["busy", "failed reason=busy"]
         assert device.report("failed", {"reason": "camera: no frame\nwithin 1 s", "shot": 13}) == "failed"
         assert peer.hear() == r"failed shot=13 reason=camera: no frame\nwithin 1 s"
 
 
-def test_nothing_is_said_to_a_leader_that_is_owed_nothing() -> None:
-    with led() as (device, peer):
-        assert device.report("ready", {"shot": 0}) == ""
-        peer.say("go")
-        assert peer.ask("state?") == "state busy"
-        assert device.report("ready", {"shot": 0}) == "", "no step has waited for it"
-        device.wait_for("go", 20.0)
-        assert [peer.hear(), device.report("ready", {}), peer.hear()] == ["busy", "ready", "ready"]
-        assert device.report("failed", {"reason": "too late"}) == ""
-        assert peer.ask("state?") == "state idle"
-
-
-def test_it_tells_its_state_at_any_time() -> None:
+def test_it_reports_its_state_at_any_time() -> None:
     with led() as (device, peer):
         assert peer.ask("state?") == "state idle"
         waiting = threading.Thread(target=device.wait_for, args=("go", 20.0))
@@ -112,21 +91,10 @@ def test_it_tells_its_state_at_any_time() -> None:
         assert peer.ask("hello") == "hello labseq 1 deadline=10"
 
 
-def test_a_second_go_is_refused_and_does_not_disturb_the_first() -> None:
-    with led() as (device, peer):
-        peer.say("go")
-        device.wait_for("go", 20.0)
-        assert peer.hear() == "busy"
-        assert peer.ask("go") == "failed reason=busy"
-        device.report("ready", {"shot": 0})
-        assert peer.hear() == "ready shot=0"
-        assert "`go` came while labseq was busy, and was refused" in device.new_events()
-
-
 def test_at_the_deadline_it_answers_by_itself_and_a_late_ready_is_not_sent() -> None:
     now_s = 0.0
     with led() as (device, peer):
-        vars(device)["_now"] = lambda: now_s
+        vars(device._link)["now"] = lambda: now_s
         peer.say("go")
         device.wait_for("go", 20.0)
         now_s = 11.0
@@ -134,7 +102,9 @@ def test_at_the_deadline_it_answers_by_itself_and_a_late_ready_is_not_sent() -> 
         assert peer.ask("go") == "failed reason=busy", "the moves may still go on"
         assert device.report("ready", {"shot": 3}) == "late"
         assert peer.ask("state?") == "state idle"
-        assert any("not over at the deadline" in text for text in device.new_events())
+        events = device.new_events()
+        assert any("not over at the deadline" in text for text in events)
+        assert "`go` came while labseq was busy, and was refused" in events
 
 
 def test_a_go_that_no_step_waits_for_is_answered_at_the_deadline() -> None:
@@ -144,7 +114,7 @@ def test_a_go_that_no_step_waits_for_is_answered_at_the_deadline() -> None:
         assert any("no step waited" in text for text in device.new_events())
 
 
-def test_a_wait_that_lasts_too_long_says_whether_anybody_is_there() -> None:
+def test_a_timeout_says_whether_a_leader_is_connected() -> None:
     nobody = r"no 'go' within 10 ms on 127.0.0.1:\d+; nobody has connected"
     with listening() as device, pytest.raises(DeviceTimeoutError, match=nobody):
         device.wait_for("go", 0.01)
@@ -217,7 +187,7 @@ def test_a_port_that_is_taken_is_reported() -> None:
         second.close()
 
 
-def test_only_this_computer_may_lead_unless_it_is_allowed() -> None:
+def test_only_this_computer_may_connect_unless_others_are_allowed() -> None:
     document = Document.parse("leader: {host: 0.0.0.0}", "p.yaml")
     with pytest.raises(ConfigError) as caught:
         document.validate(TcpLeaderSettings, ("leader",))
@@ -228,17 +198,17 @@ def test_only_this_computer_may_lead_unless_it_is_allowed() -> None:
         assert TcpLeaderSettings(host=host).host == host
 
 
-def test_a_simulated_leader_loads_and_says_go_by_itself_on_the_sessions_clock() -> None:
+def test_a_simulated_leader_loads_and_sends_go_on_the_clock_of_the_session() -> None:
     clock = FakeClock()
-    world = RecordingSimulation()
+    simulation = RecordingSimulation()
     device = tcp_leader(
         TcpLeaderSettings(leader="simulated", simulated_go_delay=0.4, deadline=2.0),
-        Context("leader", clock=clock, simulation=world),
+        Context("leader", clock=clock, simulation=simulation),
     )
     device.open()
     assert device.wait_for("go", 10.0) == "1"
     assert clock.now() == 0.4
-    assert [str(call) for call in world.calls.of("simulation.load")] == ["simulation.load(0.0, 0.4)"]
+    assert [str(call) for call in simulation.calls.of("simulation.load")] == ["simulation.load(0.0, 0.4)"]
     assert device.report("ready", {"shot": 0}) == "ready"
     assert device.wait_for("go", 10.0) == "2"
     clock.sleep(3.0)
@@ -252,7 +222,7 @@ def test_loading_needs_a_simulated_lab() -> None:
         tcp_leader(TcpLeaderSettings(loads=True), Context("leader"))
 
 
-EVENTS = st.lists(st.sampled_from(["go", "take", "tell", "pass", "leave", "noise"]), max_size=40)
+EVENTS = st.lists(st.sampled_from(["go", "take", "report", "pass", "leave", "noise"]), max_size=40)
 
 
 @given(EVENTS)
@@ -270,12 +240,10 @@ def test_each_go_gets_exactly_one_answer(events: list[str]) -> None:
             said += dialogue.receive_line("gog", now_s)
         elif event == "take" and (taken := dialogue.take(now_s)) is not None:
             said += taken[1]
-        elif event == "tell":
+        elif event == "report":
             said += dialogue.report("ready", {"shot": 0}, now_s)[1]
         elif event == "leave":
-            n_lost += (
-                n_go_signals - n_lost - n_answers
-            )  # whoever leaves gives up its answer, and gets no other
+            n_lost += n_go_signals - n_lost - n_answers  # a leader that leaves gives up its answer
             dialogue.lost("it left")
             dialogue.connected("another leader")
     said += dialogue.end()
