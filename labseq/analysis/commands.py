@@ -1,7 +1,5 @@
 """`labseq replay`, `labseq analyse` and `labseq plot`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

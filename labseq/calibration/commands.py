@@ -1,7 +1,5 @@
 """The commands `labseq calibrate` and `labseq calibration`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """The command line: all commands and their options; the code of a command is imported when it runs."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Final
 

@@ -1,7 +1,5 @@
 """The options of `labseq plan` and `labseq waveform`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
@@ -166,7 +164,7 @@ def _request(
     origin: str | None,
     profile: str | None,
     overrides: list[str] | None,
-) -> PlanRequest:
+) -> "PlanRequest":
     from labseq.session.planning import PlanRequest
 
     return PlanRequest(

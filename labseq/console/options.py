@@ -13,9 +13,6 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 import typer
 
-from labseq.files import PROFILES, data_root, packaged_profiles_dir
-from labseq.registry import KINDS
-
 if TYPE_CHECKING:
     from labseq.session import Options
 
@@ -32,6 +29,8 @@ def new_kinds(incomplete: str) -> list[str]:
         >>> new_kinds("st")
         ['static_tweezers', 'step']
     """
+    from labseq.registry import KINDS
+
     return [kind for kind in (*_FILES, *KINDS) if kind.startswith(incomplete)]
 
 
@@ -42,6 +41,8 @@ def file_kinds(incomplete: str) -> list[str]:
 
 def profile_names(incomplete: str) -> list[str]:
     """Names of the profiles in ./hardware_profiles and of those that come with labseq."""
+    from labseq.files import PROFILES, packaged_profiles_dir
+
     found: set[str] = set()
     for folder in (Path(PROFILES), packaged_profiles_dir()):
         with suppress(OSError):
@@ -51,6 +52,8 @@ def profile_names(incomplete: str) -> list[str]:
 
 def run_folders(incomplete: str) -> list[str]:
     """Folders of runs, the newest first."""
+    from labseq.files import data_root
+
     with suppress(OSError):
         runs = sorted(data_root().glob("????-??-??/[0-9]*/run.json"), reverse=True)
         found = (str(path.parent) for path in runs)

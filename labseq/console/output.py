@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, Final, TextIO
 
 from labseq.errors import ConfigError, Problem, RecordingError
-from labseq.files import whole_file
 from labseq.messages import visible
 
 STDOUT: Final = "-"
@@ -189,6 +188,8 @@ def write_text(path: Path, text: str) -> None:
     Raises:
         ConfigError: It cannot be written.
     """
+    from labseq.files import whole_file
+
     try:
         with whole_file(path) as file:
             file.write(text.encode())

@@ -1,7 +1,5 @@
 """The commands of `labseq queue`; `labseq queue run` is in `labseq.cli.app`."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import typer

@@ -1,7 +1,5 @@
 """The commands `labseq new` and `labseq schema`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Final
 
