@@ -8,6 +8,7 @@ import sys
 import tempfile
 import tomllib
 from collections.abc import Callable
+from importlib.machinery import SourceFileLoader
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -25,15 +26,15 @@ for _name in ("LABSEQ_DATA", "LABSEQ_PLUGIN_PATH"):  # the user's own must not r
     os.environ.pop(_name, None)
 os.environ["LABSEQ_STATE"] = os.devnull  # for fixtures that outlive a test: leads nowhere
 
-_WRITES_BYTECODE = not sys.dont_write_bytecode
 if sys.dont_write_bytecode:  # else each process would compile the tests and numba's source anew
     _BYTECODE, _TEMPORARY = cache_root() / "bytecode", Path(tempfile.gettempdir())
     shutil.rmtree(_BYTECODE / _TEMPORARY.relative_to(_TEMPORARY.anchor), ignore_errors=True)  # of past tests
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
     os.environ["PYTHONPYCACHEPREFIX"] = sys.pycache_prefix = str(_BYTECODE)
-    sys.dont_write_bytecode = False  # while tests are collected
+    sys.dont_write_bytecode = False
 
 _NUMBERS = itertools.count()
+_WRITE: Callable[..., None] = vars(SourceFileLoader)["_cache_bytecode"]
 
 
 def pytest_collection_finish() -> None:
@@ -45,12 +46,20 @@ def pytest_collection_finish() -> None:
     """
     from labseq.session import session
 
-    sys.dont_write_bytecode = not _WRITES_BYTECODE  # files that a test edits within a second are read anew
     gc.collect()
     gc.freeze()
     patch = pytest.MonkeyPatch()
     patch.setattr(session, "gc", SimpleNamespace(collect=int, freeze=int, unfreeze=int))
     patch.setattr(os, "fsync", os.fstat)
+    patch.setattr(SourceFileLoader, "_cache_bytecode", _cache_bytecode)
+
+
+def _cache_bytecode(
+    loader: SourceFileLoader, source: str, bytecode: str, data: bytes, write: Callable[..., None] = _WRITE
+) -> None:
+    """Write bytecode, except of temporary files: a test may edit them within a second."""
+    if not source.startswith(tempfile.gettempdir()):
+        write(loader, source, bytecode, data)
 
 
 @pytest.fixture(autouse=True)

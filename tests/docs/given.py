@@ -65,7 +65,7 @@ class Store:
             copy_repository(data)
             profile = str(data / "hardware_profiles" / "virtual.yaml")
             code, _, errors = labseq(
-                ["calibrate", "sites", "-p", profile, "--shots", "30", "--seed", "1", "--output", str(data)]
+                ["calibrate", "sites", "-p", profile, "--shots", "8", "--seed", "1", "--output", str(data)]
             )
             assert code == 0, errors
             (run,) = data.glob("*/*_calibrate-sites")
@@ -132,26 +132,12 @@ def _andor(to: Path) -> Given:
 
 def _calibrations(to: Path) -> Given:
     """Two calibrations of the sites of ``lab``, and a table of sites."""
-    rows = [f"{i},{j},{20 + 20 * i},{20 + 20 * j}" for i in range(20) for j in range(20)]
-    (to / "sites.csv").write_text("\n".join(["row,col,y,x", *rows]))
     ids: list[str] = []
-    for seed in (1, 2):
-        lab = str(to / "hardware_profiles" / "lab.yaml")
-        code, said, errors = labseq(
-            [
-                "calibrate",
-                "sites",
-                "-p",
-                lab,
-                "--shots",
-                "8",
-                "--seed",
-                str(seed),
-                "--output",
-                str(to / "lab"),
-                "--json",
-            ]
-        )
+    for offset in (21, 20):
+        rows = [f"{i},{j},{offset + 20 * i},{20 + 20 * j}" for i in range(20) for j in range(20)]
+        (to / "sites.csv").write_text("\n".join(["row,col,y,x", *rows]))
+        command = f"calibrate sites -p {to}/hardware_profiles/lab.yaml --from {to}/sites.csv --force --json"
+        code, said, errors = labseq(command.split())
         assert code == 0, errors
         ids.append(json.loads(said)["id"])
     return Given({"f102b3": ids[0], "a18d16": ids[1]})

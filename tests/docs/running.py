@@ -25,6 +25,7 @@ FEW: Final = {
     "bench latency": "--loadings 2",
     "bench waveform": "--repeats 1",
     "calibrate tweezers": "",
+    "calibrate sites": "--shots 8 --seed 1",
     "calibrate": "--shots 30 --seed 1",
 }
 """Commands that take long -> what makes them short where the page says nothing else."""
