@@ -23,8 +23,13 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """What each command does once for its process is not done a hundred times in this one."""
     monkeypatch.setattr("typer.main.get_command", get_command)
-    monkeypatch.setattr("labseq.calibration.measure.encode_figure", lambda *_, **__: b"")  # see tests/calibration
+    monkeypatch.setattr("labseq.calibration.measure.encode_figure", no_picture)
     monkeypatch.setenv("GIT_DIR", os.devnull)  # no digest of the code's changes for each run
+
+
+def no_picture(*_: object, **__: object) -> bytes:
+    """In place of the pictures of calibrations, which have tests of their own."""
+    return b""
 
 
 get_command = cache(typer.main.get_command)
