@@ -367,7 +367,7 @@ class Point:
 
     def __init__(self, name: str, distribution: str, load: Callable[[], object]) -> None:
         self.name = self.value = name
-        self.dist = SimpleNamespace(name=distribution, version="1.2")
+        self.dist = SimpleNamespace(metadata={"Name": distribution, "Version": "1.2"})
         self.load = load
 
 

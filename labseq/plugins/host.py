@@ -166,9 +166,9 @@ class PluginHost:
     def load_entry_points(self) -> None:
         """Load every installed plugin; each failure is kept for the report."""
         for point in importlib.metadata.entry_points(group=ENTRY_POINT_GROUP):
-            version = (point.dist.version if point.dist is not None else "") or ""
-            distribution = (point.dist.name if point.dist is not None else "") or "unknown"
-            source = f"the distribution {distribution} {version}".rstrip()
+            about: Any = {} if point.dist is None else point.dist.metadata  # parsed at each access
+            version = about.get("Version") or ""
+            source = f"the distribution {about.get('Name') or 'unknown'} {version}".rstrip()
             info = PluginInfo(point.name, "installed", version, source=source)
             self._load(info, partial(module_location, point.value.partition(":")[0]), point.load)
 
