@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import random
 import warnings
 from typing import Any
 
@@ -31,19 +30,9 @@ class Loading:
         return float(shot.frames.max()) if shot.frames.size else None
 
 
-class GivesANumber(Loading):
-    def shot(self, shot: RecordedShot) -> Any:
-        return super().shot(shot)["filling"]
-
-
 class CountsUnderShot(Loading):
     def shot(self, shot: RecordedShot) -> Any:
         return super().shot(shot) | {"shot": shot.index}
-
-
-class GivesTheTarget(Loading):
-    def shot(self, shot: RecordedShot) -> Any:
-        return super().shot(shot) | {"more": [{"target": shot.target}]}
 
 
 class FailsOnCycles(Loading):
@@ -60,18 +49,6 @@ class AddsUp(Loading):
         return result | {"filling": self.total}
 
 
-class NumbersItself(Loading):
-    n_made = 0
-
-    def __init__(self, context: Context) -> None:
-        super().__init__(context)
-        NumbersItself.n_made += 1
-        self.number = NumbersItself.n_made
-
-    def shot(self, shot: RecordedShot) -> Any:
-        return super().shot(shot) | {"number": self.number}
-
-
 class SubtractsInPlace(Loading):
     def bright(self, shot: RecordedShot) -> float | None:
         value = super().bright(shot)
@@ -79,28 +56,9 @@ class SubtractsInPlace(Loading):
         return value
 
 
-class ClearsTheOccupancy(Loading):
-    def shot(self, shot: RecordedShot) -> Any:
-        result = super().shot(shot)
-        shot.images[-1].occupancy[...] = False
-        return result
-
-
 class NeedsFrames(Loading):
     def bright(self, shot: RecordedShot) -> float | None:
         return float(shot.frames.max())
-
-
-class NeedsAtoms(Loading):
-    def shot(self, shot: RecordedShot) -> Any:
-        result = super().shot(shot)
-        return result | {"first": int(np.flatnonzero(result["sites"])[0])}
-
-
-class DrawsFromRandom(Loading):
-    def shot(self, shot: RecordedShot) -> Any:
-        random.random()
-        return super().shot(shot)
 
 
 class SilencesWarnings(Loading):
@@ -113,17 +71,11 @@ PLANTED = Planted(
     AnalysisContract(),
     Loading,
     (
-        (GivesANumber, "test_gives_results"),
         (CountsUnderShot, "test_gives_results"),
-        (GivesTheTarget, "test_gives_results"),
         (FailsOnCycles, "test_gives_results"),
         (AddsUp, "test_same_shot_same_result"),
-        (NumbersItself, "test_same_shot_same_result"),
         (SubtractsInPlace, "test_leaves_the_shot_untouched"),
-        (ClearsTheOccupancy, "test_leaves_the_shot_untouched"),
         (NeedsFrames, "test_takes_odd_shots"),
-        (NeedsAtoms, "test_takes_odd_shots"),
-        (DrawsFromRandom, "test_is_pure"),
         (SilencesWarnings, "test_is_pure"),
     ),
 )

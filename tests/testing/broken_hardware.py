@@ -22,12 +22,6 @@ class ReadsAFile(RecordingCamera):
         Path(os.devnull).read_bytes()
 
 
-class LooksForPorts(RecordingCamera):
-    def __init__(self, context: Context) -> None:
-        super().__init__(context)
-        list(Path().iterdir())
-
-
 class OpensOnce(RecordingCamera):
     def open(self) -> None:
         if self.is_open:
@@ -47,19 +41,6 @@ class ClosesOnce(RecordingCamera):
     def open(self) -> None:
         super().open()
         self.closed = False
-
-
-class OpensOnlyOnceEver(RecordingCamera):
-    closed = False
-
-    def open(self) -> None:
-        if self.closed:
-            raise DeviceError(self.name, "the handle was given back")
-        super().open()
-
-    def close(self) -> None:
-        super().close()
-        self.closed = True
 
 
 class ClosesOnlyWhatIsOpen(RecordingCamera):
@@ -156,11 +137,6 @@ class DescribesInNumpy(RecordingCamera):
         return {**super().describe(), "temperature": np.float32(-70.0)}
 
 
-class DescribesWithNan(RecordingCamera):
-    def describe(self) -> Mapping[str, Any]:
-        return {**super().describe(), "temperature": float("nan")}
-
-
 class ArmsWhileClosed(RecordingCamera):
     def arm(self, n_frames: int, exposure_s: float, trigger: Trigger) -> None:
         was_open, self.is_open = self.is_open, True
@@ -170,30 +146,9 @@ class ArmsWhileClosed(RecordingCamera):
             self.is_open = was_open
 
 
-class HasNoHandleBeforeOpen(RecordingCamera):
-    def trigger(self) -> None:
-        if not self.is_open:
-            raise AttributeError("'NoneType' object has no attribute 'trigger'")
-        super().trigger()
-
-
 class TakesAnyExposure(RecordingCamera):
     def arm(self, n_frames: int, exposure_s: float, trigger: Trigger) -> None:
         super().arm(n_frames, exposure_s if 0 < exposure_s < 10 else 0.01, trigger)
-
-
-class RefusesWithTheWrongError(RecordingCamera):
-    def arm(self, n_frames: int, exposure_s: float, trigger: Trigger) -> None:
-        if n_frames < 1:
-            raise ValueError("n_frames")
-        super().arm(n_frames, exposure_s, trigger)
-
-
-class RefusesAfterAWait(RecordingCamera):
-    def arm(self, n_frames: int, exposure_s: float, trigger: Trigger) -> None:
-        if not exposure_s > 0:
-            self.clock.sleep(0.1)
-        super().arm(n_frames, exposure_s, trigger)
 
 
 class RefusesAfterAnExposure(RecordingCamera):
@@ -227,14 +182,6 @@ class WaitsLonger(RecordingCamera):
         return super().read(10 * timeout_s)
 
 
-class GivesAnOldFrame(RecordingCamera):
-    def read(self, timeout_s: float) -> Frame:
-        try:
-            return super().read(timeout_s)
-        except DeviceTimeoutError:
-            return Frame(np.zeros(self.frame_shape, np.uint16), 0.01, 0.0)
-
-
 class PollsForEver(RecordingCamera):
     def read(self, timeout_s: float) -> Frame:
         while True:
@@ -253,7 +200,7 @@ class CallsItselfAndor(RecordingCamera):
 
 
 class Suite(CameraContract):
-    max_wait_s: ClassVar[float] = 0.2
+    max_wait_s: ClassVar[float] = 0.05
 
 
 PLANTED = Planted(
@@ -261,10 +208,8 @@ PLANTED = Planted(
     RecordingCamera,
     (
         (ReadsAFile, "test_constructor_does_no_io"),
-        (LooksForPorts, "test_constructor_does_no_io"),
         (OpensOnce, "test_opens_and_closes_twice"),
         (ClosesOnce, "test_opens_and_closes_twice"),
-        (OpensOnlyOnceEver, "test_opens_and_closes_twice"),
         (ClosesOnlyWhatIsOpen, "test_closes_before_open"),
         (NeedsTheDeviceToBeSafe, "test_safe_state_in_every_state"),
         (UnsafeAfterClose, "test_safe_state_in_every_state"),
@@ -273,17 +218,12 @@ PLANTED = Planted(
         (ClosesToBeSafe, "test_works_after_safe_state"),
         (CannotBeClosedAfterAFailure, "test_closes_after_failures"),
         (DescribesInNumpy, "test_describes_itself"),
-        (DescribesWithNan, "test_describes_itself"),
         (ArmsWhileClosed, "test_refuses_calls_while_closed"),
-        (HasNoHandleBeforeOpen, "test_refuses_calls_while_closed"),
         (TakesAnyExposure, "test_refuses_what_exceeds_limits"),
-        (RefusesWithTheWrongError, "test_refuses_what_exceeds_limits"),
-        (RefusesAfterAWait, "test_refuses_what_exceeds_limits"),
         (RefusesAfterAnExposure, "test_refuses_what_exceeds_limits"),
         (IsStuckAfterARefusal, "test_refuses_what_exceeds_limits"),
         (RaisesItsOwnTimeout, "test_keeps_timeouts"),
         (WaitsLonger, "test_keeps_timeouts"),
-        (GivesAnOldFrame, "test_keeps_timeouts"),
         (PollsForEver, "test_keeps_timeouts"),
         (CallsItselfAndor, "test_errors_name_the_device"),
     ),

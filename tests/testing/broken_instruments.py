@@ -2,7 +2,7 @@
 
 from typing import Any, ClassVar
 
-from labseq.errors import DeviceError, LimitError
+from labseq.errors import LimitError
 from labseq.testing import DeviceContract
 from labseq.testing.fakes import RecordingDevice
 
@@ -28,20 +28,6 @@ class CannotTellItsState(Right):
         raise NotImplementedError
 
 
-class RaisesKeyError(Right):
-    def command(self, name: str, **arguments: Any) -> None:
-        if name not in self.commands:
-            raise KeyError(name)
-        super().command(name, **arguments)
-
-
-class IsTerse(Right):
-    def command(self, name: str, **arguments: Any) -> None:
-        if name not in self.commands:
-            raise DeviceError(self.name, "what?")
-        super().command(name, **arguments)
-
-
 class IgnoresUnknownCommands(Right):
     def command(self, name: str, **arguments: Any) -> None:
         if name in self.commands:
@@ -62,8 +48,6 @@ PLANTED = Planted(
     Right,
     (
         (CannotTellItsState, "test_does_what_it_declares"),
-        (RaisesKeyError, "test_refuses_unknown_commands"),
-        (IsTerse, "test_refuses_unknown_commands"),
         (IgnoresUnknownCommands, "test_refuses_unknown_commands"),
         (AnswersNone, "test_refuses_unknown_values"),
         (ObeysAnyPower, "test_refuses_what_exceeds_limits"),

@@ -23,26 +23,11 @@ class RunsSlow(RecordingLines):
         super().compile(replace(program, t_s=np.array(program.t_s) * 1.01))
 
 
-class FiresTheFirstProgramAgain(RecordingLines):
-    first: LineProgram | None = None
-
-    def compile(self, program: LineProgram) -> None:
-        super().compile(program)
-        self.first = self._compiled = self.first or program
-
-
 class ComesBackAtOnce(RecordingLines):
     def wait(self, timeout_s: float) -> None:
         if self._over_s - self.clock.now() > 10.0:  # a timeout is kept
             super().wait(timeout_s)
         self.use("wait", timeout_s)
-
-
-class WaitsInFire(RecordingLines):
-    def fire(self) -> None:
-        super().fire()
-        if self.programs[-1].duration_s < 1.0:
-            self.clock.sleep(self.programs[-1].duration_s)
 
 
 class StaysArmed(RecordingLines):
@@ -57,25 +42,14 @@ class LeavesLightOn(RecordingLines):
         self.reset()
 
 
-class StartsDark(RecordingLines):
-    def _apply_lines(self, program: LineProgram) -> None:
-        if program.kind != "idle":
-            super()._apply_lines(program)
-        else:
-            super()._apply_lines(replace(program, on=np.zeros_like(program.on)))
-
-
 PLANTED = Planted(
     LinesContract(),
     RecordingLines,
     (
         (LeavesALineOn, "test_does_what_was_compiled"),
         (RunsSlow, "test_does_what_was_compiled"),
-        (FiresTheFirstProgramAgain, "test_does_what_was_compiled"),
         (ComesBackAtOnce, "test_waits_for_the_end"),
-        (WaitsInFire, "test_waits_for_the_end"),
         (StaysArmed, "test_refuses_fire_without_arm"),
         (LeavesLightOn, "test_rests"),
-        (StartsDark, "test_rests"),
     ),
 )

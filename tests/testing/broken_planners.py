@@ -2,7 +2,6 @@
 
 import itertools
 import os
-import random
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
@@ -35,26 +34,12 @@ class Suite(PlannerContract):
 
     def trials(self) -> settings:
         quick = set(Phase) - {Phase.shrink, Phase.explain}
-        return settings(super().trials(), max_examples=20, phases=quick)
+        return settings(super().trials(), max_examples=10, phases=quick)
 
 
 class ReturnsBatches(OneByOnePlanner):
     def plan(self, occupancy: Occupancy, target: TargetPattern) -> Any:
         return list(super().plan(occupancy, target).batches)
-
-
-class ReturnsNothingWhenThereIsNothingToDo(OneByOnePlanner):
-    def plan(self, occupancy: Occupancy, target: TargetPattern) -> Any:
-        plan = super().plan(occupancy, target)
-        return plan if plan.n_batches else None
-
-
-class FailsOnOneRow(OneByOnePlanner):
-    def plan(self, occupancy: Occupancy, target: TargetPattern) -> Plan:
-        plan = super().plan(occupancy, target)
-        if target.shape[0] == 1:
-            raise IndexError("index 1 is out of bounds")
-        return plan
 
 
 class RefusesEmptyTargets(OneByOnePlanner):
@@ -73,19 +58,6 @@ class CreatesAnAtom(OneByOnePlanner):
         return Plan.from_batches([([empty[0]], [empty[-1]]), *plan.batches])
 
 
-class MovesTheSameAtomTwiceAtOnce(OneByOnePlanner):
-    def plan(self, occupancy: Occupancy, target: TargetPattern) -> Plan:
-        plan = super().plan(occupancy, target)
-        twice = [Batch(np.repeat(b.from_sites, 2, 0), np.repeat(b.to_sites, 2, 0)) for b in plan.batches]
-        return Plan.from_batches(twice)
-
-
-class LinksEverything(OneByOnePlanner):
-    def plan(self, occupancy: Occupancy, target: TargetPattern) -> Plan:
-        plan = super().plan(occupancy, target)
-        return Plan(plan.moves, plan.batch_offsets, np.ones(plan.n_batches, np.bool_))
-
-
 class CutsCorners(OneByOnePlanner):
     def plan(self, occupancy: Occupancy, target: TargetPattern) -> Plan:
         cut: list[Batch] = []
@@ -100,11 +72,6 @@ class DoesNothing(OneByOnePlanner):
     def plan(self, occupancy: Occupancy, target: TargetPattern) -> Plan:
         super().plan(occupancy, target)
         return Plan.from_batches([])
-
-
-class ForgetsToClear(OneByOnePlanner):
-    def plan(self, occupancy: Occupancy, target: TargetPattern) -> Plan:
-        return super().plan(occupancy, TargetPattern(target.fill, np.zeros_like(target.clear)))
 
 
 class GivesUpWithTooFewAtoms(OneByOnePlanner):
@@ -124,37 +91,11 @@ class RemembersHowOftenItWasAsked(OneByOnePlanner):
         return upside_down(super().plan, occupancy, target, next(self.turns))
 
 
-class DrawsItsOwnStart(OneByOnePlanner):
-    turns = itertools.cycle((1, -1))
-
-    def __init__(self, settings: None = None, context: Any = None) -> None:
-        super().__init__(settings, context)
-        self.turn = next(DrawsItsOwnStart.turns)
-
-    def plan(self, occupancy: Occupancy, target: TargetPattern) -> Plan:
-        return upside_down(super().plan, occupancy, target, self.turn)
-
-
 class WritesIntoTheOccupancy(OneByOnePlanner):
     def plan(self, occupancy: Occupancy, target: TargetPattern) -> Plan:
         plan = super().plan(occupancy, target)
         if occupancy.flags.writeable:
             occupancy[...] = False
-        return plan
-
-
-class WritesIntoTheTarget(OneByOnePlanner):
-    def plan(self, occupancy: Occupancy, target: TargetPattern) -> Plan:
-        plan = super().plan(occupancy, target)
-        target.clear.flags.writeable = True
-        target.clear[...] = False
-        return plan
-
-
-class WantsToWrite(OneByOnePlanner):
-    def plan(self, occupancy: Occupancy, target: TargetPattern) -> Plan:
-        plan = super().plan(occupancy, target)
-        occupancy[0, 0] = occupancy[0, 0]
         return plan
 
 
@@ -170,23 +111,9 @@ class ChecksNothing(OneByOnePlanner):
         return super().plan(np.resize(occupancy, target.shape) != 0, target)
 
 
-class FailsSomewhereInside(OneByOnePlanner):
-    def plan(self, occupancy: Occupancy, target: TargetPattern) -> Plan:
-        try:
-            return super().plan(occupancy, target)
-        except ValueError as error:
-            raise IndexError("too many indices") from error
-
-
 class ReadsAFile(OneByOnePlanner):
     def plan(self, occupancy: Occupancy, target: TargetPattern) -> Plan:
         Path(os.devnull).read_bytes()
-        return super().plan(occupancy, target)
-
-
-class DrawsFromRandom(OneByOnePlanner):
-    def plan(self, occupancy: Occupancy, target: TargetPattern) -> Plan:
-        random.random()
         return super().plan(occupancy, target)
 
 
@@ -194,13 +121,6 @@ class SeedsNumpy(OneByOnePlanner):
     def plan(self, occupancy: Occupancy, target: TargetPattern) -> Plan:
         np.random.seed(1)  # noqa: NPY002 - the fault
         np.random.random()  # noqa: NPY002 - the fault
-        return super().plan(occupancy, target)
-
-
-class SilencesNumpy(OneByOnePlanner):
-    def plan(self, occupancy: Occupancy, target: TargetPattern) -> Plan:
-        before = np.seterr()["over"]
-        np.seterr(over="ignore" if before == "warn" else "warn")
         return super().plan(occupancy, target)
 
 
@@ -224,28 +144,17 @@ PLANTED = Planted(
     partial(OneByOnePlanner, None),
     (
         (partial(ReturnsBatches, None), ("test_returns_a_plan", "test_plans_for_extremes")),
-        (partial(ReturnsNothingWhenThereIsNothingToDo, None), "test_plans_for_extremes"),
-        (partial(FailsOnOneRow, None), "test_plans_for_extremes"),
         (partial(RefusesEmptyTargets, None), "test_plans_for_extremes"),
         (partial(CreatesAnAtom, None), "test_creates_no_atom"),
-        (partial(MovesTheSameAtomTwiceAtOnce, None), "test_creates_no_atom"),
-        (partial(LinksEverything, None), "test_plans_are_legal"),
         (partial(CutsCorners, None), "test_plans_are_legal"),
         (partial(DoesNothing, None), "test_fills_the_target"),
-        (partial(ForgetsToClear, None), "test_fills_the_target"),
         (partial(GivesUpWithTooFewAtoms, None), "test_does_what_it_can_with_too_few_atoms"),
         (partial(RemembersHowOftenItWasAsked, None), "test_same_input_same_plan"),
-        (partial(DrawsItsOwnStart, None), "test_same_input_same_plan"),
         (partial(WritesIntoTheOccupancy, None), "test_leaves_the_input_untouched"),
-        (partial(WritesIntoTheTarget, None), "test_leaves_the_input_untouched"),
-        (partial(WantsToWrite, None), "test_takes_any_memory_layout"),
         (partial(ReadsTheMemoryAsItLies, None), "test_takes_any_memory_layout"),
         (partial(ChecksNothing, None), "test_refuses_wrong_input"),
-        (partial(FailsSomewhereInside, None), "test_refuses_wrong_input"),
         (partial(ReadsAFile, None), "test_is_pure"),
-        (partial(DrawsFromRandom, None), "test_is_pure"),
         (partial(SeedsNumpy, None), "test_is_pure"),
-        (partial(SilencesNumpy, None), "test_is_pure"),
         (partial(TakesThreeSeconds, None), "test_plans_in_time"),
     ),
 )

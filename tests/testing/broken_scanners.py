@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import random
 import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -17,7 +16,7 @@ from .planted import Planted
 
 class Suite(ScannerContract):
     n_points: ClassVar[int] = 5
-    time_limit_s: ClassVar[float] = 0.5
+    time_limit_s: ClassVar[float] = 0.1
 
 
 class Draws:
@@ -45,16 +44,6 @@ class GivesNothing(Draws):
         return None
 
 
-class GivesPairs(Draws):
-    def next_point(self, visited: Sequence[VisitedPoint]) -> Any:
-        return list(super().next_point(visited).items())
-
-
-class LeavesOneOut(Draws):
-    def next_point(self, visited: Sequence[VisitedPoint]) -> Any:
-        return dict([*super().next_point(visited).items()][1:])
-
-
 class GoesTooFar(Draws):
     def next_point(self, visited: Sequence[VisitedPoint]) -> Any:
         return {one.address: 1.1 * one.high for one in self.space.ranges}
@@ -80,17 +69,6 @@ class CountsItsCalls(Draws):
         return {one.address: one.at(rng.random()) for one in self.space.ranges}
 
 
-class RemembersTheBest(Draws):
-    best = -math.inf
-
-    def next_point(self, visited: Sequence[VisitedPoint]) -> Any:
-        point = super().next_point(visited)
-        if visited and visited[-1].score <= self.best:  # what a resumed run no longer knows
-            return dict(visited[-1].values)
-        self.best = visited[-1].score if visited else -math.inf
-        return point
-
-
 class SpoilsTheValues(Draws):
     def next_point(self, visited: Sequence[VisitedPoint]) -> Any:
         for point in visited:
@@ -106,26 +84,16 @@ class LooksIntoTheFolder(Draws):
         return super().next_point(visited)
 
 
-class DrawsFromRandom(Draws):
-    def __init__(self, space: ScanSpace) -> None:
-        super().__init__(space)
-        random.random()
-
-
 PLANTED = Planted(
     Suite(),
     Draws,
     (
         (GivesNothing, "test_points_are_in_their_ranges"),
-        (GivesPairs, "test_points_are_in_their_ranges"),
-        (LeavesOneOut, "test_points_are_in_their_ranges"),
         (GoesTooFar, "test_points_are_in_their_ranges"),
         (NeedsScores, "test_points_are_in_their_ranges"),
         (WaitsForAScore, "test_points_are_in_their_ranges"),
         (CountsItsCalls, "test_same_results_same_point"),
-        (RemembersTheBest, "test_same_results_same_point"),
         (SpoilsTheValues, "test_leaves_its_input_untouched"),
         (LooksIntoTheFolder, "test_is_pure"),
-        (DrawsFromRandom, "test_is_pure"),
     ),
 )

@@ -65,13 +65,6 @@ class ReadsAFile(TinyWorld):
         Path(os.devnull).read_bytes()
 
 
-class OpensOnce(TinyWorld):
-    def open(self) -> None:
-        if self.is_open:
-            raise DeviceError("simulation", "it is open already")
-        super().open()
-
-
 class ClosesOnlyWhatIsOpen(TinyWorld):
     def close(self) -> None:
         super().close()
@@ -82,11 +75,6 @@ class TellsMilliseconds(TinyWorld):
     def expose(self, t_start_s: float, exposure_s: float, mode: SensorMode = WHOLE_SENSOR) -> Frame:
         frame = super().expose(t_start_s, exposure_s, mode)
         return replace(frame, exposure_s=1e3 * exposure_s)
-
-
-class CountsFromTheShot(TinyWorld):
-    def expose(self, t_start_s: float, exposure_s: float, mode: SensorMode = WHOLE_SENSOR) -> Frame:
-        return replace(super().expose(t_start_s, exposure_s, mode), t_start_s=0.0)
 
 
 class SharesItsImage(TinyWorld):
@@ -102,19 +90,6 @@ class SharesItsImage(TinyWorld):
         return replace(frame, image=view)
 
 
-class MakesNoFrame(TinyWorld):
-    def expose(self, t_start_s: float, exposure_s: float, mode: SensorMode = WHOLE_SENSOR) -> Any:
-        frame = super().expose(t_start_s, exposure_s, mode)
-        return FrameLike(frame)
-
-
-class FrameLike:
-    """What looks like a frame, but is none."""
-
-    def __init__(self, frame: Frame) -> None:
-        self.image, self.exposure_s, self.t_start_s = frame.image, frame.exposure_s, frame.t_start_s
-
-
 class DrawsItsOwnDisorder(TinyWorld):
     def open(self) -> None:
         super().open()
@@ -123,21 +98,6 @@ class DrawsItsOwnDisorder(TinyWorld):
     def expose(self, t_start_s: float, exposure_s: float, mode: SensorMode = WHOLE_SENSOR) -> Frame:
         frame = super().expose(t_start_s, exposure_s, mode)
         return replace(frame, image=np.rint(100 * self.gain).astype(np.uint16))
-
-
-class HearsNoSeed(TinyWorld):
-    def expose(self, t_start_s: float, exposure_s: float, mode: SensorMode = WHOLE_SENSOR) -> Frame:
-        frame = super().expose(t_start_s, exposure_s, mode)
-        return replace(frame, image=np.full_like(frame.image, 7))
-
-
-class WearsOut(TinyWorld):
-    n_exposed = 0
-
-    def expose(self, t_start_s: float, exposure_s: float, mode: SensorMode = WHOLE_SENSOR) -> Frame:
-        frame = super().expose(t_start_s, exposure_s, mode)
-        self.n_exposed += 1
-        return replace(frame, image=frame.image + np.uint16(self.n_exposed))
 
 
 class DrawsFromOneStream(TinyWorld):
@@ -155,16 +115,6 @@ class LoadsInTheDark(TinyWorld):
         is_lit, self.is_lit = self.is_lit, True
         super().load(t_start_s, duration_s)
         self.is_lit = is_lit
-
-
-class LoadsNothing(TinyWorld):
-    def load(self, t_start_s: float, duration_s: float) -> None:
-        pass
-
-
-class TellsNumbers(TinyWorld):
-    def truth(self) -> Any:
-        return super().truth().astype(int)
 
 
 class KeepsAtoms(TinyWorld):
@@ -207,19 +157,12 @@ PLANTED = Planted(
     TinyWorld,
     (
         (ReadsAFile, "test_constructor_does_no_io"),
-        (OpensOnce, "test_opens_and_closes_twice"),
         (ClosesOnlyWhatIsOpen, "test_opens_and_closes_twice"),
         (TellsMilliseconds, "test_gives_frames"),
-        (CountsFromTheShot, "test_gives_frames"),
         (SharesItsImage, "test_gives_frames"),
-        (MakesNoFrame, "test_gives_frames"),
         (DrawsItsOwnDisorder, "test_same_seed_same_frames"),
-        (HearsNoSeed, "test_same_seed_same_frames"),
-        (WearsOut, "test_shots_are_independent"),
         (DrawsFromOneStream, "test_shots_are_independent"),
         (LoadsInTheDark, "test_loads_atoms"),
-        (LoadsNothing, "test_loads_atoms"),
-        (TellsNumbers, "test_loads_atoms"),
         (KeepsAtoms, "test_loads_atoms"),
         (ExposesBackwards, "test_refuses_impossible_exposures"),
         (PlaysAnything, "test_refuses_wrong_signals"),

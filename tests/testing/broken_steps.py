@@ -1,6 +1,5 @@
 """Steps that break one promise each."""
 
-import itertools
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -28,33 +27,14 @@ class Right:
         shot.take_image(0.045)
 
 
-class PlansInWords(Right):
-    def plan_timeline(self, context: StepContext) -> Sequence[Any]:
-        super().plan_timeline(context)
-        return ["wait", "image"]
-
-
 class UsuallyTakesLonger(Right):
     def plan_timeline(self, context: StepContext) -> Sequence[Any]:
         return [TimelineEntry("wait", 0.15, 0.2, n_images=1)]
 
 
-class HasNoEnd(Right):
-    def plan_timeline(self, context: StepContext) -> Sequence[Any]:
-        return [TimelineEntry("wait", float("inf"), 0.1, n_images=1)]
-
-
 class ReadsAFile(Right):
     def __init__(self) -> None:
         Path(os.devnull).read_bytes()
-
-
-class ChangesItsMind(Right):
-    def __init__(self) -> None:
-        self.durations = itertools.cycle((0.2, 0.3))
-
-    def plan_timeline(self, context: StepContext) -> Sequence[Any]:
-        return [TimelineEntry("wait", next(self.durations), 0.1, n_images=1)]
 
 
 class KnowsItsImagesLater(Right):
@@ -77,10 +57,6 @@ class RecordedSetup(Right):
     """Right: may be tried again."""
 
     repeatable: Any = True
-
-
-class RepeatsALot(RecordedSetup):
-    repeatable = 3
 
 
 class LowersTheTweezers(RecordedSetup):
@@ -112,16 +88,12 @@ PLANTED = Planted(
     Right,
     (
         (UsuallyTakesLonger, "test_lays_out_its_timeline"),
-        (HasNoEnd, "test_lays_out_its_timeline"),
         (ReadsAFile, "test_timeline_is_pure"),
-        (ChangesItsMind, "test_timeline_is_pure"),
         (KnowsItsImagesLater, "test_declares_its_images"),
         (TakesLonger, "test_keeps_its_timeline"),
         (TakesAnotherImage, "test_keeps_its_timeline"),
-        (RepeatsALot, "test_runs_again"),
         (LowersTheTweezers, "test_runs_again"),
         (WorksOnce, "test_runs_again"),
         (HearsNothing, "test_hears_a_stop_request"),
-        (PlansInWords, "test_lays_out_its_timeline"),
     ),
 )

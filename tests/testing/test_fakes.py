@@ -7,10 +7,8 @@ from labseq.errors import DeviceError, StopRequested, TransientError
 from labseq.guard import Guard
 from labseq.model import Frame, Plan, TargetPattern
 from labseq.testing.fakes import (
-    Calls,
     FakeClock,
     Hang,
-    ListSink,
     RecordingCamera,
     RecordingDevice,
     RecordingObserver,
@@ -92,12 +90,6 @@ def test_a_lab_is_as_large_as_its_occupancies() -> None:
     assert seen == [0, 6, 6]
 
 
-def test_a_lab_takes_the_tests_own_parts() -> None:
-    clock, camera = FakeClock(), RecordingCamera()
-    lab = fake_lab(camera=camera, clock=clock, stop=clock.stop, degree_of_parallelism=7)
-    assert (lab.camera, lab.clock, lab.stop, lab.degree_of_parallelism) == (camera, clock, clock.stop, 7)
-
-
 def test_an_image_taken_with_a_lab_is_what_the_test_scripted() -> None:
     from labseq.model import ShotRecord
     from labseq.sequencer.shot import RunningShot
@@ -128,15 +120,6 @@ def test_deciders_follow_their_script() -> None:
         ScriptedDetector([])
 
 
-def test_what_a_sequencer_tells_is_kept() -> None:
-    from labseq.model import ShotRecord
-
-    sink = ListSink()
-    shot = ShotRecord(0, 0, 0, "")
-    sink.write_shot(shot)
-    assert sink.shots == [shot]
-
-
 def test_the_fake_clock_notes_waits_and_hears_the_stop() -> None:
     clock = FakeClock()
     clock.sleep(1.0)
@@ -145,9 +128,3 @@ def test_the_fake_clock_notes_waits_and_hears_the_stop() -> None:
         clock.sleep(2.0)
     assert clock.sleeps == [1.0]
     assert clock.now() == 1.0
-
-
-def test_calls_without_a_clock_have_no_time() -> None:
-    calls = Calls()
-    calls.note("camera", "open")
-    assert calls[0].t_s == 0.0
