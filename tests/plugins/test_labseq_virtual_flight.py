@@ -114,7 +114,7 @@ def test_the_trap_frequencies_are_the_papers() -> None:
     assert axial == pytest.approx(9.0e3, rel=0.25)  # real beams have aberrations
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=8)
 @given(st.integers(0, 10**6))
 def test_moving_agrees_with_an_adaptive_integrator(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -137,17 +137,6 @@ def test_moving_agrees_with_an_adaptive_integrator(seed: int) -> None:
     assert atom[3:] == pytest.approx(expected[3:], abs=1e-3)
 
 
-def test_energy_is_kept_in_a_static_tweezer() -> None:
-    rng = np.random.default_rng(1)
-    state = np.concatenate([rng.normal(0, 0.1e-6, (20, 3)), rng.normal(0, 0.05, (20, 3))], axis=1)
-    sites, depth = np.zeros((20, 2)), np.full(20, STATIC)
-    before = energies(state, sites, depth, WAIST, STATIC_Z)
-    for atom in state:
-        move(atom, np.zeros(4), STATIC, NOBODY, BEAMS, 1e-3, 10_000)
-    after = energies(state, sites, depth, WAIST, STATIC_Z)
-    assert after == pytest.approx(before, abs=2e-3 * STATIC)
-
-
 def test_an_atom_is_carried_and_set_down() -> None:
     state = at_rest((5, 3))
     alive, record = carriage(4).act(state)
@@ -156,23 +145,6 @@ def test_an_atom_is_carried_and_set_down() -> None:
     assert 0 < record[0, HELD_S] < 60e-6
     assert record[0, OFFSET] == pytest.approx(0, abs=1e-12)
     assert record[0, DEPTH] == pytest.approx(MOBILE)
-
-
-def test_a_sudden_start_shakes_the_atom_as_an_oscillator_says() -> None:
-    """In the tweezer's frame the atom starts with its speed: it stays v / omega behind, at most."""
-    speed, first = 0.05, 1
-    light = carriage(3, speed, ramp_s=HOP_S, hold_s=0)
-    omega = math.sqrt(4 * MOBILE / WAIST**2)
-    behind: list[float] = []
-    for last in range(first + 3, int(light.t_s.searchsorted(100e-6))):
-        rows, cols, depth = (v[first:last, 0].tolist() for v in (light.rows, light.cols, light.depth))
-        state = at_rest((5, 3))
-        Light(rows, cols, depth).act(state, 100)
-        way_m = (cols[-1] - 3) * GRID.spacing_m
-        if way_m > 2 * WAIST:  # out of the static tweezer
-            behind.append(abs(state[0, 0] - GRID.positions_m[5, 3, 0] - way_m))
-    assert max(behind) < 1.6 * speed / omega
-    assert max(behind) > 0.5 * speed / omega
 
 
 def test_a_shallow_tweezer_leaves_the_atom_behind_and_a_distant_one_does_too() -> None:
@@ -185,16 +157,6 @@ def test_a_shallow_tweezer_leaves_the_atom_behind_and_a_distant_one_does_too() -
         alive, _ = light.act(state)
         assert alive[0]
         assert np.hypot(*(state[0, :2] - GRID.positions_m[5, 3])) < WAIST
-
-
-def test_light_that_goes_out_between_sites_lets_the_atom_fall() -> None:
-    light = carriage(1.5)
-    state = at_rest((5, 3))
-    state[0, 3] = 0.05
-    alive, record = light.act(state)
-    site = GRID.positions_m[5, 4]
-    assert not alive[0] or np.hypot(*(state[0, :2] - site)) > WAIST
-    assert alive[0] or record[0, LOST_S] > light.t_s[-30]
 
 
 def test_two_atoms_in_one_tweezer_are_both_lost() -> None:
@@ -217,17 +179,18 @@ SURE = SimulationSettings(transport_loss=0.0)
 
 
 def fly(
-    program: ToneProgram, atoms: list[tuple[int, int]], settings: SimulationSettings = SURE, seed: int = 1
-) -> tuple[set[tuple[int, int]], NDArray[Any]]:
-    """The sites that hold atoms afterwards, and the table of flights."""
+    program: ToneProgram, atoms: list[tuple[int, int]], settings: SimulationSettings = SURE
+) -> tuple[set[tuple[int, int]], NDArray[Any], NDArray[Any]]:
+    """The sites that hold atoms afterwards, and the tables of flights and jumps."""
     flight = RfTransport(GRID, spec(), settings)
     occupied = np.zeros(GRID.shape, np.bool_)
     for site in atoms:
         occupied[site] = True
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(1)
     for pulse in PulseReceiver(PlayedRfSource(played(program)), 60e-6).receive_until(START_S + 10.0):
         flight.carry(occupied, pulse, np.ones(GRID.shape), rng, 1.0)
-    return {(int(row), int(col)) for row, col in np.argwhere(occupied)}, flight.tables(START_S)["flights"]
+    tables = flight.tables(START_S)
+    return {(int(row), int(col)) for row, col in np.argwhere(occupied)}, tables["flights"], tables["jumps"]
 
 
 def batch(*pairs: tuple[tuple[int, int], tuple[int, int]]) -> SitePairs:
@@ -240,7 +203,7 @@ def test_atoms_are_where_the_plan_says() -> None:
         batch(((3, 7), (6, 7)), ((8, 7), (9, 7))),
     )
     atoms = [(5, 2), (5, 4), (5, 9), (3, 7), (8, 7), (12, 12)]
-    sites, flights = fly(program, atoms)
+    sites, flights, _ = fly(program, atoms)
     assert sites == {(5, 1), (5, 4), (5, 13), (6, 7), (9, 7), (12, 12)}
     assert flights["fate"].tolist() == [b"kept"] * 5
     assert flights["depth_K"] == pytest.approx(np.full(5, 2.1e-3), rel=0.01)
@@ -248,36 +211,29 @@ def test_atoms_are_where_the_plan_says() -> None:
     assert (flights["held_s"][:3] < program.joint_s[-1] / 2).all()
 
 
-def test_rows_that_move_by_a_site_at_equal_distance_keep_all_atoms() -> None:
-    sites, _ = fly(
-        program_of(batch(*(((4, c), (4, c + 1)) for c in range(3, 10)))), [(4, c) for c in range(3, 10)]
-    )
-    assert sites == {(4, c) for c in range(4, 11)}
+def test_a_row_that_moves_by_a_site_keeps_all_atoms() -> None:
+    row = range(3, 10)
+    sites, _, _ = fly(program_of(batch(*(((4, c), (4, c + 1)) for c in row))), [(4, c) for c in row])
+    assert sites == {(4, c + 1) for c in row}
 
 
 def test_an_atom_that_is_moved_over_another_costs_both() -> None:
-    sites, flights = fly(program_of(batch(((5, 2), (5, 8)))), [(5, 2), (5, 5)])
+    sites, flights, _ = fly(program_of(batch(((5, 2), (5, 8)))), [(5, 2), (5, 5)])
     assert sites == set()
     assert flights["fate"].tolist() == [b"collision", b"collision"]
     assert flights["lost_col"] == pytest.approx([5, 5], abs=0.3)
     assert flights["lost_s"][0] == pytest.approx(0.5e-3 + 60e-6 + 3 * 4.49e-6 / 0.13, abs=10e-6)
 
 
-def test_an_atom_that_is_set_down_on_another_costs_both() -> None:
-    sites, flights = fly(program_of(batch(((5, 2), (5, 5)))), [(5, 2), (5, 5)])
-    assert sites == set()
-    assert flights["fate"].tolist() == [b"collision", b"collision"]
-
-
 def test_an_atom_that_leaves_the_grid_is_ejected() -> None:
-    sites, flights = fly(program_of(batch(((5, 2), (5, -1)))), [(5, 2)])
+    sites, flights, _ = fly(program_of(batch(((5, 2), (5, -1)))), [(5, 2)])
     assert sites == set()
     assert flights["fate"].tolist() == [b"ejected"]
 
 
 def test_the_transport_loss_is_drawn_for_held_atoms() -> None:
     settings = SimulationSettings(transport_loss=1.0)
-    sites, flights = fly(program_of(batch(((5, 2), (5, 4)))), [(5, 2), (9, 9)], settings)
+    sites, flights, _ = fly(program_of(batch(((5, 2), (5, 4)))), [(5, 2), (9, 9)], settings)
     assert sites == {(9, 9)}
     assert flights["fate"].tolist() == [b"hand_over"]
 
@@ -288,7 +244,7 @@ def test_a_misplaced_tweezer_is_reported_and_far_ones_move_nothing(axis: int) ->
     for offset_m, moves in ((0.3e-6, True), (2.2e-6, False)):
         offset = (offset_m, 0.0) if axis == 0 else (0.0, offset_m)
         light = MobileLightSettings(offset=offset)
-        sites, flights = fly(program, [(5, 2)], SimulationSettings(transport_loss=0.0, mobile_light=light))
+        sites, flights, _ = fly(program, [(5, 2)], SimulationSettings(transport_loss=0.0, mobile_light=light))
         assert sites == ({(5, 4)} if moves else {(5, 2)})
         if moves:
             assert flights["offset_m"] == pytest.approx([offset_m], rel=0.05)
@@ -299,39 +255,26 @@ def test_a_misplaced_tweezer_is_reported_and_far_ones_move_nothing(axis: int) ->
 def test_half_the_volts_on_one_axis_are_a_quarter_of_the_depth() -> None:
     program = program_of(batch(((5, 2), (5, 4))))
     light = MobileLightSettings(tone_voltage=FULL_SCALE_V / 20 * 2**0.5)
-    _, flights = fly(program, [(5, 2)], SimulationSettings(transport_loss=0.0, mobile_light=light))
+    _, flights, _ = fly(program, [(5, 2)], SimulationSettings(transport_loss=0.0, mobile_light=light))
     assert flights["depth_K"] == pytest.approx([2.1e-3 / 4], rel=0.01)
 
 
-def test_hotter_atoms_are_lost_more_often() -> None:
-    program = program_of(batch(*(((r, 2), (r, 6)) for r in (4,))))
-    kept = [
-        sum((4, 6) in fly(program, [(4, 2)], settings, seed)[0] for seed in range(25))
-        for settings in (SURE, SimulationSettings(transport_loss=0.0, temperature=150e-6))
-    ]
-    assert kept[0] == 25 > kept[1]
+def test_a_temperature_that_the_tweezers_cannot_hold_is_refused() -> None:
+    assert SimulationSettings(temperature=150e-6).temperature == 150e-6
+    with pytest.raises(ValueError, match="too hot for tweezers with a static_depth of 300 uK; expected at"):
+        SimulationSettings(temperature=151e-6)
 
 
-@pytest.mark.parametrize(("temperature", "fine"), [(150e-6, True), (151e-6, False), (1.0, False)])
-def test_a_temperature_that_the_tweezers_cannot_hold_is_refused(temperature: float, fine: bool) -> None:
-    if fine:
-        assert SimulationSettings(temperature=temperature).temperature == temperature
-    else:
-        with pytest.raises(
-            ValueError, match="too hot for tweezers with a static_depth of 300 uK; expected at"
-        ):
-            SimulationSettings(temperature=temperature)
-
-
-@pytest.mark.parametrize("depth", [1e-9, 15e-6, 30e-6, 300e-6])
+@pytest.mark.parametrize("depth", [15e-6, 300e-6])
 def test_atoms_are_bound_and_no_hotter_than_their_tweezer_allows(depth: float) -> None:
-    waist, rayleigh, n = 0.98e-6, 3.7e-6, 2000
+    waist, rayleigh, n = 0.98e-6, 3.7e-6, 1000
     depths, kt = np.full(n, KELVIN * depth), KELVIN * 15e-6
     state = draw_atoms(depths, kt, waist, rayleigh, np.random.default_rng(1))
     assert (energies(state, np.zeros((n, 2)), depths, waist, rayleigh) < 0).all()
     assert state[:, 3:].var() < 1.1 * min(kt, KELVIN * depth / 2)
 
 
+@settings(max_examples=30)
 @given(
     arrays(np.float64, (5, 3), elements=st.one_of(st.just(np.nan), st.floats(-30, 30))),
     arrays(np.float64, (5, 2), elements=st.one_of(st.just(np.nan), st.floats(-2, 6))),
@@ -345,25 +288,12 @@ def test_near_a_tweezer_are_the_sites_around_it(rows: Floats, cols: Floats) -> N
     np.testing.assert_array_equal(RfTransport(grid, spec(), SURE)._near(rows, cols), near)
 
 
-def test_the_same_seed_gives_the_same_flights() -> None:
-    program = program_of(batch(((5, 2), (5, 4)), ((5, 7), (5, 12))))
-    first, second = (
-        fly(program, [(5, 2), (5, 7)], SimulationSettings(temperature=100e-6), 3)[1] for _ in range(2)
-    )
-    assert first.tobytes() == second.tobytes()
-
-
 MOVE = ([(5, 2), (5, 5)], [(5, 5), (5, 9)])
 """Segments: 0 pause, 1 pick-up, 2 and 3 transport (one arrives before the other), 4 drop-off."""
 
 
-def jumps_of(program: ToneProgram) -> NDArray[np.void]:
-    flight = RfTransport(GRID, spec(), SimulationSettings(transport_loss=0.0))
-    occupied = np.zeros(GRID.shape, np.bool_)
-    occupied[5, 2] = occupied[5, 5] = True
-    for pulse in PulseReceiver(PlayedRfSource(played(program)), 60e-6).receive_until(START_S + 1.0):
-        flight.carry(occupied, pulse, np.ones(GRID.shape), np.random.default_rng(1), 1.0)
-    return flight.tables(START_S)["jumps"]
+def jumps_of(program: ToneProgram) -> NDArray[Any]:
+    return fly(program, [(5, 2), (5, 5)])[2]
 
 
 @pytest.mark.parametrize("speed_profile", ["constant", "minimum_jerk", "constant_jerk"])
@@ -372,8 +302,7 @@ def test_smooth_motion_has_no_jumps(speed_profile: str) -> None:
     assert len(jumps_of(program_of(*batches, speed_profile=speed_profile))) == 0
 
 
-@pytest.mark.parametrize("segment", [2, 3, 4])
-@pytest.mark.parametrize("size_rad", [-2.0, -1.0, 1.0, 2.0])
+@pytest.mark.parametrize(("segment", "size_rad"), [(2, -1.0), (3, 2.0), (4, -2.0)])
 def test_a_phase_jump_is_found_with_its_size_and_place(segment: int, size_rad: float) -> None:
     smooth = program_of(MOVE)
     all_jumps = jumps_of(with_phase_jump(smooth, segment, size_rad))
@@ -402,7 +331,7 @@ def test_a_ramp_of_no_length_is_a_jump_of_the_depth(ramp: str, size: float) -> N
 
 # Waveforms broken on purpose, against a prediction that never sees a sample: it takes the tone program's
 # formulas, smooths them over the beam by sums over time, and moves an ensemble of atoms in numpy.
-N_ATOMS = int(os.environ.get("LABSEQ_ATOMS", "400"))
+N_ATOMS = int(os.environ.get("LABSEQ_ATOMS", "200"))
 WAY, ROW = 4, 5
 TRANSIT_S, STEP_S = 10e-6, 0.2e-6
 HOT_K = 25e-6
@@ -429,21 +358,24 @@ class Broken:
 
 
 CASES = [
-    Broken("nothing"),
-    Broken("150 nm beside the sites", offset_m=150e-9),
     Broken("900 nm beside the sites", offset_m=900e-9),
-    Broken("10 % less depth", depth_k=0.9 * 2.1e-3),
     Broken("65 % less depth", depth_k=0.35 * 2.1e-3),
-    Broken("a phase jump of 1 rad at the start", change=lambda p: with_phase_jump(p, 2, 1.0)),
     Broken("a phase jump of 2 rad at the start", change=lambda p: with_phase_jump(p, 2, 2.0)),
-    Broken("a pick-up of no length", motion={"pick_up_s": 1e-9}),
     Broken("a drop-off of no length", motion={"drop_off_s": 1e-9}),
     Broken("twice the speed", motion={"speed_m_s": 0.26}),
 ]
+if "LABSEQ_ATOMS" in os.environ:
+    CASES += [
+        Broken("nothing"),
+        Broken("150 nm beside the sites", offset_m=150e-9),
+        Broken("10 % less depth", depth_k=0.9 * 2.1e-3),
+        Broken("a phase jump of 1 rad at the start", change=lambda p: with_phase_jump(p, 2, 1.0)),
+        Broken("a pick-up of no length", motion={"pick_up_s": 1e-9}),
+    ]
 
 
 class CachedTransport(RfTransport):
-    """A flight that demodulates each episode once: what was played does not depend on the atoms."""
+    """Finds the tones of each pulse once: they do not depend on the atoms."""
 
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
@@ -462,13 +394,13 @@ def simulated_loss(case: Broken) -> tuple[int, NDArray[Any], NDArray[Any]]:
         GRID, spec(), SimulationSettings(transport_loss=0.0, temperature=HOT_K, mobile_light=light)
     )
     outputs, rng = played(case.program), np.random.default_rng(7)
-    episodes = [*PulseReceiver(PlayedRfSource(outputs), 60e-6).receive_until(START_S + 10.0)]
+    pulses = [*PulseReceiver(PlayedRfSource(outputs), 60e-6).receive_until(START_S + 10.0)]
     columns = np.array(case.columns)
     n_kept, n_rows = 0, N_ATOMS // len(columns)
     for _ in range(n_rows):
         occupied = np.zeros(GRID.shape, np.bool_)
         occupied[ROW, columns] = True
-        for pulse in episodes:
+        for pulse in pulses:
             flight.carry(occupied, pulse, np.ones(GRID.shape), rng, 1.0)
         n_kept += int(np.count_nonzero(occupied[ROW, columns + WAY]))
     tables = flight.tables(START_S)
@@ -554,7 +486,7 @@ def force(x: Floats, depth: float, waist: float, rayleigh: float) -> Floats:
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 def test_the_loss_is_the_predicted_one(case: Broken) -> None:
     n_lost, flights, jumps = simulated_loss(case)
-    n_predicted = max(1000, N_ATOMS)
+    n_predicted = max(600, N_ATOMS)
     expected = predicted_loss(case, n_predicted)
     variance = N_ATOMS * expected * (1 - expected) * (1 + N_ATOMS / n_predicted) + 1.0
     print(f"{case.name}: lost {n_lost} of {N_ATOMS}, predicted {expected:.2%}")

@@ -6,17 +6,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, strategies as st
-from labseq_virtual.camera import VirtualCamera
+from hypothesis import given, settings, strategies as st
 from labseq_virtual.images import Images, corner_distance, photoelectrons, site_brightness, site_spots
 from labseq_virtual.sensors import View
-from labseq_virtual.settings import CameraSettings, ImageSettings, SimulationSettings
+from labseq_virtual.settings import ImageSettings, SimulationSettings
 from labseq_virtual.simulation import VirtualSimulation
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from labseq.detection.sites import site_pixels
-from labseq.plugin import Context, DepthRamp, LimitError, RandomStream, SensorMode, SiteGrid
+from labseq.plugin import Context, LimitError, SensorMode, SiteGrid
 from labseq.roles import WHOLE_SENSOR
 
 GRID = SiteGrid()
@@ -40,14 +39,15 @@ def take(
     exposure_s: float = 45e-3, seed: int = 1, mode: SensorMode = WHOLE_SENSOR, **image: Any
 ) -> NDArray[np.uint16]:
     """A frame with an atom on every site."""
-    settings = ImageSettings.model_validate(image)
+    optics = ImageSettings.model_validate(image)
     row, col = np.indices(GRID.shape).reshape(2, -1)
-    images = Images(settings, GRID, seed, mode)
+    images = Images(optics, GRID, seed, mode)
     frame = images.take(row, col, np.ones(len(row)), exposure_s, np.random.default_rng(2))
-    assert frame.shape == mode.frame_shape(settings.frame)
+    assert frame.shape == mode.frame_shape(optics.frame)
     return frame
 
 
+@settings(max_examples=30)
 @given(st.floats(-np.pi, np.pi), st.tuples(st.floats(-50, 600), st.floats(-50, 600)), st.floats(0.1e-6, 1e-6))
 def test_without_distortion_the_sites_are_where_the_detectors_look(
     angle: float, centre: tuple[float, float], pixel: float
@@ -71,12 +71,12 @@ def test_a_stretch_makes_one_direction_longer_than_the_other() -> None:
 
 
 def test_a_barrel_moves_the_corner_inwards_and_nothing_in_the_middle() -> None:
-    settings = ImageSettings(barrel=0.1)
+    optics = ImageSettings(barrel=0.1)
     straight, bent = spots(), spots(barrel=0.1)
-    far = corner_distance(settings, straight)
-    np.testing.assert_allclose(corner_distance(settings, bent), far * (1 - 0.1 * far**2))
-    assert corner_distance(settings, np.array([-0.5, -0.5])) == pytest.approx(1.0)
-    assert corner_distance(settings, np.array([255.5, 255.5])) == 0.0
+    far = corner_distance(optics, straight)
+    np.testing.assert_allclose(corner_distance(optics, bent), far * (1 - 0.1 * far**2))
+    assert corner_distance(optics, np.array([-0.5, -0.5])) == pytest.approx(1.0)
+    assert corner_distance(optics, np.array([255.5, 255.5])) == 0.0
 
 
 def test_the_spots_are_drawn_at_these_places() -> None:
@@ -91,10 +91,9 @@ def test_the_spots_are_drawn_at_these_places() -> None:
 
 
 def test_vignetting_darkens_the_corner() -> None:
-    settings = ImageSettings(vignetting=0.4)
-    rng = np.random.default_rng(0)
+    optics, rng = ImageSettings(vignetting=0.4), np.random.default_rng(0)
     places = np.array([[[255.5, 255.5], [-0.5, 511.5], [255.5, 511.5]]])
-    np.testing.assert_allclose(site_brightness(settings, places, rng), [[1.0, 0.6, 0.8]])
+    np.testing.assert_allclose(site_brightness(optics, places, rng), [[1.0, 0.6, 0.8]])
 
 
 def test_the_brightness_of_sites_belongs_to_the_machine() -> None:
@@ -129,10 +128,7 @@ def test_wings_give_neighbours_the_fraction_of_the_light_that_theory_says() -> N
     assert 1 - inside == pytest.approx(halo * width / (40.5 * pixel), rel=0.25)  # a square, not a circle
 
 
-def test_without_wings_neighbours_receive_nothing() -> None:
-    assert light(np.array([[100.0, 100.0]]), 4e6)[98:103, 111:116].sum() == 0
-
-
+@settings(max_examples=15)
 @given(st.integers(0, 200), st.integers(0, 200), st.integers(1, 150), st.integers(1, 150))
 def test_a_region_is_that_part_of_the_sensor(y: int, x: int, height: int, width: int) -> None:
     whole = light(spots().reshape(-1, 2), 100.0)
@@ -148,8 +144,8 @@ def test_binning_adds_pixels_up() -> None:
 
 @pytest.mark.parametrize("sensor", ["emccd", "qcmos"])
 def test_binned_frames_hold_the_same_light(sensor: str) -> None:
-    settings: dict[str, Any] = {"sensor": sensor, "offset": 0.0, "qcmos": {"offset": 0.0}, "read_noise": 0.0}
-    plain, binned = (take(mode=SensorMode((10, 20, 400, 440), b), **settings) for b in (1, 2))
+    image: dict[str, Any] = {"sensor": sensor, "offset": 0.0, "qcmos": {"offset": 0.0}, "read_noise": 0.0}
+    plain, binned = (take(mode=SensorMode((10, 20, 400, 440), b), **image) for b in (1, 2))
     assert binned.shape == (200, 220)
     assert binned.sum() == pytest.approx(plain.sum(), rel=0.03)
 
@@ -166,45 +162,17 @@ def test_a_part_of_the_sensor_reads_out_faster() -> None:
     assert fraction(binned, sensor="qcmos") == 1.0
 
 
-REGION = {"y": 56, "x": 6, "height": 400, "width": 500}
-
-
-def test_a_camera_delivers_its_region() -> None:
-    simulation = VirtualSimulation(SimulationSettings(), Context("simulation", random=RandomStream(0)))
-    settings = CameraSettings.model_validate({"region": REGION, "binning": 2, "readout": 8e-3})
-    camera = VirtualCamera(settings, Context("camera", simulation=simulation))
-    simulation.open()
-    camera.open()
-    simulation.play("static_tweezers", DepthRamp(0.0, 1.0), 0.0)
-    assert camera.facts.frame_shape == (200, 250)
-    assert camera.facts.readout_s == pytest.approx(8e-3 * 400 * 500 / 512**2 / 4)
-    camera.arm(1, 45e-3, "software")
-    camera.trigger()
-    assert camera.read(1.0).image.shape == (200, 250)
-
-
-@pytest.mark.parametrize(
-    ("image", "reason"),
-    [
-        ({"stretch": -0.9}, "greater than -0.5"),
-        ({"em_gain": 0.5}, "greater than or equal to 1"),
-        ({"sensor": "film"}, "'emccd' or 'qcmos'"),
-    ],
-)
-def test_impossible_settings_are_refused(image: dict[str, Any], reason: str) -> None:
-    with pytest.raises(ValidationError, match=reason):
-        ImageSettings.model_validate(image)
+def test_impossible_settings_are_refused() -> None:
+    with pytest.raises(ValidationError, match=r"greater than -0\.5"):
+        ImageSettings(stretch=-0.9)
 
 
 @pytest.mark.parametrize(
     ("mode", "image", "reason"),
     [
-        (SensorMode((500, 0, 20, 20)), {}, r"the limit is its 512 x 512 pixels"),
         (SensorMode((0, 500, 20, 20)), {}, r"\[0, 500, 20, 20\]; the limit is its 512 x 512 pixels"),
         (SensorMode((-1, 0, 20, 20)), {}, "the region of the sensor"),
-        (SensorMode((0, 0, 20, 0)), {}, "the region of the sensor"),
         (SensorMode((0, 0, 21, 20), 2), {}, "the binning is 2; the limit is what divides the 21 x 20 pixels"),
-        (SensorMode(binning=3), {}, "divides the 512 x 512 pixels"),
         (
             SensorMode(em_gain=30.0),
             {"sensor": "qcmos"},
@@ -217,8 +185,3 @@ def test_a_sensor_refuses_impossible_modes(mode: SensorMode, image: dict[str, An
     for use in (simulation.readout_fraction, simulation.prepare_sensor):
         with pytest.raises(LimitError, match=reason):
             use(mode)
-
-
-def test_the_same_seed_gives_the_same_frame() -> None:
-    for sensor in ("emccd", "qcmos"):
-        np.testing.assert_array_equal(take(sensor=sensor, seed=3), take(sensor=sensor, seed=3))

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, strategies as st
+from hypothesis import given, settings, strategies as st
 from labseq_virtual.images import photoelectrons
 from labseq_virtual.sensors import N_ONE_BY_ONE, CountDistribution, Emccd, Qcmos, Register, View, power_of_two
 from labseq_virtual.settings import ImageSettings, SimulationSettings
@@ -23,19 +23,15 @@ NOWHERE = np.empty((0, 2))
 
 
 def render(
-    positions_px: NDArray[np.float64] = NOWHERE,
-    exposure_s: float = EXPOSURE_S,
-    shining: float = 1.0,
-    **image: Any,
+    positions_px: NDArray[np.float64] = NOWHERE, exposure_s: float = EXPOSURE_S, **image: Any
 ) -> NDArray[np.float64]:
     dark = {"background": 0.0, "clock_induced_charge": 0.0}
-    settings = View.of(ImageSettings.model_validate(dark | image))
+    view = View.of(ImageSettings.model_validate(dark | image))
     rng = np.random.default_rng(0)
-    mean = settings.photoelectrons * shining * exposure_s / settings.exposure
-    light = photoelectrons(settings, positions_px, np.full(len(positions_px), mean), rng)
-    frame = Emccd(settings).read(light, exposure_s, rng)
+    light = photoelectrons(view, positions_px, np.full(len(positions_px), view.photoelectrons), rng)
+    frame = Emccd(view).read(light, exposure_s, rng)
     assert frame.dtype == np.uint16
-    assert frame.shape == settings.frame
+    assert frame.shape == view.frame
     return frame.astype(float)
 
 
@@ -78,19 +74,6 @@ def test_an_atom_is_a_gaussian_spot_at_its_place() -> None:
     np.testing.assert_allclose(width, np.sqrt(1.2**2 + 1 / 12), rtol=0.01)
 
 
-def test_an_atom_shines_until_it_is_lost() -> None:
-    place = np.array([[100.0, 200.0]])
-    whole, half = (
-        render(place, shining=fraction, photoelectrons=1e5, em_gain=10.0).sum() for fraction in (1.0, 0.5)
-    )
-    dark = 500.0 * 512 * 512
-    assert (half - dark) / (whole - dark) == pytest.approx(0.5, rel=0.05)
-
-
-def test_counts_saturate() -> None:
-    assert render(np.array([[10.0, 10.0]]), photoelectrons=1e5).max() == 65535
-
-
 def test_light_beside_the_sensor_is_lost() -> None:
     corner = np.array([[-0.5, -0.5], [1e4, 1e4], [-50.0, 3.0]])
     frame = render(corner, photoelectrons=1e4, read_noise=0.0, em_gain=10.0) - 500
@@ -98,42 +81,64 @@ def test_light_beside_the_sensor_is_lost() -> None:
     assert frame[:8, :8].sum() == frame.sum()
 
 
-def test_a_frame_need_not_be_square() -> None:
-    frame = render(np.array([[10.0, 150.0]]), frame=(40, 300), photoelectrons=1e4, read_noise=0.0)
-    assert np.unravel_index(frame.argmax(), frame.shape) == pytest.approx((10, 150), abs=1)
-
-
-def test_the_shipped_detector_reaches_the_papers_fidelity() -> None:
-    """Mean fidelity 99.946 %: of 6,000 empty sites 6 look full, of 18,000 atoms 1 is missed."""
+def count_errors(
+    n_shots: int, image: dict[str, Any], *detectors: ThresholdDetector | WeightedDetector
+) -> NDArray[np.float64]:
+    """Atoms missed, atoms, empty sites taken for full and empty sites, (n_detectors, 4)."""
     random = RandomStream(3)
-    simulation = VirtualSimulation(SimulationSettings(), Context("simulation", random=random))
+    settings = SimulationSettings.model_validate({"image": image})
+    simulation = VirtualSimulation(settings, Context("simulation", random=random))
     simulation.open()
     simulation.play("static_tweezers", DepthRamp(0.0, 1.0), 0.0)
-    detector = ThresholdDetector(ThresholdSettings(), Context("detector"))
-    missed = imagined = n_atoms = n_empty = 0
-    for shot in range(60):
+    counts = np.zeros((len(detectors), 4))
+    for shot in range(n_shots):
         random.begin_shot(shot, 0)
         simulation.begin_shot()
         simulation.load(0.0, 0.5)
-        before = simulation.truth()
-        seen, confidence = detector.detect(simulation.expose(0.5, EXPOSURE_S))
-        survivors = before & simulation.truth()
-        missed += int((survivors & ~seen).sum())
-        imagined += int((seen & ~before).sum())
-        n_atoms += int(survivors.sum())
-        n_empty += int((~before).sum())
-        assert np.median(confidence) > 0.99
-    assert missed <= 6  # expected 1.0
-    assert 0 < imagined <= 17  # expected 6.2
-    assert n_atoms + n_empty > 23_000
+        empty = ~simulation.truth()
+        frame = simulation.expose(0.5, EXPOSURE_S)
+        atoms = ~empty & simulation.truth()
+        for row, detector in zip(counts, detectors, strict=True):
+            seen, _ = detector.detect(frame)
+            row += (atoms & ~seen).sum(), atoms.sum(), (seen & empty).sum(), empty.sum()
+    return counts
 
 
-@pytest.mark.parametrize("gain", [1.0, 4.0, 300.0])
+def test_the_shipped_detector_reaches_the_papers_fidelity() -> None:
+    """Mean fidelity 99.946 %: of 4,000 empty sites 4 look full, of 12,000 atoms 0.7 are missed."""
+    detector = ThresholdDetector(ThresholdSettings(), Context("detector"))
+    ((missed, n_atoms, imagined, n_empty),) = count_errors(40, {}, detector)
+    assert missed <= 5
+    assert 0 < imagined <= 13
+    assert n_atoms + n_empty > 15_000
+
+
+def test_both_detectors_work_on_frames_of_a_qcmos_camera() -> None:
+    """See docs/explanation/virtual-images.md."""
+    context = Context("detector")
+    threshold = ThresholdSettings(offset=200.0, threshold=155.0, width=15.0, shape="disc")
+    weighted = WeightedSettings(
+        photoelectrons=36.0,
+        background=0.2225,
+        counts_per_photoelectron=1 / 0.11,
+        read_noise=0.27 / 0.11,
+        em_register=False,
+        offset=200.0,
+        threshold=0.0,
+    )
+    detectors = ThresholdDetector(threshold, context), WeightedDetector(weighted, context)
+    counts = count_errors(20, {"sensor": "qcmos"}, *detectors)
+    errors = (counts[:, 0] / counts[:, 1] + counts[:, 2] / counts[:, 3]) / 2
+    assert errors[0] < 1e-2
+    assert errors[1] < 1e-3
+
+
+@pytest.mark.parametrize("gain", [1.0, 300.0])
 def test_dark_pixels_from_the_table_are_like_pixels_followed_step_by_step(gain: float) -> None:
-    settings = ImageSettings(
+    image = ImageSettings(
         background=1.5, em_gain=gain, read_noise=9.0, electrons_per_adu=3.0, register_clock_induced_charge=0.2
     )
-    camera, rng = Emccd(View.of(settings)), np.random.default_rng(4)
+    camera, rng = Emccd(View.of(image)), np.random.default_rng(4)
     frame = camera.read(np.zeros((512, 512), np.int32), EXPOSURE_S, rng).ravel()
     electrons = camera.register.multiply(rng.poisson(1.505, frame.size), rng)
     followed = np.rint((electrons + 9.0 * rng.standard_normal(frame.size)) / 3.0 + 500)
@@ -166,7 +171,7 @@ def test_a_pixel_and_the_register_hold_a_limited_number_of_electrons() -> None:
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-GAINS = (1.0, 1.02, 1.5, 3.0, 10.0, 100.0, 300.0, 1000.0)
+GAINS = (1.0, 1.02, 3.0, 300.0, 1000.0)
 KOLMOGOROV = 1.95
 """Over the root of the number of draws: the distance that 1 of 1,000 right samples exceeds."""
 
@@ -203,23 +208,22 @@ def distance_to(sample: Ints, probability: Floats) -> float:
     return float(np.abs(found[: len(probability)] - np.cumsum(probability)).max() * np.sqrt(len(sample)))
 
 
-@pytest.mark.parametrize("gain", [1.0, 1.5, 10.0, 300.0])
-@pytest.mark.parametrize("n_electrons", [1, 4, N_ONE_BY_ONE + 1])
+@pytest.mark.parametrize(("gain", "n_electrons"), [(1.5, 1), (10.0, N_ONE_BY_ONE + 1), (300.0, 4)])
 def test_the_output_is_that_of_every_electron_in_every_stage(gain: float, n_electrons: int) -> None:
     register, rng = Register(536, gain), np.random.default_rng(5)
-    n = np.full(4000, n_electrons)
+    n = np.full(3000, n_electrons)
     assert distance(register.multiply(n, rng), stage_by_stage(register, n, rng)) < KOLMOGOROV
 
 
 @pytest.mark.parametrize("gain", GAINS)
-@pytest.mark.parametrize("n_electrons", [1, 2, 10])
+@pytest.mark.parametrize("n_electrons", [1, 10])
 def test_few_electrons_follow_the_exact_probability(gain: float, n_electrons: int) -> None:
     register = Register(604, gain)
-    drawn = register.multiply(np.full(100_000, n_electrons), np.random.default_rng(1))
+    drawn = register.multiply(np.full(30_000, n_electrons), np.random.default_rng(1))
     assert distance_to(drawn, exact(register, n_electrons)) < KOLMOGOROV
 
 
-@pytest.mark.parametrize("gain", GAINS[:-1])
+@pytest.mark.parametrize("gain", [1.02, 300.0])
 def test_many_electrons_follow_it_within_two_in_ten_thousand(gain: float) -> None:
     register, n_electrons = Register(536, gain), N_ONE_BY_ONE + 1
     drawn = register.multiply(np.full(100_000, n_electrons), np.random.default_rng(2))
@@ -227,8 +231,7 @@ def test_many_electrons_follow_it_within_two_in_ten_thousand(gain: float) -> Non
     assert distance_to(drawn, exact(register, n_electrons)) < KOLMOGOROV + allowed
 
 
-@pytest.mark.parametrize("gain", GAINS)
-@pytest.mark.parametrize("n_stages", [100, 536])
+@pytest.mark.parametrize(("gain", "n_stages"), [(1.0, 536), (1.02, 100), (300.0, 536), (1000.0, 536)])
 def test_gain_and_excess_noise_are_those_of_theory(gain: float, n_stages: int) -> None:
     """Variance over gain^2 for a Poisson input of 1: Robbins and Hadwen 2003."""
     register = Register(n_stages, gain)
@@ -239,6 +242,7 @@ def test_gain_and_excess_noise_are_those_of_theory(gain: float, n_stages: int) -
     assert probability @ (n - mean) ** 2 / gain**2 == pytest.approx(register.excess_noise, rel=1e-8)
 
 
+@settings(max_examples=20)
 @given(st.floats(1.0, 2000.0) | st.floats(0.0, 1e-6).map(lambda over: 1 + over), st.integers(100, 600))
 def test_no_electron_is_lost_in_the_register(gain: float, n_stages: int) -> None:
     n = np.arange(300)
@@ -259,6 +263,7 @@ def test_spurious_charge_of_the_register_is_multiplied_only_by_the_stages_after_
     assert probability @ np.arange(len(probability)) == pytest.approx(mean, rel=1e-6)
 
 
+@settings(max_examples=30)
 @given(st.lists(st.integers(0, 5), min_size=1, max_size=40).filter(any), st.integers(0, 1000))
 def test_a_distribution_draws_each_number_with_its_probability(weights: list[int], first: int) -> None:
     probability = CountDistribution.of(np.array(weights, float), first)
@@ -299,8 +304,7 @@ def read(
 ) -> Floats:
     """Frames of even light (n_frames, height, width)."""
     image = {"sensor": "qcmos", "background": background, "frame": (256, 256)}
-    settings = ImageSettings.model_validate(image | {"qcmos": {"dark_current": 0.0} | qcmos})
-    view = View.of(settings, mode)
+    view = View.of(ImageSettings.model_validate(image | {"qcmos": {"dark_current": 0.0} | qcmos}), mode)
     camera, rng = Qcmos(view, np.random.default_rng(1)), np.random.default_rng(2)
     light = np.full(view.region[2:], electrons, np.int32)
     return np.stack([camera.read(light, EXPOSURE_S, rng) for _ in range(n_frames)]).astype(float)
@@ -325,14 +329,14 @@ def test_dark_current_grows_with_the_exposure() -> None:
 
 
 def test_the_read_noise_differs_from_pixel_to_pixel_about_its_mean_square() -> None:
-    frames = read(n_frames=60, read_noise=0.43, read_noise_spread=0.3, electrons_per_adu=0.02)
+    frames = read(n_frames=30, read_noise=0.43, read_noise_spread=0.3, electrons_per_adu=0.02)
     noise = frames.std(axis=0, ddof=1) * 0.02
     assert np.sqrt((noise**2).mean()) == pytest.approx(0.43, rel=0.02)
-    assert np.log(noise).std() == pytest.approx(np.hypot(0.3, 1 / np.sqrt(120)), rel=0.05)
+    assert np.log(noise).std() == pytest.approx(np.hypot(0.3, 1 / np.sqrt(60)), rel=0.06)
 
 
 def test_offset_and_gain_have_a_fixed_pattern() -> None:
-    dark = read(n_frames=60, read_noise=0.1, offset_spread=2.0, gain_spread=0.0).mean(axis=0)
+    dark = read(n_frames=30, read_noise=0.1, offset_spread=2.0, gain_spread=0.0).mean(axis=0)
     assert dark.std() == pytest.approx(2.0, rel=0.05)
     bright = read(1000, n_frames=10, read_noise=0.1, offset_spread=0.0, gain_spread=0.02).mean(axis=0) - 200
     assert bright.std() / bright.mean() == pytest.approx(0.02, rel=0.05)
@@ -355,42 +359,3 @@ def test_binned_pixels_are_added_up_after_the_read_out() -> None:
     assert frame.shape == (128, 128)
     assert frame.mean() == pytest.approx(800.0, abs=0.2)
     assert frame.std() == pytest.approx(2 * np.sqrt(3.0**2 + 1 / 12), rel=0.02)
-
-
-def test_both_detectors_work_on_its_frames() -> None:
-    """Expected of 18,000 atoms and 6,000 empty sites: see docs/explanation/virtual-images.md."""
-    random = RandomStream(5)
-    settings = SimulationSettings.model_validate({"image": {"sensor": "qcmos"}})
-    simulation = VirtualSimulation(settings, Context("simulation", random=random))
-    simulation.open()
-    simulation.play("static_tweezers", DepthRamp(0.0, 1.0), 0.0)
-    camera: dict[str, Any] = {"offset": 200.0, "threshold": 0.0}
-    weighted = WeightedSettings(
-        photoelectrons=36.0,
-        background=0.2225,
-        counts_per_photoelectron=1 / 0.11,
-        read_noise=0.27 / 0.11,
-        em_register=False,
-        **camera,
-    )
-    detectors = (
-        ThresholdDetector(
-            ThresholdSettings(offset=200.0, threshold=155.0, width=15.0, shape="disc"), Context("detector")
-        ),
-        WeightedDetector(weighted, Context("detector")),
-    )
-    errors, n = np.zeros((2, 2)), np.zeros(2)
-    for shot in range(60):
-        random.begin_shot(shot, 0)
-        simulation.begin_shot()
-        simulation.load(0.0, 0.5)
-        before = simulation.truth()
-        frame = simulation.expose(0.5, EXPOSURE_S)
-        survivors = before & simulation.truth()
-        n += survivors.sum(), (~before).sum()
-        for errors_here, detector in zip(errors, detectors, strict=True):
-            seen, _ = detector.detect(frame)
-            errors_here += (survivors & ~seen).sum(), (seen & ~before).sum()
-    mean_error = (errors / n).mean(axis=1)
-    assert mean_error[0] < 1e-2
-    assert mean_error[1] < 1e-3

@@ -18,6 +18,9 @@ from labseq.testing.fakes import OneByOnePlanner
 from labseq.testing.rf import ON, PROGRAM_GRID as GRID, ToneProgramBuilder
 
 PLANE = SiteGrid(5, 6)
+Tone2 = tuple[float, float]
+"""Place of a tone at the start and at the end, in sites."""
+Sites = set[tuple[int, int]]
 
 
 @pytest.mark.parametrize("sign", [1, -1])
@@ -85,151 +88,104 @@ def after(
     return {(int(r), int(c)) for r, c in np.argwhere(occupied)}
 
 
-def test_a_line_shifts_by_one_into_the_free_site() -> None:
-    tape = ToneProgramBuilder().move([(2, 2)], [(0, 1), (1, 2), (2, 3)])
-    assert after(tape, (2, 0), (2, 1), (2, 2)) == {(2, 1), (2, 2), (2, 3)}
+def start(rows: list[float], cols: list[float]) -> ToneProgramBuilder:
+    """Row tones on, column tones rising from 0 to full amplitude."""
+    return ToneProgramBuilder().add([(r, r, ON, ON) for r in rows], [(c, c, 0.0, ON) for c in cols])
 
 
-def test_rows_and_columns_of_tones_make_a_block_of_tweezers() -> None:
-    tape = ToneProgramBuilder().move([(0, 0), (1, 1)], [(0, 2), (1, 3)])
-    assert after(tape, (0, 0), (0, 1), (1, 0), (1, 1)) == {(0, 2), (0, 3), (1, 2), (1, 3)}
+def move(rows: list[Tone2], cols: list[Tone2]) -> ToneProgramBuilder:
+    return ToneProgramBuilder().move(rows, cols)
 
 
-def test_a_tweezer_that_finds_no_atom_moves_nothing() -> None:
-    tape = ToneProgramBuilder().move([(0, 0)], [(0, 3), (1, 4)])
-    assert after(tape, (0, 1), (3, 3)) == {(0, 4), (3, 3)}
+R0, C0 = [(0, 0, ON, ON)], [(0, 0, 0.0, ON)]
+CREEP = start([0], [0])  # small jumps, never a sweep
+for place in (0.2, 0.4, 0.6, 0.8):
+    CREEP.add(R0, [(place, place, ON, ON)])
+CREEP.add(R0, [(1, 1, ON, 0.0)])
+CORNER = start([0], [0]).add(R0, [(0, 3, ON, ON)]).add([(0, 4, ON, ON)], [(3, 3, ON, ON)])
+CORNER.add([(4, 4, ON, 0.0)], [(3, 3, ON, ON)])
+REORDERED = start([0], [0, 3]).add([(0, 0, ON, 0.0)], [(3, 3, ON, ON), (0, 0, ON, ON)])
+DARK = start([0], [0]).add(R0, [(0, 2, ON, ON), (0.0, 5.0, 0.0, 0.0)]).add(R0, [(2, 2, ON, 0.0)])
+SPLIT = start([0], [2]).add(R0, [(1.75, 1.2, ON, ON), (2.25, 2.8, ON, ON)])
+SPLIT.add(R0, [(1.2, 1.2, ON, 0.0), (2.8, 2.8, ON, 0.0)])
+BESIDE = start([0], [1.7, 2.3]).add(R0, [(1.7, 1.0, ON, ON), (2.3, 3.0, ON, ON)])
+BESIDE.add(R0, [(1.0, 1.0, ON, 0.0), (3.0, 3.0, ON, 0.0)])
+FROM_0 = [(0, 0)]
+
+RULES: list[tuple[str, ToneProgramBuilder, Sites, Sites]] = [
+    ("a line shifts by one", move([(2, 2)], [(0, 1), (1, 2), (2, 3)]),
+        {(2, 0), (2, 1), (2, 2)}, {(2, 1), (2, 2), (2, 3)}),
+    ("rows and columns make a block of tweezers", move([(0, 0), (1, 1)], [(0, 2), (1, 3)]),
+        {(0, 0), (0, 1), (1, 0), (1, 1)}, {(0, 2), (0, 3), (1, 2), (1, 3)}),
+    ("a tweezer without an atom moves nothing", move(FROM_0, [(0, 3), (1, 4)]),
+        {(0, 1), (3, 3)}, {(0, 4), (3, 3)}),
+    ("set down between sites", move(FROM_0, [(0, 2.45)]), {(0, 0)}, set()),
+    ("set down near a site", move(FROM_0, [(0, 2.2)]), {(0, 0)}, {(0, 2)}),
+    ("ejected to the left", move([(2, 2)], [(0, -1)]), {(2, 0), (4, 5)}, {(4, 5)}),
+    ("ejected to the right", move([(2, 2)], [(0, 6)]), {(2, 0), (4, 5)}, {(4, 5)}),
+    ("ejected upwards", move([(2, -1)], FROM_0), {(2, 0), (4, 5)}, {(4, 5)}),
+    ("ejected downwards", move([(2, 5)], FROM_0), {(2, 0), (4, 5)}, {(4, 5)}),
+    ("only the outermost atom is ejected", move([(2, 2)], [(0, -1), (1, 0)]),
+        {(2, 0), (2, 1), (2, 2)}, {(2, 0), (2, 2)}),
+    ("two atoms on one site", move(FROM_0, [(0, 3)]), {(0, 0), (0, 3), (1, 3)}, {(1, 3)}),
+    ("small jumps keep the atom", CREEP, {(0, 0)}, {(0, 1)}),
+    ("two atoms on one site without a sweep", CREEP, {(0, 0), (0, 1)}, set()),
+    ("an atom in the way costs the first tweezer's atom", move(FROM_0, [(0, 4), (1, 5)]),
+        {(0, 0), (0, 1), (0, 3)}, {(0, 4)}),
+    ("an empty tweezer throws out the atom in its way", move(FROM_0, [(0, 4)]), {(0, 2), (1, 2)}, {(1, 2)}),
+    ("the first loaded tweezer is lost wherever it hits", move(FROM_0, [(1, 4), (2, 5)]),
+        {(0, 1), (0, 2), (0, 3), (0, 4)}, {(0, 4)}),
+    ("an unintended crossing takes its atom along", move([(0, 0), (3, 3)], [(0, 1), (4, 5)]),
+        {(0, 0), (3, 4), (3, 0)}, {(0, 1), (3, 5), (3, 1)}),
+    ("a diagonal move passes atoms beside its line", move([(0, 2)], [(0, 2)]),
+        {(0, 0), (1, 0), (0, 1)}, {(2, 2), (1, 0), (0, 1)}),
+    ("a diagonal move hits atoms on its line", move([(0, 2)], [(0, 2)]), {(0, 0), (1, 1)}, set()),
+    ("tweezers that stay on turn a corner", CORNER, {(0, 0), (2, 2)}, {(4, 3), (2, 2)}),
+    ("a tone that goes out between segments",
+        start([0], [0]).add(R0, C0).add(R0, [(0, 0, ON, 0.0)]), {(0, 0)}, set()),
+    ("tones may change their order in the list", REORDERED, {(0, 0), (1, 1)}, {(0, 0), (1, 1)}),
+    ("a pause needs no tones", move(FROM_0, [(0, 2)]).add([], []).move(FROM_0, [(2, 3)]), {(0, 0)}, {(0, 3)}),
+    ("tones that pass", move(FROM_0, [(0, 3), (3, 0), (5, 5)]), {(0, 0), (0, 3), (0, 5)}, {(0, 5)}),
+    ("tones that come close", move(FROM_0, [(0, 1.9), (3, 2.3), (5, 5)]), {(0, 0), (0, 3), (0, 5)}, {(0, 5)}),
+    ("a tone without light disturbs nothing", DARK, {(0, 0), (0, 4)}, {(0, 2), (0, 4)}),
+    ("a tweezer that splits keeps one atom", SPLIT, {(0, 2)}, {(0, 1)}),
+    ("two tweezers beside one atom take it once", BESIDE, {(0, 2)}, {(0, 1)}),
+    ("a weak tweezer neither takes nor throws out an atom",
+        ToneProgramBuilder().add([(0, 0, 0.3 * ON, 0.3 * ON)], C0).add(
+            [(0, 0, 0.3 * ON, 0.3 * ON)], [(0, 3, ON, ON)]
+        ), {(0, 0), (0, 2)}, {(0, 0), (0, 2)}),
+    ("a grid of two sites", ToneProgramBuilder(SiteGrid(1, 2)).move(FROM_0, [(0, 1)]), {(0, 0)}, {(0, 1)}),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(
-    ("off_by", "taken"),
-    [(0.0, True), (0.34, True), (-0.34, True), (0.36, False), (0.5, False)],
+    ("tape", "before", "expected"), [rule[1:] for rule in RULES], ids=[r[0] for r in RULES]
 )
+def test_rules(tape: ToneProgramBuilder, before: Sites, expected: Sites) -> None:
+    assert after(tape, *before) == expected
+
+
+@pytest.mark.parametrize(("off_by", "taken"), [(0.34, True), (-0.34, True), (0.36, False)])
 @pytest.mark.parametrize("axis", ["row", "column"])
 def test_a_pick_up_takes_only_wells_that_merge_with_its_own(off_by: float, taken: bool, axis: str) -> None:
     row, col = (2 + off_by, 2.0) if axis == "row" else (2.0, 2 + off_by)
-    there_and_gone = ToneProgramBuilder().add([(row, row, ON, ON)], [(col, col, 0.0, ON)])
-    assert after(there_and_gone, (2, 2)) == (set() if taken else {(2, 2)})
-
-
-def test_an_atom_set_down_between_sites_is_lost() -> None:
-    assert after(ToneProgramBuilder().move([(0, 0)], [(0, 2.45)]), (0, 0)) == set()
-    assert after(ToneProgramBuilder().move([(0, 0)], [(0, 2.2)]), (0, 0)) == {(0, 2)}
-
-
-@pytest.mark.parametrize(
-    ("rows", "cols"),
-    [([(2, 2)], [(0, -1)]), ([(2, 2)], [(0, 6)]), ([(2, -1)], [(0, 0)]), ([(2, 5)], [(0, 0)])],
-)
-def test_an_atom_that_ends_outside_of_the_grid_is_gone(rows: Any, cols: Any) -> None:
-    assert after(ToneProgramBuilder().move(rows, cols), (2, 0), (4, 5)) == {(4, 5)}
-
-
-def test_ejection_takes_the_outermost_atom_only() -> None:
-    assert after(ToneProgramBuilder().move([(2, 2)], [(0, -1), (1, 0)]), (2, 0), (2, 1), (2, 2)) == {
-        (2, 0),
-        (2, 2),
-    }
-
-
-def test_two_atoms_on_one_site_are_both_lost() -> None:
-    assert after(ToneProgramBuilder().move([(0, 0)], [(0, 3)]), (0, 0), (0, 3), (1, 3)) == {(1, 3)}
-
-
-def test_two_atoms_on_one_site_are_both_lost_however_the_second_came() -> None:
-    creep = ToneProgramBuilder().add([(0, 0, ON, ON)], [(0, 0, 0.0, ON)])  # small jumps, never a sweep
-    for place in (0.2, 0.4, 0.6, 0.8):
-        creep.add([(0, 0, ON, ON)], [(place, place, ON, ON)])
-    creep.add([(0, 0, ON, ON)], [(1, 1, ON, 0.0)])
-    assert after(creep, (0, 0)) == {(0, 1)}
-    assert after(creep, (0, 0), (0, 1)) == set()
-
-
-def test_a_loaded_tweezer_and_the_atom_in_its_way_are_both_lost_and_the_next_passes() -> None:
-    tape = ToneProgramBuilder().move([(0, 0)], [(0, 4), (1, 5)])
-    assert after(tape, (0, 0), (0, 1), (0, 3)) == {(0, 4)}
-
-
-def test_an_empty_tweezer_throws_out_the_atom_in_its_way() -> None:
-    assert after(ToneProgramBuilder().move([(0, 0)], [(0, 4)]), (0, 2), (1, 2)) == {(1, 2)}
-
-
-def test_the_first_loaded_tweezer_is_lost_wherever_it_hits() -> None:
-    tape = ToneProgramBuilder().move([(0, 0)], [(1, 4), (2, 5)])
-    assert after(tape, (0, 1), (0, 2), (0, 3), (0, 4)) == {(0, 4)}
-
-
-def test_an_unintended_crossing_takes_its_atom_along() -> None:
-    tape = ToneProgramBuilder().move([(0, 0), (3, 3)], [(0, 1), (4, 5)])
-    assert after(tape, (0, 0), (3, 4), (3, 0)) == {(0, 1), (3, 5), (3, 1)}
-
-
-def test_a_diagonal_move_hits_what_lies_on_its_line_only() -> None:
-    tape = ToneProgramBuilder().move([(0, 2)], [(0, 2)])
-    assert after(tape, (0, 0), (1, 0), (0, 1)) == {(2, 2), (1, 0), (0, 1)}
-    assert after(tape, (0, 0), (1, 1)) == set()
-
-
-def test_tweezers_that_stay_on_turn_a_corner() -> None:
-    corner = (
-        ToneProgramBuilder()
-        .add([(0, 0, ON, ON)], [(0, 0, 0.0, ON)])
-        .add([(0, 0, ON, ON)], [(0, 3, ON, ON)])
-        .add([(0, 4, ON, ON)], [(3, 3, ON, ON)])
-        .add([(4, 4, ON, 0.0)], [(3, 3, ON, ON)])
-    )
-    assert after(corner, (0, 0), (2, 2)) == {(4, 3), (2, 2)}
+    assert after(start([row], [col]), (2, 2)) == (set() if taken else {(2, 2)})
 
 
 @pytest.mark.parametrize(("jump", "kept"), [(0.2, True), (0.3, False), (3.0, False)])
 def test_a_tone_that_jumps_loses_its_atom(jump: float, kept: bool) -> None:
-    tape = ToneProgramBuilder().add([(0, 0, ON, ON)], [(0, 0, 0.0, ON)])
-    tape.add([(0, 0, ON, ON)], [(jump, 2, ON, ON)]).add([(0, 0, ON, ON)], [(2, 2, ON, 0.0)])
+    tape = start([0], [0]).add(R0, [(jump, 2, ON, ON)]).add(R0, [(2, 2, ON, 0.0)])
     assert after(tape, (0, 0)) == ({(0, 2)} if kept else set())
 
 
-def test_a_tone_that_goes_out_between_segments_loses_its_atom() -> None:
-    tape = ToneProgramBuilder().add([(0, 0, ON, ON)], [(0, 0, 0.0, ON)])
-    tape.add([(0, 0, ON, ON)], [(0, 0, 0.0, ON)]).add([(0, 0, ON, ON)], [(0, 0, ON, 0.0)])
-    assert after(tape, (0, 0)) == set()
-
-
-def test_tones_may_change_their_order_in_the_list() -> None:
-    tape = ToneProgramBuilder().add([(0, 0, ON, ON)], [(0, 0, 0.0, ON), (3, 3, 0.0, ON)])
-    tape.add([(0, 0, ON, 0.0)], [(3, 3, ON, ON), (0, 0, ON, ON)])
-    assert after(tape, (0, 0), (1, 1)) == {(0, 0), (1, 1)}
-
-
 def test_atoms_still_held_at_the_end_are_lost() -> None:
-    tape = ToneProgramBuilder().move([(0, 0)], [(0, 2)])
+    tape = move(FROM_0, [(0, 2)])
     assert after(tape, (0, 0), (4, 4), n_segments=2) == {(4, 4)}
     assert after(tape, (0, 0), (4, 4), n_segments=0) == {(0, 0), (4, 4)}
 
 
-def test_a_pause_between_batches_needs_no_tones() -> None:
-    tape = ToneProgramBuilder().move([(0, 0)], [(0, 2)]).add([], []).move([(0, 0)], [(2, 3)])
-    assert after(tape, (0, 0)) == {(0, 3)}
-
-
-@pytest.mark.parametrize("ends", [(3, 0), (1.9, 2.3), (2, 2)])
-def test_tones_that_meet_or_pass_lose_their_atoms(ends: tuple[float, float]) -> None:
-    tape = ToneProgramBuilder().move([(0, 0)], [(0, ends[0]), (3, ends[1]), (5, 5)])
-    assert after(tape, (0, 0), (0, 3), (0, 5)) == {(0, 5)}
-
-
-def test_a_tone_without_light_disturbs_nothing() -> None:
-    dark = [(0.0, 5.0, 0.0, 0.0)]
-    tape = ToneProgramBuilder().add([(0, 0, ON, ON)], [(0, 0, 0.0, ON)])
-    tape.add([(0, 0, ON, ON)], [(0, 2, ON, ON), *dark]).add([(0, 0, ON, ON)], [(2, 2, ON, 0.0)])
-    assert after(tape, (0, 0), (0, 4)) == {(0, 2), (0, 4)}
-
-
-def test_a_program_on_a_row_of_two_sites_works() -> None:
-    tape = ToneProgramBuilder(SiteGrid(1, 2)).move([(0, 0)], [(0, 1)])
-    assert after(tape, (0, 0)) == {(0, 1)}
-
-
 @given(st.data())
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=40)
 def test_a_legal_shift_of_a_whole_line_does_exactly_what_it_says(data: st.DataObject) -> None:
     n_cols = GRID.n_cols
     columns = st.lists(st.integers(0, n_cols - 1), min_size=1, max_size=n_cols, unique=True).map(sorted)
@@ -251,36 +207,19 @@ TONES = st.lists(
 @given(
     st.lists(st.tuples(TONES, TONES), max_size=5), st.sets(st.tuples(st.integers(0, 4), st.integers(0, 5)))
 )
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=60)
 def test_no_program_makes_atoms(segments: list[Any], sites: set[tuple[int, int]]) -> None:
     assert len(after(ToneProgramBuilder(segments=segments), *sites)) <= len(sites)
 
 
-def atoms_on(*sites: tuple[int, int]) -> NDArray[np.bool_]:
-    occupied = np.zeros(GRID.shape, np.bool_)
-    for site in sites:
-        occupied[site] = True
-    return occupied
-
-
-def remain(tape: ToneProgramBuilder, *sites: tuple[int, int], **physics: Any) -> set[tuple[int, int]]:
-    """Where the atoms_on are after a program."""
-    occupied = atoms_on(*sites)
+def survivors(n_repeats: int, n_tones: int, **physics: float) -> int:
+    """How many of 5 atoms, carried ``n_repeats`` times with ``n_tones`` column tones, survive in all."""
+    program = move([(r, r) for r in range(5)], [(0, 1), *((c, c) for c in range(2, n_tones + 1))]).program()
     transport = Transport(GRID, MotionSpec(), SimulationSettings.model_validate(physics))
-    transport.carry(occupied, tape.program(), len(tape.segments), FULL, np.random.default_rng(0), 1.0)
-    return {(int(r), int(c)) for r, c in np.argwhere(occupied)}
-
-
-def survivors(n_repeats: int, n_tones: int, loss_factor: float = 1.0, **physics: float) -> int:
-    """How many of 5 atoms_on, carried ``n_repeats`` times with ``n_tones`` column tones, survive in all."""
-    cols = [(0, 1), *((c, c) for c in range(2, n_tones + 1))]
-    program = ToneProgramBuilder().move([(r, r) for r in range(5)], cols).program()
-    transport = Transport(GRID, MotionSpec(), SimulationSettings.model_validate(physics))
-    rng = np.random.default_rng(2)
-    total = 0
+    rng, total = np.random.default_rng(2), 0
     for _ in range(n_repeats):
-        occupied = atoms_on(*((r, 0) for r in range(5)))
-        transport.carry(occupied, program, 3, FULL, rng, loss_factor)
+        occupied = atoms(*((r, 0) for r in range(5)))
+        transport.carry(occupied, program, 3, FULL, rng, 1.0)
         total += int(occupied.sum())
     return total
 
@@ -292,63 +231,44 @@ def within_four_sigma(count: int, n: int, p: float) -> bool:
 def test_each_further_tone_adds_to_the_loss() -> None:
     physics = {"transport_loss": 0.1, "transport_loss_per_tone": 0.05}
     further = 4 + 2  # five row tones and three column tones are on
-    assert within_four_sigma(survivors(1000, 3, **physics), 5000, 1 - (0.1 + 0.05 * further))
+    assert within_four_sigma(survivors(600, 3, **physics), 3000, 1 - (0.1 + 0.05 * further))
 
 
-def test_atoms_that_are_not_moved_are_not_lost() -> None:
-    tape = ToneProgramBuilder().move([(0, 0)], [(0, 2)])
-    assert remain(tape, (4, 4), (0, 5), transport_loss=1.0) == {(4, 4), (0, 5)}
+SURE_LOSS = {"adiabatic_depth": 3e-3, "shallow_loss": 1.0}
 
 
-def lost_by(
-    tape: ToneProgramBuilder, *sites: tuple[int, int], depth: float = 1.0, **physics: Any
-) -> dict[str, int]:
-    """What the atoms_on of a program are lost by."""
+@pytest.mark.parametrize(
+    ("tape", "before", "physics", "expected"),
+    [
+        (move(FROM_0, [(0, 2)]), {(0, 0)}, {"transport_loss": 1.0}, {"hand_over": 1}),
+        (move(FROM_0, [(0, 2)]), {(4, 4), (0, 5)}, {"transport_loss": 1.0}, {}),
+        (move(FROM_0, [(0, 2)]), {(0, 0)}, {}, {}),
+        (move(FROM_0, [(0, -1)]), {(0, 0)}, {}, {"ejected": 1}),
+        (move(FROM_0, [(0, 3)]), {(0, 0), (0, 3)}, {}, {"collision": 2}),
+        (move(FROM_0, [(0, 3)]), {(0, 0), (0, 1)}, {}, {"collision": 2}),
+        (move(FROM_0, [(0, 3), (3, 0)]), {(0, 0), (0, 3)}, {}, {"collision": 2}),
+        (start([0], [0]), {(0, 0)}, {}, {"program": 1}),
+        (start([0], [0]).add([], []), {(0, 0)}, {}, {"program": 1}),
+        (move(FROM_0, [(0, 2)]), {(0, 0)}, {"mobile_light": SURE_LOSS}, {}),  # at 9 um/ms
+    ],
+)
+def test_every_loss_has_its_cause(
+    tape: ToneProgramBuilder, before: Sites, physics: dict[str, Any], expected: dict[str, int]
+) -> None:
     settings = SimulationSettings.model_validate({"transport_loss": 0.0, "temperature": 1e-6} | physics)
-    transport = Transport(tape.grid, MotionSpec(), settings)
-    static = np.full(tape.grid.shape, depth)
-    occupied = atoms_on(*sites)
-    n = len(tape.segments)
-    lost = transport.carry(occupied, tape.program(), n, static, np.random.default_rng(0), 1.0)
-    assert int(occupied.sum()) == len(sites) - sum(lost.values())
-    return dict(lost)
-
-
-def test_every_loss_has_its_cause() -> None:
-    assert lost_by(ToneProgramBuilder().move([(0, 0)], [(0, 2)]), (0, 0), transport_loss=1.0) == {
-        "hand_over": 1
-    }
-    assert lost_by(ToneProgramBuilder().move([(0, 0)], [(0, 2)]), (0, 0)) == {}
-    assert lost_by(ToneProgramBuilder().move([(0, 0)], [(0, -1)]), (0, 0)) == {"ejected": 1}
-    assert lost_by(ToneProgramBuilder().move([(0, 0)], [(0, 3)]), (0, 0), (0, 3)) == {"collision": 2}
-    assert lost_by(ToneProgramBuilder().move([(0, 0)], [(0, 3)]), (0, 0), (0, 1)) == {"collision": 2}
-    assert lost_by(ToneProgramBuilder().move([(0, 0)], [(0, 3), (3, 0)]), (0, 0), (0, 3)) == {"collision": 2}
-    assert lost_by(ToneProgramBuilder().add([(0, 0, ON, ON)], [(0, 0, 0.0, ON)]), (0, 0)) == {"program": 1}
-    held = ToneProgramBuilder().add([(0, 0, ON, ON)], [(0, 0, 0.0, ON)])
-    assert lost_by(held.add([], []), (0, 0)) == {"program": 1}
-    light = {"adiabatic_depth": 3e-3, "shallow_loss": 1.0}
-    assert lost_by(ToneProgramBuilder().move([(0, 0)], [(0, 2)]), (0, 0), mobile_light=light) == {}
-    slow = ToneProgramBuilder().move([(0, 0)], [(0, 2)])
-    assert remain(slow, (0, 0), transport_loss=0.0, mobile_light=light) == {(0, 2)}  # 9 um/ms
+    occupied = atoms(*before)
+    n, rng = len(tape.segments), np.random.default_rng(0)
+    lost = Transport(GRID, MotionSpec(), settings).carry(occupied, tape.program(), n, FULL, rng, 1.0)
+    assert lost == expected
+    assert occupied.sum() == len(before) - sum(lost.values())
 
 
 def test_a_shallow_tweezer_at_full_speed_loses_its_atom_on_the_way() -> None:
-    occupied = atoms_on((0, 0))
-    light = {"adiabatic_depth": 3e-3, "shallow_loss": 1.0}
-    settings = SimulationSettings.model_validate({"transport_loss": 0.0, "mobile_light": light})
-    program = ToneProgramBuilder().move([(0, 0)], [(0, 2)]).program(segment_s=2 * GRID.spacing_m / 0.13)
+    settings = SimulationSettings.model_validate({"transport_loss": 0.0, "mobile_light": SURE_LOSS})
+    program = move(FROM_0, [(0, 2)]).program(segment_s=2 * GRID.spacing_m / 0.13)
     transport = Transport(GRID, MotionSpec(), settings)
-    assert transport.carry(occupied, program, 3, FULL, np.random.default_rng(0), 1.0) == {"transport": 1}
-
-
-def test_a_weak_tweezer_neither_takes_nor_throws_out_an_atom() -> None:
-    weak = ON * 0.3  # 9 % of the depth, on the axis that is not ramped
-    tape = (
-        ToneProgramBuilder()
-        .add([(0, 0, weak, weak)], [(0, 0, 0.0, ON)])
-        .add([(0, 0, weak, weak)], [(0, 3, ON, ON)])
-    )
-    assert remain(tape, (0, 0), (0, 2)) == {(0, 0), (0, 2)}
+    lost = transport.carry(atoms((0, 0)), program, 3, FULL, np.random.default_rng(0), 1.0)
+    assert lost == {"transport": 1}
 
 
 @pytest.mark.parametrize(("offset_um", "kept"), [(0.0, 1.0), (0.9, 0.984), (1.2, 0.75), (2.0, 1.0)])
@@ -366,26 +286,12 @@ def test_pick_up_and_drop_off_beside_the_site_keeps_what_the_energy_allows(
     )
     transport = Transport(GRID, MotionSpec(), SimulationSettings(transport_loss=0.0))
     rng, total = np.random.default_rng(3), 0
-    for _ in range(60):
+    for _ in range(20):
         occupied = np.ones(GRID.shape, np.bool_)
         transport.carry(occupied, tape.program(), 2, FULL, rng, 1.0)
         total += int(occupied.sum())
-    n = 60 * 30
+    n = 20 * 30
     assert abs(total - n * kept) <= 4 * np.sqrt(n * kept * (1 - kept)) + 0.01 * n
-
-
-def test_a_tweezer_that_splits_keeps_one_atom() -> None:
-    tape = ToneProgramBuilder().add([(0, 0, ON, ON)], [(2, 2, 0.0, ON)])
-    tape.add([(0, 0, ON, ON)], [(1.75, 1.2, ON, ON), (2.25, 2.8, ON, ON)])
-    tape.add([(0, 0, ON, ON)], [(1.2, 1.2, ON, 0.0), (2.8, 2.8, ON, 0.0)])
-    assert remain(tape, (0, 2), transport_loss=0.0, temperature=1e-6) == {(0, 1)}
-
-
-def test_two_tweezers_that_come_on_beside_one_atom_take_it_once() -> None:
-    tape = ToneProgramBuilder().add([(0, 0, ON, ON)], [(1.7, 1.7, 0.0, ON), (2.3, 2.3, 0.0, ON)])
-    tape.add([(0, 0, ON, ON)], [(1.7, 1.0, ON, ON), (2.3, 3.0, ON, ON)])
-    tape.add([(0, 0, ON, ON)], [(1.0, 1.0, ON, 0.0), (3.0, 3.0, ON, 0.0)])
-    assert remain(tape, (0, 2), transport_loss=0.0) == {(0, 1)}
 
 
 PROFILES = pytest.mark.parametrize("profile", ["constant", "minimum_jerk", "constant_jerk"])
@@ -400,7 +306,7 @@ def carried(plan: Plan, occupied: NDArray[np.bool_], profile: SpeedProfile = "co
 
 
 @PROFILES
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("seed", range(3))
 def test_a_checked_plan_does_what_the_check_predicts(seed: int, profile: SpeedProfile) -> None:
     occupied = np.random.default_rng(seed).random(PLANE.shape) < 0.6
     target = pattern(np.array([[1, 0, 1], [0, 1, 0], [1, 0, 1]], np.bool_), PLANE)
