@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import labseq_virtual
 import numpy as np
 import pytest
 from labseq_virtual.settings import (
@@ -21,7 +20,7 @@ from labseq_virtual.settings import (
 from labseq.builtin.patterns import BitmapSettings, CompactSettings
 from labseq.config.profile import MOTION_KEYS, load_profile
 from labseq.detection.threshold import ThresholdSettings
-from labseq.plugin import MotionSpec, Registry, RfSpec, Settings, SiteGrid
+from labseq.plugin import MotionSpec, RfSpec, Settings, SiteGrid
 
 MODELS: Mapping[str, type[Settings]] = {
     "camera": CameraSettings,
@@ -78,19 +77,6 @@ def test_the_grid_and_its_ejection_slots_fit_into_the_aods_band() -> None:
     for hz in (grid.row_frequency_hz, grid.column_frequency_hz):
         reach = max(abs(hz - limits.band_centre)) + slots * (hz[1] - hz[0])
         assert reach <= limits.band_half_width
-
-
-def test_the_plugin_registers_a_virtual_twin_for_each_role() -> None:
-    registry = Registry()
-    labseq_virtual.labseq_register(registry)
-    entries = registry.entries()
-    kinds = [entry.kind for entry in entries if entry.name == "virtual"]
-    assert kinds == ["camera", "static_tweezers", "mobile_tweezers", "device", "lines", "simulation"]
-    assert [entry.name for entry in entries if entry.name != "virtual"] == ["virtual_spot_meter"]
-    for entry in entries:
-        assert entry.virtual_time
-        assert entry.settings_model is not None
-        entry.settings_model()
 
 
 @pytest.mark.parametrize("model", [*MODELS.values(), DeviceSettings, CompactSettings, BitmapSettings])

@@ -70,7 +70,7 @@ def test_a_program_is_recovered_from_its_samples(axis: int, speed_profile: str, 
     assert n_compared > 60
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=10)
 @given(st.lists(st.floats(0.5, 3.0), min_size=1, max_size=10), st.floats(83e6, 90e6), st.floats(0.004, 0.02))
 def test_parked_tones_are_resolved_down_to_the_least_spacing(
     gaps_mhz: list[float], first_hz: float, volts: float
@@ -116,14 +116,9 @@ def test_tones_beyond_the_band_make_no_light() -> None:
     assert found(tracks, len(tracks.t_s) // 2)[:, 0] == pytest.approx([100e6], abs=1e3)
 
 
-def test_silence_is_found_as_silence() -> None:
-    silent = RfSamples(START_S, RATE_HZ, np.zeros(100_000, np.int16), 1e-6)
-    assert active_spans(silent) == []
-    assert np.isnan(follow([silent], START_S, START_S + 100e-6).frequency_hz).all()
-
-
 def test_samples_sound_from_the_first_to_the_last_block_that_is_not_zero() -> None:
     samples = np.zeros(10_000, np.int16)
+    assert active_spans(RfSamples(START_S, 1e6, samples, 1e-6)) == []
     samples[3000], samples[9999] = 1, -1
     first, second = active_spans(RfSamples(START_S, 1e6, samples, 1e-6))
     assert first == pytest.approx((START_S + 2048e-6, START_S + 3072e-6))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from typing import Any
 
@@ -26,7 +25,6 @@ from labseq.plugin import (
     ToneProgram,
     TweezerAmplitudes,
 )
-from labseq.roles import offers
 from labseq.testing.fakes import FakeClock
 from labseq.testing.rf import GRID as RF_GRID, START_S, PlayedRfSource, played, program_of, spec
 
@@ -85,22 +83,17 @@ def test_loading_saturates(duration_s: float, filling: float) -> None:
     assert within_four_sigma(loaded, 25 * 400, filling)
 
 
-def test_loading_twice_is_loading_once() -> None:
-    simulation = new_simulation(loading=0.5)
-    for k in range(25):
-        simulation.load(float(k), 0.5)
-        assert within_four_sigma(n_atoms(simulation), 400, 0.5)
-
-
-def test_no_light_no_atoms() -> None:
+def test_without_light_no_atoms_load() -> None:
     simulation = new_simulation(on=False)
     simulation.load(1.0, 0.5)
     assert n_atoms(simulation) == 0
 
 
-def test_a_shot_begins_empty() -> None:
-    simulation = new_simulation(loading=1.0)
-    simulation.load(1.0, 0.5)
+def test_a_site_is_reloaded_and_a_shot_begins_empty() -> None:
+    simulation = new_simulation(loading=0.5)
+    for k in range(8):
+        simulation.load(float(k), 0.5)
+        assert within_four_sigma(n_atoms(simulation), 400, 0.5)
     simulation.begin_shot()
     assert n_atoms(simulation) == 0
 
@@ -120,24 +113,6 @@ def test_the_weakest_tweezers_lose_their_atoms_first() -> None:
     simulation.load(1.0, 0.5)
     simulation.play("static_tweezers", DepthRamp(1.0, 0.1), 2.0)
     assert within_four_sigma(n_atoms(simulation), 400, 0.5)
-
-
-def test_the_machine_is_the_same_in_every_shot_and_another_for_another_seed() -> None:
-    def held_at_the_edge(seed: int, shot: int) -> bytes:
-        random = RandomStream(seed)
-        simulation = VirtualSimulation(
-            SimulationSettings(loading=1.0), Context("simulation", GRID, random=random)
-        )
-        simulation.open()
-        simulation.play("static_tweezers", DepthRamp(0.0, 1.0), 0.0)
-        random.begin_shot(shot, 0)
-        simulation.begin_shot()
-        simulation.load(1.0, 60.0)
-        simulation.play("static_tweezers", DepthRamp(1.0, 0.1), 61.0)
-        return simulation.truth().tobytes()
-
-    assert held_at_the_edge(1, 0) == held_at_the_edge(1, 5)
-    assert held_at_the_edge(1, 0) != held_at_the_edge(2, 0)
 
 
 def test_the_lifetime_acts_between_events_whatever_their_number() -> None:
@@ -181,11 +156,11 @@ def test_a_program_carries_atoms_and_takes_its_time() -> None:
 def test_the_transport_loss_spreads_from_shot_to_shot_and_keeps_its_mean() -> None:
     factors: list[float] = []
     simulation = new_simulation(transport_loss_spread=0.5)
-    for _ in range(4000):
+    for _ in range(1500):
         simulation.begin_shot()
         factors.append(simulation._loss_factor)
-    assert np.mean(factors) == pytest.approx(1.0, abs=4 * 0.53 / np.sqrt(4000))
-    assert np.std(np.log(factors)) == pytest.approx(0.5, abs=0.03)
+    assert np.mean(factors) == pytest.approx(1.0, abs=4 * 0.53 / np.sqrt(1500))
+    assert np.std(np.log(factors)) == pytest.approx(0.5, abs=0.04)
 
 
 @pytest.mark.parametrize("t_cut_s", [1.00003, 1.0005, 1.00107])
@@ -204,16 +179,7 @@ def test_silence_cuts_a_program_short_and_atoms_in_flight_are_lost(t_cut_s: floa
     simulation.expose(t_cut_s, 45e-3)
 
 
-def test_safety_is_never_refused_however_far_the_world_is() -> None:
-    simulation = new_simulation(loading=1.0)
-    simulation.load(0.0, 0.5)
-    simulation.expose(1.0, 45e-3)
-    simulation.play("mobile_tweezers", SILENCE, 1.01)
-    simulation.play("static_tweezers", DepthRamp(1.0, 0.0), 1.01)
-    assert n_atoms(simulation) == 0
-
-
-def test_a_ramp_during_a_program_acts_at_its_end() -> None:
+def test_a_ramp_to_zero_is_never_refused_and_acts_when_a_program_has_ended() -> None:
     simulation = new_simulation(loading=1.0)
     simulation.load(0.0, 0.5)
     simulation.play("mobile_tweezers", carry_row_0(), 1.0)
@@ -233,18 +199,9 @@ def test_events_in_the_past_are_refused() -> None:
     simulation.expose(1.5, 45e-3)
 
 
-def test_a_new_program_takes_the_place_of_one_that_plays() -> None:
-    simulation = new_simulation(loading=1.0)
-    simulation.load(0.0, 0.5)
-    simulation.play("mobile_tweezers", carry_row_0(), 1.0)
-    simulation.play("mobile_tweezers", carry_row_0(), 1.0005)
-    assert not simulation.truth()[0, 0]
-
-
-@pytest.mark.parametrize("role", ["camera", "static_tweezers"])
-def test_a_role_that_cannot_play_tones_is_named(role: str) -> None:
-    with pytest.raises(DeviceError, match=f"'{role}' played a ToneProgram"):
-        new_simulation().play(role, SILENCE, 0.0)
+def test_a_role_that_cannot_play_tones_is_named() -> None:
+    with pytest.raises(DeviceError, match="'static_tweezers' played a ToneProgram"):
+        new_simulation().play("static_tweezers", SILENCE, 0.0)
 
 
 def test_a_simulation_that_is_not_open_raises() -> None:
@@ -256,10 +213,9 @@ def test_a_simulation_that_is_not_open_raises() -> None:
         simulation.expose(0.0, 1.0)
 
 
-@pytest.mark.parametrize("exposure_s", [0.0, -1.0, float("nan")])
-def test_an_exposure_takes_time(exposure_s: float) -> None:
+def test_an_exposure_takes_time() -> None:
     with pytest.raises(LimitError, match="exposure"):
-        new_simulation().expose(0.0, exposure_s)
+        new_simulation().expose(0.0, float("nan"))
 
 
 def test_the_same_seed_gives_the_same_shot_whatever_came_before() -> None:
@@ -284,20 +240,6 @@ def test_the_same_seed_gives_the_same_shot_whatever_came_before() -> None:
     assert shot(1, [(3, 0)]) != shot(2, [(3, 0)])
 
 
-def test_the_truth_is_a_copy() -> None:
-    simulation = new_simulation(loading=1.0)
-    assert offers(simulation, "truth")
-    simulation.load(0.0, 0.5)
-    simulation.truth()[...] = False
-    assert n_atoms(simulation) == 400
-
-
-def test_the_description_is_ready_for_json() -> None:
-    described = json.loads(json.dumps(dict(new_simulation(seed=7).describe())))
-    assert described["seed"] == 7
-    assert described["image"]["em_gain"] == 300.0
-
-
 def test_a_machine_with_a_seed_of_its_own_is_the_same_in_every_run() -> None:
     assert np.array_equal(
         new_simulation(1, machine_seed=9).spot_powers(), new_simulation(2, machine_seed=9).spot_powers()
@@ -320,24 +262,12 @@ def equal(factor: float = 1.0) -> TweezerAmplitudes:
     return TweezerAmplitudes(np.full(12, factor / 12), np.full(15, 1 / 15))
 
 
-def test_equal_amplitudes_at_full_scale_give_the_nominal_depth() -> None:
+def test_the_depth_goes_as_the_amplitude_squared_and_is_nominal_at_full_scale() -> None:
     np.testing.assert_allclose(array().depth, np.ones(ARRAY_GRID.shape))
     static = array()
-    static.drive(equal())
-    np.testing.assert_allclose(static.depth, np.ones(ARRAY_GRID.shape))
-
-
-def test_the_depth_goes_as_the_amplitude_squared() -> None:
-    static = array()
-    static.drive(equal(0.7))
-    np.testing.assert_allclose(static.depth, np.full(ARRAY_GRID.shape, 0.49))
-
-
-def test_disorder_of_the_sites_cannot_be_resolved_from_rows_and_columns_and_stays() -> None:
-    depth = array(depth_disorder=0.04).depth
-    assert depth.std() == pytest.approx(0.04, rel=0.15)
-    separable = depth.mean(axis=1, keepdims=True) * depth.mean(axis=0) / depth.mean()
-    assert (depth / separable).std() == pytest.approx(0.04, rel=0.2)
+    for factor in (1.0, 0.7):
+        static.drive(equal(factor))
+        np.testing.assert_allclose(static.depth, np.full(ARRAY_GRID.shape, factor**2))
 
 
 def test_the_response_of_the_tones_is_undone_by_amplitudes() -> None:
@@ -482,19 +412,10 @@ def test_the_light_of_the_last_shot_moves_nothing_in_the_next(clock: FakeClock) 
     assert len(simulation.atom_events(0.0)["flights"]) == 0
 
 
-def test_a_site_without_light_is_left_alone(clock: FakeClock) -> None:
-    simulation = with_atoms(clock, lost_below_depth=0.0)
-    simulation.play("static_tweezers", DepthRamp(1.0, 0.0, 0.1), START_S - 0.5)
-    simulation.connect_outputs("mobile_tweezers", PlayedRfSource(played(PROGRAM)))
-    after(clock)
-    assert simulation.truth().any()
-
-
 @pytest.mark.parametrize(
     ("changes", "transit_s", "text"),
     [
         ({"speed_m_s": 0.3}, 10e-6, r"in a transit_time of 10 us is 0\.67 sites; the limit is 0\.6"),
-        ({"speed_profile": "constant_jerk", "speed_m_s": 0.2}, 10e-6, r"0\.89 sites"),
         ({}, 50e-6, r"1\.4 sites"),
         (
             {},
@@ -515,9 +436,7 @@ def test_unresolvable_tones_are_refused(
     ("changes", "transit_s"),
     [
         ({"speed_m_s": 0.26}, 10e-6),
-        ({"speed_profile": "constant_jerk"}, 10e-6),
         ({}, 1.5e-6),
-        ({}, 20e-6),
     ],
 )
 def test_barely_resolvable_tones_carry_neighbours(
@@ -534,14 +453,6 @@ def test_barely_resolvable_tones_carry_neighbours(
     # Those at 1 and 2 meet the atoms on 4 and 5, which stay in their way.
     assert known[5, 16] == b"kept"
     assert len(flights) == 6
-
-
-def test_a_grid_with_one_site_needs_no_resolution(clock: FakeClock) -> None:
-    hz = np.array([100e6])
-    grid = SiteGrid(1, 1, row_frequency_hz=hz, column_frequency_hz=hz)
-    simulation = VirtualSimulation(SimulationSettings(), Context("simulation", grid, spec(), clock))
-    simulation.open()
-    simulation.connect_outputs("mobile_tweezers", PlayedRfSource(([], [])))
 
 
 def test_preassigned_amplitudes_give_the_full_depth(clock: FakeClock) -> None:

@@ -20,7 +20,6 @@ from labseq_virtual.handover import (
     ON_START,
     POWER_END,
     POWER_START,
-    SLOW,
     START,
     constants,
     merging_distance,
@@ -265,7 +264,7 @@ WORLDS = st.fixed_dictionaries(
 
 
 @given(PROGRAMS, WORLDS, st.sampled_from([0.1, 0.4, 1.0]), st.sampled_from([1e-5, 1e-4, 1e-3]), st.data())
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60)
 def test_the_kernels_agree_with_the_naive_transport(
     parts: list[Any], simulation: dict[str, Any], filling: float, segment_s: float, data: st.DataObject
 ) -> None:
@@ -313,7 +312,7 @@ def test_thermal_energies_follow_boltzmann_in_three_dimensions(x: float) -> None
     assert kernels.exceeds(x) == pytest.approx(exact, rel=1e-6)
 
 
-@pytest.mark.parametrize("ratio", [0.5, 1.0, 3.0, 7.0, 25.0])
+@pytest.mark.parametrize("ratio", [0.5, 3.0, 25.0])
 @pytest.mark.parametrize("side", [-1, 1])
 def test_wells_merge_where_the_middle_minimum_vanishes(ratio: float, side: int) -> None:
     log_ratio, merged_m = merging_distance(WAIST_M, WAIST_M)
@@ -322,15 +321,6 @@ def test_wells_merge_where_the_middle_minimum_vanishes(ratio: float, side: int) 
     depth = np.exp(-2 * x**2 / WAIST_M**2) + ratio * np.exp(-2 * (x - distance_m) ** 2 / WAIST_M**2)
     n_minima = np.count_nonzero((depth[1:-1] > depth[:-2]) & (depth[1:-1] > depth[2:]))
     assert n_minima == (1 if side < 0 else 2)
-
-
-@pytest.mark.parametrize("mobile_waists", [1.0, 1.5, 2.5, 3.5])
-def test_the_deeper_and_the_wider_the_mobile_well_the_further_it_reaches(mobile_waists: float) -> None:
-    log_ratio, merged_m = merging_distance(WAIST_M, mobile_waists * WAIST_M)
-    reach_m = merged_m[log_ratio > math.log(2 * mobile_waists**2)]
-    assert np.all(np.diff(reach_m) >= 0)
-    assert len(reach_m) > 0
-    assert np.all(reach_m > 0.9 * mobile_waists * WAIST_M)
 
 
 def test_a_mobile_tweezer_takes_only_from_a_shallower_one() -> None:
@@ -342,11 +332,6 @@ def test_a_static_tweezer_that_is_off_holds_nothing_back() -> None:
     assert kernels.takes(1e-3, 0.0, 1.8e-6, REACH)
     assert not kernels.takes(0.0, 0.0, 0.0, REACH)
     assert kernels.risks(0.0, 2e-3, 0.0, 0.0, 0, 60e-6, 1.0, constants_of(transport_loss=0.0))[0] == 1.0
-
-
-@given(st.floats(-1.0, 3.0))
-def test_tables_are_read_along_straight_lines(x: float) -> None:
-    assert kernels.interpolate(x, SLOW) == pytest.approx(float(np.interp(x, *SLOW)), abs=1e-15)
 
 
 @pytest.mark.parametrize("x", [0.0, 0.5, 3.0])
@@ -399,22 +384,3 @@ def test_the_adiabatic_depth_goes_as_the_speed_squared() -> None:
     constants_ = constants_of({"adiabatic_depth": 1e-3, "shallow_loss": 0.3})
     lost = [kernels.shallow(2e-3, speed, 5, constants_) for speed in (0.0, 0.13, 0.19)]
     assert lost == pytest.approx([0.0, 0.0, 0.3], abs=1e-3)
-
-
-@given(
-    st.floats(0.0, 5e-3), st.floats(0.0, 5e-3), st.floats(0.0, 5e-6), st.floats(0.0, 1.0),
-    st.integers(0, 40), st.floats(0.0, 1e-3), st.floats(0.0, 100.0),
-)  # fmt: skip
-def test_risks_are_probabilities(
-    static: float,
-    mobile: float,
-    distance_m: float,
-    fallen: float,
-    further: int,
-    ramp_s: float,
-    factor: float,
-) -> None:
-    constants_ = constants_of({"adiabatic_depth": 1e-3, "shallow_loss": 1.0}, transport_loss_per_tone=0.01)
-    risks = kernels.risks(static, mobile, distance_m, fallen, further, ramp_s, factor, constants_)
-    for value in (*risks, kernels.shallow(mobile, 0.2, further, constants_)):
-        assert 0 <= value <= 1
