@@ -1,4 +1,4 @@
-"""Small runs that are interrupted, and gone on with."""
+"""Small runs that are interrupted and resumed."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ order: shuffled""",
 
 @pytest.fixture(autouse=True)
 def no_git(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nobody's edits of labseq's code while the tests run are a change here."""
+    """Edits of labseq's code while the tests run are no change here."""
     monkeypatch.setenv("GIT_DIR", os.devnull)
 
 
@@ -122,6 +122,24 @@ def table(run: labseq.Run) -> list[Any]:
         )
         for shot in run.shots
     ]
+
+
+class Wholes:
+    """Tables of runs that were never interrupted, by the name of their scan."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.tables: dict[str, list[Any]] = {}
+
+    def __call__(self, scan: str) -> list[Any]:
+        if scan not in self.tables:
+            self.tables[scan] = table(labseq.open_run(interrupted(write(self.folder, scan), "never", 1)))
+        return self.tables[scan]
+
+
+@pytest.fixture(scope="session")
+def wholes(tmp_path_factory: pytest.TempPathFactory) -> Wholes:
+    return Wholes(tmp_path_factory.mktemp("whole"))
 
 
 def lines(run_dir: Path) -> list[str]:

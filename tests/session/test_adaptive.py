@@ -20,7 +20,6 @@ from .small_runs import no_git
 __all__ = ["no_git"]
 
 DOP = "planner.degree_of_parallelism"
-ROOT = Path(__file__).parents[2]
 
 
 def test_each_point_is_chosen_by_what_came_of_those_before(tmp_path: Path) -> None:
@@ -28,13 +27,13 @@ def test_each_point_is_chosen_by_what_came_of_those_before(tmp_path: Path) -> No
     done = run(tmp_path, f"use: scripted, dops: [3, 5, 3], {OVER}, points: 5", "repeats: 2\n", observer=seen)
     assert done.status == "complete"
     assert [shot.parameters[DOP] for shot in done.shots] == [3, 3, 5, 5, 3, 3]
-    told = [values for name, values in seen.events if name == "scan_point"]
+    points = [values for name, values in seen.events if name == "scan_point"]
     filling = [np.mean([shot.filling_fraction for shot in done.shots[i : i + 2]]) for i in (0, 2, 4)]
-    assert [values["value"] for values in told] == pytest.approx(filling)
+    assert [values["value"] for values in points] == pytest.approx(filling)
     of_points = {"3": (filling[0] + filling[2]) / 2, "5": filling[1]}
     best = max(of_points, key=lambda dop: of_points[dop])
-    assert told[-1]["best"]["written"] == {DOP: best}
-    assert told[-1]["best"]["value"] == pytest.approx(of_points[best])
+    assert points[-1]["best"]["written"] == {DOP: best}
+    assert points[-1]["best"]["value"] == pytest.approx(of_points[best])
 
 
 def test_a_point_visited_twice_is_one_point_of_the_scan(tmp_path: Path) -> None:
@@ -43,23 +42,15 @@ def test_a_point_visited_twice_is_one_point_of_the_scan(tmp_path: Path) -> None:
     assert [(point.parameters[DOP], len(point.shots)) for point in points] == [(3, 2), (5, 1)]
     assert [point.written[DOP] for point in points] == ["3", "5"]
     assert done.scan["point_of_shot"] == [0, 1, 0]
-    assert json.loads((done.path / "run.json").read_text("utf-8"))["scan"] == {
-        "addresses": [DOP],
-        "units": [""],
-        "ranges": [
-            {"address": DOP, "low": 1, "high": 9, "is_whole": True, "n_steps": 0, "start": 2.0},
-        ],
-        "scanner": {"use": "scripted", "dops": [3, 5, 3], "then": "end"},
-        "figure": "filling_fraction",
-        "maximise": True,
-        "n_points": 3,
-        "repeats": 1,
-    }
+    record = json.loads((done.path / "run.json").read_text("utf-8"))["scan"]
+    assert (record["addresses"], record["figure"], record["n_points"]) == ([DOP], "filling_fraction", 3)
+    assert record["ranges"][0].items() >= {"address": DOP, "low": 1, "high": 9, "start": 2.0}.items()
+    assert record["scanner"] == {"use": "scripted", "dops": [3, 5, 3], "then": "end"}
     pytest.importorskip("xarray")
     assert done.to_xarray(occupancies=False)["filling_fraction"].dims == (DOP, "repeat")
 
 
-def test_quantities_are_told_in_their_unit_and_chosen_in_si(tmp_path: Path) -> None:
+def test_quantities_are_recorded_in_their_unit_and_chosen_in_si(tmp_path: Path) -> None:
     scan = """use: climb, over: {profile.mobile_tweezers.pick_up: {from: 20 us, to: 0.4 ms, steps: 19},
         shot.sort.window: {from: 10 ms, to: 60 ms}}, minimise: duration_s, points: 4"""
     done = run(tmp_path, scan)
@@ -85,23 +76,17 @@ def test_a_scanner_may_end_the_run_and_then_it_is_complete(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize(
-    ("then", "told"),
+    ("then", "text"),
     [
         ("nan", f"next_point() gave nan for '{DOP}'; expected a whole number from 1 to 9"),
-        ("text", f"next_point() gave '7' for '{DOP}'; expected a whole number from 1 to 9"),
-        ("yes", f"next_point() gave True for '{DOP}'; expected"),
         ("half", f"next_point() gave 2.5 for '{DOP}'; expected"),
-        ("far", f"next_point() gave 10 for '{DOP}'; expected"),
-        ("huge", f"for '{DOP}'; expected"),
         ("other", f"next_point() gave values for 'planner.use'; expected a value for each of '{DOP}'"),
         ("list", f"next_point() gave a list; expected a value for each of '{DOP}'"),
-        ("nobody", f"next_point() gave values for no address; expected a value for each of '{DOP}'"),
         ("raise", "next_point() raised RuntimeError: no idea"),
-        ("exit", "raised SystemExit: 3"),
     ],
 )
 def test_a_wrong_answer_names_the_scanner_and_what_was_taken_stays(
-    tmp_path: Path, then: str, told: str
+    tmp_path: Path, then: str, text: str
 ) -> None:
     with opened(tmp_path, f"use: scripted, dops: [3], then: {then}, {OVER}, points: 5") as session:
         with pytest.raises(DeviceError) as caught:
@@ -109,7 +94,7 @@ def test_a_wrong_answer_names_the_scanner_and_what_was_taken_stays(
         assert session.run_dir is not None
         done = labseq.open_run(session.run_dir)
     assert str(caught.value).startswith("scanner 'scripted': ")
-    assert told in str(caught.value)
+    assert text in str(caught.value)
     assert len(str(caught.value)) < 300
     assert caught.value.exit_code == 3
     assert (done.status, len(done.shots)) == ("failed", 1)
@@ -148,14 +133,14 @@ def test_a_shot_that_is_gone_is_taken_again_at_its_point(tmp_path: Path) -> None
     assert [shot.occupancies.tobytes() for shot in again.shots] == before
 
 
-def test_what_a_shot_has_not_is_told_once_and_is_no_score(tmp_path: Path) -> None:
+def test_a_missing_figure_is_one_warning_and_no_score(tmp_path: Path) -> None:
     seen = RecordingObserver()
     over = OVER.replace("filling_fraction", "reading.laser.power_w")
     run(tmp_path, f"use: scripted, dops: [3, 5], {over}, points: 2", observer=seen)
     (warning,) = [values["text"] for name, values in seen.events if name == "warning"]
     assert warning.startswith("shot 1 has no 'reading.laser.power_w' to climb on")
-    told = [values for name, values in seen.events if name == "scan_point"]
-    assert [(values["value"], values["best"]) for values in told] == [(None, None)] * 2
+    points = [values for name, values in seen.events if name == "scan_point"]
+    assert [(values["value"], values["best"]) for values in points] == [(None, None)] * 2
 
 
 def test_an_option_takes_the_place_of_a_range(tmp_path: Path) -> None:
@@ -169,7 +154,7 @@ def test_an_option_takes_the_place_of_a_range(tmp_path: Path) -> None:
         opened(tmp_path, f"use: climb, {OVER}, points: 3", overrides=[f"{DOP}=4"])
 
 
-def test_the_check_tells_the_most_points_and_the_time_of_the_slowest_corner(tmp_path: Path) -> None:
+def test_the_check_shows_the_most_points_and_the_time_of_the_slowest_corner(tmp_path: Path) -> None:
     scan = "use: climb, over: {shot.0.load.duration: {from: 1 s, to: 3 s}}, maximise: success, points: 3"
     report = check(opened(tmp_path, scan, "repeats: 2\n"))
     assert (report.n_points, report.n_shots) == (3, 6)
@@ -177,7 +162,7 @@ def test_the_check_tells_the_most_points_and_the_time_of_the_slowest_corner(tmp_
     assert report.run_s[1] == pytest.approx(alone.run_s[1])
 
 
-def test_shots_may_stand_in_place_of_points_and_end_a_point_early(tmp_path: Path) -> None:
+def test_shots_limit_a_scan_without_points_and_end_a_point_early(tmp_path: Path) -> None:
     done = run(tmp_path, f"use: scripted, dops: [3, 5, 7], {OVER}", "shots: 5\nrepeats: 2\n", shots=3)
     assert [shot.parameters[DOP] for shot in done.shots] == [3, 3, 5]
 
@@ -186,73 +171,40 @@ BOTH = "from: 1, to: 9"
 
 
 @pytest.mark.parametrize(
-    ("scan", "told"),
+    ("scan", "text"),
     [
         ("use: climb", "1:7: 'over' is missing"),
         (f"use: clim, {OVER}, points: 3", "1:13: unknown scanner 'clim'; expected one of"),
         (f"use: climb, {OVER}", "1:7: 'points' is missing from 'scan' (the most points)"),
         (f"use: climb, {OVER}, points: 3, stop: 0.1", "'stop' is not a setting of scanner 'climb'"),
-        (f"use: climb, {OVER}, points: 20000", "points is 20000"),
-        ("use: climb, over: {}, maximise: success, points: 3", "over"),
         (f"use: climb, over: {{{DOP}: {{from: 1}}}}, maximise: success, points: 3", "'to' is missing"),
-        (f"use: climb, over: {{{DOP}: [1, 9]}}, maximise: success, points: 3", f"{DOP} is a list"),
-        (
-            f"use: climb, over: {{{DOP}: {{from: 9, to: 1}}}}, maximise: success, points: 3",
-            "goes from 9 to 1",
-        ),
         (
             f"use: climb, over: {{{DOP}: {{from: 1, to: 9 ms}}}}, maximise: success, points: 3",
             "'9 ms' does not go with 1; expected a number without a unit",
-        ),
-        (
-            f"use: climb, over: {{{DOP}: {{from: 0, to: 9}}}}, maximise: success, points: 3",
-            "the scan puts it into 'planner.degree_of_parallelism'",
         ),
         (
             f"use: climb, over: {{{DOP}: {{{BOTH}, steps: 3}}}}, maximise: success, points: 3",
             "3 equal steps from 1 to 9 are no whole ones; expected a number of steps that 8 is a multiple of",
         ),
         (
-            f"use: climb, over: {{planner.dop: {{{BOTH}}}}}, maximise: success, points: 3",
-            "'dop' is not a setting of planner 'psca'",
-        ),
-        (
             f"use: climb, over: {{grid.rows: {{{BOTH}}}}}, maximise: success, points: 3",
             "there is no 'grid' in",
         ),
-        (
-            f"use: climb, over: {{profile.grid.rows: {{{BOTH}}}}}, maximise: success, points: 3",
-            "a scan cannot change 'profile.grid.rows'",
-        ),
-        (
-            f"use: climb, over: {{target.rows: {{{BOTH}}}}}, maximise: success, points: 3",
-            "a scan cannot change 'target.rows'",
-        ),
         (f"use: climb, over: {{{DOP}: {{{BOTH}}}}}, points: 3", "the scan has no aim"),
-        (
-            f"use: climb, over: {{{DOP}: {{{BOTH}}}}}, maximise: success, minimise: success, points: 3",
-            "'maximise' and 'minimise' stand together",
-        ),
         (
             f"use: climb, over: {{{DOP}: {{{BOTH}}}}}, maximise: filling, points: 3",
             "there is no figure 'filling' to climb on; expected",
         ),
         (f"use: scripted, then: refuse, {OVER}, points: 3", "it does not want to"),
-        (f"use: climb, {OVER}, points: 3, step: 0", "step is 0"),
     ],
 )
-def test_a_wrong_scan_is_refused_with_its_place(tmp_path: Path, scan: str, told: str) -> None:
+def test_a_wrong_scan_is_refused_with_its_place(tmp_path: Path, scan: str, text: str) -> None:
     with pytest.raises(ConfigError) as caught:
         opened(tmp_path, scan)
     lines = str(caught.value).replace(f"s.yaml:{N_LINES + 1}:", "s.yaml:1:")
     lines += str([problem.notes for problem in caught.value.problems])
-    assert told in lines
+    assert text in lines
     assert all(problem.line == N_LINES + 1 for problem in caught.value.problems), lines
-
-
-def test_an_order_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="'order' is given, but the points are chosen one after another"):
-        opened(tmp_path, f"use: climb, {OVER}, points: 3", "order: shuffled\n")
 
 
 def test_a_figure_that_needs_an_image_is_refused_without_one(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import errno
 import os
 from collections.abc import Generator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -78,18 +79,18 @@ def held() -> Generator[None]:
         yield
 
 
-def run(observer: RecordingObserver | None = None) -> labseq.Run:
-    with labseq.Session.open("s.yaml", observer=observer) as session:
+def run(observer: RecordingObserver | None = None, **options: Any) -> labseq.Run:
+    with labseq.Session.open("s.yaml", observer=observer, **options) as session:
         return session.run()
 
 
-def test_a_second_run_is_refused_and_told_of_the_first(held: None) -> None:
+def test_a_second_run_is_refused_with_the_name_of_the_first(held: None) -> None:
     with pytest.raises(
         DeviceError, match=r"bench: its devices are in use by the run x \(process \d+ on .*\)"
     ) as e:
-        run()
+        run(output="elsewhere")
     assert "labseq stop" in str(e.value)
-    assert not Path("data").exists()
+    assert not Path("elsewhere").exists()
 
 
 def test_the_devices_are_free_after_a_run_and_after_one_that_failed() -> None:
@@ -120,44 +121,27 @@ def test_a_run_holds_its_devices_and_says_which_run_it_is() -> None:
     assert f"in use by the run {done.path} (process {os.getpid()} on " in looking.told
 
 
-def test_data_elsewhere_make_no_difference(held: None, tmp_path: Path) -> None:
-    with (
-        pytest.raises(DeviceError, match="in use by the run x"),
-        labseq.Session.open("s.yaml", output=tmp_path / "elsewhere") as session,
-    ):
-        session.run()
-
-
-def test_devices_are_not_tested_while_somebody_uses_them(held: None) -> None:
+def test_devices_are_not_tested_while_they_are_in_use(held: None) -> None:
     with pytest.raises(DeviceError, match="bench: its devices are in use by the run x"):
         check_devices("./p.yaml")
     assert check_devices("./p.yaml", dry_run="fast").devices  # it touches none
+    assert not Path("data").exists()
 
 
-def test_devices_are_made_safe_whoever_uses_them(held: None) -> None:
+def test_devices_are_made_safe_even_while_they_are_in_use(held: None) -> None:
     seen = RecordingObserver()
     assert not make_profile_safe("./p.yaml", observer=seen).failures
     assert [v["text"][:39] for v in seen.of("warning")] == ["its devices are in use by the run x (pr"]
 
 
-def test_nobody_is_kept_from_simulated_devices(held: None) -> None:
+def test_simulated_devices_and_dry_runs_are_not_locked(held: None) -> None:
+    assert run(dry_run="full").status == "complete"
     write("virtual")
     assert run().status == "complete"
     assert check_devices("./p.yaml").devices
 
 
-def test_nobody_is_kept_from_a_dry_run(held: None) -> None:
-    with labseq.Session.open("s.yaml", dry_run="full") as session:
-        assert session.run().status == "complete"
-
-
-def test_a_command_that_records_nothing_makes_no_data_folder() -> None:
-    check_devices("./p.yaml")
-    make_profile_safe("./p.yaml")
-    assert not Path("data").exists()
-
-
-def test_a_folder_without_locks_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_without_locks_is_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
     fcntl = pytest.importorskip("fcntl")
 
     def refuse(*_: object) -> None:
@@ -171,11 +155,3 @@ def test_a_folder_without_locks_is_told(monkeypatch: pytest.MonkeyPatch) -> None
     folder = lock_files(marker_roots(Path("data")), "x")[0].parent
     assert texts[0].startswith(f"the folder {folder} knows no locks: nothing keeps a run on another")
     assert texts[-1] == "no lock could be had: nothing keeps another run from the same devices"
-
-
-def test_a_state_folder_that_cannot_be_used_does_no_harm(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("LABSEQ_STATE", os.devnull)
-    Path("data").mkdir()
-    seen = RecordingObserver()
-    run(seen)
-    assert not seen.of("warning")

@@ -9,10 +9,8 @@ from typing import Any
 import pytest
 
 import labseq
-from labseq.config.sequence import CheckSettings
 from labseq.errors import CheckFailedError, ConfigError, DeviceError
 from labseq.session.check import check
-from labseq.session.policies import Checks
 from labseq.testing.fakes import RecordingObserver
 
 from .small_runs import Interrupting, interrupted, no_git, resumed, table, write
@@ -75,13 +73,6 @@ def run(path: Path, observer: Any = None) -> labseq.Run:
         return session.run()
 
 
-def stopped_at(path: Path, event: str, n: int) -> Path:
-    """The folder of a run that was stopped at the n-th event."""
-    run_dir = interrupted(path, event, n)
-    assert labseq.open_run(run_dir).status == "stopped"
-    return run_dir
-
-
 def test_a_shot_that_fails_again_and_again_is_skipped_and_the_run_complete(tmp_path: Path) -> None:
     policy = {"on_failure": "repeat_shot", "when_exhausted": "skip_point"}
     seen = RecordingObserver()
@@ -108,11 +99,29 @@ def test_the_rest_of_a_point_is_skipped_with_it(tmp_path: Path) -> None:
     assert [shot.index for shot in done.shots] == [shot for shot in range(6) if shot not in left_out]
 
 
-@pytest.mark.parametrize("event", ["shot_started", "shots_skipped"])
-def test_a_resumed_run_skips_what_was_skipped(tmp_path: Path, event: str) -> None:
-    path = sequence(tmp_path, "planner", "{at: [1]}", policy={"on_failure": "skip_point"})
+CHECKS = [{"value": "reading.laser.power_w", "at_least": 0.15, "shots": 2, "then": "skip_point"}]
+
+
+@pytest.mark.parametrize(
+    ("scan", "step", "policy", "event", "n"),
+    [
+        ("planner", "{at: [1]}", {"on_failure": "skip_point"}, "shot_started", 3),
+        ("planner", "{}", {"checks": CHECKS}, "shot_started", 2),
+        ("adaptive", "{}", {"checks": CHECKS}, "shots_skipped", 1),
+    ],
+)
+def test_a_resumed_run_skips_what_was_skipped(
+    tmp_path: Path, scan: str, step: str, policy: dict[str, Any], event: str, n: int
+) -> None:
+    path = sequence(tmp_path, scan, step, policy=policy)
+    text = path.read_text(encoding="utf-8").replace("shot.2", "shot.3").replace("repeats: 2", "repeats: 3")
+    path.write_text(text, encoding="utf-8")
     whole = run(path)
-    run_dir = stopped_at(path, event, 3 if event == "shot_started" else 1)
+    assert whole.skipped
+    run_dir = interrupted(path, event, n)
+    assert labseq.open_run(run_dir).status == "stopped"
+    if event == "shots_skipped":  # as if it had died before it recorded what to skip
+        (run_dir / "skipped.jsonl").unlink()
     again = resumed(run_dir)
     assert (again.status, again.skipped) == ("complete", whole.skipped)
     assert table(again) == table(whole)
@@ -140,28 +149,7 @@ def test_a_check_between_shots_warns_or_stops(tmp_path: Path) -> None:
     assert len(stopped.shots) == 5
 
 
-def test_a_check_may_skip_the_rest_of_a_point_also_after_a_resume(tmp_path: Path) -> None:
-    checks = [{"value": "reading.laser.power_w", "at_least": 0.15, "shots": 2, "then": "skip_point"}]
-    path = sequence(tmp_path, "planner", policy={"checks": checks})
-    whole = run(path)
-    assert whole.skipped
-    run_dir = stopped_at(path, "shot_started", 2)
-    again = resumed(run_dir)
-    assert again.skipped == whole.skipped
-    assert table(again) == table(whole)
-
-
-def test_values_that_shots_do_not_have_do_not_count() -> None:
-    one = CheckSettings(value="reading.x", at_least=1.0, shots=2, then="stop")
-    checks = Checks([one], [{"shot": 0, "readings": {"x": 0.1}}], warn=print)
-    with pytest.raises(CheckFailedError):
-        checks.after({"shot": 1, "readings": {}})
-    checks = Checks([one], [], warn=print)
-    assert checks.after({"shot": 0, "readings": {}}) == ""
-    assert checks.after({"shot": 1, "readings": {"x": "text"}}) == ""
-
-
-def test_policies_are_on_record_and_told_before(tmp_path: Path) -> None:
+def test_policies_are_in_the_record(tmp_path: Path) -> None:
     step = "{}\n    policy: {timeout: 2 s, retries: 1}"
     path = sequence(tmp_path, step=step, policy={"over_budget": "warn"})
     with labseq.Session.open(path) as session:
@@ -173,7 +161,7 @@ def test_policies_are_on_record_and_told_before(tmp_path: Path) -> None:
         assert session.assembly.policy.steps[0].over_budget == "warn"
 
 
-def test_a_timeout_shorter_than_the_step_is_told(tmp_path: Path) -> None:
+def test_a_timeout_shorter_than_the_step_is_a_warning(tmp_path: Path) -> None:
     path = write(tmp_path)
     text = path.read_text(encoding="utf-8").replace(
         "- load: {duration: 500 ms}", "- load: {duration: 500 ms}\n    policy: {timeout: 400 ms}"
@@ -190,8 +178,6 @@ def test_a_timeout_shorter_than_the_step_is_told(tmp_path: Path) -> None:
     [
         ("{}\n    policy: {retry: 1}", {}, "10:14: 'retry' is not a setting of the policy of 'failing'"),
         ("{}\n    policy: {timeout: 0 s}", {}, "10:23: timeout is '0 s'; expected more than 0"),
-        ("{}\n    policy: 5", {}, "10:13: policy is 5; expected a mapping of settings"),
-        ("{}", {"policy": {"when_exhausted": "repeat"}}, "when_exhausted is 'repeat'; expected"),
         ("{}", {"policy": {"checks": [{"value": "x"}]}}, "the check has no limit; expected 'at_least'"),
         (
             "{}",
@@ -210,7 +196,7 @@ def test_a_timeout_shorter_than_the_step_is_told(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_a_wrong_policy_is_told_with_its_place(
+def test_a_wrong_policy_is_refused_with_its_place(
     tmp_path: Path, step: str, keys: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(ConfigError) as caught:
@@ -247,35 +233,20 @@ def test_options_change_policies(tmp_path: Path) -> None:
         session.run()
 
 
-@pytest.mark.parametrize("scan", ["planner", "adaptive"])
-def test_a_run_that_died_before_it_put_down_what_to_skip_skips_it_all_the_same(
-    tmp_path: Path, scan: str
-) -> None:
-    checks = [{"value": "reading.laser.power_w", "at_least": 0.15, "shots": 2, "then": "skip_point"}]
-    path = sequence(tmp_path, scan, policy={"checks": checks})
-    path.write_text(
-        path.read_text(encoding="utf-8").replace("shot.2", "shot.3").replace("repeats: 2", "repeats: 3"),
-        encoding="utf-8",
-    )
-    whole = run(path)
-    assert whole.skipped
-    run_dir = stopped_at(path, "shots_skipped", 1)
-    (run_dir / "skipped.jsonl").unlink()  # as if it had died a moment before
-    again = resumed(run_dir)
-    assert again.skipped == whole.skipped
-    assert table(again) == table(whole)
-
-
-def test_an_adaptive_scan_tells_of_a_point_whose_last_shots_are_skipped(tmp_path: Path) -> None:
+def test_an_adaptive_scan_reports_a_point_whose_last_shots_are_skipped(tmp_path: Path) -> None:
     path = sequence(tmp_path, "adaptive", "{at: [1, 2]}", policy={"on_failure": "skip_point"})
     path.write_text(path.read_text(encoding="utf-8").replace("shot.2", "shot.3"), encoding="utf-8")
     seen = RecordingObserver()
     run(path, seen)
-    told = seen.of("scan_point")
-    assert [(event["point"], event["value"] is None) for event in told] == [(0, False), (1, True), (2, False)]
+    points = seen.of("scan_point")
+    assert [(event["point"], event["value"] is None) for event in points] == [
+        (0, False),
+        (1, True),
+        (2, False),
+    ]
 
 
-def test_a_value_that_no_shot_has_is_told_once(tmp_path: Path) -> None:
+def test_a_value_that_no_shot_has_is_one_warning(tmp_path: Path) -> None:
     checks = [
         {"value": "reading.laser.pwer_w", "at_least": 0.1},
         {"value": "stage.plan", "at_most": 0.1},

@@ -23,7 +23,7 @@ def test_each_array_of_the_papers_figure_6_has_a_sequence() -> None:
 @EACH
 def test_it_is_accepted_without_a_warning_and_runs(sequence: Path, tmp_path: Path) -> None:
     dry_run = "full" if sequence.stem == "follow" else "off"  # it waits for another program
-    with labseq.Session.open(sequence, shots=3, seed=1, output=tmp_path, dry_run=dry_run) as session:
+    with labseq.Session.open(sequence, shots=1, seed=1, output=tmp_path, dry_run=dry_run) as session:
         assert not check(session).warnings
         run = session.run()
     assert run.status == "complete"
@@ -39,7 +39,7 @@ def test_the_atoms_are_enough_for_it_and_some_are_left_to_mend_it(name: str) -> 
     assert (~target.fill & ~target.clear).sum() > 100
 
 
-@pytest.mark.parametrize("dop", [2, 3, 4, 7, 15])
+@pytest.mark.parametrize("dop", [2, 7])
 def test_nearly_all_plans_fit_the_own_windows_of_figure_4(dop: int) -> None:
     scan = labseq.Session.open(ROOT / "sequences" / "figure4_dop_scan.yaml").assembly
     assert scan.scanned is not None

@@ -26,32 +26,34 @@ def contents(run):
     ]
 
 
-PATIENT = ["profile.timeouts.call=120 s"]
-"""The first open() of a process imports a vendor's package, which takes long on a busy computer."""
-
-
-@pytest.mark.parametrize(
-    "options", [{}, {"profile": "lab", "dry_run": "full", "overrides": PATIENT}, {"dry_run": "fast"}]
-)
-def test_the_same_seed_gives_the_same_data(tmp_path, options):
-    first = run(tmp_path, shots=1, seed=11, **options)
-    again = run(tmp_path, shots=1, seed=11, **options)
-    other = run(tmp_path, shots=1, seed=12, **options)
+def test_the_same_seed_gives_the_same_data(tmp_path):
+    first, again, other = (run(tmp_path, shots=1, seed=seed) for seed in (11, 11, 12))
     assert contents(first) == contents(again)
     assert contents(first) != contents(other)
     assert first.path != again.path
 
 
-def test_what_has_kernels_compiles_before_anything_is_opened(tmp_path, monkeypatch):
-    from labseq_virtual import camera, tweezers as mobile_tweezers
+def test_the_lab_in_a_dry_run_gives_the_same_data_for_the_same_seed(tmp_path):
+    seen = RecordingObserver()
+    few = ["profile.timeouts.call=120 s", "shot.2.rearrange.cycles=1"]  # the first open() imports a package
+    options: dict[str, Any] = {"profile": "lab", "dry_run": "full", "overrides": few, "shots": 1, "seed": 11}
+    first, again = (run(tmp_path, observer=seen, **options) for _ in range(2))
+    assert contents(first) == contents(again)
+    assert first.simulated
+    assert first.shots[0].frames.shape[1:] == (512, 512)
+    assert not [values for values in seen.of("warning") if "virtual twin" in values["text"]]
 
-    told: list[str] = []
-    for driver in (camera.VirtualCamera, mobile_tweezers.VirtualMobileTweezers):
+
+def test_kernels_are_compiled_before_anything_is_opened(tmp_path, monkeypatch):
+    from labseq_virtual import camera, tweezers
+
+    calls: list[str] = []
+    for driver in (camera.VirtualCamera, tweezers.VirtualMobileTweezers):
         driver_open = driver.open
-        monkeypatch.setattr(driver, "warm", lambda self: told.append("warm"), raising=False)
-        monkeypatch.setattr(driver, "open", lambda self, do=driver_open: (told.append("open"), do(self)))
-    run(tmp_path, shots=1, seed=1)
-    assert told == ["warm"] * 2 + ["open"] * 2
+        monkeypatch.setattr(driver, "warm", lambda self: calls.append("warm"), raising=False)
+        monkeypatch.setattr(driver, "open", lambda self, do=driver_open: (calls.append("open"), do(self)))
+    assert run(tmp_path, shots=1).seed != run(tmp_path, shots=1).seed
+    assert calls == (["warm"] * 2 + ["open"] * 2) * 2
 
 
 def test_a_run_reads_back(tmp_path):
@@ -63,80 +65,45 @@ def test_a_run_reads_back(tmp_path):
     assert len(shot.frames) == len(shot.occupancies) == len(shot.plans) + 2
     assert 0.9 < shot.filling_fraction <= 1.0
     assert {t.stage for t in shot.timing} >= {"expose", "detect", "plan", "check", "prepare", "play", "move"}
+    assert [t for shot in done.shots for t in shot.timing if t.over_budget] == []
     assert shot.parameters == {"shots": "2", "seed": "3"}
     planner = done.record["resolved"]["planner"]
     assert (planner["use"], planner["degree_of_parallelism"], planner["variant"]) == ("psca", 7, "fewest")
-    assert done.record["resolved"]["profile"]["mobile_tweezers"]["speed"] == 0.13
     assert done.record["devices"]["camera"]
     assert {p["name"] for p in done.record["plugins"]} == {"labseq_psca", "labseq_virtual", "labseq.builtin"}
     assert done.record["sequence_text"] == COMPACT.read_text(encoding="utf-8")
     assert "numpy" in done.record["provenance"]["packages"]
     assert not done.events[-1]["values"]["error"]
-
-
-def test_a_shot_file_needs_no_labseq(tmp_path):
-    done = run(tmp_path, shots=1, seed=3)
-    with h5py.File(next((done.path / "shots").glob("*.h5"))) as file:
+    with h5py.File(shot.file) as file:  # a viewer of HDF5 shows the frames
         entry: Any = file[file.attrs["default"]]
         view = entry[entry.attrs["default"]]
         assert view[view.attrs["signal"]].shape[1:] == (512, 512)
 
 
-def test_nothing_is_over_budget_on_the_virtual_lab(tmp_path):
-    done = run(tmp_path, shots=3, seed=4)
-    assert [t for shot in done.shots for t in shot.timing if t.over_budget] == []
-
-
 def test_values_can_be_set(tmp_path):
-    options: dict[str, Any] = {
-        "shots": 1,
-        "overrides": [
-            "planner.degree_of_parallelism=3",
-            "shot.2.rearrange.window=200 ms",
-            "profile.mobile_tweezers.speed=100 um/ms",
-            "record_frames=last",
-        ],
+    changes = {
+        "planner.degree_of_parallelism": "3",
+        "shot.2.rearrange.window": "200 ms",
+        "profile.mobile_tweezers.speed": "100 um/ms",
+        "record_frames": "last",
     }
-    done = run(tmp_path, seed=1, **options)
+    done = run(tmp_path, seed=1, shots=1, overrides=[f"{key}={value}" for key, value in changes.items()])
     shot = done.shots[0]
     assert max(len(batch) for plan in shot.plans for batch in plan.batches) == 3
     assert shot.cycles[0].window_s == 0.2
     assert done.record["resolved"]["profile"]["mobile_tweezers"]["speed"] == pytest.approx(0.1)
     assert len(shot.frames) == 1
-    assert shot.parameters["planner.degree_of_parallelism"] == "3"
+    assert shot.parameters == {**changes, "shots": "1", "seed": "1"}
 
 
 @pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        (["planer.use=psca"], "did you mean 'planner'"),
-        (["planner.degree_of_parallelism=0"], "--set planner.degree_of_parallelism=0"),
-        (["profile.camera.use=cannon"], "unknown camera 'cannon'"),
-        (["target.rows=21"], "21"),
-    ],
+    ("override", "message"),
+    [("planner.degree_of_parallelism=0", "--set planner.degree_of_parallelism=0"), ("target.rows=21", "21")],
 )
-def test_wrong_values_are_refused_before_anything_opens(tmp_path, overrides, message):
+def test_a_wrong_value_is_refused_before_anything_opens(tmp_path, override, message):
     with pytest.raises(ConfigError, match=message):
-        run(tmp_path, overrides=overrides)
+        run(tmp_path, overrides=[override])
     assert not (tmp_path / "data").exists()
-
-
-def test_all_problems_are_told_in_one_go(tmp_path):
-    text = COMPACT.read_text(encoding="utf-8")
-    text = (
-        text.replace("rows: 15", "rows: 25").replace("psca", "pcsa").replace("window: 60 ms", "windw: 60 ms")
-    )
-    wrong = tmp_path / "wrong.yaml"
-    wrong.write_text(text, encoding="utf-8")
-    with pytest.raises(ConfigError) as caught:
-        run(tmp_path, wrong)
-    assert len(caught.value.problems) == 3
-    assert [p.line for p in caught.value.problems] == sorted(p.line for p in caught.value.problems)
-
-
-def test_an_option_is_named_as_the_user_gave_it(tmp_path):
-    with pytest.raises(ConfigError, match=r"--shots 0: shots is 0"):
-        run(tmp_path, shots=0)
 
 
 def test_a_session_runs_once(tmp_path):
@@ -144,10 +111,6 @@ def test_a_session_runs_once(tmp_path):
         session.run()
         with pytest.raises(ConfigError, match="runs once"):
             session.run()
-
-
-def test_without_a_seed_every_run_is_another(tmp_path):
-    assert run(tmp_path, shots=1).seed != run(tmp_path, shots=1).seed
 
 
 def test_a_missing_plugin_is_replaced_in_a_dry_run_with_a_warning(tmp_path):
@@ -189,26 +152,3 @@ def test_an_unwritable_place_is_named_before_anything_opens(tmp_path):
     with pytest.raises(labseq.RecordingError, match="data"):
         run(tmp_path, shots=1, observer=seen)
     assert "state" not in seen.names
-
-
-def test_a_disk_that_fills_up_stops_the_run_and_keeps_what_is_there(tmp_path, monkeypatch):
-    from labseq.recording import RunWriter
-
-    real, n_written = RunWriter.write_shot, 0
-
-    def write(self, shot):
-        nonlocal n_written
-        if n_written == 2:
-            raise labseq.RecordingError(self.run_dir, "no space left on device")
-        n_written += 1
-        return real(self, shot)
-
-    monkeypatch.setattr(RunWriter, "write_shot", write)
-    seen = RecordingObserver()
-    with pytest.raises(labseq.RecordingError, match="no space left"):
-        run(tmp_path, shots=5, seed=1, observer=seen)
-    assert len(seen.of("safe_state")) == 4
-    (state,) = (tmp_path / "data").glob("*/*/STATE")
-    done = labseq.open_run(state.parent)
-    assert (done.status, len(done.shots)) == ("failed", 2)
-    assert done.shots[1].frames.size
