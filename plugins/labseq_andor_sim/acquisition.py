@@ -14,7 +14,7 @@ from labseq_andor.codes import Code
 
 from labseq.plugin import Clock, Frame, Series, SimulatedSensor
 from labseq_andor_sim.configuration import EXTERNAL, INTERNAL, SOFTWARE, Timing
-from labseq_andor_sim.functions import implements
+from labseq_andor_sim.functions import implements, require
 
 ROUNDING_S: Final = 1e-9
 BUFFER_BYTES: Final = 48 * 2**20
@@ -93,22 +93,20 @@ class Acquisition:
         self._empty_buffer()
 
     @implements("PrepareAcquisition", "FreeInternalMemory", only_idle=True)
-    def _empty_buffer(self) -> Code:
+    def _empty_buffer(self) -> None:
         self._buffer: OrderedDict[int, Frame] = OrderedDict()
         self._n_arrived = self.n_fetched = 0
-        return Code.SUCCESS
 
     @implements("GetSizeOfCircularBuffer", outputs=1)
-    def _get_buffer_size(self) -> tuple[int]:
+    def _get_buffer_size(self) -> int:
         height, width = self._timing.optics.frame_shape
-        return (self._faults.buffer_frames or max(2, BUFFER_BYTES // (2 * height * width)),)
+        return self._faults.buffer_frames or max(2, BUFFER_BYTES // (2 * height * width))
 
     @implements("StartAcquisition", only_idle=True)
-    def _start(self) -> Code:
+    def _start(self) -> None:
         """Arm the sensor; with the internal trigger the first exposure begins."""
         timing, mode = self._timing, self._timing.sensor_mode
-        if not timing.optics.reads_images:
-            return Code.INVALID_MODE
+        require(timing.optics.reads_images, Code.INVALID_MODE)
         self._empty_buffer()
         series = Series(timing.n_frames, timing.exposure_s, KINDS[timing.trigger], mode.em_gain or 1.0)
         self._sensor.arm(series, mode, timing.readout_s, timing.kinetic_s)
@@ -117,7 +115,6 @@ class Acquisition:
         self._started_s = self._busy_until_s = self._clock.now()
         self._coming.clear()
         self.proceed()
-        return Code.SUCCESS
 
     @implements("AbortAcquisition")
     def abort(self) -> Code:
@@ -129,16 +126,12 @@ class Acquisition:
         return Code.SUCCESS
 
     @implements("SendSoftwareTrigger")
-    def _trigger(self) -> Code:
+    def _trigger(self) -> None:
         """Expose; refused during an exposure, or a read-out that cannot overlap with the next exposure."""
-        if self._timing.trigger != SOFTWARE or not self._timing.runs_till_abort:
-            return Code.INVALID_MODE
-        if not self.is_acquiring:
-            return Code.IDLE
-        if self._is_busy:
-            return Code.ERROR_CODES
+        require(self._timing.trigger == SOFTWARE and self._timing.runs_till_abort, Code.INVALID_MODE)
+        require(self.is_acquiring, Code.IDLE)
+        require(not self._is_busy, Code.ERROR_CODES)
         self._expose()
-        return Code.SUCCESS
 
     def pulse(self) -> bool:
         """An edge at the trigger input, now; False if it started no exposure, since it came too soon."""
@@ -153,7 +146,7 @@ class Acquisition:
         """Idle, acquiring, or why the acquisition ended early."""
         self.proceed()
         idle = self._fault if self._fault != Code.SUCCESS else Code.IDLE
-        return (Code.ACQUIRING if self.is_acquiring else idle,)
+        return (Code.ACQUIRING if self.is_acquiring else idle,)  # an output, not the return code
 
     @implements("GetAcquisitionProgress", outputs=2)
     def _get_progress(self) -> tuple[int, int]:
@@ -162,25 +155,23 @@ class Acquisition:
         return 0, self._n_arrived
 
     @implements("GetNumberNewImages", outputs=2)
-    def _get_new(self) -> Code | tuple[int, int]:
+    def _get_new(self) -> tuple[int, int]:
         """Numbers of the first and the last frame that were not fetched."""
         self.proceed()
         new = [number for number in self._buffer if number > self.n_fetched]
-        return (new[0], new[-1]) if new else Code.NO_NEW_DATA
+        require(new, Code.NO_NEW_DATA)
+        return new[0], new[-1]
 
     @implements("GetImages16", outputs=2, waits=True)
-    def _get_images(self, first: int, last: int, pixels: Any, size: int) -> Code | tuple[int, int]:
+    def _get_images(self, first: int, last: int, pixels: Any, size: int) -> tuple[int, int]:
         """Copy frames into an array of ``size`` pixels."""
         if self._faults.hang is not None:
             self.hangs.set()
             self._faults.hang.wait()
-        if first not in self._buffer:
-            return Code.P1INVALID
-        if last not in self._buffer or last < first:
-            return Code.P2INVALID
+        require(first in self._buffer)
+        require(last in self._buffer and last >= first, Code.P2INVALID)
         images = [np.ascontiguousarray(self._buffer[number].image) for number in range(first, last + 1)]
-        if size != sum(image.size for image in images):
-            return Code.P4INVALID
+        require(size == sum(image.size for image in images), Code.P4INVALID)
         address = ctypes.addressof(pixels.contents)
         for image in images:
             ctypes.memmove(address, image.ctypes.data, image.nbytes)
@@ -189,18 +180,15 @@ class Acquisition:
         return first, last
 
     @implements("SetMetaData", only_idle=True)
-    def _set_metadata(self, state: int) -> Code:
+    def _set_metadata(self, state: int) -> None:
         """No effect: there are always time stamps."""
-        return Code.SUCCESS if state in (0, 1) else Code.P1INVALID
+        require(state in (0, 1))
 
     @implements("GetMetaDataInfo")
-    def _get_time_stamp(self, _start: int | None, since_start_ms: Any, index: int) -> Code:
+    def _get_time_stamp(self, _start: int | None, since_start_ms: Any, index: int) -> None:
         """Milliseconds from the start of the series to that of a frame counted from 0."""
-        frame = self._buffer.get(index + 1)
-        if frame is None:
-            return Code.P2INVALID
-        since_start_ms[0] = (frame.t_start_s - self._started_s) * 1e3
-        return Code.SUCCESS
+        require(index + 1 in self._buffer, Code.P2INVALID)
+        since_start_ms[0] = (self._buffer[index + 1].t_start_s - self._started_s) * 1e3
 
     @implements("WaitForAcquisitionByHandleTimeOut", waits=True)
     def _wait(self, _handle: int, timeout_ms: int) -> Code:
@@ -221,11 +209,10 @@ class Acquisition:
                 self._arrived.wait(min(left_s, next_s))
 
     @implements("CancelWait")
-    def _cancel_wait(self) -> Code:
+    def _cancel_wait(self) -> None:
         with self._arrived:
             self._is_cancelled = True
             self._arrived.notify_all()
-        return Code.SUCCESS
 
     def proceed(self) -> None:
         """Do what is due by now: frames arrive; with the internal trigger the next exposure begins."""
@@ -266,7 +253,7 @@ class Acquisition:
             return
         self._n_arrived = number
         self._buffer[number] = frame
-        if len(self._buffer) > self._get_buffer_size()[0]:
+        if len(self._buffer) > self._get_buffer_size():
             self._buffer.popitem(last=False)
         if not self._n_left and not self._coming:
             self._finish()

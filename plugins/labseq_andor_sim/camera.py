@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Any, Final
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar, Final
 
 from labseq_andor.codes import EM_GAIN_REAL, AcqModes, Code, Features, GetFunctions, SetFunctions, Triggers
 from labseq_andor.heads import Head
@@ -12,7 +12,7 @@ from labseq_andor.heads import Head
 from labseq.plugin import Clock, SimulatedSensor, Simulation
 from labseq_andor_sim.acquisition import Acquisition, Faults
 from labseq_andor_sim.configuration import Amplifiers, Optics, Timing
-from labseq_andor_sim.functions import Function, functions_of, implements
+from labseq_andor_sim.functions import Function, functions_of, implements, require
 
 SERIAL: Final = 10001
 FIRMWARE: Final = (2, 1)
@@ -45,6 +45,14 @@ class SimulatedCamera:
         faults: Failures to simulate.
         functions: The SDK functions that the camera implements, by name.
     """
+
+    getters: ClassVar[Mapping[str, Callable[[Any], object]]] = {
+        "GetControllerCardModel": lambda _: "USB",
+        "GetHeadModel": lambda self: self.head.model,
+        "GetCameraSerialNumber": lambda self: self._serial,
+        "GetHardwareVersion": lambda _: (0, 0, 0, 0, *FIRMWARE),
+        "GetPixelSize": lambda self: (self.head.pixel_m * 1e6, self.head.pixel_m * 1e6),
+    }
 
     def __init__(
         self, world: Simulation, clock: Clock, head: Head, sensor_shape: tuple[int, int], serial: int = SERIAL
@@ -100,28 +108,8 @@ class SimulatedCamera:
         """An edge at the trigger input, now; False if it started no exposure."""
         return self.acquisition.pulse()
 
-    @implements("GetControllerCardModel", outputs=1)
-    def _get_controller(self) -> tuple[str]:
-        return ("USB",)
-
-    @implements("GetHeadModel", outputs=1)
-    def _get_head(self) -> tuple[str]:
-        return (self.head.model,)
-
-    @implements("GetCameraSerialNumber", outputs=1)
-    def _get_serial(self) -> tuple[int]:
-        return (self._serial,)
-
-    @implements("GetHardwareVersion", outputs=6)
-    def _get_versions(self) -> tuple[int, ...]:
-        return (0, 0, 0, 0, *FIRMWARE)
-
-    @implements("GetPixelSize", outputs=2)
-    def _get_pixel_size(self) -> tuple[float, float]:
-        return self.head.pixel_m * 1e6, self.head.pixel_m * 1e6
-
     @implements("GetCapabilities")
-    def _get_capabilities(self, capabilities: Any) -> Code:
+    def _get_capabilities(self, capabilities: Any) -> None:
         caps = capabilities[0]
         caps.ulAcqModes = sum(AcqModes)
         caps.ulReadModes = caps.ulFTReadModes = READ_MODES
@@ -132,7 +120,6 @@ class SimulatedCamera:
         caps.ulGetFunctions = sum(GetFunctions)
         caps.ulFeatures = sum(Features)
         caps.ulEMGainCapability = EM_GAIN_REAL
-        return Code.SUCCESS
 
 
 class Cooler:
@@ -141,6 +128,11 @@ class Cooler:
     Attributes:
         is_on: Whether the cooler is on.
     """
+
+    getters: ClassVar[Mapping[str, Callable[[Any], object]]] = {
+        "GetTemperatureRange": lambda _: TEMPERATURES_C,
+        "IsCoolerOn": lambda self: int(self.is_on),
+    }
 
     def __init__(self, clock: Clock, faults: Faults) -> None:
         self._clock = clock
@@ -174,18 +166,12 @@ class Cooler:
         if not self._stays_on:
             self._change(is_on=False)
 
-    @implements("GetTemperatureRange", outputs=2)
-    def _get_range(self) -> tuple[int, int]:
-        return TEMPERATURES_C
-
     @implements("SetTemperature", only_idle=True)
-    def set_temperature(self, celsius: int) -> Code:
+    def set_temperature(self, celsius: int) -> None:
         """Set the temperature that the cooler aims at."""
-        if not TEMPERATURES_C[0] <= celsius <= TEMPERATURES_C[1]:
-            return Code.P1INVALID
+        require(TEMPERATURES_C[0] <= celsius <= TEMPERATURES_C[1])
         if celsius != self._setpoint_c:
             self._change(setpoint_c=celsius)
-        return Code.SUCCESS
 
     @implements("GetTemperatureF", only_idle=True)
     def _get_temperature(self, celsius: Any) -> Code:
@@ -193,32 +179,25 @@ class Cooler:
         return self.status
 
     @implements("CoolerON", only_idle=True)
-    def switch_on(self) -> Code:
+    def switch_on(self) -> None:
         """Start to cool."""
         if not self.is_on:
             self._change(is_on=True)
-        return Code.SUCCESS
 
     @implements("CoolerOFF", only_idle=True)
-    def _switch_off(self) -> Code:
+    def _switch_off(self) -> None:
         if self.is_on:
             self._change(is_on=False)
-        return Code.SUCCESS
-
-    @implements("IsCoolerOn", outputs=1)
-    def _get_is_on(self) -> tuple[int]:
-        return (int(self.is_on),)
 
     @implements("SetCoolerMode", only_idle=True)
-    def _set_mode(self, stays_on: int) -> Code:
+    def _set_mode(self, stays_on: int) -> None:
         """1: the cooler stays on when the SDK is shut down."""
         self._stays_on = bool(stays_on)
-        return Code.SUCCESS
 
     @implements("SetFanMode", only_idle=True)
-    def _set_fan(self, mode: int) -> Code:
+    def _set_fan(self, mode: int) -> None:
         """0: full, 1: low, 2: off."""
-        return Code.SUCCESS if 0 <= mode <= 2 else Code.P1INVALID
+        require(0 <= mode <= 2)
 
     @property
     def _end_c(self) -> float:

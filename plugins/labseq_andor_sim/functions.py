@@ -1,7 +1,9 @@
 """How the parts of the simulator declare which SDK functions they implement.
 
-A method marked with :func:`implements` takes the inputs of the C function. It returns a return code, or the
-outputs: these are then written through the pointers at the end of the C function's arguments.
+A method marked with :func:`implements` takes the inputs of the C function, and returns its outputs: these are
+written through the pointers at the end of the C function's arguments. Where it refuses a call, it raises
+:class:`Refused`; where it returns a :class:`Code`, the C function does, too. Functions that have only outputs
+are listed in the dictionary ``getters`` of the class.
 """
 
 from __future__ import annotations
@@ -9,16 +11,41 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Final, TypeVar
 
 from labseq_andor.codes import Code
 
-F = TypeVar("F", bound=Callable[..., "Code | tuple[Any, ...]"])
+F = TypeVar("F", bound=Callable[..., object])
+T = TypeVar("T")
 
 TEXT_BYTES: Final = 256
 """Size of the buffers for texts whose length the SDK does not pass."""
 
+ALL: Final = -1
+"""Number of outputs of a function without inputs."""
+
 _MARK: Final = "_labseq_andor_sim"
+
+
+class Refused(Exception):  # noqa: N818 - it is a return code of the SDK, not an error of labseq
+    """An SDK function refuses a call, with this return code."""
+
+    def __init__(self, code: Code) -> None:
+        self.code = code
+        super().__init__(code)
+
+
+def require(is_valid: object, code: Code = Code.P1INVALID) -> None:
+    """Refuse a call unless a condition holds."""
+    if not is_valid:
+        raise Refused(code)
+
+
+def pick(values: Sequence[T], index: int, code: Code = Code.P1INVALID) -> T:
+    """One of some values; refuses an index that is out of range."""
+    require(0 <= index < len(values), code)
+    return values[index]
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,18 +59,22 @@ class Function:
         waits: It waits, so other calls must be possible meanwhile.
     """
 
-    method: Callable[..., Code | tuple[Any, ...]]
-    n_outputs: int
-    only_idle: bool
-    waits: bool
+    method: Callable[..., object]
+    n_outputs: int = 0
+    only_idle: bool = False
+    waits: bool = False
 
     def call(self, arguments: Sequence[Any]) -> int:
         """Call it with the arguments of the C function; returns its return code."""
-        n_inputs = len(arguments) - self.n_outputs
-        result = self.method(*arguments[:n_inputs])
+        n_inputs = 0 if self.n_outputs == ALL else len(arguments) - self.n_outputs
+        try:
+            result = self.method(*arguments[:n_inputs])
+        except Refused as refused:
+            return refused.code
         if isinstance(result, Code):
             return result
-        for pointer, value in zip(arguments[n_inputs:], result, strict=True):
+        outputs: Sequence[Any] = [] if result is None else result if isinstance(result, tuple) else [result]
+        for pointer, value in zip(arguments[n_inputs:], outputs, strict=True):
             if isinstance(value, str):
                 write_text(pointer, value)
             else:
@@ -65,7 +96,7 @@ def implements(
 
 def functions_of(part: object) -> Mapping[str, Function]:
     """SDK functions that an object implements, by name."""
-    found: dict[str, Function] = {}
+    found = {name: Function(partial(get, part), ALL) for name, get in getters_of(type(part)).items()}
     for attribute in vars(type(part)).values():
         if (mark := getattr(attribute, _MARK, None)) is not None:
             names, *rules = mark
@@ -76,16 +107,16 @@ def functions_of(part: object) -> Mapping[str, Function]:
 def names_in(*classes: type) -> frozenset[str]:
     """Names of the SDK functions that objects of some classes implement."""
     marks = [getattr(attribute, _MARK, None) for kind in classes for attribute in vars(kind).values()]
-    return frozenset(name for mark in marks if mark is not None for name in mark[0])
+    names = {name for mark in marks if mark is not None for name in mark[0]}
+    return frozenset(names.union(*map(getters_of, classes)))
 
 
-def write_text(address: int, text: str, length: int = TEXT_BYTES) -> Code:
+def getters_of(kind: type) -> Mapping[str, Callable[[Any], object]]:
+    """Functions that only read something: by name, what gets their outputs from an object of a class."""
+    return getattr(kind, "getters", {})
+
+
+def write_text(address: int, text: str, length: int = TEXT_BYTES) -> None:
     """Write text with its closing zero to an address, at most ``length`` bytes."""
     encoded = text.encode()[: length - 1] + b"\0"
     ctypes.memmove(address, encoded, len(encoded))
-    return Code.SUCCESS
-
-
-def check_index(index: int, values: Sequence[object], otherwise: Code = Code.P1INVALID) -> Code:
-    """SUCCESS for an index of the values, else the code for an invalid argument."""
-    return Code.SUCCESS if 0 <= index < len(values) else otherwise

@@ -228,7 +228,8 @@ class SimulatedSdk:
         return Code.SUCCESS
 
     def _get_version(self, _kind: int, text: int, length: int) -> int:
-        return write_text(text, VERSION, length)
+        write_text(text, VERSION, length)
+        return Code.SUCCESS
 
     def _initialize(self, _folder: int | None) -> int:
         camera = self._cameras.get(self._current or 0)

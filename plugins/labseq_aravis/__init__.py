@@ -6,7 +6,7 @@ that the process of a simulated camera starts fast.
 
 from labseq_aravis.camera import Camera, FoundCamera, find_cameras
 from labseq_aravis.library import AravisError, LibraryMissingError, PixelFormatError, load_library
-from labseq_aravis.stream import Buffer, Statistics, Stream, StreamOptions
+from labseq_aravis.stream import Buffer, Stream, StreamOptions
 
 __all__ = [
     "AravisError",
@@ -15,7 +15,6 @@ __all__ = [
     "FoundCamera",
     "LibraryMissingError",
     "PixelFormatError",
-    "Statistics",
     "Stream",
     "StreamOptions",
     "find_cameras",

@@ -48,16 +48,12 @@ class FoundCamera:
         return f"{self.vendor} {self.model}, serial number {self.serial}, {self.address or self.protocol}"
 
 
-def find_cameras(interfaces: tuple[str, ...] = INTERFACES) -> tuple[FoundCamera, ...]:
-    """Search all networks and buses for cameras; takes about a second.
-
-    Args:
-        interfaces: Interfaces to search.
-    """
+def find_cameras() -> tuple[FoundCamera, ...]:
+    """Search all networks and buses for cameras; takes about a second."""
     lib = load_library()
     for index in range(lib.arv_get_n_interfaces()):
         name = lib.arv_get_interface_id(index)
-        switch = lib.arv_enable_interface if text(name) in interfaces else lib.arv_disable_interface
+        switch = lib.arv_enable_interface if text(name) in INTERFACES else lib.arv_disable_interface
         switch(name)
     lib.arv_update_device_list()
     return tuple(_found(lib, index) for index in range(lib.arv_get_n_devices()))
@@ -160,10 +156,6 @@ class Camera:
     def is_lost(self) -> bool:
         """Whether the library has noticed that the camera no longer answers."""
         return self._lost.is_set()
-
-    def wait_lost(self, timeout_s: float) -> bool:
-        """Wait until the camera is lost; returns whether it is."""
-        return self._lost.wait(timeout_s)
 
     @property
     def vendor(self) -> str:

@@ -193,10 +193,8 @@ SIGNATURES: Final[dict[str, str]] = {
     "arv_buffer_get_status": "i p",
     "arv_buffer_get_timestamp": "L p",
     "arv_buffer_new_allocate": "p z",
-    "arv_gv_stream_get_statistics": "v ppp",
     "arv_gv_stream_packet_resend_get_type": "z ",
     "arv_gv_stream_socket_buffer_get_type": "z ",
-    "arv_stream_get_statistics": "v pppp",
     "arv_stream_push_buffer": "v pp",
     "arv_stream_timeout_pop_buffer": "p pL",
     # the simulated camera

@@ -112,25 +112,6 @@ class Buffer:
     image: NDArray[np.uint16] | None
 
 
-@dataclass(frozen=True, slots=True)
-class Statistics:
-    """Counts since the stream was made.
-
-    Attributes:
-        n_completed: Complete frames.
-        n_failed: Incomplete frames.
-        n_underruns: Frames that arrived when there was no free buffer.
-        n_resent: Packets that arrived after they were requested again; GigE only.
-        n_missing: Packets that never arrived; GigE only.
-    """
-
-    n_completed: int
-    n_failed: int
-    n_underruns: int
-    n_resent: int
-    n_missing: int
-
-
 class Stream:
     """Receives frames in the background; made by :meth:`Camera.create_stream`."""
 
@@ -169,12 +150,6 @@ class Stream:
             self._handle = None
             self._streams.remove(self)
 
-    def __enter__(self) -> Stream:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
     def pop(self, timeout_s: float) -> Buffer | None:
         """Wait for the next frame, complete or not.
 
@@ -189,16 +164,6 @@ class Stream:
             return self._read(buffer)
         finally:
             self._library.arv_stream_push_buffer(handle, buffer)
-
-    @property
-    def statistics(self) -> Statistics:
-        """Counts since the stream was made."""
-        values = [ctypes.c_uint64() for _ in range(5)]
-        places = [ctypes.byref(value) for value in values]
-        self._library.arv_stream_get_statistics(self._open_handle(), *places[:3])
-        if self._is_ethernet:
-            self._library.arv_gv_stream_get_statistics(self._open_handle(), *places[3:])
-        return Statistics(*(value.value for value in values))
 
     def _read(self, buffer: int) -> Buffer:
         lib = self._library

@@ -19,7 +19,7 @@ from typing import Any, Final
 from labseq_aravis.camera import Camera
 from labseq_aravis.library import G_TYPE_DOUBLE, AravisError, load_library
 
-from labseq_genicam_sim.description import REGISTERS, TEXTS, description
+from labseq_genicam_sim.description import MODEL, REGISTERS, TEXTS, VENDOR, description
 from labseq_genicam_sim.messages import (
     DONE,
     EXPOSE,
@@ -32,6 +32,7 @@ from labseq_genicam_sim.messages import (
     Exposure,
     Faults,
     Setup,
+    to_json,
 )
 from labseq_genicam_sim.network import FIRST_ADDRESS, has_port, move, own_addresses
 
@@ -75,8 +76,8 @@ class SimulatedCamera:
         self.address = FIRST_ADDRESS if self._cable is None else self._cable.address
         self._write(CURRENT_ADDRESS, bytes(int(part) for part in self.address.split(".")))
         texts = {
-            "DeviceVendorName": setup.faults.vendor,
-            "DeviceModelName": setup.faults.model,
+            "DeviceVendorName": VENDOR,
+            "DeviceModelName": MODEL,
             "DeviceManufacturerInfo": "simulated",
             "DeviceSerialNumber": setup.serial,
         }
@@ -135,8 +136,7 @@ class SimulatedCamera:
 def _start_camera(setup: Setup) -> int:
     """Start the camera; waits while another one is being started on this machine."""
     lib = load_library()
-    faults = setup.faults
-    xml = description(faults.vendor, faults.model, ignores_triggers=faults.ignores_triggers)
+    xml = description(ignores_triggers=setup.faults.ignores_triggers)
     file, name = tempfile.mkstemp(suffix=".xml")
     try:
         with os.fdopen(file, "w", encoding="utf-8") as stream:
@@ -171,7 +171,8 @@ class Process:
         message = self._channel.receive()
         if message is None:
             return
-        setup = Setup.from_json(message[1])
+        values = json.loads(message[1])
+        setup = Setup(**values | {"faults": Faults(**values["faults"])})
         try:
             self._camera = SimulatedCamera(setup, self._expose)
             self._occupy(setup.faults)
@@ -182,7 +183,7 @@ class Process:
         while (message := self._channel.receive()) is not None:
             kind, data = message
             if kind == FAULTS:
-                self._camera.faults = Faults.from_values(json.loads(data))
+                self._camera.faults = Faults(**json.loads(data))
                 self._occupy(self._camera.faults)
                 self._channel.send(DONE)
             elif kind in (IMAGE, NO_IMAGE):
@@ -190,7 +191,7 @@ class Process:
 
     def _expose(self, exposure: Exposure) -> bytearray | None:
         try:
-            self._channel.send(EXPOSE, exposure.to_bytes())
+            self._channel.send(EXPOSE, to_json(exposure))
         except OSError:
             os._exit(0)
         return self._images.get()

@@ -6,12 +6,13 @@ Addresses are those of Aravis' simulated camera and of the GigE Vision bootstrap
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from html import escape
 from typing import Final
 
 from labseq_aravis.stream import MONO
 
 from labseq_genicam_sim.messages import GAIN_STEP
+
+VENDOR, MODEL = "labseq", "Simulated"
 
 REGISTERS: Final = {
     "Width": 0x100,
@@ -66,14 +67,8 @@ CATEGORIES: Final = {
 """Features, by category."""
 
 
-def description(vendor: str, model: str, *, ignores_triggers: bool = False) -> str:
-    """The description, as XML.
-
-    Args:
-        vendor: Manufacturer of the camera.
-        model: Model of the camera.
-        ignores_triggers: Whether its software trigger has no effect.
-    """
+def description(*, ignores_triggers: bool = False) -> str:
+    """The description, as XML; with ``ignores_triggers`` the software trigger has no effect."""
     places = dict(REGISTERS)
     if ignores_triggers:
         places["TriggerSoftware"] = places["Unconnected"]
@@ -87,7 +82,7 @@ def description(vendor: str, model: str, *, ignores_triggers: bool = False) -> s
         '<Port Name="Device"/>',
     ]
     head = (
-        f'<RegisterDescription ModelName="{escape(model)}" VendorName="{escape(vendor)}" '
+        f'<RegisterDescription ModelName="{MODEL}" VendorName="{VENDOR}" '
         'StandardNameSpace="GEV" '
         'SchemaMajorVersion="1" SchemaMinorVersion="1" SchemaSubMinorVersion="0" '
         'MajorVersion="1" MinorVersion="0" SubMinorVersion="0" ToolTip="Simulated camera" '

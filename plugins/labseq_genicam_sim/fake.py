@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 import tempfile
@@ -166,7 +167,7 @@ class FakeCamera:
         while (message := _receive(channel)) is not None:
             kind, data = message
             if kind == EXPOSE:
-                self._answer(channel, Exposure.from_bytes(data))
+                self._answer(channel, Exposure(**json.loads(data)))
             with self._changed:
                 if kind == READY:
                     self.address, self._is_ready = data.decode(), True

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import struct
 import threading
-from dataclasses import asdict, astuple, dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from typing import IO, Any, Final
 
 HEAD: Final = struct.Struct("<4sQ")
@@ -19,13 +20,11 @@ NO_IMAGE: Final = b"NONE"  # there is no image; the frame fails
 # from the camera
 READY: Final = b"HELO"  # its address
 REFUSED: Final = b"ERRO"  # why it cannot start
-EXPOSE: Final = b"EXPO"  # an Exposure
+EXPOSE: Final = b"EXPO"  # JSON of an Exposure
 DONE: Final = b"DONE"  # the faults are active
 
 GAIN_STEP: Final = 1e-3
 """Gain per step of its register."""
-
-_EXPOSURE: Final = struct.Struct("<10Q")
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,24 +38,14 @@ class Faults:
         unplugged_at: Number of the frame at which the camera vanishes, before it is sent; None for never.
         is_busy: Whether another application controls the camera.
         ignores_triggers: Whether its software trigger has no effect; fixed when it starts.
-        vendor: Manufacturer that it reports; fixed when it starts.
-        model: Model that it reports; fixed when it starts.
     """
 
     packet_loss: float = 0.0
-    failed_frames: tuple[int, ...] = ()
+    failed_frames: Sequence[int] = ()
     late_s: float = 0.0
     unplugged_at: int | None = None
     is_busy: bool = False
     ignores_triggers: bool = False
-    vendor: str = "labseq"
-    model: str = "Simulated"
-
-    @classmethod
-    def from_values(cls, values: dict[str, Any]) -> Faults:
-        """Faults from decoded JSON, which has lists for tuples."""
-        values["failed_frames"] = tuple(values["failed_frames"])
-        return cls(**values)
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,17 +64,9 @@ class Setup:
     address: str
     faults: Faults
 
-    @classmethod
-    def from_json(cls, data: bytes | bytearray) -> Setup:
-        """Setup from JSON."""
-        values = json.loads(data)
-        height, width = values["sensor_shape"]
-        faults = Faults.from_values(values["faults"])
-        return cls(values["serial"], (height, width), values["address"], faults)
 
-
-def to_json(message: Setup | Faults) -> bytes:
-    """JSON of a message."""
+def to_json(message: Setup | Faults | Exposure) -> bytes:
+    """JSON of a message; its values are the arguments of its class."""
     return json.dumps(asdict(message)).encode()
 
 
@@ -126,15 +107,6 @@ class Exposure:
     def gain(self) -> float:
         """The camera's gain; 0 unless it was set."""
         return self.gain_steps * GAIN_STEP
-
-    def to_bytes(self) -> bytes:
-        """The exposure as bytes."""
-        return _EXPOSURE.pack(*astuple(self))
-
-    @classmethod
-    def from_bytes(cls, data: bytes | bytearray) -> Exposure:
-        """The exposure from bytes."""
-        return cls(*_EXPOSURE.unpack(data))
 
 
 class Channel:

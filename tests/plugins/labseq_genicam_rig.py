@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 import numpy as np
-from labseq_aravis import Camera, Stream, StreamOptions
+from labseq_aravis import AravisError, Camera, Stream, StreamOptions
 from labseq_genicam_sim.fake import FakeCamera
 from labseq_genicam_sim.messages import Exposure, Faults
 from numpy.typing import NDArray
@@ -60,3 +60,5 @@ def opened(
         stream = camera.create_stream(n_buffers, StreamOptions(frame_retention_s=RETENTION_S, resend=False))
         camera.start()
         yield camera, stream
+        with suppress(AravisError):  # the test has closed it
+            camera.stop()

@@ -98,10 +98,8 @@ def test_frames_arrive_as_they_were_made(fake: FakeCamera) -> None:
                 ids.append(buffer.frame_id)
                 times.append(buffer.camera_time_ns)
                 n += 1
-            statistics = stream.statistics
         assert ids == list(range(ids[0], ids[0] + 4))
         assert times == sorted(times)
-        assert (statistics.n_completed, statistics.n_failed, statistics.n_underruns) == (4, 0, 0)
 
 
 def test_closing_is_legal_in_any_order_and_again(fake: FakeCamera) -> None:

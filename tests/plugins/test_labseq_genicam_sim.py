@@ -117,13 +117,10 @@ def test_the_process_ends_with_its_parent() -> None:
         os.close(child)
 
 
-def test_lost_packets_fail_their_frames_and_are_counted() -> None:
+def test_lost_packets_fail_their_frames() -> None:
     with plugged_in(faults=Faults(packet_loss=0.02)) as fake, opened(fake, trigger=None) as (camera, stream):
-        buffers = [stream.pop(WAIT_S) for _ in range(20)]
+        buffers = [stream.pop(WAIT_S) for _ in range(12)]
         camera.stop()
-        statistics = stream.statistics
     statuses = [buffer.status for buffer in buffers if buffer is not None]
     assert "success" in statuses
     assert {"missing packets", "timeout"} & {*statuses}  # the first if a later frame is whole before
-    assert statistics.n_failed > 0
-    assert statistics.n_missing > 0
