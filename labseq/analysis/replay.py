@@ -33,7 +33,7 @@ from labseq.model.estimate import Estimate, mean
 from labseq.motion import check_plan
 from labseq.recording import Run, Shot
 from labseq.recording.folders import PROFILE_FILE, SEQUENCE_FILE
-from labseq.roles import Detector, NeedsWarmUp, NeverStopped, Planner
+from labseq.roles import Context, Detector, NeedsWarmUp, Planner
 from labseq.session.assembly import Assembly, assemble
 from labseq.session.chosen import ChosenPlugin, resolve
 from labseq.session.lab import construct, parallelism_of
@@ -412,7 +412,9 @@ class _Replayer:
         chosen = {kind: self._changed(kind, one) for kind, one in own.items() if kind in names}
         motion = point.bench.profile.motion
         made, streams = construct(
-            chosen, self.grid, motion, NeverStopped(), self.run.seed, calibrations=self.calibrations
+            chosen,
+            Context(grid=self.grid, motion=motion, calibrations=self.calibrations),
+            self.run.seed,
         )
         for one in made.values():
             if isinstance(one, NeedsWarmUp):

@@ -21,7 +21,7 @@ from labseq.messages import clean
 from labseq.model import MotionSpec, Occupancy, Plan, SiteGrid, TargetPattern
 from labseq.motion import check_plan
 from labseq.plugins import PluginHost
-from labseq.roles import NeedsWarmUp, NeverStopped, Planner
+from labseq.roles import Context, NeedsWarmUp, Planner
 from labseq.session.chosen import ChosenPlugin, construct_target, dump, load_plugins, resolve
 from labseq.session.lab import construct
 from labseq.session.occupancies import MAX_SITES
@@ -336,7 +336,7 @@ def _document(overrides: list[Override], top: str) -> Document:
 
 
 def _runner(chosen: ChosenPlugin, grid: SiteGrid, motion: MotionSpec, seed: int) -> Runner:
-    planner: Planner = construct({"planner": chosen}, grid, motion, NeverStopped(), seed)[0]["planner"]
+    planner: Planner = construct({"planner": chosen}, Context(grid=grid, motion=motion), seed)[0]["planner"]
     dop = getattr(planner, _DOP, None)
     dop = dop if isinstance(dop, int) else motion.max_tweezers
     return Runner(planner, chosen.entry.name, dump(chosen.entry, chosen.settings), dop)

@@ -94,14 +94,8 @@ class CalibrationData:
     def detector(self) -> Detector:
         """The profile's detector, with the calibrations that the analysis uses."""
         bench = self.bench
-        made, _ = construct(
-            {"detector": bench.chosen["detector"]},
-            bench.grid,
-            bench.profile.motion,
-            VirtualClock(StopFlag()),
-            0,
-            calibrations=bench.calibrations,
-        )
+        clock = VirtualClock(StopFlag())
+        made, _ = construct({"detector": bench.chosen["detector"]}, bench.context(clock), 0)
         return made["detector"]
 
 

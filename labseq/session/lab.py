@@ -13,9 +13,9 @@ from labseq.config.profile import MotionSettings, ProfileSpec
 from labseq.errors import ConfigError, LabseqError, PlanError, Problem, one_of
 from labseq.guard import Guard, StopFlag
 from labseq.kernel import announcing
-from labseq.model import CalibrationEntry, LineSpec, MotionSpec, RandomStream, SiteGrid, TargetPattern
+from labseq.model import MotionSpec, RandomStream, SiteGrid, TargetPattern
 from labseq.plugins import call_plugin
-from labseq.roles import Clock, Context, NeedsWarmUp, RunObserver, Simulation, offers
+from labseq.roles import Clock, Context, NeedsWarmUp, RunObserver, offers
 from labseq.sequencer.clock import PacedClock, RealClock, VirtualClock
 from labseq.sequencer.lab import Blinding, Lab, Timeouts
 from labseq.sequencer.lines import blinding_lines, trigger_line
@@ -51,16 +51,7 @@ def build_lab(point: Point, target: TargetPattern, clock: Clock, seed: int) -> L
     bench = point.bench
     profile, motion = bench.profile, bench.profile.motion
     chosen = {**bench.chosen, "planner": point.planner}
-    made, streams = construct(
-        chosen,
-        bench.grid,
-        motion,
-        clock,
-        seed,
-        calibrations=bench.calibrations,
-        true_grid=profile.grid_model(),
-        lines=profile.line_specs,
-    )
+    made, streams = construct(chosen, bench.context(clock), seed, true_grid=profile.grid_model())
     lab = Lab(
         grid=bench.grid,
         motion=motion,
@@ -89,30 +80,21 @@ def build_lab(point: Point, target: TargetPattern, clock: Clock, seed: int) -> L
 
 def construct(
     chosen: Mapping[str, ChosenPlugin],
-    grid: SiteGrid,
-    motion: MotionSpec,
-    clock: Clock,
+    context: Context,
     seed: int,
-    simulation: Simulation | None = None,
-    calibrations: Mapping[str, CalibrationEntry] | None = None,
-    true_grid: SiteGrid | None = None,
-    lines: tuple[LineSpec, ...] = (),
     *,
+    true_grid: SiteGrid | None = None,
     refused: dict[str, LabseqError] | None = None,
 ) -> tuple[dict[str, Any], tuple[RandomStream, ...]]:
     """Construct the object of every role; constructors do no I/O, so nothing is open yet.
 
     Args:
         chosen: Role -> its plugin.
-        grid: The grid of sites, with calibrated tones.
-        motion: How the mobile tweezers move.
-        clock: The session's clock.
+        context: Their common context; name and random numbers are added for each, and the simulation if it
+            is among the chosen.
         seed: The run's seed.
-        simulation: The simulation, if none is among the chosen.
-        calibrations: The active calibrations: kind -> entry.
         true_grid: The grid without calibrations, for the simulation, in which they are measured; None
             without calibrations.
-        lines: The lines connected to the timing box.
         refused: Receives the errors, role -> error; without it they are raised.
 
     Returns:
@@ -125,14 +107,16 @@ def construct(
     made: dict[str, Any] = {}
     streams: list[RandomStream] = []
     for role in sorted(chosen, key=lambda role: role != "simulation"):  # the others receive the simulation
-        is_simulation = role == "simulation"
-        stream = RandomStream(seed, "" if is_simulation else role)
+        own = replace(context, name=role, simulation=made.get("simulation", context.simulation))
+        if role == "simulation":
+            stream = RandomStream(seed, "")
+            own = replace(own, random=stream, grid=context.grid if true_grid is None else true_grid)
+        else:
+            stream = RandomStream(seed, role)
+            own = replace(own, random=stream)
         streams.append(stream)
-        sites = true_grid if is_simulation and true_grid is not None else grid
-        shared = made.get("simulation", simulation)
-        context = Context(role, sites, motion, clock, stream, calibrations or {}, shared, lines)
         try:
-            made[role] = construct_one(chosen[role], context)
+            made[role] = construct_one(chosen[role], own)
         except LabseqError as error:
             if refused is None:
                 raise
@@ -165,14 +149,9 @@ def rebuild_lab(lab: Lab, before: Point, after: Point, seed: int) -> tuple[Lab, 
     chosen = {**after.bench.chosen, "planner": after.planner}
     made, streams = construct(
         {name: chosen[name] for name in chosen if name in names},
-        lab.grid,
-        motion,
-        lab.clock,
+        replace(after.bench.context(lab.clock), simulation=lab.simulation),
         seed,
-        lab.simulation,
-        after.bench.calibrations,
-        after.bench.profile.grid_model(),
-        after.bench.profile.line_specs,
+        true_grid=after.bench.profile.grid_model(),
     )
     roles = ("camera", "static_tweezers", "mobile_tweezers", "detector", "planner", "lines", "simulation")
     return replace(

@@ -21,7 +21,7 @@ from labseq.messages import clean, visible
 from labseq.model import MotionSpec, Occupancy, Plan, PlanReport, SiteGrid, TargetPattern
 from labseq.motion import check_plan
 from labseq.plugins import PluginHost
-from labseq.roles import NeverStopped, Planner
+from labseq.roles import Context, Planner
 from labseq.session.chosen import ChosenPlugin, construct_target, load_plugins, resolve
 from labseq.session.lab import construct, parallelism_of
 from labseq.session.occupancies import Source, read_source
@@ -324,7 +324,7 @@ def plan_moves(
     occupancy, seed = source.occupancy, request.seed if source.seed is None else source.seed
     inputs = read_inputs(request, source)
     grid, motion, target = inputs.machine.grid, inputs.machine.motion, inputs.target
-    made, _ = construct({"planner": inputs.planner}, grid, motion, NeverStopped(), seed or 0)
+    made, _ = construct({"planner": inputs.planner}, Context(grid=grid, motion=motion), seed or 0)
     planner: Planner = made["planner"]
     dop = parallelism_of(inputs.planner, planner, motion)
     with announcing(announce):

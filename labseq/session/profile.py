@@ -26,6 +26,7 @@ from labseq.model.lines import IDLE
 from labseq.motion import standing_on_sites
 from labseq.plugins import PluginHost
 from labseq.registry import VIRTUAL_TWIN
+from labseq.roles import Clock, Context
 from labseq.session.chosen import HARDWARE_KINDS, ChosenPlugin, DryRun, choose, load_plugins
 from labseq.settings import Choice
 
@@ -53,6 +54,17 @@ class ResolvedProfile:
     warnings: tuple[str, ...]
     refused: Mapping[str, ConfigError] = field(default_factory=dict[str, ConfigError])
     calibrations: Mapping[str, CalibrationEntry] = field(default_factory=dict[str, CalibrationEntry])
+
+    def context(self, clock: Clock) -> Context:
+        """The context of its plugins, without a name, random numbers and a simulation."""
+        profile = self.profile
+        return Context(
+            grid=self.grid,
+            motion=profile.motion,
+            clock=clock,
+            calibrations=self.calibrations,
+            lines=profile.line_specs,
+        )
 
     @property
     def hardware_key(self) -> str:

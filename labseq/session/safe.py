@@ -176,17 +176,8 @@ def construct_hardware(bench: ResolvedProfile, clock: Clock) -> tuple[dict[str, 
     """
     chosen = {role: c for role, c in bench.chosen.items() if c.entry.kind in _NEEDED_KINDS}
     failures: dict[str, LabseqError] = {}
-    made, _ = construct(
-        chosen,
-        bench.grid,
-        bench.profile.motion,
-        clock,
-        seed=0,
-        calibrations=bench.calibrations,
-        true_grid=bench.profile.grid_model(),
-        lines=bench.profile.line_specs,
-        refused=failures,
-    )
+    true_grid = bench.profile.grid_model()
+    made, _ = construct(chosen, bench.context(clock), 0, true_grid=true_grid, refused=failures)
     return made, {role: chosen[role].placed(error) for role, error in failures.items()}
 
 
