@@ -111,9 +111,7 @@ def test_a_write_that_fails_leaves_the_older_file(
     [
         (errno.EDQUOT, "quota"),
         (errno.EACCES, "may not write there; choose another place with --output or LABSEQ_DATA"),
-        (errno.EROFS, "read-only"),
         (errno.ENOTDIR, "a file is in the way"),
-        (errno.EIO, "the disk reports a fault"),
         (errno.EMFILE, "check the disk"),
     ],
 )
@@ -135,16 +133,6 @@ def test_a_folder_that_cannot_be_flushed_is_no_fault(tmp_path: Path, monkeypatch
     monkeypatch.setattr(os, "fsync", network_folder)
     write_file(tmp_path / "file", b"one")
     assert (tmp_path / "file").read_bytes() == b"one"
-
-
-def test_a_log_goes_on_after_a_torn_line(tmp_path: Path) -> None:
-    path = tmp_path / "log"
-    LineLog(path).append({"a": 1}, sync=True)
-    path.write_bytes(path.read_bytes() + b'{"a": 2, "torn')
-    assert read_lines(path) == ([{"a": 1}], [])
-    LineLog(path).append({"a": 3}, sync=False)
-    assert read_lines(path) == ([{"a": 1}, {"a": 3}], [2])
-    assert path.read_bytes() == b'{"a": 1}\n{"a": 2, "torn\n{"a": 3}\n'
 
 
 @given(st.binary(max_size=60).filter(lambda torn: b"\n" not in torn))
@@ -188,19 +176,9 @@ def test_damaged_lines_in_the_middle_are_counted(tmp_path: Path) -> None:
     assert read_lines(path) == ([{"a": 1}, {"a": 2}], [2, 3])
 
 
-def test_a_log_that_is_not_there_is_empty(tmp_path: Path) -> None:
-    assert read_lines(tmp_path / "log") == ([], [])
-
-
 def test_a_log_that_cannot_be_read_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="cannot be read"):
         read_lines(tmp_path)
-
-
-def test_packaged_profiles() -> None:
-    folder = packaged_profiles_dir()
-    assert folder.name == "hardware_profiles"
-    assert (folder / "virtual.yaml").is_file()
 
 
 def test_packaged_profiles_of_a_wheel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -250,25 +228,12 @@ def test_a_user_without_a_home_has_no_state(monkeypatch: pytest.MonkeyPatch) -> 
     assert state_root() is None
 
 
-def test_this_process_runs_here() -> None:
-    owner = Process.current()
-    assert owner.is_here
-    assert owner.is_running
-
-
 def test_it_comes_back_from_plain_values() -> None:
     owner = Process.current()
     assert Process.from_plain(asdict(owner)) == owner
     assert Process.from_plain({}) is None
     assert Process.from_plain({"pid": "12"}) is None
     assert Process.from_plain({"pid": -1}) is None
-
-
-def test_a_process_that_ended_is_not_running() -> None:
-    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as child:
-        owner = replace(Process.current(), pid=child.pid, started=0.0)
-        assert owner.is_running
-    assert not owner.is_running
 
 
 def test_a_killed_process_that_nobody_has_waited_for_is_not_running() -> None:
@@ -289,10 +254,6 @@ def test_a_killed_process_that_nobody_has_waited_for_is_not_running() -> None:
 def test_a_later_process_of_the_same_number_is_another_one() -> None:
     owner = replace(Process.current(), started=Process.current().started - 60)
     assert not owner.is_running
-
-
-def test_another_computer_is_not_here() -> None:
-    assert not replace(Process.current(), host="another").is_here
 
 
 HOLD = """
@@ -342,7 +303,7 @@ def test_a_holder_that_is_killed_loses_its_lock(tmp_path: Path) -> None:
     mine.release()
 
 
-@pytest.mark.parametrize("content", [None, b"", b"[]", b'{"what": "x"}', b"\xff"])
+@pytest.mark.parametrize("content", [None, b"[]", b'{"what": "x"}'])
 def test_a_holder_that_cannot_be_read_is_still_one(tmp_path: Path, content: bytes | None) -> None:
     first, second = Lock(tmp_path / "a.lock", "x"), Lock(tmp_path / "a.lock", "y")
     first.take()
@@ -353,7 +314,7 @@ def test_a_holder_that_cannot_be_read_is_still_one(tmp_path: Path, content: byte
     first.release()
 
 
-@pytest.mark.parametrize("number", [errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP])
+@pytest.mark.parametrize("number", [errno.ENOSYS, errno.ENOLCK])
 def test_a_folder_without_locks_is_told_from_one_that_cannot_be_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
 ) -> None:

@@ -7,7 +7,6 @@ from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import pytest
 
 from labseq.analysis.charts import (
@@ -18,7 +17,7 @@ from labseq.analysis.charts import (
     draw_stages,
     draw_trend,
 )
-from labseq.analysis.overview import CHOICES, RunPicture, overview, picture_of
+from labseq.analysis.overview import RunPicture, overview, picture_of
 from labseq.analysis.statistics import jeffreys
 from labseq.errors import ConfigError
 from labseq.model import ShotRecord
@@ -47,11 +46,6 @@ def test_a_run_of_the_virtual_lab_fills_the_sheet(compact: Run) -> None:
     ]
 
 
-@pytest.mark.parametrize("what", sorted({*CHOICES} - {"scan"}))
-def test_each_part_is_there_alone(compact: Run, what: str) -> None:
-    assert picture_of(compact, what).rows
-
-
 def test_a_run_without_rearrangement_has_the_rest(write: Write, shot: Shot) -> None:
     run = write([shot(i, n_cycles=0) for i in range(3)], resolved={})
     assert kinds(overview(run)) == [[draw_trend, draw_defects], [draw_trend], [draw_sites, draw_stages]]
@@ -66,14 +60,6 @@ def test_a_run_without_images_has_its_stages(write: Write, shot: Shot) -> None:
     assert kinds(overview(run)) == [[draw_stages]]
     with pytest.raises(ConfigError, match="nothing to show of filling"):
         picture_of(run, "filling")
-
-
-def test_one_shot_is_enough(write: Write, shot: Shot) -> None:
-    trend = drawn(overview(write([shot(0, n_defects=1)])))
-    _, y, low, _ = trend.running
-    assert trend.values.tolist() == [pytest.approx(5 / 6)]
-    assert y.tolist() == [pytest.approx(5 / 6)]
-    assert np.isnan(low).all()
 
 
 def test_shots_that_are_not_judged_are_shown_by_the_image_that_ended_the_last_cycle(
@@ -132,10 +118,3 @@ def test_shots_whose_files_are_gone_are_left_out_of_what_needs_them(write: Write
     assert draw_trend in kinds(gone)[0]
     with pytest.raises(ConfigError, match="nothing to show of survival by site"):
         picture_of(open_run(run.path), "survival")
-
-
-def test_an_unknown_part_is_told(compact: Run) -> None:
-    with pytest.raises(
-        ConfigError, match=r"--what: there is no picture 'x' of a run; expected one of 'defects'"
-    ):
-        picture_of(compact, "x")

@@ -12,7 +12,6 @@ import pytest
 
 from labseq.analysis.charts import draw_curves, draw_map
 from labseq.analysis.overview import overview, picture_of
-from labseq.errors import ConfigError
 from labseq.model import ShotRecord
 from labseq.recording import Run
 
@@ -115,10 +114,3 @@ def test_a_scan_in_progress_has_blank_cells(write: Write, shot: Shot) -> None:
     of = scan(("a", [a for a, _ in rows]), ("b", [b for _, b in rows]))
     (filling, _), *_ = charts(taken(write, shot, of, n_shots=3))
     assert np.isnan(filling.values).tolist() == [[False, False], [False, True]]
-
-
-def test_a_run_without_a_scan_says_so(write: Write, shot: Shot) -> None:
-    with pytest.raises(
-        ConfigError, match="nothing to show of the scan; expected a run of a sequence with 'scan:'"
-    ):
-        picture_of(write([shot(0)]), "scan")

@@ -63,16 +63,10 @@ def test_an_interrupted_shot_is_shown_as_far_as_it_came(write: Write, shot: Shot
     assert panel.title.endswith("then 1 move in 1 batch")
 
 
-def test_what_counts_is_shown_before_attempts_that_do_not(write: Write, shot: Shot) -> None:
-    run = write([shot(0, status="failed", error="no light"), shot(0, attempt=1)])
-    assert shot_picture(run, 1).title == "shot 1"
-
-
 @pytest.mark.parametrize(
     ("number", "cycle", "told"),
     [
         (3, None, "--shot: the run has no shot 3; expected one from 1 to 2"),
-        (0, None, "--shot: the run has no shot 0"),
         (1, 2, "has no cycle 2; expected one from 1 to 1"),
         (2, 1, "has no cycle 1; expected a shot that rearranges"),
     ],
@@ -83,11 +77,6 @@ def test_what_is_not_there_is_told(
     run = write([shot(0), shot(1, n_cycles=0)])
     with pytest.raises(ConfigError, match=told):
         shot_picture(run, number, cycle)
-
-
-def test_a_shot_without_images_has_no_picture(write: Write, shot: Shot) -> None:
-    with pytest.raises(ConfigError, match="shot 1 has no images"):
-        shot_picture(write([shot(0, images=[], cycles=[])]), 1)
 
 
 def test_an_array_that_cannot_be_made_out_is_told(

@@ -131,9 +131,7 @@ def test_an_analysis_that_fails_exits_with_1(run, capsys):
         (None, ["atoms=all"], "--set atoms=all: .*; name it with --use"),
         ("sruvival", [], "unknown analysis 'sruvival'.*did you mean 'survival'"),
         ("survival", ["atom=all"], "'atom' is not a setting.*did you mean 'atoms'"),
-        ("survival", ["atoms=some"], "atoms is 'some'"),
         ("survival", ["profile.atoms=all"], "an analysis has no settings in the profile"),
-        ("survival", ["atoms"], "not of the form"),
     ],
 )
 def test_what_cannot_be_analysed_is_refused(run, use, overrides, expected):

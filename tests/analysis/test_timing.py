@@ -59,13 +59,6 @@ def test_a_model_knows_nothing_of_writing(write: Write, shot: Shot) -> None:
         assert stage.host_s[0] > 0
 
 
-def test_no_shots_have_no_stages(write: Write) -> None:
-    run = write([])
-    timing = timing_of(run, run.shots)
-    assert (timing.n_read, timing.stages) == (0, ())
-    assert math.isnan(timing.shot_s[0])
-
-
 @given(st.lists(st.floats(0, 1), min_size=1))
 def test_quantiles_lie_within_the_values(values: list[float]) -> None:
     p50, p99 = quantiles(values)

@@ -6,7 +6,6 @@ import re
 from pathlib import Path
 
 import pytest
-from labseq_climb.scanner import Climb
 
 import labseq
 from labseq.cli.check import check_sequence
@@ -24,11 +23,6 @@ def test_the_scan_of_the_page_is_that_of_the_sequence() -> None:
     file = "\n".join(line.partition("#")[0].rstrip() for line in SEQUENCE.read_text("utf-8").splitlines())
     for line in shown.splitlines():
         assert line in file.splitlines()
-
-
-def test_the_scanner_of_the_page_is_short() -> None:
-    code = Path(Climb.__init__.__code__.co_filename).read_text("utf-8").partition("class Climb:")[2]
-    assert len([line for line in code.splitlines() if line.strip() and '"""' not in line]) < 30
 
 
 def test_the_climb_of_the_page(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

@@ -111,9 +111,7 @@ def test_runs_are_drawn_and_compared(tmp_path: Path, monkeypatch: pytest.MonkeyP
     ("name", "shots", "figure", "message"),
     [
         ("compact_225", 2, "5", "figure 5 needs shots that all make every cycle"),
-        ("scan_dop", 4, "5", "figure 5 needs a run without a scan"),
         ("compact_225", 1, "4", "figure 4 needs a scan of planner.degree_of_parallelism"),
-        ("scan_dop", 4, "4", "with one cycle"),
     ],
 )
 def test_other_runs_are_refused(tmp_path: Path, name: str, shots: int, figure: str, message: str) -> None:

@@ -82,12 +82,6 @@ def test_the_bound_is_drawn_with_the_planners(report: Report) -> None:
     assert [*curves(report, figure())] == [f"{one.label}: $N^{{{one.law.exponent}}}$" for one in points]
 
 
-def test_times_are_drawn_in_milliseconds(report: Report) -> None:
-    (points,) = points_of(report, figure(y="motion_s"))
-    (curve,) = curves(report, figure(y="motion_s")).values()
-    assert curve.lines[0].get_ydata().tolist() == pytest.approx((1e3 * points.y).tolist())
-
-
 def test_a_figure_over_the_degree_of_parallelism_has_no_law_but_histograms(tmp_path: Path) -> None:
     conditions = tuple(replace(CONDITIONS[1], degree_of_parallelism=dop) for dop in (2, 3, 5))
     over_dop = replace(FIGURES["2c"], planner_entries=(PlannerEntry("psca"),), conditions=conditions)
@@ -115,16 +109,6 @@ def test_an_incomplete_comparison_says_so(report: Report) -> None:
     stopped = replace(report, n_done=7, ended_by=StopRequested(), rows=report.rows[:1])
     assert "incomplete: 7 of 30" in stopped.extent_text
     assert [one.law for one in points_of(stopped, figure())] == [None, None]
-
-
-def test_the_script_draws_one_figure(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(SCRIPT, "FIGURES", {"2b": figure()})
-    path = tmp_path / "2b.png"
-    SCRIPT.main(["--figure", "2b", "--loadings", "5", "--set", "speed=130 um/ms", "--output", str(path)])
-    assert path.read_bytes().startswith(b"\x89PNG")
-    assert "psca: N^" in capsys.readouterr().out
 
 
 def test_a_comparison_is_drawn_as_a_histogram(tmp_path: Path) -> None:

@@ -5,8 +5,6 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-import pytest
-
 from .scripts import load_script
 
 ROOT = Path(__file__).parents[2]
@@ -30,16 +28,3 @@ def test_only_the_measured_part_is_replaced() -> None:
     once = SCRIPT.replaced(page, "a", ["new"])
     assert once == page.replace("old", "\nnew\n")
     assert SCRIPT.replaced(once, "a", ["new"]) == once
-
-
-def test_a_part_that_is_not_on_the_page_is_named() -> None:
-    with pytest.raises(LookupError, match="no part <!-- measured: c -->"):
-        SCRIPT.replaced("", "c", [])
-
-
-def test_the_sizes_are_measured_as_told() -> None:
-    lines = SCRIPT.sizes(2)
-    assert lines[1].endswith("--loadings 2 --workers 1")
-    assert [line.split("|")[1].strip() for line in lines[6:]] == [
-        f"{grid} x {grid} to {side} x {side}" for grid, side in SCRIPT.SIZES
-    ]

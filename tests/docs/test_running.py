@@ -90,15 +90,6 @@ def test_a_file_is_written_where_the_page_says(folder: Path) -> None:
     assert (folder / "my" / "file.yaml").read_text() == "a: 1\n"
 
 
-def test_what_a_command_prints_goes_through_a_pipe() -> None:
-    code, plan, _ = labseq(
-        ["plan", "random:10x10@0.75", "--seed", "4", "--target", "kagome:7x7", "--json", "-"]
-    )
-    assert code == 0
-    code, _, said = labseq(["waveform", "-", "--json", "-"], plan)
-    assert code == 0, said
-
-
 def test_the_streams_are_left_as_they_were(capfd: pytest.CaptureFixture[str]) -> None:
     labseq(["--version"])
     print("still here")

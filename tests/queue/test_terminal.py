@@ -14,27 +14,7 @@ from labseq.errors import StopRequested
 from labseq.session.stopping import ask_to_stop
 from labseq.testing.fakes import RecordingObserver
 
-SEQUENCE = """
-labseq: 1
-name: look µ
-profile: ./p.yaml
-shots: 3
-seed: 1
-target: {pattern: compact, rows: 2, cols: 2}
-shot:
-  - load: {duration: 1 ms}
-  - image: {}
-"""
-PROFILE = """
-labseq: 1
-name: bench
-grid: {rows: 4, cols: 4, spacing: 4.49 um}
-camera: {use: virtual}
-static_tweezers: {use: virtual}
-mobile_tweezers: {use: virtual}
-detector: {use: threshold}
-simulation: {use: virtual}
-"""
+from .queued import PROFILE, SEQUENCE
 
 
 @pytest.fixture(autouse=True)
@@ -93,14 +73,6 @@ def test_the_list_says_what_one_should_know(capsys: pytest.CaptureFixture[str]) 
     assert values["options"]["dry_run"] == "off"
 
 
-def test_what_is_wrong_with_a_sequence_is_reported_with_its_line(capsys: pytest.CaptureFixture[str]) -> None:
-    Path("s.yaml").write_text(SEQUENCE.replace("compact", "kompact"), encoding="utf-8")
-    code, out, err = call(capsys, "queue", "add", "s.yaml")
-    assert (code, out) == (2, "")
-    assert "s.yaml:7:19: unknown pattern 'kompact'" in err
-    assert "^^^^^^^" in err
-
-
 def test_a_queue_that_keeps_going_ends_with_the_first_failure(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -120,12 +92,9 @@ def test_a_queue_that_keeps_going_ends_with_the_first_failure(
     ("arguments", "message"),
     [
         (("queue", "remove", "5"), "error: the queue has no entry 5; expected nothing: the queue is empty\n"),
-        (("queue", "move", "5", "--before", "6"), "error: the queue has no entry 5; expected nothing"),
-        (("stop",), "error: no run is in progress\n"),
         (("stop", "--profile", "./p.yaml"), "error: no run is in progress on the profile ./p.yaml\n"),
         (("stop", "--queue"), "error: no process runs the queue; 'labseq stop' without --queue ends a run\n"),
         (("stop", "nowhere"), "nowhere: no such file or folder"),
-        (("resume", "nowhere"), "nowhere: no such file or folder"),
     ],
 )
 def test_what_is_not_there_is_said(

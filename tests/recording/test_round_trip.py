@@ -124,7 +124,7 @@ def runs_and_shots(draw: st.DrawFn) -> tuple[dict[str, Any], ShotRecord]:
 folder_number = itertools.count()
 
 
-@settings(deadline=None, max_examples=30, suppress_health_check=[HealthCheck.too_slow])
+@settings(deadline=None, max_examples=12, suppress_health_check=[HealthCheck.too_slow])
 @given(runs_and_shots())
 def test_every_record_comes_back(
     tmp_path_factory: pytest.TempPathFactory,

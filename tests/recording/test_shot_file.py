@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import io
-import json
-import subprocess
-import sys
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,7 +16,6 @@ import pytest
 from labseq.errors import RecordingError
 from labseq.model import Frame, RunRecord, ShotRecord
 from labseq.recording import schema
-from labseq.recording.schema import FORMAT_VERSION
 from labseq.recording.shot_file import ShotEncoder, read_content
 
 MakeRun = Callable[..., RunRecord]
@@ -67,42 +63,6 @@ def test_viewers_open_the_occupancies_where_there_are_no_frames(
         assert "camera" not in file["entry"]
 
 
-def test_the_root_and_the_entry_say_what_it_is(make_run: MakeRun, make_shot: MakeShot) -> None:
-    with opened(ShotEncoder(make_run(), "2026-11-20/0001_a").encode(make_shot(3))) as file:
-        assert file.attrs["format"] == "labseq-shot"
-        assert file.attrs["format_version"] == FORMAT_VERSION
-        assert file.attrs["NX_class"] == "NXroot"
-        assert file.attrs["creator"].startswith("labseq ")
-        entry = file["entry"].attrs
-        assert entry["NX_class"] == "NXentry"
-        assert file["entry/run"].attrs["run_id"] == "2026-11-20/0001_a"
-        assert entry["shot"] == 3
-        assert entry["filling_fraction"] == 0.875
-        assert file["entry/run"].attrs["simulated"]
-        assert entry["success"]
-        assert entry["t_start_utc"] == "2026-11-20T10:00:00.000000+00:00"
-
-
-def test_every_time_has_its_unit(make_run: MakeRun, make_shot: MakeShot) -> None:
-    checked: list[str] = []
-
-    def check(name: str, node: Any) -> None:
-        if not isinstance(node, h5py.Dataset):
-            return
-        if node.dtype.names:
-            units: Any = node.attrs["units"]
-            assert list(units) == ["s" if column.endswith("_s") else "" for column in node.dtype.names]
-            checked.append(name)
-        elif name.endswith("_s"):
-            assert node.attrs["units"] == "s"
-            checked.append(name)
-
-    with opened(ShotEncoder(make_run(), "day/run").encode(make_shot())) as file:
-        file.visititems(check)
-        assert file["entry/images_view/images"].attrs["units"] == "adu"
-    assert len(checked) == 8
-
-
 def test_the_tables_hold_every_move(make_run: MakeRun, make_shot: MakeShot) -> None:
     shot = make_shot()
     with opened(ShotEncoder(make_run(), "day/run").encode(shot)) as file:
@@ -145,47 +105,10 @@ def test_a_shot_without_atom_events_has_no_group_for_them(make_run: MakeRun, mak
         assert "atom_events" not in file["entry"]
 
 
-def test_provenance_and_devices_stand_in_every_file(make_run: MakeRun, make_shot: MakeShot) -> None:
-    with opened(ShotEncoder(make_run(), "day/run").encode(make_shot())) as file:
-        run = file["entry/run"]
-        assert json.loads(run["provenance"][()])["git_commit"] == "a" * 40
-        assert len(run.attrs["sequence_sha256"]) == 64
-        assert run["sequence"][()].decode() == make_run().sequence_text
-        assert json.loads(run["devices"][()])["laser/780 nm"] == {"power_w": 0.1}
-
-
 def test_any_hdf5_from_1_8_on_can_read_it(make_run: MakeRun, make_shot: MakeShot) -> None:
     data = bytes(ShotEncoder(make_run(), "day/run").encode(make_shot()))
     assert data[:8] == b"\x89HDF\r\n\x1a\n"
     assert data[8] == 0  # superblock version 0: no flag that a killed writer could leave set
-
-
-def test_it_reads_without_labseq(make_run: MakeRun, make_shot: MakeShot, tmp_path: Path) -> None:
-    path = tmp_path / "shot.h5"
-    path.write_bytes(ShotEncoder(make_run(), "day/run").encode(make_shot()))
-    code = (
-        "import sys, h5py\n"
-        "with h5py.File(sys.argv[1]) as f:\n"
-        "    print(f['entry/images_view/images'].shape, f['entry/rearrangement/moves'].dtype.names[:3])\n"
-        "assert 'labseq' not in sys.modules\n"
-    )
-    done = subprocess.run([sys.executable, "-c", code, path], capture_output=True, text=True, check=True)
-    assert done.stdout == "(3, 6, 8) ('step', 'cycle', 'batch')\n"
-
-
-@pytest.mark.parametrize(("record_frames", "kept"), [("all", [0, 1, 2]), ("last", [2]), ("none", [])])
-def test_the_frames_that_are_asked_for_are_kept(
-    make_run: MakeRun, make_shot: MakeShot, record_frames: str, kept: list[int]
-) -> None:
-    with opened(ShotEncoder(make_run(record_frames=record_frames), "day/run").encode(make_shot())) as file:
-        found = list(file["entry/camera/camera/image"]) if "camera" in file["entry"] else []
-        assert found == kept
-        assert file["entry/detection/occupancy"].shape == (3, 4, 5)
-
-
-def test_the_same_record_gives_the_same_bytes(make_run: MakeRun, make_shot: MakeShot) -> None:
-    one, two = (ShotEncoder(make_run(), "day/run").encode(make_shot()) for _ in range(2))
-    assert one == two
 
 
 def test_frames_of_several_cameras_and_sizes_have_groups_of_their_own(
@@ -219,33 +142,6 @@ def test_a_file_of_an_older_minor_format_reads_with_defaults(
     path.write_bytes(ShotEncoder(make_run(), "day/run").encode(make_shot()))
     monkeypatch.undo()
     assert read_content(path).record.n_missing_atoms == 0
-
-
-def test_compressed_frames_are_smaller_and_the_same(make_run: MakeRun, make_shot: MakeShot) -> None:
-    pytest.importorskip("hdf5plugin")
-    shot = make_shot(n_images=1)
-    dark = np.random.default_rng(0).poisson(3, (256, 256)).astype(np.uint16)
-    shot.images = [dataclasses.replace(shot.images[0], frame=Frame(dark, 0.1, 0.0))]
-    plain = ShotEncoder(make_run(), "day/run").encode(shot)
-    small = ShotEncoder(make_run(), "day/run", compress=True).encode(shot)
-    assert small.nbytes < 0.6 * plain.nbytes
-    with opened(small) as file:
-        np.testing.assert_array_equal(file["entry/images_view/images"][0], dark)
-
-
-def test_compression_without_its_package_is_explained(
-    make_run: MakeRun, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "hdf5plugin", None)
-    with pytest.raises(RecordingError, match=r"pip install 'labseq\[compress\]'"):
-        ShotEncoder(make_run(), "day/run", compress=True)
-
-
-def test_a_record_that_contradicts_itself_is_explained(make_run: MakeRun, make_shot: MakeShot) -> None:
-    shot = make_shot(5)
-    shot.images[1] = dataclasses.replace(shot.images[1], occupancy=np.zeros((2, 2), np.bool_))
-    with pytest.raises(RecordingError, match=r"shot 5 \(attempt 0\): cannot be laid out as a file"):
-        ShotEncoder(make_run(), "day/run").encode(shot)
 
 
 def test_a_record_that_a_plugin_has_spoilt_is_explained(make_run: MakeRun, make_shot: MakeShot) -> None:

@@ -147,9 +147,7 @@ def test_a_shot_with_a_damaged_line_is_left_out_and_named(of_defects: Any, recor
     "damage",
     [
         {"images": None},
-        {"images": {"cycle": [0, 1]}},
         {"cycles": {"n_batches": [1], "n_batches_played": [], "n_atom_moves": []}},
-        {"simulation": [1]},
         {"cycles": {"n_batches": ["1"], "n_batches_played": [1], "n_atom_moves": [1]}},
     ],
 )
@@ -165,22 +163,6 @@ def test_an_empty_run_has_nothing_to_tell(recorded: Any) -> None:
     assert (found.n_shots, found.cycles, found.defects) == (0, (), ())
     assert found.seen == Rate(0, 0)
     assert json.loads(json.dumps(found.as_dict()))["filling"] == {"mean": None, "error": None}
-
-
-def test_a_shot_with_images_alone_is_judged(of_defects: Any, recorded: Any) -> None:
-    run = recorded(of_defects(0, (), last=0))
-    found = statistics_of(run.shots, run.target)
-    assert (found.defect_free, found.cycles) == (Rate(1, 1), ())
-
-
-def test_many_shots_are_summed_up_from_the_index_alone(of_defects: Any, recorded: Any) -> None:
-    run = recorded(of_defects(0, (2, 0), last=0))
-    (line,) = (run.path / "index.jsonl").read_text("utf-8").splitlines()
-    rows = ({**json.loads(line), "shot": index} for index in range(2_000))
-    (run.path / "index.jsonl").write_text("".join(f"{json.dumps(row)}\n" for row in rows), "utf-8")
-    run.shots[0].file.unlink()
-    run = open_run(run.path)
-    assert statistics_of(run.shots, run.target).cycles[1].defect_free == Rate(2_000, 2_000)
 
 
 def test_a_summary_survives_the_index(of_defects: Any, make_run: MakeRun) -> None:

@@ -214,7 +214,7 @@ lines = st.fixed_dictionaries(
 )
 
 
-@settings(max_examples=60)
+@settings(max_examples=25)
 @given(st.lists(lines, min_size=1, max_size=3))
 def test_any_index_makes_columns_of_equal_length(run: Run, changes: list[dict[str, Any]]) -> None:
     index = run.path / "index.jsonl"

