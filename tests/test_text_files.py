@@ -99,10 +99,7 @@ def test_path_is_kept_as_given() -> None:
             b"a: b\nspacing: 4.49 \xb5m\n",
             f"f.yaml:2:15: byte 0xB5 at offset 19 is not UTF-8 (in Latin-1 it is '\xb5'); {SAVE}",
         ),
-        (
-            b"\xef\xbb\xbfa: \x80",
-            f"f.yaml:1:4: byte 0x80 at offset 6 is not UTF-8; {SAVE}",
-        ),
+        (b"\xef\xbb\xbfa: \x80", f"f.yaml:1:4: byte 0x80 at offset 6 is not UTF-8; {SAVE}"),
         (
             "\xb5: b\r\nc: ".encode() + b"\xe4",
             f"f.yaml:2:4: byte 0xE4 at offset 10 is not UTF-8 (in Latin-1 it is '\xe4'); {SAVE}",

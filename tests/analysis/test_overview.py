@@ -20,10 +20,10 @@ from labseq.analysis.charts import (
 from labseq.analysis.overview import RunPicture, overview, picture_of
 from labseq.analysis.statistics import jeffreys
 from labseq.errors import ConfigError
-from labseq.model import ShotRecord
 from labseq.recording import Run, open_run
 
-Shot = Callable[..., ShotRecord]
+from .records import make_shot
+
 Write = Callable[..., Run]
 
 
@@ -46,8 +46,8 @@ def test_a_run_of_the_virtual_lab_fills_the_sheet(compact: Run) -> None:
     ]
 
 
-def test_a_run_without_rearrangement_has_the_rest(write: Write, shot: Shot) -> None:
-    run = write([shot(i, n_cycles=0) for i in range(3)], resolved={})
+def test_a_run_without_rearrangement_has_the_rest(write: Write) -> None:
+    run = write([make_shot(i, n_cycles=0) for i in range(3)], resolved={})
     assert kinds(overview(run)) == [[draw_trend, draw_defects], [draw_trend], [draw_sites, draw_stages]]
     with pytest.raises(
         ConfigError, match=r"nothing to show of lost atoms; expected readable shots with a rear"
@@ -55,32 +55,30 @@ def test_a_run_without_rearrangement_has_the_rest(write: Write, shot: Shot) -> N
         picture_of(run, "losses")
 
 
-def test_a_run_without_images_has_its_stages(write: Write, shot: Shot) -> None:
-    run = write([shot(0, n_cycles=0, judged=False, images=[])])
+def test_a_run_without_images_has_its_stages(write: Write) -> None:
+    run = write([make_shot(0, n_cycles=0, judged=False, images=[])])
     assert kinds(overview(run)) == [[draw_stages]]
     with pytest.raises(ConfigError, match="nothing to show of filling"):
         picture_of(run, "filling")
 
 
-def test_shots_that_are_not_judged_are_shown_by_the_image_that_ended_the_last_cycle(
-    write: Write, shot: Shot
-) -> None:
-    drawing = overview(write([shot(i, n_defects=i, judged=False) for i in range(3)]))
+def test_shots_that_are_not_judged_are_shown_by_the_image_that_ended_the_last_cycle(write: Write) -> None:
+    drawing = overview(write([make_shot(i, n_defects=i, judged=False) for i in range(3)]))
     filling, success = drawn(drawing), drawn(drawing, 1)
     assert filling.values == pytest.approx([1, 5 / 6, 4 / 6])
     assert success.values.tolist() == [1, 0, 0]
 
 
-def test_a_running_rate_has_jeffreys_intervals(write: Write, shot: Shot) -> None:
-    trend = drawn(picture_of(write([shot(i, n_defects=i % 2) for i in range(30)]), "success"))
+def test_a_running_rate_has_jeffreys_intervals(write: Write) -> None:
+    trend = drawn(picture_of(write([make_shot(i, n_defects=i % 2) for i in range(30)]), "success"))
     x, _, low, high = trend.running[:, 0]
     assert x == 5.5  # ten shots
     assert (low, high) == jeffreys(5, 10)
     assert trend.is_rate
 
 
-def test_defects_stand_beside_those_of_independent_sites(write: Write, shot: Shot) -> None:
-    chart = drawn(picture_of(write([shot(i, n_defects=(0, 0, 3)[i % 3]) for i in range(6)]), "defects"))
+def test_defects_stand_beside_those_of_independent_sites(write: Write) -> None:
+    chart = drawn(picture_of(write([make_shot(i, n_defects=(0, 0, 3)[i % 3]) for i in range(6)]), "defects"))
     _, y, low, high = chart.shares
     assert y == pytest.approx([4 / 6, 0, 0, 2 / 6])
     assert (low[1], high[1]) == jeffreys(0, 6)
@@ -89,25 +87,25 @@ def test_defects_stand_beside_those_of_independent_sites(write: Write, shot: Sho
 
 
 @pytest.mark.parametrize("n_defects", [0, 6])
-def test_shots_that_are_all_alike_can_be_drawn(write: Write, shot: Shot, n_defects: int) -> None:
-    chart = drawn(picture_of(write([shot(i, n_defects=n_defects) for i in range(2)]), "defects"))
+def test_shots_that_are_all_alike_can_be_drawn(write: Write, n_defects: int) -> None:
+    chart = drawn(picture_of(write([make_shot(i, n_defects=n_defects) for i in range(2)]), "defects"))
     assert chart.expected[n_defects] == 1.0
 
 
-def test_a_run_that_goes_on_says_so(write: Write, shot: Shot) -> None:
-    run = write([shot(0)], status="running", n_shots=20)
+def test_a_run_that_goes_on_says_so(write: Write) -> None:
+    run = write([make_shot(0)], status="running", n_shots=20)
     assert "(running, 1 of 20 shots)" in overview(run).note
 
 
-def test_a_run_without_shots_says_so(write: Write, shot: Shot) -> None:
+def test_a_run_without_shots_says_so(write: Write) -> None:
     with pytest.raises(ConfigError, match="no shots yet; expected at least one complete shot"):
         overview(write([], status="running"))
     with pytest.raises(ConfigError, match="no shots that count"):
-        overview(write([shot(0, status="failed", error="no light")], status="failed"))
+        overview(write([make_shot(0, status="failed", error="no light")], status="failed"))
 
 
-def test_shots_whose_files_are_gone_are_left_out_of_what_needs_them(write: Write, shot: Shot) -> None:
-    run = write([shot(i) for i in range(3)])
+def test_shots_whose_files_are_gone_are_left_out_of_what_needs_them(write: Write) -> None:
+    run = write([make_shot(i) for i in range(3)])
     for one in run.shots[:2]:
         one.file.unlink()
     drawing = overview(open_run(run.path))

@@ -12,10 +12,10 @@ import pytest
 
 from labseq.analysis.charts import draw_curves, draw_map
 from labseq.analysis.overview import overview, picture_of
-from labseq.model import ShotRecord
 from labseq.recording import Run
 
-Shot = Callable[..., ShotRecord]
+from .records import make_shot
+
 Write = Callable[..., Run]
 
 
@@ -30,9 +30,9 @@ def scan(*columns: tuple[str, Sequence[str]], repeats: int = 1) -> dict[str, Any
     }
 
 
-def taken(write: Write, shot: Shot, of: dict[str, Any], n_shots: int | None = None) -> Run:
+def taken(write: Write, of: dict[str, Any], n_shots: int | None = None) -> Run:
     n = len(of["point_of_shot"]) if n_shots is None else n_shots
-    return write([shot(i, n_defects=i % 3) for i in range(n)], scan=of)
+    return write([make_shot(i, n_defects=i % 3) for i in range(n)], scan=of)
 
 
 def charts(run: Run) -> list[list[Any]]:
@@ -40,10 +40,8 @@ def charts(run: Run) -> list[list[Any]]:
     return [[SimpleNamespace(func=panel.func, **panel.keywords) for panel in row] for row in panels]
 
 
-def test_a_quantity_is_an_axis_in_its_unit(write: Write, shot: Shot) -> None:
-    ((filling, success),) = charts(
-        taken(write, shot, scan(("a.window", ["90 ms", "30 ms", "60 ms"]), repeats=2))
-    )
+def test_a_quantity_is_an_axis_in_its_unit(write: Write) -> None:
+    ((filling, success),) = charts(taken(write, scan(("a.window", ["90 ms", "30 ms", "60 ms"]), repeats=2)))
     assert filling.func is draw_curves
     assert filling.x_label == "a.window (ms)"
     assert filling.curves[""][0].tolist() == [30, 60, 90]
@@ -62,33 +60,33 @@ def test_a_quantity_is_an_axis_in_its_unit(write: Write, shot: Shot) -> None:
     ],
 )
 def test_values_at_equal_ratios_are_on_a_logarithmic_axis(
-    write: Write, shot: Shot, words: list[str], logarithmic: bool
+    write: Write, words: list[str], logarithmic: bool
 ) -> None:
-    ((chart, _),) = charts(taken(write, shot, scan(("a", words))))
+    ((chart, _),) = charts(taken(write, scan(("a", words))))
     assert chart.logarithmic is logarithmic
 
 
 @pytest.mark.parametrize("words", [["psca", "other"], ["10 ms", "1 s"], ["1", "true"]])
-def test_what_is_no_number_is_written_below_the_axis(write: Write, shot: Shot, words: list[str]) -> None:
-    ((chart, _),) = charts(taken(write, shot, scan(("planner", words))))
+def test_what_is_no_number_is_written_below_the_axis(write: Write, words: list[str]) -> None:
+    ((chart, _),) = charts(taken(write, scan(("planner", words))))
     assert tuple(chart.ticks) == tuple(words)
     assert chart.curves[""][0].tolist() == [0, 1]
 
 
-def test_two_values_make_a_map(write: Write, shot: Shot) -> None:
+def test_two_values_make_a_map(write: Write) -> None:
     rows = list(product(["1", "2", "3"], ["10 ms", "20 ms"]))
     of = scan(("dop", [a for a, _ in rows]), ("window", [b for _, b in rows]))
-    (filling, success), *_ = charts(taken(write, shot, of))
+    (filling, success), *_ = charts(taken(write, of))
     assert filling.func is draw_map
     assert (filling.y_label, filling.x_label, filling.values.shape) == ("dop", "window", (3, 2))
     assert filling.values.ravel() == pytest.approx([1, 5 / 6, 4 / 6] * 2)
     assert success.label == "defect-free (%)"
 
 
-def test_more_values_make_a_row_of_maps_with_one_scale(write: Write, shot: Shot) -> None:
+def test_more_values_make_a_row_of_maps_with_one_scale(write: Write) -> None:
     rows = list(product("ab", "123", "xy"))
     of = scan(*((name, [row[i] for row in rows]) for i, name in enumerate(("first", "second", "third"))))
-    run = taken(write, shot, of)
+    run = taken(write, of)
     maps, _ = charts(run)
     assert [chart.title for chart in maps] == ["first a", "first b"]
     assert len({chart.limits for chart in maps}) == 1
@@ -96,21 +94,21 @@ def test_more_values_make_a_row_of_maps_with_one_scale(write: Write, shot: Shot)
     assert [panel.func for panel in row] == [draw_map, draw_map]
 
 
-def test_values_that_go_together_are_one_axis(write: Write, shot: Shot) -> None:
+def test_values_that_go_together_are_one_axis(write: Write) -> None:
     of = scan(("dop", ["1", "2", "3"]), ("window", ["30 ms", "20 ms", "20 ms"]), ("fixed", ["7", "7", "7"]))
-    ((chart, _),) = charts(taken(write, shot, of))
+    ((chart, _),) = charts(taken(write, of))
     assert chart.x_label == "dop with window"
 
 
-def test_points_of_an_optimiser_are_drawn_in_their_order(write: Write, shot: Shot) -> None:
+def test_points_of_an_optimiser_are_drawn_in_their_order(write: Write) -> None:
     a, b = ["0.1", "0.4", "0.2", "0.35", "0.3", "0.15"], ["1", "5", "2", "3", "4", "6"]
-    ((chart, _),) = charts(taken(write, shot, scan(("a", a), ("b", b))))
+    ((chart, _),) = charts(taken(write, scan(("a", a), ("b", b))))
     assert chart.x_label == "point of the scan"
     assert chart.curves[""][0].tolist() == [1, 2, 3, 4, 5, 6]
 
 
-def test_a_scan_in_progress_has_blank_cells(write: Write, shot: Shot) -> None:
+def test_a_scan_in_progress_has_blank_cells(write: Write) -> None:
     rows = list(product("12", "xy"))
     of = scan(("a", [a for a, _ in rows]), ("b", [b for _, b in rows]))
-    (filling, _), *_ = charts(taken(write, shot, of, n_shots=3))
+    (filling, _), *_ = charts(taken(write, of, n_shots=3))
     assert np.isnan(filling.values).tolist() == [[False, False], [False, True]]

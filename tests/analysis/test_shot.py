@@ -10,10 +10,10 @@ import pytest
 
 from labseq.analysis.shot import save_shot, shot_picture
 from labseq.errors import ConfigError
-from labseq.model import ShotRecord
 from labseq.recording import Run
 
-Shot = Callable[..., ShotRecord]
+from .records import make_shot
+
 Write = Callable[..., Run]
 
 
@@ -37,26 +37,26 @@ def test_frames_lie_under_the_sites(compact: Run, tmp_path: Path) -> None:
     assert (tmp_path / "shot.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_a_cycle_is_the_image_before_and_the_one_after_it(write: Write, shot: Shot) -> None:
-    panels = shot_picture(write([shot(0, n_cycles=2)]), 1, cycle=2).panels
+def test_a_cycle_is_the_image_before_and_the_one_after_it(write: Write) -> None:
+    panels = shot_picture(write([make_shot(0, n_cycles=2)]), 1, cycle=2).panels
     assert [panel.title.partition(":")[0] for panel in panels] == ["after cycle 1", "after cycle 2"]
 
 
-def test_without_frames_the_sites_are_drawn_alone(write: Write, shot: Shot, tmp_path: Path) -> None:
-    drawing = shot_picture(write([shot(0)]), 1)
+def test_without_frames_the_sites_are_drawn_alone(write: Write, tmp_path: Path) -> None:
+    drawing = shot_picture(write([make_shot(0)]), 1)
     assert drawing.note.endswith("no frames: not kept")
     save_shot(tmp_path / "shot.svg", drawing)
 
 
-def test_frames_of_another_size_than_the_sites_are_left_out(write: Write, shot: Shot) -> None:
-    drawing = shot_picture(write([shot(0, kept=True)]), 1)
+def test_frames_of_another_size_than_the_sites_are_left_out(write: Write) -> None:
+    drawing = shot_picture(write([make_shot(0, kept=True)]), 1)
     assert drawing.sites_px is None
     assert drawing.note.endswith("no frames: not of the sites' size")
 
 
-def test_an_interrupted_shot_is_shown_as_far_as_it_came(write: Write, shot: Shot) -> None:
-    whole = shot(0)
-    broken = shot(0, images=whole.images[:1], status="interrupted", error="StopRequested: enough")
+def test_an_interrupted_shot_is_shown_as_far_as_it_came(write: Write) -> None:
+    whole = make_shot(0)
+    broken = make_shot(0, images=whole.images[:1], status="interrupted", error="StopRequested: enough")
     drawing = shot_picture(write([broken], status="stopped"), 1)
     assert drawing.title == "shot 1, interrupted: StopRequested: enough"
     (panel,) = drawing.panels
@@ -71,23 +71,19 @@ def test_an_interrupted_shot_is_shown_as_far_as_it_came(write: Write, shot: Shot
         (2, 1, "has no cycle 1; expected a shot that rearranges"),
     ],
 )
-def test_what_is_not_there_is_told(
-    write: Write, shot: Shot, number: int, cycle: int | None, told: str
-) -> None:
-    run = write([shot(0), shot(1, n_cycles=0)])
+def test_what_is_not_there_is_told(write: Write, number: int, cycle: int | None, told: str) -> None:
+    run = write([make_shot(0), make_shot(1, n_cycles=0)])
     with pytest.raises(ConfigError, match=told):
         shot_picture(run, number, cycle)
 
 
-def test_an_array_that_cannot_be_made_out_is_told(
-    write: Write, shot: Shot, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_array_that_cannot_be_made_out_is_told(write: Write, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("labseq.analysis.shot.MAX_SITES", 4)
     with pytest.raises(ConfigError, match="4 x 5 sites are too many"):
-        shot_picture(write([shot(0)]), 1)
+        shot_picture(write([make_shot(0)]), 1)
 
 
-def test_rows_that_shift_to_the_left_are_drawn_so(write: Write, shot: Shot) -> None:
-    run = write([shot(0)], resolved={"profile": {"grid": {"shear": -1}}})
+def test_rows_that_shift_to_the_left_are_drawn_so(write: Write) -> None:
+    run = write([make_shot(0)], resolved={"profile": {"grid": {"shear": -1}}})
     assert shot_picture(run, 1).grid.shear == -1
     assert np.isclose(shot_picture(run, 1).grid.spacing_m, 4e-6)

@@ -10,10 +10,11 @@ import pytest
 from labseq.analysis.statistics import Rate
 from labseq.analysis.survival import Survival, expected, steps_that_load
 from labseq.errors import RecordingError
-from labseq.model import CycleRecord, Plan, PlanReport, ShotRecord
+from labseq.model import CycleRecord, Plan, PlanReport
 from labseq.recording import Run
 
-Shot = Callable[..., ShotRecord]
+from .records import make_shot
+
 Write = Callable[..., Run]
 
 
@@ -47,8 +48,8 @@ def test_batches_that_were_not_played_move_nothing() -> None:
     assert np.argwhere(kept).tolist() == [[1, 0]]
 
 
-def test_moved_and_kept_atoms_are_counted_apart(write: Write, shot: Shot) -> None:
-    found = counted(write([shot(i, n_defects=i) for i in range(3)]))
+def test_moved_and_kept_atoms_are_counted_apart(write: Write) -> None:
+    found = counted(write([make_shot(i, n_defects=i) for i in range(3)]))
     assert found.n_read == 3
     assert found.moved.rate == Rate(3, 3)
     assert found.moved.fractions[1, 1] == 1.0
@@ -60,14 +61,14 @@ def test_moved_and_kept_atoms_are_counted_apart(write: Write, shot: Shot) -> Non
 
 @pytest.mark.parametrize(("steps", "n_kept"), [(({"load": {}},), 11), (({"load": {}}, {}, {"load": {}}), 6)])
 def test_atoms_are_not_followed_through_a_load(
-    write: Write, shot: Shot, steps: tuple[dict[str, object], ...], n_kept: int
+    write: Write, steps: tuple[dict[str, object], ...], n_kept: int
 ) -> None:
-    run = write([shot(0)], resolved={"shot": steps})
+    run = write([make_shot(0)], resolved={"shot": steps})
     assert counted(run).kept.rate.n_trials == n_kept
 
 
-def test_a_file_that_is_not_what_the_index_tells_of_is_damaged(write: Write, shot: Shot) -> None:
-    run = write([shot(0), shot(1, n_cycles=2)])
+def test_a_file_that_is_not_what_the_index_tells_of_is_damaged(write: Write) -> None:
+    run = write([make_shot(0), make_shot(1, n_cycles=2)])
     run.shots[0].file.write_bytes(run.shots[1].file.read_bytes())
     with pytest.raises(RecordingError, match="has other images than the index says"):
         counted(run)

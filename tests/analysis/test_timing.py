@@ -12,10 +12,10 @@ from hypothesis import given, strategies as st
 
 from labseq.analysis.overview import evenly
 from labseq.analysis.timing import quantiles, timing_of, writing_s
-from labseq.model import ShotRecord
 from labseq.recording import Run, open_run
 
-Shot = Callable[..., ShotRecord]
+from .records import make_shot
+
 Write = Callable[..., Run]
 
 
@@ -26,8 +26,8 @@ def test_stages_come_in_the_order_of_a_shot_and_whole_steps_last(compact: Run) -
     assert names[10:] == ["step 0 load", "step 1 image", "step 2 rearrange", "step 3 image"]
 
 
-def test_each_stage_is_told_against_its_budget(write: Write, shot: Shot) -> None:
-    run = write([shot(i, n_cycles=2) for i in range(4)])
+def test_each_stage_is_told_against_its_budget(write: Write) -> None:
+    run = write([make_shot(i, n_cycles=2) for i in range(4)])
     timing = timing_of(run, run.shots)
     stages = {stage.stage: stage for stage in timing.stages}
     move = stages["move"]
@@ -39,8 +39,8 @@ def test_each_stage_is_told_against_its_budget(write: Write, shot: Shot) -> None
     assert timing.shot_s == pytest.approx((1.0, 1.0))
 
 
-def test_writing_is_told_by_the_event_log(write: Write, shot: Shot) -> None:
-    run = write([shot(0), shot(1)])
+def test_writing_is_told_by_the_event_log(write: Write) -> None:
+    run = write([make_shot(0), make_shot(1)])
     lines = [json.loads(line) for line in (run.path / "events.jsonl").read_text("utf-8").splitlines()]
     for line, written in zip(
         lines, ("2026-11-20T10:00:01.020+00:00", "2026-11-20T09:59:00+00:00"), strict=False
@@ -51,9 +51,9 @@ def test_writing_is_told_by_the_event_log(write: Write, shot: Shot) -> None:
     assert writing_s(open_run(run.path)) == pytest.approx([0.02])
 
 
-def test_a_model_knows_nothing_of_writing(write: Write, shot: Shot) -> None:
+def test_a_model_knows_nothing_of_writing(write: Write) -> None:
     for simulated in (True, False):
-        run = write([shot(0)], simulated=simulated)
+        run = write([make_shot(0)], simulated=simulated)
         (stage,) = (one for one in timing_of(run, run.shots).stages if one.stage == "write")
         assert math.isnan(stage.session_s[0]) is simulated
         assert stage.host_s[0] > 0

@@ -128,11 +128,7 @@ def help_examples(group: Any, names: str = "labseq") -> list[Block]:
 
 OF_ALL = ("--help", "--version", "--install-completion", "--show-completion")
 COMMAND: Any = typer.main.get_command(app)
-SHOWN = [
-    *of("console"),
-    *(block for page in PAGES for block in inline_of(page)),
-    *help_examples(COMMAND),
-]
+SHOWN = [*of("console"), *(block for page in PAGES for block in inline_of(page)), *help_examples(COMMAND)]
 LINES = [(block, line) for block in SHOWN for line in lines_of(block)]
 
 

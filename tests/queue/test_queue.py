@@ -22,10 +22,7 @@ __all__ = ["queue"]
 
 @pytest.mark.parametrize(
     ("spoil", "message"),
-    [
-        (("shots: 3", "shots: many"), r"s\.yaml:5:8: shots is 'many'"),
-        (("rows: 2", "rows: 20"), "20"),
-    ],
+    [(("shots: 3", "shots: many"), r"s\.yaml:5:8: shots is 'many'"), (("rows: 2", "rows: 20"), "20")],
 )
 def test_what_is_wrong_is_reported_at_once(queue: Queue, spoil: tuple[str, str], message: str) -> None:
     Path("s.yaml").write_text(SEQUENCE.replace(*spoil), encoding="utf-8")

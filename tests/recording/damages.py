@@ -11,17 +11,15 @@ from typing import Any
 import h5py
 import numpy as np
 
-from labseq.model import RunRecord, ShotRecord
 from labseq.recording import RunWriter
 from labseq.recording.doctor import Report
 
-MakeRun = Callable[..., RunRecord]
-MakeShot = Callable[..., ShotRecord]
+from .records import make_run, make_shot
 
 N_SHOTS = 4
 
 
-def write_whole_run(root: Path, make_run: MakeRun, make_shot: MakeShot) -> Path:
+def write_whole_run(root: Path) -> Path:
     """Write a finished run: four shots, and an attempt that failed."""
     writer = RunWriter.create(root, make_run(name="größer µ", n_shots=N_SHOTS))
     for index in range(N_SHOTS):

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from labseq.recording import RunWriter
+
+from .records import make_run, make_shot
 
 ADDRESSES = ["planner.degree_of_parallelism", "shot.2.rearrange.window"]
 DEGREES = [1, 5, 15]
@@ -32,13 +34,7 @@ def scan(points: Sequence[Sequence[Any]], n_repeats: int = N_REPEATS) -> dict[st
 
 
 def write_scan(
-    root: Path,
-    make_run: Callable[..., Any],
-    make_shot: Callable[..., Any],
-    *,
-    points: Sequence[Sequence[Any]] = POINTS,
-    n_repeats: int = N_REPEATS,
-    n_missing: int = 0,
+    root: Path, *, points: Sequence[Sequence[Any]] = POINTS, n_repeats: int = N_REPEATS, n_missing: int = 0
 ) -> Path:
     """Write the run; the last shots may be missing."""
     plan = scan(points, n_repeats)

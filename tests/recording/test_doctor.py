@@ -23,8 +23,6 @@ from .damages import (
     LOST,
     MENDED,
     N_SHOTS,
-    MakeRun,
-    MakeShot,
     contents,
     copied,
     damaged_line,
@@ -44,11 +42,12 @@ from .damages import (
     torn_events,
     write_whole_run,
 )
+from .records import make_run, make_shot
 
 
 @pytest.fixture(scope="module")
-def template(tmp_path_factory: pytest.TempPathFactory, make_run: MakeRun, make_shot: MakeShot) -> Path:
-    return write_whole_run(tmp_path_factory.mktemp("made"), make_run, make_shot)
+def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_whole_run(tmp_path_factory.mktemp("made"))
 
 
 @pytest.fixture
@@ -151,9 +150,7 @@ def test_a_dead_run_is_marked_as_interrupted(run_dir: Path) -> None:
     assert open_run(run_dir).error == "interrupted: the process that ran it is gone"
 
 
-def test_an_earlier_take_of_a_shot_does_not_replace_the_later(
-    run_dir: Path, make_run: MakeRun, make_shot: MakeShot
-) -> None:
+def test_an_earlier_take_of_a_shot_does_not_replace_the_later(run_dir: Path) -> None:
     lost_line(run_dir)
     writer = RunWriter.reopen(run_dir, make_run(), n_written=3)
     later = writer.write_shot(make_shot(1, success=False))

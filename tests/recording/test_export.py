@@ -7,7 +7,6 @@ import json
 import math
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,19 +15,16 @@ import numpy as np
 import pytest
 
 from labseq.errors import ConfigError
-from labseq.model import RunRecord, ShotRecord
 from labseq.recording import Run, RunWriter, open_run
 from labseq.recording.export import ENDINGS, check_export, export_run
 
+from .records import make_run, make_shot
 from .scanned import ADDRESSES, POINTS, write_scan
-
-MakeRun = Callable[..., RunRecord]
-MakeShot = Callable[..., ShotRecord]
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory, make_run: MakeRun, make_shot: MakeShot) -> Run:
-    folder = write_scan(tmp_path_factory.mktemp("scan"), make_run, make_shot, points=POINTS, n_repeats=1)
+def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    folder = write_scan(tmp_path_factory.mktemp("scan"), points=POINTS, n_repeats=1)
     (folder / "calibration_sites.json").write_text('{"kind": "sites", "µ": 1}\n', "utf-8")
     (folder / "odd.bin").write_bytes(b"\xff\0")
     (folder / "analysis").mkdir()
@@ -61,9 +57,7 @@ def test_csv_is_a_table_with_a_line_of_names_and_a_table_of_units(run: Run, tmp_
             assert float(row[ADDRESSES[1]]) == json.loads(entry["parameters"][()])[ADDRESSES[1]]
 
 
-def test_csv_has_nothing_where_nothing_is_known(
-    tmp_path: Path, make_run: MakeRun, make_shot: MakeShot
-) -> None:
+def test_csv_has_nothing_where_nothing_is_known(tmp_path: Path) -> None:
     writer = RunWriter.create(tmp_path, make_run())
     writer.write_shot(make_shot(filling_fraction=math.nan, readings={"a,b\n": 'say "µ"'}))
     with exported(open_run(writer.run_dir), "csv", tmp_path).open(encoding="utf-8", newline="") as file:
@@ -94,9 +88,7 @@ def test_netcdf_reads_back_as_it_was(run: Run, tmp_path: Path) -> None:
         assert data.attrs["name"] == run.name
 
 
-def test_names_that_netcdf_does_not_take_are_changed(
-    tmp_path: Path, make_run: MakeRun, make_shot: MakeShot
-) -> None:
+def test_names_that_netcdf_does_not_take_are_changed(tmp_path: Path) -> None:
     xarray = pytest.importorskip("xarray")
     writer = RunWriter.create(tmp_path, make_run())
     writer.write_shot(make_shot(readings={"laser/780": 1.5}))
@@ -105,7 +97,7 @@ def test_names_that_netcdf_does_not_take_are_changed(
 
 
 @pytest.mark.parametrize("kind", ["netcdf", "parquet", "csv", "archive"])
-def test_a_run_without_shots_is_exported(kind: str, tmp_path: Path, make_run: MakeRun) -> None:
+def test_a_run_without_shots_is_exported(kind: str, tmp_path: Path) -> None:
     run = open_run(RunWriter.create(tmp_path, make_run()).run_dir)
     assert exported(run, kind, tmp_path).stat().st_size
 
@@ -189,9 +181,7 @@ def test_what_is_the_same_in_all_shots_stands_in_an_archive_once(run: Run, tmp_p
         assert first == last
 
 
-def test_an_archive_keeps_what_differs_after_a_resume(
-    tmp_path: Path, make_run: MakeRun, make_shot: MakeShot
-) -> None:
+def test_an_archive_keeps_what_differs_after_a_resume(tmp_path: Path) -> None:
     run_dir = (writer := RunWriter.create(tmp_path, make_run())).run_dir
     writer.write_shot(make_shot(0))
     later = RunWriter.reopen(run_dir, make_run(provenance={"labseq": "later"}), n_written=1)
@@ -201,9 +191,7 @@ def test_an_archive_keeps_what_differs_after_a_resume(
         assert [json.loads(text[()])["labseq"] for text in texts] == ["0.1.0", "later"]
 
 
-def test_an_archive_of_compressed_frames_is_plain(
-    tmp_path: Path, make_run: MakeRun, make_shot: MakeShot
-) -> None:
+def test_an_archive_of_compressed_frames_is_plain(tmp_path: Path) -> None:
     pytest.importorskip("hdf5plugin")
     writer = RunWriter.create(tmp_path, make_run(), compress=True)
     writer.write_shot(make_shot())
@@ -214,9 +202,7 @@ def test_an_archive_of_compressed_frames_is_plain(
     assert int(done.stdout) == sum(int(frame.image.sum()) for frame in frames if frame is not None)
 
 
-def test_damaged_shots_are_left_out_of_an_archive_and_told(
-    tmp_path: Path, make_run: MakeRun, make_shot: MakeShot
-) -> None:
+def test_damaged_shots_are_left_out_of_an_archive_and_told(tmp_path: Path) -> None:
     writer = RunWriter.create(tmp_path, make_run())
     paths = [writer.write_shot(make_shot(index)) for index in range(3)]
     writer.write_shot(make_shot(3, status="failed"))

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from labseq.errors import RecordingError
-from labseq.model import RunRecord, ShotRecord
 from labseq.recording import RunWriter, open_run
 from labseq.recording.points import scan_points
+
+from .records import make_run, make_shot
 
 SCAN: dict[str, Any] = {
     "addresses": ["shot.sort.window", "planner"],
@@ -25,9 +25,7 @@ SCAN: dict[str, Any] = {
 }
 
 
-def write(
-    folder: Path, make_run: Callable[..., RunRecord], make_shot: Callable[..., ShotRecord], **changes: Any
-) -> Path:
+def write(folder: Path, **changes: Any) -> Path:
     writer = RunWriter.create(folder, make_run(n_shots=6, **changes))
     fillings = [0.5, 1.0, None, 0.75, math.nan]
     for index, filling in enumerate(fillings):
@@ -38,10 +36,8 @@ def write(
     return writer.run_dir
 
 
-def test_a_point_knows_its_values_and_its_shots(
-    tmp_path: Path, make_run: Callable[..., RunRecord], make_shot: Callable[..., ShotRecord]
-) -> None:
-    run = open_run(write(tmp_path, make_run, make_shot, scan=SCAN))
+def test_a_point_knows_its_values_and_its_shots(tmp_path: Path) -> None:
+    run = open_run(write(tmp_path, scan=SCAN))
     assert run.record["scan"] == SCAN
     first, second = scan_points(run)
     assert first.parameters == {"shot.sort.window": 0.06, "planner": {"use": "psca"}}
@@ -51,20 +47,13 @@ def test_a_point_knows_its_values_and_its_shots(
     assert [shot.index for shot in second.shots] == [0, 4]
 
 
-def test_a_run_without_a_scan_has_no_points(
-    tmp_path: Path, make_run: Callable[..., RunRecord], make_shot: Callable[..., ShotRecord]
-) -> None:
-    assert scan_points(open_run(write(tmp_path, make_run, make_shot))) == []
+def test_a_run_without_a_scan_has_no_points(tmp_path: Path) -> None:
+    assert scan_points(open_run(write(tmp_path))) == []
 
 
 @pytest.mark.parametrize("damaged", [{"points": []}, {"point_of_shot": None}, {"addresses": ["one"]}])
-def test_a_damaged_scan_is_told(
-    tmp_path: Path,
-    make_run: Callable[..., RunRecord],
-    make_shot: Callable[..., ShotRecord],
-    damaged: dict[str, Any],
-) -> None:
-    folder = write(tmp_path, make_run, make_shot, scan=SCAN)
+def test_a_damaged_scan_is_told(tmp_path: Path, damaged: dict[str, Any]) -> None:
+    folder = write(tmp_path, scan=SCAN)
     record = json.loads((folder / "run.json").read_text())
     (folder / "run.json").write_text(json.dumps(record | {"scan": SCAN | damaged}))
     with pytest.raises(RecordingError, match="damaged scan"):

@@ -6,7 +6,6 @@ import json
 import math
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,17 +13,15 @@ import h5py
 import pytest
 
 from labseq.errors import RecordingError
-from labseq.model import RunRecord, ShotRecord
 from labseq.recording import RunWriter, open_run
 from labseq.recording.folders import INDEX_FILE
 from labseq.recording.reader import Follower
 
-MakeRun = Callable[..., RunRecord]
-MakeShot = Callable[..., ShotRecord]
+from .records import make_run, make_shot
 
 
 @pytest.fixture
-def run_dir(tmp_path: Path, make_run: MakeRun, make_shot: MakeShot) -> Path:
+def run_dir(tmp_path: Path) -> Path:
     """A finished run of three shots, one of them a success."""
     writer = RunWriter.create(tmp_path, make_run())
     for index, (success, filling) in enumerate([(True, 1.0), (False, 0.5), (False, math.nan)]):
@@ -62,7 +59,7 @@ def test_a_run_tells_what_it_was(run_dir: Path) -> None:
     assert "Shot 1" in repr(shot)
 
 
-def test_a_run_without_shots_has_no_averages(tmp_path: Path, make_run: MakeRun) -> None:
+def test_a_run_without_shots_has_no_averages(tmp_path: Path) -> None:
     run = open_run(RunWriter.create(tmp_path, make_run()).run_dir)
     assert math.isnan(run.defect_free)
     assert math.isnan(run.filling_fraction)
@@ -129,7 +126,7 @@ def test_a_line_with_a_value_of_the_wrong_kind_is_damaged(run_dir: Path, name: s
     assert run.n_damaged_lines == 1
 
 
-def test_a_shot_written_again_counts_once(tmp_path: Path, make_run: MakeRun, make_shot: MakeShot) -> None:
+def test_a_shot_written_again_counts_once(tmp_path: Path) -> None:
     writer = RunWriter.create(tmp_path, make_run())
     writer.write_shot(make_shot(0, success=False))
     writer.write_shot(make_shot(0, success=True))
@@ -246,7 +243,7 @@ def test_what_is_no_path_is_no_run(path: Any) -> None:
         open_run(path)
 
 
-def test_only_shots_of_the_run_are_skipped(tmp_path: Path, make_run: Any) -> None:
+def test_only_shots_of_the_run_are_skipped(tmp_path: Path) -> None:
     writer = RunWriter.create(tmp_path, make_run(n_shots=3))
     writer.skip([2], "no light")
     with (writer.run_dir / "skipped.jsonl").open("a", encoding="utf-8") as file:
@@ -254,7 +251,7 @@ def test_only_shots_of_the_run_are_skipped(tmp_path: Path, make_run: Any) -> Non
     assert open_run(writer.run_dir).skipped == {2: "no light"}
 
 
-def test_every_shot_that_counts_comes_once(tmp_path, make_run, make_shot):
+def test_every_shot_that_counts_comes_once(tmp_path):
     writer = RunWriter.create(tmp_path, make_run())
     follower = Follower(writer.run_dir)
     assert list(follower.new()) == []
@@ -269,7 +266,7 @@ def test_every_shot_that_counts_comes_once(tmp_path, make_run, make_shot):
     assert list(follower.new()) == []
 
 
-def test_half_a_line_is_not_looked_at_before_it_is_whole(tmp_path, make_run, make_shot):
+def test_half_a_line_is_not_looked_at_before_it_is_whole(tmp_path):
     writer = RunWriter.create(tmp_path, make_run())
     writer.write_shot(make_shot(shot_index=0))
     index = writer.run_dir / INDEX_FILE

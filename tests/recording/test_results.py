@@ -11,6 +11,8 @@ from labseq.errors import RecordingError
 from labseq.recording import RunWriter, open_run
 from labseq.recording.results import ResultsLog, done, read_results, results_file
 
+from .records import make_run
+
 ABOUT = {"analysis": "mine", "settings": {"width": 1.0}, "anew": False}
 
 
@@ -61,7 +63,7 @@ def test_what_is_no_result_is_refused(result):
         ResultsLog.checked(result)
 
 
-def test_a_run_finds_its_results(tmp_path, make_run):
+def test_a_run_finds_its_results(tmp_path):
     writer = RunWriter.create(tmp_path, make_run())
     ResultsLog(results_file(writer.run_dir, "my µ/analysis"), ABOUT).write(0, {"mean": 1})
     assert open_run(writer.run_dir).analysis("my µ/analysis") == [{"shot": 0, "mean": 1}]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -22,16 +21,13 @@ from labseq.model import (
     ImageRecord,
     Plan,
     PlanReport,
-    RunRecord,
     ShotRecord,
     StageTiming,
     TargetPattern,
 )
 from labseq.recording import RunWriter, open_run
 
-MakeRun = Callable[..., RunRecord]
-MakeShot = Callable[..., ShotRecord]
-Same = Callable[[Any, Any], None]
+from .records import assert_same, make_run, make_shot
 
 text = st.text(st.characters(exclude_categories=("Cs",), exclude_characters="\0"), max_size=20)
 small = st.integers(0, 2**31 - 1)
@@ -127,10 +123,7 @@ folder_number = itertools.count()
 @settings(deadline=None, max_examples=12, suppress_health_check=[HealthCheck.too_slow])
 @given(runs_and_shots())
 def test_every_record_comes_back(
-    tmp_path_factory: pytest.TempPathFactory,
-    make_run: MakeRun,
-    assert_same: Same,
-    drawn: tuple[dict[str, Any], ShotRecord],
+    tmp_path_factory: pytest.TempPathFactory, drawn: tuple[dict[str, Any], ShotRecord]
 ) -> None:
     changes, shot = drawn
     record = make_run(**changes)
@@ -147,9 +140,7 @@ def test_every_record_comes_back(
     assert (writer.run_dir / "sequence.yaml").read_bytes().decode() == record.sequence_text
 
 
-def test_a_rich_shot_comes_back_by_every_door(
-    tmp_path: Path, make_run: MakeRun, make_shot: MakeShot, assert_same: Same
-) -> None:
+def test_a_rich_shot_comes_back_by_every_door(tmp_path: Path) -> None:
     shot = make_shot(seed=2**100)
     writer = RunWriter.create(tmp_path, make_run())
     writer.write_shot(shot)
@@ -171,9 +162,7 @@ def test_a_rich_shot_comes_back_by_every_door(
     assert found.devices["camera"] == {"model": "EMCCD"}
 
 
-def test_a_shot_of_nothing_comes_back(
-    tmp_path: Path, make_run: MakeRun, make_shot: MakeShot, assert_same: Same
-) -> None:
+def test_a_shot_of_nothing_comes_back(tmp_path: Path) -> None:
     shot = make_shot(n_images=0, batches=(), timing=[], filling_fraction=float("nan"))
     writer = RunWriter.create(tmp_path, make_run())
     writer.write_shot(shot)
@@ -185,7 +174,7 @@ def test_a_shot_of_nothing_comes_back(
     assert found.plans == ()
 
 
-def test_values_that_json_lacks_become_null(tmp_path: Path, make_run: MakeRun, make_shot: MakeShot) -> None:
+def test_values_that_json_lacks_become_null(tmp_path: Path) -> None:
     readings = {"power_w": float("nan"), "spectrum": np.array([1.0, np.inf]), "n": np.int16(3)}
     writer = RunWriter.create(tmp_path, make_run())
     writer.write_shot(make_shot(readings=readings, parameters={3: np.float32(0.5)}))
@@ -195,7 +184,7 @@ def test_values_that_json_lacks_become_null(tmp_path: Path, make_run: MakeRun, m
     assert found.row["parameters"] == {"3": 0.5}
 
 
-def test_text_that_hdf5_refuses_is_escaped(tmp_path: Path, make_run: MakeRun, make_shot: MakeShot) -> None:
+def test_text_that_hdf5_refuses_is_escaped(tmp_path: Path) -> None:
     writer = RunWriter.create(tmp_path, make_run(provenance={"user": "a\udc80", "log": "x\0" * 400}))
     writer.write_shot(make_shot(error="a\0b\udc80", status="failed"))
     (found,) = open_run(writer.run_dir).attempts
@@ -204,14 +193,7 @@ def test_text_that_hdf5_refuses_is_escaped(tmp_path: Path, make_run: MakeRun, ma
 
 
 @pytest.mark.parametrize(("record_frames", "kept"), [("last", [2]), ("none", [])])
-def test_frames_that_are_not_kept_are_none(
-    tmp_path: Path,
-    make_run: MakeRun,
-    make_shot: MakeShot,
-    assert_same: Same,
-    record_frames: str,
-    kept: list[int],
-) -> None:
+def test_frames_that_are_not_kept_are_none(tmp_path: Path, record_frames: str, kept: list[int]) -> None:
     shot = make_shot()
     writer = RunWriter.create(tmp_path, make_run(record_frames=record_frames))
     writer.write_shot(shot)
@@ -223,9 +205,7 @@ def test_frames_that_are_not_kept_are_none(
     assert len(found.frames) == len(kept)
 
 
-def test_compressed_frames_come_back(
-    tmp_path: Path, make_run: MakeRun, make_shot: MakeShot, assert_same: Same, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_compressed_frames_come_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("hdf5plugin")
     shot = make_shot()
     writer = RunWriter.create(tmp_path, make_run(), compress=True)
@@ -237,9 +217,7 @@ def test_compressed_frames_come_back(
         _ = found.frames
 
 
-def test_frames_of_several_sizes_are_given_one_by_one(
-    tmp_path: Path, make_run: MakeRun, make_shot: MakeShot, assert_same: Same
-) -> None:
+def test_frames_of_several_sizes_are_given_one_by_one(tmp_path: Path) -> None:
     shot = make_shot()
     shot.images[1] = dataclasses.replace(shot.images[1], frame=Frame(np.ones((2, 3), np.uint16), 0.1, 0.2))
     writer = RunWriter.create(tmp_path, make_run())
@@ -250,9 +228,7 @@ def test_frames_of_several_sizes_are_given_one_by_one(
     assert_same(found.record(), shot)
 
 
-def test_frames_of_several_cameras_come_in_the_order_of_the_images(
-    tmp_path: Path, make_run: MakeRun, make_shot: MakeShot
-) -> None:
+def test_frames_of_several_cameras_come_in_the_order_of_the_images(tmp_path: Path) -> None:
     shot = make_shot()
     for i, camera in enumerate(["b", "a", "b"]):
         frame = Frame(np.full((2, 2), i, np.uint16), 0.1, 0.2, camera)

@@ -4,23 +4,21 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import h5py
 import numpy as np
 import pytest
 
-from labseq.model import RunRecord, ShotRecord
 from labseq.recording import schema
 from labseq.recording.shot_file import ShotEncoder
 
-MakeRun = Callable[..., RunRecord]
-MakeShot = Callable[..., ShotRecord]
+from .records import make_run, make_shot
 
 
 @pytest.fixture
-def file(make_run: MakeRun, make_shot: MakeShot) -> Iterator[Any]:
+def file() -> Iterator[Any]:
     """A shot's file with everything that one can hold."""
     columns = {"descriptions": {"t_s": "when it jumped"}}
     jumps = np.zeros(2, np.dtype([("t_s", "f8"), ("row", "f4")], metadata=columns))

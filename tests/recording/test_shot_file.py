@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import io
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -14,12 +14,11 @@ import numpy as np
 import pytest
 
 from labseq.errors import RecordingError
-from labseq.model import Frame, RunRecord, ShotRecord
+from labseq.model import Frame
 from labseq.recording import schema
 from labseq.recording.shot_file import ShotEncoder, read_content
 
-MakeRun = Callable[..., RunRecord]
-MakeShot = Callable[..., ShotRecord]
+from .records import make_run, make_shot
 
 
 @contextmanager
@@ -37,7 +36,7 @@ def default_plot(file: Any) -> Any:
     return node
 
 
-def test_viewers_open_the_frames(make_run: MakeRun, make_shot: MakeShot) -> None:
+def test_viewers_open_the_frames() -> None:
     shot = make_shot()
     with opened(ShotEncoder(make_run(), "day/run").encode(shot)) as file:
         view = default_plot(file)
@@ -50,9 +49,7 @@ def test_viewers_open_the_frames(make_run: MakeRun, make_shot: MakeShot) -> None
         np.testing.assert_array_equal(signal[1], shot.images[1].frame.image)  # pyright: ignore[reportOptionalMemberAccess]
 
 
-def test_viewers_open_the_occupancies_where_there_are_no_frames(
-    make_run: MakeRun, make_shot: MakeShot
-) -> None:
+def test_viewers_open_the_occupancies_where_there_are_no_frames() -> None:
     shot = make_shot()
     with opened(ShotEncoder(make_run(record_frames="none"), "day/run").encode(shot)) as file:
         view = default_plot(file)
@@ -63,7 +60,7 @@ def test_viewers_open_the_occupancies_where_there_are_no_frames(
         assert "camera" not in file["entry"]
 
 
-def test_the_tables_hold_every_move(make_run: MakeRun, make_shot: MakeShot) -> None:
+def test_the_tables_hold_every_move() -> None:
     shot = make_shot()
     with opened(ShotEncoder(make_run(), "day/run").encode(shot)) as file:
         moves = file["entry/rearrangement/moves"][()]
@@ -78,14 +75,14 @@ def test_the_tables_hold_every_move(make_run: MakeRun, make_shot: MakeShot) -> N
     assert cycles["planned_duration_s"][0] == shot.cycles[0].report.duration_s
 
 
-def test_stages_over_budget_are_marked(make_run: MakeRun, make_shot: MakeShot) -> None:
+def test_stages_over_budget_are_marked() -> None:
     with opened(ShotEncoder(make_run(), "day/run").encode(make_shot())) as file:
         timing = file["entry/timing"][()]
         assert [stage.decode() for stage in timing["stage"]] == ["load", "plan", "plan", "prüfen"]
         assert list(timing["over_budget"]) == [False, True, False, False]
 
 
-def test_atom_events_are_kept_as_tables(make_run: MakeRun, make_shot: MakeShot, tmp_path: Path) -> None:
+def test_atom_events_are_kept_as_tables(tmp_path: Path) -> None:
     flights = np.array([(0.5, b"kept", 2e-9)], [("held_s", "f8"), ("fate", "S8"), ("offset_m", "f4")])
     shot = make_shot()
     shot.atom_events = {"flights": flights, "a/b": flights[:0]}
@@ -100,20 +97,18 @@ def test_atom_events_are_kept_as_tables(make_run: MakeRun, make_shot: MakeShot, 
     assert atom_events["a_b"].dtype == flights.dtype
 
 
-def test_a_shot_without_atom_events_has_no_group_for_them(make_run: MakeRun, make_shot: MakeShot) -> None:
+def test_a_shot_without_atom_events_has_no_group_for_them() -> None:
     with opened(ShotEncoder(make_run(), "day/run").encode(make_shot())) as file:
         assert "atom_events" not in file["entry"]
 
 
-def test_any_hdf5_from_1_8_on_can_read_it(make_run: MakeRun, make_shot: MakeShot) -> None:
+def test_any_hdf5_from_1_8_on_can_read_it() -> None:
     data = bytes(ShotEncoder(make_run(), "day/run").encode(make_shot()))
     assert data[:8] == b"\x89HDF\r\n\x1a\n"
     assert data[8] == 0  # superblock version 0: no flag that a killed writer could leave set
 
 
-def test_frames_of_several_cameras_and_sizes_have_groups_of_their_own(
-    make_run: MakeRun, make_shot: MakeShot
-) -> None:
+def test_frames_of_several_cameras_and_sizes_have_groups_of_their_own() -> None:
     shot = make_shot(n_images=4)
     sizes_and_names = [((6, 8), "a/b"), ((3, 2), "a/b"), ((6, 8), "a/b"), ((6, 8), "日")]
     frames = [
@@ -134,7 +129,7 @@ def test_frames_of_several_cameras_and_sizes_have_groups_of_their_own(
 
 
 def test_a_file_of_an_older_minor_format_reads_with_defaults(
-    make_run: MakeRun, make_shot: MakeShot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shown = tuple(field for field in schema.SHOT if field.name != "n_missing_atoms")
     monkeypatch.setattr(schema, "SHOT", shown)
@@ -144,7 +139,7 @@ def test_a_file_of_an_older_minor_format_reads_with_defaults(
     assert read_content(path).record.n_missing_atoms == 0
 
 
-def test_a_record_that_a_plugin_has_spoilt_is_explained(make_run: MakeRun, make_shot: MakeShot) -> None:
+def test_a_record_that_a_plugin_has_spoilt_is_explained() -> None:
     shot = make_shot(5)
     frame = shot.images[0].frame
     assert frame is not None

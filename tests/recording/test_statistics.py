@@ -15,18 +15,18 @@ import pytest
 
 from labseq.analysis.statistics import Rate, statistics_of
 from labseq.errors import RecordingError
-from labseq.model import CycleRecord, ImageRecord, Plan, PlanReport, RunRecord, ShotRecord
+from labseq.model import CycleRecord, ImageRecord, Plan, PlanReport, ShotRecord
 from labseq.recording import Run, RunWriter, open_run
 from labseq.recording.run_file import summarise, summary_of
 
-MakeRun = Callable[..., RunRecord]
-MakeShot = Callable[..., ShotRecord]
+from .records import make_run, make_shot
+
 Defects = Sequence[int | None]
 """Empty target sites on the image of each cycle; None: full, but with an atom where none may be."""
 
 
 @pytest.fixture
-def of_defects(make_run: MakeRun, make_shot: MakeShot) -> Callable[..., ShotRecord]:
+def of_defects() -> Callable[..., ShotRecord]:
     """Build a shot whose cycles leave so many defects; cycle k moves k atoms in k batches of k + 1."""
     target = make_run().target
 
@@ -62,7 +62,7 @@ def of_defects(make_run: MakeRun, make_shot: MakeShot) -> Callable[..., ShotReco
 
 
 @pytest.fixture
-def recorded(tmp_path: Path, make_run: MakeRun) -> Callable[..., Run]:
+def recorded(tmp_path: Path) -> Callable[..., Run]:
     """Write shots as a run, and read it back."""
 
     def record(*shots: ShotRecord) -> Run:
@@ -165,6 +165,6 @@ def test_an_empty_run_has_nothing_to_tell(recorded: Any) -> None:
     assert json.loads(json.dumps(found.as_dict()))["filling"] == {"mean": None, "error": None}
 
 
-def test_a_summary_survives_the_index(of_defects: Any, make_run: MakeRun) -> None:
+def test_a_summary_survives_the_index(of_defects: Any) -> None:
     summary = summarise(of_defects(0, (2, None, 0), last=1, lost__vacuum=3), make_run().target)
     assert summary_of(json.loads(json.dumps(asdict(summary)))) == summary

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,22 +13,19 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from labseq.errors import ConfigError, RecordingError
-from labseq.model import RunRecord, ShotRecord
 from labseq.recording import Run, RunWriter, open_run
 from labseq.recording.columns import columns_of
 
+from .records import make_run, make_shot
 from .scanned import ADDRESSES, DEGREES, N_REPEATS, POINTS, WINDOWS_S, write_scan
-
-MakeRun = Callable[..., RunRecord]
-MakeShot = Callable[..., ShotRecord]
 
 pytest.importorskip("pandas")
 pytest.importorskip("xarray")
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory, make_run: MakeRun, make_shot: MakeShot) -> Run:
-    return open_run(write_scan(tmp_path_factory.mktemp("scan"), make_run, make_shot))
+def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    return open_run(write_scan(tmp_path_factory.mktemp("scan")))
 
 
 def entries(run: Run) -> list[Any]:
@@ -84,7 +80,7 @@ def test_every_column_has_a_unit_and_a_description(run: Run) -> None:
     assert json.dumps(table.attrs)
 
 
-def test_what_is_not_known_is_nan(tmp_path: Path, make_run: MakeRun, make_shot: MakeShot) -> None:
+def test_what_is_not_known_is_nan(tmp_path: Path) -> None:
     writer = RunWriter.create(tmp_path, make_run())
     writer.write_shot(make_shot(0, filling_fraction=float("nan"), n_images=0, readings={"a": 1, "b": "on"}))
     writer.write_shot(make_shot(1, readings={"c": True}, parameters={"x": [1, 2]}, calibrations={}))
@@ -97,9 +93,7 @@ def test_what_is_not_known_is_nan(tmp_path: Path, make_run: MakeRun, make_shot: 
     assert table["calibration.sites"].tolist() == ["f102b3cd999c", ""]
 
 
-def test_attempts_have_rows_where_they_are_asked_for(
-    tmp_path: Path, make_run: MakeRun, make_shot: MakeShot
-) -> None:
+def test_attempts_have_rows_where_they_are_asked_for(tmp_path: Path) -> None:
     writer = RunWriter.create(tmp_path, make_run())
     for shot in (make_shot(0, status="failed"), make_shot(0, attempt=1), make_shot(1)):
         writer.write_shot(shot)
@@ -111,7 +105,7 @@ def test_attempts_have_rows_where_they_are_asked_for(
     ]  # fmt: skip
 
 
-def test_a_run_without_shots_is_an_empty_table(tmp_path: Path, make_run: MakeRun) -> None:
+def test_a_run_without_shots_is_an_empty_table(tmp_path: Path) -> None:
     run = open_run(RunWriter.create(tmp_path, make_run()).run_dir)
     assert run.to_dataframe().shape[0] == 0
     assert run.to_xarray().sizes["shot"] == 0
@@ -146,27 +140,23 @@ def test_a_dataset_has_the_axes_of_the_scan(run: Run) -> None:
     assert data["occupancy"].attrs["description"]
 
 
-def test_shots_that_are_missing_leave_gaps(tmp_path: Path, make_run: MakeRun, make_shot: MakeShot) -> None:
-    run = open_run(write_scan(tmp_path, make_run, make_shot, n_repeats=1, n_missing=7))
+def test_shots_that_are_missing_leave_gaps(tmp_path: Path) -> None:
+    run = open_run(write_scan(tmp_path, n_repeats=1, n_missing=7))
     data = run.to_xarray()
     assert int(np.isnan(data["filling_fraction"]).sum()) == 7
     assert int((data["status"] == "").sum()) == 7
     assert int((data["occupancy"] == -1).all(("image", "row", "col")).sum()) == 7
 
 
-def test_a_scan_that_is_no_product_has_an_axis_of_points(
-    tmp_path: Path, make_run: MakeRun, make_shot: MakeShot
-) -> None:
+def test_a_scan_that_is_no_product_has_an_axis_of_points(tmp_path: Path) -> None:
     points = [[1, 0.12], [5, 0.06], [15, 0.03]]
-    data = open_run(write_scan(tmp_path, make_run, make_shot, points=points)).to_xarray()
+    data = open_run(write_scan(tmp_path, points=points)).to_xarray()
     assert data["filling_fraction"].dims == ("point", "repeat")
     assert data[ADDRESSES[0]].values.tolist() == [1, 5, 15]
     assert data[ADDRESSES[1]].dims == ("point",)
 
 
-def test_without_a_scan_the_axis_is_that_of_the_shots(
-    tmp_path: Path, make_run: MakeRun, make_shot: MakeShot
-) -> None:
+def test_without_a_scan_the_axis_is_that_of_the_shots(tmp_path: Path) -> None:
     writer = RunWriter.create(tmp_path, make_run())
     for index in (0, 2):
         writer.write_shot(make_shot(index))
@@ -176,8 +166,8 @@ def test_without_a_scan_the_axis_is_that_of_the_shots(
     assert data["target_fill"].values.sum() == 6
 
 
-def test_a_damaged_scan_is_explained(tmp_path: Path, make_run: MakeRun, make_shot: MakeShot) -> None:
-    folder = write_scan(tmp_path, make_run, make_shot, points=POINTS[:1], n_repeats=2)
+def test_a_damaged_scan_is_explained(tmp_path: Path) -> None:
+    folder = write_scan(tmp_path, points=POINTS[:1], n_repeats=2)
     record = json.loads((folder / "run.json").read_text("utf-8"))
     record["scan"]["point_of_shot"] = [0]
     (folder / "run.json").write_text(json.dumps(record), "utf-8")

@@ -18,12 +18,11 @@ from typing import Any
 import pytest
 
 from labseq.errors import RecordingError
-from labseq.model import RunRecord, ShotRecord
+from labseq.model import RunRecord
 from labseq.recording import RunWriter, open_run
 from labseq.recording.run_file import summarise
 
-MakeRun = Callable[..., RunRecord]
-MakeShot = Callable[..., ShotRecord]
+from .records import make_run, make_shot
 
 
 class FullDisk:
@@ -62,7 +61,7 @@ def files(folder: Path) -> set[str]:
     return {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
 
 
-def test_a_run_folder_holds_everything_from_the_start(tmp_path: Path, make_run: MakeRun) -> None:
+def test_a_run_folder_holds_everything_from_the_start(tmp_path: Path) -> None:
     record = make_run()
     writer = RunWriter.create(tmp_path / "new" / "data", record, {"git.diff": "+ µ\r\n", "env.bin": b"\xff"})
     run_dir = writer.run_dir
@@ -84,7 +83,7 @@ def test_a_run_folder_holds_everything_from_the_start(tmp_path: Path, make_run: 
     assert {*RunRecord.__slots__} <= run.keys()
 
 
-def test_the_index_tells_each_shot_in_a_line(tmp_path: Path, make_run: MakeRun, make_shot: MakeShot) -> None:
+def test_the_index_tells_each_shot_in_a_line(tmp_path: Path) -> None:
     writer = RunWriter.create(tmp_path, make_run())
     path = writer.write_shot(make_shot())
     row = json.loads((writer.run_dir / "index.jsonl").read_text("utf-8"))
@@ -115,9 +114,7 @@ def test_the_index_tells_each_shot_in_a_line(tmp_path: Path, make_run: MakeRun, 
     }
 
 
-def test_attempts_that_failed_stand_beside_the_shot(
-    tmp_path: Path, make_run: MakeRun, make_shot: MakeShot
-) -> None:
+def test_attempts_that_failed_stand_beside_the_shot(tmp_path: Path) -> None:
     writer = RunWriter.create(tmp_path, make_run())
     writer.write_shot(make_shot(3, status="failed", error="no frame", filling_fraction=float("nan")))
     writer.write_shot(make_shot(3, attempt=1))
@@ -133,7 +130,7 @@ def test_attempts_that_failed_stand_beside_the_shot(
     assert run.attempts[0].row["filling_fraction"] is None
 
 
-def test_events_come_from_any_thread(tmp_path: Path, make_run: MakeRun) -> None:
+def test_events_come_from_any_thread(tmp_path: Path) -> None:
     writer = RunWriter.create(tmp_path, make_run())
     threads = [
         threading.Thread(target=lambda: [writer.event("tick", text="x" * 500) for _ in range(50)])
@@ -146,9 +143,7 @@ def test_events_come_from_any_thread(tmp_path: Path, make_run: MakeRun) -> None:
     assert len(open_run(writer.run_dir).events) == 200
 
 
-def test_a_full_disk_loses_events_and_counts_them(
-    tmp_path: Path, make_run: MakeRun, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_loses_events_and_counts_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     writer = RunWriter.create(tmp_path, make_run())
     with FullDisk(0, 99).inserted(monkeypatch):
         writer.event("lost")
@@ -162,14 +157,14 @@ def test_a_full_disk_loses_events_and_counts_them(
     ]
 
 
-def test_a_place_that_cannot_be_written_to_is_explained(tmp_path: Path, make_run: MakeRun) -> None:
+def test_a_place_that_cannot_be_written_to_is_explained(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(RecordingError, match="choose another place with --output or LABSEQ_DATA"):
         RunWriter.create(tmp_path / "file", make_run())
 
 
 @pytest.mark.parametrize("name", ["run.json", "../x"])
-def test_an_extra_file_cannot_stand_in_the_way(tmp_path: Path, make_run: MakeRun, name: str) -> None:
+def test_an_extra_file_cannot_stand_in_the_way(tmp_path: Path, name: str) -> None:
     with pytest.raises(RecordingError, match="cannot be an extra file"):
         RunWriter.create(tmp_path, make_run(), {name: ""})
     assert files(tmp_path) == set()
@@ -183,7 +178,7 @@ def n_disk_calls(action: Callable[[], object], monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_a_run_that_finds_no_room_at_its_start_leaves_nothing(
-    tmp_path: Path, make_run: MakeRun, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     record = make_run()
     n_calls = n_disk_calls(lambda: RunWriter.create(tmp_path / "good", record), monkeypatch)
@@ -197,7 +192,7 @@ def test_a_run_that_finds_no_room_at_its_start_leaves_nothing(
 
 @pytest.mark.parametrize("n_failures", [1, 99])
 def test_a_full_disk_at_any_moment_of_a_shot_leaves_the_others_whole(
-    tmp_path: Path, make_run: MakeRun, make_shot: MakeShot, monkeypatch: pytest.MonkeyPatch, n_failures: int
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, n_failures: int
 ) -> None:
     writer = RunWriter.create(tmp_path, make_run())
     n_calls = n_disk_calls(lambda: writer.write_shot(make_shot(0)), monkeypatch)
@@ -221,7 +216,7 @@ def test_a_full_disk_at_any_moment_of_a_shot_leaves_the_others_whole(
 
 
 def test_a_full_disk_at_the_end_is_an_error_and_harms_nothing(
-    tmp_path: Path, make_run: MakeRun, make_shot: MakeShot, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     writer = RunWriter.create(tmp_path, make_run())
     writer.write_shot(make_shot())
@@ -232,7 +227,7 @@ def test_a_full_disk_at_the_end_is_an_error_and_harms_nothing(
     run.shots[0].verify()
 
 
-def test_devices_are_added_once_they_are_open(tmp_path: Path, make_run: MakeRun, make_shot: MakeShot) -> None:
+def test_devices_are_added_once_they_are_open(tmp_path: Path) -> None:
     writer = RunWriter.create(tmp_path, make_run())
     writer.set_devices({"camera": {"model": "iXon", "serial_number": "X-1"}})
     writer.write_shot(make_shot())
@@ -245,7 +240,7 @@ ONCE = {"t_utc": "2026-11-21T08:00:00+00:00", "first_shot": 1, "changes": [], "p
 
 
 @pytest.fixture
-def stopped_dir(tmp_path: Path, make_run: MakeRun, make_shot: MakeShot) -> Path:
+def stopped_dir(tmp_path: Path) -> Path:
     """A run of which shot 0 is done and shot 1 was interrupted."""
     writer = RunWriter.create(tmp_path, make_run())
     writer.set_devices({"camera": {"model": "first"}})
@@ -259,7 +254,7 @@ def reopen(stopped_dir: Path, run: RunRecord, n_written: int = 1) -> RunWriter:
     return RunWriter.reopen(stopped_dir, replace(run, resumed=(ONCE,)), n_written=n_written)
 
 
-def test_a_run_goes_on_in_its_folder(stopped_dir: Path, make_run: MakeRun, make_shot: MakeShot) -> None:
+def test_a_run_goes_on_in_its_folder(stopped_dir: Path) -> None:
     writer = reopen(stopped_dir, make_run())
     assert open_run(stopped_dir).status == "running"
     writer.write_shot(make_shot(1))
@@ -272,7 +267,7 @@ def test_a_run_goes_on_in_its_folder(stopped_dir: Path, make_run: MakeRun, make_
     assert [e["values"]["n_shots"] for e in run.events if e["event"] == "run_finished"] == [1, 2]
 
 
-def test_run_json_keeps_what_it_said(stopped_dir: Path, make_run: MakeRun) -> None:
+def test_run_json_keeps_what_it_said(stopped_dir: Path) -> None:
     file = stopped_dir / "run.json"
     file.write_text(json.dumps({**json.loads(file.read_text(encoding="utf-8")), "of_later": 5}))
     before = open_run(stopped_dir).record
@@ -280,22 +275,20 @@ def test_run_json_keeps_what_it_said(stopped_dir: Path, make_run: MakeRun) -> No
     assert open_run(stopped_dir).record == {**before, "resumed": [ONCE]}
 
 
-def test_devices_of_a_run_that_had_not_come_so_far_are_noted(tmp_path: Path, make_run: MakeRun) -> None:
+def test_devices_of_a_run_that_had_not_come_so_far_are_noted(tmp_path: Path) -> None:
     stopped_dir = RunWriter.create(tmp_path, make_run(devices={})).run_dir
     reopen(stopped_dir, make_run(), 0).set_devices({"camera": {"model": "second"}})
     assert open_run(stopped_dir).record["devices"] == {"camera": {"model": "second"}}
 
 
-def test_the_shots_know_what_is_true_of_them(
-    stopped_dir: Path, make_run: MakeRun, make_shot: MakeShot
-) -> None:
+def test_the_shots_know_what_is_true_of_them(stopped_dir: Path) -> None:
     writer = reopen(stopped_dir, make_run(provenance={"labseq": "later"}))
     writer.write_shot(make_shot(1))
     first, second = open_run(stopped_dir).shots
     assert (first.provenance["labseq"], second.provenance["labseq"]) == ("0.1.0", "later")
 
 
-def test_no_file_is_overwritten(stopped_dir: Path, make_run: MakeRun, make_shot: MakeShot) -> None:
+def test_no_file_is_overwritten(stopped_dir: Path) -> None:
     before = {path: path.read_bytes() for path in (stopped_dir / "shots").iterdir()}
     for _ in range(2):
         writer = reopen(stopped_dir, make_run())
@@ -314,7 +307,7 @@ def test_no_file_is_overwritten(stopped_dir: Path, make_run: MakeRun, make_shot:
         shot.verify()
 
 
-def test_a_stop_that_was_asked_for_is_over(stopped_dir: Path, make_run: MakeRun) -> None:
+def test_a_stop_that_was_asked_for_is_over(stopped_dir: Path) -> None:
     (stopped_dir / "STOP").touch()
     writer = reopen(stopped_dir, make_run())
     assert not (stopped_dir / "STOP").exists()
@@ -323,7 +316,7 @@ def test_a_stop_that_was_asked_for_is_over(stopped_dir: Path, make_run: MakeRun)
     assert not (stopped_dir / "STOP").exists()
 
 
-def test_a_damaged_run_is_left_alone(stopped_dir: Path, make_run: MakeRun) -> None:
+def test_a_damaged_run_is_left_alone(stopped_dir: Path) -> None:
     (stopped_dir / "run.json").write_text("{")
     state = (stopped_dir / "STATE").read_bytes()
     with pytest.raises(RecordingError, match="is damaged"):

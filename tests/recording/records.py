@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import pytest
 
 from labseq.model import (
     CycleRecord,
@@ -26,7 +24,7 @@ START = "2026-11-20T10:00:00.000000+00:00"
 SHAPE = (4, 5)
 
 
-def _run(**changes: Any) -> RunRecord:
+def make_run(**changes: Any) -> RunRecord:
     fill = np.zeros(SHAPE, np.bool_)
     fill[1:3, 1:4] = True
     clear = np.zeros(SHAPE, np.bool_)
@@ -92,7 +90,7 @@ def _image(number: int, cycle: int, rng: np.random.Generator, frame_shape: tuple
     )
 
 
-def _shot(
+def make_shot(
     index: int = 0,
     *,
     n_images: int = 3,
@@ -127,37 +125,19 @@ def _shot(
     return dataclasses.replace(shot, **changes)
 
 
-def _assert_same(a: Any, b: Any, where: str = "") -> None:
+def assert_same(a: Any, b: Any, where: str = "") -> None:
     assert type(a) is type(b), (where, a, b)
     if dataclasses.is_dataclass(a):
         for item in dataclasses.fields(a):
-            _assert_same(getattr(a, item.name), getattr(b, item.name), f"{where}.{item.name}")
+            assert_same(getattr(a, item.name), getattr(b, item.name), f"{where}.{item.name}")
     elif isinstance(a, np.ndarray):
         assert a.dtype == b.dtype, where
         np.testing.assert_array_equal(a, b, where)
     elif isinstance(a, (list, tuple)):
         assert len(a) == len(b), where
         for i, (x, y) in enumerate(zip(a, b, strict=True)):
-            _assert_same(x, y, f"{where}[{i}]")
+            assert_same(x, y, f"{where}[{i}]")
     elif isinstance(a, float) and math.isnan(a):
         assert math.isnan(b), where
     else:
         assert a == b, where
-
-
-@pytest.fixture(scope="session")
-def make_run() -> Callable[..., RunRecord]:
-    """Build a RunRecord; keywords change fields."""
-    return _run
-
-
-@pytest.fixture(scope="session")
-def make_shot() -> Callable[..., ShotRecord]:
-    """Build a rich ShotRecord; keywords change fields."""
-    return _shot
-
-
-@pytest.fixture(scope="session")
-def assert_same() -> Callable[[Any, Any], None]:
-    """Compare records exactly; nan equals nan, types and dtypes count."""
-    return _assert_same
