@@ -1,8 +1,6 @@
 from __future__ import annotations
 
 import io
-import os
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +12,8 @@ from hypothesis import given, settings, strategies as st
 import labseq
 from labseq.errors import ConfigError
 from labseq.model import Occupancy
-from labseq.session.occupancies import MAX_BYTES, MAX_NPY_BYTES, parse_text, read_source
+from labseq.session.occupancies import MAX_BYTES, parse_text, read_source
+from labseq.session.planning import PlanRequest, plan_moves
 from labseq.testing.strategies import occupancies
 
 ROOT = Path(__file__).parents[2]
@@ -32,15 +31,11 @@ def test_random_is_drawn_as_documented() -> None:
     assert np.array_equal(source.occupancy, np.random.default_rng(5).random((20, 30)) < 0.75)
     assert (source.seed, source.label) == (5, "random:20x30@0.75, seed 5")
 
-
-@pytest.mark.parametrize("text", ["random:3x4@0", "random:3x4@1", "random: 3 x 4@100 %", "random:3X4@1.0"])
-def test_random_takes_sizes_and_fractions_as_people_write_them(text: str) -> None:
-    occupancy = read_source(text).occupancy
-    assert occupancy.shape == (3, 4)
-    assert occupancy.all() == (text != "random:3x4@0")
+    for text in ("random: 3 x 4@100 %", "random:3X4@1.0"):
+        assert np.array_equal(read_source(text).occupancy, np.ones((3, 4)))
 
 
-def test_a_fresh_seed_is_told_and_repeats_the_draw() -> None:
+def test_a_fresh_seed_is_named_and_repeats_the_draw() -> None:
     first, second = read_source("random:20x20@0.5"), read_source("random:20x20@0.5")
     assert first.seed != second.seed
     assert f"seed {first.seed}" in first.label
@@ -51,21 +46,11 @@ def test_a_fresh_seed_is_told_and_repeats_the_draw() -> None:
     ("text", "words"),
     [
         ("random:", "expected random:ROWSxCOLS@P"),
-        ("random:20@0.75", "expected random:ROWSxCOLS@P"),
-        ("random:20x20", "expected random:ROWSxCOLS@P"),
-        ("random:20x-2@0.75", "expected random:ROWSxCOLS@P"),
         ("random:20x20@1.5", "the filling fraction is '1.5'; expected a number from 0 to 1"),
-        ("random:20x20@75", "the filling fraction is '75'"),
-        ("random:20x20@-0.1", "the filling fraction is '-0.1'"),
         ("random:20x20@nan", "the filling fraction is 'nan'"),
-        ("random:20x20@x", "the filling fraction is 'x'"),
-        ("random:0x20@0.75", "0 x 20 sites; expected 1 to 1000"),
         ("random:20x1001@0.75", "20 x 1001 sites; expected 1 to 1000"),
-        ("random:999999999x999999999@0.75", "expected 1 to 1000"),
         ("", "the occupancy is an empty text; expected a .npy file"),
         ("nowhere.npy", "nowhere.npy: there is no such file; expected a .npy file, a text file"),
-        ("nowhere.h5#2", "nowhere.h5: there is no such file"),
-        ("a\0b", "there is no such file"),
         ("x" * 5000, "there is no such file"),
     ],
 )
@@ -74,17 +59,7 @@ def test_what_is_no_occupancy_is_refused(text: str, words: str) -> None:
     assert len(message(text)) < 400
 
 
-def test_a_folder_is_no_occupancy(tmp_path: Path) -> None:
-    assert "this is a folder" in message(tmp_path)
-
-
-def test_a_misspelt_file_is_guessed(tmp_path: Path) -> None:
-    np.save(tmp_path / "loading.npy", ARRAY)
-    assert "did you mean 'loading.npy'?" in message(tmp_path / "laoding.npy")
-
-
-@pytest.mark.parametrize("dtype", [np.bool_, np.uint8, np.int64, np.float32, ">i4"])
-@pytest.mark.parametrize("order", ["C", "F"])
+@pytest.mark.parametrize(("dtype", "order"), [(np.bool_, "C"), (np.float32, "F"), (">i4", "C")])
 def test_npy_of_any_number_type(tmp_path: Path, dtype: Any, order: Any) -> None:
     np.save(tmp_path / "a.npy", np.asarray(ARRAY.astype(dtype), order=order))
     source = read_source(str(tmp_path / "a.npy"), 3)
@@ -97,16 +72,11 @@ def test_npy_of_any_number_type(tmp_path: Path, dtype: Any, order: Any) -> None:
 @pytest.mark.parametrize(
     ("array", "words"),
     [
-        (np.array([0, 1]), "an array of shape (2,) and type int64"),
         (np.zeros((2, 3, 4)), "an array of shape (2, 3, 4)"),
-        (np.array(1), "an array of shape ()"),
         (np.array([["1", "0"]]), "type <U1"),
-        (np.array([[1j, 0]]), "type complex128"),
         (np.array([[1, 2]]), "only 0 and 1"),
-        (np.array([[0.5, 1.0]]), "only 0 and 1"),
         (np.array([[np.nan, 1.0]]), "only 0 and 1"),
         (np.zeros((0, 5), np.bool_), "0 x 5 sites; expected 1 to 1000"),
-        (np.zeros((1001, 1), np.bool_), "1001 x 1 sites; expected 1 to 1000"),
         (np.array([[None, {}]], dtype=object), "it cannot be read"),
     ],
 )
@@ -132,16 +102,9 @@ def test_a_header_that_promises_too_much_is_refused(tmp_path: Path) -> None:
     assert "it cannot be read" in message(tmp_path / "a.npy")
 
 
-def test_a_huge_npy_is_not_even_opened(tmp_path: Path) -> None:
-    with (tmp_path / "a.npy").open("wb") as file:
-        file.truncate(MAX_NPY_BYTES + 1)
-    assert "it is larger than 32 MiB" in message(tmp_path / "a.npy")
-
-
 @pytest.mark.parametrize(
     "text",
     [
-        b"101\n001\n",
         b"1 0 1\n0 0 1",
         b"1,0,1\r\n0,0,1\r\n",
         b"#.#\r..#",
@@ -153,7 +116,7 @@ def test_texts_in_any_usual_form(text: bytes) -> None:
     assert np.array_equal(parse_text(text, "mine"), ARRAY)
 
 
-@settings(deadline=None)
+@settings(max_examples=30)
 @given(occupancies(), st.sampled_from(["01", ".#"]), st.sampled_from(["", " ", ", ", "\t"]))
 def test_texts_are_read_as_they_were_written(occupancy: Occupancy, signs: str, between: str) -> None:
     text = "\n".join(between.join(signs[int(site)] for site in row) for row in occupancy)
@@ -164,13 +127,11 @@ def test_texts_are_read_as_they_were_written(occupancy: Occupancy, signs: str, b
     ("text", "words"),
     [
         (b"", "mine: it is empty"),
-        (b" \n\n", "mine: it is empty"),
         (b"101\n01\n", "mine:2:1: this row has 2 sites; expected 3, as in line 1"),
         (b"\n101\n\n101", "mine:3:1: this row has 0 sites; expected 3, as in line 2"),
         (b"102\n", "mine:1:3: '2' is no site; expected 0 or '.'"),
         (b"10\n1\x00\n", r"mine:2:2: '\x00' is no site"),
         (b"10\n1\xff\n", "mine:2:2: byte 0xFF at offset 4 is not UTF-8"),
-        (b"1" * 1001, "1 x 1001 sites"),
         (b"1" * (MAX_BYTES + 1), "it is larger than 4 MiB"),
     ],
 )
@@ -180,9 +141,9 @@ def test_other_texts_are_refused_with_their_place(text: bytes, words: str) -> No
     assert words in str(caught.value)
 
 
-@settings(deadline=None)
+@settings(max_examples=50)
 @given(st.binary(max_size=60))
-def test_no_text_is_a_surprise(text: bytes) -> None:
+def test_any_text_is_read_or_refused(text: bytes) -> None:
     try:
         assert parse_text(text, "mine").size > 0
     except ConfigError as error:
@@ -222,13 +183,14 @@ def test_a_shot_gives_the_image_that_each_cycle_was_planned_on(run: labseq.Run) 
     assert first.target.n_atoms == 225
     assert first.machine is not None
     assert first.machine["grid"]["rows"] == 20
+    for cycle in ("0", "4", "x", ""):
+        assert f"there is no cycle '{cycle}'; expected a cycle from 1 to 3" in message(f"{path}#{cycle}")
 
 
-@pytest.mark.parametrize("cycle", ["0", "4", "99", "x", "-1", "", "²"])
-def test_a_shot_has_only_the_cycles_it_has(run: labseq.Run, cycle: str) -> None:
-    assert f"there is no cycle '{cycle}'; expected a cycle from 1 to 3" in message(
-        f"{shot_file(run)}#{cycle}"
-    )
+def test_a_shot_is_planned_again_as_it_was(run: labseq.Run) -> None:
+    for cycle, plan in enumerate(run.shots[0].plans, start=1):
+        planned = plan_moves(PlanRequest(f"{shot_file(run)}#{cycle}")).plan
+        assert planned.moves.tolist() == plan.moves.tolist()
 
 
 def test_a_file_that_is_no_shot_is_refused(tmp_path: Path) -> None:
@@ -238,6 +200,9 @@ def test_a_file_that_is_no_shot_is_refused(tmp_path: Path) -> None:
     assert "expected a shot's file" in message(path)
     h5py.File(path, "w").close()
     assert "expected a shot's file" in message(f"{path}#1")
+    assert "this is a folder" in message(tmp_path)
+    np.save(tmp_path / "loading.npy", ARRAY)
+    assert "did you mean 'loading.npy'?" in message(tmp_path / "laoding.npy")
 
 
 def test_a_shot_without_cycles_is_refused(tmp_path: Path) -> None:
@@ -248,16 +213,3 @@ def test_a_shot_without_cycles_is_refused(tmp_path: Path) -> None:
     with labseq.Session.open(sequence, profile="virtual", shots=1, seed=1, output=tmp_path) as session:
         path = shot_file(session.run())
     assert "this shot has no cycles" in message(path)
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere names of files are text")
-@pytest.mark.parametrize(
-    ("raw", "label"), [(b"a\xff.npy", "a\\udcff.npy"), (b"a\x1b[31m.npy", "a\\x1b[31m.npy")]
-)
-def test_a_file_with_an_odd_name_has_a_label_that_can_be_shown(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, raw: bytes, label: str
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    with Path(os.fsdecode(raw)).open("wb") as file:
-        np.save(file, np.eye(3, dtype=np.bool_))
-    assert read_source(os.fsdecode(raw)).label == label

@@ -21,11 +21,11 @@ def read(document: dict[str, Any], **options: Any) -> dict[str, Any]:
     ).as_dict()
 
 
-@settings(max_examples=20)
+@settings(max_examples=8)
 @given(
     st.integers(0, 1000), st.sampled_from(["compact:4x4", "kagome:5x5", "ring:radius=3"]), st.integers(1, 9)
 )
-def test_a_plan_that_was_written_is_the_same_when_it_is_read(seed: int, target: str, dop: int) -> None:
+def test_a_plan_reads_back_as_it_was_written(seed: int, target: str, dop: int) -> None:
     request = PlanRequest("random:8x9@0.7", target, degree_of_parallelism=dop, seed=seed)
     moves = plan_moves(request)
     document = moves.as_dict()
@@ -70,10 +70,8 @@ def test_a_plan_for_another_grid_than_the_profiles_is_refused() -> None:
     ("options", "option"),
     [
         ({"target": "compact:3x3"}, "--target"),
-        ({"planner": "lsap"}, "--planner"),
         ({"degree_of_parallelism": 3}, "--dop"),
         ({"seed": 3}, "--seed"),
-        ({"origin": "1,1"}, "--origin"),
         ({"overrides": ["degree_of_parallelism=3"]}, "--set degree_of_parallelism=3"),
     ],
 )

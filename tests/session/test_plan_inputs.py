@@ -48,17 +48,15 @@ def test_targets_in_words(text: str, expected: Any) -> None:
     assert parse_target(text) == expected
 
 
-@pytest.mark.parametrize(
-    "text", ["", ":", ":3x3", "compact:", "compact:15", "compact:3x3,4x4", "compact:,", "3x3", "a b"]
-)
+@pytest.mark.parametrize("text", ["", ":3x3", "compact:15", "compact:3x3,4x4", "a b"])
 def test_what_is_no_target_is_refused(text: str) -> None:
     with pytest.raises(ConfigError, match="this is no target; expected a pattern such as kagome:15x15"):
         parse_target(text)
 
 
-@settings(deadline=None)
-@given(st.text(max_size=30))
-def test_no_target_is_a_surprise(text: str) -> None:
+@settings(max_examples=40)
+@given(st.text("abcxyz019:=,[]. ", max_size=30))
+def test_any_target_is_read_or_refused(text: str) -> None:
     try:
         name, values = parse_target(text)
     except ConfigError:
@@ -85,36 +83,20 @@ def test_the_target_of_a_sequence() -> None:
     ("target", "options", "words"),
     [
         (None, {}, "--target is missing; expected a pattern such as kagome:15x15"),
-        (None, {"origin": "1,1"}, "--target is missing"),
         ("compakt:3x3", {}, "--target compakt:3x3: unknown pattern 'compakt'; expected one of"),
-        ("compakt:3x3", {}, "did you mean 'compact'?"),
-        ("compact", {}, "'rows' is missing from pattern 'compact'"),
         ("compact:0x3", {}, "--target compact:0x3: rows is 0; expected at least 1"),
-        ("compact:3x3,orign=[1, 1]", {}, "'orign' is not a setting of pattern 'compact'"),
         ("compact:21x20", {}, "21 rows x 20 columns; the limit is the grid of 20 rows x 20 columns"),
         ("compact:15x15", {"origin": "6,0"}, "row 6, column 0; the limit is rows 0 to 5 and columns 0 to 5"),
-        ("compact:15x15", {"origin": "-1,0"}, "--origin -1,0"),
-        ("compact:15x15", {"origin": "1"}, "--origin 1: this is no site; expected row and column"),
         ("compact:15x15", {"origin": "1,x"}, "this is no site"),
         ("nowhere.yaml", {}, "nowhere.yaml: there is no such file"),
-        ("bitmap:file=nowhere.txt", {}, "nowhere.txt"),
         ("compact:3x3", {"planner": "pcsa"}, "--planner pcsa: unknown planner 'pcsa'; expected"),
-        ("compact:3x3", {"planner": "pcsa"}, "did you mean 'psca'?"),
         ("compact:3x3", {"planner": "a b"}, "this is no name of a planner"),
-        ("compact:3x3", {"planner": ""}, "this is no name of a planner"),
         (
             "compact:3x3",
             {"degree_of_parallelism": 0},
             "--dop 0: degree_of_parallelism is 0; expected at least 1",
         ),
-        ("compact:3x3", {"overrides": ["x"]}, "--set x: this is not of the form address=value"),
         ("compact:3x3", {"overrides": ["dop=3"]}, "--set dop=3: 'dop' is not a setting of planner 'psca'"),
-        (
-            "compact:3x3",
-            {"overrides": ["degree_of_parallelism=x"]},
-            "degree_of_parallelism is 'x'; expected a whole",
-        ),
-        ("compact:3x3", {"overrides": ["degree_of_parallelism.x=3"]}, "degree_of_parallelism is a mapping"),
         ("compact:3x3", {"overrides": ["profile.grid.rows=3"]}, "there is no --profile to change"),
         ("compact:3x3", {"profile": "virtul"}, "did you mean 'virtual'?"),
     ],
@@ -123,7 +105,7 @@ def test_what_cannot_be_planned_is_refused(target: Any, options: Any, words: str
     assert words in message(target, **options)
 
 
-def test_all_that_is_wrong_with_a_target_is_told_at_once() -> None:
+def test_all_that_is_wrong_with_a_target_is_reported_at_once() -> None:
     text = message("compact:0x0,width=3")
     assert text.count("\n") == 2
     assert all(word in text for word in ("rows is 0", "cols is 0", "'width' is not a setting"))
@@ -176,14 +158,14 @@ def inputs_motion(**changes: Any) -> dict[str, Any]:
     return values | changes
 
 
-@pytest.mark.parametrize("machine", [{}, {"grid": {"rows": 0, "cols": 5}}, {"grid": {"rows": 4}}])
-def test_a_damaged_profile_in_a_shot_is_told(machine: Any) -> None:
+@pytest.mark.parametrize("machine", [{}, {"grid": {"rows": 0, "cols": 5}}])
+def test_a_damaged_profile_in_a_shot_is_refused(machine: Any) -> None:
     source = Source(np.ones((4, 5), np.bool_), "a shot", machine=machine)
     with pytest.raises(ConfigError, match="the profile in the shot's file"):
         read_inputs(PlanRequest("a shot", "compact:2x2"), source)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=12)
 @given(st.integers(1, 6), st.integers(1, 6), st.integers(0, 6), st.integers(0, 6))
 def test_an_origin_is_where_it_says_or_refused(rows: int, cols: int, row: int, col: int) -> None:
     fits = row + rows <= 6 and col + cols <= 6

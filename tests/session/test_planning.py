@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from labseq.errors import ConfigError, InvalidPlanError, PlanError, PluginLoadError
+from labseq.errors import InvalidPlanError, PlanError, PluginLoadError
 from labseq.session.planning import PlannedMoves, PlanRequest, plan_moves
+from tests.system.replay import replay
 
 PLANNERS = '''
 import numpy as np
@@ -81,63 +82,30 @@ def plugins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("LABSEQ_PLUGIN_PATH", str(tmp_path))
 
 
-def replay(document: Any) -> list[list[int]]:
-    """Move the atoms as the document says, by nothing but its words."""
-    n_rows, n_cols = document["grid"]["n_rows"], document["grid"]["n_cols"]
-    atoms = {(r, c) for r, row in enumerate(document["occupancy"]) for c, bit in enumerate(row) if bit}
-    for batch in document["batches"]:
-        starts, ends = ([tuple(site) for site in batch[key]] for key in ("from", "to"))
-        assert set(starts) <= atoms
-        atoms -= set(starts)
-        on_grid = {(r, c) for r, c in ends if 0 <= r < n_rows and 0 <= c < n_cols}
-        assert not atoms & on_grid
-        atoms |= on_grid
-    return [[int((r, c) in atoms) for c in range(n_cols)] for r in range(n_rows)]
-
-
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=10)
 @given(
     st.integers(0, 10_000),
     st.sampled_from(["compact:6x6", "kagome:7x7", "sierpinski:8x8", "checkerboard:5x6", "ring:radius=3"]),
     st.integers(1, 20),
 )
-def test_the_json_tells_all_that_is_needed_to_replay_a_plan(seed: int, target: str, dop: int) -> None:
+def test_the_json_is_enough_to_replay_a_plan(seed: int, target: str, dop: int) -> None:
     moves = planned("random:10x10@0.75", target, seed=seed, degree_of_parallelism=dop)
     document = json.loads(json.dumps(moves.as_dict()))
-    assert replay(document) == document["predicted"] == moves.report.predicted.astype(int).tolist()
-    assert document["n_batches"] == len(document["batches"]) == moves.plan.n_batches
-    assert document["n_atom_moves"] == sum(len(batch["from"]) for batch in document["batches"])
+    replay(document)
+    assert document["predicted"] == moves.report.predicted.astype(int).tolist()
     assert (document["planner"], document["seed"], document["degree_of_parallelism"]) == ("psca", seed, dop)
     assert document["duration_s"] == moves.report.duration_s
-    assert np.array_equal(document["target"]["fill"], moves.target.fill)
-    assert np.array_equal(document["target"]["clear"], moves.target.clear)
+    assert document["grid"].items() >= {"spacing_m": 4.49e-6, "lattice": "triangular", "shear": 1}.items()
     assert moves.n_ejected == np.sum(document["occupancy"]) - np.sum(document["predicted"])
     assert moves.n_filled == moves.target.n_atoms - moves.n_missing_atoms
     assert moves.max_tweezers <= dop
 
 
-def test_the_keys_of_the_json() -> None:
-    document = planned("random:5x6@1", seed=1).as_dict()
-    assert list(document) == [
-        "planner",
-        "grid",
-        "degree_of_parallelism",
-        "seed",
-        "occupancy",
-        "target",
-        "n_batches",
-        "n_atom_moves",
-        "duration_s",
-        "batches",
-        "predicted",
-    ]
-    assert document["grid"] == {
-        "n_rows": 5,
-        "n_cols": 6,
-        "spacing_m": 4.49e-6,
-        "lattice": "triangular",
-        "shear": 1,
-    }
+@pytest.mark.parametrize("occupancy", ["random:3x3@0", "random:3x3@1"])
+def test_without_atoms_or_defects_nothing_is_moved(occupancy: str) -> None:
+    moves = planned(occupancy, seed=1)
+    assert (moves.plan.n_batches, moves.max_tweezers, moves.n_ejected) == (0, 0, 0)
+    assert moves.report.duration_s == 0.0
 
 
 def test_too_few_atoms_are_no_error() -> None:
@@ -147,22 +115,22 @@ def test_too_few_atoms_are_no_error() -> None:
     assert not moves.report.meets_target
 
 
-def test_no_atoms_and_nothing_to_do() -> None:
-    for occupancy in ("random:3x3@0", "random:3x3@1"):
-        moves = planned(occupancy, seed=1)
-        assert (moves.plan.n_batches, moves.max_tweezers, moves.n_ejected) == (0, 0, 0)
-        assert moves.report.duration_s == 0.0
-
-
-def test_the_same_words_give_the_same_plan() -> None:
-    first, again = (planned("random:20x20@0.75", "kagome:15x15", seed=8).as_dict() for _ in range(2))
-    assert first == again
-    fresh = planned("random:20x20@0.75", "kagome:15x15")
-    assert planned("random:20x20@0.75", "kagome:15x15", seed=fresh.seed).as_dict() == fresh.as_dict()
-
-
 def test_more_parallelism_than_the_machine_has_is_not_used() -> None:
     assert planned("random:5x5@0.7", seed=1, degree_of_parallelism=99).degree_of_parallelism == 20
+
+
+@pytest.mark.usefixtures("plugins")
+def test_the_seed_repeats_the_occupancy_and_what_the_planner_draws(tmp_path: Path) -> None:
+    first, again, *others = (planned("random:4x9@1", planner="draws", seed=seed) for seed in (1, 1, 2, 3, 4))
+    assert first.as_dict() == again.as_dict()
+    assert len({move.plan.moves.tobytes() for move in (first, *others)}) > 1
+    assert first.as_dict()["batches"][0]["to"][0][0] == -1
+    assert (first.n_ejected, first.degree_of_parallelism) == (1, 2)
+    fresh = planned("random:4x9@0.7", planner="draws")
+    assert planned("random:4x9@0.7", planner="draws", seed=fresh.seed).as_dict() == fresh.as_dict()
+    np.save(tmp_path / "full.npy", np.ones((4, 9), np.bool_))
+    assert planned(str(tmp_path / "full.npy"), planner="draws", seed=5).seed == 5
+    assert planned(str(tmp_path / "full.npy"), planner="draws").seed is None
 
 
 @pytest.mark.usefixtures("plugins")
@@ -185,31 +153,3 @@ def test_a_planner_that_fails_is_named(planner: str, error: Any, words: str) -> 
 @pytest.mark.usefixtures("plugins")
 def test_a_planner_cannot_change_the_occupancy() -> None:
     assert planned("random:4x4@1", planner="writes", seed=1).occupancy.all()
-
-
-@pytest.mark.usefixtures("plugins")
-def test_a_planner_draws_from_the_seed() -> None:
-    moves = [planned("random:4x9@1", planner="draws", seed=seed) for seed in (1, 1, 2, 3, 4)]
-    assert moves[0].as_dict() == moves[1].as_dict()
-    assert len({move.plan.moves.tobytes() for move in moves}) > 1
-    assert moves[0].as_dict()["batches"][0]["to"][0][0] == -1
-    assert moves[0].n_ejected == 1
-    assert moves[0].degree_of_parallelism == 2
-
-
-@pytest.mark.usefixtures("plugins")
-def test_a_fresh_seed_also_repeats_what_the_planner_draws() -> None:
-    fresh = planned("random:4x9@1", planner="draws")
-    assert planned("random:4x9@1", planner="draws", seed=fresh.seed).as_dict() == fresh.as_dict()
-
-
-@pytest.mark.usefixtures("plugins")
-def test_a_seed_for_the_planner_alone_is_told(tmp_path: Path) -> None:
-    np.save(tmp_path / "full.npy", np.ones((4, 9), np.bool_))
-    assert planned(str(tmp_path / "full.npy"), planner="draws", seed=5).seed == 5
-    assert planned(str(tmp_path / "full.npy"), planner="draws").seed is None
-
-
-def test_a_setting_of_another_planner_is_refused() -> None:
-    with pytest.raises(ConfigError, match="'colour' is not a setting of planner 'psca'"):
-        planned("random:4x4@1", overrides=["colour=red"])

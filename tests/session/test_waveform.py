@@ -59,14 +59,13 @@ def samples_of(made: PlannedWaveform) -> np.ndarray[Any, np.dtype[np.int16]]:
     return labseq.render(made.program, made.renderer.sample_rate_hz).samples[:, part]
 
 
-def test_a_plan_in_a_file_sounds_like_the_one_just_made(whole: PlannedWaveform, plan_json: Path) -> None:
+def test_a_plan_in_a_file_gives_the_same_samples(whole: PlannedWaveform, plan_json: Path) -> None:
     read = waveform(PlanRequest(str(plan_json)))
     assert np.array_equal(samples_of(read), samples_of(whole))
     assert read.as_dict() | {"source": ""} == whole.as_dict() | {"source": ""}
 
 
-@pytest.mark.parametrize("mark", ["", "\ufeff"], ids=["plain", "marked"])
-@pytest.mark.parametrize("as_plan", [True, False])
+@pytest.mark.parametrize(("as_plan", "mark"), [(True, ""), (False, "\ufeff")])
 def test_standard_input_holds_a_plan_or_an_occupancy(
     whole: PlannedWaveform, as_plan: bool, mark: str
 ) -> None:
@@ -78,7 +77,7 @@ def test_standard_input_holds_a_plan_or_an_occupancy(
     assert np.array_equal(made.program.column.phase_rad, whole.program.column.phase_rad)
 
 
-@pytest.mark.parametrize("batches", [None, "1", "2-3"])
+@pytest.mark.parametrize("batches", [None, "2-3"])
 def test_the_numbers_are_those_of_the_samples(batches: str | None) -> None:
     made = waveform(batches=batches)
     samples, rf = samples_of(made), made.moves.motion.rf
@@ -94,7 +93,11 @@ def test_the_numbers_are_those_of_the_samples(batches: str | None) -> None:
         volts = samples[channel, on] * (rf.full_scale_v / 32767)
         rms_v = float(np.sqrt(np.mean(volts**2)))
         assert axis.peak_v == pytest.approx(np.abs(volts).max())
-        assert axis.crest_factor == pytest.approx(crest(made, channel))
+        carried = [i for i in made.segments if made.program.kind[i] == SegmentKind.TRANSPORT]
+        all_samples = labseq.render(made.program, 250e6).samples[channel].astype(float)
+        parts = [all_samples[starts[i] : starts[i + 1]] for i in carried]
+        crest = max(float(np.abs(part).max() / np.sqrt(np.mean(part**2))) for part in parts)
+        assert axis.crest_factor == pytest.approx(crest)
         assert axis.mean_power_w == pytest.approx(rms_v**2 / 50)
         assert axis.aod_mean_power_w == pytest.approx(100 * axis.mean_power_w)  # 20 dB
         assert axis.aod_peak_v == pytest.approx(10 * axis.peak_v)
@@ -106,19 +109,6 @@ def test_the_numbers_are_those_of_the_samples(batches: str | None) -> None:
         json.dumps(axis.as_dict(), allow_nan=False)
     assert made.tones_on_s == pytest.approx(len(on) / made.renderer.sample_rate_hz, rel=1e-4)
     assert made.n_bytes == samples.nbytes
-
-
-def crest(made: PlannedWaveform, channel: int) -> float:
-    starts, whole = made.renderer.first_sample, labseq.render(made.program, 250e6).samples[channel]
-    carried = [i for i in made.segments if made.program.kind[i] == SegmentKind.TRANSPORT]
-    parts = [whole[starts[i] : starts[i + 1]].astype(float) for i in carried]
-    return max(float(np.abs(part).max() / np.sqrt(np.mean(part**2))) for part in parts)
-
-
-def test_n_equal_tones_have_no_higher_crest_than_all_in_phase(whole: PlannedWaveform) -> None:
-    for axis in whole.statistics():
-        assert axis.crest_factor is not None
-        assert np.sqrt(2) * 0.99 < axis.crest_factor < np.sqrt(2 * axis.max_tones) * 1.01
 
 
 def test_one_tone_has_the_numbers_of_a_sine() -> None:
@@ -133,14 +123,7 @@ def test_one_tone_has_the_numbers_of_a_sine() -> None:
     assert row.amplitude_sum == pytest.approx(0.05)
 
 
-def test_the_peak_is_in_the_batch_that_is_named(whole: PlannedWaveform) -> None:
-    for axis in whole.statistics():
-        alone = waveform(batches=str(axis.peak_batch + 1))
-        same = next(other for other in alone.statistics() if other.name == axis.name)
-        assert (same.peak_v, same.peak_batch) == (axis.peak_v, axis.peak_batch)
-
-
-def test_tones_moved_onto_a_comb_are_told(tmp_path: Path) -> None:
+def test_tones_moved_onto_a_comb_are_reported(tmp_path: Path) -> None:
     table = [99.2, 100.804, 102.4, 104.0, 105.6, 107.2]
     profile = Path("hardware_profiles/virtual.yaml")
     text = (Path(__file__).parents[2] / profile).read_text("utf-8")
@@ -174,25 +157,18 @@ def test_a_range_of_batches_never_cuts_a_chain(linked: list[bool], first: int, l
             read_batches(f"{first}-{last}", plan)
 
 
-def test_the_range_that_cuts_no_chain_is_named() -> None:
-    made = [([(0, i)], [(0, i + 1)]) for i in range(4)]
-    batches = [
-        labseq.Batch(np.array(a, np.int16), np.array(b, np.int16), i in (1, 2))
-        for i, (a, b) in enumerate(made)
-    ]
+def test_the_range_of_a_whole_chain_is_suggested() -> None:
+    sites = [([(0, i)], [(0, i + 1)]) for i in range(4)]
+    chain = [labseq.Batch(np.array(a), np.array(b), i in (1, 2)) for i, (a, b) in enumerate(sites)]
     with pytest.raises(ConfigError, match="expected --batches 1-3"):
-        read_batches("2", Plan.from_batches(batches))
+        read_batches("2", Plan.from_batches(chain))
 
 
 @pytest.mark.parametrize(
     ("rate", "words"),
     [
         ("200 MHz", "MHz cannot be sampled at 200 MHz; expected more than 211.2 MHz"),
-        ("0", "this is no sample rate; expected more than 0 Hz, at most 10 GHz"),
         ("-625e6", "this is no sample rate"),
-        ("1e12", "this is no sample rate"),
-        ("1e999", "this is no sample rate"),
-        ("nan", "'nan' is not a frequency"),
         ("5 parsec", "'parsec' in '5 parsec' is not a unit of frequency"),
     ],
 )
@@ -201,11 +177,6 @@ def test_a_sample_rate_that_makes_no_sense_is_refused(rate: str, words: str) -> 
         waveform(rate=rate)
     assert str(caught.value).startswith(f"--sample-rate {rate}: ")
     assert words in str(caught.value)
-
-
-def test_without_a_profile_the_sample_rate_is_the_papers() -> None:
-    assert waveform(rate=None).renderer.sample_rate_hz == DEFAULT_RATE_HZ
-    assert waveform(rate="300e6").renderer.sample_rate_hz == 300e6
 
 
 PROFILE = """
@@ -223,7 +194,6 @@ detector: {{use: threshold}}
     ("tweezers", "rate_hz", "n_warnings"),
     [
         ("{use: spcm, sample_rate: 500 MHz}", 500e6, 0),
-        ("{use: spcm}", 625e6, 0),
         ("{use: virtual}", 625e6, 0),
         ("{use: not_installed, sample_rate: 500 MHz}", 625e6, 1),
     ],
@@ -238,6 +208,7 @@ def test_the_profiles_mobile_tweezers_choose_the_sample_rate(
     assert made.renderer.sample_rate_hz == rate_hz
     assert len(made.warnings) == n_warnings
     assert waveform(request, rate=RATE).renderer.sample_rate_hz == 250e6
+    assert waveform(rate=None).renderer.sample_rate_hz == DEFAULT_RATE_HZ
 
 
 def test_a_shot_brings_the_sample_rate_that_it_was_taken_with() -> None:
@@ -247,7 +218,7 @@ def test_a_shot_brings_the_sample_rate_that_it_was_taken_with() -> None:
     assert read_sample_rate(None, REQUEST, {"mobile_tweezers": {"use": "virtual"}}).hz == DEFAULT_RATE_HZ
 
 
-def test_the_share_of_each_render_path_is_told() -> None:
+def test_the_share_of_each_render_path() -> None:
     jerk = ["profile.mobile_tweezers.speed_profile=minimum_jerk"]
     made = waveform(
         PlanRequest("random:20x20@0.75", "compact:6x6", seed=1, profile="virtual", overrides=jerk)
