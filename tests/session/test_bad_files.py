@@ -62,22 +62,6 @@ CASES: list[tuple[str, dict[str, str], list[str]]] = [
         ["p.yaml:14:9: rows is -20; expected at least 1"],
     ),
     (
-        "a wrong device takes no other away",
-        {
-            "shutter: {use: virtual": "laser: 5\n  shutter: {use: virtual",
-            "- image: {exposure: 45 ms}": "- device: {name: shutter, do: open}\n  - image: {exposure: 45 ms}",
-        },
-        ["p.yaml:79:10: laser is 5; expected a mapping (key: value)"],
-    ),
-    (
-        "one wrong step among right ones",
-        {"- load: {duration: 500 ms}": "- load", "window: 60 ms": "window: 60 mm"},
-        [
-            "s.yaml:11:5: a step is just 'load'; expected a mapping; write '- load: {}'",
-            f"s.yaml:14:37: window: '60 mm' is a length, not a time; {TIME}",
-        ],
-    ),
-    (
         "no profile: the settings are checked all the same",
         {"profile: p.yaml": "profile: ./gone.yaml", "rows: 15": "rows: 0", "use: psca": "use: elsewhere"},
         [
@@ -91,18 +75,6 @@ CASES: list[tuple[str, dict[str, str], list[str]]] = [
         [
             "s.yaml:5:8: shots is 0; expected at least 1",
             "s.yaml:6:18: there is no plugin folder 'gone'; expected a folder at gone",
-        ],
-    ),
-    (
-        "plugin folders wrong: what they would offer is not unknown",
-        {"shots: 20": "shots: 20\nplugin_folders: mine", "use: psca": "use: mine"},
-        ["s.yaml:6:17: plugin_folders is 'mine'; expected a list ([a, b], or lines that begin with '- ')"],
-    ),
-    (
-        "a comma for a decimal point",
-        {"- image: {exposure: 45 ms}": "- image: {exposure: 4,5 ms}"},
-        [
-            "s.yaml:12:25: '5 ms' is not a setting of step 'image'; expected exposure; a ',' begins another key: write 4.5 for 4,5 and [4, 5] for a list"
         ],
     ),
     (
@@ -153,7 +125,7 @@ def test_all_messages(changes: dict[str, str], expected: list[str]) -> None:
     ] == expected
 
 
-def test_wrong_options_are_told_with_the_files() -> None:
+def test_wrong_options_are_reported_with_the_files() -> None:
     write({"rows: 15": "rows: 0"})
     assert messages(shots=0, overrides=["planr.x=1", "profile.camera.gain=5"]) == [
         "--set planr.x=1: there is no 'planr' in s.yaml; expected one of labseq, name, profile, shots, target, planner, shot; did you mean 'planner'?",
@@ -163,18 +135,13 @@ def test_wrong_options_are_told_with_the_files() -> None:
     ]
 
 
-def test_an_empty_profile_name_is_no_name() -> None:
-    write({})
-    assert messages(profile="")[0].startswith("there is no hardware profile '' in ")
-
-
-@pytest.mark.parametrize("dry_run", [True, False, None, "slow", "Full"])
+@pytest.mark.parametrize("dry_run", [True, "slow"])
 def test_a_wrong_kind_of_dry_run_is_refused(dry_run: Any) -> None:
     write({})
     assert messages(dry_run=dry_run) == [f"dry_run is {dry_run!r}; expected one of 'off', 'full', 'fast'"]
 
 
-@pytest.mark.parametrize("overrides", ["shots=5", [("shots", "5")], [5]])
+@pytest.mark.parametrize("overrides", ["shots=5", [("shots", "5")]])
 def test_overrides_of_the_wrong_type_are_refused(overrides: Any) -> None:
     write({})
     assert messages(overrides=overrides) == [
@@ -191,7 +158,6 @@ def test_overrides_of_the_wrong_type_are_refused(overrides: Any) -> None:
             "the region of interest of site (0, 0), according to the detector's settings, is rows ",
         ),
         ("threshold: 1630", "threshold: gone.npy", "thresholds cannot be read from 'gone.npy': No such file"),
-        ("threshold: 1630", "threshold: [[1, 2]]", "the shape of the detector's thresholds is (1, 2)"),
     ],
 )
 def test_what_a_constructor_refuses_has_its_place(old: str, new: str, words: str) -> None:
@@ -236,7 +202,7 @@ def labseq_register(registry):
         ),
     ],
 )
-def test_a_plugin_that_does_not_load_is_told_where_it_is_named(
+def test_a_plugin_that_does_not_load_is_reported_where_it_is_named(
     old: str, new: str, use: str, words: str
 ) -> None:
     write({"{use: psca, degree_of_parallelism: 7}": f"{{use: {use}}}", "rows: 15": "rows: 0"})

@@ -53,7 +53,7 @@ def test_an_array_at_half_the_depth_keeps_its_atoms(tmp_path: Path) -> None:
         assert again >= shallow - 8
 
 
-def test_atoms_in_tweezers_that_hold_none_are_lost_and_the_next_shot_loads_at_full_depth(
+def test_atoms_in_shallow_tweezers_are_lost_and_the_next_shot_loads_at_full_depth(
     tmp_path: Path,
 ) -> None:
     for shot in shots(tmp_path, "5 %"):
@@ -64,7 +64,7 @@ def test_atoms_in_tweezers_that_hold_none_are_lost_and_the_next_shot_loads_at_fu
         assert again <= 2  # they do not come back with the light
 
 
-def test_a_rearrangement_hands_over_to_tweezers_of_the_depth_that_there_is(tmp_path: Path) -> None:
+def test_a_rearrangement_hands_over_to_tweezers_of_their_present_depth(tmp_path: Path) -> None:
     n_lost = dict[str, int]()
     for depth in ("100 %", "11 %"):
         for shot in shots(tmp_path, depth, "  - rearrange: {cycles: 1, window: 60 ms}\n"):

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, strategies as st
 
 import labseq
 from labseq.analysis.replay import ReplayRequest, replay, shots_of
@@ -61,7 +60,6 @@ target: {pattern: compact, rows: 12, cols: 12}
 planner: {use: psca}
 scan:
   planner.use: [psca, tetris]
-  profile.mobile_tweezers.max_tweezers: [3, 9]
   profile.detector.threshold: [1630, 1500]
 order: shuffled
 shot:
@@ -89,7 +87,7 @@ def taken(tmp_path_factory: pytest.TempPathFactory) -> labseq.Run:
     return take(tmp_path_factory.mktemp("taken"), SEQUENCE)
 
 
-def test_the_run_s_own_planner_and_detector_give_what_was_recorded(taken):
+def test_the_planner_and_detector_of_the_run_give_what_was_recorded(taken):
     found = replay(taken, ReplayRequest())
     assert found.is_own
     assert found.is_reproduced
@@ -110,7 +108,7 @@ def test_every_point_of_a_scan_has_its_own_settings(tmp_path):
     assert len({shot.parameters["planner.use"] for shot in run.shots}) == 2
     found = replay(run, ReplayRequest())
     assert found.is_reproduced
-    assert (len(found.plans), found.images.n_differing) == (8, 0)
+    assert (len(found.plans), found.images.n_differing) == (4, 0)
 
 
 def test_another_planner_is_checked_and_counted(taken):
@@ -138,7 +136,7 @@ def test_one_setting_of_the_own_planner_can_be_changed(taken):
 @pytest.mark.parametrize(
     ("batches", "rule"), [("[([(0, 0)], [(3, 3)])]", "breaks the rule"), ("1 / 0", "ZeroDivisionError")]
 )
-def test_a_plan_that_is_none_is_told_and_not_hidden(taken, batches, rule):
+def test_a_plan_that_fails_is_reported(taken, batches, rule):
     folder = taken.path.parents[2]
     write_plugin(folder, batches)
     found = replay(taken, ReplayRequest(planner="lazy"))
@@ -147,7 +145,7 @@ def test_a_plan_that_is_none_is_told_and_not_hidden(taken, batches, rule):
     assert all(rule in plan.failure and "lazy" in plan.failure for plan in found.plans)
 
 
-def test_code_that_has_changed_is_found_out(tmp_path):
+def test_changed_code_is_noticed(tmp_path):
     run = take(tmp_path, SEQUENCE.replace("psca", "lazy").replace("shots: 4", "shots: 1"))
     assert replay(run, ReplayRequest()).is_reproduced
     row = run.shots[0].occupancies[0][5]
@@ -169,22 +167,16 @@ def test_another_detector_is_compared_site_by_site(taken):
         shot.readings["simulation.n_atoms_true"] for shot in taken.shots
     ]
     assert {image.n_atoms_replayed for image in last} == {0}
+    failing = replay(taken, ReplayRequest(detector="blinking", shots="2")).images.failures
+    assert failing == {(1, i): "RuntimeError: closed" for i in range(len(taken.shots[1].occupancies))}
 
 
-def test_a_detector_that_raises_is_told(taken):
-    found = replay(taken, ReplayRequest(detector="blinking", shots="2"))
-    assert found.images.failures == {
-        (1, i): "RuntimeError: closed" for i in range(len(taken.shots[1].occupancies))
-    }
-
-
-@pytest.mark.parametrize(("kept", "n_kept"), [("none", 0), ("last", 1)])
-def test_frames_that_were_not_kept_are_no_fault(tmp_path, kept, n_kept):
-    run = take(tmp_path, SEQUENCE, overrides=[f"record_frames={kept}"], shots=1)
+def test_frames_that_were_not_kept_are_no_failure(tmp_path):
+    run = take(tmp_path, SEQUENCE, overrides=["record_frames=last"], shots=1)
     found = replay(run, ReplayRequest())
     assert found.is_reproduced
-    assert (len(found.images.images), len(found.plans) > 0) == (n_kept, True)
-    assert found.images.n_without_frame == len(run.shots[0].occupancies) - n_kept
+    assert (len(found.images.images), len(found.plans) > 0) == (1, True)
+    assert found.images.n_without_frame == len(run.shots[0].occupancies) - 1
 
 
 def test_a_run_in_progress_is_replayed_as_far_as_it_is(taken, tmp_path):
@@ -197,7 +189,7 @@ def test_a_run_in_progress_is_replayed_as_far_as_it_is(taken, tmp_path):
     assert (found.n_shots, found.is_reproduced) == (2, True)
 
 
-def test_a_shot_that_cannot_be_read_is_left_out_and_told(taken, tmp_path):
+def test_a_shot_that_cannot_be_read_is_left_out_and_reported(taken, tmp_path):
     folder = tmp_path / "run"
     shutil.copytree(taken.path, folder)
     open_run(folder).shots[1].file.unlink()
@@ -230,8 +222,6 @@ def test_calibrations_come_from_the_run_s_own_folder(tmp_path):
         (ReplayRequest(degree_of_parallelism=0), "--dop 0: degree_of_parallelism is 0; expected at least 1"),
         (ReplayRequest(overrides=["planner.dop=3"]), "--set planner.dop=3: .*degree_of_parallelism"),
         (ReplayRequest(overrides=["shots=3"]), "nothing but the planner and the detector"),
-        (ReplayRequest(overrides=["profile.grid.rows=3"]), "nothing but the planner and the detector"),
-        (ReplayRequest(overrides=["planner"]), "not of the form address=value"),
     ],
 )
 def test_what_cannot_be_tried_is_refused(taken, request_, expected):
@@ -239,18 +229,12 @@ def test_what_cannot_be_tried_is_refused(taken, request_, expected):
         replay(taken, request_)
 
 
-def test_texts_that_somebody_has_changed_are_refused(taken, tmp_path):
+def test_a_text_that_was_edited_is_refused(taken, tmp_path):
     folder = tmp_path / "run"
     shutil.copytree(taken.path, folder)
     (folder / "sequence.yaml").write_text(SEQUENCE + "# later\n")
     with pytest.raises(RecordingError, match=r"sequence.yaml: is not what run.json says"):
         replay(open_run(folder), ReplayRequest())
-
-
-@given(st.sets(st.integers(1, 4), min_size=1))
-def test_shots_are_named_by_their_numbers(taken, numbers):
-    text = ",".join(map(str, numbers))
-    assert [shot.index + 1 for shot in shots_of(taken, text)] == sorted(numbers)
 
 
 @pytest.mark.parametrize(
@@ -264,12 +248,9 @@ def test_ranges_of_shots(taken, text, numbers):
     ("text", "expected"),
     [
         ("", "'' is no shot; expected numbers such as 3,5-9"),
-        ("1;2", "'1;2' is no shot"),
         ("-1", "'-1' is no shot"),
         ("5", "there is no shot 5; expected 1 to 4"),
-        ("0", "there is no shot 0"),
         ("3-1", "3-1 goes backwards; expected 1-3"),
-        ("1-999999999", "there is no shot 5"),
     ],
 )
 def test_shots_that_are_not_there(taken, text, expected):

@@ -42,8 +42,6 @@ def profile(folder: Path, mobile: str) -> str:
 @pytest.mark.parametrize(
     ("mobile", "is_virtual"),
     [
-        ("{use: virtual}", True),
-        ("{use: spcm, card: simulated}", True),
         ("{use: spcm, card: simulated, mode: fifo, sample_rate: 250 MHz}", True),
         ("{use: spcm, card: /dev/spcm0}", False),
         ("{use: spcm, card: simulated, trigger: external}", False),  # somebody else must give it
