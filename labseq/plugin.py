@@ -6,7 +6,7 @@ A plugin needs no other module of labseq, except :mod:`labseq.testing` in its te
 from __future__ import annotations
 
 from labseq.drivers import CameraDriver, Cooling, ExposureResult, Series, SimulatedSensor, settle, wait_for
-from labseq.drivers.camera import nearest
+from labseq.drivers.camera import check_step, nearest
 from labseq.drivers.serial_port import (
     BROKEN,
     Port,
@@ -245,6 +245,7 @@ __all__ = [
     "cache_root",
     "check_plan",
     "check_size",
+    "check_step",
     "clean",
     "closest",
     "const",

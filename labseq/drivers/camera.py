@@ -443,3 +443,22 @@ def nearest(value: int, low: int, high: int, step: int) -> int:
     """
     n_steps = (min(max(value, low), high) - low + step // 2) // step
     return low + step * min(n_steps, (high - low) // step)
+
+
+def check_step(what: str, value: int, bounds: tuple[int, int, int], unit: int = 1) -> None:
+    """Refuse a number that a camera does not accept.
+
+    Args:
+        what: Camera and name of the number, for the error.
+        value: The number, in pixels of the sensor.
+        bounds: Smallest, largest and increment, in the camera's own pixels.
+        unit: Pixels of the sensor per pixel of the camera: the binning.
+
+    Raises:
+        LimitError: It is out of range or between two steps; the error names the nearest valid one.
+    """
+    low, high, step = (unit * bound for bound in bounds)
+    good = nearest(value, low, high, step)
+    if good != value:
+        limit = f"{low} to {high}, in steps of {step}, which the camera can do"
+        raise LimitError(what, value, limit, f"the nearest good one is {good}")

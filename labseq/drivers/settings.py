@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Annotated, Literal, Self
 
-from pydantic import Field, NonNegativeInt, PositiveInt, model_validator
+from pydantic import Field, NonNegativeInt, PositiveInt, field_validator, model_validator
 
 from labseq.drivers import Cooling
-from labseq.errors import ConfigError
+from labseq.errors import ConfigError, LimitError
 from labseq.model import SensorMode
 from labseq.roles import Context, Simulation, offers
 from labseq.settings import Duration, Settings, Temperature
@@ -40,6 +40,11 @@ class CameraSettings(Settings):
         region = self.region
         place = None if region is None else (region.y, region.x, region.height, region.width)
         return SensorMode(place, self.binning)
+
+    def frame_shape(self, sensor_shape: tuple[int, int] | None) -> tuple[int, int] | None:
+        """(height, width) of the frames; None if neither the sensor nor a region is known."""
+        is_known = sensor_shape is not None or self.region is not None
+        return self.mode.frame_shape(sensor_shape or (0, 0)) if is_known else None
 
     def sensor_conflict(self, sensor_shape: tuple[int, int]) -> str:
         """Why region and binning do not go with a sensor of (height, width) pixels; "" if they do."""
@@ -92,6 +97,25 @@ class IndustrialCameraSettings(CameraSettings):
         description="pause between two network packets (GigE), for cameras that share a cable; none: as the "
         "camera is set",
     )
+
+    @field_validator("camera", "serial", mode="before", check_fields=False)
+    @classmethod
+    def _number_is_text(cls, value: object) -> object:
+        """YAML reads a serial number without quotes as a number."""
+        return str(value) if type(value) is int else value
+
+    def region_on(self, sensor_shape: tuple[int, int], name: str) -> tuple[int, int, int, int]:
+        """First row, first column, height and width of the region on a sensor of (height, width) pixels.
+
+        Raises:
+            LimitError: It goes beyond the sensor of the camera ``name``.
+        """
+        y, x, height, width = self.mode.region or (0, 0, *sensor_shape)
+        if y + height > sensor_shape[0] or x + width > sensor_shape[1]:
+            end, size = f"row {y + height}, column {x + width}", "{} x {} pixels".format(*sensor_shape)
+            hint = "choose a smaller or another one"
+            raise LimitError(f"{name}: end of the region", end, f"the sensor's {size}", hint)
+        return y, x, height, width
 
 
 class CoolingSettings(Settings):

@@ -93,9 +93,7 @@ class AndorCamera(CameraDriver):
     @property
     def facts(self) -> CameraFacts:
         """Limits of the camera; the read-out time is an estimate before ``open()``, then the SDK's value."""
-        shape = None
-        if self._sensor_shape is not None or self._settings.region is not None:
-            shape = self._settings.mode.frame_shape(self._sensor_shape or (0, 0))
+        shape = self._settings.frame_shape(self._sensor_shape)
         gain = float(self._settings.em_gain)
         return CameraFacts(self._readout_s, self._max_exposure_s, shape, gain, self._triggers)
 

@@ -35,11 +35,7 @@ class GenicamCamera(CameraDriver):
     @property
     def facts(self) -> CameraFacts:
         """Read-out time of the settings; longest exposure and frame shape as soon as they are known."""
-        mode, shape = self._settings.mode, self._reported.get("frame_shape")
-        if shape is None and self._connection.sensor_shape is not None:
-            shape = mode.frame_shape(self._connection.sensor_shape)
-        elif shape is None and mode.region is not None:
-            shape = mode.frame_shape(mode.region[2:])
+        shape = self._reported.get("frame_shape") or self._settings.frame_shape(self._connection.sensor_shape)
         _, longest_s = self._reported.get("exposure_bounds_s", (0.0, self._settings.max_exposure))
         longest_s = min(longest_s, self._settings.max_exposure)
         triggers = ("software", "internal", "external")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Final, Literal, TypeAlias
 
-from pydantic import Field, NonNegativeInt, field_validator
+from pydantic import Field, NonNegativeInt
 
 from labseq.plugin import Duration, Fraction, Frequency, IndustrialCameraSettings, Settings
 
@@ -73,9 +73,3 @@ class GenicamSettings(IndustrialCameraSettings):
         default=0.5, description="time without a packet after which an incomplete frame is abandoned (GigE)"
     )
     faults: FaultSettings = Field(default=FaultSettings(), description="failures of the simulated camera")
-
-    @field_validator("camera", "serial", mode="before")
-    @classmethod
-    def _number_is_text(cls, value: object) -> object:
-        """YAML reads a serial number without quotes as a number."""
-        return str(value) if type(value) is int else value

@@ -6,7 +6,7 @@ from typing import Any
 
 from labseq_aravis import Camera
 
-from labseq.plugin import ZERO_CELSIUS_K, DeviceError, LimitError, nearest, one_of
+from labseq.plugin import ZERO_CELSIUS_K, DeviceError, LimitError, check_step, nearest, one_of
 from labseq_genicam.connection import Link
 from labseq_genicam.settings import FORMATS, GenicamSettings, PixelFormat
 
@@ -98,7 +98,7 @@ def _set_binning(name: str, camera: Camera, binning: int) -> tuple[int, int]:
     camera.set_binning(1, 1)
     sensor_shape = camera.sensor_shape
     for axis in ("Horizontal", "Vertical") if binning > 1 else ():
-        _check(name, "binning", binning, camera.integer_bounds(f"Binning{axis}"))
+        check_step(f"{name}: binning", binning, camera.integer_bounds(f"Binning{axis}"))
         if camera.is_available(f"Binning{axis}Mode"):
             camera.set_string(f"Binning{axis}Mode", "Sum")
     camera.set_binning(binning, binning)
@@ -109,11 +109,7 @@ def _set_region(
     name: str, camera: Camera, settings: GenicamSettings, sensor_shape: tuple[int, int]
 ) -> tuple[int, int]:
     """Set the region; returns (height, width) of the frames."""
-    y, x, height, width = settings.mode.region or (0, 0, *sensor_shape)
-    if y + height > sensor_shape[0] or x + width > sensor_shape[1]:
-        end, size = f"row {y + height}, column {x + width}", "{} x {} pixels".format(*sensor_shape)
-        hint = "choose a smaller or another one"
-        raise LimitError(f"{name}: end of the region", end, f"the sensor's {size}", hint)
+    y, x, height, width = settings.region_on(sensor_shape, name)
     can_move = camera.is_available("OffsetX") and camera.is_available("OffsetY")
     for axis, size in (("Y", "Height"), ("X", "Width")):  # each limits the range of the other
         camera.set_integer(size, camera.integer_bounds(size)[0])
@@ -125,31 +121,14 @@ def _set_region(
         n_pixels = extent // binning
         if settings.region is None:
             n_pixels = nearest(n_pixels, low, high, step)
-        _check(name, f"region's {size.lower()}", n_pixels * binning, (low, high, step), binning)
+        check_step(f"{name}: region's {size.lower()}", n_pixels * binning, (low, high, step), binning)
         camera.set_integer(size, n_pixels)
         bounds = camera.integer_bounds(f"Offset{axis}") if can_move else (0, 0, 1)
-        _check(name, f"region's {axis.lower()}", start, bounds, binning)
+        check_step(f"{name}: region's {axis.lower()}", start, bounds, binning)
         if can_move:
             camera.set_integer(f"Offset{axis}", start // binning)
         shape.append(n_pixels)
     return shape[0], shape[1]
-
-
-def _check(name: str, what: str, value: int, bounds: tuple[int, int, int], unit: int = 1) -> None:
-    """Refuse a number that the camera does not accept; the error names the nearest valid one.
-
-    Args:
-        name: Name of the camera.
-        what: Name of the number, for errors.
-        value: The number, in pixels of the sensor.
-        bounds: Smallest, largest and increment, in the camera's own pixels.
-        unit: Pixels of the sensor per pixel of the camera: the binning.
-    """
-    low, high, step = (unit * bound for bound in bounds)
-    good = nearest(value, low, high, step)
-    if good != value:
-        limit = f"{low} to {high}, in steps of {step}, which the camera can do"
-        raise LimitError(f"{name}: {what}", value, limit, f"the nearest good one is {good}")
 
 
 def _set_gain(name: str, camera: Camera, gain: float | None) -> None:

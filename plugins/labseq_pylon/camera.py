@@ -35,11 +35,7 @@ class PylonCamera(CameraDriver):
     @property
     def facts(self) -> CameraFacts:
         """Read-out time and longest exposure of the settings; shape of the frames as soon as it is known."""
-        mode, shape = self._settings.mode, self._reported.get("frame_shape")
-        if shape is None and self._connection.sensor_shape is not None:
-            shape = mode.frame_shape(self._connection.sensor_shape)
-        elif shape is None and mode.region is not None:
-            shape = mode.frame_shape(mode.region[2:])
+        shape = self._reported.get("frame_shape") or self._settings.frame_shape(self._connection.sensor_shape)
         triggers = ("software", "internal", "external")
         return CameraFacts(self._settings.readout, self._settings.max_exposure, shape, triggers=triggers)
 

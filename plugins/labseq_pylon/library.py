@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Final, TypeAlias
 
-from labseq.plugin import DeviceError, LimitError, nearest, one_of
+from labseq.plugin import DeviceError, LimitError, check_step, one_of
 
 OTHERWISE: Final = "to try things without it, use another camera, for example `use: virtual`"
 
@@ -166,12 +166,8 @@ class Nodes:
             unit: Of the node, for errors: pixels of the sensor per pixel of a frame.
         """
         with self._sdk.doing(f"set its {what}"):
-            low, high, step = node.Min, node.Max, node.Inc
-            good = nearest(value, low, high, step)
-            if good != value:
-                limit = f"{low * unit} to {high * unit}, in steps of {step * unit}, which the camera can do"
-                hint = f"the nearest good one is {good * unit}"
-                raise LimitError(f"{self._sdk.name}: {what}", value * unit, limit, hint)
+            bounds = (node.Min, node.Max, node.Inc)
+            check_step(f"{self._sdk.name}: {what}", value * unit, bounds, unit)
             node.SetValue(value)
 
     def _can_write(self, node: Any | None) -> bool:

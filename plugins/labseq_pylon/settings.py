@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Final, Literal, Self, TypeAlias
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
 from labseq.plugin import IndustrialCameraSettings
 
@@ -41,12 +41,6 @@ class PylonSettings(IndustrialCameraSettings):
     packet_size: Annotated[int, Field(ge=220, le=16404)] | None = Field(
         default=None, description="bytes of a network packet (GigE); none: as the camera is set"
     )
-
-    @field_validator("camera", mode="before")
-    @classmethod
-    def _number_is_text(cls, camera: object) -> object:
-        """YAML reads a serial number without quotes as a number."""
-        return str(camera) if type(camera) is int else camera
 
     @model_validator(mode="after")
     def _one_gain(self) -> Self:

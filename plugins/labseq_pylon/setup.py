@@ -137,11 +137,7 @@ def set_sensor(
     Returns:
         (height, width) of the frames.
     """
-    y, x, height, width = settings.mode.region or (0, 0, *sensor_shape)
-    if y + height > sensor_shape[0] or x + width > sensor_shape[1]:
-        end, size = f"row {y + height}, column {x + width}", "{} x {} pixels".format(*sensor_shape)
-        hint = "choose a smaller or another one"
-        raise LimitError(f"{sdk.name}: end of the region", end, f"the sensor's {size}", hint)
+    y, x, height, width = settings.region_on(sensor_shape, sdk.name)
     for offset in ("OffsetY", "OffsetX"):  # first, since the offset limits the size
         nodes.set_integer(nodes.get((offset,), "region"), "start of the region", 0)
     binning, whole = settings.binning, settings.region is None

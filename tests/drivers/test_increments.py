@@ -1,8 +1,9 @@
 """Numbers that a device takes in steps."""
 
+import pytest
 from hypothesis import given, strategies as st
 
-from labseq.drivers.camera import nearest
+from labseq.plugin import LimitError, check_step, nearest
 
 
 @given(
@@ -20,3 +21,8 @@ def test_no_good_number_is_nearer_than_the_nearest(
     found = nearest(value, low, high, step)
     assert found in good
     assert abs(found - value) == min(abs(one - value) for one in good)
+
+
+def test_a_region_between_the_cameras_steps_is_refused_with_the_nearest_good_one() -> None:
+    with pytest.raises(LimitError, match=r"width is 500; .*in steps of 32.*the nearest good one is 512"):
+        check_step("camera: region's width", 500, (16, 1024, 16), 2)

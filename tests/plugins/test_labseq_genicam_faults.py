@@ -10,7 +10,6 @@ from typing import Any
 import labseq_aravis.library as aravis_library
 import pytest
 from labseq_aravis import load_library
-from labseq_genicam.setup import _check
 from labseq_genicam_sim import connection
 
 from labseq import DeviceError, LimitError, TransientError
@@ -71,12 +70,6 @@ def test_a_region_beyond_the_cameras_sensor_is_refused() -> None:
     with plugged_in() as fake:
         error = str(opening(camera=fake.address, region=region))
     assert "end of the region is row 64, column 2100; the limit is the sensor's 2048 x 2048 pixels" in error
-
-
-def test_a_region_between_the_cameras_steps_is_refused_with_the_nearest_good_one() -> None:
-    """Without a camera: the simulated one takes steps of one pixel."""
-    with pytest.raises(LimitError, match=r"width is 500; .*in steps of 32.*the nearest good one is 512"):
-        _check("camera", "region's width", 500, (16, 1024, 16), 2)
 
 
 def test_a_failed_buffer_is_a_lost_frame_and_the_series_goes_on() -> None:
