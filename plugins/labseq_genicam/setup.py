@@ -30,12 +30,7 @@ def identify(link: Link, settings: GenicamSettings) -> dict[str, Any]:
 
 
 def set_up(link: Link, settings: GenicamSettings, packet_size: int | None) -> dict[str, Any]:
-    """Bring a camera from any state into the driver's.
-
-    Args:
-        link: The open camera.
-        settings: The driver's settings.
-        packet_size: Bytes of a network packet; None: as the camera is set.
+    """Bring a camera from any state into the driver's; without a packet size, as the camera is set.
 
     Returns:
         The resulting settings: JSON-ready.

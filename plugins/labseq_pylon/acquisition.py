@@ -17,11 +17,7 @@ from labseq.plugin import (
     format_quantity,
     wait_for,
 )
-from labseq_pylon.library import (
-    EXPOSURE,
-    Nodes,
-    Sdk,
-)
+from labseq_pylon.library import Nodes, Sdk
 from labseq_pylon.setup import ticks_per_s
 
 BUFFER_BYTES: Final = 256 * 2**20
@@ -52,7 +48,7 @@ class Acquisition:
     def set_exposure(self, exposure_s: float) -> None:
         """Set the exposure time; frames carry the value that the camera accepted."""
         self._check_connected()
-        node = self._nodes.get(EXPOSURE, "exposure time")
+        node = self._nodes.get("exposure time", "ExposureTime", "ExposureTimeAbs")
         taken_us = self._nodes.set_real(node, "exposure", 1e6 * exposure_s, _microseconds)
         self._exposure_s = 1e-6 * taken_us
 
@@ -65,14 +61,14 @@ class Acquisition:
             edge: Its edge, "rising" or "falling".
         """
         choose = self._nodes.choose
-        choose(("TriggerSelector",), "trigger", "FrameStart", if_there=True)
-        choose(("TriggerMode",), "trigger mode", "Off" if trigger == "internal" else "On")
+        choose("TriggerSelector", "trigger", "FrameStart", if_there=True)
+        choose("TriggerMode", "trigger mode", "Off" if trigger == "internal" else "On")
         if trigger == "software":
-            choose(("TriggerSource",), "trigger source", "Software")
+            choose("TriggerSource", "trigger source", "Software")
         if trigger == "external":
-            choose(("TriggerSource",), "trigger source", line)
+            choose("TriggerSource", "trigger source", line)
             activation = {"rising": "RisingEdge", "falling": "FallingEdge"}[edge]
-            choose(("TriggerActivation",), "trigger edge", activation)
+            choose("TriggerActivation", "trigger edge", activation)
 
     def start(self, n_frames: int) -> None:
         """Queue the buffers and start; with the internal trigger the first exposure begins."""

@@ -58,7 +58,7 @@ class PylonCamera(CameraDriver):
         self._camera = camera = open_camera(sdk, connection.device(sdk), settings.model)
         self._nodes = nodes = Nodes(sdk, camera.GetNodeMap())
         sensor_shape = connection.set_up(nodes)
-        self._reported = identify(sdk, camera, nodes) | set_up(sdk, nodes, settings, sensor_shape)
+        self._reported = identify(sdk, camera, nodes) | set_up(nodes, settings, sensor_shape)
         self._acquisition = Acquisition(sdk, camera, nodes, self._clock, connection.ready_s)
 
     def _disconnect(self) -> None:

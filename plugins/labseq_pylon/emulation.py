@@ -75,9 +75,9 @@ class EmulatedCamera(CameraConnection):
     def set_up(self, nodes: Nodes) -> tuple[int, int]:
         """Make the camera read files of the simulated sensor's size, or of its minimum size."""
         for name, size in zip(("HeightMax", "WidthMax"), self._shape, strict=True):
-            node = nodes.get((name,), "size")
+            node = nodes.get("size", name)
             nodes.set_integer(node, "size", max(size, node.Min))
-        nodes.choose(("TestImageSelector",), "test image", "Off")
+        nodes.choose("TestImageSelector", "test image", "Off")
         self._folder = Path(mkdtemp(prefix="labseq-pylon-"))
         self._remove = weakref.finalize(self, shutil.rmtree, self._folder, ignore_errors=True)
         self._nodes = nodes
@@ -98,9 +98,9 @@ class EmulatedCamera(CameraConnection):
         self._n_exposed = self._n_due = 0
         for number in range(series.n_frames):
             self._path(number).touch()
-        nodes.get(("ImageFilename",), "image file").SetValue(str(self._path(0).parent))
-        nodes.choose(("ImageFileMode",), "image file", "On")
-        node = nodes.get(("ExposureTimeAbs",), "exposure")
+        nodes.get("image file", "ImageFilename").SetValue(str(self._path(0).parent))
+        nodes.choose("ImageFileMode", "image file", "On")
+        node = nodes.get("exposure", "ExposureTimeAbs")
         own_us = min(max(1e6 * series.exposure_s, node.Min), node.Max)
         node.SetValue(node.Min if self._clock.virtual else own_us)
         self._sensor.arm(series, self._mode, self._readout_s)

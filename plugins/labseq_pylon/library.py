@@ -7,28 +7,11 @@ import warnings
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, Final, TypeAlias
+from typing import Any, Final
 
 from labseq.plugin import DeviceError, LimitError, check_step, one_of
 
 OTHERWISE: Final = "to try things without it, use another camera, for example `use: virtual`"
-
-
-Names: TypeAlias = tuple[str, ...]
-"""Names of a node, those of newer cameras first."""
-
-EXPOSURE: Final[Names] = ("ExposureTime", "ExposureTimeAbs")
-GAIN: Final[Names] = ("Gain",)
-GAIN_RAW: Final[Names] = ("GainRaw",)
-TEMPERATURE: Final[Names] = ("DeviceTemperature", "TemperatureAbs")
-FIRMWARE: Final[Names] = ("DeviceFirmwareVersion", "DeviceVersion")
-READOUT: Final[Names] = ("SensorReadoutTime", "ReadoutTimeAbs")
-FRAME_RATE_ON: Final[Names] = ("AcquisitionFrameRateEnable",)
-SENSOR_HEIGHT: Final[Names] = ("SensorHeight", "HeightMax")
-SENSOR_WIDTH: Final[Names] = ("SensorWidth", "WidthMax")
-TICKS_PER_S: Final[Names] = ("GevTimestampTickFrequency",)
-PACKET_SIZE: Final[Names] = ("GevSCPSPacketSize",)
-PACKET_DELAY: Final[Names] = ("GevSCPD",)
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,13 +62,20 @@ def _reason(error: Exception) -> str:
 
 
 class Nodes:
-    """The settings of an open camera, which GenICam calls nodes; their names differ between generations."""
+    """The settings of an open camera, which GenICam calls nodes.
+
+    Their names differ between generations of cameras: where several are given, the newest comes first.
+
+    Attributes:
+        name: Name of the camera in the profile, for errors.
+    """
 
     def __init__(self, sdk: Sdk, node_map: Any) -> None:
+        self.name = sdk.name
         self._sdk = sdk
         self._map = node_map
 
-    def find(self, names: Names) -> Any | None:
+    def find(self, *names: str) -> Any | None:
         """The first of these nodes that the camera has now; None if it has none."""
         for name in names:
             node = self._map.GetNode(name)
@@ -93,45 +83,45 @@ class Nodes:
                 return node
         return None
 
-    def get(self, names: Names, what: str, hint: str = "") -> Any:
+    def get(self, what: str, *names: str, hint: str = "") -> Any:
         """The first of these nodes that the camera has now."""
-        node = self.find(names)
+        node = self.find(*names)
         if node is None:
             text = f"the camera has no {what} (no node {one_of(names)})"
-            raise DeviceError(self._sdk.name, f"{text}; {hint}" if hint else text)
+            raise DeviceError(self.name, f"{text}; {hint}" if hint else text)
         return node
 
-    def read(self, names: Names) -> Any | None:
+    def read(self, *names: str) -> Any | None:
         """The value of a node; None if the camera has none or does not answer."""
         try:
-            node = self.find(names)
+            node = self.find(*names)
             return None if node is None else node.GetValue()
         except self._sdk.genicam.GenericException:
             return None
 
-    def choose(self, names: Names, what: str, value: str, *, if_there: bool = False) -> None:
+    def choose(self, name: str, what: str, value: str, *, if_there: bool = False) -> None:
         """Set a node to one of several values.
 
         Args:
-            names: Names of the node.
+            name: Name of the node.
             what: Its name in errors.
             value: The value to choose.
             if_there: Whether to do nothing if the camera does not have it, or does not allow changes.
         """
-        if if_there and not self._can_write(self.find(names)):
+        if if_there and not self._can_write(self.find(name)):
             return
-        node = self.get(names, what)
+        node = self.get(what, name)
         if value not in node.Symbolics:
             text = f"its {what} cannot be {value}; expected {one_of(node.Symbolics)}"
-            raise DeviceError(self._sdk.name, text)
+            raise DeviceError(self.name, text)
         with self._sdk.doing(f"set its {what} to {value}"):
             node.SetValue(value)
 
-    def switch_off(self, names: Names) -> None:
+    def switch_off(self, name: str) -> None:
         """Set a node to False, if the camera has it."""
-        node = self.find(names)
+        node = self.find(name)
         if node is not None and self._can_write(node):
-            with self._sdk.doing(f"switch {names[0]} off"):
+            with self._sdk.doing(f"switch {name} off"):
                 node.SetValue(False)
 
     def set_real(
@@ -152,7 +142,7 @@ class Nodes:
             low, high = node.Min, node.Max
             if not low <= value <= high:
                 limit = f"{say(low)} to {say(high)}, which the camera can do"
-                raise LimitError(f"{self._sdk.name}: {what}", say(value), limit)
+                raise LimitError(f"{self.name}: {what}", say(value), limit)
             node.SetValue(value)
             return float(node.GetValue())
 
@@ -167,7 +157,7 @@ class Nodes:
         """
         with self._sdk.doing(f"set its {what}"):
             bounds = (node.Min, node.Max, node.Inc)
-            check_step(f"{self._sdk.name}: {what}", value * unit, bounds, unit)
+            check_step(f"{self.name}: {what}", value * unit, bounds, unit)
             node.SetValue(value)
 
     def _can_write(self, node: Any | None) -> bool:

@@ -5,90 +5,70 @@ from __future__ import annotations
 from typing import Any
 
 from labseq.plugin import ZERO_CELSIUS_K, DeviceError, LimitError, nearest
-from labseq_pylon.library import (
-    FIRMWARE,
-    FRAME_RATE_ON,
-    GAIN,
-    GAIN_RAW,
-    PACKET_DELAY,
-    PACKET_SIZE,
-    READOUT,
-    SENSOR_HEIGHT,
-    SENSOR_WIDTH,
-    TEMPERATURE,
-    TICKS_PER_S,
-    Nodes,
-    Sdk,
-)
+from labseq_pylon.library import Nodes, Sdk
 from labseq_pylon.settings import BITS, PixelFormat, PylonSettings
 
 NANOSECONDS_PER_S = 1_000_000_000
 """Ticks per second of cameras that do not report their frequency."""
 
 
-def set_up(sdk: Sdk, nodes: Nodes, settings: PylonSettings, sensor_shape: tuple[int, int]) -> dict[str, Any]:
+def set_up(nodes: Nodes, settings: PylonSettings, sensor_shape: tuple[int, int]) -> dict[str, Any]:
     """Set everything that stays the same from series to series, whatever state the camera is in.
-
-    Args:
-        sdk: pylon.
-        nodes: The nodes of the open camera.
-        settings: The driver's settings.
-        sensor_shape: (height, width) of the sensor.
 
     Returns:
         The resulting settings: JSON-ready.
     """
     for auto in ("ExposureAuto", "GainAuto"):
-        nodes.choose((auto,), auto, "Off", if_there=True)
-    nodes.choose(("ExposureMode",), "exposure mode", "Timed", if_there=True)
-    nodes.switch_off(FRAME_RATE_ON)
-    pixel_format = _set_pixel_format(sdk, nodes, settings.pixel_format)
-    frame_shape = set_sensor(sdk, nodes, settings, sensor_shape)
+        nodes.choose(auto, auto, "Off", if_there=True)
+    nodes.choose("ExposureMode", "exposure mode", "Timed", if_there=True)
+    nodes.switch_off("AcquisitionFrameRateEnable")
+    pixel_format = _set_pixel_format(nodes, settings.pixel_format)
+    frame_shape = _set_sensor(nodes, settings, sensor_shape)
     _set_gain(nodes, settings)
     _set_packets(nodes, settings)
     return {
         "pixel_format": pixel_format,
         "sensor_shape": sensor_shape,
         "frame_shape": frame_shape,
-        "gain_now": nodes.read(GAIN),
-        "gain_raw_now": nodes.read(GAIN_RAW),
-        "packet_size_now": nodes.read(PACKET_SIZE),
-        "sensor_readout_s": _microseconds(nodes.read(READOUT)),
+        "gain_now": nodes.read("Gain"),
+        "gain_raw_now": nodes.read("GainRaw"),
+        "packet_size_now": nodes.read("GevSCPSPacketSize"),
+        "sensor_readout_s": _microseconds(nodes.read("SensorReadoutTime", "ReadoutTimeAbs")),
     }
 
 
 def ticks_per_s(nodes: Nodes) -> int:
     """Frequency of the clock of a camera's time stamps."""
-    return int(nodes.read(TICKS_PER_S) or NANOSECONDS_PER_S)
+    return int(nodes.read("GevTimestampTickFrequency") or NANOSECONDS_PER_S)
 
 
-def _set_pixel_format(sdk: Sdk, nodes: Nodes, wanted: PixelFormat | None) -> PixelFormat:
-    node = nodes.get(("PixelFormat",), "pixel format")
+def _set_pixel_format(nodes: Nodes, wanted: PixelFormat | None) -> PixelFormat:
+    node = nodes.get("pixel format", "PixelFormat")
     if wanted is None:
         wanted = next((one for one in BITS if one in node.Symbolics), None)
         if wanted is None:
             text = "the camera has none of the pixel formats Mono8, Mono10, Mono12 and Mono16"
-            raise DeviceError(sdk.name, f"{text}; expected a monochrome camera")
-    nodes.choose(("PixelFormat",), "pixel format", wanted)
+            raise DeviceError(nodes.name, f"{text}; expected a monochrome camera")
+    nodes.choose("PixelFormat", "pixel format", wanted)
     return wanted
 
 
 def _set_gain(nodes: Nodes, settings: PylonSettings) -> None:
     if settings.gain is not None:
-        node = nodes.get(GAIN, "gain in dB", "use `gain_raw`")
+        node = nodes.get("gain in dB", "Gain", hint="use `gain_raw`")
         nodes.set_real(node, "gain", settings.gain, lambda gain: f"{gain:g} dB")
     if settings.gain_raw is not None:
-        node = nodes.get(GAIN_RAW, "gain in steps", "use `gain`")
+        node = nodes.get("gain in steps", "GainRaw", hint="use `gain`")
         nodes.set_integer(node, "gain_raw", settings.gain_raw)
 
 
 def _set_packets(nodes: Nodes, settings: PylonSettings) -> None:
     only = "only GigE cameras have packets: leave out `{}`"
     if settings.packet_size is not None:
-        node = nodes.get(PACKET_SIZE, "packet size", only.format("packet_size"))
+        node = nodes.get("packet size", "GevSCPSPacketSize", hint=only.format("packet_size"))
         nodes.set_integer(node, "packet size", settings.packet_size)
     if settings.packet_delay is not None:
-        node = nodes.get(PACKET_DELAY, "packet delay", only.format("packet_delay"))
+        node = nodes.get("packet delay", "GevSCPD", hint=only.format("packet_delay"))
         n_ticks = round(settings.packet_delay * ticks_per_s(nodes))
         nodes.set_integer(node, "packet delay in ticks", n_ticks)
 
@@ -103,7 +83,7 @@ def identify(sdk: Sdk, camera: Any, nodes: Nodes) -> dict[str, Any]:
     return {
         "model": info.GetModelName(),
         "serial_number": info.GetSerialNumber(),
-        "firmware": nodes.read(FIRMWARE),
+        "firmware": nodes.read("DeviceFirmwareVersion", "DeviceVersion"),
         "connection": info.GetDeviceClass(),
         "pylon_version": ".".join(map(str, sdk.pylon.GetPylonVersion()[:3])),
     }
@@ -111,7 +91,7 @@ def identify(sdk: Sdk, camera: Any, nodes: Nodes) -> dict[str, Any]:
 
 def temperature_k(nodes: Nodes) -> float | None:
     """Temperature of camera or sensor, whichever is selected, in kelvins; None if it has no sensor."""
-    celsius = nodes.read(TEMPERATURE)
+    celsius = nodes.read("DeviceTemperature", "TemperatureAbs")
     return None if celsius is None else round(celsius + ZERO_CELSIUS_K, 2)
 
 
@@ -119,54 +99,47 @@ def sensor_shape(nodes: Nodes) -> tuple[int, int]:
     """(height, width) of the sensor in pixels, read without binning: some cameras report binned pixels."""
     for axis in ("Vertical", "Horizontal"):
         _set_binning(nodes, axis, 1)
-    height, width = (nodes.get(names, "size").GetValue() for names in (SENSOR_HEIGHT, SENSOR_WIDTH))
+    height = nodes.get("size", "SensorHeight", "HeightMax").GetValue()
+    width = nodes.get("size", "SensorWidth", "WidthMax").GetValue()
     return int(height), int(width)
 
 
-def set_sensor(
-    sdk: Sdk, nodes: Nodes, settings: PylonSettings, sensor_shape: tuple[int, int]
-) -> tuple[int, int]:
-    """Set region and binning.
-
-    Args:
-        sdk: pylon.
-        nodes: The nodes of the open camera.
-        settings: The driver's settings; without a region the largest possible part of the sensor is read.
-        sensor_shape: (height, width) of the sensor.
+def _set_sensor(nodes: Nodes, settings: PylonSettings, sensor_shape: tuple[int, int]) -> tuple[int, int]:
+    """Set region and binning; without a region the largest possible part of the sensor is read.
 
     Returns:
         (height, width) of the frames.
     """
-    y, x, height, width = settings.region_on(sensor_shape, sdk.name)
+    y, x, height, width = settings.region_on(sensor_shape, nodes.name)
     for offset in ("OffsetY", "OffsetX"):  # first, since the offset limits the size
-        nodes.set_integer(nodes.get((offset,), "region"), "start of the region", 0)
+        nodes.set_integer(nodes.get("region", offset), "start of the region", 0)
     binning, whole = settings.binning, settings.region is None
     _set_binning(nodes, "Vertical", binning)
     _set_binning(nodes, "Horizontal", binning)
-    n_rows = _set_axis(sdk, nodes, "Y", y, height, binning, whole=whole)
-    n_cols = _set_axis(sdk, nodes, "X", x, width, binning, whole=whole)
+    n_rows = _set_axis(nodes, "Y", y, height, binning, whole=whole)
+    n_cols = _set_axis(nodes, "X", x, width, binning, whole=whole)
     return n_rows, n_cols
 
 
 def _set_binning(nodes: Nodes, axis: str, binning: int) -> None:
-    name = (f"Binning{axis}",)
+    name = f"Binning{axis}"
     if binning > 1 or nodes.find(name) is not None:
-        nodes.set_integer(nodes.get(name, "binning", "leave out `binning`"), "binning", binning)
+        nodes.set_integer(nodes.get("binning", name, hint="leave out `binning`"), "binning", binning)
     if binning > 1:
-        nodes.choose((f"Binning{axis}Mode",), "way of binning", "Sum", if_there=True)
+        nodes.choose(f"Binning{axis}Mode", "way of binning", "Sum", if_there=True)
 
 
-def _set_axis(sdk: Sdk, nodes: Nodes, axis: str, start: int, size: int, binning: int, *, whole: bool) -> int:
+def _set_axis(nodes: Nodes, axis: str, start: int, size: int, binning: int, *, whole: bool) -> int:
     """Set offset and size of the region along an axis; returns its number of pixels in a frame."""
     name = {"Y": "Height", "X": "Width"}[axis]
     begins, extends = (f"region's {what}" for what in (axis.lower(), name.lower()))
     if start % binning:
         hint = f"the nearest good one is {nearest(start, 0, start + binning, binning)}"
-        raise LimitError(f"{sdk.name}: {begins}", start, f"multiples of the binning, {binning}", hint)
-    node = nodes.get((name,), "region")
+        raise LimitError(f"{nodes.name}: {begins}", start, f"multiples of the binning, {binning}", hint)
+    node = nodes.get("region", name)
     n_pixels = size // binning
     if whole:
         n_pixels = nearest(n_pixels, node.Min, node.Max, node.Inc)
     nodes.set_integer(node, extends, n_pixels, binning)
-    nodes.set_integer(nodes.get((f"Offset{axis}",), "region"), begins, start // binning, binning)
+    nodes.set_integer(nodes.get("region", f"Offset{axis}"), begins, start // binning, binning)
     return n_pixels
