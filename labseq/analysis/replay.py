@@ -412,9 +412,7 @@ class _Replayer:
         chosen = {kind: self._changed(kind, one) for kind, one in own.items() if kind in names}
         motion = point.bench.profile.motion
         made, streams = construct(
-            chosen,
-            Context(grid=self.grid, motion=motion, calibrations=self.calibrations),
-            self.run.seed,
+            chosen, Context(grid=self.grid, motion=motion, calibrations=self.calibrations), self.run.seed
         )
         for one in made.values():
             if isinstance(one, NeedsWarmUp):

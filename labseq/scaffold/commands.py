@@ -31,12 +31,10 @@ def new(
         ),
     ],
     name: Annotated[
-        str,
-        typer.Argument(metavar="NAME", help="Its name, for sequences and profiles.", show_default=False),
+        str, typer.Argument(metavar="NAME", help="Its name, for sequences and profiles.", show_default=False)
     ],
     package: Annotated[
-        bool,
-        typer.Option("--package", help="Make the plugin a Python package that can be installed."),
+        bool, typer.Option("--package", help="Make the plugin a Python package that can be installed.")
     ] = False,
     profile: Annotated[
         str | None,

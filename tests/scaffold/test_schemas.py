@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import runpy
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -18,64 +18,37 @@ from labseq.registry import Registry
 from labseq.scaffold.schemas import FileKind, file_schema, model_schema, quantity_schema
 from labseq.session import load_plugins
 from labseq.units import UNITS
+from tests.config import test_wrong_sequences
+from tests.config.test_profile import WRONG
+from tests.config.wrong_files import wrong_files
 
 ROOT = Path(__file__).parents[2]
 FILES = [
     *(("sequence", path) for path in sorted((ROOT / "sequences").glob("*.yaml"))),
     *(("profile", path) for path in sorted((ROOT / "hardware_profiles").glob("*.yaml"))),
 ]
-ABOUT_VALUES = {
-    "sequence": {
-        "shots as a float",
-        "name with a separator",
-        "name with a control character",
-        "name of dots",
-    },
-    "bad_steps": {
-        "step name twice",
-        "zero exposure",
-        "infinite time",
-        "time that is no number",
-        "time beyond numbers",
-        "too few windows",
-        "too many windows",
-        "limit of nothing",
-        "argument infinite",
-        "required setting missing in an empty step",
-        "wait for a time and for a signal",
-        "wait for a signal without end",
-        "timeout of a wait for a time",
-        "depth of a ramp above 1",
-        "ramp that takes no time",
-    },
-    "profile": {
-        "spacing of zero",
-        "comb below zero",
-        "comb that begins at zero",
-        "comb of one frequency",
-        "device called like a role",
-        "device with a space",
-        "timeout of zero",
-    },
-}
-"""What is wrong about the values of a file that is well-formed; `labseq check` reports it."""
+ABOUT_VALUES = re.compile(
+    r"with '/' in it|at least one letter|is taken by step|'0 ms'; expected more|finite number|one per cycle"
+    r"|in SI units|a wait needs|excludes 'for'|has no 'timeout'|needs 'for'|lowest of the|a step of 0|a device is called"
+)
+"""Messages about the values of a file that is well-formed; only `labseq check` reports them."""
 
 
 def catalogue() -> list[Any]:
-    """The bad files of the tests of the configuration: kind, content, and whether only values are wrong."""
+    """The wrong files of the tests of the configuration: kind, content, and whether only values are wrong."""
     found: list[Any] = []
-    for name, about_values in ABOUT_VALUES.items():
-        module = runpy.run_path(str(ROOT / "tests" / "config" / f"test_{name}.py"))
-        cases = {case[0]: case for case in module["CASES"]}
-        assert about_values <= set(cases)
-        kind = "profile" if name == "profile" else "sequence"
-        for case, (_, old, new, _) in cases.items():
+    tables = (("sequence", test_wrong_sequences.KEYS + test_wrong_sequences.STEPS[1:]), ("profile", WRONG))
+    for kind, table in tables:
+        good = (ROOT / "tests" / "config" / "data" / f"{kind}.yaml").read_text("utf-8")
+        for old, new, message in wrong_files(table):
             try:
-                node = compose(module["GOOD"].replace(old, new, 1), case)
+                node = compose(good.replace(old, new, 1), kind)
             except ConfigError:  # no YAML
                 continue
             data = None if node is None else node.plain()
-            found.append(pytest.param(kind, data, case in about_values, id=f"{name}: {case}"))
+            found.append(
+                pytest.param(kind, data, bool(ABOUT_VALUES.search(message)), id=f"{kind}: {message}")
+            )
     return found
 
 
