@@ -29,7 +29,8 @@ FILES = [
 ]
 ABOUT_VALUES = re.compile(
     r"with '/' in it|at least one letter|is taken by step|'0 ms'; expected more|finite number|one per cycle"
-    r"|in SI units|a wait needs|excludes 'for'|has no 'timeout'|needs 'for'|lowest of the|a step of 0|a device is called"
+    r"|in SI units|a wait needs|excludes 'for'|has no 'timeout'|needs 'for'|lowest of the"
+    r"|a step of 0|a device is called"
 )
 """Messages about the values of a file that is well-formed; only `labseq check` reports them."""
 
