@@ -84,20 +84,10 @@ def planners(
 ) -> None:
     """Let planners plan the same random loadings, check every plan, and compare the results."""
     from labseq.bench.planners import BenchRequest
-    from labseq.bench.terminal import BenchOutput, bench_planners
+    from labseq.bench.terminal import bench_planners
 
-    request = BenchRequest(
-        planners=planners,
-        grid=grid,
-        target=target,
-        loading=loading,
-        dop=dop,
-        loadings=loadings,
-        seed=seed,
-        overrides=tuple(overrides or ()),
-        workers=workers,
-    )
-    bench_planners(request, BenchOutput(json=json, csv=csv, png=png))
+    request = BenchRequest(planners, grid, target, loading, dop, loadings, seed, tuple(overrides or ()))
+    bench_planners(request, workers, json=json, csv=csv, png=png)
 
 
 @bench.command(epilog=LATENCY_EXAMPLES, short_help="Measure the time from a frame to the first light.")

@@ -43,12 +43,7 @@ _GRID: Final = re.compile(r"\s*(\d{1,6})\s*[xX]\s*(\d{1,6})\s*")
 
 @dataclass(frozen=True, slots=True)
 class PlannerEntry:
-    """A planner in a comparison, with its settings.
-
-    Attributes:
-        planner: Its name.
-        settings: Its settings, as typed; all others have their defaults.
-    """
+    """A planner in a comparison; settings that are not given have their defaults."""
 
     planner: str
     settings: Words = ()
@@ -89,7 +84,7 @@ class Comparison:
 
     Attributes:
         planner_entries: The planners.
-        conditions: Grids, loadings, targets and motions.
+        conditions: Each has ``n_loadings`` loadings.
         n_loadings: Number of loadings of each condition.
         seed: Seed of all loadings.
         settings: Settings from ``--set`` for every planner, as typed.
@@ -135,9 +130,6 @@ def parse_entrants(text: str) -> tuple[PlannerEntry, ...]:
 def parse_grid(text: str) -> tuple[int, int]:
     """Read the size of a grid.
 
-    Raises:
-        ConfigError: It is none.
-
     Example:
         >>> parse_grid("20x24")
         (20, 24)
@@ -152,9 +144,6 @@ def parse_grid(text: str) -> tuple[int, int]:
 
 def parse_loading(text: str) -> float:
     """Read the probability that a site is loaded.
-
-    Raises:
-        ConfigError: It is none.
 
     Example:
         >>> parse_loading("75 %"), parse_loading("0.55")
@@ -204,12 +193,9 @@ _MOTION_ADDRESS: Final = "profile.mobile_tweezers"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Runner:
-    """A constructed planner.
+    """A constructed planner, with all its settings, JSON-ready.
 
     Attributes:
-        planner: The planner.
-        name: Its name.
-        settings: All its settings, JSON-ready.
         degree_of_parallelism: Maximum number of tweezers on at once, for the check of its plans.
     """
 
@@ -221,15 +207,7 @@ class Runner:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PreparedCondition:
-    """A condition, ready for planning.
-
-    Attributes:
-        grid: The grid of sites.
-        motion: How the mobile tweezers move.
-        target: The target pattern.
-        loading: Probability that a site is loaded.
-        runners: A planner per entrant.
-    """
+    """A condition, ready for planning, with one runner for each planner of the comparison."""
 
     grid: SiteGrid
     motion: MotionSpec
@@ -239,24 +217,15 @@ class PreparedCondition:
 
 
 def set_up(comparison: Comparison) -> list[PreparedCondition]:
-    """Read and validate a comparison; returns one prepared condition for each.
-
-    Raises:
-        ConfigError: The comparison has an error; says what was expected.
-        PluginLoadError: A named plugin failed to load.
-    """
+    """Load the plugins, and validate and prepare every condition."""
     host = load_plugins()
-    return [_course(host, comparison, condition) for condition in comparison.conditions]
+    return [_prepare(host, comparison, condition) for condition in comparison.conditions]
 
 
-def warm(courses: list[PreparedCondition]) -> None:
-    """Compile all kernels that will be needed, or load them from the cache.
-
-    Raises:
-        PlanError: A planner failed; names the planner.
-    """
+def warm(prepared: list[PreparedCondition]) -> None:
+    """Compile all kernels that will be needed, or load them from the cache."""
     importlib.import_module("labseq.motion.check_kernels")
-    for runner in [runner for course in courses for runner in course.runners]:
+    for runner in [runner for condition in prepared for runner in condition.runners]:
         if isinstance(runner.planner, NeedsWarmUp):
             try:
                 runner.planner.warm()
@@ -264,7 +233,7 @@ def warm(courses: list[PreparedCondition]) -> None:
                 raise PlanError(f"warm() raised {type(error).__name__}: {error}", runner.name) from error
 
 
-def _course(host: PluginHost, comparison: Comparison, condition: Condition) -> PreparedCondition:
+def _prepare(host: PluginHost, comparison: Comparison, condition: Condition) -> PreparedCondition:
     found = ProblemCollector()
     grid, motion, target = SiteGrid(*condition.shape), _motion(condition), None
     with found:
@@ -366,17 +335,18 @@ _FAILED: Final = (0, 0, 0.0, 0.0, *_NO_SCANS, 0.0, 0, 0, True)
 
 
 class Scanned(Protocol):
-    """A plan made of scans, in which moving tweezers pick up and drop atoms without stopping."""
+    """A plan made of scans, in which moving tweezers pick up and drop atoms without stopping.
+
+    Attributes:
+        plan: The equivalent batches.
+        n_scans: Number of scans, which the paper of the algorithm counts as moves.
+    """
 
     @property
-    def plan(self) -> Plan:
-        """The equivalent batches."""
-        ...
+    def plan(self) -> Plan: ...  # noqa: D102 - see above
 
     @property
-    def n_scans(self) -> int:
-        """Number of scans, which the paper of the algorithm counts as moves."""
-        ...
+    def n_scans(self) -> int: ...  # noqa: D102
 
     def duration_s(self, grid: SiteGrid, motion: MotionSpec) -> float:
         """Time that the scans would take, in seconds."""
@@ -403,14 +373,7 @@ class Job:
 
 @dataclass(frozen=True, slots=True)
 class Failure:
-    """A planner raised, or its plan breaks a rule.
-
-    Attributes:
-        planner_entry: Index of the planner.
-        condition: Index of the condition.
-        loading: Index of the loading.
-        message: The error.
-    """
+    """A planner raised, or its plan breaks a rule; planner, condition and loading are indices."""
 
     planner_entry: int
     condition: int
@@ -423,8 +386,7 @@ class Done:
     """The results of a job.
 
     Attributes:
-        job: The job.
-        results: :data:`RESULT` (n_entrants, n_loadings).
+        results: :data:`RESULT` (n_planners, n_loadings).
         loadings: :data:`LOADING` (n_loadings,).
         failures: The first failure of each planner.
     """
@@ -433,9 +395,6 @@ class Done:
     results: NDArray[Any]
     loadings: NDArray[Any]
     failures: tuple[Failure, ...]
-
-
-Scan = Callable[[Occupancy, TargetPattern], Scanned]
 
 
 def loading_seed(seed: int, index: int) -> int:
@@ -487,29 +446,22 @@ def lines_to_cover(vacancies: NDArray[np.bool_]) -> NDArray[np.int32]:
     return np.count_nonzero(matched.reshape(n_loadings, n_rows) >= 0, axis=1).astype(np.int32)
 
 
-def work(courses: list[PreparedCondition], seed: int, job: Job) -> Done:
-    """Run every planner on the loadings of a job, and check and count its plans.
-
-    Args:
-        courses: The prepared conditions.
-        seed: Seed of all loadings.
-        job: The loadings.
-    """
-    course = courses[job.condition]
+def work(prepared: list[PreparedCondition], seed: int, job: Job) -> Done:
+    """Run every planner on the loadings of a job, and check and count its plans."""
+    condition = prepared[job.condition]
     indices = range(job.start, job.stop)
-    occupancies = [draw(course.grid.shape, course.loading, seed, index) for index in indices]
+    occupancies = [draw(condition.grid.shape, condition.loading, seed, index) for index in indices]
     loadings = np.empty(len(occupancies), LOADING)
     stack = np.array(occupancies)
     loadings["n_atoms"] = np.count_nonzero(stack, axis=(1, 2))
-    loadings["n_lines"] = lines_to_cover(course.target.fill & ~stack)
-    results = np.empty((len(course.runners), len(occupancies)), RESULT)
+    loadings["n_lines"] = lines_to_cover(condition.target.fill & ~stack)
+    results = np.empty((len(condition.runners), len(occupancies)), RESULT)
     failures: list[Failure] = []
-    for i, runner in enumerate(course.runners):
+    for i, runner in enumerate(condition.runners):
         rows: list[tuple[Any, ...]] = []
-        scan = runner.planner.scan if isinstance(runner.planner, ScanningPlanner) else None
         for index, occupancy in zip(indices, occupancies, strict=True):
             try:
-                rows.append(_run(course, runner, scan, occupancy))
+                rows.append(_run(condition, runner, occupancy))
             except Exception as error:  # noqa: BLE001 - a planner may raise anything; it is counted
                 if not any(failure.planner_entry == i for failure in failures):
                     failures.append(Failure(i, job.condition, index, _format_error(error)))
@@ -520,33 +472,35 @@ def work(courses: list[PreparedCondition], seed: int, job: Job) -> Done:
 
 def prepare(comparison: Comparison) -> Callable[[Job], Done]:
     """Prepare for jobs; every planner is called once, so that no measured call is the first one."""
-    courses = set_up(comparison)
-    warm(courses)
-    for i in range(len(courses)):
-        work(courses, comparison.seed, Job(i, 0, 1))
-    return lambda job: work(courses, comparison.seed, job)
+    prepared = set_up(comparison)
+    warm(prepared)
+    for i in range(len(prepared)):
+        work(prepared, comparison.seed, Job(i, 0, 1))
+    return lambda job: work(prepared, comparison.seed, job)
 
 
-def _run(
-    course: PreparedCondition, runner: Runner, scan: Scan | None, occupancy: Occupancy
-) -> tuple[Any, ...]:
-    own = occupancy.copy()  # a copy, in case a planner changes its input
+def _run(condition: PreparedCondition, runner: Runner, occupancy: Occupancy) -> tuple[Any, ...]:
+    own = occupancy.copy()  # a planner may change its input
     scanned: Scanned | None = None
     start_s = perf_counter()
-    if scan is None:
-        plan = runner.planner.plan(own, course.target)
-    else:
-        scanned = scan(own, course.target)
+    if isinstance(runner.planner, ScanningPlanner):
+        scanned = runner.planner.scan(own, condition.target)
         plan = scanned.plan
+    else:
+        plan = runner.planner.plan(own, condition.target)
     planning_s = perf_counter() - start_s
     dop = runner.degree_of_parallelism
-    report = check_plan(plan, occupancy, course.target, dop, course.grid, course.motion)
+    report = check_plan(plan, occupancy, condition.target, dop, condition.grid, condition.motion)
     scans = _NO_SCANS
     if scanned is not None:
-        scans = float(scanned.n_scans), scanned.duration_s(course.grid, course.motion)
+        scans = float(scanned.n_scans), scanned.duration_s(condition.grid, condition.motion)
+    starts = ~plan.linked
+    n_atoms_moved = int(np.diff(plan.batch_offsets)[starts].sum())
+    n_sites = int(np.abs(plan.moves[:, 2:] - plan.moves[:, :2]).sum())
     return (
-        *_batches_and_atoms(plan),
-        _n_sites(plan) * course.grid.spacing_m,
+        int(np.count_nonzero(starts)),
+        n_atoms_moved,
+        n_sites * condition.grid.spacing_m,
         report.duration_s,
         *scans,
         planning_s,
@@ -554,19 +508,6 @@ def _run(
         report.n_surplus,
         False,
     )
-
-
-def _batches_and_atoms(plan: Plan) -> tuple[int, int]:
-    """Number of batches and of atoms moved, with linked batches counted as one."""
-    if not plan.linked.any():
-        return plan.n_batches, plan.n_atom_moves
-    starts = ~plan.linked
-    return int(np.count_nonzero(starts)), int(np.diff(plan.batch_offsets)[starts].sum())
-
-
-def _n_sites(plan: Plan) -> int:
-    """Total distance of all atom moves, in sites."""
-    return int(np.abs(plan.moves[:, 2:] - plan.moves[:, :2]).sum())
 
 
 def _format_error(error: Exception) -> str:

@@ -41,7 +41,6 @@ class Stage:
     """Durations of a stage over all loadings.
 
     Attributes:
-        name: Its name.
         median_s: Median on this computer's clock.
         p99_s: The 99th percentile on this computer's clock.
         modelled_s: Median of the additional time of the hardware, modelled on the session's clock.
@@ -66,10 +65,6 @@ class LatencyReport:
     """The times of a profile and a sequence, on this computer.
 
     Attributes:
-        n_loadings: Number of random loadings.
-        seed: Seed of the loadings.
-        profile: Name of the profile.
-        planner: Name of the planner.
         degree_of_parallelism: Maximum number of tweezers on at once.
         n_batches: Median number of batches of a plan.
         playing_s: Median playing time of its tone program.
@@ -79,13 +74,11 @@ class LatencyReport:
         planned: From a frame in memory to the tone program.
         device: Model of the mobile tweezers, from their description.
         mode: Their mode, if they have one.
-        readout_s: The camera's read-out time, from its facts.
+        readout_s: The camera's read-out time.
         prepare: Duration of ``prepare()`` of the mobile tweezers, which must end before they can start.
         start: Duration of ``play()``.
         trigger_s: Time from the trigger to the output, from the description of the device.
-        n_cores: Processor cores.
         load: Mean number of busy processes in the last minute; None if unknown.
-        warnings: Warnings about the profile.
     """
 
     n_loadings: int
@@ -235,14 +228,12 @@ class _Timed:
         self.detect_s = self.plan_s = 0.0
 
     def detect(self, frame: Frame) -> tuple[Occupancy, NDArray[np.float32]]:
-        """Find the atoms."""
         start_s = time.perf_counter()
         answer = self._detector.detect(frame)
         self.detect_s = time.perf_counter() - start_s
         return answer
 
     def plan(self, occupancy: Occupancy, target: TargetPattern) -> Plan:
-        """Plan the moves."""
         start_s = time.perf_counter()
         answer = self._planner.plan(occupancy, target)
         self.plan_s = time.perf_counter() - start_s

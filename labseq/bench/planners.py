@@ -40,11 +40,6 @@ _FAREWELL_S: Final = 1.0
 def run_jobs(comparison: Comparison, jobs: Iterable[Job], n_workers: int) -> Generator[Done]:
     """Run all jobs; one worker runs them in this process.
 
-    Args:
-        comparison: The comparison of the jobs, valid.
-        jobs: The jobs; the results come in nearly the same order.
-        n_workers: Number of processes.
-
     Yields:
         The results of each job, as soon as it is done. A generator that is closed early
         ends its processes at once.
@@ -142,19 +137,7 @@ ALONE_S: Final = 2.0
 
 @dataclass(frozen=True, slots=True)
 class BenchRequest:
-    """The comparison, as text from the command line.
-
-    Attributes:
-        planners: See :func:`labseq.bench.comparison.parse_entrants`.
-        grid: "20x20".
-        target: "compact:15x15".
-        loading: "75 %".
-        dop: Degree of parallelism, for every planner that has such a setting.
-        loadings: Number of loadings of each condition.
-        seed: Seed of all loadings.
-        overrides: See :func:`labseq.bench.comparison.parse_overrides`.
-        workers: Number of processes; None for one per core, if there is enough work.
-    """
+    """The options of ``labseq bench planners`` that say what is compared, as text."""
 
     planners: str = "psca"
     grid: str = "20x20"
@@ -164,15 +147,10 @@ class BenchRequest:
     loadings: int = 1000
     seed: int = 1
     overrides: Sequence[str] = ()
-    workers: int | None = None
 
 
 def read_request(request: BenchRequest) -> Comparison:
-    """Convert a request to a comparison.
-
-    Raises:
-        ConfigError: The request has an error; says what was expected.
-    """
+    """Convert a request to a comparison; raises ``ConfigError`` if it has an error."""
     settings, motion = parse_overrides(request.overrides)
     shape, loading = parse_grid(request.grid), parse_loading(request.loading)
     condition = Condition(shape, request.target, loading, request.dop, (*BARE_MOTION, *motion))
@@ -207,15 +185,15 @@ def compare(
     from labseq.kernel import announcing
 
     start_s = time.perf_counter()
-    courses = set_up(comparison)
-    tally = Tally(comparison, courses)
-    wanted = comparison.n_loadings * len(courses)
+    prepared = set_up(comparison)
+    tally = Tally(comparison, prepared)
+    wanted = comparison.n_loadings * len(prepared)
     ended_by: LabseqError | None = None
     received: list[int] = []
     try:
         with _interrupted_by_signals(received):
             with announcing(announce):
-                warm(courses)
+                warm(prepared)
             progress(0, wanted)
             with closing(_results(comparison, n_workers)) as results:
                 for done in results:

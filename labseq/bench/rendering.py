@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import time
+import timeit
 from collections.abc import Callable, Generator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
@@ -28,6 +28,8 @@ STORED_5: Final = "stored waveforms, 5 tones"
 STORED_20: Final = "stored waveforms, 20 tones"
 NUMPY_20: Final = "numpy, 20 tones"
 
+Samples = NDArray[np.int16]
+
 SITE_S: Final = 4.49e-6 / 0.130
 SITES: Final = 5
 """Distance of each transport, in sites, about the mean of a plan."""
@@ -39,14 +41,7 @@ PLAN: Final = PlanRequest("random:20x20@75%", "compact:15x15", "psca", 7, seed=1
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One measurement.
-
-    Attributes:
-        name: The rendered program and the method.
-        gigasamples_per_s: Samples of both channels per second, in 1e9.
-        playing_over_rendering: Playing time over rendering time.
-        goal: Minimum of ``playing_over_rendering``; None if there is none.
-    """
+    """One measurement: samples of both channels per second, in 1e9, and the goal for the other ratio."""
 
     name: str
     gigasamples_per_s: float
@@ -56,14 +51,7 @@ class Row:
 
 @dataclass(frozen=True, slots=True)
 class Ratio:
-    """The ratio of two rendering times.
-
-    Attributes:
-        name: Its name.
-        value: The ratio.
-        goal: Its maximum or minimum.
-        at_most: Whether ``goal`` is a maximum.
-    """
+    """The ratio of two rendering times; the goal is a minimum, or a maximum if ``at_most``."""
 
     name: str
     value: float
@@ -77,7 +65,6 @@ class WaveformReport:
 
     Attributes:
         rows: A row for each kind of segment and for a plan; stored waveforms and numpy last.
-        ratios: The ratios with goals.
         sample_rate_hz: Sample rate of all rows.
         repeats: Number of repetitions; the fastest one counts.
     """
@@ -171,15 +158,24 @@ def uniform_program(
 def render_all(renderer: Renderer) -> None:
     """Render a whole program in two threads, each into its own buffer and half of the time."""
 
+    def render(out: Samples, at: int) -> None:
+        for channel in range(N_CHANNELS):
+            renderer.write(channel, at, out)
+
+    _in_two_threads(render, renderer.n_samples)
+
+
+def _in_two_threads(render: Callable[[Samples, int], None], n_samples: int) -> None:
+    """Render chunks that start at a sample into a buffer of each thread."""
+
     def work(start: int, stop: int) -> None:
         out = np.empty(CHUNK, np.int16)
         for at in range(start, stop, CHUNK):
-            for channel in range(N_CHANNELS):
-                renderer.write(channel, at, out[: min(CHUNK, stop - at)])
+            render(out[: min(CHUNK, stop - at)], at)
 
-    half = renderer.n_samples // 2
+    half = n_samples // 2
     with ThreadPoolExecutor(1) as other:
-        later = other.submit(work, half, renderer.n_samples)
+        later = other.submit(work, half, n_samples)
         work(0, half)
         later.result()
 
@@ -200,33 +196,19 @@ def stored_waveforms(grid: SiteGrid, sample_rate_hz: float) -> NDArray[np.int16]
 
 
 def sum_all_stored(stored: NDArray[np.int16], n_tones: int) -> None:
-    """The paper's method: sum ``n_tones`` stored waveforms for one channel, and take one for the other.
-
-    As in :func:`render_all`, two threads do half of the time each, into the same buffers.
-    """
+    """The paper's method: sum ``n_tones`` stored waveforms for one channel, and take one for the other."""
     from labseq.motion.render_direct_kernels import sum_stored
 
-    def work(start: int, stop: int) -> None:
-        out = np.empty(CHUNK, np.int16)
-        for at in range(start, stop, CHUNK):
-            for picked in (np.arange(1), np.arange(n_tones)):
-                sum_stored(stored, picked, at, out[: min(CHUNK, stop - at)])
+    def add(out: Samples, at: int) -> None:
+        for picked in (np.arange(1), np.arange(n_tones)):
+            sum_stored(stored, picked, at, out)
 
-    half = STORED // 2
-    with ThreadPoolExecutor(1) as other:
-        later = other.submit(work, half, STORED)
-        work(0, half)
-        later.result()
+    _in_two_threads(add, STORED)
 
 
 def _best(call: Callable[[], object], repeats: int) -> float:
     """Shortest duration of some calls, in seconds."""
-    taken: list[float] = []
-    for _ in range(repeats):
-        start_s = time.perf_counter()
-        call()
-        taken.append(time.perf_counter() - start_s)
-    return min(taken)
+    return min(timeit.repeat(call, number=1, repeat=repeats))
 
 
 def _row(name: str, n_samples: int, sample_rate_hz: float, taken_s: float, goal: float | None = None) -> Row:

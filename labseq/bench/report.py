@@ -63,17 +63,11 @@ ESTIMATES: Final = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Row:
-    """Results of one planner under one condition.
-
-    The means are over the loadings with a valid plan.
+    """Results of one planner under one condition; the means are over the loadings with a valid plan.
 
     Attributes:
-        planner_entry: The planner.
-        condition: Grid, target, loading and motion.
-        settings: All its settings, JSON-ready.
+        settings: All settings of the planner, JSON-ready.
         degree_of_parallelism: Maximum number of tweezers on at once for which its plans were checked.
-        n_target_atoms: Atoms in the target.
-        n_loadings: Number of loadings.
         n_short: Number of loadings with fewer atoms than the target.
         n_failed: Loadings for which the planner failed or its plan broke a rule.
         first_failure: The first of these, or None.
@@ -152,7 +146,6 @@ class Report:
     """The results of a comparison.
 
     Attributes:
-        comparison: The comparison.
         rows: A row per condition and planner; none for a condition without any loading done.
         n_done: Loadings that were done, over all conditions.
         duration_s: Duration of the comparison, in seconds.
@@ -203,13 +196,13 @@ class Report:
 class Tally:
     """Collects the results of the jobs of a comparison."""
 
-    def __init__(self, comparison: Comparison, courses: Sequence[PreparedCondition]) -> None:
-        n_entrants, n_loadings = len(comparison.planner_entries), comparison.n_loadings
+    def __init__(self, comparison: Comparison, prepared: Sequence[PreparedCondition]) -> None:
+        n_planners, n_loadings = len(comparison.planner_entries), comparison.n_loadings
         self._comparison = comparison
-        self._courses = courses
-        self._results = [np.empty((n_entrants, n_loadings), RESULT) for _ in courses]
-        self._loadings = [np.empty(n_loadings, LOADING) for _ in courses]
-        self._is_done = [np.zeros(n_loadings, np.bool_) for _ in courses]
+        self._prepared = prepared
+        self._results = [np.empty((n_planners, n_loadings), RESULT) for _ in prepared]
+        self._loadings = [np.empty(n_loadings, LOADING) for _ in prepared]
+        self._is_done = [np.zeros(n_loadings, np.bool_) for _ in prepared]
         self._failures: dict[tuple[int, int], Failure] = {}
 
     @property
@@ -238,13 +231,13 @@ class Tally:
         )
 
     def _row(self, i: int, planner_entry: int) -> Row:
-        course, done = self._courses[i], self._is_done[i]
+        condition, done = self._prepared[i], self._is_done[i]
         results, loadings = self._results[i][planner_entry, done], self._loadings[i][done]
         right = ~results["failed"]
-        good, n_atoms = results[right], course.target.n_atoms
+        good, n_atoms = results[right], condition.target.n_atoms
         filled = good["n_defects"] == 0
         planning_s = good["planning_s"] if len(good) else np.array([math.nan])
-        runner = course.runners[planner_entry]
+        runner = condition.runners[planner_entry]
         return Row(
             planner_entry=self._comparison.planner_entries[planner_entry],
             condition=self._comparison.conditions[i],
@@ -289,11 +282,7 @@ def _flat(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def save_histogram(path: Path, report: Report) -> None:
-    """Draw how many batches the planners need, for a comparison with one condition.
-
-    Args:
-        path: The PNG file.
-        report: The comparison.
+    """Draw how many batches the planners need, for a comparison with one condition, as a PNG.
 
     Raises:
         ConfigError: The file cannot be written.
@@ -322,14 +311,7 @@ def save_histogram(path: Path, report: Report) -> None:
 
 
 def draw_histogram(axes: Axes, counts: NDArray[np.int64], colour: str, label: str) -> None:
-    """Draw the share of each number of batches.
-
-    Args:
-        axes: Axes to draw on.
-        counts: int64 (n,), how often 0, 1, 2, ... batches were needed.
-        colour: Colour of the bars.
-        label: Name in the legend.
-    """
+    """Draw the share of each number of batches; ``counts``: how often 0, 1, 2, ... were needed."""
     seen = np.flatnonzero(counts)
     if len(seen):
         first, last = int(seen[0]), int(seen[-1])

@@ -7,7 +7,6 @@ import shlex
 import sys
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -18,13 +17,11 @@ from labseq.bench.rendering import WaveformReport, bench_waveform
 from labseq.bench.report import Report, Row, save_histogram
 from labseq.console.output import (
     STDOUT,
-    as_line,
     check_different,
     check_writable,
     json_writer,
     report_compiling,
     say,
-    stdout_to_stderr,
     write_text,
 )
 from labseq.console.text import columns, percent, plural
@@ -38,11 +35,7 @@ _STEPS: Final = 10
 
 @contextmanager
 def progress_of(what: str) -> Generator[Callable[[int, int], None]]:
-    """A progress bar on stderr if that is a terminal, else a line for every tenth.
-
-    Args:
-        what: Noun for the counted items, in the plural.
-    """
+    """A progress bar on stderr if that is a terminal, else a line for every tenth; ``what`` is counted."""
     if not sys.stderr.isatty():
         reported = 0
 
@@ -167,27 +160,22 @@ def _again(report: Report, row: Row, loading: int) -> str:
     return shlex.join(words)
 
 
-@dataclass(frozen=True, slots=True)
-class BenchOutput:
-    """The files to write in addition to the table.
-
-    Attributes:
-        json: Name of the file for everything as JSON; "-" for stdout, which then holds nothing else.
-        csv: The file for the table as CSV.
-        png: The file for the picture.
-    """
-
-    json: str | None = None
-    csv: Path | None = None
-    png: Path | None = None
-
-
-def bench_planners(request: BenchRequest, output: BenchOutput) -> None:
-    """Compare planners and print the result, also if it was stopped.
+def bench_planners(
+    request: BenchRequest,
+    workers: int | None = None,
+    *,
+    json: str | None = None,
+    csv: Path | None = None,
+    png: Path | None = None,
+) -> None:
+    """Compare planners, print the table and write the files, also if it was stopped.
 
     Args:
         request: The comparison.
-        output: The files to write in addition to the table.
+        workers: Number of processes; None for one per core, if there is enough work.
+        json: Name of the file for everything as JSON; "-" for stdout, which then holds nothing else.
+        csv: The file for the table as CSV.
+        png: The file for the picture.
 
     Raises:
         ConfigError: The request has an error, or a file cannot be written.
@@ -195,41 +183,28 @@ def bench_planners(request: BenchRequest, output: BenchOutput) -> None:
         PlanError: A planner failed, or a plan breaks a rule, for some loadings.
         StopRequested: It was stopped; the results so far were printed.
     """
-    answer = stdout_to_stderr() if output.json == STDOUT else None
-    comparison, files = read_request(request), _files(output)
-    check_different(*files.values())
-    for kind, path in files.items():
-        if kind == "png":
-            check_picture(path, (1, 1))
+    comparison = read_request(request)
+    check_different(json, csv, png)
+    if png is not None:
+        check_picture(png, (1, 1))
+    for path in filter(None, (csv, png)):
         check_writable(path)
+    write = json_writer(json)
     with progress_of("loadings") as progress:
-        report = compare(comparison, request.workers, announce=report_compiling, progress=progress)
+        report = compare(comparison, workers, announce=report_compiling, progress=progress)
     say(*table(report), *notes(report))
     if report.rows:
-        _write_files(files, report)
-    if answer is not None:
-        answer(as_line(report.as_dict()))
+        if csv is not None:
+            write_text(csv, report.as_csv())
+        if png is not None:
+            save_histogram(png, report)
+    files = [name for name in (csv, png, None if json == STDOUT else json) if name is not None]
+    if report.rows and files:
+        say(f"written: {', '.join(map(str, files))}")
+    write(report.as_dict())
     if report.ended_by is not None:
         raise report.ended_by
     _raise_failures(report)
-
-
-def _files(output: BenchOutput) -> dict[str, Path]:
-    """The files to write, by kind."""
-    named = {"csv": output.csv, "png": output.png}
-    if output.json not in (None, STDOUT):
-        named["json"] = Path(output.json)
-    return {kind: path for kind, path in named.items() if path is not None}
-
-
-def _write_files(files: dict[str, Path], report: Report) -> None:
-    for kind, path in files.items():
-        if kind == "png":
-            save_histogram(path, report)
-            continue
-        write_text(path, report.as_csv() if kind == "csv" else f"{as_line(report.as_dict())}\n")
-    if files:
-        say(f"written: {', '.join(map(str, files.values()))}")
 
 
 def _raise_failures(report: Report) -> None:
@@ -241,17 +216,7 @@ def _raise_failures(report: Report) -> None:
 
 
 def bench_latency(request: LatencyRequest, json: str | None = None) -> None:
-    """Measure the latency from a frame to the first light, and print it.
-
-    Args:
-        request: The measurement.
-        json: Name of the file for everything as JSON; "-" for stdout, which then holds nothing else.
-
-    Raises:
-        ConfigError: The request has an error, or the file cannot be written.
-        PluginLoadError: A named plugin failed to load.
-        LabseqError: The error that ended a shot.
-    """
+    """Measure the latency from a frame to the first light, print it, and write it as JSON."""
     write = json_writer(json)
     with progress_of("loadings") as progress:
         report = measure_latency(request, announce=report_compiling, progress=progress)
@@ -284,14 +249,7 @@ def light_table(report: LatencyReport) -> list[str]:
         for s in parts
     ]
     here_s = sum(stage.median_s for stage in parts)
-    rows.append(
-        (
-            "end of exposure to light",
-            _time(here_s),
-            "-",
-            _time(report.to_light_s - here_s),
-        )
-    )
+    rows.append(("end of exposure to light", _time(here_s), "-", _time(report.to_light_s - here_s)))
     return columns(rows, right=(1, 2, 3))
 
 
@@ -312,15 +270,7 @@ def latency_notes(report: LatencyReport) -> list[str]:
 
 
 def bench_rendering(repeats: int, json: str | None = None) -> None:
-    """Measure the speed of rendering, and print it.
-
-    Args:
-        repeats: Number of repetitions.
-        json: Name of the file for everything as JSON; "-" for stdout, which then holds nothing else.
-
-    Raises:
-        ConfigError: The file cannot be written.
-    """
+    """Measure the speed of rendering, print it, and write it as JSON."""
     write = json_writer(json)
     report = bench_waveform(repeats, announce=report_compiling)
     say(*rendering_table(report), "", *ratios(report), "", _rendering_extent(report))

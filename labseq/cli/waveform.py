@@ -6,7 +6,8 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from labseq.bench.waveform import AxisStatistics, PlannedWaveform, WaveformRequest, plan_waveform
+from labseq.bench.axis_statistics import AxisStatistics
+from labseq.bench.waveform import PlannedWaveform, WaveformRequest, plan_waveform
 from labseq.cli.plan import subject, warnings
 from labseq.console.output import check_different, json_writer, report_compiling, say
 from labseq.console.text import columns, percent, plural, size_text
@@ -51,7 +52,7 @@ def show_waveform(request: WaveformRequest, output: WaveformOutput) -> None:
     waveform = plan_waveform(request, announce=report_compiling)
     both = waveform.statistics()
     if output.npz is not None:
-        from labseq.bench.waveform import save_samples
+        from labseq.bench.samples_file import save_samples
 
         save_samples(output.npz, waveform)
     if output.png is not None:
@@ -68,7 +69,7 @@ def _check_files(output: WaveformOutput) -> None:
 
         check_picture(output.png, (1, 1))
     if output.npz is not None:
-        from labseq.bench.waveform import check_samples_file
+        from labseq.bench.samples_file import check_samples_file
 
         check_samples_file(output.npz)
 
@@ -117,7 +118,7 @@ def note(axis: AxisStatistics) -> str:
     """An axis on one line."""
     parts = [
         f"{axis.name} axis: at most {plural(axis.max_tones, 'tone')}",
-        _span(axis.lowest_hz, axis.highest_hz),
+        _span(*axis.frequency_hz),
         f"peak {format_quantity(axis.peak_v, 'voltage')}",
         f"crest factor {_crest(axis).partition(',')[0]}",
         f"mean power {format_quantity(axis.aod_mean_power_w, 'power')} at the AOD",
@@ -137,7 +138,7 @@ def _axis_rows(axis: AxisStatistics, rf: RfSpec) -> list[tuple[str, str]]:
     return [
         ("", f"{axis.name} axis"),
         ("tones at once", f"at most {axis.max_tones}"),
-        ("frequencies", _span(axis.lowest_hz, axis.highest_hz)),
+        ("frequencies", _span(*axis.frequency_hz)),
         ("band of the AOD", _span(*axis.band_hz)),
         ("shifted onto a comb", f"by at most {1e9 * axis.snapped_m:.3g} nm" if axis.snapped_m else "-"),
         ("sum of amplitudes", f"at most {axis.amplitude_sum:.3g} of full scale"),

@@ -8,13 +8,8 @@ import numpy as np
 import pytest
 
 import labseq
-from labseq.bench.waveform import (
-    PlannedWaveform,
-    WaveformRequest,
-    check_samples_file,
-    plan_waveform,
-    save_samples,
-)
+from labseq.bench.samples_file import check_samples_file, save_samples
+from labseq.bench.waveform import PlannedWaveform, WaveformRequest, plan_waveform
 from labseq.errors import ConfigError
 from labseq.session.planning import PlanRequest
 
