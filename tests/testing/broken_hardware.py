@@ -200,7 +200,7 @@ class CallsItselfAndor(RecordingCamera):
 
 
 class Suite(CameraContract):
-    max_wait_s: ClassVar[float] = 0.05
+    max_wait_s: ClassVar[float] = 0.15
 
 
 PLANTED = Planted(

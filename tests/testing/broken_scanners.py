@@ -16,7 +16,7 @@ from .planted import Planted
 
 class Suite(ScannerContract):
     n_points: ClassVar[int] = 5
-    time_limit_s: ClassVar[float] = 0.1
+    time_limit_s: ClassVar[float] = 0.2
 
 
 class Draws:
