@@ -5,7 +5,17 @@ from typing import Annotated
 
 import typer
 
-from labseq.console.options import DryRun as RunDry, DryRunKind, Json, Overrides, profile_names
+from labseq.console.options import (
+    DryRun as RunDry,
+    DryRunKind,
+    Json,
+    Output,
+    Overrides,
+    Seed,
+    Shots,
+    dry_run_mode,
+    profile_names,
+)
 
 calibration = typer.Typer(
     name="calibration",
@@ -45,11 +55,8 @@ DryRun = Annotated[
         show_choices=False,
     ),
 ]
+Force = Annotated[bool, typer.Option("--force", help="Use it even if it is worse than the one in use.")]
 Id = Annotated[str, typer.Argument(metavar="ID", help=ID_HELP, show_default=False)]
-
-
-def _mode(dry_run: DryRunKind | None) -> str:
-    return "off" if dry_run is None else dry_run.value
 
 
 @calibration.command("list", short_help="List the calibrations of a profile.")
@@ -57,7 +64,7 @@ def list_all(profile: Profile = "virtual", dry_run: DryRun = None, as_json: Json
     """List the calibrations of a profile, damaged ones included, and mark those in use."""
     from labseq.calibration.terminal import list_calibrations
 
-    list_calibrations(profile, _mode(dry_run), as_json=as_json)
+    list_calibrations(profile, dry_run_mode(dry_run), as_json=as_json)
 
 
 @calibration.command(short_help="Show one calibration.")
@@ -67,7 +74,7 @@ def show(
     """Show the values of a calibration, its quality, and its origin."""
     from labseq.calibration.terminal import show_calibration
 
-    show_calibration(calibration_id, profile, _mode(dry_run), as_json=as_json)
+    show_calibration(calibration_id, profile, dry_run_mode(dry_run), as_json=as_json)
 
 
 @calibration.command(epilog=USE_EXAMPLES, short_help="Use a calibration, or none of its kind.")
@@ -82,14 +89,12 @@ def use(
     ],
     profile: Profile = "virtual",
     dry_run: DryRun = None,
-    force: Annotated[
-        bool, typer.Option("--force", help="Use it even if it is worse than the one in use.")
-    ] = False,
+    force: Force = False,
 ) -> None:
     """Use a calibration from the next run on; runs in progress keep theirs."""
     from labseq.calibration.terminal import use_calibration
 
-    use_calibration(choice, profile, _mode(dry_run), force=force)
+    use_calibration(choice, profile, dry_run_mode(dry_run), force=force)
 
 
 @calibration.command(short_help="Compare two calibrations of one kind.")
@@ -103,7 +108,7 @@ def diff(
     """Compare two calibrations of one kind: the change of every value, and the quality."""
     from labseq.calibration.terminal import compare_calibrations
 
-    compare_calibrations(before, after, profile, _mode(dry_run), as_json=as_json)
+    compare_calibrations(before, after, profile, dry_run_mode(dry_run), as_json=as_json)
 
 
 def calibrate(
@@ -125,19 +130,12 @@ def calibrate(
             "a .npy or .csv file.",
         ),
     ] = None,
-    shots: Annotated[
-        int | None, typer.Option(metavar="N", help="Number of shots, instead of the sequence's own.")
-    ] = None,
-    seed: Annotated[int | None, typer.Option(metavar="N", help="Seed of all random numbers.")] = None,
+    shots: Shots = None,
+    seed: Seed = None,
     overrides: Overrides = None,
-    output: Annotated[
-        Path | None,
-        typer.Option(metavar="DIR", help="Folder for the data, instead of LABSEQ_DATA or ./data."),
-    ] = None,
+    output: Output = None,
     dry_run: RunDry = None,
-    force: Annotated[
-        bool, typer.Option("--force", help="Use it even if it is worse than the one in use.")
-    ] = False,
+    force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Calibrate a profile: take a run, analyse it, store the result, and use it unless it is worse."""
@@ -151,7 +149,7 @@ def calibrate(
         seed=seed,
         overrides=tuple(overrides or ()),
         output=output,
-        dry_run="off" if dry_run is None else dry_run.value,
+        dry_run=dry_run_mode(dry_run),
         force=force,
     )
     calibrate_kind(kind, request, as_json=as_json)

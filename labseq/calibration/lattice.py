@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Final, NoReturn
+from typing import TYPE_CHECKING, Any, Final, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,9 @@ from labseq.calibration.spots import (
 )
 from labseq.errors import DeviceError
 from labseq.model import SiteGrid
+
+if TYPE_CHECKING:
+    from scipy.spatial import KDTree
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -97,11 +100,7 @@ def find_vectors(flat: Floats, grid: SiteGrid) -> Vectors | None:
 
 
 def autocorrelation(flat: Floats) -> Floats:
-    """Autocorrelation for lags up to 55 pixels, float64 (2 m + 1, 2 m + 1), 1 without a lag.
-
-    Args:
-        flat: float64 (height, width); its mean is subtracted.
-    """
+    """Autocorrelation for lags up to 55 pixels, float64 (2 m + 1, 2 m + 1), 1 without a lag."""
     from scipy.fft import irfft2, next_fast_len, rfft2
 
     reach = int(min(LONGEST_PX, *(n - 1 for n in flat.shape)))
@@ -256,12 +255,6 @@ def index_spots(spots: Spots, vectors: Vectors, n_sites: int, reach: int) -> Ind
     outwards a few sites at a time. The places are fitted again after each step, so
     that distortions do not add up.
 
-    Args:
-        spots: From :func:`find_spots`.
-        vectors: From :func:`labseq.calibration.lattice.find_vectors`.
-        n_sites: Number of expected spots.
-        reach: Maximum number of rows or columns from the start.
-
     Returns:
         None if no three spots are neighbours.
     """
@@ -304,12 +297,7 @@ def _in_full_lines(square: Ints, near: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def find_window(
     spots: Spots, indexed: Indexed, shape: tuple[int, int]
 ) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Choose the rows and columns of the array: those with the most light.
-
-    Args:
-        spots: From :func:`find_spots`.
-        indexed: From :func:`index_spots`.
-        shape: (n_rows, n_cols) of the grid.
+    """Choose the rows and columns of the array, ``shape`` of the grid: those with the most light.
 
     Returns:
         Row and column of site (0, 0), and the number of bright rows and columns of the array.
@@ -339,11 +327,8 @@ def _extent(lit: Floats) -> int:
     return int(lines[-1] - lines[0] + 1) if len(lines) else 0
 
 
-def _best_place(places: Floats, tree: object, vectors: Vectors, shortest: float) -> Floats:
+def _best_place(places: Floats, tree: KDTree, vectors: Vectors, shortest: float) -> Floats:
     """The spot with the largest number of its eight neighbours at the expected places."""
-    from scipy.spatial import KDTree
-
-    assert isinstance(tree, KDTree)
     steps = np.array([i * vectors.down + j * vectors.along for i in (-1, 0, 1) for j in (-1, 0, 1)])
     off, _ = tree.query(places[:, None] + steps)
     n_near = (off < 0.2 * shortest).sum(axis=1)
@@ -399,9 +384,7 @@ class FoundLattice:
         return int(self.found.sum())
 
 
-def find_lattice(
-    image: NDArray[Any], grid: SiteGrid, *, saturated: float = 65535.0, camera: str = "camera"
-) -> FoundLattice:
+def find_lattice(image: NDArray[Any], grid: SiteGrid, *, saturated: float = 65535.0) -> FoundLattice:
     """Find the positions of a grid's sites on an averaged frame.
 
     Rows run along the image's x axis within 15 degrees, from left to right;
@@ -417,42 +400,38 @@ def find_lattice(
         image: (height, width), mean of frames on which each site often holds an atom.
         grid: The grid of sites: its size, lattice and shear; its spacing is not used.
         saturated: Counts of a saturated pixel.
-        camera: Name of the camera, for messages.
 
     Raises:
         DeviceError: No such lattice is on the frame; says why.
     """
-    counts = _checked(image, grid, saturated, camera)
+    counts = _checked(image, grid, saturated)
     flat = flattened(counts, grid.n_rows * grid.n_cols)
     noise = pixel_noise(counts)
     vectors = find_vectors(flat, grid)
     if vectors is None:
         n_spots = len(find_spots(flat, 10.0, 1.2, 2 * noise).light)
         _fail(
-            camera,
             f"{n_spots} spots found of {grid.n_rows * grid.n_cols} expected, but they do not repeat as a "
             f"{grid.lattice} lattice with rows within 15 degrees of the x axis; {_DARK}",
         )
     spots = find_spots(flat, vectors.shortest_px, vectors.width_px, noise)
-    surface, first = _indexed(spots, vectors, grid, camera)
+    surface, first = _indexed(spots, vectors, grid)
     index = np.moveaxis(np.indices(grid.shape), 0, -1)
-    return _refined(flat, noise, vectors, surface, index + np.array(first), grid, camera)
+    return _refined(flat, noise, vectors, surface, index + np.array(first), grid)
 
 
 _DARK: Final = "check the exposure, the light, the loading, the focus, and `grid.lattice`"
 
 
-def _checked(image: NDArray[Any], grid: SiteGrid, saturated: float, camera: str) -> Floats:
+def _checked(image: NDArray[Any], grid: SiteGrid, saturated: float) -> Floats:
     if min(grid.shape) < 2:
         _fail(
-            camera,
             f"a lattice has two directions, {grid.n_rows} x {grid.n_cols} sites do not; set `detector.sites` "
             "to a file with their positions",
         )
     counts = np.asarray(image, np.float64)
     if counts.ndim != 2 or min(counts.shape) < 16 or not np.isfinite(counts).all():
         _fail(
-            camera,
             f"the frame is {image.dtype} {image.shape}; expected finite numbers, (height, width) of 16 "
             "pixels or more",
         )
@@ -461,17 +440,16 @@ def _checked(image: NDArray[Any], grid: SiteGrid, saturated: float, camera: str)
     n_full = int(np.count_nonzero(counts >= full))
     if n_full > max(20, grid.n_rows * grid.n_cols // 20):
         _fail(
-            camera,
             f"{n_full} pixels of the frame are saturated ({full:g} counts); use less light, gain or exposure",
         )
     return counts
 
 
-def _fail(camera: str, message: str) -> NoReturn:
-    raise DeviceError(camera, f"no lattice found: {message}")
+def _fail(message: str) -> NoReturn:
+    raise DeviceError("camera", f"no lattice found: {message}")
 
 
-def _indexed(spots: Spots, vectors: Vectors, grid: SiteGrid, camera: str) -> tuple[Surface, tuple[int, int]]:
+def _indexed(spots: Spots, vectors: Vectors, grid: SiteGrid) -> tuple[Surface, tuple[int, int]]:
     """The fitted places of all rows and columns, and the indices of row 0 and column 0."""
     n_sites = grid.n_rows * grid.n_cols
     indexed = index_spots(spots, vectors, n_sites, max(grid.shape) + 2)
@@ -479,14 +457,12 @@ def _indexed(spots: Spots, vectors: Vectors, grid: SiteGrid, camera: str) -> tup
     n_indexed = 0 if indexed is None else len(indexed.spots)
     if indexed is None or n_indexed < MIN_FOUND * min(bright, n_sites):
         _fail(
-            camera,
             f"of {bright} spots only {n_indexed} are on a lattice; {n_sites} are expected; {_DARK}",
         )
     first, seen = find_window(spots, indexed, grid.shape)
     if seen != grid.shape:
         rows, cols = seen
         _fail(
-            camera,
             f"{rows} x {cols} rows and columns of sites are lit, the grid has {grid.n_rows} x {grid.n_cols}; "
             "a dark row or column at the edge is ambiguous: load it, or set the "
             "size and `shear` of `grid` to those of the static tweezers",
@@ -501,7 +477,6 @@ def _refined(
     surface: Surface,
     index: NDArray[np.int64],
     grid: SiteGrid,
-    camera: str,
 ) -> FoundLattice:
     shortest = vectors.shortest_px
     sites = index.reshape(-1, 2)
@@ -511,20 +486,19 @@ def _refined(
         off = np.hypot(*(fitted.places - surface.at(sites)).T)
         lit = (fitted.light > 0.25 * np.median(fitted.light)) & (off < 0.29 * shortest)
         if lit.sum() < max(3, MIN_FOUND * len(sites)):
-            _fail(camera, f"{lit.sum()} spots found of {len(sites)} expected; {_DARK}")
+            _fail(f"{lit.sum()} spots found of {len(sites)} expected; {_DARK}")
         surface, _ = fit_surface(sites[lit], fitted.places[lit], 3, fitted.light[lit])
     positions = surface.at(sites)
     residuals = np.where(lit[:, None], fitted.places - positions, np.nan)
     residual = float(np.sqrt(np.nanmean((residuals**2).sum(axis=1))))
     if residual > MAX_RESIDUAL * shortest:
         _fail(
-            camera,
             f"the spots are {residual:.2f} pixels (r.m.s.) away from a lattice of {shortest:.1f} pixels; "
             "sites of an irregular array come from a file: set `detector.sites`",
         )
     height, width = flat.shape
     if ((positions < -0.5) | (positions > np.array([height, width]) - 0.5)).any():
-        _fail(camera, "some of its sites are outside of the frame; move the camera or take a larger frame")
+        _fail("some of its sites are outside of the frame; move the camera or take a larger frame")
     return _described(positions, residuals, fitted, residual, surface, index, flat.shape, grid)
 
 

@@ -48,18 +48,18 @@ def draw_sites(mean: Floats, positions_px: Floats, residuals_px: Floats) -> Figu
     size = 0.6 * spacing / wide * WIDTH_IN * 72
     for here, marker, label in ((found, "o", "site"), (~found, "x", "site without a spot")):
         if here.any():
-            look: dict[str, Any] = {
-                "color": SITE,
-                "markersize": size,
-                "fillstyle": "none",
-                "markeredgewidth": 0.8,
-            }
-            axes.plot(x[here], y[here], marker, label=label, **look)
+            axes.plot(
+                *(x[here], y[here], marker),
+                label=label,
+                color=SITE,
+                markersize=size,
+                fillstyle="none",
+                markeredgewidth=0.8,
+            )
     axes.plot(x[:1], y[:1], "s", color=SITE, markersize=1.4 * size, fillstyle="none", label="row 0, column 0")
     longest = _draw_arrows(axes, x[found], y[found], residuals_px.reshape(-1, 2)[found], spacing)
     axes.set_title(f"arrows: distance of spots from their sites, {longest:.2g} px at most")
-    axes.set_xlabel("x (px)")
-    axes.set_ylabel("y (px)")
+    axes.set(xlabel="x (px)", ylabel="y (px)")
     axes.legend(loc="upper right", fontsize="small", markerscale=0.5)
     return figure
 
@@ -69,14 +69,8 @@ def _draw_arrows(axes: Axes, x: Floats, y: Floats, off_px: Floats, spacing_px: f
     longest = float(np.hypot(*off_px.T).max(initial=0.0))
     if longest > 0:
         along_y, along_x = ARROW_SPACINGS * spacing_px / longest * off_px.T
-        look: dict[str, Any] = {
-            "color": ARROW,
-            "angles": "xy",
-            "scale_units": "xy",
-            "scale": 1.0,
-            "width": 0.0015,
-        }
-        axes.quiver(x, y, along_x, along_y, **look)
+        to_scale: Any = {"angles": "xy", "scale_units": "xy", "scale": 1.0}
+        axes.quiver(x, y, along_x, along_y, color=ARROW, width=0.0015, **to_scale)
     return longest
 
 
@@ -94,22 +88,17 @@ def draw_thresholds(signals: Floats, thresholds: Floats, unit: str) -> Figure:
     edges = np.linspace(low, high, N_BINS + 1)
     above.hist(signals.ravel(), edges, color="0.6", log=True)
     above.axvspan(float(thresholds.min()), float(thresholds.max()), color=SITE, alpha=0.5, label="thresholds")
-    above.set_xlabel(f"signal of all sites ({unit})")
-    above.set_ylabel("signals")
-    above.legend(loc="upper right", fontsize="small")
-    _draw_each(below, signals.reshape(len(signals), -1), thresholds.ravel(), edges)
-    below.set_ylabel(f"signal ({unit})")
+    above.set(xlabel=f"signal of all sites ({unit})", ylabel="signals")
+    by_site = signals.reshape(len(signals), -1).T
+    counts = np.stack([np.histogram(of_site, edges)[0] for of_site in by_site], axis=1)
+    extent = (-0.5, len(by_site) - 0.5, low, high)
+    below.imshow(np.log1p(counts), cmap="gray_r", aspect="auto", origin="lower", extent=extent)
+    site = np.arange(len(by_site))
+    below.step(site, thresholds.ravel(), where="mid", color=ARROW, linewidth=0.8, label="threshold")
+    below.set(xlabel="site, row by row", ylabel=f"signal ({unit})")
+    for axes in (above, below):
+        axes.legend(loc="upper right", fontsize="small")
     return figure
-
-
-def _draw_each(axes: Axes, by_site: Floats, thresholds: Floats, edges: Floats) -> None:
-    n_sites = by_site.shape[1]
-    counts = np.stack([np.histogram(by_site[:, site], edges)[0] for site in range(n_sites)], axis=1)
-    extent = (-0.5, n_sites - 0.5, edges[0], edges[-1])
-    axes.imshow(np.log1p(counts), cmap="gray_r", aspect="auto", origin="lower", extent=extent)
-    axes.step(np.arange(n_sites), thresholds, where="mid", color=ARROW, linewidth=0.8, label="threshold")
-    axes.set_xlabel("site, row by row")
-    axes.legend(loc="upper right", fontsize="small")
 
 
 def _spacing_px(positions_px: Floats) -> float:
@@ -148,8 +137,7 @@ def draw_survival(
         line_m = np.repeat(middle[None], 200, axis=0)
         line_m[:, axis] = np.linspace(offset_m[:, axis].min(), offset_m[:, axis].max(), 200)
         axes.plot(1e6 * line_m[:, axis], survival(line_m), color=CURVE, label="fit")
-        axes.set_xlabel(f"offset {DIRECTIONS[axis]} (um)")
-        axes.set_ylim(-0.02, 1.02)
+        axes.set(xlabel=f"offset {DIRECTIONS[axis]} (um)", ylim=(-0.02, 1.02))
     figure.axes[0].set_ylabel("survival")
     figure.axes[0].legend(fontsize="small")
     return figure
@@ -167,17 +155,13 @@ def draw_tone_offsets(rows: tuple[Floats, Floats], columns: tuple[Floats, Floats
         figure.subplots(1, 2), ("row", "column"), (rows, columns), reversed(DIRECTIONS), strict=True
     ):
         axes.errorbar(np.arange(len(off_m)), 1e9 * off_m, 1e9 * error_m, fmt="o", color=POINT, markersize=4)
-        axes.set_xlabel(name)
-        axes.set_ylabel(f"offset {direction} (nm)")
+        axes.set(xlabel=name, ylabel=f"offset {direction} (nm)")
     return figure
 
 
 SIZE_IN: Final = (8.4, 5.6)
 MIN_RANGE: Final = 0.05
 """Minimum range of the colour scale, as deviation from the mean."""
-TITLE_PT: Final = 10
-LABEL_PT: Final = 9
-TICK_PT: Final = 8
 
 
 def draw_powers(before: Floats, after: Floats, rows: Floats, cols: Floats) -> Figure:
@@ -195,24 +179,16 @@ def draw_powers(before: Floats, after: Floats, rows: Floats, cols: Floats) -> Fi
     most = max(MIN_RANGE, *(float(np.nanmax(np.abs(each))) for each in maps))
     for axes, each, title in zip(panels[0], maps, ("before", "after"), strict=True):
         axes.imshow(100 * each, cmap="RdBu_r", vmin=-100 * most, vmax=100 * most)
-        axes.set_title(f"{title}: {100 * float(np.nanstd(each)):.1f} % r.m.s.", fontsize=TITLE_PT)
-        _label(axes, "column", "row")
+        axes.set(title=f"{title}: {100 * float(np.nanstd(each)):.1f} % r.m.s.", xlabel="column", ylabel="row")
         _count(axes.xaxis)
         _count(axes.yaxis)
     bar = figure.colorbar(panels[0][0].images[0], ax=panels[0], shrink=0.9)
-    _label(bar.ax, "", "deviation from the mean (%)")
+    bar.set_label("deviation from the mean (%)")
     for axes, amplitudes, name in zip(panels[1], (rows, cols), ("row", "column"), strict=True):
         axes.bar(np.arange(len(amplitudes)), 100 * amplitudes, color="#1f4e8c")
-        axes.set_ylim(0, 115 * float(amplitudes.max()))
-        _label(axes, name, "tone (% of full scale)")
+        axes.set(ylim=(0, 115 * float(amplitudes.max())), xlabel=name, ylabel="tone (% of full scale)")
         _count(axes.xaxis)
     return figure
-
-
-def _label(axes: Axes, x: str, y: str) -> None:
-    axes.set_xlabel(x, fontsize=LABEL_PT)
-    axes.set_ylabel(y, fontsize=LABEL_PT)
-    axes.tick_params(labelsize=TICK_PT)
 
 
 def _count(axis: Axis) -> None:

@@ -10,7 +10,6 @@ import numpy as np
 from labseq.calibration.lattice import FoundLattice, find_lattice
 from labseq.calibration.method import AnalysisResult, CalibrationData
 from labseq.calibration.pictures import draw_sites
-from labseq.calibration.spots import FrameAverage
 from labseq.detection.sites import read_sites
 from labseq.errors import ConfigError, Problem
 from labseq.session.profile import ResolvedProfile
@@ -24,10 +23,10 @@ def analyse_sites(data: CalibrationData) -> AnalysisResult:
         DeviceError: No lattice was found; says why.
         ConfigError: The run has no frames.
     """
-    average = FrameAverage()
+    total, n_frames = np.zeros(1), 0
     for frame in data.frames():
-        average.add(frame)
-    mean = average.image
+        total, n_frames = total + frame.image, n_frames + 1
+    mean = total / n_frames
     found = find_lattice(mean, data.bench.grid)
     quality = {
         "residual_px": found.residual_px,
@@ -41,7 +40,7 @@ def analyse_sites(data: CalibrationData) -> AnalysisResult:
     return AnalysisResult(
         {"positions_px": found.positions_px, "frame": found.frame},
         quality,
-        _summary_lines(found, average.n_frames),
+        _summary_lines(found, n_frames),
         draw=lambda: draw_sites(mean, found.positions_px, found.residuals_px),
     )
 

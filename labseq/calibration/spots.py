@@ -9,8 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.detection.sites import spot_light
-from labseq.errors import DeviceError
-from labseq.model import Frame
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -19,55 +17,6 @@ TILE_PX: Final = 48
 DARK_QUANTILE: Final = 0.3
 HOT: Final = 6.0
 """A pixel this many times brighter than its second brightest neighbour is hot; spots of 0.45 px are not."""
-
-
-class FrameAverage:
-    """Mean of frames.
-
-    Args:
-        camera: Name of the camera, for messages.
-
-    Example:
-        >>> import numpy as np
-        >>> average = FrameAverage()
-        >>> for counts in (100, 200):
-        ...     average.add(Frame(np.full((2, 3), counts, np.uint16), 0.045, 0.0))
-        >>> average.n_frames, average.image[0].tolist()
-        (2, [150.0, 150.0, 150.0])
-    """
-
-    def __init__(self, camera: str = "camera") -> None:
-        self._camera = camera
-        self._sum: NDArray[np.float64] | None = None
-        self.n_frames = 0
-
-    @property
-    def image(self) -> NDArray[np.float64]:
-        """Mean counts, float64 (height, width).
-
-        Raises:
-            DeviceError: There is no frame yet.
-        """
-        if self._sum is None:
-            raise DeviceError(self._camera, "there is no average: no frame was taken")
-        return self._sum / self.n_frames
-
-    def add(self, frame: Frame) -> None:
-        """Add a frame.
-
-        Raises:
-            DeviceError: Its size differs from those before.
-        """
-        if self._sum is None:
-            self._sum = np.zeros(frame.image.shape)
-        if frame.image.shape != self._sum.shape:
-            raise DeviceError(
-                self._camera,
-                f"frame {self.n_frames} has {frame.image.shape} pixels, those before {self._sum.shape}; "
-                "leave the camera's crop as it is during a calibration",
-            )
-        self._sum += frame.image
-        self.n_frames += 1
 
 
 def flattened(image: NDArray[Any], n_sites: int) -> Floats:
@@ -93,11 +42,7 @@ def flattened(image: NDArray[Any], n_sites: int) -> Floats:
 
 
 def without_hot_pixels(image: NDArray[Any]) -> Floats:
-    """Replace single bright pixels, and pairs, by the median of their neighbours.
-
-    Args:
-        image: (height, width), of any real dtype.
-    """
+    """Replace single bright pixels, and pairs, by the median of their neighbours."""
     from scipy.ndimage import median_filter, rank_filter
 
     counts = np.array(image, np.float64)
@@ -114,9 +59,6 @@ def pixel_noise(counts: Floats) -> float:
 
     The mask is that of Immerkaer, Computer Vision and Image Understanding 64, 300
     (1996). The darkest tenth of the frame's tiles counts, because spots add noise.
-
-    Args:
-        counts: float64 (height, width).
     """
     bends = counts[:-2] - 2 * counts[1:-1] + counts[2:]
     bends = np.abs(bends[:, :-2] - 2 * bends[:, 1:-1] + bends[:, 2:])
@@ -125,11 +67,7 @@ def pixel_noise(counts: Floats) -> float:
 
 
 def stray_light(counts: Floats) -> Floats:
-    """The slowly varying part of a frame, float64 (height, width).
-
-    Args:
-        counts: float64 (height, width).
-    """
+    """The slowly varying part of a frame, float64 (height, width)."""
     from scipy.ndimage import gaussian_filter, zoom
 
     levels = np.array([[np.quantile(tile, DARK_QUANTILE) for tile in row] for row in _tiles(counts)])

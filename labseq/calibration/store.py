@@ -91,10 +91,6 @@ def read_entry(path: Path) -> CalibrationEntry:
 def read_object(path: Path, file_format: str) -> dict[str, Any]:
     """Read a JSON object with the keys ``format`` and ``format_version``.
 
-    Args:
-        path: The file.
-        file_format: Expected value of ``format``.
-
     Raises:
         ConfigError: It is missing, damaged, of another format, or written by a newer labseq.
     """
@@ -212,12 +208,7 @@ def why_worse(new: CalibrationEntry, old: CalibrationEntry | None) -> str:
 
 
 def check_grid(entry: CalibrationEntry, grid: SiteGrid, source: str) -> None:
-    """Raise if an entry is for another grid.
-
-    Args:
-        entry: The entry.
-        grid: The grid of the profile.
-        source: Origin of the entry, for the message.
+    """Raise if an entry, which came from ``source``, is for another grid.
 
     Raises:
         ConfigError: It is of another grid; the message names both.
@@ -323,11 +314,7 @@ class Store:
         return read
 
     def add(self, entry: CalibrationEntry, picture: bytes | None = None) -> Stored:
-        """Store an entry; this does not put it to use.
-
-        Args:
-            entry: The entry.
-            picture: A PNG of it.
+        """Store an entry and a PNG of it; this does not put it to use.
 
         Raises:
             ConfigError: The folder cannot be written to.
@@ -388,12 +375,7 @@ class Store:
         return Stored(entry, path)
 
     def use(self, stored: Stored, grid: SiteGrid, *, force: bool = False) -> None:
-        """Put an entry to use from now on.
-
-        Args:
-            stored: The entry.
-            grid: The grid of the profile.
-            force: Whether to accept one that is worse than the one in use.
+        """Put an entry to use from now on; with ``force`` even if it is worse than the one in use.
 
         Raises:
             ConfigError: It is of another grid, it is worse, or the folder cannot be written to.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -30,18 +29,13 @@ MAX_LISTED: Final = 4
 """Maximum number of numbers that are printed of a value; for more, lowest, highest and mean are printed."""
 
 
-def list_calibrations(profile: str, dry_run: str, *, as_json: bool) -> None:
+def list_calibrations(profile: str, dry_run: DryRun, *, as_json: bool) -> None:
     """Print a row per calibration, oldest first.
-
-    Args:
-        profile: Name or path of the profile.
-        dry_run: "off", "full" or "fast".
-        as_json: Whether to print one line of JSON instead.
 
     Raises:
         ConfigError: The profile has an error, or the folder of its calibrations cannot be read.
     """
-    store, spec = open_store(profile, cast("DryRun", dry_run))
+    store, spec = open_store(profile, dry_run)
     found, problems = store.entries(), list[str]()
     try:
         used = in_use(store, spec.calibrations.use)
@@ -60,13 +54,13 @@ def list_calibrations(profile: str, dry_run: str, *, as_json: bool) -> None:
     say(*([""] if problems else []), *problems)
 
 
-def show_calibration(wanted: str, profile: str, dry_run: str, *, as_json: bool) -> None:
+def show_calibration(wanted: str, profile: str, dry_run: DryRun, *, as_json: bool) -> None:
     """Print one calibration.
 
     Raises:
         ConfigError: There is no such calibration, there are several, or it is damaged.
     """
-    store, spec = open_store(profile, cast("DryRun", dry_run))
+    store, spec = open_store(profile, dry_run)
     stored, used = store.find(wanted), in_use(store, spec.calibrations.use)
     if as_json:
         say(as_line(_values_of(stored, used)))
@@ -90,19 +84,13 @@ def show_calibration(wanted: str, profile: str, dry_run: str, *, as_json: bool) 
     )
 
 
-def use_calibration(choice: str, profile: str, dry_run: str, *, force: bool) -> None:
-    """Use a calibration, or none of a kind.
-
-    Args:
-        choice: Its id, or "KIND=off".
-        profile: Name or path of the profile.
-        dry_run: "off", "full" or "fast".
-        force: Whether to use it even if it is worse than the one in use.
+def use_calibration(choice: str, profile: str, dry_run: DryRun, *, force: bool) -> None:
+    """Use a calibration, or with "KIND=off" none of that kind.
 
     Raises:
         ConfigError: There is no such calibration, it belongs to another grid, or it is worse.
     """
-    store, spec = open_store(profile, cast("DryRun", dry_run))
+    store, spec = open_store(profile, dry_run)
     name, equals, value = choice.partition("=")
     if equals:
         kind = _kind(name, value)
@@ -117,18 +105,18 @@ def use_calibration(choice: str, profile: str, dry_run: str, *, force: bool) -> 
         say(f"warning: the profile has 'calibrations.use.{kind}: {clean(pin)}', which takes precedence")
 
 
-def compare_calibrations(before: str, after: str, profile: str, dry_run: str, *, as_json: bool) -> None:
+def compare_calibrations(before: str, after: str, profile: str, dry_run: DryRun, *, as_json: bool) -> None:
     """Print what changed from one calibration to another.
 
     Raises:
         ConfigError: They are of different kinds, or one cannot be read.
     """
-    store, _ = open_store(profile, cast("DryRun", dry_run))
+    store, _ = open_store(profile, dry_run)
     one, other = store.find(before).entry, store.find(after).entry
     values, figures = compare(one, other)
     if as_json:
-        dumps = {name: [_dump(d) for d in ds] for name, ds in (("values", values), ("quality", figures))}
-        say(as_line({"kind": one.kind, "before": one.id, "after": other.id, **dumps}))
+        changes = {"values": [*map(asdict, values)], "quality": [*map(asdict, figures)]}
+        say(as_line({"kind": one.kind, "before": one.id, "after": other.id, **changes}))
         return
     ends = (f"{entry.id} ({_time_text(entry.taken_utc)})" for entry in (one, other))
     say(f"{one.kind}: {' to '.join(ends)}", "", *difference_table(values))
@@ -173,7 +161,7 @@ def _row(one: Stored | Damaged, used: Mapping[str, str]) -> tuple[str, ...]:
 
 
 def _values_of(one: Stored | Damaged, used: Mapping[str, str]) -> dict[str, Any]:
-    head = {"file": str(one.path), "in_use": _is_used(one, used)}
+    head = {"file": one.path, "in_use": _is_used(one, used)}
     if isinstance(one, Damaged):
         return {"kind": one.kind, "id": one.id, **head, "error": str(one.error)}
     entry = one.entry
@@ -183,10 +171,10 @@ def _values_of(one: Stored | Damaged, used: Mapping[str, str]) -> dict[str, Any]
         **head,
         "taken_utc": entry.taken_utc,
         "age_s": age_s(entry),
-        "quality": {name: _or_none(value) for name, value in entry.quality.items()},
+        "quality": entry.quality,
         "grid": entry.grid,
         "origin": entry.origin,
-        "picture": None if one.picture is None else str(one.picture),
+        "picture": one.picture,
         "error": None,
     }
 
@@ -225,26 +213,12 @@ def _time_text(taken_utc: str) -> str:
     return f"{datetime.fromisoformat(taken_utc).astimezone(UTC):%Y-%m-%d %H:%M} UTC"
 
 
-def _dump(difference: Difference) -> dict[str, Any]:
-    values = asdict(difference)
-    return {name: _or_none(value) if isinstance(value, float) else value for name, value in values.items()}
-
-
-def _or_none(value: float) -> float | None:
-    return None if math.isnan(value) else value
-
-
 N_MARKS: Final = 10
 """Number of progress lines of a run."""
 
 
 def calibrate_kind(kind: str, request: CalibrationRequest, *, as_json: bool) -> None:
     """Make a calibration, store it, and use it unless it is worse.
-
-    Args:
-        kind: Kind of calibration.
-        request: The profile and the run.
-        as_json: Whether to print the result as one line of JSON, alone on stdout.
 
     Raises:
         ConfigError: The request has an error; or the calibration is worse than the one in use, and was
@@ -288,18 +262,18 @@ def summary_lines(outcome: Outcome) -> list[str]:
 
 
 def _outcome_values(outcome: Outcome) -> dict[str, Any]:
-    entry, picture = outcome.stored.entry, outcome.stored.picture
+    entry = outcome.stored.entry
     return {
         "kind": entry.kind,
         "id": entry.id,
         "in_use": not outcome.refused,
         "refused": outcome.refused or None,
-        "quality": {name: None if math.isnan(value) else value for name, value in entry.quality.items()},
+        "quality": entry.quality,
         "before": None if outcome.before is None else outcome.before.id,
-        "file": str(outcome.stored.path),
-        "picture": None if picture is None else str(picture),
-        "run_dir": None if outcome.run is None else str(outcome.run.path),
-        "warnings": list(outcome.warnings),
+        "file": outcome.stored.path,
+        "picture": outcome.stored.picture,
+        "run_dir": None if outcome.run is None else outcome.run.path,
+        "warnings": outcome.warnings,
     }
 
 

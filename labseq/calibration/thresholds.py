@@ -49,9 +49,8 @@ class Peak:
         if abs(self.skewness) < FLATTEST:
             return -0.5 * z**2 - np.log(self.width * np.sqrt(2 * np.pi))
         order = 4 / self.skewness**2
-        part = (
-            z * np.sign(self.skewness) / np.sqrt(order)
-        )  # distance from the mean, in units of the gamma distribution's mean
+        # distance from the mean, in units of the gamma distribution's mean
+        part = z * np.sign(self.skewness) / np.sqrt(order)
         inside = np.maximum(part, -1 + 1e-12)
         norm = (order - 0.5) * np.log(order) - order - gammaln(order)
         if order > 1e4:
@@ -131,28 +130,21 @@ def fit_shapes(signals: Floats, loading: float, width_empty: float, width_full: 
         [0.0, np.log(width_empty), 0.3, 1.0, np.log(width_full), 0.3, np.log(full / (1 - full)), -6.0]
     )
     unit = np.array([width_empty / 3, 0.1, 0.3, width_full / 3, 0.1, 0.3, 0.3, 1.0])
-    bounds = [(low / one, high / one) for (low, high), one in zip(_bounds(start), unit, strict=True)]
+    bounds = _bounds(start) / unit[:, None]
+    options = {"maxiter": 500, "ftol": 1e-13, "gtol": 1e-3}
 
     def in_units(x: Floats) -> float:
         return unlikelihood(x * unit)
 
-    options = {"maxiter": 500, "ftol": 1e-13, "gtol": 1e-3}
     found = minimize(in_units, start / unit, method="L-BFGS-B", bounds=bounds, options=options)
     return _shapes(found.x * unit)[0]
 
 
-def _bounds(start: Floats) -> list[tuple[float, float]]:
-    narrow, wide = np.log(0.4), np.log(2.5)
-    return [
-        (-0.3, 0.3),
-        (start[1] + narrow, start[1] + wide),
-        (-1.8, 1.8),
-        (0.7, 1.3),
-        (start[4] + narrow, start[4] + wide),
-        (-1.8, 1.8),
-        (-6.0, 6.0),
-        (-12.0, -2.0),
-    ]
+def _bounds(start: Floats) -> Floats:
+    log_width, log_full = ((x + np.log(0.4), x + np.log(2.5)) for x in start[[1, 4]])
+    skewness = (-1.8, 1.8)
+    empty, full = ((-0.3, 0.3), log_width, skewness), ((0.7, 1.3), log_full, skewness)
+    return np.array([*empty, *full, (-6.0, 6.0), (-12.0, -2.0)])
 
 
 def _shapes(x: Floats) -> tuple[Shapes, float]:
@@ -255,14 +247,12 @@ def fit_thresholds(signals: Floats, miss_cost: float = 3.0, detector: str = "det
     )
     at, missed, imagined = _cheapest(shapes, ratio_empty, ratio_full, miss_cost)
     thresholds = places.empty + at * steps
+    loading = (by_site > thresholds[:, None]).mean(axis=1)
     return FittedThresholds(
-        thresholds.reshape(shape),
-        missed.reshape(shape),
-        imagined.reshape(shape),
-        (by_site > thresholds[:, None]).mean(axis=1).reshape(shape),
-        never.reshape(shape),
-        always.reshape(shape),
-        shapes.between,
+        *(values.reshape(shape) for values in (thresholds, missed, imagined, loading)),
+        never_loaded=never.reshape(shape),
+        always_loaded=always.reshape(shape),
+        lost=shapes.between,
     )
 
 
@@ -306,12 +296,10 @@ def _moments(by_site: Floats, part: Bools) -> tuple[Floats, Floats, Floats]:
 def _check_enough(two: Bools, by_site: Floats, detector: str) -> None:
     n_one = int((~two).sum())
     if n_one > MAX_ONE_PEAK * len(two):
-        spread = (
-            "all signals are equal: black or saturated frames"
-            if np.ptp(by_site) == 0
-            else ("check the loading, the light, and that the sites are where the atoms are")
-        )
-        raise DeviceError(detector, f"{n_one} of {len(two)} sites show one peak, not two; {spread}")
+        remedy = "check the loading, the light, and that the sites are where the atoms are"
+        if np.ptp(by_site) == 0:
+            remedy = "all signals are equal: black or saturated frames"
+        raise DeviceError(detector, f"{n_one} of {len(two)} sites show one peak, not two; {remedy}")
 
 
 def _with_single_peaks(peaks: _SitePeaks, by_site: Floats) -> tuple[_SitePeaks, Bools, Bools]:

@@ -97,15 +97,7 @@ def site_kinds(occupancy: Occupancy, target: TargetPattern) -> NDArray[np.int8]:
 def draw_array(
     occupancy: Occupancy, target: TargetPattern, shear: int, scale: Scale, glyphs: Glyphs
 ) -> list[Text]:
-    """Draw an occupancy, one line of text per row of sites (or per two rows).
-
-    Args:
-        occupancy: bool (n_rows, n_cols).
-        target: The target.
-        shear: +1 if rows shift to the right on the way down, -1 to the left, 0 on a square lattice.
-        scale: Size of the sites.
-        glyphs: The characters to draw with.
-    """
+    """Draw an occupancy, one line of text per row of sites (or per two rows)."""
     rows: list[list[int]] = site_kinds(occupancy, target).tolist()
     n_rows = len(rows)
     if scale.rows == 1:

@@ -34,13 +34,7 @@ Timeline = Sequence[tuple[str, Sequence[TimelineEntry]]]
 
 
 def timeline_table(timeline: Timeline, block: str, width: int = BAR_WIDTH) -> list[str]:
-    """A row per bar of the timeline: step, start, length, and the bar itself.
-
-    Args:
-        timeline: Name of each step and its bars.
-        block: The character of the bars.
-        width: Width of the longest bar in characters; 0 for no bars.
-    """
+    """A row per bar of the timeline: step, start, length, and the bar itself; no bars if the width is 0."""
     total_s = sum(bar.duration_s for _, bars in timeline for bar in bars)
     rows = [("step", "", "start", "at most", "")]
     start_s = 0.0
@@ -66,14 +60,7 @@ def _bar(start_s: float, duration_s: float, total_s: float, block: str, width: i
 def lines_table(
     lines: Mapping[str, Sequence[tuple[float, float]]], total_s: float, block: str, width: int = BAR_WIDTH
 ) -> list[str]:
-    """A row per line: the time that it is on, and a bar that shows when.
-
-    Args:
-        lines: Name -> (start, end) of each time that the line is on, in seconds.
-        total_s: Duration of the shot, in seconds.
-        block: The character of the bars.
-        width: Width of the longest bar in characters; 0 for no bars.
-    """
+    """A row per line: the time that it is on, and a bar that shows when; ``lines`` has (start, end) in s."""
     if not lines:
         return []
     rows = [("line", "", "times on", "at most", "")]
@@ -133,20 +120,7 @@ _TEXT_WIDTH: Final = 48  # width of the timeline without its bars
 def check_sequence(
     sequence: Path, profile: str | None, overrides: Sequence[str], dry_run: DryRun, *, as_json: bool
 ) -> None:
-    """Check a sequence, and print its timeline, limits and errors; no device is opened.
-
-    Args:
-        sequence: The sequence file.
-        profile: Name or path of the profile, instead of the sequence's own.
-        overrides: ``"address=value"`` strings.
-        dry_run: "off", "full" or "fast".
-        as_json: Whether to print all of it as one line of JSON, alone on stdout.
-
-    Raises:
-        ConfigError: Sequence, profile or an override has an error.
-        UnknownPluginError: A named plugin does not exist.
-        PluginLoadError: A named plugin failed to load.
-    """
+    """Check a sequence, and print its timeline, limits and errors; no device is opened."""
     answer = stdout_to_stderr() if as_json else None
     observer = LogLines(sys.stderr)
     try:

@@ -22,17 +22,8 @@ MAX_ROWS: Final = 200
 def examine(data: Path | None, *, dry_run: bool, as_json: bool) -> int:
     """Find damage, repair it where possible, and print the findings.
 
-    Args:
-        data: A data folder or a run's; None for LABSEQ_DATA or ./data.
-        dry_run: Whether to change nothing.
-        as_json: Whether to print one line of JSON instead of a table.
-
     Returns:
         The exit code: 1 if damage is left, else 0.
-
-    Raises:
-        ConfigError: There is no such folder.
-        RecordingError: It cannot be read.
     """
     root = data_root() if data is None else data.expanduser()
     if not root.is_dir():
@@ -98,19 +89,8 @@ def _as_values(report: Report) -> dict[str, Any]:
 def export_to(run: Path | None, kind: str, output: Path | None, *, frames: bool, replace: bool) -> int:
     """Export a run, and print the names of the files.
 
-    Args:
-        run: The run's folder or any file in it; None for the newest run.
-        kind: One of :data:`labseq.recording.export.ENDINGS`.
-        output: The file; None for one named after the run, in the current folder.
-        frames: Whether an archive holds the frames.
-        replace: Whether existing files may be replaced.
-
     Returns:
         The exit code: 1 if shots are missing in the file.
-
-    Raises:
-        ConfigError: There is no such run, or the file cannot be written.
-        RecordingError: The run is damaged.
     """
     if output is not None:
         check_export(kind, output, frames=frames, replace=replace)

@@ -29,12 +29,6 @@ _HEADER = ("device", "plugin", "model", "serial number", "firmware", "latency", 
 def show_devices(profile: str, overrides: Sequence[str], dry_run: DryRun, *, as_json: bool) -> int:
     """Check the devices of a profile, and print a table of them.
 
-    Args:
-        profile: Name or path of the profile.
-        overrides: ``"address=value"`` strings.
-        dry_run: "off", "full" or "fast".
-        as_json: Whether to print everything as one line of JSON, alone on stdout.
-
     Returns:
         The exit code: 0 if all devices work, 3 if one failed, else 2 if one could not be constructed.
 
@@ -112,16 +106,9 @@ def _as_values(report: DevicesReport) -> dict[str, Any]:
 def secure_profile(profile: str, overrides: Sequence[str]) -> int:
     """Make a profile's devices safe; print a line for each.
 
-    Args:
-        profile: Name or path of the profile.
-        overrides: ``"address=value"`` strings.
-
     Returns:
         The exit code: 0 if every device is safe and the profile has no error, 3 if a device
         failed, else 2.
-
-    Raises:
-        ConfigError: The profile cannot be read; no device was opened.
     """
     secured = make_profile_safe(profile, overrides, _Lines())
     if secured.problems is not None:
@@ -145,16 +132,7 @@ class _Lines:
 
 
 def list_plugins(profile: str | None, *, as_json: bool = False) -> None:
-    """Print a table of the plugins.
-
-    Args:
-        profile: Name or path of a profile whose plugin folders are searched too; without a profile, the
-            folder ``plugins`` is searched, if it exists.
-        as_json: Whether to print one line of JSON instead.
-
-    Raises:
-        ConfigError: The profile has an error, or one of its folders does not exist.
-    """
+    """Print a table of the plugins, those in the folders of a profile or in ``plugins`` included."""
     answer = stdout_to_stderr() if as_json else None
     folders, max_wait_s = _folders(profile)
     host = load_plugins(folders, max_wait_s=max_wait_s)

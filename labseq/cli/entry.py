@@ -102,9 +102,6 @@ def _end_process(code: Any) -> NoReturn:
     """End the process with an exit code, even if a plugin left a thread that Python would wait for.
 
     At this point all data are on disk and every device is safe, so such a thread can be ended.
-
-    Args:
-        code: As for ``sys.exit``.
     """
     deadline = time.monotonic() + MAX_WAIT_S
     with suppress(KeyboardInterrupt):  # on Ctrl-C, stop waiting

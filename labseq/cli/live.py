@@ -33,12 +33,7 @@ _BETWEEN_SHOTS: Final = frozenset(
 
 
 def observer_for(stream: TextIO, run_now: Callable[[], float] | None = None) -> LiveView | LogLines:
-    """The live view if the stream is a terminal that can show it, else plain lines.
-
-    Args:
-        stream: The stream for the view.
-        run_now: Clock of the run in seconds, if it is not that of this process.
-    """
+    """The live view if the stream is a terminal that can show it, else plain lines."""
     if stream.isatty() and os.environ.get("TERM", "") not in {"dumb", "unknown"}:
         return LiveView(Console(file=stream), run_now=run_now)
     return LogLines(stream)
@@ -284,17 +279,7 @@ _FILLING_RANGE: Final = 0.01
 
 
 def draw_scan(tally: ScanTally, width: int, height: int, glyphs: Glyphs) -> list[Text]:
-    """Draw the share of defect-free shots at each point, or the filling while no shot is defect-free.
-
-    Args:
-        tally: The scan.
-        width: Characters per line.
-        height: Number of lines, title and values included.
-        glyphs: The characters to draw with.
-
-    Returns:
-        The lines; empty if there is no room, or no shot yet.
-    """
+    """Draw the share of defect-free shots at each point, or the filling while no shot is defect-free."""
     points = tally.points()
     shown = _merged([point for _, point in points], width - _LABEL)
     taken = [point for point in shown if point.n_shots]

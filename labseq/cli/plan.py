@@ -42,17 +42,7 @@ class PlanOutput:
 
 
 def plan_once(request: PlanRequest, output: PlanOutput) -> None:
-    """Plan the moves for one occupancy, and print or write them.
-
-    Args:
-        request: The arguments of the plan.
-        output: The output to print and write.
-
-    Raises:
-        ConfigError: The request has an error, or a file cannot be written.
-        PluginLoadError: A named plugin failed to load.
-        PlanError: The planner failed, or its plan breaks a rule.
-    """
+    """Plan the moves for one occupancy, and print or write them."""
     check_different(request.occupancy, output.json, output.png)
     write = json_writer(output.json)
     source = read_source(request.occupancy, request.seed)
@@ -108,13 +98,7 @@ def _draw(moves: PlannedMoves, path: Path) -> None:
 
 
 def batch_lines(moves: PlannedMoves, canvas: ArrayPair, arrow: str) -> Iterator[list[Text]]:
-    """Describe and draw each batch.
-
-    Args:
-        moves: The plan.
-        canvas: Draws the arrays before and after.
-        arrow: Printed between the ends of a move.
-    """
+    """Describe and draw each batch."""
     plan, report, shape = moves.plan, moves.report, moves.grid.shape
     arrays = occupancies(plan, moves.occupancy)
     for i, batch in enumerate(plan.batches):
@@ -137,11 +121,6 @@ def batch_lines(moves: PlannedMoves, canvas: ArrayPair, arrow: str) -> Iterator[
 
 def moves_text(batch: Batch, shape: tuple[int, int], arrow: str = "->") -> list[str]:
     """Describe the moves of a batch, a line of text per row or column.
-
-    Args:
-        batch: The batch.
-        shape: (n_rows, n_cols) of the grid.
-        arrow: Printed between the ends of a move.
 
     Example:
         >>> moves_text(Batch([(2, 0), (2, 4)], [(2, 3), (2, 5)]), (5, 5))
@@ -173,16 +152,7 @@ class _Console(Console):
 
 
 def print_plan(moves: PlannedMoves, stream: TextIO, *, step: bool) -> None:
-    """Print a plan.
-
-    Args:
-        moves: The plan.
-        stream: Output stream. If it and stdin are terminals, each batch waits for Enter.
-        step: Whether to print the plan batch by batch first.
-
-    Raises:
-        RecordingError: It cannot be written, for example to a full disk.
-    """
+    """Print a plan, batch by batch if wanted; in a terminal each batch waits for Enter."""
     console = _Console(file=stream, highlight=False, soft_wrap=True)
     with writing_to(stream):
         _print_all(console, moves, step=step)

@@ -29,16 +29,7 @@ from labseq.session.stopping import ask_to_stop, find_running, is_running, owner
 
 
 def run_sequence(sequence: Path, options: Options, *, as_json: bool) -> None:
-    """Run a sequence and print the result, also if it was stopped or failed.
-
-    Args:
-        sequence: The sequence file.
-        options: The options of the session.
-        as_json: Whether to print the result as JSON, last and alone on stdout.
-
-    Raises:
-        LabseqError: The error that ended the run.
-    """
+    """Run a sequence and print the result, also if it was stopped or failed."""
 
     def start(observer: RunObserver | None) -> Session:
         return Session.open(sequence, **asdict(options), observer=observer)
@@ -47,17 +38,7 @@ def run_sequence(sequence: Path, options: Options, *, as_json: bool) -> None:
 
 
 def resume_run(path: Path, *, accept_changes: bool, realtime: bool, as_json: bool) -> None:
-    """Resume a run that ended early, and print the result.
-
-    Args:
-        path: The run's folder or any file in it.
-        accept_changes: Whether to resume even if something has changed since.
-        realtime: Whether virtual time passes as fast as real time.
-        as_json: Whether to print the result as JSON, last and alone on stdout.
-
-    Raises:
-        LabseqError: The error that ended the run.
-    """
+    """Resume a run that ended early, and print the result."""
 
     def resume(observer: RunObserver | None) -> Session:
         options = {"accept_changes": accept_changes, "realtime": realtime}
@@ -67,15 +48,7 @@ def resume_run(path: Path, *, accept_changes: bool, realtime: bool, as_json: boo
 
 
 def run_session(opening: Callable[[RunObserver | None], Session], *, as_json: bool) -> None:
-    """Run a session and print the result, also if it was stopped or failed.
-
-    Args:
-        opening: Opens the session; its argument is the observer that shows it.
-        as_json: Whether to print the result as JSON, last and alone on stdout.
-
-    Raises:
-        LabseqError: The error that ended the run.
-    """
+    """Run the session that ``opening`` opens with an observer; print the result even if the run failed."""
     answer = stdout_to_stderr() if as_json else None
     observer = observer_for(sys.stdout)
     session: Session | None = None
@@ -98,13 +71,7 @@ def run_session(opening: Callable[[RunObserver | None], Session], *, as_json: bo
 
 
 def json_result(session: Session | None, run: Run | None, failure: BaseException | None) -> str:
-    """The result of a run as one line of JSON.
-
-    Args:
-        session: The session, if it could be opened.
-        run: The run as it is on disk, if it can be read.
-        failure: The error that ended the run, or None.
-    """
+    """The result of a run as one line of JSON."""
     values = json_summary(run)
     if run is None and session is not None and session.run_dir is not None:
         values["run_dir"] = str(session.run_dir)
@@ -147,18 +114,7 @@ POLL_S: Final = 0.1
 
 
 def stop_run(run: Path | None, profile: str | None, *, queue: bool, wait: bool) -> None:
-    """Ask a run in progress to end after its current shot, and print a confirmation.
-
-    Args:
-        run: Its folder; None if it is the only one in progress.
-        profile: Its profile, instead of its folder.
-        queue: Whether the queue ends as well.
-        wait: Whether to wait for the end of the run.
-
-    Raises:
-        ConfigError: No run is in progress, or several are; or no process runs the queue.
-        RecordingError: Its folder cannot be written to.
-    """
+    """Ask a run in progress to end after its current shot, and print a confirmation."""
     if queue:
         if not Queue(data_root()).ask_to_stop():
             raise ConfigError("no process runs the queue; 'labseq stop' without --queue ends a run")
@@ -181,15 +137,7 @@ SHOTS: Final = 10
 
 
 def run_demo(shots: int | None, output: Path | None) -> None:
-    """Run a packaged sequence on the packaged virtual profile, and explain it before and after.
-
-    Args:
-        shots: Number of shots; None for :data:`SHOTS`.
-        output: Folder for the data; None for LABSEQ_DATA or ./data.
-
-    Raises:
-        LabseqError: The error that ended the run.
-    """
+    """Run a packaged sequence on the packaged virtual profile, and explain it before and after."""
     opened: list[Session] = []
     profile = str(packaged_profiles_dir() / f"{PROFILE}.yaml")  # not one of this name in the current folder
     options = Options(profile, SHOTS if shots is None else shots, output=output)
@@ -242,10 +190,7 @@ def ending(run_dir: Path) -> list[str]:
 
 
 def copy_files(folder: Path) -> None:
-    """Copy the packaged sequences and profiles for the user to change; no file is replaced.
-
-    Args:
-        folder: Gets the folders ``sequences`` and ``hardware_profiles``.
+    """Copy the packaged sequences and profiles to a folder, for the user to change; no file is replaced.
 
     Raises:
         ConfigError: One of the files exists already, and none was copied; or one cannot be written.

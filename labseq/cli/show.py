@@ -48,17 +48,7 @@ class Tables:
 
 
 def show_run(path: Path | None, *, as_json: bool, tables: Tables | None = None) -> None:
-    """Print the summary or tables of a run.
-
-    Args:
-        path: The run's folder or any file in it; None for the newest run.
-        as_json: Whether to print one line of JSON instead.
-        tables: The tables to print instead of the summary.
-
-    Raises:
-        ConfigError: There is no such run, or it has no data for a table.
-        RecordingError: It is damaged.
-    """
+    """Print the summary or tables of a run; without a path, of the newest."""
     wanted = tables or Tables()
     try:
         run = chosen_run(path)
@@ -105,13 +95,7 @@ def _json_tables(run: Run, wanted: Tables) -> dict[str, Any]:
 
 
 def shot_table(run: Run, *, details: bool = False) -> list[str]:
-    """A row per shot.
-
-    Args:
-        run: The run.
-        details: Whether to include the scanned values, the number of batches, and the attempts that
-            did not complete.
-    """
+    """A row per shot; with details also scanned values, batches, and attempts that did not complete."""
     addresses: list[str] = [str(one) for one in run.scan.get("addresses", ())] if details else []
     header = ["shot", *map(clean, addresses), "outcome", "filling", "cycles", "atom moves", "shot time"]
     rows = [_shot_row(shot, run, details=details) for shot in (_all_attempts(run) if details else run.shots)]

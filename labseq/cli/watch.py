@@ -37,17 +37,7 @@ Event = tuple[str, Mapping[str, Any]]
 def watch_run(
     path: Path | None, stream: TextIO | None = None, wait: Callable[[float], None] = time.sleep
 ) -> None:
-    """Show a run until it ends, then print its summary; only its files are read.
-
-    Args:
-        path: The run's folder or any file in it; None for the newest run.
-        stream: The stream for the view; stdout by default.
-        wait: Function that waits for a time in seconds.
-
-    Raises:
-        ConfigError: There is no such run.
-        RecordingError: It is damaged.
-    """
+    """Show a run until it ends, then print its summary; only its files are read."""
     run = chosen_run(path)
     reader = EventReader(run)
     shown = stream or sys.stdout

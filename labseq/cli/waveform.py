@@ -33,19 +33,7 @@ class WaveformOutput:
 
 
 def show_waveform(request: WaveformRequest, output: WaveformOutput) -> None:
-    """Render the waveform of a plan, print its numbers, and write the output files.
-
-    Args:
-        request: The arguments.
-        output: The files to write.
-
-    Raises:
-        ConfigError: The request has an error, there is nothing to play, or a file
-            cannot be written.
-        PluginLoadError: A named plugin failed to load.
-        PlanError: The planner failed, or its plan breaks a rule.
-        LimitError: The tones break a limit of AOD or amplifier.
-    """
+    """Render the waveform of a plan, print its numbers, and write the output files."""
     check_different(request.plan.occupancy, output.json, output.png, output.npz)
     write = json_writer(output.json)
     _check_files(output)

@@ -82,11 +82,7 @@ MAX_REPORTED: Final = 50
 
 
 def report(error: BaseException, *, debug: bool = False) -> int:
-    """Print on stderr what went wrong.
-
-    Args:
-        error: What ended the command.
-        debug: Whether to print the traceback as well.
+    """Print on stderr what went wrong, with the traceback if wanted.
 
     Returns:
         The exit code.

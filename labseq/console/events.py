@@ -50,11 +50,6 @@ class LogLines:
 def event_text(name: str, values: Mapping[str, Any], run: RunRecord | None) -> str:
     """Describe an event on one line. Shots, attempts and points are counted from 1.
 
-    Args:
-        name: Name of the event.
-        values: Its values.
-        run: The run, once it is known.
-
     Returns:
         "" for an event that is not printed.
     """
@@ -121,13 +116,7 @@ def shot_text(shot: ShotRecord, run: RunRecord | None) -> str:
 
 
 def outcome(success: bool, seen_cycle: int, filling_fraction: float, n_atoms: int) -> str:
-    """How a shot ended. Cycles are counted from 1.
-
-    Args:
-        success: Whether its last image met the target.
-        seen_cycle: The first cycle whose image met it; 0 for none.
-        filling_fraction: Share of target sites with an atom; nan without an image.
-        n_atoms: Number of target sites.
+    """How a shot ended. Cycles are counted from 1; ``seen_cycle`` is 0 if no image met the target.
 
     Example:
         >>> outcome(True, 2, 1.0, 225)

@@ -34,14 +34,10 @@ def replace_unencodable() -> None:
 
 
 def say(*lines: str, stream: TextIO | None = None) -> None:
-    """Print lines and flush.
+    """Print lines and flush; to stdout by default.
 
     If the reader has closed the pipe, as ``| head`` does, the lines are dropped: a command neither ends
     nor changes its exit code because of it.
-
-    Args:
-        *lines: Without line ends.
-        stream: Where to print; stdout by default.
 
     Raises:
         RecordingError: They cannot be written, for example because the disk is full.
@@ -89,8 +85,10 @@ def report_compiling(module: str) -> None:
 
 
 def as_line(values: Any) -> str:
-    """JSON on one line, in ASCII, so that every terminal can show it."""
-    return json.dumps(values)
+    """Any values as JSON on one line, nan as null; in ASCII, so that every terminal can show it."""
+    from labseq.plain import to_plain
+
+    return json.dumps(to_plain(values))
 
 
 def stdout_to_stderr() -> Callable[[str], None]:
@@ -142,10 +140,7 @@ def json_writer(name: str | None) -> Callable[[Any], None]:
 
 
 def check_different(*names: str | Path | None) -> None:
-    """Check that no file is named twice: the last output would replace the others.
-
-    Args:
-        *names: The files that a command reads and writes; None and "-" are ignored.
+    """Check that no file is named twice: the last output would replace the others. None and "-" are ignored.
 
     Raises:
         ConfigError: Two of them are the same file.

@@ -11,10 +11,7 @@ from labseq.recording.folders import find_run
 
 
 def chosen_run(path: Path | None) -> Run:
-    """Open the run that a command is given.
-
-    Args:
-        path: The run's folder or any file in it; None for the newest run.
+    """Open the run of this folder or of any file in it; without a path the newest.
 
     Raises:
         ConfigError: There is no such run.
@@ -24,10 +21,7 @@ def chosen_run(path: Path | None) -> Run:
 
 
 def existing_run(path: Path) -> Path:
-    """The folder of the run that a command is given.
-
-    Args:
-        path: The run's folder or any file in it.
+    """The folder of the run that a command is given, or any file in it.
 
     Raises:
         ConfigError: There is no such run: the command line is wrong, not the data.
