@@ -93,9 +93,6 @@ def draw_trend(
     """Draw a fraction for each shot, and its running mean with the error.
 
     Args:
-        axes: Axes to draw on.
-        title: Title.
-        label: Label of the y axis.
         shots: float64 (n,), numbers of the shots, from 1.
         values: float64 (n,), a fraction for each.
         running: The running mean, see :func:`points_of`.
@@ -130,15 +127,8 @@ def draw_curves(
     """Draw fractions with error bars.
 
     Args:
-        axes: Axes to draw on.
-        title: Title.
-        x_label: Label of the x axis.
-        y_label: Label of the y axis.
         curves: Name -> points, see :func:`points_of`; at least one of each.
         ticks: Text at x = 0, 1, 2, ... instead of numbers; the points are then not joined.
-        whole: Whether x is a count.
-        logarithmic: Whether the x axis is logarithmic.
-        from_zero: Whether the y axis begins at 0.
     """
     for (name, (x, y, low, high)), colour, marker in zip(curves.items(), (DARK, ORANGE), "os", strict=False):
         bars = 100 * np.nan_to_num([y - low, high - y]).clip(min=0.0)
@@ -179,15 +169,7 @@ def draw_map(
     """Draw a fraction against two scanned values, a cell for each pair.
 
     Args:
-        axes: Axes to draw on.
-        title: Title.
-        x_label: The address along x.
-        y_label: The address along y.
-        x_ticks: Its values, as written.
-        y_ticks: Values of the other address, as written.
         values: float64 (len(y_ticks), len(x_ticks)), fractions; NaN if unknown.
-        label: Label of the colour bar.
-        limits: Range of the colours.
     """
     from matplotlib import colormaps
 
@@ -219,10 +201,6 @@ def draw_sites(
     """Draw a fraction for each site, in its cell.
 
     Args:
-        axes: Axes to draw on.
-        title: Title.
-        label: Label of the colour bar.
-        grid: The grid of sites.
         values: float64 (n_rows, n_cols), fractions; NaN if unknown.
         outlined: bool (n_rows, n_cols), the target, around which a line is drawn.
     """
@@ -256,9 +234,6 @@ def draw_defects(axes: Axes, *, title: str, x_label: str, shares: Floats, expect
     """Draw the share of the shots with each number of defects.
 
     Args:
-        axes: Axes to draw on.
-        title: Title.
-        x_label: Label of the x axis.
         shares: Share of the shots at 0, 1, 2, ... defects, see :func:`points_of`.
         expected: float64 (n,), the shares for independent sites with the same mean filling.
     """
@@ -300,9 +275,6 @@ def draw_stages(
     A point shows the median, a line reaches to the 99th percentile, a mark shows the budget.
 
     Args:
-        axes: Axes to draw on.
-        title: Title.
-        stages: The stages, in order.
         clocks: "session_s" and perhaps "host_s" -> name of the clock.
     """
     from matplotlib.ticker import FuncFormatter, NullFormatter

@@ -114,9 +114,6 @@ class RunPicture:
 def overview(run: Run) -> RunPicture:
     """All panels of a run. Those that need shot files may use part of the shots, as their titles then say.
 
-    Args:
-        run: The run, finished or not.
-
     Raises:
         ConfigError: It has no shots yet.
         RecordingError: It is damaged.
@@ -139,7 +136,6 @@ def picture_of(run: Run, what: str) -> RunPicture:
     """One part of the overview.
 
     Args:
-        run: The run, finished or not.
         what: One of :data:`CHOICES`.
 
     Raises:
@@ -412,7 +408,6 @@ class _Summary:
     """Sums over a run, computed on first use.
 
     Args:
-        run: The run.
         max_read: Maximum number of shots whose files are read.
     """
 
@@ -532,13 +527,7 @@ def note_of(run: Run) -> str:
 
 
 def cannot_draw(run: Run, what: str, expected: str) -> ConfigError:
-    """The error for a picture that cannot be drawn from a run.
-
-    Args:
-        run: The run.
-        what: The reason.
-        expected: The data that the picture needs.
-    """
+    """The error for a picture that cannot be drawn from a run."""
     text = f"the picture cannot be drawn from this run: {what}"
     return ConfigError(Problem(text, clean(str(run.path)), expected=expected))
 

@@ -97,11 +97,7 @@ class ReplayedImages:
 
     @classmethod
     def none(cls, shape: tuple[int, int]) -> ReplayedImages:
-        """Empty results, to which shots are added.
-
-        Args:
-            shape: n_rows and n_cols of the grid.
-        """
+        """Empty results, to which shots are added."""
         return cls([], np.zeros(shape, np.int64), np.zeros(shape, np.int64))
 
     @property
@@ -251,14 +247,6 @@ def replay_plans(
     shot: Shot, planner: Planner, name: str, degree_of_parallelism: int, grid: SiteGrid, motion: MotionSpec
 ) -> list[ReplayedPlan]:
     """Plan again for every image of a shot for which a plan was recorded.
-
-    Args:
-        shot: The shot.
-        planner: The planner.
-        name: Its name, for messages.
-        degree_of_parallelism: Maximum number of tweezers on at once, for the check of its plans.
-        grid: The grid of sites.
-        motion: How the mobile tweezers move.
 
     Raises:
         RecordingError: The shot cannot be read.
@@ -447,8 +435,6 @@ def replay(run: Run, request: ReplayRequest, *, announce: Callable[[str], None] 
     Settings, calibrations and motion are the run's own, from its folder.
 
     Args:
-        run: The run, finished or not.
-        request: The planner and detector to replay.
         announce: Called with the name of a module before its kernels are compiled.
 
     Raises:

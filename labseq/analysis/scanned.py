@@ -51,11 +51,7 @@ class Scanned:
     statistics: tuple[Statistics, ...]
 
     def means(self, mean_of: Callable[[Statistics | CycleStatistics], Estimated]) -> list[Estimated]:
-        """A mean at each point; if no shot is judged, over the images at the end of the last cycles.
-
-        Args:
-            mean_of: Takes the mean from the statistics.
-        """
+        """A mean at each point; if no shot is judged, over the images at the end of the last cycles."""
         judged = any(one.defect_free.n_trials for one in self.statistics)
         of = [one if judged or not one.cycles else one.cycles[-1] for one in self.statistics]
         return [mean_of(one) for one in of]

@@ -110,10 +110,6 @@ class ShotDrawing:
 def save_shot(path: Path, drawing: ShotDrawing) -> None:
     """Draw the images of a shot, each aligned with the lattice.
 
-    Args:
-        path: The PNG, SVG or PDF file.
-        drawing: The content of the picture.
-
     Raises:
         ConfigError: The file cannot be written.
     """
@@ -250,7 +246,6 @@ def shot_picture(run: Run, number: int, cycle: int | None = None) -> ShotDrawing
     """The images of a shot with the detected atoms and the moves that followed.
 
     Args:
-        run: The run.
         number: The shot, counted from 1 as ``labseq show`` does. Of one that did not complete, the last
             attempt.
         cycle: Only this cycle, counted from 1 over all rearrangements of the shot: the image that it was

@@ -51,8 +51,6 @@ def jeffreys(n: int, n_trials: int, level: float = ONE_SIGMA) -> tuple[float, fl
     Statist. Sci. 16, 101, 2001).
 
     Args:
-        n: Number of events.
-        n_trials: Number of trials.
         level: Probability of the interval, between 0 and 1.
 
     Returns:
@@ -152,12 +150,7 @@ class Statistics:
 
 
 def statistics_of(shots: Iterable[Shot], target: TargetPattern) -> Statistics:
-    """Compute the statistics of shots from the index, or from their files if needed; no frames are read.
-
-    Args:
-        shots: The shots.
-        target: The target of their run.
-    """
+    """Compute the statistics of shots from the index, or from their files if needed; no frames are read."""
     all_shots = list(shots)
     read: list[tuple[Shot, ShotSummary]] = []
     unreadable: list[Shot] = []

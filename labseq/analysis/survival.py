@@ -77,7 +77,6 @@ class Survival:
         """Count the atoms of a shot.
 
         Args:
-            shot: Its file is read.
             loads: Indices of the steps that load atoms; survival is not counted across them.
 
         Raises:

@@ -38,17 +38,8 @@ WIDEST: Final = 64
 def replay_run(path: Path | None, request: ReplayRequest, output: Path | None, *, as_json: bool) -> int:
     """Replay a run and print the comparison.
 
-    Args:
-        path: The run's folder or any file in it; None for the newest run.
-        request: The planner and detector to replay.
-        output: File for all results as JSON, or None.
-        as_json: Whether to print them as one line of JSON instead.
-
     Returns:
         The exit code: 1 if the run's own planner or detector did not reproduce the recorded results.
-
-    Raises:
-        LabseqError: The request has an error, or the run cannot be replayed.
     """
     run = chosen_run(path)
     write = json_writer(None if output is None else str(output))
@@ -251,17 +242,8 @@ def _means_values(means: MeanCounts) -> dict[str, Any]:
 def analyse_run(path: Path | None, use: str | None, overrides: Sequence[str], *, again: bool) -> int:
     """Analyse the shots of a run that have no result yet, and print how many.
 
-    Args:
-        path: The run's folder or any file in it; None for the newest run.
-        use: Name of an analysis; None for those of the run's sequence.
-        overrides: ``"key=value"`` strings: settings of that analysis.
-        again: Whether to analyse all shots again.
-
     Returns:
         The exit code: 1 if the analysis of a shot failed.
-
-    Raises:
-        LabseqError: An option has an error, or the results cannot be written.
     """
     run = chosen_run(path)
     failed = False
@@ -273,11 +255,7 @@ def analyse_run(path: Path | None, use: str | None, overrides: Sequence[str], *,
 
 
 def _wanted(run: Run, use: str | None, overrides: Sequence[str]) -> list[dict[str, Any]]:
-    """The settings of each analysis to run.
-
-    Raises:
-        ConfigError: There is no analysis, or an option has an error.
-    """
+    """The settings of each analysis to run."""
     own = analyses_of(run)
     if use is not None:
         settings = next((one for one in own if one[USE] == use), {USE: use})
@@ -292,11 +270,7 @@ def _wanted(run: Run, use: str | None, overrides: Sequence[str]) -> list[dict[st
 
 
 def _changes(overrides: Sequence[str]) -> dict[str, Any]:
-    """The values of ``--set``.
-
-    Raises:
-        ConfigError: One is not of the form key=value, or its value is not YAML.
-    """
+    """The values of ``--set``."""
     for_sequence, for_profile = split_overrides(overrides)
     if for_profile:
         what = "an analysis has no settings in the profile"
@@ -356,18 +330,7 @@ class PlotRequest:
 
 
 def plot_run(run: Path | None, request: PlotRequest, output: Path | None) -> None:
-    """Draw a run.
-
-    Args:
-        run: The run's folder or any file in it; None for the newest run.
-        request: The part or shot to draw.
-        output: The picture; None for its default name in the current folder.
-
-    Raises:
-        ConfigError: There is no such run or picture, the run has no data for it, or the
-            picture cannot be written.
-        RecordingError: The run is damaged.
-    """
+    """Draw a run."""
     request.check()
     path = Path(f"{request.name}.png") if output is None else output
     check_place(path)

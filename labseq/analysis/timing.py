@@ -94,9 +94,6 @@ class StageTotals:
     def add(self, shot: Shot) -> None:
         """Add the stages of a shot.
 
-        Args:
-            shot: Its file is read.
-
         Raises:
             RecordingError: The file cannot be read.
         """
@@ -106,11 +103,7 @@ class StageTotals:
         self._shot_s.append(math.fsum(one.duration_s for one in timing if one.stage.startswith(STEP)))
 
     def sum_up(self, run: Run) -> RunTiming:
-        """The statistics of all stages added so far.
-
-        Args:
-            run: The run; the time for writing is taken from its index and event log, for all its shots.
-        """
+        """The statistics of all stages added so far."""
         n_read, total_s = len(self._shot_s), math.fsum(self._shot_s)
         names = sorted(self._found, key=_place)
         stages = [_sum_up(name, self._found[name], n_read, total_s) for name in names]
@@ -120,12 +113,7 @@ class StageTotals:
 
 
 def timing_of(run: Run, shots: Iterable[Shot]) -> RunTiming:
-    """Durations of the stages of the given shots; those whose files cannot be read are left out.
-
-    Args:
-        run: Their run.
-        shots: The shots.
-    """
+    """Durations of the stages of the given shots; those whose files cannot be read are left out."""
     watch = StageTotals()
     for shot in shots:
         with suppress(RecordingError):

@@ -100,11 +100,7 @@ class Entry:
 
 
 class Queue:
-    """The queue of a data root.
-
-    Args:
-        root: The data root.
-    """
+    """The queue of a data root."""
 
     def __init__(self, root: Path) -> None:
         self.folder = root.absolute() / FOLDER
@@ -164,11 +160,7 @@ class Queue:
             self.drop(number)
 
     def drop(self, number: int) -> None:
-        """Take an entry out; legal if it is not there.
-
-        Raises:
-            RecordingError: The queue cannot be written to.
-        """
+        """Take an entry out; legal if it is not there."""
         with explained(self._file(number)):
             self._file(number).unlink(missing_ok=True)
 
@@ -414,11 +406,7 @@ class _EntryRecorder:
 
 
 def _open(entry: Entry, observer: RunObserver) -> Session:
-    """The session of an entry: that of its run if that was interrupted, else a new one.
-
-    Raises:
-        LabseqError: It cannot be opened.
-    """
+    """The session of an entry: that of its run if that was interrupted, else a new one."""
     options = entry.options
     if entry.run_dir is not None and entry.run_dir.is_dir():
         return Session.resume(entry.run_dir, realtime=options.realtime, observer=observer)

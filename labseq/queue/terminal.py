@@ -22,11 +22,7 @@ _HEADER = ("id", "state", "sequence", "added", "options")
 
 
 def add_entry(sequence: Path, options: Options) -> None:
-    """Check a sequence and add it to the queue.
-
-    Raises:
-        LabseqError: Something is wrong with it; nothing is added.
-    """
+    """Check a sequence and add it to the queue."""
     entry, checked = Queue(data_root()).add(sequence, options)
     for warning in checked.warnings:
         say(*warning_lines(warning), stream=sys.stderr)
@@ -34,11 +30,7 @@ def add_entry(sequence: Path, options: Options) -> None:
 
 
 def list_entries(*, as_json: bool) -> None:
-    """Print the entries of the queue, in order.
-
-    Raises:
-        RecordingError: One is damaged.
-    """
+    """Print the entries of the queue, in order."""
     queue = Queue(data_root())
     entries = queue.entries()
     if as_json:
@@ -51,20 +43,12 @@ def list_entries(*, as_json: bool) -> None:
 
 
 def remove_entries(ids: Sequence[int]) -> None:
-    """Take entries out of the queue.
-
-    Raises:
-        ConfigError: There is no such entry, or it is running.
-    """
+    """Take entries out of the queue."""
     Queue(data_root()).remove(ids)
 
 
 def move_entry(number: int, before: int) -> None:
-    """Put an entry before another one.
-
-    Raises:
-        ConfigError: There is no such entry.
-    """
+    """Put an entry before another one."""
     Queue(data_root()).move(number, before)
 
 
@@ -77,16 +61,8 @@ class RunSession(Protocol):
 def run_entries(run_session: RunSession, *, keep_going: bool, watch: bool) -> int:
     """Run the entries of the queue.
 
-    Args:
-        run_session: Runs the session of an entry and shows it.
-        keep_going: Whether to continue after an entry that failed.
-        watch: Whether to wait for new entries.
-
     Returns:
         The exit code: that of the first entry that failed, or 0.
-
-    Raises:
-        LabseqError: The error that ended a run; or another process runs the queue.
     """
 
     def take(opening: Opening) -> None:

@@ -58,7 +58,6 @@ def mark_active(roots: Sequence[Path], profile_key: str, run_dir: Path) -> None:
     Args:
         roots: See :func:`marker_roots`; only the first must be writable.
         profile_key: Key of the profile, for example its absolute path.
-        run_dir: The run's folder.
 
     Raises:
         RecordingError: The first root cannot be written to.

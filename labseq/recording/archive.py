@@ -42,11 +42,6 @@ _PACKED: Final = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
 def write_archive(run: Run, path: Path, *, frames: bool) -> list[str]:
     """Write the archive of a run; the file appears only when it is complete.
 
-    Args:
-        run: The run.
-        path: The file; an older one is replaced.
-        frames: Whether it holds the frames.
-
     Returns:
         Why shots were left out: files that are missing or damaged. Empty if all are in it.
 

@@ -82,7 +82,6 @@ def columns_of(run: Run, shots: Sequence[Shot] | None = None) -> list[Column]:
     """The shots of a run as columns, from the index alone.
 
     Args:
-        run: The run.
         shots: The shots of the rows; by default those that count.
     """
     rows = [shot.row for shot in (run.shots if shots is None else shots)]

@@ -260,11 +260,7 @@ class _Check:
                     self._quarantine("a lock whose holder is gone", folder / name, folder)
 
     def check_data_folder(self, stale: list[Marker]) -> None:
-        """Check for leftovers in a data folder next to its runs.
-
-        Args:
-            stale: Markers of runs that are no longer in progress.
-        """
+        """Check for leftovers in a data folder next to its runs."""
         for marker in stale:
             advice = f"'labseq safe {marker.profile or 'PROFILE'}', or the next run on it, makes it safe"
             self._add("a run died here without making its hardware safe", marker.path, f"left: {advice}")

@@ -32,12 +32,6 @@ def files_of(kind: str, path: Path) -> tuple[Path, ...]:
 def check_export(kind: str, path: Path, *, frames: bool = False, replace: bool = False) -> None:
     """Check whether a run can be exported, before anything is read.
 
-    Args:
-        kind: One of :data:`ENDINGS`.
-        path: The file.
-        frames: Whether to export frames; only the archive has them.
-        replace: Whether existing files may be replaced.
-
     Raises:
         ConfigError: It cannot be exported; says what was expected.
     """
@@ -68,12 +62,6 @@ def check_export(kind: str, path: Path, *, frames: bool = False, replace: bool =
 
 def export_run(run: Run, kind: str, path: Path, *, frames: bool = False) -> list[str]:
     """Write a run to a file, which appears only when it is complete; call :func:`check_export` first.
-
-    Args:
-        run: The run; if it is still in progress, the shots up to when it was opened are exported.
-        kind: One of :data:`ENDINGS`.
-        path: The file; an older one is replaced.
-        frames: Whether an archive holds the frames.
 
     Returns:
         One line for each shot that an archive lacks because its file is damaged.

@@ -54,8 +54,6 @@ def shot_file_name(shot_index: int, attempt: int, *, counts: bool, take: int = 1
     """Path of a shot's file, relative to the run's folder.
 
     Args:
-        shot_index: Index of the shot, from 0.
-        attempt: Number of the attempt, from 0.
         counts: Whether the attempt completed the shot.
         take: Counted up from 1 in a resumed run that keeps the file of an earlier take.
 
@@ -112,9 +110,6 @@ def _counters(day: Path, *, claims: bool = True) -> list[int]:
 
 def find_run(path: Path) -> Path:
     """Find the folder of the run that a path belongs to.
-
-    Args:
-        path: A run's folder or any file or folder in it.
 
     Raises:
         RecordingError: The path is not part of a run; the message says what to give instead.

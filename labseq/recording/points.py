@@ -55,7 +55,6 @@ def completed(scan: Mapping[str, Any], rows: Iterable[Mapping[str, Any]]) -> dic
     """The record of an adaptive scan, completed with its points so that it reads like any other scan's.
 
     Args:
-        scan: The scan's record in run.json.
         rows: The lines of the index, in any order; ``point_of_shot`` is -1 for a shot without one.
     """
     chosen = ChosenPoints(scan)

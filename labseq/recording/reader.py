@@ -220,11 +220,7 @@ class Run:
 
 
 class Follower:
-    """Follows the index of a run in progress: returns each shot that counts once.
-
-    Args:
-        run_dir: The run's folder.
-    """
+    """Follows the index of a run in progress: returns each shot that counts once."""
 
     def __init__(self, run_dir: Path) -> None:
         self._run_dir = run_dir

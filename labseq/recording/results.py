@@ -60,19 +60,11 @@ class ResultsLog:
         return values
 
     def write(self, shot: int, result: Mapping[str, Any]) -> None:
-        """Write the result of a shot.
-
-        Raises:
-            RecordingError: The disk is full.
-        """
+        """Write the result of a shot."""
         self._log.append({SHOT: shot, **result}, sync=True)
 
     def fail(self, shot: int, error: BaseException) -> None:
-        """Write why a shot has no result.
-
-        Raises:
-            RecordingError: The disk is full.
-        """
+        """Write why a shot has no result."""
         self._log.append({SHOT: shot, ERROR: f"{type(error).__name__}: {error}"}, sync=True)
 
 

@@ -41,17 +41,7 @@ class OtherFormatError(RecordingError):
 
 
 def check_version(path: Path, found: str, known: str) -> None:
-    """Raise for a file whose format has another major version.
-
-    Args:
-        path: The file.
-        found: Its format version.
-        known: The format version of this labseq.
-
-    Raises:
-        OtherFormatError: The major version is another one.
-        RecordingError: The version is missing.
-    """
+    """Raise for a file whose format has another major version."""
     major = found.partition(".")[0]
     if not major.isdecimal():
         raise RecordingError(
@@ -228,12 +218,7 @@ class ShotSummary:
 
 
 def summarise(shot: ShotRecord, target: TargetPattern) -> ShotSummary:
-    """Sum up a shot.
-
-    Args:
-        shot: Its record.
-        target: The target of the run.
-    """
+    """Sum up a shot."""
     occupancies = [image.occupancy.reshape(target.shape) for image in shot.images]
     images = Images(
         cycle=tuple(image.cycle for image in shot.images),

@@ -118,7 +118,6 @@ class Table:
         """Several rows for each record; a column is read as an array, or as a number that is repeated.
 
         Args:
-            records: The records.
             length: Number of rows of a record.
         """
         ends = np.cumsum([0, *map(length, records)])
@@ -141,10 +140,6 @@ class Table:
         """Convert rows that were read to arguments for the constructor of a record.
 
         Values that its constructor does not take are left out, as are columns that an older file lacks.
-
-        Args:
-            kind: The record's class, a dataclass.
-            table: The rows.
         """
         taken = {field.name for field in fields(kind)}
         columns = {

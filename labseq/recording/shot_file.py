@@ -44,8 +44,6 @@ class ShotEncoder:
     are exactly the written ones.
 
     Args:
-        run: The run that the shots belong to.
-        run_id: The run's folder, relative to the data root.
         compress: Whether frames are compressed (bitshuffle and LZ4).
 
     Raises:
@@ -206,11 +204,7 @@ def read_content(path: Path) -> ShotContent:
 
 
 def read_occupancies(path: Path) -> NDArray[np.uint8]:
-    """Read the occupancies of a shot's file and nothing else: uint8 (n_images, n_rows, n_cols).
-
-    Raises:
-        RecordingError: As for :func:`read_content`.
-    """
+    """Read the occupancies of a shot's file and nothing else: uint8 (n_images, n_rows, n_cols)."""
     with _opened(path) as entry:
         return entry["detection/occupancy"][()]
 

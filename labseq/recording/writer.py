@@ -107,10 +107,8 @@ class RunWriter:
         """Resume a run that ended before its last shot; no other process may write to it.
 
         Args:
-            run_dir: Its folder.
             run: Its current record, for the files of the next shots; only ``resumed`` is written to run.json.
             n_written: Number of shots written before that count.
-            compress: Whether frames are compressed; needs ``labseq[compress]``.
 
         Raises:
             RecordingError: The folder cannot be written to, the disk is full, or run.json is damaged.
@@ -127,9 +125,6 @@ class RunWriter:
 
     def set_devices(self, devices: Mapping[str, Mapping[str, Any]]) -> None:
         """Add the descriptions of the devices; called before the first shot, when they are open.
-
-        Args:
-            devices: Role or device name -> its ``describe()``.
 
         Raises:
             RecordingError: The disk is full.
@@ -173,10 +168,6 @@ class RunWriter:
 
     def skip(self, shots: Sequence[int], why: str) -> None:
         """Record that shots will not be taken, even if the run is resumed.
-
-        Args:
-            shots: Their indices.
-            why: Why their point is skipped.
 
         Raises:
             RecordingError: The disk is full.

@@ -66,8 +66,6 @@ def make_plugin(kind: str, name: str, folder: Path, *, package: bool = False) ->
     """Make a plugin that runs at once: the plugin, its settings, tests of its contract, a README.
 
     Args:
-        kind: One of :data:`labseq.registry.KINDS`.
-        name: Its name, for sequences and profiles.
         folder: Where sequences and profiles are; the plugin goes into ``plugins`` there.
         package: Whether to make it a distribution of its own, next to them.
 
@@ -122,10 +120,7 @@ def make_file(kind: FileKind, name: str, folder: Path, *, profile: str = "virtua
     """Make a sequence or a profile that runs at once, and the schema that editors read with it.
 
     Args:
-        kind: "sequence" or "profile".
         name: Its name; the file is ``NAME.yaml``.
-        folder: Where it goes.
-        profile: Name of the profile that a sequence runs on.
 
     Raises:
         ConfigError: The name is not allowed or taken, there is no such profile, or something cannot be
@@ -157,12 +152,6 @@ def make_file(kind: FileKind, name: str, folder: Path, *, profile: str = "virtua
 def check_plugin_name(kind: str, name: str, package: str, host: PluginHost) -> None:
     """Refuse a name that a plugin cannot have, or that is taken.
 
-    Args:
-        kind: Kind of the plugin.
-        name: Its name.
-        package: Name of the Python package that it will be.
-        host: The plugins that exist.
-
     Raises:
         ConfigError: It is refused; the message suggests another name.
     """
@@ -189,11 +178,6 @@ def check_plugin_name(kind: str, name: str, package: str, host: PluginHost) -> N
 
 def check_file_name(kind: str, name: str, profiles: Path) -> None:
     """Refuse a name that a sequence or profile cannot have.
-
-    Args:
-        kind: "sequence" or "profile".
-        name: Its name, without an ending.
-        profiles: Folder of the profiles that come with labseq.
 
     Raises:
         ConfigError: It is refused; the message suggests another name.
@@ -277,10 +261,6 @@ def class_prefix(name: str) -> str:
 
 def _write_folder(path: Path, texts: Mapping[str, str]) -> Iterable[Path]:
     """Write a folder completely or not at all.
-
-    Args:
-        path: The folder.
-        texts: Path of each file in it, with '/', and its text.
 
     Raises:
         OSError: It exists already, or it cannot be written.

@@ -79,15 +79,7 @@ def refresh_schemas(folder: Path, registry: Registry) -> list[Path]:
 
 
 def file_schema(kind: FileKind, registry: Registry) -> JsonSchema:
-    """The schema of a kind of file.
-
-    Args:
-        kind: "sequence" or "profile".
-        registry: What the plugins offer.
-
-    Returns:
-        JSON schema, draft 7, JSON-ready.
-    """
+    """The schema of a kind of file."""
     return _FileSchema(registry).sequence() if kind == "sequence" else _FileSchema(registry).profile()
 
 
@@ -194,10 +186,7 @@ def model_schema(
     """The schema of a mapping of settings.
 
     Args:
-        model: The settings model; None if there are no settings.
         prefix: Put before the names of its definitions, so that those of two models do not clash.
-        definitions: Its definitions are added here.
-        expressions: Whether a number may also be an expression.
     """
     if model is None:
         return {"type": "object", "properties": {}, "additionalProperties": False}

@@ -16,19 +16,7 @@ from labseq.session.chosen import load_plugins
 
 
 def make_new(kind: str, name: str, folder: Path, *, package: bool, profile: str | None) -> None:
-    """Make a plugin, a sequence or a profile, and print its files and what to do next.
-
-    Args:
-        kind: A kind of plugin, "sequence" or "profile".
-        name: Its name.
-        folder: Folder of the sequences and profiles.
-        package: Whether a plugin becomes a distribution of its own.
-        profile: Profile that a sequence runs on.
-
-    Raises:
-        ConfigError: The name is not allowed or taken, an option does not apply to the kind, or something
-            cannot be written.
-    """
+    """Make a plugin, a sequence or a profile, and print its files and what to do next."""
     if kind not in (*KINDS, *FILE_KINDS):
         known = (*KINDS, *FILE_KINDS)
         what = f"there is no kind '{clean(kind)}'"
@@ -60,16 +48,7 @@ def _called(kind: str) -> str:
 
 
 def write_schema(kind: str, output: Path | None, plugins: Sequence[Path] | None) -> None:
-    """Write the schema to a file, or print it.
-
-    Args:
-        kind: "sequence" or "profile".
-        output: The file; None prints it.
-        plugins: Folders of plugins; None for the folder ``plugins``, if there is one.
-
-    Raises:
-        ConfigError: There is no such kind or folder, or the file cannot be written.
-    """
+    """Write the schema to a file, or print it."""
     if kind not in FILE_KINDS:
         what = f"there is no schema of a '{clean(kind)}'"
         raise ConfigError(Problem(what, expected=listing(FILE_KINDS), hint=did_you_mean(kind, FILE_KINDS)))
