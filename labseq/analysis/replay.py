@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any, Final
@@ -488,10 +488,7 @@ def assembly_of(run: Run) -> Assembly:
     options = Options.of(record["overrides"])
     return assemble(
         Path(record["sequence_path"]),
-        profile=Path(record["profile_path"]),
-        overrides=options.overrides,
-        given=options.own(),
-        dry_run="fast",
+        replace(options, profile=Path(record["profile_path"]), dry_run="fast"),
         kept=stored_text(run.path / SEQUENCE_FILE, record["sequence_sha256"]),
         again=RecordedSetup(stored_text(run.path / PROFILE_FILE, record["profile_sha256"]), {}),
     )

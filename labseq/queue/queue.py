@@ -410,12 +410,4 @@ def _open(entry: Entry, observer: RunObserver) -> Session:
     options = entry.options
     if entry.run_dir is not None and entry.run_dir.is_dir():
         return Session.resume(entry.run_dir, realtime=options.realtime, observer=observer)
-    assembly = assemble(
-        entry.sequence,
-        profile=options.profile,
-        overrides=options.overrides,
-        given=options.own(),
-        dry_run=options.dry_run,
-        kept=entry.stored_text,
-    )
-    return Session(assembly, options, observer)
+    return Session(assemble(entry.sequence, options, kept=entry.stored_text), options, observer)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from labseq import builtin as builtins
-from labseq.config.addresses import ROLES, Override, split_overrides
+from labseq.config.addresses import ROLES, split_overrides
 from labseq.config.document import Document, StoredText, plugin_paths
 from labseq.config.find import find_sequence
 from labseq.config.scan import Adaptive, Axis, Ends, Scan
@@ -31,6 +31,7 @@ from labseq.session.chosen import (
     resolve,
     validate,
 )
+from labseq.session.options import Options
 from labseq.session.policies import check_figure, make_policy, with_policies
 from labseq.session.profile import RecordedSetup, ResolvedProfile, resolve_profile, with_tones
 from labseq.session.scan import Point, ScanPoints, make_step, place_note
@@ -94,11 +95,8 @@ class Assembly:
 
 def assemble(
     sequence_path: Path,
+    options: Options,
     *,
-    profile: str | Path | None = None,
-    overrides: Sequence[str] = (),
-    given: Sequence[Override] = (),
-    dry_run: DryRun = "off",
     kept: StoredText | None = None,
     again: RecordedSetup | None = None,
 ) -> Assembly:
@@ -106,11 +104,7 @@ def assemble(
 
     Args:
         sequence_path: The sequence file, or the name of one; see :func:`labseq.config.find.find_sequence`.
-        profile: Name or path of the profile, instead of the sequence's own.
-        overrides: ``"address=value"`` strings, as given to ``--set``; they take precedence.
-        given: Overrides from other options.
-        dry_run: "full": every device by its simulator if its plugin has one, else by its virtual
-            twin; "fast": virtual twins only.
+        options: Values that replace those in the files.
         kept: The sequence's text when the run began, if it is resumed.
         again: Profile and calibrations when the run began, if it is resumed.
 
@@ -119,14 +113,15 @@ def assemble(
         UnknownPluginError: A named plugin does not exist.
         PluginLoadError: A named plugin failed to load.
     """
+    profile, dry_run = options.profile, options.dry_run
     check_dry_run(dry_run)
     sequence_path = sequence_path if kept is not None else find_sequence(sequence_path)
-    for_sequence, for_profile = split_overrides(overrides)
+    for_sequence, for_profile = split_overrides(options.overrides)
     profile_set = [one._replace(address=f"profile.{one.address}") for one in for_profile]
     found = ProblemCollector()
     try:
         document, sequence, scan = load_sequence(
-            sequence_path, [*given, *for_sequence], profile_set=profile_set, found=found, kept=kept
+            sequence_path, [*options.own(), *for_sequence], profile_set=profile_set, found=found, kept=kept
         )
     except ConfigError as error:
         raise found.stop(error) from None

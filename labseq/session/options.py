@@ -38,11 +38,12 @@ class Options:
         seed: Seed, instead of the sequence's own or a fresh one.
         overrides: ``"address=value"`` strings, as given to ``--set``; they take precedence.
         output: Folder for the data, instead of LABSEQ_DATA or ``./data``.
-        dry_run: "off", "full" or "fast".
+        dry_run: "full": every device by its simulator if its plugin has one, else by its virtual twin;
+            "fast": virtual twins only; or "off".
         realtime: Let virtual time pass at the speed of real time.
     """
 
-    profile: str | None = None
+    profile: str | Path | None = None
     shots: int | None = None
     seed: int | None = None
     overrides: Sequence[str] = ()
@@ -80,7 +81,7 @@ class Options:
         changed: dict[str, Any] = {override.address: override.value for override in self.own()}
         changed |= dict(item.split("=", 1) for item in self.overrides)
         if self.profile is not None:
-            changed["profile"] = self.profile
+            changed["profile"] = str(self.profile)
         if self.dry_run != "off":
             changed["dry_run"] = self.dry_run
         return changed

@@ -138,10 +138,7 @@ class ResumableRun:
         }
         assembly = assemble(
             sequence,
-            profile=profile,
-            overrides=options.overrides,
-            given=options.own(),
-            dry_run=options.dry_run,
+            replace(options, profile=profile),
             kept=kept["sequence"],
             again=RecordedSetup(kept["profile"], record.get("calibrations", {})),
         )

@@ -103,15 +103,8 @@ class Session:
             PluginLoadError: A plugin that is named failed to load.
         """
         folder = None if output is None else path_of(output, "output")
-        options = Options(profile, shots, seed, tuple(overrides), folder, dry_run, realtime)
-        assembly = assemble(
-            path_of(sequence, "sequence"),
-            profile=profile,
-            overrides=overrides,
-            given=options.own(),
-            dry_run=dry_run,
-        )
-        return cls(assembly, options, observer)
+        options = Options(profile, shots, seed, overrides, folder, dry_run, realtime)
+        return cls(assemble(path_of(sequence, "sequence"), options), options, observer)
 
     @classmethod
     def resume(

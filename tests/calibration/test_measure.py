@@ -16,7 +16,7 @@ import labseq
 from labseq.calibration.measure import METHODS
 from labseq.errors import ConfigError, DeviceError
 from labseq.model import CalibrationKind, SiteGrid
-from labseq.session import assemble
+from labseq.session import Options, assemble
 from labseq.testing.fakes import fake_calibration
 
 PROFILE = """grid: {rows: 6, cols: 6, spacing: 4.49 um}
@@ -234,7 +234,7 @@ def test_a_choice_in_the_profile_is_reported(lab: Any, measured: Any) -> None:
 
 @pytest.mark.parametrize("method", METHODS.values(), ids=METHODS)
 def test_every_sequence_can_be_run_on_every_profile_with_virtual_devices(method: Any) -> None:
-    assembly = assemble(method.sequence, profile="practice" if method.kind == "tweezers" else "virtual")
+    assembly = assemble(method.sequence, Options("practice" if method.kind == "tweezers" else "virtual"))
     assert assembly.sequence.name == f"calibrate-{method.kind}"
     assert assembly.sequence.record_frames == ("none" if method.kind == "tweezers" else "all")
     assert not assembly.warnings
