@@ -16,7 +16,7 @@ from pathlib import Path
 
 from labseq import SiteGrid, TargetPattern
 from labseq.config.document import Document
-from labseq.pictures.plans import save_target
+from labseq.pictures.targets import save_target
 from labseq.session import load_plugins
 from labseq.session.chosen import construct_target, resolve
 from labseq.settings import PatternChoice

@@ -15,6 +15,7 @@ from labseq.messages import clean
 from labseq.model import CycleRecord, ImageRecord, Occupancy, ShotRecord, SiteGrid, TargetPattern
 from labseq.pictures.figures import (
     PANEL_IN,
+    MarkerStyle,
     Sheet,
     extent_of_sites,
     lay_out,
@@ -30,7 +31,6 @@ from labseq.pictures.plans import (
     EMPTY_LOOK,
     RESERVOIR_LOOK,
     SURPLUS_LOOK,
-    MarkerStyle,
     frame,
     on_grid,
     paint_moves,

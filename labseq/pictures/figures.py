@@ -34,10 +34,6 @@ _UNDATED: Final = {".png": {"Software": None}, ".svg": {"Date": None}, ".pdf": {
 def check_place(path: Path, endings: Sequence[str] = ENDINGS) -> None:
     """Check that a picture can be drawn and written, before any other work.
 
-    Args:
-        path: The file.
-        endings: Allowed endings of its name.
-
     Raises:
         ConfigError: The file has another ending, its folder does not exist, or matplotlib is not installed.
     """
@@ -61,13 +57,7 @@ def check_place(path: Path, endings: Sequence[str] = ENDINGS) -> None:
 
 
 def make_figure(width_in: float, height_in: float, **options: Any) -> Figure:
-    """Make a figure that needs no screen.
-
-    Args:
-        width_in: Width in inches.
-        height_in: Height in inches.
-        options: Of matplotlib's ``Figure``.
-    """
+    """Make a figure of a size in inches that needs no screen; options are those of ``Figure``."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -139,7 +129,7 @@ MIN_WIDTH_IN: Final = 9.0
 
 @dataclass(frozen=True, slots=True)
 class Extent:
-    """The part of the lattice that a panel shows, in units of the spacing, y down the image."""
+    """A part of the lattice, in units of the spacing, y down the image."""
 
     left: float
     right: float
@@ -159,14 +149,10 @@ class Extent:
 
 @dataclass(frozen=True, slots=True)
 class Sheet:
-    """The sheet.
+    """A sheet of equal panels.
 
     Attributes:
-        n_cols: Panels next to one another.
-        n_rows: Panels below one another.
         site_in: Distance between neighbours, in inches.
-        width_in: Width, in inches.
-        height_in: Height, in inches.
         extent: What each panel shows.
     """
 
@@ -184,12 +170,8 @@ class Sheet:
         aside = (self.width_in - self.n_cols * width) / 2
         left = aside + col * width
         below = self.height_in - HEAD_IN - (row + 1) * (height + TITLE_IN)
-        return (
-            left / self.width_in,
-            below / self.height_in,
-            width / self.width_in,
-            height / self.height_in,
-        )
+        across, up = self.width_in, self.height_in
+        return left / across, below / up, width / across, height / up
 
 
 def place_sites(sites: NDArray[np.generic], grid: SiteGrid) -> NDArray[np.float64]:
@@ -255,6 +237,40 @@ def lay_out(extent: Extent, n_panels: int, panel_in: float = PANEL_IN) -> Sheet:
     return Sheet(n_cols, n_rows, site_in, max(across, MIN_WIDTH_IN), down, extent)
 
 
+POINTS_PER_INCH: Final = 72
+
+
+@dataclass(frozen=True, slots=True)
+class MarkerStyle:
+    """A marker and how it is painted.
+
+    Attributes:
+        label: Its meaning, in the key.
+        marker: matplotlib's name of the shape.
+        size: Diameter, in units of the spacing.
+        face: Colour inside; "none" for a ring.
+        edge: Colour of the rim.
+    """
+
+    label: str
+    marker: str
+    size: float
+    face: str
+    edge: str
+
+    def keywords(self, site_in: float) -> dict[str, Any]:
+        """Keywords for matplotlib, for a distance of neighbours in inches."""
+        points = site_in * POINTS_PER_INCH
+        return {
+            "linestyle": "none",
+            "marker": self.marker,
+            "markersize": self.size * points,
+            "markerfacecolor": self.face,
+            "markeredgecolor": self.edge,
+            "markeredgewidth": min(1.0, 0.07 * points),
+        }
+
+
 _TOUCHING = 1.01
 """Distance up to which sites are neighbours, in units of the spacing."""
 
@@ -287,11 +303,7 @@ def cell(grid: SiteGrid) -> Floats:
 
 
 def outline(sites: NDArray[np.bool_], grid: SiteGrid) -> Floats:
-    """The border around some sites.
-
-    Args:
-        sites: bool (n_rows, n_cols).
-        grid: The grid that they lie on.
+    """The border around some sites, bool (n_rows, n_cols).
 
     Returns:
         float64 (n, 2, 2): start and end (x, y) of each stretch, in units of the spacing.

@@ -1,4 +1,4 @@
-"""Pictures of plans and targets."""
+"""Pictures of plans."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from labseq.errors import ConfigError, Problem
 from labseq.model import Batch, Occupancy, Plan, PlanReport, SiteGrid, TargetPattern
 from labseq.pictures.figures import (
-    MARGIN,
+    POINTS_PER_INCH,
+    MarkerStyle,
     Sheet,
     check_place,
     extent_of,
@@ -144,11 +145,7 @@ class BatchSummary:
 
 
 def summarise_batches(plan: Plan, shape: tuple[int, int]) -> list[BatchSummary]:
-    """Sum up each batch of a checked plan.
-
-    Args:
-        plan: The plan.
-        shape: (n_rows, n_cols) of the grid.
+    """Sum up each batch of a checked plan, on a grid with (n_rows, n_cols) sites.
 
     Example:
         >>> summarise_batches(Plan.from_batches([([(2, 0), (2, 1)], [(2, 3), (2, 4)])]), (5, 4))
@@ -161,25 +158,12 @@ def _summarise(batch: Batch, shape: tuple[int, int]) -> BatchSummary:
     way = batch.to_sites - batch.from_sites
     axis: Axis = "column" if way[:, 0].any() else "row"
     lines = np.unique(batch.from_sites[:, 1 if axis == "column" else 0])
-    return BatchSummary(
-        axis=axis,
-        lines=tuple(lines.tolist()),
-        n_atoms=len(batch),
-        n_ejected=int(np.count_nonzero(~on_grid(batch.to_sites, shape))),
-        n_sites=int(np.abs(way).max(initial=0)),
-    )
+    n_ejected = int(np.count_nonzero(~on_grid(batch.to_sites, shape)))
+    return BatchSummary(axis, tuple(lines.tolist()), len(batch), n_ejected, int(np.abs(way).max(initial=0)))
 
 
 def on_grid(sites: NDArray[np.integer], shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """Which sites are on the grid.
-
-    Args:
-        sites: (n, 2), row and column.
-        shape: (n_rows, n_cols) of the grid.
-
-    Returns:
-        bool (n,).
-    """
+    """Which of some sites (n, 2) are on a grid with (n_rows, n_cols) sites, bool (n,)."""
     inside = (sites >= 0) & (sites < shape)
     return inside[:, 0] & inside[:, 1]
 
@@ -220,40 +204,8 @@ def lines_label(axis: Axis, lines: Iterable[int]) -> str:
     return f"{axis}{'s' if len(numbers) > 1 else ''} {', '.join(words)}"
 
 
-POINTS_PER_INCH: Final = 72
 ATOM, SURPLUS, RESERVOIR = "0.45", "#86c5ea", "0.80"
 DEFECT, RING, DOT, BAND = "#c8102e", "0.45", "0.82", "#dff0e0"
-
-
-@dataclass(frozen=True, slots=True)
-class MarkerStyle:
-    """A marker and how it is painted.
-
-    Attributes:
-        label: Its meaning, in the key.
-        marker: matplotlib's name of the shape.
-        size: Diameter, in units of the spacing.
-        face: Colour inside; "none" for a ring.
-        edge: Colour of the rim.
-    """
-
-    label: str
-    marker: str
-    size: float
-    face: str
-    edge: str
-
-    def keywords(self, site_in: float) -> dict[str, Any]:
-        """Keywords for matplotlib, for a distance of neighbours in inches."""
-        points = site_in * POINTS_PER_INCH
-        return {
-            "linestyle": "none",
-            "marker": self.marker,
-            "markersize": self.size * points,
-            "markerfacecolor": self.face,
-            "markeredgecolor": self.edge,
-            "markeredgewidth": min(1.0, 0.07 * points),
-        }
 
 
 ATOM_LOOK: Final = MarkerStyle("atom on a target site", "o", 0.62, ATOM, ATOM)
@@ -268,18 +220,10 @@ EJECTED_LOOK: Final = MarkerStyle("ejected", "X", 0.55, DEFECT, DEFECT)
 def paint_sites(
     axes: Axes, sheet: Sheet, grid: SiteGrid, occupancy: Occupancy, target: TargetPattern, *, final: bool
 ) -> list[MarkerStyle]:
-    """Paint every site as what it is.
-
-    Args:
-        axes: The panel.
-        sheet: Its size.
-        grid: The grid of sites.
-        occupancy: bool (n_rows, n_cols).
-        target: The target pattern.
-        final: Whether target sites that are empty now stay so.
+    """Paint every site; ``final``: target sites that are empty now stay so.
 
     Returns:
-        The looks that occur, in the order of the key.
+        The markers that occur, in the order of the key.
     """
     wanted, unwanted = target.fill, target.clear
     layers = (
@@ -299,15 +243,7 @@ def paint_sites(
 
 
 def paint_moves(axes: Axes, sheet: Sheet, grid: SiteGrid, moves: NDArray[np.int16], colours: Any) -> None:
-    """Paint atom moves as arrows, with a cross where an atom is ejected.
-
-    Args:
-        axes: The panel.
-        sheet: Its size.
-        grid: The grid of sites.
-        moves: int16 (n, 4), from row, from column, to row, to column.
-        colours: One per move, as matplotlib takes them.
-    """
+    """Paint atom moves (n, 4) as arrows of given colours, with a cross where an atom is ejected."""
     from matplotlib.collections import LineCollection, PolyCollection
 
     start, end = place_sites(moves[:, :2], grid), place_sites(moves[:, 2:], grid)
@@ -346,14 +282,7 @@ def paint_numbers(axes: Axes, grid: SiteGrid, colour: str = "0.4") -> None:
 
 
 def frame(axes: Axes, sheet: Sheet, title: str, edge: NDArray[np.float64]) -> None:
-    """Set a panel's limits and title, and draw a thin line around the array.
-
-    Args:
-        axes: The panel.
-        sheet: Its size.
-        title: Its title.
-        edge: float64 (n, 2), corners of the array.
-    """
+    """Set a panel's limits and title, and draw a thin line around the array with corners ``edge`` (n, 2)."""
     extent = sheet.extent
     axes.set_xlim(extent.left, extent.right)
     axes.set_ylim(extent.bottom, extent.top)
@@ -396,12 +325,9 @@ class Panel:
             >>> Panel(2, 4, (("row", (7, 9)),)).title
             'batches 3-5: rows 7, 9'
         """
-        numbers = f"batch {self.first + 1}" if self.n_batches == 1 else f"batches {self._numbers}"
+        first, last = self.first + 1, self.last + 1
+        numbers = f"batch {first}" if first == last else f"batches {first}-{last}"
         return f"{numbers}: " + "; ".join(_words(axis, lines) for axis, lines in self.moves_along)
-
-    @property
-    def _numbers(self) -> str:
-        return f"{self.first + 1}-{self.last + 1}"
 
 
 def make_panels(summaries: Sequence[BatchSummary], max_panels: int = MAX_PANELS) -> list[Panel]:
@@ -470,17 +396,7 @@ COLOURS: Final = ("plasma", 0.0, 0.82)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlanDrawing:
-    """What is drawn.
-
-    Attributes:
-        title: Stands at the top.
-        source: Where the occupancy comes from; the line below the title.
-        grid: The grid of sites.
-        occupancy: bool (n_rows, n_cols), before.
-        target: The target pattern.
-        plan: The plan, checked.
-        report: What the check says of it.
-    """
+    """What is drawn: a checked plan, the occupancy before it, and two lines of text at the top."""
 
     title: str
     source: str
@@ -492,11 +408,7 @@ class PlanDrawing:
 
 
 def check_picture(path: Path, shape: tuple[int, int]) -> None:
-    """Find out whether a picture can be drawn and where it is to go, before anything is planned.
-
-    Args:
-        path: The file.
-        shape: (n_rows, n_cols) of the grid.
+    """Check that a picture of (n_rows, n_cols) sites can be drawn and saved, before anything is planned.
 
     Raises:
         ConfigError: The file has another ending than .png, its folder does not
@@ -510,10 +422,6 @@ def check_picture(path: Path, shape: tuple[int, int]) -> None:
 
 def save_plan(path: Path, drawing: PlanDrawing) -> None:
     """Draw the array before and after, and between them a panel for each batch or some of them.
-
-    Args:
-        path: The PNG file.
-        drawing: What is drawn.
 
     Raises:
         ConfigError: The file cannot be written.
@@ -568,17 +476,13 @@ def _paint_panel(axes: Axes, sheet: Sheet, drawing: PlanDrawing, panel: Panel, *
     plan = drawing.plan
     offsets = plan.batch_offsets[panel.first : panel.last + 2]
     moves = plan.moves[offsets[0] : offsets[-1]]
-    of_batch = [colour_of(*place) for place in _order(panel, plan.n_batches, alone=alone)]
+    if alone:  # else colours tell the batches of a panel apart
+        of_batch = [colour_of(panel.first, plan.n_batches)]
+    else:
+        of_batch = [colour_of(i, panel.n_batches) for i in range(panel.n_batches)]
     colours = np.repeat(of_batch, np.diff(offsets), axis=0)
     paint_lines(axes, sheet, drawing.grid, moves)
     paint_moves(axes, sheet, drawing.grid, moves, colours)
-
-
-def _order(panel: Panel, n_batches: int, *, alone: bool) -> list[tuple[int, int]]:
-    """Each batch's place and of how many: in the plan if all are alone in their panels, else in the panel."""
-    if alone:
-        return [(panel.first, n_batches)]
-    return [(i, panel.n_batches) for i in range(panel.n_batches)]
 
 
 def colour_of(index: int, n_batches: int) -> Any:
@@ -630,88 +534,3 @@ def _colour_bar(figure: Figure, sheet: Sheet, title: str, ends: tuple[str, str])
     axes.set_title(title, fontsize=8, pad=3)
     axes.text(-4, 0, ends[0], fontsize=7, ha="right", va="center")
     axes.text(104, 0, ends[1], fontsize=7, ha="left", va="center")
-
-
-TARGET_DPI: Final = 100
-SITE_IN: Final = 0.18
-"""Distance between neighbours in a picture of :func:`save_target`, in inches."""
-
-FILL_LOOK: Final = MarkerStyle("atom", "o", 0.76, "#1b5e8c", "#1b5e8c")
-CLEAR_LOOK: Final = MarkerStyle("must be empty", "o", 0.34, "white", "0.78")
-OTHER_LOOK: Final = MarkerStyle("reservoir", "o", 0.16, "0.6", "0.6")
-
-
-def draw_target(axes: Axes, target: TargetPattern, grid: SiteGrid, site_in: float = SITE_IN) -> None:
-    """Draw a target: atoms filled, sites that must be empty as rings, the reservoir as dots.
-
-    Args:
-        axes: Where; gets limits that show the whole grid, and no axes.
-        target: The target pattern.
-        grid: The grid that it lies on.
-        site_in: Distance between neighbours in the finished picture, in inches.
-
-    Raises:
-        ValueError: Target and grid differ in shape.
-    """
-    if target.shape != grid.shape:
-        raise ValueError(f"the target has {target.shape} sites and the grid {grid.shape}; expected the same")
-    for look, here in (
-        (OTHER_LOOK, ~target.fill & ~target.clear),
-        (CLEAR_LOOK, target.clear),
-        (FILL_LOOK, target.fill),
-    ):
-        x, y = place_sites(np.argwhere(here), grid).T
-        axes.plot(x, y, **look.keywords(site_in))
-    left, right, top, bottom = _extent(grid)
-    axes.set_xlim(left, right)
-    axes.set_ylim(bottom, top)
-    axes.set_aspect("equal")
-    axes.set_axis_off()
-
-
-def save_target(path: Path, target: TargetPattern, grid: SiteGrid) -> None:
-    """Save a target as a PNG, with the target's name and :func:`target_text` in its text chunks.
-
-    Args:
-        path: The file.
-        target: The target pattern.
-        grid: The grid that it lies on.
-
-    Raises:
-        ConfigError: The file cannot be written.
-    """
-    metadata = {"Title": target.name, "Description": target_text(target), "Software": None}
-    save_figure(
-        path,
-        lambda: _draw_target(target, grid),
-        dpi=TARGET_DPI,
-        metadata=metadata,
-        pil_kwargs={"optimize": True},
-    )
-
-
-def _draw_target(target: TargetPattern, grid: SiteGrid) -> Figure:
-    left, right, top, bottom = _extent(grid)
-    figure = make_figure((right - left) * SITE_IN, (bottom - top) * SITE_IN)
-    draw_target(figure.add_axes((0.0, 0.0, 1.0, 1.0)), target, grid)
-    return figure
-
-
-def target_text(target: TargetPattern) -> str:
-    r"""A target as text, one line per row: "#" an atom, "o" must be empty, "." reservoir.
-
-    Example:
-        >>> fill = np.array([[True, False, False]])
-        >>> target_text(TargetPattern(fill, np.array([[False, True, False]])))
-        '#o.'
-    """
-    signs = np.where(target.fill, "#", np.where(target.clear, "o", "."))
-    return "\n".join("".join(row) for row in signs)
-
-
-def _extent(grid: SiteGrid) -> tuple[float, float, float, float]:
-    """Left, right, top and bottom of the grid with a margin, in units of the spacing."""
-    corners = np.array([[row, col] for row in (0, grid.n_rows - 1) for col in (0, grid.n_cols - 1)])
-    places = place_sites(corners, grid)
-    (left, top), (right, bottom) = places.min(axis=0) - MARGIN, places.max(axis=0) + MARGIN
-    return float(left), float(right), float(top), float(bottom)

@@ -84,7 +84,7 @@ def spectrogram(
         renderer: Makes the samples.
         channel: 0 for the row tones, 1 for the column tones.
         stretches: What is shown.
-        n_columns: How many columns.
+        n_columns: Number of columns.
         band_hz: Lowest and highest frequency of the result.
 
     Returns:
@@ -118,17 +118,7 @@ def spectrogram(
 def envelope(
     renderer: Renderer, channel: int, stretches: WaveformPieces, n_columns: int
 ) -> NDArray[np.float64]:
-    """Find the largest sample of each column, looking at every sample.
-
-    Args:
-        renderer: Makes the samples.
-        channel: 0 for the row tones, 1 for the column tones.
-        stretches: What is shown.
-        n_columns: How many columns.
-
-    Returns:
-        float64 (n_columns,), absolute values as fractions of full scale.
-    """
+    """The largest sample of each column as a fraction of full scale, float64 (n_columns,)."""
     edges = np.rint(np.linspace(0, stretches.n_samples, n_columns + 1)).astype(np.int64)
     cuts = np.unique(np.concatenate([edges, stretches.at]))
     column = np.searchsorted(edges, cuts[:-1], side="right") - 1
@@ -180,16 +170,12 @@ LABEL_PART: Final = (0.008, 0.0067)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WaveformDrawing:
-    """What is drawn.
+    """What is drawn: the intended tones of a program, and the samples of its renderer.
 
     Attributes:
-        title: Stands at the top.
         source: Where the plan comes from; the line below the title.
         notes: Titles of the row axis and of the column axis.
-        program: The tones that are intended.
-        renderer: Makes the samples.
         segments: The segments of the program that are drawn; at least one has tones.
-        rf: What drives the AODs.
     """
 
     title: str
@@ -218,10 +204,6 @@ class _Timeline:
 
 def save_waveform(path: Path, drawing: WaveformDrawing) -> None:
     """Draw spectrogram and envelope of both axes, with the intended tones on top.
-
-    Args:
-        path: The PNG file.
-        drawing: What is drawn.
 
     Raises:
         ConfigError: The file cannot be written.
@@ -344,16 +326,10 @@ def _draw_spectrogram(axes: Axes, drawing: WaveformDrawing, channel: int, timeli
 
 
 def tone_lines(program: ToneProgram, tones: AxisTones, on: list[int], at_s: Floats) -> list[Floats]:
-    """Lines of the intended tones of an axis: time in the picture in s, frequency in Hz.
-
-    Args:
-        program: The tone program.
-        tones: Its tones of the axis.
-        on: The segments that are drawn.
-        at_s: Where each starts in the picture, and the end.
+    """Lines of the intended tones of an axis in the segments ``on``, which start at ``at_s`` in the picture.
 
     Returns:
-        One float64 (n_points, 2) per tone and segment.
+        Time in the picture in s, and frequency in Hz: one float64 (n_points, 2) per tone and segment.
     """
     lines: list[Floats] = []
     for k, i in enumerate(on):

@@ -14,7 +14,7 @@ from PIL import Image
 
 import labseq
 from labseq import builtin as builtins
-from labseq.pictures.plans import target_text
+from labseq.pictures.targets import target_text
 from labseq.registry import Registry
 
 from .scripts import load_script

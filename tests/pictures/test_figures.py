@@ -87,7 +87,7 @@ DRAWS = """
 import sys
 from pathlib import Path
 import numpy as np
-from labseq.pictures.plans import save_target
+from labseq.pictures.targets import save_target
 import labseq.pictures.waveforms
 from labseq.model import SiteGrid, TargetPattern
 assert "matplotlib" not in sys.modules

@@ -8,9 +8,9 @@ import pytest
 from PIL import Image
 
 from labseq.model import SiteGrid, TargetPattern
-from labseq.pictures.plans import FILL_LOOK, SITE_IN, TARGET_DPI, save_target
+from labseq.pictures.targets import DPI, FILL_LOOK, SITE_IN, save_target
 
-SITE_PX = SITE_IN * TARGET_DPI
+SITE_PX = SITE_IN * DPI
 WHITE = (255, 255, 255)
 
 
