@@ -33,10 +33,6 @@ def test_a_problem_says_where_what_and_what_to_do():
     assert str(problem) == "a.yaml:3:7: 'rwos' is unknown; expected one of rows, cols; did you mean 'rows'?"
 
 
-def test_a_problem_from_an_option_has_no_line():
-    assert str(Problem("bad", "--set shots=x")) == "--set shots=x: bad"
-
-
 def test_all_problems_are_reported():
     error = ConfigError([Problem("one", "a", 1, 1), Problem("two", "a", 2, 1)])
     assert str(error) == "a:1:1: one\na:2:1: two"

@@ -1,6 +1,6 @@
-"""Third-party plugins that misbehave when they are loaded or constructed: named, contained, reported.
+"""Third-party plugins that fail when they are loaded or constructed: named, contained, reported.
 
-Each trouble is a small plugin of its own. What a plugin does wrong in a run is in tests/session.
+Each failure is a small plugin of its own. Failures in a run are in tests/session.
 """
 
 from __future__ import annotations
@@ -90,18 +90,14 @@ HOOK = "@hookimpl\ndef labseq_register(registry):"
 AT_LOADING: dict[str, tuple[str, str, str]] = {
     # name -> what in the good plugin is replaced, by what, and the reason that is given
     "sdk is missing": ("# at the top", "import no_such_sdk", "ModuleNotFoundError: No module named 'no_such"),
-    "own module is missing": ("# at the top", "from . import part", "ImportError: cannot import name 'part'"),
     "leaves Python": ("# at the top", "raise SystemExit(0)", "SystemExit: 0 ("),
-    "leaves by quit": ("# at the top", "quit()", "SystemExit"),
     "imitates Ctrl-C": ("# at the top", "raise KeyboardInterrupt", "KeyboardInterrupt ("),
     "recursion": ("# at the top", "def f(): f()\nf()", "RecursionError: maximum recursion depth"),
-    "endless text": ("# at the top", "raise ValueError('x' * 10**7)", "xxx ... ("),
     "error without text": (
         "# at the top",
         "class Odd(Exception):\n    def __str__(self): raise KeyError\nraise Odd",
         "Odd: (its text cannot be had: KeyError)",
     ),
-    "generator is closed": ("# at the top", "raise GeneratorExit", "GeneratorExit ("),
     "error of labseq's": (
         "# at the top",
         "import labseq\nraise labseq.DeviceError('camera', 'no cable')",
@@ -111,11 +107,6 @@ AT_LOADING: dict[str, tuple[str, str, str]] = {
         "# at the top",
         "import signal\nsignal.signal(signal.SIGINT, signal.SIG_IGN)",
         "ValueError: signal only works in main thread",
-    ),
-    "older interface": (
-        "LABSEQ_API = 1",
-        "LABSEQ_API = 0",
-        "LABSEQ_API 0; this labseq has LABSEQ_API = 1; t",
     ),
     "newer interface": (
         "LABSEQ_API = 1",
@@ -128,8 +119,6 @@ AT_LOADING: dict[str, tuple[str, str, str]] = {
         "does not state LABSEQ_API; this labseq has LABSEQ_API = 1",
     ),
     "interface as text": ("LABSEQ_API = 1", "LABSEQ_API = '1.0'", "'1.0', which is no whole number"),
-    "interface is true": ("LABSEQ_API = 1", "LABSEQ_API = True", "True, which is no whole number"),
-    "interface is an array": ("LABSEQ_API = 1", "LABSEQ_API = [1]", "[1], which is no whole number"),
     "hook is misspelled": (
         "def labseq_register",
         "def labseq_regster",
@@ -142,7 +131,6 @@ AT_LOADING: dict[str, tuple[str, str, str]] = {
     ),
     "wrong argument": ("(registry):", "(register):", "an argument 'register'; expected 'registry'"),
     "no argument": ("(registry):", "():", "has no argument; expected 'registry'"),
-    "one more argument": ("(registry):", "(registry, config):", "an argument 'config'"),
     "hook is async": (
         "def labseq_register",
         "async def labseq_register",
@@ -151,32 +139,13 @@ AT_LOADING: dict[str, tuple[str, str, str]] = {
     "hook is a generator": (REGISTER, "yield", "is a generator and would never run"),
     "hook is a wrapper": ("@hookimpl", "@hookimpl(wrapper=True)", "its labseq_register is a wrapper"),
     "registration fails": (REGISTER, "1 / 0", "ZeroDivisionError: division by zero"),
-    "registers and fails": (REGISTER, f"{REGISTER}\n    raise SystemExit(0)", "SystemExit: 0"),
     "unknown kind": (
         "registry.planner",
         "registry.planer",
         "has no attribute 'planer'",
     ),
-    "unknown option": ("Mine)  #", "Mine, fast=True)  #", "unexpected keyword argument 'fast'"),
-    "odd name": (
-        '"mine", Mine',
-        '"my planner", Mine',
-        "a planner cannot be called 'my planner'; exp",
-    ),
-    "name of a path": ('"mine", Mine', '"../../etc", Mine', "a planner cannot be called '../../etc'"),
-    "name of another kind": ('"mine", Mine', "3, Mine", "a planner needs a name, not 3"),
     "nothing to call": ('"mine", Mine', '"mine", "Mine"', "the factory of planner 'mine' cannot be called"),
     "registers twice": (REGISTER, f"{REGISTER}\n    {REGISTER}", "is offered by 'mine' already"),
-    "settings are no settings": (
-        "Mine)  #",
-        "Mine, dict)  #",
-        "is <class 'dict'>; expected a subclass",
-    ),
-    "settings of plain pydantic": (
-        "Mine)  #",
-        "Mine, __import__('pydantic').BaseModel)  #",
-        "expected a subclass of labseq.plugin.Settings",
-    ),
     "settings that cannot be made": (
         "# at the top",
         "class Bad(Settings):\n    size: 'NoSuchType' = None\n    model_config = {'frozen': 3}\nBad(size=1)",
@@ -187,12 +156,11 @@ AT_LOADING: dict[str, tuple[str, str, str]] = {
         "def __getattr__(name): raise OSError(name)",
         "OSError: LABSEQ_API",
     ),
-    "null bytes": ("# at the top", "\0", "null bytes"),
 }
 
 
 @pytest.mark.parametrize("trouble", AT_LOADING)
-def test_trouble_at_loading(trouble: str, tmp_path: Path) -> None:
+def test_a_plugin_that_fails_to_load_is_contained(trouble: str, tmp_path: Path) -> None:
     old, new, reason = AT_LOADING[trouble]
     assert old in GOOD
     host, info = loaded(tmp_path, GOOD.replace(old, new))
@@ -206,26 +174,6 @@ def test_trouble_at_loading(trouble: str, tmp_path: Path) -> None:
         host.get("planner", "mine")
     assert str(caught.value).startswith("plugin 'mine' failed to load: ")
     assert str(tmp_path / "mine.py") in str(caught.value)  # where it comes from
-
-
-def test_the_good_plugin_is_good(tmp_path: Path) -> None:
-    host, info = loaded(tmp_path, GOOD)
-    assert (info.state, info.reason, info.notes) == ("loaded", "", [])
-    assert construct(host).degree_of_parallelism == 1
-    assert host.notes == []
-
-
-def test_a_giant_docstring_costs_nothing(tmp_path: Path) -> None:
-    host, info = loaded(tmp_path, GOOD.replace("A planner.", "word " * 10**6))
-    assert info.state == "loaded"
-    assert sum(map(len, table(host))) < 1000
-
-
-def test_a_file_that_is_no_text(tmp_path: Path) -> None:
-    (tmp_path / "mine.py").write_bytes(b"\xff\xfe\x00")
-    host = PluginHost()
-    host.load_folders([tmp_path])
-    assert "SyntaxError" in host.infos[0].reason
 
 
 class TestHanging:
@@ -254,8 +202,10 @@ class TestHanging:
         code = GOOD.replace("pass  # constructor", "import gate; gate.event.wait()")
         host, info = loaded(tmp_path, code)
         assert info.state == "loaded"
-        told = r"the constructor of planner 'mine' did not return within 0\.5 s and was abandoned; if it is"
-        with pytest.raises(PluginLoadError, match=told):
+        message = (
+            r"the constructor of planner 'mine' did not return within 0\.5 s and was abandoned; if it is"
+        )
+        with pytest.raises(PluginLoadError, match=message):
             construct_one(ChosenPlugin(impatient(host), None), Context("planner"))
 
 
@@ -266,8 +216,6 @@ IN_THE_CONSTRUCTOR: dict[str, tuple[str, str, str]] = {
         "constructor of planner 'mine' raised OSErr",
     ),
     "leaves Python": ("pass  # constructor", "raise SystemExit(0)", "raised SystemExit: 0 ("),
-    "imitates Ctrl-C": ("pass  # constructor", "raise KeyboardInterrupt", "raised KeyboardInterrupt ("),
-    "recursion": ("pass  # constructor", "self.__init__(settings, context)", "raised RecursionError"),
     "too few arguments": (
         "(self, settings, context)",
         "(self, settings)",
@@ -278,22 +226,7 @@ IN_THE_CONSTRUCTOR: dict[str, tuple[str, str, str]] = {
         'registry.planner("mine", lambda s, c: None)',
         "made None; expected",
     ),
-    "makes a class": (
-        REGISTER,
-        'registry.planner("mine", lambda s, c: Mine)',
-        "made the class Mine it",
-    ),
-    "makes something else": (
-        REGISTER,
-        'registry.planner("mine", lambda s, c: 5)',
-        "planner 'mine' has no plan",
-    ),
     "has no method": ("def plan(", "def plann(", "planner 'mine' has no plan; see labseq.plugin.Planner"),
-    "method is no method": (
-        "    def plan(",
-        "    plan = 3\n    def _(",
-        "plan of planner 'mine' cannot be c",
-    ),
     "method cannot be had": (
         "    def plan(",
         "    @property\n    def plan(self): raise KeyError('x')\n    def _(",
@@ -308,7 +241,7 @@ IN_THE_CONSTRUCTOR: dict[str, tuple[str, str, str]] = {
 
 
 @pytest.mark.parametrize("trouble", IN_THE_CONSTRUCTOR)
-def test_trouble_in_the_constructor(trouble: str, tmp_path: Path) -> None:
+def test_a_plugin_whose_constructor_fails_is_named(trouble: str, tmp_path: Path) -> None:
     old, new, reason = IN_THE_CONSTRUCTOR[trouble]
     assert old in GOOD
     host, info = loaded(tmp_path, GOOD.replace(old, new))
@@ -320,7 +253,7 @@ def test_trouble_in_the_constructor(trouble: str, tmp_path: Path) -> None:
     assert [entry.name for entry in host.registry.entries()] == ["mine"]
 
 
-def test_trouble_in_a_pattern(tmp_path: Path) -> None:
+def test_a_pattern_of_the_wrong_shape_is_named(tmp_path: Path) -> None:
     code = GOOD.replace(REGISTER, 'registry.pattern("mine", lambda settings, grid: [1, 2])')
     host, _ = loaded(tmp_path, code)
     grid = labseq.SiteGrid(3, 3, 5e-6)
@@ -342,14 +275,15 @@ class Odd(Settings):
 
 
 @pytest.mark.parametrize(
-    ("code", "told"),
+    ("code", "message"),
     [
         ("raise SystemExit(0)", "the settings model of planner 'mine' raised SystemExit: 0 ("),
-        ("raise KeyboardInterrupt", "the settings model of planner 'mine' raised KeyboardInterrupt ("),
         ("import gate; gate.event.wait()", "the settings model of planner 'mine' did not return within "),
     ],
 )
-def test_trouble_in_the_settings(code: str, told: str, tmp_path: Path, gate: threading.Event) -> None:
+def test_a_settings_model_that_fails_is_named(
+    code: str, message: str, tmp_path: Path, gate: threading.Event
+) -> None:
     code = GOOD.replace("# at the top", SETTINGS.replace("TROUBLE", code)).replace(
         "Mine)  #", "Mine, Odd)  #"
     )
@@ -358,7 +292,7 @@ def test_trouble_in_the_settings(code: str, told: str, tmp_path: Path, gate: thr
     document = Document.parse("planner: {use: mine, size: 3}\n", "s.yaml")
     with pytest.raises(LabseqError) as caught:
         validate(document, impatient(host), ("planner",), frozenset({"use"}))
-    assert told in str(caught.value)
+    assert message in str(caught.value)
     assert str(caught.value).startswith("s.yaml:1:")
 
 
@@ -395,7 +329,7 @@ def test_two_distributions_with_a_plugin_of_one_name(monkeypatch: pytest.MonkeyP
     assert host.get("planner", "mine").origin == "ixon"
 
 
-def test_an_installed_plugin_is_told_by_its_distribution(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_installed_plugin_is_named_by_its_distribution(monkeypatch: pytest.MonkeyPatch) -> None:
     code = GOOD.replace("pass  # constructor", "raise OSError('no port')")
     points = [
         Point("ixon", "labseq-ixon", lambda: module("ixon", code)),
@@ -438,25 +372,21 @@ def test_what_plugins_print_spoils_no_json(
     assert [name for name, one in found.items() if one["notes"]] == ["mine"]  # labseq's own print nothing
 
 
-def test_the_table_shows_what_a_plugin_printed(
+def test_the_table_shows_failures_and_what_a_plugin_printed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "mine.py").write_text(GOOD.replace("# at the top", "print('hi')"))
+    (tmp_path / "other.py").write_text("1 / 0")
     monkeypatch.setenv("LABSEQ_PLUGIN_PATH", str(tmp_path))
     with pytest.raises(SystemExit):
         main(["plugins"])
-    last = capsys.readouterr().out.splitlines()[-1]
-    assert last == (
-        "mine: warning: while it was loaded it printed ('hi'); this went to stderr: use "
-        "'logging.getLogger(__name__)'"
-    )
-
-
-def test_a_plugin_may_keep_stdout(capsys: pytest.CaptureFixture[str]) -> None:
-    kept = call_plugin(Owner("mine"), "", lambda: sys.stdout)
-    print("later", file=kept)
-    assert capsys.readouterr() == ("later\n", "")
-    assert kept.encoding == sys.stdout.encoding
+    lines = capsys.readouterr().out.splitlines()
+    rows = {line.split()[0]: line for line in lines if line}
+    assert "loaded" in rows["labseq_virtual"]
+    assert "camera:virtual" in rows["labseq_virtual"]
+    assert "failed" in rows["other"]
+    assert "ZeroDivisionError" in rows["other:"]
+    assert any(line.startswith("mine: warning: while it was loaded it printed ('hi')") for line in lines)
 
 
 def test_a_program_without_stdout(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -32,14 +32,9 @@ def test_a_name_that_is_taken_names_both_origins():
         second.planner("mine", factory)
     assert (caught.value.plugin, caught.value.source) == ("second", "/lab/second.py")
     assert str(caught.value).endswith("; rename one of them; it comes from /lab/second.py")
-
-
-def test_a_name_that_is_taken_is_contested():
-    registry = Registry()
-    for origin in ("first", "second"):
-        with suppress(PluginLoadError), registry.opened_for(Owner(origin)) as own:
-            own.planner("mine", factory)
     assert list(registry.contested) == [("planner", "mine")]
+    with pytest.raises(UnknownPluginError, match="did you mean 'mine'"):
+        registry.get("planner", "mien")
 
 
 class Plain(BaseModel):
@@ -50,7 +45,7 @@ class Mine(Settings):
     port: str = ""
 
 
-@pytest.mark.parametrize("model", [5, dict, Plain, Mine()], ids=str)
+@pytest.mark.parametrize("model", [5, Plain, Mine()], ids=str)
 def test_a_settings_model_is_a_class_of_settings(model):
     with pytest.raises(PluginLoadError, match=r"settings model of planner 'mine' is .*; expected a subclass"):
         Registry().planner("mine", factory, model)
@@ -73,7 +68,7 @@ def test_the_same_name_may_serve_several_kinds():
     assert registry.get("device", "virtual").simulated == {"port": "simulated"}
 
 
-ODD_NAMES = ["", 5, None, "two words", "a.b", "a/b", "../a", "1st", "-a", "a\n", "\x1b[31m", "true", "NULL"]
+ODD_NAMES = ["", 5, "two words", "../a", "1st", "\x1b[31m", "true"]
 
 
 @pytest.mark.parametrize("name", [*ODD_NAMES, "a" * 65], ids=repr)
@@ -89,7 +84,7 @@ def test_a_step_cannot_be_called_as_the_key_beside_it():
     Registry().planner("name", factory)
 
 
-@pytest.mark.parametrize("name", ["größe", "HCA_2", "two-stage", "x"])
+@pytest.mark.parametrize("name", ["größe", "two-stage_2"])
 def test_names_that_files_can_name(name):
     registry = Registry()
     registry.step(name, factory)
@@ -103,14 +98,6 @@ def test_nothing_is_registered_later():
     with pytest.raises(PluginLoadError, match=r"registers planner 'mine' after its labseq_register has ret"):
         own.planner("mine", factory)
     assert registry.names("planner") == ["in_time"]
-
-
-def test_an_unknown_name_suggests_the_nearest():
-    registry = Registry()
-    registry.planner("psca", factory)
-    with pytest.raises(UnknownPluginError, match="did you mean 'psca'"):
-        registry.get("planner", "pcsa")
-    assert registry.find("planner", "pcsa") is None
 
 
 def test_a_plugin_that_fails_leaves_nothing():

@@ -33,7 +33,7 @@ SITES = np.exp(np.random.default_rng(1).normal(0, 0.04, GRID.shape))
 
 
 class Meter:
-    """Measures what the fake static tweezers were last told to play; what it says may be spoilt."""
+    """Measures what the fake static tweezers play; its answer may be spoilt."""
 
     def __init__(self, spoil: Callable[[Floats], Any] = lambda power: power, noise: float = 0.01) -> None:
         self.spoil, self.noise = spoil, noise
@@ -92,23 +92,11 @@ def test_rows_and_columns_become_even_and_the_record_says_how() -> None:
     assert found["spreads"][-1] == found["separable_spread"]
     before, after = (np.array(found[f"power_{when}"]) for when in ("before", "after"))
     assert before.shape == after.shape == GRID.shape
+    (first_rows, first_cols), *_, (rows, cols) = amplitudes_of(lab)
+    assert first_rows == pytest.approx(np.full(6, 1 / 6))
+    assert first_cols == pytest.approx(np.full(8, 1 / 8))
+    assert (found["row_amplitudes"], found["column_amplitudes"]) == (rows.tolist(), cols.tolist())
     assert factors(before).separable_spread > 10 * factors(after).separable_spread
-
-
-def test_what_it_tells_is_what_is_in_force() -> None:
-    lab = lab_with(Meter())
-    found = found_in(run(lab))
-    rows, cols = amplitudes_of(lab)[-1]
-    assert found["row_amplitudes"] == rows.tolist()
-    assert found["column_amplitudes"] == cols.tolist()
-
-
-def test_without_a_calibration_it_begins_with_equal_tones_at_full_scale() -> None:
-    lab = lab_with(Meter())
-    run(lab)
-    rows, cols = amplitudes_of(lab)[0]
-    assert rows == pytest.approx(np.full(6, 1 / 6))
-    assert cols == pytest.approx(np.full(8, 1 / 8))
 
 
 def test_it_begins_at_the_calibration_in_use() -> None:
@@ -124,17 +112,13 @@ def test_it_begins_at_the_calibration_in_use() -> None:
     assert sum(found["row_amplitudes"]) == pytest.approx(0.9)
 
 
-def test_sites_that_the_meter_cannot_tell_are_left_out() -> None:
+def test_sites_that_the_meter_cannot_measure_are_left_out() -> None:
     missing = np.random.default_rng(3).random(GRID.shape) < 0.15
-    meter = Meter(lambda power: np.where(missing, np.nan, power))
+    meter = Meter(lambda power: np.where(missing, np.nan, power).tolist())
     found = found_in(run(lab_with(meter)))
     assert found["separable_spread"] <= 0.005
     assert np.array_equal(np.isnan(np.array(found["power_after"])), missing)
     assert factors(np.where(missing, np.nan, meter.powers())).separable_spread < 0.006
-
-
-def test_lists_serve_as_well_as_arrays() -> None:
-    assert found_in(run(lab_with(Meter(lambda power: power.tolist()))))["separable_spread"] <= 0.005
 
 
 def dead(power: Floats) -> Floats:
@@ -149,35 +133,21 @@ def dead(power: Floats) -> Floats:
             lambda _power: np.ones((8, 6)),
             r"trap_camera: its value 'spot_powers' is \(8, 6\); expected .*\(6, 8\)",
         ),
-        (lambda power: power.ravel(), r"trap_camera: its value 'spot_powers' is \(48,\); expected"),
         (
             lambda _power: "warming up",
             "trap_camera: its value 'spot_powers' is str; expected the power of each",
         ),
-        (lambda _power: None, "trap_camera: its value 'spot_powers' is NoneType; expected"),
-        (lambda _power: 0.7, "trap_camera: its value 'spot_powers' is float; expected"),
-        (lambda _power: [], r"trap_camera: its value 'spot_powers' is \(0,\); expected"),
         (lambda _power: [[1.0, 2.0], [3.0]], "trap_camera: its value 'spot_powers' is list; expected"),
         (lambda power: power * np.nan, "static_tweezers: no light on row 0, 1, 2, 3, 4, ...: is its tone on"),
-        (lambda power: -power, "static_tweezers: no light on row 0, "),
         (dead, "static_tweezers: no light on row 3: is its tone on"),
     ],
 )
-def test_a_meter_that_answers_nonsense_is_told_and_everything_is_made_safe(
+def test_nonsense_from_the_meter_is_refused_and_everything_is_made_safe(
     spoil: Callable[[Floats], Any], message: str
 ) -> None:
     lab = lab_with(Meter(spoil))
     with pytest.raises(DeviceError, match=message):
         run(lab)
-    assert_safe(lab)
-
-
-def test_too_much_noise_says_how_many_averages_it_takes() -> None:
-    lab = lab_with(Meter(noise=0.2))
-    with pytest.raises(
-        DeviceError, match=r"not equalised: too much noise: 10 averages .*; about \d+ averages"
-    ):
-        run(lab, max_averages=10)
     assert_safe(lab)
 
 
@@ -188,14 +158,7 @@ def test_a_meter_that_does_not_follow_the_tones_ends_the_loop() -> None:
     assert_safe(lab)
 
 
-def test_tweezers_that_refuse_the_amplitudes_are_named() -> None:
-    lab = lab_with(Meter(), fail_on={"static_tweezers.load": RuntimeError("cable")})
-    with pytest.raises(DeviceError, match=r"static_tweezers: .*cable"):
-        run(lab)
-    assert_safe(lab)
-
-
-def test_a_device_that_the_profile_does_not_have_is_told_before_anything_is_changed() -> None:
+def test_a_device_that_the_profile_does_not_have_is_refused_before_anything_is_changed() -> None:
     lab = lab_with(Meter())
     with pytest.raises(
         ConfigError, match="the profile has no device 'wavemeter'; it has: trap_camera, shutter"
@@ -255,7 +218,7 @@ def test_a_few_sites_may_be_missing() -> None:
     assert np.isnan(found.residual[3, 4])
 
 
-def test_what_is_not_separable_is_told_apart() -> None:
+def test_what_is_not_separable_is_the_residual() -> None:
     rng = np.random.default_rng(2)
     power = np.exp(rng.normal(0, 0.04, (20, 20)) + rng.normal(0, 0.1, (20, 1)))
     found = factors(power)
@@ -287,7 +250,7 @@ def test_amplitudes_stay_within_full_scale() -> None:
     assert weak.row_amplitudes.max() == 1.0
 
 
-@pytest.mark.parametrize("light", [0.0, 1e-3, -0.01, np.nan])
+@pytest.mark.parametrize("light", [1e-3, -0.01, np.nan])
 def test_a_row_or_column_without_light_is_named(light: float) -> None:
     power = np.ones((6, 5))
     power[:, 3] = light
@@ -295,23 +258,6 @@ def test_a_row_or_column_without_light_is_named(light: float) -> None:
         factors(power)
     with pytest.raises(DeviceError, match=r"no light on row 3"):
         factors(power.T)
-
-
-def test_a_black_measurement_is_refused() -> None:
-    with pytest.raises(DeviceError, match=r"no light on row 0, 1, 2, 3, 4, \.\.\.: "):
-        factors(np.zeros((6, 6)))
-
-
-@pytest.mark.parametrize(
-    ("rows", "cols", "message"),
-    [
-        (np.ones(3), np.ones(4), r"powers of shape \(4, 4\); expected \(3, 4\)"),
-        (np.array([1.0, 0.0, 1.0, 1.0]), np.ones(4), "an amplitude is not above 0"),
-    ],
-)
-def test_amplitudes_that_do_not_belong_are_refused(rows: Any, cols: Any, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        equalise(np.ones((4, 4)), rows, cols)
 
 
 class Array:
@@ -351,7 +297,7 @@ def begin(array: Array, limits: EqualiseSettings | None = None) -> LoopResult:
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from([(20, 20), (12, 30)]))
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=4)
 def test_the_separable_part_is_made_even_and_the_rest_is_left_alone(
     seed: int, shape: tuple[int, int]
 ) -> None:
@@ -368,29 +314,12 @@ def test_the_separable_part_is_made_even_and_the_rest_is_left_alone(
 
 @pytest.mark.parametrize(
     "response",
-    [lambda p: np.sin(np.minimum(p, 2.0) * 0.7) ** 2, lambda p: p / (1 + 0.5 * p), lambda p: p**1.5],
+    [lambda p: np.sin(np.minimum(p, 2.0) * 0.7) ** 2, lambda p: p**1.5],
 )
 def test_a_response_that_is_not_linear_takes_some_rounds_more(response: Any) -> None:
     array = Array(3, response=response)
     begin(array)
     assert factors(array.power()).separable_spread < 0.0055
-
-
-def test_the_amplitudes_that_come_back_are_in_force() -> None:
-    array = Array(4)
-    result = begin(array)
-    assert result.equalised.row_amplitudes is array.amplitudes[0]
-    assert result.equalised.column_amplitudes is array.amplitudes[1]
-
-
-def test_sites_that_cannot_be_measured_are_left_out() -> None:
-    array = Array(5)
-    missing = np.random.default_rng(1).random(array.shape) < 0.1
-    measure = array.measure
-    array.measure = lambda: np.where(missing, np.nan, measure())
-    result = begin(array)
-    assert result.equalised.separable_spread <= 0.005
-    assert factors(np.where(missing, np.nan, array.power())).separable_spread < 0.0055
 
 
 def test_too_much_noise_ends_the_loop_and_says_how_many_averages_it_takes() -> None:
@@ -405,13 +334,6 @@ def test_too_much_noise_ends_the_loop_and_says_how_many_averages_it_takes() -> N
         begin(again, EqualiseSettings(max_averages=needed // 2))
     again = Array(6, noise=0.1)
     assert begin(again, EqualiseSettings(max_averages=1000)).noise <= 0.005 / 3
-
-
-def test_a_dead_row_is_named() -> None:
-    array = Array(7)
-    array.bias[0][11] = 0.0
-    with pytest.raises(DeviceError, match="no light on row 11"):
-        begin(array)
 
 
 def test_a_row_that_does_not_follow_its_tone_is_named() -> None:

@@ -26,8 +26,12 @@ def test_the_static_tweezers_are_ramped_and_the_shot_waits_for_it() -> None:
     assert [stage.duration_s for stage in rig.record().timing if "ramp" in stage.stage] == pytest.approx(
         [5e-3, 2e-3]
     )
-    told = [values for name, values in rig.observer.events if name == "ramped"]
-    assert told[0] == {"shot": 0, "device": "static_tweezers", "depth": 0.5, "duration_s": 5e-3}
+    assert rig.observer.of("ramped")[0] == {
+        "shot": 0,
+        "device": "static_tweezers",
+        "depth": 0.5,
+        "duration_s": 5e-3,
+    }
 
 
 def test_each_shot_begins_at_full_depth() -> None:
@@ -72,7 +76,7 @@ def test_a_repeated_shot_begins_at_full_depth() -> None:
     ]
 
 
-def test_atoms_load_at_the_depth_that_there_is() -> None:
+def test_atoms_load_at_the_present_depth() -> None:
     rig = Rig((LOWER, LOAD))
     rig.run()
     names = rig.lab.calls.names("static_tweezers")
@@ -82,7 +86,7 @@ def test_atoms_load_at_the_depth_that_there_is() -> None:
     ]
 
 
-def test_lines_go_with_a_ramp() -> None:
+def test_lines_are_played_with_a_ramp() -> None:
     cooling = LineSpec("cooling", 2, frozenset({"ramp"}), lead_s=1e-3, lag_s=2e-3)
     rig = Rig((LOWER,), line_specs=[cooling])
     (bar,) = LOWER[1].plan_timeline(rig.lab.step_context)

@@ -1,4 +1,4 @@
-"""The closed loop, on scripted sights."""
+"""The closed loop, on scripted occupancies."""
 
 import threading
 from typing import Any
@@ -18,13 +18,13 @@ FILL = np.array([[1, 1, 0], [0, 0, 0]], bool)
 DONE = np.array([[1, 1, 0], [0, 0, 0]], bool)
 
 
-def rearranging(sights, planner=None, after=(IMAGE,), **settings):
+def rearranging(occupancies_seen, planner=None, after=(IMAGE,), **settings):
     defaults = {"cycles": 3, "exposure": 0.02, "stop_when": "defect_free", "window_mode": "early"}
     window_s = settings.pop("window", 0.06)
     settings_given = given(**{**defaults, **settings}, window_of=lambda cycle: window_s)
     parts: dict[str, Any] = {} if planner is None else {"planner": planner, "planner_name": "scripted"}
     return Rig(
-        occupancies=sights,
+        occupancies=occupancies_seen,
         fill=FILL,
         steps=(LOAD, IMAGE, ("sort", RearrangeStep(settings_given)), *after),
         **parts,
@@ -132,14 +132,14 @@ def test_a_plan_that_is_wrong_never_plays():
     assert rig.made_safe() == SAFE_ORDER
 
 
-@pytest.mark.parametrize("answer", [None, [], "a plan", np.zeros((1, 4))])
-def test_what_is_no_plan_is_named(answer):
+@pytest.mark.parametrize("answer", [None, "a plan"])
+def test_an_answer_that_is_no_plan_is_named(answer):
     rig = rearranging([HALF], planner=ScriptedPlanner([answer]))
     with pytest.raises(PlanError, match="expected a Plan"):
         rig.run()
 
 
-@pytest.mark.parametrize("answer", [None, "1 ms", float("nan"), float("inf"), -1.0])
+@pytest.mark.parametrize("answer", [None, float("nan"), -1.0])
 def test_a_playing_time_that_is_none_is_named(answer):
     rig = rearranging([HALF])
     vars(rig.lab.mobile_tweezers)["prepare"] = lambda program: answer

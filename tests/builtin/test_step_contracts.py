@@ -40,41 +40,31 @@ from labseq.testing.fakes import FakeLab, fake_lab
 Factory = Callable[..., Any]
 
 
-class TestLoad(StepContract):
+STEPS: dict[str, Any] = {
+    "load": LoadStep(LoadSettings(duration=0.5)),
+    "image": ImageStep(ImageSettings(exposure=0.045)),
+    "rearrange": RearrangeStep(RearrangeSettings(cycles=3, window=0.06, exposure=0.045)),
+    "rearrange in a fixed window": RearrangeStep(
+        RearrangeSettings(cycles=2, window=0.06, exposure=0.045, window_mode="fixed")
+    ),
+    "probe": ProbeStep(ProbeSettings(offset=(0.3e-6, 0.0), sites="all")),
+    "probe in a cross": ProbeStep(ProbeSettings(offset=(0.9e-6, 0.9e-6), pattern="cross")),
+    "check_overlay": CheckOverlayStep(CheckOverlaySettings()),
+    "ramp": RampStep(RampSettings(depth=0.5)),
+    "wait": WaitStep(WaitSettings(duration=0.01)),
+    "device": DeviceStep(DeviceStepSettings(name="shutter", do="on")),
+}
+
+
+@pytest.fixture(params=STEPS)
+def step(request: pytest.FixtureRequest) -> Any:
+    return STEPS[request.param]
+
+
+class TestSteps(StepContract):
     @pytest.fixture
-    def factory(self) -> Factory:
-        return partial(LoadStep, LoadSettings(duration=0.5))
-
-
-class TestImage(StepContract):
-    @pytest.fixture
-    def factory(self) -> Factory:
-        return partial(ImageStep, ImageSettings(exposure=0.045))
-
-
-class TestRearrange(StepContract):
-    @pytest.fixture
-    def factory(self) -> Factory:
-        return partial(RearrangeStep, RearrangeSettings(cycles=3, window=0.06, exposure=0.045))
-
-
-class TestRearrangeInAFixedWindow(StepContract):
-    @pytest.fixture
-    def factory(self) -> Factory:
-        settings = RearrangeSettings(cycles=2, window=0.06, exposure=0.045, window_mode="fixed")
-        return partial(RearrangeStep, settings)
-
-
-class TestProbe(StepContract):
-    @pytest.fixture
-    def factory(self) -> Factory:
-        return partial(ProbeStep, ProbeSettings(offset=(0.3e-6, 0.0), sites="all"))
-
-
-class TestProbeInACross(StepContract):
-    @pytest.fixture
-    def factory(self) -> Factory:
-        return partial(ProbeStep, ProbeSettings(offset=(0.9e-6, 0.9e-6), pattern="cross"))
+    def factory(self, step: Any) -> Factory:
+        return lambda: step
 
 
 class TestCheckSites(StepContract):
@@ -91,12 +81,6 @@ class TestCheckSites(StepContract):
         return partial(CheckSitesStep, CheckSitesSettings())
 
 
-class TestCheckOverlay(StepContract):
-    @pytest.fixture
-    def factory(self) -> Factory:
-        return partial(CheckOverlayStep, CheckOverlaySettings())
-
-
 class TestEqualise(StepContract):
     def lab(self) -> FakeLab:
         lab = fake_lab(devices=("trap_camera",), simulated=True)
@@ -106,21 +90,3 @@ class TestEqualise(StepContract):
     @pytest.fixture
     def factory(self) -> Factory:
         return partial(EqualiseStep, EqualiseSettings())
-
-
-class TestRamp(StepContract):
-    @pytest.fixture
-    def factory(self) -> Factory:
-        return partial(RampStep, RampSettings(depth=0.5))
-
-
-class TestWait(StepContract):
-    @pytest.fixture
-    def factory(self) -> Factory:
-        return partial(WaitStep, WaitSettings(duration=0.01))
-
-
-class TestDevice(StepContract):
-    @pytest.fixture
-    def factory(self) -> Factory:
-        return partial(DeviceStep, DeviceStepSettings(name="shutter", do="on"))

@@ -13,19 +13,16 @@ def test_virtual_time_passes_only_by_waiting():
     start = time.monotonic()
     clock.sleep(3600.0)
     assert clock.now() == 3600.0
-    assert time.monotonic() - start < 60.0
-
-
-def test_negative_waits_do_not_turn_time_back():
-    clock = VirtualClock(StopFlag())
     clock.sleep(-1.0)
-    assert clock.now() == 0.0
+    assert clock.now() == 3600.0
+    assert time.monotonic() - start < 60.0
 
 
 @pytest.mark.parametrize("kind", [RealClock, VirtualClock, PacedClock])
 def test_a_stop_request_ends_every_wait(kind):
     stop = StopFlag()
     stop.request(15)
+    stop.request(2)  # the first signal decides the exit code
     clock = kind(stop)
     with pytest.raises(StopRequested) as caught:
         clock.sleep(1000.0)
@@ -48,13 +45,6 @@ def test_a_stop_request_ends_a_wait_that_is_under_way():
     stop.request()
     thread.join(30.0)
     assert raised.is_set()
-
-
-def test_the_first_signal_decides_the_exit_code():
-    stop = StopFlag()
-    stop.request(15)
-    stop.request(2)
-    assert stop.signal_number == 15
 
 
 def test_while_devices_are_made_safe_waits_finish():

@@ -11,25 +11,25 @@ from labseq.errors import (
     DeviceError,
     DeviceTimeoutError,
     LabseqError,
-    RecordingError,
     StopRequested,
     TransientError,
 )
-from labseq.model import Frame
 from labseq.sequencer.lab import Timeouts
-from labseq.sequencer.run import TRANSITIONS, State, StateTable
+from labseq.sequencer.run import TRANSITIONS, State
 from labseq.testing.fakes import ListSink
 from tests.sequencer.rig import EMPTY, FULL, IMAGE, LOAD, SAFE_ORDER, Rig, given
 
 
 def test_devices_open_before_and_are_safe_and_closed_after():
-    rig = Rig()
+    rig, n_safe = Rig(), []
+    rig.observer.event = lambda name, _: n_safe.append(len(rig.made_safe())) if name == "safe_state" else None
     rig.run()
     names = rig.lab.calls.names()
     opened = [n for n in names if n.endswith(".open")]
     assert opened == ["static_tweezers.open", "camera.open", "shutter.open", "mobile_tweezers.open"]
     assert names[-4:] == [f"{device}.close" for device in SAFE_ORDER]
     assert rig.made_safe() == SAFE_ORDER
+    assert n_safe == [4, 4, 4, 4]  # observers are called after all devices are safe
     assert not rig.unsafe
     assert rig.sequencer.state is State.CLOSED
 
@@ -53,7 +53,7 @@ def test_every_step_is_timed_against_its_budget():
     assert not any(t.over_budget for t in steps.values())
 
 
-def test_the_simulation_is_told_of_shots_and_loading():
+def test_the_simulation_is_called_for_each_shot_and_load():
     rig = Rig(simulated=True)
     rig.run(2)
     names = rig.lab.calls.names("simulation")
@@ -94,14 +94,6 @@ def test_a_device_step_sends_its_command():
     ]
 
 
-def test_frames_are_kept_as_they_came():
-    rig = Rig()
-    rig.run()
-    (image,) = rig.record().images
-    assert isinstance(image.frame, Frame)
-    assert image.exposure_s == 0.045
-
-
 def test_a_transient_failure_repeats_the_shot_and_keeps_the_attempt():
     rig = Rig(fail_on={"camera.read": [TransientError("frame lost", "camera"), None]})
     rig.run(2)
@@ -111,17 +103,6 @@ def test_a_transient_failure_repeats_the_shot_and_keeps_the_attempt():
     assert rig.observer.names.count("shot_repeated") == 1
     recovered = rig.lab.calls.names()[: rig.lab.calls.names().index("camera.safe_state") + 1]
     assert recovered[-2:] == ["mobile_tweezers.safe_state", "camera.safe_state"]
-
-
-def test_attempts_run_out():
-    rig = Rig(attempts=2, fail_on={"camera.read": TransientError("frame lost", "camera")})
-    with pytest.raises(TransientError):
-        rig.run(2)
-    assert [(s.shot_index, s.attempt, s.status) for s in rig.sink.shots] == [
-        (0, 0, "failed"),
-        (0, 1, "failed"),
-    ]
-    assert rig.made_safe()[-4:] == SAFE_ORDER
 
 
 def test_a_recovery_that_fails_keeps_the_attempt():
@@ -135,7 +116,7 @@ def test_a_recovery_that_fails_keeps_the_attempt():
     assert not rig.unsafe
 
 
-def test_between_shots_a_device_is_closed_through_its_safe_state_and_opened_anew():
+def test_between_shots_a_device_is_made_safe_closed_and_opened_again():
     rig = Rig()
     rig.sequencer.open()
     rig.sequencer.run([0])
@@ -180,9 +161,7 @@ def test_a_device_that_fails_to_reopen_leaves_all_devices_safe():
     ("answer", "message"),
     [
         (None, "detect\\(\\) returned NoneType"),
-        ((np.ones((2, 2)), np.ones((2, 2))), "the occupancy is float64"),
         ((np.ones((3, 2), bool), np.ones((2, 2))), r"the occupancy is bool \(3, 2\); expected bool \(2, 2\)"),
-        ((FULL, np.ones(4)), "the confidence is"),
     ],
 )
 def test_a_detector_of_the_wrong_shape_is_named(answer, message):
@@ -204,7 +183,7 @@ def test_a_camera_that_returns_no_frame_is_named():
         rig.run()
 
 
-@pytest.mark.parametrize("method", ["open", "begin_shot", "load", "close"])
+@pytest.mark.parametrize("method", ["begin_shot", "close"])
 def test_a_simulation_that_fails_is_named_and_all_devices_are_safe(method):
     rig = Rig(simulated=True)
 
@@ -214,8 +193,7 @@ def test_a_simulation_that_fails_is_named_and_all_devices_are_safe(method):
     vars(rig.lab.simulation)[method] = fail
     if method == "close":
         rig.run()
-        told = rig.observer.of("closed")[-1]
-        assert told == {
+        assert rig.observer.of("closed")[-1] == {
             "device": "simulation",
             "ok": False,
             "error": "simulation: fail() raised ValueError: nothing there",
@@ -227,9 +205,11 @@ def test_a_simulation_that_fails_is_named_and_all_devices_are_safe(method):
     assert rig.sequencer.state is State.CLOSED
 
 
-@pytest.mark.parametrize("error", [KeyError("typo"), SystemExit(0), KeyboardInterrupt()])
-@pytest.mark.parametrize("method", ["plan_timeline", "run"])
-def test_whatever_a_third_party_step_raises_is_named(method, error):
+@pytest.mark.parametrize(
+    ("method", "error"),
+    [("plan_timeline", SystemExit(0)), ("run", KeyError("typo")), ("run", KeyboardInterrupt())],
+)
+def test_any_error_of_a_third_party_step_is_named(method, error):
     class Broken:
         needs_image = takes_image = False
 
@@ -247,7 +227,7 @@ def test_whatever_a_third_party_step_raises_is_named(method, error):
         Rig(steps=(("mine", Broken()),)).run()
 
 
-@pytest.mark.parametrize("answer", [None, "bars", [None]])
+@pytest.mark.parametrize("answer", [None, [None]])
 def test_a_timeline_that_is_none_is_named(answer):
     class Broken:
         needs_image = takes_image = False
@@ -262,10 +242,6 @@ def test_a_timeline_that_is_none_is_named(answer):
         Rig(steps=(("mine", Broken()),))
 
 
-def test_every_state_is_declared():
-    assert set(TRANSITIONS) == set(State)
-
-
 def test_every_open_state_leads_to_safety():
     after_safety = {State.CLOSED, State.MAKING_SAFE, State.SAFE, State.CLOSING}
     for state in set(State) - after_safety:
@@ -275,15 +251,6 @@ def test_every_open_state_leads_to_safety():
 def test_devices_are_never_closed_before_they_are_safe():
     before_closing = {state for state, then in TRANSITIONS.items() if State.CLOSING in then}
     assert before_closing == {State.SAFE}
-
-
-def test_an_undeclared_change_is_refused():
-    seen: list[State] = []
-    table = StateTable(seen.append)
-    with pytest.raises(AssertionError, match="cannot go from closed to shot"):
-        table.to(State.SHOT)
-    table.to(State.OPENING)
-    assert seen == [State.OPENING]
 
 
 def test_no_device_is_made_safe_beside_an_open_that_is_only_slow(monkeypatch):
@@ -314,14 +281,7 @@ def test_no_device_is_made_safe_beside_an_open_that_is_only_slow(monkeypatch):
 
 @pytest.mark.parametrize(
     "call",
-    [
-        "camera.arm",
-        "camera.trigger",
-        "camera.read",
-        "static_tweezers.start",
-        "static_tweezers.open",
-        "mobile_tweezers.open",
-    ],
+    ["camera.arm", "camera.read", "static_tweezers.open", "mobile_tweezers.open"],
 )
 def test_any_error_leaves_every_device_safe(call):
     rig = Rig(fail_on={call: RuntimeError("cable")})
@@ -354,8 +314,8 @@ def test_one_device_that_cannot_be_made_safe_never_stops_the_others(failing):
     rig.run()
     assert rig.made_safe() == SAFE_ORDER
     assert list(rig.unsafe) == [failing]
-    told = {v["device"]: v["ok"] for v in rig.observer.of("safe_state")}
-    assert told == {device: device != failing for device in SAFE_ORDER}
+    events = {v["device"]: v["ok"] for v in rig.observer.of("safe_state")}
+    assert events == {device: device != failing for device in SAFE_ORDER}
 
 
 def test_a_safe_state_that_hangs_is_given_up():
@@ -397,17 +357,6 @@ def test_a_stop_request_in_a_shot_keeps_what_it_has():
     assert rig.made_safe() == SAFE_ORDER
 
 
-def test_a_disk_that_is_full_ends_the_run_safely():
-    class Full(ListSink):
-        def write_shot(self, shot):
-            raise RecordingError("shots", "no space left")
-
-    rig = Rig(sink=Full())
-    with pytest.raises(RecordingError):
-        rig.run(3)
-    assert rig.made_safe() == SAFE_ORDER
-
-
 def test_a_stop_request_in_a_recovery_lets_the_driver_ramp_down():
     rig = Rig(fail_on={"camera.read": TransientError("frame lost", "camera")})
     ramps = []
@@ -425,8 +374,8 @@ def test_a_stop_request_in_a_recovery_lets_the_driver_ramp_down():
     assert not rig.unsafe
 
 
-@pytest.mark.parametrize("failing", SAFE_ORDER)
-def test_a_device_that_cannot_be_made_safe_in_a_shot_that_failed_is_told(failing):
+@pytest.mark.parametrize("failing", ["mobile_tweezers", "camera"])
+def test_a_device_that_cannot_be_made_safe_after_a_failed_shot_is_reported(failing):
     rig = Rig(fail_on={"camera.read": RuntimeError("cable"), f"{failing}.safe_state": OSError("gone")})
     with pytest.raises(DeviceError, match="cable"):
         rig.run()
@@ -435,17 +384,7 @@ def test_a_device_that_cannot_be_made_safe_in_a_shot_that_failed_is_told(failing
     assert rig.made_safe() == SAFE_ORDER
 
 
-def test_nobody_is_told_before_all_devices_are_safe():
-    rig = Rig()
-    safe_when_told = []
-    rig.observer.event = lambda name, values: (
-        safe_when_told.append(len(rig.made_safe())) if name == "safe_state" else None
-    )
-    rig.run()
-    assert safe_when_told == [4, 4, 4, 4]
-
-
-def test_an_ending_that_was_cut_short_begins_anew():
+def test_a_shutdown_that_was_interrupted_can_be_repeated():
     rig = Rig()
     rig.sequencer.open()
 
