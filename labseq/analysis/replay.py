@@ -20,7 +20,6 @@ from labseq.messages import clean
 from labseq.model import (
     CalibrationEntry,
     CycleRecord,
-    ImageRecord,
     MotionSpec,
     Plan,
     PlanReport,
@@ -123,36 +122,23 @@ class ReplayedImages:
             except (Exception, SystemExit) as error:  # noqa: BLE001 - a plugin may raise anything
                 self.failures[shot.index, i] = f"{type(error).__name__}: {error}"
                 continue
-            is_last = i == len(images) - 1
-            self._note(
-                shot.index, i, image, seen, certainty, int(truth) if is_last and truth is not None else None
+            appeared, vanished = seen & ~image.occupancy, image.occupancy & ~seen
+            self.appeared += appeared
+            self.vanished += vanished
+            is_known = truth is not None and i == len(images) - 1
+            self.images.append(
+                ReplayedImage(
+                    shot=shot.index,
+                    image=i,
+                    n_atoms=int(np.count_nonzero(image.occupancy)),
+                    n_atoms_replayed=int(np.count_nonzero(seen)),
+                    n_appeared=int(np.count_nonzero(appeared)),
+                    n_vanished=int(np.count_nonzero(vanished)),
+                    confidence=float(np.mean(image.confidence)),
+                    confidence_replayed=certainty,
+                    n_atoms_true=int(truth) if is_known else None,
+                )
             )
-
-    def _note(
-        self,
-        shot: int,
-        number: int,
-        image: ImageRecord,
-        seen: NDArray[np.bool_],
-        confidence: float,
-        n_atoms_true: int | None,
-    ) -> None:
-        appeared, vanished = seen & ~image.occupancy, image.occupancy & ~seen
-        self.appeared += appeared
-        self.vanished += vanished
-        self.images.append(
-            ReplayedImage(
-                shot=shot,
-                image=number,
-                n_atoms=int(np.count_nonzero(image.occupancy)),
-                n_atoms_replayed=int(np.count_nonzero(seen)),
-                n_appeared=int(np.count_nonzero(appeared)),
-                n_vanished=int(np.count_nonzero(vanished)),
-                confidence=float(np.mean(image.confidence)),
-                confidence_replayed=confidence,
-                n_atoms_true=n_atoms_true,
-            )
-        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,16 +195,11 @@ class ReplayedPlan:
 
 @dataclass(frozen=True, slots=True)
 class MeanCounts:
-    """Means over several plans.
+    """Means over several plans; for each attribute see :class:`PlanCounts`.
 
     Attributes:
         n_plans: Number of plans.
         n_met: Number of plans that meet the target, if no atom is lost.
-        n_batches: Batches.
-        n_atom_moves: Atom moves.
-        duration_s: From the start of the cycle to the end of the last batch.
-        planning_s: Time that planning took.
-        filling: Filling of the target afterwards, if no atom is lost.
     """
 
     n_plans: int
@@ -232,15 +213,12 @@ class MeanCounts:
     @classmethod
     def over(cls, plans: Sequence[PlanCounts]) -> MeanCounts:
         """Average over plans; unknown times are left out."""
-        return cls(
-            n_plans=len(plans),
-            n_met=sum(plan.meets_target for plan in plans),
-            n_batches=mean([plan.n_batches for plan in plans]),
-            n_atom_moves=mean([plan.n_atom_moves for plan in plans]),
-            duration_s=mean([plan.duration_s for plan in plans]),
-            planning_s=mean([s for plan in plans if not math.isnan(s := plan.planning_s)]),
-            filling=mean([plan.filling for plan in plans]),
-        )
+
+        def mean_of(name: str) -> Estimate:
+            return mean([value for plan in plans if not math.isnan(value := getattr(plan, name))])
+
+        names = ("n_batches", "n_atom_moves", "duration_s", "planning_s", "filling")
+        return cls(len(plans), sum(plan.meets_target for plan in plans), *map(mean_of, names))
 
 
 def replay_plans(

@@ -16,6 +16,7 @@ from labseq.console.options import (
     Shots,
     run_options,
 )
+from labseq.files import data_root
 
 queue = typer.Typer(
     name="queue",
@@ -75,9 +76,9 @@ def remove(
     ],
 ) -> None:
     """Remove entries from the queue; the data of their runs stay."""
-    from labseq.queue.terminal import remove_entries
+    from labseq.queue.queue import Queue
 
-    remove_entries(ids)
+    Queue(data_root()).remove(ids)
 
 
 @queue.command(short_help="Move an entry before another one.")
@@ -86,6 +87,6 @@ def move(
     before: Annotated[int, typer.Option("--before", metavar="ID", help="The entry that will follow it.")],
 ) -> None:
     """Move an entry before another one."""
-    from labseq.queue.terminal import move_entry
+    from labseq.queue.queue import Queue
 
-    move_entry(entry, before)
+    Queue(data_root()).move(entry, before)

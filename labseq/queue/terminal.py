@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
 from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
@@ -42,16 +41,6 @@ def list_entries(*, as_json: bool) -> None:
     say(*table, *([""] if notes else []), *notes, *([] if holder is None else ["", f"run by: {holder}"]))
 
 
-def remove_entries(ids: Sequence[int]) -> None:
-    """Take entries out of the queue."""
-    Queue(data_root()).remove(ids)
-
-
-def move_entry(number: int, before: int) -> None:
-    """Put an entry before another one."""
-    Queue(data_root()).move(number, before)
-
-
 class RunSession(Protocol):
     """Opens a session, runs it and prints the result."""
 
@@ -85,13 +74,8 @@ def _row(entry: Entry) -> tuple[str, ...]:
         entry.state,
         clean(_short(entry.sequence)),
         added,
-        clean(_options_text(entry.options)),
+        clean(", ".join(f"{address}={value}" for address, value in entry.options.changes().items())),
     )
-
-
-def _options_text(options: Options) -> str:
-    changes = options.changes()
-    return ", ".join(f"{address}={value}" for address, value in changes.items())
 
 
 def _short(path: Path) -> str:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Generator, Iterable, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from labseq.errors import RecordingError
@@ -17,6 +19,20 @@ if TYPE_CHECKING:
 
 SCANNER: Final = "scanner"
 """Key in the record of an adaptive scan (and no other): the scanner and its settings."""
+
+
+@contextmanager
+def reporting_damage(run_dir: Path) -> Generator[None]:
+    """Report the record of a scan that is not as it was written.
+
+    Raises:
+        RecordingError: The body could not read it.
+    """
+    try:
+        yield
+    except (KeyError, IndexError, TypeError, ValueError) as error:
+        reason = f"has a damaged scan: {error!r}; take it from a backup"
+        raise RecordingError(run_dir / RUN_FILE, reason) from error
 
 
 class ChosenPoints:
@@ -90,7 +106,7 @@ def scan_points(run: Run) -> list[ScanPoint]:
     if not scan:
         return []
     shots: dict[int, list[Shot]] = {}
-    try:
+    with reporting_damage(run.path):
         for shot in run.shots:
             shots.setdefault(int(scan["point_of_shot"][shot.index]), []).append(shot)
         addresses = scan["addresses"]
@@ -102,6 +118,3 @@ def scan_points(run: Run) -> list[ScanPoint]:
             )
             for point in sorted(shots)
         ]
-    except (KeyError, IndexError, TypeError, ValueError) as error:
-        reason = f"has a damaged scan: {error!r}; take it from a backup"
-        raise RecordingError(run.path / RUN_FILE, reason) from error

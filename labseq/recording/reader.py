@@ -16,7 +16,7 @@ from labseq.model.estimate import mean
 from labseq.model.records import RunStatus
 from labseq.plain import parse_object, to_plain
 from labseq.recording import folders
-from labseq.recording.points import SCANNER, completed
+from labseq.recording.points import SCANNER, completed, reporting_damage
 from labseq.recording.results import rows_of
 from labseq.recording.run_file import is_index_row, is_skip_row, read_run, read_state, target_of
 from labseq.recording.shot import Shot, load_content
@@ -134,11 +134,8 @@ class Run:
         scan: Mapping[str, Any] = self.record.get("scan") or {}
         if SCANNER not in scan:
             return scan
-        try:
+        with reporting_damage(self.path):
             return completed(scan, [shot.row for shot in (*self.shots, *self.attempts)])
-        except (KeyError, TypeError, ValueError) as error:
-            reason = f"has a damaged scan: {error!r}; take it from a backup"
-            raise RecordingError(self.path / folders.RUN_FILE, reason) from error
 
     @property
     def defect_free(self) -> float:

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.errors import ConfigError, Problem, RecordingError
+from labseq.errors import ConfigError, Problem
 from labseq.plain import dumps
 from labseq.recording.columns import columns_of
-from labseq.recording.folders import RUN_FILE
+from labseq.recording.points import reporting_damage
 from labseq.recording.reader import Run
 
 if TYPE_CHECKING:
@@ -152,12 +152,9 @@ def _grid_of(run: Run) -> _Grid | None:
     scan: Mapping[str, Any] = run.scan
     if not scan:
         return None
-    try:
+    with reporting_damage(run.path):
         points = [int(scan["point_of_shot"][shot.index]) for shot in run.shots]
         return _grid(list(scan["addresses"]), [list(values) for values in scan["points"]], points)
-    except (KeyError, IndexError, TypeError, ValueError) as error:
-        reason = f"has a damaged scan: {error!r}; take it from a backup"
-        raise RecordingError(run.path / RUN_FILE, reason) from error
 
 
 def _grid(addresses: list[str], points: list[list[Any]], point_of_shot: list[int]) -> _Grid:
@@ -166,14 +163,15 @@ def _grid(addresses: list[str], points: list[list[Any]], point_of_shot: list[int
     for point in point_of_shot:
         repeats.append(counts[point])
         counts[point] += 1
+    axes = [dict(zip(map(dumps, values), values, strict=True)) for values in zip(*points, strict=True)]
     keys = [tuple(map(dumps, point)) for point in points]
-    axes = [list(dict.fromkeys(column)) for column in zip(*keys, strict=True)]
     is_product = math.prod(map(len, axes)) == len(points) == len(set(keys))
     if is_product:
         dims, shape = tuple(addresses), tuple(map(len, axes))
-        place_of_point = [tuple(map(list.index, axes, key)) for key in keys]
-        columns = [dict(zip(of, values, strict=True)) for of, values in _by_axis(keys, points)]
-        along = [[column[key] for key in axis] for column, axis in zip(columns, axes, strict=True)]
+        place_of_point = [
+            tuple(list(axis).index(k) for axis, k in zip(axes, key, strict=True)) for key in keys
+        ]
+        along = [tuple(axis.values()) for axis in axes]
     else:
         dims, shape = ("point",), (len(points),)
         place_of_point = [(number,) for number in range(len(points))]
@@ -182,11 +180,6 @@ def _grid(addresses: list[str], points: list[list[Any]], point_of_shot: list[int
     coords = {name: (axis, _values(of)) for name, axis, of in zip(addresses, axis_of, along, strict=True)}
     places = [(*place_of_point[point], repeat) for point, repeat in zip(point_of_shot, repeats, strict=True)]
     return _Grid((*dims, "repeat"), (*shape, max(counts.values(), default=0)), places, coords)
-
-
-def _by_axis(keys: Sequence[tuple[str, ...]], points: Sequence[list[Any]]) -> list[tuple[Any, Any]]:
-    """The addresses and the values along each axis."""
-    return list(zip(zip(*keys, strict=True), zip(*points, strict=True), strict=True))
 
 
 def _values(values: Sequence[Any]) -> NDArray[Any]:
