@@ -97,10 +97,6 @@ class Acquisition:
         fault = FAULTS.get(buffer.status, f"its buffer is '{buffer.status}'")
         return ExposureResult(number, buffer.image, fault, self._exposure_s, device_time_s=time_s)
 
-    def check_alive(self) -> None:
-        """Check that the camera still answers."""
-        self._link.check_alive()
-
     def stop(self) -> None:
         """End the acquisition; frames that were not read are dropped, including those being transferred."""
         stream, start = self._stream, self._start

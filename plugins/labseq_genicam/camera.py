@@ -83,19 +83,20 @@ class GenicamCamera(CameraDriver):
 
     def _wait(self, timeout_s: float) -> ExposureResult | None:
         """Wait for a frame, and check from time to time whether the camera still answers."""
-        acquisition, checked_s = self._opened(), time.monotonic()
+        acquisition, link, checked_s = self._opened(), self._link, time.monotonic()
+        assert link is not None
 
         def poll(longest_s: float) -> ExposureResult | None:
             nonlocal checked_s
             taken = acquisition.poll(longest_s)
             if taken is None and time.monotonic() - checked_s >= CHECK_PERIOD_S:
-                acquisition.check_alive()
+                link.check_alive()
                 checked_s = time.monotonic()
             return taken
 
         taken = wait_for(poll, timeout_s, self._clock)
         if taken is None:
-            acquisition.check_alive()
+            link.check_alive()
         return taken
 
     def _end(self) -> None:

@@ -21,9 +21,7 @@ from labseq_aravis.library import G_TYPE_DOUBLE, AravisError, load_library
 
 from labseq_genicam_sim.description import MODEL, REGISTERS, TEXTS, VENDOR, description
 from labseq_genicam_sim.messages import (
-    DONE,
     EXPOSE,
-    FAULTS,
     IMAGE,
     NO_IMAGE,
     READY,
@@ -164,7 +162,6 @@ class Process:
     def __init__(self, channel: Channel) -> None:
         self._channel = channel
         self._images: queue.SimpleQueue[bytearray | None] = queue.SimpleQueue()
-        self._other: Camera | None = None
 
     def run(self) -> None:
         """Run the camera until the parent is gone."""
@@ -175,18 +172,15 @@ class Process:
         setup = Setup(**values | {"faults": Faults(**values["faults"])})
         try:
             self._camera = SimulatedCamera(setup, self._expose)
-            self._occupy(setup.faults)
+            if setup.faults.is_busy:  # control of the camera, as another application would have it
+                self._other = Camera(self._camera.address)
         except AravisError as error:
             self._channel.send(REFUSED, str(error).encode())
             return
         self._channel.send(READY, self._camera.address.encode())
         while (message := self._channel.receive()) is not None:
             kind, data = message
-            if kind == FAULTS:
-                self._camera.faults = Faults(**json.loads(data))
-                self._occupy(self._camera.faults)
-                self._channel.send(DONE)
-            elif kind in (IMAGE, NO_IMAGE):
+            if kind in (IMAGE, NO_IMAGE):
                 self._images.put(data if kind == IMAGE else None)
 
     def _expose(self, exposure: Exposure) -> bytearray | None:
@@ -195,14 +189,6 @@ class Process:
         except OSError:
             os._exit(0)
         return self._images.get()
-
-    def _occupy(self, faults: Faults) -> None:
-        """Take control of the camera as another application would, or release it."""
-        if faults.is_busy and self._other is None:
-            self._other = Camera(self._camera.address)
-        elif not faults.is_busy and self._other is not None:
-            self._other.close()
-            self._other = None
 
 
 def main() -> None:

@@ -107,11 +107,11 @@ class SimulatedConnection(CameraConnection):
         Its image is made before the trigger is sent: the camera answers nothing while it waits for an image,
         and on a busy computer it would seem to be gone.
         """
-        n = self._fake.n_begun
+        n = self._fake.n_made
         if not self._ignores_triggers:
             self._made.append(self._sensor.expose(self._late_s, self._edge_s))
         acquisition.fire()
-        if not self._fake.wait_for_exposure(n, MAX_WAIT_S, answered=True):
+        if not self._fake.wait_for_image(n, MAX_WAIT_S):
             self._made.clear()  # its frame will be missing
         self._fake.raise_pending()
 

@@ -16,9 +16,7 @@ from labseq_aravis.stream import MONO
 from numpy.typing import NDArray
 
 from labseq_genicam_sim.messages import (
-    DONE,
     EXPOSE,
-    FAULTS,
     IMAGE,
     NO_IMAGE,
     READY,
@@ -68,7 +66,7 @@ class FakeCamera:
         self._process: subprocess.Popen[bytes] | None = None
         self._errors: list[Exception] = []
         self._changed = threading.Condition()
-        self._n_begun = self._n_answered = self._n_done = 0
+        self._n_made = 0
         self._is_ready = self._has_ended = False
         self.address = ""
 
@@ -79,7 +77,7 @@ class FakeCamera:
         self.stop()
         load_library()  # reports a missing one here
         self._log: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 - closed by stop()
-        self._n_begun = self._n_answered = 0
+        self._n_made = 0
         self._is_ready = self._has_ended = False
         self._process = subprocess.Popen(
             [sys.executable, "-P", "-m", "labseq_genicam_sim"],
@@ -132,24 +130,14 @@ class FakeCamera:
         return self._process is not None and not self._has_ended and self._process.poll() is None
 
     @property
-    def n_begun(self) -> int:
-        """How many exposures the camera has begun: the number of the next one."""
+    def n_made(self) -> int:
+        """How many images were made: the number of the next exposure."""
         with self._changed:
-            return self._n_begun
+            return self._n_made
 
-    def wait_for_exposure(self, n: int, timeout_s: float, *, answered: bool = False) -> bool:
-        """Wait until the camera has begun exposure ``n``, or its image was made; returns whether it is so."""
-        return self._wait(lambda: n < (self._n_answered if answered else self._n_begun), timeout_s)
-
-    def set_faults(self, faults: Faults) -> None:
-        """Change the failures to simulate, for frames that begin from now on."""
-        self._faults = faults
-        if not self.is_running:
-            return
-        n = self._n_done
-        self._send(FAULTS, to_json(faults))
-        if not self._wait(lambda: self._n_done > n or self._has_ended, STOP_TIMEOUT_S) or self._n_done == n:
-            raise AravisError(self._reason(), "not connected")
+    def wait_for_image(self, n: int, timeout_s: float) -> bool:
+        """Wait until the image of exposure ``n`` was made; returns whether it was."""
+        return self._wait(lambda: n < self._n_made, timeout_s)
 
     def unplug(self) -> None:
         """Kill the camera, whatever it is doing; :meth:`start` plugs it in again, at its address."""
@@ -173,24 +161,19 @@ class FakeCamera:
                     self.address, self._is_ready = data.decode(), True
                 elif kind == REFUSED:
                     self._errors.append(AravisError(data.decode(), "refused"))
-                elif kind == DONE:
-                    self._n_done += 1
                 self._changed.notify_all()
         with self._changed:
             self._has_ended = self._has_ended or channel is self._channel
             self._changed.notify_all()
 
     def _answer(self, channel: Channel, exposure: Exposure) -> None:
-        with self._changed:
-            self._n_begun += 1
-            self._changed.notify_all()
         try:
             image = _pixels(self._expose(exposure), exposure)
         except Exception as error:  # noqa: BLE001 - kept for raise_pending
             self._errors.append(error)
             image = None
         with self._changed:
-            self._n_answered += 1
+            self._n_made += 1
             self._changed.notify_all()
         try:
             channel.send(NO_IMAGE if image is None else IMAGE, b"" if image is None else image)

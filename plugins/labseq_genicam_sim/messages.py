@@ -14,14 +14,12 @@ HEAD: Final = struct.Struct("<4sQ")
 
 # from the parent
 SETUP: Final = b"SET1"  # JSON of a Setup
-FAULTS: Final = b"FAUL"  # JSON of Faults; answered by DONE
 IMAGE: Final = b"IMAG"  # the bytes of a frame, in the camera's pixel format
 NO_IMAGE: Final = b"NONE"  # there is no image; the frame fails
 # from the camera
 READY: Final = b"HELO"  # its address
 REFUSED: Final = b"ERRO"  # why it cannot start
 EXPOSE: Final = b"EXPO"  # JSON of an Exposure
-DONE: Final = b"DONE"  # the faults are active
 
 GAIN_STEP: Final = 1e-3
 """Gain per step of its register."""
@@ -37,7 +35,7 @@ class Faults:
         late_s: Delay of each frame, in seconds. The camera answers nothing meanwhile.
         unplugged_at: Number of the frame at which the camera vanishes, before it is sent; None for never.
         is_busy: Whether another application controls the camera.
-        ignores_triggers: Whether its software trigger has no effect; fixed when it starts.
+        ignores_triggers: Whether its software trigger has no effect.
     """
 
     packet_loss: float = 0.0
@@ -65,7 +63,7 @@ class Setup:
     faults: Faults
 
 
-def to_json(message: Setup | Faults | Exposure) -> bytes:
+def to_json(message: Setup | Exposure) -> bytes:
     """JSON of a message; its values are the arguments of its class."""
     return json.dumps(asdict(message)).encode()
 

@@ -162,9 +162,7 @@ class TypedSettings(Settings):
     @property
     def limits(self) -> tuple[float, float]:
         """Least and most, in SI; infinite where there is none."""
-        low, high = self.min, self.max
-        read = self.quantity.read
-        return (-math.inf if low is None else read(low), math.inf if high is None else read(high))
+        return limits_of(self.min, self.max, self.quantity)
 
     def allows(self, value: Scalar) -> bool:
         """Whether a value, in SI, is within the limits; anything but a number is."""
@@ -300,6 +298,11 @@ def check_limits(unit: str | None, low: Number | None, high: Number | None, *at:
         raise setting_error(f"min is {shown[0]}, more than max, {shown[1]}", "min below max", at=(*at, "min"))
 
 
+def limits_of(low: Number | None, high: Number | None, quantity: Unit) -> tuple[float, float]:
+    """Least and most, in SI; infinite where there is none."""
+    return -math.inf if low is None else quantity.read(low), math.inf if high is None else quantity.read(high)
+
+
 def format_limits(low: float, high: float, quantity: Unit) -> str:
     """Describe limits; infinite ones are left out."""
     if math.isinf(low):
@@ -342,8 +345,7 @@ class InterlockSettings(Settings):
 
     def limits(self, quantity: Unit) -> tuple[float, float]:
         """Least and most, in SI; infinite where there is none."""
-        low = -math.inf if self.min is None else quantity.read(self.min)
-        return low, math.inf if self.max is None else quantity.read(self.max)
+        return limits_of(self.min, self.max, quantity)
 
     def shown(self, quantity: Unit) -> str:
         """Describe the allowed values."""
@@ -407,16 +409,12 @@ class ValueSettings(TypedSettings):
             return self.interlock.one_of[0]
         if not self.is_number:
             return False if self.type == "bool" else "0"
-        pairs = (
-            [self.limits] if self.interlock is None else [self.limits, self.interlock.limits(self.quantity)]
-        )
-        low, high = max(pair[0] for pair in pairs), min(pair[1] for pair in pairs)
-        if math.isinf(low) and math.isinf(high):
-            middle = self.quantity.from_line(0.0)
-        elif math.isinf(low) or math.isinf(high):
-            middle = high if math.isinf(low) else low
-        else:
-            middle = (low + high) / 2
+        ranges = [self.limits]
+        if self.interlock is not None:
+            ranges.append(self.interlock.limits(self.quantity))
+        low, high = max(least for least, _ in ranges), min(most for _, most in ranges)
+        ends = [limit for limit in (low, high) if math.isfinite(limit)]
+        middle = sum(ends) / len(ends) if ends else self.quantity.from_line(0.0)
         return math.floor(middle) if self.type == "int" else middle
 
     def _read(self, text: str) -> Scalar:

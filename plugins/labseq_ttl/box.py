@@ -341,24 +341,6 @@ def cause_text(bits: int) -> str:
     return ", ".join(text for bit, text in CAUSES.items() if bits & bit) or "unknown"
 
 
-def reset_error(device: str, cause: int) -> DeviceError:
-    """The box was reset in the middle of its work."""
-    text = f"the box was reset (reason: {cause_text(cause)}) and turned all lines off"
-    return DeviceError(device, f"{text}; check its supply and cable")
-
-
-def turned_off_error(device: str) -> DeviceError:
-    """The box received a stop that this driver did not send."""
-    text = "the box was told to turn all lines off, but not by this driver"
-    return DeviceError(device, f"{text}; does another program use it?")
-
-
-def watchdog_error(device: str, timeout_s: float) -> DeviceError:
-    """The box received nothing from this computer for too long."""
-    text = f"the box heard nothing for {format_quantity(timeout_s, 'time')} and turned all lines off"
-    return DeviceError(device, f"{text}; is this computer too busy? raise 'watchdog_timeout'")
-
-
 def late_error(device: str, timeout_s: float, *, is_external: bool = False) -> DeviceTimeoutError:
     """A program has not ended in time."""
     text = f"the lines' program is not over after {format_quantity(timeout_s, 'time')}"

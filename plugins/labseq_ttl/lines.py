@@ -23,7 +23,7 @@ from labseq.plugin import (
     one_of,
 )
 from labseq_ttl.access import choose_box
-from labseq_ttl.box import Box, Identity, late_error, reset_error, turned_off_error, watchdog_error
+from labseq_ttl.box import Box, Identity, cause_text, late_error
 from labseq_ttl.programs import MAX_EDGES, Slots, edges_of, mask_of
 from labseq_ttl.protocol import (
     CHANNELS,
@@ -325,10 +325,13 @@ class TtlLines(Lines):
             self._was_reset(*numbers)
         elif what == "off":
             self._forget()
-            raise turned_off_error(self._name)
+            text = "the box was told to turn all lines off, but not by this driver"
+            raise DeviceError(self._name, f"{text}; does another program use it?")
         elif what == "alone":
             self._forget()
-            raise watchdog_error(self._name, self._settings.watchdog_timeout)
+            silent = format_quantity(self._settings.watchdog_timeout, "time")
+            text = f"the box heard nothing for {silent} and turned all lines off"
+            raise DeviceError(self._name, f"{text}; is this computer too busy? raise 'watchdog_timeout'")
 
     def _has_ended(self, n_runs: int) -> None:
         self._is_running, self._n_runs = False, n_runs
@@ -337,7 +340,8 @@ class TtlLines(Lines):
         self._forget()
         self._slots.clear()
         self._n_boots, self._n_runs, self._was_lost = n_boots, 0, True
-        raise reset_error(self._name, cause)
+        text = f"the box was reset (reason: {cause_text(cause)}) and turned all lines off"
+        raise DeviceError(self._name, f"{text}; check its supply and cable")
 
 
 class Heartbeat(threading.Thread):

@@ -105,7 +105,7 @@ def test_a_computer_that_is_slow_costs_no_time_on_a_virtual_clock(monkeypatch: p
     with rig(readout="5 ms") as lab:
         acquisition, asked = lab.camera._opened(), list[None]()
         poll = acquisition.poll
-        monkeypatch.setattr(acquisition, "check_alive", lambda: asked.append(None))
+        monkeypatch.setattr(lab.camera._link, "check_alive", lambda: asked.append(None))
         monkeypatch.setattr(acquisition, "poll", lambda s: poll(s) if len(asked) > 2 else None)
         frames = lab.take(1, 0.01)
         assert len(asked) == 3
