@@ -14,7 +14,7 @@ from labseq.console.options import (
     Seed,
     Shots,
     dry_run_mode,
-    profile_names,
+    profile_option,
 )
 
 calibration = typer.Typer(
@@ -40,12 +40,7 @@ Examples:
   labseq calibrate sites --profile lab --from sites.csv
 """
 
-Profile = Annotated[
-    str,
-    typer.Option(
-        "--profile", "-p", metavar="NAME|FILE", help="Hardware profile.", autocompletion=profile_names
-    ),
-]
+Profile = Annotated[str, profile_option("Hardware profile.")]
 DryRun = Annotated[
     DryRunKind | None,
     typer.Option(

@@ -30,8 +30,8 @@ from labseq.console.options import (
     SequenceFile,
     Shots,
     dry_run_mode,
-    profile_names,
-    run_folders,
+    profile_option,
+    run_argument,
     run_options,
 )
 from labseq.queue.commands import queue
@@ -141,15 +141,7 @@ def run(
 
 @app.command(epilog=RESUME_EXAMPLES, short_help="Resume a run that ended early.")
 def resume(
-    run: Annotated[
-        Path,
-        typer.Argument(
-            metavar="RUN",
-            help="The run's folder, or any file in it.",
-            show_default=False,
-            autocompletion=run_folders,
-        ),
-    ],
+    run: Annotated[Path, run_argument("The run's folder, or any file in it.")],
     accept_changes: Annotated[
         bool,
         typer.Option(
@@ -168,25 +160,8 @@ def resume(
 
 @app.command(short_help="End a run in progress after its current shot.")
 def stop(
-    run: Annotated[
-        Path | None,
-        typer.Argument(
-            metavar="RUN",
-            help="The run's folder; default: the run in progress.",
-            show_default=False,
-            autocompletion=run_folders,
-        ),
-    ] = None,
-    profile: Annotated[
-        str | None,
-        typer.Option(
-            "--profile",
-            "-p",
-            metavar="NAME|FILE",
-            help="Stop the run that uses this profile.",
-            autocompletion=profile_names,
-        ),
-    ] = None,
+    run: Annotated[Path | None, run_argument("The run's folder; default: the run in progress.")] = None,
+    profile: Annotated[str | None, profile_option("Stop the run that uses this profile.")] = None,
     queue: Annotated[
         bool, typer.Option("--queue", help="Also let `labseq queue run` start no further entry.")
     ] = False,
@@ -323,14 +298,7 @@ app.command(epilog=SCHEMA_EXAMPLES, short_help="Write the JSON schema of files, 
 @app.command(short_help="List the plugins and what they offer.")
 def plugins(
     profile: Annotated[
-        str | None,
-        typer.Option(
-            "--profile",
-            "-p",
-            metavar="NAME|FILE",
-            help="Look in this profile's plugin folders instead of ./plugins.",
-            autocompletion=profile_names,
-        ),
+        str | None, profile_option("Look in this profile's plugin folders instead of ./plugins.")
     ] = None,
     as_json: Json = False,
 ) -> None:

@@ -133,7 +133,7 @@ def check_sequence(
             answer(json_errors(error))
         raise
     if answer is not None:
-        answer(as_line(_as_values(checked) | {"calibrations": _calibrations(session.assembly)}))
+        answer(as_line(_as_values(session.assembly, checked)))
     else:
         _print(session.assembly, checked)
 
@@ -154,24 +154,28 @@ def _print(assembly: Assembly, checked: CheckReport) -> None:
         say(*warning_lines(warning), stream=sys.stderr)
 
 
-def _as_values(checked: CheckReport) -> dict[str, Any]:
+def _as_values(assembly: Assembly, checked: CheckReport) -> dict[str, Any]:
     rehearsal = checked.rehearsal
     return {
         "problems": [],
-        "warnings": [asdict(warning) for warning in checked.warnings],
+        "warnings": [*map(asdict, checked.warnings)],
         "timeline": [
-            {"step": number, "name": name, "bars": [asdict(bar) for bar in bars]}
+            {"step": number, "name": name, "bars": [*map(asdict, bars)]}
             for number, (name, bars) in enumerate(checked.timeline)
         ],
         "shots": checked.n_shots,
         "shot_s": [checked.shortest_shot_s, checked.longest_shot_s],
         "points": checked.n_points,
-        "run_s": list(checked.run_s),
-        "lines": {line: [list(span) for span in spans] for line, spans in checked.lines.items()},
+        "run_s": checked.run_s,
+        "lines": checked.lines,
         "n_images": checked.n_images,
         "shot_bytes": checked.shot_bytes,
         "run_bytes": None if checked.shot_bytes is None else checked.n_shots * checked.shot_bytes,
         "first_cycle_s": None if rehearsal is None else _quantiles(rehearsal),
+        "calibrations": [
+            {"kind": entry.kind, "id": entry.id, "taken_utc": entry.taken_utc, "age_s": age_s(entry)}
+            for entry in assembly.bench.calibrations.values()
+        ],
     }
 
 
@@ -185,32 +189,21 @@ def _subject(assembly: Assembly) -> list[tuple[str, str]]:
     grid, document = assembly.bench.grid, assembly.bench.document
     listed = settings_text({k: v for k, v in assembly.planner.dump().items() if k != "use"})
     n_clear = int(target.clear.sum())
+    simulated = ", dry run" if assembly.dry_run != "off" else ", simulated" * assembly.virtual_time
     return [
         ("sequence", f"{spec.name} ({assembly.document.path})"),
-        ("profile", f"{assembly.bench.profile.name} ({document.path}){_simulation(assembly)}"),
+        ("profile", f"{assembly.bench.profile.name} ({document.path}){simulated}"),
         (
             "grid",
             f"{grid.n_rows} x {grid.n_cols}, {grid.lattice}, {format_quantity(grid.spacing_m, 'length')}",
         ),
         ("target", f"{target.name}, {plural(target.n_atoms, 'atom')}, {plural(n_clear, 'site')} to be empty"),
         ("planner", assembly.planner.entry.name + (f" ({listed})" if listed else "")),
-        *(("calibration", text) for text in _calibrated(assembly)),
+        *(
+            ("calibration", f"{one.kind} {one.id}, {age_text(age_s(one))} old, {quality_text(one)}")
+            for one in assembly.bench.calibrations.values()
+        ),
         *(("scan", text) for text in _scanned(assembly)),
-    ]
-
-
-def _calibrated(assembly: Assembly) -> list[str]:
-    """A line for each calibration in use."""
-    return [
-        f"{entry.kind} {entry.id}, {age_text(age_s(entry))} old, {quality_text(entry)}"
-        for entry in assembly.bench.calibrations.values()
-    ]
-
-
-def _calibrations(assembly: Assembly) -> list[dict[str, Any]]:
-    return [
-        {"kind": entry.kind, "id": entry.id, "taken_utc": entry.taken_utc, "age_s": age_s(entry)}
-        for entry in assembly.bench.calibrations.values()
     ]
 
 
@@ -248,12 +241,6 @@ def _chosen(search: Search) -> list[str]:
 def _ends(axis: Axis) -> str:
     first, last = (clean(str(axis.values[i].raw or axis.values[i].plain())) for i in (0, -1))
     return f"{first} to {last}" if len(axis.values) > 1 else first
-
-
-def _simulation(assembly: Assembly) -> str:
-    if assembly.dry_run != "off":
-        return ", dry run"
-    return ", simulated" if assembly.virtual_time else ""
 
 
 def _totals(checked: CheckReport, assembly: Assembly) -> list[tuple[str, str]]:
@@ -306,10 +293,7 @@ def _windows(resolved: Mapping[str, Any]) -> list[str]:
         values = cast("list[float]", window if isinstance(window, list) else [window])
         times = ", ".join(format_quantity(value, "time") for value in values)
         each = "for the moves of each cycle" if len(values) == 1 else "for the moves of the cycles"
-        image = (
-            "follows the last batch"
-            if settings["window_mode"] == "early"
-            else "waits for the end of the window"
-        )
+        is_early = settings["window_mode"] == "early"
+        image = "follows the last batch" if is_early else "waits for the end of the window"
         texts.append(f"{times} {each}, {plural(settings['cycles'], 'cycle')} at most; the image {image}")
     return texts

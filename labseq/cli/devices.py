@@ -15,7 +15,6 @@ from labseq.console.text import columns
 from labseq.errors import ConfigError, DeviceError
 from labseq.kernel import announcing
 from labseq.messages import clean
-from labseq.plain import dumps
 from labseq.plugins import PluginHost, PluginInfo
 from labseq.registry import LOAD_S
 from labseq.scaffold.new import PLUGINS
@@ -48,7 +47,7 @@ def show_devices(profile: str, overrides: Sequence[str], dry_run: DryRun, *, as_
     for warning in report.warnings:
         say(f"warning: {warning}", stream=sys.stderr)
     if answer is not None:
-        answer(dumps(_as_values(report)))
+        answer(as_line(_as_values(report)))
     else:
         say(*table(report))
     if report.stopped is not None:
@@ -147,9 +146,8 @@ def plugins_table(host: PluginHost) -> list[str]:
     rows = [("plugin", "state", "version", "origin", "offers")]
     remarks: list[str] = []
     for info in host.infos:
-        rows.append(
-            (info.name, info.state, info.version or "-", info.origin, ", ".join(_offers(host, info)) or "-")
-        )
+        offers = ", ".join(_offers(host, info)) or "-"
+        rows.append((info.name, info.state, info.version or "-", info.origin, offers))
         remarks += [f"{info.name}: {info.reason}"] if info.reason else []
         remarks += [f"{info.name}: warning: {note}" for note in info.notes]
     return [*columns(rows), *([""] if remarks else []), *remarks]

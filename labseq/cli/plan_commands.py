@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from labseq.console.options import JsonFile
+from labseq.console.options import JsonFile, profile_option
 
 if TYPE_CHECKING:
     from labseq.session.planning import PlanRequest
@@ -50,12 +50,9 @@ Origin = Annotated[
 ]
 Profile = Annotated[
     str | None,
-    typer.Option(
-        "--profile",
-        "-p",
-        metavar="NAME|FILE",
-        help="Hardware profile with the grid, the motion and the plugin folders. Default: those of the "
-        "shot file, else the paper's spacing and motion.",
+    profile_option(
+        "Hardware profile with the grid, the motion and the plugin folders. Default: those of the shot "
+        "file, else the paper's spacing and motion."
     ),
 ]
 Overrides = Annotated[

@@ -6,7 +6,7 @@ import math
 import shutil
 import textwrap
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, cast
 
@@ -18,7 +18,6 @@ from labseq.console.runs import chosen_run
 from labseq.console.text import columns, percent, settings_text
 from labseq.errors import ConfigError, LabseqError, Problem
 from labseq.messages import clean, visible
-from labseq.plain import to_plain
 from labseq.recording import Run, Shot
 from labseq.units import format_quantity
 
@@ -81,7 +80,7 @@ def _json_tables(run: Run, wanted: Tables) -> dict[str, Any]:
     values: dict[str, Any] = {"run_dir": str(run.path), "status": run.status}
     if wanted.shots:
         values["shot_list"] = [
-            {"index": shot.index, **{name: to_plain(shot.row.get(name)) for name in SHOT_KEYS}}
+            {"index": shot.index, **{name: shot.row.get(name) for name in SHOT_KEYS}}
             for shot in _all_attempts(run)
         ]
     if wanted.timing:
@@ -90,7 +89,7 @@ def _json_tables(run: Run, wanted: Tables) -> dict[str, Any]:
         scan_table(run)  # raises if there is nothing to show
         values["points"] = json_points(run)
     if wanted.devices:
-        values["devices"] = to_plain(_devices(run))
+        values["devices"] = _devices(run)
     return values
 
 
@@ -208,19 +207,10 @@ def _json_timing(run: Run) -> dict[str, Any]:
 
     timing = _read_timing(run)
     stages = [
-        {
-            "stage": stage.stage,
-            "n": stage.n,
-            "n_per_shot": stage.n_per_shot,
-            "budget_s": stage.budget_s,
-            "session_s": quantiles(stage.session_s),
-            "host_s": quantiles(stage.host_s),
-            "share": stage.share,
-            "n_over": stage.n_over,
-        }
+        asdict(stage) | {"session_s": quantiles(stage.session_s), "host_s": quantiles(stage.host_s)}
         for stage in timing.stages
     ]
-    return to_plain({"n_read": timing.n_read, "shot_s": quantiles(timing.shot_s), "stages": stages})
+    return {"n_read": timing.n_read, "shot_s": quantiles(timing.shot_s), "stages": stages}
 
 
 def devices_table(run: Run) -> list[str]:

@@ -11,7 +11,6 @@ from labseq.analysis.statistics import CycleStatistics, Rate, Statistics, statis
 from labseq.console.text import columns, count_of, plural
 from labseq.messages import clean
 from labseq.model.estimate import Estimate
-from labseq.plain import to_plain
 from labseq.recording import Run
 from labseq.recording.points import scan_points
 from labseq.units import format_quantity
@@ -64,8 +63,8 @@ def json_points(run: Run) -> list[dict[str, Any]]:
         {
             "parameters": dict(point.parameters),
             "shots": len(point.shots),
-            "defect_free": to_plain(statistics.defect_free.value),
-            "filling_fraction": to_plain(statistics.filling.value),
+            "defect_free": statistics.defect_free.value,
+            "filling_fraction": statistics.filling.value,
             "statistics": statistics.as_dict(),
         }
         for point, statistics in points
@@ -107,9 +106,9 @@ def cycle_table(statistics: Statistics) -> list[str]:
         return []
     header = ("cycle", "shots", "defect-free", "filling", "atom moves", "batches", "left out")
     lines = columns([header, *map(_cycle_row, statistics.cycles)], right=range(len(header)))
-    if statistics.cycles[-1].n_shots < statistics.cycles[0].n_shots:
-        return [*lines, "each cycle on its own image, without the shots that had ended before it"]
-    return [*lines, "each cycle on its own image"]
+    ended = statistics.cycles[-1].n_shots < statistics.cycles[0].n_shots
+    without = ", without the shots that had ended before it" if ended else ""
+    return [*lines, f"each cycle on its own image{without}"]
 
 
 def _cycle_row(cycle: CycleStatistics) -> tuple[str, ...]:

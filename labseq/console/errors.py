@@ -8,7 +8,6 @@ import re
 import shutil
 import sys
 import traceback
-import unicodedata
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -31,6 +30,8 @@ def excerpt(problem: Problem) -> list[str]:
         The line with its number, and a line with carets below the offending word; nothing if the problem
         has no line, or its file cannot be read.
     """
+    from rich.cells import cell_len
+
     line = _line_of(problem)
     if line is None or not line.strip():
         return []
@@ -39,21 +40,15 @@ def excerpt(problem: Problem) -> list[str]:
     word = _WORD.match(line, start)
     end = max(start + 1, word.end() if word else 0)
     shift = min(start, max(0, end + _MARGIN - widest)) if len(line) > widest else 0
-    while _width(line[shift:start]) >= widest:
+    while cell_len(line[shift:start]) >= widest:
         shift += 1
     shown = line[shift : shift + widest].rstrip()
-    while _width(shown) > widest:
+    while cell_len(shown) > widest:
         shown = shown[:-1]
     # a tab is as wide in both lines
-    pad = "".join("\t" if char == "\t" else " " * _width(char) for char in line[shift:start])
-    carets = "^" * max(1, min(_width(line[start:end]), widest - _width(line[shift:start])))
+    pad = "".join("\t" if char == "\t" else " " * cell_len(char) for char in line[shift:start])
+    carets = "^" * max(1, min(cell_len(line[start:end]), widest - cell_len(line[shift:start])))
     return [f"{problem.line:>5} | {shown}", " " * 5 + " | " + pad + carets]
-
-
-def _width(text: str) -> int:
-    """Width of a text in a terminal, in columns."""
-    narrow = len(text) - sum(unicodedata.combining(char) != 0 for char in text)
-    return narrow + sum(unicodedata.east_asian_width(char) in "WF" for char in text)
 
 
 def _line_of(problem: Problem) -> str | None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from contextlib import suppress
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import typer
 
@@ -68,20 +68,23 @@ class DryRunKind(StrEnum):
     FAST = "fast"
 
 
+def profile_option(text: str) -> Any:
+    """The option ``--profile`` with another help text."""
+    return typer.Option("--profile", "-p", metavar="NAME|FILE", help=text, autocompletion=profile_names)
+
+
+def run_argument(text: str) -> Any:
+    """The argument ``RUN`` with another help text."""
+    return typer.Argument(metavar="RUN", help=text, show_default=False, autocompletion=run_folders)
+
+
 def dry_run_mode(kind: DryRunKind | None) -> Literal["off", "full", "fast"]:
     """The mode of a dry run; "off" without ``--dry-run``."""
     return "off" if kind is None else kind.value  # pyright: ignore[reportReturnType]
 
 
 Profile = Annotated[
-    str | None,
-    typer.Option(
-        "--profile",
-        "-p",
-        metavar="NAME|FILE",
-        help="Hardware profile, instead of the one that the sequence names.",
-        autocompletion=profile_names,
-    ),
+    str | None, profile_option("Hardware profile, instead of the one that the sequence names.")
 ]
 ProfileArgument = Annotated[
     str,
@@ -143,13 +146,7 @@ Output = Annotated[
 ]
 Realtime = Annotated[bool, typer.Option("--realtime", help="Let a simulated run take as long as a real one.")]
 RunFolder = Annotated[
-    Path | None,
-    typer.Argument(
-        metavar="RUN",
-        help="The run's folder, or any file in it; default: the newest run.",
-        show_default=False,
-        autocompletion=run_folders,
-    ),
+    Path | None, run_argument("The run's folder, or any file in it; default: the newest run.")
 ]
 
 
