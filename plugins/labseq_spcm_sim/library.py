@@ -17,15 +17,15 @@ import sys
 import threading
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
+from functools import partialmethod
 from types import SimpleNamespace
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from labseq.plugin import Clock, DeviceError, ReceivesOutput, RfSamples, RfSpan, RfTones, Simulation
 from labseq_spcm_sim import registers as r
-from labseq_spcm_sim.card import DRIVER_VERSION, LIST_PARAM, SimulatedCard
+from labseq_spcm_sim.card import DRIVER_VERSION, LIST_PARAM, SimulatedCard, list_writes
 from labseq_spcm_sim.modes import Buffer
 from labseq_spcm_sim.output import FULL_SCALE, SampleSpan, Span
 from labseq_spcm_sim.setup import ErrorInfo, Number
@@ -68,25 +68,6 @@ def typed(library: Any, name: str) -> Any:
     result, arguments = SIGNATURES[name]
     address = ctypes.cast(getattr(library, name), ctypes.c_void_p).value
     return ctypes.CFUNCTYPE(result, *arguments)(address or 0)
-
-
-def put_number(kind: type[Slot], address: int, value: Number) -> int:
-    """Write a number to where a pointer points; returns "no error"."""
-    slot: Any = kind.from_address(address)
-    slot.value = value if kind is ctypes.c_double else int(value)
-    return r.ERR_OK
-
-
-def put_text(address: int, text: str, n_bytes: int) -> None:
-    """Write a text with its final zero, cut to the buffer's length."""
-    raw = text.encode()[: max(0, n_bytes - 1)] + b"\0"
-    ctypes.memmove(address, raw, len(raw))
-
-
-def list_entries(address: int, n_bytes: int) -> NDArray[np.void]:
-    """A copy of a register list, ``LIST_PARAM`` (n,)."""
-    raw = (ctypes.c_char * n_bytes).from_address(address)
-    return np.frombuffer(memoryview(raw), LIST_PARAM).copy()
 
 
 LIBRARY: Final = "spcm_win64.dll" if os.name == "nt" else "libspcm_linux.so"
@@ -190,7 +171,8 @@ class Library:
             return r.ERR_INVALIDHANDLE
         if register != r.SPC_REGISTER_LIST:
             return r.ERR_REG
-        return card.write_list(list_entries(address, n_bytes))
+        raw = (ctypes.c_char * n_bytes).from_address(address)
+        return card.write_all(list_writes(np.frombuffer(memoryview(raw), LIST_PARAM)))
 
     def _read(self, handle: int | None, register: int) -> tuple[int, Number]:
         card = self._open.get(handle or 0)
@@ -200,41 +182,32 @@ class Library:
             return r.ERR_OK, DRIVER_VERSION
         return r.ERR_INVALIDHANDLE, 0
 
-    def _dwgetparam_i32(self, handle: int | None, register: int, out: int) -> int:
+    def _read_into(self, kind: type[Slot], handle: int | None, register: int, out: int) -> int:
         code, value = self._read(handle, register)
-        if not code and not -(2**31) <= value < 2**31:
-            return r.ERR_EXCEEDSINT32
-        return code or put_number(ctypes.c_int32, out, value)
+        if kind is ctypes.c_int32 and not -(2**31) <= value < 2**31:
+            return code or r.ERR_EXCEEDSINT32
+        if not code:
+            _put_number(kind, out, value)
+        return code
 
-    def _dwgetparam_i64(self, handle: int | None, register: int, out: int) -> int:
-        code, value = self._read(handle, register)
-        return code or put_number(ctypes.c_int64, out, value)
-
-    def _dwgetparam_d64(self, handle: int | None, register: int, out: int) -> int:
-        code, value = self._read(handle, register)
-        return code or put_number(ctypes.c_double, out, value)
+    _dwgetparam_i32 = partialmethod(_read_into, ctypes.c_int32)
+    _dwgetparam_i64 = partialmethod(_read_into, ctypes.c_int64)
+    _dwgetparam_d64 = partialmethod(_read_into, ctypes.c_double)
 
     def _dwgetparam_ptr(self, handle: int | None, register: int, out: int, n_bytes: int) -> int:
         card = self._open.get(handle or 0)
         if card is None:
             return r.ERR_INVALIDHANDLE
-        put_text(out, card.model.name if register == r.SPC_PCITYP else "", n_bytes)
+        _put_text(out, card.model.name if register == r.SPC_PCITYP else "", n_bytes)
         return r.ERR_OK
 
     def _dwdeftransfer_i64(
-        self,
-        handle: int | None,
-        kind: int,
-        direction: int,
-        notify: int,
-        address: int,
-        offset: int,
-        n_bytes: int,
+        self, handle: int | None, kind: int, direction: int, notify: int, address: int, offset: int, size: int
     ) -> int:
         card = self._open.get(handle or 0)
         if card is None:
             return r.ERR_INVALIDHANDLE
-        return card.define_transfer(kind, direction, Buffer(address or 0, offset, n_bytes, notify))
+        return card.define_transfer(kind, direction, offset, Buffer(address or 0, size, notify))
 
     def _dwinvalidatebuf(self, handle: int | None, _kind: int) -> int:
         card = self._open.get(handle or 0)
@@ -247,21 +220,16 @@ class Library:
         else:
             error = card.take_error()
         if register:
-            put_number(ctypes.c_uint32, register, error.register)
+            _put_number(ctypes.c_uint32, register, error.register)
         if value:
-            put_number(kind, value, error.value)
+            _put_number(kind, value, error.value)
         if text:
-            put_text(text, error.text, r.ERRORTEXTLEN)
+            _put_text(text, error.text, r.ERRORTEXTLEN)
         return error.code
 
-    def _dwgeterrorinfo_i32(self, handle: int | None, register: int, value: int, text: int) -> int:
-        return self._take_error(ctypes.c_int32, handle, register, value, text)
-
-    def _dwgeterrorinfo_i64(self, handle: int | None, register: int, value: int, text: int) -> int:
-        return self._take_error(ctypes.c_int64, handle, register, value, text)
-
-    def _dwgeterrorinfo_d64(self, handle: int | None, register: int, value: int, text: int) -> int:
-        return self._take_error(ctypes.c_double, handle, register, value, text)
+    _dwgeterrorinfo_i32 = partialmethod(_take_error, ctypes.c_int32)
+    _dwgeterrorinfo_i64 = partialmethod(_take_error, ctypes.c_int64)
+    _dwgeterrorinfo_d64 = partialmethod(_take_error, ctypes.c_double)
 
     def _dwgetcontbuf_i64(self, _handle: int | None, _kind: int, _out: int, _length: int) -> int:
         return r.ERR_FNCNOTSUPPORTED
@@ -270,6 +238,18 @@ class Library:
         return r.ERR_OK
 
     _dwsendidnrequest = _dwdiscovery
+
+
+def _put_number(kind: type[Slot], address: int, value: Number) -> None:
+    """Write a number to where a pointer points."""
+    slot: Any = kind.from_address(address)
+    slot.value = value if kind is ctypes.c_double else int(value)
+
+
+def _put_text(address: int, text: str, n_bytes: int) -> None:
+    """Write a text with its final zero, cut to the buffer's length."""
+    raw = text.encode()[: max(0, n_bytes - 1)] + b"\0"
+    ctypes.memmove(address, raw, len(raw))
 
 
 PREFIX: Final = "simulated"
@@ -434,26 +414,15 @@ def _vendor() -> Any:
 
 
 def _library() -> Library:
-    """The library of this process; the first call imports ``spcm``."""
+    """The library of this process; the first call imports ``spcm``, also where it was imported before."""
     if not _LIBRARIES:
-        core: Any = sys.modules.get("spcm_core.pyspcm")
-        vendor: Any = getattr(core, "spcmDll", None)
-        if vendor is not None:
-            library = Library(vendor)
-            _take_over(library, core)
-        else:
-            library = Library(_vendor())
-            for name in _loaded():  # without a library, as SPCM_NO_DLL allows
-                del sys.modules[name]
-            with _answered(library):
-                importlib.import_module("spcm")
+        library = Library(_vendor())
+        for name in [name for name in sys.modules if name.partition(".")[0] in ("spcm", "spcm_core")]:
+            del sys.modules[name]  # an importer of the old one keeps the vendor's functions
+        with _answered(library):
+            importlib.import_module("spcm")
         _LIBRARIES.append(library)
     return _LIBRARIES[0]
-
-
-def _loaded() -> list[str]:
-    """The modules of ``spcm`` that were imported."""
-    return [name for name in sys.modules if name.partition(".")[0] in ("spcm", "spcm_core")]
 
 
 @contextmanager
@@ -470,15 +439,3 @@ def _answered(library: Library) -> Generator[None]:
         yield
     finally:
         loader.LoadLibrary = load
-
-
-def _take_over(library: Library, core: Any) -> None:
-    """``spcm`` was imported with the vendor's library: put our functions in the place of its own."""
-    for name, function in library.functions.items():
-        wrapped = name + "_"  # spcm keeps the C function so where it puts one of its own in front
-        kept = wrapped if hasattr(core, wrapped) else name
-        original = getattr(core, kept)
-        function.restype = original.restype
-        for module in map(sys.modules.__getitem__, _loaded()):
-            if getattr(module, kept, None) is original:
-                setattr(module, kept, function)

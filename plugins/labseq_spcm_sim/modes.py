@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ctypes
 import math
-import weakref
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -19,8 +18,7 @@ from labseq_spcm_sim.setup import Refusal, refuse
 
 Samples = NDArray[np.int16]
 
-PAGE = 4096
-SMALL_NOTIFY = (16, 32, 64, 128, 256, 512, 1024, 2048)
+PAGE: Final = 4096
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,66 +27,37 @@ class Buffer:
 
     Attributes:
         address: Where it starts.
-        offset: Where its data go, in bytes from the start of the memory.
         n_bytes: Its length.
         notify_bytes: Granularity in which the card reports what it has transferred; 0: all at once.
     """
 
     address: int
-    offset: int
     n_bytes: int
     notify_bytes: int
 
-    def check(self, buffer_type: int, direction: int) -> None:
-        """Refuse what the driver refuses, and a buffer that is not aligned to a page.
-
-        Raises:
-            Refusal: Wrong kind, direction, size or notify size, or not aligned.
-        """
-        if buffer_type != r.SPCM_BUF_DATA:
-            raise refuse(buffer_type, f"the buffer type {r.SPCM_BUF_DATA}")
+    def check(self, kind: int, direction: int, offset: int) -> None:
+        """Refuse what the driver refuses, and a buffer that is not aligned to a page."""
+        if kind != r.SPCM_BUF_DATA:
+            raise refuse(kind, f"the buffer type {r.SPCM_BUF_DATA}")
         if direction != r.SPCM_DIR_PCTOCARD:
             raise Refusal(r.ERR_DIRMISMATCH, "a generator card takes data from the PC only")
-        if self.notify_bytes % PAGE and self.notify_bytes not in SMALL_NOTIFY:
-            raise Refusal(
-                r.ERR_NOTIFYSIZE, f"notify size {self.notify_bytes} is not a multiple of 4096 bytes"
-            )
-        if self.n_bytes <= 0 or self.n_bytes % 2 or self.offset % 2:
+        if offset:
+            raise Refusal(r.ERR_FNCNOTSUPPORTED, "the simulator models only transfers without an offset")
+        if self.notify_bytes % PAGE:
+            text = f"notify size {self.notify_bytes} is not a multiple of {PAGE} bytes"
+            raise Refusal(r.ERR_NOTIFYSIZE, text)
+        if self.n_bytes <= 0 or self.n_bytes % 2:
             raise refuse(self.n_bytes, "a whole number of samples")
         if not self.address or self.address % PAGE:
-            raise Refusal(r.ERR_INVALIDPARAM, "the buffer must be aligned to 4096 bytes")
+            raise Refusal(r.ERR_INVALIDPARAM, f"the buffer must be aligned to {PAGE} bytes")
 
-    def content(self) -> Samples:
-        """A copy of all of it, int16 (n_bytes / 2,)."""
-        out = np.empty(self.n_bytes // 2, np.int16)
-        self.fetch(0, out)
-        return out
-
-    def fetch(self, start: int, out: Samples) -> None:
-        """Copy some of its samples, which may go around its end, from byte ``start`` on."""
+    def fetch(self, start: int, n_bytes: int) -> Samples:
+        """A copy of some of its samples, int16 (n_bytes / 2,), from byte ``start`` on and around its end."""
         whole = (ctypes.c_char * self.n_bytes).from_address(self.address)
         samples = np.frombuffer(memoryview(whole), np.int16)
         first = start % self.n_bytes // 2
-        n = min(len(out), len(samples) - first)
-        out[:n] = samples[first : first + n]
-        out[n:] = samples[: len(out) - n]
-
-
-@dataclass(frozen=True, slots=True)
-class Upload:
-    """Data on their way to the memory.
-
-    Attributes:
-        done_s: When the last sample arrives.
-        n_samples: Size of the memory that is set up, all channels together.
-        first: Index of the first sample in it.
-        data: int16 (n,).
-    """
-
-    done_s: float
-    n_samples: int
-    first: int
-    data: Samples
+        head = samples[first : first + n_bytes // 2]
+        return np.concatenate([head, samples[: n_bytes // 2 - len(head)]])
 
 
 class Memory:
@@ -98,74 +67,29 @@ class Memory:
         bus_bytes_per_s: Speed of the bus.
 
     Attributes:
-        uploads: Uploads that have not arrived yet, in order.
-        done_s: When the bus will be, or became, idle.
+        uploads: Arrival and content of uploads that have not arrived yet, in order.
     """
 
     def __init__(self, bus_bytes_per_s: float) -> None:
         self._bus_bytes_per_s = bus_bytes_per_s
         self._samples: Samples = np.zeros(0, np.int16)
-        self.done_s = -math.inf
-        self.uploads: deque[Upload] = deque()
+        self._idle_s = -math.inf
+        self.uploads: deque[tuple[float, Samples]] = deque()
 
-    def send(self, now_s: float, n_samples: int, first: int, data: Samples) -> None:
-        """Put data on the bus."""
-        self.done_s = max(now_s, self.done_s) + data.nbytes / self._bus_bytes_per_s
-        self.uploads.append(Upload(self.done_s, n_samples, first, data))
+    def send(self, now_s: float, data: Samples) -> None:
+        """Put data for the beginning of the memory on the bus."""
+        self._idle_s = max(now_s, self._idle_s) + data.nbytes / self._bus_bytes_per_s
+        self.uploads.append((self._idle_s, data))
 
-    def store(self, upload: Upload) -> None:
+    def store(self, data: Samples) -> None:
         """Data arrive, in a new array: a replay that has begun keeps the old content."""
-        if len(upload.data) == upload.n_samples:
-            self._samples = upload.data
-            return
-        self._samples = self._resized(upload.n_samples).copy()
-        self._samples[upload.first : upload.first + len(upload.data)] = upload.data
+        self._samples = np.concatenate([data, self._samples[len(data) :]])
 
     def read(self, n_samples: int, n_channels: int) -> Samples:
         """The content, int16 (n_samples, n_channels); zeros where nothing was ever written."""
-        return self._resized(n_samples * n_channels).reshape(n_samples, n_channels)
-
-    def _resized(self, n: int) -> Samples:
-        if len(self._samples) < n:
-            self._samples = np.concatenate([self._samples, np.zeros(n - len(self._samples), np.int16)])
-        return self._samples[:n]
-
-
-AREA: Final = 1 << 21
-"""Samples that are allocated at a time."""
-MAX_AHEAD: Final = 1 << 27
-"""Most samples that are allocated in advance."""
-
-
-class Store:
-    """Memory that is reused when nothing refers to its content any more.
-
-    To get fresh memory from the operating system, page by page, can take longer than to play what
-    is put there: a stream would run dry for a reason that no real card has.
-    """
-
-    def __init__(self) -> None:
-        self._free: list[Samples] = []
-        self._rest: Samples = np.empty(0, np.int16)
-
-    def reserve(self, n: int) -> None:
-        """Allocate memory for a number of samples, up to a limit."""
-        while len(self._free) * AREA < min(n, MAX_AHEAD):
-            area = np.empty(AREA, np.int16)
-            area.fill(0)  # before, the operating system has not provided it
-            self._free.append(area)
-
-    def take(self, n: int) -> Samples:
-        """Memory for n samples, int16 (n,); it is free again when nothing refers to it any more."""
-        if n > AREA:
-            return np.empty(n, np.int16)
-        if len(self._rest) < n:
-            self.reserve(n)
-            area = self._free.pop()
-            self._rest = np.frombuffer(area.data, np.int16)  # slices of it keep it alive
-            weakref.finalize(self._rest, self._free.append, area)
-        taken, self._rest = self._rest[:n], self._rest[n:]
-        return taken
+        missing = max(0, n_samples * n_channels - len(self._samples))
+        found = np.pad(self._samples, (0, missing)) if missing else self._samples
+        return found[: n_samples * n_channels].reshape(n_samples, n_channels)
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,10 +126,6 @@ class Run(Protocol):
 
     def trigger(self, out_s: float) -> None:
         """A trigger that reaches the output at ``out_s``."""
-        ...
-
-    def ends_s(self) -> float | None:
-        """When it will end, if that is known."""
         ...
 
     def played(self, now_s: float) -> list[Stretch]:
@@ -251,19 +171,15 @@ class Replay:
         if not self._stretches:
             samples = self._content()
             n_samples = len(samples) * self._loops if self._loops else 2**62
-            self._end_s = out_s + n_samples / self._rate if self._loops else math.inf
+            self._end_s = out_s + n_samples / self._rate
             self._stretches.append(Stretch(out_s, samples, n_samples))
-
-    def ends_s(self) -> float | None:
-        """Known once it plays, unless it plays until the stop."""
-        return self._end_s if math.isfinite(self._end_s) else None
 
     def played(self, now_s: float) -> list[Stretch]:
         """The samples played so far."""
         return cut(self._stretches, self._rate, now_s)
 
 
-SMALL: float = 1e-3
+SMALL: Final = 1e-3
 """Bytes that are a rounding error of time."""
 
 
@@ -276,25 +192,22 @@ class Fifo:
 
     Args:
         buffer: The ring.
-        n_channels: Active channels.
+        frame_bytes: Bytes of one sample of all active channels.
         sample_rate_hz: Sample rate.
         room_bytes: How much of the on-board memory is used.
         bus_bytes_per_s: Speed of the bus.
-        store: Memory for what was handed over.
     """
 
     def __init__(
         self,
         buffer: Buffer,
-        n_channels: int,
+        frame_bytes: int,
         sample_rate_hz: float,
         room_bytes: int,
         bus_bytes_per_s: float,
-        store: Store,
     ) -> None:
         self._buffer = buffer
-        self._store = store
-        self._frame = 2 * n_channels
+        self._frame = frame_bytes
         self._rate = sample_rate_hz
         self._room = room_bytes
         self._bus = bus_bytes_per_s
@@ -319,68 +232,42 @@ class Fifo:
         Raises:
             Refusal: More than were free, or not whole samples.
         """
-        if not 0 <= n_bytes <= self._buffer.n_bytes - (self._handed - self._notified()):
+        if not 0 <= n_bytes <= self.user_bytes:
             raise refuse(n_bytes, f"0 to {self.user_bytes} bytes")
         if n_bytes % self._frame:
             raise refuse(n_bytes, f"a multiple of {self._frame} bytes")
         if n_bytes:
-            data = self._store.take(n_bytes // 2)
-            self._buffer.fetch(self._handed, data)
-            data = data.reshape(-1, self._frame // 2)
+            data = self._buffer.fetch(self._handed, n_bytes).reshape(-1, self._frame // 2)
             self._pieces.append((self._handed // self._frame, Stretch(0.0, data, len(data))))
             self._handed += n_bytes
 
-    def start_dma(self, now_s: float) -> None:
-        """The bus begins to fetch."""
+    def switch_dma(self, on: bool, now_s: float) -> None:
+        """Whether the bus fetches what was handed over."""
         self.advance(now_s)
-        self._dma = True
-
-    def stop_dma(self, now_s: float) -> None:
-        """The bus fetches no more."""
-        self.advance(now_s)
-        self._dma = False
-
-    def _notified(self) -> int:
-        done = math.floor(self._transferred + SMALL)
-        notify = self._buffer.notify_bytes
-        return done // notify * notify if notify else done
+        self._dma = on
 
     @property
     def user_bytes(self) -> int:
         """Bytes that are free for the user, in whole notify sizes."""
-        return self._buffer.n_bytes - (self._handed - self._notified())
-
-    @property
-    def user_position(self) -> int:
-        """Where in the ring the free bytes start."""
-        return self._handed % self._buffer.n_bytes
-
-    @property
-    def fill_promille(self) -> int:
-        """How full the on-board memory is, in sixteenths."""
-        sixteenths = math.floor(16 * (self._transferred - self._consumed) / self._room + SMALL)
-        return round(sixteenths * 62.5)
+        done = math.floor(self._transferred + SMALL)
+        notified = done - done % max(1, self._buffer.notify_bytes)
+        return self._buffer.n_bytes - (self._handed - notified)
 
     @property
     def block_ready(self) -> bool:
-        """Whether a wait for the transfer would return."""
+        """Whether there is room for a block, or all was transferred."""
         return self.user_bytes >= max(1, self._buffer.notify_bytes) or self._transferred >= self._handed
-
-    def block_s(self) -> float | None:
-        """When a wait for the transfer will return, at the present speed."""
-        speed = self._speed()
-        missing = max(1, self._buffer.notify_bytes) - self.user_bytes
-        return self._now_s + max(1.0, missing) / speed if speed > 0 else None
-
-    def _drain(self) -> float:
-        return self._rate * self._frame if self._now_s >= self._play_s and not self._over else 0.0
 
     @property
     def _over(self) -> bool:
         return self.failed or self.finished
 
+    def _drain(self) -> float:
+        """Bytes per second that the output takes now."""
+        return self._rate * self._frame if self._now_s >= self._play_s and not self._over else 0.0
+
     def _speed(self) -> float:
-        """Present speed of the bus, in bytes per second."""
+        """Bytes per second on the bus now."""
         if not self._dma or self._over or self._transferred >= self._handed - SMALL:
             return 0.0
         full = self._transferred - self._consumed >= self._room - SMALL
@@ -422,11 +309,6 @@ class Fifo:
     def trigger(self, out_s: float) -> None:
         """The first trigger starts the output."""
         self._play_s = min(self._play_s, out_s)
-
-    def ends_s(self) -> float | None:
-        """Known if the length is, and it plays."""
-        end_s = self._play_s + self._total / (self._rate * self._frame)
-        return end_s if end_s < math.inf else None
 
     def played(self, now_s: float) -> list[Stretch]:
         """The samples that were output so far."""

@@ -48,10 +48,6 @@ class SampleSpan:
             return self.samples[self.first : self.first + self.n_samples]
         return self.samples[np.arange(self.first, self.first + self.n_samples) % len(self.samples)]
 
-    def volts(self) -> NDArray[np.float64]:
-        """The voltage into 50 Ohm at each sample, float64 (n_samples,)."""
-        return self.values().astype(np.float64) * (self.amplitude_v / FULL_SCALE)
-
     def between(self, start_s: float, end_s: float) -> SampleSpan:
         """The samples of the span that were at the output within a time."""
         first, last = (self._at(time_s) for time_s in (start_s, end_s))
@@ -88,29 +84,15 @@ class Tone:
     amplitude_slope: float = 0.0
     phase_rad: float = 0.0
 
-    @property
-    def silent(self) -> bool:
-        """Whether the core is silent, and stays so."""
-        return self.amplitude == 0.0 and self.amplitude_slope == 0.0
-
     def after(self, duration_s: float) -> Tone:
         """The tone some time later."""
         turns = (self.frequency_hz + 0.5 * self.frequency_slope * duration_s) * duration_s
         return replace(
             self,
             frequency_hz=self.frequency_hz + self.frequency_slope * duration_s,
-            amplitude=self._amplitude(duration_s),
+            amplitude=min(1.0, max(-1.0, self.amplitude + self.amplitude_slope * duration_s)),
             phase_rad=math.remainder(self.phase_rad + math.tau * math.remainder(turns, 1.0), math.tau),
         )
-
-    def _amplitude(self, duration_s: float) -> float:
-        return min(1.0, max(-1.0, self.amplitude + self.amplitude_slope * duration_s))
-
-    def values(self, t_s: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The tone at some times after its moment, fractions of full scale, float64 (n,)."""
-        turns = (self.frequency_hz + 0.5 * self.frequency_slope * t_s) * t_s
-        amplitude = np.clip(self.amplitude + self.amplitude_slope * t_s, -1.0, 1.0)
-        return amplitude * np.sin(self.phase_rad + math.tau * turns)
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,14 +110,6 @@ class ToneSpan:
     end_s: float
     amplitude_v: float
     tones: tuple[Tone, ...]
-
-    def volts(self, sample_rate_hz: float) -> NDArray[np.float64]:
-        """The voltage into 50 Ohm, float64 (n,), clipped where the tones add up to more than 1."""
-        t_s = np.arange(math.floor((self.end_s - self.start_s) * sample_rate_hz)) / sample_rate_hz
-        total = np.zeros(len(t_s))
-        for tone in self.tones:
-            total += tone.values(t_s)
-        return np.clip(total, -1.0, 1.0) * self.amplitude_v
 
     def between(self, start_s: float, end_s: float) -> ToneSpan:
         """The part of the span within a time."""

@@ -1,215 +1,48 @@
-"""The registers of the card, and the values that they take, under the vendor's names.
+"""The registers of the card, their values and the error codes, under the vendor's names.
 
-Only those that the simulator knows. The numbers are those of the vendor's header files;
-They cannot be taken from ``spcm``, which cannot be imported without a driver library.
+They come from the vendor's package ``spcm_core``: it cannot be imported without a driver library, but its two
+files of constants can.
 """
 
 from __future__ import annotations
 
-from typing import Final
+from importlib.util import find_spec, module_from_spec, spec_from_file_location
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
 
-# Commands and status
-SPC_M2CMD: Final = 100
-M2CMD_CARD_RESET: Final = 0x1
-M2CMD_CARD_WRITESETUP: Final = 0x2
-M2CMD_CARD_START: Final = 0x4
-M2CMD_CARD_ENABLETRIGGER: Final = 0x8
-M2CMD_CARD_FORCETRIGGER: Final = 0x10
-M2CMD_CARD_DISABLETRIGGER: Final = 0x20
-M2CMD_CARD_STOP: Final = 0x40
-M2CMD_CARD_WAITTRIGGER: Final = 0x2000
-M2CMD_CARD_WAITREADY: Final = 0x4000
-M2CMD_DATA_STARTDMA: Final = 0x10000
-M2CMD_DATA_WAITDMA: Final = 0x20000
-M2CMD_DATA_STOPDMA: Final = 0x40000
-SPC_M2STATUS: Final = 110
-M2STAT_CARD_TRIGGER: Final = 0x2
-M2STAT_CARD_READY: Final = 0x4
-M2STAT_DATA_BLOCKREADY: Final = 0x100
-M2STAT_DATA_END: Final = 0x200
-M2STAT_DATA_OVERRUN: Final = 0x400
-SPC_TIMEOUT: Final = 295130
-SPC_REGISTER_LIST: Final = 120
-SPC_WRITE_TO_LOG: Final = 121
-
-# Identity
-SPC_GETDRVVERSION: Final = 1200
-SPC_GETDRVTYPE: Final = 1220
-SPC_GETKERNELVERSION: Final = 1210
-SPC_PCITYP: Final = 2000
-SPC_FNCTYPE: Final = 2001
-SPCM_TYPE_AO: Final = 0x2
-SPC_PCISERIALNO: Final = 2030
-SPC_PCIMEMSIZE: Final = 2110
-SPC_PCIFEATURES: Final = 2120
-SPC_PCIEXTFEATURES: Final = 2121
-SPCM_FEAT_EXTFW_DDS20: Final = 0x10
-SPCM_FEAT_EXTFW_AWG: Final = 0x40
-SPC_MIINST_MODULES: Final = 1100
-SPC_MIINST_CHPERMODULE: Final = 1110
-SPC_MIINST_BYTESPERSAMPLE: Final = 1120
-SPC_MIINST_BITSPERSAMPLE: Final = 1125
-SPC_MIINST_MAXADCVALUE: Final = 1126
-SPC_MIINST_MINADCLOCK: Final = 1130
-SPC_MIINST_MAXADCLOCK: Final = 1140
-SPC_MIINST_ISDEMOCARD: Final = 1175
-SPC_READAOGAINMIN: Final = 9100
-SPC_READAOGAINMAX: Final = 9110
-SPC_AVAILCARDMODES: Final = 9501
-SPC_AVAILMEMSIZE_MIN: Final = 10201
-SPC_AVAILMEMSIZE_MAX: Final = 10202
-SPC_AVAILMEMSIZE_STEP: Final = 10203
-
-# Set-up
-SPC_CARDMODE: Final = 9500
-SPC_REP_STD_SINGLE: Final = 0x100
-SPC_REP_FIFO_SINGLE: Final = 0x800
-SPC_REP_STD_DDS: Final = 0x4000000
-SPC_CHENABLE: Final = 11000
-SPC_CHCOUNT: Final = 11001
-SPC_MEMSIZE: Final = 10000
-SPC_SEGMENTSIZE: Final = 10010
-SPC_LOOPS: Final = 10020
-SPC_SAMPLERATE: Final = 20000
-SPC_CLOCKMODE: Final = 20200
-SPC_CM_INTPLL: Final = 0x1
-SPC_CM_EXTREFCLOCK: Final = 0x20
-SPC_REFERENCECLOCK: Final = 20140
-SPC_CLOCKOUT: Final = 20110
-SPC_SPECIALCLOCK: Final = 295100
-SPC_OFFS0: Final = 30000
-SPC_AMP0: Final = 30010
-SPC_DIFF0: Final = 30040
-SPC_DOUBLEOUT0: Final = 30041
-SPC_FILTER0: Final = 30080
-SPC_ENABLEOUT0: Final = 30091
-SPC_OFFS1: Final = 30100
-SPC_AMP1: Final = 30110
-SPC_FILTER1: Final = 30180
-SPC_ENABLEOUT1: Final = 30191
-SPC_CH0_STOPLEVEL: Final = 206020
-SPC_CH1_STOPLEVEL: Final = 206021
-SPCM_STOPLVL_LOW: Final = 0x2
-SPCM_STOPLVL_HIGH: Final = 0x4
-SPCM_STOPLVL_HOLDLAST: Final = 0x8
-SPCM_STOPLVL_ZERO: Final = 0x10
-
-# Trigger
-SPC_TRIG_ORMASK: Final = 40410
-SPC_TRIG_AVAILORMASK: Final = 40400
-SPC_TMASK_NONE: Final = 0x0
-SPC_TMASK_SOFTWARE: Final = 0x1
-SPC_TMASK_EXT0: Final = 0x2
-SPC_TRIG_ANDMASK: Final = 40430
-SPC_TRIG_TERM: Final = 40110
-SPC_TRIG_EXT0_ACDC: Final = 40120
-SPC_TRIG_EXT0_MODE: Final = 40510
-SPC_TM_NONE: Final = 0x0
-SPC_TM_POS: Final = 0x1
-SPC_TM_NEG: Final = 0x2
-SPC_TM_BOTH: Final = 0x4
-SPC_TRIG_EXT0_LEVEL0: Final = 42320
-SPC_TRIG_DELAY: Final = 40810
-SPC_TRIG_AVAILDELAY: Final = 40800
-SPC_TRIG_AVAILDELAY_STEP: Final = 40801
-SPC_TRIGGERCOUNTER: Final = 200905
-
-# Data transfer
-SPC_DATA_AVAIL_USER_LEN: Final = 200
-SPC_DATA_AVAIL_USER_POS: Final = 201
-SPC_DATA_AVAIL_CARD_LEN: Final = 202
-SPC_DATA_OUTBUFSIZE: Final = 209
-SPC_FILLSIZEPROMILLE: Final = 200910
-
-# DDS
-SPC_DDS_CORE0_FREQ: Final = 603000
-SPC_DDS_CORE0_FREQ_SLOPE: Final = 604000
-SPC_DDS_CORE0_AMP: Final = 605000
-SPC_DDS_CORE0_AMP_SLOPE: Final = 606000
-SPC_DDS_CORE0_PHASE: Final = 607000
-SPC_DDS_TRG_SRC: Final = 608000
-SPCM_DDS_TRG_SRC_NONE: Final = 0
-SPCM_DDS_TRG_SRC_TIMER: Final = 1
-SPCM_DDS_TRG_SRC_CARD: Final = 2
-SPC_DDS_TRG_TIMER: Final = 608001
-SPC_DDS_PHASE_BEHAVIOUR: Final = 608002
-SPCM_DDS_PHASE_JUMP: Final = 0
-SPCM_DDS_PHASE_SHIFT: Final = 1
-SPC_DDS_CMD: Final = 608003
-SPCM_DDS_CMD_RESET: Final = 0x1
-SPCM_DDS_CMD_EXEC_AT_TRG: Final = 0x2
-SPCM_DDS_CMD_EXEC_NOW: Final = 0x4
-SPCM_DDS_CMD_WRITE_TO_CARD: Final = 0x8
-SPC_DDS_STATUS: Final = 608004
-SPCM_DDS_STAT_WAITING_FOR_TRG: Final = 0x1
-SPCM_DDS_STAT_QUEUE_UNDERRUN: Final = 0x2
-SPCM_DDS_STAT_QUEUE_OVERRUN: Final = 0x4
-SPC_DDS_QUEUE_CMD_MAX: Final = 608005
-SPC_DDS_QUEUE_CMD_COUNT: Final = 608006
-SPC_DDS_NUM_CORES: Final = 608007
-SPC_DDS_FREQ_RAMP_STEPSIZE: Final = 608008
-SPC_DDS_AMP_RAMP_STEPSIZE: Final = 608009
-SPC_DDS_NUM_QUEUED_CMD_IN_SW: Final = 608011
-SPC_DDS_DATA_TRANSFER_MODE: Final = 608012
-SPCM_DDS_DTM_SINGLE: Final = 0
-SPCM_DDS_DTM_DMA: Final = 1
-SPC_DDS_TRG_COUNT: Final = 608013
-SPC_DDS_CORES_ON_CH0: Final = 608040
-SPC_DDS_CORES_ON_CH1: Final = 608041
-SPC_DDS_AVAIL_FREQ_MIN: Final = 608500
-SPC_DDS_AVAIL_FREQ_MAX: Final = 608501
-SPC_DDS_AVAIL_FREQ_STEP: Final = 608502
-SPC_DDS_AVAIL_FREQ_SLOPE_MIN: Final = 608503
-SPC_DDS_AVAIL_FREQ_SLOPE_MAX: Final = 608504
-SPC_DDS_AVAIL_FREQ_SLOPE_STEP: Final = 608505
-SPC_DDS_AVAIL_AMP_MIN: Final = 608506
-SPC_DDS_AVAIL_AMP_MAX: Final = 608507
-SPC_DDS_AVAIL_AMP_STEP: Final = 608508
-SPC_DDS_AVAIL_AMP_SLOPE_MIN: Final = 608509
-SPC_DDS_AVAIL_AMP_SLOPE_MAX: Final = 608510
-SPC_DDS_AVAIL_AMP_SLOPE_STEP: Final = 608511
-SPC_DDS_AVAIL_PHASE_MIN: Final = 608512
-SPC_DDS_AVAIL_PHASE_MAX: Final = 608513
-SPC_DDS_AVAIL_PHASE_STEP: Final = 608514
-
-# Sensors
-SPC_MON_TC_BASE_CTRL: Final = 500025
-SPC_MON_TC_MODULE_0: Final = 500026
-
-# Error codes
 ERR_OK: Final = 0x0
-ERR_FNCNOTSUPPORTED: Final = 0x4
-ERR_INVALIDHANDLE: Final = 0x9
-ERR_BOARDNOTFOUND: Final = 0xA
-ERR_BOARDINUSE: Final = 0xB
-ERR_LASTERR: Final = 0x10
-ERR_ABORT: Final = 0x20
-ERR_INVALIDPARAM: Final = 0x46
-ERR_REG: Final = 0x100
-ERR_VALUE: Final = 0x101
-ERR_SEQUENCE: Final = 0x103
-ERR_TIMEOUT: Final = 0x107
-ERR_EXCEEDSINT32: Final = 0x109
-ERR_NOWRITEALLOWED: Final = 0x10A
-ERR_SETUP: Final = 0x10B
-ERR_NOTIFYSIZE: Final = 0x111
-ERR_RUNNING: Final = 0x120
-ERR_DIRMISMATCH: Final = 0x141
-ERR_FIFOHWOVERRUN: Final = 0x301
-ERR_INTERNAL_ERROR: Final = 0xFFFF
-
-# Of the driver's C interface
 SPCM_BUF_DATA: Final = 1000
 SPCM_DIR_PCTOCARD: Final = 0
-TYPE_INT64: Final = 0
 TYPE_DOUBLE: Final = 1
-ERRORTEXTLEN: Final = 200
+"""Of the driver's C interface: kind and direction of a transfer, type of an entry of a register list."""
 
-CORES: Final = 64
-"""Registers of each kind that there are per DDS core."""
+
+def _constants() -> dict[str, int]:
+    package = find_spec("spcm_core")
+    if package is None or package.origin is None:
+        raise ModuleNotFoundError("No module named 'spcm_core'", name="spcm_core")
+    constants: dict[str, int] = {}
+    for name in ("regs", "spcerr"):
+        spec = spec_from_file_location(f"{__name__}_{name}", Path(package.origin).with_name(f"{name}.py"))
+        assert spec is not None
+        assert spec.loader is not None
+        module = module_from_spec(spec)
+        spec.loader.exec_module(module)
+        constants |= {key: value for key, value in vars(module).items() if isinstance(value, int)}
+    return constants
+
+
+_found: Final = _constants()
+globals().update(_found)
+
+if TYPE_CHECKING:
+
+    def __getattr__(name: str) -> int: ...
+
+
 NAMES: Final = {
     value: name
-    for name, value in globals().items()
-    if name.startswith("SPC_") and not name.startswith(("SPC_TMASK", "SPC_TM_", "SPC_CM_", "SPC_REP_"))
+    for name, value in _found.items()
+    if name.startswith("SPC_") and not name.startswith(("SPC_TM", "SPC_CM_", "SPC_REP_"))
 }
 """Register number -> name, for error messages."""

@@ -85,16 +85,10 @@ DDS_AMPLITUDE_SLOPE_STEP: Final = 298.03231910153505
 DDS_AMPLITUDE_SLOPE_MAX: Final = 305174.6170612535
 DDS_TRIGGER_DELAY_S: Final = 560e-9
 """From a trigger to the change of the output."""
-DDS_RETRIGGER_S: Final = 72e-9
-"""Least time between two triggers."""
-DDS_SINGLE_PER_S: Final = 400e3
-"""Commands per second that reach the card one by one; the caller is kept waiting meanwhile."""
-DDS_DMA_PER_S: Final = 10e6
+DDS_COMMANDS_PER_S: Final = 10e6
 """Commands per second that reach the card by DMA, in the background."""
-DDS_DMA_LATENCY_S: Final = 20e-6
+DDS_LATENCY_S: Final = 20e-6
 """Latency of a block by DMA."""
-DDS_DMA_QUEUE: Final = 512 * 1024**2
-"""Commands that the on-board memory queues in DMA mode."""
 
 
 Number = int | float
@@ -141,7 +135,6 @@ class Setup:
     def __init__(self, model: CardModel) -> None:
         self.model = model
         self._values: dict[int, Number] = {**_DEFAULTS, **_fixed(model)}
-        self._values[r.SPC_SAMPLERATE] = int(model.sample_rate_hz[1])
 
     def __contains__(self, register: int) -> bool:
         return register in self._values
@@ -165,7 +158,7 @@ class Setup:
         return 2 * len(self.channels)
 
     def write(self, register: int, value: Number, *, running: bool) -> None:
-        """Take a value, or refuse it.
+        """Take a value.
 
         Raises:
             Refusal: Unknown or fixed register, value out of range, or not while running.
@@ -174,12 +167,13 @@ class Setup:
         if rule is None:
             if register in self._values:
                 raise Refusal(r.ERR_NOWRITEALLOWED, "this register can only be read")
-            raise Refusal(r.ERR_REG, "the simulator does not know this register")
+            raise Refusal(r.ERR_REG, UNKNOWN)
         if running and register not in _WHILE_RUNNING:
             raise Refusal(r.ERR_RUNNING, "card is still running, access not possible")
         self._values[register] = rule(self, value)
 
 
+UNKNOWN: Final = "the simulator does not know this register"
 Rule = Callable[[Setup, Number], Number]
 
 
@@ -188,15 +182,24 @@ def refuse(value: Number, expected: str) -> Refusal:
     return Refusal(r.ERR_VALUE, f"value {value} not allowed; expected {expected}")
 
 
-def within(low: float, high: float, step: float = 1, *, rounded: bool = False) -> Rule:
-    """A range and a step; a value between two steps is refused, or rounded."""
+def stepped(value: Number, low: float, high: float, step: float = 1) -> Number:
+    """A value rounded to a step.
+
+    Raises:
+        Refusal: It is out of range.
+    """
+    if not low <= value <= high:
+        raise refuse(value, f"{low:g} to {high:g}")
+    return round(value / step) * step
+
+
+def within(low: float, high: float, step: float = 1) -> Rule:
+    """A range and a step; a value between two steps is refused."""
 
     def rule(_setup: Setup, value: Number) -> Number:
-        if not low <= value <= high:
-            raise refuse(value, f"{low:g} to {high:g}")
-        if not rounded and value % step:
+        if low <= value <= high and value % step:
             raise refuse(value, f"a multiple of {step:g}")
-        return round(value / step) * step
+        return stepped(value, low, high, step)
 
     return rule
 
@@ -217,34 +220,21 @@ def modelled(*allowed: int) -> Rule:
 
     def rule(_setup: Setup, value: Number) -> Number:
         if value not in allowed:
-            known = ", ".join(hex(int(known)) for known in allowed)
-            raise Refusal(r.ERR_FNCNOTSUPPORTED, f"the simulator models only {known}")
+            raise Refusal(
+                r.ERR_FNCNOTSUPPORTED,
+                f"the simulator models only {', '.join(hex(known) for known in allowed)}",
+            )
         return int(value)
-
-    return rule
-
-
-def power_of_two(low: int, high: int) -> Rule:
-    """Powers of two within a range."""
-
-    def rule(_setup: Setup, value: Number) -> Number:
-        whole = int(value)
-        if not low <= whole <= high or whole & (whole - 1):
-            raise refuse(value, f"a power of two from {low} to {high}")
-        return whole
 
     return rule
 
 
 def _sample_rate(setup: Setup, value: Number) -> Number:
     model = setup.model
-    low, high = model.sample_rate_hz
-    if not low <= value <= high:
-        raise refuse(value, f"{low:g} to {high:g} S/s")
     for start, end in model.rate_gaps_hz:
         if start < value < end:
             raise refuse(value, f"a rate outside of the clock's gap from {start:g} to {end:g} S/s")
-    return round(value / model.rate_step_hz) * model.rate_step_hz
+    return stepped(value, *model.sample_rate_hz, model.rate_step_hz)
 
 
 def _memory_size(setup: Setup, value: Number) -> Number:
@@ -256,75 +246,53 @@ def _amplitude(setup: Setup, value: Number) -> Number:
     return within(*setup.model.amplitude_mv)(setup, value)
 
 
+def _power_of_two(_setup: Setup, value: Number) -> Number:
+    whole = int(stepped(value, 1024, 4 * 1024**3))
+    if whole & (whole - 1):
+        raise refuse(value, "a power of two")
+    return whole
+
+
 _SWITCH: Final = one_of(0, 1)
-_STOP_LEVELS: Final = (r.SPCM_STOPLVL_ZERO, r.SPCM_STOPLVL_LOW, r.SPCM_STOPLVL_HIGH, r.SPCM_STOPLVL_HOLDLAST)
-_MODES: Final = (
-    r.SPC_REP_STD_SINGLE,
-    r.SPC_REP_FIFO_SINGLE,
-    r.SPC_REP_STD_DDS,
+_STOP_LEVEL: Final = one_of(
+    r.SPCM_STOPLVL_ZERO, r.SPCM_STOPLVL_LOW, r.SPCM_STOPLVL_HIGH, r.SPCM_STOPLVL_HOLDLAST
 )
+_MODES: Final = (r.SPC_REP_STD_SINGLE, r.SPC_REP_FIFO_SINGLE, r.SPC_REP_STD_DDS)
 
-_RULES: Final[dict[int, Rule]] = {
-    r.SPC_TIMEOUT: within(0, 2**31 - 1),
-    r.SPC_CARDMODE: modelled(*_MODES),
-    r.SPC_CHENABLE: one_of(1, 2, 3),
-    r.SPC_MEMSIZE: _memory_size,
-    r.SPC_SEGMENTSIZE: within(16, 8 * 1024**3 - 16, 16),
-    r.SPC_LOOPS: within(0, MAX_LOOPS),
-    r.SPC_SAMPLERATE: _sample_rate,
-    r.SPC_CLOCKMODE: modelled(r.SPC_CM_INTPLL, r.SPC_CM_EXTREFCLOCK),
-    r.SPC_REFERENCECLOCK: within(10e6, 1.25e9),
-    r.SPC_CLOCKOUT: _SWITCH,
-    r.SPC_SPECIALCLOCK: modelled(0),
-    r.SPC_OFFS0: one_of(0),
-    r.SPC_OFFS1: one_of(0),
-    r.SPC_AMP0: _amplitude,
-    r.SPC_AMP1: _amplitude,
-    r.SPC_FILTER0: _SWITCH,
-    r.SPC_FILTER1: _SWITCH,
-    r.SPC_ENABLEOUT0: _SWITCH,
-    r.SPC_ENABLEOUT1: _SWITCH,
-    r.SPC_DIFF0: modelled(0),
-    r.SPC_DOUBLEOUT0: modelled(0),
-    r.SPC_CH0_STOPLEVEL: one_of(*_STOP_LEVELS),
-    r.SPC_CH1_STOPLEVEL: one_of(*_STOP_LEVELS),
-    r.SPC_TRIG_ORMASK: modelled(r.SPC_TMASK_NONE, r.SPC_TMASK_SOFTWARE, r.SPC_TMASK_EXT0),
-    r.SPC_TRIG_ANDMASK: modelled(r.SPC_TMASK_NONE),
-    r.SPC_TRIG_TERM: _SWITCH,
-    r.SPC_TRIG_EXT0_ACDC: _SWITCH,
-    r.SPC_TRIG_EXT0_MODE: modelled(r.SPC_TM_NONE, r.SPC_TM_POS, r.SPC_TM_NEG, r.SPC_TM_BOTH),
-    r.SPC_TRIG_EXT0_LEVEL0: within(-10_000, 10_000, 10, rounded=True),
-    r.SPC_TRIG_DELAY: within(0, 8 * 1024**3 - 32, 32),
-    r.SPC_DATA_OUTBUFSIZE: power_of_two(1024, 4 * 1024**3),
+_SETTINGS: Final[dict[int, tuple[Rule, Number]]] = {
+    r.SPC_TIMEOUT: (within(0, 2**31 - 1), 0),
+    r.SPC_CARDMODE: (modelled(*_MODES), r.SPC_REP_STD_SINGLE),
+    r.SPC_CHENABLE: (one_of(1, 2, 3), 3),
+    r.SPC_MEMSIZE: (_memory_size, 32),
+    r.SPC_SEGMENTSIZE: (within(16, 8 * 1024**3 - 16, 16), 16),
+    r.SPC_LOOPS: (within(0, MAX_LOOPS), 1),
+    r.SPC_SAMPLERATE: (_sample_rate, 1.25e9),
+    r.SPC_CLOCKMODE: (modelled(r.SPC_CM_INTPLL, r.SPC_CM_EXTREFCLOCK), r.SPC_CM_INTPLL),
+    r.SPC_REFERENCECLOCK: (within(10e6, 1.25e9), 10_000_000),
+    r.SPC_AMP0: (_amplitude, 1000),
+    r.SPC_AMP1: (_amplitude, 1000),
+    r.SPC_FILTER0: (_SWITCH, 0),
+    r.SPC_FILTER1: (_SWITCH, 0),
+    r.SPC_ENABLEOUT0: (_SWITCH, 0),
+    r.SPC_ENABLEOUT1: (_SWITCH, 0),
+    r.SPC_CH0_STOPLEVEL: (_STOP_LEVEL, r.SPCM_STOPLVL_ZERO),
+    r.SPC_CH1_STOPLEVEL: (_STOP_LEVEL, r.SPCM_STOPLVL_ZERO),
+    r.SPC_TRIG_ORMASK: (modelled(r.SPC_TMASK_NONE, r.SPC_TMASK_EXT0), r.SPC_TMASK_NONE),
+    r.SPC_TRIG_ANDMASK: (modelled(r.SPC_TMASK_NONE), r.SPC_TMASK_NONE),
+    r.SPC_TRIG_TERM: (_SWITCH, 0),
+    r.SPC_TRIG_EXT0_MODE: (modelled(r.SPC_TM_NONE, r.SPC_TM_POS, r.SPC_TM_NEG, r.SPC_TM_BOTH), r.SPC_TM_NONE),
+    r.SPC_TRIG_EXT0_LEVEL0: (lambda _, value: stepped(value, -10_000, 10_000, 10), 0),
+    r.SPC_DATA_OUTBUFSIZE: (_power_of_two, 4 * 1024**3),
 }
-
-_WHILE_RUNNING: Final = {
-    r.SPC_TIMEOUT,
-    r.SPC_AMP0,
-    r.SPC_AMP1,
-    r.SPC_ENABLEOUT0,
-    r.SPC_ENABLEOUT1,
-}
-
-_DEFAULTS: Final[dict[int, Number]] = {
-    **dict.fromkeys(_RULES, 0),
-    r.SPC_CARDMODE: r.SPC_REP_STD_SINGLE,
-    r.SPC_CHENABLE: 3,
-    r.SPC_MEMSIZE: 32,
-    r.SPC_SEGMENTSIZE: 16,
-    r.SPC_LOOPS: 1,
-    r.SPC_CLOCKMODE: r.SPC_CM_INTPLL,
-    r.SPC_REFERENCECLOCK: 10_000_000,
-    r.SPC_AMP0: 1000,
-    r.SPC_AMP1: 1000,
-    r.SPC_CH0_STOPLEVEL: r.SPCM_STOPLVL_ZERO,
-    r.SPC_CH1_STOPLEVEL: r.SPCM_STOPLVL_ZERO,
-    r.SPC_DATA_OUTBUFSIZE: 4 * 1024**3,
-}
+"""Register -> its rule, and its value after power-on."""
+_RULES: Final = {register: rule for register, (rule, _) in _SETTINGS.items()}
+_DEFAULTS: Final = {register: value for register, (_, value) in _SETTINGS.items()}
+_WHILE_RUNNING: Final = {r.SPC_TIMEOUT, r.SPC_AMP0, r.SPC_AMP1, r.SPC_ENABLEOUT0, r.SPC_ENABLEOUT1}
 
 
 def _fixed(model: CardModel) -> dict[int, Number]:
     return {
+        r.SPC_SAMPLERATE: int(model.sample_rate_hz[1]),
         r.SPC_PCITYP: model.card_type,
         r.SPC_FNCTYPE: r.SPCM_TYPE_AO,
         r.SPC_PCIMEMSIZE: 2 * model.memory_samples,
@@ -346,7 +314,4 @@ def _fixed(model: CardModel) -> dict[int, Number]:
         r.SPC_AVAILMEMSIZE_MIN: MEMORY_STEP,
         r.SPC_AVAILMEMSIZE_MAX: model.memory_samples,
         r.SPC_AVAILMEMSIZE_STEP: MEMORY_STEP,
-        r.SPC_TRIG_AVAILORMASK: r.SPC_TMASK_SOFTWARE | r.SPC_TMASK_EXT0,
-        r.SPC_TRIG_AVAILDELAY: 8 * 1024**3 - 32,
-        r.SPC_TRIG_AVAILDELAY_STEP: 32,
     }

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import json
 import subprocess
 import sys
 from contextlib import ExitStack, suppress
@@ -88,8 +87,7 @@ class TestCards:
             lab.play(lab.program())
 
 
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("timeout_s", [0.0, 50e-3])
+@pytest.mark.parametrize(("mode", "timeout_s"), [("replay", 0.0), ("fifo", 50e-3), ("dds", 50e-3)])
 def test_a_trigger_that_never_comes_times_out_into_the_safe_state(
     driver: Any, mode: str, timeout_s: float
 ) -> None:
@@ -104,14 +102,17 @@ def test_a_trigger_that_never_comes_times_out_into_the_safe_state(
 
 
 class TestSettings:
-    @pytest.mark.parametrize("rate_hz", [751e6, 1.13e9])
-    def test_sample_rates_in_the_gaps_of_the_clock_are_refused(self, rate_hz: float) -> None:
-        with pytest.raises(ValueError, match=r"a gap from .*; expected a rate outside of it"):
-            SpcmSettings(sample_rate=rate_hz)
-
-    @pytest.mark.parametrize("rate_hz", [49e6, 1.26e9, float("nan")])
-    def test_sample_rates_beyond_the_clock_are_refused(self, rate_hz: float) -> None:
-        with pytest.raises(ValueError, match=r"expected 50 MHz to 1\.25 GHz|finite"):
+    @pytest.mark.parametrize(
+        ("rate_hz", "text"),
+        [
+            (751e6, r"a gap from .*; expected a rate outside of it"),
+            (1.13e9, r"a gap from .*; expected a rate outside of it"),
+            (49e6, r"expected 50 MHz to 1\.25 GHz"),
+            (1.26e9, r"expected 50 MHz to 1\.25 GHz"),
+        ],
+    )
+    def test_sample_rates_that_the_clock_cannot_make_are_refused(self, rate_hz: float, text: str) -> None:
+        with pytest.raises(ValueError, match=text):
             SpcmSettings(sample_rate=rate_hz)
 
     @pytest.mark.parametrize(
@@ -133,7 +134,6 @@ def with_row_tone(program: ToneProgram, name: str, value: float) -> ToneProgram:
     return replace(program, row=replace(program.row, **{name: values}))
 
 
-@pytest.mark.parametrize("mode", MODES)
 class TestPrograms:
     @pytest.mark.parametrize(
         ("name", "value", "text"),
@@ -141,24 +141,22 @@ class TestPrograms:
             ("start_hz", 81e6, r"frequency of a row tone in batch 1 is .* 82 to 118 MHz"),
             ("end_hz", 119e6, r"frequency of a row tone in batch 1 is .* 82 to 118 MHz"),
             ("start_hz", np.nan, "frequency of a row tone in batch 1 is nan"),
-            ("end_hz", np.inf, "frequency of a row tone in batch 1 is inf"),
             ("start_amplitude", 1.5, r"amplitude of a row tone in batch 1 is 1\.5; .* 0 to 1 of full scale"),
             ("end_amplitude", -0.1, r"amplitude of a row tone in batch 1 is -0\.1"),
-            ("end_amplitude", np.nan, "amplitude of a row tone in batch 1 is nan"),
             ("phase_rad", np.nan, "phase of a row tone in batch 1 is nan"),
         ],
     )
     def test_with_wrong_tones_are_refused_before_anything_is_uploaded(
-        self, driver: Any, mode: str, name: str, value: float, text: str
+        self, driver: Any, name: str, value: float, text: str
     ) -> None:
-        with driver(mode) as lab:
+        with driver() as lab:
             lab.card.log.clear()
             with pytest.raises(LimitError, match=text):
                 lab.tweezers.prepare(with_row_tone(lab.program(), name, value))
             assert not list(lab.card.log)
 
-    def test_that_clip_only_together_are_refused(self, driver: Any, mode: str) -> None:
-        with driver(mode) as lab:
+    def test_that_clip_only_together_are_refused(self, driver: Any) -> None:
+        with driver() as lab:
             program = lab.program()
             n_tones = int(np.diff(program.column.offsets).max())
             loud = np.full_like(program.column.start_amplitude, 1.01 / n_tones)
@@ -169,17 +167,15 @@ class TestPrograms:
     @pytest.mark.parametrize(
         ("factor", "text"), [(0.0, "length"), (np.inf, "duration"), (np.nan, "duration"), (-1.0, "duration")]
     )
-    def test_of_no_length_are_refused(self, driver: Any, mode: str, factor: float, text: str) -> None:
-        with driver(mode) as lab:
+    def test_of_no_length_are_refused(self, driver: Any, factor: float, text: str) -> None:
+        with driver() as lab:
             program = lab.program()
             with pytest.raises(LimitError, match=text):
                 lab.tweezers.prepare(replace(program, duration_s=program.duration_s * factor))
             with pytest.raises(DeviceError, match="without a prepared program"):
                 lab.tweezers.play()
-
-    def test_of_no_segments_are_refused(self, driver: Any, mode: str) -> None:
-        with driver(mode) as lab, pytest.raises(LimitError, match="length"):
-            lab.tweezers.prepare(lab.program(0))
+            with pytest.raises(LimitError, match="length"):
+                lab.tweezers.prepare(lab.program(0))
 
 
 def test_a_program_longer_than_the_memory_is_refused(driver: Any) -> None:
@@ -188,9 +184,8 @@ def test_a_program_longer_than_the_memory_is_refused(driver: Any) -> None:
         lab.tweezers.prepare(lab.program())
 
 
-AMP0, TIMEOUT, TRIG_ORMASK = 30010, 295130, 40410
-DDS_CMD, CORES_ON_CH1, TRG_COUNT = 608003, 608041, 608013
-EXEC_AT_TRG, WRITE_TO_CARD = 2, 8
+AMP0, TIMEOUT = 30010, 295130
+CORES_ON_CH1 = 608041
 
 
 @pytest.fixture
@@ -207,16 +202,6 @@ class TestFaultsOfThePackage:
     ) -> None:
         with driver("dds") as lab:
             lab.card.write(AMP0, 9000)  # also with an error pending
-        gc.collect()
-        assert not unraisable
-
-    def test_a_card_that_was_not_found_is_forgotten_in_silence(
-        self, driver: Any, unraisable: list[object]
-    ) -> None:
-        with driver():
-            other = SpcmMobileTweezers(SpcmSettings(card="simulated-none"), context())
-            with pytest.raises(DeviceError):
-                other.open()
         gc.collect()
         assert not unraisable
 
@@ -237,22 +222,13 @@ class TestFaultsOfThePackage:
                 (span, *_) = lab.card.played(1)
                 assert [tone.core for tone in span.tones] == [core]
 
-    def test_commands_are_sent_in_whole_blocks_and_never_more_than_the_queue_holds(self, driver: Any) -> None:
-        with driver("dds") as lab:
-            lab.tweezers.prepare(lab.program(200))
-            n_sent = sum(603000 <= entry.register < DDS_CMD for entry in lab.card.log)
-            assert 3000 < n_sent < 4100
-            lab.tweezers.play()
-            lab.tweezers.wait(1.0)
-            commands = [(entry.register, entry.value) for entry in lab.card.log if entry.register >= 603000]
-            assert len(commands) > 2 * n_sent
-            sent = [i for i, command in enumerate(commands) if command == (DDS_CMD, WRITE_TO_CARD)]
-            assert len(sent) > 5
-            assert all(commands[i - 1] == (DDS_CMD, EXEC_AT_TRG) for i in sent)
-
     def test_it_is_imported_when_warming_and_prints_nothing(self) -> None:
         code = """
 import sys
+import labseq_spcm
+from labseq.registry import Registry
+labseq_spcm.labseq_register(Registry())
+assert not {"labseq_spcm_sim", "numba", "matplotlib"} & sys.modules.keys()
 from labseq.plugin import Context, MotionSpec
 from labseq_spcm.mobile_tweezers import SpcmMobileTweezers
 from labseq_spcm.settings import SpcmSettings
@@ -269,22 +245,9 @@ tweezers.close()
 
 
 class TestBehaviourOfTheCard:
-    def test_a_refused_value_is_an_error_and_the_next_call_works(self, driver: Any) -> None:
-        with driver() as lab:
-            card = lab.tweezers._card
-            with pytest.raises(DeviceError, match=r"amplitude = 9000: .*SPC_AMP0"):
-                card.write(AMP0, 9000, "amplitude")
-            assert card.set(AMP0, 1600, "amplitude") == 1600
-
     def test_a_snapped_mask_is_noticed(self, driver: Any) -> None:
         with driver("dds") as lab, pytest.raises(DeviceError, match="was set to 1, and the card reads"):
             lab.tweezers._card.set(CORES_ON_CH1, 1, "cores of output 1")
-
-    @pytest.mark.parametrize("mode", MODES)
-    def test_the_cards_own_software_trigger_is_never_used(self, driver: Any, mode: str) -> None:
-        with driver(mode) as lab:
-            lab.play(lab.program(1))
-            assert set(lab.written(TRIG_ORMASK)) == {0}
 
     def test_the_first_dds_block_is_not_lost_in_run_after_run(self, driver: Any) -> None:
         with driver("dds") as lab:
@@ -295,49 +258,29 @@ class TestBehaviourOfTheCard:
                 spans = lab.card.played(1)
                 assert spans[-1].end_s - spans[0].start_s == pytest.approx(223.6e-6, abs=0.2e-6)
 
-    def test_the_end_is_not_taken_from_the_queue_that_empties_one_block_early(self, driver: Any) -> None:
-        with driver("dds") as lab:
-            lab.play(lab.program(1))
-            assert not [span for span in lab.card.played(1) if span.end_s > lab.clock.now()]
-            assert lab.card.read(TRG_COUNT)[1] > 0
 
-
-class TestWithoutTheLibrary:
-    def test_importing_the_plugin_imports_no_spcm(self) -> None:
-        code = (
-            "import sys, json, labseq_spcm, labseq_spcm.mobile_tweezers\n"
-            "from labseq.registry import Registry\n"
-            "labseq_spcm.labseq_register(Registry())\n"
-            "names = ('spcm', 'spcm_core', 'labseq_spcm_sim', 'numba', 'matplotlib')\n"
-            "print(json.dumps([name for name in names if name in sys.modules]))"
-        )
-        run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-        assert json.loads(run.stdout) == []
-
-    @pytest.mark.skipif(vendor_library_found(), reason="the vendor's library is installed here")
-    @pytest.mark.parametrize("after_a_simulated_card", [False, True])
-    def test_opening_names_the_package_and_the_simulated_card(self, after_a_simulated_card: bool) -> None:
-        code = (
-            "import sys\n"
-            "from labseq.plugin import Context, LabseqError\n"
-            "from labseq_spcm.mobile_tweezers import SpcmMobileTweezers\n"
-            "from labseq_spcm.settings import SpcmSettings\n"
-            "for card in sys.argv[1:]:\n"
-            "    tweezers = SpcmMobileTweezers(SpcmSettings(card=card), Context('mobile_tweezers'))\n"
-            "    try:\n"
-            "        tweezers.open()\n"
-            "    except LabseqError as error:\n"
-            "        print(error.exit_code, error)\n"
-            "    tweezers.close()\n"
-        )
-        cards = ["simulated"] if after_a_simulated_card else []
-        run = subprocess.run(
-            [sys.executable, "-c", code, *cards, "/dev/spcm0"], capture_output=True, text=True, check=True
-        )
-        assert run.stdout.startswith("3 mobile_tweezers: ")
+@pytest.mark.skipif(vendor_library_found(), reason="the vendor's library is installed here")
+def test_opening_without_the_library_names_the_package_and_the_simulated_card() -> None:
+    """Before a simulated card was opened in the same process, and after."""
+    code = """
+from labseq.plugin import Context, LabseqError
+from labseq_spcm.mobile_tweezers import SpcmMobileTweezers
+from labseq_spcm.settings import SpcmSettings
+for card in ("/dev/spcm0", "simulated", "/dev/spcm0"):
+    tweezers = SpcmMobileTweezers(SpcmSettings(card=card), Context("mobile_tweezers"))
+    try:
+        tweezers.open()
+    except LabseqError as error:
+        print(error.exit_code, error)
+    tweezers.close()
+"""
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert not run.stderr
+    before, after = run.stdout.splitlines()
+    for line in (before, after):
+        assert line.startswith("3 mobile_tweezers: ")
         for text in ("no driver library", "install Spectrum's driver", "`card: simulated`"):
-            assert text in run.stdout
-        assert not run.stderr
+            assert text in line
 
 
 def test_a_package_that_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -408,12 +351,7 @@ def test_a_simulated_card_plays_in_virtual_time(tmp_path: Path, mobile: str) -> 
         ("card: simulated, mode: fifo, sample_rate: 1 GHz", 2, "the bus carries at most 700 MHz"),
         ("card: simulated, mode: dds", 2, "set max_row_tones and max_column_tones to at most 16 and 5"),
         ("card: simulated, rf: {full_scale: 3 V}", 2, "rf.full_scale is 3 V; the limit is the card's 80 mV"),
-        ("card: simulated, rf: {full_scale: 450 mV}", 2, "the card's output relay may switch, for 10 ms"),
         ("card: simulated, row_channel: 1", 2, "row_channel and column_channel are both 1; expected 0 and 1"),
-        pytest.param(
-            *("card: /dev/spcm0", 3, "no driver library"),
-            marks=pytest.mark.skipif(vendor_library_found(), reason="the vendor's library is installed here"),
-        ),
     ],
 )
 def test_mistakes_are_reported_with_what_is_expected(
@@ -442,6 +380,9 @@ class TestSafeState:
             assert levels[-1] == 1600
             assert not lab.card.running
             assert lab.card.outputs_on == (False, False)
+            lab.card.log.clear()
+            lab.tweezers.safe_state()
+            assert set(lab.written(AMP0)) == {1600}, "there is nothing to ramp down"
 
     def test_ramps_to_the_least_amplitude_where_no_relay_is_in_the_way(self, driver: Any) -> None:
         with driver(motion=MotionSpec(rf=RfSpec(full_scale_v=0.3))) as lab:
@@ -449,16 +390,6 @@ class TestSafeState:
             lab.tweezers.play()
             lab.tweezers.safe_state()
             assert min(lab.written(AMP0)) == 80
-
-    def test_twice_ramps_only_once(self, driver: Any) -> None:
-        with driver() as lab:
-            lab.tweezers.prepare(lab.program())
-            lab.tweezers.play()
-            lab.tweezers.safe_state()
-            lab.card.log.clear()
-            lab.tweezers.safe_state()
-            assert set(lab.written(AMP0)) == {1600}
-            assert lab.card.outputs_on == (False, False)
 
     def test_works_when_an_error_locks_the_driver(self, driver: Any) -> None:
         with driver() as lab:
@@ -489,13 +420,6 @@ class TestSafeState:
                     lab.tweezers.safe_state()
             assert lab.card.outputs_on == (True, False)
             assert not lab.card.running
-
-    def test_drops_what_was_prepared(self, driver: Any) -> None:
-        with driver() as lab:
-            lab.tweezers.prepare(lab.program())
-            lab.tweezers.safe_state()
-            with pytest.raises(DeviceError, match="without a prepared program"):
-                lab.tweezers.play()
 
     @pytest.mark.parametrize("mode", MODES)
     def test_nothing_of_the_old_program_is_played_after_it(self, driver: Any, mode: str) -> None:
@@ -604,5 +528,5 @@ class Calls(RuleBasedStateMachine):
 @pytest.mark.parametrize("trigger", ["software", "external"])
 @pytest.mark.parametrize("mode", MODES)
 def test_any_calls_end_in_silence(driver: Any, mode: str, trigger: str) -> None:
-    few = settings(max_examples=15, stateful_step_count=20)
+    few = settings(max_examples=8, stateful_step_count=20)
     run_state_machine_as_test(lambda: Calls(driver, mode, trigger), settings=few)  # type: ignore[no-untyped-call]

@@ -2,470 +2,257 @@
 
 from __future__ import annotations
 
-import ctypes
 import itertools
-from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, strategies as st
-from labseq_spcm_sim import M4I6631, CardModel, LogEntry, SimulatedCard, ToneSpan, registers as r
-from labseq_spcm_sim.card import LIST_PARAM, Log, list_writes
+from hypothesis import given, settings, strategies as st
+from labseq_spcm_sim import M4I6631, SimulatedCard, Tone, ToneSpan, registers as r
+from labseq_spcm_sim.card import LIST_PARAM, list_writes
 from labseq_spcm_sim.setup import DDS_TIMER_STEP_S, DDS_TRIGGER_DELAY_S
-from numpy.typing import NDArray
 
 from labseq.testing.fakes import FakeClock
 
+FREQ, FREQ_SLOPE, AMP = r.SPC_DDS_CORE0_FREQ, r.SPC_DDS_CORE0_FREQ_SLOPE, r.SPC_DDS_CORE0_AMP
+AMP_SLOPE, PHASE = r.SPC_DDS_CORE0_AMP_SLOPE, r.SPC_DDS_CORE0_PHASE
+SOURCE, TIMER, CMD = r.SPC_DDS_TRG_SRC, r.SPC_DDS_TRG_TIMER, r.SPC_DDS_CMD
+BY_TIMER, BY_CARD = r.SPCM_DDS_TRG_SRC_TIMER, r.SPCM_DDS_TRG_SRC_CARD
+UNDERRUN, OVERRUN = r.SPCM_DDS_STAT_QUEUE_UNDERRUN, r.SPCM_DDS_STAT_QUEUE_OVERRUN
 
-class Synthesizer:
-    """The DDS of a bench: the trigger comes from the card, the outputs are on."""
 
-    def __init__(self, bench) -> None:
-        s = bench.spcm
-        self.bench = bench
-        self.s = s
-        bench.outputs()
-        bench.external_trigger()
-        bench.card.card_mode(s.SPC_REP_STD_DDS)
-        self.dds = s.DDS(bench.card)
-        self.dds.reset()
+class Synthesizer(SimulatedCard):
+    """A card in DDS mode with its outputs on at 1 V."""
 
-    def block(self, source: int | None = None, period_s: float | None = None, **core: float) -> None:
-        """One block for core 0."""
-        if source is not None:
-            self.dds.trg_src(source)
-        if period_s is not None:
-            self.dds.trg_timer(period_s)
-        for name, value in core.items():
-            getattr(self.dds[0], name)(value)
-        self.dds.exec_at_trg()
+    def __init__(self) -> None:
+        self.clock = FakeClock()
+        super().__init__(self.clock)
+        setup = {
+            r.SPC_CARDMODE: r.SPC_REP_STD_DDS,
+            r.SPC_DDS_DATA_TRANSFER_MODE: r.SPCM_DDS_DTM_DMA,
+            r.SPC_ENABLEOUT0: 1,
+            r.SPC_ENABLEOUT1: 1,
+        }
+        assert self.write_all(setup.items()) == r.ERR_OK
+        self.clock.sleep(0.02)
 
-    def start(self, *commands: int) -> None:
-        self.dds.write_to_card()
-        self.bench.card.start(self.s.M2CMD_CARD_ENABLETRIGGER, *commands)
+    def block(self, writes: dict[int, float]) -> None:
+        assert self.write_all([*writes.items(), (CMD, r.SPCM_DDS_CMD_EXEC_AT_TRG)]) == r.ERR_OK
 
-    def tone(self):
+    def send(self) -> None:
+        """Send all blocks to the card, and wait until they have arrived."""
+        self.write(CMD, r.SPCM_DDS_CMD_WRITE_TO_CARD)
+        self.clock.sleep(1e-3)
+
+    def start(self, *blocks: dict[int, float]) -> None:
+        for block in blocks:
+            self.block(block)
+        self.send()
+        assert self.write(r.SPC_M2CMD, r.M2CMD_CARD_START) == r.ERR_OK
+
+    def force(self, then_s: float = 1e-3) -> float:
+        """Force a trigger, and let some time pass; returns when the output changed."""
+        out_s = self.clock.now() + DDS_TRIGGER_DELAY_S
+        self.write(r.SPC_M2CMD, r.M2CMD_CARD_FORCETRIGGER)
+        self.clock.sleep(then_s)
+        return out_s
+
+    def spans(self, channel: int = 0) -> list[ToneSpan]:
+        spans = self.played(channel)
+        assert all(isinstance(span, ToneSpan) for span in spans)
+        return spans  # pyright: ignore[reportReturnType]
+
+    def tone(self) -> Tone:
         """What core 0 does in the last span."""
-        return self.bench.sim.played(0)[-1].tones[0]
+        return self.spans()[-1].tones[0]
+
+    def status(self) -> int:
+        return int(self.read(r.SPC_DDS_STATUS)[1])
 
 
-def test_a_block_waits_in_the_shadow_registers_for_its_trigger(bench):
-    synthesizer = Synthesizer(bench)
-    synthesizer.block(freq=80e6, amp=0.1, phase=90.0)
-    synthesizer.block(freq_slope=5e9)
-    synthesizer.block(freq=90e6, freq_slope=0.0)
-    assert synthesizer.dds.queue_cmd_count() == 0
-    assert bench.card.get_i(synthesizer.s.SPC_DDS_NUM_QUEUED_CMD_IN_SW) == 6
-    synthesizer.start()
-    assert synthesizer.dds.queue_cmd_count() == 3  # the first block is in the shadow registers
-    assert bench.sim.played(0) == []
-    bench.sim.trigger()
-    start_s = bench.clock.now() + DDS_TRIGGER_DELAY_S
-    bench.clock.sleep(1e-3)
-    (span,) = bench.sim.played(0)
-    assert (span.start_s, span.end_s) == (pytest.approx(start_s, abs=1e-12), bench.clock.now())
-    assert span.amplitude_v == 0.5
-    assert span.tones[0].frequency_hz == pytest.approx(80e6, abs=0.15)
-    assert span.tones[0].amplitude == pytest.approx(0.1, abs=1e-4)
-    assert span.tones[0].phase_rad == pytest.approx(np.pi / 2)
-    assert synthesizer.dds.queue_cmd_count() == 2
-    bench.sim.trigger()
-    bench.clock.sleep(1e-3)
-    bench.sim.trigger()
-    bench.clock.sleep(1e-3)
-    _, ramp, end = bench.sim.played(0)
+def test_a_block_waits_in_the_shadow_registers_for_its_trigger() -> None:
+    card = Synthesizer()
+    card.start({FREQ: 80e6, AMP: 0.1, PHASE: 90.0}, {FREQ_SLOPE: 5e9}, {FREQ: 90e6, FREQ_SLOPE: 0.0})
+    assert card.read(r.SPC_DDS_QUEUE_CMD_COUNT)[1] == 3  # the first block is in the shadow registers
+    assert card.status() == r.SPCM_DDS_STAT_WAITING_FOR_TRG
+    assert card.spans() == []
+    out_s = card.force()
+    (span,) = card.spans()
+    assert (span.start_s, span.end_s) == (pytest.approx(out_s, abs=1e-12), card.clock.now())
+    assert span.amplitude_v == 1.0
+    assert card.tone().frequency_hz == pytest.approx(80e6, abs=0.15)
+    assert card.tone().amplitude == pytest.approx(0.1, abs=1e-4)
+    assert card.tone().phase_rad == pytest.approx(np.pi / 2)
+    card.force()
+    card.force()
+    _, ramp, end = card.spans()
     assert ramp.tones[0].frequency_slope == pytest.approx(5e9, rel=1e-6)
     assert ramp.tones[0].after(ramp.end_s - ramp.start_s).frequency_hz == pytest.approx(85e6, rel=1e-6)
     assert end.tones[0].frequency_hz == pytest.approx(90e6, abs=0.15)
+    for before, after in itertools.pairwise(card.spans()):  # the phase goes on
+        last = before.tones[0].after(before.end_s - before.start_s)
+        assert np.exp(1j * last.phase_rad) == pytest.approx(np.exp(1j * after.tones[0].phase_rad), abs=1e-6)
 
 
-def test_the_phase_goes_on_where_only_frequency_or_slope_change(bench):
-    synthesizer = Synthesizer(bench)
-    synthesizer.block(freq=80e6, amp=0.5)
-    synthesizer.block(freq_slope=1e9)
-    synthesizer.block(freq=81e6, freq_slope=0.0)
-    synthesizer.start()
-    for _ in range(3):
-        bench.sim.trigger()
-        bench.clock.sleep(123e-6)
-    spans = bench.sim.played(0)
-    for before, after in itertools.pairwise(spans):
-        end = before.tones[0].after(before.end_s - before.start_s)
-        assert np.exp(1j * end.phase_rad) == pytest.approx(np.exp(1j * after.tones[0].phase_rad), abs=1e-6)
-
-
-def test_the_phase_jumps_or_shifts_as_it_is_set(bench):
-    for behaviour, expected_deg in ((0, 90.0), (1, 90.0 - 30.0)):
-        synthesizer = Synthesizer(bench)
-        synthesizer.dds.phase_behaviour(behaviour)
-        synthesizer.block(freq=0.0, amp=0.5, phase=30.0)
-        synthesizer.block(phase=90.0)
-        synthesizer.start()
-        bench.sim.trigger()
-        bench.clock.sleep(1e-3)
-        before = synthesizer.tone()
-        bench.sim.trigger()
-        bench.clock.sleep(1e-3)
-        start_rad = before.phase_rad if behaviour else 0.0
-        shift_deg = np.degrees(synthesizer.tone().phase_rad - start_rad)
-        assert shift_deg == pytest.approx(expected_deg, abs=0.1)
-        bench.card.stop()
-
-
-def test_each_block_carries_the_timer_that_leads_to_the_next_event(bench):
-    synthesizer = Synthesizer(bench)
-    timer, card = synthesizer.s.SPCM_DDS_TRG_SRC_TIMER, synthesizer.s.SPCM_DDS_TRG_SRC_CARD
-    synthesizer.block(timer, 100e-6, freq=80e6, amp=0.5)
-    synthesizer.block(timer, 300e-6, freq=81e6)
-    synthesizer.block(card, freq=82e6)
-    synthesizer.block(amp=0.0)
-    synthesizer.start()
-    bench.clock.sleep(1e-3)
-    assert bench.sim.played(0) == []
-    bench.sim.trigger()
-    bench.clock.sleep(1e-3)
-    lengths_s = [span.end_s - span.start_s for span in bench.sim.played(0)]
+def test_each_block_carries_the_timer_that_leads_to_the_next_event() -> None:
+    card = Synthesizer()
+    card.start(
+        {SOURCE: BY_TIMER, TIMER: 100e-6, FREQ: 80e6, AMP: 0.5},
+        {SOURCE: BY_TIMER, TIMER: 300e-6, FREQ: 81e6},
+        {SOURCE: BY_CARD, FREQ: 82e6},
+        {AMP: 0.0},
+    )
+    card.clock.sleep(1e-3)
+    assert card.spans() == []
+    card.force()
+    lengths_s = [span.end_s - span.start_s for span in card.spans()]
     assert lengths_s[:2] == pytest.approx([100e-6, 300e-6], abs=DDS_TIMER_STEP_S)
-    bench.sim.trigger()
-    bench.clock.sleep(1e-3)
-    assert len(bench.sim.played(0)) == 3
-    assert bench.sim.played(0)[-1].end_s < bench.clock.now() - 0.9e-3
-    assert not bench.card.get_i(r.SPC_DDS_STATUS) & r.SPCM_DDS_STAT_QUEUE_UNDERRUN
+    card.force()
+    assert len(card.spans()) == 3
+    assert card.spans()[-1].end_s < card.clock.now() - 0.9e-3
+    assert not card.status() & UNDERRUN
 
 
-def test_the_trigger_count_is_one_short_but_its_differences_are_right(bench):
-    synthesizer = Synthesizer(bench)
-    for _ in range(4):
-        synthesizer.block(freq=80e6)
-    synthesizer.start()
-    counts: list[int] = []
-    for _ in range(4):
-        bench.sim.trigger()
-        counts.append(bench.card.get_i(r.SPC_DDS_TRG_COUNT))
-    assert counts == [0, 1, 2, 3]
+def test_the_trigger_count_is_one_short_and_a_trigger_without_a_block_is_an_underrun() -> None:
+    card = Synthesizer()
+    card.start(*[{FREQ: 80e6}] * 3)
+    counts: list[float] = []
+    for _ in range(3):
+        card.force()
+        counts.append(card.read(r.SPC_DDS_TRG_COUNT)[1])
+    assert counts == [0, 1, 2]
+    assert not card.status() & UNDERRUN
+    card.force()
+    assert card.status() & UNDERRUN
 
 
-def test_a_trigger_before_the_block_is_there_sets_the_underrun_flag(bench):
-    synthesizer = Synthesizer(bench)
-    synthesizer.block(freq=80e6, amp=0.5)
-    synthesizer.start()
-    bench.sim.trigger()
-    assert not synthesizer.dds.status() & r.SPCM_DDS_STAT_QUEUE_UNDERRUN
-    bench.sim.trigger()
-    assert synthesizer.dds.status() & r.SPCM_DDS_STAT_QUEUE_UNDERRUN
+def test_the_timer_without_a_block_sets_the_underrun_flag_and_ticks_on() -> None:
+    card = Synthesizer()
+    card.start({SOURCE: BY_TIMER, TIMER: 1e-3, FREQ: 80e6, AMP: 0.5})
+    out_s = card.force(10.5e-3)
+    assert card.status() & UNDERRUN
+    card.block({FREQ: 90e6})
+    card.send()
+    assert card.spans()[-1].start_s == pytest.approx(out_s + 11e-3, abs=1e-7)
 
 
-def test_the_timer_without_a_block_sets_the_underrun_flag_and_ticks_on(bench):
-    synthesizer = Synthesizer(bench)
-    timer = synthesizer.s.SPCM_DDS_TRG_SRC_TIMER
-    synthesizer.block(timer, 1e-3, freq=80e6, amp=0.5)
-    synthesizer.start()
-    bench.sim.trigger()
-    start_s = bench.clock.now() + DDS_TRIGGER_DELAY_S
-    bench.clock.sleep(10.5e-3)
-    assert synthesizer.dds.status() & r.SPCM_DDS_STAT_QUEUE_UNDERRUN
-    synthesizer.block(freq=90e6)
-    synthesizer.dds.write_to_card()
-    bench.clock.sleep(1e-3)
-    assert bench.sim.played(0)[-1].start_s == pytest.approx(start_s + 11e-3, abs=1e-7)
+def test_a_block_can_be_triggered_only_when_all_of_it_has_arrived() -> None:
+    card = Synthesizer()
+    assert card.write(r.SPC_M2CMD, r.M2CMD_CARD_START) == r.ERR_OK
+    card.write_all([(FREQ, 80e6)] * 1000)
+    card.block({AMP: 0.5})
+    card.write(CMD, r.SPCM_DDS_CMD_WRITE_TO_CARD)
+    card.clock.sleep(1001 / 10e6 + 20e-6 - 1e-6)
+    assert card.status() == 0
+    card.force(2e-6)
+    assert card.status() == UNDERRUN | r.SPCM_DDS_STAT_WAITING_FOR_TRG
+    card.force()
+    assert card.tone().frequency_hz == pytest.approx(80e6, abs=0.15)
 
 
-def test_the_software_trigger_burns_what_is_queued(bench):
-    synthesizer = Synthesizer(bench)
-    bench.card.set_i(r.SPC_TRIG_ORMASK, r.SPC_TMASK_SOFTWARE)
-    for hz in (80e6, 81e6, 82e6):
-        synthesizer.block(freq=hz, amp=0.5)
-    synthesizer.start()
-    bench.clock.sleep(1e-6)
-    assert synthesizer.tone().frequency_hz == pytest.approx(82e6, abs=0.15)
-    assert synthesizer.dds.status() & r.SPCM_DDS_STAT_QUEUE_UNDERRUN
-
-
-def test_a_force_advances_by_one_step_whatever_the_mask(bench):
-    synthesizer = Synthesizer(bench)
-    bench.card.set_i(r.SPC_TRIG_ORMASK, r.SPC_TMASK_NONE)
-    for hz in (80e6, 81e6):
-        synthesizer.block(freq=hz, amp=0.5)
-    synthesizer.start(r.M2CMD_CARD_FORCETRIGGER)
-    bench.clock.sleep(1e-6)
-    assert synthesizer.tone().frequency_hz == pytest.approx(80e6, abs=0.15)
-    bench.card.cmd(r.M2CMD_CARD_FORCETRIGGER)
-    bench.clock.sleep(1e-6)
-    assert synthesizer.tone().frequency_hz == pytest.approx(81e6, abs=0.15)
-
-
-def test_exec_now_needs_a_block_at_trigger_before_it_and_write_to_card_after_it(bench):
-    synthesizer = Synthesizer(bench)
-    bench.card.start(r.M2CMD_CARD_ENABLETRIGGER)
-    with pytest.raises(synthesizer.s.SpcmException, match="the setup isn't valid"):
-        synthesizer.dds.exec_now()
-    synthesizer.block(freq=80e6, amp=0.5)
-    synthesizer.dds.write_to_card()
-    bench.sim.trigger()
-    synthesizer.dds[0].freq(85e6)
-    synthesizer.dds.exec_now()
-    bench.clock.sleep(1e-4)
-    assert synthesizer.tone().frequency_hz == pytest.approx(80e6, abs=0.15)
-    synthesizer.dds.write_to_card()
-    bench.clock.sleep(1e-4)
-    assert synthesizer.tone().frequency_hz == pytest.approx(85e6, abs=0.15)
-
-
-def test_a_trigger_that_overtakes_the_dma_finds_nothing(bench):
-    synthesizer = Synthesizer(bench)
-    bench.card.start(r.M2CMD_CARD_ENABLETRIGGER)
-    synthesizer.dds.data_transfer_mode(r.SPCM_DDS_DTM_DMA)
-    synthesizer.block(freq=80e6, amp=0.5)
-    synthesizer.dds.write_to_card()
-    bench.sim.trigger()
-    assert synthesizer.dds.status() & r.SPCM_DDS_STAT_QUEUE_UNDERRUN
-    bench.clock.sleep(1e-3)
-    bench.sim.trigger()
-    bench.clock.sleep(1e-3)
-    assert synthesizer.tone().frequency_hz == pytest.approx(80e6, abs=0.15)
-
-
-def test_a_queue_that_is_too_full_loses_blocks_and_says_so(bench):
-    synthesizer = Synthesizer(bench)
+def test_a_queue_that_is_too_full_loses_blocks_and_reports_it() -> None:
+    card = Synthesizer()
     for _ in range(4100):
-        synthesizer.block(freq=80e6)
-    synthesizer.dds.write_to_card()
-    assert synthesizer.dds.status() & r.SPCM_DDS_STAT_QUEUE_OVERRUN
-    assert synthesizer.dds.queue_cmd_count() == synthesizer.dds.queue_cmd_max() - 1
+        card.block({FREQ: 80e6})
+    card.send()
+    assert card.status() & OVERRUN
+    assert card.read(r.SPC_DDS_QUEUE_CMD_COUNT)[1] == card.read(r.SPC_DDS_QUEUE_CMD_MAX)[1] - 1
 
 
-def test_cores_play_on_the_channel_that_they_are_connected_to(bench):
-    synthesizer = Synthesizer(bench)
-    synthesizer.dds.cores_on_channel(1, 0xF00)
-    for core in (0, 8, 20):
-        synthesizer.dds[core].freq(80e6 + 1e6 * core)
-        synthesizer.dds[core].amp(0.2)
-    synthesizer.dds.exec_at_trg()
-    synthesizer.start(r.M2CMD_CARD_FORCETRIGGER)
-    bench.clock.sleep(1e-3)
-    cores = [[tone.core for tone in bench.sim.played(channel)[0].tones] for channel in (0, 1)]
-    assert cores == [[0], [8, 20]]
+def test_cores_play_on_the_channel_that_they_are_connected_to() -> None:
+    card = Synthesizer()
+    card.write(r.SPC_DDS_CORES_ON_CH1, 0xF00)
+    card.start({FREQ + core: 80e6 for core in (0, 8, 20)} | {AMP + core: 0.2 for core in (0, 8, 20)})
+    card.force()
+    assert [[tone.core for tone in card.spans(channel)[0].tones] for channel in (0, 1)] == [[0], [8, 20]]
 
 
-def test_the_output_has_the_tones_and_clips_where_they_add_up_to_more_than_full_scale(bench):
-    synthesizer = Synthesizer(bench)
-    for core in (0, 1):
-        synthesizer.dds[core].freq(80e6 + 20e6 * core)
-        synthesizer.dds[core].amp(0.7)
-    synthesizer.dds.exec_at_trg()
-    synthesizer.start(r.M2CMD_CARD_FORCETRIGGER)
-    bench.clock.sleep(1e-4)
-    volts = bench.sim.played(0)[0].volts(1.25e9)
-    spectrum = np.abs(np.fft.rfft(volts))
-    frequency_hz = np.fft.rfftfreq(len(volts), 1 / 1.25e9)
-    for hz in (80e6, 100e6):
-        near = np.abs(frequency_hz - hz) < 2e5
-        assert spectrum[near].max() > 0.25 * spectrum.max()
-    assert np.max(np.abs(volts)) == 0.5
+def test_an_amplitude_ramp_ends_at_full_scale() -> None:
+    card = Synthesizer()
+    card.start({FREQ: 80e6, AMP_SLOPE: 5000.0})
+    card.force(500e-6)
+    tone = card.tone()
+    assert tone.after(100e-6).amplitude == pytest.approx(0.5, abs=0.02)
+    assert tone.after(300e-6).amplitude == 1.0
+    card.block({AMP_SLOPE: 0.0})
+    card.send()
+    card.force()
+    assert card.tone().amplitude == 1.0
 
 
-def test_amplitude_ramps_reach_what_they_should(bench):
-    synthesizer = Synthesizer(bench)
-    synthesizer.block(freq=80e6, amp=0.0, amp_slope=5000.0)
-    synthesizer.block(amp=0.5, amp_slope=0.0)
-    synthesizer.start()
-    bench.sim.trigger()
-    bench.clock.sleep(100e-6)
-    bench.sim.trigger()
-    bench.clock.sleep(100e-6)
-    ramp, _ = bench.sim.played(0)
-    assert ramp.tones[0].after(100e-6).amplitude == pytest.approx(0.5, abs=0.02)
-
-
-def test_a_stop_silences_and_a_new_start_begins_in_silence(bench):
-    synthesizer = Synthesizer(bench)
-    synthesizer.block(freq=80e6, amp=0.5)
-    synthesizer.start(r.M2CMD_CARD_FORCETRIGGER)
-    bench.clock.sleep(1e-3)
-    bench.card.stop()
-    stopped_s = bench.clock.now()
-    bench.card.start(r.M2CMD_CARD_ENABLETRIGGER)
-    bench.clock.sleep(1e-3)
-    assert [span.end_s for span in bench.sim.played(0)] == [stopped_s]
-
-
-def test_a_reset_while_running_ends_the_tones_and_keeps_what_was_played(bench):
-    synthesizer = Synthesizer(bench)
-    synthesizer.block(freq=80e6, amp=0.5)
-    synthesizer.start(r.M2CMD_CARD_FORCETRIGGER)
-    bench.clock.sleep(1e-3)
-    synthesizer.dds.reset()
-    reset_s = bench.clock.now()
-    bench.clock.sleep(1e-3)
-    assert [span.end_s for span in bench.sim.played(0)] == [reset_s]
-
-
-Write = tuple[int, float]
-
-
-def entries(writes: list[Write]) -> NDArray[np.void]:
-    """A register list; integers where the card wants them."""
-    made = np.zeros(len(writes), LIST_PARAM)
-    for entry, (register, value) in zip(made, writes, strict=True):
-        whole = register in (r.SPC_DDS_CMD, r.SPC_DDS_TRG_SRC, r.SPC_TIMEOUT)
-        entry["register"], entry["type"] = register, r.TYPE_INT64 if whole else r.TYPE_DOUBLE
-        entry["value"] = int(value) if whole else np.float64(value).view(np.int64)
-    return made
-
-
-def synthesizer(by_dma: bool = False, model: CardModel = M4I6631) -> tuple[SimulatedCard, FakeClock]:
-    """A card in DDS mode with its outputs on."""
-    clock = FakeClock()
-    card = SimulatedCard(clock, model=model)
-    card.write(r.SPC_CARDMODE, r.SPC_REP_STD_DDS)
-    card.write(r.SPC_DDS_DATA_TRANSFER_MODE, int(by_dma))
-    card.write(r.SPC_ENABLEOUT0, 1)
-    card.write(r.SPC_ENABLEOUT1, 1)
-    clock.sleep(0.02)
-    return card, clock
-
-
-REASONABLE = st.one_of(
-    st.tuples(st.sampled_from([603000, 603007, 603020]), st.floats(0, 625e6)),
-    st.tuples(st.sampled_from([604000, 604012]), st.floats(-1e13, 1e13)),
-    st.tuples(st.sampled_from([605000, 605007, 605020]), st.floats(-1, 1)),
-    st.tuples(st.sampled_from([606000, 606012]), st.floats(-3e5, 3e5)),
-    st.tuples(st.sampled_from([607000, 607020]), st.floats(-1e4, 1e4)),
-    st.tuples(st.just(r.SPC_DDS_TRG_TIMER), st.floats(1e-7, 1e-3)),
-    st.tuples(st.just(r.SPC_DDS_TRG_SRC), st.sampled_from([1.0, 2.0])),
-    st.tuples(st.just(r.SPC_DDS_CMD), st.sampled_from([2.0, 2.0, 8.0])),
-)
-WRONG: list[Write] = [
-    (603000, -1.0),
-    (603000, float("nan")),
-    (605001, 1.5),
-    (607003, float("inf")),
-    (603040, 80e6),
-    (r.SPC_DDS_TRG_TIMER, 1e-9),
-    (r.SPC_DDS_CMD, float(r.SPCM_DDS_CMD_EXEC_NOW)),
-    (r.SPC_DDS_CMD, float(r.SPCM_DDS_CMD_RESET)),
-    (r.SPC_DDS_NUM_CORES, 3.0),
-    (r.SPC_TIMEOUT, 5.0),
-]
-
-
-@given(st.lists(REASONABLE, max_size=40), st.one_of(st.none(), st.sampled_from(WRONG)), st.integers(0, 40))
-def test_a_list_does_what_its_writes_do_one_by_one(
-    writes: list[Write], wrong: Write | None, place: int
-) -> None:
-    if wrong is not None:
-        writes.insert(place, wrong)
-    seen: list[Any] = []
-    for at_once in (True, False):
-        card, clock = synthesizer()
-        made = entries(writes)
-        code = card.write_list(made) if at_once else card.write_all(list_writes(made))
-        logged = [(entry.register, float(entry.value)) for entry in card.log]
-        error = replace(card.take_error(), value=0)
-        values = [card.read(register) for register in (603000, 604012, 605007, 607020, r.SPC_DDS_TRG_TIMER)]
-        card.write(r.SPC_M2CMD, r.M2CMD_CARD_START | r.M2CMD_CARD_ENABLETRIGGER)
-        for _ in range(3):
-            card.write(r.SPC_M2CMD, r.M2CMD_CARD_FORCETRIGGER)
-            clock.sleep(1e-4)
-        state = [card.read(register) for register in (r.SPC_DDS_STATUS, r.SPC_DDS_QUEUE_CMD_COUNT)]
-        seen.append([code, error, values, state, card.played(0), card.played(1), repr(logged)])
-    assert seen[0] == seen[1]
-
-
-def test_a_block_waits_for_its_trigger_only_when_all_of_it_has_arrived() -> None:
-    card, clock = synthesizer(by_dma=True)
-    writes: list[Write] = [(603000, 80e6)] * 1000 + [(605000, 0.5), (r.SPC_DDS_CMD, 2), (r.SPC_DDS_CMD, 8)]
-    card.write_list(entries(writes))
-    card.write(r.SPC_M2CMD, r.M2CMD_CARD_START)
-    arrival_s = clock.now() + 1001 / 10e6 + 20e-6
-    clock.sleep(arrival_s - clock.now() - 1e-6)
-    assert card.read(r.SPC_DDS_STATUS) == (r.ERR_OK, 0)
-    clock.sleep(2e-6)
-    assert card.read(r.SPC_DDS_STATUS) == (r.ERR_OK, r.SPCM_DDS_STAT_WAITING_FOR_TRG)
-
-
-def test_cards_with_fewer_cores_play_what_they_have() -> None:
-    card, clock = synthesizer(model=replace(M4I6631, n_dds_cores=8))
-    card.write_list(entries([(603007, 80e6), (605007, 0.5), (r.SPC_DDS_CMD, 2), (r.SPC_DDS_CMD, 8)]))
-    card.write(r.SPC_M2CMD, r.M2CMD_CARD_START | r.M2CMD_CARD_ENABLETRIGGER | r.M2CMD_CARD_FORCETRIGGER)
-    clock.sleep(1e-3)
-    (span,) = card.played(0)
-    assert isinstance(span, ToneSpan)
-    assert [tone.core for tone in span.tones] == [7]
-    assert card.write_list(entries([(603008, 80e6)])) == r.ERR_REG
-
-
-class TestLog:
-    def test_gives_writes_in_order_and_one_by_one(self) -> None:
-        log = Log(100)
-        log.add(1.0, [5], [7])
-        log.add(2.0, [6, 8], [0.5, 0.25])
-        assert list(log) == [LogEntry(1.0, 5, 7), LogEntry(2.0, 6, 0.5), LogEntry(2.0, 8, 0.25)]
-        assert len(log) == 3
-
-    def test_forgets_the_oldest_calls(self) -> None:
-        log = Log(3)
-        for k in range(10):
-            log.add(float(k), [k], [k])
-        assert [entry.register for entry in log] == [7, 8, 9]
+def test_a_stop_or_a_reset_silences_and_keeps_what_was_played() -> None:
+    card = Synthesizer()
+    card.start({FREQ: 80e6, AMP: 0.5})
+    card.force()
+    card.write(r.SPC_M2CMD, r.M2CMD_CARD_STOP)
+    stopped_s = card.clock.now()
+    card.start()
+    card.clock.sleep(1e-3)
+    assert [span.end_s for span in card.spans()] == [stopped_s]
+    card.block({FREQ: 80e6, AMP: 0.5})
+    card.send()
+    card.force()
+    card.write(CMD, r.SPCM_DDS_CMD_RESET)
+    reset_s = card.clock.now()
+    card.clock.sleep(1e-3)
+    assert [span.end_s for span in card.spans()] == [stopped_s, reset_s]
 
 
 @pytest.mark.parametrize(
-    ("channel", "asked", "got", "other"),
+    ("channel", "mask", "found", "other"),
     [
         (0, 1, 0xFF, 1 << 20),
         (0, 0xFFFFFF, 0xFFFFF, 1 << 20),
         (1, 0xF00, 0x100F00, 0xFF0FF),
-        (1, 0, 1 << 20, 0xFFFFF),
         (1, 0x3, 1 << 20, 0xFFFFF),
     ],
 )
-def test_masks_that_the_chip_cannot_make_are_snapped_without_a_word(bench, channel, asked, got, other):
-    dds = bench.spcm.DDS(bench.card)
-    dds.cores_on_channel(channel, asked)
-    assert dds.get_cores_on_channel(channel) == got
-    assert dds.get_cores_on_channel(1 - channel) == other
+def test_masks_that_the_chip_cannot_make_are_snapped_without_a_report(
+    channel: int, mask: int, found: int, other: int
+) -> None:
+    card, registers = Synthesizer(), (r.SPC_DDS_CORES_ON_CH0, r.SPC_DDS_CORES_ON_CH1)
+    assert card.write(registers[channel], mask) == r.ERR_OK
+    assert [card.read(registers[one])[1] for one in (channel, 1 - channel)] == [found, other]
 
 
+@settings(max_examples=30)
 @given(st.floats(83.2e-9, 27.48), st.floats(0, 625e6), st.floats(-1e12, 1e12))
-def test_inexact_dds_values_are_rounded_and_read_back(timer_s, frequency_hz, slope):
+def test_inexact_values_are_rounded_and_read_back(timer_s: float, frequency_hz: float, slope: float) -> None:
     card = SimulatedCard(FakeClock())
     for register, value, step in (
-        (r.SPC_DDS_TRG_TIMER, timer_s, 6.4e-9),
-        (r.SPC_DDS_CORE0_FREQ, frequency_hz, 0.291038305),
-        (r.SPC_DDS_CORE0_FREQ_SLOPE + 20, slope, 2775.5575616),
+        (TIMER, timer_s, 6.4e-9),
+        (FREQ, frequency_hz, 0.291038305),
+        (FREQ_SLOPE + 20, slope, 2775.5575616),
     ):
         assert card.write(register, value) == 0
         assert card.read(register)[1] == pytest.approx(value, abs=0.5001 * step)
 
 
-def test_smaller_ramp_steps_make_finer_slopes(bench):
-    bench.card.set_d(r.SPC_DDS_FREQ_RAMP_STEPSIZE, 1000.0)
-    bench.card.set_d(r.SPC_DDS_CORE0_FREQ_SLOPE, 100.0)
-    assert bench.card.get_d(r.SPC_DDS_CORE0_FREQ_SLOPE) == pytest.approx(100.0, abs=1.5)
+def test_smaller_ramp_steps_make_finer_slopes() -> None:
+    card = SimulatedCard(FakeClock())
+    card.write(r.SPC_DDS_FREQ_RAMP_STEPSIZE, 1000)
+    card.write(FREQ_SLOPE, 100.0)
+    assert card.read(FREQ_SLOPE)[1] == pytest.approx(100.0, abs=1.5)
 
 
-def test_a_register_list_is_carried_out_up_to_the_first_refusal(bench):
-    from spcm_core import ST_LIST_PARAM
-
-    entries = (ST_LIST_PARAM * 3)()
-    for entry, (register, amplitude) in zip(entries, ((0, 0.1), (1, 2.0), (2, 0.3)), strict=True):
-        entry.lReg, entry.lType, entry.dValue = r.SPC_DDS_CORE0_AMP + register, 1, amplitude
-    with pytest.raises(bench.spcm.SpcmException, match=r"value 2\.0 not allowed"):
-        bench.card.set_ptr(r.SPC_REGISTER_LIST, entries, ctypes.sizeof(entries))
-    got = [bench.card.get_d(r.SPC_DDS_CORE0_AMP + core) for core in range(3)]
-    assert got == pytest.approx([0.1, 0.0, 0.0], abs=1e-4)
-
-
-@pytest.mark.parametrize(("by_dma", "call_s"), [(False, 200 / 400e3), (True, 0.0)])
-def test_writing_to_the_card_takes_its_time_in_single_mode_and_the_background_by_dma(bench, by_dma, call_s):
-    dds = bench.spcm.DDS(bench.card)
-    dds.data_transfer_mode(int(by_dma))
-    for _ in range(100):
-        dds[0].freq(80e6)
-        dds[0].amp(0.1)
-        dds.exec_at_trg()
-    start_s = bench.clock.now()
-    dds.write_to_card()
-    assert bench.clock.now() - start_s == pytest.approx(call_s, abs=1e-9)
+@pytest.mark.parametrize(
+    ("register", "value", "code"),
+    [
+        (FREQ, -1.0, r.ERR_VALUE),
+        (FREQ, float("nan"), r.ERR_VALUE),
+        (AMP + 1, 1.5, r.ERR_VALUE),
+        (PHASE, float("inf"), r.ERR_VALUE),
+        (TIMER, 1e-9, r.ERR_VALUE),
+        (FREQ + M4I6631.n_dds_cores, 80e6, r.ERR_REG),
+        (r.SPC_DDS_NUM_CORES, 3.0, r.ERR_NOWRITEALLOWED),
+        (CMD, r.SPCM_DDS_CMD_EXEC_NOW, r.ERR_FNCNOTSUPPORTED),
+    ],
+)
+def test_a_list_is_carried_out_up_to_the_first_refusal(register: int, value: float, code: int) -> None:
+    card = Synthesizer()
+    entries = np.zeros(3, LIST_PARAM)
+    for entry, (one, wanted) in zip(entries, ((AMP, 0.25), (register, value), (AMP + 2, 0.25)), strict=True):
+        entry["register"], entry["type"], entry["value"] = one, 1, np.float64(wanted).view(np.int64)
+    assert card.write_all(list_writes(entries)) == code
+    card.take_error()
+    found = [card.read(AMP + core)[1] for core in (0, 2)]
+    assert found == pytest.approx([0.25, 0.0], abs=1e-4)
