@@ -33,10 +33,6 @@ class VirtualLines(VirtualDriver, Lines):
     """Ideal lines: the simulation receives exactly the compiled program.
 
     Every ``fire`` needs a compiled program and its own ``arm``, so no program is fired by mistake.
-
-    Args:
-        settings: The limits.
-        context: Lines, clock and the simulation.
     """
 
     def __init__(self, settings: LinesSettings, context: Context) -> None:
@@ -142,10 +138,6 @@ class VirtualDevice(Device):
     The value ``state`` is the last command ("closed" before ``open``, "ready"
     after it, "safe" in the safe state). Arguments of a command are kept as values
     of the same name: after ``command("set", power=0.5)``, ``read("power")`` is 0.5.
-
-    Args:
-        settings: Its commands and values.
-        context: Its name.
     """
 
     def __init__(self, settings: DeviceSettings, context: Context) -> None:
@@ -208,10 +200,6 @@ class VirtualSpotMeter(VirtualDriver, Device):
     """Measures the power of each static tweezer, with noise.
 
     Its only value is ``spot_powers``, float64 (n_rows, n_cols), relative to the nominal power.
-
-    Args:
-        settings: Noise and time of a measurement.
-        context: Clock, random numbers and the simulation.
     """
 
     def __init__(self, settings: SpotMeterSettings, context: Context) -> None:

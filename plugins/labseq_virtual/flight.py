@@ -1,4 +1,4 @@
-"""Transport of atoms by the light of a played RF output: drawing atoms, moving them, phase and depth jumps.
+"""Transport of atoms by the light of a played RF output: drawing atoms, and moving them.
 
 Energies and depths inside are per mass of the atom, in m^2/s^2.
 """
@@ -10,125 +10,16 @@ from collections import Counter
 from typing import Any, Final
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from labseq.plugin import MotionSpec, SiteGrid
 from labseq_virtual.handover import full_amplitudes
-from labseq_virtual.rf_analysis import HOPS, WINDOW, Band, RfPulse, Tracks, check_resolvable, track_tones
+from labseq_virtual.jumps import JUMPS, find_jumps
+from labseq_virtual.rf_analysis import WINDOW, Band, RfPulse, Tracks, check_resolvable, track_tones
 from labseq_virtual.settings import SimulationSettings
-from labseq_virtual.transport import TonePositions
+from labseq_virtual.tone_positions import TonePositions
 
 Floats = NDArray[np.float64]
-
-JUMPS: Final = np.dtype(
-    [
-        ("t_s", np.float64),
-        ("kind", "S5"),
-        ("row", np.float32),
-        ("col", np.float32),
-        ("size", np.float32),
-    ],
-    metadata={
-        "descriptions": {
-            "t_s": "when, from the start of the shot",
-            "kind": "phase, of a tone; or depth, of a tweezer",
-            "row": "row in sites; nan for the phase of a column's tone",
-            "col": "column in sites; nan for the phase of a row's tone",
-            "size": "in rad, or as a fraction of the full depth",
-        }
-    },
-)
-"""A jump: when, of which kind, where in sites, and how large.
-
-A "phase" jump is that of one tone, in rad: of the column's tone where ``row`` is nan, and the other
-way round. A "depth" jump is that of a tweezer, as a fraction of the full depth.
-"""
-
-INNER: Final = 3 * HOPS // 4
-OUTER: Final = 2 * HOPS
-"""A jump is found by extrapolating fits to the frames from OUTER to INNER before it and from INNER to
-OUTER after it; nearer frames are blurred by the jump itself."""
-MIN_RAD: Final = 0.5
-"""Smallest phase jump that is reported (ours)."""
-RESIDUAL_RAD: Final = 0.02
-"""Largest residual of the fits; where it is larger, something else happens, such as a second start."""
-CHIRP_RAD: Final = 0.3
-"""Smallest phase that a change of the chirp adds within the inner frames for its time to be known."""
-MIN_DEPTH: Final = 0.6
-"""Smallest reported change of the depth within a transit time; a ramp of 60 us makes a sixth."""
-
-
-def phase_jumps(tracks: Tracks, j: int) -> list[tuple[float, int, float]]:
-    """The phase jumps of one of the tones.
-
-    The phase before and the phase after are each fitted by a quadratic in time (constant chirp); the jump
-    is the difference of the two fits. Where the chirp changes too, the difference is taken at the time
-    when both have the same frequency, because the tweezer's motion is continuous.
-
-    Args:
-        tracks: The tones.
-        j: Number of the tone.
-
-    Returns:
-        Time, frame and size in rad of each.
-    """
-    hz, phase = tracks.frequency_hz[:, j], tracks.phase_rad[:, j]
-    n_span = 2 * OUTER + 1
-    if len(hz) < n_span:
-        return []
-    step_s = float(tracks.t_s[1] - tracks.t_s[0])
-    advance = np.pi * step_s * (hz[1:] + hz[:-1])
-    advance += _wrapped(np.diff(phase) - advance)
-    # Relative to the frequency in the middle of each window.
-    steps = sliding_window_view(advance, n_span - 1) - 2 * np.pi * step_s * hz[OUTER:-OUTER, None]
-    courses = np.concatenate([np.zeros((len(steps), 1)), np.cumsum(steps, axis=1)], axis=1)
-    before, after = np.arange(OUTER - INNER + 1), np.arange(OUTER + INNER, n_span)
-    at_s = np.arange(-OUTER, OUTER + 1, dtype=np.float64) * step_s
-    first, residual_before = _fit(courses[:, before], at_s[before])
-    second, residual_after = _fit(courses[:, after], at_s[after])
-    shift, slope, bend = (second - first).T
-    inner_s = INNER * step_s
-    bent = np.abs(bend) * inner_s**2 > CHIRP_RAD
-    place_s = np.where(bent, -slope / np.where(bent, 2 * bend, 1.0), 0.0)
-    size = _wrapped(shift + slope * place_s + bend * place_s**2)
-    fine = (np.maximum(residual_before, residual_after) < RESIDUAL_RAD) & (np.abs(place_s) <= inner_s)
-    found = peaks(np.where(fine, np.abs(size), 0.0), MIN_RAD, 2 * INNER)
-    return [(float(tracks.t_s[k + OUTER] + place_s[k]), k + OUTER, float(size[k])) for k in found]
-
-
-def depth_jumps(depth: Floats) -> list[tuple[int, float]]:
-    """The jumps of a tweezer's depth.
-
-    Args:
-        depth: Fraction of the full depth in each frame, (n_frames,), 0 where off.
-
-    Returns:
-        Frame and size of each.
-    """
-    change = depth[HOPS:] - depth[:-HOPS]
-    return [(k + HOPS // 2, float(change[k])) for k in peaks(np.abs(change), MIN_DEPTH, HOPS)]
-
-
-def peaks(values: Floats, least: float, apart: int) -> list[int]:
-    """Middle of each run of values above ``least``; gaps of at most ``apart`` do not end a run."""
-    above = np.flatnonzero(values > least)
-    if not len(above):
-        return []
-    groups = np.split(above, np.flatnonzero(np.diff(above) > apart) + 1)
-    return [int(group[len(group) // 2]) for group in groups]
-
-
-def _fit(courses: Floats, at_s: Floats) -> tuple[Floats, Floats]:
-    """Coefficients of quadratics fitted to each course, and their largest residuals."""
-    powers = np.vander(at_s, 3, increasing=True)
-    fit = courses @ np.linalg.pinv(powers).T
-    return fit, np.abs(courses - fit @ powers.T).max(axis=1)
-
-
-def _wrapped(phase_rad: Floats) -> Floats:
-    return (phase_rad + np.pi) % (2 * np.pi) - np.pi
-
 
 WIDER: Final = np.array([2.2, 2.2, 4.0])
 """Width of the proposed positions relative to a harmonic well's, (x, y, z): covers a beam's weaker flanks."""
@@ -246,14 +137,7 @@ in sites, where.
 
 
 class RfTransport:
-    """Moves atoms in the light of what the mobile tweezers' outputs played.
-
-    Args:
-        grid: The grid of sites, with its frequencies.
-        motion: The RF chain: the amplitudes that give the full depth.
-        settings: The constants of the model.
-        positions: Where the tones put their light; by default without errors of the tones.
-    """
+    """Moves atoms in the light of what the mobile tweezers' outputs played."""
 
     def __init__(
         self,
@@ -379,23 +263,8 @@ class RfTransport:
             intended, full_v = self._positions.intended(axis, hz), self._full_v[axis]
             sites.append(self._positions.actual(axis, hz))
             depths.append((volts / np.interp(intended, np.arange(len(full_v)), full_v)) ** 2)
-        self._record_jumps(found, sites, depths)
+        self._jumps += find_jumps(found, sites, depths)
         return (sites[0], depths[0], sites[1], depths[1]), found[0].t_s[:n_frames]
-
-    def _record_jumps(self, found: list[Tracks], sites: list[Floats], depths: list[Floats]) -> None:
-        for axis, tracks in enumerate(found):
-            for j in range(sites[axis].shape[1]):
-                for time_s, k, size in phase_jumps(tracks, j):
-                    place = sites[axis][min(k, len(sites[axis]) - 1), j]
-                    where = (place, math.nan) if axis == 0 else (math.nan, place)
-                    self._jumps.append((time_s, b"phase", *where, size))
-        rows, cols = (np.nan_to_num(depth) for depth in depths)
-        for i in range(rows.shape[1]):
-            for j in range(cols.shape[1]):
-                for k, size in depth_jumps(rows[:, i] * cols[:, j]):
-                    near = slice(max(0, k - HOPS), k + HOPS + 1)
-                    where = (_known(sites[0][near, i]), _known(sites[1][near, j]))
-                    self._jumps.append((float(found[0].t_s[k]), b"depth", *where, size))
 
     def _near(self, rows: Floats, cols: Floats) -> Mask:
         """Sites that any tweezer comes close to, bool (n_rows, n_cols)."""
@@ -460,8 +329,3 @@ def _lines(tracks: Floats, n_sites: int) -> Mask:
 
 def _max_on(tracks: Floats) -> int:
     return int((~np.isnan(tracks)).sum(axis=1).max(initial=0))
-
-
-def _known(values: Floats) -> float:
-    known = values[~np.isnan(values)]
-    return float(known[0]) if len(known) else math.nan

@@ -36,11 +36,6 @@ def site_brightness(
 ) -> NDArray[np.float64]:
     """Brightness of an atom on each site, relative to one in the middle of the frame.
 
-    Args:
-        settings: Constants of the optics.
-        spots: The centres from :func:`site_spots`.
-        rng: Random numbers of the machine.
-
     Returns:
         float64 (n_rows, n_cols).
     """
@@ -111,13 +106,7 @@ def _rotation(angle_rad: float) -> NDArray[np.float64]:
 
 
 class Images:
-    """Draws frames of atoms on the sites, all in one mode of the sensor.
-
-    Args:
-        settings: Constants of optics and camera.
-        grid: The sites.
-        seed: Seed of the differences from site to site and from pixel to pixel.
-        mode: How the sensor is exposed and read.
+    """Draws frames of atoms on the sites, all in one mode of the sensor; ``seed``: that of the machine.
 
     Raises:
         LimitError: The sensor has no such mode.
@@ -145,17 +134,9 @@ class Images:
         exposure_s: float,
         rng: np.random.Generator,
     ) -> NDArray[np.uint16]:
-        """Draw a frame.
+        """Draw a frame, uint16 (height, width), of atoms that shine for a fraction of the exposure each.
 
-        Args:
-            row: int64 (n_atoms,), row of each atom's site.
-            col: int64 (n_atoms,), its column.
-            shining: float64 (n_atoms,), how long each atom shines, as a fraction of the exposure.
-            exposure_s: Exposure time, in seconds.
-            rng: Random numbers of the shot.
-
-        Returns:
-            uint16 (height, width), in counts.
+        ``row``, ``col`` and ``shining`` are of shape (n_atoms,).
         """
         view = self._view
         full = view.photoelectrons * self._sensor.quantum_efficiency * exposure_s / view.exposure
@@ -165,13 +146,7 @@ class Images:
 
 
 class Exposure:
-    """Takes frames of the atoms.
-
-    Args:
-        grid: The grid of sites.
-        settings: Losses and image.
-        seed: Seed of the machine's own disorder.
-    """
+    """Takes frames of the atoms."""
 
     def __init__(self, grid: SiteGrid, settings: SimulationSettings, seed: int) -> None:
         self._settings = settings
@@ -179,19 +154,6 @@ class Exposure:
         self._seed = seed
         self._images: dict[SensorMode, Images] = {}
         self._light_hz = -math.log1p(-settings.imaging_loss) / settings.imaging_loss_exposure
-
-    @property
-    def sensor_shape(self) -> tuple[int, int]:
-        """(height, width) of the sensor in pixels."""
-        return self._settings.image.frame
-
-    def readout_fraction(self, mode: SensorMode) -> float:
-        """Time to read a frame, relative to that of the whole sensor without binning.
-
-        Raises:
-            LimitError: The sensor has no such mode.
-        """
-        return View.of(self._settings.image, mode).readout_fraction
 
     def prepare(self, mode: SensorMode) -> None:
         """Compute what all frames of a mode have in common.

@@ -84,12 +84,6 @@ def envelope(spans: Sequence[RfSpan], start_s: float, end_s: float, band: Band) 
 
     Samples are filtered by one Fourier transform of the whole interval; tones are
     added up directly. The band's edges are soft.
-
-    Args:
-        spans: What the output played, in order of time, all samples at one rate.
-        start_s: Start of the interval.
-        end_s: Its end.
-        band: The AOD's band.
     """
     sampled = [span for span in spans if isinstance(span, RfSamples)]
     if sampled:
@@ -196,11 +190,6 @@ class Tracks:
 def check_resolvable(grid: SiteGrid, motion: MotionSpec, transit_s: float) -> None:
     """Check that :func:`track_tones` can resolve the tones; otherwise atoms would be lost in the analysis.
 
-    Args:
-        grid: The grid, with the tones of its sites.
-        motion: The speed.
-        transit_s: Time that the sound takes to cross the beam.
-
     Raises:
         LimitError: The tones of two neighbours are too close, or move too fast.
     """
@@ -262,12 +251,7 @@ def track_tones(
 
 
 class _Spectra:
-    """Spectra of the acoustic wave inside the beam, frame by frame.
-
-    Args:
-        values: The envelope of an output.
-        transit: The transit time, in samples of the envelope.
-    """
+    """Spectra of the acoustic wave inside the beam, frame by frame."""
 
     def __init__(self, values: NDArray[np.complex64], transit: float) -> None:
         from scipy import fft
@@ -336,11 +320,7 @@ class PulseReceiver:
         self._cut_s = -math.inf
 
     def receive_until(self, until_s: float) -> Iterator[RfPulse]:
-        """The pulses played until a time; the last one is cut off there if it has not ended.
-
-        Args:
-            until_s: The time; later output is left for the next call.
-        """
+        """The pulses played until a time; the last one is cut off there if it has not ended."""
         played = self._source.played(until_s)
         cut_s, self._cut_s = self._cut_s, until_s
         times = [times for spans in played for span in spans for times in active_spans(span)]

@@ -36,12 +36,7 @@ class CountDistribution:
 
     @classmethod
     def of(cls, probability: NDArray[np.float64], first: int = 0) -> CountDistribution:
-        """Tabulate a distribution.
-
-        Args:
-            probability: float64 (n,), probability of ``first``, ``first`` + 1, ...; need not add up to 1.
-            first: The smallest number.
-        """
+        """Tabulate the probabilities (n,) of ``first``, ``first`` + 1, ...; they need not add up to 1."""
         from labseq_virtual import image_kernels as kernels
 
         below = np.cumsum(np.maximum(probability, 0.0))
@@ -150,10 +145,6 @@ class Register:
         Exact up to N_ONE_BY_ONE electrons. For more, the electrons added by the stages are drawn from a
         negative binomial distribution with the exact mean and variance, which is exact in the limit of
         many stages.
-
-        Args:
-            n_electrons: int64 (n,).
-            rng: Random numbers.
 
         Returns:
             int64 (n,), electrons out.
@@ -284,9 +275,6 @@ class Emccd:
     register; then follow read noise, offset and an analogue-to-digital converter of 16 bit. Pixels
     without an atom's light share one distribution, which is computed once for an exposure time and
     drawn from a table; for the others each step is drawn.
-
-    Args:
-        settings: Constants of the camera, and how it is read.
     """
 
     quantum_efficiency: Final = 1.0
@@ -309,16 +297,7 @@ class Emccd:
     def read(
         self, light: NDArray[np.int32], exposure_s: float, rng: np.random.Generator
     ) -> NDArray[np.uint16]:
-        """Draw the counts of a frame.
-
-        Args:
-            light: int32 (height, width), photoelectrons of the atoms on each pixel.
-            exposure_s: Exposure time, in seconds.
-            rng: Random numbers of the shot.
-
-        Returns:
-            uint16 (height, width).
-        """
+        """Counts, uint16, from the photoelectrons of atoms on each pixel, int32 (height, width)."""
         dark_electrons = self._dark_electrons(exposure_s)
         dark = _dark_counts(self.register, self._output, dark_electrons)
         image = np.empty(light.size, np.uint16)
@@ -379,10 +358,6 @@ class Qcmos:
 
     Photoelectrons and dark current fill the pixel's well; its own gain, read noise and offset follow,
     then an analogue-to-digital converter of 16 bit. Pixels are binned after that.
-
-    Args:
-        settings: Constants of the camera, and how it is read.
-        rng: Random numbers of the machine, for the differences from pixel to pixel.
     """
 
     binning: Final = 1
@@ -400,16 +375,7 @@ class Qcmos:
     def read(
         self, light: NDArray[np.int32], exposure_s: float, rng: np.random.Generator
     ) -> NDArray[np.uint16]:
-        """Draw the counts of a frame.
-
-        Args:
-            light: int32, photoelectrons of the atoms on each pixel of the part that is read.
-            exposure_s: Exposure time, in seconds.
-            rng: Random numbers of the shot.
-
-        Returns:
-            uint16 (height, width), binned.
-        """
+        """Counts, uint16, binned, from the photoelectrons of atoms on each pixel, int32 (height, width)."""
         adu_per_electron, read_noise, offset = self._pixels
         electrons = np.empty(light.shape, np.int32)
         _poisson(self._dark_electrons(exposure_s)).draw(electrons.ravel(), rng)

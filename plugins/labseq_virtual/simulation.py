@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import importlib
 import math
-from collections import Counter, deque
-from collections.abc import Callable, Mapping, Sequence
-from itertools import pairwise
+from collections import Counter
+from collections.abc import Callable, Mapping
 from typing import Any, Final, cast
 
 import numpy as np
@@ -14,192 +13,31 @@ from numpy.typing import NDArray
 
 from labseq.plugin import (
     WHOLE_SENSOR,
-    ConfigError,
     Context,
     DepthRamp,
     DeviceError,
     Frame,
     LimitError,
     LineProgram,
-    LineSpec,
     Occupancy,
     RandomStream,
     RfSource,
     SensorMode,
     Signal,
     Simulation,
-    SiteGrid,
     ToneProgram,
     ToneSource,
     TweezerAmplitudes,
 )
 from labseq_virtual.flight import RfTransport
 from labseq_virtual.images import Exposure
+from labseq_virtual.lights import Lights
 from labseq_virtual.rf_analysis import PulseReceiver
-from labseq_virtual.settings import LightSettings, SimulationSettings
-from labseq_virtual.transport import CAUSES, RunningProgram, TonePositions, Transport
-
-N_REMEMBERED: Final = 8
-"""Number of line programs kept; an event needs the last one or two."""
-
-
-class Lights:
-    """Which light is on, given the programs of the lines; without lines, all light is always on.
-
-    Args:
-        settings: Which lines each kind of light needs.
-        specs: The lines of the profile.
-
-    Raises:
-        ConfigError: The settings name a line that the profile does not have.
-    """
-
-    def __init__(self, settings: LightSettings, specs: Sequence[LineSpec]) -> None:
-        names = [spec.name for spec in specs]
-        self._needs = {kind: getattr(settings, kind) for kind in LightSettings.model_fields}
-        for kind, needed in self._needs.items():
-            if names and (missing := [name for name in needed if name not in names]):
-                known = ", ".join(f"'{name}'" for name in names)
-                raise ConfigError(f"`lights.{kind}` names a line '{missing[0]}'; the profile has {known}")
-        self._triggers = {spec.name: spec.triggers for spec in specs if spec.triggers}
-        self._wires: dict[str, Callable[[float], object]] = {}
-        self._played: deque[tuple[float, LineProgram]] = deque(maxlen=N_REMEMBERED)
-
-    def reset(self) -> None:
-        """Forget all programs: all light is on until the lines play again."""
-        self._played.clear()
-        self._wires.clear()
-
-    def wire(self, role: str, on_edge: Callable[[float], object]) -> None:
-        """Call ``on_edge`` at every later edge of the line that triggers a role."""
-        self._wires[role] = on_edge
-
-    def switch(self, program: LineProgram, t_start_s: float) -> None:
-        """Start a program, which ends the one before, and trigger the devices wired to its lines."""
-        self._played.append((t_start_s, program))
-        edges = [
-            (t_start_s + t_s, role) for line, role in self._triggers.items() for t_s in program.rising(line)
-        ]
-        for t_s, role in sorted(edges):
-            if role in self._wires:
-                self._wires[role](t_s)
-
-    def fraction_on(self, kind: str, start_s: float, end_s: float) -> float:
-        """Fraction of an interval during which a kind of light is on, that is, all its lines are.
-
-        Args:
-            kind: "loading", "cooling" or "imaging".
-            start_s: Start on the session's clock.
-            end_s: End; not before the start.
-        """
-        needed = self._needs[kind]
-        if not self._played or not needed:
-            return 1.0
-        if end_s <= start_s:
-            return float(self._all_on(needed, start_s))
-        edges = [start_s, *(t for t in self._edges() if start_s < t < end_s), end_s]
-        on_s = sum(b - a for a, b in pairwise(edges) if self._all_on(needed, (a + b) / 2))
-        return on_s / (end_s - start_s)
-
-    def _edges(self) -> list[float]:
-        return sorted({t_start_s + t for t_start_s, program in self._played for t in program.t_s.tolist()})
-
-    def _all_on(self, names: Sequence[str], t_s: float) -> bool:
-        """Whether the last program that began before ``t_s`` has all these lines on at that time."""
-        before = [(start_s, program) for start_s, program in self._played if start_s <= t_s]
-        if not before:
-            return False
-        start_s, program = before[-1]
-        edge = int((program.t_s <= t_s - start_s).sum()) - 1
-        return all(bool(program.on[edge, program.lines.index(name)]) for name in names)
-
-
-Floats = NDArray[np.float64]
-
-
-class StaticArray:
-    """Depths of the static tweezers, as fractions of the nominal depth.
-
-    At full power the depth of a site is the product of the powers of its row tone and its column tone, of
-    the AODs' response to these tones (``tone_response``), and of the site's own disorder
-    (``depth_disorder``), which no choice of amplitudes corrects. The power of a tone is proportional to its
-    amplitude squared; equal amplitudes that add up to full scale give the nominal depth.
-
-    Args:
-        grid: The grid of sites.
-        settings: The constants.
-    """
-
-    def __init__(self, grid: SiteGrid, settings: SimulationSettings) -> None:
-        self._grid, self._settings = grid, settings
-        self._site: Floats = np.ones(grid.shape)
-        self._response: tuple[Floats, Floats] = np.ones(grid.n_rows), np.ones(grid.n_cols)
-        self._power: tuple[Floats, Floats] = self._response
-        self._level = 0.0
-        self._source: ToneSource | None = None
-
-    def draw(self, random: np.random.Generator) -> None:
-        """Draw the machine's disorder; the light is off, the amplitudes are equal."""
-        n_rows, n_cols = self._grid.shape
-        disorder = random.standard_normal((n_rows, n_cols))
-        self._site = np.maximum(0.0, 1.0 + self._settings.depth_disorder * disorder)
-        row, col = (
-            np.exp(self._settings.tone_response * random.standard_normal(n)) for n in (n_rows, n_cols)
-        )
-        self._response = row, col
-        self._power = np.ones(n_rows), np.ones(n_cols)
-        self._level = 0.0
-
-    @property
-    def depth(self) -> Floats:
-        """Depth of each site now, float64 (n_rows, n_cols)."""
-        rows, cols = (power * response for power, response in zip(self._power, self._response, strict=True))
-        return self._level * self._site * rows[:, None] * cols
-
-    def holds(self) -> NDArray[np.bool_]:
-        """Which sites are deep enough to hold an atom, bool (n_rows, n_cols)."""
-        return self.depth >= self._settings.lost_below_depth
-
-    def switch_off(self) -> None:
-        """Turn the light off and disconnect the outputs."""
-        self._level = 0.0
-        self._source = None
-
-    def connect_outputs(self, source: ToneSource) -> None:
-        """From now on the depths follow what these outputs play."""
-        rows, cols = self._grid.shape
-        self.drive(TweezerAmplitudes(np.zeros(rows), np.zeros(cols)))
-        self._source, self._level = source, 1.0
-
-    def receive_until(self, until_s: float, occupied: NDArray[np.bool_]) -> int:
-        """Apply the output played until a time; atoms in tweezers that become too shallow leave ``occupied``.
-
-        Returns:
-            Number of atoms lost.
-        """
-        before = np.count_nonzero(occupied)
-        for amplitudes in () if self._source is None else self._source.played(until_s):
-            self.drive(amplitudes)
-            occupied &= self.holds()
-        return int(before - np.count_nonzero(occupied))
-
-    def drive(self, amplitudes: TweezerAmplitudes) -> None:
-        """Set the amplitudes of the tones."""
-        rows, cols = amplitudes.row, amplitudes.column
-        self._power = (rows * len(rows)) ** 2, (cols * len(cols)) ** 2
-
-    def ramp(self, ramp: DepthRamp, occupied: NDArray[np.bool_]) -> int:
-        """Change the depth; atoms in tweezers that become too shallow leave ``occupied``.
-
-        Returns:
-            Number of atoms lost.
-        """
-        before = np.count_nonzero(occupied)
-        for level in (ramp.start, ramp.end):
-            self._level = level
-            occupied &= self.holds()
-        return int(before - np.count_nonzero(occupied))
-
+from labseq_virtual.sensors import View
+from labseq_virtual.settings import SimulationSettings
+from labseq_virtual.static_array import StaticArray
+from labseq_virtual.tone_positions import TonePositions
+from labseq_virtual.transport import CAUSES, RunningProgram, Transport
 
 ROUNDING_S: Final = 1e-6
 """Tolerance for events out of order, in seconds: sums of times are rounded."""
@@ -216,10 +54,6 @@ class VirtualSimulation(Simulation):
     (``transport.py``). Or the driver connects its RF outputs: the simulation finds the tones in the samples
     that were played and integrates the motion of the atoms in that light (``flight.py``). Static tweezers
     likewise either pass their ramps, or connect outputs whose tones are measured.
-
-    Args:
-        settings: Every constant of the model.
-        context: Grid, clock and random numbers.
     """
 
     def __init__(self, settings: SimulationSettings, context: Context) -> None:
@@ -242,11 +76,11 @@ class VirtualSimulation(Simulation):
     @property
     def sensor_shape(self) -> tuple[int, int]:
         """(height, width) of the sensor in pixels."""
-        return self._exposure.sensor_shape
+        return self._settings.image.frame
 
     def readout_fraction(self, mode: SensorMode) -> float:
         """Time to read a frame, relative to that of the whole sensor without binning."""
-        return self._exposure.readout_fraction(mode)
+        return View.of(self._settings.image, mode).readout_fraction
 
     def prepare_sensor(self, mode: SensorMode) -> None:
         """Compute what all frames of a mode have in common, and load the kernels."""

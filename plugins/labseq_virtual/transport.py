@@ -31,93 +31,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.plugin import FrequencyCourse, LimitError, MotionSpec, SiteGrid, ToneProgram
+from labseq.plugin import FrequencyCourse, MotionSpec, SiteGrid, ToneProgram
 from labseq_virtual.handover import constants, full_amplitudes, merging_distance, tone_table
-from labseq_virtual.settings import MobileLightSettings, SimulationSettings
+from labseq_virtual.settings import SimulationSettings
+from labseq_virtual.tone_positions import TonePositions
 
 Floats = NDArray[np.float64]
-
-BEYOND: Final = 1000
-"""Sites beyond the grid to which the frequency map is extended on each side."""
-
-
-class FrequencyMap:
-    """Frequency -> position along an axis, in sites; extrapolated beyond the grid with the outermost step.
-
-    Args:
-        frequency_hz: float64 (n_sites,), rising or falling.
-        lone_step_hz: Step to assume if there is only one site.
-        axis: "row" or "column", for the error message.
-
-    Raises:
-        LimitError: The frequencies neither all rise nor all fall.
-    """
-
-    def __init__(self, frequency_hz: Floats, lone_step_hz: float, axis: str) -> None:
-        steps = np.diff(frequency_hz)
-        if not (np.all(steps > 0) or np.all(steps < 0)):
-            raise LimitError(
-                f"the {axis} frequencies of the grid", "out of order", "frequencies that all rise or all fall"
-            )
-        first, last = (steps[0], steps[-1]) if len(steps) else (lone_step_hz, lone_step_hz)
-        ends = frequency_hz[0] - BEYOND * first, frequency_hz[-1] + BEYOND * last
-        hz = np.concatenate([ends[:1], frequency_hz, ends[1:]])
-        n_sites = len(frequency_hz)
-        sites = np.concatenate([[-BEYOND], np.arange(n_sites), [n_sites - 1 + BEYOND]])
-        rising = hz[-1] > hz[0]
-        self._hz, self._sites = (hz, sites) if rising else (hz[::-1], sites[::-1])
-
-    def sites(self, frequency_hz: Floats) -> Floats:
-        """Positions of tones, in sites from the first row or column."""
-        return np.interp(frequency_hz, self._hz, self._sites)
-
-
-class TonePositions:
-    """The true positions of row and column tones, with the errors that a calibration has to find.
-
-    The grid says where each tone is intended to be. The true position differs by a common offset, a
-    magnification, and an error of each tone (``settings.py``, ``mobile_light``).
-
-    Args:
-        grid: The grid of sites, with the intended frequencies before any calibration.
-        light: The errors.
-    """
-
-    def __init__(self, grid: SiteGrid, light: MobileLightSettings) -> None:
-        steps = np.concatenate([np.diff(grid.row_frequency_hz), np.diff(grid.column_frequency_hz)])
-        lone_step_hz = float(steps.mean()) if len(steps) else 1.6e6
-        self._maps = (
-            FrequencyMap(grid.row_frequency_hz, lone_step_hz, "row"),
-            FrequencyMap(grid.column_frequency_hz, lone_step_hz, "column"),
-        )
-        self._spacing_m = grid.spacing_m
-        self._light = light
-        along_row, from_row_to_row = light.offset
-        centres = [(n - 1) / 2 for n in grid.shape]
-        self._errors = [
-            offset / grid.spacing_m + light.magnification_error * (np.arange(n) - centre)
-            for offset, n, centre in zip((from_row_to_row, along_row), grid.shape, centres, strict=True)
-        ]
-        self._known = [error.copy() for error in self._errors]
-
-    def draw(self, random: np.random.Generator) -> None:
-        """Draw the errors of the tones from the machine's random numbers."""
-        for axis, known in enumerate(self._known):
-            scatter = random.standard_normal(len(known)) * self._light.tone_error / self._spacing_m
-            self._errors[axis] = known + scatter
-
-    def intended(self, axis: int, frequency_hz: Floats) -> Floats:
-        """Intended positions of tones of the rows (axis 0) or columns (axis 1), in sites."""
-        return self._maps[axis].sites(frequency_hz)
-
-    def actual(self, axis: int, frequency_hz: Floats) -> Floats:
-        """True positions of tones of the rows (axis 0) or columns (axis 1), in sites."""
-        intended, errors = self._maps[axis].sites(frequency_hz), self._errors[axis]
-        if not errors.any():
-            return intended
-        return intended + np.interp(intended, np.arange(len(errors)), errors)
-
-
 Mask = NDArray[np.bool_]
 
 CAUSES: Final[tuple[str, ...]] = ("hand_over", "transport", "collision", "ejected", "program")
@@ -152,14 +71,7 @@ class RunningProgram:
 
 
 class Transport:
-    """Moves atoms according to tone programs.
-
-    Args:
-        grid: The grid of sites, with its frequencies.
-        motion: The RF chain: the amplitudes that give the full depth.
-        settings: Tolerances and losses.
-        positions: Where the tones put their light; by default without errors of the tones.
-    """
+    """Moves atoms according to tone programs."""
 
     def __init__(
         self,

@@ -92,10 +92,6 @@ class VirtualMobileTweezers(VirtualDriver, MobileTweezers):
     A program is refused before it plays if it leaves the AOD's band or would clip.
     Each ``play`` needs its own ``prepare``, so no program is replayed by mistake.
     ``safe_state`` stops a program early: atoms in flight are lost.
-
-    Args:
-        settings: The limits.
-        context: Grid, clock and the simulation.
     """
 
     def __init__(self, settings: MobileTweezersSettings, context: Context) -> None:
@@ -260,10 +256,6 @@ class VirtualStaticTweezers(VirtualDriver, StaticTweezers):
     """The static array of the simulation.
 
     Depths in the simulation follow the amplitudes of the tones, ``start`` and ``ramp``.
-
-    Args:
-        settings: Limits.
-        context: Grid, clock and the simulation.
     """
 
     def __init__(self, settings: StaticTweezersSettings, context: Context) -> None:

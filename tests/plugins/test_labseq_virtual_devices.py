@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from labseq_virtual.camera import VirtualCamera
 from labseq_virtual.devices import VirtualDevice, VirtualLines, VirtualSpotMeter
+from labseq_virtual.lights import Lights
 from labseq_virtual.settings import (
     CameraSettings,
     DeviceSettings,
@@ -23,7 +24,7 @@ from labseq_virtual.settings import (
     SpotMeterSettings,
     StaticTweezersSettings,
 )
-from labseq_virtual.simulation import Lights, VirtualSimulation
+from labseq_virtual.simulation import VirtualSimulation
 from labseq_virtual.tweezers import VirtualMobileTweezers, VirtualStaticTweezers
 
 import labseq

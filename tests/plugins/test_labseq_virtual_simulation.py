@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 from labseq_virtual.settings import SimulationSettings
-from labseq_virtual.simulation import StaticArray, VirtualSimulation
+from labseq_virtual.simulation import VirtualSimulation
+from labseq_virtual.static_array import StaticArray
 from labseq_virtual.tweezers import SILENCE
 
 from labseq.model import AxisTones

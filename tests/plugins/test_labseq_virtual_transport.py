@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 from labseq_virtual.settings import SimulationSettings
-from labseq_virtual.transport import FrequencyMap, TonePositions, Transport
+from labseq_virtual.tone_positions import FrequencyMap, TonePositions
+from labseq_virtual.transport import Transport
 from numpy.typing import NDArray
 
 from labseq import Batch, LimitError, MotionSpec, Plan, SiteGrid, check_plan, tone_program

@@ -1,0 +1,75 @@
+"""Which light is on at which time, as the lines switch it."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from typing import Final
+
+from labseq.plugin import ConfigError, LineProgram, LineSpec
+from labseq_virtual.settings import LightSettings
+
+N_REMEMBERED: Final = 8
+"""Number of line programs kept; an event needs the last one or two."""
+
+
+class Lights:
+    """Which light is on, given the programs of the lines; without lines, all light is always on.
+
+    Raises:
+        ConfigError: The settings name a line that the profile does not have.
+    """
+
+    def __init__(self, settings: LightSettings, specs: Sequence[LineSpec]) -> None:
+        names = [spec.name for spec in specs]
+        self._needs = {kind: getattr(settings, kind) for kind in LightSettings.model_fields}
+        for kind, needed in self._needs.items():
+            if names and (missing := [name for name in needed if name not in names]):
+                known = ", ".join(f"'{name}'" for name in names)
+                raise ConfigError(f"`lights.{kind}` names a line '{missing[0]}'; the profile has {known}")
+        self._triggers = {spec.name: spec.triggers for spec in specs if spec.triggers}
+        self._wires: dict[str, Callable[[float], object]] = {}
+        self._played: deque[tuple[float, LineProgram]] = deque(maxlen=N_REMEMBERED)
+
+    def reset(self) -> None:
+        """Forget all programs: all light is on until the lines play again."""
+        self._played.clear()
+        self._wires.clear()
+
+    def wire(self, role: str, on_edge: Callable[[float], object]) -> None:
+        """Call ``on_edge`` at every later edge of the line that triggers a role."""
+        self._wires[role] = on_edge
+
+    def switch(self, program: LineProgram, t_start_s: float) -> None:
+        """Start a program, which ends the one before, and trigger the devices wired to its lines."""
+        self._played.append((t_start_s, program))
+        edges = [
+            (t_start_s + t_s, role) for line, role in self._triggers.items() for t_s in program.rising(line)
+        ]
+        for t_s, role in sorted(edges):
+            if role in self._wires:
+                self._wires[role](t_s)
+
+    def fraction_on(self, kind: str, start_s: float, end_s: float) -> float:
+        """Fraction of an interval during which a kind of light is on, that is, all its lines are."""
+        needed = self._needs[kind]
+        if not self._played or not needed:
+            return 1.0
+        if end_s <= start_s:
+            return float(self._all_on(needed, start_s))
+        edges = [start_s, *(t for t in self._edges() if start_s < t < end_s), end_s]
+        on_s = sum(b - a for a, b in pairwise(edges) if self._all_on(needed, (a + b) / 2))
+        return on_s / (end_s - start_s)
+
+    def _edges(self) -> list[float]:
+        return sorted({t_start_s + t for t_start_s, program in self._played for t in program.t_s.tolist()})
+
+    def _all_on(self, names: Sequence[str], t_s: float) -> bool:
+        """Whether the last program that began before ``t_s`` has all these lines on at that time."""
+        before = [(start_s, program) for start_s, program in self._played if start_s <= t_s]
+        if not before:
+            return False
+        start_s, program = before[-1]
+        edge = int((program.t_s <= t_s - start_s).sum()) - 1
+        return all(bool(program.on[edge, program.lines.index(name)]) for name in names)
