@@ -59,17 +59,7 @@ def with_phase_jump(program: ToneProgram, segment: int, size_rad: float) -> Tone
     column = program.column
     phase_rad = column.phase_rad.copy()
     phase_rad[column.offsets[segment] :] += size_rad
-    return replace(
-        program,
-        column=AxisTones(
-            column.offsets,
-            column.start_hz,
-            column.end_hz,
-            column.start_amplitude,
-            column.end_amplitude,
-            phase_rad,
-        ),
-    )
+    return replace(program, column=replace(column, phase_rad=phase_rad))
 
 
 PROGRAM_GRID = SiteGrid(5, 6)

@@ -45,8 +45,14 @@ class Wait(Generic[D]):
     wait: Action[D]
 
 
-class HardwareContractBase(Generic[D]):
-    """The calls, states and waits of a role, as the promises of all roles use them.
+ALWAYS_SAFE: Final = "safe_state() is legal in every state, and twice"
+
+
+class HardwareContract(Generic[D]):
+    """Promises of every camera, tweezer driver and instrument.
+
+    Inherit the suite of the role, not this one, and provide the fixture ``factory``. A role says what its
+    calls, states and waits are.
 
     Attributes:
         role: Name that the device has in the profile.
@@ -150,45 +156,6 @@ class HardwareContractBase(Generic[D]):
             if isinstance(context.clock, FakeClock):
                 context.clock.stop.request()
             raise
-
-
-def close_quietly(device: Hardware) -> None:
-    """Close a device and ignore errors; the promises of close() have their own tests."""
-    with suppress(Exception):
-        device.close()
-
-
-def _stay(device: object) -> None:
-    """Do nothing: the device has been opened already."""
-    del device
-
-
-def begin_shot(context: Context) -> None:
-    """Begin a shot of the simulation, if there is one, as the sequencer does."""
-    if context.simulation is not None:
-        context.simulation.begin_shot()
-
-
-def n_calls(context: Context) -> int:
-    """Number of calls of the simulation; 0 for one that does not record them."""
-    simulation = context.simulation
-    return len(simulation.calls) if isinstance(simulation, RecordingSimulation) else 0
-
-
-__all__ = ["Action", "Factory", "HardwareContract", "Wait", "n_calls"]
-
-ALWAYS_SAFE: Final = "safe_state() is legal in every state, and twice"
-
-
-class HardwareContract(HardwareContractBase[D]):
-    """Promises of every camera, tweezer driver and instrument.
-
-    Inherit the suite of the role, not this one, and provide the fixture ``factory``.
-
-    Attributes:
-        role: Name that the device has in the profile.
-        max_wait_s: Real time after which a call counts as hung, in seconds.
-    """
 
     @promise("the constructor does no I/O and changes no shared state")
     def test_constructor_does_no_io(self, factory: Factory[D]) -> None:
@@ -331,3 +298,26 @@ def _safe_twice(device: Hardware, state: str) -> None:
     for count in ("once", "twice"):
         with doing(f"safe_state() {state}, {count}"):
             device.safe_state()
+
+
+def close_quietly(device: Hardware) -> None:
+    """Close a device and ignore errors; the promises of close() have their own tests."""
+    with suppress(Exception):
+        device.close()
+
+
+def _stay(device: object) -> None:
+    """Do nothing: the device has been opened already."""
+    del device
+
+
+def begin_shot(context: Context) -> None:
+    """Begin a shot of the simulation, if there is one, as the sequencer does."""
+    if context.simulation is not None:
+        context.simulation.begin_shot()
+
+
+def n_calls(context: Context) -> int:
+    """Number of calls of the simulation; 0 for one that does not record them."""
+    simulation = context.simulation
+    return len(simulation.calls) if isinstance(simulation, RecordingSimulation) else 0

@@ -471,10 +471,9 @@ class RecordingDevice(RecordingHardware):
         calls: Calls | None = None,
         *,
         commands: tuple[str, ...] = ("on", "off"),
-        fail_on: Mapping[str, Failure] | None = None,
-        hang_on: Mapping[str, Hang] | None = None,
+        **faults: Any,
     ) -> None:
-        super().__init__(context, calls, fail_on=fail_on, hang_on=hang_on)
+        super().__init__(context, calls, **faults)
         self.commands = commands
         self.values: dict[str, Any] = {"state": "off"}
 
