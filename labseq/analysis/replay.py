@@ -125,7 +125,7 @@ class ReplayedImages:
             appeared, vanished = seen & ~image.occupancy, image.occupancy & ~seen
             self.appeared += appeared
             self.vanished += vanished
-            is_known = truth is not None and i == len(images) - 1
+            is_last = i == len(images) - 1
             self.images.append(
                 ReplayedImage(
                     shot=shot.index,
@@ -136,7 +136,7 @@ class ReplayedImages:
                     n_vanished=int(np.count_nonzero(vanished)),
                     confidence=float(np.mean(image.confidence)),
                     confidence_replayed=certainty,
-                    n_atoms_true=int(truth) if is_known else None,
+                    n_atoms_true=int(truth) if is_last and truth is not None else None,
                 )
             )
 

@@ -26,7 +26,8 @@ from labseq.errors import ConfigError, Problem
 from labseq.files import packaged_profiles_dir
 from labseq.messages import clean, visible
 from labseq.plugins import PluginHost
-from labseq.scaffold.schemas import FileKind, refresh_schemas, schema_path, write_schema
+from labseq.registry import Registry
+from labseq.scaffold.schemas import KINDS as FILE_KINDS, FileKind, schema_path, write_schema
 from labseq.session.chosen import load_plugins
 
 MAX_LENGTH: Final = 40
@@ -104,8 +105,15 @@ def make_plugin(kind: str, name: str, folder: Path, *, package: bool = False) ->
         texts |= {"pyproject.toml": read_template("pyproject.txt"), f"{source}py.typed": ""}
     with _reporting(path):
         made = _write_folder(path, {fill(file, words): fill(text, words) for file, text in texts.items()})
-        schemas = refresh_schemas(folder, _plugins_of(folder).registry)
+        schemas = _refresh_schemas(folder)
     return CreatedFiles(path, (*made, *schemas), _needed(commands, folder))
+
+
+def _refresh_schemas(folder: Path) -> list[Path]:
+    """Write again the schemas that a folder has, because there are other plugins now."""
+    kinds = [kind for kind in FILE_KINDS if schema_path(kind, folder).is_file()]
+    registry = _plugins_of(folder).registry if kinds else Registry()
+    return [write_schema(kind, folder, registry) for kind in kinds]
 
 
 def _needed(commands: list[str], folder: Path) -> tuple[str, ...]:

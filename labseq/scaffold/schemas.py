@@ -69,15 +69,6 @@ def write_schema(kind: FileKind, folder: Path, registry: Registry) -> Path:
     return path
 
 
-def refresh_schemas(folder: Path, registry: Registry) -> list[Path]:
-    """Write again the schemas that a folder has, because there are other plugins now.
-
-    Raises:
-        OSError: One cannot be written.
-    """
-    return [write_schema(kind, folder, registry) for kind in KINDS if schema_path(kind, folder).is_file()]
-
-
 def file_schema(kind: FileKind, registry: Registry) -> JsonSchema:
     """The schema of a kind of file."""
     return _FileSchema(registry).sequence() if kind == "sequence" else _FileSchema(registry).profile()

@@ -5,8 +5,6 @@ from __future__ import annotations
 import re
 import shlex
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,6 +12,7 @@ import pytest
 
 import labseq
 from labseq.cli import main
+from tests.nested import run_pytest
 
 ROOT = Path(__file__).parents[2]
 PLANNER, CAMERA = "docs/tutorials/planner.md", "docs/tutorials/camera-driver.md"
@@ -41,11 +40,6 @@ def run(lines: list[str]) -> None:
         else:
             assert program in ("pytest", "pip")
             assert Path(words[-1]).is_dir(), line
-
-
-def run_pytest(*arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "pytest", "-q", "-n0", "-p", "no:cacheprovider", *arguments]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
 def test_the_first_run_can_be_read_back_as_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -84,13 +78,14 @@ def test_the_planners_of_the_tutorial(
     warned = capsys.readouterr().err  # `mine` leaves much unfilled, as the page says
     assert re.fullmatch(r"warning: .* loadings allow to fill the target;.*\n.*\n.*\n", warned)
     some = "returns_a_plan or fills_the_target or refuses_wrong_input or order"  # the others take long
-    monkeypatch.setenv("PYTHONPATH", "labseq-helix/src")
-    tested = run_pytest("-k", some, "plugins/spiral", "test_mine.py", "labseq-helix/tests")
-    assert tested.returncode == 0, tested.stdout
-    assert "13 passed" in tested.stdout
+    code, out = run_pytest(capsys, "-k", some, "plugins/spiral", "test_mine.py", "labseq-helix/tests")
+    assert code == 0, out
+    assert "13 passed" in out
 
 
-def test_the_promise_that_the_tutorial_breaks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_promise_that_the_tutorial_breaks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.chdir(tmp_path)
     run(["labseq new planner spiral"])
     lines, said = blocks(PLANNER, "text")
@@ -98,9 +93,9 @@ def test_the_promise_that_the_tutorial_breaks(tmp_path: Path, monkeypatch: pytes
     text = planner.read_text()
     assert lines in text
     planner.write_text(text.replace(lines, ""))
-    tested = run_pytest("-k", "fills_the_target", "plugins/spiral")
-    assert tested.returncode == 1
-    assert said in tested.stdout
+    code, out = run_pytest(capsys, "-k", "fills_the_target", "plugins/spiral")
+    assert code == 1
+    assert said in out
 
 
 def test_the_readme_shows_the_planner_of_the_tutorial() -> None:
@@ -117,8 +112,8 @@ def test_the_camera_driver_of_the_tutorial(
     assert {"acme.py", *(path.name for path in plugin.glob("*.py"))} == {*shown}
     for name in shown:
         shutil.copy(ROOT / "docs" / "tutorials" / "mycam" / name, plugin)
-    tested = run_pytest(commands(CAMERA, 1)[0].removeprefix("pytest "))
-    assert tested.returncode == 0, tested.stdout
+    code, out = run_pytest(capsys, commands(CAMERA, 1)[0].removeprefix("pytest "))
+    assert code == 0, out
     (camera,) = blocks(CAMERA, "text")
     profile = Path("mylab.yaml")
     text = profile.read_text()

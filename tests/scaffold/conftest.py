@@ -37,8 +37,8 @@ def name_of(kind: str) -> str:
 @pytest.fixture(scope="session")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Folder:
     folder = tmp_path_factory.mktemp("made")
-    sequence = make_file("sequence", "first", folder)
-    profile = make_file("profile", "mine", folder)
     plugins = {kind: make_plugin(kind, name_of(kind), folder) for kind in KINDS}
     package = make_plugin("planner", "packed", folder, package=True)
+    sequence = make_file("sequence", "first", folder)
+    profile = make_file("profile", "mine", folder)
     return Folder(folder, plugins, package, sequence, profile)

@@ -21,19 +21,13 @@ from labseq.config.document import Document
 from labseq.registry import KINDS
 from labseq.session import load_plugins
 from labseq.session.check import check
+from tests.nested import run_pytest
 
 
-def run(*command: str, cwd: Path, **environment: str) -> str:
-    done = subprocess.run(
-        [sys.executable, "-m", *command],
-        cwd=cwd,
-        capture_output=True,
-        text=True,
-        check=False,
-        env={**os.environ, **environment},
-    )
+def run(*command: str, cwd: Path) -> None:
+    command = (sys.executable, "-m", *command)
+    done = subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout
 
 
 def options_of(command: str) -> list[str]:
@@ -44,12 +38,13 @@ def options_of(command: str) -> list[str]:
     return words[4::2]
 
 
-def test_their_own_tests_pass(made: Any) -> None:
-    source = made.package.path / "src"
-    folders = ["plugins", str(made.package.path / "tests")]
-    out = run(
-        "pytest", "-q", "-n0", "-p", "no:cacheprovider", *folders, cwd=made.path, PYTHONPATH=str(source)
-    )
+def test_their_own_tests_pass(
+    made: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(made.path)
+    monkeypatch.syspath_prepend(made.package.path / "src")
+    code, out = run_pytest(capsys, "plugins", str(made.package.path / "tests"))
+    assert code == 0, out
     passed = re.search(r"(\d+) passed", out)
     assert passed is not None
     assert int(passed[1]) > 100  # promises of seven roles and more: none was left out
