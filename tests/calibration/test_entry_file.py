@@ -115,8 +115,3 @@ def test_what_is_no_entry_at_all_is_refused(tmp_path: Path, content: bytes) -> N
     path.write_bytes(content)
     with pytest.raises(ConfigError, match="this file is damaged"):
         read_entry(path)
-
-
-def test_a_missing_file_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="cannot be read: No such file"):
-        read_entry(tmp_path / "x.json")

@@ -130,15 +130,6 @@ def test_a_damaged_note_of_what_is_in_use_is_refused(store: Store, content: str)
     assert (store.folder / "active.json").read_text("utf-8") == content
 
 
-def test_a_note_that_leads_out_of_the_folder_is_refused(store: Store) -> None:
-    stored = store.add(overlay())
-    store.use(stored, GRID)
-    note = store.folder / "active.json"
-    note.write_text(note.read_text("utf-8").replace(stored.path.name, "../../else.json"), "utf-8")
-    with pytest.raises(ConfigError, match="outside of its folder"):
-        store.active()
-
-
 def test_a_file_in_the_way_of_the_folder_is_reported(store: Store) -> None:
     store.folder.parent.parent.mkdir(parents=True, exist_ok=True)
     store.folder.parent.write_text("x", "utf-8")

@@ -65,14 +65,6 @@ def test_errors_cost_at_most_a_fifth_more_than_at_the_best_thresholds(
     assert 0.6 * ours < expected < 1.6 * ours
 
 
-def test_sites_of_different_brightness_get_their_own_thresholds() -> None:
-    lab = Emccd(np.random.default_rng(1), spread=0.15)
-    found = fitted(lab.draw(300, 0.6))
-    ours, best = lab.cost(found.thresholds.ravel(), 3.0)
-    assert ours < 1.2 * best
-    assert np.corrcoef(found.thresholds.ravel(), lab.dark + lab.light)[0, 1] > 0.5
-
-
 def test_thresholds_of_calibrated_log_odds_are_minus_the_log_of_the_cost() -> None:
     """Two Gaussians of the same width, a distance d^2 apart: their log-odds are the signal itself."""
     rng, d = np.random.default_rng(2), 7.0

@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given, strategies as st
 
 from labseq.cli.arrays import (
-    ASCII,
     ATOM,
     DEFECT,
     DENSE,
@@ -18,7 +17,6 @@ from labseq.cli.arrays import (
     SURPLUS,
     UNICODE,
     draw_array,
-    scales,
     site_kinds,
 )
 from labseq.model import TargetPattern
@@ -81,8 +79,3 @@ def test_a_drawing_has_the_size_that_was_promised(n_rows: int, n_cols: int, shea
     width, height = scale.size(n_rows, n_cols, shear)
     assert len(lines) == height
     assert max(line.cell_len for line in lines) <= width
-
-
-def test_ascii_has_no_half_blocks() -> None:
-    assert HALF_BLOCKS in scales(UNICODE)
-    assert HALF_BLOCKS not in scales(ASCII)

@@ -2,10 +2,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import pytest
 from hypothesis import given, strategies as st
 
-from labseq.cli import main
 from labseq.cli.check import BAR_WIDTH, lines_table, timeline_table
 from labseq.model import TimelineEntry
 
@@ -54,27 +52,3 @@ def test_bars_follow_one_another_and_stay_in_their_column(durations_s: list[floa
     assert all(len(line) - first <= BAR_WIDTH for line in lines)
     starts = [line.index("#") for line in lines]
     assert starts == sorted(starts)
-
-
-def test_a_narrow_terminal_gets_no_bars() -> None:
-    assert not any("#" in line for line in timeline_table(TIMELINE, "#", 0))
-    assert (
-        max(map(len, timeline_table(TIMELINE, "#", 7)))
-        == len("1 image                   500 ms    45 ms  ") + 7
-    )
-
-
-@pytest.mark.parametrize(
-    "arguments", [["missing.yaml"], [SEQUENCE, "--set", "planner.speed=1"], [SEQUENCE, "-p", "x"]]
-)
-def test_wrong_input_is_the_users_mistake(
-    arguments: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit, match=r"^2$"):
-        main(["check", *arguments])
-    out, err = capsys.readouterr()
-    assert out == ""
-    assert err
-    assert "Traceback" not in err
-    assert "internal error" not in err

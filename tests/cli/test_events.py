@@ -69,17 +69,3 @@ def test_a_shot_as_text(fake: Any, changes: Any, words: str) -> None:
 def test_a_shot_that_was_interrupted_needs_no_reason(fake: Any) -> None:
     shot = fake.shot(0, status="interrupted", error="StopRequested: stopped by Ctrl-C")
     assert event_text("shot_finished", {"shot": shot}, fake.run()) == "shot 1/20  interrupted"
-
-
-def test_a_window_that_was_too_short(fake: Any) -> None:
-    values = {"shot": 0, "cycle": 2, "n_batches": 40, "n_batches_played": 12}
-    assert (
-        event_text("window_too_short", values, fake.run())
-        == "shot 1, cycle 2: 12 of 40 batches fit the window"
-    )
-
-
-def test_whom_a_run_waits_for(fake: Any) -> None:
-    values = {"shot": 0, "device": "leader", "signal": "go", "timeout_s": 60.0}
-    text = "shot 1: waiting for 'go' from leader, at most 60 s"
-    assert event_text("leader_awaited", values, fake.run()) == text

@@ -3,7 +3,6 @@ from __future__ import annotations
 import io
 import sys
 from dataclasses import replace
-from itertools import pairwise
 from typing import Any
 
 import pytest
@@ -179,17 +178,6 @@ def test_a_wide_terminal_shows_everything(fake: Any) -> None:
     assert lines[-3:] == RECENT
 
 
-def test_rows_are_sheared_as_on_the_array(fake: Any) -> None:
-    def left_edges(**grid: Any) -> list[int]:
-        lines = picture(tally_of(fake, fake.run(**grid)), 120, 30)
-        return [line.index("● ● ● ●") for line in lines if "● " * 14 + "●" in line]
-
-    right, left, square = left_edges(), left_edges(shear=-1), left_edges(lattice="square")
-    assert [b - a for a, b in pairwise(right)] == [1] * 14
-    assert [b - a for a, b in pairwise(left)] == [-1] * 14
-    assert len(set(square)) == 1
-
-
 @pytest.mark.parametrize(
     ("size", "drawn"),
     [((120, 30), "● ● ●"), ((80, 24), "●●●"), ((80, 16), "███"), ((70, 24), None)],
@@ -208,14 +196,6 @@ def test_on_real_hardware_there_is_one_clock(fake: Any) -> None:
     ):
         lines = picture(tally_of(fake, fake.run(simulated=simulated)), 120, 30)
         assert [line for line in lines if heads in " ".join(line.split())]
-
-
-def test_before_the_first_image_there_is_no_array(fake: Any) -> None:
-    tally = Tally(lambda: 0.0)
-    tally.add("run_starting", {"record": fake.run(), "run_dir": "x"})
-    text = "\n".join(picture(tally, 120, 30, recent=[]))
-    assert "0/20 shots" in text
-    assert "●" not in text
 
 
 def test_a_defect_and_a_surplus_atom_are_counted(fake: Any) -> None:

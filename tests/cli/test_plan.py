@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from rich.text import Text
 
-from labseq.cli.plan import PlanOutput, moves_text, plan_once, print_plan, title, totals, warnings
+from labseq.cli.plan import PlanOutput, moves_text, plan_once, print_plan, totals, warnings
 from labseq.model import Batch
 from labseq.session.planning import PlannedMoves, PlanRequest, plan_moves
 
@@ -76,13 +76,6 @@ def test_in_a_terminal_each_batch_waits_for_enter(
     assert "filled" in text
 
 
-def test_a_pipe_as_keyboard_does_not_wait(moves: PlannedMoves, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sys.stdin", io.StringIO(""))
-    text = printed(moves, Terminal(), step=True)
-    assert "Enter" not in text
-    assert f"batch {moves.plan.n_batches} of {moves.plan.n_batches}" in text
-
-
 @pytest.mark.parametrize("width", ["16", "80", "200"])
 def test_a_plan_fits_the_terminal(moves: PlannedMoves, monkeypatch: pytest.MonkeyPatch, width: str) -> None:
     monkeypatch.setenv("COLUMNS", width)
@@ -104,12 +97,6 @@ def test_move_words_name_every_line() -> None:
     ]
     column = Batch(np.array([(2, 1)], np.int16), np.array([(-1, 1)], np.int16))
     assert moves_text(column, (4, 5)) == ["column 1: row 2->ejected"]
-
-
-def test_the_title_of_a_picture(moves: PlannedMoves) -> None:
-    assert title(moves).startswith("psca, degree of parallelism 7: checkerboard 4 x 4, ")
-    nothing = plan_moves(PlanRequest("random:3x3@1", "compact:3x3", seed=1))
-    assert title(nothing).endswith("compact 3 x 3, 0 batches, 0 atom moves, 0 s")
 
 
 def test_what_falls_short_is_reported() -> None:

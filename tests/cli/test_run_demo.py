@@ -76,12 +76,6 @@ def test_copies_can_be_run_and_are_never_replaced(capsys: pytest.CaptureFixture[
     assert not Path("lab/sequences/kagome.yaml").exists()
 
 
-def test_a_folder_that_cannot_be_written_to() -> None:
-    Path("lab").touch()
-    with pytest.raises(ConfigError, match="cannot be written: "):
-        demo.copy_files(Path("lab"))
-
-
 @pytest.mark.parametrize(
     ("arguments", "printed"),
     [

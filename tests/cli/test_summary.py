@@ -92,10 +92,6 @@ def test_shots_that_cannot_be_read_are_named(unreadable: Sequence[int], printed:
     assert lines(unreadable=tuple(unreadable))["warning"] == printed
 
 
-def test_windows_that_were_too_short_are_reported() -> None:
-    assert lines(too_short=Rate(3, 20))["window"] == "too short in 3 of 20 (15.0 %)"
-
-
 def test_each_cycle_has_a_row() -> None:
     header, row, note = cycle_table(STATISTICS)
     assert header.split()[:3] == ["cycle", "shots", "defect-free"]

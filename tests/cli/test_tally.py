@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from labseq.cli.tally import StageTally, Tally
+from labseq.cli.tally import Tally
 from labseq.model import StageTiming
 from labseq.model.estimate import Estimate
 
@@ -47,13 +47,6 @@ def test_over_budget_is_counted() -> None:
     for duration_s in (59e-3, 60e-3, 62e-3):
         tally.add("stage", {"timing": StageTiming("move", 2, 1, 0.0, duration_s, 1e-3, 60e-3)})
     assert tally.stages["move"].n_over == 1
-
-
-def test_the_99th_percentile_is_nearly_the_longest() -> None:
-    stage = StageTally()
-    for i in range(1, 201):
-        stage.add(StageTiming("plan", 2, 1, 0.0, 0.0, i * 1e-3))
-    assert stage.p99_s() == pytest.approx(0.198)
 
 
 def test_time_left_follows_the_pace_so_far(fake: Any) -> None:

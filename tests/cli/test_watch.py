@@ -110,13 +110,6 @@ def test_lines_of_another_version_and_damaged_ones_are_passed_over(watched: Watc
     assert any(line.startswith("shot 1/3") for line in watched.watch())
 
 
-def test_a_shot_whose_file_is_gone_is_still_reported(watched: WatchedRun) -> None:
-    watched.take(0)
-    watched.writer.finish("complete")
-    next(watched.writer.run_dir.glob("shots/*.h5")).unlink()
-    assert any(line.startswith("shot 1/3") for line in watched.watch())
-
-
 def test_only_whole_lines_are_read_and_each_once(tmp_path: Path) -> None:
     tail = NewLines(tmp_path / "log")
     assert tail.read() == []

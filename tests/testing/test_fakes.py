@@ -1,19 +1,13 @@
 import threading
 
-import numpy as np
 import pytest
 
-from labseq.errors import DeviceError, StopRequested, TransientError
-from labseq.guard import Guard
-from labseq.model import Frame, Plan, TargetPattern
+from labseq.errors import StopRequested, TransientError
 from labseq.testing.fakes import (
     FakeClock,
     Hang,
     RecordingCamera,
     RecordingDevice,
-    RecordingObserver,
-    ScriptedDetector,
-    ScriptedPlanner,
     fake_lab,
 )
 
@@ -79,45 +73,6 @@ def test_a_call_that_does_not_exist_cannot_be_planned(call: str) -> None:
         fake_lab(fail_on={call: OSError()})
     with pytest.raises(ValueError, match=f"no fake has the call '{call}'"):
         fake_lab(hang_on={call})
-
-
-def test_a_lab_is_as_large_as_its_occupancies() -> None:
-    lab = fake_lab([np.zeros((2, 3)), np.ones((2, 3))], fill=[[1, 0, 0], [0, 0, 1]])
-    assert lab.grid.shape == (2, 3)
-    assert lab.target.n_atoms == 2
-    frame = Frame(np.zeros((4, 4), np.uint16), 0.045, 0.0)
-    seen = [int(lab.detector.detect(frame)[0].sum()) for _ in range(3)]
-    assert seen == [0, 6, 6]
-
-
-def test_an_image_taken_with_a_lab_is_what_the_test_scripted() -> None:
-    from labseq.model import ShotRecord
-    from labseq.sequencer.shot import RunningShot
-
-    lab = fake_lab([[[1, 0]], [[1, 1]]])
-    lab.camera.open()
-    observer = RecordingObserver()
-    shot = RunningShot(lab, Guard(lab.stop), ShotRecord(0, 0, 0, ""), observer.event)
-    assert shot.take_image(0.045).tolist() == [[True, False]]
-    assert shot.take_image(0.045).tolist() == [[True, True]]
-    assert shot.elapsed_s == pytest.approx(0.09)
-    assert lab.calls.names("camera")[1:4] == ["camera.arm", "camera.trigger", "camera.read"]
-    assert observer.names.count("image") == 2
-    assert [values["filling_fraction"] for values in observer.of("image")] == [0.5, 1.0]
-
-
-def test_deciders_follow_their_script() -> None:
-    plans = [Plan.from_batches([]), Plan.from_batches([([(0, 0)], [(0, 1)])])]
-    planner = ScriptedPlanner(plans)
-    target = TargetPattern(np.ones((1, 2), np.bool_), np.zeros((1, 2), np.bool_))
-    occupancy = np.array([[True, False]])
-    assert [planner.plan(occupancy, target).n_batches for _ in range(3)] == [0, 1, 1]
-    occupancy[0, 0] = False
-    assert planner.occupancies[0].tolist() == [[True, False]]
-    with pytest.raises(DeviceError, match="expected \\(4, 4\\)"):
-        ScriptedDetector([occupancy], (4, 4)).detect(Frame(np.zeros((2, 2), np.uint16), 0.1, 0.0))
-    with pytest.raises(ValueError, match="at least one occupancy"):
-        ScriptedDetector([])
 
 
 def test_the_fake_clock_notes_waits_and_hears_the_stop() -> None:
