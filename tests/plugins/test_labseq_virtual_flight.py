@@ -31,7 +31,8 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 from labseq.model import SiteGrid, ToneProgram, TonesNow
-from labseq.testing.rf import (
+
+from .rf import (
     FULL_SCALE_V,
     GRID,
     START_S,

@@ -18,7 +18,8 @@ from labseq_virtual.rf_analysis import (
 )
 
 from labseq.model import RfSamples, RfSpan, RfTones, TonesNow
-from labseq.testing.rf import FULL_SCALE_V, RATE_HZ, START_S, played, program_of
+
+from .rf import FULL_SCALE_V, RATE_HZ, START_S, played, program_of
 
 BAND = Band(75e6, 50e6)
 TRANSIT_S = 10e-6

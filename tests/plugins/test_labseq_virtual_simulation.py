@@ -27,7 +27,8 @@ from labseq.plugin import (
     TweezerAmplitudes,
 )
 from labseq.testing.fakes import FakeClock
-from labseq.testing.rf import GRID as RF_GRID, START_S, PlayedRfSource, played, program_of, spec
+
+from .rf import GRID as RF_GRID, START_S, PlayedRfSource, played, program_of, spec
 
 GRID = SiteGrid(20, 20)
 TINY_IMAGE = {"frame": (2, 2), "background": 0.0}

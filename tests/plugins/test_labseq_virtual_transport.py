@@ -16,7 +16,8 @@ from labseq import Batch, LimitError, MotionSpec, Plan, SiteGrid, check_plan, to
 from labseq.geometry import pattern
 from labseq.model.motion import SpeedProfile
 from labseq.testing.fakes import OneByOnePlanner
-from labseq.testing.rf import ON, PROGRAM_GRID as GRID, ToneProgramBuilder
+
+from .rf import ON, PROGRAM_GRID as GRID, ToneProgramBuilder
 
 PLANE = SiteGrid(5, 6)
 Tone2 = tuple[float, float]

@@ -32,7 +32,8 @@ from scipy.integrate import quad
 from scipy.special import ndtr
 
 from labseq import MotionSpec, SiteGrid, ToneProgram
-from labseq.testing.rf import ON, ToneProgramBuilder
+
+from .rf import ON, ToneProgramBuilder
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -1,4 +1,4 @@
-"""Tone programs for tests, and what an ideal card plays of them."""
+"""Tone programs, and what an ideal card plays of them."""
 
 from __future__ import annotations
 
