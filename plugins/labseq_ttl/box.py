@@ -127,6 +127,8 @@ class Conversation:
             self.send(STOP)
             with self.lock:
                 self._aborted = False
+                # until the box has said so, it drops what it receives
+                self._wait(lambda: ["off"] in [event[:1] for event in self._news] or None, self._max_wait_s)
                 self.ask("off", tries=1)
         finally:
             self._aborted = False

@@ -11,7 +11,7 @@ import pytest
 from labseq_ttl import box as box_module
 from labseq_ttl.__main__ import main
 from labseq_ttl.lines import Heartbeat
-from labseq_ttl.protocol import framed
+from labseq_ttl.protocol import STOP, framed
 from labseq_ttl_sim.model import ModelBox
 from labseq_ttl_sim.simavr import SimavrBox, runner
 
@@ -111,6 +111,35 @@ def test_what_came_damaged_is_sent_again(monkeypatch: pytest.MonkeyPatch, cable:
         for _ in range(5):
             works(lab)
         lab.lines.self_test()
+
+
+class StopsLater(ModelBox):
+    """Drops what it receives between the stop byte and its message, as the firmware does."""
+
+    is_stopping = False
+
+    def _take(self, byte: int) -> None:
+        if byte == STOP[0]:
+            self.is_stopping = True
+        elif not self.is_stopping:
+            super()._take(byte)
+
+    @property
+    def in_waiting(self) -> int:
+        if self.is_stopping:
+            self.is_stopping = False
+            super()._take(STOP[0])
+        return super().in_waiting
+
+
+def test_the_safe_state_waits_until_the_box_has_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("labseq_ttl_sim.access.SimulatedAccess.max_wait_s", 0.1)
+    use_box(monkeypatch, StopsLater())
+    with rig() as lab:
+        works(lab)
+        monkeypatch.setattr(lab.lines, "_connect", lambda: pytest.fail("it has lost the box"))
+        lab.lines.safe_state()
+        works(lab)
 
 
 class KeepsQuiet(ModelBox):
