@@ -113,11 +113,14 @@ def compile_commands(name: str, program: ToneProgram, cores: Cores) -> Commands:
     from labseq_spcm import kernels
 
     row, column = _tones(program.row), _tones(program.column)
-    n_most = 5 * kernels.COURSE_STEPS * (row.shape[1] + column.shape[1]) + 200 * (program.n_segments + 1)
+    tones, both = np.hstack([row, column]), np.concatenate([cores.row, cores.column])
+    offsets = np.stack([program.row.offsets, program.column.offsets + np.int32(row.shape[1])])
+    n_most = 5 * kernels.COURSE_STEPS * tones.shape[1] + 200 * (program.n_segments + 1)
     registers, values = np.empty(n_most, np.int32), np.empty(n_most)
     ends = np.empty(kernels.COURSE_STEPS * program.n_segments + 2, np.int64)
-    axes = (program.row.offsets, row, cores.row, program.column.offsets, column, cores.column)
-    n_blocks = kernels.compile_program(program.duration_s, program.course, *axes, registers, values, ends)
+    n_blocks = kernels.compile_program(
+        program.duration_s, program.course, offsets, tones, both, len(cores.row), registers, values, ends
+    )
     if n_blocks == kernels.TOO_MANY:
         raise _too_many_tones(name, program, cores, int(ends[0]))
     if n_blocks == kernels.TOO_SHORT:
@@ -258,12 +261,6 @@ class Dds:
             text = f"the DDS had no commands in time, after {n_events} of {len(self._commands.ends)} blocks"
             raise TransientError(f"{text}; use fewer tones at once, or the mode replay", card.name)
         return False
-
-    def abort(self) -> None:
-        """Empty the queue; otherwise the card would play the rest at the next start."""
-        self._commands = NO_COMMANDS
-        self._n_sent = 0
-        self._reset()
 
     def _feed(self) -> bool:
         """Send whole blocks while the queue has room; returns whether any were sent.

@@ -26,7 +26,6 @@ RAMP_STEPS: Final = 8
 """Steps of a depth ramp: within 1 / (4 n^2), 0.4 % of the full depth, of a linear ramp."""
 COURSE_STEPS: Final = 16
 """Steps of a transport: the frequency is within 0.3 % of its change."""
-MAX_CORES: Final = 20
 SAME_HZ: Final = 1.0
 """A tone that starts within this of where another ended keeps that tone's core."""
 SAME_TURNS: Final = 1e-3
@@ -46,9 +45,9 @@ FROM_CARD: Final = 2
 AT_TRIGGER: Final = 2
 
 START_HZ, END_HZ, START, END, TURNS = 0, 1, 2, 3, 4
-"""Rows of an axis' tones: frequencies, amplitudes, phase in turns."""
+"""Rows of the tones: frequencies, amplitudes, phase in turns."""
 HZ, HZ_PER_S, AMP, AMP_PER_S = 0, 1, 2, 3
-"""Rows of the present state of an axis' cores."""
+"""Rows of the present state of the cores."""
 
 TOO_SHORT: Final = -1
 TOO_MANY: Final = -2
@@ -118,25 +117,26 @@ def cut(widest: Reals, course: int, duration_s: float, knots: Reals) -> int:
     return n_steps
 
 
-@kernel(f"int64({OFFSETS}, {TONES}, int64, float64, {CORES}, int64[::1], bool_[::1], bool_[::1])")
+@kernel(f"boolean({OFFSETS}, {TONES}, int64, float64, int64, int64, int64[::1], bool_[::1], bool_[::1])")
 def assign(
-    offsets: Shorts, tones: Reals, segment: int, before_s: float, cores: Ints, core_of: Ints,
-    set_phase: Bools, used: Bools,
-) -> int:  # fmt: skip
-    """Assign a core to each tone of a segment: the one that it had, or a free one.
+    offsets: Shorts, tones: Reals, segment: int, before_s: float, first_core: int, last_core: int,
+    core_of: Ints, set_phase: Bools, used: Bools,
+) -> bool:  # fmt: skip
+    """Assign a core to each tone of an axis in a segment: the one that it had, or a free one.
 
     Args:
         offsets: Where each segment's tones start.
-        tones: The axis' tones.
+        tones: All tones.
         segment: The segment.
         before_s: Duration of the segment before it.
-        cores: The axis' cores.
+        first_core: The axis' cores start here in the list of cores.
+        last_core: And end before this.
         core_of: For each tone the index of its core; filled in for the segment's tones.
         set_phase: For each tone whether its phase must be set; likewise.
-        used: (2 MAX_CORES,): scratch.
+        used: Scratch, for each core.
 
     Returns:
-        0, or TOO_MANY.
+        Whether there are enough cores.
     """
     first, last = offsets[segment], offsets[segment + 1]
     used[:] = False
@@ -153,19 +153,19 @@ def assign(
                 never_set = before_s == 0.0 and set_phase[old]
                 set_phase[tone] = never_set or abs(jump - np.rint(jump)) > SAME_TURNS
                 break
-    free = 0
+    free = first_core
     for tone in range(first, last):
         if core_of[tone] < 0:
-            while free < len(cores) and used[free]:
+            while free < last_core and used[free]:
                 free += 1
-            if free == len(cores):
-                return TOO_MANY
+            if free == last_core:
+                return False
             core_of[tone] = free
             used[free] = True
-    return 0
+    return True
 
 
-@kernel("int64(int32, float64, int32[::1], float64[::1], int64)")
+@kernel("int64(int64, float64, int32[::1], float64[::1], int64)")
 def add_command(register: int, value: float, registers: Shorts, values: Reals, n: int) -> int:
     """Add a command."""
     registers[n] = register
@@ -174,14 +174,15 @@ def add_command(register: int, value: float, registers: Shorts, values: Reals, n
 
 
 @kernel(
-    "int64(int64, float64, float64, float64, float64, float64[:, ::1], int64, int32[::1], float64[::1],"
+    f"int64({CORES}, int64, float64, float64, float64, float64, float64[:, ::1], int32[::1], float64[::1],"
     " int64)"
 )
 def drive_core(
-    core: int, hz: float, hz_per_s: float, amp: float, amp_per_s: float, now: Reals, at: int,
+    cores: Ints, at: int, hz: float, hz_per_s: float, amp: float, amp_per_s: float, now: Reals,
     registers: Shorts, values: Reals, n: int,
 ) -> int:  # fmt: skip
     """Add the commands that bring a core from its present state into a new one."""
+    core = cores[at]
     if hz_per_s != 0.0 or now[HZ_PER_S, at] != 0.0 or hz != now[HZ, at]:
         n = add_command(FREQUENCY + core, hz, registers, values, n)
     if hz_per_s != now[HZ_PER_S, at]:
@@ -194,22 +195,31 @@ def drive_core(
     return n
 
 
+@kernel(f"int64({CORES}, bool_[::1], float64[:, ::1], int32[::1], float64[::1], int64)")
+def silence(cores: Ints, keep: Bools, now: Reals, registers: Shorts, values: Reals, n: int) -> int:
+    """Add the commands that silence all cores but some."""
+    for at in range(len(cores)):
+        if not keep[at]:
+            n = drive_core(cores, at, now[HZ, at], 0.0, 0.0, 0.0, now, registers, values, n)
+    return n
+
+
 @kernel(
-    f"int64({OFFSETS}, {TONES}, int64, {CORES}, int64[::1], bool_[::1], int64, boolean, float64, float64,"
+    f"int64({TONES}, int64, int64, {CORES}, int64[::1], bool_[::1], int64, boolean, float64, float64,"
     " float64, float64, float64[:, ::1], int32[::1], float64[::1], int64)"
 )
-def drive_axis(
-    offsets: Shorts, tones: Reals, segment: int, cores: Ints, core_of: Ints, set_phase: Bools, course: int,
+def drive_tones(
+    tones: Reals, first: int, last: int, cores: Ints, core_of: Ints, set_phase: Bools, course: int,
     begins: bool, u: float, until: float, step_s: float, late_s: float, now: Reals, registers: Shorts,
     values: Reals, n: int,
 ) -> int:  # fmt: skip
-    """Add the commands of one axis for one step of a segment.
+    """Add the commands of some tones for one step of a segment.
 
     Args:
-        offsets: Where each segment's tones start.
-        tones: The axis' tones.
-        segment: The segment.
-        cores: The axis' cores.
+        tones: All tones.
+        first: The first of these.
+        last: The one after the last of these.
+        cores: All cores.
         core_of: For each tone the index of its core.
         set_phase: For each tone whether its phase must be set.
         course: The segment's course.
@@ -218,7 +228,7 @@ def drive_axis(
         until: Fraction at which it ends on the card.
         step_s: How long it takes on the card.
         late_s: How much later than in the program it starts, because the card rounds times to ticks.
-        now: Present state of the axis' cores, (4, MAX_CORES).
+        now: Present state of the cores, (4, n).
         registers: The commands' registers.
         values: Their values.
         n: How many commands there are.
@@ -226,14 +236,6 @@ def drive_axis(
     Returns:
         How many commands there are now.
     """
-    first, last = offsets[segment], offsets[segment + 1]
-    if begins:
-        for at in range(len(cores)):
-            on = False
-            for tone in range(first, last):
-                on = on or core_of[tone] == at
-            if not on:
-                n = drive_core(cores[at], now[HZ, at], 0.0, 0.0, 0.0, now, at, registers, values, n)
     s0, s1 = course_at(course, u), course_at(course, until)
     for tone in range(first, last):
         at = int(core_of[tone])
@@ -241,7 +243,7 @@ def drive_axis(
         hz = tones[START_HZ, tone] + way * s0
         a0, a1 = amplitude_at(tones, tone, u), amplitude_at(tones, tone, until)
         hz_per_s, amp_per_s = way * (s1 - s0) / step_s, (a1 - a0) / step_s
-        n = drive_core(cores[at], hz, hz_per_s, a0, amp_per_s, now, at, registers, values, n)
+        n = drive_core(cores, at, hz, hz_per_s, a0, amp_per_s, now, registers, values, n)
         if begins and set_phase[tone]:
             turns = tones[TURNS, tone] + hz * late_s + 0.25  # the card's tones are sines
             n = add_command(PHASE + cores[at], 360.0 * (turns - np.floor(turns)), registers, values, n)
@@ -249,12 +251,12 @@ def drive_axis(
 
 
 @kernel(
-    f"int64({const('float64', 1)}, {const('int8', 1)}, {OFFSETS}, {TONES}, {CORES}, {OFFSETS}, {TONES},"
-    f" {CORES}, int32[::1], float64[::1], int64[::1])"
+    f"int64({const('float64', 1)}, {const('int8', 1)}, {const('int32', 2)}, {TONES}, {CORES}, int64,"
+    " int32[::1], float64[::1], int64[::1])"
 )
 def compile_program(
-    duration_s: Reals, course: NDArray[np.int8], row_offsets: Shorts, row: Reals, row_cores: Ints,
-    column_offsets: Shorts, column: Reals, column_cores: Ints, registers: Shorts, values: Reals, ends: Ints,
+    duration_s: Reals, course: NDArray[np.int8], offsets: Shorts, tones: Reals, cores: Ints,
+    n_row_cores: int, registers: Shorts, values: Reals, ends: Ints,
 ) -> int:  # fmt: skip
     """Compile a tone program into blocks of commands.
 
@@ -264,12 +266,10 @@ def compile_program(
     Args:
         duration_s: Of each segment.
         course: Of each segment.
-        row_offsets: Where each segment's row tones start.
-        row: float64 (5, n): start and end frequency, start and end amplitude, phase in turns.
-        row_cores: The cores of the row axis.
-        column_offsets: The same for the column axis.
-        column: Likewise.
-        column_cores: Likewise.
+        offsets: int32 (2, n_segments + 1), for the row and the column axis where each segment's tones start.
+        tones: float64 (5, n): start and end frequency, start and end amplitude, phase in turns.
+        cores: The cores of the row axis, then those of the column axis.
+        n_row_cores: How many the row axis has.
         registers: Result: register of each command.
         values: Result: its value.
         ends: Result: end of each block among the commands.
@@ -277,26 +277,25 @@ def compile_program(
     Returns:
         Number of blocks; or TOO_SHORT or TOO_MANY, and ``ends[0]`` is the segment.
     """
-    row_now, column_now = np.zeros((4, MAX_CORES)), np.zeros((4, MAX_CORES))
-    row_core, column_core = np.zeros(row.shape[1], np.int64), np.zeros(column.shape[1], np.int64)
-    row_set_phase, column_set_phase = np.ones(row.shape[1], np.bool_), np.ones(column.shape[1], np.bool_)
-    used, widest, knots = np.zeros(2 * MAX_CORES, np.bool_), np.zeros(2), np.zeros(COURSE_STEPS + 1)
+    now, core_of = np.zeros((4, len(cores))), np.zeros(tones.shape[1], np.int64)
+    set_phase = np.ones(tones.shape[1], np.bool_)
+    used, on = np.zeros(len(cores), np.bool_), np.zeros(len(cores), np.bool_)
+    widest, knots = np.zeros(2), np.zeros(COURSE_STEPS + 1)
     n = add_command(SOURCE, FROM_TIMER, registers, values, 0)
     n_blocks, joint_s, before_s = 0, 0.0, 0.0
     for i in range(len(duration_s)):
-        status = assign(row_offsets, row, i, before_s, row_cores, row_core, row_set_phase, used)
-        status += assign(
-            column_offsets, column, i, before_s, column_cores, column_core, column_set_phase, used
-        )
+        on[:] = False
+        widest[:] = 0.0
+        for axis in range(2):
+            first_core, last_core = (0, n_row_cores) if axis == 0 else (n_row_cores, len(cores))
+            if not assign(offsets[axis], tones, i, before_s, first_core, last_core, core_of, set_phase, used):
+                ends[0] = i
+                return TOO_MANY
+            on |= used
+            widest_ramp(tones, offsets[axis, i], offsets[axis, i + 1], widest)
         before_s = duration_s[i]
-        if status < 0:
-            ends[0] = i
-            return TOO_MANY
         if before_s == 0.0:
             continue
-        widest[:] = 0.0
-        widest_ramp(row, row_offsets[i], row_offsets[i + 1], widest)
-        widest_ramp(column, column_offsets[i], column_offsets[i + 1], widest)
         n_steps = cut(widest, course[i], before_s, knots)
         for k in range(n_steps):
             tick = np.rint((joint_s + knots[k] * before_s) / DDS_TICK_S)
@@ -307,25 +306,20 @@ def compile_program(
             step_s, late_s = n_ticks * DDS_TICK_S, tick * DDS_TICK_S - (joint_s + knots[k] * before_s)
             u = knots[k] + late_s / before_s
             until = u + step_s / before_s
-            n = drive_axis(
-                row_offsets, row, i, row_cores, row_core, row_set_phase, course[i], k == 0, u, until, step_s,
-                late_s, row_now, registers, values, n,
-            )  # fmt: skip
-            n = drive_axis(
-                column_offsets, column, i, column_cores, column_core, column_set_phase, course[i], k == 0, u,
-                until, step_s, late_s, column_now, registers, values, n,
-            )  # fmt: skip
+            if k == 0:
+                n = silence(cores, on, now, registers, values, n)
+            for axis in range(2):
+                n = drive_tones(
+                    tones, offsets[axis, i], offsets[axis, i + 1], cores, core_of, set_phase, course[i],
+                    k == 0, u, until, step_s, late_s, now, registers, values, n,
+                )  # fmt: skip
             n = add_command(TIMER, step_s, registers, values, n)
             n = add_command(COMMAND, AT_TRIGGER, registers, values, n)
             ends[n_blocks] = n
             n_blocks += 1
         joint_s += before_s
-    for at in range(len(row_cores)):
-        n = drive_core(row_cores[at], row_now[HZ, at], 0.0, 0.0, 0.0, row_now, at, registers, values, n)
-    for at in range(len(column_cores)):
-        n = drive_core(
-            column_cores[at], column_now[HZ, at], 0.0, 0.0, 0.0, column_now, at, registers, values, n
-        )
+    on[:] = False
+    n = silence(cores, on, now, registers, values, n)
     n = add_command(TIMER, 2 * DDS_MIN_TICKS * DDS_TICK_S, registers, values, n)
     n = add_command(COMMAND, AT_TRIGGER, registers, values, n)
     ends[n_blocks] = n

@@ -65,10 +65,6 @@ class PlayMode(Protocol):
         """Whether the program was played to its end; called repeatedly, it keeps the card supplied."""
         ...
 
-    def abort(self) -> None:
-        """Drop the program, after the card was stopped."""
-        ...
-
 
 class SpcmMobileTweezers(MobileTweezers):
     """Plays tone programs on two outputs of an arbitrary waveform generator.
@@ -333,7 +329,7 @@ class SpcmMobileTweezers(MobileTweezers):
             DeviceError: The card refused a step; all other steps were done.
         """
         self._duration_s = self._due_s = None
-        card, mode = self._card, self._mode
+        card = self._card
         if card is None:
             return
         with suppress(LabseqError):
@@ -346,8 +342,6 @@ class SpcmMobileTweezers(MobileTweezers):
             partial(_open_relay, card, card.spcm.SPC_ENABLEOUT1),
             partial(self._set_amplitude, card, self._amplitude_mv),
         ]
-        if mode is not None:
-            steps.append(mode.abort)
         failures = [failure for step in steps if (failure := _attempt_twice(step)) is not None]
         if failures:
             raise failures[0]

@@ -113,9 +113,6 @@ class Replay:
         """Whether the program has been played to its end."""
         return not self._card.running
 
-    def abort(self) -> None:
-        """Nothing to do: the next program replaces this one."""
-
 
 class Fifo:
     """Mode ``fifo``: streams a program while the rest is still being rendered. See ``PlayMode``.
@@ -205,11 +202,6 @@ class Fifo:
             text = f"underrun: the card ran out of samples ({share}); raise `fill`, lower sample_rate, or use"
             raise TransientError(f"{text} the mode replay", self._card.name)
         return ended
-
-    def abort(self) -> None:
-        """Drop what was not rendered."""
-        self._renderer = None
-        self._n_rendered = self._n_samples
 
     def _feed(self) -> int:
         """Render into the ring while there is room, once around at most; returns how many chunks."""
