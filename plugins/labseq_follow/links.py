@@ -53,11 +53,7 @@ class Link:
     listens = True
 
     def open(self) -> None:
-        """Prepare for a control system to connect.
-
-        Raises:
-            DeviceError: It is not possible.
-        """
+        """Prepare for a control system to connect."""
 
     def now(self) -> float:
         """The time for deadlines, in seconds."""
@@ -77,11 +73,7 @@ class Link:
         return []
 
     def send(self, line: bytes) -> None:
-        """Send a line; from any thread.
-
-        Raises:
-            OSError: No control system is connected, or it does not take the line.
-        """
+        """Send a line; from any thread."""
 
     def close(self) -> None:
         """Close the connection; ``poll`` is not called any more."""

@@ -107,22 +107,14 @@ class Link:
         return self.facts
 
     def load(self, loop: Samples, fade_s: float) -> None:
-        """Play another loop, float32 (2, 2 n) by the channels' numbers; wait until it is at the connectors.
-
-        Raises:
-            DeviceError: The stream is dead.
-        """
+        """Play another loop, float32 (2, 2 n), its channels in order; wait until it is at the connectors."""
         with tempfile.TemporaryDirectory(prefix="labseq-") as folder:
             file = Path(folder) / "loop.npy"
             np.save(file, loop)
             self._do("loop", file=str(file), fade_s=fade_s)
 
     def ramp(self, depth: float, duration_s: float) -> None:
-        """Change the depth, and wait until the end of the ramp is at the connectors.
-
-        Raises:
-            DeviceError: The stream is dead.
-        """
+        """Change the depth, and wait until the end of the ramp is at the connectors."""
         self._do("ramp", depth=depth, duration_s=duration_s)
 
     def check(self) -> None:

@@ -98,11 +98,7 @@ class SimulatedRadio:
         return Ring(self.folder)
 
     def warm(self) -> None:
-        """Compile it.
-
-        Raises:
-            DeviceError: It cannot be compiled.
-        """
+        """Compile it."""
         build_module(self._name)
 
     def connect(self) -> tuple[str, Mapping[str, str], Path]:
@@ -110,9 +106,6 @@ class SimulatedRadio:
 
         Returns:
             The arguments that open it, the environment in which SoapySDR finds it, and a folder for logs.
-
-        Raises:
-            DeviceError: It cannot be compiled.
         """
         environment = {**os.environ, "SOAPY_SDR_PLUGIN_PATH": str(build_module(self._name))}
         self.folder = Path(self._arguments["folder"] if self._given else tempfile.mkdtemp(prefix="labseq-"))

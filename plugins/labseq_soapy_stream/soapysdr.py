@@ -237,11 +237,7 @@ class Stream:
         raise _stream_error("writing to the stream", n_taken)
 
     def underflows(self) -> int:
-        """How often the radio reported since the last call that it ran out of samples.
-
-        Raises:
-            SoapyError: The stream is broken.
-        """
+        """How often the radio reported since the last call that it ran out of samples."""
         count = 0
         while self._knows_status:
             code = self._library.SoapySDRDevice_readStreamStatus(

@@ -209,11 +209,7 @@ def repeated(loop: Samples) -> Samples:
 
 
 def stream(commands: CommandReader, messages: StatusWriter) -> None:
-    """Open the radio, stream, close it.
-
-    Raises:
-        SoapyError: It cannot be opened or set up, or the stream broke.
-    """
+    """Open the radio, stream, close it."""
     setup = commands.setup
     radio = open_radio(setup)
     try:

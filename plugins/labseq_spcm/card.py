@@ -55,7 +55,8 @@ class AwgCard:
         spcm: The vendor's package.
 
     Raises:
-        DeviceError: No package or driver library, no such card, or another program holds it.
+        DeviceError: No package or driver library, no such card, or another program holds it. Every method
+            raises it if the card refuses or reads back another value than was set.
     """
 
     def __init__(self, name: str, library: Library, clock: Clock) -> None:
@@ -125,20 +126,12 @@ class AwgCard:
         return str(self._card.get_error_info())
 
     def read(self, register: int) -> int:
-        """Read a register.
-
-        Raises:
-            DeviceError: The card refuses.
-        """
+        """Read a register."""
         with self._translated_errors(f"reading register {register}"):
             return int(self._card.get_i(register))
 
     def write(self, register: int, value: int, what: str) -> None:
-        """Write a register that cannot be read back.
-
-        Raises:
-            DeviceError: The card refuses.
-        """
+        """Write a register that cannot be read back."""
         with self._translated_errors(f"{what} = {value}"):
             self._card.set_i(register, value)
 
@@ -153,9 +146,6 @@ class AwgCard:
 
         Returns:
             The value that the card reads.
-
-        Raises:
-            DeviceError: The card refuses, or reads another value.
         """
         self.write(register, value, what)
         found = self.read(register)
@@ -169,29 +159,18 @@ class AwgCard:
         Args:
             entries: (n,), as the driver library's ``ST_LIST_PARAM``: register, type, value.
             what: What it does, for messages.
-
-        Raises:
-            DeviceError: The card refuses one; those before it are written.
         """
         address = ctypes.c_void_p(entries.ctypes.data)
         with self._translated_errors(what):
             self._card.set_ptr(self.spcm.SPC_REGISTER_LIST, address, entries.nbytes)
 
     def command(self, command: int, what: str) -> None:
-        """Send a command, one or several M2CMD bits.
-
-        Raises:
-            DeviceError: The card refuses.
-        """
+        """Send a command, one or several M2CMD bits."""
         with self._translated_errors(what):
             self._card.set_i(self.spcm.SPC_M2CMD, command)
 
     def define_transfer(self, frames: NDArray[np.int16], notify_bytes: int = 0) -> None:
-        """Name the samples of the next transfer; the array must live until the transfer is over.
-
-        Raises:
-            DeviceError: The card refuses.
-        """
+        """Name the samples of the next transfer; the array must live until the transfer is over."""
         spcm, address = self.spcm, ctypes.c_void_p(frames.ctypes.data)
         kind, direction = spcm.SPCM_BUF_DATA, spcm.SPCM_DIR_PCTOCARD
         handle = self._card.handle()
@@ -199,12 +178,7 @@ class AwgCard:
             raise DeviceError(self.name, f"naming the transfer buffer: {self.clear_error()}")
 
     def upload(self, frames: NDArray[np.int16]) -> None:
-        """Transfer samples to the on-board memory, and wait until they have arrived.
-
-        Raises:
-            DeviceError: The card refuses.
-            DeviceTimeoutError: The bus is too slow.
-        """
+        """Transfer samples to the on-board memory, and wait until they have arrived."""
         self.define_transfer(frames)
         self.command(self.spcm.M2CMD_DATA_STARTDMA, "upload")
         limit_s = frames.nbytes / SLOW_BUS + TRANSFER_TIMEOUT_S
@@ -215,11 +189,7 @@ class AwgCard:
             self.clock.sleep(POLL_S)
 
     def stop(self) -> None:
-        """Stop playing and transferring; no effect if it does neither.
-
-        Raises:
-            DeviceError: The card refuses.
-        """
+        """Stop playing and transferring; no effect if it does neither."""
         spcm = self.spcm
         self.command(spcm.M2CMD_CARD_STOP | spcm.M2CMD_DATA_STOPDMA, "stop")
         if spcm.spcm_dwInvalidateBuf(self._card.handle(), spcm.SPCM_BUF_DATA):

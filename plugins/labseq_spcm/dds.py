@@ -204,12 +204,7 @@ class Dds:
         card.set(spcm.SPC_DDS_AMP_RAMP_STEPSIZE, AMPLITUDE_STEPSIZE, "DDS amplitude ramp step size")
 
     def prepare(self, program: ToneProgram) -> float:
-        """Compile a program, and queue as much as there is room for; returns its playing time in seconds.
-
-        Raises:
-            LimitError: The DDS cannot play it.
-            DeviceTimeoutError: The card does not take the commands.
-        """
+        """Compile a program, and queue as much as there is room for; returns its playing time in seconds."""
         clock = self._card.clock
         start_s = time.perf_counter()
         self._commands = compile_commands(self._card.name, program, self._cores)
@@ -226,11 +221,7 @@ class Dds:
         return program.total_duration_s
 
     def start(self, command: int) -> None:
-        """Start the card; enable triggers only when the first block waits for one.
-
-        Raises:
-            DeviceTimeoutError: The first block did not arrive.
-        """
+        """Start the card; enable triggers only when the first block waits for one."""
         card, spcm = self._card, self._card.spcm
         self._n_events = card.read(spcm.SPC_DDS_TRG_COUNT)
         card.command(spcm.M2CMD_CARD_START, "start")
@@ -246,9 +237,6 @@ class Dds:
         """Queue more while there is room; whether the last block took effect.
 
         The number of queued commands is 0 while a block still waits, so the events are counted.
-
-        Raises:
-            TransientError: A block came too late.
         """
         card, spcm = self._card, self._card.spcm
         self._feed()

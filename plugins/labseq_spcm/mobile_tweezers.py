@@ -54,7 +54,12 @@ class PlayMode(Protocol):
     render_s: float
 
     def prepare(self, program: ToneProgram) -> float:
-        """Transfer a program to the card; returns the playing time in seconds."""
+        """Transfer a program to the card; returns the playing time in seconds.
+
+        Raises:
+            LimitError: The mode cannot play it.
+            DeviceTimeoutError: The card does not take the data.
+        """
         ...
 
     def start(self, command: int) -> None:
@@ -62,7 +67,11 @@ class PlayMode(Protocol):
         ...
 
     def finished(self) -> bool:
-        """Whether the program was played to its end; called repeatedly, it keeps the card supplied."""
+        """Whether the program was played to its end; called repeatedly, it keeps the card supplied.
+
+        Raises:
+            TransientError: The card ran out of data.
+        """
         ...
 
 

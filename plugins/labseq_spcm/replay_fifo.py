@@ -85,11 +85,7 @@ class Replay:
         self._memory_samples = card.read(spcm.SPC_PCIMEMSIZE) // FRAME_BYTES
 
     def prepare(self, program: ToneProgram) -> float:
-        """Render and upload a program; returns its playing time in seconds.
-
-        Raises:
-            LimitError: It does not fit into the card's memory.
-        """
+        """Render and upload a program; returns its playing time in seconds."""
         start_s = time.perf_counter()
         renderer = InterleavedRenderer(program, self._rate_hz, self._row_channel)
         n_samples = renderer.n_samples
@@ -147,11 +143,7 @@ class Fifo:
         card.set(spcm.SPC_DATA_OUTBUFSIZE, self._fill, "size of the card's FIFO in bytes")
 
     def prepare(self, program: ToneProgram) -> float:
-        """Fill ring and card with the beginning of a program; returns its playing time in seconds.
-
-        Raises:
-            DeviceTimeoutError: The card does not fetch the data.
-        """
+        """Fill ring and card with the beginning of a program; returns its playing time in seconds."""
         card, spcm = self._card, self._card.spcm
         start_s = time.perf_counter()
         self._renderer = InterleavedRenderer(program, self._rate_hz, self._row_channel)
@@ -176,11 +168,7 @@ class Fifo:
         self._card.command(command, "start")
 
     def finished(self) -> bool:
-        """Feed the card while it has room; whether it has played to the end.
-
-        Raises:
-            TransientError: The card ran out of data.
-        """
+        """Feed the card while it has room; whether it has played to the end."""
         try:
             is_full = self._feed() < RING_CHUNKS
         except DeviceError:  # the card may have stopped just after it reported room
@@ -190,11 +178,7 @@ class Fifo:
         return self._has_ended()
 
     def _has_ended(self) -> bool:
-        """Whether the card has played to the end.
-
-        Raises:
-            TransientError: It ran out of data.
-        """
+        """Whether the card has played to the end."""
         spcm, status = self._card.spcm, self._card.status
         ended = bool(status & spcm.M2STAT_CARD_READY)
         if status & spcm.M2STAT_DATA_OVERRUN or (ended and self._n_rendered < self._n_samples):

@@ -184,11 +184,7 @@ class Dds:
     # Registers and commands
 
     def write(self, register: int, value: Number, now_s: float) -> None:
-        """Take a value or a command.
-
-        Raises:
-            Refusal: Out of range, a register that can only be read, or a command that is not modelled.
-        """
+        """Take a value or a command."""
         if register == r.SPC_DDS_CMD:
             self._command(int(value), now_s)
         elif register in (r.SPC_DDS_CORES_ON_CH0, r.SPC_DDS_CORES_ON_CH1):
@@ -254,11 +250,7 @@ class Dds:
         self._wire_free_s = wire_s
 
     def read(self, register: int) -> float:
-        """The value of a DDS register.
-
-        Raises:
-            Refusal: There is no such register.
-        """
+        """The value of a DDS register."""
         if register == r.SPC_DDS_STATUS:
             waiting = self._shadow is not None and self._is_running
             return self._flags | (r.SPCM_DDS_STAT_WAITING_FOR_TRG if waiting else 0)

@@ -115,11 +115,7 @@ class Machine:
     # Registers
 
     def write(self, register: int, value: Number, now_s: float) -> None:
-        """Write a register, also a command.
-
-        Raises:
-            Refusal: The card does not take it.
-        """
+        """Write a register, also a command."""
         if register == r.SPC_M2CMD:
             self._command(int(value), now_s)
         elif register in DDS_REGISTERS:
@@ -136,11 +132,7 @@ class Machine:
                 self.amplifiers[OUTPUTS[register]].enable(bool(self.setup[register]), now_s)
 
     def read(self, register: int) -> Number:
-        """Read a register.
-
-        Raises:
-            Refusal: There is no such register.
-        """
+        """Read a register."""
         if register in DDS_REGISTERS:
             return self.dds.read(register)
         if register == r.SPC_M2STATUS:
@@ -245,11 +237,7 @@ class Machine:
     # Data
 
     def define_transfer(self, buffer: Buffer) -> None:
-        """Name the buffer of the next transfer.
-
-        Raises:
-            Refusal: It is larger than the memory that is set up, or the FIFO is running.
-        """
+        """Name the buffer of the next transfer."""
         setup = self.setup
         self.fifo = None
         self.underrun = False

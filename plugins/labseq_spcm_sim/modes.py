@@ -227,11 +227,7 @@ class Fifo:
         self._total = n_samples * self._frame if n_samples else math.inf
 
     def hand_over(self, n_bytes: int) -> None:
-        """The user has filled bytes, which the card may now fetch.
-
-        Raises:
-            Refusal: More than were free, or not whole samples.
-        """
+        """The user has filled bytes, which the card may now fetch."""
         if not 0 <= n_bytes <= self.user_bytes:
             raise refuse(n_bytes, f"0 to {self.user_bytes} bytes")
         if n_bytes % self._frame:

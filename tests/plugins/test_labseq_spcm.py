@@ -10,14 +10,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, strategies as st
-from hypothesis.extra.numpy import arrays
-from labseq_spcm.kernels import interleave
 from labseq_spcm.mobile_tweezers import HOT_C, TEST_SAMPLES, SpcmMobileTweezers
 from labseq_spcm.replay_fifo import CHUNK, InterleavedRenderer
 from labseq_spcm.settings import SpcmSettings
 from labseq_spcm_sim import M4I6631, SimulatedLibrary, Span, Tone, ToneSpan
-from numpy.typing import NDArray
 
 from labseq.motion import render, tone_program
 from labseq.plugin import (
@@ -251,19 +247,6 @@ class CreepingClock(FakeClock):
         return super().now()
 
 
-def test_programs_are_streamed_beyond_what_card_and_ring_hold(driver: Any) -> None:
-    with driver("fifo", fill=1e-3) as lab:
-        program = lab.program(16)
-        rendered = render(program, lab.rate_hz).samples
-        lab.tweezers.prepare(program)
-        filled_s = lab.card._machine.fifo._handed / 4 / lab.rate_hz
-        assert filled_s < 0.6 * program.total_duration_s
-        lab.tweezers.play()
-        lab.tweezers.wait(1.0)
-        assert np.array_equal(lab.samples(0)[: rendered.shape[1]], rendered[0])
-        assert np.array_equal(lab.samples(1)[: rendered.shape[1]], rendered[1])
-
-
 @pytest.mark.parametrize("fill_s", [8e-3, 20e-3])
 def test_card_and_ring_are_filled_about_as_far_ahead_as_the_profile_says(driver: Any, fill_s: float) -> None:
     with driver("fifo", fill=fill_s) as lab:
@@ -333,14 +316,6 @@ def test_an_underrun_in_the_middle_of_feeding_is_an_underrun(driver: Any, creep_
         clock.creep_s = 0.0
         assert lab.card.outputs_on == (False, False)
         assert not lab.card.running
-
-
-@given(st.integers(0, 100).flatmap(lambda n: arrays(np.int16, (2, n))))
-def test_interleaving_puts_the_samples_of_both_outputs_side_by_side(samples: NDArray[np.int16]) -> None:
-    first, second = samples.view(np.uint16)
-    frames = np.empty(samples.shape[1], np.uint32)
-    interleave(first, second, frames)
-    assert np.array_equal(frames.view(np.int16).reshape(-1, 2), samples.T)
 
 
 @pytest.mark.parametrize("row_channel", [0, 1])

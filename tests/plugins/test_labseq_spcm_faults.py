@@ -20,7 +20,6 @@ from hypothesis.stateful import (
     rule,
     run_state_machine_as_test,
 )
-from labseq_spcm.dds import ENTRY, TYPE_INT64
 from labseq_spcm.library import VendorLibrary, load_spcm
 from labseq_spcm.mobile_tweezers import SpcmMobileTweezers
 from labseq_spcm.settings import SpcmSettings
@@ -204,23 +203,6 @@ class TestFaultsOfThePackage:
             lab.card.write(AMP0, 9000)  # also with an error pending
         gc.collect()
         assert not unraisable
-
-    def test_register_lists_longer_than_1024_entries_are_written_whole(self, driver: Any) -> None:
-        with driver("dds") as lab:
-            entries = np.zeros(3000, ENTRY)
-            entries["register"], entries["type"] = TIMEOUT, TYPE_INT64
-            entries["value"] = np.arange(3000)
-            lab.tweezers._card.write_list(entries, "many values")
-            assert lab.written(TIMEOUT)[-3000:] == list(range(3000))
-
-    def test_two_cards_in_one_process_keep_their_own_cores(self, driver: Any) -> None:
-        few = MotionSpec(max_row_tones=20, max_column_tones=1)
-        plan = Plan.from_batches([([(0, 0)], [(0, 3)])])
-        with driver("dds", motion=few) as first, driver("dds") as second:
-            for lab, core in ((first, 20), (second, 8)):
-                lab.play(tone_program(plan, motion=lab.motion))
-                (span, *_) = lab.card.played(1)
-                assert [tone.core for tone in span.tones] == [core]
 
     def test_it_is_imported_when_warming_and_prints_nothing(self) -> None:
         code = """

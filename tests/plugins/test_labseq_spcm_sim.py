@@ -380,20 +380,6 @@ class Stream(Card):
         return np.concatenate([span.values() for span in self.spans()])
 
 
-def test_a_stream_is_played_in_order_without_a_gap() -> None:
-    stream = Stream()
-    stream.start(8)
-    for _ in range(40):
-        stream.clock.sleep(NOTIFY / 500e6)
-        stream.fill(stream.n_free)
-    stream.command(r.M2CMD_CARD_STOP)
-    values, spans = stream.values(), stream.spans(1)
-    assert stream.n_sent >= 40
-    assert np.array_equal(values, (np.arange(len(values)) // NOTIFY + 1).astype(np.int16))
-    for before, after in itertools.pairwise(spans):
-        assert after.start_s == pytest.approx(before.end_s, abs=1e-12)
-
-
 def test_an_underrun_stops_the_output_until_a_new_stream_is_played() -> None:
     stream = Stream()
     stream.start(4)
@@ -410,21 +396,6 @@ def test_an_underrun_stops_the_output_until_a_new_stream_is_played() -> None:
     stream.clock.sleep(5 * NOTIFY / 500e6)
     assert stream.running
     assert len(stream.values()) > 8 * NOTIFY
-
-
-def test_two_channels_at_full_rate_outrun_the_bus() -> None:
-    stream = Stream(64, SPC_SAMPLERATE=1_250_000_000, SPC_DATA_OUTBUFSIZE=64 * 1024)
-    stream.start(64)
-    stream.clock.sleep(10 * 64 * 1024 / (5e9 - BUS))
-    assert stream.status() & r.M2STAT_DATA_OVERRUN
-
-
-def test_a_bounded_stream_ends_by_itself() -> None:
-    stream = Stream(SPC_SEGMENTSIZE=NOTIFY, SPC_LOOPS=6)
-    stream.start(8)
-    stream.clock.sleep(238.5 / 500e6 + 16e-9 + 6 * NOTIFY / 500e6 + 1e-9)
-    assert stream.status() & (r.M2STAT_CARD_READY | r.M2STAT_DATA_OVERRUN) == r.M2STAT_CARD_READY
-    assert np.array_equal(np.unique(stream.values()), np.arange(1, 7))
 
 
 def test_the_ring_is_free_again_in_whole_blocks_and_no_more_is_taken_than_is_free() -> None:

@@ -158,14 +158,6 @@ def test_a_queue_that_is_too_full_loses_blocks_and_reports_it() -> None:
     assert card.read(r.SPC_DDS_QUEUE_CMD_COUNT)[1] == card.read(r.SPC_DDS_QUEUE_CMD_MAX)[1] - 1
 
 
-def test_cores_play_on_the_channel_that_they_are_connected_to() -> None:
-    card = Synthesizer()
-    card.write(r.SPC_DDS_CORES_ON_CH1, 0xF00)
-    card.start({FREQ + core: 80e6 for core in (0, 8, 20)} | {AMP + core: 0.2 for core in (0, 8, 20)})
-    card.force()
-    assert [[tone.core for tone in card.spans(channel)[0].tones] for channel in (0, 1)] == [[0], [8, 20]]
-
-
 def test_an_amplitude_ramp_ends_at_full_scale() -> None:
     card = Synthesizer()
     card.start({FREQ: 80e6, AMP_SLOPE: 5000.0})
